@@ -1,0 +1,1 @@
+"""mcsim: is the isotropy violation I measure made by my instrument?"""

@@ -1,0 +1,39 @@
+"""Harmonic coefficients in healpy's m-major order: a_00, a_10, ..., a_lmax0, a_11, a_21, ..."""
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def size(lmax: int) -> int:
+    """Number of coefficients with 0 <= m <= l <= lmax."""
+    return (lmax + 1) * (lmax + 2) // 2
+
+
+def start(lmax: int, m: int) -> int:
+    """Offset such that a_lm stands at ``start(lmax, m) + l``."""
+    return m * (2 * lmax + 1 - m) // 2
+
+
+@lru_cache(maxsize=8)
+def degrees(lmax: int) -> NDArray[np.int64]:
+    """Degree l of every coefficient, shape (size(lmax),), read-only."""
+    ell = np.concatenate([np.arange(m, lmax + 1) for m in range(lmax + 1)])
+    ell.setflags(write=False)
+    return ell
+
+
+def multiply(alm: NDArray[np.complex128], factor: NDArray, lmax: int) -> NDArray[np.complex128]:
+    """Coefficients f_l a_lm for a factor f_l of shape (>= lmax + 1,), real or complex."""
+    return alm * factor[degrees(lmax)]
+
+
+def resize(alm: NDArray[np.complex128], lmax: int, new_lmax: int) -> NDArray[np.complex128]:
+    """Coefficients up to ``new_lmax``: cut, or padded with zeros."""
+    resized = np.zeros(size(new_lmax), dtype=np.complex128)
+    top = min(lmax, new_lmax)
+    for m in range(top + 1):
+        source, target = start(lmax, m), start(new_lmax, m)
+        resized[target + m : target + top + 1] = alm[source + m : source + top + 1]
+    return resized

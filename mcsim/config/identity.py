@@ -1,0 +1,72 @@
+"""What defines the result of a run: its hash, and how two runs differ."""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from mcsim.config import paths
+from mcsim.config.load import to_dict
+from mcsim.config.schema import RunConfig, analysis_lmax, pixel_window
+
+
+def science(config: RunConfig) -> dict[str, Any]:
+    """The part of a run that defines its numbers, with the contents of files in place of their names.
+
+    Sky, map, channels, biposh, seed and pairing; not name, compute, the number of realizations or keep_maps. A file is stood
+    for by the SHA-256 of its contents, a template by those of its files. Skies given one file per realization are stood for by
+    the part of their template that has the placeholder and by the contents of realization 0: the others are not read.
+
+    Raises
+    ------
+    InputError
+        A file does not exist.
+    """
+    plain = to_dict(config)
+    for entry in paths.entries(plain):
+        found = {label: _sha256(path) for label, path in paths.files(entry, config.map.splits, config.name).items()}
+        contents: Any = found[""] if list(found) == [""] else found
+        if "realization" in entry.rule.placeholders:
+            contents = {"template": paths.template_tail(entry.template), "first": contents}
+        entry.holder[entry.field] = contents
+    plain["biposh"]["lmax"] = analysis_lmax(config)
+    window = plain["map"].pop("pixel_window")
+    for table, channel in zip(plain["channel"], config.channels, strict=True):
+        table["pixel_window"] = pixel_window(config, channel) if window is None else window
+    return {
+        "schema": plain["schema"],
+        **{section: plain[section] for section in ("sky", "map", "channel", "biposh")},
+        "ensemble": {key: plain["ensemble"][key] for key in ("seed", "paired")},
+    }
+
+
+def digest(config: RunConfig) -> str:
+    """SHA-256 of the canonical JSON of :func:`science`, in hexadecimal."""
+    return hashlib.sha256(json.dumps(science(config), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()).hexdigest()
+
+
+def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
+    """Keys whose values differ between two results of :func:`science`, as ``key: old -> new``, sorted by key."""
+    before, after = dict(_leaves(old, "")), dict(_leaves(new, ""))
+    return [
+        f"{key}: {before.get(key, 'absent')} -> {after.get(key, 'absent')}"
+        for key in sorted(before.keys() | after.keys())
+        if before.get(key) != after.get(key)
+    ]
+
+
+def _leaves(value: Any, key: str) -> list[tuple[str, str]]:
+    if isinstance(value, dict):
+        return [leaf for name, item in value.items() for leaf in _leaves(item, f"{key}.{name}" if key else name)]
+    if isinstance(value, list) and value and all(isinstance(item, dict) for item in value):
+        names = [str(item.get("name", number)) for number, item in enumerate(value)]
+        inner = [leaf for name, item in zip(names, value, strict=True) for leaf in _leaves(item, f"{key}[{name}]")]
+        return [(f"{key} (order)", ", ".join(names)), *inner]
+    if isinstance(value, str) and value.startswith("sha256:"):
+        return [(key, f"contents {value[:19]}")]
+    return [(key, json.dumps(value))]
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as stream:
+        return f"sha256:{hashlib.file_digest(stream, 'sha256').hexdigest()}"

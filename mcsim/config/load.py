@@ -1,0 +1,140 @@
+"""Read a run from TOML or a dict, and write it as JSON for a worker."""
+
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from mcsim import resources
+from mcsim.config import paths
+from mcsim.config.messages import sentence, shown
+from mcsim.config.schema import RunConfig, analysis_lmax, pixel_window
+from mcsim.errors import InputError
+
+_ADAPTER = TypeAdapter(RunConfig)
+
+
+def load(source: str | Path | Mapping[str, Any], base: str | Path | None = None) -> RunConfig:
+    """Read and check a run.
+
+    Parameters
+    ----------
+    source
+        Path of a TOML file of schema 1; or the name of a packaged workflow (``"quickstart"``), used where no such file exists;
+        or a dict of the same structure.
+    base
+        Folder that the relative paths of a dict start from; default: the working folder. Those of a file start from its folder.
+
+    Returns
+    -------
+    RunConfig
+        With absolute paths, in which {channel}, {split} and {realization} are still to be filled by :func:`channel_path` and
+        :func:`sky_path`. All files that it names exist.
+
+    Raises
+    ------
+    InputError
+        Whatever is wrong: one sentence with file, key, value, limit and remedy.
+    """
+    if isinstance(source, Mapping):
+        where, folder = "configuration", Path(base or ".")
+        plain = _plain(source, where)
+    else:
+        path = Path(source)
+        where = str(source)
+        plain, folder = _read(path if _is_file(path) else resources.workflow(source))
+    if "effect" in plain:
+        raise InputError(f"{where}: effects ([[effect]]) are not in this version of mcsim; remove them.")
+    paths.make_absolute(plain, folder, where)
+    config = _validate(plain, where)
+    paths.check_files(config, plain, where)
+    return config
+
+
+def check_skies(config: RunConfig, realizations: range) -> None:
+    """Refuse a run whose sky files of these realizations do not all exist."""
+    paths.check_files(config, to_dict(config), config.name, realizations)
+
+
+def to_dict(config: RunConfig) -> dict[str, Any]:
+    """Plain dict as in TOML: ``load(to_dict(config)) == config``; None marks what is left out."""
+    plain: dict[str, Any] = _ADAPTER.dump_python(config, mode="json", by_alias=True)
+    return plain
+
+
+def resolved(config: RunConfig) -> dict[str, Any]:
+    """Plain dict with every default written out, for the attributes of a store and for people.
+
+    ``biposh.lmax`` is the degree used, and every channel has the ``pixel_window`` that applies to it.
+    """
+    plain = to_dict(config)
+    plain["biposh"]["lmax"] = analysis_lmax(config)
+    del plain["map"]["pixel_window"]
+    for table, channel in zip(plain["channel"], config.channels, strict=True):
+        table["pixel_window"] = pixel_window(config, channel)
+    return plain
+
+
+def to_json(config: RunConfig) -> str:
+    """JSON from which :func:`from_json` rebuilds the same configuration."""
+    return _ADAPTER.dump_json(config, by_alias=True).decode()
+
+
+def from_json(text: str) -> RunConfig:
+    """Rebuild a configuration, for instance on a worker; files are not looked for."""
+    return _validate(json.loads(text), "configuration")
+
+
+def json_schema() -> dict[str, Any]:
+    """JSON schema of the TOML file, for editors."""
+    return _ADAPTER.json_schema(by_alias=True)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # a name that no file system takes
+        return False
+
+
+def _read(path: Path) -> tuple[dict[str, Any], Path]:
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}); check its permissions.") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path} is not text in UTF-8; give a TOML file.") from None
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise InputError(f"{path} is not valid TOML: {error}; correct it there.") from None
+    return _plain(table, str(path)), path.parent
+
+
+def _plain(source: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Copy that consists of what JSON knows, with numpy's scalars and pathlib's paths converted."""
+
+    def convert(value: Any) -> Any:
+        if isinstance(value, np.generic):
+            return value.item()
+        if isinstance(value, Path):
+            return str(value)
+        raise InputError(f"{where}: the value {shown(str(value))} is a {type(value).__name__}; give a number, text, true or false.")
+
+    try:
+        plain: dict[str, Any] = json.loads(json.dumps(dict(source), default=convert))
+    except (TypeError, ValueError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{where} cannot be read ({error}); give a dict with the structure of the TOML file.") from None
+    return plain
+
+
+def _validate(plain: dict[str, Any], where: str) -> RunConfig:
+    # JSON mode is strict about numbers and text but takes lists for tuples, which TOML has and Python's strict mode refuses.
+    try:
+        return _ADAPTER.validate_json(json.dumps(plain), by_alias=True, by_name=False)
+    except ValidationError as error:
+        raise InputError(sentence(error, plain, where)) from None

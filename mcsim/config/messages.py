@@ -1,0 +1,127 @@
+"""From a failed check of the schema to one sentence: file, key, value, limit, remedy."""
+
+import difflib
+import json
+from collections.abc import Iterable
+from dataclasses import fields
+from typing import Any
+
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails
+
+from mcsim.config import schema
+
+# Table -> what may stand in it. A beam or scan is told apart by its kind, which pydantic puts into the location.
+_TABLES: dict[tuple[str, ...], type] = {
+    (): schema.RunConfig,
+    ("sky",): schema.Sky,
+    ("map",): schema.Map,
+    ("channel",): schema.Channel,
+    ("channel", "noise"): schema.Noise,
+    ("biposh",): schema.Biposh,
+    ("ensemble",): schema.Ensemble,
+    ("compute",): schema.Compute,
+    ("channel", "beam", "gaussian"): schema.BeamGaussian,
+    ("channel", "beam", "elliptical_gaussian"): schema.BeamEllipticalGaussian,
+    ("channel", "beam", "map"): schema.BeamMap,
+    ("channel", "beam", "blm"): schema.BeamBlm,
+    ("channel", "scan", "parallel_transport"): schema.ScanParallelTransport,
+    ("channel", "scan", "hit_averaged"): schema.ScanHitAveraged,
+    ("channel", "scan", "moments"): schema.ScanMoments,
+    ("channel", "scan", "pointing"): schema.ScanPointing,
+}
+_TOML_NAMES = {"schema_version": "schema", "channels": "channel"}
+
+_EXPECTED = {
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "int_parsing_size": "a whole number of fewer digits",
+    "float_type": "a number",
+    "finite_number": "a finite number",
+    "string_type": "text in quotes",
+    "string_unicode": "text in UTF-8",
+    "bool_type": "true or false",
+    "tuple_type": "a list in [ ]",
+    "dataclass_type": "a table of keys",
+    "model_attributes_type": "a table of keys",
+    "union_tag_not_found": "a table with a kind",
+}
+_BOUNDS = {
+    "greater_than": ("gt", "is too small", "above"),
+    "greater_than_equal": ("ge", "is too small", "at least"),
+    "less_than": ("lt", "is too large", "below"),
+    "less_than_equal": ("le", "is too large", "at most"),
+}
+
+
+def sentence(error: ValidationError, plain: Any, where: str) -> str:
+    """One sentence about the first thing that is wrong; unknown keys first, for they explain the missing ones."""
+    details = error.errors(include_url=False)
+    first = next((item for item in details if item["type"] == "unexpected_keyword_argument"), details[0])
+    key, tables = _locate(first["loc"], plain)
+    return f"{where}: {_text(first, key, tables)}."
+
+
+def _text(item: ErrorDetails, key: str, tables: tuple[str, ...]) -> str:
+    kind, context = item["type"], item.get("ctx", {})
+    stated = f"{key} = {shown(item['input'])}" if key else "the configuration"
+    if kind == "unexpected_keyword_argument":
+        known = [_TOML_NAMES.get(field.name, field.name) for field in fields(_TABLES[tables])]
+        return f"the key {key} is unknown{_closest(str(item['loc'][-1]), known)}; remove it or correct it to one of {', '.join(known)}"
+    if kind == "missing":
+        return f"the key {key} is missing; add it"
+    if kind == "value_error":
+        reason = str(context["error"])
+        if isinstance(item["input"], dict | schema.RunConfig):
+            return f"{key}: {reason}" if key else reason
+        return f"{stated} {reason}"
+    if kind in _BOUNDS:
+        name, what, limit = _BOUNDS[kind]
+        return f"{stated} {what}; give {limit} {context[name]:g}"
+    if kind == "too_short":
+        return f"{key} is empty; give at least one"
+    if kind == "literal_error":
+        if key == "schema":
+            return f"{stated} is not supported; this version of mcsim reads schema = 1"
+        return f"{stated} is not one of {context['expected']}{_closest(str(item['input']), context['expected'].split(chr(39))[1::2])}; use one of them"
+    if kind == "union_tag_invalid":
+        tag, known = str(context["tag"]), context["expected_tags"].split("'")[1::2]
+        if tag == "differencing":
+            return f'{key}.kind = "differencing" is not in this version of mcsim; use one of {", ".join(known)}'
+        return f"{key}.kind = {shown(tag)} is unknown{_closest(tag, known)}; use one of {', '.join(known)}"
+    if kind == "union_tag_not_found" and isinstance(item["input"], dict):
+        return f"the key {key}.kind is missing; add it"
+    if kind in _EXPECTED:
+        return f"{stated} has the wrong type or value; give {_EXPECTED[kind]}"
+    return f"{stated} cannot be used ({item['msg'].rstrip('.')}); correct it"
+
+
+def shown(value: Any) -> str:
+    """A value as TOML writes it, cut to a readable length."""
+    try:
+        text = json.dumps(value, default=str)
+    except (ValueError, TypeError):
+        text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _closest(word: str, known: Iterable[str]) -> str:
+    match = difflib.get_close_matches(word, list(known), n=1)
+    return f" (did you mean {match[0]}?)" if match else ""
+
+
+def _locate(loc: tuple[int | str, ...], plain: Any) -> tuple[str, tuple[str, ...]]:
+    """Dotted key for people, with the names of channels, and the table that it stands in."""
+    key, here = "", plain
+    tag_passed = False
+    for part in loc:
+        if isinstance(part, int):
+            here = here[part] if isinstance(here, list) and part < len(here) else None
+            key += f"[{here['name']}]" if isinstance(here, dict) and isinstance(here.get("name"), str) else f"[{part}]"
+            continue
+        if isinstance(here, dict) and here.get("kind") == part and not tag_passed:
+            tag_passed = True
+            continue
+        key = f"{key}.{part}" if key else part
+        here = here.get(part) if isinstance(here, dict) else None
+    return key, tuple(str(part) for part in loc[:-1] if not isinstance(part, int))

@@ -1,0 +1,276 @@
+"""Schema 1 of a run: frozen dataclasses that check themselves, one definition for TOML and for Python.
+
+The unit of every number stands in its key. A check that fails raises ValueError whose text follows ``key = value``;
+:mod:`mcsim.config.messages` makes the sentence of it.
+"""
+
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
+from pydantic.dataclasses import dataclass
+
+_STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, validate_by_name=True, validate_by_alias=True)
+
+NSIDE_MAX = 8192
+LMAX_MAX = 32768
+
+
+def _power_of_two(value: int) -> int:
+    if value < 1 or value & (value - 1):
+        above = 1 << max(value, 1).bit_length()
+        raise ValueError(f"is not a power of two; use {max(above // 2, 1)} or {above}")
+    return value
+
+
+def _label(value: str) -> str:
+    """Names of channels and splits become parts of file names and of the labels ``channel:split,channel:split``."""
+    if not value.strip() or value != value.strip() or any(c in "/\\:,{}" or not c.isprintable() for c in value):
+        raise ValueError("is not a usable name: it needs a printable character, no blanks at its ends and none of / \\ : , { }; rename it")
+    return value
+
+
+def _different(values: Sequence[str]) -> None:
+    twice = [value for value in values if values.count(value) > 1]
+    if twice:
+        raise ValueError(f"names {twice[0]!r} twice; give every one its own name")
+
+
+def _unique(values: tuple[str, ...]) -> tuple[str, ...]:
+    _different(values)
+    return values
+
+
+def _not_empty(value: str) -> str:
+    if not value.strip():
+        raise ValueError("is empty; give a name or a path")
+    return value
+
+
+Label = Annotated[str, AfterValidator(_label)]
+PathText = Annotated[str, AfterValidator(_not_empty)]
+Degree = Annotated[int, Field(ge=2, le=LMAX_MAX)]
+BeamOrder = Annotated[int, Field(ge=0, le=LMAX_MAX)] | None
+Fwhm = Annotated[float, Field(gt=0.0, le=10800.0)]
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class Sky:
+    """Isotropic Gaussian skies from ``spectrum``, or skies given as a_lm or map files (templates with {realization})."""
+
+    lmax: Degree
+    spectrum: PathText | None = None
+    alm: PathText | None = None
+    map: PathText | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if self.alm is not None and self.map is not None:
+            raise ValueError("both alm and map are given; keep one of them")
+        if self.alm is None and self.map is None and self.spectrum is None:
+            raise ValueError('none of spectrum, alm, map is given; add one, for example spectrum = "wmap7"')
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class Map:
+    """Pixels, frame, mask, splits and pixel window.
+
+    ``pixel_window``: "computed", "none" or a FITS file; left out, it is "computed" for scans whose samples spread over
+    the pixels and "none" for parallel transport, whose samples stand at the centres.
+    """
+
+    nside: Annotated[int, Field(ge=1, le=NSIDE_MAX), AfterValidator(_power_of_two)]
+    frame: Literal["ecliptic", "galactic", "equatorial"] = "ecliptic"
+    mask: PathText | None = None
+    splits: Annotated[tuple[Label, ...], AfterValidator(_unique)] = ()
+    pixel_window: PathText | None = None
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class BeamGaussian:
+    """Circular Gaussian."""
+
+    kind: Literal["gaussian"] = "gaussian"
+    fwhm_arcmin: Fwhm
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class BeamEllipticalGaussian:
+    """Elliptical Gaussian; ``angle_deg`` is that of the major axis, from the beam's x axis towards y."""
+
+    kind: Literal["elliptical_gaussian"] = "elliptical_gaussian"
+    fwhm_major_arcmin: Fwhm
+    fwhm_minor_arcmin: Fwhm
+    angle_deg: float = 0.0
+    m_max: BeamOrder = None
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.fwhm_major_arcmin < self.fwhm_minor_arcmin:
+            raise ValueError(
+                f"fwhm_major_arcmin = {self.fwhm_major_arcmin:g} is smaller than fwhm_minor_arcmin = {self.fwhm_minor_arcmin:g}; "
+                "exchange them and add 90 to angle_deg"
+            )
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class BeamMap:
+    """Two-dimensional beam map in FITS; ``pixel_deg`` left out is read from the file."""
+
+    kind: Literal["map"] = "map"
+    path: PathText
+    pixel_deg: Annotated[float, Field(gt=0.0, le=10.0)] | None = None
+    cut_deg: Annotated[float, Field(gt=0.0, le=90.0)] = 3.5
+    m_max: BeamOrder = None
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class BeamBlm:
+    """File of b_lm."""
+
+    kind: Literal["blm"] = "blm"
+    path: PathText
+    m_max: BeamOrder = None
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class ScanParallelTransport:
+    """One sample at every pixel centre, at the angle ``psi0_deg`` from e_theta."""
+
+    kind: Literal["parallel_transport"] = "parallel_transport"
+    psi0_deg: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class ScanHitAveraged:
+    """Orientation moments of a scan model: a packaged name or a TOML file."""
+
+    kind: Literal["hit_averaged"] = "hit_averaged"
+    model: PathText
+    sample_period_s: Annotated[float, Field(gt=0.0)] | None = None
+    line_of_sight: PathText | None = None
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class ScanMoments:
+    """Orientation moments from a FITS file."""
+
+    kind: Literal["moments"] = "moments"
+    path: PathText
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class ScanPointing:
+    """Orientation moments of a file of pointings: theta, phi, psi[, time]."""
+
+    kind: Literal["pointing"] = "pointing"
+    path: PathText
+
+
+Beam = Annotated[BeamGaussian | BeamEllipticalGaussian | BeamMap | BeamBlm, Field(discriminator="kind")]
+Scan = Annotated[ScanParallelTransport | ScanHitAveraged | ScanMoments | ScanPointing, Field(discriminator="kind")]
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class Noise:
+    """White noise per sample; the variance of a pixel is sigma0_uk^2 / hits."""
+
+    sigma0_uk: Annotated[float, Field(ge=0.0)] = 0.0
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class Channel:
+    """One detector or band: a beam under a scan, with noise."""
+
+    name: Label
+    beam: Beam
+    scan: Scan
+    frequency_ghz: Annotated[float, Field(gt=0.0)] | None = None
+    noise: Noise = Noise()
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class Biposh:
+    """What is estimated; ``lmax`` left out is the sky's, ``iterations`` are Jacobi iterations of the analysis."""
+
+    L_max: Annotated[int, Field(ge=0)] = 2
+    lmax: Degree | None = None
+    summary_bin: Annotated[int, Field(ge=1)] = 50
+    weighting: Literal["uniform", "hits"] = "uniform"
+    iterations: Annotated[int, Field(ge=0, le=20)] = 0
+    pairs: Literal["all", "auto"] = "all"
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class Ensemble:
+    """Realizations 0 .. realizations - 1 of the seed; ``paired`` adds the circular twin of every one."""
+
+    realizations: Annotated[int, Field(ge=1, le=10_000_000)]
+    seed: Annotated[int, Field(ge=0, le=2**63 - 1)]
+    paired: bool = True
+    keep_maps: bool = False
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class Compute:
+    """How it is computed; nothing here changes a result. ``chunk``: realizations of a task, chosen by mcsim when left out."""
+
+    workers: Annotated[int, Field(ge=1, le=100_000)] = 2
+    chunk: Annotated[int, Field(ge=1, le=2**20), AfterValidator(_power_of_two)] | None = None
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class RunConfig:
+    """A whole run. In TOML ``schema_version`` is ``schema`` and ``channels`` are the tables ``[[channel]]``."""
+
+    schema_version: Annotated[Literal[1], Field(alias="schema")] = 1
+    name: Label
+    sky: Sky
+    map: Map
+    channels: Annotated[tuple[Channel, ...], Field(alias="channel", min_length=1)]
+    biposh: Biposh = Biposh()
+    ensemble: Ensemble
+    compute: Compute = Compute()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        limit = 3 * self.map.nside - 1
+        lmax = analysis_lmax(self)
+        key = "biposh.lmax" if self.biposh.lmax is not None else "biposh.lmax (by default sky.lmax)"
+        if lmax > self.sky.lmax:
+            raise ValueError(f"{key} = {lmax} is above sky.lmax = {self.sky.lmax}; lower it or raise sky.lmax")
+        if lmax > limit:
+            raise ValueError(
+                f"{key} = {lmax} is above 3 nside - 1 = {limit} of map.nside = {self.map.nside}; set biposh.lmax to at most {limit} or raise nside"
+            )
+        if self.biposh.L_max > lmax:
+            raise ValueError(f"biposh.L_max = {self.biposh.L_max} is above the lmax of the analysis, {lmax}; lower it")
+        try:
+            _different([channel.name for channel in self.channels])
+        except ValueError as error:
+            raise ValueError(f"channel {error}") from None
+        for channel in self.channels:
+            m_max = getattr(channel.beam, "m_max", None)
+            if m_max is not None and m_max > self.sky.lmax:
+                raise ValueError(f"channel[{channel.name}].beam.m_max = {m_max} is above sky.lmax = {self.sky.lmax}; lower m_max")
+        return self
+
+
+def analysis_lmax(config: RunConfig) -> int:
+    """Highest degree that the maps are analysed to."""
+    return config.sky.lmax if config.biposh.lmax is None else config.biposh.lmax
+
+
+def pixel_window(config: RunConfig, channel: Channel) -> str:
+    """Pixel window of a channel: "computed", "none" or the path of a FITS file."""
+    if config.map.pixel_window is not None:
+        return config.map.pixel_window
+    return "none" if isinstance(channel.scan, ScanParallelTransport) else "computed"
+
+
+def map_names(config: RunConfig) -> tuple[str, ...]:
+    """Names of the maps of one realization: "channel", or "channel:split" for each of the splits."""
+    splits: tuple[Any, ...] = config.map.splits or (None,)
+    return tuple(channel.name if split is None else f"{channel.name}:{split}" for channel in config.channels for split in splits)

@@ -1,0 +1,9 @@
+"""The one exception that users are meant to read."""
+
+
+class InputError(ValueError):
+    """Input that mcsim cannot use.
+
+    The message is one sentence that names the value, the limit and the remedy; the command line prints it
+    without a traceback and exits with code 2.
+    """

@@ -1,0 +1,141 @@
+"""HEALPix maps and their harmonic coefficients: transforms, quadrature weights, pixel window."""
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import ducc0
+import healpy
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from mcsim import alm as alm_
+from mcsim.errors import InputError
+
+Map = NDArray[np.float64]
+Alm = NDArray[np.complex128]
+
+
+@lru_cache(maxsize=4)
+def geometry(nside: int) -> dict[str, Any]:
+    """Rings of the RING-ordered map, as ducc0's transforms take them."""
+    return dict(ducc0.healpix.Healpix_Base(nside, "RING").sht_info())
+
+
+def synthesis(alm: Alm, nside: int, lmax: int, spin: int = 0, nthreads: int = 1) -> NDArray[np.float64]:
+    """Map of a_lm: shape (1, npix) from (1, size) at spin 0, (2, npix) from E and B (2, size) otherwise."""
+    maps = ducc0.sht.synthesis(alm=alm, spin=spin, lmax=lmax, nthreads=nthreads, **geometry(nside))
+    return np.asarray(maps)
+
+
+def gradient(alm: Alm, nside: int, lmax: int, nthreads: int = 1) -> NDArray[np.float64]:
+    """(d/dtheta, 1/sin(theta) d/dphi) of a spin-0 map, shape (2, npix)."""
+    maps = ducc0.sht.synthesis_deriv1(alm=alm[None], lmax=lmax, nthreads=nthreads, **geometry(nside))
+    return np.asarray(maps)
+
+
+def analysis(map_: Map, lmax: int, iterations: int = 0, nthreads: int = 1) -> Alm:
+    """Coefficients of a map by ring-weighted quadrature and Jacobi iterations.
+
+    Parameters
+    ----------
+    map_
+        RING-ordered map, shape (npix,).
+    lmax
+        Largest degree, <= 3 nside - 1.
+    iterations
+        Each adds a synthesis and an adjoint synthesis to the one adjoint synthesis of the quadrature.
+
+    Notes
+    -----
+    Relative error at nside 512, lmax 1024 for a sky seen by a 13.6' beam: 3e-5, 3e-6 and 4e-7 with 0, 1 and 2
+    iterations (``tests/unit/test_healpix.py`` holds a smaller case).
+    """
+    nside = healpy.npix2nside(map_.size)
+    weight = _pixel_weights(nside)
+
+    def quadrature(residual: Map) -> Alm:
+        weighted = (weight * residual)[None]
+        alm = ducc0.sht.adjoint_synthesis(map=weighted, spin=0, lmax=lmax, nthreads=nthreads, **geometry(nside))
+        return np.asarray(alm)[0]
+
+    alm = quadrature(map_)
+    for _ in range(iterations):
+        alm = alm + quadrature(map_ - synthesis(alm[None], nside, lmax, nthreads=nthreads)[0])
+    return alm
+
+
+@lru_cache(maxsize=2)
+def _pixel_weights(nside: int) -> Map:
+    """Quadrature weight of every pixel: its area times the ring weights that healpy ships (none for nside 1)."""
+    rings = np.ones(4 * nside - 1)
+    path = Path(healpy.__file__).parent / "data" / f"weight_ring_n{nside:05d}.fits"
+    if nside > 1:
+        north = 1.0 + fits.getdata(path).field(0).astype(float).ravel()[: 2 * nside]
+        rings = np.concatenate([north, north[-2::-1]])
+    weights = np.repeat(rings, geometry(nside)["nphi"].astype(int)) * healpy.nside2pixarea(nside)
+    weights.setflags(write=False)
+    return weights
+
+
+@lru_cache(maxsize=4)
+def pixel_window(nside: int, lmax: int) -> NDArray[np.float64]:
+    r"""Pixel window w_l, averaged over all pixels and computed from their shapes; shape (lmax + 1,).
+
+    Notes
+    -----
+    w_l^2 is the mean over pixels of <P_l(x . y)>, x and y uniform in the pixel. A lattice of at most 32 x 32 pixels on one
+    polar and one equatorial face stands for all; a pixel is sampled at the centres of 8 x 8 equal sub-pixels, whose own
+    (Gaussian, to this order) window multiplies. Against the published HEALPix tables, nside 32 to 1024: within 1.0e-4 for
+    l <= nside and 3.8e-4 for l <= 3 nside; where that matters, name a table in ``[map] pixel_window``.
+    """
+    lattice = min(nside, 32)
+    step = (nside // lattice) ** 2
+    cell = np.arange(lattice * lattice)
+    # Alternately the pixels just above and just below the middle of a cell: their mean is at the middle.
+    above = (cell ^ (cell >> 1)) & 1 == 0
+    pixels = cell * step + np.where(above, 3 * step // 4, max(step // 4 - 1, 0))
+    square = np.zeros(lmax + 1)
+    for face, share in ((0, 2.0 / 3.0), (4, 1.0 / 3.0)):
+        square += share * _mean_legendre(pixels + face * nside * nside, nside, lmax)
+    ell = np.arange(lmax + 1)
+    subpixel = np.exp(-ell * (ell + 1) * healpy.nside2pixarea(8 * nside) / 24.0)
+    window: NDArray[np.float64] = np.sqrt(np.abs(square)) * subpixel
+    window.setflags(write=False)
+    return window
+
+
+def _mean_legendre(pixels: NDArray[np.int64], nside: int, lmax: int) -> NDArray[np.float64]:
+    """<P_l(x . y)> over the pairs of sub-pixel centres of the given NESTED pixels, by a histogram of separations."""
+    centres = np.stack(healpy.pix2vec(8 * nside, pixels[:, None] * 64 + np.arange(64), nest=True), axis=-1)
+    difference = centres[:, :, None, :] - centres[:, None, :, :]
+    chord = np.sqrt(np.einsum("pijk,pijk->pij", difference, difference)).ravel()
+    count, edges = np.histogram(chord, bins=4000, range=(0.0, chord.max() * (1.0 + 1e-12)))
+    total, _ = np.histogram(chord, bins=edges, weights=chord)
+    filled = count > 0
+    cosine = 1.0 - (total[filled] / count[filled]) ** 2 / 2.0
+    weight = count[filled] / count.sum()
+    before, legendre = np.ones_like(cosine), cosine
+    mean = np.ones(lmax + 1)
+    for ell in range(1, lmax + 1):
+        mean[ell] = weight @ legendre
+        before, legendre = legendre, ((2 * ell + 1) * cosine * legendre - ell * before) / (ell + 1)
+    return mean
+
+
+def read_pixel_window(path: Path, lmax: int) -> NDArray[np.float64]:
+    """Temperature pixel window of a FITS file in the HEALPix format, shape (lmax + 1,).
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or ends below lmax.
+    """
+    try:
+        window = np.asarray(fits.getdata(path, 1).field(0), dtype=float).ravel()
+    except (OSError, IndexError, TypeError, AttributeError) as error:
+        raise InputError(f"{path} is not a FITS pixel window ({error}); give a HEALPix pixel_window file.") from error
+    if window.size <= lmax or not np.all(np.isfinite(window[: lmax + 1])):
+        raise InputError(f"{path} holds a pixel window up to l = {window.size - 1}, below the lmax {lmax} of the sky.")
+    return window[: lmax + 1]

@@ -1,0 +1,1 @@
+"""Figures, drawn on matplotlib's Figure without any global state."""

@@ -1,0 +1,115 @@
+"""Moments on disk, computed once for all processes and runs that need them."""
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from mcsim.errors import InputError
+from mcsim.scan.model import ScanModel
+
+ALGORITHM = 1
+"""Raised whenever the same numbers would give other moments."""
+
+
+def default_cache_dir() -> Path:
+    """$MCSIM_CACHE, or $XDG_CACHE_HOME/mcsim, or ~/.cache/mcsim."""
+    if own := os.environ.get("MCSIM_CACHE"):
+        return Path(own)
+    if xdg := os.environ.get("XDG_CACHE_HOME"):
+        return Path(xdg) / "mcsim"
+    return Path.home() / ".cache" / "mcsim"
+
+
+def moments_key(
+    model: ScanModel,
+    nside: int,
+    smax: int,
+    frame: str,
+    lines_of_sight: list[str] | tuple[str, ...] | None = None,
+    time_range: tuple[float, float] = (0.0, 1.0),
+) -> str:
+    """SHA-256 of every number that the moments depend on, names and citations left out."""
+    lines = [
+        [line.boresight_angle_deg, line.azimuth_deg, model.period_of_samples(line)]
+        for line in model.select(lines_of_sight)
+    ]
+    everything = {
+        "algorithm": ALGORITHM,
+        "spin": [model.spin_period_s, model.spin_phase_deg],
+        "precession": [model.precession_period_s, model.precession_angle_deg, model.precession_phase_deg],
+        "orbit": [model.orbit_period_s, model.orbit_phase_deg],
+        "duration_days": model.duration_days,
+        "lines_of_sight": lines,
+        "time_range": [float(edge) for edge in time_range],
+        "nside": nside,
+        "smax": smax,
+        "frame": frame,
+    }
+    return hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()
+
+
+def cached_moments(
+    model: ScanModel,
+    nside: int,
+    smax: int,
+    frame: str = "ecliptic",
+    lines_of_sight: list[str] | tuple[str, ...] | None = None,
+    time_range: tuple[float, float] = (0.0, 1.0),
+    nthreads: int = 1,
+    progress: Callable[[float], None] | None = None,
+    cache_dir: str | Path | None = None,
+) -> Path:
+    """Folder with the streamed moments of a survey, computed if it is not there yet.
+
+    Parameters
+    ----------
+    model, nside, smax, frame, lines_of_sight, time_range, nthreads, progress
+        As in :func:`mcsim.scan.accumulate.stream_moments`.
+    cache_dir
+        Where to keep it; None: :func:`default_cache_dir`.
+
+    Returns
+    -------
+    Path
+        Folder for :meth:`mcsim.scan.moments.Moments.load`. It appears complete or not at all: it is written under
+        another name and renamed.
+
+    Raises
+    ------
+    InputError
+        If the cache folder cannot be written, or as in ``stream_moments``.
+    """
+    root = default_cache_dir() if cache_dir is None else Path(cache_dir)
+    folder = root / f"moments-{moments_key(model, nside, smax, frame, lines_of_sight, time_range)}"
+    if folder.is_dir():
+        return folder
+    from mcsim.scan.accumulate import stream_moments
+
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix="partial-", dir=root))
+    except OSError as error:
+        raise InputError(
+            f"cache folder {str(root)!r} cannot be written ({error.strerror}); set MCSIM_CACHE to one that can."
+        ) from None
+    try:
+        moments = stream_moments(model, nside, smax, frame, lines_of_sight, time_range, nthreads, progress)
+        try:
+            moments.save(temporary)
+        except OSError as error:
+            raise InputError(
+                f"moments cannot be written to {str(root)!r} ({error.strerror}); set MCSIM_CACHE elsewhere."
+            ) from None
+        try:
+            temporary.rename(folder)
+        except OSError:
+            # Another process was faster; its moments are the same.
+            if not folder.is_dir():
+                raise
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    return folder

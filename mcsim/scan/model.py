@@ -1,0 +1,269 @@
+"""Spin-precession-orbit scan models, read from TOML."""
+
+import math
+import tomllib
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+from mcsim.errors import InputError
+
+SECONDS_PER_DAY = 86400.0
+
+
+@dataclass(frozen=True)
+class LineOfSight:
+    """Direction of one beam in the spin frame (z = spin axis).
+
+    Parameters
+    ----------
+    name
+        For example ``"A"`` or ``"W1A"``.
+    boresight_angle_deg
+        Angle between the spin axis and the line of sight, strictly between 0 and 180 degrees.
+    azimuth_deg
+        Azimuth about the spin axis at spin phase 0, in degrees.
+    sample_period_s
+        Time between samples, where it differs from the model's; None: the model's.
+    source
+        Where the numbers come from.
+    """
+
+    name: str
+    boresight_angle_deg: float
+    azimuth_deg: float = 0.0
+    sample_period_s: float | None = None
+    source: str = ""
+
+
+@dataclass(frozen=True)
+class ScanModel:
+    """A survey by spin, precession and orbit.
+
+    Parameters
+    ----------
+    name
+        Name of the mission or survey.
+    spin_period_s
+        Spin period, > 0.
+    precession_period_s
+        Precession period about the anti-Sun direction; negative turns backwards.
+    precession_angle_deg
+        Angle between the spin axis and the anti-Sun direction, 0 to 90 degrees.
+    orbit_period_s
+        Period of the anti-Sun direction along the ecliptic, > 0 (eastwards).
+    sample_period_s
+        Time between samples, > 0; samples are taken at t = 0, 1, 2, ... times this period.
+    duration_days
+        Length of the survey, > 0.
+    lines_of_sight
+        The beams, at least one.
+    default_lines
+        Names of the lines of sight that are used when none are asked for.
+    pairs
+        Differencing pairs: name of the assembly and the names of its two lines of sight.
+    spin_phase_deg, precession_phase_deg, orbit_phase_deg
+        Angles at t = 0.
+    source
+        Citation of each number, by key.
+
+    Notes
+    -----
+    R_y, R_z rotate by positive angles in right-handed frames. In the spin frame the line of sight is at polar
+    angle ``boresight_angle_deg`` and azimuth 2 pi t / spin_period + spin_phase + azimuth; to ecliptic coordinates
+    it is turned by R_z(2 pi t / orbit) R_y(90 deg) R_z(2 pi t / precession) R_y(precession_angle), so that the
+    anti-Sun direction is at longitude ``orbit_phase_deg`` at t = 0.
+    """
+
+    name: str
+    spin_period_s: float
+    precession_period_s: float
+    precession_angle_deg: float
+    orbit_period_s: float
+    sample_period_s: float
+    duration_days: float
+    lines_of_sight: tuple[LineOfSight, ...]
+    default_lines: tuple[str, ...]
+    pairs: dict[str, tuple[str, str]] = field(default_factory=dict)
+    spin_phase_deg: float = 0.0
+    precession_phase_deg: float = 0.0
+    orbit_phase_deg: float = 0.0
+    description: str = ""
+    source: dict[str, str] = field(default_factory=dict)
+
+    def line_of_sight(self, name: str) -> LineOfSight:
+        """The line of sight called ``name``; InputError if there is none."""
+        for line in self.lines_of_sight:
+            if line.name == name:
+                return line
+        known = ", ".join(line.name for line in self.lines_of_sight)
+        raise InputError(f"scan model {self.name!r} has no line of sight {name!r}: choose from {known}.")
+
+    def pair(self, name: str) -> tuple[LineOfSight, LineOfSight]:
+        """The two lines of sight of the differencing assembly ``name``; InputError if there is none."""
+        if name not in self.pairs:
+            known = ", ".join(self.pairs) or "none are defined"
+            raise InputError(f"scan model {self.name!r} has no differencing pair {name!r}: choose from {known}.")
+        side_a, side_b = self.pairs[name]
+        return self.line_of_sight(side_a), self.line_of_sight(side_b)
+
+    def select(self, names: list[str] | tuple[str, ...] | None) -> tuple[LineOfSight, ...]:
+        """The lines of sight called ``names``; the model's default ones if None."""
+        return tuple(self.line_of_sight(name) for name in (self.default_lines if names is None else names))
+
+    def period_of_samples(self, line: LineOfSight) -> float:
+        """Time between samples of a line of sight, in seconds."""
+        return self.sample_period_s if line.sample_period_s is None else line.sample_period_s
+
+    def samples(self, line: LineOfSight) -> int:
+        """Number of samples of a line of sight in the whole survey."""
+        # The small number keeps 31557600 / 0.0512 from losing its last sample to rounding.
+        return int(math.floor(self.duration_days * SECONDS_PER_DAY / self.period_of_samples(line) + 1e-6))
+
+    def with_sampling(self, sample_period_s: float) -> "ScanModel":
+        """The same survey with every line of sight sampled every ``sample_period_s`` seconds."""
+        lines = tuple(replace(line, sample_period_s=None) for line in self.lines_of_sight)
+        return _checked(replace(self, sample_period_s=float(sample_period_s), lines_of_sight=lines), self.name)
+
+
+_TABLES = {"schema", "line_of_sight", "lines_of_sight", "default_lines", "pairs", "source"}
+_TEXT = {"name", "description"}
+_NUMBERS = {f.name for f in fields(ScanModel)} - _TEXT - _TABLES
+_OPTIONAL = {"spin_phase_deg", "precession_phase_deg", "orbit_phase_deg"}
+_LINE_NUMBERS = {"boresight_angle_deg", "azimuth_deg", "sample_period_s"}
+
+
+def load_model(path: str | Path) -> ScanModel:
+    """Read a scan model from a TOML file.
+
+    Parameters
+    ----------
+    path
+        The file. Its keys are the fields of :class:`ScanModel`, with tables ``[[line_of_sight]]`` (fields of
+        :class:`LineOfSight`), ``[pairs]`` (assembly = [line, line]) and ``[source]`` (key = citation).
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, a key is unknown or missing, or a value is not physical.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as stream:
+            table = tomllib.load(stream)
+    except OSError as error:
+        raise InputError(f"scan model {str(path)!r} cannot be read: {error.strerror}; give a TOML file.") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"scan model {str(path)!r} is not valid TOML: {error}.") from None
+    return model_from_table(table, str(path))
+
+
+def model_from_table(table: dict[str, Any], where: str) -> ScanModel:
+    """Build a scan model from a parsed TOML table; ``where`` names it in error messages."""
+    known = _NUMBERS | _TEXT | _TABLES - {"lines_of_sight"}
+    _refuse_unknown(table, known, where)
+    if table.get("schema") != 1:
+        raise InputError(f"{where}: schema is {table.get('schema')!r}, but this version reads schema = 1.")
+    if not isinstance(table.get("name"), str) or not table["name"]:
+        raise InputError(f"{where}: key 'name' is missing; give the survey a name.")
+    numbers = {key: _number(table, key, where) for key in _NUMBERS if key in table or key not in _OPTIONAL}
+    lines = _lines(table.get("line_of_sight"), where)
+    names = tuple(line.name for line in lines)
+    default_lines = _group(table.get("default_lines", list(names)), names, "default_lines", where)
+    pairs = {}
+    for key, value in _subtable(table, "pairs", where).items():
+        pair = _group(value, names, f"pairs.{key}", where)
+        if len(pair) != 2:
+            raise InputError(f"{where}: pairs.{key} has {len(pair)} lines of sight, but a pair needs 2.")
+        pairs[key] = (pair[0], pair[1])
+    source = _subtable(table, "source", where)
+    _refuse_unknown(source, _NUMBERS, f"{where}, [source]")
+    model = ScanModel(
+        name=table["name"],
+        description=str(table.get("description", "")),
+        lines_of_sight=lines,
+        default_lines=default_lines,
+        pairs=pairs,
+        source={key: str(value) for key, value in source.items()},
+        **numbers,
+    )
+    return _checked(model, where)
+
+
+def _refuse_unknown(table: dict[str, Any], known: set[str], where: str) -> None:
+    unknown = sorted(set(table) - known)
+    if unknown:
+        raise InputError(f"{where}: unknown key {unknown[0]!r}; the keys are {', '.join(sorted(known))}.")
+
+
+def _subtable(table: dict[str, Any], key: str, where: str) -> dict[str, Any]:
+    value = table.get(key, {})
+    if not isinstance(value, dict):
+        raise InputError(f"{where}: {key} is {value!r}, but it must be a table [{key}].")
+    return value
+
+
+def _group(value: Any, names: tuple[str, ...], label: str, where: str) -> tuple[str, ...]:
+    if not isinstance(value, list) or not value:
+        raise InputError(f"{where}: {label} is {value!r}, but it must be a list of names of lines of sight.")
+    for name in value:
+        if name not in names:
+            raise InputError(f"{where}: {label} names {name!r}, but the lines of sight are {', '.join(names)}.")
+    return tuple(value)
+
+
+def _number(table: dict[str, Any], key: str, where: str) -> float:
+    if key not in table:
+        raise InputError(f"{where}: key {key!r} is missing; give a number.")
+    value = table[key]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{where}: {key} is {value!r}, but it must be a finite number.")
+    return float(value)
+
+
+def _lines(tables: Any, where: str) -> tuple[LineOfSight, ...]:
+    if not isinstance(tables, list) or not tables:
+        raise InputError(f"{where}: no [[line_of_sight]] is given; add one with name and boresight_angle_deg.")
+    lines = []
+    for table in tables:
+        _refuse_unknown(table, _LINE_NUMBERS | {"name", "source"}, f"{where}, [[line_of_sight]]")
+        name = table.get("name")
+        if not isinstance(name, str) or not name:
+            raise InputError(f"{where}: a [[line_of_sight]] has no name; give it one.")
+        inside = f"{where}, line of sight {name!r}"
+        numbers = {key: _number(table, key, inside) for key in _LINE_NUMBERS if key in table}
+        if "boresight_angle_deg" not in numbers:
+            raise InputError(f"{inside}: key 'boresight_angle_deg' is missing; give a number.")
+        lines.append(LineOfSight(name=name, source=str(table.get("source", "")), **numbers))
+    names = [line.name for line in lines]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{where}: two lines of sight are called {name!r}; names must differ.")
+    return tuple(lines)
+
+
+def _checked(model: ScanModel, where: str) -> ScanModel:
+    """Return the model if its numbers describe a possible survey."""
+    for key in ("spin_period_s", "orbit_period_s", "sample_period_s", "duration_days"):
+        if not getattr(model, key) > 0.0:
+            raise InputError(f"{where}: {key} is {getattr(model, key):g}, but it must be > 0.")
+    if model.precession_period_s == 0.0:
+        raise InputError(f"{where}: precession_period_s is 0; for no precession set precession_angle_deg = 0 instead.")
+    if not 0.0 <= model.precession_angle_deg <= 90.0:
+        raise InputError(
+            f"{where}: precession_angle_deg is {model.precession_angle_deg:g}, but it must be between 0 and 90."
+        )
+    for line in model.lines_of_sight:
+        inside = f"{where}, line of sight {line.name!r}"
+        if not 0.0 < line.boresight_angle_deg < 180.0:
+            raise InputError(
+                f"{inside}: boresight_angle_deg is {line.boresight_angle_deg:g}, but it must lie between 0 and 180."
+            )
+        if line.sample_period_s is not None and not line.sample_period_s > 0.0:
+            raise InputError(f"{inside}: sample_period_s is {line.sample_period_s:g}, but it must be > 0.")
+        if model.samples(line) < 1:
+            raise InputError(
+                f"{inside}: a survey of {model.duration_days:g} days has no sample every "
+                f"{model.period_of_samples(line):g} s; lengthen duration_days."
+            )
+    return model

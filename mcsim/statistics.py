@@ -1,0 +1,102 @@
+"""Streaming means, standard deviations and covariances, merged by a fixed tree.
+
+A reduction is chunk -> combine -> finalise. Leaves are single realizations; the tree over them is the binary tree of
+their indices, so the result is the same bit for bit whatever the chunks, workers and order of arrival, and a missing realization
+leaves the shape of the tree unchanged.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.complex128] | NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Sufficient statistics of ``count`` realizations.
+
+    Attributes
+    ----------
+    count
+        Number of realizations.
+    mean
+        Mean of each variable.
+    square
+        Sum of |x - mean|^2 of each variable, real.
+    comoment
+        Sum of (x - mean) conj(x - mean)^T over the last axis of the variables for which it was asked.
+    """
+
+    count: int
+    mean: dict[str, Array]
+    square: dict[str, NDArray[np.float64]]
+    comoment: dict[str, Array]
+
+
+def leaf(values: dict[str, Array], covariance_of: tuple[str, ...] = ()) -> Sums:
+    """Statistics of one realization."""
+    square = {name: np.zeros(np.shape(x)) for name, x in values.items()}
+    comoment = {name: np.zeros((*values[name].shape, values[name].shape[-1]), values[name].dtype) for name in covariance_of}
+    return Sums(1, dict(values), square, comoment)
+
+
+def combine(a: Sums | None, b: Sums | None) -> Sums | None:
+    """Statistics of the union of two disjoint sets (Chan, Golub & LeVeque 1983); ``None`` is the empty set."""
+    if a is None or b is None:
+        return b if a is None else a
+    count = a.count + b.count
+    share, weight = b.count / count, a.count * b.count / count
+    mean, square, comoment = {}, {}, {}
+    for name in a.mean:
+        delta = b.mean[name] - a.mean[name]
+        mean[name] = a.mean[name] + share * delta
+        square[name] = a.square[name] + b.square[name] + weight * (delta.real**2 + delta.imag**2)
+        if name in a.comoment:
+            outer = delta[..., :, None] * np.conj(delta[..., None, :])
+            comoment[name] = a.comoment[name] + b.comoment[name] + weight * outer
+    return Sums(count, mean, square, comoment)
+
+
+def tree(node: Callable[[int], Sums | None], nodes: int) -> Sums | None:
+    """Combine nodes 0 ... nodes - 1 of one level of the binary tree.
+
+    Parameters
+    ----------
+    node
+        Gives the statistics of one node, ``None`` if it is empty; each is asked for once, in order.
+    nodes
+        How many there are.
+
+    Notes
+    -----
+    Node k of the next level joins nodes 2k and 2k + 1 of this one. At most log2(nodes) + 1 partial results are held.
+    """
+    stack: list[tuple[int, Sums | None]] = []
+    for index in range(nodes):
+        level, sums = 0, node(index)
+        while stack and stack[-1][0] == level:
+            sums = combine(stack.pop()[1], sums)
+            level += 1
+        stack.append((level, sums))
+    result: Sums | None = None
+    while stack:
+        result = combine(stack.pop()[1], result)
+    return result
+
+
+def standard_deviation(sums: Sums, name: str) -> NDArray[np.float64]:
+    """Standard deviation over realizations, of |x - mean| for complex x; NaN for fewer than two."""
+    if sums.count < 2:
+        return np.full(sums.square[name].shape, np.nan)
+    return np.sqrt(sums.square[name] / (sums.count - 1))
+
+
+def covariance(sums: Sums, name: str) -> Array:
+    """Covariance E (x - mean) conj(x - mean)^T over the last axis; NaN for fewer than two realizations."""
+    if sums.count < 2:
+        return np.full(sums.comoment[name].shape, np.nan)
+    result: Array = sums.comoment[name] / (sums.count - 1)
+    return result
