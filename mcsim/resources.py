@@ -1,7 +1,7 @@
 """Files shipped with mcsim: scan models, workflows and power spectra.
 
-An installed wheel has them inside the package; a source checkout (or an editable installation of it) has ``scan_models`` and
-``workflows`` beside the package, where people look for them.
+An installed wheel has them inside the package; a source checkout (or an editable installation of it) has
+``scan_models`` and ``workflows`` beside the package, where people look for them.
 """
 
 from pathlib import Path
@@ -17,8 +17,8 @@ def scan_model(name_or_path: str | Path, relative_to: str | Path | None = None) 
     Parameters
     ----------
     name_or_path
-        Name of a packaged model, for example ``"wmap"``, or the path of a TOML file. A packaged name wins: write ``./wmap``
-        for a file of that name.
+        Name of a packaged model, for example ``"wmap"``, or the path of a TOML file. A packaged name wins: write
+        ``./wmap`` for a file of that name.
     relative_to
         Folder that a relative path starts from; default: the working folder.
 

@@ -12,7 +12,7 @@ from mcsim import beams, config, convolve, healpix, resources, scan, spectra
 from mcsim.biposh import Estimator, estimator
 from mcsim.errors import InputError
 
-Progress = Callable[[str, float], None]
+Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
@@ -144,30 +144,24 @@ def _moments(
     nthreads: int,
     progress: Progress | None,
 ) -> scan.Moments:
-    nside, frame = run.map.nside, run.map.frame
+    nside, frame, smax = run.map.nside, run.map.frame, max(mmax, 1)
     match spec.scan:
         case config.ScanParallelTransport():
-            return scan.parallel_transport(np.deg2rad(spec.scan.psi0_deg), nside, mmax, frame)
+            return scan.parallel_transport(np.deg2rad(spec.scan.psi0_deg), nside, smax, frame)
         case config.ScanMoments():
-            moments = scan.read_moments_fits(config.channel_path(spec.scan.path, spec.name, split), nside, mmax)
-            return replace(moments, frame=frame)
+            path = config.channel_path(spec.scan.path, spec.name, split)
+            return scan.read_moments_fits(path, nside, smax, frame)
         case config.ScanPointing():
             path = config.channel_path(spec.scan.path, spec.name, split)
-            return scan.pointing_moments([path], nside, mmax, frame)
+            return scan.pointing_moments([path], nside, smax, frame)
         case config.ScanHitAveraged():
             template = config.channel_path(spec.scan.model, spec.name, split)
             model = scan.load_model(resources.scan_model(str(template)))
             if spec.scan.sample_period_s is not None:
                 model = replace(model, sample_period_s=spec.scan.sample_period_s)
+            lines = None if spec.scan.line_of_sight is None else [spec.scan.line_of_sight]
             folder = scan.cached_moments(
-                model,
-                nside,
-                mmax,
-                frame,
-                line_of_sight=spec.scan.line_of_sight,
-                share=share,
-                nthreads=nthreads,
-                progress=progress,
+                model, nside, smax, frame, lines, time_range=share, nthreads=nthreads, progress=progress
             )
             return scan.Moments.load(folder, mmap=True)
 

@@ -13,9 +13,10 @@ from mcsim.config.schema import RunConfig, analysis_lmax, pixel_window
 def science(config: RunConfig) -> dict[str, Any]:
     """The part of a run that defines its numbers, with the contents of files in place of their names.
 
-    Sky, map, channels, biposh, seed and pairing; not name, compute, the number of realizations or keep_maps. A file is stood
-    for by the SHA-256 of its contents, a template by those of its files. Skies given one file per realization are stood for by
-    the part of their template that has the placeholder and by the contents of realization 0: the others are not read.
+    Sky, map, channels, biposh, seed and pairing; not name, compute, the number of realizations or keep_maps. A file
+    is stood for by the SHA-256 of its contents, a template by those of its files. Skies given one file per
+    realization are stood for by the part of their template that has the placeholder and by the contents of
+    realization 0: the others are not read.
 
     Raises
     ------
@@ -42,7 +43,9 @@ def science(config: RunConfig) -> dict[str, Any]:
 
 def digest(config: RunConfig) -> str:
     """SHA-256 of the canonical JSON of :func:`science`, in hexadecimal."""
-    return hashlib.sha256(json.dumps(science(config), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()).hexdigest()
+    return hashlib.sha256(
+        json.dumps(science(config), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+    ).hexdigest()
 
 
 def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:

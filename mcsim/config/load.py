@@ -24,16 +24,17 @@ def load(source: str | Path | Mapping[str, Any], base: str | Path | None = None)
     Parameters
     ----------
     source
-        Path of a TOML file of schema 1; or the name of a packaged workflow (``"quickstart"``), used where no such file exists;
-        or a dict of the same structure.
+        Path of a TOML file of schema 1; or the name of a packaged workflow (``"quickstart"``), used where no such
+        file exists; or a dict of the same structure.
     base
-        Folder that the relative paths of a dict start from; default: the working folder. Those of a file start from its folder.
+        Folder that the relative paths of a dict start from; default: the working folder. Those of a file start from
+        its folder.
 
     Returns
     -------
     RunConfig
-        With absolute paths, in which {channel}, {split} and {realization} are still to be filled by :func:`channel_path` and
-        :func:`sky_path`. All files that it names exist.
+        With absolute paths, in which {channel}, {split} and {realization} are still to be filled by
+        :func:`channel_path` and :func:`sky_path`. All files that it names exist.
 
     Raises
     ------
@@ -67,15 +68,14 @@ def to_dict(config: RunConfig) -> dict[str, Any]:
 
 
 def resolved(config: RunConfig) -> dict[str, Any]:
-    """Plain dict with every default written out, for the attributes of a store and for people.
+    """Plain dict with the defaults written out, for the attributes of a store and for people; it loads as the same run.
 
-    ``biposh.lmax`` is the degree used, and every channel has the ``pixel_window`` that applies to it.
+    ``map.pixel_window`` stays None where channels differ in it.
     """
     plain = to_dict(config)
     plain["biposh"]["lmax"] = analysis_lmax(config)
-    del plain["map"]["pixel_window"]
-    for table, channel in zip(plain["channel"], config.channels, strict=True):
-        table["pixel_window"] = pixel_window(config, channel)
+    windows = {pixel_window(config, channel) for channel in config.channels}
+    plain["map"]["pixel_window"] = windows.pop() if len(windows) == 1 else None
     return plain
 
 
@@ -121,19 +121,24 @@ def _plain(source: Mapping[str, Any], where: str) -> dict[str, Any]:
             return value.item()
         if isinstance(value, Path):
             return str(value)
-        raise InputError(f"{where}: the value {shown(str(value))} is a {type(value).__name__}; give a number, text, true or false.")
+        raise InputError(
+            f"{where}: the value {shown(str(value))} is a {type(value).__name__}; give a number, text, true or false."
+        )
 
     try:
         plain: dict[str, Any] = json.loads(json.dumps(dict(source), default=convert))
     except (TypeError, ValueError, RecursionError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{where} cannot be read ({error}); give a dict with the structure of the TOML file.") from None
+        raise InputError(
+            f"{where} cannot be read ({error}); give a dict with the structure of the TOML file."
+        ) from None
     return plain
 
 
 def _validate(plain: dict[str, Any], where: str) -> RunConfig:
-    # JSON mode is strict about numbers and text but takes lists for tuples, which TOML has and Python's strict mode refuses.
+    # JSON mode is strict about numbers and text but takes lists for tuples, which TOML has and Python's strict mode
+    # refuses.
     try:
         return _ADAPTER.validate_json(json.dumps(plain), by_alias=True, by_name=False)
     except ValidationError as error:

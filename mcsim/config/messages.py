@@ -43,7 +43,7 @@ _EXPECTED = {
     "bool_type": "true or false",
     "tuple_type": "a list in [ ]",
     "dataclass_type": "a table of keys",
-    "model_attributes_type": "a table of keys",
+    "dict_type": "a table of keys",
     "union_tag_not_found": "a table with a kind",
 }
 _BOUNDS = {
@@ -67,7 +67,8 @@ def _text(item: ErrorDetails, key: str, tables: tuple[str, ...]) -> str:
     stated = f"{key} = {shown(item['input'])}" if key else "the configuration"
     if kind == "unexpected_keyword_argument":
         known = [_TOML_NAMES.get(field.name, field.name) for field in fields(_TABLES[tables])]
-        return f"the key {key} is unknown{_closest(str(item['loc'][-1]), known)}; remove it or correct it to one of {', '.join(known)}"
+        hint = _closest(str(item["loc"][-1]), known)
+        return f"the key {key} is unknown{hint}; remove it or correct it to one of {', '.join(known)}"
     if kind == "missing":
         return f"the key {key} is missing; add it"
     if kind == "value_error":
@@ -75,17 +76,19 @@ def _text(item: ErrorDetails, key: str, tables: tuple[str, ...]) -> str:
         if isinstance(item["input"], dict | schema.RunConfig):
             return f"{key}: {reason}" if key else reason
         return f"{stated} {reason}"
+    if key == "schema":
+        return f"{stated} is not supported; this version of mcsim reads schema = 1"
     if kind in _BOUNDS:
         name, what, limit = _BOUNDS[kind]
-        return f"{stated} {what}; give {limit} {context[name]:g}"
+        bound = context[name]
+        return f"{stated} {what}; give {limit} {f'{bound:g}' if isinstance(bound, float) else bound}"
     if kind == "too_short":
         return f"{key} is empty; give at least one"
     if kind == "literal_error":
-        if key == "schema":
-            return f"{stated} is not supported; this version of mcsim reads schema = 1"
-        return f"{stated} is not one of {context['expected']}{_closest(str(item['input']), context['expected'].split(chr(39))[1::2])}; use one of them"
+        known = _quoted(context["expected"])
+        return f"{stated} is unknown{_closest(str(item['input']), known)}; use one of {', '.join(known)}"
     if kind == "union_tag_invalid":
-        tag, known = str(context["tag"]), context["expected_tags"].split("'")[1::2]
+        tag, known = str(context["tag"]), _quoted(context["expected_tags"])
         if tag == "differencing":
             return f'{key}.kind = "differencing" is not in this version of mcsim; use one of {", ".join(known)}'
         return f"{key}.kind = {shown(tag)} is unknown{_closest(tag, known)}; use one of {', '.join(known)}"
@@ -96,6 +99,12 @@ def _text(item: ErrorDetails, key: str, tables: tuple[str, ...]) -> str:
     return f"{stated} cannot be used ({item['msg'].rstrip('.')}); correct it"
 
 
+def label(table: Any, number: int) -> str:
+    """Name of a channel in a key, or its number where it has no readable one."""
+    name = table.get("name") if isinstance(table, dict) else None
+    return name if isinstance(name, str) and name.isprintable() else str(number)
+
+
 def shown(value: Any) -> str:
     """A value as TOML writes it, cut to a readable length."""
     try:
@@ -103,6 +112,11 @@ def shown(value: Any) -> str:
     except (ValueError, TypeError):
         text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _quoted(text: str) -> list[str]:
+    """Words within quotes: pydantic lists what it expects as 'a', 'b' or 'c'."""
+    return text.split("'")[1::2]
 
 
 def _closest(word: str, known: Iterable[str]) -> str:
@@ -117,11 +131,12 @@ def _locate(loc: tuple[int | str, ...], plain: Any) -> tuple[str, tuple[str, ...
     for part in loc:
         if isinstance(part, int):
             here = here[part] if isinstance(here, list) and part < len(here) else None
-            key += f"[{here['name']}]" if isinstance(here, dict) and isinstance(here.get("name"), str) else f"[{part}]"
+            key += f"[{label(here, part)}]"
             continue
         if isinstance(here, dict) and here.get("kind") == part and not tag_passed:
             tag_passed = True
             continue
-        key = f"{key}.{part}" if key else part
+        readable = part if part.isprintable() else shown(part)
+        key = f"{key}.{readable}" if key else readable
         here = here.get(part) if isinstance(here, dict) else None
     return key, tuple(str(part) for part in loc[:-1] if not isinstance(part, int))

@@ -8,6 +8,7 @@ from string import Formatter
 from typing import Any, NamedTuple
 
 from mcsim import resources
+from mcsim.config.messages import label
 from mcsim.config.schema import RunConfig
 from mcsim.errors import InputError
 
@@ -65,16 +66,19 @@ def entries(plain: dict[str, Any]) -> Iterator[Entry]:
     channels = plain.get("channel")
     tables = [channel for channel in channels if isinstance(channel, dict)] if isinstance(channels, list) else []
     every = tuple(str(table.get("name")) for table in tables)
-    sections: list[tuple[str, str, Any, tuple[str, ...]]] = [(name, name, plain.get(name), every) for name in ("sky", "map")]
-    for name, table in zip(every, tables, strict=True):
-        sections += [(part, f"channel[{name}].{part}", table.get(part), (name,)) for part in ("beam", "scan")]
-    for section, label, holder, speaks_of in sections:
+    sections: list[tuple[str, str, Any, tuple[str, ...]]] = [
+        (name, name, plain.get(name), every) for name in ("sky", "map")
+    ]
+    for number, table in enumerate(tables):
+        key = f"channel[{label(table, number)}]"
+        sections += [(part, f"{key}.{part}", table.get(part), (every[number],)) for part in ("beam", "scan")]
+    for section, where, holder, speaks_of in sections:
         for path, rule in _RULES.items():
             table_name, field = path.split(".")
             if table_name == section and isinstance(holder, dict):
                 value = holder.get(field)
                 if isinstance(value, str) and value.strip() and value not in rule.words:
-                    yield Entry(f"{label}.{field}", holder, field, rule, speaks_of)
+                    yield Entry(f"{where}.{field}", holder, field, rule, speaks_of)
 
 
 def make_absolute(plain: dict[str, Any], base: Path, where: str) -> None:
@@ -88,8 +92,8 @@ def make_absolute(plain: dict[str, Any], base: Path, where: str) -> None:
                 return _literal(os.environ[match[1]], entry.rule)
             except KeyError:
                 raise InputError(
-                    f"{where}: {entry.key} = {entry.template!r} uses the environment variable {match[1]}, which is not set; set it or "
-                    "write the folder out."
+                    f"{where}: {entry.key} = {entry.template!r} uses the environment variable {match[1]}, which is "
+                    "not set; set it or write the folder out."
                 ) from None
 
         path = _VARIABLE.sub(expand, entry.template)
@@ -106,12 +110,16 @@ def files(entry: Entry, splits: Sequence[str], where: str, realization: int = 0)
     """
     used = _placeholders(entry, where)
     if "split" in used and not splits:
-        raise InputError(f"{where}: {entry.key} = {entry.template!r} contains {{split}}, but map.splits is empty; name the splits there.")
+        raise InputError(
+            f"{where}: {entry.key} = {entry.template!r} contains {{split}}, but map.splits is empty; "
+            "name the splits there."
+        )
     found = {}
     for channel in entry.channels if "channel" in used else [""]:
         for split in splits if "split" in used else [""]:
-            label = ",".join(value for value in (channel, split) if value)
-            found[label] = _existing(entry, {"channel": channel, "split": split, "realization": realization}, where)
+            found[",".join(value for value in (channel, split) if value)] = _existing(
+                entry, {"channel": channel, "split": split, "realization": realization}, where
+            )
     return found
 
 
@@ -146,15 +154,19 @@ def _placeholders(entry: Entry, where: str) -> set[str]:
         return set()
     allowed = ", ".join(f"{{{name}}}" for name in rule.placeholders)
     wrong = InputError(
-        f"{where}: {entry.key} = {entry.template!r} has a placeholder that is not understood here; use {allowed} only, and double a brace "
-        "that is part of a name."
+        f"{where}: {entry.key} = {entry.template!r} has a placeholder that is not understood here; use {allowed} only, "
+        "and double a brace that is part of a name."
     )
     try:
         parts = [part for part in Formatter().parse(entry.template) if part[1] is not None]
     except ValueError:
         raise wrong from None
     for _, name, spec, conversion in parts:
-        if name not in rule.placeholders or conversion or (spec and not (name == "realization" and _NUMBER_FORMAT.fullmatch(spec))):
+        if (
+            name not in rule.placeholders
+            or conversion
+            or (spec and not (name == "realization" and _NUMBER_FORMAT.fullmatch(spec)))
+        ):
             raise wrong
     return {str(part[1]) for part in parts}
 
@@ -168,5 +180,11 @@ def _existing(entry: Entry, values: dict[str, Any], where: str) -> Path:
             return path
     except (OSError, ValueError):  # a name that no file system takes
         pass
-    packaged = f" or one of the packaged names {', '.join(resources.names(entry.rule.packaged))}" if entry.rule.packaged else ""
-    raise InputError(f"{where}: {entry.key} names the file {str(path)!r}, which does not exist; give an existing one{packaged}.")
+    packaged = (
+        f" or one of the packaged names {', '.join(resources.names(entry.rule.packaged))}"
+        if entry.rule.packaged
+        else ""
+    )
+    raise InputError(
+        f"{where}: {entry.key} names the file {str(path)!r}, which does not exist; give an existing one{packaged}."
+    )

@@ -26,7 +26,10 @@ def _power_of_two(value: int) -> int:
 def _label(value: str) -> str:
     """Names of channels and splits become parts of file names and of the labels ``channel:split,channel:split``."""
     if not value.strip() or value != value.strip() or any(c in "/\\:,{}" or not c.isprintable() for c in value):
-        raise ValueError("is not a usable name: it needs a printable character, no blanks at its ends and none of / \\ : , { }; rename it")
+        raise ValueError(
+            "is not a usable name: it needs printable characters, no blanks at its ends and none of / \\ : , { }; "
+            "rename it"
+        )
     return value
 
 
@@ -56,7 +59,7 @@ Fwhm = Annotated[float, Field(gt=0.0, le=10800.0)]
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Sky:
-    """Isotropic Gaussian skies from ``spectrum``, or skies given as a_lm or map files (templates with {realization})."""
+    """Isotropic Gaussian skies from ``spectrum``, or skies given as a_lm or map files (a template: {realization})."""
 
     lmax: Degree
     spectrum: PathText | None = None
@@ -109,8 +112,8 @@ class BeamEllipticalGaussian:
     def _ordered(self) -> Self:
         if self.fwhm_major_arcmin < self.fwhm_minor_arcmin:
             raise ValueError(
-                f"fwhm_major_arcmin = {self.fwhm_major_arcmin:g} is smaller than fwhm_minor_arcmin = {self.fwhm_minor_arcmin:g}; "
-                "exchange them and add 90 to angle_deg"
+                f"fwhm_major_arcmin = {self.fwhm_major_arcmin:g} is smaller than "
+                f"fwhm_minor_arcmin = {self.fwhm_minor_arcmin:g}; exchange them and add 90 to angle_deg"
             )
         return self
 
@@ -215,7 +218,7 @@ class Ensemble:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Compute:
-    """How it is computed; nothing here changes a result. ``chunk``: realizations of a task, chosen by mcsim when left out."""
+    """How it is computed: no result depends on it. ``chunk``: realizations of a task, by default chosen by mcsim."""
 
     workers: Annotated[int, Field(ge=1, le=100_000)] = 2
     chunk: Annotated[int, Field(ge=1, le=2**20), AfterValidator(_power_of_two)] | None = None
@@ -225,7 +228,7 @@ class Compute:
 class RunConfig:
     """A whole run. In TOML ``schema_version`` is ``schema`` and ``channels`` are the tables ``[[channel]]``."""
 
-    schema_version: Annotated[Literal[1], Field(alias="schema")] = 1
+    schema_version: Annotated[int, Field(alias="schema", ge=1, le=1)] = 1
     name: Label
     sky: Sky
     map: Map
@@ -243,7 +246,8 @@ class RunConfig:
             raise ValueError(f"{key} = {lmax} is above sky.lmax = {self.sky.lmax}; lower it or raise sky.lmax")
         if lmax > limit:
             raise ValueError(
-                f"{key} = {lmax} is above 3 nside - 1 = {limit} of map.nside = {self.map.nside}; set biposh.lmax to at most {limit} or raise nside"
+                f"{key} = {lmax} is above 3 nside - 1 = {limit} of map.nside = {self.map.nside}; "
+                f"set biposh.lmax to at most {limit} or raise nside"
             )
         if self.biposh.L_max > lmax:
             raise ValueError(f"biposh.L_max = {self.biposh.L_max} is above the lmax of the analysis, {lmax}; lower it")
@@ -254,7 +258,9 @@ class RunConfig:
         for channel in self.channels:
             m_max = getattr(channel.beam, "m_max", None)
             if m_max is not None and m_max > self.sky.lmax:
-                raise ValueError(f"channel[{channel.name}].beam.m_max = {m_max} is above sky.lmax = {self.sky.lmax}; lower m_max")
+                raise ValueError(
+                    f"channel[{channel.name}].beam.m_max = {m_max} is above sky.lmax = {self.sky.lmax}; lower m_max"
+                )
         return self
 
 
@@ -273,4 +279,6 @@ def pixel_window(config: RunConfig, channel: Channel) -> str:
 def map_names(config: RunConfig) -> tuple[str, ...]:
     """Names of the maps of one realization: "channel", or "channel:split" for each of the splits."""
     splits: tuple[Any, ...] = config.map.splits or (None,)
-    return tuple(channel.name if split is None else f"{channel.name}:{split}" for channel in config.channels for split in splits)
+    return tuple(
+        channel.name if split is None else f"{channel.name}:{split}" for channel in config.channels for split in splits
+    )

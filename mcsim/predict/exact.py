@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mcsim.predict.beam_biposh import ScannedBeam
 from mcsim.predict.cmb_biposh import check_spectrum
 from mcsim.predict.modes import Mode, check_modes, existing
-from mcsim.predict.sixj import sixj_family
+from mcsim.predict.wigner import sixj_family, threej_family
 
 _BLOCK = 32
 
@@ -23,7 +23,7 @@ def cmb_biposh_exact(
     lmax: int,
     x: ScannedBeam,
     y: ScannedBeam | None = None,
-    tolerance: float = 1e-8,
+    tolerance: float = 1e-12,
     nthreads: int = 1,
 ) -> NDArray[np.complex128]:
     """Mean A^{LM}_{l1 l2} of one map, or of the ordered pair X, Y, to all orders in b_ls.
@@ -75,6 +75,7 @@ def cmb_biposh_exact(
     }
     reach = max(abs(d) for _, d in groups) if groups else 0
     response_x, response_y = x.response(len(cl) - 1), y.response(len(cl) - 1)
+    power = cl * (2.0 * np.arange(len(cl)) + 1) / (4 * np.pi)
     same = x is y
 
     def work(first: int) -> None:
@@ -85,7 +86,7 @@ def cmb_biposh_exact(
         for (L, d), rows in groups.items():
             l2 = np.arange(first, last)[existing(L, d, lmax)[first:last]]
             block = np.zeros((len(rows), len(l2)), dtype=np.complex128)
-            _contract(L, d, l2, low, np.ascontiguousarray(cl, dtype=np.float64), table_x, table_y, *plans[L, d], block)
+            _contract(L, d, l2, low, power, table_x, table_y, *plans[L, d], block)
             for row, values in zip(rows, block, strict=True):
                 result[row, l2] = values
 
@@ -154,37 +155,47 @@ def _moment_couplings(
             yield L1, L2, coupling
 
 
+@njit(cache=True, nogil=True)
 def _spin_table(
     low: int, high: int, smax: int, L_max: int, response: NDArray[np.complex128]
 ) -> NDArray[np.complex128]:
     """k_l b_ls (l1 L1 l; 0 s -s) at [l1 - low, L1, l - l1 + L_max, smax + s], zero where it does not exist."""
     lsky = response.shape[1] - 1
     table = np.zeros((high - low, L_max + 1, 2 * L_max + 1, 2 * smax + 1), dtype=np.complex128)
+    family = np.zeros(2 * L_max + 1)
     for l1 in range(low, high):
         for L1 in range(L_max + 1):
             for s in range(min(smax, L1) + 1):
-                lowest, family = ducc0.misc.wigner3j_int(l1, L1, 0, s)
-                ell = np.arange(lowest, min(lowest + len(family), lsky + 1))
-                family = family[: len(ell)]
-                at = table[l1 - low, L1, ell[0] - l1 + L_max : ell[-1] - l1 + L_max + 1] if len(ell) else None
-                if at is None:
-                    continue
-                at[:, smax + s] = family * response[smax + s, ell]
-                if s > 0:
-                    parity = (-1.0) ** (l1 + L1 + ell)
-                    at[:, smax - s] = parity * family * response[smax - s, ell]
+                bottom, n = threej_family(l1, L1, 0, s, family)
+                for ell in range(bottom, min(bottom + n, lsky + 1)):
+                    symbol = family[ell - bottom]
+                    mirrored = symbol if (l1 + L1 + ell) % 2 == 0 else -symbol
+                    row = table[l1 - low, L1, ell - l1 + L_max]
+                    row[smax - s] = mirrored * response[smax - s, ell]
+                    row[smax + s] = symbol * response[smax + s, ell]
     return table
 
 
 @njit(cache=True, nogil=True)
-def _contract(  # type: ignore[no-untyped-def]
-    L, d, degrees, low, cl, table_x, table_y, pairs, first_term, spins, coupling, block
-):
+def _contract(
+    L: int,
+    d: int,
+    degrees: NDArray[np.int64],
+    low: int,
+    power: NDArray[np.float64],
+    table_x: NDArray[np.complex128],
+    table_y: NDArray[np.complex128],
+    pairs: NDArray[np.int64],
+    first_term: NDArray[np.int64],
+    spins: NDArray[np.int64],
+    coupling: NDArray[np.complex128],
+    block: NDArray[np.complex128],
+) -> None:
     """Add to ``block[M, l2]`` the sums over l, (L1, L2) and (s, s')."""
     L_max_x, L_max_y = table_x.shape[1] - 1, table_y.shape[1] - 1
     symbols = np.zeros(2 * max(L_max_x, L_max_y) + 2)
     sums = np.zeros(table_x.shape[3] * table_y.shape[3], dtype=np.complex128)
-    lsky = len(cl) - 1
+    lsky = len(power) - 1
     for i in range(len(degrees)):
         l2 = degrees[i]
         l1 = l2 - d
@@ -192,14 +203,14 @@ def _contract(  # type: ignore[no-untyped-def]
         for p in range(len(pairs)):
             L1, L2 = pairs[p, 0], pairs[p, 1]
             bottom = max(abs(l1 - L1), abs(l2 - L2))
-            top = min(l1 + L1, l2 + L2)
-            if top < bottom or bottom > lsky:
+            top = min(l1 + L1, l2 + L2, lsky)
+            if top < bottom or L1 + L2 < L:
                 continue
-            sixj_family(l1, L1, L, L2, l2, symbols)
+             sixj_family(l1, L1, L, L2, l2, symbols)
             begin, end = first_term[p], first_term[p + 1]
             sums[: end - begin] = 0.0
-            for ell in range(bottom, min(top, lsky) + 1):
-                weight = cl[ell] * symbols[ell - bottom]
+            for ell in range(bottom, top + 1):
+                weight = power[ell] * symbols[ell - bottom]
                 row_x = table_x[l1 - low, L1, ell - l1 + L_max_x]
                 row_y = table_y[l2 - low, L2, ell - l2 + L_max_y]
                 for t in range(begin, end):

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mcsim import alm as alm_
 from mcsim.errors import InputError
+from mcsim.healpix import geometry
 
 
 def orientation_harmonics(
@@ -43,7 +44,7 @@ def orientation_harmonics(
     nside = round(np.sqrt(npix / 12))
     if 12 * nside**2 != npix:
         raise InputError(f"a moment map has {npix} pixels, which no HEALPix map has; give maps of 12 nside^2 pixels.")
-    grid = ducc0.healpix.Healpix_Base(nside, "RING").sht_info()
+    grid = geometry(nside)
     area = 4 * np.pi / npix
     result = np.zeros((smax + 1, L_max + 1, 2 * L_max + 1), dtype=np.complex128)
     if observed is None or observed.all():

@@ -1,1 +1,17 @@
 """Scan models, pointing, orientation moments of the beam, and their exact long-time limit."""
+
+from mcsim.scan.cache import cached_moments
+from mcsim.scan.model import ScanModel, load_model
+from mcsim.scan.moments import Moments, parallel_transport, read_moments_fits, write_moments_fits
+from mcsim.scan.user_pointing import pointing_moments
+
+__all__ = [
+    "Moments",
+    "ScanModel",
+    "cached_moments",
+    "load_model",
+    "parallel_transport",
+    "pointing_moments",
+    "read_moments_fits",
+    "write_moments_fits",
+]

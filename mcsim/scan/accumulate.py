@@ -83,6 +83,7 @@ def pixel_sums(nside: int, smax: int) -> NDArray[np.float64]:
     """Zeroed accumulator, shape (npix, 4 + 2 smax): hits, sums of the unit vector, of cos(s psi) and -sin(s psi)."""
     columns = 4 + 2 * smax
     memory = np.zeros(12 * nside * nside * columns + _CACHE_LINE // 8)
+    # At smax 2 each pixel is one cache line, if the first one starts at its boundary.
     offset = (-memory.ctypes.data % _CACHE_LINE) // 8
     return memory[offset : offset + 12 * nside * nside * columns].reshape(-1, columns)
 
@@ -176,15 +177,21 @@ def add_sample(sums, pixel, x, y, z, cos_psi, sin_psi, smax):  # type: ignore[no
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_samples(start, block_turns, tables, geometry, to_frame, count, nside, smax, sums):  # type: ignore[no-untyped-def]
-    work = np.empty((5, BLOCK))
+    work = np.empty((6, BLOCK))
     pixels = np.empty(BLOCK, dtype=np.int64)
     turns = np.empty(3)
+    touched = 0.0
     for block in range((count + BLOCK - 1) // BLOCK):
         size = min(BLOCK, count - block * BLOCK)
         for axis in range(3):
             turns[axis] = (start[axis] + block * block_turns[axis]) % 1.0
         fill_block(turns, tables, geometry, to_frame, size, work)
         for k in range(size):
-            pixels[k] = ring_pixel(nside, work[0, k], work[1, k], work[2, k])
+            pixels[k] = ring_pixel(nside, work[5, k], work[0, k], work[1, k], work[2, k])
+        # Reading ahead keeps many cache misses in flight at once: a third less time at nside 512. The value is
+        # returned so that the compiler cannot drop the reads.
+        for k in range(size):
+            touched += sums[pixels[k], 0]
         for k in range(size):
             add_sample(sums, pixels[k], work[0, k], work[1, k], work[2, k], work[3, k], work[4, k], smax)
+    return touched

@@ -132,13 +132,52 @@ def limit_harmonics(
 
     Notes
     -----
-    (-s)Y_L0(theta) = (-1)^s sqrt((2L+1)/4pi (L-s)!/(L+s)!) P_L^s(cos theta) with the Condon-Shortley phase in P_L^s.
+    (-s)Y_L0(theta) = Y_Ls(theta, 0), so the coefficient is 2 pi int w_s(theta) Y_Ls(theta, 0) sin(theta) dtheta.
     """
     theta, weights = limit_quadrature(model, line_of_sight)
     _, w = limit_moments(model, theta, smax, line_of_sight)
-    z = np.cos(theta)
     coefficients = np.zeros((smax, lmax + 1), dtype=np.complex128)
     for s in range(1, smax + 1):
-        for degree, harmonic in _spin_harmonics(s, lmax, z, np.sin(theta)):
+        for degree, harmonic in enumerate(_harmonics(s, lmax, theta), start=s):
             coefficients[s - 1, degree] = 2.0 * math.pi * np.sum(weights * w[s - 1] * harmonic)
     return coefficients
+
+
+def _line(model: ScanModel, name: str | None) -> LineOfSight:
+    """The line of sight, if the model's precession is fast enough for a limit in colatitude alone."""
+    if model.precession_angle_deg > 0.0 and model.orbit_period_s < _FAST_PRECESSION * abs(model.precession_period_s):
+        raise InputError(
+            f"scan model {model.name!r} precesses {model.orbit_period_s / abs(model.precession_period_s):.3g} times an "
+            f"orbit, but the long-time limit needs more than {_FAST_PRECESSION:g}; stream its moments instead."
+        )
+    return model.line_of_sight(model.default_lines[0] if name is None else name)
+
+
+def _elliptic_nodes(roots: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Integral of 1/sqrt|(c-r1)(c-r2)(c-r3)(c-r4)| over [r2, r3], and nodes c uniform in its elliptic argument.
+
+    ``roots`` has shape (4, n), sorted; the nodes have shape (_NODES, n).
+    """
+    r1, r2, r3, r4 = roots
+    scale = (r4 - r2) * (r3 - r1)
+    # 1 - m from differences: it vanishes at the caustics.
+    complement = np.maximum((r2 - r1) * (r4 - r3) / scale, 1e-30)
+    quarter_period = ellipkm1(complement)
+    argument = np.linspace(0.0, 1.0, _NODES)[:, np.newaxis] * quarter_period
+    sn = ellipj(argument, 1.0 - complement)[0]
+    ratio = sn**2 * (r3 - r2) / (r3 - r1)
+    return 2.0 * quarter_period / np.sqrt(scale), (r2 - ratio * r1) / (1.0 - ratio)
+
+
+def _harmonics(m: int, lmax: int, theta: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Y_lm(theta, 0) for l = m .. lmax by the three-term recurrence in l."""
+    z = np.cos(theta)
+    norm = math.sqrt(math.prod((2 * k + 1) / (2 * k) for k in range(1, m + 1)) / (4.0 * math.pi))
+    previous, current = np.zeros_like(z), (-1) ** m * norm * np.sin(theta) ** m
+    harmonics = []
+    for degree in range(m, lmax + 1):
+        harmonics.append(current)
+        ahead = math.sqrt((4 * (degree + 1) ** 2 - 1) / ((degree + 1) ** 2 - m * m))
+        behind = math.sqrt((degree**2 - m * m) / (4 * degree**2 - 1)) if degree else 0.0
+        previous, current = current, ahead * (z * current - behind * previous)
+    return harmonics

@@ -14,6 +14,18 @@ BLOCK = 512
 """Samples whose trigonometry is done together: the work arrays of a block stay in the processor's first caches."""
 
 _TWO_PI = 2.0 * math.pi
+_TAN_PI_8 = math.sqrt(2.0) - 1.0
+
+
+def _arctangent_coefficients(degree: int = 11) -> NDArray[np.float64]:
+    """Polynomial in t^2 of (2/pi) arctan(t)/t for 0 <= t <= tan(pi/8), to rounding."""
+    chebyshev = np.polynomial.Chebyshev.interpolate(
+        lambda v: np.arctan(np.sqrt(v)) / np.sqrt(v) * (2.0 / math.pi), degree, domain=[0.0, _TAN_PI_8**2]
+    )
+    return chebyshev.convert(kind=np.polynomial.Polynomial).coef
+
+
+_ARCTANGENT = _arctangent_coefficients()
 
 
 class PointingStream:
@@ -75,11 +87,30 @@ def pointing(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def quarter_turns(x, y):  # type: ignore[no-untyped-def]
+    """Longitude of (x, y) in quarter turns, in [0, 4): atan2 without branches or calls, for vector instructions."""
+    width, height = abs(x), abs(y)
+    large, small = max(width, height), min(width, height)
+    steep = small > _TAN_PI_8 * large
+    # arctan(t) = pi/4 + arctan((t - 1)/(t + 1)) above tan(pi/8).
+    ratio = (small - large if steep else small) / max(small + large if steep else large, 1e-300)
+    square = ratio * ratio
+    turns = _ARCTANGENT[11]
+    for power in range(10, -1, -1):
+        turns = turns * square + _ARCTANGENT[power]
+    turns = turns * ratio + (0.5 if steep else 0.0)
+    turns = 1.0 - turns if height > width else turns
+    turns = 2.0 - turns if x < 0.0 else turns
+    turns = 4.0 - turns if y < 0.0 else turns
+    return 0.0 if turns >= 4.0 else turns
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def fill_block(turns, tables, geometry, to_frame, count, work):  # type: ignore[no-untyped-def]
     """Directions and orientations of ``count`` <= BLOCK samples that start at ``turns``.
 
-    ``work``, shape (5, BLOCK), takes n_x, n_y, n_z of the line of sight in the frame of the maps, and cos psi and
-    sin psi of the beam's x axis. Only elementwise arithmetic, so that the compiler uses vector instructions.
+    ``work``, shape (6, BLOCK), takes n_x, n_y, n_z of the line of sight in the frame of the maps, cos psi and
+    sin psi of the beam's x axis, and the longitude in quarter turns. Only elementwise arithmetic, so that the compiler uses vector instructions.
     """
     cos_a, sin_a = math.cos(_TWO_PI * turns[0]), math.sin(_TWO_PI * turns[0])
     cos_p, sin_p = math.cos(_TWO_PI * turns[1]), math.sin(_TWO_PI * turns[1])
@@ -112,30 +143,25 @@ def fill_block(turns, tables, geometry, to_frame, count, work):  # type: ignore[
         work[2, k] = vz
         work[3, k] = -uz * scale
         work[4, k] = (vx * uy - vy * ux) * scale
+        work[5, k] = quarter_turns(vx, vy)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def ring_pixel(nside, x, y, z):  # type: ignore[no-untyped-def]
-    """Pixel of a unit vector in RING order (Gorski et al. 2005, section 5.2)."""
+def ring_pixel(nside, turns, x, y, z):  # type: ignore[no-untyped-def]
+    """Pixel of a unit vector at longitude ``turns`` (quarter turns) in RING order (Gorski et al. 2005, section 5)."""
     height = abs(z)
-    quarter_turns = math.atan2(y, x) * (2.0 / math.pi)
-    if quarter_turns < 0.0:
-        quarter_turns += 4.0
-    if quarter_turns >= 4.0:
-        quarter_turns = 0.0
     if height <= 2.0 / 3.0:
-        base, slope = nside * (0.5 + quarter_turns), nside * z * 0.75
+        base, slope = nside * (0.5 + turns), nside * z * 0.75
         ascending, descending = int(base - slope), int(base + slope)
         ring = nside + 1 + ascending - descending
         shift = 1 - (ring & 1)
         column = ((ascending + descending - nside + shift + 1) >> 1) & (4 * nside - 1)
         return 2 * nside * (nside - 1) + (ring - 1) * 4 * nside + column
-    fraction = quarter_turns - int(quarter_turns)
+    fraction = turns - int(turns)
     # sin(theta) from x and y: 1 - |z| loses digits near the poles.
     radius = nside * math.sqrt((x * x + y * y) * 3.0 / (1.0 + height))
-    left, right = int(fraction * radius), int((1.0 - fraction) * radius)
-    ring = min(left + right + 1, nside)
-    column = min(int(quarter_turns * ring), 4 * ring - 1)
+    ring = min(int(fraction * radius) + int((1.0 - fraction) * radius) + 1, nside)
+    column = min(int(turns * ring), 4 * ring - 1)
     if z > 0.0:
         return 2 * ring * (ring - 1) + column
     return 12 * nside * nside - 2 * ring * (ring + 1) + column
@@ -143,7 +169,7 @@ def ring_pixel(nside, x, y, z):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _angles(start, block_turns, tables, geometry, to_frame, theta, phi, psi):  # type: ignore[no-untyped-def]
-    work = np.empty((5, BLOCK))
+    work = np.empty((6, BLOCK))
     turns = np.empty(3)
     for block in range((theta.size + BLOCK - 1) // BLOCK):
         first = block * BLOCK
@@ -154,5 +180,5 @@ def _angles(start, block_turns, tables, geometry, to_frame, theta, phi, psi):  #
         for k in range(count):
             x, y = work[0, k], work[1, k]
             theta[first + k] = math.atan2(math.sqrt(x * x + y * y), work[2, k])
-            phi[first + k] = math.atan2(y, x) % _TWO_PI
+            phi[first + k] = work[5, k] * (0.5 * math.pi)
             psi[first + k] = math.atan2(work[4, k], work[3, k])

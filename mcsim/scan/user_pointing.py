@@ -14,7 +14,7 @@ from mcsim.errors import InputError
 from mcsim.scan.accumulate import add_sample, moments_from_sums, pixel_sums
 from mcsim.scan.geometry import check_frame, check_nside
 from mcsim.scan.moments import Moments
-from mcsim.scan.pointing import ring_pixel
+from mcsim.scan.pointing import quarter_turns, ring_pixel
 
 _ROWS = 1 << 20
 _NAMES = ("theta", "phi", "psi")
@@ -114,4 +114,4 @@ def _add_angles(theta, phi, psi, nside, smax, sums):  # type: ignore[no-untyped-
     for k in range(theta.size):
         sin_theta = math.sin(theta[k])
         x, y, z = sin_theta * math.cos(phi[k]), sin_theta * math.sin(phi[k]), math.cos(theta[k])
-        add_sample(sums, ring_pixel(nside, x, y, z), x, y, z, math.cos(psi[k]), math.sin(psi[k]), smax)
+        add_sample(sums, ring_pixel(nside, quarter_turns(x, y), x, y, z), x, y, z, math.cos(psi[k]), math.sin(psi[k]), smax)

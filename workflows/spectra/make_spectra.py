@@ -3,16 +3,17 @@
 Parameters
 ----------
 wmap7
-    Maximum-likelihood flat LCDM of WMAP-7 alone (LCDM + SZ + lensing), D. Larson et al. 2011, arXiv:1001.4635. WMAP-7 was
-    analysed with RECFAST 1.4.2, so its recombination is used: RECFAST 1.5 lowers C_l by 2 % at l = 2000.
+    Maximum-likelihood flat LCDM of WMAP-7 alone (LCDM + SZ + lensing), D. Larson et al. 2011, arXiv:1001.4635. WMAP-7
+    was analysed with RECFAST 1.4.2, so its recombination is used: RECFAST 1.5 lowers C_l by 2 % at l = 2000.
 planck2018
     Best fit of Planck TT,TE,EE+lowE+lensing (Plik), Planck Collaboration VI 2020, arXiv:1807.06209, Table 1.
 
 Notes
 -----
-Lensed scalar TT in uK^2, without an SZ template. Over the tables that the two collaborations distribute: wmap7 is within 0.9 % for
-l = 2..2000 (mean ratio 0.9967, scatter 0.0009 above l = 10), planck2018 within 0.3 % for l = 2..3700. The constant 0.33 % of
-wmap7 is the rounding of the published amplitude and optical depth; the published values are kept.
+Lensed scalar TT in uK^2, without an SZ template. Over the tables that the two collaborations distribute: wmap7 is
+within 0.9 % for l = 2..2000 (mean ratio 0.9967, scatter 0.0009 above l = 10), planck2018 within 0.3 % for l =
+2..3700. The constant 0.33 % of wmap7 is the rounding of the published amplitude and optical depth; the published
+values are kept.
 """
 
 import argparse
@@ -26,7 +27,7 @@ LMAX = 4096
 
 PARAMETERS: dict[str, dict[str, Any]] = {
     "wmap7": {
-        "reference": "WMAP-7 LCDM maximum likelihood, Larson et al. 2011, arXiv:1001.4635; RECFAST 1.4.2; linear lensing",
+        "reference": "WMAP-7 maximum likelihood, Larson et al. 2011, arXiv:1001.4635; RECFAST 1.4.2; linear lensing",
         "cosmology": {
             "ombh2": 0.02270,
             "omch2": 0.1107,
@@ -42,7 +43,7 @@ PARAMETERS: dict[str, dict[str, Any]] = {
         },
     },
     "planck2018": {
-        "reference": "Planck 2018 TT,TE,EE+lowE+lensing best fit, Planck VI 2020, arXiv:1807.06209; lensing with halofit",
+        "reference": "Planck 2018 TT,TE,EE+lowE+lensing best fit, arXiv:1807.06209; lensing with halofit",
         "cosmology": {
             "ombh2": 0.022383,
             "omch2": 0.12011,

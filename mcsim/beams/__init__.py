@@ -1,0 +1,24 @@
+"""Beams: from a width, a beam map or a file to harmonic coefficients b_lm."""
+
+from mcsim.beams.beam import MMAX_TOLERANCE, Beam, choose_mmax
+from mcsim.beams.beammap import BeamMap, blm_of_map, find_centre, from_map, read_map
+from mcsim.beams.files import from_blm_file
+from mcsim.beams.gaussian import elliptical_gaussian, gaussian
+from mcsim.beams.summary import BeamSummary, format_summary, summarize
+
+__all__ = [
+    "MMAX_TOLERANCE",
+    "Beam",
+    "BeamMap",
+    "BeamSummary",
+    "blm_of_map",
+    "choose_mmax",
+    "elliptical_gaussian",
+    "find_centre",
+    "format_summary",
+    "from_blm_file",
+    "from_map",
+    "gaussian",
+    "read_map",
+    "summarize",
+]

@@ -1,0 +1,158 @@
+"""The command line: thin calls of public functions. Exit codes: 0 done, 1 failed realizations, 2 bad input, 130 interrupted."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from mcsim.errors import InputError
+
+app = typer.Typer(
+    name="mcsim",
+    help="Is the isotropy violation that I measure made by my instrument?",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+out = Console(highlight=False, soft_wrap=True)
+
+Config = Annotated[str, typer.Argument(metavar="CONFIG", help="TOML file, or a packaged workflow such as quickstart.")]
+Store = Annotated[Path, typer.Argument(metavar="STORE", help="Folder that mcsim run wrote.")]
+Png = Annotated[Path | None, typer.Option("-o", "--output", metavar="PNG", help="Picture to write.")]
+
+
+def main() -> None:
+    """Run the command line; bad input ends in one sentence and exit code 2."""
+    try:
+        app()
+    except InputError as error:
+        Console(stderr=True, highlight=False, soft_wrap=True).print(f"mcsim: {error}", markup=False)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("mcsim: interrupted; run the same command again to continue.", file=sys.stderr)
+        sys.exit(130)
+
+
+@app.command()
+def run(
+    config: Config,
+    store: Annotated[Path | None, typer.Option("-o", "--output", metavar="STORE", help="Default: NAME.zarr here.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue a store; refuse to start a new one.")] = False,
+    realizations: Annotated[
+        str | None, typer.Option(metavar="A:B", help="Only realizations A to B - 1, for slices that merge joins.")
+    ] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Local processes; default: the configuration's.")] = None,
+    scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Running Dask scheduler, tcp://host:port.")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say memory, disk, files and time; compute nothing.")] = False,
+) -> None:
+    """Run an ensemble; continue it if it was interrupted; extend it if more realizations are asked for."""
+    if workers is not None and scheduler is not None:
+        raise InputError("--workers and --scheduler exclude each other: workers of a running scheduler are its own.")
+    part = _slice(realizations)
+    if dry_run:
+        from mcsim import plan
+
+        out.print(plan.describe(config, part, workers), markup=False)
+        return
+    from mcsim import runner
+
+    result = runner.run(
+        config, store, resume=resume, realizations=part, workers=workers, scheduler=scheduler, quiet=False
+    )
+    _report(result)
+
+
+@app.command()
+def merge(
+    slices: Annotated[list[Path], typer.Argument(metavar="STORE...", help="Stores of slices of one ensemble.")],
+    store: Annotated[Path, typer.Option("-o", "--output", metavar="STORE", help="Store to make.")],
+) -> None:
+    """Join slices that were run with --realizations A:B."""
+    from mcsim import runner
+
+    _report(runner.merge(slices, store, quiet=False))
+
+
+@app.command()
+def info(
+    store: Store,
+    export: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the summary: .nc (NetCDF) or .ecsv (table of binned spectra).")
+    ] = None,
+) -> None:
+    """Say what a store holds; export its summary."""
+    from mcsim import inspect
+
+    out.print(inspect.describe(store), markup=False)
+    if export is not None:
+        inspect.export(store, export)
+        out.print(f"wrote {export}", markup=False)
+
+
+@app.command()
+def plot(
+    store: Store,
+    output: Png = None,
+    L: Annotated[int | None, typer.Option("--L", help="Only this L.")] = None,
+    M: Annotated[int | None, typer.Option("--M", help="Only this M.")] = None,
+    d: Annotated[int | None, typer.Option("--d", help="Only this d = l2 - l1.")] = None,
+    pair: Annotated[str | None, typer.Option(help='Pair of maps, for example "W1,W1"; default: the first.')] = None,
+) -> None:
+    """Draw the binned spectra of a store with their error bars."""
+    from mcsim.plot.spectra import ensemble_figure
+
+    _save(ensemble_figure(store, L=L, M=M, d=d, pair=pair), output or store.with_suffix(".png"))
+
+
+@app.command()
+def config(
+    name: Annotated[str | None, typer.Argument(metavar="CONFIG", help="Check this configuration and print it resolved.")] = None,
+    schema: Annotated[bool, typer.Option("--schema", help="Print the JSON schema of the TOML file.")] = False,
+) -> None:
+    """Check a configuration, or print the schema of all."""
+    from mcsim import config as config_
+
+    if schema:
+        print(json.dumps(config_.json_schema(), indent=2))
+    elif name is not None:
+        loaded = config_.load(name)
+        print(json.dumps({"digest": config_.digest(loaded), **config_.resolved(loaded)}, indent=2))
+    else:
+        raise InputError("Nothing was asked for; give a configuration to check, or --schema.")
+
+
+def _slice(text: str | None) -> slice | None:
+    if text is None:
+        return None
+    start, colon, stop = text.partition(":")
+    if not colon or not (start or "0").isdecimal() or (stop and not stop.isdecimal()):
+        raise InputError(f"--realizations {text} is not of the form A:B with whole numbers; for example 0:50.")
+    return slice(int(start or 0), int(stop) if stop else None)
+
+
+def _save(figure, path: Path) -> None:  # type: ignore[no-untyped-def]
+    try:
+        figure.savefig(path)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be written ({error}); choose another file with -o.") from error
+    out.print(f"wrote {path}", markup=False)
+
+
+def _report(result) -> None:  # type: ignore[no-untyped-def]
+    if result.computed == 0 and not result.failures:
+        out.print(f"{result.store} is finished: {result.finished} realizations, nothing to do.", markup=False)
+    else:
+        out.print(f"{result.store}: {result.finished} realizations, {result.computed} of them new.", markup=False)
+    for failure in result.failures[:10]:
+        out.print(f"realization {failure.realization} failed: {failure.reason}", markup=False)
+    if result.failures:
+        out.print(f"{len(result.failures)} realizations failed; run the same command again to retry them.", markup=False)
+        raise typer.Exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,205 @@
+"""What a run will be before it is one: its realizations, chunks, attributes, and cost."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mcsim import alm as alm_
+from mcsim import config, healpix, rng, store, summary
+from mcsim.biposh import Mode, modes
+from mcsim.errors import InputError
+from mcsim.sky import gaussian_alm
+from mcsim.store import Layout
+from mcsim.survey import Survey, load_beam
+
+CHUNKS = 128
+CHUNK_BYTES = 1 << 26
+
+CONVENTIONS = {
+    "temperature": "uK_CMB",
+    "alm": "healpy m-major order, analysis divided by the pixel window",
+    "psi": "rotation of the beam about its axis, from e_theta (south) towards e_phi (east)",
+    "beam": "b_lm of the beam pointed at the pole, b_l0 = sqrt((2l+1)/4pi) B_l, B_0 = 1; x axis = spin axis x boresight",
+    "biposh": "A^{LM}_{l1 l2} = sum a_{l1 m1} conj(a_{l2 m2}) (-1)^{m2} C^{LM}_{l1 m1 l2 -m2}, at ell = l2, d = l2 - l1",
+    "normalisation": "Hajian-Souradeep",
+    "weights": "maps are multiplied by weights of unit mean square, spectra divided by the mean product of the two weights",
+}
+_PACKAGES = ("mcsim", "numpy", "healpy", "ducc0", "numba", "scipy", "dask", "distributed", "zarr", "xarray")
+
+
+def wanted(run: config.RunConfig, part: slice | None) -> range:
+    """Realizations to compute: all, or a slice ``A:B`` of them.
+
+    Raises
+    ------
+    InputError
+        If the slice is empty or reaches beyond the ensemble.
+    """
+    total = run.ensemble.realizations
+    if part is None:
+        return range(total)
+    start, stop = part.start or 0, total if part.stop is None else part.stop
+    if not 0 <= start < stop <= total:
+        raise InputError(
+            f"The slice {start}:{stop} of realizations is not within 0:{total}; choose A < B up to ensemble.realizations."
+        )
+    return range(start, stop)
+
+
+def layout(survey: Survey) -> Layout:
+    """Layout of a new store."""
+    run = survey.config
+    bare = Layout(
+        run.ensemble.realizations,
+        1,
+        survey.map_names,
+        survey.pair_names,
+        survey.estimator.modes,
+        survey.lmax,
+        run.ensemble.paired,
+        12 * run.map.nside**2 if run.ensemble.keep_maps else None,
+    )
+    return _chunked(bare, run.compute.chunk)
+
+
+def _chunked(bare: Layout, chunk: int | None) -> Layout:
+    """About 128 chunks, which keeps files few and tasks many, unless a chunk would pass 64 MiB. Powers of two, as the tree of sums needs."""
+    if chunk is None:
+        chunk = 1
+        while chunk * CHUNKS < bare.realizations and 2 * chunk * bare.realization_bytes() <= CHUNK_BYTES:
+            chunk *= 2
+    return Layout(**{**bare.__dict__, "chunk": chunk})
+
+
+def recipe(survey: Survey) -> summary.Recipe:
+    """Recipe of the summary."""
+    run = survey.config
+    return summary.Recipe(
+        survey.pair_names, survey.estimator.modes, survey.lmax, run.biposh.summary_bin, run.ensemble.paired
+    )
+
+
+def attributes(run: config.RunConfig) -> dict[str, Any]:
+    """Attributes of a store: the resolved configuration (without what leaves the result alone), its hash, conventions, versions."""
+    resolved = config.resolved(run)
+    del resolved["compute"]
+    return {
+        "configuration": resolved,
+        "science": config.science(run),
+        "digest": config.digest(run),
+        "conventions": CONVENTIONS,
+        "packages": {name: version(name) for name in _PACKAGES},
+    }
+
+
+def check_same(path: Path, run: config.RunConfig) -> None:
+    """Refuse a store of another configuration, or one that has other variables.
+
+    Raises
+    ------
+    InputError
+        Naming the keys that differ.
+    """
+    found = store.attributes(path)
+    changes = config.differences(found["science"], config.science(run))
+    kept = found["configuration"]["ensemble"]["keep_maps"]
+    if kept != run.ensemble.keep_maps:
+        changes.append(f"ensemble.keep_maps: {kept} -> {run.ensemble.keep_maps}")
+    if changes:
+        raise InputError(
+            f"{path} was made with another configuration ({'; '.join(changes)}); choose another store with -o, or restore the values."
+        )
+
+
+def check_mergeable(path: Path, first: Mapping[str, Any], other: Path, attributes: Mapping[str, Any]) -> None:
+    """Refuse to merge stores of different configurations."""
+    changes = config.differences(first["science"], attributes["science"])
+    if changes:
+        raise InputError(f"{other} and {path} differ ({'; '.join(changes)}); merge slices of one configuration.")
+
+
+def stored(path: Path, realizations: int) -> tuple[Layout, summary.Recipe]:
+    """Layout and recipe of an existing store, for a store of as many realizations with the same contents."""
+    with store.open_ensemble(path) as found:
+        attrs = found.attrs["configuration"]
+        pairs = tuple(str(pair) for pair in found["pair"].values)
+        kept = found.sizes.get("pixel")
+        maps = tuple(str(name) for name in found["map_name"].values) if kept else ()
+        lmax, paired = found.sizes["ell"] - 1, "biposh_circular" in found
+        stored_modes = tuple(
+            Mode(int(L), int(M), int(d)) for L, M, d in zip(found["L"], found["M"], found["d"], strict=True)
+        )
+    layout = Layout(realizations, store.chunk(path), maps, pairs, stored_modes, lmax, paired, kept)
+    return layout, summary.Recipe(pairs, stored_modes, lmax, attrs["biposh"]["summary_bin"], paired)
+
+
+def describe(source: str | Path, part: slice | None = None, workers: int | None = None) -> str:
+    """What a run will take, in words: realizations, tasks, memory, disk, files and time."""
+    run = config.load(source)
+    planned = cost(run, wanted(run, part))
+    count = workers or run.compute.workers
+    hours = planned.realizations * planned.seconds_per_realization / 3600.0
+    return "\n".join(
+        [
+            f"{run.name}: {planned.realizations} realizations in {planned.tasks} tasks",
+            f"  memory  {planned.worker_bytes / 1e9:.2f} GB per worker, {count} workers",
+            f"  disk    {planned.store_bytes / 1e6:.1f} MB in about {planned.files} files",
+            f"  time    {planned.seconds_per_realization:.3g} s per realization and core, {hours:.3g} core-hours,"
+            f" {60.0 * hours / count:.3g} minutes with {count} workers on as many idle cores",
+        ]
+    )
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a run will take: realizations, tasks, worker memory, disk, files, and processor time of the transforms."""
+
+    realizations: int
+    tasks: int
+    worker_bytes: float
+    store_bytes: float
+    files: int
+    seconds_per_realization: float
+
+
+def cost(run: config.RunConfig, realizations: range) -> Cost:
+    """Estimate the cost of a run from its sizes, its beams, and one timed transform."""
+    mmax = [load_beam(channel.beam, run.sky.lmax).mmax for channel in run.channels]
+    lmax, nside = config.analysis_lmax(run), run.map.nside
+    names = config.map_names(run)
+    both = run.biposh.pairs == "all"
+    pairs = len(names) * (len(names) + 1) // 2 if both else len(names)
+    found = modes(run.biposh.L_max, both and len(names) > 1)
+    npix = 12 * nside**2
+    bare = Layout(
+        run.ensemble.realizations, 1, names, ("",) * pairs, found, lmax, run.ensemble.paired,
+        npix if run.ensemble.keep_maps else None,
+    )  # fmt: skip
+    planned = _chunked(bare, run.compute.chunk)
+    splits = len(run.map.splits) or 1
+    transform = _timed_transform(nside, run.sky.lmax)
+    transforms = sum(1.0 + 2.0 * m + splits * (2.0 + 4.0 * run.biposh.iterations) for m in mmax)
+    largest = max(mmax)
+    memory = 3e8 + 8.0 * npix * (6 + 2 * largest) + 16.0 * alm_.size(run.sky.lmax) * (6 + len(names) * 2)
+    memory += planned.chunk * planned.realization_bytes()
+    return Cost(
+        len(realizations),
+        -(-len(realizations) // planned.chunk),
+        memory,
+        float(planned.realization_bytes()) * len(realizations),
+        planned.files(),
+        transform * transforms,
+    )
+
+
+def _timed_transform(nside: int, lmax: int) -> float:
+    """Seconds of one spin-0 synthesis on one thread."""
+    alm = gaussian_alm(np.ones(lmax + 1), rng.generator(0, 0, "timing"))
+    start = time.perf_counter()
+    healpix.synthesis(alm[None], nside, lmax)
+    return time.perf_counter() - start

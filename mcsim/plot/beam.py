@@ -1,0 +1,149 @@
+"""A beam at a glance: its peak, its faint surroundings and its coefficients."""
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from mcsim.beams import Beam, BeamMap, BeamSummary, summarize
+from mcsim.beams.beammap import solid_angle_values
+
+FLOOR_DB = 40.0
+_PIXELS = 361
+_CONTOURS = (0.1, 0.25, 0.5, 0.75, 0.9)
+_LARGEST_ORDER = 8
+_ARCMIN = np.degrees(1.0) * 60
+# Negative blue, positive ochre, white at and below the floor: told apart by any eye and in grey at the ends.
+_SIGNED = LinearSegmentedColormap.from_list(
+    "signed_db", ["#08204a", "#1f5fa8", "#a9cbe8", "#ffffff", "#f5cfa0", "#c8641e", "#4f1605"]
+)
+
+
+def beam_figure(beam: Beam, beam_map: BeamMap | None = None, title: str = "") -> Figure:
+    """Draw a beam's peak, its faint annulus in dB with the sign, and |b_lm|.
+
+    Parameters
+    ----------
+    beam
+        The beam.
+    beam_map
+        The map that it comes from; without it the pattern is synthesised from the coefficients.
+    title
+        Heading of the figure.
+
+    Returns
+    -------
+    Figure
+        A figure that no pyplot state knows of; save it with ``figure.savefig``.
+    """
+    summary = summarize(beam, beam_map)
+    figure = Figure(figsize=(15.0, 4.9), layout=ConstrainedLayoutEngine(wspace=0.06))
+    peak_axes, faint_axes, blm_axes = figure.subplots(1, 3, width_ratios=[1, 1.12, 1.25])
+    if title:
+        figure.suptitle(title, fontsize=13, fontweight="bold")
+    fwhm = summary.fwhm_major_arcmin if np.isfinite(summary.fwhm_major_arcmin) else np.degrees(0.5) * 60
+    _draw_peak(peak_axes, beam, beam_map, summary, 1.25 * fwhm)
+    reach = 5 * fwhm if beam_map is None else 1.05 * _data_reach_arcmin(beam_map)
+    _draw_faint(faint_axes, beam, beam_map, min(reach, 90 * 60))
+    _draw_blm(blm_axes, beam)
+    return figure
+
+
+def _data_reach_arcmin(beam_map: BeamMap) -> float:
+    """Largest distance from the centre of a pixel with data inside the cut."""
+    _, theta, _ = solid_angle_values(
+        beam_map.image, beam_map.pixel_rad, beam_map.centre, beam_map.cut_rad, beam_map.projection
+    )
+    return float(theta.max() * _ARCMIN)
+
+
+def _pattern(beam: Beam, beam_map: BeamMap | None, reach_arcmin: float) -> NDArray[np.float64]:
+    """Response over its peak on a square of +-reach in theta (cos phi, sin phi); row = y."""
+    axis = np.linspace(-reach_arcmin, reach_arcmin, _PIXELS) / _ARCMIN
+    x, y = np.meshgrid(axis, axis)
+    theta, phi = np.hypot(x, y), np.arctan2(y, x)
+    if beam_map is None:
+        values = np.where(theta <= np.pi, beam.values(np.minimum(theta, np.pi), phi), 0.0)
+    else:
+        values = np.where(theta <= beam_map.cut_rad, beam_map.values(np.minimum(theta, beam_map.cut_rad), phi), 0.0)
+    return values
+
+
+def _draw_peak(axes: Axes, beam: Beam, beam_map: BeamMap | None, summary: BeamSummary, reach: float) -> None:
+    values = _pattern(beam, beam_map, reach)
+    values /= values.max()
+    extent = (-reach, reach, -reach, reach)
+    image = axes.imshow(
+        values, origin="lower", extent=extent, cmap="YlGnBu_r", vmin=0, vmax=1, interpolation="bilinear"
+    )
+    contours = axes.contour(
+        values, levels=_CONTOURS, extent=extent, colors=["w", "w", "w", "k", "k"], linewidths=[0.8, 0.8, 1.8, 0.8, 0.8]
+    )
+    axes.clabel(contours, fmt=lambda level: f"{level:.0%}", fontsize=7)
+    axes.set_title(
+        f"Peak: {summary.fwhm_major_arcmin:.1f}′ × {summary.fwhm_minor_arcmin:.1f}′ FWHM, "
+        f"ratio {summary.axis_ratio:.3f}",
+        fontsize=10,
+    )
+    axes.set_xlabel("x, in-scan  [arcmin]")
+    axes.set_ylabel("y, cross-scan  [arcmin]")
+    axes.figure.colorbar(image, ax=axes, label="response / peak", shrink=0.85, pad=0.02)
+
+
+def _draw_faint(axes: Axes, beam: Beam, beam_map: BeamMap | None, reach: float) -> None:
+    values = _pattern(beam, beam_map, reach)
+    values /= values.max()
+    unit, name = (60.0, "deg") if reach > 120 else (1.0, "arcmin")
+    with np.errstate(divide="ignore"):
+        above_floor = np.maximum(FLOOR_DB + 10 * np.log10(np.abs(values)), 0.0)
+    side = reach / unit
+    image = axes.imshow(
+        np.sign(values) * above_floor,
+        origin="lower",
+        extent=(-side, side, -side, side),
+        cmap=_SIGNED,
+        vmin=-FLOOR_DB,
+        vmax=FLOOR_DB,
+        interpolation="nearest",
+    )
+    axes.set_title("Surroundings, with the sign of the response", fontsize=10)
+    axes.set_xlabel(f"x, in-scan  [{name}]")
+    axes.set_ylabel(f"y, cross-scan  [{name}]")
+    bar = axes.figure.colorbar(image, ax=axes, shrink=0.85, pad=0.02)
+    ticks = np.arange(-FLOOR_DB, FLOOR_DB + 1, 10).tolist()
+    bar.set_ticks(ticks, labels=[_decibel_label(tick) for tick in ticks])
+    bar.set_label("negative   |   positive     [dB below the peak]")
+
+
+def _decibel_label(tick: float) -> str:
+    if tick == 0:
+        return f"below −{FLOOR_DB:.0f}"
+    below = FLOOR_DB - abs(tick)
+    return f"{'+' if tick > 0 else '−'}  {'0' if below == 0 else f'−{below:.0f}'}"
+
+
+def _draw_blm(axes: Axes, beam: Beam) -> None:
+    ell = np.arange(beam.lmax + 1)
+    scale = np.sqrt(4 * np.pi / (2 * ell + 1))
+    drawn = [m for m in range(min(beam.mmax, _LARGEST_ORDER) + 1) if np.any(beam.blm[m])]
+    colours = ["#222222", *colormaps["viridis"](np.linspace(0.1, 0.9, max(len(drawn) - 1, 1)))]
+    for m, colour in zip(drawn, colours, strict=False):
+        size = scale[m:] * np.abs(beam.blm[m, m:])
+        axes.semilogy(
+            ell[m:], size, color=colour, linewidth=2.0 if m in (0, 2) else 1.1, ls="--" if m % 2 else "-", label=f"{m}"
+        )
+    axes.set_ylim(1e-6, 2)
+    axes.set_xlim(0, beam.lmax)
+    axes.xaxis.set_major_locator(MaxNLocator(6))
+    axes.grid(which="major", color="#dddddd", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.set_xlabel("multipole ℓ")
+    axes.set_ylabel(r"$|b_{\ell m}|\,\sqrt{4\pi/(2\ell+1)}$   ($m=0$: $|B_\ell|$)")
+    beyond = f"; {beam.neglected_power:.1e} of the power beyond" if beam.neglected_power > 0 else ""
+    axes.set_title(f"Coefficients, m ≤ {beam.mmax}{beyond}", fontsize=10)
+    axes.legend(title="m", fontsize=8, ncols=3, loc="best", framealpha=0.9)

@@ -1,0 +1,97 @@
+"""The paper's scan figure: orientation of the beam and <cos 2 rho> over the sky, with hits and w_2 by latitude."""
+
+from typing import Any
+
+import healpy
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from mcsim.errors import InputError
+from mcsim.scan.factors import ring_means
+from mcsim.scan.limit import limit_moments
+from mcsim.scan.model import ScanModel
+from mcsim.scan.moments import Moments
+
+
+def scan_figure(moments: Moments, title: str = "", model: ScanModel | None = None) -> Figure:
+    """Draw what a survey does to the orientation of the beam.
+
+    Parameters
+    ----------
+    moments
+        With smax >= 2.
+    title
+        Heading.
+    model
+        If given, its exact long-time limit is drawn beside the moments; leave it out for other frames than
+        ecliptic and for models whose limit does not exist.
+
+    Returns
+    -------
+    Figure
+        Four panels: rho-bar = -arg(w_2) / 2, the mean orientation of the beam's x axis from e_theta towards e_phi,
+        an axis and so known up to 180 degrees; <cos 2 rho> = Re w_2; hits and Re w_2 against latitude.
+
+    Notes
+    -----
+    The paper (arXiv:1210.7318, fig. cos2rho) averages the angles rho themselves, which depends on where the circle
+    is cut. The circular mean of e^{i rho}, -arg(w_1), would be +-90 degrees nearly everywhere: the two passes over
+    a pixel see it at rho and 180 deg - rho.
+    """
+    if moments.smax < 2:
+        raise InputError(f"the moments end at s = {moments.smax}, but the figure needs s = 2; use smax >= 2.")
+    seen = np.asarray(moments.hits > 0.0)
+    w2 = np.where(seen, moments.w[1], np.nan)
+    figure = Figure(figsize=(11.0, 7.6), layout="constrained")
+    figure.suptitle(title)
+    axes = figure.subplots(2, 2, height_ratios=(1.0, 0.85))
+    mean_rho = np.degrees(-0.5 * np.angle(w2))
+    _mollweide(figure, axes[0, 0], mean_rho, moments.nside, "twilight", (-90.0, 90.0), "degrees, modulo 180")
+    axes[0, 0].set_title(r"mean orientation $\bar\rho = -\frac{1}{2}\,\arg w_2$")
+    _mollweide(figure, axes[0, 1], w2.real, moments.nside, "RdBu", (-1.0, 1.0), "")
+    axes[0, 1].set_title(r"$\langle\cos 2\rho\rangle = \mathrm{Re}\,w_2$")
+    _against_latitude(axes[1, 0], axes[1, 1], moments, model)
+    return figure
+
+
+def _mollweide(
+    figure: Figure,
+    axes: Axes,
+    values: NDArray[np.float64],
+    nside: int,
+    colours: str,
+    limits: tuple[float, float],
+    unit: str,
+) -> None:
+    """Draw a RING map in Mollweide projection, longitude 0 in the middle and growing to the left."""
+    projector: Any = healpy.projector.MollweideProj(xsize=1200)
+    image = projector.projmap(values, lambda x, y, z: healpy.vec2pix(nside, x, y, z))
+    image = np.ma.masked_invalid(np.where(np.isneginf(image), np.nan, image))
+    shown = axes.imshow(
+        image, origin="lower", extent=projector.get_extent(), cmap=colours, vmin=limits[0], vmax=limits[1]
+    )
+    axes.set_axis_off()
+    figure.colorbar(shown, ax=axes, orientation="horizontal", shrink=0.6, pad=0.02, label=unit)
+
+
+def _against_latitude(hits_axes: Axes, w_axes: Axes, moments: Moments, model: ScanModel | None) -> None:
+    theta, hits, w = ring_means(moments)
+    latitude = 90.0 - np.degrees(theta)
+    hits_axes.plot(latitude, hits, color="tab:blue", linewidth=1.2, label="mean of each ring")
+    w_axes.plot(latitude, w[1].real, color="tab:blue", linewidth=1.2, label="mean of each ring")
+    if model is not None:
+        fine = np.radians(np.linspace(0.02, 179.98, 4000))
+        density, limit = limit_moments(model, fine, 2)
+        hits_axes.plot(90.0 - np.degrees(fine), density, color="tab:orange", linewidth=0.8, label="long-time limit")
+        w_axes.plot(90.0 - np.degrees(fine), limit[1].real, color="tab:orange", linewidth=0.8, label="long-time limit")
+    hits_axes.set_ylim(0.0, 1.15 * float(hits.max()))
+    hits_axes.set_ylabel("hits / mean")
+    w_axes.set_ylabel(r"Re $w_2$")
+    w_axes.axhline(0.0, color="0.6", linewidth=0.6)
+    for axes in (hits_axes, w_axes):
+        axes.set_xlim(-90.0, 90.0)
+        axes.set_xticks(range(-90, 91, 30))
+        axes.set_xlabel(f"{moments.frame} latitude [degrees]")
+        axes.legend(frameon=False)

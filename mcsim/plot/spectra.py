@@ -1,0 +1,107 @@
+"""Binned BipoSH spectra of an ensemble with their error bars."""
+
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from mcsim import store
+from mcsim.errors import InputError
+
+_COLOURS = ("#1f5fa8", "#c44e22", "#3c8c3c", "#7b4fa3", "#8c6d1f", "#1f8f94")
+
+
+def ensemble_figure(
+    path: str | Path, L: int | None = None, M: int | None = None, d: int | None = None, pair: str | None = None
+) -> Figure:
+    """Draw C_l and the binned BipoSH spectra of one pair of maps.
+
+    Parameters
+    ----------
+    path
+        Store with a summary.
+    L, M, d
+        Draw only these; by default one panel for every L > 0 and M.
+    pair
+        Label of the pair; by default the first.
+
+    Raises
+    ------
+    InputError
+        If nothing of the store fits the choice.
+    """
+    with store.open_summary(path) as summary:
+        pairs = [str(label) for label in summary["pair"].values]
+        label = pairs[0] if pair is None else pair
+        if label not in pairs:
+            raise InputError(f"There is no pair {label} in {path}; choose among {'; '.join(pairs)}.")
+        chosen = summary.sel(pair=label).load()
+    keep = np.ones(chosen.sizes["mode"], dtype=bool)
+    for name, value in (("L", L), ("M", M), ("d", d)):
+        if value is not None:
+            keep &= chosen[name].values == value
+    if L is None:
+        keep &= chosen["L"].values > 0
+    modes = chosen.isel(mode=np.flatnonzero(keep))
+    # A pair of orders -d, d beside an auto spectrum is all NaN there: nothing to draw.
+    modes = modes.isel(mode=np.flatnonzero(np.isfinite(modes["biposh_binned_mean"].values).any(axis=-1)))
+    if modes.sizes["mode"] == 0:
+        raise InputError(f"{path} has no mode with L = {L}, M = {M}, d = {d}; mcsim info names what it holds.")
+    panels = sorted({(int(a), int(b)) for a, b in zip(modes["L"].values, modes["M"].values, strict=True)})
+    return _draw(modes, panels, f"{path}: {label}, {int(modes['count'])} realizations")
+
+
+def _draw(modes: xr.Dataset, panels: list[tuple[int, int]], title: str) -> Figure:
+    columns = min(3, len(panels))
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(5.2 * columns, 3.6 * rows + 0.4), layout="constrained")
+    figure.suptitle(title, fontsize=11)
+    paired = "biposh_difference_binned_mean" in modes
+    for number, (L, M) in enumerate(panels):
+        axes = figure.add_subplot(rows, columns, number + 1)
+        inside = (modes["L"].values == L) & (modes["M"].values == M)
+        for colour, index in zip(_COLOURS * 9, np.flatnonzero(inside), strict=False):
+            _spectrum(axes, modes.isel(mode=index), colour, paired)
+        axes.axhline(0.0, color="0.6", linewidth=0.8, zorder=0)
+        axes.set_title(f"L = {L}, M = {M}", fontsize=10)
+        axes.set_xlabel(r"multipole $\ell = l_2$")
+        axes.set_ylabel(rf"$\ell(\ell+1)A^{{{L}{M}}}/2\pi$  [$\mu$K$^2$]")
+        axes.legend(fontsize=8, frameon=False)
+    if paired:
+        figure.supxlabel("points: non-circular minus circular twin;  band: plain mean and its standard error", fontsize=9)
+    return figure
+
+
+def _spectrum(axes: Axes, one: xr.Dataset, colour: str, paired: bool) -> None:
+    """One mode: points with errors, and behind paired ones the band of the plain mean."""
+    d, M, odd = int(one["d"]), int(one["M"]), str(one["parity"].values) == "odd"
+
+    def component(name: str, imaginary: bool) -> np.ndarray:
+        values = one[name].values
+        return np.asarray(values.imag if imaginary else values.real)
+
+    name = "biposh_difference_binned" if paired else "biposh_binned"
+    parts = [odd] if M == 0 else [False, True]
+    for imaginary in parts:
+        label = f"d = {d}" + (f", {'imaginary' if imaginary else 'real'}" if M > 0 or odd else "")
+        # The modulus' variance of a mode with M > 0 is shared by its two parts.
+        share = 1.0 if M == 0 else np.sqrt(0.5)
+        x = one["bin"].values + 3.0 * d
+        axes.errorbar(
+            x,
+            component(f"{name}_mean", imaginary),
+            share * one[f"{name}_standard_error"].values,
+            fmt="o" if not imaginary else "s",
+            markersize=3.5,
+            markerfacecolor="white" if imaginary and M > 0 else colour,
+            color=colour,
+            linewidth=1.0,
+            capsize=2,
+            label=label,
+        )
+        if paired:
+            middle = component("biposh_binned_mean", imaginary)
+            width = share * one["biposh_binned_standard_error"].values
+            axes.fill_between(x, middle - width, middle + width, color=colour, alpha=0.15, linewidth=0)

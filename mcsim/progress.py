@@ -1,0 +1,94 @@
+"""Progress of long work: a bar on a terminal, a plain line a minute elsewhere."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+
+class Reporter(Protocol):
+    """Told how far the work is."""
+
+    def __call__(self, finished: float, failed: int = 0) -> None:
+        """``finished`` units are done, ``failed`` of them in vain."""
+
+
+@contextmanager
+def reporting(label: str, total: float, unit: str, quiet: bool = False, every_s: float = 60.0) -> Iterator[Reporter]:
+    """Report work of ``total`` units on standard error.
+
+    Parameters
+    ----------
+    label, unit
+        What is done, and what is counted.
+    total
+        Number of units.
+    quiet
+        Report nothing.
+    every_s
+        Seconds between lines where standard error is no terminal.
+    """
+    console = Console(stderr=True)
+    if quiet:
+        yield _Silent()
+    elif console.is_terminal:
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn() if unit else TextColumn("{task.percentage:3.0f} %"),
+            TextColumn("{task.fields[rate]}"),
+            TimeRemainingColumn(),
+        )
+        with Progress(*columns, console=console) as bar:
+            yield _Bar(bar, label, total, unit)
+    else:
+        yield _Lines(console, label, total, unit, every_s)
+
+
+class _Silent:
+    def __call__(self, finished: float, failed: int = 0) -> None:
+        pass
+
+
+class _Rate:
+    """Units per second since the start, and what follows for the rest."""
+
+    def __init__(self, total: float, unit: str) -> None:
+        self.total, self.unit, self.start = total, unit, time.monotonic()
+
+    def text(self, finished: float, failed: int) -> str:
+        rate = finished / max(time.monotonic() - self.start, 1e-9)
+        speed = f"{rate:.3g} {self.unit}/s" if self.unit else ""
+        return f"{speed}, {failed} failed" if failed else speed
+
+    def left_s(self, finished: float) -> float:
+        elapsed = time.monotonic() - self.start
+        return elapsed * (self.total - finished) / finished if finished else float("inf")
+
+
+class _Bar:
+    def __init__(self, bar: Progress, label: str, total: float, unit: str) -> None:
+        self.bar, self.rate = bar, _Rate(total, unit)
+        self.task = bar.add_task(label, total=total, rate="")
+
+    def __call__(self, finished: float, failed: int = 0) -> None:
+        self.bar.update(self.task, completed=finished, rate=self.rate.text(finished, failed))
+
+
+class _Lines:
+    def __init__(self, console: Console, label: str, total: float, unit: str, every_s: float) -> None:
+        self.console, self.label, self.total, self.unit, self.every_s = console, label, total, unit, every_s
+        self.rate, self.last = _Rate(total, unit), time.monotonic()
+
+    def __call__(self, finished: float, failed: int = 0) -> None:
+        now = time.monotonic()
+        if now - self.last < self.every_s and finished < self.total:
+            return
+        self.last = now
+        share = f"{finished:g}/{self.total:g} {self.unit}" if self.unit else f"{100 * finished / self.total:.0f} %"
+        speed, left = self.rate.text(finished, failed), self.rate.left_s(finished)
+        parts = [share, speed, f"{left:.0f} s left" if 0 < left < float("inf") else ""]
+        self.console.print(f"{self.label}: {', '.join(part for part in parts if part)}", highlight=False, soft_wrap=True)

@@ -1,0 +1,166 @@
+"""Dependencies point one way, heavy libraries stay where they belong, public names are pinned."""
+
+import ast
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import mcsim
+
+ROOT = Path(mcsim.__file__).parent
+
+# The only modules that may import what stands on the right of them.
+RESERVED = {
+    "zarr": {"mcsim.store"},
+    "dask": {"mcsim.runner"},
+    "distributed": {"mcsim.runner"},
+    "pydantic": {"mcsim.config"},
+    "typer": {"mcsim.cli"},
+    "camb": set(),
+}
+
+# Pure science: numbers in, numbers out. It imports nothing of the wiring, which reads configurations, stores and draws.
+SCIENCE = {
+    "mcsim.alm",
+    "mcsim.beams",
+    "mcsim.biposh",
+    "mcsim.convolve",
+    "mcsim.errors",
+    "mcsim.healpix",
+    "mcsim.predict",
+    "mcsim.resources",
+    "mcsim.rng",
+    "mcsim.scan",
+    "mcsim.sky",
+    "mcsim.spectra",
+    "mcsim.statistics",
+    "mcsim.wigner",
+}
+
+PUBLIC = {
+    "mcsim.config": [
+        "Beam",
+        "BeamBlm",
+        "BeamEllipticalGaussian",
+        "BeamGaussian",
+        "BeamMap",
+        "Biposh",
+        "Channel",
+        "Compute",
+        "Ensemble",
+        "Map",
+        "Noise",
+        "RunConfig",
+        "Scan",
+        "ScanHitAveraged",
+        "ScanMoments",
+        "ScanParallelTransport",
+        "ScanPointing",
+        "Sky",
+        "analysis_lmax",
+        "channel_path",
+        "check_skies",
+        "differences",
+        "digest",
+        "from_json",
+        "json_schema",
+        "load",
+        "map_names",
+        "pixel_window",
+        "resolved",
+        "science",
+        "sky_path",
+        "to_dict",
+        "to_json",
+    ],
+    "mcsim.errors": ["InputError"],
+    "mcsim.resources": ["names", "scan_model", "spectrum", "workflow"],
+    "mcsim.spectra": ["load"],
+}
+
+
+def module_name(path: Path) -> str:
+    parts = ("mcsim", *path.relative_to(ROOT).with_suffix("").parts)
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {module_name(path): path for path in sorted(ROOT.rglob("*.py"))}
+
+
+def imports(name: str, whole: bool) -> set[str]:
+    """Modules that a module imports; ``whole`` includes imports inside functions."""
+    found = set()
+    tree = ast.parse(MODULES[name].read_text())
+    for node in ast.walk(tree) if whole else tree.body:
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{name} imports relatively; the project imports absolutely"
+            for alias in node.names:
+                full = f"{node.module}.{alias.name}"
+                found.add(full if full in MODULES else str(node.module))
+    return found
+
+
+def inside(name: str, packages: set[str]) -> bool:
+    return any(name == package or name.startswith(f"{package}.") for package in packages)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_heavy_libraries_stay_in_their_modules(name):
+    for imported in imports(name, whole=True):
+        top = imported.split(".")[0]
+        assert top not in RESERVED or inside(name, RESERVED[top]), f"{name} imports {imported}"
+
+
+@pytest.mark.parametrize("name", [name for name in MODULES if inside(name, SCIENCE)])
+def test_science_imports_only_science(name):
+    own = {imported for imported in imports(name, whole=True) if inside(imported, {"mcsim"})}
+    assert all(inside(imported, SCIENCE) for imported in own), f"{name} imports {sorted(own)}"
+
+
+def test_imports_have_no_circles():
+    graph = {name: {target for target in imports(name, whole=True) if target in MODULES} for name in MODULES}
+    done: set[str] = set()
+
+    def visit(name: str, trail: tuple[str, ...]) -> None:
+        assert name not in trail, " -> ".join((*trail, name))
+        if name not in done:
+            for target in graph[name]:
+                visit(target, (*trail, name))
+            done.add(name)
+
+    for name in graph:
+        # What ``import mcsim`` offers lazily from its own modules is no circle.
+        if name != "mcsim":
+            visit(name, ())
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_public_names(name):
+    module = importlib.import_module(name)
+    own = getattr(module, "__all__", None)
+    if own is None:
+        own = [
+            key
+            for key, value in vars(module).items()
+            if not key.startswith("_") and getattr(value, "__module__", "") == name
+        ]
+    assert sorted(own) == PUBLIC[name]
+    assert all(hasattr(module, key) for key in own)
+
+
+def test_modules_fit_a_screen_of_thought():
+    long = {name: lines for name, path in MODULES.items() if (lines := len(path.read_text().splitlines())) > 450}
+    assert not long
+
+
+def test_configuration_is_light():
+    """Reading a TOML file must not start dask, zarr, numba or matplotlib: ``--help`` and errors are quick."""
+    heavy = ("dask", "distributed", "zarr", "numba", "matplotlib")
+    code = f"import sys, mcsim.config; print([name for name in {heavy} if name in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"

@@ -1,0 +1,87 @@
+import healpy
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from mcsim import healpix
+from mcsim.errors import InputError
+from mcsim.sky import gaussian_alm
+
+
+def smooth_sky(lmax: int) -> np.ndarray:
+    ell = np.arange(lmax + 1)
+    return gaussian_alm(1.0 / (ell + 1.0) ** 2, np.random.default_rng(5))
+
+
+def error(found: np.ndarray, true: np.ndarray) -> float:
+    return float(np.sqrt(np.sum(np.abs(found - true) ** 2) / np.sum(np.abs(true) ** 2)))
+
+
+@pytest.mark.parametrize("nside", [1, 2, 32])
+@pytest.mark.parametrize("iterations", [0, 2])
+def test_analysis_is_that_of_healpy(nside: int, iterations: int) -> None:
+    lmax = 2 * nside
+    sky = smooth_sky(lmax)
+    map_ = healpix.synthesis(sky[None], nside, lmax)[0]
+    np.testing.assert_allclose(map_, healpy.alm2map(sky, nside, lmax=lmax), atol=1e-12)
+    expected = healpy.map2alm(map_, lmax, iter=iterations, use_weights=nside > 1)
+    assert error(healpix.analysis(map_, lmax, iterations), expected) < 1e-12
+
+
+def test_every_iteration_gains_a_decade() -> None:
+    nside, lmax = 64, 128
+    sky = smooth_sky(lmax)
+    map_ = healpix.synthesis(sky[None], nside, lmax)[0]
+    errors = [error(healpix.analysis(map_, lmax, n), sky) for n in range(4)]
+    assert errors[0] < 1e-3
+    assert all(after < before / 10 for before, after in zip(errors, errors[1:], strict=False))
+
+
+def test_gradient_against_finite_differences() -> None:
+    nside, lmax, step = 16, 20, 1e-6
+    sky = smooth_sky(lmax)
+    theta, phi = healpy.pix2ang(nside, np.arange(12 * nside**2))
+    found = healpix.gradient(sky, nside, lmax)
+
+    def at(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:
+        import ducc0
+
+        points = np.stack([theta, phi], axis=1)
+        return ducc0.sht.synthesis_general(alm=sky[None], lmax=lmax, spin=0, loc=points, epsilon=1e-13, nthreads=1)[0]
+
+    south = (at(theta + step, phi) - at(theta - step, phi)) / (2 * step)
+    east = (at(theta, phi + step) - at(theta, phi - step)) / (2 * step * np.sin(theta))
+    np.testing.assert_allclose(found[0], south, atol=1e-5)
+    np.testing.assert_allclose(found[1], east, atol=1e-5)
+
+
+def test_pixel_window_against_the_power_of_pixels() -> None:
+    """w_l^2 is the mean over pixels of 4 pi / (2l+1) sum_m |w_lm|^2: pixel indicators on a grid 64 times finer, nside 2."""
+    nside, fine, lmax = 2, 128, 6
+    ratio = (fine // nside) ** 2
+    power = np.zeros(lmax + 1)
+    for pixel in range(12 * nside**2):
+        indicator = np.zeros(12 * fine**2)
+        inside = np.arange(pixel * ratio, (pixel + 1) * ratio)
+        indicator[healpy.nest2ring(fine, inside)] = 12 * nside**2 / (4 * np.pi)
+        power += 4 * np.pi * healpy.anafast(indicator, lmax=lmax, iter=0) / (12 * nside**2)
+    ell = np.arange(lmax + 1)
+    fine_window = 1 - ell * (ell + 1) * (4 * np.pi / (12 * fine**2)) / 24
+    found, expected = healpix.pixel_window(nside, lmax), np.sqrt(power) * fine_window
+    # What the extrapolation in the sub-pixels leaves grows as l^4.
+    np.testing.assert_allclose(found[:5], expected[:5], rtol=1e-4)
+    np.testing.assert_allclose(found[5:], expected[5:], rtol=4e-4)
+
+
+def test_read_pixel_window(tmp_path) -> None:
+    path = tmp_path / "window.fits"
+    column = fits.Column("TEMPERATURE", "D", array=np.linspace(1, 0.5, 11))
+    fits.BinTableHDU.from_columns([column]).writeto(path)
+    np.testing.assert_allclose(healpix.read_pixel_window(path, 5), np.linspace(1, 0.5, 11)[:6])
+    with pytest.raises(InputError, match="up to l = 10, below the lmax 20"):
+        healpix.read_pixel_window(path, 20)
+    with pytest.raises(InputError, match=r"missing\.fits"):
+        healpix.read_pixel_window(tmp_path / "missing.fits", 20)
+    path.write_text("not FITS")
+    with pytest.raises(InputError, match="not a FITS pixel window"):
+        healpix.read_pixel_window(path, 5)

@@ -1,0 +1,148 @@
+"""Power spectra: the three sources, and every way in which a table can be wrong."""
+
+import gzip
+
+import healpy
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from mcsim import spectra
+from mcsim.errors import InputError
+
+CL = np.array([0.0, 0.0, 1200.0, 557.0, 310.5])
+
+
+def write_fits(path, unit=None, name="TT", cl=CL):
+    column = fits.Column(name=name, format="D", array=cl, unit=unit)
+    fits.BinTableHDU.from_columns([column]).writeto(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "quadrupole", "peak"),
+    # D_2 and the first peak (height in uK^2, degree) of the tables that WMAP and Planck distribute. 1 % is the aim for
+    # the published parameters (they are rounded); degree within 1, for the top is flat.
+    [("wmap7", 1146.2, (5778.0, 220)), ("planck2018", 1017.0, (5729.0, 221))],
+)
+def test_packaged_tables_have_the_published_quadrupole_and_peak(name, quadrupole, peak):
+    cl = spectra.load(name, 4096)
+    ell = np.arange(4097)
+    d_l = ell * (ell + 1) * cl / (2 * np.pi)
+    assert cl[0] == cl[1] == 0.0
+    assert d_l[2] == pytest.approx(quadrupole, rel=0.01)
+    assert d_l[:400].max() == pytest.approx(peak[0], rel=0.01)
+    assert abs(int(d_l[:400].argmax()) - peak[1]) <= 1
+    # The damping tail: smooth, positive and falling, so that no row is lost or doubled.
+    assert np.all(cl[2:] > 0.0)
+    assert np.all(np.diff(cl[1500:]) < 0.0)
+
+
+def test_text_table_in_any_order_with_comments_commas_and_no_monopole(tmp_path):
+    path = tmp_path / "cl.dat"
+    path.write_text("# ell, C_ell [uK^2]\n\n4, 310.5\n2, 1200\n3, 557\n")
+    np.testing.assert_array_equal(spectra.load(path, 4), CL)
+    np.testing.assert_array_equal(spectra.load(str(path), 2), CL[:3])
+
+
+def test_text_table_with_monopole_and_dipole(tmp_path):
+    path = tmp_path / "cl.txt"
+    path.write_text("0 7\n1 8\n2 9\n")
+    np.testing.assert_array_equal(spectra.load(path, 2), [7.0, 8.0, 9.0])
+
+
+def test_compressed_text_table(tmp_path):
+    path = tmp_path / "cl.txt.gz"
+    path.write_bytes(gzip.compress(b"2 1200\n3 557\n4 310.5\n"))
+    np.testing.assert_array_equal(spectra.load(path, 4), CL)
+
+
+def test_fits_as_healpy_reads_it(tmp_path):
+    path = tmp_path / "cl.fits"
+    healpy.write_cl(path, [CL, CL / 50, CL / 500, CL / 9], dtype=np.float64)
+    np.testing.assert_array_equal(spectra.load(path, 4), healpy.read_cl(path)[0])
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"),
+    [(None, 1.0), ("uK^2", 1.0), ("muK2", 1.0), ("uK_CMB^2", 1.0), ("uK**2", 1.0), ("mK^2", 1e6), ("K_CMB^2", 1e12)],
+)
+@pytest.mark.filterwarnings("ignore::astropy.units.UnitsWarning")  # FITS knows neither muK nor K_CMB
+def test_fits_units(tmp_path, unit, factor):
+    np.testing.assert_allclose(spectra.load(write_fits(tmp_path / "cl.fits", unit), 4), CL * factor, rtol=1e-15)
+
+
+def test_ascii_table_of_fits(tmp_path):
+    path = tmp_path / "cl.fits"
+    column = fits.Column(name="TEMPERATURE", format="E24.15", array=CL, unit="uK^2", ascii=True)
+    fits.TableHDU.from_columns([column]).writeto(path)
+    np.testing.assert_allclose(spectra.load(path, 4), CL, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "has no rows; give the two columns"),
+        ("# only a header\n", "has no rows"),
+        ("2 1\n3 1\n5 1\n", "no row for ell = 4; give every ell"),
+        ("3 1\n4 1\n5 1\n", "no row for ell = 2"),
+        ("2 1\n999999999999 1\n", "no row for ell = 3"),
+        ("2 1\n3 nan\n4 1\n", "C_l = nan at l = 3, which is not finite"),
+        ("2 1\n3 inf\n4 1\n", "C_l = inf at l = 3, which is not finite"),
+        ("2 1\n3 1\n4 -2.5\n", "C_l = -2.5 at l = 4, which is negative"),
+        ("2 1\n3 1\n", "ends at l = 3, but lmax = 4 is wanted; lower lmax"),
+        ("2 1\n2 1\n3 1\n4 1\n", r"line 2: '2 1' is not a row .* occurs once"),
+        ("2 1\n2.5 1\n", r"line 2: '2\.5 1' is not a row"),
+        ("-2 1\n", "line 1: '-2 1' is not a row"),
+        ("nan 1\n", "line 1: 'nan 1' is not a row"),
+        ("inf 1\n", "line 1: 'inf 1' is not a row"),
+        ("ell cl\n2 1\n", "line 1: 'ell cl' is not a row of the two columns"),
+        ("2 1000 3 4 5\n", "is not a row of the two columns"),
+        ("# ell D_ell\n2 1\n", "seems to hold D_l"),
+        ("# l Dl [uK^2]\n2 1\n", "seems to hold D_l"),
+        ("# l, l(l+1)C_l/2pi\n2 1\n", "seems to hold D_l"),
+    ],
+)
+def test_wrong_text_tables(tmp_path, text, message):
+    path = tmp_path / "cl.txt"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        spectra.load(path, 4)
+
+
+def test_binary_rubbish_and_broken_compression(tmp_path):
+    for name, contents in (
+        ("cl.txt", b"\xff\xfe\x00"),
+        ("cl.txt.gz", b"no gzip"),
+        ("cl2.txt.gz", gzip.compress(b"2 1\n")[:-9]),
+    ):
+        path = tmp_path / name
+        path.write_bytes(contents)
+        with pytest.raises(InputError, match="cannot be read as text"):
+            spectra.load(path, 2)
+
+
+@pytest.mark.parametrize("kept", [0, 100, 2880, 5000, 5760])
+def test_truncated_fits(tmp_path, kept):
+    path = write_fits(tmp_path / "cl.fits", "uK^2", cl=np.ones(4000))
+    path.write_bytes(path.read_bytes()[:kept])
+    with pytest.raises(InputError, match="cannot be read as a FITS table"):
+        spectra.load(path, 4)
+
+
+@pytest.mark.parametrize(
+    ("unit", "name", "message"),
+    [
+        ("Jy^2", "TT", r"has the unit 'Jy\^2'; convert it to uK\^2"),
+        ("uK", "TT", "unit 'uK'"),
+        ("uK^2", "D_ELL", "seems to hold D_l"),
+    ],
+)
+def test_wrong_fits_columns(tmp_path, unit, name, message):
+    with pytest.raises(InputError, match=message):
+        spectra.load(write_fits(tmp_path / "cl.fits", unit, name), 4)
+
+
+def test_missing_file_lists_the_packaged_names(tmp_path):
+    with pytest.raises(InputError, match="one of: planck2018, wmap7"):
+        spectra.load(tmp_path / "none.txt", 4)
