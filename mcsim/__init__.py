@@ -1,1 +1,29 @@
-"""mcsim: is the isotropy violation I measure made by my instrument?"""
+"""mcsim: is the isotropy violation that I measure made by my instrument?
+
+Monte Carlo ensembles of isotropic skies seen through non-circular beams under a scan, their BipoSH coefficients and power
+spectra, stored as xarray/Zarr. Names are loaded when they are first used, so that ``import mcsim`` costs nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mcsim.errors import InputError
+    from mcsim.runner import merge, run
+    from mcsim.store import open_ensemble, open_summary
+
+__all__ = ["InputError", "merge", "open_ensemble", "open_summary", "run"]
+
+_HOME = {
+    "InputError": "mcsim.errors",
+    "merge": "mcsim.runner",
+    "open_ensemble": "mcsim.store",
+    "open_summary": "mcsim.store",
+    "run": "mcsim.runner",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(import_module(_HOME[name]), name)
+    raise AttributeError(f"module 'mcsim' has no attribute {name!r}")

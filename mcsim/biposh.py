@@ -163,39 +163,72 @@ def _parts(alm: NDArray[np.complex128]) -> tuple[NDArray[np.float64], NDArray[np
 def _accumulate(  # type: ignore[no-untyped-def]
     ar, ai, br, bi, lmax, M, d, norm, rising_a, rising_b, shift_a, shift_b, constant, slope, previous, total
 ):  # fmt: skip
-    """Add sum_m2 G_L P to total[L - L_min, (real, imaginary), l2]; every inner loop runs along l2, in unit strides."""
+    """Add sum_m2 G_L P to total[L - L_min, (real, imaginary), l2]."""
     rows = total.shape[0]
-    real, imag, g, before = np.empty(lmax + 1), np.empty(lmax + 1), np.empty(lmax + 1), np.empty(lmax + 1)
+    work = np.empty((4, lmax + 1))
     for m2 in range(0 if M == 0 else -lmax, lmax + 1):
         m1 = m2 + M
         p, q = abs(m1), abs(m2)
         first = max(q, p + d)
-        last = min(lmax, lmax + d)
+        stop = min(lmax, lmax + d) + 1
+        if stop <= first:
+            continue
         ia = p * (2 * lmax + 1 - p) // 2 - d
         ib = q * (2 * lmax + 1 - q) // 2
         # a_{l1 m1} conj(b_{l2 m2}) from m >= 0 by a_{l -m} = (-1)^m conj(a_lm).
-        sign_ai, sign_bi, sign = 1.0, -1.0, 1.0
+        sign_a, sign_b, sign = 1.0, -1.0, 1.0
         if m2 < 0:
-            sign_bi = 1.0
+            sign_b = 1.0
             sign = 1.0 if q % 2 == 0 else -1.0
             if m1 < 0:
-                sign_ai = -1.0
+                sign_a = -1.0
                 sign = 1.0 if M % 2 == 0 else -1.0
         elif M == 0 and m2 > 0:
             sign = 2.0
-        for l2 in range(first, last + 1):
-            x, y = sign * ar[ia + l2], sign * sign_ai * ai[ia + l2]
-            u, v = br[ib + l2], sign_bi * bi[ib + l2]
-            real[l2] = x * u - y * v
-            imag[l2] = x * v + y * u
-            g[l2] = norm[l2] * rising_a[l2 - m1 + shift_a] * rising_b[l2 + m1 + shift_b]
-            before[l2] = 0.0
+        real, imag, g, before = work[:, : stop - first]
+        _products(
+            ar[ia + first : ia + stop], ai[ia + first : ia + stop], br[ib + first : ib + stop],
+            bi[ib + first : ib + stop], sign, sign * sign_a, sign_b, real, imag,
+        )  # fmt: skip
+        a, b = first - m1 + shift_a, first + m1 + shift_b
+        _bottom(norm[first:stop], rising_a[a : a + stop - first], rising_b[b : b + stop - first], g, before)
         for row in range(rows):
-            for l2 in range(first, last + 1):
-                total[row, 0, l2] += g[l2] * real[l2]
-                total[row, 1, l2] += g[l2] * imag[l2]
+            _add(g, real, imag, total[row, 0, first:stop], total[row, 1, first:stop])
             if row + 1 < rows:
-                for l2 in range(first, last + 1):
-                    after = (constant[row, l2] + slope[row, l2] * m1) * g[l2] + previous[row, l2] * before[l2]
-                    before[l2] = g[l2]
-                    g[l2] = after
+                _step(constant[row, first:stop], slope[row, first:stop], previous[row, first:stop], m1, g, before)
+
+
+# The inner loops run along l2 over slices of unit stride, so that the compiler turns them into vector instructions.
+
+
+@numba.njit(cache=True, nogil=True)
+def _products(x, y, u, v, sign_x, sign_y, sign_v, real, imag):  # type: ignore[no-untyped-def]
+    """(sign_x x + i sign_y y)(u + i sign_v v)."""
+    for i in range(real.size):
+        a, b, c = sign_x * x[i], sign_y * y[i], sign_v * v[i]
+        real[i] = a * u[i] - b * c
+        imag[i] = a * c + b * u[i]
+
+
+@numba.njit(cache=True, nogil=True)
+def _bottom(norm, rising_a, rising_b, g, before):  # type: ignore[no-untyped-def]
+    """G at the smallest L, and zero below it."""
+    for i in range(g.size):
+        g[i] = norm[i] * rising_a[i] * rising_b[i]
+        before[i] = 0.0
+
+
+@numba.njit(cache=True, nogil=True)
+def _add(g, real, imag, total_real, total_imag):  # type: ignore[no-untyped-def]
+    for i in range(g.size):
+        total_real[i] += g[i] * real[i]
+        total_imag[i] += g[i] * imag[i]
+
+
+@numba.njit(cache=True, nogil=True)
+def _step(constant, slope, previous, m1, g, before):  # type: ignore[no-untyped-def]
+    """From L to L + 1."""
+    for i in range(g.size):
+        after = (constant[i] + slope[i] * m1) * g[i] + previous[i] * before[i]
+        before[i] = g[i]
+        g[i] = after

@@ -109,6 +109,54 @@ def plot(
 
 
 @app.command()
+def beam(
+    source: Annotated[str, typer.Argument(metavar="BEAM", help="Beam map or b_lm (FITS), or a CONFIG.")],
+    lmax: Annotated[int, typer.Option(min=2, help="Degree of the coefficients.")] = 2048,
+    m_max: Annotated[int | None, typer.Option(min=0, help="Order; default: chosen from the beam.")] = None,
+    pixel_deg: Annotated[float | None, typer.Option(help="Side of a pixel of a beam map; default: its header's.")] = None,
+    output: Png = None,
+) -> None:
+    """Say what a beam is like: solid angle, widths, B_l and b_lm; draw it."""
+    from mcsim.commands import look_at_beams
+
+    for number, look in enumerate(look_at_beams(source, lmax, m_max, pixel_deg)):
+        out.print(look.text, markup=False)
+        target = output or Path("beam.png")
+        _save(look.figure, target if number == 0 else target.with_stem(f"{target.stem}-{look.name}"))
+
+
+@app.command()
+def scan(
+    model: Annotated[str, typer.Argument(metavar="MODEL", help="Scan model: a packaged name such as wmap, or TOML.")],
+    nside: Annotated[int, typer.Option(help="Resolution of the moments.")] = 256,
+    smax: Annotated[int, typer.Option(min=2, help="Largest s of the moments w_s.")] = 4,
+    frame: Annotated[str, typer.Option(help="ecliptic, galactic or equatorial.")] = "ecliptic",
+    sample_period_s: Annotated[float | None, typer.Option(help="Time between samples; default: the model's.")] = None,
+    line_of_sight: Annotated[str | None, typer.Option(help="One of the model's lines of sight.")] = None,
+    output: Png = None,
+) -> None:
+    """Say what a scan does to a beam: hits, orientation moments, the three factors; draw it."""
+    from mcsim.commands import look_at_scan
+
+    look = look_at_scan(model, nside, smax, frame, sample_period_s, line_of_sight, quiet=False)
+    out.print(look.text, markup=False)
+    _save(look.figure, output or Path(f"scan-{look.name}.png"))
+
+
+@app.command()
+def bench(
+    nside: Annotated[int, typer.Option(help="Resolution of the maps.")] = 512,
+    lmax: Annotated[int, typer.Option(min=2, help="Degree of the analysis.")] = 1024,
+    repeats: Annotated[int, typer.Option(min=1, help="Pairs of timings.")] = 5,
+) -> None:
+    """Measure this machine: a realization over the transforms that it needs, workers, moments."""
+    from mcsim.bench import bench as measure
+
+    for line in measure(nside, lmax, repeats):
+        out.print(line, markup=False)
+
+
+@app.command()
 def config(
     name: Annotated[str | None, typer.Argument(metavar="CONFIG", help="Check this configuration and print it resolved.")] = None,
     schema: Annotated[bool, typer.Option("--schema", help="Print the JSON schema of the TOML file.")] = False,

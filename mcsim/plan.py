@@ -169,7 +169,7 @@ class Cost:
 
 def cost(run: config.RunConfig, realizations: range) -> Cost:
     """Estimate the cost of a run from its sizes, its beams, and one timed transform."""
-    mmax = [load_beam(channel.beam, run.sky.lmax).mmax for channel in run.channels]
+    mmax = [load_beam(channel, run.sky.lmax).mmax for channel in run.channels]
     lmax, nside = config.analysis_lmax(run), run.map.nside
     names = config.map_names(run)
     both = run.biposh.pairs == "all"

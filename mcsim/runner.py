@@ -153,21 +153,8 @@ def _merge_chunk(sources: list[Path], target: Path, start: int, stop: int) -> No
 
 
 @contextmanager
-def _connected(client: Client | None, scheduler: str | None, workers: int) -> Iterator[Client]:
-    """The client to work with: the given one, one of a running scheduler, or one of a local cluster that ends with it."""
-    if client is not None:
-        yield client
-        return
-    if scheduler is not None:
-        try:
-            remote = Client(scheduler, timeout=10)
-        except (OSError, ValueError, TimeoutError) as error:
-            raise InputError(
-                f"No Dask scheduler answers at {scheduler} within 10 s ({type(error).__name__}); start one or correct the address."
-            ) from error
-        with remote:
-            yield remote
-        return
+def local_client(workers: int) -> Iterator[Client]:
+    """Client of a local cluster of single-threaded processes, whose ports are open to this machine alone."""
     single = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "DUCC0", "NUMBA")}
     settings = {"distributed.nanny.pre-spawn-environ": single, "logging.distributed": "error"}
     with (
@@ -177,12 +164,32 @@ def _connected(client: Client | None, scheduler: str | None, workers: int) -> It
             threads_per_worker=1,
             processes=True,
             host="127.0.0.1",
-            dashboard_address=None,
+            dashboard_address="127.0.0.1:0",
             memory_limit=None,
         ) as cluster,
-        Client(cluster) as local,
+        Client(cluster) as client,
     ):
-        yield local
+        yield client
+
+
+@contextmanager
+def _connected(client: Client | None, scheduler: str | None, workers: int) -> Iterator[Client]:
+    """The client to work with: the given one, one of a running scheduler, or one of a local cluster that ends with it."""
+    if client is not None:
+        yield client
+    elif scheduler is None:
+        with local_client(workers) as local:
+            yield local
+    else:
+        try:
+            remote = Client(scheduler, timeout=5)
+        except (OSError, ValueError, TimeoutError) as error:
+            raise InputError(
+                f"No Dask scheduler answers at {scheduler} within 5 s ({type(error).__name__}); "
+                "start one or correct the address."
+            ) from error
+        with remote:
+            yield remote
 
 
 def _simulate(client: Client, target: Path, run: config.RunConfig, wanted: range, quiet: bool) -> list[Failure]:

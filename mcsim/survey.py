@@ -1,7 +1,7 @@
 """From a configuration to what a realization needs: spectrum, beam responses, moments, weights, estimator tables."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import healpy
@@ -96,25 +96,35 @@ def survey(run: config.RunConfig, nthreads: int = 1, progress: Progress | None =
     return Survey(run, cl, channels, lmax, tables, pairs, norm)
 
 
-def load_beam(spec: config.Beam, lmax: int) -> beams.Beam:
-    """The beam that a configuration names, up to lmax."""
+def load_beam(channel: config.Channel, lmax: int) -> beams.Beam:
+    """The beam of a channel, up to lmax."""
+    spec = channel.beam
     match spec:
         case config.BeamGaussian():
             return beams.gaussian(spec.fwhm_arcmin, lmax)
         case config.BeamEllipticalGaussian():
-            return beams.elliptical_gaussian(
-                spec.fwhm_major_arcmin, spec.fwhm_minor_arcmin, spec.angle_deg, lmax, mmax=spec.m_max
-            )
+            major, minor = spec.fwhm_major_arcmin, spec.fwhm_minor_arcmin
+            return beams.elliptical_gaussian(major, minor, spec.angle_deg, lmax, mmax=spec.m_max)
         case config.BeamMap():
-            return beams.from_map(
-                Path(spec.path), lmax, mmax=spec.m_max, pixel_deg=spec.pixel_deg, cut_deg=spec.cut_deg
-            )
+            return load_beam_map(channel.name, spec).beam(lmax, spec.m_max)
         case config.BeamBlm():
-            return beams.from_blm_file(Path(spec.path), lmax, mmax=spec.m_max)
+            return beams.from_blm_file(config.channel_path(spec.path, channel.name), lmax, mmax=spec.m_max)
+
+
+def load_beam_map(channel: str, spec: config.BeamMap) -> beams.BeamMap:
+    """The beam map of a channel."""
+    return beams.read_map(
+        config.channel_path(spec.path, channel),
+        pixel_deg=spec.pixel_deg,
+        cut_deg=spec.cut_deg,
+        centre=spec.centre_pixel,
+        plane=spec.plane,
+        projection=spec.projection,
+    )
 
 
 def _channel(run: config.RunConfig, spec: config.Channel, nthreads: int, progress: Progress | None) -> Channel:
-    beam = load_beam(spec.beam, run.sky.lmax)
+    beam = load_beam(spec, run.sky.lmax)
     window = _window(run, spec)
     splits = run.map.splits or (None,)
     maps = []
@@ -158,7 +168,7 @@ def _moments(
             template = config.channel_path(spec.scan.model, spec.name, split)
             model = scan.load_model(resources.scan_model(str(template)))
             if spec.scan.sample_period_s is not None:
-                model = replace(model, sample_period_s=spec.scan.sample_period_s)
+                model = model.with_sampling(spec.scan.sample_period_s)
             lines = None if spec.scan.line_of_sight is None else [spec.scan.line_of_sight]
             folder = scan.cached_moments(
                 model, nside, smax, frame, lines, time_range=share, nthreads=nthreads, progress=progress

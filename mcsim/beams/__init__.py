@@ -1,7 +1,7 @@
 """Beams: from a width, a beam map or a file to harmonic coefficients b_lm."""
 
 from mcsim.beams.beam import MMAX_TOLERANCE, Beam, choose_mmax
-from mcsim.beams.beammap import BeamMap, blm_of_map, find_centre, from_map, read_map
+from mcsim.beams.beammap import BeamMap, blm_of_map, find_centre, from_map, holds_image, read_map
 from mcsim.beams.files import from_blm_file
 from mcsim.beams.gaussian import elliptical_gaussian, gaussian
 from mcsim.beams.summary import BeamSummary, format_summary, summarize
@@ -19,6 +19,7 @@ __all__ = [
     "from_blm_file",
     "from_map",
     "gaussian",
+    "holds_image",
     "read_map",
     "summarize",
 ]

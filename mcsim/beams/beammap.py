@@ -12,7 +12,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from mcsim.beams._fits import READ_ERRORS, truncation_raises
+from mcsim.beams._fits import READ_ERRORS, opened
 from mcsim.beams.beam import Beam, check_lmax, check_mmax, normalize
 from mcsim.errors import InputError
 
@@ -151,7 +151,7 @@ def read_map(
     -----
     Projections differ at third order in the distance. For the WMAP-7 maps with a cut of 3.5 deg (projection not
     recorded), orthographic for equidistant changes B_l by at most 3e-5 of B_0 and b_l2 by at most 2e-4 of the largest
-    |b_l2| in V and W, 4e-4 in K. The plane of projection is taken to touch the sphere at the beam's centre; that the
+    |b_l2| in V and W, 8e-5 and 4e-4 in K. The plane of projection is taken to touch the sphere at the beam's centre; that the
     WMAP maps have the optic axis there, up to 3 deg away, is of the same order.
     """
     if projection not in get_args(Projection):
@@ -186,8 +186,10 @@ def find_centre(image: NDArray[np.float64], origin: str = "the beam map") -> tup
     """Return the intensity centroid around the peak as (row, column).
 
     The centroid is over the 15 x 15 pixels less than 8 pixels from the peak in row and column: the choice that the
-    published reference spectra of the WMAP-7 beam maps were made with (one more pixel on each side moves the binned
-    A^{20}_ll of W1 by up to 1.8 of 477 uK^2, and that of V2 by 2 of 265 uK^2).
+    reference spectra of the WMAP-7 beam maps were made with (one more pixel on each side moves the binned A^{20}_ll of
+    W1 by up to 1.8 of 477 uK^2, and that of V2 by 2 of 265 uK^2). A beam with wings beyond these pixels has no centre
+    that all rules agree on: for the WMAP maps 0.1 pixel is at stake, which is 1 to 5 % of the even orders but all of
+    b_l1. Where odd orders matter, give the centre that the pointing refers to.
 
     Raises
     ------
@@ -247,8 +249,9 @@ def blm_of_map(
     -----
     b_lm = sum_p B_p dOmega_p conj(Y_lm(theta_p, phi_p)) over the pixels, each at its own direction and with the solid
     angle that the projection gives it, by a transform for arbitrary directions (relative accuracy 1e-12): every order,
-    odd ones and imaginary parts included. For a beam that the pixels resolve the sum is the integral to round-off: at 5
-    pixels per FWHM an elliptical Gaussian agrees with its closed form to 1e-10 (tests/unit/test_beams_beammap.py).
+    odd ones and imaginary parts included. For a beam that the pixels resolve the sum is the integral to round-off: an
+    elliptical Gaussian agrees with its closed form to 1e-10 at 5 pixels per FWHM, to 2e-7 at 2.3
+    (tests/unit/test_beams_beammap.py).
     """
     if lmax * pixel_rad > pi:
         raise InputError(
@@ -306,11 +309,26 @@ _PROJECTIONS: dict[Projection, tuple[_Function, _Function, _Function]] = {
 }
 
 
+def holds_image(path: str | Path) -> bool:
+    """Whether a FITS file holds an image, as beam maps do, and not just tables.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read as FITS.
+    """
+    try:
+        with opened(Path(path)) as hdus:
+            return any(hdu.is_image and hdu.header.get("NAXIS", 0) >= 2 for hdu in hdus)
+    except READ_ERRORS as error:
+        raise InputError(f"{path} cannot be read as a FITS file ({error}): give a beam map or a file of b_lm") from error
+
+
 def _read_image(path: Path, plane: int) -> tuple[NDArray[np.float64], fits.Header]:
     if not path.is_file():
         raise InputError(f"beam map {path} does not exist: give the path of a FITS image")
     try:
-        with truncation_raises(), fits.open(path) as hdus:
+        with opened(path) as hdus:
             images = [hdu for hdu in hdus if hdu.is_image and hdu.data is not None]
             image = np.array(images[0].data, dtype=np.float64) if images else np.zeros(0)
             header = images[0].header.copy() if images else fits.Header()

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import alm as alm_
-from mcsim.beams._fits import READ_ERRORS, truncation_raises
+from mcsim.beams._fits import READ_ERRORS, opened
 from mcsim.beams.beam import Beam, check_lmax, check_mmax, normalize, power_by_order
 from mcsim.errors import InputError
 
@@ -74,8 +74,9 @@ def _read(path: Path) -> NDArray[np.complex128]:
     if not path.is_file():
         raise InputError(f"beam coefficients {path} do not exist: give the path of a FITS file of b_lm")
     try:
-        with truncation_raises():
-            packed, mmax = healpy.read_alm(path, hdu=1, return_mmax=True)
+        # A file with infinities is refused later, by name; joining real and imaginary parts would warn of them.
+        with opened(path) as hdus, np.errstate(invalid="ignore"):
+            packed, mmax = healpy.read_alm(hdus, hdu=1, return_mmax=True)
         lmax = healpy.Alm.getlmax(len(packed), mmax)
     except READ_ERRORS as error:
         raise InputError(

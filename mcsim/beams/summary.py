@@ -11,7 +11,7 @@ from mcsim.beams.beam import Beam
 from mcsim.beams.beammap import BeamMap, solid_angle_values
 
 DEFAULT_ELLS = (50, 100, 200, 300, 500, 700, 1000, 1500, 2000, 3000)
-BAND_LIMITED_WINDOW = 1e-3
+BAND_LIMITED_WINDOW = 1e-5
 CIRCULAR_AXIS_RATIO = 1e-3
 _LISTED_ORDERS = 6
 _RADII = 400

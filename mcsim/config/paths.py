@@ -135,7 +135,7 @@ def check_files(config: RunConfig, plain: dict[str, Any], where: str, realizatio
 def template_tail(template: str) -> str:
     """Part of a template from the first folder or file name that has a placeholder."""
     parts = Path(template).parts
-    first = next((number for number, part in enumerate(parts) if "{" in part), len(parts))
+    first = next((number for number, part in enumerate(parts) if "{" in part.replace("{{", "")), len(parts))
     return "/".join(parts[first:])
 
 

@@ -120,12 +120,19 @@ class BeamEllipticalGaussian:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class BeamMap:
-    """Two-dimensional beam map in FITS; ``pixel_deg`` left out is read from the file."""
+    """Two-dimensional beam map in FITS.
+
+    ``pixel_deg`` left out is read from the file, ``centre_pixel`` (column, row) left out is the intensity centroid;
+    ``plane`` picks one image of a cube.
+    """
 
     kind: Literal["map"] = "map"
     path: PathText
     pixel_deg: Annotated[float, Field(gt=0.0, le=10.0)] | None = None
     cut_deg: Annotated[float, Field(gt=0.0, le=90.0)] = 3.5
+    centre_pixel: tuple[float, float] | None = None
+    plane: Annotated[int, Field(ge=0)] = 0
+    projection: Literal["equidistant", "orthographic", "equal_area"] = "equidistant"
     m_max: BeamOrder = None
 
 

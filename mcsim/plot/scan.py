@@ -44,11 +44,11 @@ def scan_figure(moments: Moments, title: str = "", model: ScanModel | None = Non
         raise InputError(f"the moments end at s = {moments.smax}, but the figure needs s = 2; use smax >= 2.")
     seen = np.asarray(moments.hits > 0.0)
     w2 = np.where(seen, moments.w[1], np.nan)
-    figure = Figure(figsize=(11.0, 7.6), layout="constrained")
+    figure = Figure(figsize=(11.0, 7.0), layout="constrained")
     figure.suptitle(title)
-    axes = figure.subplots(2, 2, height_ratios=(1.0, 0.85))
+    axes = figure.subplots(2, 2, height_ratios=(1.0, 0.8))
     mean_rho = np.degrees(-0.5 * np.angle(w2))
-    _mollweide(figure, axes[0, 0], mean_rho, moments.nside, "twilight", (-90.0, 90.0), "degrees, modulo 180")
+    _mollweide(figure, axes[0, 0], mean_rho, moments.nside, "twilight_shifted", (-90.0, 90.0), "degrees, modulo 180")
     axes[0, 0].set_title(r"mean orientation $\bar\rho = -\frac{1}{2}\,\arg w_2$")
     _mollweide(figure, axes[0, 1], w2.real, moments.nside, "RdBu", (-1.0, 1.0), "")
     axes[0, 1].set_title(r"$\langle\cos 2\rho\rangle = \mathrm{Re}\,w_2$")
@@ -84,8 +84,17 @@ def _against_latitude(hits_axes: Axes, w_axes: Axes, moments: Moments, model: Sc
     if model is not None:
         fine = np.radians(np.linspace(0.02, 179.98, 4000))
         density, limit = limit_moments(model, fine, 2)
-        hits_axes.plot(90.0 - np.degrees(fine), density, color="tab:orange", linewidth=0.8, label="long-time limit")
-        w_axes.plot(90.0 - np.degrees(fine), limit[1].real, color="tab:orange", linewidth=0.8, label="long-time limit")
+        hits_axes.plot(
+            90.0 - np.degrees(fine), density, color="black", linewidth=0.7, linestyle="--", label="long-time limit"
+        )
+        w_axes.plot(
+            90.0 - np.degrees(fine),
+            limit[1].real,
+            color="black",
+            linewidth=0.7,
+            linestyle="--",
+            label="long-time limit",
+        )
     hits_axes.set_ylim(0.0, 1.15 * float(hits.max()))
     hits_axes.set_ylabel("hits / mean")
     w_axes.set_ylabel(r"Re $w_2$")

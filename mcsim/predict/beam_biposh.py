@@ -73,10 +73,10 @@ def beam_biposh(beam: ScannedBeam, mode: Mode, lmax: int) -> NDArray[np.complex1
 
     Notes
     -----
-    B^{LM}_{l1 l2} = (-1)^{l1-l2} sum_s w_{s,LM} k_{l2} b_{l2,s} sqrt((2 l1+1)(2 l2+1)/4pi) (l1 L l2; 0 s -s), both parities.
-    It equals the definition of arXiv:1210.7318, eq. beam-BipoSH, to 1e-13 of the largest coefficient for random
-    complex beams with odd m and orientations without symmetry (tests/unit/test_predict_beam_biposh.py).
-    A circular beam gives (-1)^l B_l sqrt(2l+1) for L = 0 and nothing else.
+    B^{LM}_{l1 l2} = (-1)^{l1-l2} sum_s w_{s,LM} k_{l2} b_{l2,s} sqrt((2 l1+1)(2 l2+1)/4pi) (l1 L l2; 0 s -s), both
+    parities. It equals the definition of arXiv:1210.7318, eq. beam-BipoSH, to 1e-13 of the largest coefficient for
+    random complex beams with odd m and orientations without symmetry (tests/unit/test_predict_brute_force.py). A
+    circular beam gives (-1)^l B_l sqrt(2l+1) for L = 0 and nothing else.
     """
     check_modes([mode])
     L, M, d = mode

@@ -14,7 +14,7 @@ def check_spectrum(cl: NDArray[np.float64], lmax: int) -> None:
     """Raise InputError when C_l ends below lmax."""
     if len(cl) <= lmax:
         raise InputError(
-            f"the spectrum ends at ell = {len(cl) - 1}, below the analysis' lmax {lmax}; lower lmax or extend the spectrum."
+            f"the spectrum ends at ell = {len(cl) - 1}, below lmax {lmax}; lower lmax or extend the spectrum."
         )
 
 
@@ -46,10 +46,10 @@ def cmb_biposh_leading(
 
     Notes
     -----
-    For L > 0, A = (-1)^{l2} [C_{l2} B^{00,Y}_{l2 l2} B^{LM,X}_{l1 l2}/sqrt(2 l2+1) + (-1)^L C_{l1} B^{00,X}_{l1 l1} B^{LM,Y}_{l2 l1}/sqrt(2 l1+1)]
-    (arXiv:1210.7318, eqs. WMAP1 and WMAP2 generalised); for L = 0 the circular spectrum (-1)^l sqrt(2l+1) C_l B^X_l B^Y_l.
-    What is left out is second order in b_ls: halving b_l2 quarters it (tests/unit/test_predict_cmb_biposh.py);
-    :func:`mcsim.predict.exact.cmb_biposh_exact` has it.
+    For L > 0, A = (-1)^{l2} [C_{l2} B^{00,Y}_{l2 l2} B^{LM,X}_{l1 l2}/sqrt(2 l2+1) + (-1)^L C_{l1} B^{00,X}_{l1 l1}
+    B^{LM,Y}_{l2 l1}/sqrt(2 l1+1)] (arXiv:1210.7318, eqs. WMAP1 and WMAP2 generalised); for L = 0 the circular spectrum
+    (-1)^l sqrt(2l+1) C_l B^X_l B^Y_l. What is left out is second order in b_ls: halving b_l2 quarters it
+    (tests/unit/test_predict_brute_force.py); :func:`mcsim.predict.exact.cmb_biposh_exact` has it.
     """
     check_modes(modes)
     check_spectrum(cl, lmax)
@@ -92,15 +92,15 @@ def noise_biposh(modes: Sequence[Mode], variance: NDArray[np.complex128], lmax: 
 
     Notes
     -----
-    A^{LM}_{l1 l2} = v_LM sqrt((2 l1+1)(2 l2+1)/(4pi (2L+1))) C^{L0}_{l1 0 l2 0}: in the Bennett normalisation v_LM/sqrt(4pi), for
-    every l. From the addition of int Y* Y V; the convolution does not enter
+    A^{LM}_{l1 l2} = v_LM sqrt((2 l1+1)(2 l2+1)/(4pi (2L+1))) C^{L0}_{l1 0 l2 0}: in the Bennett normalisation
+    v_LM/sqrt(4pi), for every l. From the addition of int Y* Y V; the convolution does not enter
     (tests/unit/test_predict_cmb_biposh.py holds it to an explicit sum).
     """
     check_modes(modes)
     L_max = len(variance) - 1
     result = np.full((len(modes), lmax + 1), np.nan, dtype=np.complex128)
     for row, (L, M, d) in zip(result, modes, strict=True):
-        v = variance[L, L_max + M] if L <= L_max else 0.0
+        v = variance[L, L_max + M] if L_max >= L else 0.0
         bennett = bennett_factor(L, d, lmax)
         row[existing(L, d, lmax)] = 0.0
         even = np.isfinite(bennett)

@@ -82,8 +82,8 @@ def signal_to_noise(
 
     Notes
     -----
-    (S/N)^2 = f_sky sum_l2 (2 - delta_M0) |A|^2 / E|A|^2. Modes with d of both signs of one pair share noise (E A_{l1 l2} A*_{l2 l1} is
-    not zero): their sum in quadrature is an approximation; :func:`fisher_information` is exact.
+    (S/N)^2 = f_sky sum_l2 (2 - delta_M0) |A|^2 / E|A|^2. Modes with d of both signs of one pair share noise (E A_{l1
+    l2} A*_{l2 l1} is not zero): their sum in quadrature is an approximation; :func:`fisher_information` is exact.
     """
     if not 0.0 < f_sky <= 1.0:
         raise InputError(f"f_sky = {f_sky} is not a fraction of the sky; give 0 < f_sky <= 1.")
@@ -106,12 +106,13 @@ def fisher_information(
     Parameters
     ----------
     biposh
-        dA^{LM}_{l1 l2} of every ordered pair of maps per unit of the parameter, uK^2, shape (n_map, n_map, n_mode, lmax + 1).
+        dA^{LM}_{l1 l2} of every ordered pair of maps per unit of the parameter, uK^2, shape (n_map, n_map, n_mode,
+        lmax + 1).
     modes
         (L, M, d) with M >= 0 and d >= 0: d < 0 is the exchanged pair's. L = 0 is C_l's own part.
     cl_total
-        Total spectra and cross-spectra of the maps, uK^2, shape (n_map, n_map, lmax + 1); degrees where this is singular
-        (such as l = 0, 1 without power) are left out.
+        Total spectra and cross-spectra of the maps, uK^2, shape (n_map, n_map, lmax + 1); degrees where this is
+        singular (such as l = 0, 1 without power) are left out.
     f_sky
         Observed fraction of the sky.
 
@@ -127,8 +128,8 @@ def fisher_information(
 
     Notes
     -----
-    f_sky sum_{L, M>=0, l1<=l2} (2 - delta_M0)/(1 + delta_l1l2) Tr[C_l1^-1 dA_l1l2 C_l2^-1 dA_l1l2^+], matrices over maps.
-    Equal to the trace over an explicit covariance to 1e-12 (tests/unit/test_predict_detectability.py).
+    f_sky sum_{L, M>=0, l1<=l2} (2 - delta_M0)/(1 + delta_l1l2) Tr[C_l1^-1 dA_l1l2 C_l2^-1 dA_l1l2^+], matrices over
+    maps. Equal to the trace over an explicit covariance to 1e-12 (tests/unit/test_predict_detectability.py).
     """
     check_modes(modes)
     if not 0.0 < f_sky <= 1.0:

@@ -33,12 +33,13 @@ def cmb_biposh_exact(
     modes
         (L, M, d) each, with |M|, |d| <= L; L = 0 gives C_l with the second-order beam correction.
     cl
-        C_l of the sky without beam, uK^2, shape (> lmax,). Skies often end above ``lmax``; power there leaks down, so give it.
+        C_l of the sky without beam, uK^2, shape (> lmax,). Skies often end above ``lmax``; power there leaks down, so
+        give it.
     lmax
         Highest l1 and l2.
     x, y
-        Beams and scans of a_{l1 m1} and of a_{l2 m2}; ``y`` is ``x`` by default. Sums over L1, L2 end with their moments
-        (64 is ample for WMAP beams).
+        Beams and scans of a_{l1 m1} and of a_{l2 m2}; ``y`` is ``x`` by default. Sums over L1, L2 end with
+        their moments: see Notes.
     tolerance
         A product of moments and beams below this fraction of the circular term is left out. 0 keeps all.
     nthreads
@@ -56,11 +57,16 @@ def cmb_biposh_exact(
 
     Notes
     -----
-    A^{LM}_{l1 l2} = sum_{l L1 L2} C_l (-1)^{l1+L2-L} sqrt((2 L1+1)(2 L2+1)) {l l1 L1; L L2 l2} sum_{M1 M2} C^{LM}_{L1 M1 L2 M2}
-    B^{L1 M1,X}_{l1 l} B^{L2 M2,Y}_{l2 l} (arXiv:1210.7318, appendix; its phase in the text, (-1)^l, fails for odd parity). The beam-BipoSH
-    are put in, so that the moments couple once, X^{ss'}_{L1 L2} = sum C^{LM}_{L1 M1 L2 M2} w_{s,L1 M1} w_{s',L2 M2}, whatever
-    l1, l2 and l; M costs nothing. Equal to 1e-12 to K C K^+ of an explicit pixel-space convolution at
-    lmax 6, all L, M and d of a pair (tests/unit/test_predict_exact.py).
+    A^{LM}_{l1 l2} = sum_{l L1 L2} C_l (-1)^{l1+L2-L} sqrt((2 L1+1)(2 L2+1)) {l l1 L1; L L2 l2}
+    sum_{M1 M2} C^{LM}_{L1 M1 L2 M2} B^{L1 M1,X}_{l1 l} B^{L2 M2,Y}_{l2 l}
+    (arXiv:1210.7318, appendix; the phase (-1)^l of its main text fails for odd parity). With the beam-BipoSH put in,
+    the moments couple once, X^{ss'}_{L1 L2} = sum C^{LM}_{L1 M1 L2 M2} w_{s,L1 M1} w_{s',L2 M2}, whatever l1, l2 and
+    l, so that M costs next to nothing.
+
+    Equal to K C K^+ of a convolution point by point to 1e-12 at lmax 6, all L <= 3, M and d of a pair
+    (tests/unit/test_predict_brute_force.py). Convergence in L1, L2 is slow under parallel transport, as L_max^-2 of the
+    second-order part: for an elliptical Gaussian of 17.7' and e = 0.46 at l = 1000, where that part is 0.8 % of
+    A^{20}, it is within 8e-4, 2.5e-4 and 7e-5 of A^{20} with L_max 32, 64 and 128 (within a sixth of this at l = 400).
     """
     check_modes(modes)
     check_spectrum(cl, lmax)
@@ -141,7 +147,7 @@ def _moment_couplings(
 ) -> Iterator[tuple[int, int, NDArray[np.complex128]]]:
     """(L1, L2, X) with X[M, s, s'] = sum_{M1 M2} C^{LM}_{L1 M1 L2 M2} w^X_{s,L1 M1} w^Y_{s',L2 M2}."""
     w_x, w_y = x.orientations(), y.orientations()
-    present_x, present_y = (w.any(axis=0) for w in (w_x, w_y))
+    present_x, present_y = (abs(w).sum(axis=0) > 0.0 for w in (w_x, w_y))
     for L1 in range(x.L_max + 1):
         for L2 in range(abs(L - L1), min(L + L1, y.L_max) + 1):
             coupling = np.zeros((len(orders), len(w_x), len(w_y)), dtype=np.complex128)
@@ -156,9 +162,7 @@ def _moment_couplings(
 
 
 @njit(cache=True, nogil=True)
-def _spin_table(
-    low: int, high: int, smax: int, L_max: int, response: NDArray[np.complex128]
-) -> NDArray[np.complex128]:
+def _spin_table(low: int, high: int, smax: int, L_max: int, response: NDArray[np.complex128]) -> NDArray[np.complex128]:
     """k_l b_ls (l1 L1 l; 0 s -s) at [l1 - low, L1, l - l1 + L_max, smax + s], zero where it does not exist."""
     lsky = response.shape[1] - 1
     table = np.zeros((high - low, L_max + 1, 2 * L_max + 1, 2 * smax + 1), dtype=np.complex128)
@@ -204,9 +208,9 @@ def _contract(
             L1, L2 = pairs[p, 0], pairs[p, 1]
             bottom = max(abs(l1 - L1), abs(l2 - L2))
             top = min(l1 + L1, l2 + L2, lsky)
-            if top < bottom or L1 + L2 < L:
+            if top < bottom:
                 continue
-             sixj_family(l1, L1, L, L2, l2, symbols)
+            sixj_family(l1, L1, L, L2, l2, symbols)
             begin, end = first_term[p], first_term[p + 1]
             sums[: end - begin] = 0.0
             for ell in range(bottom, top + 1):

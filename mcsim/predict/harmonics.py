@@ -1,7 +1,7 @@
 """Spin-harmonic coefficients w_{s,LM} of the orientation moments w_s = <e^{-i s psi}>.
 
-Every function returns a complex array of shape (smax + 1, L_max + 1, 2 L_max + 1) with w_{s,LM} at ``[s, L, L_max + M]``
-and zero where |M| > L or L < s: w_s = sum_LM w_{s,LM} (-s)Y_LM.
+Every function returns a complex array of shape (smax + 1, L_max + 1, 2 L_max + 1) with w_{s,LM} at ``[s, L, L_max +
+M]`` and zero where |M| > L or L < s: w_s = sum_LM w_{s,LM} (-s)Y_LM.
 """
 
 import ducc0
@@ -36,9 +36,8 @@ def orientation_harmonics(
 
     Notes
     -----
-    The integrals are sums over pixels of equal weight. Of band-limited moments at nside 64 they are right to 2e-4 of the
-    largest coefficient up to L = 16 (tests/unit/test_predict_harmonics.py); the moments of a scan, which jump at caustics,
-    have no better-defined integral.
+    The integrals are sums over pixels of equal weight, wrong by about nside^-2 of the largest coefficient where the
+    moments are smooth (tests/unit/test_predict_harmonics.py), 4e-6 at nside 512.
     """
     smax, npix = w.shape
     nside = round(np.sqrt(npix / 12))
@@ -90,8 +89,8 @@ def ring_orientation_harmonics(w: NDArray[np.complex128], L_max: int) -> NDArray
     Parameters
     ----------
     w
-        w_s(theta) for s = 1..smax at the Gauss-Legendre colatitudes (north to south) of ``ducc0.misc.GL_thetas(ntheta)``,
-        shape (smax, ntheta).
+        w_s(theta) for s = 1..smax at the Gauss-Legendre colatitudes (north to south) of
+        ``ducc0.misc.GL_thetas(ntheta)``, shape (smax, ntheta).
     L_max
         Highest degree; only M = 0 is filled.
 
@@ -103,7 +102,7 @@ def ring_orientation_harmonics(w: NDArray[np.complex128], L_max: int) -> NDArray
     Notes
     -----
     w_{s,L0} = 2 pi int w_s (-s)Y_L0 sin(theta) d theta. Odd s are not polynomials in cos(theta): their error falls as
-    ntheta^-3 (for w_s = 1, 7e-7 with 200 rings, tests/unit/test_predict_harmonics.py).
+    ntheta^-3 (for w_s = 1, 5e-6 with 200 rings, tests/unit/test_predict_harmonics.py).
     """
     smax, ntheta = w.shape
     result = _isotropic_zero(smax, L_max)
@@ -130,9 +129,10 @@ def parallel_transport_harmonics(smax: int, L_max: int, psi0: float = 0.0) -> ND
 
     Notes
     -----
-    A constant w_s is singular at the poles as a spin field, so the coefficients fall only as L^{-3/2}; yet each is an integral that
-    a finite rule does exactly: Gauss-Legendre for even s, where d^L_{0s} is a polynomial in cos(theta), and equal steps in theta for
-    odd s, where d^L_{0s} sin(theta) is a cosine series. The power of w_2 at L = 2, 4, 6, 8 is 83.3, 10, 3.1, 1.35 %.
+    A constant w_s is singular at the poles as a spin field, so the coefficients fall only as L^{-3/2}; yet each is an
+    integral that a finite rule does exactly: Gauss-Legendre for even s, where d^L_{0s} is a polynomial in cos(theta),
+    and equal steps in theta for odd s, where d^L_{0s} sin(theta) is a cosine series. The power of w_2 at L = 2, 4, 6,
+    8 is 83.3, 10, 3.1, 1.35 %.
     """
     result = _isotropic_zero(smax, L_max)
     gauss = spin_functions(smax, L_max, ducc0.misc.GL_thetas(L_max + 2))

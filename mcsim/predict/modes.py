@@ -52,8 +52,8 @@ def bennett_factor(L: int, d: int, lmax: int) -> NDArray[np.float64]:
     Returns
     -------
     ndarray
-        sqrt(2L+1) / (sqrt((2 l1+1)(2 l2+1)) C^{L0}_{l1 0 l2 0}) at l2, shape (lmax + 1,); NaN where the mode does not exist
-        or has odd parity (l1 + l2 + L odd), for which the normalisation is not defined.
+        sqrt(2L+1) / (sqrt((2 l1+1)(2 l2+1)) C^{L0}_{l1 0 l2 0}) at l2, shape (lmax + 1,); NaN where the mode does not
+        exist or has odd parity (l1 + l2 + L odd), for which the normalisation is not defined.
 
     Notes
     -----

@@ -1,4 +1,4 @@
-"""Families of Wigner 3j and 6j symbols by the two-sided three-term recursion, compiled; independent of the estimator's."""
+"""Families of Wigner 3j and 6j symbols by the two-sided three-term recursion, compiled."""
 
 import numpy as np
 from numba import njit
@@ -21,7 +21,7 @@ def _minimal_at_both_ends(
     n: int,
     out: NDArray[np.float64],
 ) -> None:
-    """Solve upper_i f_{i+1} + diagonal_i f_i + lower_i f_{i-1} = 0 for the f that falls off at both ends, up to a factor.
+    """Solution of upper_i f_{i+1} + diagonal_i f_i + lower_i f_{i-1} = 0 that falls off at both ends, up to a factor.
 
     Forward to the first decrease, backward from the top, joined by least squares over three points, so that neither
     recursion runs into a region where its solution should fall.

@@ -1,6 +1,9 @@
 """Scan models, pointing, orientation moments of the beam, and their exact long-time limit."""
 
+from mcsim.scan.accumulate import stream_moments
 from mcsim.scan.cache import cached_moments
+from mcsim.scan.factors import limit_factors, scan_factors, summary
+from mcsim.scan.limit import limit_moments
 from mcsim.scan.model import ScanModel, load_model
 from mcsim.scan.moments import Moments, parallel_transport, read_moments_fits, write_moments_fits
 from mcsim.scan.user_pointing import pointing_moments
@@ -9,9 +12,14 @@ __all__ = [
     "Moments",
     "ScanModel",
     "cached_moments",
+    "limit_factors",
+    "limit_moments",
     "load_model",
     "parallel_transport",
     "pointing_moments",
     "read_moments_fits",
+    "scan_factors",
+    "stream_moments",
+    "summary",
     "write_moments_fits",
 ]

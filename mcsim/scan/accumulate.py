@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import pairwise
 
 import healpy
 import numpy as np
@@ -10,8 +11,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
-from mcsim.scan.model import LineOfSight, ScanModel
 from mcsim.scan.geometry import check_nside
+from mcsim.scan.model import LineOfSight, ScanModel
 from mcsim.scan.moments import Moments
 from mcsim.scan.pointing import BLOCK, PointingStream, fill_block, ring_pixel
 
@@ -128,7 +129,7 @@ def _tasks(model: ScanModel, line: LineOfSight, frame: str, start: float, stop: 
     stream = PointingStream(model, line, frame)
     first, last = round(start * stream.samples), round(stop * stream.samples)
     edges = [first + (last - first) * part // _RANGES for part in range(_RANGES + 1)]
-    return [_Task(stream, low, high - low) for low, high in zip(edges, edges[1:], strict=False) if high > low]
+    return [_Task(stream, low, high - low) for low, high in pairwise(edges) if high > low]
 
 
 def _sum_of_tasks(

@@ -12,6 +12,7 @@ from mcsim.scan.model import LineOfSight, ScanModel
 _NODES = 128
 _FAST_PRECESSION = 50.0
 _GRADED = 60
+_TINY = 1e-18
 
 
 def limit_moments(
@@ -52,7 +53,8 @@ def limit_moments(
     and the two solutions psi, pi - psi leave cos(s psi) for even s, -i sin(s psi) for odd s. The substitution by a
     Jacobi elliptic function (Byrd & Friedman 1971, 254) turns the integrand into an analytic periodic function, for
     which the trapezoidal rule with 128 nodes converges exponentially up to the caustics, where two roots meet.
-    Measured against adaptive quadrature: 1e-10 (tests/unit/test_scan_limit.py).
+    Measured against adaptive quadrature: 4e-11 at 0.01 degrees from a caustic, 1e-13 elsewhere
+    (tests/unit/test_scan_limit.py).
     """
     line = _line(model, line_of_sight)
     theta = np.atleast_1d(np.asarray(theta, dtype=np.float64))
@@ -113,9 +115,7 @@ def limit_quadrature(
     return theta, (half[:, np.newaxis] * weight).ravel() * np.sin(theta)
 
 
-def limit_harmonics(
-    model: ScanModel, smax: int, lmax: int, line_of_sight: str | None = None
-) -> NDArray[np.complex128]:
+def limit_harmonics(model: ScanModel, smax: int, lmax: int, line_of_sight: str | None = None) -> NDArray[np.complex128]:
     """Spin-weighted harmonic coefficients w_{s,L0} of the limit's moments.
 
     Parameters
@@ -159,14 +159,15 @@ def _elliptic_nodes(roots: NDArray[np.float64]) -> tuple[NDArray[np.float64], ND
     ``roots`` has shape (4, n), sorted; the nodes have shape (_NODES, n).
     """
     r1, r2, r3, r4 = roots
+    # The gaps vanish at the caustics; so 1 - m and 1 - ratio come from them, not from differences with 1.
+    lower, upper = np.maximum(r2 - r1, _TINY), np.maximum(r4 - r3, _TINY)
     scale = (r4 - r2) * (r3 - r1)
-    # 1 - m from differences: it vanishes at the caustics.
-    complement = np.maximum((r2 - r1) * (r4 - r3) / scale, 1e-30)
+    complement = lower * upper / scale
     quarter_period = ellipkm1(complement)
     argument = np.linspace(0.0, 1.0, _NODES)[:, np.newaxis] * quarter_period
-    sn = ellipj(argument, 1.0 - complement)[0]
-    ratio = sn**2 * (r3 - r2) / (r3 - r1)
-    return 2.0 * quarter_period / np.sqrt(scale), (r2 - ratio * r1) / (1.0 - ratio)
+    sn, cn, _, _ = ellipj(argument, 1.0 - complement)
+    gap = lower / (r3 - r1)
+    return 2.0 * quarter_period / np.sqrt(scale), r1 + lower / (cn**2 + gap * sn**2)
 
 
 def _harmonics(m: int, lmax: int, theta: NDArray[np.float64]) -> list[NDArray[np.float64]]:

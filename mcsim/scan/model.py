@@ -118,7 +118,7 @@ class ScanModel:
     def samples(self, line: LineOfSight) -> int:
         """Number of samples of a line of sight in the whole survey."""
         # The small number keeps 31557600 / 0.0512 from losing its last sample to rounding.
-        return int(math.floor(self.duration_days * SECONDS_PER_DAY / self.period_of_samples(line) + 1e-6))
+        return math.floor(self.duration_days * SECONDS_PER_DAY / self.period_of_samples(line) + 1e-6)
 
     def with_sampling(self, sample_period_s: float) -> "ScanModel":
         """The same survey with every line of sight sampled every ``sample_period_s`` seconds."""

@@ -29,7 +29,7 @@ class Moments:
         w[s - 1] = mean of e^{-i s psi} over the pixel's samples, shape (smax, npix); 0 where nothing was observed.
     dtheta, dphi
         Mean offset of the samples from the pixel's centre along e_theta and e_phi, in radians (components of the
-        mean direction in the tangent plane at the centre), shape (npix,); None if unknown.
+        mean direction in the tangent plane at the centre), shape (npix,); None if zero or unknown.
     """
 
     nside: int
@@ -112,14 +112,11 @@ def parallel_transport(psi0: float, nside: int, smax: int, frame: str = "eclipti
         raise InputError(f"smax is {smax}, but moments need smax >= 1.")
     npix = 12 * nside * nside
     w = np.exp(-1j * psi0 * np.arange(1, smax + 1))[:, np.newaxis]
-    zero = np.broadcast_to(np.float64(0.0), npix)
     return Moments(
         nside=nside,
         frame=frame,
         hits=np.broadcast_to(np.float64(1.0), npix),
         w=np.broadcast_to(w, (smax, npix)),
-        dtheta=zero,
-        dphi=zero,
     )
 
 
@@ -237,7 +234,9 @@ def _read_table(path: str | Path) -> tuple[dict[str, NDArray[np.float64]], dict[
                 table = next((hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU)), None)
                 if table is None:
                     raise ValueError("it has no binary table")
-                columns = {name.upper(): np.array(table.data[name], dtype=np.float64).ravel() for name in table.names}
+                columns = {
+                    name.upper(): np.array(table.data[name], dtype=np.float64).ravel() for name in table.columns.names
+                }
                 header = {key: table.header.get(key) for key in ("NSIDE", "ORDERING", "COORDSYS")}
     except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
         raise InputError(f"moments file {str(path)!r} cannot be read: {error}; give a complete FITS table.") from None

@@ -22,7 +22,7 @@ def _arctangent_coefficients(degree: int = 11) -> NDArray[np.float64]:
     chebyshev = np.polynomial.Chebyshev.interpolate(
         lambda v: np.arctan(np.sqrt(v)) / np.sqrt(v) * (2.0 / math.pi), degree, domain=[0.0, _TAN_PI_8**2]
     )
-    return chebyshev.convert(kind=np.polynomial.Polynomial).coef
+    return np.asarray(chebyshev.convert(kind=np.polynomial.Polynomial).coef, dtype=np.float64)
 
 
 _ARCTANGENT = _arctangent_coefficients()
@@ -42,7 +42,9 @@ class PointingStream:
     def __init__(self, model: ScanModel, line: LineOfSight, frame: str) -> None:
         step = Fraction(model.period_of_samples(line))
         self.samples = model.samples(line)
-        self._turns = [step / Fraction(p) for p in (model.spin_period_s, model.precession_period_s, model.orbit_period_s)]
+        self._turns = [
+            step / Fraction(p) for p in (model.spin_period_s, model.precession_period_s, model.orbit_period_s)
+        ]
         offsets_deg = (model.spin_phase_deg + line.azimuth_deg, model.precession_phase_deg, model.orbit_phase_deg)
         self._offsets = [Fraction(offset) / 360 for offset in offsets_deg]
         in_block = np.array([[float(k * turn % 1) for k in range(BLOCK)] for turn in self._turns])
@@ -110,7 +112,8 @@ def fill_block(turns, tables, geometry, to_frame, count, work):  # type: ignore[
     """Directions and orientations of ``count`` <= BLOCK samples that start at ``turns``.
 
     ``work``, shape (6, BLOCK), takes n_x, n_y, n_z of the line of sight in the frame of the maps, cos psi and
-    sin psi of the beam's x axis, and the longitude in quarter turns. Only elementwise arithmetic, so that the compiler uses vector instructions.
+    sin psi of the beam's x axis, and the longitude in quarter turns. Only elementwise arithmetic, so that the
+    compiler uses vector instructions.
     """
     cos_a, sin_a = math.cos(_TWO_PI * turns[0]), math.sin(_TWO_PI * turns[0])
     cos_p, sin_p = math.cos(_TWO_PI * turns[1]), math.sin(_TWO_PI * turns[1])

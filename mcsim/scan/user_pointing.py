@@ -114,4 +114,6 @@ def _add_angles(theta, phi, psi, nside, smax, sums):  # type: ignore[no-untyped-
     for k in range(theta.size):
         sin_theta = math.sin(theta[k])
         x, y, z = sin_theta * math.cos(phi[k]), sin_theta * math.sin(phi[k]), math.cos(theta[k])
-        add_sample(sums, ring_pixel(nside, quarter_turns(x, y), x, y, z), x, y, z, math.cos(psi[k]), math.sin(psi[k]), smax)
+        add_sample(
+            sums, ring_pixel(nside, quarter_turns(x, y), x, y, z), x, y, z, math.cos(psi[k]), math.sin(psi[k]), smax
+        )

@@ -445,6 +445,22 @@ def test_given_skies_are_hashed_by_template_and_first_file(plain, folder):
     assert config.science(run) != before
 
 
+def test_given_skies_may_be_moved(plain, folder):
+    """Only the part of the template with the placeholder counts, whatever the folders above it are called."""
+    digests = set()
+    for name in ("here", "a{b}", "deep/there"):
+        (folder / name / "sims").mkdir(parents=True)
+        for number in range(4):
+            (folder / name / "sims" / f"{number}.fits").write_text(str(number))
+        run = changed(plain, "sky", {"lmax": 128, "alm": "sims/{realization}.fits"})
+        digests.add(
+            config.digest(
+                config.load(changed(run, "channel.1.scan", {"kind": "parallel_transport"}), base=folder / name)
+            )
+        )
+    assert len(digests) == 1
+
+
 def test_what_the_hash_covers():
     """Whatever changes here refuses to continue every store of earlier versions: it must be meant."""
     run = config.RunConfig(

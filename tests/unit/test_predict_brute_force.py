@@ -135,7 +135,7 @@ def channel_y():
 
 
 def test_beam_biposh_is_its_definition(channel_x):
-    """B^{LM} = sum C^{LM}_{l1 m1 l2 m2} int int B Y*_{l1 m1} Y*_{l2 m2}: all L <= 3, M, d; complex b_lm, odd m; round-off."""
+    """B^{LM} = sum C^{LM}_{l1 m1 l2 m2} int int B Y*_{l1 m1} Y*_{l2 m2}, complex b_lm with odd m; to round-off."""
     for L, M, d in ALL_MODES:
         expected = explicit_biposh(channel_x.matrix, L, M, d)
         got = beam_biposh(channel_x.beam, (L, M, d), LMAX)
@@ -166,7 +166,7 @@ def test_exact_power_spectrum_is_that_of_the_convolved_sky(channel_x):
 
 
 def test_leading_order_misses_second_order_only(channel_x, channel_y):
-    """Scaling every b_l,m>0 by 1/10 scales what leading order misses by 1/100 (the missing part is a pure quadratic)."""
+    """Scaling every b_l,m>0 by 1/10 scales what leading order misses by 1/100 (it is quadratic)."""
 
     def missing(factor):
         scaled = []

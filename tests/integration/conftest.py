@@ -1,0 +1,52 @@
+"""A small run that takes a fraction of a second, and a client in this process to run it with."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from distributed import Client, LocalCluster
+
+from mcsim import config, runner
+
+
+@pytest.fixture(scope="session")
+def client() -> Iterator[Client]:
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0") as cluster,
+        Client(cluster) as connected,
+    ):
+        yield connected
+
+
+def table(**changes: Any) -> dict[str, Any]:
+    """Configuration of 10 realizations at nside 16; ``changes`` replace whole sections."""
+    base: dict[str, Any] = {
+        "schema": 1,
+        "name": "small",
+        "sky": {"spectrum": "wmap7", "lmax": 32},
+        "map": {"nside": 16},
+        "channel": [
+            {
+                "name": "W1",
+                "beam": {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 300.0, "fwhm_minor_arcmin": 250.0},
+                "scan": {"kind": "parallel_transport", "psi0_deg": 20.0},
+            }
+        ],
+        "biposh": {"L_max": 2, "summary_bin": 10},
+        "ensemble": {"realizations": 10, "seed": 7},
+        "compute": {"chunk": 4},
+    }
+    return base | changes
+
+
+def ensemble(realizations: int = 10, seed: int = 7, **more: Any) -> dict[str, Any]:
+    return {"ensemble": {"realizations": realizations, "seed": seed, **more}}
+
+
+@pytest.fixture(scope="session")
+def small_store(client: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small run, finished; tests must not write to it."""
+    path = tmp_path_factory.mktemp("store") / "small.zarr"
+    runner.run(config.load(table()), path, client=client)
+    return path

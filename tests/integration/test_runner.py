@@ -1,0 +1,189 @@
+"""The batch from configuration to store: resumption, extension, slices, refusals, and the same bits every time."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from distributed import Client
+
+from mcsim import config, open_ensemble, runner, simulate, store
+from mcsim.errors import InputError
+from mcsim.survey import survey
+
+from .conftest import ensemble, table
+
+
+def assert_same(a: Path, b: Path, attributes: bool = True) -> None:
+    """Same arrays, summary and scientific attributes, bit for bit."""
+    xr.testing.assert_identical(open_ensemble(a).drop_attrs(), open_ensemble(b).drop_attrs())
+    xr.testing.assert_identical(store.open_summary(a), store.open_summary(b))
+    for path in (a, b):
+        assert open_ensemble(path).done.all()
+    if attributes:
+        for key in ("science", "digest", "conventions", "packages"):
+            assert store.attributes(a)[key] == store.attributes(b)[key]
+
+
+def tree(path: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}
+
+
+def test_store_holds_what_a_realization_gives(small_store: Path) -> None:
+    shared = survey(config.load(table()))
+    with open_ensemble(small_store) as stored:
+        for r in (0, 3, 9):
+            values = simulate.realize(shared, r)
+            for name, array in values.items():
+                np.testing.assert_array_equal(stored[name][r].values, array)
+        assert stored.sel(mode="L2M0d0").biposh.dims == ("realization", "pair", "ell")
+        assert stored.biposh.attrs["units"] == "uK^2"
+        assert all("long_name" in variable.attrs for variable in stored.variables.values())
+
+
+def test_summary_is_that_of_the_realizations(small_store: Path) -> None:
+    with open_ensemble(small_store) as stored, store.open_summary(small_store) as summary:
+        difference = (stored.biposh - stored.biposh_circular).values
+        for name, sample in {"biposh": stored.biposh.values, "biposh_difference": difference, "cl": stored.cl.values}.items():
+            np.testing.assert_allclose(summary[f"{name}_mean"], sample.mean(axis=0), rtol=1e-12, atol=1e-12)
+            deviation = sample.std(axis=0, ddof=1)
+            np.testing.assert_allclose(summary[f"{name}_standard_deviation"], deviation, rtol=1e-9, atol=1e-12)
+            np.testing.assert_allclose(summary[f"{name}_standard_error"], deviation / np.sqrt(10), rtol=1e-9, atol=1e-12)
+        factor = summary.bin_factor.values
+        bins = np.array([np.nanmean((factor * stored.biposh.values[:, 0])[..., a : a + 10], axis=-1) for a in (0, 10, 20)])
+        binned = np.moveaxis(bins, 0, -1)
+        np.testing.assert_allclose(summary.biposh_binned_mean[0, :, :3], binned.mean(axis=0), rtol=1e-10, atol=1e-12)
+        for mode in range(summary.sizes["mode"]):
+            expected = np.cov(binned[:, mode].T, ddof=1)
+            found = summary.biposh_binned_covariance[0, mode, :3, :3]
+            np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max() + 1e-20)
+
+
+def test_finished_store_is_left_alone(small_store: Path, client: Client) -> None:
+    before = tree(small_store)
+    result = runner.run(table(), small_store, client=client)
+    assert (result.finished, result.computed) == (10, 0)
+    assert tree(small_store) == before
+
+
+def test_interrupted_run_continues_to_the_same_bits(small_store: Path, client: Client, tmp_path: Path) -> None:
+    path = tmp_path / "interrupted.zarr"
+    shutil.copytree(small_store, path)
+    # What a killed run leaves: chunks without their done, one of them with half of its data.
+    (path / "done" / "c" / "1").unlink()
+    shutil.rmtree(path / "biposh" / "c" / "1")
+    (path / "done" / "c" / "2").unlink()
+    shutil.rmtree(path / "summary")
+    result = runner.run(table(), path, resume=True, client=client)
+    assert (result.finished, result.computed) == (10, 6)
+    assert_same(path, small_store)
+
+
+def test_extension_keeps_what_is_there_and_gives_the_bits_of_one_run(small_store: Path, client: Client, tmp_path: Path) -> None:
+    path = tmp_path / "extended.zarr"
+    assert runner.run(table(**ensemble(3)), path, client=client).computed == 3
+    assert runner.run(table(**ensemble(10)), path, client=client).computed == 7
+    assert_same(path, small_store)
+
+
+def test_slices_merge_to_the_same_bits(small_store: Path, client: Client, tmp_path: Path) -> None:
+    paths = [tmp_path / "a.zarr", tmp_path / "b.zarr"]
+    runner.run(table(), paths[0], realizations=slice(0, 5), client=client)
+    runner.run(table(), paths[1], realizations=slice(5, None), client=client)
+    merged = tmp_path / "merged.zarr"
+    assert runner.merge(paths, merged).finished == 10
+    assert_same(merged, small_store)
+
+
+@pytest.mark.parametrize("chunk", [1, 16])
+def test_chunks_do_not_change_a_bit(chunk: int, small_store: Path, client: Client, tmp_path: Path) -> None:
+    path = tmp_path / "chunked.zarr"
+    runner.run(table(compute={"chunk": chunk}), path, client=client)
+    assert_same(path, small_store)
+
+
+def test_separate_processes_give_the_same_bits(small_store: Path, tmp_path: Path) -> None:
+    path = tmp_path / "processes.zarr"
+    runner.run(table(), path, workers=1)
+    assert_same(path, small_store)
+
+
+def test_another_configuration_is_refused_by_name(small_store: Path, client: Client) -> None:
+    before = tree(small_store)
+    with pytest.raises(InputError, match=r"another configuration \(ensemble\.seed: 7 -> 8\)"):
+        runner.run(table(**ensemble(seed=8)), small_store, client=client)
+    with pytest.raises(InputError, match=r"biposh\.L_max: 2 -> 1"):
+        runner.run(table(biposh={"L_max": 1, "summary_bin": 10}), small_store, client=client)
+    with pytest.raises(InputError, match=r"keep_maps"):
+        runner.run(table(**ensemble(keep_maps=True)), small_store, client=client)
+    assert tree(small_store) == before
+
+
+def test_resume_needs_a_store(client: Client, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no store .* to resume"):
+        runner.run(table(), tmp_path / "none.zarr", resume=True, client=client)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_foreign_folder_is_refused(client: Client, tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("precious")
+    with pytest.raises(InputError, match="not an ensemble store"):
+        runner.run(table(), tmp_path, client=client)
+    assert (tmp_path / "thesis.tex").read_text() == "precious"
+
+
+def test_unreachable_scheduler(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"No Dask scheduler answers at tcp://127\.0\.0\.1:1 "):
+        runner.run(table(), tmp_path / "x.zarr", scheduler="tcp://127.0.0.1:1")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unwritable_store(client: Client, tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("a file where a folder is needed")
+    with pytest.raises(InputError, match="cannot be written"):
+        runner.run(table(), blocked / "x.zarr", client=client)
+    assert blocked.read_text() == "a file where a folder is needed"
+
+
+def test_a_failing_realization_does_not_stop_the_others(
+    client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = simulate.realize
+
+    def realize(shared, r: int, nthreads: int = 1):
+        if r == 4:
+            raise FloatingPointError("cosmic ray")
+        return real(shared, r, nthreads)
+
+    monkeypatch.setattr(simulate, "realize", realize)
+    path = tmp_path / "x.zarr"
+    result = runner.run(table(), path, client=client)
+    assert result.finished == 9
+    assert [(f.realization, f.reason) for f in result.failures] == [(4, "FloatingPointError: cosmic ray")]
+    assert np.isnan(open_ensemble(path).biposh[4]).all()
+    monkeypatch.undo()
+    assert runner.run(table(), path, client=client).computed == 1
+    assert open_ensemble(path).done.all()
+
+
+def test_kept_maps(client: Client, tmp_path: Path) -> None:
+    path = tmp_path / "x.zarr"
+    runner.run(table(**ensemble(2, keep_maps=True)), path, client=client)
+    with open_ensemble(path) as stored:
+        assert stored["map"].sizes == {"realization": 2, "map_name": 1, "pixel": 3072}
+        assert stored["map"].attrs["units"] == "uK"
+        shared = survey(config.load(table(**ensemble(2, keep_maps=True))))
+        expected = simulate.realize(shared, 1)["map"]
+        np.testing.assert_array_equal(stored["map"][1], expected.astype(np.float32))
+
+
+def test_merge_refuses_what_does_not_belong_together(small_store: Path, client: Client, tmp_path: Path) -> None:
+    other = tmp_path / "other.zarr"
+    runner.run(table(**ensemble(2, seed=8)), other, client=client)
+    with pytest.raises(InputError, match=r"differ \(ensemble\.seed: 7 -> 8\)"):
+        runner.merge([small_store, other], tmp_path / "merged.zarr")
+    assert not (tmp_path / "merged.zarr").exists()
+    with pytest.raises(InputError, match="exists already"):
+        runner.merge([small_store], other)

@@ -1,0 +1,298 @@
+"""Beam maps: known beams drawn into FITS images come back as their known coefficients."""
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from scipy.special import gammaln
+
+from mcsim.beams import blm_of_map, elliptical_gaussian, find_centre, from_map, read_map
+from mcsim.errors import InputError
+
+PIXEL_DEG = 0.04
+PIXEL = np.radians(PIXEL_DEG)
+SIGMA_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
+
+
+def spherical_harmonics(lmax: int, m: int, theta: float, phi: float) -> np.ndarray:
+    """Y_lm(theta, phi) for l = 0..lmax by the recurrence in l."""
+    y = np.zeros(lmax + 1)
+    log_norm = 0.5 * (np.log((2 * m + 1) / (4 * np.pi)) + gammaln(2 * m + 1)) - gammaln(m + 1) - m * np.log(2)
+    y[m] = (-1) ** m * np.exp(log_norm) * np.sin(theta) ** m
+    for ell in range(m + 1, lmax + 1):
+        factor = np.sqrt((4 * ell**2 - 1) / (ell**2 - m**2))
+        y[ell] = factor * np.cos(theta) * y[ell - 1]
+        if ell > m + 1:
+            y[ell] -= factor * np.sqrt(((ell - 1) ** 2 - m**2) / (4 * (ell - 1) ** 2 - 1)) * y[ell - 2]
+    return y * np.exp(1j * m * phi)
+
+
+def directions(size: int, centre: tuple[float, float], projection: str = "equidistant"):
+    """Theta and phi of the pixels of a square map."""
+    y = (np.arange(size) - centre[0])[:, None] * PIXEL
+    x = (np.arange(size) - centre[1])[None, :] * PIXEL
+    radius = np.hypot(x, y)
+    theta = {"equidistant": radius, "orthographic": np.arcsin(radius), "equal_area": 2 * np.arcsin(radius / 2)}
+    return theta[projection], np.arctan2(y, x)
+
+
+def ellipse(theta, phi, major=13.9, minor=12.7, angle_deg=25.0):
+    """The beam that :func:`elliptical_gaussian` is the transform of."""
+    sigma_major, sigma_minor = np.radians(np.array([major, minor]) / 60) * SIGMA_PER_FWHM
+    phi = phi - np.radians(angle_deg)
+    exponent = (theta * np.cos(phi) / sigma_major) ** 2 + (theta * np.sin(phi) / sigma_minor) ** 2
+    return np.exp(-exponent / 2) / np.sqrt(np.sinc(theta / np.pi))
+
+
+def lobe(theta, phi, fwhm, at_theta=0.0, at_phi=0.0):
+    """A Gaussian with B_l = exp(-l(l+1) sigma^2 / 2) and unit integral, centred anywhere on the sphere."""
+    sigma = np.radians(fwhm / 60) * SIGMA_PER_FWHM
+    # Half the chord, not the cosine: no digits are lost at small separations.
+    square = np.sin((theta - at_theta) / 2) ** 2 + np.sin(theta) * np.sin(at_theta) * np.sin((phi - at_phi) / 2) ** 2
+    separation = 2 * np.arcsin(np.sqrt(square))
+    beam = np.exp(-(separation**2) / (2 * sigma**2)) / np.sqrt(np.sinc(separation / np.pi))
+    # sigma^2/8 from kappa^2 = l(l+1) + 1/3 - m^2/3 at l = m = 0: exp(-sigma^2/6) is the integral over 2 pi sigma^2.
+    return beam / (2 * np.pi * sigma**2 * np.exp(-(sigma**2) / 6))
+
+
+def lobe_blm(lmax, mmax, fwhm, at_theta=0.0, at_phi=0.0):
+    ell = np.arange(lmax + 1)
+    window = np.exp(-ell * (ell + 1) * (np.radians(fwhm / 60) * SIGMA_PER_FWHM) ** 2 / 2)
+    return window * np.array([spherical_harmonics(lmax, m, at_theta, at_phi).conj() for m in range(mmax + 1)])
+
+
+def write(path, image, pixel_deg=PIXEL_DEG, **header):
+    hdu = fits.PrimaryHDU(image)
+    if pixel_deg is not None:
+        hdu.header["CDELT1"] = hdu.header["CDELT2"] = pixel_deg
+    for key, value in header.items():
+        hdu.header[key] = value
+    hdu.writeto(path)
+    return path
+
+
+def relative(blm, expected):
+    """Largest difference over the largest coefficient of the beam."""
+    return np.abs(blm - expected).max() / np.abs(expected).max()
+
+
+@pytest.mark.parametrize("projection", ["equidistant", "orthographic", "equal_area"])
+def test_elliptical_gaussian_map_gives_the_closed_form(tmp_path, projection) -> None:
+    theta, phi = directions(200, (98.3, 101.6), projection)
+    path = write(tmp_path / "beam.fits", ellipse(theta, phi))
+    beam = from_map(path, 1024, 6, projection=projection, centre=(98.3, 101.6))
+    expected = elliptical_gaussian(13.9, 12.7, 25.0, 1024, 6)
+    # What is left is the closed form's error, 2e-11 of the order; no pixel effect at 5 pixels per FWHM.
+    assert relative(beam.blm, expected.blm) < 1e-10
+    for m in (2, 4):
+        assert relative(beam.blm[m], expected.blm[m]) < 1e-9
+
+
+def test_wrong_projection_is_seen_in_a_wide_beam(tmp_path) -> None:
+    theta, phi = directions(240, (120, 120))
+    path = write(tmp_path / "beam.fits", ellipse(theta, phi, 120, 90))
+    expected = elliptical_gaussian(120, 90, 25.0, 200, 2).blm
+    assert relative(from_map(path, 200, 2, cut_deg=4.5).blm, expected) < 1e-6
+    assert relative(from_map(path, 200, 2, cut_deg=4.5, projection="orthographic").blm, expected) > 1e-4
+
+
+def test_comatic_beam_has_its_odd_orders_and_imaginary_parts(tmp_path) -> None:
+    # A main lobe, a positive lobe at 0.5 deg and a negative one at 0.7 deg elsewhere: every order, complex.
+    first, second = (np.radians(0.5), 0.7), (np.radians(0.7), -2.0)
+    theta, phi = directions(220, (109.25, 110.5))
+    image = lobe(theta, phi, 14) + 0.2 * lobe(theta, phi, 20, *first) - 0.05 * lobe(theta, phi, 16, *second)
+    blm = lobe_blm(1024, 8, 14) + 0.2 * lobe_blm(1024, 8, 20, *first) - 0.05 * lobe_blm(1024, 8, 16, *second)
+    path = write(tmp_path / "beam.fits", 3.0 * image)
+    beam = from_map(path, 1024, 8, centre=(109.25, 110.5))
+    assert beam.integral == pytest.approx(3.0 * 1.15, rel=1e-9)
+    for m in range(9):
+        assert np.abs(beam.blm[m].imag).max() > (1e-3 if m else -1)
+        # The lobes' own closed form holds to 1e-11.
+        assert np.abs(beam.blm[m] * 1.15 - blm[m]).max() < 1e-9 * np.abs(blm).max()
+
+
+def test_sum_over_pixels_is_the_sum_of_harmonics() -> None:
+    rng = np.random.default_rng(11)
+    image = rng.standard_normal((12, 15))
+    pixel, centre, lmax, mmax = np.radians(1.0), (5.2, 7.7), 40, 5
+    blm = blm_of_map(image, pixel, centre, np.radians(5.0), lmax, mmax)
+    expected = np.zeros((mmax + 1, lmax + 1), dtype=complex)
+    for row in range(12):
+        for column in range(15):
+            y, x = (row - centre[0]) * pixel, (column - centre[1]) * pixel
+            radius = np.hypot(x, y)
+            if radius <= np.radians(5.0):
+                area = pixel**2 * np.sin(radius) / radius
+                for m in range(mmax + 1):
+                    harmonic = spherical_harmonics(lmax, m, radius, np.arctan2(y, x))
+                    expected[m] += image[row, column] * area * harmonic.conj()
+    # epsilon of the transform is 1e-12 of the largest.
+    np.testing.assert_allclose(blm, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(
+    ("width", "centre"),
+    [
+        # A peak that the 15 pixels of the centroid hold whole: the centre is found.
+        (7.0, None),
+        # With wings beyond them a centroid over a square depends on how the beam lies in it: the centre is given.
+        (16.0, (119.5, 121.3)),
+    ],
+)
+def test_rotated_map_turns_the_phases(tmp_path, width, centre) -> None:
+    # Asymmetric, with a negative lobe, drawn once upright and once turned from x towards y by 37 deg.
+    angle = np.radians(37.0)
+    beams = []
+    for turn in (0.0, angle):
+        theta, phi = directions(240, (119.5, 121.3))
+        phi = phi - turn
+        image = ellipse(theta, phi, width, 0.7 * width, 20)
+        for strength, at_theta, at_phi in ((6e-7, 0.02, 2.0), (-8e-7, 0.025, -1.0)):
+            image += strength * lobe(theta, phi, 15, at_theta, at_phi)
+        beams.append(from_map(write(tmp_path / f"beam{turn:.2f}.fits", image), 1024, 8, centre=centre))
+    upright, turned = beams
+    for m in range(9):
+        largest = np.abs(upright.blm[m]).max()
+        assert largest > 1e-4
+        expected = upright.blm[m] * np.exp(-1j * m * angle)
+        np.testing.assert_allclose(turned.blm[m], expected, rtol=0, atol=1e-3 * largest)
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (-13, 21), (0.5, 0.25)])
+def test_beam_does_not_depend_on_where_it_lies_in_the_map(tmp_path, shift) -> None:
+    # 15 pixels hold this peak whole, so that the centroid is exact; at 2.3 pixels per FWHM the sum over pixels has the
+    # alias exp(-(2 pi / pixel - lmax)^2 sigma^2 / 2) = 3e-7.
+    theta, phi = directions(200, (99 + shift[0], 98 + shift[1]))
+    path = write(tmp_path / "beam.fits", ellipse(theta, phi, 6, 5.5))
+    beam_map = read_map(path, cut_deg=2.0)
+    assert beam_map.centre == pytest.approx((99 + shift[0], 98 + shift[1]), abs=1e-6)
+    assert relative(beam_map.beam(1024, 4).blm, elliptical_gaussian(6, 5.5, 25, 1024, 4).blm) < 3e-7
+
+
+def test_centroid_is_over_fifteen_pixels() -> None:
+    image = np.zeros((41, 41))
+    image[20, 20] = 1.0
+    image[20, 27] = 0.5
+    image[28, 20] = 0.5
+    assert find_centre(image) == pytest.approx((20, 20 + 7 / 3))
+
+
+def test_negative_sidelobes_are_kept_and_the_cut_is_applied(tmp_path) -> None:
+    image = np.zeros((101, 101))
+    image[50, 50], image[50, 75], image[90, 50] = 1.0, -0.25, 9.0e-3
+    path = write(tmp_path / "beam.fits", image)
+    wide, narrow = (
+        from_map(path, 50, 2, cut_deg=1.2, centre=(50, 50)),
+        from_map(path, 50, 2, cut_deg=0.9, centre=(50, 50)),
+    )
+    assert wide.integral == pytest.approx(0.75 * PIXEL**2, rel=1e-4)
+    assert narrow.integral == pytest.approx(PIXEL**2, rel=1e-12)
+
+
+def test_pixel_means_are_restored(tmp_path) -> None:
+    # Means over the pixels by 6 x 6 Gauss-Legendre points; without the correction 4 % of B_l is missing at l = 1024.
+    node, weight = np.polynomial.legendre.leggauss(6)
+    mean = 0.0
+    for y, weight_y in zip(node / 2, weight / 2, strict=True):
+        for x, weight_x in zip(node / 2, weight / 2, strict=True):
+            theta, phi = directions(160, (79.3 - y, 80.1 - x))
+            mean = mean + weight_y * weight_x * ellipse(theta, phi)
+    path = write(tmp_path / "beam.fits", mean)
+    expected = elliptical_gaussian(13.9, 12.7, 25.0, 1024, 4).blm
+    assert relative(from_map(path, 1024, 4, centre=(79.3, 80.1), pixel_average=True).blm, expected) < 1e-6
+    assert relative(from_map(path, 1024, 4, centre=(79.3, 80.1)).blm, expected) > 1e-3
+
+
+def test_mmax_is_chosen_and_the_rest_reported(tmp_path) -> None:
+    theta, phi = directions(160, (80, 80))
+    path = write(tmp_path / "beam.fits", ellipse(theta, phi, 20, 12))
+    closed = elliptical_gaussian(20, 12, 25, 1024)
+    beam = from_map(path, 1024)
+    assert beam.mmax == closed.mmax == 4
+    assert beam.neglected_power == pytest.approx(closed.neglected_power, rel=1e-6)
+
+
+def test_plane_of_a_cube_and_given_pixel(tmp_path) -> None:
+    theta, phi = directions(100, (50, 50))
+    cube = np.stack([ellipse(theta, phi), np.ones_like(theta), ellipse(theta, phi, 20, 12)])
+    path = write(tmp_path / "cube.fits", cube, pixel_deg=None)
+    beam = from_map(path, 500, 2, pixel_deg=PIXEL_DEG, plane=2)
+    assert relative(beam.blm, elliptical_gaussian(20, 12, 25, 500, 2).blm) < 1e-6
+
+
+def small_image() -> np.ndarray:
+    theta, phi = directions(40, (20, 20))
+    return ellipse(theta, phi)
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "named"),
+    [
+        ("none", {"lmax": 100, "mmax": 101}, "mmax = 101"),
+        ("none", {"lmax": 5000}, "lmax = 5000 is beyond .* at most 4500"),
+        ("none", {"cut_deg": 0.0}, "cut_deg = 0.0"),
+        ("none", {"cut_deg": 0.05}, "less than 2 pixels"),
+        ("none", {"cut_deg": 120.0}, "at most 90"),
+        ("none", {"projection": "mercator"}, "'mercator' is not one of"),
+        ("none", {"centre": (50.0, 20.0)}, "outside"),
+        ("none", {"pixel_deg": -0.04}, "pixel"),
+        ("nan", {}, "1 values that are not finite"),
+        ("zero", {}, "no positive value"),
+        ("negative", {}, "no positive value"),
+        ("negative total", {}, "integrates to"),
+        ("edge", {}, "less than 8 pixels from an edge"),
+        ("empty inside", {"centre": (3.0, 3.0), "cut_deg": 0.1}, "is zero within 0.1 deg"),
+    ],
+)
+def test_unusable_map_is_refused(tmp_path, change, options, named) -> None:
+    image = small_image()
+    if change == "nan":
+        image[3, 3] = np.nan
+    elif change == "zero":
+        image *= 0
+    elif change == "negative":
+        image *= -1
+    elif change == "negative total":
+        image[0, :] = -100
+    elif change == "edge":
+        image = image[16:]
+    elif change == "empty inside":
+        image[:10, :10] = 0
+    path = write(tmp_path / "beam.fits", image)
+    with pytest.raises(InputError, match=named):
+        from_map(path, **{"lmax": 100, **options})
+
+
+def test_unusable_headers_are_refused(tmp_path) -> None:
+    image = small_image()
+    bare = write(tmp_path / "bare.fits", image, pixel_deg=None)
+    oblong = write(tmp_path / "oblong.fits", image, CDELT2=0.05)
+    mirrored = write(tmp_path / "mirrored.fits", image, CDELT1=-0.04)
+    radians = write(tmp_path / "radians.fits", image, CUNIT1="rad")
+    cube = write(tmp_path / "cube.fits", np.stack([image, image]))
+    line = write(tmp_path / "line.fits", image[20])
+    for path, named in [
+        (bare, "give pixel_deg"),
+        (oblong, "must be equal and positive"),
+        (mirrored, "must be equal and positive"),
+        (radians, "CUNIT1 = 'rad'"),
+        (line, "1 dimensions"),
+        (tmp_path / "absent.fits", "does not exist"),
+    ]:
+        with pytest.raises(InputError, match=named):
+            from_map(path, 100)
+    with pytest.raises(InputError, match=r"plane = 2 .* planes 0 to 1"):
+        from_map(cube, 100, plane=2)
+
+
+def test_truncated_empty_and_foreign_files_are_refused(tmp_path) -> None:
+    whole = write(tmp_path / "whole.fits", small_image()).read_bytes()
+    (tmp_path / "truncated.fits").write_bytes(whole[:6000])
+    (tmp_path / "text.fits").write_text("not a beam")
+    fits.HDUList([fits.PrimaryHDU()]).writeto(tmp_path / "empty.fits")
+    for name, named in [
+        ("truncated", "cannot be read as a FITS image"),
+        ("text", "cannot be read as a FITS image"),
+        ("empty", "holds no image"),
+    ]:
+        with pytest.raises(InputError, match=named):
+            from_map(tmp_path / f"{name}.fits", 100)

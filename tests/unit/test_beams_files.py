@@ -1,0 +1,92 @@
+"""Beams from files of coefficients."""
+
+import healpy
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from mcsim import alm as alm_
+from mcsim.beams import Beam, elliptical_gaussian, from_blm_file
+from mcsim.errors import InputError
+
+
+def write(path, beam: Beam, scale: float = 1.0):
+    packed = np.zeros(healpy.Alm.getsize(beam.lmax, beam.mmax), dtype=complex)
+    for m in range(beam.mmax + 1):
+        start = alm_.start(beam.lmax, m)
+        packed[start + m : start + beam.lmax + 1] = beam.blm[m, m:]
+    healpy.write_alm(
+        path,
+        packed if scale == 1.0 else scale * packed,
+        lmax=beam.lmax,
+        mmax=beam.mmax,
+        mmax_in=beam.mmax,
+        out_dtype=np.float64,
+    )
+    return path
+
+
+@pytest.fixture
+def beam() -> Beam:
+    return elliptical_gaussian(60, 40, 30, 120, 6)
+
+
+def test_file_comes_back_normalised(tmp_path, beam) -> None:
+    path = write(tmp_path / "beam.alm.fits", beam, scale=0.4945)
+    read = from_blm_file(path, 120, 6)
+    np.testing.assert_allclose(read.blm, beam.blm, rtol=0, atol=1e-15)
+    assert read.integral == pytest.approx(0.4945, rel=1e-14)
+
+
+def test_lower_lmax_and_chosen_mmax(tmp_path, beam) -> None:
+    read = from_blm_file(write(tmp_path / "beam.alm.fits", beam), 80)
+    expected = elliptical_gaussian(60, 40, 30, 80)
+    assert (read.lmax, read.mmax) == (80, expected.mmax)
+    np.testing.assert_allclose(read.blm, expected.blm, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("lmax", "mmax", "named"),
+    [
+        (121, None, "stops at lmax = 120"),
+        (120, 7, "stops at mmax = 6"),
+        (5, 6, "mmax = 6 .* lmax = 5"),
+        (0, None, "lmax = 0"),
+    ],
+)
+def test_more_than_the_file_holds_is_refused(tmp_path, beam, lmax, mmax, named) -> None:
+    with pytest.raises(InputError, match=named):
+        from_blm_file(write(tmp_path / "beam.alm.fits", beam), lmax, mmax)
+
+
+@pytest.mark.parametrize(
+    ("index", "value", "named"),
+    [
+        ((0, 7), 0.5j, "complex coefficients at m = 0"),
+        ((2, 9), complex(np.inf), "not finite"),
+        ((0, 0), complex(-1.0), "integrates to"),
+        ((1, 100), complex(50.0), "pointed at the pole"),
+    ],
+)
+def test_coefficients_that_are_no_beam_are_refused(tmp_path, beam, index, value, named) -> None:
+    blm = beam.blm.copy()
+    blm[index] = value
+    with pytest.raises(InputError, match=named):
+        from_blm_file(write(tmp_path / "beam.alm.fits", Beam(blm)), 120)
+
+
+def test_all_zero_file_is_refused(tmp_path, beam) -> None:
+    with pytest.raises(InputError, match="at m = 0"):
+        from_blm_file(write(tmp_path / "beam.alm.fits", Beam(0 * beam.blm)), 120)
+
+
+def test_unreadable_files_are_refused(tmp_path, beam) -> None:
+    whole = write(tmp_path / "beam.alm.fits", beam).read_bytes()
+    (tmp_path / "truncated.fits").write_bytes(whole[:9000])
+    (tmp_path / "text.fits").write_text("not a beam")
+    fits.PrimaryHDU(np.ones((3, 3))).writeto(tmp_path / "image.fits")
+    for name in ("truncated", "text", "image"):
+        with pytest.raises(InputError, match="cannot be read as FITS coefficients"):
+            from_blm_file(tmp_path / f"{name}.fits", 100)
+    with pytest.raises(InputError, match="do not exist"):
+        from_blm_file(tmp_path / "absent.fits", 100)

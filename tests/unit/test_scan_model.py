@@ -1,0 +1,137 @@
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from mcsim.errors import InputError
+from mcsim.scan.model import LineOfSight, ScanModel, load_model
+
+MODELS = Path(__file__).parents[2] / "scan_models"
+GOOD = """
+schema = 1
+name = "toy"
+spin_period_s = 100.0
+precession_period_s = -5000.0
+precession_angle_deg = 30.0
+orbit_period_s = 31557600.0
+sample_period_s = 0.5
+duration_days = 10.0
+[[line_of_sight]]
+name = "left"
+boresight_angle_deg = 60.0
+[[line_of_sight]]
+name = "right"
+boresight_angle_deg = 61.0
+azimuth_deg = 180.0
+sample_period_s = 0.25
+[pairs]
+both = ["left", "right"]
+[source]
+spin_period_s = "made up"
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write_text(text):
+        path = tmp_path / "model.toml"
+        path.write_text(text)
+        return path
+
+    return write_text
+
+
+def test_reads_every_key(write):
+    model = load_model(write(GOOD))
+    assert (model.name, model.spin_period_s, model.precession_period_s) == ("toy", 100.0, -5000.0)
+    assert model.default_lines == ("left", "right")
+    assert model.pair("both") == (LineOfSight("left", 60.0), LineOfSight("right", 61.0, 180.0, 0.25))
+    assert [model.samples(line) for line in model.lines_of_sight] == [1728000, 3456000]
+    assert model.source == {"spin_period_s": "made up"}
+
+
+def test_other_sampling_holds_for_every_line(write):
+    model = load_model(write(GOOD)).with_sampling(2.0)
+    assert [model.period_of_samples(line) for line in model.lines_of_sight] == [2.0, 2.0]
+    with pytest.raises(InputError, match="sample_period_s is -1"):
+        model.with_sampling(-1.0)
+
+
+def test_last_sample_survives_rounding():
+    # 365.25 days / 0.0512 s = 616359375 exactly; the quotient of the doubles may fall just below.
+    line = LineOfSight("A", 70.5)
+    assert ScanModel("w", 129.3, -3600.0, 22.5, 31557600.0, 0.0512, 365.25, (line,), ("A",)).samples(line) == 616359375
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("schema = 1", "schema = 2", "schema is 2"),
+        ('name = "toy"', "", "'name' is missing"),
+        ("spin_period_s = 100.0", "spin_period = 100.0", "unknown key 'spin_period'"),
+        ("spin_period_s = 100.0", "", "'spin_period_s' is missing"),
+        ("spin_period_s = 100.0", "spin_period_s = 0.0", "spin_period_s is 0, but it must be > 0"),
+        ("spin_period_s = 100.0", 'spin_period_s = "100"', "must be a finite number"),
+        ("spin_period_s = 100.0", "spin_period_s = true", "must be a finite number"),
+        ("spin_period_s = 100.0", "spin_period_s = nan", "must be a finite number"),
+        ("precession_period_s = -5000.0", "precession_period_s = 0.0", "precession_period_s is 0"),
+        ("precession_angle_deg = 30.0", "precession_angle_deg = 91.0", "between 0 and 90"),
+        ("sample_period_s = 0.5", "sample_period_s = -0.5", "sample_period_s is -0.5"),
+        ("duration_days = 10.0", "duration_days = 1e-6", "has no sample"),
+        ("boresight_angle_deg = 60.0", "boresight_angle_deg = 180.0", "must lie between 0 and 180"),
+        ("boresight_angle_deg = 60.0", "", "'boresight_angle_deg' is missing"),
+        ("boresight_angle_deg = 60.0", "boresight_angle_deg = 60.0\npsi = 1.0", "unknown key 'psi'"),
+        ('name = "right"', 'name = "left"', "two lines of sight are called 'left'"),
+        ('name = "right"', "", "has no name"),
+        ('both = ["left", "right"]', 'both = ["left"]', "a pair needs 2"),
+        ('both = ["left", "right"]', 'both = ["left", "middle"]', "names 'middle'"),
+        ('both = ["left", "right"]', 'both = "left"', "must be a list"),
+        ('spin_period_s = "made up"', 'spin = "made up"', "unknown key 'spin'"),
+        ("schema = 1", "schema = 1\ndefault_lines = []", "must be a list"),
+        ("schema = 1", "schema = ", "not valid TOML"),
+    ],
+)
+def test_bad_models_say_what_is_wrong(write, old, new, message):
+    assert old in GOOD
+    path = write(GOOD.replace(old, new, 1))
+    with pytest.raises(InputError, match=message) as caught:
+        load_model(path)
+    assert str(path) in str(caught.value)
+
+
+def test_missing_file_and_missing_lines(tmp_path, write):
+    with pytest.raises(InputError, match="cannot be read"):
+        load_model(tmp_path / "none.toml")
+    with pytest.raises(InputError, match=r"no \[\[line_of_sight\]\]"):
+        load_model(write(GOOD.split("[[line_of_sight]]")[0]))
+
+
+def test_unknown_names(write):
+    model = load_model(write(GOOD))
+    with pytest.raises(InputError, match="choose from left, right"):
+        model.line_of_sight("up")
+    with pytest.raises(InputError, match="choose from both"):
+        model.pair("W1")
+
+
+@pytest.mark.parametrize("path", sorted(MODELS.glob("*.toml")), ids=lambda path: path.stem)
+def test_packaged_models_cite_every_number(path):
+    model = load_model(path)
+    with path.open("rb") as stream:
+        keys = {key for key, value in tomllib.load(stream).items() if isinstance(value, float)}
+    assert keys == set(model.source)
+    assert all(model.source.values())
+    assert all(line.source for line in model.lines_of_sight)
+
+
+def test_wmap_focal_plane_has_both_sides_of_every_assembly():
+    model = load_model(MODELS / "wmap_focal_plane.toml")
+    assert list(model.pairs) == ["K1", "Ka1", "Q1", "Q2", "V1", "V2", "W1", "W2", "W3", "W4"]
+    for name in model.pairs:
+        side_a, side_b = model.pair(name)
+        assert (side_a.name, side_b.name) == (f"{name}A", f"{name}B")
+        assert side_a.sample_period_s == side_b.sample_period_s
+        # The sides face each other: within the focal plane's 2.5 degrees of azimuth 0 and 180.
+        assert abs((side_a.azimuth_deg + 180.0) % 360.0 - 180.0) < 2.5
+        assert abs(side_b.azimuth_deg - 180.0) < 2.5
+        assert 67.0 < side_a.boresight_angle_deg < 73.0

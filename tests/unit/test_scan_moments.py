@@ -1,0 +1,323 @@
+from dataclasses import replace
+
+import healpy
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from mcsim.errors import InputError
+from mcsim.scan.accumulate import stream_moments
+from mcsim.scan.cache import cached_moments, default_cache_dir, moments_key
+from mcsim.scan.model import LineOfSight, ScanModel
+from mcsim.scan.moments import Moments, parallel_transport, read_moments_fits, write_moments_fits
+from mcsim.scan.pointing import pointing
+from mcsim.scan.user_pointing import pointing_moments
+
+LINES = (LineOfSight("A", 70.5), LineOfSight("B", 69.0, 170.0, 3.0))
+MODEL = ScanModel("toy", 129.3, -3600.0, 22.5, 31557600.0, 2.0, 1.0, LINES, ("A",))
+NSIDE, SMAX = 16, 3
+
+
+def brute_force(samples, nside, smax):
+    """Moments of listed samples by healpy's pixels, numpy's sums and explicit tangent vectors."""
+    theta, phi, psi = (np.concatenate(angle) for angle in zip(*samples, strict=True))
+    npix = 12 * nside * nside
+    pixel = healpy.ang2pix(nside, theta, phi)
+    hits = np.bincount(pixel, minlength=npix)
+    count = np.maximum(hits, 1)
+
+    def mean(values):
+        return np.bincount(pixel, weights=values, minlength=npix) / count
+
+    w = np.array([mean(np.cos(s * psi)) - 1j * mean(np.sin(s * psi)) for s in range(1, smax + 1)])
+    centre_theta, centre_phi = healpy.pix2ang(nside, pixel)
+    vector = healpy.ang2vec(theta, phi)
+    e_theta = np.stack(
+        [np.cos(centre_theta) * np.cos(centre_phi), np.cos(centre_theta) * np.sin(centre_phi), -np.sin(centre_theta)]
+    )
+    e_phi = np.stack([-np.sin(centre_phi), np.cos(centre_phi), 0.0 * centre_phi])
+    return hits, w, mean(np.sum(vector.T * e_theta, axis=0)), mean(np.sum(vector.T * e_phi, axis=0))
+
+
+def assert_same(moments, expected, tolerance):
+    hits, w, dtheta, dphi = expected
+    np.testing.assert_array_equal(moments.hits, hits)
+    assert np.abs(moments.w - w).max() < tolerance
+    assert np.abs(moments.dtheta - dtheta).max() < tolerance
+    assert np.abs(moments.dphi - dphi).max() < tolerance
+
+
+@pytest.mark.parametrize(
+    ("names", "time_range", "frame"),
+    [(None, (0.0, 1.0), "ecliptic"), (["A", "B"], (0.25, 0.5), "galactic"), (["B"], (0.5, 1.0), "equatorial")],
+)
+def test_streamed_moments_against_brute_force(names, time_range, frame):
+    moments = stream_moments(MODEL, NSIDE, SMAX, frame, names, time_range)
+    samples = []
+    for line in MODEL.select(names):
+        first, last = (round(edge * MODEL.samples(line)) for edge in time_range)
+        samples.append(pointing(MODEL, line, first, last - first, frame))
+    assert (moments.nside, moments.frame, moments.smax, moments.npix) == (NSIDE, frame, SMAX, 3072)
+    # The phases of the two runs are advanced from different starts: 1e-13 rad, times s / sin(theta) = 60 at the poles.
+    assert_same(moments, brute_force(samples, NSIDE, SMAX), 6e-12)
+
+
+def test_threads_change_no_bit_and_progress_ends_at_one():
+    seen = []
+    runs = [stream_moments(MODEL, NSIDE, SMAX, nthreads=n, progress=seen.append) for n in (1, 2, 3)]
+    for run in runs[1:]:
+        for name in ("hits", "w", "dtheta", "dphi"):
+            assert getattr(run, name).tobytes() == getattr(runs[0], name).tobytes()
+    assert seen.count(1.0) == 3
+
+
+def test_halves_add_up_to_the_whole():
+    whole, one, two = (stream_moments(MODEL, NSIDE, 2, time_range=part) for part in ((0, 1), (0, 0.5), (0.5, 1)))
+    np.testing.assert_array_equal(one.hits + two.hits, whole.hits)
+    assert np.abs(one.hits * one.w + two.hits * two.w - whole.hits * whole.w).max() < 1e-11
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"nside": 17}, "nside is 17"),
+        ({"smax": 0}, "smax is 0"),
+        ({"frame": "lunar"}, "frame is 'lunar'"),
+        ({"lines_of_sight": ["C"]}, "no line of sight 'C'"),
+        ({"time_range": (0.5, 0.5)}, "time_range"),
+        ({"time_range": (0.0, 1.5)}, "time_range"),
+        ({"time_range": (0.0, 1e-9)}, "contains no sample"),
+    ],
+)
+def test_streaming_checks_its_input(change, message):
+    with pytest.raises(InputError, match=message):
+        stream_moments(MODEL, **({"nside": NSIDE, "smax": 2} | change))
+
+
+def test_parallel_transport_is_constant_and_takes_no_memory():
+    moments = parallel_transport(0.3, 512, 4)
+    assert moments.hits.strides == (0,)
+    assert moments.w.strides[1] == 0
+    np.testing.assert_allclose(moments.w[:, 7], np.exp(-1j * 0.3 * np.arange(1, 5)), rtol=1e-15)
+    assert moments.dtheta is None
+    assert moments.dphi is None
+    assert moments.hits[0] == 1.0
+    with pytest.raises(InputError, match="smax is 0"):
+        parallel_transport(0.0, 8, 0)
+
+
+@pytest.mark.parametrize("mmap", [True, False])
+def test_save_and_load(tmp_path, mmap):
+    moments = stream_moments(MODEL, NSIDE, 2)
+    moments.save(tmp_path / "m")
+    loaded = Moments.load(tmp_path / "m", mmap=mmap)
+    assert isinstance(loaded.w, np.memmap) is mmap
+    for name in ("hits", "w", "dtheta", "dphi"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(moments, name))
+    (tmp_path / "m" / "w.npy").unlink()
+    with pytest.raises(InputError, match="does not hold complete moments"):
+        Moments.load(tmp_path / "m")
+
+
+def test_cache_computes_once_and_leaves_nothing_behind(tmp_path, monkeypatch):
+    monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / "cache"))
+    assert default_cache_dir() == tmp_path / "cache"
+    folder = cached_moments(MODEL, NSIDE, 2)
+    stamp = (folder / "w.npy").stat().st_mtime_ns
+    assert cached_moments(MODEL, NSIDE, 2, nthreads=2) == folder
+    assert (folder / "w.npy").stat().st_mtime_ns == stamp
+    assert [entry.name for entry in (tmp_path / "cache").iterdir()] == [folder.name]
+    np.testing.assert_array_equal(Moments.load(folder).hits, stream_moments(MODEL, NSIDE, 2).hits)
+
+
+def test_interrupted_computation_leaves_the_cache_empty(tmp_path):
+    def interrupt(fraction):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        cached_moments(MODEL, NSIDE, 2, progress=interrupt, cache_dir=tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_cache_folder_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot be written"):
+        cached_moments(MODEL, NSIDE, 2, cache_dir=tmp_path / "file")
+
+
+def test_key_depends_on_every_number_and_on_nothing_else():
+    base = moments_key(MODEL, NSIDE, 2, "ecliptic")
+    assert moments_key(replace(MODEL, name="other", source={"spin_period_s": "x"}), NSIDE, 2, "ecliptic") == base
+    assert moments_key(MODEL, NSIDE, 2, "ecliptic", ["A"]) == base
+    changed = [
+        moments_key(MODEL, 32, 2, "ecliptic"),
+        moments_key(MODEL, NSIDE, 3, "ecliptic"),
+        moments_key(MODEL, NSIDE, 2, "galactic"),
+        moments_key(MODEL, NSIDE, 2, "ecliptic", ["B"]),
+        moments_key(MODEL, NSIDE, 2, "ecliptic", None, (0.0, 0.5)),
+    ]
+    for name in [
+        "spin_period_s",
+        "precession_period_s",
+        "precession_angle_deg",
+        "orbit_period_s",
+        "sample_period_s",
+        "duration_days",
+        "spin_phase_deg",
+        "precession_phase_deg",
+        "orbit_phase_deg",
+    ]:
+        changed.append(moments_key(replace(MODEL, **{name: getattr(MODEL, name) + 1.0}), NSIDE, 2, "ecliptic"))
+    assert len({base, *changed}) == len(changed) + 1
+
+
+def test_fits_round_trip(tmp_path):
+    moments = stream_moments(MODEL, NSIDE, SMAX, "galactic")
+    path = tmp_path / "moments.fits"
+    write_moments_fits(path, moments)
+    back = read_moments_fits(path, NSIDE, SMAX, "galactic")
+    assert (back.nside, back.frame, back.smax) == (NSIDE, "galactic", SMAX)
+    for name in ("hits", "w", "dtheta", "dphi"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(moments, name))
+    assert read_moments_fits(path, smax=2).smax == 2
+
+
+def test_fits_as_healpy_writes_it(tmp_path):
+    # Rows of 1024 pixels, single precision; unobserved pixels may hold anything.
+    rng = np.random.default_rng(5)
+    hits = rng.integers(0, 3, 3072).astype(float)
+    w = np.where(hits > 0, 0.5 * np.exp(1j * rng.uniform(0, 6, 3072)), healpy.UNSEEN)
+    path = tmp_path / "moments.fits"
+    healpy.write_map(
+        path, [hits, w.real, w.imag], coord="E", column_names=["HITS", "RE_1", "IM_1"], dtype=np.float32, overwrite=True
+    )
+    back = read_moments_fits(path)
+    assert back.frame == "ecliptic"
+    assert back.dtheta is None
+    np.testing.assert_array_equal(back.hits, hits)
+    np.testing.assert_allclose(back.w[0], np.where(hits > 0, w, 0.0), atol=1e-7)
+
+
+def damaged(path, change):
+    with fits.open(path) as hdus:
+        table = hdus[1].copy()
+        table.data = hdus[1].data.copy()
+    change(table)
+    table.writeto(path, overwrite=True)
+
+
+def drop(name):
+    def change(table):
+        table.columns[name].name = f"NO_{name}"
+
+    return change
+
+
+def put(name, value):
+    def change(table):
+        table.data[name][5] = value
+
+    return change
+
+
+def header(key, value):
+    def change(table):
+        if value is None:
+            del table.header[key]
+        else:
+            table.header[key] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "arguments", "message"),
+    [
+        (drop("HITS"), {}, "no column HITS"),
+        (drop("IM_2"), {"smax": 2}, "no column IM_2"),
+        (drop("RE_1"), {}, "no column RE_1"),
+        (drop("DPHI"), {}, "DTHETA alone"),
+        (put("HITS", np.nan), {}, "HITS is not finite in 1 pixels, first 5"),
+        (put("RE_2", np.inf), {}, "RE_2 is not finite"),
+        (put("HITS", -1.0), {}, "HITS is -1 in pixel 5"),
+        (put("RE_1", 1.5), {}, "modulus"),
+        (header("ORDERING", "NESTED"), {}, "ORDERING = 'NESTED'"),
+        (header("ORDERING", None), {}, "ORDERING = None"),
+        (header("COORDSYS", None), {}, "no COORDSYS"),
+        (header("COORDSYS", "X"), {}, "COORDSYS = 'X'"),
+        (header("NSIDE", 32), {}, "says NSIDE = 32"),
+        (header("NSIDE", 16), {"nside": 32}, "the maps have nside 32"),
+        (header("NSIDE", 16), {"frame": "galactic"}, "the maps are galactic"),
+        (header("NSIDE", 16), {"frame": "lunar"}, "frame is 'lunar'"),
+    ],
+)
+def test_bad_fits_files_say_what_is_wrong(tmp_path, change, arguments, message):
+    path = tmp_path / "moments.fits"
+    npix = 12 * NSIDE**2
+    fill = np.full(npix, 0.1)
+    write_moments_fits(path, Moments(NSIDE, "ecliptic", fill * 10, np.full((2, npix), 0.1 + 0.1j), fill, fill))
+    damaged(path, change)
+    with pytest.raises(InputError, match=message):
+        read_moments_fits(path, **arguments)
+
+
+def test_missing_and_truncated_fits_files(tmp_path):
+    path = tmp_path / "moments.fits"
+    with pytest.raises(InputError, match="cannot be read"):
+        read_moments_fits(path)
+    write_moments_fits(path, parallel_transport(0.0, NSIDE, 2))
+    path.write_bytes(path.read_bytes()[:30000])
+    with pytest.raises(InputError, match="cannot be read"):
+        read_moments_fits(path)
+    fits.PrimaryHDU(np.zeros((3, 3))).writeto(path, overwrite=True)
+    with pytest.raises(InputError, match="no binary table"):
+        read_moments_fits(path)
+    path.write_text("not a fits file")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_moments_fits(path)
+
+
+def write_pointing(folder, form, theta, phi, psi):
+    table = np.stack([theta, phi, psi], axis=1)
+    path = folder / {"text": "p.txt", "npy4": "p.npy", "records": "p.npy", "npz": "p.npz", "fits": "p.fits"}[form]
+    if form == "text":
+        np.savetxt(path, table, header="theta phi psi", fmt="%.17g")
+    elif form == "npy4":
+        np.save(path, np.column_stack([table, np.arange(len(theta))]))
+    elif form == "records":
+        np.save(path, np.rec.fromarrays([psi, theta, phi], names="psi,theta,phi"))
+    elif form == "npz":
+        np.savez(path, theta=theta, phi=phi, psi=psi)
+    else:
+        columns = [fits.Column(n, "D", array=a) for n, a in (("PSI", psi), ("THETA", theta), ("PHI", phi))]
+        fits.BinTableHDU.from_columns(columns).writeto(path)
+    return path
+
+
+@pytest.mark.parametrize("form", ["text", "npy4", "records", "npz", "fits"])
+def test_user_pointing_in_every_format(tmp_path, form):
+    samples = pointing(MODEL, LINES[0], 100, 3000)
+    path = write_pointing(tmp_path, form, *samples)
+    # The same numbers on both sides: rounding of a hundred additions.
+    assert_same(pointing_moments(path, NSIDE, SMAX), brute_force([samples], NSIDE, SMAX), 1e-13)
+    assert_same(pointing_moments([path, path], NSIDE, SMAX), brute_force([samples, samples], NSIDE, SMAX), 1e-13)
+
+
+@pytest.mark.parametrize(
+    ("theta", "message"), [([91.0], "theta runs from 91"), ([np.nan], "theta has values"), ([], "no samples")]
+)
+def test_bad_user_pointing(tmp_path, theta, message):
+    path = write_pointing(tmp_path, "npz", np.array(theta), np.zeros(len(theta)), np.zeros(len(theta)))
+    with pytest.raises(InputError, match=message):
+        pointing_moments(path, NSIDE, 2)
+
+
+def test_unreadable_user_pointing(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        pointing_moments(tmp_path / "none.fits", NSIDE, 2)
+    np.savez(tmp_path / "p.npz", theta=np.zeros(3), phi=np.zeros(3))
+    with pytest.raises(InputError, match=r"cannot be read.*psi"):
+        pointing_moments(tmp_path / "p.npz", NSIDE, 2)
+    np.save(tmp_path / "p.npy", np.zeros((3, 2)))
+    with pytest.raises(InputError, match=r"shape is \(3, 2\)"):
+        pointing_moments(tmp_path / "p.npy", NSIDE, 2)
