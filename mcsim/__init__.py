@@ -1,7 +1,7 @@
 """mcsim: is the isotropy violation that I measure made by my instrument?
 
-Monte Carlo ensembles of isotropic skies seen through non-circular beams under a scan, their BipoSH coefficients and power
-spectra, stored as xarray/Zarr. Names are loaded when they are first used, so that ``import mcsim`` costs nothing.
+Monte Carlo ensembles of isotropic skies seen through non-circular beams under a scan, their BipoSH coefficients and
+power spectra, stored as xarray/Zarr. Names are loaded when they are first used, so that ``import mcsim`` costs nothing.
 """
 
 from importlib import import_module

@@ -80,14 +80,14 @@ def estimate(
     tables
         From :func:`estimator`.
     alm_x, alm_y
-        Coefficients of the maps that carry l1 and l2, shape (alm.size(lmax),), m-major order; without ``alm_y`` both are
-        ``alm_x``.
+        Coefficients of the maps that carry l1 and l2, shape (alm.size(lmax),), m-major order; without ``alm_y`` both
+        are ``alm_x``.
 
     Returns
     -------
     ndarray
-        A^{LM}_{l2 - d, l2}, shape (modes, lmax + 1), in the square of the input's unit. NaN where the coefficient does not
-        exist (l1 < 0, l1 > lmax, the triangle of l1, l2, L), and for one map in the modes that repeat others.
+        A^{LM}_{l2 - d, l2}, shape (modes, lmax + 1), in the square of the input's unit. NaN where the coefficient does
+        not exist (l1 < 0, l1 > lmax, the triangle of l1, l2, L), and for one map in the modes that repeat others.
 
     Notes
     -----
@@ -145,9 +145,7 @@ def bennett_factor(mode: Mode, lmax: int) -> NDArray[np.float64]:
     return factor
 
 
-def power_spectrum(
-    alm_x: NDArray[np.complex128], alm_y: NDArray[np.complex128], lmax: int
-) -> NDArray[np.float64]:
+def power_spectrum(alm_x: NDArray[np.complex128], alm_y: NDArray[np.complex128], lmax: int) -> NDArray[np.float64]:
     """C_l = sum_m a_lm conj(b_lm) / (2 l + 1) of two real maps, shape (lmax + 1,)."""
     product = alm_x.real * alm_y.real + alm_x.imag * alm_y.imag
     product[lmax + 1 :] *= 2.0

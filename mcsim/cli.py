@@ -1,4 +1,7 @@
-"""The command line: thin calls of public functions. Exit codes: 0 done, 1 failed realizations, 2 bad input, 130 interrupted."""
+"""The command line: thin calls of public functions.
+
+Exit codes: 0 done, 1 failed realizations, 2 bad input, 130 interrupted.
+"""
 
 import json
 import sys
@@ -40,14 +43,20 @@ def main() -> None:
 @app.command()
 def run(
     config: Config,
-    store: Annotated[Path | None, typer.Option("-o", "--output", metavar="STORE", help="Default: NAME.zarr here.")] = None,
+    store: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="STORE", help="Default: NAME.zarr here.")
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue a store; refuse to start a new one.")] = False,
     realizations: Annotated[
         str | None, typer.Option(metavar="A:B", help="Only realizations A to B - 1, for slices that merge joins.")
     ] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Local processes; default: the configuration's.")] = None,
-    scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Running Dask scheduler, tcp://host:port.")] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say memory, disk, files and time; compute nothing.")] = False,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Running Dask scheduler, tcp://host:port.")
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say memory, disk, files and time; compute nothing.")
+    ] = False,
 ) -> None:
     """Run an ensemble; continue it if it was interrupted; extend it if more realizations are asked for."""
     if workers is not None and scheduler is not None:
@@ -81,7 +90,8 @@ def merge(
 def info(
     store: Store,
     export: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write the summary: .nc (NetCDF) or .ecsv (table of binned spectra).")
+        Path | None,
+        typer.Option(metavar="FILE", help="Write the summary: .nc (NetCDF) or .ecsv (table of binned spectra)."),
     ] = None,
 ) -> None:
     """Say what a store holds; export its summary."""
@@ -113,7 +123,9 @@ def beam(
     source: Annotated[str, typer.Argument(metavar="BEAM", help="Beam map or b_lm (FITS), or a CONFIG.")],
     lmax: Annotated[int, typer.Option(min=2, help="Degree of the coefficients.")] = 2048,
     m_max: Annotated[int | None, typer.Option(min=0, help="Order; default: chosen from the beam.")] = None,
-    pixel_deg: Annotated[float | None, typer.Option(help="Side of a pixel of a beam map; default: its header's.")] = None,
+    pixel_deg: Annotated[
+        float | None, typer.Option(help="Side of a pixel of a beam map; default: its header's.")
+    ] = None,
     output: Png = None,
 ) -> None:
     """Say what a beam is like: solid angle, widths, B_l and b_lm; draw it."""
@@ -158,7 +170,9 @@ def bench(
 
 @app.command()
 def config(
-    name: Annotated[str | None, typer.Argument(metavar="CONFIG", help="Check this configuration and print it resolved.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(metavar="CONFIG", help="Check this configuration and print it resolved.")
+    ] = None,
     schema: Annotated[bool, typer.Option("--schema", help="Print the JSON schema of the TOML file.")] = False,
 ) -> None:
     """Check a configuration, or print the schema of all."""
@@ -198,7 +212,9 @@ def _report(result) -> None:  # type: ignore[no-untyped-def]
     for failure in result.failures[:10]:
         out.print(f"realization {failure.realization} failed: {failure.reason}", markup=False)
     if result.failures:
-        out.print(f"{len(result.failures)} realizations failed; run the same command again to retry them.", markup=False)
+        out.print(
+            f"{len(result.failures)} realizations failed; run the same command again to retry them.", markup=False
+        )
         raise typer.Exit(1)
 
 

@@ -31,8 +31,8 @@ def look_at_beams(
     Parameters
     ----------
     source
-        A TOML configuration or packaged workflow (every channel is shown), or a FITS file: an image is a beam map, a table
-        holds b_lm.
+        A TOML configuration or packaged workflow (every channel is shown), or a FITS file: an image is a beam map, a
+        table holds b_lm.
     lmax, m_max
         Degree and order of the coefficients; m_max by default from the beam.
     pixel_deg

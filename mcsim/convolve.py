@@ -1,6 +1,7 @@
 r"""From a sky to the map of a survey: spin transforms of the beam's components, combined with orientation moments.
 
-    T(n) = S_0(n) + 2 Re sum_{s > 0} w_s(n) S_s(n),   S_s(n) = sum_lm k_l a_lm b_ls sY_lm(n),   k_l = sqrt(4 pi / (2l + 1)).
+    T(n) = S_0(n) + 2 Re sum_{s > 0} w_s(n) S_s(n),
+    S_s(n) = sum_lm k_l a_lm b_ls sY_lm(n),   k_l = sqrt(4 pi / (2l + 1)).
 
 One transform per kept s, whatever the number of samples in the survey (paper, Sec. III and App. C).
 """

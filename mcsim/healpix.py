@@ -10,7 +10,6 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from mcsim import alm as alm_
 from mcsim.errors import InputError
 
 Map = NDArray[np.float64]
@@ -85,9 +84,10 @@ def pixel_window(nside: int, lmax: int) -> NDArray[np.float64]:
 
     Notes
     -----
-    w_l^2 is the mean over pixels of <P_l(x . y)>, x and y uniform in the pixel. A lattice of at most 32 x 32 pixels on one
-    polar and one equatorial face stands for all; a pixel is sampled at the centres of its sub-pixels. Against the
-    published HEALPix tables, l <= 3 nside: within 2e-4 for nside 32 to 1024; where that matters, name a table in ``[map] pixel_window``.
+    w_l^2 is the mean over pixels of <P_l(x . y)>, x and y uniform in the pixel. A lattice of at most 32 x 32 pixels on
+    one polar and one equatorial face stands for all; a pixel is sampled at the centres of its sub-pixels. Against the
+    published HEALPix tables, l <= 3 nside: within 2e-4 for nside 32 to 1024; where that matters, name a table in
+    ``[map] pixel_window``.
     """
     lattice = min(nside, 32)
     step = (nside // lattice) ** 2
@@ -99,14 +99,16 @@ def pixel_window(nside: int, lmax: int) -> NDArray[np.float64]:
     for face, share in ((0, 2.0 / 3.0), (4, 1.0 / 3.0)):
         shifted = pixels + face * nside * nside
         # The centres of n x n sub-pixels miss 1/n^2 of a pixel's extent: extrapolated from n = 4 and 8.
-        window += share * (4.0 * _mean_legendre(shifted, nside, 8, lmax) - _mean_legendre(shifted, nside, 4, lmax)) / 3.0
+        window += (
+            share * (4.0 * _mean_legendre(shifted, nside, 8, lmax) - _mean_legendre(shifted, nside, 4, lmax)) / 3.0
+        )
     window = np.sqrt(np.abs(window))
     window.setflags(write=False)
     return window
 
 
 def _mean_legendre(pixels: NDArray[np.int64], nside: int, split: int, lmax: int) -> NDArray[np.float64]:
-    """<P_l(x . y)> over pairs of the split x split sub-pixel centres of NESTED pixels, by a histogram of separations."""
+    """<P_l(x . y)> over pairs of split x split sub-pixel centres of NESTED pixels, by a histogram of separations."""
     inside = pixels[:, None] * split**2 + np.arange(split**2)
     centres = np.stack(healpy.pix2vec(split * nside, inside, nest=True), axis=-1)
     difference = centres[:, :, None, :] - centres[:, None, :, :]

@@ -23,7 +23,8 @@ def describe(path: str | Path) -> str:
     run = attributes["configuration"]
     lines = [
         f"{target}: {run['name']}, {int(done.sum())} of {done.size} realizations finished",
-        f"  maps      nside {run['map']['nside']}, {run['map']['frame']}, lmax {sizes['ell'] - 1}, seed {run['ensemble']['seed']}",
+        f"  maps      nside {run['map']['nside']}, {run['map']['frame']} frame, lmax {sizes['ell'] - 1}",
+        f"  seed      {run['ensemble']['seed']}",
         f"  pairs     {'; '.join(pairs)}",
         f"  modes     {sizes['mode']}, L <= {run['biposh']['L_max']}{', with circular twins' if paired else ''}",
         f"  size      {sum(file.stat().st_size for file in files) / 1e6:.1f} MB in {len(files)} files",
@@ -68,7 +69,9 @@ def export(path: str | Path, output: str | Path) -> None:
             elif target.suffix == ".ecsv":
                 table(summary).write(target, format="ascii.ecsv", overwrite=True)
             else:
-                raise InputError(f"{target} ends in {target.suffix or 'nothing'}; choose .nc (NetCDF) or .ecsv (table).")
+                raise InputError(
+                    f"{target} ends in {target.suffix or 'nothing'}; choose .nc (NetCDF) or .ecsv (table)."
+                )
         except OSError as error:
             raise InputError(f"{target} cannot be written ({error.strerror or error}); choose another file.") from error
 

@@ -24,10 +24,10 @@ CONVENTIONS = {
     "temperature": "uK_CMB",
     "alm": "healpy m-major order, analysis divided by the pixel window",
     "psi": "rotation of the beam about its axis, from e_theta (south) towards e_phi (east)",
-    "beam": "b_lm of the beam pointed at the pole, b_l0 = sqrt((2l+1)/4pi) B_l, B_0 = 1; x axis = spin axis x boresight",
-    "biposh": "A^{LM}_{l1 l2} = sum a_{l1 m1} conj(a_{l2 m2}) (-1)^{m2} C^{LM}_{l1 m1 l2 -m2}, at ell = l2, d = l2 - l1",
+    "beam": "b_lm of the beam at the pole, b_l0 = sqrt((2l+1)/4pi) B_l, B_0 = 1; x axis = spin axis x boresight",
+    "biposh": "A^{LM}_{l1 l2} = sum a_{l1 m1} conj(a_{l2 m2}) (-1)^{m2} C^{LM}_{l1 m1 l2 -m2}, ell = l2, d = l2 - l1",
     "normalisation": "Hajian-Souradeep",
-    "weights": "maps are multiplied by weights of unit mean square, spectra divided by the mean product of the two weights",
+    "weights": "maps times weights of unit mean square, spectra over the mean product of the two weights",
 }
 _PACKAGES = ("mcsim", "numpy", "healpy", "ducc0", "numba", "scipy", "dask", "distributed", "zarr", "xarray")
 
@@ -46,7 +46,7 @@ def wanted(run: config.RunConfig, part: slice | None) -> range:
     start, stop = part.start or 0, total if part.stop is None else part.stop
     if not 0 <= start < stop <= total:
         raise InputError(
-            f"The slice {start}:{stop} of realizations is not within 0:{total}; choose A < B up to ensemble.realizations."
+            f"The slice {start}:{stop} of realizations is not within 0:{total} (ensemble.realizations); choose A < B."
         )
     return range(start, stop)
 
@@ -68,7 +68,10 @@ def layout(survey: Survey) -> Layout:
 
 
 def _chunked(bare: Layout, chunk: int | None) -> Layout:
-    """About 128 chunks, which keeps files few and tasks many, unless a chunk would pass 64 MiB. Powers of two, as the tree of sums needs."""
+    """About 128 chunks, which keeps files few and tasks many, unless a chunk would pass 64 MiB.
+
+    Powers of two, as the tree of sums needs.
+    """
     if chunk is None:
         chunk = 1
         while chunk * CHUNKS < bare.realizations and 2 * chunk * bare.realization_bytes() <= CHUNK_BYTES:
@@ -85,7 +88,7 @@ def recipe(survey: Survey) -> summary.Recipe:
 
 
 def attributes(run: config.RunConfig) -> dict[str, Any]:
-    """Attributes of a store: the resolved configuration (without what leaves the result alone), its hash, conventions, versions."""
+    """Attributes of a store: configuration (without what leaves the result alone), hash, conventions, versions."""
     resolved = config.resolved(run)
     del resolved["compute"]
     return {
@@ -112,7 +115,8 @@ def check_same(path: Path, run: config.RunConfig) -> None:
         changes.append(f"ensemble.keep_maps: {kept} -> {run.ensemble.keep_maps}")
     if changes:
         raise InputError(
-            f"{path} was made with another configuration ({'; '.join(changes)}); choose another store with -o, or restore the values."
+            f"{path} was made with another configuration ({'; '.join(changes)}); "
+            "choose another store with -o, or restore the values."
         )
 
 

@@ -91,4 +91,6 @@ class _Lines:
         share = f"{finished:g}/{self.total:g} {self.unit}" if self.unit else f"{100 * finished / self.total:.0f} %"
         speed, left = self.rate.text(finished, failed), self.rate.left_s(finished)
         parts = [share, speed, f"{left:.0f} s left" if 0 < left < float("inf") else ""]
-        self.console.print(f"{self.label}: {', '.join(part for part in parts if part)}", highlight=False, soft_wrap=True)
+        self.console.print(
+            f"{self.label}: {', '.join(part for part in parts if part)}", highlight=False, soft_wrap=True
+        )

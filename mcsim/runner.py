@@ -1,7 +1,7 @@
 """The batch: one Dask task per chunk of realizations, results from worker to store, a tree of sums to the summary.
 
-The only module that touches dask. Nothing large is in the graph: tasks carry the configuration as text and load beams and
-moments on the worker, once.
+The only module that touches dask. Nothing large is in the graph: tasks carry the configuration as text and load beams
+and moments on the worker, once.
 """
 
 import os
@@ -144,12 +144,17 @@ def _merge_chunk(sources: list[Path], target: Path, start: int, stop: int) -> No
         rows = store.read(source, start, stop, maps=True)
         present = rows["done"]
         if not merged:
-            merged = {name: np.full((stop - start, *a.shape[1:]), False if name == "done" else np.nan, a.dtype) for name, a in rows.items()}  # fmt: skip
+            merged = {name: _empty(stop - start, a) for name, a in rows.items()}
         for name, array in rows.items():
             merged[name][: len(present)][present] = array[present]
     done = merged.pop("done")
     if done.any():
         store.write(target, start, merged, done)
+
+
+def _empty(count: int, like: NDArray) -> NDArray:
+    """Rows of realizations that do not exist: not done, or NaN."""
+    return np.full((count, *like.shape[1:]), False if like.dtype == bool else np.nan, like.dtype)
 
 
 @contextmanager
@@ -174,7 +179,7 @@ def local_client(workers: int) -> Iterator[Client]:
 
 @contextmanager
 def _connected(client: Client | None, scheduler: str | None, workers: int) -> Iterator[Client]:
-    """The client to work with: the given one, one of a running scheduler, or one of a local cluster that ends with it."""
+    """The client to work with: the given one, that of a running scheduler, or one of a local cluster."""
     if client is not None:
         yield client
     elif scheduler is None:
@@ -252,7 +257,7 @@ def realize_chunk(
             continue
         for name, value in values.items():
             if name not in rows:
-                rows[name] = np.full((stop - start, *value.shape), np.nan, value.dtype)
+                rows[name] = _empty(stop - start, value[None])
             rows[name][r - start] = value
         done[r - start] = True
         computed += 1

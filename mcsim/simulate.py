@@ -40,8 +40,8 @@ def realize(survey: Survey, realization: int, nthreads: int = 1) -> dict[str, ND
     Returns
     -------
     dict
-        ``biposh`` (pair, mode, lmax + 1) complex and ``cl`` (pair, lmax + 1), uK^2; with pairing the same of the circular
-        twin, ``biposh_circular`` and ``cl_circular``; with kept maps ``map`` (map, npix), uK.
+        ``biposh`` (pair, mode, lmax + 1) complex and ``cl`` (pair, lmax + 1), uK^2; with pairing the same of the
+        circular twin, ``biposh_circular`` and ``cl_circular``; with kept maps ``map`` (map, npix), uK.
     """
     ensemble = survey.config.ensemble
     sky = draw_sky(survey, realization)
@@ -93,9 +93,9 @@ def _observe(survey: Survey, channel: Channel, sky: Alm, realization: int, nthre
         if m.moments.dtheta is not None and gradient is not None:
             extra = convolve.centroid_map(gradient, m.moments)
         if m.noise_uk is not None:
-            noise = m.noise_uk * rng.generator(
-                run.ensemble.seed, realization, f"noise/{m.name}"
-            ).standard_normal(m.noise_uk.size)
+            noise = m.noise_uk * rng.generator(run.ensemble.seed, realization, f"noise/{m.name}").standard_normal(
+                m.noise_uk.size
+            )
             extra = noise if extra is None else extra + noise
         difference = convolve.noncircular_map(spins, m.moments) if spins else None
         if _is_exact(survey, m):
@@ -114,7 +114,7 @@ def _observe(survey: Survey, channel: Channel, sky: Alm, realization: int, nthre
 
 
 def _is_exact(survey: Survey, m: SurveyMap) -> bool:
-    """Whether the circular twin's a_lm are known without making its map: all sky, no noise, nothing beyond the analysis."""
+    """Whether the twin's a_lm are known without making its map: all sky, no noise, no power beyond the analysis."""
     return m.weight is None and m.noise_uk is None and survey.config.sky.lmax == survey.lmax
 
 
@@ -132,7 +132,9 @@ def _read_alm(path: Path, lmax: int) -> Alm:
     try:
         alm, mmax = healpy.read_alm(path, return_mmax=True)
     except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
-        raise InputError(f"{path} cannot be read as a_lm ({error}); give a FITS file as healpy.write_alm makes it.") from error
+        raise InputError(
+            f"{path} cannot be read as a_lm ({error}); give a FITS file as healpy.write_alm makes it."
+        ) from error
     found = healpy.Alm.getlmax(alm.size, mmax)
     if mmax != found or found < lmax:
         raise InputError(f"{path} holds a_lm up to l = {found}, m = {mmax}; the sky needs both up to {lmax}.")

@@ -1,8 +1,8 @@
 """Streaming means, standard deviations and covariances, merged by a fixed tree.
 
 A reduction is chunk -> combine -> finalise. Leaves are single realizations; the tree over them is the binary tree of
-their indices, so the result is the same bit for bit whatever the chunks, workers and order of arrival, and a missing realization
-leaves the shape of the tree unchanged.
+their indices, so the result is the same bit for bit whatever the chunks, workers and order of arrival, and a missing
+realization leaves the shape of the tree unchanged.
 """
 
 from collections.abc import Callable
@@ -39,7 +39,9 @@ class Sums:
 def leaf(values: dict[str, Array], covariance_of: tuple[str, ...] = ()) -> Sums:
     """Statistics of one realization."""
     square = {name: np.zeros(np.shape(x)) for name, x in values.items()}
-    comoment = {name: np.zeros((*values[name].shape, values[name].shape[-1]), values[name].dtype) for name in covariance_of}
+    comoment = {
+        name: np.zeros((*values[name].shape, values[name].shape[-1]), values[name].dtype) for name in covariance_of
+    }
     return Sums(1, dict(values), square, comoment)
 
 

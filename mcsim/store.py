@@ -40,7 +40,12 @@ class Layout:
     def variables(self) -> dict[str, tuple[tuple[str, ...], str, str, str]]:
         """Dimensions, type, unit and long name of every array over realizations."""
         spectra = {
-            "biposh": (("pair", "mode", "ell"), "complex128", "uK^2", "BipoSH coefficient A^{LM}_{l2-d,l2} at ell = l2"),
+            "biposh": (
+                ("pair", "mode", "ell"),
+                "complex128",
+                "uK^2",
+                "BipoSH coefficient A^{LM}_{l2-d,l2} at ell = l2",
+            ),
             "cl": (("pair", "ell"), "float64", "uK^2", "power spectrum C_l"),
         }
         found = dict(spectra)
@@ -180,7 +185,8 @@ def open_ensemble(path: str | Path) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        ``biposh``, ``cl``, their circular twins, ``done``; coordinates realization, pair, mode (with L, M, d, parity), ell.
+        ``biposh``, ``cl``, their circular twins, ``done``; coordinates realization, pair, mode (with L, M, d, parity),
+        ell.
         ``.sel(mode="L2M0d0")`` picks a spectrum.
 
     Raises
@@ -202,7 +208,9 @@ def open_summary(path: str | Path) -> xr.Dataset:
     """
     attributes(Path(path))
     if not (Path(path) / "summary").is_dir():
-        raise InputError(f"{path} has no summary, because no run on it has ended yet; continue it with mcsim run --resume.")
+        raise InputError(
+            f"{path} has no summary, because no run on it has ended yet; continue it with mcsim run --resume."
+        )
     return xr.open_zarr(path, group="summary")
 
 
@@ -253,7 +261,7 @@ def _member(group: zarr.Group, name: str) -> zarr.Array:
 
 
 def _over_realizations(array: zarr.Array) -> bool:
-    return array.metadata.dimension_names is not None and array.metadata.dimension_names[0] == "realization"
+    return (getattr(array.metadata, "dimension_names", None) or ("",))[0] == "realization"
 
 
 def _consolidate(path: Path) -> None:

@@ -181,7 +181,9 @@ def _survey_map(
 ) -> SurveyMap:
     observed = moments.hits > 0
     if not observed.any():
-        raise InputError(f"The scan of map {name} hits no pixel of nside {moments.nside}; check the scan of the channel.")
+        raise InputError(
+            f"The scan of map {name} hits no pixel of nside {moments.nside}; check the scan of the channel."
+        )
     weight = observed.astype(float)
     if run.biposh.weighting == "hits":
         weight *= moments.hits
@@ -224,5 +226,7 @@ def _overlap(x: SurveyMap, y: SurveyMap) -> float:
     product = (1.0 if x.weight is None else x.weight) * (1.0 if y.weight is None else y.weight)
     overlap = float(np.mean(product))
     if overlap <= 0.0:
-        raise InputError(f"Maps {x.name} and {y.name} share no pixel, so they have no cross spectra; set pairs = \"auto\".")
+        raise InputError(
+            f'Maps {x.name} and {y.name} share no pixel, so they have no cross spectra; set pairs = "auto".'
+        )
     return overlap

@@ -58,8 +58,6 @@ def _rising(x: Table, k: int) -> Table:
     return product
 
 
-
-
 def band(L_max: int, M: int, d: int, lmax: int) -> Band:
     r"""Tables of the Clebsch-Gordan band of order M and offset d = l2 - l1 for l2 <= lmax.
 
@@ -78,8 +76,8 @@ def band(L_max: int, M: int, d: int, lmax: int) -> Band:
     -----
     At L = |d| >= M the larger of l1, l2 is the stretched sum of the others, at L = M > |d| the order is stretched;
     both are single products (Varshalovich et al. 1988, 8.5.1). The recursion in L is that of Schulten & Gordon (1975),
-    J. Math. Phys. 16, 1961, run upwards from the bottom of the range, where L << l keeps it stable. Measured against exact
-    integer arithmetic: below 1e-12 of the largest coefficient for l <= 2000, L <= 8
+    J. Math. Phys. 16, 1961, run upwards from the bottom of the range, where L << l keeps it stable. Against
+    exact integer arithmetic: below 1e-13 of the largest coefficient for l <= 2000, L <= 8
     (``tests/unit/test_wigner.py``).
     """
     l2 = np.arange(lmax + 1, dtype=np.float64)
@@ -124,7 +122,7 @@ def band(L_max: int, M: int, d: int, lmax: int) -> Band:
         scale = lead * (2 * L + 1) / np.sqrt(2 * L + 1)
         constant[row, valid] = -scale * (M * (j1 * (j1 + 1) - j2 * (j2 + 1)) + L * (L + 1) * M)
         slope[row, valid] = scale * 2 * L * (L + 1)
-        if L > L_min:
+        if L_min < L:
             previous[row, valid] = -lead * (L + 1) * root(L) / np.sqrt(2 * L - 1)
     return Band(M, d, L_min, L_max, norm, _rising(x, a), _rising(x, b), shift_a, shift_b, constant, slope, previous)
 
@@ -132,11 +130,9 @@ def band(L_max: int, M: int, d: int, lmax: int) -> Band:
 def evaluate(tables: Band, L: int, l2: int, m1: int) -> float:
     """One coefficient (-1)^{m2} C^{LM}_{l1 m1 l2 -m2}, l1 = l2 - d, m2 = m1 - M: the recursion spelled out."""
     l1, m2 = l2 - tables.d, m1 - tables.M
-    if l1 < 0 or abs(m1) > l1 or abs(m2) > l2 or L > l1 + l2:
+    if l1 < 0 or abs(m1) > l1 or abs(m2) > l2 or l1 + l2 < L:
         return 0.0
-    value = (
-        tables.norm[l2] * tables.rising_a[l2 - m1 + tables.shift_a] * tables.rising_b[l2 + m1 + tables.shift_b]
-    )
+    value = tables.norm[l2] * tables.rising_a[l2 - m1 + tables.shift_a] * tables.rising_b[l2 + m1 + tables.shift_b]
     before = 0.0
     for row in range(L - tables.L_min):
         step = tables.constant[row, l2] + tables.slope[row, l2] * m1

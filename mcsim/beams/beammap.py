@@ -151,8 +151,8 @@ def read_map(
     -----
     Projections differ at third order in the distance. For the WMAP-7 maps with a cut of 3.5 deg (projection not
     recorded), orthographic for equidistant changes B_l by at most 3e-5 of B_0 and b_l2 by at most 2e-4 of the largest
-    |b_l2| in V and W, 8e-5 and 4e-4 in K. The plane of projection is taken to touch the sphere at the beam's centre; that the
-    WMAP maps have the optic axis there, up to 3 deg away, is of the same order.
+    |b_l2| in V and W, 8e-5 and 4e-4 in K. The plane of projection is taken to touch the sphere at the beam's centre;
+    that the WMAP maps have the optic axis there, up to 3 deg away, is of the same order.
     """
     if projection not in get_args(Projection):
         raise InputError(f"projection = {projection!r} is not one of {', '.join(get_args(Projection))}")
@@ -321,7 +321,7 @@ def holds_image(path: str | Path) -> bool:
         with opened(Path(path)) as hdus:
             return any(hdu.is_image and hdu.header.get("NAXIS", 0) >= 2 for hdu in hdus)
     except READ_ERRORS as error:
-        raise InputError(f"{path} cannot be read as a FITS file ({error}): give a beam map or a file of b_lm") from error
+        raise InputError(f"{path} cannot be read as a FITS file ({error}): give a beam map or b_lm") from error
 
 
 def _read_image(path: Path, plane: int) -> tuple[NDArray[np.float64], fits.Header]:

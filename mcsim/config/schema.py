@@ -217,8 +217,8 @@ class Biposh:
 class Ensemble:
     """Realizations 0 .. realizations - 1 of the seed; ``paired`` adds the circular twin of every one."""
 
-    realizations: Annotated[int, Field(ge=1, le=10_000_000)]
-    seed: Annotated[int, Field(ge=0, le=2**63 - 1)]
+    realizations: Annotated[int, Field(ge=1, le=10_000_000)] = 100
+    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0
     paired: bool = True
     keep_maps: bool = False
 
@@ -241,7 +241,7 @@ class RunConfig:
     map: Map
     channels: Annotated[tuple[Channel, ...], Field(alias="channel", min_length=1)]
     biposh: Biposh = Biposh()
-    ensemble: Ensemble
+    ensemble: Ensemble = Ensemble()
     compute: Compute = Compute()
 
     @model_validator(mode="after")

@@ -70,7 +70,9 @@ def _draw(modes: xr.Dataset, panels: list[tuple[int, int]], title: str) -> Figur
         axes.set_ylabel(rf"$\ell(\ell+1)A^{{{L}{M}}}/2\pi$  [$\mu$K$^2$]")
         axes.legend(fontsize=8, frameon=False)
     if paired:
-        figure.supxlabel("points: non-circular minus circular twin;  band: plain mean and its standard error", fontsize=9)
+        figure.supxlabel(
+            "points: non-circular minus circular twin;  band: plain mean and its standard error", fontsize=9
+        )
     return figure
 
 

@@ -45,13 +45,21 @@ def test_store_holds_what_a_realization_gives(small_store: Path) -> None:
 def test_summary_is_that_of_the_realizations(small_store: Path) -> None:
     with open_ensemble(small_store) as stored, store.open_summary(small_store) as summary:
         difference = (stored.biposh - stored.biposh_circular).values
-        for name, sample in {"biposh": stored.biposh.values, "biposh_difference": difference, "cl": stored.cl.values}.items():
+        for name, sample in {
+            "biposh": stored.biposh.values,
+            "biposh_difference": difference,
+            "cl": stored.cl.values,
+        }.items():
             np.testing.assert_allclose(summary[f"{name}_mean"], sample.mean(axis=0), rtol=1e-12, atol=1e-12)
             deviation = sample.std(axis=0, ddof=1)
             np.testing.assert_allclose(summary[f"{name}_standard_deviation"], deviation, rtol=1e-9, atol=1e-12)
-            np.testing.assert_allclose(summary[f"{name}_standard_error"], deviation / np.sqrt(10), rtol=1e-9, atol=1e-12)
+            np.testing.assert_allclose(
+                summary[f"{name}_standard_error"], deviation / np.sqrt(10), rtol=1e-9, atol=1e-12
+            )
         factor = summary.bin_factor.values
-        bins = np.array([np.nanmean((factor * stored.biposh.values[:, 0])[..., a : a + 10], axis=-1) for a in (0, 10, 20)])
+        bins = np.array(
+            [np.nanmean((factor * stored.biposh.values[:, 0])[..., a : a + 10], axis=-1) for a in (0, 10, 20)]
+        )
         binned = np.moveaxis(bins, 0, -1)
         np.testing.assert_allclose(summary.biposh_binned_mean[0, :, :3], binned.mean(axis=0), rtol=1e-10, atol=1e-12)
         for mode in range(summary.sizes["mode"]):
@@ -80,7 +88,9 @@ def test_interrupted_run_continues_to_the_same_bits(small_store: Path, client: C
     assert_same(path, small_store)
 
 
-def test_extension_keeps_what_is_there_and_gives_the_bits_of_one_run(small_store: Path, client: Client, tmp_path: Path) -> None:
+def test_extension_keeps_what_is_there_and_gives_the_bits_of_one_run(
+    small_store: Path, client: Client, tmp_path: Path
+) -> None:
     path = tmp_path / "extended.zarr"
     assert runner.run(table(**ensemble(3)), path, client=client).computed == 3
     assert runner.run(table(**ensemble(10)), path, client=client).computed == 7
@@ -121,7 +131,7 @@ def test_another_configuration_is_refused_by_name(small_store: Path, client: Cli
 
 
 def test_resume_needs_a_store(client: Client, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no store .* to resume"):
+    with pytest.raises(InputError, match=r"no store .* to resume"):
         runner.run(table(), tmp_path / "none.zarr", resume=True, client=client)
     assert list(tmp_path.iterdir()) == []
 

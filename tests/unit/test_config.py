@@ -251,7 +251,7 @@ WRONG = [
     (
         BEAM,
         {"kind": "map", "path": "beam.fits", "map": 0},
-        r"channel\[W1\]\.beam\.map is unknown.* kind, path, pixel_deg, cut_deg, m_max",
+        r"channel\[W1\]\.beam\.map is unknown.* kind, path, pixel_deg, cut_deg, centre_pixel, plane, projection, m_max",
     ),
     (BEAM, {"kind": "blm", "path": "{split}.fits"}, r"use \{channel\} only"),
     (

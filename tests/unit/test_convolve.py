@@ -22,7 +22,9 @@ def beam() -> Beam:
     blm = np.zeros((MMAX + 1, LMAX + 1), complex)
     for m in range(MMAX + 1):
         phase = np.exp(2j * np.pi * rng.random(LMAX + 1)) if m else 1.0
-        blm[m] = np.where(ell >= m, np.sqrt((2 * ell + 1) / (4 * np.pi)) * np.exp(-((ell / 150.0) ** 2)) / (1 + m) * phase, 0)
+        blm[m] = np.where(
+            ell >= m, np.sqrt((2 * ell + 1) / (4 * np.pi)) * np.exp(-((ell / 150.0) ** 2)) / (1 + m) * phase, 0
+        )
     return Beam(blm)
 
 
@@ -82,9 +84,7 @@ def test_beam_turned_against_the_scan_cancels(beam: Beam, sky: np.ndarray, psi: 
     """A beam rotated by +a and samples rotated by -a give the same map."""
     angle = 0.7
     turned = Beam(beam.blm * np.exp(-1j * angle * np.arange(MMAX + 1))[:, None])
-    first = convolve.noncircular_map(
-        convolve.spin_maps(sky, convolve.response(beam, LMAX), NSIDE), moments(psi, MMAX)
-    )
+    first = convolve.noncircular_map(convolve.spin_maps(sky, convolve.response(beam, LMAX), NSIDE), moments(psi, MMAX))
     second = convolve.noncircular_map(
         convolve.spin_maps(sky, convolve.response(turned, LMAX), NSIDE), moments(psi - angle, MMAX)
     )
@@ -105,7 +105,9 @@ def test_centroid_is_the_first_order_of_a_shift(sky: np.ndarray) -> None:
     theta, phi = healpy.pix2ang(NSIDE, np.arange(npix))
     smooth = alm_.multiply(sky, np.exp(-((np.arange(LMAX + 1) / 60.0) ** 2)), LMAX)
     moved = np.stack([theta + d[0], (phi + d[1] / np.sin(theta)) % (2 * np.pi)], axis=1)
-    at_sample = ducc0.sht.synthesis_general(alm=smooth[None], lmax=LMAX, spin=0, loc=moved, epsilon=1e-13, nthreads=1)[0]
+    at_sample = ducc0.sht.synthesis_general(alm=smooth[None], lmax=LMAX, spin=0, loc=moved, epsilon=1e-13, nthreads=1)[
+        0
+    ]
     centre = healpix.synthesis(smooth[None], NSIDE, LMAX)[0]
     placed = Moments(NSIDE, "ecliptic", np.ones(npix), np.zeros((1, npix), complex), d[0], d[1])
     found = convolve.centroid_map(healpix.gradient(smooth, NSIDE, LMAX), placed)

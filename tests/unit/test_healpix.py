@@ -1,3 +1,5 @@
+import itertools
+
 import healpy
 import numpy as np
 import pytest
@@ -34,7 +36,7 @@ def test_every_iteration_gains_a_decade() -> None:
     map_ = healpix.synthesis(sky[None], nside, lmax)[0]
     errors = [error(healpix.analysis(map_, lmax, n), sky) for n in range(4)]
     assert errors[0] < 1e-3
-    assert all(after < before / 10 for before, after in zip(errors, errors[1:], strict=False))
+    assert all(after < before / 10 for before, after in itertools.pairwise(errors))
 
 
 def test_gradient_against_finite_differences() -> None:
@@ -56,7 +58,7 @@ def test_gradient_against_finite_differences() -> None:
 
 
 def test_pixel_window_against_the_power_of_pixels() -> None:
-    """w_l^2 is the mean over pixels of 4 pi / (2l+1) sum_m |w_lm|^2: pixel indicators on a grid 64 times finer, nside 2."""
+    """w_l^2 is the mean over pixels of 4 pi / (2l+1) sum_m |w_lm|^2, here of indicators on a grid 64 times finer."""
     nside, fine, lmax = 2, 128, 6
     ratio = (fine // nside) ** 2
     power = np.zeros(lmax + 1)

@@ -14,7 +14,8 @@ def leaves(n: int, missing: tuple[int, ...] = ()):
 def test_against_numpy(n: int) -> None:
     x, node = leaves(n)
     sums = statistics.tree(node, n)
-    assert sums is not None and sums.count == n
+    assert sums is not None
+    assert sums.count == n
     np.testing.assert_allclose(sums.mean["x"], x.mean(axis=0), rtol=1e-13)
     np.testing.assert_allclose(statistics.standard_deviation(sums, "x"), x.std(axis=0, ddof=1), rtol=1e-13)
     for pair in range(3):
@@ -34,7 +35,8 @@ def test_result_does_not_depend_on_chunks_bit_for_bit(size: int) -> None:
         return statistics.tree(lambda i: node(start + i), min(size, n - start))
 
     chunked = statistics.tree(chunk, -(-n // size))
-    assert whole is not None and chunked is not None
+    assert whole is not None
+    assert chunked is not None
     assert whole.count == chunked.count == n - len(missing)
     for kind in ("mean", "square", "comoment"):
         np.testing.assert_array_equal(getattr(whole, kind)["x"], getattr(chunked, kind)["x"])

@@ -1,0 +1,322 @@
+"""The pairs of pixels that a differencing scan sees at once: counted, merged, kept on disk, shared by all realizations."""
+
+import hashlib
+import json
+import shutil
+import tempfile
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mcsim.errors import InputError
+from mcsim.scan.cache import default_cache_dir
+from mcsim.scan.geometry import check_frame, check_nside
+from mcsim.scan.model import LineOfSight, ScanModel
+from mcsim.scan.pointing import BLOCK, PointingStream, fill_block, ring_pixel
+from mcsim.tod import sample_range
+
+ALGORITHM = 1
+"""Raised whenever the same numbers would give other pairs."""
+
+RANGES = 16
+"""Parts of the survey that threads share out; fixed, so that sums do not depend on the number of threads."""
+
+CHUNK = 1 << 20
+_BAND = 1 << 27
+_META = "pairs.json"
+
+
+@dataclass(frozen=True)
+class DifferencingScan:
+    """What map-making needs to know about the pointing of two beams that are read as a difference.
+
+    Parameters
+    ----------
+    model, side_a, side_b
+        The survey and its two lines of sight, of one sampling rate.
+    nside, frame
+        Of the map.
+    time_range
+        Part of the survey, as fractions of its samples.
+    hits_a, hits_b
+        Samples with side A, side B in a pixel, shape (npix,).
+    row_start
+        Pixel i is seen together with the pixels ``partner[row_start[i]:row_start[i + 1]]``; shape (npix + 1,).
+    partner, count
+        Partners of every pixel in increasing order, and how often the two were seen at once with whichever side on
+        whichever pixel: the off-diagonal part of the normal matrix, symmetric, compressed by rows.
+    """
+
+    model: ScanModel
+    side_a: LineOfSight
+    side_b: LineOfSight
+    nside: int
+    frame: str
+    time_range: tuple[float, float]
+    hits_a: NDArray[np.float64]
+    hits_b: NDArray[np.float64]
+    row_start: NDArray[np.int64]
+    partner: NDArray[np.int32]
+    count: NDArray[np.unsignedinteger]
+
+    @property
+    def npix(self) -> int:
+        """Number of pixels."""
+        return int(self.hits_a.size)
+
+    @property
+    def samples(self) -> int:
+        """Number of differences."""
+        first, last = sample_range(self.model, self.side_a, self.time_range)
+        return last - first
+
+
+def prepare(
+    model: ScanModel,
+    pair: str,
+    nside: int,
+    frame: str = "ecliptic",
+    time_range: tuple[float, float] = (0.0, 1.0),
+    cache_dir: str | Path | None = None,
+    nthreads: int = 1,
+    progress: Callable[[float], None] | None = None,
+) -> DifferencingScan:
+    """Pairs of pixels of a differencing scan, computed once and memory-mapped from then on.
+
+    Parameters
+    ----------
+    model, pair
+        The survey and the name of one of its differencing pairs (assemblies).
+    nside, frame
+        Of the map: HEALPix resolution, and "ecliptic", "galactic" or "equatorial".
+    time_range
+        Part of the survey, as fractions of its samples.
+    cache_dir
+        Where to keep the pairs; None: the folder of :func:`mcsim.scan.cache.default_cache_dir`.
+    nthreads
+        Number of threads; the result does not depend on it, bit for bit.
+    progress
+        Called with the fraction done.
+
+    Raises
+    ------
+    InputError
+        If the pair is unknown or its sides are sampled at different rates, nside, frame or time range cannot be used,
+        or the cache cannot be written.
+
+    Notes
+    -----
+    While it works it needs 8 bytes per sample on disk and 0.6 GB of memory per thread. What stays on disk is 5 to 8
+    bytes for each of the at most 2 x samples ordered pairs of pixels.
+    """
+    check_nside(nside)
+    check_frame(frame)
+    side_a, side_b = model.pair(pair)
+    if model.period_of_samples(side_a) != model.period_of_samples(side_b):
+        raise InputError(
+            f"pair {pair!r} samples side A every {model.period_of_samples(side_a):g} s and side B every "
+            f"{model.period_of_samples(side_b):g} s, but a difference needs one rate; give both the same sample_period_s."
+        )
+    sample_range(model, side_a, time_range)
+    root = default_cache_dir() if cache_dir is None else Path(cache_dir)
+    folder = root / f"pairs-{_key(model, side_a, side_b, nside, frame, time_range)}"
+    if not folder.is_dir():
+        try:
+            root.mkdir(parents=True, exist_ok=True)
+            temporary = Path(tempfile.mkdtemp(prefix="partial-", dir=root))
+        except OSError as error:
+            raise InputError(
+                f"cache folder {str(root)!r} cannot be written ({error.strerror}); set MCSIM_CACHE to one that can."
+            ) from None
+        try:
+            _write(temporary, model, (side_a, side_b), nside, frame, time_range, max(1, nthreads), progress)
+            try:
+                temporary.rename(folder)
+            except OSError:
+                # Another process was faster; its pairs are the same.
+                if not folder.is_dir():
+                    raise
+        except OSError as error:
+            raise InputError(
+                f"pairs cannot be written to {str(root)!r} ({error.strerror}); make room or set MCSIM_CACHE elsewhere."
+            ) from None
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+    arrays = _load(folder, 12 * nside * nside)
+    return DifferencingScan(model, side_a, side_b, nside, frame, time_range, **arrays)
+
+
+def ranges(scan_samples: tuple[int, int], parts: int = RANGES) -> list[tuple[int, int]]:
+    """Cut [first, last) into at most ``parts`` ranges."""
+    first, last = scan_samples
+    edges = [first + (last - first) * part // parts for part in range(parts + 1)]
+    return [(low, high) for low, high in zip(edges, edges[1:], strict=False) if high > low]
+
+
+def _key(
+    model: ScanModel, side_a: LineOfSight, side_b: LineOfSight, nside: int, frame: str, time_range: tuple[float, float]
+) -> str:
+    """SHA-256 of every number that the pairs depend on."""
+    everything = {
+        "algorithm": ALGORITHM,
+        "spin": [model.spin_period_s, model.spin_phase_deg],
+        "precession": [model.precession_period_s, model.precession_angle_deg, model.precession_phase_deg],
+        "orbit": [model.orbit_period_s, model.orbit_phase_deg],
+        "duration_days": model.duration_days,
+        "sides": [[side.boresight_angle_deg, side.azimuth_deg] for side in (side_a, side_b)],
+        "sample_period_s": model.period_of_samples(side_a),
+        "time_range": [float(edge) for edge in time_range],
+        "nside": nside,
+        "frame": frame,
+    }
+    return hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()
+
+
+def _load(folder: Path, npix: int) -> dict[str, Any]:
+    try:
+        meta = json.loads((folder / _META).read_text())
+        arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in ("hits_a", "hits_b", "row_start")}
+        shape = (meta["pairs"],)
+        arrays["partner"] = np.memmap(folder / "partner.raw", dtype=np.int32, mode="r", shape=shape)
+        arrays["count"] = np.memmap(folder / "count.raw", dtype=meta["count"], mode="r", shape=shape)
+        if arrays["row_start"].shape != (npix + 1,) or arrays["row_start"][-1] != meta["pairs"]:
+            raise ValueError("its arrays do not fit each other")
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(
+            f"folder {str(folder)!r} does not hold complete pairs ({error}); delete it and compute them again."
+        ) from None
+    return arrays
+
+
+def _write(
+    folder: Path,
+    model: ScanModel,
+    sides: tuple[LineOfSight, LineOfSight],
+    nside: int,
+    frame: str,
+    time_range: tuple[float, float],
+    nthreads: int,
+    progress: Callable[[float], None] | None,
+) -> None:
+    first, last = sample_range(model, sides[0], time_range)
+    npix = 12 * nside * nside
+    pixels = np.memmap(folder / "samples.raw", dtype=np.int32, mode="w+", shape=(2, last - first))
+    with ThreadPoolExecutor(nthreads) as pool:
+        jobs = [
+            pool.submit(_stream, PointingStream(model, line, frame), low, high, nside, pixels[side, low - first : high - first])
+            for low, high in ranges((first, last))
+            for side, line in enumerate(sides)
+        ]
+        for done, job in enumerate(jobs):
+            job.result()
+            if progress is not None:
+                progress(0.5 * (done + 1) / len(jobs))
+        hits = [np.bincount(side, minlength=npix).astype(np.float64) for side in pixels]
+        entries = hits[0] + hits[1]
+        # No pair can be more frequent than the pixel with the most samples.
+        count_type = next(kind for kind in (np.uint8, np.uint16, np.uint32) if entries.max() <= np.iinfo(kind).max)
+        row_start = np.zeros(npix + 1, dtype=np.int64)
+        bands = _bands(entries)
+        with (folder / "partner.raw").open("wb") as partner_file, (folder / "count.raw").open("wb") as count_file:
+            for group in range(0, len(bands), nthreads):
+                merged = pool.map(lambda band: _band(pixels, entries, *band), bands[group : group + nthreads])
+                for (low, high), (partner, count, lengths) in zip(bands[group : group + nthreads], merged, strict=True):
+                    partner.tofile(partner_file)
+                    count.astype(count_type).tofile(count_file)
+                    row_start[low + 1 : high + 1] = lengths
+                if progress is not None:
+                    progress(0.5 + 0.5 * min(1.0, (group + nthreads) / len(bands)))
+    np.cumsum(row_start, out=row_start)
+    np.save(folder / "row_start.npy", row_start)
+    np.save(folder / "hits_a.npy", hits[0])
+    np.save(folder / "hits_b.npy", hits[1])
+    del pixels
+    (folder / "samples.raw").unlink()
+    (folder / _META).write_text(json.dumps({"pairs": int(row_start[-1]), "count": np.dtype(count_type).name}))
+
+
+def _stream(stream: PointingStream, low: int, high: int, nside: int, pixels: NDArray[np.int32]) -> None:
+    for first in range(low, high, CHUNK):
+        count = min(CHUNK, high - first)
+        part = pixels[first - low : first - low + count]
+        start = stream.start_turns(first)
+        _pixels(start, stream.block_turns, stream.tables, stream.geometry, stream.to_frame, nside, part)
+
+
+def _bands(entries: NDArray[np.float64]) -> list[tuple[int, int]]:
+    """Bands of pixels with at most _BAND entries each (or one pixel)."""
+    total = np.concatenate([[0], np.cumsum(entries)])
+    bands, low = [], 0
+    while low < entries.size:
+        high = max(int(np.searchsorted(total, total[low] + _BAND, side="right")) - 1, low + 1)
+        bands.append((low, min(high, entries.size)))
+        low = high
+    return bands
+
+
+def _band(
+    pixels: NDArray[np.int32], entries: NDArray[np.float64], low: int, high: int
+) -> tuple[NDArray[np.int32], NDArray[np.uint32], NDArray[np.int64]]:
+    """Merged partners and counts of the pixels low ... high - 1, and the number of partners of each."""
+    edges = np.concatenate([[0], np.cumsum(entries[low:high])]).astype(np.int64)
+    partner = np.empty(edges[-1], dtype=np.int32)
+    _collect(pixels[0], pixels[1], low, high, edges[:-1].copy(), partner)
+    count = np.empty(edges[-1], dtype=np.uint32)
+    lengths = np.empty(high - low, dtype=np.int64)
+    size = _merge(edges, np.zeros(entries.size, dtype=np.uint32), partner, count, lengths)
+    return partner[:size], count[:size], lengths
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _pixels(start, block_turns, tables, geometry, to_frame, nside, pixels):  # type: ignore[no-untyped-def]
+    work = np.empty((6, BLOCK))
+    turns = np.empty(3)
+    for block in range((pixels.size + BLOCK - 1) // BLOCK):
+        first = block * BLOCK
+        size = min(BLOCK, pixels.size - first)
+        for axis in range(3):
+            turns[axis] = (start[axis] + block * block_turns[axis]) % 1.0
+        fill_block(turns, tables, geometry, to_frame, size, work)
+        for k in range(size):
+            pixels[first + k] = ring_pixel(nside, work[5, k], work[0, k], work[1, k], work[2, k])
+
+
+@njit(cache=True, nogil=True)
+def _collect(pixel_a, pixel_b, low, high, cursor, partner):  # type: ignore[no-untyped-def]
+    """Write the partner of every sample to the rows low ... high - 1, in the order of time."""
+    for k in range(pixel_a.size):
+        a, b = pixel_a[k], pixel_b[k]
+        if low <= a < high:
+            partner[cursor[a - low]] = b
+            cursor[a - low] += 1
+        if low <= b < high:
+            partner[cursor[b - low]] = a
+            cursor[b - low] += 1
+
+
+@njit(cache=True, nogil=True)
+def _merge(edges, seen, partner, count, lengths):  # type: ignore[no-untyped-def]
+    """Merge equal partners of each row in place, in increasing order; returns the number that is left."""
+    out = 0
+    for row in range(lengths.size):
+        size = 0
+        # What is left never overtakes what is still to be read.
+        for k in range(edges[row], edges[row + 1]):
+            j = partner[k]
+            if seen[j] == 0:
+                partner[out + size] = j
+                size += 1
+            seen[j] += 1
+        partner[out : out + size].sort()
+        for k in range(out, out + size):
+            count[k] = seen[partner[k]]
+            seen[partner[k]] = 0
+        lengths[row] = size
+        out += size
+    return out
