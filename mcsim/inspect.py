@@ -90,7 +90,7 @@ def _real(summary: xr.Dataset) -> xr.Dataset:
         if coordinate.dtype == np.int64:
             real = real.assign_coords({name: coordinate.astype("int32")})
         elif coordinate.dtype.kind in "OT":
-            real = real.assign_coords({name: (coordinate.dims, coordinate.values.astype("U"), coordinate.attrs)})
+            real = real.assign_coords({name: (coordinate.dims, np.array([str(label) for label in coordinate.values]), coordinate.attrs)})
     return real
 
 

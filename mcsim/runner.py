@@ -90,6 +90,8 @@ def run(
         stored = store.done(target)
         if all(r < len(stored) and stored[r] for r in wanted):
             return Result(target, int(stored.sum()), 0, ())
+    else:
+        store.check_writable(target)
     config.check_skies(loaded, wanted)
     with reporting("orientation moments", 1.0, "", quiet) as report:
         shared = survey(loaded, nthreads=os.cpu_count() or 1, progress=report)

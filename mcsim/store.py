@@ -81,6 +81,21 @@ class Layout:
         return (len(self.variables()) + 1) * (chunks + 1) + 20
 
 
+def check_writable(path: Path) -> None:
+    """Refuse a place where no store can be made, and leave it as it was.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written.
+    """
+    folder = path.absolute().parent
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    with _refuse_unwritable(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=folder):
+        pass
+
+
 def create(path: Path, layout: Layout, attributes: Mapping[str, Any]) -> None:
     """Make an empty store at ``path``, whole or not at all.
 

@@ -27,8 +27,8 @@ from mcsim.scan.geometry import check_nside
 from mcsim.scan.model import LineOfSight, ScanModel
 from mcsim.scan.pointing import BLOCK, PointingStream, fill_block, ring_pixel
 
-CHUNK = 1 << 19
-"""Samples of a chunk: 25 MB of arrays, and enough of them that the interpolation does not wait for its set-up."""
+CHUNK = 1 << 18
+"""Samples of a chunk: 12 MB of arrays, and enough of them that the interpolation does not wait for its set-up."""
 
 EPSILON = 1e-10
 """Accuracy asked of the interpolation, relative to the signal."""
@@ -79,6 +79,11 @@ def sample_range(model: ScanModel, line: LineOfSight, time_range: tuple[float, f
     return first, last
 
 
+def chunks(first: int, last: int) -> list[tuple[int, int]]:
+    """Cut the samples first ... last - 1 into chunks, from each one's first sample to the one after its last."""
+    return [(low, min(low + CHUNK, last)) for low in range(first, last, CHUNK)]
+
+
 def samples(
     model: ScanModel,
     line: LineOfSight,
@@ -105,8 +110,8 @@ def samples(
     stream = PointingStream(model, line, frame)
     period = model.period_of_samples(line)
     centres = healpy.pix2ang(nside, np.arange(12 * nside * nside)) if at_pixel_centres else None
-    for low in range(first, last, CHUNK):
-        count = min(CHUNK, last - low)
+    for low, high in chunks(first, last):
+        count = high - low
         angles = np.empty((3, count))
         pixel = np.empty(count, dtype=np.int64)
         start = stream.start_turns(low)
@@ -114,7 +119,7 @@ def samples(
         theta, phi, psi = angles
         if centres is not None:
             theta, phi = centres[0][pixel], centres[1][pixel]
-        yield Samples(period * np.arange(low, low + count), theta, phi, psi, pixel, np.zeros(count))
+        yield Samples(period * np.arange(low, high), theta, phi, psi, pixel, np.zeros(count))
 
 
 def dipole_alm(dipole_uk: Sequence[float] | NDArray[np.float64], lmax: int) -> NDArray[np.complex128]:
@@ -164,8 +169,8 @@ def sky_signal(
         alm[None], packed[None], separate=False, lmax=lmax, kmax=mmax, epsilon=epsilon, nthreads=nthreads
     )
 
-    def stage(chunks: Iterable[Samples]) -> Iterator[Samples]:
-        for chunk in chunks:
+    def stage(stream: Iterable[Samples]) -> Iterator[Samples]:
+        for chunk in stream:
             where = np.stack([chunk.theta, chunk.phi, chunk.psi], axis=1)
             yield replace(chunk, signal_uk=chunk.signal_uk + interpolator.interpol(where)[0])
 
@@ -175,8 +180,8 @@ def sky_signal(
 def white_noise(sigma0_uk: float, rng: np.random.Generator) -> Stage:
     """Stage that adds white noise of ``sigma0_uk`` per sample, drawn in the order of time: chunks do not matter."""
 
-    def stage(chunks: Iterable[Samples]) -> Iterator[Samples]:
-        for chunk in chunks:
+    def stage(stream: Iterable[Samples]) -> Iterator[Samples]:
+        for chunk in stream:
             noise = sigma0_uk * rng.standard_normal(chunk.signal_uk.size)
             yield replace(chunk, signal_uk=chunk.signal_uk + noise)
 

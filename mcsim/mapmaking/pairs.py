@@ -19,15 +19,14 @@ from mcsim.scan.cache import default_cache_dir
 from mcsim.scan.geometry import check_frame, check_nside
 from mcsim.scan.model import LineOfSight, ScanModel
 from mcsim.scan.pointing import BLOCK, PointingStream, fill_block, ring_pixel
-from mcsim.tod import sample_range
+from mcsim.tod import chunks, sample_range
 
 ALGORITHM = 1
 """Raised whenever the same numbers would give other pairs."""
 
-RANGES = 16
+PARTS = 16
 """Parts of the survey that threads share out; fixed, so that sums do not depend on the number of threads."""
 
-CHUNK = 1 << 20
 _BAND = 1 << 27
 _META = "pairs.json"
 
@@ -152,11 +151,11 @@ def prepare(
     return DifferencingScan(model, side_a, side_b, nside, frame, time_range, **arrays)
 
 
-def ranges(scan_samples: tuple[int, int], parts: int = RANGES) -> list[tuple[int, int]]:
-    """Cut [first, last) into at most ``parts`` ranges."""
-    first, last = scan_samples
-    edges = [first + (last - first) * part // parts for part in range(parts + 1)]
-    return [(low, high) for low, high in zip(edges, edges[1:], strict=False) if high > low]
+def parts(first: int, last: int) -> list[list[tuple[int, int]]]:
+    """Chunks of the samples first ... last - 1 in at most PARTS consecutive groups."""
+    everything = chunks(first, last)
+    edges = [len(everything) * part // PARTS for part in range(PARTS + 1)]
+    return [everything[low:high] for low, high in zip(edges, edges[1:], strict=False) if high > low]
 
 
 def _key(
@@ -209,8 +208,8 @@ def _write(
     pixels = np.memmap(folder / "samples.raw", dtype=np.int32, mode="w+", shape=(2, last - first))
     with ThreadPoolExecutor(nthreads) as pool:
         jobs = [
-            pool.submit(_stream, PointingStream(model, line, frame), low, high, nside, pixels[side, low - first : high - first])
-            for low, high in ranges((first, last))
+            pool.submit(_stream, PointingStream(model, line, frame), part, nside, pixels[side, part[0][0] - first :])
+            for part in parts(first, last)
             for side, line in enumerate(sides)
         ]
         for done, job in enumerate(jobs):
@@ -241,12 +240,10 @@ def _write(
     (folder / _META).write_text(json.dumps({"pairs": int(row_start[-1]), "count": np.dtype(count_type).name}))
 
 
-def _stream(stream: PointingStream, low: int, high: int, nside: int, pixels: NDArray[np.int32]) -> None:
-    for first in range(low, high, CHUNK):
-        count = min(CHUNK, high - first)
-        part = pixels[first - low : first - low + count]
-        start = stream.start_turns(first)
-        _pixels(start, stream.block_turns, stream.tables, stream.geometry, stream.to_frame, nside, part)
+def _stream(stream: PointingStream, part: list[tuple[int, int]], nside: int, pixels: NDArray[np.int32]) -> None:
+    for low, high in part:
+        own, start = pixels[low - part[0][0] : high - part[0][0]], stream.start_turns(low)
+        _pixels(start, stream.block_turns, stream.tables, stream.geometry, stream.to_frame, nside, own)
 
 
 def _bands(entries: NDArray[np.float64]) -> list[tuple[int, int]]:

@@ -1,0 +1,175 @@
+"""The command line as a user meets it: outputs, exit codes, one sentence for bad input, nothing left behind."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from astropy.io import fits
+from astropy.table import Table
+
+from mcsim import cli, config
+
+from .conftest import table
+
+Command = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def mcsim(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Command:
+    """Run a command in an empty folder: exit code, standard output, standard error."""
+
+    def run(*words: object) -> tuple[int, str, str]:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["mcsim", *map(str, words)])
+        code = 0
+        try:
+            cli.main()
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return run
+
+
+def test_help_loads_no_heavy_library() -> None:
+    """That keeps it under half a second on any machine."""
+    program = (
+        "import sys, mcsim.cli\n"
+        "sys.argv = ['mcsim', '--help']\n"
+        "try:\n    mcsim.cli.main()\n"
+        "except SystemExit:\n    print(sorted({'numpy', 'numba', 'dask', 'xarray', 'pydantic', 'healpy'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    for command in ("run", "merge", "info", "plot", "beam", "scan", "bench", "config"):
+        assert command in done.stdout
+    assert done.stdout.rstrip().endswith("[]")
+
+
+def test_info_and_exports(mcsim: Command, small_store: Path, tmp_path: Path) -> None:
+    code, out, _ = mcsim("info", small_store, "--export", "summary.nc")
+    assert code == 0
+    assert "10 of 10 realizations finished" in out
+    assert "L2M0d0" in out
+    with xr.open_dataset(tmp_path / "summary.nc", engine="scipy") as summary:
+        assert summary["biposh_mean_re"].attrs["units"] == "uK^2"
+        assert int(summary["count"]) == 10
+    assert mcsim("info", small_store, "--export", "summary.ecsv")[0] == 0
+    rows = Table.read(tmp_path / "summary.ecsv", format="ascii.ecsv")
+    assert set(rows.colnames) >= {"pair", "L", "M", "d", "ell_min", "ell_max", "value", "error"}
+    assert str(rows["value"].unit) == "uK2"
+    assert "Bennett" in rows.meta["normalisation"]
+
+
+def test_plot_chooses_modes(mcsim: Command, small_store: Path, tmp_path: Path) -> None:
+    assert mcsim("plot", small_store, "--L", 2, "--M", 0, "-o", "a20.png")[0] == 0
+    assert (tmp_path / "a20.png").stat().st_size > 10_000
+    code, _, err = mcsim("plot", small_store, "--L", 9)
+    assert code == 2
+    assert "no mode with L = 9" in err
+
+
+def test_dry_run_says_the_cost_and_computes_nothing(mcsim: Command, tmp_path: Path) -> None:
+    code, out, _ = mcsim("run", "quickstart", "--dry-run")
+    assert code == 0
+    for word in ("memory", "disk", "files", "time", "realizations"):
+        assert word in out
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_finished_store_says_so(mcsim: Command, small_store: Path, tmp_path: Path) -> None:
+    (tmp_path / "small.json").write_text(json.dumps(table()))
+    toml = tmp_path / "small.toml"
+    toml.write_text(SMALL)
+    assert config.digest(config.load(toml)) == config.digest(config.load(table()))
+    code, out, _ = mcsim("run", toml, "-o", small_store)
+    assert code == 0
+    assert "is finished: 10 realizations, nothing to do" in out
+
+
+SMALL = """\
+schema = 1
+name = "small"
+[sky]
+spectrum = "wmap7"
+lmax = 32
+[map]
+nside = 16
+[[channel]]
+name = "W1"
+beam = { kind = "elliptical_gaussian", fwhm_major_arcmin = 300.0, fwhm_minor_arcmin = 250.0 }
+scan = { kind = "parallel_transport", psi0_deg = 20.0 }
+[biposh]
+L_max = 2
+summary_bin = 10
+[ensemble]
+realizations = 10
+seed = 7
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("run", "no-such-run"), "no-such-run"),
+        (("run", "quickstart", "--realizations", "5"), "not of the form A:B"),
+        (("run", "quickstart", "--realizations", "50:20"), "choose A < B"),
+        (("run", "quickstart", "--resume"), "no store quickstart.zarr to resume"),
+        (("run", "quickstart", "--workers", "2", "--scheduler", "tcp://127.0.0.1:1"), "exclude each other"),
+        (("run", "quickstart", "-o", "/proc/x.zarr"), "cannot be written"),
+        (("info", "nothing.zarr"), "not an ensemble store"),
+        (("plot", "nothing.zarr"), "not an ensemble store"),
+        (("merge", "nothing.zarr", "-o", "x.zarr"), "not an ensemble store"),
+        (("beam", "nothing.fits"), "nothing.fits"),
+        (("scan", "no-such-scan"), "no-such-scan"),
+        (("scan", "wmap", "--nside", "100"), "100"),
+        (("config",), "Nothing was asked for"),
+    ],
+)
+def test_bad_input_is_one_sentence(words: tuple[str, ...], message: str, mcsim: Command, tmp_path: Path) -> None:
+    code, _, err = mcsim(*words)
+    assert code == 2
+    assert message in err
+    assert err.count("\n") == 1
+    assert "Traceback" not in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unknown_option_is_exit_code_2(mcsim: Command) -> None:
+    assert mcsim("run", "quickstart", "--no-such-option")[0] == 2
+
+
+def test_config_checks_and_prints_the_schema(mcsim: Command) -> None:
+    code, out, _ = mcsim("config", "quickstart")
+    assert code == 0
+    assert json.loads(out)["name"] == "quickstart"
+    code, out, _ = mcsim("config", "--schema")
+    assert json.loads(out)["title"] == "RunConfig"
+
+
+def test_beam_of_a_configuration_and_of_files(mcsim: Command, tmp_path: Path) -> None:
+    code, out, _ = mcsim("beam", "quickstart", "--lmax", 700)
+    assert code == 0
+    assert "axis ratio" in out
+    assert (tmp_path / "beam.png").exists()
+    y, x = np.mgrid[-40:41, -40:41] * 0.1
+    image = np.exp(-(x**2) / 2 / 0.5**2 - y**2 / 2 / 0.4**2)
+    header = fits.Header({"CDELT1": 0.1, "CDELT2": 0.1, "CUNIT1": "deg", "CUNIT2": "deg"})
+    fits.PrimaryHDU(image, header).writeto(tmp_path / "map.fits")
+    code, out, _ = mcsim("beam", "map.fits", "--lmax", 500, "-o", "map.png")
+    assert code == 0
+    assert "1.25" in out
+    assert (tmp_path / "map.png").exists()
+
+
+def test_scan(mcsim: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / "cache"))
+    code, out, _ = mcsim("scan", "wmap", "--nside", 32, "--sample-period-s", 30.7, "-o", "scan.png")
+    assert code == 0
+    assert "three factors" in out
+    assert (tmp_path / "scan.png").stat().st_size > 10_000
