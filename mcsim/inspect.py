@@ -62,7 +62,8 @@ def export(path: str | Path, output: str | Path) -> None:
         For another ending, or an output that cannot be written.
     """
     target = Path(output)
-    with store.open_summary(path) as summary:
+    with store.open_summary(path) as stored:
+        summary = stored.load()
         try:
             if target.suffix == ".nc":
                 _real(summary).to_netcdf(target, engine="scipy")

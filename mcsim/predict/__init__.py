@@ -2,3 +2,27 @@
 
 Nothing here is shared with the convolution and the estimator of the ensembles, so that each checks the other.
 """
+
+from mcsim.predict.beam_biposh import ScannedBeam, beam_biposh
+from mcsim.predict.cmb_biposh import cmb_biposh_leading, noise_biposh
+from mcsim.predict.detectability import fisher_information, isotropic_variance, signal_to_noise
+from mcsim.predict.exact import cmb_biposh_exact, power_spectrum_exact
+from mcsim.predict.harmonics import orientation_harmonics, parallel_transport_harmonics
+from mcsim.predict.modes import Mode, bennett_factor, existing
+
+__all__ = [
+    "Mode",
+    "ScannedBeam",
+    "beam_biposh",
+    "bennett_factor",
+    "cmb_biposh_exact",
+    "cmb_biposh_leading",
+    "existing",
+    "fisher_information",
+    "isotropic_variance",
+    "noise_biposh",
+    "orientation_harmonics",
+    "parallel_transport_harmonics",
+    "power_spectrum_exact",
+    "signal_to_noise",
+]

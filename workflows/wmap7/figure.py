@@ -41,7 +41,9 @@ def draw(summaries: dict[str, xr.Dataset], reference: dict[str, list[float]]) ->
                 axes.errorbar(x, value, error, color=colour, ms=4, lw=1, label=f"{channel}, {LABELS[scan]}", **style)
                 table = reference.get(f"WMAP7 {channel}A map {scan} d={d}")
                 if table is not None:
-                    axes.plot(x[: len(table)], table, "x", color="black", ms=6, zorder=5)
+                    first = (scan, channel) == ("PT", "V2")
+                    label = "independent, leading order" if first else None
+                    axes.plot(x[: len(table)], table, "x", color="black", ms=6, zorder=5, label=label)
         axes.axhline(0, color="0.6", lw=0.8)
         axes.set_xlabel(r"multipole $\ell$")
         axes.set_ylabel(rf"$\ell(\ell+1){SPECTRUM[d]}/2\pi$  [$\mu$K$^2$]")
