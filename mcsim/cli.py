@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from mcsim.errors import InputError
+from mcsim.errors import InputError, RunError
 
 app = typer.Typer(
     name="mcsim",
@@ -32,12 +32,9 @@ def main() -> None:
     """Run the command line; bad input ends in one sentence and exit code 2."""
     try:
         app()
-    except InputError as error:
+    except (InputError, RunError) as error:
         Console(stderr=True, highlight=False, soft_wrap=True).print(f"mcsim: {error}", markup=False)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("mcsim: interrupted; run the same command again to continue.", file=sys.stderr)
-        sys.exit(130)
+        sys.exit(2 if isinstance(error, InputError) else 1)
 
 
 @app.command()
@@ -69,9 +66,13 @@ def run(
         return
     from mcsim import runner
 
-    result = runner.run(
-        config, store, resume=resume, realizations=part, workers=workers, scheduler=scheduler, quiet=False
-    )
+    try:
+        result = runner.run(
+            config, store, resume=resume, realizations=part, workers=workers, scheduler=scheduler, quiet=False
+        )
+    except KeyboardInterrupt:
+        print("mcsim: interrupted; run the same command again to continue.", file=sys.stderr)
+        raise typer.Exit(130) from None
     _report(result)
 
 
@@ -95,11 +96,11 @@ def info(
     ] = None,
 ) -> None:
     """Say what a store holds; export its summary."""
-    from mcsim import inspect
+    from mcsim import describe
 
-    out.print(inspect.describe(store), markup=False)
+    out.print(describe.describe(store), markup=False)
     if export is not None:
-        inspect.export(store, export)
+        describe.export(store, export)
         out.print(f"wrote {export}", markup=False)
 
 
@@ -121,7 +122,7 @@ def plot(
 @app.command()
 def beam(
     source: Annotated[str, typer.Argument(metavar="BEAM", help="Beam map or b_lm (FITS), or a CONFIG.")],
-    lmax: Annotated[int, typer.Option(min=2, help="Degree of the coefficients.")] = 2048,
+    lmax: Annotated[int, typer.Option(min=2, max=8192, help="Degree of the coefficients.")] = 2048,
     m_max: Annotated[int | None, typer.Option(min=0, help="Order; default: chosen from the beam.")] = None,
     pixel_deg: Annotated[
         float | None, typer.Option(help="Side of a pixel of a beam map; default: its header's.")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mcsim import alm as alm_
 from mcsim import healpix
 from mcsim.beams import Beam
+from mcsim.errors import InputError
 from mcsim.scan import Moments
 
 
@@ -74,8 +75,12 @@ def spin_maps(
 
 def noncircular_map(maps: list[NDArray[np.float64]], moments: Moments) -> healpix.Map:
     """2 Re sum_{s > 0} w_s S_s: what the non-circular part of the beam adds under a scan, uK, shape (npix,)."""
+    if moments.smax < len(maps):
+        raise InputError(
+            f"The moments end at s = {moments.smax}, the beam has orders up to {len(maps)}; lower its m_max."
+        )
     total = np.zeros(12 * moments.nside**2)
-    for w, (real, imag) in zip(moments.w, maps, strict=False):
+    for w, (real, imag) in zip(moments.w[: len(maps)], maps, strict=True):
         total += 2.0 * (w.real * real - w.imag * imag)
     return total
 

@@ -1,4 +1,4 @@
-"""The one exception that users are meant to read."""
+"""The exceptions that users are meant to read."""
 
 
 class InputError(ValueError):
@@ -7,3 +7,7 @@ class InputError(ValueError):
     The message is one sentence that names the value, the limit and the remedy; the command line prints it
     without a traceback and exits with code 2.
     """
+
+
+class RunError(RuntimeError):
+    """A run that could not go on, though its input was right; what is finished is stored. Exit code 1."""

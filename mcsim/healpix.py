@@ -1,5 +1,6 @@
 """HEALPix maps and their harmonic coefficients: transforms, quadrature weights, pixel window."""
 
+import warnings
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ import ducc0
 import healpy
 import numpy as np
 from astropy.io import fits
+from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
@@ -126,6 +128,41 @@ def _mean_legendre(pixels: NDArray[np.int64], nside: int, split: int, lmax: int)
     return mean
 
 
+_READ_ERRORS = (OSError, ValueError, TypeError, KeyError, IndexError, AttributeError, AstropyUserWarning)
+_FRAMES = {"E": "ecliptic", "G": "galactic", "C": "equatorial"}
+_TO_UK = {"uk": 1.0, "mk": 1e3, "k": 1e6}
+
+
+def read_map(path: Path) -> tuple[Map, str | None, str | None]:
+    """First map of a HEALPix FITS file in RING order, its frame and its unit as far as the header tells them.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read as a HEALPix map.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", category=AstropyUserWarning)
+            map_, header = healpy.read_map(path, dtype=float, h=True)
+    except _READ_ERRORS as error:
+        raise InputError(f"{path} cannot be read as a HEALPix map ({error}); give a complete FITS map.") from error
+    keywords = dict(header)
+    frame = _FRAMES.get(str(keywords.get("COORDSYS", "")).strip().upper()[:1])
+    unit = str(keywords.get("TUNIT1", "")).strip() or None
+    return np.asarray(map_), frame, unit
+
+
+def to_uk(unit: str | None, path: Path) -> float:
+    """Factor from a unit of temperature to uK; 1 where the header gives none."""
+    if unit is None:
+        return 1.0
+    factor = _TO_UK.get(unit.lower().replace("_", ",").split(",")[0].strip().replace("µ", "u"))
+    if factor is None:
+        raise InputError(f"{path} is in {unit!r}; give a map in uK, mK or K (CMB).")
+    return factor
+
+
 def read_pixel_window(path: Path, lmax: int) -> NDArray[np.float64]:
     """Temperature pixel window of a FITS file in the HEALPix format, shape (lmax + 1,).
 
@@ -135,9 +172,13 @@ def read_pixel_window(path: Path, lmax: int) -> NDArray[np.float64]:
         If the file cannot be read or ends below lmax.
     """
     try:
-        window = np.asarray(fits.getdata(path, 1).field(0), dtype=float).ravel()
-    except (OSError, IndexError, TypeError, AttributeError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", category=AstropyUserWarning)
+            window = np.asarray(fits.getdata(path, 1).field(0), dtype=float).ravel()
+    except _READ_ERRORS as error:
         raise InputError(f"{path} is not a FITS pixel window ({error}); give a HEALPix pixel_window file.") from error
-    if window.size <= lmax or not np.all(np.isfinite(window[: lmax + 1])):
+    if window.size <= lmax:
         raise InputError(f"{path} holds a pixel window up to l = {window.size - 1}, below the lmax {lmax} of the sky.")
+    if not np.all(window[: lmax + 1] > 0.0):
+        raise InputError(f"{path} holds a pixel window that is not positive up to l = {lmax}; give a HEALPix table.")
     return window[: lmax + 1]

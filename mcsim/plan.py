@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from mcsim import alm as alm_
-from mcsim import config, healpix, rng, store, summary
-from mcsim.biposh import Mode, modes
+from mcsim import config, healpix, rng, spectra, store, summary
+from mcsim.biposh import Mode, estimate, estimator, modes
 from mcsim.errors import InputError
 from mcsim.sky import gaussian_alm
 from mcsim.store import Layout
@@ -51,6 +51,24 @@ def wanted(run: config.RunConfig, part: slice | None) -> range:
     return range(start, stop)
 
 
+def default_store(run: config.RunConfig, part: slice | None) -> Path:
+    """``{name}.zarr`` in the working folder; slices of an ensemble get stores of their own, ``{name}.{A}-{B}.zarr``."""
+    if part is None:
+        return Path(f"{run.name}.zarr")
+    realizations = wanted(run, part)
+    return Path(f"{run.name}.{realizations.start}-{realizations.stop}.zarr")
+
+
+def exists(path: Path) -> bool:
+    """Whether there is something at ``path``; refuses names that no file system takes."""
+    try:
+        return path.exists()
+    except OSError as error:
+        raise InputError(
+            f"{str(path)[:60]}... cannot be a store ({error.strerror}); give a shorter path with -o."
+        ) from error
+
+
 def layout(survey: Survey) -> Layout:
     """Layout of a new store."""
     run = survey.config
@@ -72,11 +90,14 @@ def _chunked(bare: Layout, chunk: int | None) -> Layout:
 
     Powers of two, as the tree of sums needs.
     """
-    if chunk is None:
+    if chunk is not None:
+        while chunk // 2 >= bare.realizations:
+            chunk //= 2
+    else:
         chunk = 1
         while chunk * CHUNKS < bare.realizations and 2 * chunk * bare.realization_bytes() <= CHUNK_BYTES:
             chunk *= 2
-    return Layout(**{**bare.__dict__, "chunk": chunk})
+    return replace(bare, chunk=chunk)
 
 
 def recipe(survey: Survey) -> summary.Recipe:
@@ -109,10 +130,7 @@ def check_same(path: Path, run: config.RunConfig) -> None:
         Naming the keys that differ.
     """
     found = store.attributes(path)
-    changes = config.differences(found["science"], config.science(run))
-    kept = found["configuration"]["ensemble"]["keep_maps"]
-    if kept != run.ensemble.keep_maps:
-        changes.append(f"ensemble.keep_maps: {kept} -> {run.ensemble.keep_maps}")
+    changes = _changes(found, attributes(run))
     if changes:
         raise InputError(
             f"{path} was made with another configuration ({'; '.join(changes)}); "
@@ -120,11 +138,23 @@ def check_same(path: Path, run: config.RunConfig) -> None:
         )
 
 
-def check_mergeable(path: Path, first: Mapping[str, Any], other: Path, attributes: Mapping[str, Any]) -> None:
+def check_mergeable(path: Path, first: Mapping[str, Any], other: Path, second: Mapping[str, Any]) -> None:
     """Refuse to merge stores of different configurations."""
-    changes = config.differences(first["science"], attributes["science"])
+    changes = _changes(first, second)
     if changes:
         raise InputError(f"{other} and {path} differ ({'; '.join(changes)}); merge slices of one configuration.")
+
+
+def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    """What keeps two stores' attributes from describing rows of one ensemble: science, kept maps, mcsim itself."""
+    changes = config.differences(old["science"], new["science"])
+    for key, before, after in (
+        ("ensemble.keep_maps", *(a["configuration"]["ensemble"]["keep_maps"] for a in (old, new))),
+        ("version of mcsim", *(a["packages"]["mcsim"] for a in (old, new))),
+    ):
+        if before != after:
+            changes.append(f"{key}: {before} -> {after}")
+    return changes
 
 
 def stored(path: Path, realizations: int) -> tuple[Layout, summary.Recipe]:
@@ -173,6 +203,8 @@ class Cost:
 
 def cost(run: config.RunConfig, realizations: range) -> Cost:
     """Estimate the cost of a run from its sizes, its beams, and one timed transform."""
+    if run.sky.spectrum is not None:
+        spectra.load(run.sky.spectrum, run.sky.lmax)
     mmax = [load_beam(channel, run.sky.lmax).mmax for channel in run.channels]
     lmax, nside = config.analysis_lmax(run), run.map.nside
     names = config.map_names(run)
@@ -186,8 +218,9 @@ def cost(run: config.RunConfig, realizations: range) -> Cost:
     )  # fmt: skip
     planned = _chunked(bare, run.compute.chunk)
     splits = len(run.map.splits) or 1
-    transform = _timed_transform(nside, run.sky.lmax)
+    transform, estimation = _timed(nside, run.sky.lmax, lmax, run.biposh.L_max)
     transforms = sum(1.0 + 2.0 * m + splits * (2.0 + 4.0 * run.biposh.iterations) for m in mmax)
+    estimates = pairs * (2 if run.ensemble.paired else 1)
     largest = max(mmax)
     memory = 3e8 + 8.0 * npix * (6 + 2 * largest) + 16.0 * alm_.size(run.sky.lmax) * (6 + len(names) * 2)
     memory += planned.chunk * planned.realization_bytes()
@@ -197,13 +230,17 @@ def cost(run: config.RunConfig, realizations: range) -> Cost:
         memory,
         float(planned.realization_bytes()) * len(realizations),
         planned.files(),
-        transform * transforms,
+        transform * transforms + estimation * estimates,
     )
 
 
-def _timed_transform(nside: int, lmax: int) -> float:
-    """Seconds of one spin-0 synthesis on one thread."""
-    alm = gaussian_alm(np.ones(lmax + 1), rng.generator(0, 0, "timing"))
+def _timed(nside: int, lmax_sky: int, lmax: int, L_max: int) -> tuple[float, float]:
+    """Seconds of one spin-0 synthesis and of one estimate of all coefficients, on one thread."""
+    alm = gaussian_alm(np.ones(lmax_sky + 1), rng.generator(0, 0, "timing"))
+    tables, cut = estimator(L_max, lmax), alm_.resize(alm, lmax_sky, lmax)
+    estimate(estimator(L_max, min(lmax, L_max + 2)), alm_.resize(alm, lmax_sky, min(lmax, L_max + 2)))  # compiles it
     start = time.perf_counter()
-    healpix.synthesis(alm[None], nside, lmax)
-    return time.perf_counter() - start
+    healpix.synthesis(alm[None], nside, lmax_sky)
+    middle = time.perf_counter()
+    estimate(tables, cut)
+    return middle - start, time.perf_counter() - middle

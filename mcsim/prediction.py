@@ -1,5 +1,6 @@
 """From a configuration to what its ensemble should give: means, errors and detectability, without Monte Carlo."""
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +12,9 @@ from healpy import nside2pixarea
 from numpy.typing import NDArray
 
 from mcsim import alm as alm_
-from mcsim import config, healpix, inspect, summary
+from mcsim import config, healpix, summary
 from mcsim import survey as survey_
+from mcsim.describe import table
 from mcsim.errors import InputError
 from mcsim.predict import (
     Mode,
@@ -38,7 +40,7 @@ L_MOMENTS = 64
 
 @dataclass(frozen=True)
 class _Pair:
-    """Means of an ordered pair of maps, shape (mode, lmax + 1): seen by the beam, by its circular part, and of noise."""
+    """Means of an ordered pair, shape (mode, lmax + 1): seen by the beams, by their circular parts, and of noise."""
 
     beam: NDArray[np.complex128]
     circular: NDArray[np.complex128]
@@ -67,10 +69,10 @@ def predict(
     Returns
     -------
     xarray.Dataset
-        Laid out like :func:`mcsim.open_summary`, so that the two subtract: ``{biposh, cl}{, _circular, _difference}_mean``
-        in uK^2, raw and binned. ``_standard_deviation`` and ``_standard_error`` are those of an isotropic sky, the error
-        for ``ensemble.realizations`` of the configuration; of the difference to the circular twin, whose scatter is not
-        that of an isotropic sky, they are NaN. Attributes say what is left out.
+        Laid out like :func:`mcsim.open_summary`, so that the two subtract: ``{biposh, cl}{, _circular,
+        _difference}_mean`` in uK^2, raw and binned. ``_standard_deviation`` and ``_standard_error`` are those of an
+        isotropic sky, the error for ``ensemble.realizations`` of the configuration; of the difference to the circular
+        twin, whose scatter is not that of an isotropic sky, they are NaN. Attributes say what is left out.
 
     Raises
     ------
@@ -130,7 +132,10 @@ def describe(prediction: xr.Dataset, count: int = 8) -> str:
     if np.isinf(total):
         lines.append("  (maps without noise see the same sky through different beams: nothing hides the beams)")
     each = prediction["signal_to_noise"].stack(spectrum=("pair", "mode")).fillna(0.0)
+    strongest = float(each.max())
     for index in np.argsort(-each.values)[:count]:
+        if each[index] <= 1e-6 * strongest:
+            break
         pair, mode = each["spectrum"].values[index]
         bins = prediction["signal_to_noise_binned"].sel(pair=pair, mode=mode)
         place = int(bins.fillna(0.0).argmax("bin"))
@@ -152,9 +157,12 @@ def write(prediction: xr.Dataset, output: str | Path) -> None:
         if target.suffix == ".zarr":
             if target.exists():
                 raise InputError(f"{target} exists already; choose another output, or delete it.")
-            prediction.to_zarr(target, zarr_format=3, consolidated=False)
+            with warnings.catch_warnings():
+                # Zarr says that its consolidated metadata and its strings are young.
+                warnings.simplefilter("ignore", category=UserWarning)
+                prediction.to_zarr(target, zarr_format=3, consolidated=True)
         elif target.suffix == ".ecsv":
-            inspect.table(prediction).write(target, format="ascii.ecsv", overwrite=True)
+            table(prediction).write(target, format="ascii.ecsv", overwrite=True)
         else:
             raise InputError(f"{target} ends in {target.suffix or 'nothing'}; choose .zarr or .ecsv (table).")
     except OSError as error:
@@ -247,9 +255,7 @@ def _variance(survey: Survey, found: dict[tuple[int, int], _Pair], pair: tuple[i
 
 def _dataset(survey: Survey, found: dict[tuple[int, int], _Pair]) -> xr.Dataset:
     run = survey.config
-    recipe = summary.Recipe(
-        survey.pair_names, survey.estimator.modes, survey.lmax, run.biposh.summary_bin, paired=True
-    )
+    recipe = summary.Recipe(survey.pair_names, survey.estimator.modes, survey.lmax, run.biposh.summary_bin, paired=True)
     mean: dict[str, NDArray] = {
         "biposh": np.stack([found[pair].beam + found[pair].noise for pair in survey.pairs]),
         "biposh_circular": np.stack([found[pair].circular + found[pair].noise for pair in survey.pairs]),
@@ -287,11 +293,13 @@ def _binned_variance(recipe: summary.Recipe, variance: NDArray[np.float64]) -> N
 
 def _attributes(survey: Survey, L_moments: int | None) -> dict[str, Any]:
     run = survey.config
-    order = "leading order" if L_moments is None else f"all orders, moments up to L = {L_moments}"
+    order = (
+        "leading order in their non-circular part" if L_moments is None else f"all orders, w_s up to L = {L_moments}"
+    )
     weighted = any(m.weight is not None for channel in survey.channels for m in channel.maps)
     return {
         "name": run.name,
-        "prediction": f"{order} in the non-circular part of the beams",
+        "prediction": f"from b_lm of the beams, {order}",
         "frame": run.map.frame,
         "digest": config.digest(run),
         "f_sky": min(_sky_fraction(survey, pair) for pair in survey.pairs),
@@ -314,11 +322,11 @@ def _detectability(survey: Survey, found: dict[tuple[int, int], _Pair]) -> dict[
     binned = np.full((*each.shape, len(first)), np.nan)
     for number, (x, y) in enumerate(survey.pairs):
         signal = (found[x, y].beam - found[x, y].circular)[rows]
-        spectra = [_total_cl(survey, found, p) for p in ((x, x), (y, y), (x, y))]
+        xx, yy, xy = (_total_cl(survey, found, pair) for pair in ((x, x), (y, y), (x, y)))
         f_sky = _sky_fraction(survey, (x, y))
-        each[number, rows] = signal_to_noise(signal, anisotropic, *spectra, f_sky=f_sky)
+        each[number, rows] = signal_to_noise(signal, anisotropic, xx, yy, xy, f_sky)
         for b, ells in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
-            binned[number, rows, b] = signal_to_noise(signal, anisotropic, *spectra, f_sky=f_sky, ell_range=ells)
+            binned[number, rows, b] = signal_to_noise(signal, anisotropic, xx, yy, xy, f_sky, ells)
     text = "signal to noise in one sky of what the beam adds to its circular part"
     return {
         "signal_to_noise": (("pair", "mode"), each, {"units": "1", "long_name": text}),
@@ -335,7 +343,9 @@ def _joint_signal_to_noise(survey: Survey, found: dict[tuple[int, int], _Pair]) 
     """Square root of the Fisher information of all maps, infinite where noiseless maps leave nothing to hide behind."""
     size, lmax = len(survey.map_names), survey.lmax
     stored = _modes(survey)
-    modes = [mode for mode in stored if mode[0] > 0 and mode[2] >= 0 and not (mode[2] == 0 and mode[0] % 2 and size == 1)]
+    modes = [
+        mode for mode in stored if mode[0] > 0 and mode[2] >= 0 and not (mode[2] == 0 and mode[0] % 2 and size == 1)
+    ]
     cl = np.empty((size, size, lmax + 1))
     signal = np.zeros((size, size, len(modes), lmax + 1), dtype=np.complex128)
     for x, y in found:

@@ -5,20 +5,23 @@ and moments on the worker, once.
 """
 
 import os
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import dask
 import numpy as np
-from distributed import Client, LocalCluster, as_completed
+from distributed import Client, KilledWorker, LocalCluster, as_completed
 from numpy.typing import NDArray
 
 from mcsim import config, plan, simulate, statistics, store, summary
-from mcsim.errors import InputError
+from mcsim.errors import InputError, RunError
+from mcsim.lock import locked
 from mcsim.progress import reporting
 from mcsim.statistics import Sums
 from mcsim.survey import Survey, survey
@@ -80,30 +83,49 @@ def run(
         For bad input, an unwritable or foreign store, a scheduler that does not answer. The store is then as it was.
     """
     loaded = source if isinstance(source, config.RunConfig) else config.load(source)
-    target = Path(path) if path is not None else Path(f"{loaded.name}.zarr")
     wanted = plan.wanted(loaded, realizations)
-    exists = target.exists()
-    if resume and not exists:
-        raise InputError(f"There is no store {target} to resume; leave out --resume to start it.")
-    if exists:
-        plan.check_same(target, loaded)
-        stored = store.done(target)
-        if all(r < len(stored) and stored[r] for r in wanted):
-            return Result(target, int(stored.sum()), 0, ())
-    else:
+    target = Path(path) if path is not None else plan.default_store(loaded, realizations)
+    if not plan.exists(target):
+        if resume:
+            raise InputError(f"There is no store {target} to resume; leave out --resume to start it.")
         store.check_writable(target)
+    elif _finished(target, loaded, wanted):
+        return Result(target, int(store.done(target).sum()), 0, ())
     config.check_skies(loaded, wanted)
-    with reporting("orientation moments", 1.0, "", quiet) as report:
-        shared = survey(loaded, nthreads=os.cpu_count() or 1, progress=report)
-    layout, recipe, attributes = plan.layout(shared), plan.recipe(shared), plan.attributes(loaded)
-    with _connected(client, scheduler, workers or loaded.compute.workers) as connected:
-        if not exists:
-            store.create(target, layout, attributes)
-        elif layout.realizations > len(store.done(target)):
-            store.extend(target, layout.realizations, attributes)
-        before = int(store.done(target).sum())
-        failures = _simulate(connected, target, loaded, wanted, quiet)
-        _summarise(connected, target, recipe, quiet)
+    with ExitStack() as stack:
+        if client is None and scheduler is not None:
+            client = stack.enter_context(_remote_client(scheduler))
+        with reporting("orientation moments", 1.0, "", quiet) as report:
+            shared = survey(loaded, nthreads=os.cpu_count() or 1, progress=report)
+        simulate.draw_sky(shared, wanted.start)  # bad files of skies are to be found before a store is made
+        stack.enter_context(locked(target))
+        if client is None:
+            client = stack.enter_context(local_client(workers or loaded.compute.workers))
+        return _run(client, shared, target, wanted, quiet)
+
+
+def _finished(target: Path, run: config.RunConfig, wanted: range) -> bool:
+    """Whether a store of this configuration has all that is wanted, its summary included."""
+    plan.check_same(target, run)
+    done = store.done(target)
+    return wanted.stop <= len(done) and bool(done[wanted].all()) and store.summarised(target) == done.sum()
+
+
+def _run(client: Client, shared: Survey, target: Path, wanted: range, quiet: bool) -> Result:
+    """Make or extend the store, compute what is missing, summarise."""
+    run = shared.config
+    if not target.exists():
+        store.create(target, plan.layout(shared), plan.attributes(run))
+    elif run.ensemble.realizations > store.size(target):
+        store.extend(target, run.ensemble.realizations, plan.attributes(run))
+    before = int(store.done(target).sum())
+    try:
+        failures = _simulate(client, target, run, wanted, quiet)
+        _summarise(client, target, plan.recipe(shared), quiet)
+    except KilledWorker as error:
+        raise RunError(
+            f"Workers died again and again on {error.task} (out of memory?); what is finished is stored in {target}."
+        ) from error
     finished = int(store.done(target).sum())
     return Result(target, finished, finished - before, tuple(failures))
 
@@ -125,19 +147,21 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
     first = store.attributes(sources[0])
     for other in sources[1:]:
         plan.check_mergeable(sources[0], first, other, store.attributes(other))
-    size = max(len(store.done(source)) for source in sources)
+    size = max(store.size(source) for source in sources)
     layout, recipe = plan.stored(sources[0], size)
-    store.create(target, layout, first)
-    chunk = layout.chunk
-    with reporting("merge", float(size), "realizations", quiet) as report:
-        for start in range(0, size, chunk):
-            stop = min(start + chunk, size)
-            _merge_chunk(sources, target, start, stop)
-            report(float(stop))
-    done = store.done(target)
-    nodes = [summary.reduce_rows(recipe, store.read(target, a, min(a + chunk, size)), a) for a in range(0, size, chunk)]
-    _write_summary(target, recipe, statistics.tree(nodes.__getitem__, len(nodes)))
-    return Result(target, int(done.sum()), 0, ())
+    first["configuration"]["ensemble"]["realizations"] = size
+    with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=store.check_writable(target)) as folder:
+        scratch = Path(folder) / "merged"
+        store.create(scratch, layout, first)
+        with reporting("merge", float(size), "realizations", quiet) as report:
+            for start in range(0, size, layout.chunk):
+                stop = min(start + layout.chunk, size)
+                _merge_chunk(sources, scratch, start, stop)
+                report(float(stop))
+        _write_summary(scratch, recipe, summarise_node(str(scratch), recipe, 0, size, layout.chunk))
+        target.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(scratch, target)
+    return Result(target, int(store.done(target).sum()), 0, ())
 
 
 def _merge_chunk(sources: list[Path], target: Path, start: int, stop: int) -> None:
@@ -180,35 +204,28 @@ def local_client(workers: int) -> Iterator[Client]:
 
 
 @contextmanager
-def _connected(client: Client | None, scheduler: str | None, workers: int) -> Iterator[Client]:
-    """The client to work with: the given one, that of a running scheduler, or one of a local cluster."""
-    if client is not None:
+def _remote_client(scheduler: str) -> Iterator[Client]:
+    try:
+        client = Client(scheduler, timeout=5)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise InputError(
+            f"No Dask scheduler answers at {scheduler} within 5 s ({type(error).__name__}); "
+            "start one or correct the address."
+        ) from error
+    with client:
         yield client
-    elif scheduler is None:
-        with local_client(workers) as local:
-            yield local
-    else:
-        try:
-            remote = Client(scheduler, timeout=5)
-        except (OSError, ValueError, TimeoutError) as error:
-            raise InputError(
-                f"No Dask scheduler answers at {scheduler} within 5 s ({type(error).__name__}); "
-                "start one or correct the address."
-            ) from error
-        with remote:
-            yield remote
 
 
 def _simulate(client: Client, target: Path, run: config.RunConfig, wanted: range, quiet: bool) -> list[Failure]:
     """Compute what is missing, chunk by chunk, with a bounded number of tasks in flight."""
-    text, chunk, done = config.to_json(run), store.chunk(target), store.done(target)
+    text, digest, chunk, done = config.to_json(run), config.digest(run), store.chunk(target), store.done(target)
     starts = [
         start
         for start in range(wanted.start // chunk * chunk, wanted.stop, chunk)
         if any(not done[r] for r in range(max(start, wanted.start), min(start + chunk, wanted.stop)))
     ]
     total = sum(not done[r] for r in wanted)
-    arguments = ((text, str(target.absolute()), start, chunk, wanted.start, wanted.stop) for start in starts)
+    arguments = ((text, digest, str(target.absolute()), start, chunk, wanted.start, wanted.stop) for start in starts)
     failures: list[Failure] = []
     finished = 0
     with reporting("realizations", float(total), "realizations", quiet) as report:
@@ -220,32 +237,42 @@ def _simulate(client: Client, target: Path, run: config.RunConfig, wanted: range
 
 
 def _bounded(client: Client, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> Iterator[Any]:
-    """Results of calls in the order of completion, three tasks per worker thread in flight."""
+    """Results of calls in the order of completion, three tasks in flight for every worker thread there is by then."""
     waiting = iter(arguments)
     flying = as_completed([], with_results=False)
-    room = 3 * max(1, sum(client.nthreads().values()))
-    for _ in range(room):
-        if (call := next(waiting, None)) is not None:
+    count = 0
+
+    def fill() -> int:
+        room = 3 * max(1, sum(client.nthreads().values())) - count
+        calls = list(islice(waiting, max(room, 0)))
+        for call in calls:
             flying.add(client.submit(function, *call, pure=False))
+        return len(calls)
+
+    count += fill()
     for future in flying:
         yield future.result()
-        if (call := next(waiting, None)) is not None:
-            flying.add(client.submit(function, *call, pure=False))
+        count -= 1
+        count += fill()
 
 
 @lru_cache(maxsize=1)
-def _survey_of(text: str) -> Survey:
-    """The survey of a configuration, made once per worker process."""
-    return survey(config.from_json(text))
+def _survey_of(text: str, digest: str) -> Survey:
+    """The survey of a configuration, made once per worker process and contents of its files."""
+    run = config.from_json(text)
+    found = config.digest(run)
+    if found != digest:
+        raise RunError("A worker sees other files than the driver does; let them share the files that the run names.")
+    return survey(run)
 
 
 def realize_chunk(
-    text: str, path: str, start: int, chunk: int, wanted_start: int, wanted_stop: int
+    text: str, digest: str, path: str, start: int, chunk: int, wanted_start: int, wanted_stop: int
 ) -> tuple[int, list[Failure]]:
     """Task: compute what is missing of one chunk and write the chunk whole; returns the count and what failed."""
-    shared, target = _survey_of(text), Path(path)
-    stop = min(start + chunk, len(store.done(target)))
-    done = store.done(target)[start:stop]
+    shared, target = _survey_of(text, digest), Path(path)
+    done = store.done(target, start, start + chunk)
+    stop = start + len(done)
     rows: dict[str, NDArray] = store.read(target, start, stop, maps=True) if done.any() else {}
     rows.pop("done", None)
     computed, failures = 0, []
@@ -254,6 +281,8 @@ def realize_chunk(
             continue
         try:
             values = simulate.realize(shared, r)
+            if not np.all(np.isfinite(values["cl"])):
+                raise FloatingPointError("its power spectrum is not finite")
         except Exception as error:  # whatever one realization meets, the others are to finish
             failures.append(Failure(r, f"{type(error).__name__}: {error}"))
             continue
@@ -281,9 +310,9 @@ def summarise_node(path: str, recipe: summary.Recipe, start: int, stop: int, chu
 
 
 def _summarise(client: Client, target: Path, recipe: summary.Recipe, quiet: bool) -> None:
-    chunk, size = store.chunk(target), len(store.done(target))
+    chunk, size = store.chunk(target), store.size(target)
     node = chunk
-    while node * 64 < size:
+    while node * 16 < size:
         node *= 2
     starts = list(range(0, size, node))
     calls = [(str(target.absolute()), recipe, a, min(a + node, size), chunk) for a in starts]
@@ -302,4 +331,4 @@ def _summarise(client: Client, target: Path, recipe: summary.Recipe, quiet: bool
 
 def _write_summary(target: Path, recipe: summary.Recipe, total: Sums | None) -> None:
     if total is not None:
-        store.write_summary(target, summary.dataset(recipe, total))
+        store.write_summary(target, summary.dataset(recipe, total, store.attributes(target)))

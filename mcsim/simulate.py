@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import alm as alm_
-from mcsim import biposh, config, convolve, healpix, rng
+from mcsim import biposh, config, convolve, differencing, healpix, rng
 from mcsim.errors import InputError
 from mcsim.sky import gaussian_alm
 from mcsim.survey import Channel, Survey, SurveyMap
@@ -62,7 +62,7 @@ def draw_sky(survey: Survey, realization: int) -> Alm:
     if sky.alm is not None:
         return _read_alm(config.sky_path(sky.alm, realization), sky.lmax)
     if sky.map is not None:
-        return _read_sky_map(config.sky_path(sky.map, realization), sky.lmax)
+        return _read_sky_map(config.sky_path(sky.map, realization), sky.lmax, survey.config.map.frame)
     assert survey.cl is not None  # the configuration holds at least one of the three sources
     return gaussian_alm(survey.cl, rng.generator(survey.config.ensemble.seed, realization, "sky"))
 
@@ -71,6 +71,8 @@ def _observe(survey: Survey, channel: Channel, sky: Alm, realization: int, nthre
     """The channel's maps of one sky; transforms that splits share are made once."""
     run = survey.config
     nside, lmax_sky = run.map.nside, run.sky.lmax
+    if channel.side_b is not None:
+        return _observe_differences(survey, channel, sky, realization, nthreads)
     circular = convolve.circular_alm(sky, channel.response)
     spins = convolve.spin_maps(sky, channel.response, nside, nthreads)
     smooth = None
@@ -79,11 +81,6 @@ def _observe(survey: Survey, channel: Channel, sky: Alm, realization: int, nthre
     gradient = None
     if any(m.moments.dtheta is not None for m in channel.maps):
         gradient = healpix.gradient(circular, nside, lmax_sky, nthreads)
-
-    def analyse(map_uk: NDArray[np.float64], weight: NDArray[np.float64] | None) -> Alm:
-        weighted = map_uk if weight is None else weight * map_uk
-        alm = healpix.analysis(weighted, survey.lmax, run.biposh.iterations, nthreads)
-        return alm_.multiply(alm, 1.0 / channel.window[: survey.lmax + 1], survey.lmax)
 
     results = []
     for m in channel.maps:
@@ -100,17 +97,41 @@ def _observe(survey: Survey, channel: Channel, sky: Alm, realization: int, nthre
         difference = convolve.noncircular_map(spins, m.moments) if spins else None
         if _is_exact(survey, m):
             exact = alm_.multiply(circular, 1.0 / channel.window, lmax_sky)
-            twin = exact if extra is None else exact + analyse(extra, None)
+            twin = exact if extra is None else exact + _analyse(survey, channel, extra, None, nthreads)
         else:
             assert smooth is not None
-            twin = analyse(smooth if extra is None else smooth + extra, m.weight)
-        alm = twin if difference is None else twin + analyse(difference, m.weight)
+            twin = _analyse(survey, channel, smooth if extra is None else smooth + extra, m.weight, nthreads)
+        alm = twin if difference is None else twin + _analyse(survey, channel, difference, m.weight, nthreads)
         kept = None
         if run.ensemble.keep_maps and smooth is not None:
             kept = sum((part for part in (extra, difference) if part is not None), start=smooth)
             kept = np.where(m.moments.hits > 0, kept, healpy.UNSEEN)
         results.append(Observed(alm, twin if run.ensemble.paired else None, kept))
     return results
+
+
+def _observe_differences(survey: Survey, channel: Channel, sky: Alm, realization: int, nthreads: int) -> list[Observed]:
+    """The channel's maps of one sky where two beams are read as a difference."""
+    run = survey.config
+    results = []
+    for m, solved in differencing.maps(channel, sky, run.map.nside, run.ensemble.seed, realization, nthreads):
+        # The two are analysed apart like those of other scans.
+        twin = _analyse(survey, channel, solved.circular, m.weight, nthreads)
+        alm = twin + _analyse(survey, channel, solved.difference, m.weight, nthreads)
+        kept = None
+        if run.ensemble.keep_maps:
+            kept = np.where(m.moments.hits > 0, solved.circular + solved.difference, healpy.UNSEEN)
+        results.append(Observed(alm, twin if run.ensemble.paired else None, kept))
+    return results
+
+
+def _analyse(
+    survey: Survey, channel: Channel, map_uk: NDArray[np.float64], weight: NDArray[np.float64] | None, nthreads: int
+) -> Alm:
+    """Coefficients of a weighted map, with the pixel window divided out."""
+    weighted = map_uk if weight is None else weight * map_uk
+    alm = healpix.analysis(weighted, survey.lmax, survey.config.biposh.iterations, nthreads)
+    return alm_.multiply(alm, 1.0 / channel.window[: survey.lmax + 1], survey.lmax)
 
 
 def _is_exact(survey: Survey, m: SurveyMap) -> bool:
@@ -143,14 +164,15 @@ def _read_alm(path: Path, lmax: int) -> Alm:
     return alm_.resize(alm.astype(np.complex128), found, lmax)
 
 
-def _read_sky_map(path: Path, lmax: int) -> Alm:
-    try:
-        map_uk = np.asarray(healpy.read_map(path, dtype=float))
-    except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
-        raise InputError(f"{path} cannot be read as a HEALPix map ({error}); give a FITS map in uK.") from error
-    nside = healpy.npix2nside(map_uk.size)
-    if not np.all(np.isfinite(map_uk)) or np.any(map_uk == healpy.UNSEEN):
+def _read_sky_map(path: Path, lmax: int, frame: str) -> Alm:
+    map_, found, unit = healpix.read_map(path)
+    nside = healpy.npix2nside(map_.size)
+    if nside & (nside - 1):
+        raise InputError(f"{path} has nside {nside}, which is not a power of two; bring the sky to one that is.")
+    if found not in (None, frame):
+        raise InputError(f"{path} is in {found} coordinates, the run's maps in {frame}; rotate the sky first.")
+    if not np.all(np.isfinite(map_)) or np.any(map_ == healpy.UNSEEN):
         raise InputError(f"{path} has pixels that are not finite or unseen; a sky must be complete.")
     if lmax > 3 * nside - 1:
         raise InputError(f"{path} has nside {nside}, good to l = {3 * nside - 1}; the sky's lmax {lmax} is above it.")
-    return healpix.analysis(map_uk, lmax, iterations=3)
+    return healpix.analysis(healpix.to_uk(unit, path) * map_, lmax, iterations=3)

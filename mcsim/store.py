@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from zarr.codecs import ZstdCodec
 
 from mcsim.biposh import Mode
-from mcsim.errors import InputError
+from mcsim.errors import InputError, RunError
 
 
 @dataclass(frozen=True)
@@ -78,11 +78,12 @@ class Layout:
     def files(self) -> int:
         """Number of data files of the finished store, coordinates and metadata included."""
         chunks = -(-self.realizations // self.chunk)
-        return (len(self.variables()) + 1) * (chunks + 1) + 20
+        # Coordinates and the summary's 32 variables or so come with metadata and one chunk each.
+        return (len(self.variables()) + 1) * (chunks + 1) + 100
 
 
-def check_writable(path: Path) -> None:
-    """Refuse a place where no store can be made, and leave it as it was.
+def check_writable(path: Path) -> Path:
+    """Refuse a place where no store can be made, leave it as it was, and return the innermost folder that exists.
 
     Raises
     ------
@@ -93,7 +94,7 @@ def check_writable(path: Path) -> None:
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
     with _refuse_unwritable(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=folder):
-        pass
+        return folder
 
 
 def create(path: Path, layout: Layout, attributes: Mapping[str, Any]) -> None:
@@ -127,25 +128,45 @@ def write(path: Path, first: int, values: Mapping[str, NDArray], done: NDArray[n
     """Write whole chunks of realizations from ``first`` on; ``done`` goes last.
 
     ``values`` holds arrays of shape (n, ...); rows that are not done are stored as NaN.
+
+    Raises
+    ------
+    RunError
+        If the store cannot be written.
     """
-    group = zarr.open_group(path, mode="r+", use_consolidated=False)
-    stop = first + len(done)
-    for name, rows in values.items():
-        _member(group, name)[first:stop] = rows
-    _member(group, "done")[first:stop] = done
+    with _faults_named(path):
+        group = _open(path, "r+")
+        stop = first + len(done)
+        for name, rows in values.items():
+            _member(group, name)[first:stop] = rows
+        _member(group, "done")[first:stop] = done
 
 
 def read(path: Path, start: int, stop: int, maps: bool = False) -> dict[str, NDArray]:
-    """Arrays over realizations ``start`` to ``stop``, ``done`` among them; kept maps only if asked for."""
-    group = zarr.open_group(path, mode="r", use_consolidated=False)
-    left_out = {"realization"} if maps else {"realization", "map"}
-    found = {name: array for name, array in group.arrays() if name not in left_out and _over_realizations(array)}
-    return {name: np.asarray(array[start:stop]) for name, array in found.items()}
+    """Arrays over realizations ``start`` to ``stop``, ``done`` among them; kept maps only if asked for.
+
+    Raises
+    ------
+    RunError
+        If an array is missing or damaged.
+    """
+    with _faults_named(path):
+        group = _open(path)
+        left_out = {"realization"} if maps else {"realization", "map"}
+        found = {name: array for name, array in group.arrays() if name not in left_out and _over_realizations(array)}
+        return {name: np.asarray(array[start:stop]) for name, array in found.items()}
 
 
-def done(path: Path) -> NDArray[np.bool_]:
-    """Which realizations are finished, shape (realizations,)."""
-    return np.asarray(_member(zarr.open_group(path, mode="r", use_consolidated=False), "done")[:])
+def done(path: Path, start: int = 0, stop: int | None = None) -> NDArray[np.bool_]:
+    """Which realizations from ``start`` to ``stop`` are finished; by default all."""
+    with _faults_named(path):
+        return np.asarray(_member(_open(path), "done")[start:stop])
+
+
+def size(path: Path) -> int:
+    """Number of realizations that a store has room for."""
+    with _faults_named(path):
+        return int(_member(_open(path), "done").shape[0])
 
 
 def attributes(path: Path) -> dict[str, Any]:
@@ -157,7 +178,7 @@ def attributes(path: Path) -> dict[str, Any]:
         If there is no mcsim store at ``path``.
     """
     try:
-        found = dict(zarr.open_group(path, mode="r", use_consolidated=False).attrs)
+        found = dict(_open(path).attrs)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path} is not an ensemble store; name the folder that mcsim run wrote.") from error
     if "science" not in found:
@@ -167,31 +188,44 @@ def attributes(path: Path) -> dict[str, Any]:
 
 def chunk(path: Path) -> int:
     """Realizations that one task owns."""
-    return int(_member(zarr.open_group(path, mode="r", use_consolidated=False), "done").chunks[0])
+    with _faults_named(path):
+        return int(_member(_open(path), "done").chunks[0])
 
 
 def extend(path: Path, realizations: int, update: Mapping[str, Any]) -> None:
-    """Grow a store to more realizations; those that are finished stay."""
+    """Grow a store to more realizations; those that are finished stay.
+
+    ``done``, whose length is that of the store, grows last: a call that was cut short is made good by another.
+    """
     with _refuse_unwritable(path):
-        group = zarr.open_group(path, mode="r+", use_consolidated=False)
-        for name, array in group.arrays():
-            if _over_realizations(array) and name != "realization":
-                array.resize((realizations, *array.shape[1:]))
-        _index(group, "realization", np.arange(realizations), "index of the realization")
+        group = _open(path, "r+")
+        growing = {name: array for name, array in group.arrays() if _over_realizations(array)}
+        last = growing.pop("done")
+        for array in (*growing.values(), last):
+            array.resize((realizations, *array.shape[1:]))
+            if array is growing["realization"]:
+                array[:] = np.arange(realizations)
         group.attrs.update(update)
         _consolidate(path)
 
 
 def write_summary(path: Path, summary: xr.Dataset) -> None:
     """Put the summary group in place of the former one."""
-    scratch = path / "summary.new"
-    shutil.rmtree(scratch, ignore_errors=True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", category=UserWarning)
-        summary.to_zarr(scratch, zarr_format=3, consolidated=False)
-    shutil.rmtree(path / "summary", ignore_errors=True)
-    os.replace(scratch, path / "summary")
-    _consolidate(path)
+    with _faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", category=UserWarning)
+            summary.to_zarr(Path(scratch) / "summary", zarr_format=3, consolidated=False)
+        shutil.rmtree(path / "summary", ignore_errors=True)
+        os.replace(Path(scratch) / "summary", path / "summary")
+        _consolidate(path)
+
+
+def summarised(path: Path) -> int:
+    """Number of realizations that the summary speaks of; 0 without one."""
+    if not (path / "summary").is_dir():
+        return 0
+    with _faults_named(path):
+        return int(np.asarray(_member(_open(path / "summary"), "count")[()]))
 
 
 def open_ensemble(path: str | Path) -> xr.Dataset:
@@ -210,7 +244,8 @@ def open_ensemble(path: str | Path) -> xr.Dataset:
         If there is no store at ``path``.
     """
     attributes(Path(path))
-    return xr.open_zarr(path)
+    with _faults_named(Path(path)):
+        return xr.open_zarr(path)
 
 
 def open_summary(path: str | Path) -> xr.Dataset:
@@ -226,7 +261,8 @@ def open_summary(path: str | Path) -> xr.Dataset:
         raise InputError(
             f"{path} has no summary, because no run on it has ended yet; continue it with mcsim run --resume."
         )
-    return xr.open_zarr(path, group="summary")
+    with _faults_named(Path(path)):
+        return xr.open_zarr(path, group="summary")
 
 
 def _write_coordinates(group: zarr.Group, layout: Layout) -> None:
@@ -257,8 +293,13 @@ def _array(  # type: ignore[no-untyped-def]
     array.attrs.update({"units": unit, "long_name": text})
 
 
+def _open(path: Path, mode: Literal["r", "r+"] = "r") -> zarr.Group:
+    """The group as it is, not as its consolidated metadata remember it."""
+    return zarr.open_group(path, mode=mode, use_consolidated=False)
+
+
 def _index(group: zarr.Group, name: str, values: NDArray[np.int64], text: str, dim: str | None = None) -> None:
-    array = group.create_array(name, data=values, chunks=values.shape, dimension_names=[dim or name], overwrite=True)
+    array = group.create_array(name, data=values, chunks=values.shape, dimension_names=[dim or name])
     array.attrs.update({"units": "1", "long_name": text})
 
 
@@ -271,7 +312,7 @@ def _labels(group: zarr.Group, name: str, values, text: str, dim: str | None = N
 def _member(group: zarr.Group, name: str) -> zarr.Array:
     array = group[name]
     if not isinstance(array, zarr.Array):
-        raise InputError(f"{group.store_path} has a group where the array {name} should be; the store is damaged.")
+        raise KeyError(name)
     return array
 
 
@@ -284,6 +325,20 @@ def _consolidate(path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", category=UserWarning)
         zarr.consolidate_metadata(path)
+
+
+@contextmanager
+def _faults_named(path: Path) -> Iterator[None]:
+    """Turn what a damaged or vanished store, or a full disk, makes of zarr's calls into one sentence."""
+    try:
+        yield
+    except (OSError, KeyError, ValueError, RuntimeError, TypeError) as error:
+        if isinstance(error, RunError):
+            raise
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise RunError(
+            f"The store {path} cannot be used ({type(error).__name__}: {reason}); repair it or its disk."
+        ) from error
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -92,8 +93,10 @@ _MEANING = {
 }
 
 
-def dataset(recipe: Recipe, sums: Sums) -> xr.Dataset:
+def dataset(recipe: Recipe, sums: Sums, attributes: Mapping[str, Any]) -> xr.Dataset:
     """The summary as a dataset: ``{variable}_{mean, standard_error, standard_deviation}``, raw and binned.
+
+    ``attributes`` are the store's: what of them says where the numbers come from stays with the summary.
 
     Binned spectra are means over bins of ``bin_factor * A``; their covariance is that of single realizations, over the
     bins of one mode.
@@ -127,12 +130,19 @@ def dataset(recipe: Recipe, sums: Sums) -> xr.Dataset:
         "mode": ("mode", np.array([m.name for m in recipe.modes], dtype=object), {"long_name": "BipoSH mode"}),
         "ell": ("ell", np.arange(recipe.lmax + 1), {"units": "1", "long_name": "degree l2"}),
         "bin": ("bin", (first + stop - 1) / 2.0, {"units": "1", "long_name": "middle of the bin in ell"}),
+        "bin_2": ("bin_2", (first + stop - 1) / 2.0, {"units": "1", "long_name": "the other bin of a covariance"}),
         "bin_first": ("bin", first, {"units": "1", "long_name": "first ell of the bin"}),
         "bin_last": ("bin", stop - 1, {"units": "1", "long_name": "last ell of the bin"}),
         "parity": ("mode", np.array([m.parity for m in recipe.modes], dtype=object), {"long_name": "of l1 + l2 + L"}),
-        **{k: ("mode", np.array([getattr(m, k) for m in recipe.modes]), {"units": "1"}) for k in ("L", "M", "d")},
+        **{
+            name: ("mode", np.array([getattr(m, name) for m in recipe.modes]), {"units": "1", "long_name": text})
+            for name, text in (("L", "bipolar degree"), ("M", "bipolar order"), ("d", "l2 - l1"))
+        },
     }
-    return xr.Dataset(variables, coordinates, {"normalisation": "Hajian-Souradeep; binned: see bin_factor"})
+    origin = {name: attributes[name] for name in ("digest", "conventions", "packages")}
+    run = {"name": attributes["configuration"]["name"], "frame": attributes["configuration"]["map"]["frame"]}
+    normalisation = "Hajian-Souradeep; binned: see bin_factor"
+    return xr.Dataset(variables, coordinates, {**run, **origin, "normalisation": normalisation})
 
 
 def _units(text: str, unit: str = "uK^2") -> dict[str, str]:

@@ -30,6 +30,7 @@ def science(config: RunConfig) -> dict[str, Any]:
         if "realization" in entry.rule.placeholders:
             contents = {"template": paths.template_tail(entry.template), "first": contents}
         entry.holder[entry.field] = contents
+    _leave_out_what_says_nothing(plain)
     plain["biposh"]["lmax"] = analysis_lmax(config)
     window = plain["map"].pop("pixel_window")
     for table, channel in zip(plain["channel"], config.channels, strict=True):
@@ -39,6 +40,25 @@ def science(config: RunConfig) -> dict[str, Any]:
         **{section: plain[section] for section in ("sky", "map", "channel", "biposh")},
         "ensemble": {key: plain["ensemble"][key] for key in ("seed", "paired")},
     }
+
+
+def _leave_out_what_says_nothing(plain: dict[str, Any]) -> None:
+    """Drop keys that stand for what a run without them is, and the limit of iterations: no finished map depends on it.
+
+    A run that does not use a key so keeps the hash that it had before there was such a key.
+    """
+    section = plain["map"]
+    if section["mask_frame"] in (None, section["frame"]):
+        del section["mask_frame"]
+    if section["mask_apodisation_deg"] == 0.0:
+        del section["mask_apodisation_deg"]
+    for channel in plain["channel"]:
+        channel["scan"].pop("max_iterations", None)
+        if channel["beam_b"] is None:
+            del channel["beam_b"]
+        for beam in (channel["beam"], channel.get("beam_b")):
+            if beam is not None and beam["kind"] in ("map", "blm") and beam["angle_deg"] == 0.0:
+                del beam["angle_deg"]
 
 
 def digest(config: RunConfig) -> str:

@@ -21,14 +21,21 @@ _TABLES: dict[tuple[str, ...], type] = {
     ("biposh",): schema.Biposh,
     ("ensemble",): schema.Ensemble,
     ("compute",): schema.Compute,
-    ("channel", "beam", "gaussian"): schema.BeamGaussian,
-    ("channel", "beam", "elliptical_gaussian"): schema.BeamEllipticalGaussian,
-    ("channel", "beam", "map"): schema.BeamMap,
-    ("channel", "beam", "blm"): schema.BeamBlm,
+    **{
+        ("channel", side, kind): beam
+        for side in ("beam", "beam_b")
+        for kind, beam in (
+            ("gaussian", schema.BeamGaussian),
+            ("elliptical_gaussian", schema.BeamEllipticalGaussian),
+            ("map", schema.BeamMap),
+            ("blm", schema.BeamBlm),
+        )
+    },
     ("channel", "scan", "parallel_transport"): schema.ScanParallelTransport,
     ("channel", "scan", "hit_averaged"): schema.ScanHitAveraged,
     ("channel", "scan", "moments"): schema.ScanMoments,
     ("channel", "scan", "pointing"): schema.ScanPointing,
+    ("channel", "scan", "differencing"): schema.ScanDifferencing,
 }
 _TOML_NAMES = {"schema_version": "schema", "channels": "channel"}
 
@@ -89,8 +96,6 @@ def _text(item: ErrorDetails, key: str, tables: tuple[str, ...]) -> str:
         return f"{stated} is unknown{_closest(str(item['input']), known)}; use one of {', '.join(known)}"
     if kind == "union_tag_invalid":
         tag, known = str(context["tag"]), _quoted(context["expected_tags"])
-        if tag == "differencing":
-            return f'{key}.kind = "differencing" is not in this version of mcsim; use one of {", ".join(known)}'
         return f"{key}.kind = {shown(tag)} is unknown{_closest(tag, known)}; use one of {', '.join(known)}"
     if kind == "union_tag_not_found" and isinstance(item["input"], dict):
         return f"the key {key}.kind is missing; add it"

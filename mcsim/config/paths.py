@@ -31,6 +31,7 @@ _RULES = {
     "map.mask": _Rule(placeholders=("channel", "split")),
     "map.pixel_window": _Rule(words=("computed", "none")),
     "beam.path": _Rule(placeholders=("channel",)),
+    "beam_b.path": _Rule(placeholders=("channel",)),
     "scan.path": _Rule(placeholders=("channel", "split")),
     "scan.model": _Rule(packaged="scan_models", placeholders=("channel", "split")),
 }
@@ -71,7 +72,7 @@ def entries(plain: dict[str, Any]) -> Iterator[Entry]:
     ]
     for number, table in enumerate(tables):
         key = f"channel[{label(table, number)}]"
-        sections += [(part, f"{key}.{part}", table.get(part), (every[number],)) for part in ("beam", "scan")]
+        sections += [(part, f"{key}.{part}", table.get(part), (every[number],)) for part in ("beam", "beam_b", "scan")]
     for section, where, holder, speaks_of in sections:
         for path, rule in _RULES.items():
             table_name, field = path.split(".")

@@ -55,6 +55,7 @@ PathText = Annotated[str, AfterValidator(_not_empty)]
 Degree = Annotated[int, Field(ge=2, le=LMAX_MAX)]
 BeamOrder = Annotated[int, Field(ge=0, le=LMAX_MAX)] | None
 Fwhm = Annotated[float, Field(gt=0.0, le=10800.0)]
+Frame = Literal["ecliptic", "galactic", "equatorial"]
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -81,13 +82,23 @@ class Map:
 
     ``pixel_window``: "computed", "none" or a FITS file; left out, it is "computed" for scans whose samples spread over
     the pixels and "none" for parallel transport, whose samples stand at the centres.
+    ``mask_frame``: frame of the mask, left out that of the maps; ``mask_apodisation_deg``: width of its soft edge.
     """
 
     nside: Annotated[int, Field(ge=1, le=NSIDE_MAX), AfterValidator(_power_of_two)]
-    frame: Literal["ecliptic", "galactic", "equatorial"] = "ecliptic"
+    frame: Frame = "ecliptic"
     mask: PathText | None = None
+    mask_frame: Frame | None = None
+    mask_apodisation_deg: Annotated[float, Field(ge=0.0, le=90.0)] = 0.0
     splits: Annotated[tuple[Label, ...], AfterValidator(_unique)] = ()
     pixel_window: PathText | None = None
+
+    @model_validator(mode="after")
+    def _mask_to_work_on(self) -> Self:
+        if self.mask is None and (self.mask_frame is not None or self.mask_apodisation_deg > 0.0):
+            key = "mask_frame" if self.mask_frame is not None else "mask_apodisation_deg"
+            raise ValueError(f"{key} is given without a mask; add mask or remove {key}")
+        return self
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -123,7 +134,7 @@ class BeamMap:
     """Two-dimensional beam map in FITS.
 
     ``pixel_deg`` left out is read from the file, ``centre_pixel`` (column, row) left out is the intensity centroid;
-    ``plane`` picks one image of a cube.
+    ``plane`` picks one image of a cube; ``angle_deg`` turns the beam about its axis, from x towards y.
     """
 
     kind: Literal["map"] = "map"
@@ -133,15 +144,17 @@ class BeamMap:
     centre_pixel: tuple[float, float] | None = None
     plane: Annotated[int, Field(ge=0)] = 0
     projection: Literal["equidistant", "orthographic", "equal_area"] = "equidistant"
+    angle_deg: float = 0.0
     m_max: BeamOrder = None
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class BeamBlm:
-    """File of b_lm."""
+    """File of b_lm; ``angle_deg`` turns the beam about its axis, from x towards y."""
 
     kind: Literal["blm"] = "blm"
     path: PathText
+    angle_deg: float = 0.0
     m_max: BeamOrder = None
 
 
@@ -179,26 +192,58 @@ class ScanPointing:
     path: PathText
 
 
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class ScanDifferencing:
+    """A differencing pair of a scan model; maps are made from (1+x) T_A - (1-x) T_B, x the transmission imbalance.
+
+    ``tolerance`` is the relative residual that the map-making must reach within ``max_iterations``.
+    """
+
+    kind: Literal["differencing"] = "differencing"
+    model: PathText
+    pair: PathText
+    sample_period_s: Annotated[float, Field(gt=0.0)] | None = None
+    transmission_imbalance: Annotated[float, Field(gt=-1.0, lt=1.0)] = 0.0
+    tolerance: Annotated[float, Field(ge=1e-14, lt=1.0)] = 1e-8
+    max_iterations: Annotated[int, Field(ge=1, le=1_000_000)] = 500
+
+
 Beam = Annotated[BeamGaussian | BeamEllipticalGaussian | BeamMap | BeamBlm, Field(discriminator="kind")]
-Scan = Annotated[ScanParallelTransport | ScanHitAveraged | ScanMoments | ScanPointing, Field(discriminator="kind")]
+Scan = Annotated[
+    ScanParallelTransport | ScanHitAveraged | ScanMoments | ScanPointing | ScanDifferencing,
+    Field(discriminator="kind"),
+]
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Noise:
-    """White noise per sample; the variance of a pixel is sigma0_uk^2 / hits."""
+    """White noise per sample; the variance of a pixel is sigma0_uk^2 / hits. Differencing: per difference."""
 
     sigma0_uk: Annotated[float, Field(ge=0.0)] = 0.0
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Channel:
-    """One detector or band: a beam under a scan, with noise."""
+    """One detector or band: a beam under a scan, with noise.
+
+    ``beam_b``: beam of side B of a differencing scan; left out, it is ``beam`` mirrored.
+    """
 
     name: Label
     beam: Beam
     scan: Scan
+    beam_b: Beam | None = None
     frequency_ghz: Annotated[float, Field(gt=0.0)] | None = None
     noise: Noise = Noise()
+
+    @model_validator(mode="after")
+    def _one_or_two_beams(self) -> Self:
+        if self.beam_b is not None and not isinstance(self.scan, ScanDifferencing):
+            raise ValueError(
+                f'beam_b is given, but a scan of kind "{self.scan.kind}" has one beam; remove beam_b or choose '
+                'kind = "differencing"'
+            )
+        return self
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -263,11 +308,13 @@ class RunConfig:
         except ValueError as error:
             raise ValueError(f"channel {error}") from None
         for channel in self.channels:
-            m_max = getattr(channel.beam, "m_max", None)
-            if m_max is not None and m_max > self.sky.lmax:
-                raise ValueError(
-                    f"channel[{channel.name}].beam.m_max = {m_max} is above sky.lmax = {self.sky.lmax}; lower m_max"
-                )
+            for key in ("beam", "beam_b"):
+                m_max = getattr(getattr(channel, key), "m_max", None)
+                if m_max is not None and m_max > self.sky.lmax:
+                    raise ValueError(
+                        f"channel[{channel.name}].{key}.m_max = {m_max} is above sky.lmax = {self.sky.lmax}; "
+                        "lower m_max"
+                    )
         return self
 
 

@@ -1,7 +1,7 @@
 """Binned BipoSH spectra as one vector of real data with its covariance, from the realizations of a store."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -118,7 +118,7 @@ def parse_mode(name: str) -> Mode:
 def project(
     rows: Sequence[Row], scaling: Scaling, spectra: Mapping[Mode, NDArray[np.complex128]]
 ) -> NDArray[np.float64]:
-    """Data vectors of spectra A^{LM}_{l2-d, l2} of shape (..., lmax + 1), shape (..., rows); NaN where a bin is empty."""
+    """Data vectors, shape (..., rows), of spectra of shape (..., lmax + 1); NaN where a bin is empty."""
     scaled = {mode: scaling.factor(mode, array.shape[-1] - 1) * array for mode, array in spectra.items()}
     columns = []
     for row in rows:
@@ -176,16 +176,41 @@ def from_store(
     if not rows:
         raise InputError(f"no bin of {path} lies within ell = {first} ... {last}; its bins are {width} wide, widen it.")
     drawn = realizations(path, rows, SUMMARY, chosen, label)
-    measured = np.isfinite(drawn).all(axis=0)
+    measured = np.atleast_1d(np.isfinite(drawn).all(axis=0))
     if not measured.any():
         raise InputError(f"{path} has none of the modes {', '.join(modes)} for the pair {label}; choose others.")
     drawn = drawn[:, measured]
-    covariance = np.cov(drawn.T, ddof=1).reshape(drawn.shape[1], -1) if len(drawn) > 1 else np.full((1, 1), np.nan)
+    covariance = np.cov(drawn.T, ddof=1).reshape(drawn.shape[1], -1)
     kept = tuple(row for row, keep in zip(rows, measured, strict=True) if keep)
     value = drawn.mean(axis=0)
     return Measurement(
         str(path), label, chosen, kept, SUMMARY, value, covariance / len(drawn), len(drawn), realizations=drawn
     )
+
+
+def with_covariance_of(measured: Measurement, path: str | Path, pair: str | None = None) -> Measurement:
+    """The data of a measurement with the covariance of one realization of an ensemble that models it.
+
+    Parameters
+    ----------
+    measured
+        Usually a table, whose errors are then not used.
+    path
+        Store with the modes and degrees of the measurement; its realizations are binned like the data.
+    pair
+        Label of the pair in the store; by default that of the measurement, or the store's first.
+
+    Raises
+    ------
+    InputError
+        If the store does not hold what the measurement does.
+    """
+    with store.open_ensemble(path) as ensemble:
+        labels = [str(name) for name in ensemble["pair"].values]
+    label = pair or (measured.pair if measured.pair in labels else labels[0])
+    drawn = realizations(path, measured.rows, measured.scaling, measured.kind, label)
+    covariance = np.cov(drawn.T, ddof=1).reshape(drawn.shape[1], -1)
+    return replace(measured, covariance=covariance, simulations=len(drawn))
 
 
 def realizations(path: str | Path, rows: Sequence[Row], scaling: Scaling, kind: str, pair: str) -> NDArray[np.float64]:

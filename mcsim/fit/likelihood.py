@@ -46,6 +46,14 @@ class Solution:
         """Correlation of the parameters, shape (K, K)."""
         return self.covariance / np.outer(self.errors, self.errors)
 
+    @property
+    def reduced_chi2(self) -> float:
+        """chi2 over its expectation: dof where the covariance is known, n dof/(n - dof - 1) for n = simulations - 1."""
+        if self.simulations is None:
+            return self.chi2 / self.dof
+        n = self.simulations - 1
+        return self.chi2 * (n - self.dof - 1) / (n * self.dof)
+
 
 def solve(
     data: NDArray[np.float64],
@@ -74,19 +82,19 @@ def solve(
 
     Notes
     -----
-    With n = N - 1, q = p - K and R = chi2 / n, (n - q + 1)/q R ~ F(q, n - q + 1), Hotelling's T^2 of the residual, and
-    (theta^ - theta)'H(theta^ - theta)/(1 + R) (n - p + 1)/K ~ F(K, n - p + 1), H = T'C^-1 T/n (Rao, Biometrika 46, 49,
-    1959; Hotelling, Ann. Math. Stat. 2, 360, 1931): a Student distribution, whose standard deviation is quoted. The
-    plain chi2 and errors of a sample covariance are wrong by factors of order 1 + p/N (Hartlap et al., A&A 464, 399,
-    2007). Uniform probabilities and pulls of unit width: tests/statistical/test_fit.py.
+    With n = N - 1, q = p - K, R = chi2/n and H = T'C^-1 T/n: (n - q + 1)/q R ~ F(q, n - q + 1), Hotelling's T^2 of the
+    residual (Ann. Math. Stat. 2, 360, 1931). The residual acts as q covariates of the parameters, so that each of them
+    over sqrt((1 + R) (H^-1)_kk/(n - q)) is a Student t with n - q degrees of freedom (Rao, Biometrika 46, 49, 1959),
+    whose standard deviation is quoted. A plain chi2 and its errors are wrong by factors of order 1 + p/N (Hartlap et
+    al., A&A 464, 399, 2007). Probabilities are uniform and pulls of unit width: tests/statistical/test_fit.py.
     """
     p, K = design.shape
     if p <= K:
         raise InputError(f"{p} data cannot be fitted with {K} parameters; give more bins or a simpler model.")
     if simulations is not None and simulations < p + 3:
         raise InputError(
-            f"{simulations} realizations are too few for the covariance of {p} binned data; give wider bins, fewer modes, "
-            f"a narrower range of ell or at least {p + 3} realizations."
+            f"{simulations} realizations are too few for the covariance of {p} binned data; give wider bins, fewer "
+            f"modes, a narrower range of ell or at least {p + 3} realizations."
         )
     scale = np.sqrt(np.diag(covariance))
     if not np.all(scale > 0.0):
@@ -110,7 +118,7 @@ def solve(
     if simulations is None:
         return Solution(parameters, inverse @ inverse.T, chi2, q, float(stats.chi2.sf(chi2, q)), residual, None)
     n = simulations - 1
-    student = n - p + 1
+    student = n - q
     widening = n * (1.0 + chi2 / n) / student * (student / (student - 2.0))
     probability = float(stats.f.sf((n - q + 1) / q * chi2 / n, q, n - q + 1))
     return Solution(parameters, widening * inverse @ inverse.T, chi2, q, probability, residual, simulations)
@@ -135,8 +143,9 @@ def compare(small: Solution, large: Solution) -> Comparison:
 
     Notes
     -----
-    The drop of chi2 is a chi^2 of as many degrees of freedom as there are added parameters; with n = N - 1 of a sample
-    covariance of p data, (n - p + 1)/added (R_small - R_large)/(1 + R_large) ~ F(added, n - p + 1), R = chi2/n (Rao 1959).
+    The drop of chi2 is a chi^2 of as many degrees of freedom as there are added parameters. With n = N - 1 of a sample
+    covariance, nu = n - q + 1 and q of the smaller model, nu/added (R_small - R_large)/(1 + R_large) ~ F(added, nu),
+    R = chi2/n (Rao 1959).
     """
     added = small.dof - large.dof
     if added <= 0:
@@ -145,9 +154,8 @@ def compare(small: Solution, large: Solution) -> Comparison:
     if small.simulations is None:
         return Comparison(drop, added, float(stats.chi2.sf(drop, added)))
     n = small.simulations - 1
-    student = n - len(small.residual) + 1
-    statistic = student / added * drop / (n + large.chi2)
-    return Comparison(drop, added, float(stats.f.sf(statistic, added, student)))
+    nu = n - small.dof + 1
+    return Comparison(drop, added, float(stats.f.sf(nu / added * drop / (n + large.chi2), added, nu)))
 
 
 def solve_each(realizations: NDArray[np.float64], design: NDArray[np.float64]) -> list[Solution]:

@@ -40,8 +40,8 @@ def model(name: str, ell_range: tuple[int, int], knots: int = 4) -> Model:
     Parameters
     ----------
     name
-        "constant": alpha. "linear": alpha + beta l. "spline": a natural cubic spline, whose parameters are its values at
-        ``knots`` equidistant multipoles and which is constant outside. "orientation": a complex constant, as
+        "constant": alpha. "linear": alpha + beta l. "spline": a natural cubic spline, constant outside, whose
+        parameters are its values at ``knots`` equidistant multipoles. "orientation": a complex constant, as
         :func:`mcsim.fit.orientation.orientation` reads it.
     ell_range
         First and last l of the spline.
@@ -55,8 +55,8 @@ def model(name: str, ell_range: tuple[int, int], knots: int = 4) -> Model:
 
     Notes
     -----
-    Each model contains the constant one, and the spline contains the linear one within ``ell_range``, so that differences
-    of chi^2 between them have the distribution that :func:`mcsim.fit.likelihood.compare` assumes.
+    Each model contains the constant one, and the spline contains the linear one within ``ell_range``, so that
+    differences of chi^2 between them have the distribution that :func:`mcsim.fit.likelihood.compare` assumes.
     """
     if name == "constant":
         return Model(name, ("alpha",), lambda ell: np.ones((1, len(ell))))

@@ -30,11 +30,11 @@ def read_table(
     Parameters
     ----------
     path
-        ECSV table. Columns L, M, d, ell_min, ell_max, value, error, and value_imag where parts are imaginary; ``value`` is
-        the mean over ell_min <= l2 <= ell_max, d = l2 - l1, with its unit. The header's ``meta`` holds ``normalisation``
-        ("Bennett", "WMAP" or "Hajian-Souradeep"), ``scaling`` ("l(l+1)/2pi" or "none") and optionally ``frame``.
-        ``mcsim info --export`` writes such tables, with a column ``pair`` and, for paired ensembles, ``value_difference``
-        and so on.
+        ECSV table. Columns L, M, d, ell_min, ell_max, value, error, and value_imag where parts are imaginary;
+        ``value`` is the mean over ell_min <= l2 <= ell_max, d = l2 - l1, with its unit. The header's ``meta`` holds
+        ``normalisation`` ("Bennett", "WMAP" or "Hajian-Souradeep"), ``scaling`` ("l(l+1)/2pi" or "none") and
+        optionally ``frame``. ``mcsim info --export`` writes such tables, with a column ``pair`` and, for paired
+        ensembles, ``value_difference`` and so on.
     frame
         Frame of the model, which that of the table must equal.
     modes, ell_range, kind, pair
@@ -94,7 +94,7 @@ def _check(path: str | Path, rows: Sequence[Row], values: Sequence[float], error
     for row, value, error in zip(rows, values, errors, strict=True):
         if not (np.isfinite(value) and np.isfinite(error) and error > 0.0):
             raise InputError(
-                f"{path}: {row.mode.name} at ell = {row.ell_min}-{row.ell_max} has value {value:g} and error {error:g}; "
+                f"{path}: {row.mode.name} at ell = {row.ell_min}-{row.ell_max} has value {value:g}, error {error:g}; "
                 "give finite values with errors above 0, or leave the row out."
             )
 
@@ -155,9 +155,7 @@ def _in_uk2(path: str | Path, table: Table, name: str) -> NDArray[np.float64]:
         raise InputError(f"{path}: the column {name} has no unit; write uK2 (or mK2, K2) into its header.")
     try:
         factor = units.Unit(column.unit).to(units.uK**2)
-        values = np.ma.filled(np.ma.asarray(column, dtype=float), np.nan)
+        values: NDArray[np.float64] = np.ma.filled(np.ma.asarray(column, dtype=float), np.nan)
     except (units.UnitConversionError, ValueError, TypeError):
         raise InputError(f"{path}: the column {name} has unit {column.unit}; convert it to uK2.") from None
     return np.asarray(factor * values)
-
-

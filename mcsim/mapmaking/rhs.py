@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -21,9 +20,7 @@ SideMaps = NDArray[np.float64]
 """S_0, then 2 Re S_s and 2 Im S_s for s = 1 ... mmax of one beam at pixel centres, in uK, shape (npix, 1 + 2 mmax)."""
 
 
-def side_maps(
-    alm: NDArray[np.complex128], response: convolve.Response, nside: int, nthreads: int = 1
-) -> SideMaps:
+def side_maps(alm: NDArray[np.complex128], response: convolve.Response, nside: int, nthreads: int = 1) -> SideMaps:
     """What one side sees at every pixel's centre in any orientation: T(psi) = S_0 + 2 Re sum_s e^{-i s psi} S_s."""
     maps = np.empty((12 * nside * nside, 1 + 2 * response.mmax))
     maps[:, 0] = convolve.circular_map(alm, response, nside, nthreads)
@@ -73,7 +70,8 @@ def rhs_from_maps(
     Notes
     -----
     d = (1 + x) T_A(p_A, psi_A) - (1 - x) T_B(p_B, psi_B). The pointing is computed again for every call, which is as
-    fast as reading it would be. Noise comes from one generator per chunk of the survey, spawned from ``rng``, so that
+    fast as reading it would be: 60 to 80 ns of one core per sample at nside 128 with mmax 2, and half as much again
+    for each further sky. Noise comes from one generator per chunk of the survey, spawned from ``rng``, so that
     :func:`rhs_from_samples` draws the same.
     """
     check_imbalance(x)
@@ -82,19 +80,19 @@ def rhs_from_maps(
     side_a, side_b = (_stacked(scan, [sky[side] for sky in skies]) for side in (0, 1))
     first, last = sample_range(scan.model, scan.side_a, scan.time_range)
     noise = _ChunkNoise(noise_sigma0_uk, rng, chunks(first, last))
-    streams = [PointingStream(scan.model, line, scan.frame) for line in (scan.side_a, scan.side_b)]
-    tables: list[Any] = [(s.block_turns, s.tables, s.geometry, s.to_frame) for s in streams]
+    a, b = (PointingStream(scan.model, line, scan.frame) for line in (scan.side_a, scan.side_b))
     gains = np.array([1.0 + x, x - 1.0, 1.0 + believed, believed - 1.0])
 
     def run(part: list[tuple[int, int]]) -> NDArray[np.float64]:
         rhs = np.zeros((scan.npix, len(skies)))
         for low, high in part:
-            a, b = (stream.start_turns(low) for stream in streams)
-            _add_chunk(a, *tables[0], b, *tables[1], scan.nside, side_a, side_b, gains, noise.draw(low, high), rhs)
+            side_of_a = (a.start_turns(low), a.block_turns, a.tables, a.geometry, side_a)
+            side_of_b = (b.start_turns(low), b.block_turns, b.tables, b.geometry, side_b)
+            _add_chunk(side_of_a, side_of_b, a.to_frame, scan.nside, gains, noise.draw(low, high), rhs)
         return rhs
 
     total = np.zeros((scan.npix, len(skies)))
-    with ThreadPoolExecutor(nthreads) as pool:
+    with ThreadPoolExecutor(max(1, nthreads)) as pool:
         for partial in pool.map(run, parts(first, last)):
             total += partial
     return np.ascontiguousarray(total.T)
@@ -185,7 +183,9 @@ def _stacked(scan: DifferencingScan, maps: list[SideMaps]) -> NDArray[np.float64
     """Maps of one side of all skies, shape (npix, skies, 1 + 2 mmax): what a sample needs lies together."""
     for array in maps:
         if array.shape[0] != scan.npix:
-            raise InputError(f"maps of a side have {array.shape[0]} pixels, but the scan has {scan.npix}; use its nside.")
+            raise InputError(
+                f"maps of a side have {array.shape[0]} pixels, but the scan has {scan.npix}; use its nside."
+            )
     stacked = np.zeros((scan.npix, len(maps), max((array.shape[1] for array in maps), default=1)))
     for sky, array in enumerate(maps):
         stacked[:, sky, : array.shape[1]] = array
@@ -193,50 +193,48 @@ def _stacked(scan: DifferencingScan, maps: list[SideMaps]) -> NDArray[np.float64
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_side(start, tables, geometry, to_frame, size, nside, side, gain, pixel, difference):  # type: ignore[no-untyped-def]
-    """Add gain x (what one side sees) to the differences of one block and leave the samples' pixels in ``pixel``."""
-    work = np.empty((6, BLOCK))
-    fill_block(start, tables, geometry, to_frame, size, work)
-    for k in range(size):
-        pixel[k] = ring_pixel(nside, work[5, k], work[0, k], work[1, k], work[2, k])
-    cosine, sine = work[3].copy(), work[4].copy()
-    # One order at a time over the block: loops of one gather each run three times as fast as samples one by one.
-    for sky in range(difference.shape[0]):
-        for k in range(size):
-            difference[sky, k] += gain * side[pixel[k], sky, 0]
-    for order in range(side.shape[2] // 2):
-        even, odd = 2 * order + 1, 2 * order + 2
-        for sky in range(difference.shape[0]):
-            for k in range(size):
-                seen = side[pixel[k], sky, even] * cosine[k] + side[pixel[k], sky, odd] * sine[k]
-                difference[sky, k] += gain * seen
-        for k in range(size):
-            turned = cosine[k] * work[3, k] - sine[k] * work[4, k]
-            sine[k] = sine[k] * work[3, k] + cosine[k] * work[4, k]
-            cosine[k] = turned
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _add_chunk(  # type: ignore[no-untyped-def]
-    start_a, block_a, tables_a, geometry_a, frame_a, start_b, block_b, tables_b, geometry_b, frame_b,
-    nside, side_a, side_b, gains, noise, rhs,
-):
-    turns_a, turns_b = np.empty(3), np.empty(3)
+def _add_chunk(side_of_a, side_of_b, to_frame, nside, gains, noise, rhs):  # type: ignore[no-untyped-def]
+    """Add the differences of consecutive samples to ``rhs``; a side is (start, block_turns, tables, geometry, maps)."""
     pixel_a, pixel_b = np.empty(BLOCK, dtype=np.int64), np.empty(BLOCK, dtype=np.int64)
     difference = np.empty((rhs.shape[1], BLOCK))
     for block in range((noise.size + BLOCK - 1) // BLOCK):
         first = block * BLOCK
         size = min(BLOCK, noise.size - first)
-        for axis in range(3):
-            turns_a[axis] = (start_a[axis] + block * block_a[axis]) % 1.0
-            turns_b[axis] = (start_b[axis] + block * block_b[axis]) % 1.0
         difference[:, :size] = noise[first : first + size]
-        _add_side(turns_a, tables_a, geometry_a, frame_a, size, nside, side_a, gains[0], pixel_a, difference)
-        _add_side(turns_b, tables_b, geometry_b, frame_b, size, nside, side_b, gains[1], pixel_b, difference)
+        _add_side(side_of_a, block, to_frame, nside, size, gains[0], pixel_a, difference)
+        _add_side(side_of_b, block, to_frame, nside, size, gains[1], pixel_b, difference)
         for sky in range(rhs.shape[1]):
             for k in range(size):
                 rhs[pixel_a[k], sky] += gains[2] * difference[sky, k]
                 rhs[pixel_b[k], sky] += gains[3] * difference[sky, k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_side(side, block, to_frame, nside, size, gain, pixel, difference):  # type: ignore[no-untyped-def]
+    """Add gain x (what one side sees) to the differences of one block and leave the samples' pixels in ``pixel``."""
+    start, block_turns, tables, geometry, maps = side
+    turns, work = np.empty(3), np.empty((6, BLOCK))
+    for axis in range(3):
+        turns[axis] = (start[axis] + block * block_turns[axis]) % 1.0
+    fill_block(turns, tables, geometry, to_frame, size, work)
+    for k in range(size):
+        pixel[k] = ring_pixel(nside, work[5, k], work[0, k], work[1, k], work[2, k])
+    # One order at a time for all samples of the block: short loops of one gather each take half the time of one loop
+    # that sums the orders sample by sample.
+    for sky in range(difference.shape[0]):
+        for k in range(size):
+            difference[sky, k] += gain * maps[pixel[k], sky, 0]
+    cosine, sine = work[3].copy(), work[4].copy()
+    for order in range(maps.shape[2] // 2):
+        even, odd = 2 * order + 1, 2 * order + 2
+        for sky in range(difference.shape[0]):
+            for k in range(size):
+                seen = maps[pixel[k], sky, even] * cosine[k] + maps[pixel[k], sky, odd] * sine[k]
+                difference[sky, k] += gain * seen
+        for k in range(size):
+            turned = cosine[k] * work[3, k] - sine[k] * work[4, k]
+            sine[k] = sine[k] * work[3, k] + cosine[k] * work[4, k]
+            cosine[k] = turned
 
 
 @njit(cache=True, nogil=True)

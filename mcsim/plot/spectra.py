@@ -14,7 +14,12 @@ _COLOURS = ("#1f5fa8", "#c44e22", "#3c8c3c", "#7b4fa3", "#8c6d1f", "#1f8f94")
 
 
 def ensemble_figure(
-    path: str | Path, L: int | None = None, M: int | None = None, d: int | None = None, pair: str | None = None
+    path: str | Path,
+    L: int | None = None,
+    M: int | None = None,
+    d: int | None = None,
+    pair: str | None = None,
+    prediction: xr.Dataset | None = None,
 ) -> Figure:
     """Draw C_l and the binned BipoSH spectra of one pair of maps.
 
@@ -26,11 +31,13 @@ def ensemble_figure(
         Draw only these; by default one panel for every L > 0 and M.
     pair
         Label of the pair; by default the first.
+    prediction
+        What :func:`mcsim.prediction.predict` expects of the ensemble, drawn as dashed lines through its binned spectra.
 
     Raises
     ------
     InputError
-        If nothing of the store fits the choice.
+        If nothing of the store fits the choice, or the prediction lacks the pair or a mode.
     """
     with store.open_summary(path) as summary:
         pairs = [str(label) for label in summary["pair"].values]
@@ -50,10 +57,21 @@ def ensemble_figure(
     if modes.sizes["mode"] == 0:
         raise InputError(f"{path} has no mode with L = {L}, M = {M}, d = {d}; mcsim info names what it holds.")
     panels = sorted({(int(a), int(b)) for a, b in zip(modes["L"].values, modes["M"].values, strict=True)})
-    return _draw(modes, panels, f"{path}: {label}, {int(modes['count'])} realizations")
+    expected = None if prediction is None else _matching(prediction, label, modes)
+    return _draw(modes, panels, f"{path}: {label}, {int(modes['count'])} realizations", expected)
 
 
-def _draw(modes: xr.Dataset, panels: list[tuple[int, int]], title: str) -> Figure:
+def _matching(prediction: xr.Dataset, pair: str, modes: xr.Dataset) -> xr.Dataset:
+    """The same pair and modes of a prediction."""
+    try:
+        return prediction.sel(pair=pair, mode=modes["mode"].values)
+    except KeyError as error:
+        raise InputError(
+            f"The prediction has no {error.args[0]}, which the ensemble has; predict from the ensemble's configuration."
+        ) from None
+
+
+def _draw(modes: xr.Dataset, panels: list[tuple[int, int]], title: str, expected: xr.Dataset | None = None) -> Figure:
     columns = min(3, len(panels))
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(5.2 * columns, 3.6 * rows + 0.4), layout="constrained")
@@ -64,16 +82,36 @@ def _draw(modes: xr.Dataset, panels: list[tuple[int, int]], title: str) -> Figur
         inside = (modes["L"].values == L) & (modes["M"].values == M)
         for colour, index in zip(_COLOURS * 9, np.flatnonzero(inside), strict=False):
             _spectrum(axes, modes.isel(mode=index), colour, paired)
+            if expected is not None:
+                _expected(axes, expected.isel(mode=index), colour, paired)
         axes.axhline(0.0, color="0.6", linewidth=0.8, zorder=0)
         axes.set_title(f"L = {L}, M = {M}", fontsize=10)
         axes.set_xlabel(r"multipole $\ell = l_2$")
         axes.set_ylabel(rf"$\ell(\ell+1)A^{{{L}{M}}}/2\pi$  [$\mu$K$^2$]")
         axes.legend(fontsize=8, frameon=False)
-    if paired:
-        figure.supxlabel(
-            "points: non-circular minus circular twin;  band: plain mean and its standard error", fontsize=9
-        )
+    notes = ["points: non-circular minus circular twin", "band: plain mean and its standard error"] if paired else []
+    if expected is not None:
+        notes.append(f"dashed: prediction, {expected.attrs['prediction']}")
+    figure.supxlabel(";  ".join(notes), fontsize=9)
     return figure
+
+
+def _parts(one: xr.Dataset) -> list[bool]:
+    """Parts of a mode that an ensemble can have: False for the real one, True for the imaginary one."""
+    return [str(one["parity"].values) == "odd"] if int(one["M"]) == 0 else [False, True]
+
+
+def _expected(axes: Axes, one: xr.Dataset, colour: str, paired: bool) -> None:
+    """The prediction of one mode, a line for each of its parts."""
+    values = one[f"biposh{'_difference' if paired else ''}_binned_mean"].values
+    for imaginary in _parts(one):
+        axes.plot(
+            one["bin"].values + 3.0 * int(one["d"]),
+            values.imag if imaginary else values.real,
+            color=colour,
+            linewidth=1.0,
+            linestyle=":" if imaginary and int(one["M"]) > 0 else "--",
+        )
 
 
 def _spectrum(axes: Axes, one: xr.Dataset, colour: str, paired: bool) -> None:
@@ -85,8 +123,7 @@ def _spectrum(axes: Axes, one: xr.Dataset, colour: str, paired: bool) -> None:
         return np.asarray(values.imag if imaginary else values.real)
 
     name = "biposh_difference_binned" if paired else "biposh_binned"
-    parts = [odd] if M == 0 else [False, True]
-    for imaginary in parts:
+    for imaginary in _parts(one):
         label = f"d = {d}" + (f", {'imaginary' if imaginary else 'real'}" if M > 0 or odd else "")
         # The modulus' variance of a mode with M > 0 is shared by its two parts.
         share = 1.0 if M == 0 else np.sqrt(0.5)

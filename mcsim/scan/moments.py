@@ -159,10 +159,10 @@ def read_moments_fits(
         smax = 0
         while f"RE_{smax + 1}" in columns and f"IM_{smax + 1}" in columns:
             smax += 1
-    needed = [f"{part}_{s}" for s in range(1, max(smax, 1) + 1) for part in ("RE", "IM")]
+    needed = [f"{part}_{s}" for s in range(1, smax + 1) for part in ("RE", "IM")]
     for name in needed:
         if name not in columns:
-            raise InputError(f"{where} has no column {name}, but moments up to s = {max(smax, 1)} are needed.")
+            raise InputError(f"{where} has no column {name}, but moments up to s = {smax} are needed.")
     offsets = [name for name in ("DTHETA", "DPHI") if name in columns]
     if len(offsets) == 1:
         raise InputError(f"{where} has {offsets[0]} alone; give both DTHETA and DPHI or neither.")
@@ -177,8 +177,9 @@ def read_moments_fits(
     for s in range(1, smax + 1):
         w[s - 1] = np.where(seen, columns[f"RE_{s}"] + 1j * columns[f"IM_{s}"], 0.0)
     # Single precision may exceed 1 by 6e-8.
-    if np.abs(w).max() > 1.0 + 1e-6:
-        raise InputError(f"{where}: a moment has modulus {np.abs(w).max():g}, but means of e^(-i s psi) are <= 1.")
+    largest = np.abs(w).max(initial=0.0)
+    if largest > 1.0 + 1e-6:
+        raise InputError(f"{where}: a moment has modulus {largest:g}, but means of e^(-i s psi) are <= 1.")
     centroid = [np.where(seen, columns[name], 0.0) for name in offsets]
     return Moments(found, frame, hits, w, *centroid)
 

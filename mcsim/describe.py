@@ -1,5 +1,6 @@
 """What a store holds, in words, and its summary in other formats."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -33,18 +34,20 @@ def describe(path: str | Path) -> str:
     ]
     if (target / "summary").is_dir():
         with store.open_summary(target) as summary:
-            lines += ["  strongest binned spectra (mean over error):", *_strongest(summary, paired)]
+            strongest = _strongest(summary, paired)
+            lines += ["  strongest binned spectra (mean over error):", *strongest] if strongest else []
     return "\n".join(lines)
 
 
 def _strongest(summary: xr.Dataset, paired: bool, count: int = 5) -> list[str]:
     name = "biposh_difference_binned" if paired else "biposh_binned"
     mean = summary[f"{name}_mean"].where(summary["L"] > 0)
-    z = (abs(mean) / summary[f"{name}_standard_error"]).fillna(0.0)
+    error = summary[f"{name}_standard_error"]
+    z = (abs(mean) / error.where(error > 0)).fillna(0.0)
     strongest = z.max("bin").stack(spectrum=("pair", "mode"))
     order = np.argsort(-strongest.values)[:count]
     found = []
-    for index in order:
+    for index in order[strongest.values[order] > 0]:
         pair, mode = strongest["spectrum"].values[index]
         place = int(z.sel(pair=pair, mode=mode).argmax("bin"))
         value = complex(mean.sel(pair=pair, mode=mode)[place].values)
@@ -86,12 +89,16 @@ def _real(summary: xr.Dataset) -> xr.Dataset:
             parts[f"{name}_re"].attrs, parts[f"{name}_im"].attrs = variable.attrs, variable.attrs
         else:
             parts[str(name)] = variable.astype("int32") if variable.dtype == np.int64 else variable
-    real = xr.Dataset(parts, attrs=summary.attrs)
+    # NetCDF has no nested attributes: they go in as text.
+    attributes = {name: value if isinstance(value, str) else json.dumps(value) for name, value in summary.attrs.items()}
+    real = xr.Dataset(parts, attrs=attributes)
     for name, coordinate in real.coords.items():
         if coordinate.dtype == np.int64:
             real = real.assign_coords({name: coordinate.astype("int32")})
         elif coordinate.dtype.kind in "OT":
-            real = real.assign_coords({name: (coordinate.dims, np.array([str(label) for label in coordinate.values]), coordinate.attrs)})
+            real = real.assign_coords(
+                {name: (coordinate.dims, np.array([str(label) for label in coordinate.values]), coordinate.attrs)}
+            )
     return real
 
 
@@ -117,6 +124,7 @@ def table(summary: xr.Dataset) -> Table:
     result = Table(rows=rows, names=["pair", "L", "M", "d", "ell_min", "ell_max", *measured])
     for name in measured:
         result[name].unit = "uK2"
+    result.meta |= {name: summary.attrs[name] for name in ("name", "frame", "digest") if name in summary.attrs}
     result.meta["scaling"] = "l(l+1)/2pi A, mean over ell_min <= l2 <= ell_max"
     result.meta["normalisation"] = (
         "Bennett (WMAP) for even parity; Hajian-Souradeep times (-1)^l2 ((2 l1 + 1)(2 l2 + 1))^(-1/4) for odd parity"

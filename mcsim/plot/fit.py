@@ -1,0 +1,93 @@
+"""Effective beams: measured BipoSH with the best fits, their residuals, and f_l."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from mcsim.fit import Fit
+from mcsim.fit.data import Scaling
+
+_COLOURS = {"constant": "#c44e22", "linear": "#1f5fa8", "spline": "#3c8c3c", "orientation": "#7b4fa3"}
+
+
+def fit_figure(fits: Sequence[Fit]) -> Figure:
+    """Draw fits of several models to the same data.
+
+    Parameters
+    ----------
+    fits
+        At least one.
+
+    Returns
+    -------
+    Figure
+        A column for every mode (and part), with the data and the best fits above their residuals in sigmas, and a last
+        one with f_l and its 68 % band.
+    """
+    measured = fits[0].measured
+    columns = list(dict.fromkeys((row.mode, row.imaginary) for row in measured.rows))
+    figure = Figure(figsize=(4.4 * (len(columns) + 1), 5.4), layout="constrained")
+    figure.suptitle(f"{measured.origin}: {measured.kind} spectra", fontsize=11)
+    axes = figure.subplots(2, len(columns) + 1, height_ratios=(2.2, 1.0), squeeze=False)
+    errors = np.sqrt(np.diag(measured.covariance))
+    for column, (mode, imaginary) in enumerate(columns):
+        here = [i for i, row in enumerate(measured.rows) if (row.mode, row.imaginary) == (mode, imaginary)]
+        x = np.array([0.5 * (measured.rows[i].ell_min + measured.rows[i].ell_max) for i in here])
+        above, below = axes[0, column], axes[1, column]
+        above.errorbar(x, measured.value[here], errors[here], fmt="o", color="0.2", markersize=3.5, capsize=2)
+        for number, one in enumerate(fits):
+            colour = _COLOURS[one.model.name]
+            above.plot(x, one.best[here], color=colour, label=one.model.name)
+            pull = (measured.value - one.best)[here] / errors[here]
+            shift = 0.12 * (number - 0.5 * (len(fits) - 1)) * (x[1] - x[0] if len(x) > 1 else 1.0)
+            below.plot(x + shift, pull, "o", color=colour, markersize=3.5)
+        part = (r"\mathrm{Im}\," if imaginary else r"\mathrm{Re}\,") if mode.M > 0 or imaginary else ""
+        first = r"\ell" if mode.d == 0 else rf"\ell{-mode.d:+d}"
+        above.set_title(rf"${part}A^{{{mode.L}{mode.M}}}_{{{first},\ell}}$", fontsize=10)
+        above.set_ylabel(_unit(measured.scaling))
+        above.legend(fontsize=8, frameon=False)
+        below.set_ylabel(r"residual / $\sigma$")
+        for one_axes in (above, below):
+            one_axes.axhline(0.0, color="0.6", linewidth=0.8, zorder=0)
+        below.set_xlabel(r"multipole $\ell$")
+    _factors(axes[0, -1], fits)
+    _words(axes[1, -1], fits)
+    return figure
+
+
+def _unit(scaling: Scaling) -> str:
+    name = r"\ell(\ell+1)A/2\pi" if scaling.spectrum else "A"
+    return rf"${name}$  [$\mu$K$^2$], {'Bennett' if scaling.bennett else 'Hajian-Souradeep'}"
+
+
+def _factors(axes: Axes, fits: Sequence[Fit]) -> None:
+    for one in fits:
+        factor, width = one.factor()
+        colour = _COLOURS[one.model.name]
+        axes.plot(one.ell, factor, color=colour, label=one.model.name)
+        axes.fill_between(one.ell, factor - width, factor + width, color=colour, alpha=0.2, linewidth=0)
+    # Where the templates vanish, at low l, a flexible model is not held at all: the band may leave the picture there.
+    centre = np.concatenate([one.factor()[0][len(one.ell) // 4 :] for one in fits])
+    margin = max(0.1, float(np.ptp(centre)))
+    axes.set_ylim(float(centre.min()) - margin, float(centre.max()) + margin)
+    axes.set_title(r"$f_\ell = b_{\ell 2}^\mathrm{eff} / b_{\ell 2}$", fontsize=10)
+    axes.set_xlabel(r"multipole $\ell$")
+    axes.legend(fontsize=8, frameon=False)
+
+
+def _words(axes: Axes, fits: Sequence[Fit]) -> None:
+    """Parameters and tests, as text under f_l."""
+    axes.set_axis_off()
+    lines = []
+    for one in fits:
+        solution = one.solution
+        values = zip(one.model.parameters, solution.parameters, solution.errors, strict=True)
+        shown = [rf"{name} = {value:.4g} ± {error:.2g}" for name, value, error in values][:2]
+        if len(solution.parameters) > 2:
+            shown = [f"{len(solution.parameters)} parameters"]
+        lines.append(f"{one.model.name}: {', '.join(shown)}")
+        lines.append(rf"   $\chi^2$ = {solution.chi2:.1f}, reduced {solution.reduced_chi2:.2f}")
+        lines.append(f"   probability {solution.probability:.2g}")
+    axes.text(0.0, 0.95, "\n".join(lines), transform=axes.transAxes, fontsize=8, va="top")

@@ -1,0 +1,88 @@
+"""Generalised least squares against explicit formulas; its exactness with few simulations is in tests/statistical."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from mcsim.errors import InputError
+from mcsim.fit import compare, solve, solve_each
+
+RNG = np.random.default_rng(11)
+P, K = 8, 2
+DESIGN = np.stack([np.ones(P), np.arange(P) * 1e-3], axis=1)
+ROOT = np.tril(RNG.normal(size=(P, P))) + 3.0 * np.eye(P)
+COVARIANCE = ROOT @ ROOT.T
+DATA = DESIGN @ [2.0, 50.0] + ROOT @ RNG.normal(size=P)
+
+
+def test_known_covariance_is_the_textbook_estimate():
+    found = solve(DATA, DESIGN, COVARIANCE)
+    weight = np.linalg.inv(COVARIANCE)
+    covariance = np.linalg.inv(DESIGN.T @ weight @ DESIGN)
+    expected = covariance @ DESIGN.T @ weight @ DATA
+    residual = DATA - DESIGN @ expected
+    np.testing.assert_allclose(found.parameters, expected, rtol=1e-10)
+    np.testing.assert_allclose(found.covariance, covariance, rtol=1e-10)
+    np.testing.assert_allclose(found.residual, residual, rtol=1e-9, atol=1e-12)
+    assert found.chi2 == pytest.approx(residual @ weight @ residual, rel=1e-10)
+    assert found.dof == P - K
+    assert found.probability == pytest.approx(stats.chi2.sf(found.chi2, P - K))
+    assert found.reduced_chi2 == pytest.approx(found.chi2 / (P - K))
+    assert found.correlation[0, 1] == pytest.approx(covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]))
+
+
+def test_many_simulations_give_the_known_covariance():
+    found, known = solve(DATA, DESIGN, COVARIANCE, 10**7), solve(DATA, DESIGN, COVARIANCE)
+    np.testing.assert_allclose(found.covariance, known.covariance, rtol=1e-5)
+    assert found.probability == pytest.approx(known.probability, rel=1e-4)
+
+
+def test_one_parameter_is_the_students_ratio_of_the_formula():
+    """(theta^ - theta)/sqrt((1 + r'S^-1 r)/((n-p+1) t'S^-1 t)) is Student's with n-p+1: the error is its deviation."""
+    N = 40
+    n = N - 1
+    scatter = n * COVARIANCE
+    t = DESIGN[:, 0]
+    found = solve(DATA, DESIGN[:, :1], COVARIANCE, N)
+    weight = np.linalg.inv(scatter)
+    residual = found.residual
+    scale = np.sqrt((1.0 + residual @ weight @ residual) / ((n - P + 1) * (t @ weight @ t)))
+    assert found.errors[0] == pytest.approx(scale * stats.t(n - P + 1).std(), rel=1e-10)
+    q = P - 1
+    assert found.probability == pytest.approx(
+        stats.f.sf((n - q + 1) / q * residual @ weight @ residual, q, n - q + 1), rel=1e-10
+    )
+
+
+def test_comparison_of_nested_models():
+    small, large = solve(DATA, DESIGN[:, :1], COVARIANCE), solve(DATA, DESIGN, COVARIANCE)
+    test = compare(small, large)
+    # Adding one parameter lowers chi2 by its squared significance.
+    assert test.drop == pytest.approx((large.parameters[1] / large.errors[1]) ** 2, rel=1e-9)
+    assert test.probability == pytest.approx(2.0 * stats.norm.sf(np.sqrt(test.drop)), rel=1e-9)
+    with pytest.raises(InputError, match="exchange them"):
+        compare(large, small)
+
+
+def test_each_realization_is_weighted_by_the_others():
+    drawn = RNG.normal(size=(30, P)) @ ROOT.T
+    found = solve_each(drawn, DESIGN)
+    expected = solve(drawn[4], DESIGN, np.cov(np.delete(drawn, 4, axis=0).T), 29)
+    np.testing.assert_allclose(found[4].parameters, expected.parameters, rtol=1e-9)
+    assert found[4].probability == pytest.approx(expected.probability, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("design", "covariance", "simulations", "message"),
+    [
+        (np.eye(P), COVARIANCE, None, "8 data cannot be fitted with 8 parameters"),
+        (DESIGN, COVARIANCE, P + 2, "10 realizations are too few"),
+        (DESIGN, np.diag([1.0] * (P - 1) + [0.0]), None, "datum 7 has no scatter"),
+        (DESIGN, np.ones((P, P)), None, "not positive definite"),
+        (DESIGN[:, [0, 0]], COVARIANCE, None, "cannot tell the parameters"),
+        (0.0 * DESIGN, COVARIANCE, None, "cannot tell the parameters"),
+    ],
+)
+def test_refusals(design, covariance, simulations, message):
+    with pytest.raises(InputError, match=message):
+        solve(DATA, design, covariance, simulations)

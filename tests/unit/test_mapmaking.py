@@ -1,0 +1,346 @@
+"""Pairs, right-hand sides and solutions of differencing, against explicit matrices and known skies."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import healpy
+import numpy as np
+import pytest
+
+from mcsim import convolve, mapmaking, tod
+from mcsim.beams import Beam, elliptical_gaussian, gaussian
+from mcsim.errors import InputError
+from mcsim.mapmaking import pairs
+from mcsim.mapmaking.solve import apply_normal
+from mcsim.scan import ScanModel
+from mcsim.scan.model import LineOfSight
+from mcsim.scan.pointing import pointing
+from mcsim.sky import gaussian_alm
+
+# Two sides that are no mirror images, and rates that see the whole sky at nside 32 in 400,000 samples.
+SIDES = (LineOfSight("A", 70.5, 2.0), LineOfSight("B", 68.0, 177.0))
+MODEL = ScanModel(
+    "toy", 129.3, -3600.0, 22.5, 31557600.0, 78.9, 365.25, SIDES, ("A",), {"D": ("A", "B"), "R": ("B", "A")}
+)
+NSIDE, LMAX = 4, 24
+PART = (0.0, 0.05)
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory) -> mapmaking.DifferencingScan:
+    return mapmaking.prepare(MODEL, "D", NSIDE, time_range=PART, cache_dir=tmp_path_factory.mktemp("pairs"))
+
+
+@pytest.fixture(scope="module")
+def fine_scan(tmp_path_factory) -> mapmaking.DifferencingScan:
+    return mapmaking.prepare(MODEL, "D", 32, cache_dir=tmp_path_factory.mktemp("pairs"), nthreads=2)
+
+
+@pytest.fixture(scope="module")
+def sky() -> np.ndarray:
+    return gaussian_alm(100.0 / (1.0 + np.arange(LMAX + 1)) ** 2, np.random.default_rng(1))
+
+
+@pytest.fixture(scope="module")
+def beams() -> tuple[Beam, Beam]:
+    """Different widths, axes and numbers of orders on the two sides."""
+    return elliptical_gaussian(700.0, 500.0, 20.0, LMAX, mmax=4), elliptical_gaussian(600.0, 500.0, -50.0, LMAX, mmax=2)
+
+
+def pointing_matrix(scan: mapmaking.DifferencingScan, x: float) -> np.ndarray:
+    """P, dense, from the pointing of the model and healpy's pixels."""
+    first, last = tod.sample_range(MODEL, SIDES[0], scan.time_range)
+    matrix = np.zeros((last - first, scan.npix))
+    for line, weight in zip((scan.side_a, scan.side_b), (1.0 + x, x - 1.0), strict=True):
+        theta, phi, _ = pointing(MODEL, line, first, last - first, scan.frame)
+        matrix[np.arange(last - first), healpy.ang2pix(scan.nside, theta, phi)] = weight
+    return matrix
+
+
+def normal_matrix(scan: mapmaking.DifferencingScan, x: float) -> np.ndarray:
+    """N as the solver applies it, column by column."""
+    with ThreadPoolExecutor(1) as pool:
+        return np.stack([apply_normal(scan, x, column, pool) for column in np.eye(scan.npix)], axis=1)
+
+
+def true_rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+@pytest.mark.parametrize("x", [0.0, 0.03])
+def test_pairs_are_the_normal_matrix(scan, x):
+    matrix = pointing_matrix(scan, x)
+    np.testing.assert_allclose(normal_matrix(scan, x), matrix.T @ matrix, atol=1e-9)
+    np.testing.assert_allclose(mapmaking.diagonal(scan, x), np.sum(matrix**2, axis=0), atol=1e-9)
+    np.testing.assert_array_equal(scan.hits_a + scan.hits_b, np.count_nonzero(matrix, axis=0))
+    assert scan.samples == len(matrix) == scan.hits_a.sum()
+
+
+def test_partners_are_merged_and_in_order(scan):
+    assert scan.count.sum() == 2 * scan.samples
+    assert scan.partner.size < scan.count.sum()
+    rows = np.repeat(np.arange(scan.npix), np.diff(scan.row_start))
+    key = rows.astype(np.int64) * scan.npix + scan.partner
+    assert np.all(np.diff(key) > 0)
+
+
+def test_a_pixel_may_be_its_own_partner(tmp_path):
+    """Sides 30 degrees apart in pixels of 58 degrees."""
+    near = replace(MODEL, lines_of_sight=(SIDES[0], LineOfSight("B", 60.0, 30.0)))
+    scan = mapmaking.prepare(near, "D", 1, time_range=(0.0, 0.01), cache_dir=tmp_path)
+    matrix = np.zeros((scan.samples, 12))
+    for line, weight in zip(near.lines_of_sight, (1.2, -0.8), strict=True):
+        theta, phi, _ = pointing(near, line, 0, scan.samples)
+        matrix[np.arange(scan.samples), healpy.ang2pix(1, theta, phi)] += weight
+    assert np.any(np.isclose(matrix, 0.4))
+    np.testing.assert_allclose(normal_matrix(scan, 0.2), matrix.T @ matrix, atol=1e-9)
+
+
+def test_bands_and_threads_do_not_change_the_pairs(scan, tmp_path, monkeypatch):
+    monkeypatch.setattr(pairs, "_BAND", 5_000)
+    other = mapmaking.prepare(MODEL, "D", NSIDE, time_range=PART, cache_dir=tmp_path, nthreads=2)
+    for name in ("hits_a", "hits_b", "row_start", "partner", "count"):
+        np.testing.assert_array_equal(getattr(other, name), getattr(scan, name))
+        assert getattr(other, name).dtype == getattr(scan, name).dtype
+
+
+def test_pairs_are_computed_once(tmp_path, monkeypatch):
+    fractions = []
+    first = mapmaking.prepare(MODEL, "D", 4, time_range=(0.0, 0.01), cache_dir=tmp_path, progress=fractions.append)
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
+    assert [path.name.split("-")[0] for path in tmp_path.iterdir()] == ["pairs"]
+    with monkeypatch.context() as patch:
+        patch.delattr(pairs, "_write")
+        again = mapmaking.prepare(MODEL, "D", 4, time_range=(0.0, 0.01), cache_dir=tmp_path)
+    np.testing.assert_array_equal(again.partner, first.partner)
+    assert isinstance(again.partner, np.memmap)
+    # Another imbalance needs no other pairs; exchanged sides, frames and parts do.
+    mapmaking.prepare(MODEL, "R", 4, time_range=(0.0, 0.01), cache_dir=tmp_path)
+    mapmaking.prepare(MODEL, "D", 4, "galactic", time_range=(0.0, 0.01), cache_dir=tmp_path)
+    mapmaking.prepare(MODEL, "D", 4, time_range=(0.01, 0.02), cache_dir=tmp_path)
+    assert len(list(tmp_path.iterdir())) == 4
+
+
+def test_damaged_pairs_are_refused(tmp_path):
+    mapmaking.prepare(MODEL, "D", 4, time_range=(0.0, 0.01), cache_dir=tmp_path)
+    next(tmp_path.glob("*/partner.raw")).write_bytes(b"")
+    with pytest.raises(InputError, match="does not hold complete pairs"):
+        mapmaking.prepare(MODEL, "D", 4, time_range=(0.0, 0.01), cache_dir=tmp_path)
+
+
+@pytest.mark.parametrize("x", [0.0, 0.02])
+def test_known_sky_is_recovered(x, fine_scan):
+    """Equal circular beams, no noise, samples at pixel centres: the map is the smoothed sky."""
+    lmax = 64
+    sky = gaussian_alm(1000.0 / (1.0 + np.arange(lmax + 1)) ** 2, np.random.default_rng(2))
+    sky = sky + tod.dipole_alm([1200.0, -2500.0, 1900.0], lmax)
+    side = mapmaking.side_maps(sky, convolve.response(gaussian(180.0, lmax), lmax), 32)
+    assert side.shape == (fine_scan.npix, 1)
+    rhs = mapmaking.rhs_from_maps(fine_scan, [(side, side)], x=x)
+    found, report = mapmaking.solve(fine_scan, rhs[0], x, tol=1e-12)
+    expected = side[:, 0] - (side[:, 0].mean() if x == 0.0 else 0.0)
+    assert report.converged
+    assert report.relative_residual < 1e-11
+    # The residual counts the monopole by 2 x^2 only.
+    assert true_rms(found - expected) < (1e-10 if x == 0.0 else 1e-8) * true_rms(expected)
+
+
+def test_imbalance_taken_for_zero_leaves_the_dipole(fine_scan):
+    """A wrong x is a signal of x (T_A + T_B): the dipole's part of it is not small."""
+    sky = tod.dipole_alm([0.0, 0.0, 3300.0], 8)
+    side = mapmaking.side_maps(sky, convolve.response(gaussian(180.0, 8), 8), 32)
+    errors = []
+    for believed in (0.01, 0.0):
+        rhs = mapmaking.rhs_from_maps(fine_scan, [(side, side)], x=0.01, x_assumed=believed)
+        found, _ = mapmaking.solve(fine_scan, rhs[0], believed, tol=1e-12)
+        errors.append(true_rms(found - side[:, 0]))
+    assert errors[0] < 1e-5
+    # x (T_A + T_B) is up to 22 uK in the differences; the year averages most of it away.
+    assert 0.2 < errors[1] < 22.0
+
+
+def test_map_is_the_least_squares_solution(scan):
+    """Noise alone, against a dense solver."""
+    rng = np.random.default_rng(3)
+    for x in (0.0, 0.05):
+        matrix = pointing_matrix(scan, x)
+        data = rng.standard_normal(len(matrix))
+        expected = np.linalg.lstsq(matrix, data, rcond=1e-10)[0]
+        found, report = mapmaking.solve(scan, matrix.T @ data, x, tol=1e-12)
+        seen = mapmaking.diagonal(scan, x) > 0
+        assert report.converged
+        shift = expected[seen].mean() if x == 0.0 else 0.0
+        np.testing.assert_allclose(found[seen], expected[seen] - shift, atol=1e-8)
+
+
+def test_right_hand_side_is_the_sum_over_samples(scan, sky, beams):
+    """Orientation of every sample from the model's pointing; beams by their maps S_s."""
+    x, believed = 0.04, 0.01
+    sides = [mapmaking.side_maps(sky, convolve.response(beam, LMAX), NSIDE) for beam in beams]
+    assert [side.shape[1] for side in sides] == [9, 5]
+    difference = 0.0
+    for line, maps, gain in zip(SIDES, sides, (1.0 + x, x - 1.0), strict=True):
+        theta, phi, psi = pointing(MODEL, line, 0, scan.samples)
+        pixel = healpy.ang2pix(NSIDE, theta, phi)
+        orders = [
+            maps[pixel, 2 * s - 1] * np.cos(s * psi) + maps[pixel, 2 * s] * np.sin(s * psi)
+            for s in range(1, maps.shape[1] // 2 + 1)
+        ]
+        difference = difference + gain * (maps[pixel, 0] + sum(orders))
+    expected = pointing_matrix(scan, believed).T @ difference
+    found = mapmaking.rhs_from_maps(scan, [tuple(sides)], x=x, x_assumed=believed)
+    np.testing.assert_allclose(found[0], expected, atol=1e-9 * np.abs(expected).max())
+
+
+def test_fast_route_is_the_referee_at_pixel_centres(scan, sky, beams, monkeypatch):
+    monkeypatch.setattr(tod, "CHUNK", 3000)
+    sides = tuple(mapmaking.side_maps(sky, convolve.response(beam, LMAX), NSIDE) for beam in beams)
+    common = {"x": 0.04, "x_assumed": 0.01, "noise_sigma0_uk": 3.0}
+    fast = mapmaking.rhs_from_maps(scan, [sides], rng=np.random.default_rng(5), **common)[0]
+    slow = mapmaking.rhs_from_samples(
+        scan, sky, LMAX, beams, at_pixel_centres=True, rng=np.random.default_rng(5), **common
+    )
+    np.testing.assert_allclose(fast, slow, atol=1e-9 * np.abs(slow).max())
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_stages_belong_to_their_side(side, scan, sky, beams):
+    """A gain of 1.5 on one side is a beam 1.5 times as strong there."""
+
+    def louder(stream):
+        for chunk in stream:
+            yield replace(chunk, signal_uk=1.5 * chunk.signal_uk)
+
+    stages = ((louder,), ()) if side == 0 else ((), (louder,))
+    found = mapmaking.rhs_from_samples(scan, sky, LMAX, beams, signal_stages=stages)
+    scaled = tuple(Beam((1.5 if k == side else 1.0) * beam.blm) for k, beam in enumerate(beams))
+    expected = mapmaking.rhs_from_samples(scan, sky, LMAX, scaled)
+    np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
+
+
+def test_skies_together_are_skies_alone(scan, sky, beams):
+    first = tuple(mapmaking.side_maps(sky, convolve.response(beam, LMAX), NSIDE) for beam in beams)
+    twin = tuple(side[:, :1] for side in first)
+    noise = {"noise_sigma0_uk": 3.0}
+    together = mapmaking.rhs_from_maps(scan, [first, twin], rng=np.random.default_rng(6), **noise)
+    for row, sides in zip(together, (first, twin), strict=True):
+        alone = mapmaking.rhs_from_maps(scan, [sides], rng=np.random.default_rng(6), **noise)[0]
+        np.testing.assert_allclose(row, alone, atol=1e-12 * np.abs(alone).max())
+
+
+def test_noise_has_the_normal_matrix_as_covariance(scan):
+    """b' N^+ b / sigma^2 is chi-square with as many degrees of freedom as N has rank."""
+    nothing = (np.zeros((scan.npix, 1)), np.zeros((scan.npix, 1)))
+    rhs = mapmaking.rhs_from_maps(scan, [nothing], noise_sigma0_uk=7.0, rng=np.random.default_rng(7))[0]
+    normal = normal_matrix(scan, 0.0)
+    rank = np.linalg.matrix_rank(normal, hermitian=True)
+    assert rank == np.count_nonzero(scan.hits_a + scan.hits_b) - 1
+    chi_square = rhs @ np.linalg.pinv(normal, hermitian=True) @ rhs / 7.0**2
+    assert abs(chi_square - rank) < 4.0 * np.sqrt(2.0 * rank)
+
+
+def test_threads_do_not_change_a_bit(scan, sky, beams, monkeypatch):
+    monkeypatch.setattr(tod, "CHUNK", 900)
+    sides = tuple(mapmaking.side_maps(sky, convolve.response(beam, LMAX), NSIDE) for beam in beams)
+    results = []
+    for nthreads in (1, 2, 3):
+        rng = np.random.default_rng(8)
+        rhs = mapmaking.rhs_from_maps(scan, [sides], x=0.01, noise_sigma0_uk=2.0, rng=rng, nthreads=nthreads)[0]
+        results.append((rhs, mapmaking.solve(scan, rhs, 0.01, nthreads=nthreads)[0]))
+    for rhs, solution in results[1:]:
+        np.testing.assert_array_equal(rhs, results[0][0])
+        np.testing.assert_array_equal(solution, results[0][1])
+
+
+def test_solution_can_be_followed_stopped_and_continued(fine_scan):
+    rng = np.random.default_rng(9)
+    side = rng.standard_normal((fine_scan.npix, 1))
+    rhs = mapmaking.rhs_from_maps(fine_scan, [(side, side)])[0]
+    seen = []
+    short, report = mapmaking.solve(
+        fine_scan,
+        rhs,
+        max_iterations=4,
+        callback=lambda number, found, residual: seen.append((number, found, residual)),
+    )
+    assert not report.converged
+    assert (report.iterations, [number for number, _, _ in seen]) == (4, [1, 2, 3, 4])
+    assert report.history == tuple(residual for _, _, residual in seen)
+    assert report.relative_residual == pytest.approx(report.history[-1], rel=1e-9)
+    np.testing.assert_array_equal(seen[-1][1], short)
+    errors = [true_rms(found - side[:, 0] + side.mean()) for _, found, _ in seen]
+    assert errors == sorted(errors, reverse=True)
+    finished, report = mapmaking.solve(fine_scan, rhs)
+    # A relative residual of ten per cent and more is left after 4 iterations; 1e-8 needs about three for each ten.
+    assert 15 < report.iterations < 40
+    _, again = mapmaking.solve(fine_scan, rhs, start=finished)
+    assert (again.iterations, again.converged) == (0, True)
+    assert again.relative_residual < 1e-8
+
+
+def test_nothing_observed_gives_nothing(scan):
+    found, report = mapmaking.solve(scan, np.zeros(scan.npix))
+    seen = scan.hits_a + scan.hits_b > 0
+    assert not found[seen].any()
+    assert report == mapmaking.MapmakingReport(0, True, 0.0, ())
+
+
+def test_unseen_pixels_say_so(tmp_path):
+    scan = mapmaking.prepare(MODEL, "D", 32, time_range=(0.0, 0.02), cache_dir=tmp_path)
+    side = np.random.default_rng(10).standard_normal((scan.npix, 1))
+    found, _ = mapmaking.solve(scan, mapmaking.rhs_from_maps(scan, [(side, side)])[0], tol=1e-6)
+    seen = scan.hits_a + scan.hits_b > 0
+    assert 0.1 < seen.mean() < 0.9
+    assert np.all(found[~seen] == healpy.UNSEEN)
+    assert np.all(np.abs(found[seen]) < 100.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"x": 1.0}, "imbalance is 1,"),
+        ({"tol": 0.0}, "tol is 0,"),
+        ({"max_iterations": -1}, "max_iterations is -1"),
+        ({"rhs": np.zeros(5)}, r"right-hand side has shape \(5,\)"),
+        ({"rhs": np.full(192, np.nan)}, "right-hand side has values that are not finite"),
+        ({"start": np.zeros(5)}, r"starting map has shape \(5,\)"),
+    ],
+)
+def test_bad_input_to_the_solver_is_named(changes, message, scan):
+    with pytest.raises(InputError, match=message):
+        mapmaking.solve(**({"scan": scan, "rhs": np.zeros(scan.npix)} | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"x": -1.5}, "imbalance is -1.5"),
+        ({"x_assumed": 2.0}, "imbalance is 2,"),
+        ({"noise_sigma0_uk": 1.0}, "no rng is given"),
+        ({"skies": [(np.zeros((12, 1)), np.zeros((192, 1)))]}, "have 12 pixels, but the scan has 192"),
+    ],
+)
+def test_bad_input_to_the_right_hand_side_is_named(changes, message, scan):
+    good = {"scan": scan, "skies": [(np.zeros((192, 1)), np.zeros((192, 1)))]}
+    with pytest.raises(InputError, match=message):
+        mapmaking.rhs_from_maps(**(good | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"pair": "X"}, "no differencing pair 'X'"),
+        ({"nside": 3}, "nside is 3"),
+        ({"frame": "solar"}, "frame is 'solar'"),
+        ({"time_range": (0.3, 0.1)}, "time_range is"),
+        ({"cache_dir": "/dev/null/pairs"}, "cannot be written"),
+        (
+            {"model": replace(MODEL, lines_of_sight=(SIDES[0], replace(SIDES[1], sample_period_s=50.0)))},
+            "needs one rate",
+        ),
+    ],
+)
+def test_bad_input_to_the_pairs_is_named(changes, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        mapmaking.prepare(**({"model": MODEL, "pair": "D", "nside": 4, "cache_dir": tmp_path} | changes))

@@ -1,0 +1,189 @@
+"""Pointing, signal and binning of the sample-by-sample route, each against an independent evaluation."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+import ducc0
+import healpy
+import numpy as np
+import pytest
+
+from mcsim import alm as alm_
+from mcsim import tod
+from mcsim.beams import Beam, gaussian
+from mcsim.errors import InputError
+from mcsim.scan import ScanModel
+from mcsim.scan.model import LineOfSight
+from mcsim.scan.pointing import pointing
+from mcsim.sky import gaussian_alm
+
+LINE = LineOfSight("A", 70.5, 12.0)
+MODEL = ScanModel("toy", 129.3, -3600.0, 22.5, 31557600.0, 11.0, 10.0, (LINE,), ("A",))
+NSIDE, LMAX = 16, 40
+
+
+@pytest.fixture(scope="module")
+def sky() -> np.ndarray:
+    return gaussian_alm(100.0 / (1.0 + np.arange(LMAX + 1)) ** 2, np.random.default_rng(1))
+
+
+@pytest.fixture(scope="module")
+def beam() -> Beam:
+    """Every order up to 3, complex, none small."""
+    rng = np.random.default_rng(2)
+    ell = np.arange(LMAX + 1)
+    blm = np.zeros((4, LMAX + 1), complex)
+    for m in range(4):
+        phase = np.exp(2j * np.pi * rng.random(LMAX + 1)) if m else 1.0
+        blm[m] = np.where(
+            ell >= m, np.sqrt((2 * ell + 1) / (4 * np.pi)) * np.exp(-((ell / 30.0) ** 2)) / (1 + m) * phase, 0
+        )
+    return Beam(blm)
+
+
+def whole(stream: Iterable[tod.Samples]) -> tod.Samples:
+    """All chunks of a stream as one."""
+    parts = list(stream)
+    fields = ("time_s", "theta", "phi", "psi", "pixel", "signal_uk")
+    return tod.Samples(*(np.concatenate([getattr(part, name) for part in parts]) for name in fields))
+
+
+def test_samples_are_the_pointing_of_the_model(monkeypatch):
+    monkeypatch.setattr(tod, "CHUNK", 7001)
+    count = MODEL.samples(LINE)
+    stream = whole(tod.samples(MODEL, LINE, NSIDE, "galactic"))
+    theta, phi, psi = pointing(MODEL, LINE, 0, count, "galactic")
+    np.testing.assert_allclose(stream.theta, theta, atol=1e-11)
+    np.testing.assert_allclose(np.exp(1j * stream.phi), np.exp(1j * phi), atol=1e-9)
+    np.testing.assert_allclose(np.exp(1j * stream.psi), np.exp(1j * psi), atol=1e-9)
+    np.testing.assert_array_equal(stream.pixel, healpy.ang2pix(NSIDE, theta, phi))
+    np.testing.assert_allclose(stream.time_s, 11.0 * np.arange(count))
+    assert not stream.signal_uk.any()
+
+
+def test_parts_of_the_survey_follow_each_other():
+    everything = whole(tod.samples(MODEL, LINE, NSIDE))
+    halves = [whole(tod.samples(MODEL, LINE, NSIDE, time_range=part)) for part in ((0.0, 0.37), (0.37, 1.0))]
+    for name in ("time_s", "theta", "pixel"):
+        joined = np.concatenate([getattr(half, name) for half in halves])
+        np.testing.assert_allclose(joined, getattr(everything, name), rtol=1e-10)
+
+
+def test_at_pixel_centres_only_the_direction_changes():
+    free = whole(tod.samples(MODEL, LINE, NSIDE))
+    moved = whole(tod.samples(MODEL, LINE, NSIDE, at_pixel_centres=True))
+    np.testing.assert_array_equal(moved.psi, free.psi)
+    np.testing.assert_array_equal(moved.pixel, free.pixel)
+    theta, phi = healpy.pix2ang(NSIDE, free.pixel)
+    np.testing.assert_array_equal(moved.theta, theta)
+    np.testing.assert_array_equal(moved.phi, phi)
+
+
+def test_signal_is_the_integral_of_sky_times_turned_beam(sky, beam):
+    """The beam turned to (phi, theta, psi) by its Euler angles, then integrated against the sky."""
+    stream = next(iter(tod.samples(MODEL, LINE, NSIDE)))
+    few = replace(stream, **{name: getattr(stream, name)[:2000:157] for name in vars(stream)})
+    found = next(tod.sky_signal(sky, LMAX, beam)([few])).signal_uk
+    full = np.zeros(alm_.size(LMAX), complex)
+    for m in range(beam.mmax + 1):
+        full[alm_.start(LMAX, m) + m : alm_.start(LMAX, m) + LMAX + 1] = beam.blm[m, m:]
+    weight = np.where(np.arange(full.size) <= LMAX, 1.0, 2.0)
+    for k in range(few.theta.size):
+        turned = ducc0.sht.rotate_alm(full, LMAX, few.psi[k], few.theta[k], few.phi[k])
+        expected = np.sum(weight * (sky * turned.conj()).real)
+        # The interpolation is asked for 1e-10 of a signal of rms 14 uK.
+        assert found[k] == pytest.approx(expected, abs=1e-8)
+
+
+def test_dipole_is_seen_through_the_beam():
+    vector = np.array([1200.0, -2500.0, 1900.0])
+    beam = gaussian(900.0, 8)
+    stream = next(iter(tod.samples(MODEL, LINE, NSIDE)))
+    found = next(tod.sky_signal(tod.dipole_alm(vector, 8), 8, beam)([stream])).signal_uk
+    expected = beam.window[1] * healpy.ang2vec(stream.theta, stream.phi) @ vector
+    assert beam.window[1] < 0.99
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    sky = gaussian_alm(np.ones(9), np.random.default_rng(3))
+    kwargs = {"line_of_sight": "A", "time_range": (0.0, 0.1)}
+    with_dipole, hits = tod.observe(sky, 8, beam, MODEL, 4, dipole_uk=vector, **kwargs)
+    summed, _ = tod.observe(sky + tod.dipole_alm(vector, 8), 8, beam, MODEL, 4, **kwargs)
+    np.testing.assert_array_equal(with_dipole[hits > 0], summed[hits > 0])
+
+
+def test_map_is_the_mean_of_the_samples(sky, beam):
+    stages = [tod.sky_signal(sky, LMAX, beam)]
+    stream = whole(tod.through(tod.samples(MODEL, LINE, 32), stages))
+    found, hits = tod.observe(sky, LMAX, beam, MODEL, 32, line_of_sight="A")
+    expected = np.full(12 * 32**2, healpy.UNSEEN)
+    for pixel in np.unique(stream.pixel):
+        expected[pixel] = stream.signal_uk[stream.pixel == pixel].mean()
+    np.testing.assert_array_equal(hits, np.bincount(stream.pixel, minlength=hits.size))
+    assert 0 < np.count_nonzero(hits == 0) < hits.size
+    np.testing.assert_allclose(found, expected, rtol=1e-10)
+
+
+def test_noise_is_white_and_does_not_depend_on_chunks(sky, beam, monkeypatch):
+    kwargs = {"line_of_sight": "A", "noise_sigma0_uk": 50.0}
+    clean, hits = tod.observe(sky, LMAX, beam, MODEL, NSIDE, line_of_sight="A")
+    noisy, _ = tod.observe(sky, LMAX, beam, MODEL, NSIDE, rng=np.random.default_rng(4), **kwargs)
+    seen = hits > 0
+    scaled = (noisy - clean)[seen] * np.sqrt(hits[seen]) / 50.0
+    # The mean square of n standard normal numbers has the standard deviation sqrt(2/n).
+    assert abs(np.mean(scaled**2) - 1.0) < 4.0 * np.sqrt(2.0 / seen.sum())
+    monkeypatch.setattr(tod, "CHUNK", 1000)
+    again, _ = tod.observe(sky, LMAX, beam, MODEL, NSIDE, rng=np.random.default_rng(4), **kwargs)
+    # Chunks begin the phases of the pointing anew, to 1e-11 rad.
+    np.testing.assert_allclose(again[seen], noisy[seen], atol=1e-6)
+
+
+def test_threads_do_not_change_a_bit(sky, beam):
+    one, two = (tod.observe(sky, LMAX, beam, MODEL, NSIDE, line_of_sight="A", nthreads=n)[0] for n in (1, 2))
+    np.testing.assert_array_equal(one, two)
+
+
+def test_stages_act_where_they_are_put(sky, beam, monkeypatch):
+    """A turn of the true beam changes what is seen, not where it is binned; a filter may remember the chunk before."""
+    monkeypatch.setattr(tod, "CHUNK", 5000)
+
+    def turn(stream: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
+        for chunk in stream:
+            yield replace(chunk, psi=chunk.psi + 0.3)
+
+    def lag(stream: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
+        before = 0.0
+        for chunk in stream:
+            yield replace(chunk, signal_uk=np.concatenate([[before], chunk.signal_uk[:-1]]))
+            before = chunk.signal_uk[-1]
+
+    turned = Beam(beam.blm * np.exp(-0.3j * np.arange(4))[:, None])
+    expected = whole(tod.through(tod.samples(MODEL, LINE, NSIDE), [tod.sky_signal(sky, LMAX, turned)]))
+    found, hits = tod.observe(
+        sky, LMAX, beam, MODEL, NSIDE, line_of_sight="A", pointing_stages=[turn], signal_stages=[lag]
+    )
+    shifted = np.concatenate([[0.0], expected.signal_uk[:-1]])
+    total = np.bincount(expected.pixel, weights=shifted, minlength=hits.size)
+    np.testing.assert_allclose(found[hits > 0] * hits[hits > 0], total[hits > 0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"line_of_sight": "Z"}, "no line of sight 'Z'"),
+        ({"time_range": (0.5, 0.5)}, r"time_range is \(0.5, 0.5\)"),
+        ({"time_range": (0.0, 1e-9)}, "contains no sample"),
+        ({"lmax": 30}, "lmax 30 needs"),
+        ({"beam": gaussian(900.0, 20)}, "ends at l = 20"),
+        ({"noise_sigma0_uk": 3.0}, "noise_sigma0_uk is 3 but no rng"),
+        ({"nside": 12}, "nside is 12"),
+        ({"frame": "solar"}, "frame is 'solar'"),
+    ],
+)
+def test_bad_input_is_named(changes, message, sky, beam):
+    good = {"alm": sky, "lmax": LMAX, "beam": beam, "model": MODEL, "nside": NSIDE, "line_of_sight": "A"}
+    with pytest.raises(InputError, match=message):
+        tod.observe(**(good | changes))
+
+
+def test_dipole_needs_its_degree():
+    with pytest.raises(InputError, match="lmax is 0"):
+        tod.dipole_alm([0.0, 0.0, 1.0], 0)
