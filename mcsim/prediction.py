@@ -12,7 +12,7 @@ from healpy import nside2pixarea
 from numpy.typing import NDArray
 
 from mcsim import alm as alm_
-from mcsim import config, healpix, summary
+from mcsim import config, healpix, plan, summary
 from mcsim import survey as survey_
 from mcsim.describe import table
 from mcsim.errors import InputError
@@ -275,7 +275,7 @@ def _dataset(survey: Survey, found: dict[tuple[int, int], _Pair]) -> xr.Dataset:
         if not name.endswith("difference"):
             comoment[f"{name}_binned"] = scatter[f"{name}_binned"][..., None] * np.eye(len(recipe.edges) - 1)
     # The sums of two realizations with these variances, so that the summary's own code lays them out.
-    result = summary.dataset(recipe, Sums(2, mean, scatter, comoment))
+    result = summary.dataset(recipe, Sums(2, mean, scatter, comoment), plan.attributes(run))
     for name in mean:
         result[f"{name}_standard_error"].values[:] = np.sqrt(scatter[name] / run.ensemble.realizations)
     result["count"].values[...] = run.ensemble.realizations

@@ -162,7 +162,6 @@ def test_bad_skies(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("mask", "message"),
     [
-        (np.ones(12), "nside 1, the maps have nside 16"),
         (np.full(3072, 2.0), "outside 0 ... 1"),
         (np.zeros(3072), "leaves no observed pixel"),
     ],

@@ -135,6 +135,23 @@ def test_folder_with_braces(plain, folder):
     assert config.channel_path(run.map.mask, "V1") == odd / "mask_V1.fits"
 
 
+def test_two_beams(plain, folder):
+    two = changed(plain, "channel.0.scan", DIFFERENCING)
+    run = config.load(two)
+    assert run.channels[0].beam_b is None
+    assert run.channels[0].scan == config.ScanDifferencing(
+        model="wmap_focal_plane", pair="W1", transmission_imbalance=0.0, tolerance=1e-8, max_iterations=500
+    )
+    assert config.pixel_window(run, run.channels[0]) == "computed"
+    own = {"kind": "map", "path": "beam.fits", "angle_deg": 140.0}
+    run = config.load(changed(two, "channel.0.beam_b", own))
+    assert run.channels[0].beam_b == config.BeamMap(path=str(folder / "beam.fits"), angle_deg=140.0)
+    with pytest.raises(InputError, match=r"channel\[W1\]\.beam_b\.path names the file '.*none\.fits', which does not"):
+        config.load(changed(two, "channel.0.beam_b", own | {"path": "none.fits"}))
+    with pytest.raises(InputError, match=r"channel\[W1\]\.beam_b\.m_max = 129 is above sky\.lmax = 128; lower m_max"):
+        config.load(changed(two, "channel.0.beam_b", own | {"m_max": 129}))
+
+
 def test_python_values(plain, folder):
     """Numpy scalars, tuples and paths are what Python has in place of TOML's values."""
     run = changed(
@@ -151,6 +168,7 @@ def test_dataclasses_check_themselves():
 
 
 BEAM = "channel.0.beam"
+DIFFERENCING = {"kind": "differencing", "model": "wmap_focal_plane", "pair": "W1"}
 WRONG = [
     ("schema", 2, r"schema = 2 is not supported; this version of mcsim reads schema = 1"),
     ("schema", True, r"schema = true is not supported"),
@@ -251,14 +269,29 @@ WRONG = [
     (
         BEAM,
         {"kind": "map", "path": "beam.fits", "map": 0},
-        r"channel\[W1\]\.beam\.map is unknown.* kind, path, pixel_deg, cut_deg, centre_pixel, plane, projection, m_max",
+        r"channel\[W1\]\.beam\.map is unknown.* kind, path, pixel_deg, cut_deg, centre_pixel, plane, projection, angle_deg, m_max",
     ),
     (BEAM, {"kind": "blm", "path": "{split}.fits"}, r"use \{channel\} only"),
     (
         "channel.0.scan.kind",
-        "differencing",
-        r"scan\.kind = \"differencing\" is not in this version of mcsim; use one of parallel",
+        "differncing",
+        r"scan\.kind = \"differncing\" is unknown \(did you mean differencing\?\); use one of parallel",
     ),
+    ("channel.0.scan", {"kind": "differencing", "model": "wmap"}, r"the key channel\[W1\]\.scan\.pair is missing"),
+    ("channel.0.scan", DIFFERENCING | {"transmission_imbalance": 1}, r"imbalance = 1 is too large; give below 1"),
+    ("channel.0.scan", DIFFERENCING | {"tolerance": 0.0}, r"scan\.tolerance = 0\.0 is too small; give at least 1e-14"),
+    ("channel.0.scan", DIFFERENCING | {"max_iterations": 0}, r"max_iterations = 0 is too small; give at least 1"),
+    ("channel.0.scan", DIFFERENCING | {"model": "none.toml"}, r"scan\.model names the file '.*none\.toml', which does"),
+    ("channel.0.scan", DIFFERENCING | {"lines": 1}, r"scan\.lines is unknown; .* kind, model, pair, sample_period_s"),
+    (
+        "channel.0.beam_b",
+        {"kind": "gaussian", "fwhm_arcmin": 30.0},
+        r'channel\[W1\]: beam_b is given, but a scan of kind "parallel_transport" has one beam; remove beam_b',
+    ),
+    ("channel.0.beam_b", {"kind": "gaussian", "fwhm": 3.0}, r"channel\[W1\]\.beam_b\.fwhm is unknown"),
+    ("map.mask_frame", "galactic", r"map: mask_frame is given without a mask; add mask or remove mask_frame"),
+    ("map.mask_apodisation_deg", 2.0, r"map: mask_apodisation_deg is given without a mask; add mask"),
+    ("map.mask_apodisation_deg", -1.0, r"map\.mask_apodisation_deg = -1\.0 is too small; give at least 0"),
     ("channel.1.scan.model", "wmpa", r"channel\[V1\]\.scan\.model names the file .* packaged names .*wmap"),
     ("channel.1.scan.sample_period_s", 0, r"scan\.sample_period_s = 0 is too small; give above 0"),
     ("channel.0.scan.psi0_deg", "x", r"scan\.psi0_deg = \"x\" .* give a number"),
@@ -366,6 +399,44 @@ UNIMPORTANT = [
     ("channel.0.beam.angle_deg", 0.0),
     ("channel.0.beam.fwhm_major_arcmin", 60),
 ]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("channel.0.scan.max_iterations", 9),
+        ("map.mask_frame", "ecliptic"),
+        ("map.mask_apodisation_deg", 0.0),
+        ("channel.1.beam.angle_deg", 0.0),
+    ],
+)
+def test_neither_do_these_of_two_beams_and_a_mask(plain, folder, key, value):
+    run = with_two_beams_and_mask(plain)
+    assert config.digest(config.load(changed(run, key, value))) == config.digest(config.load(run))
+
+
+def with_two_beams_and_mask(plain: dict) -> dict:
+    run = changed(changed(plain, "channel.0.scan", DIFFERENCING), "channel.1.beam", {"kind": "blm", "path": "beam.fits"})
+    return changed(run, "map.mask", "mask.fits")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("channel.0.scan.pair", "W2", 'channel[W1].scan.pair: "W1" -> "W2"'),
+        ("channel.0.scan.tolerance", 1e-6, "channel[W1].scan.tolerance: 1e-08 -> 1e-06"),
+        ("channel.0.scan.transmission_imbalance", 0.01, "channel[W1].scan.transmission_imbalance: 0.0 -> 0.01"),
+        ("channel.0.scan.model", "scan.toml", "channel[W1].scan.model: contents sha256:"),
+        ("channel.1.beam.angle_deg", 5.0, "channel[V1].beam.angle_deg: absent -> 5.0"),
+        ("map.mask_frame", "galactic", 'map.mask_frame: absent -> "galactic"'),
+        ("map.mask_apodisation_deg", 3.0, "map.mask_apodisation_deg: absent -> 3.0"),
+    ],
+)
+def test_but_these_of_two_beams_and_a_mask_do(plain, folder, key, value, expected):
+    run = with_two_beams_and_mask(plain)
+    old, new = config.science(config.load(run)), config.science(config.load(changed(run, key, value)))
+    (found,) = config.differences(old, new)
+    assert found.startswith(expected)
 
 
 @pytest.mark.parametrize(("key", "value"), UNIMPORTANT)
