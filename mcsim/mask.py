@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mcsim import rotation
+from mcsim import healpix, rotation
 from mcsim.errors import InputError
 
 Mask = NDArray[np.float64]
@@ -25,7 +25,7 @@ def read_mask(
     nside, frame
         Of the maps.
     mask_frame
-        Frame of the mask; None: that of the maps.
+        Frame of the mask; None: what the file's COORDSYS says, or that of the maps where it says nothing.
     apodisation_deg
         Width of the soft edge (:func:`apodise`), >= 0.
 
@@ -37,7 +37,8 @@ def read_mask(
     Raises
     ------
     InputError
-        If the file is no HEALPix map or has values outside 0 ... 1.
+        If the file is no HEALPix map, has an nside that is no power of two, values outside 0 ... 1, or another frame
+        than the one given.
 
     Notes
     -----
@@ -45,17 +46,22 @@ def read_mask(
     frame is changed pixel by pixel (:func:`mcsim.rotation.rotate_pixels`) at the finer of the two resolutions. The edge
     is softened last, so that its width is the same whatever the mask came from.
     """
-    try:
-        mask = np.asarray(healpy.read_map(path, dtype=float))
-    except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
-        raise InputError(f"{path} cannot be read as a HEALPix mask ({error}); give a FITS map of weights.") from error
+    mask, stated, _ = healpix.read_map(path)
+    found = healpy.get_nside(mask)
+    if found & (found - 1):
+        raise InputError(f"{path} has nside {found}, which is not a power of two; bring the mask to one that is.")
+    if mask_frame is not None and stated not in (None, mask_frame):
+        raise InputError(
+            f"{path} says that it is in {stated} coordinates, map.mask_frame is {mask_frame}; correct one of them."
+        )
+    mask_frame = mask_frame or stated or frame
     if not (np.all(np.isfinite(mask)) and mask.min() >= 0.0 and mask.max() <= 1.0):
         raise InputError(f"{path} has values outside 0 ... 1; a mask is a map of weights, 1 where the sky is used.")
-    if healpy.get_nside(mask) < nside:
+    if found < nside:
         mask = healpy.ud_grade(mask, nside)
-    if mask_frame is not None and mask_frame != frame:
+    if mask_frame != frame:
         mask = rotation.rotate_pixels(mask, mask_frame, frame)
-    if healpy.get_nside(mask) > nside:
+    if found > nside:
         mask = healpy.ud_grade(mask, nside)
     return apodise(mask, np.deg2rad(apodisation_deg))
 
@@ -73,7 +79,8 @@ def apodise(mask: Mask, width: float) -> Mask:
     Notes
     -----
     The edge is (1 - cos(pi d / width)) / 2 of the angle d from a pixel's centre to that of the nearest pixel of weight
-    0; its slope is continuous, which damps the mask's power at l > pi / width. It takes sky away and gives none back.
+    0. Its slope is continuous: the mask's power at l > 3 pi / width is at most 1/64 of a sharp edge's. It takes sky
+    away and gives none back.
     """
     zeros = mask == 0.0
     if width == 0.0 or not zeros.any() or zeros.all():

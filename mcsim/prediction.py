@@ -1,7 +1,7 @@
 """From a configuration to what its ensemble should give: means, errors and detectability, without Monte Carlo."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -82,7 +82,8 @@ def predict(
     Notes
     -----
     Signal: :mod:`mcsim.predict`, from b_lm, the spin harmonics of the moments w_s (exact ones for parallel transport)
-    and C_l. The analysis divides a_lm by the pixel window, which cancels but for the noise. Noise of variance v(n) per
+    and C_l. The pixel window multiplies what enters a map and divides what its analysis gives: the scan couples
+    degrees in between, so it cancels in part only. Noise of variance v(n) per
     pixel adds v_LM times the pixel area to the autos. Weights W(n) (masks, unobserved pixels) replace w_s by W^2 w_s:
     so they act on the beam's part where l is far above their own scales; what they make of an isotropic sky is left
     out, as in the paired difference. Variances are C_l1 C_l2 (1 + delta_l1l2) / f_sky, f_sky = <W_x W_y>^2 / <W_x^2
@@ -112,13 +113,27 @@ def survey_of(source: Source, nthreads: int = 1) -> Survey:
 
 
 def scanned_beams(survey: Survey, L_max: int, nthreads: int = 1) -> tuple[ScannedBeam, ...]:
-    """Beam and moments up to degree ``L_max`` of every map."""
+    """Beam, times the pixel window, and moments up to degree ``L_max`` of every map."""
     specs = {channel.name: channel.scan for channel in survey.config.channels}
     return tuple(
-        ScannedBeam(channel.beam.blm, _orientations(specs[channel.name], channel, m, L_max, nthreads))
+        ScannedBeam(
+            channel.beam.blm * channel.window, _orientations(specs[channel.name], channel, m, L_max, nthreads)
+        )
         for channel in survey.channels
         for m in channel.maps
     )
+
+
+def without_windows(
+    survey: Survey, spectra: NDArray[np.complex128], modes: Sequence[Mode], pair: tuple[int, int]
+) -> NDArray[np.complex128]:
+    """Coefficients of maps as the analysis leaves them: over the pixel windows at l1 and l2."""
+    windows = [channel.window for channel in survey.channels for _ in channel.maps]
+    result = spectra.copy()
+    for row, (L, _, d) in zip(result, modes, strict=True):
+        l2 = np.flatnonzero(existing(L, d, survey.lmax))
+        row[l2] /= windows[pair[0]][l2 - d] * windows[pair[1]][l2]
+    return result
 
 
 def describe(prediction: xr.Dataset, count: int = 8) -> str:
@@ -187,6 +202,7 @@ def _mean(survey: Survey, beams: tuple[ScannedBeam, ...], pair: tuple[int, int],
     circular = np.where(np.array([L for L, _, _ in modes])[:, None] == 0, signal, 0.0 * signal)
     if exact:
         signal = cmb_biposh_exact(modes, survey.cl, lmax, x, x if pair[0] == pair[1] else y, nthreads=nthreads)
+    signal, circular = (without_windows(survey, array, modes, pair) for array in (signal, circular))
     noise = np.zeros_like(signal)
     if pair[0] == pair[1]:
         noise = _noise(survey, pair[0])
@@ -202,7 +218,7 @@ def _modes(survey: Survey) -> list[Mode]:
 
 def _noise(survey: Survey, number: int) -> NDArray[np.complex128]:
     """Mean BipoSH of the noise of a map."""
-    channel, m = [(channel, m) for channel in survey.channels for m in channel.maps][number]
+    m = [m for channel in survey.channels for m in channel.maps][number]
     L_max, modes, lmax = survey.config.biposh.L_max, _modes(survey), survey.lmax
     if m.noise_uk is None:
         return np.zeros((len(modes), lmax + 1), dtype=np.complex128)
@@ -213,11 +229,7 @@ def _noise(survey: Survey, number: int) -> NDArray[np.complex128]:
         column = alm[alm_.start(L_max, M) + M : alm_.start(L_max, M) + L_max + 1]
         variance[M:, L_max - M] = (-1) ** M * column.conj()
         variance[M:, L_max + M] = column
-    mean = noise_biposh(modes, variance, lmax)
-    for row, (L, _, d) in zip(mean, modes, strict=True):
-        l2 = np.flatnonzero(existing(L, d, lmax))
-        row[l2] /= channel.window[l2 - d] * channel.window[l2]
-    return mean
+    return without_windows(survey, noise_biposh(modes, variance, lmax), modes, (number, number))
 
 
 def _cl(survey: Survey, monopole: NDArray[np.complex128]) -> NDArray[np.float64]:

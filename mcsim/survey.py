@@ -228,7 +228,7 @@ def _moments(
             path = config.channel_path(spec.scan.path, spec.name, split)
             return scan.pointing_moments([path], nside, smax, frame)
         case config.ScanHitAveraged():
-            model = _scan_model(spec, spec.scan, split)
+            model = scan_model(spec, spec.scan, split)
             lines = None if spec.scan.line_of_sight is None else [spec.scan.line_of_sight]
             folder = scan.cached_moments(
                 model, nside, smax, frame, lines, time_range=share, nthreads=nthreads, progress=progress
@@ -238,9 +238,10 @@ def _moments(
             raise TypeError("a differencing scan has pairs of pixels, no moments")
 
 
-def _scan_model(
+def scan_model(
     spec: config.Channel, chosen: config.ScanHitAveraged | config.ScanDifferencing, split: str | None
 ) -> scan.ScanModel:
+    """The scan model of a channel, at the sampling that the channel asks for."""
     template = config.channel_path(chosen.model, spec.name, split)
     model = scan.load_model(resources.scan_model(str(template)))
     return model if chosen.sample_period_s is None else model.with_sampling(chosen.sample_period_s)
@@ -255,7 +256,7 @@ def _pairs(
     nthreads: int,
     progress: Progress | None,
 ) -> mapmaking.DifferencingScan:
-    model = _scan_model(spec, chosen, split)
+    model = scan_model(spec, chosen, split)
     return mapmaking.prepare(
         model, chosen.pair, run.map.nside, run.map.frame, share, nthreads=nthreads, progress=progress
     )

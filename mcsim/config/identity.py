@@ -48,7 +48,7 @@ def _leave_out_what_says_nothing(plain: dict[str, Any]) -> None:
     A run that does not use a key so keeps the hash that it had before there was such a key.
     """
     section = plain["map"]
-    if section["mask_frame"] in (None, section["frame"]):
+    if section["mask_frame"] is None:
         del section["mask_frame"]
     if section["mask_apodisation_deg"] == 0.0:
         del section["mask_apodisation_deg"]

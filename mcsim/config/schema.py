@@ -82,7 +82,8 @@ class Map:
 
     ``pixel_window``: "computed", "none" or a FITS file; left out, it is "computed" for scans whose samples spread over
     the pixels and "none" for parallel transport, whose samples stand at the centres.
-    ``mask_frame``: frame of the mask, left out that of the maps; ``mask_apodisation_deg``: width of its soft edge.
+    ``mask_frame``: frame of the mask, left out what its file says, or that of the maps; ``mask_apodisation_deg``: width
+    of its soft edge.
     """
 
     nside: Annotated[int, Field(ge=1, le=NSIDE_MAX), AfterValidator(_power_of_two)]

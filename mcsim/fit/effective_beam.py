@@ -219,14 +219,16 @@ def templates(
         )
     L_max = max(mode.L for mode in measured.modes)
     beams = prediction.scanned_beams(survey, L_max, nthreads)
-    x, y = (beams[number] for number in _maps_of(survey, measured.pair))
+    pair = _maps_of(survey, measured.pair)
+    x, y = (beams[number] for number in pair)
     if x.smax < 2 or y.smax < 2:
         raise InputError(f"a beam of {survey.config.name} is circular, so it has no b_l2 to rescale; give its shape.")
     cl, modes = survey.cl, [(mode.L, mode.M, mode.d) for mode in measured.modes]
 
     def expected(change: Any) -> NDArray[np.float64]:
         left, right = (ScannedBeam(change(beam.blm.copy()), beam.w) for beam in (x, y))
-        spectra = cmb_biposh_leading(modes, cl, survey.lmax, left, right)
+        seen = cmb_biposh_leading(modes, cl, survey.lmax, left, right)
+        spectra = prediction.without_windows(survey, seen, modes, pair)
         return project(measured.rows, measured.scaling, dict(zip(measured.modes, spectra, strict=True)))
 
     def without(blm: NDArray[np.complex128]) -> NDArray[np.complex128]:

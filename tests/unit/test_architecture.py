@@ -81,7 +81,7 @@ PUBLIC = {
         "to_dict",
         "to_json",
     ],
-    "mcsim.errors": ["InputError"],
+    "mcsim.errors": ["InputError", "RunError"],
     "mcsim.resources": ["names", "scan_model", "spectrum", "workflow"],
     "mcsim.spectra": ["load"],
 }

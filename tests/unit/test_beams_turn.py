@@ -46,10 +46,8 @@ def test_mirrored_is_the_other_side_of_a_mirror_through_the_spin_axis(beam):
         y = np.cross(n, x)
         return np.array([np.arccos(direction @ n)]), np.array([np.arctan2(direction @ y, direction @ x)])
 
-    side_a = np.array(
-        [np.sin(boresight) * np.cos(azimuth), np.sin(boresight) * np.sin(azimuth), np.cos(boresight)]
-    )
-    direction = side_a + [0.05, 0.2, -0.1]
+    side_a = np.array([np.sin(boresight) * np.cos(azimuth), np.sin(boresight) * np.sin(azimuth), np.cos(boresight)])
+    direction = side_a + np.array([0.05, 0.2, -0.1])
     direction /= np.linalg.norm(direction)
     seen = beam.values(*angles(direction, side_a))
     np.testing.assert_allclose(mirrored(beam).values(*angles(mirror @ direction, mirror @ side_a)), seen, rtol=1e-10)

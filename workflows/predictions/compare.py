@@ -1,0 +1,117 @@
+"""Hold ensembles against their exact predictions: chi^2 over all modes, with its small-sample probability.
+
+    python workflows/predictions/compare.py NAME.toml=NAME.zarr ... [-o predictions.png]
+
+For every channel the paired differences of all modes with L > 0 (real and imaginary parts) are binned in three ranges of ell;
+T^2 = N r' S^-1 r of their mean against the prediction, with the sample covariance S of N realizations, is Hotelling's:
+(N - p) / (p (N - 1)) T^2 ~ F(p, N - p). The probabilities of all channels are then tested for uniformity.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy import stats
+
+import mcsim
+from mcsim import config, prediction
+from mcsim.biposh import Mode
+from mcsim.summary import bin_factor
+
+BINS = 3
+
+
+def vectors(biposh: np.ndarray, modes: list[Mode], edges: np.ndarray) -> np.ndarray:
+    """Binned real and imaginary parts of all modes, shape (..., p)."""
+    columns = []
+    for index, mode in enumerate(modes):
+        if mode.L == 0:
+            continue
+        scaled = bin_factor(mode, biposh.shape[-1] - 1) * biposh[..., index, :]
+        for a, b in zip(edges[:-1], edges[1:], strict=True):
+            value = np.nanmean(scaled[..., a:b], axis=-1)
+            if mode.M > 0 or mode.parity == "even":
+                columns.append(value.real)
+            if mode.M > 0 or mode.parity == "odd":
+                columns.append(value.imag)
+    return np.stack(columns, axis=-1)
+
+
+def probability(sample: np.ndarray, expected: np.ndarray) -> tuple[float, int, float]:
+    """chi^2 per degree of freedom (corrected to have mean 1), degrees of freedom, probability."""
+    n, p = sample.shape
+    residual = sample.mean(axis=0) - expected
+    t2 = n * residual @ np.linalg.solve(np.cov(sample.T), residual)
+    f = (n - p) / (p * (n - 1)) * t2
+    return f * (n - p - 2) / (n - p), p, float(stats.f.sf(f, p, n - p))
+
+
+def main() -> None:
+    """Compare, print, draw."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="+", metavar="CONFIG=STORE")
+    parser.add_argument("-o", "--output", type=Path)
+    arguments = parser.parse_args()
+    panels, found = [], []
+    for text in arguments.runs:
+        source, path = text.split("=")
+        run = config.load(source)
+        ensemble = mcsim.open_ensemble(path).load()
+        modes = [Mode(int(L), int(M), int(d)) for L, M, d in zip(ensemble.L, ensemble.M, ensemble.d, strict=True)]
+        edges = np.linspace(4, ensemble.sizes["ell"], BINS + 1).astype(int)
+        orders = {order: prediction.predict(run, exact=order == "exact") for order in ("exact", "leading")}
+        for channel in run.channels:
+            pair = f"{channel.name},{channel.name}"
+            one = ensemble.sel(pair=pair)
+            difference = (one.biposh - one.biposh_circular).values
+            sample = vectors(difference, modes, edges)
+            results = {}
+            for order, predicted in orders.items():
+                expected = predicted.sel(pair=pair)["biposh_difference_mean"].values
+                results[order] = probability(sample, vectors(expected, modes, edges))
+            found.append(results["exact"][2])
+            print(
+                f"{run.name} {channel.name}: N = {len(sample)}, p = {results['exact'][1]}; "
+                f"exact chi^2/dof {results['exact'][0]:.2f}, probability {results['exact'][2]:.3f}; "
+                f"leading order {results['leading'][0]:.2f}, {results['leading'][2]:.2g}",
+                flush=True,
+            )
+            panels.append((f"{run.name}, {channel.name}", modes, difference, orders, pair))
+    test = stats.kstest(found, "uniform")
+    print(f"Kolmogorov-Smirnov of {len(found)} exact probabilities against uniform: p = {test.pvalue:.3f}")
+    if arguments.output:
+        draw(panels).savefig(arguments.output, dpi=90)
+
+
+def draw(panels: list) -> Figure:
+    """A^{20} of every channel: ensemble with errors in bins of 32, exact prediction as lines."""
+    rows = -(-len(panels) // 3)
+    figure = Figure(figsize=(13, 3.2 * rows), layout="constrained")
+    for number, (title, modes, difference, orders, pair) in enumerate(panels):
+        axes = figure.add_subplot(rows, 3, number + 1)
+        lmax = difference.shape[-1] - 1
+        edges = np.arange(0, lmax + 2, 32)
+        for mode, colour in ((Mode(2, 0, 0), "#1f5fa8"), (Mode(2, 0, 2), "#c44e22")):
+            factor, index = bin_factor(mode, lmax), modes.index(mode)
+
+            def binned(a: np.ndarray, factor: np.ndarray = factor, edges: np.ndarray = edges) -> np.ndarray:
+                bounds = zip(edges[:-1], edges[1:], strict=True)
+                return np.stack([np.nanmean((factor * a)[..., i:j], axis=-1) for i, j in bounds], axis=-1).real
+
+            sample = binned(difference[:, index])
+            x = (edges[:-1] + edges[1:]) / 2
+            error = sample.std(axis=0, ddof=1) / np.sqrt(len(sample))
+            axes.errorbar(x, sample.mean(axis=0), error, fmt="o", ms=3, color=colour, label=f"d = {mode.d}")
+            exact = orders["exact"].sel(pair=pair, mode=mode.name)["biposh_difference_mean"].values
+            axes.plot(x, binned(exact), color=colour, lw=1)
+        axes.axhline(0, color="0.6", lw=0.8)
+        axes.set_title(title, fontsize=10)
+        axes.set_xlabel(r"multipole $\ell$")
+        axes.set_ylabel(r"$\ell(\ell+1)A^{20}/2\pi$  [$\mu$K$^2$]")
+        axes.legend(frameon=False, fontsize=8)
+    return figure
+
+
+if __name__ == "__main__":
+    main()
