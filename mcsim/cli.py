@@ -4,6 +4,7 @@ Exit codes: 0 done, 1 failed realizations, 2 bad input, 130 interrupted.
 """
 
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -112,11 +113,59 @@ def plot(
     M: Annotated[int | None, typer.Option("--M", help="Only this M.")] = None,
     d: Annotated[int | None, typer.Option("--d", help="Only this d = l2 - l1.")] = None,
     pair: Annotated[str | None, typer.Option(help='Pair of maps, for example "W1,W1"; default: the first.')] = None,
+    predict: Annotated[str | None, typer.Option(metavar="CONFIG", help="Draw what this run should give, too.")] = None,
+    exact: Annotated[bool, typer.Option("--exact", help="The prediction to all orders in the beam.")] = False,
 ) -> None:
-    """Draw the binned spectra of a store with their error bars."""
+    """Draw the binned spectra of a store with their error bars, and a prediction over them."""
+    from mcsim import prediction
     from mcsim.plot.spectra import ensemble_figure
 
-    _save(ensemble_figure(store, L=L, M=M, d=d, pair=pair), output or store.with_suffix(".png"))
+    expected = None if predict is None else prediction.predict(predict, exact=exact, nthreads=os.cpu_count() or 1)
+    figure = ensemble_figure(store, L=L, M=M, d=d, pair=pair, prediction=expected)
+    _save(figure, output or store.with_suffix(".png"))
+
+
+@app.command()
+def predict(
+    config: Config,
+    exact: Annotated[bool, typer.Option("--exact", help="To all orders in the beam; default: leading order.")] = False,
+    snr: Annotated[bool, typer.Option("--snr", help="Add the signal to noise of every mode.")] = False,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write it: .zarr, or .ecsv (binned).")
+    ] = None,
+) -> None:
+    """Predict the summary of a run without Monte Carlo."""
+    from mcsim import prediction
+
+    expected = prediction.predict(config, exact=exact, snr=snr, nthreads=os.cpu_count() or 1)
+    out.print(prediction.describe(expected), markup=False)
+    if output is not None:
+        prediction.write(expected, output)
+        out.print(f"wrote {output}", markup=False)
+
+
+@app.command()
+def fit(
+    data: Annotated[str, typer.Argument(metavar="DATA", help="Store, or ECSV table of binned spectra.")],
+    config: Config,
+    model: Annotated[
+        list[str] | None, typer.Option("--model", help="constant, linear, spline or orientation; may be repeated.")
+    ] = None,
+    ell_min: Annotated[int, typer.Option(min=0, help="First ell of the data.")] = 2,
+    ell_max: Annotated[int | None, typer.Option(min=2, help="Last ell of the data.")] = None,
+    pair: Annotated[str | None, typer.Option(help="Pair of maps; default: the only one.")] = None,
+    output: Png = None,
+) -> None:
+    """Fit an effective beam, b_l2 f_l with f_l = alpha or alpha + beta l, to measured or simulated spectra."""
+    from mcsim import fit as fit_
+    from mcsim.plot.fit import fit_figure
+
+    nthreads = os.cpu_count() or 1
+    span = None if ell_max is None and ell_min == 2 else (ell_min, ell_max if ell_max is not None else 1 << 30)
+    measured = fit_.measurement(data, config, ell_range=span, pair=pair)
+    fits = [fit_.fit(measured, config, name, nthreads=nthreads) for name in model or ["constant", "linear"]]
+    out.print(fit_.report(fits), markup=False)
+    _save(fit_figure(fits), output or Path("fit.png"))
 
 
 @app.command()

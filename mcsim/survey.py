@@ -25,7 +25,7 @@ class SurveyMap:
     name
         ``channel`` or ``channel:split``.
     moments
-        Orientation moments of the samples in it; of a differencing scan the hits of both sides, no moments.
+        Orientation moments of the samples in it; of a differencing scan the hits of both sides, and NaN.
     weight
         Weight before analysis, shape (npix,), mean square 1; ``None``: every pixel counts alike.
     noise_uk
@@ -184,7 +184,7 @@ def _channel(run: config.RunConfig, spec: config.Channel, nthreads: int, progres
         pairs = None
         if isinstance(spec.scan, config.ScanDifferencing):
             pairs = _pairs(run, spec, spec.scan, split, share, nthreads, progress)
-            moments = _hits_alone(pairs)
+            moments = _hits_alone(pairs, max(beam.mmax, 1))
         else:
             moments = _moments(run, spec, split, share, beam.mmax, nthreads, progress)
         maps.append(_survey_map(run, spec, split, name, moments, pairs))
@@ -262,10 +262,10 @@ def _pairs(
     )
 
 
-def _hits_alone(pairs: mapmaking.DifferencingScan) -> scan.Moments:
-    """What weights and masks ask of a scan: its hits."""
-    none = np.empty((0, pairs.npix), dtype=np.complex128)
-    return scan.Moments(pairs.nside, pairs.frame, pairs.hits_a + pairs.hits_b, none)
+def _hits_alone(pairs: mapmaking.DifferencingScan, smax: int) -> scan.Moments:
+    """What weights and masks ask of a scan, its hits; whatever asks for moments, which mean nothing here, gets NaN."""
+    unknown = np.broadcast_to(np.complex128(np.nan), (smax, pairs.npix))
+    return scan.Moments(pairs.nside, pairs.frame, pairs.hits_a + pairs.hits_b, unknown)
 
 
 def _survey_map(

@@ -21,14 +21,14 @@ def ensemble_figure(
     pair: str | None = None,
     prediction: xr.Dataset | None = None,
 ) -> Figure:
-    """Draw C_l and the binned BipoSH spectra of one pair of maps.
+    """Draw the binned BipoSH spectra of one pair of maps.
 
     Parameters
     ----------
     path
         Store with a summary.
     L, M, d
-        Draw only these; by default one panel for every L > 0 and M.
+        Draw only these; by default one panel for every L > 0 and M (L = 0 if there is no other).
     pair
         Label of the pair; by default the first.
     prediction
@@ -49,13 +49,14 @@ def ensemble_figure(
     for name, value in (("L", L), ("M", M), ("d", d)):
         if value is not None:
             keep &= chosen[name].values == value
-    if L is None:
+    if L is None and np.any(chosen["L"].values > 0):
         keep &= chosen["L"].values > 0
     modes = chosen.isel(mode=np.flatnonzero(keep))
     # A pair of orders -d, d beside an auto spectrum is all NaN there: nothing to draw.
     modes = modes.isel(mode=np.flatnonzero(np.isfinite(modes["biposh_binned_mean"].values).any(axis=-1)))
     if modes.sizes["mode"] == 0:
-        raise InputError(f"{path} has no mode with L = {L}, M = {M}, d = {d}; mcsim info names what it holds.")
+        wanted = ", ".join(f"{name} = {value}" for name, value in (("L", L), ("M", M), ("d", d)) if value is not None)
+        raise InputError(f"{path} has no mode with {wanted or 'finite values'}; mcsim info names what it holds.")
     panels = sorted({(int(a), int(b)) for a, b in zip(modes["L"].values, modes["M"].values, strict=True)})
     expected = None if prediction is None else _matching(prediction, label, modes)
     return _draw(modes, panels, f"{path}: {label}, {int(modes['count'])} realizations", expected)
@@ -87,13 +88,21 @@ def _draw(modes: xr.Dataset, panels: list[tuple[int, int]], title: str, expected
         axes.axhline(0.0, color="0.6", linewidth=0.8, zorder=0)
         axes.set_title(f"L = {L}, M = {M}", fontsize=10)
         axes.set_xlabel(r"multipole $\ell = l_2$")
-        axes.set_ylabel(rf"$\ell(\ell+1)A^{{{L}{M}}}/2\pi$  [$\mu$K$^2$]")
+        axes.set_ylabel(rf"$\ell(\ell+1)\hat{{A}}^{{{L}{M}}}/2\pi$  [$\mu$K$^2$]")
         axes.legend(fontsize=8, frameon=False)
-    notes = ["points: non-circular minus circular twin", "band: plain mean and its standard error"] if paired else []
+    notes = [r"$\hat{A}$: Bennett normalisation (odd parity: see bin_factor)"]
+    if paired:
+        notes += ["points: non-circular minus circular twin", "band (M = 0): plain mean and its standard error"]
     if expected is not None:
         notes.append(f"dashed: prediction, {expected.attrs['prediction']}")
     figure.supxlabel(";  ".join(notes), fontsize=9)
     return figure
+
+
+def _abscissa(one: xr.Dataset) -> np.ndarray:
+    """Middles of the bins; modes of one panel stand a tenth of a bin apart."""
+    width = one["bin_last"].values - one["bin_first"].values + 1.0
+    return np.asarray(one["bin"].values + 0.1 * width * int(one["d"]))
 
 
 def _parts(one: xr.Dataset) -> list[bool]:
@@ -106,7 +115,7 @@ def _expected(axes: Axes, one: xr.Dataset, colour: str, paired: bool) -> None:
     values = one[f"biposh{'_difference' if paired else ''}_binned_mean"].values
     for imaginary in _parts(one):
         axes.plot(
-            one["bin"].values + 3.0 * int(one["d"]),
+            _abscissa(one),
             values.imag if imaginary else values.real,
             color=colour,
             linewidth=1.0,
@@ -127,7 +136,7 @@ def _spectrum(axes: Axes, one: xr.Dataset, colour: str, paired: bool) -> None:
         label = f"d = {d}" + (f", {'imaginary' if imaginary else 'real'}" if M > 0 or odd else "")
         # The modulus' variance of a mode with M > 0 is shared by its two parts.
         share = 1.0 if M == 0 else np.sqrt(0.5)
-        x = one["bin"].values + 3.0 * d
+        x = _abscissa(one)
         axes.errorbar(
             x,
             component(f"{name}_mean", imaginary),
@@ -140,7 +149,7 @@ def _spectrum(axes: Axes, one: xr.Dataset, colour: str, paired: bool) -> None:
             capsize=2,
             label=label,
         )
-        if paired:
+        if paired and M == 0:
             middle = component("biposh_binned_mean", imaginary)
             width = share * one["biposh_binned_standard_error"].values
             axes.fill_between(x, middle - width, middle + width, color=colour, alpha=0.15, linewidth=0)

@@ -46,7 +46,7 @@ def test_help_loads_no_heavy_library() -> None:
         "except SystemExit:\n    print(sorted({'numpy', 'numba', 'dask', 'xarray', 'healpy'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    for command in ("run", "merge", "info", "plot", "beam", "scan", "bench", "config"):
+    for command in ("run", "merge", "info", "plot", "predict", "fit", "beam", "scan", "bench", "config"):
         assert command in done.stdout
     assert done.stdout.rstrip().endswith("[]")
 
@@ -173,3 +173,19 @@ def test_scan(mcsim: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert code == 0
     assert "three factors" in out
     assert (tmp_path / "scan.png").stat().st_size > 10_000
+
+
+def test_predict_plot_and_fit(mcsim: Command, small_store: Path, tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(SMALL)
+    code, out, _ = mcsim("predict", "small.toml", "--snr", "-o", "expected.ecsv")
+    assert code == 0
+    assert "signal to noise" in out
+    assert "value" in Table.read(tmp_path / "expected.ecsv", format="ascii.ecsv").colnames
+    assert mcsim("plot", small_store, "--predict", "small.toml", "-o", "both.png")[0] == 0
+    code, out, _ = mcsim("fit", small_store, "small.toml", "--model", "constant", "-o", "fit.png")
+    assert code == 0
+    assert "alpha = " in out
+    assert (tmp_path / "fit.png").stat().st_size > 10_000
+    code, _, err = mcsim("fit", small_store, "small.toml", "--model", "cubic")
+    assert code == 2
+    assert "cubic" in err

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mcsim import alm as alm_
-from mcsim import biposh, config, healpix, scan, simulate
+from mcsim import beams, biposh, config, healpix, mask, scan, simulate
 from mcsim.errors import InputError
 from mcsim.survey import survey
 
@@ -108,6 +108,34 @@ def test_mask_keeps_the_power_spectrum_in_the_mean(tmp_path: Path) -> None:
     weight = 2 * np.arange(8, 33) + 1
     # A third of the sky has a third of the modes.
     assert abs((weight * cl).sum() / weight.sum() / expected - 1) < 5 * np.sqrt(2.0 / (n * weight.sum() / 3))
+
+
+def test_mask_of_another_frame_and_resolution_with_a_soft_edge(tmp_path: Path) -> None:
+    path = tmp_path / "mask.fits"
+    theta, _ = healpy.pix2ang(8, np.arange(768))
+    healpy.write_map(path, (np.abs(theta - np.pi / 2) > 0.3).astype(float), dtype=np.float64)
+    soft = {"nside": 16, "mask": str(path), "mask_frame": "galactic", "mask_apodisation_deg": 20.0}
+    shared = survey(config.load(table(map=soft)))
+    expected = mask.read_mask(path, 16, "ecliptic", "galactic", 20.0)
+    weight = shared.channels[0].maps[0].weight
+    assert weight is not None
+    np.testing.assert_allclose(weight, expected / np.sqrt(np.mean(expected**2)), rtol=1e-12)
+    fraction = np.mean(expected**2) ** 2 / np.mean(expected**4)
+    assert shared.sky_fractions == {"W1": pytest.approx(fraction, rel=1e-12)}
+    # Spectra are divided by <W^2>: the power of the twin is that of the whole sky within the sampling of what is left.
+    cl = [np.mean([realize(r, map=m)["cl_circular"][0, 10:] for r in range(8)], axis=0) for m in (soft, {"nside": 16})]
+    modes = fraction * 8 * np.sum(2 * np.arange(10, 33) + 1)
+    assert abs(np.mean(cl[0] / cl[1]) - 1.0) < 5 * np.sqrt(2.0 / modes)
+
+
+def test_files_of_b_lm_may_be_turned(tmp_path: Path) -> None:
+    ellipse = beams.elliptical_gaussian(300.0, 250.0, 10.0, 32, mmax=4)
+    packed = np.concatenate([ellipse.blm[m, m:] for m in range(5)])
+    healpy.write_alm(tmp_path / "b.fits", packed, lmax=32, mmax=4, mmax_in=4, out_dtype=np.float64)
+    turned = {"kind": "blm", "path": str(tmp_path / "b.fits"), "m_max": 4, "angle_deg": 25.0}
+    (loaded,) = survey(config.load(table(channel=[channel(beam=turned)]))).channels
+    expected = beams.elliptical_gaussian(300.0, 250.0, 35.0, 32, mmax=4).blm
+    np.testing.assert_allclose(loaded.beam.blm, expected, atol=1e-12)
 
 
 def test_hits_weighting_changes_the_weights_of_uneven_hits_only(tmp_path: Path) -> None:

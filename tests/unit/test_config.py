@@ -269,7 +269,7 @@ WRONG = [
     (
         BEAM,
         {"kind": "map", "path": "beam.fits", "map": 0},
-        r"channel\[W1\]\.beam\.map is unknown.* kind, path, pixel_deg, cut_deg, .*, plane, projection, angle_deg, m_max",
+        r"channel\[W1\]\.beam\.map is unknown.* kind, path, pixel_deg, cut_deg, .*, projection, angle_deg, m_max",
     ),
     (BEAM, {"kind": "blm", "path": "{split}.fits"}, r"use \{channel\} only"),
     (
