@@ -182,7 +182,10 @@ def test_predict_plot_and_fit(mcsim: Command, small_store: Path, tmp_path: Path)
     assert "signal to noise" in out
     assert "value" in Table.read(tmp_path / "expected.ecsv", format="ascii.ecsv").colnames
     assert mcsim("plot", small_store, "--predict", "small.toml", "-o", "both.png")[0] == 0
-    code, out, _ = mcsim("fit", small_store, "small.toml", "--model", "constant", "-o", "fit.png")
+    code, _, err = mcsim("fit", small_store, "small.toml")
+    assert code == 2
+    assert "10 realizations are too few" in err
+    code, out, _ = mcsim("fit", small_store, "small.toml", "--model", "constant", "--ell-min", 10, "-o", "fit.png")
     assert code == 0
     assert "alpha = " in out
     assert (tmp_path / "fit.png").stat().st_size > 10_000
