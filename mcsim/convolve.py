@@ -8,6 +8,7 @@ One transform per kept s, whatever the number of samples in the survey (paper, S
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -55,34 +56,42 @@ def circular_map(alm: NDArray[np.complex128], response: Response, nside: int, nt
 
 def spin_maps(
     alm: NDArray[np.complex128], response: Response, nside: int, nthreads: int = 1
-) -> list[NDArray[np.float64]]:
-    """S_s for s = 1 ... mmax at pixel centres: real and imaginary parts, each of shape (2, npix), in uK.
+) -> dict[int, NDArray[np.float64]]:
+    """S_s at pixel centres for every s > 0 that the beam has: real and imaginary parts, shape (2, npix), in uK.
 
     Notes
     -----
     ducc0 returns -S_s from E = Re(k b_s) a, B = Im(k b_s) a. The test against ``ducc0.totalconvolve`` holds the sign
     (``tests/unit/test_convolve.py``).
     """
-    maps = []
+    maps = {}
     for s in range(1, response.mmax + 1):
         factor = -response.factors[s]
+        if not factor.any():  # the odd orders of an ellipse, say
+            continue
         electric_magnetic = np.stack(
             [alm_.multiply(alm, factor.real, response.lmax), alm_.multiply(alm, factor.imag, response.lmax)]
         )
-        maps.append(healpix.synthesis(electric_magnetic, nside, response.lmax, spin=s, nthreads=nthreads))
+        maps[s] = healpix.synthesis(electric_magnetic, nside, response.lmax, spin=s, nthreads=nthreads)
     return maps
 
 
-def noncircular_map(maps: list[NDArray[np.float64]], moments: Moments) -> healpix.Map:
+def noncircular_map(maps: dict[int, NDArray[np.float64]], moments: Moments) -> healpix.Map:
     """2 Re sum_{s > 0} w_s S_s: what the non-circular part of the beam adds under a scan, uK, shape (npix,)."""
-    if moments.smax < len(maps):
-        raise InputError(
-            f"The moments end at s = {moments.smax}, the beam has orders up to {len(maps)}; lower its m_max."
-        )
+    highest = max(maps, default=0)
+    if moments.smax < highest:
+        raise InputError(f"The moments end at s = {moments.smax}, the beam has orders up to {highest}; lower its m_max.")
     total = np.zeros(12 * moments.nside**2)
-    for w, (real, imag) in zip(moments.w[: len(maps)], maps, strict=True):
-        total += 2.0 * (w.real * real - w.imag * imag)
+    for s, (real, imag) in maps.items():
+        _add_twice_real_part(moments.w[s - 1], real, imag, total)
     return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_twice_real_part(w, real, imag, total):  # type: ignore[no-untyped-def]
+    """total += 2 Re(w (real + i imag)) in one pass over memory, which is what this costs."""
+    for pixel in range(total.size):
+        total[pixel] += 2.0 * (w[pixel].real * real[pixel] - w[pixel].imag * imag[pixel])
 
 
 def centroid_map(gradient: NDArray[np.float64], moments: Moments) -> healpix.Map:

@@ -22,9 +22,9 @@ SideMaps = NDArray[np.float64]
 
 def side_maps(alm: NDArray[np.complex128], response: convolve.Response, nside: int, nthreads: int = 1) -> SideMaps:
     """What one side sees at every pixel's centre in any orientation: T(psi) = S_0 + 2 Re sum_s e^{-i s psi} S_s."""
-    maps = np.empty((12 * nside * nside, 1 + 2 * response.mmax))
+    maps = np.zeros((12 * nside * nside, 1 + 2 * response.mmax))
     maps[:, 0] = convolve.circular_map(alm, response, nside, nthreads)
-    for s, (real, imag) in enumerate(convolve.spin_maps(alm, response, nside, nthreads), start=1):
+    for s, (real, imag) in convolve.spin_maps(alm, response, nside, nthreads).items():
         maps[:, 2 * s - 1], maps[:, 2 * s] = 2.0 * real, 2.0 * imag
     return maps
 
