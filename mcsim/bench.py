@@ -26,7 +26,7 @@ def bench(nside: int = 512, lmax: int = 1024, repeats: int = 5) -> Iterator[str]
     """
     yield f"nside {nside}, lmax {lmax}, m_max 2, L_max 2, paired; one thread; medians of {repeats} interleaved pairs"
     yield from _realization(nside, lmax, repeats)
-    yield from _workers(nside, lmax, 8 * repeats)
+    yield from _workers(nside, lmax, 16 * repeats)
     yield _moments(nside)
 
 

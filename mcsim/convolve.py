@@ -80,7 +80,9 @@ def noncircular_map(maps: dict[int, NDArray[np.float64]], moments: Moments) -> h
     """2 Re sum_{s > 0} w_s S_s: what the non-circular part of the beam adds under a scan, uK, shape (npix,)."""
     highest = max(maps, default=0)
     if moments.smax < highest:
-        raise InputError(f"The moments end at s = {moments.smax}, the beam has orders up to {highest}; lower its m_max.")
+        raise InputError(
+            f"The moments end at s = {moments.smax}, the beam has orders up to {highest}; lower its m_max."
+        )
     total = np.zeros(12 * moments.nside**2)
     for s, (real, imag) in maps.items():
         _add_twice_real_part(moments.w[s - 1], real, imag, total)

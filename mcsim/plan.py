@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mcsim import alm as alm_
-from mcsim import config, healpix, rng, spectra, store, summary
+from mcsim import config, differencing, healpix, rng, spectra, store, summary
 from mcsim.biposh import Mode, estimate, estimator, modes
 from mcsim.errors import InputError
 from mcsim.sky import gaussian_alm
@@ -117,6 +117,7 @@ def attributes(run: config.RunConfig) -> dict[str, Any]:
         "science": config.science(run),
         "digest": config.digest(run),
         "conventions": CONVENTIONS,
+        "side_b": differencing.sides(run),
         "packages": {name: version(name) for name in _PACKAGES},
     }
 
@@ -230,7 +231,7 @@ def cost(run: config.RunConfig, realizations: range) -> Cost:
         memory,
         float(planned.realization_bytes()) * len(realizations),
         planned.files(),
-        transform * transforms + estimation * estimates,
+        transform * transforms + estimation * estimates + differencing.seconds(run),
     )
 
 

@@ -115,10 +115,14 @@ def survey_of(source: Source, nthreads: int = 1) -> Survey:
 def scanned_beams(survey: Survey, L_max: int, nthreads: int = 1) -> tuple[ScannedBeam, ...]:
     """Beam, times the pixel window, and moments up to degree ``L_max`` of every map."""
     specs = {channel.name: channel.scan for channel in survey.config.channels}
+    for name, scan in specs.items():
+        if isinstance(scan, config.ScanDifferencing):
+            raise InputError(
+                f"Channel {name} reads two beams as a difference, which predictions do not cover; "
+                "predict the same model with hit_averaged instead."
+            )
     return tuple(
-        ScannedBeam(
-            channel.beam.blm * channel.window, _orientations(specs[channel.name], channel, m, L_max, nthreads)
-        )
+        ScannedBeam(channel.beam.blm * channel.window, _orientations(specs[channel.name], channel, m, L_max, nthreads))
         for channel in survey.channels
         for m in channel.maps
     )

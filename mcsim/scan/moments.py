@@ -159,6 +159,7 @@ def read_moments_fits(
         smax = 0
         while f"RE_{smax + 1}" in columns and f"IM_{smax + 1}" in columns:
             smax += 1
+        smax = max(smax, 1)
     needed = [f"{part}_{s}" for s in range(1, smax + 1) for part in ("RE", "IM")]
     for name in needed:
         if name not in columns:

@@ -123,7 +123,7 @@ def draw_ratio(axes: Axes, folder: Path, ell: np.ndarray, lines: dict[float, str
             offset += 2.0
     for factor, text in lines.items():
         axes.axhline(factor, color="0.55", lw=1, ls="--", zorder=0)
-        axes.text(258, factor - 0.003, f"{factor:.3f}: {text}", ha="right", va="top", fontsize=7.5, color="0.35")
+        axes.text(258, factor - 0.016, f"{factor:.3f}: {text}", ha="right", va="top", fontsize=7.5, color="0.35")
     axes.set_ylim(0.42, 0.76)
     axes.set_xlabel(r"multipole $\ell$")
     axes.set_ylabel("over parallel transport")
@@ -173,6 +173,7 @@ def report(folder: Path, ell: np.ndarray) -> None:
     curve = overall(hit, whole)[0] * turned_factor(angle)
     reached = angle[:-1][np.diff(np.sign(curve - 0.45)) != 0]
     print(f"leading order: 0.45 at {', '.join(f'{a:.1f}' for a in reached)} degrees", end="; ")
+    # Half a turn changes nothing at m = 2: -40 degrees is +140.
     for at in (-140.0, -40.0):
         print(f"{curve[np.argmin(np.abs(angle - at))]:.4f} at {at:g} degrees", end="; ")
     print(f"turned by {TURN_DEG:g}, the simulation is above")

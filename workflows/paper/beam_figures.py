@@ -1,14 +1,16 @@
 """Figures of beams: coefficients of elliptical Gaussians and of the raw WMAP-7 beam maps, and the maps themselves."""
 
 import numpy as np
-from matplotlib.colors import TwoSlopeNorm
+from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
+from scipy.ndimage import gaussian_filter
 
 from mcsim import beams
 from mcsim.beams.beammap import solid_angle_values
 
 ARCMIN = np.degrees(1.0) * 60.0
 LMAX = 1024
+SMOOTHING_ARCMIN = 5.0
 COLOURS = {"V2": "#c44e22", "W1": "#1f5fa8"}
 ELLIPSES = {"W": (13.579, 0.4), "V": (17.7036, 0.46)}
 """FWHM of the major axis in arcmin, and eccentricity, of the paper's elliptical Gaussians."""
@@ -65,7 +67,7 @@ def _pattern(beam_map: beams.BeamMap, reach_arcmin: float, size: int) -> tuple[n
 
 def beam_maps(maps: dict[str, beams.BeamMap]) -> Figure:
     """The peak in three dimensions over its contours, and the whole map on a scale that shows where it is negative."""
-    figure = Figure(figsize=(11.0, 9.2), layout="constrained")
+    figure = Figure(figsize=(10.5, 8.4), layout="constrained")
     for row, (name, beam_map) in enumerate(maps.items()):
         axis, peak = _pattern(beam_map, 24.0, 97)
         solid = figure.add_subplot(2, 2, 2 * row + 1, projection="3d")
@@ -76,12 +78,19 @@ def beam_maps(maps: dict[str, beams.BeamMap]) -> Figure:
         solid.set_title(f"{name}, side A: response / peak, contours 10 to 90 %", fontsize=10)
         solid.set_xlabel("x, in-scan [arcmin]")
         solid.set_ylabel("y, cross-scan [arcmin]")
-        axis, whole = _pattern(beam_map, 150.0, 501)
+        axis, whole = _pattern(beam_map, 150.0, 301)
         flat = figure.add_subplot(2, 2, 2 * row + 2)
+        # At 1 arcmin a pixel; unsmoothed, the noise of the map hides the negative regions.
         drawn = flat.imshow(
-            1e3 * whole, origin="lower", extent=(-150, 150, -150, 150), cmap="RdBu_r", norm=TwoSlopeNorm(0, -2, 2)
+            gaussian_filter(whole, SMOOTHING_ARCMIN),
+            origin="lower",
+            extent=(-150, 150, -150, 150),
+            cmap="RdBu_r",
+            norm=SymLogNorm(3e-4, vmin=-1, vmax=1),
         )
-        figure.colorbar(drawn, ax=flat, shrink=0.85, extend="both", label="response, thousandths of the peak")
+        figure.colorbar(
+            drawn, ax=flat, shrink=0.85, label=f"response / peak, smoothed with sigma = {SMOOTHING_ARCMIN:g}′"
+        )
         flat.set_title(f"{name}: negative response is {negative_share(beam_map):.1%} of the positive", fontsize=10)
         flat.set_xlabel("x, in-scan [arcmin]")
         flat.set_ylabel("y, cross-scan [arcmin]")

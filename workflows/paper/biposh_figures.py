@@ -1,6 +1,6 @@
 """Figures of BipoSH: predictions against ensembles, and effective beams fitted to ensembles."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import xarray as xr
@@ -97,7 +97,9 @@ def agreement(summary: xr.Dataset, exact: xr.Dataset, leading: xr.Dataset, chann
             n, p = int(one["count"]), len(value)
             text = f"  {channel} d = {d}: strongest bin {value[np.argmax(np.abs(value))]:.1f} uK^2, chi^2/bins"
             for name, dataset in (("exact", exact), ("leading order", leading)):
-                expected = _mode(dataset, channel, d).isel(bin=slice(0, -1))["biposh_difference_binned_mean"].values.real
+                expected = (
+                    _mode(dataset, channel, d).isel(bin=slice(0, -1))["biposh_difference_binned_mean"].values.real
+                )
                 residual = value - expected
                 chi2 = (n - p - 2) / (n - 1) * residual @ np.linalg.solve(covariance, residual)
                 text += f" {chi2 / p:.2f} ({name})"
@@ -105,7 +107,7 @@ def agreement(summary: xr.Dataset, exact: xr.Dataset, leading: xr.Dataset, chann
     return lines
 
 
-def effective_beams(fits: dict[str, Sequence[Fit]], expected: float) -> Figure:
+def effective_beams(fits: Mapping[str, Sequence[Fit]], expected: float) -> Figure:
     """f_l of fits to hit-averaged data with parallel-transported beams, and the data over the template.
 
     Parameters

@@ -50,7 +50,11 @@ def factors(model: scan.ScanModel, one_year: scan.Moments) -> Figure:
     for weight, key, text in (
         (1.5 * np.sin(theta) ** 2, "biposh", r"$\sin^2\theta$: weight of $A^{20}$"),
         (np.ones_like(theta), "mean", "1: weight of the sky mean"),
-        (2.0 / (np.pi * np.sin(theta)), "f", r"$\propto 1/\sin\theta$: of $(d^\ell_{22})^2$ at large $\ell$"),
+        (
+            2.0 / (np.pi * np.maximum(np.sin(theta), 1e-2)),
+            "f",
+            r"$\propto 1/\sin\theta$: of $(d^\ell_{22})^2$ at large $\ell$",
+        ),
     ):
         right.plot(latitude, weight, "--", color=colours[key], label=text)
     right.set_xlim(-90, 90)

@@ -1,6 +1,6 @@
 """Write coma-beam.fits: a Gaussian of 40' times 1 + k (u^3 - 3u) along 30 degrees, an odd-m beam of known origin.
 
-    python workflows/predictions/make_coma_beam.py
+python workflows/predictions/make_coma_beam.py
 """
 
 import numpy as np
