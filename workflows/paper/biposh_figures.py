@@ -124,7 +124,7 @@ def effective_beams(fits: Mapping[str, Sequence[Fit]], expected: float) -> Figur
         for one, colour in zip(models, (ENSEMBLE, EXACT), strict=True):
             solution, (factor, width) = one.solution, one.factor()
             values = ", ".join(
-                f"{name} = {value:.4g} ± {error:.1g}"
+                f"{name} = {value:.3g} ± {error:.2g}"
                 for name, value, error in zip(one.model.parameters, solution.parameters, solution.errors, strict=True)
             )
             text = f"{values}\n$\\chi^2$/dof {solution.reduced_chi2:.2f}, probability {solution.probability:.2g}"

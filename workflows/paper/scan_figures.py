@@ -7,9 +7,9 @@ from mcsim import resources, scan
 from mcsim.plot.scan import scan_figure
 from mcsim.scan.limit import limit_quadrature
 
-NSIDE = 256
+NSIDE = 128
 SAMPLE_PERIOD_S = 0.2048
-"""Four times WMAP's: 154 million samples are 196 in each pixel, enough for a picture."""
+"""Four times WMAP's: 154 million samples are 780 in each pixel, enough for a picture."""
 
 
 def moments() -> tuple[scan.ScanModel, scan.Moments]:

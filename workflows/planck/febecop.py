@@ -11,8 +11,8 @@ MCSIM_DATA names a folder with
   (Souradeep-CMBLab/NC_beam_codes_Akashdeep, folder febecop_biposh_analysis).
 
 Every radiometer is an elliptical Gaussian; their b_lm are averaged over the horns of a frequency. One year of a
-Planck-like scan gives the orientation moments in ecliptic coordinates; A^{2M} follows to leading order and is rotated to
-galactic ones. The README of this folder says how close the two are.
+Planck-like scan gives the orientation moments in ecliptic coordinates; A^{2M} follows to leading order and is rotated
+to galactic ones. The README of this folder says how close the two are.
 """
 
 import argparse

@@ -1,0 +1,95 @@
+"""Predictions laid out as summaries: against a small ensemble, and as data of a fit."""
+
+from pathlib import Path
+
+import healpy
+import numpy as np
+import pytest
+from distributed import Client
+from scipy import stats
+
+from mcsim import config, fit, open_ensemble, open_summary, prediction, resources, runner, scan
+from mcsim.errors import InputError
+
+from .conftest import ensemble, table
+
+BEAM = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 300.0, "fwhm_minor_arcmin": 220.0, "m_max": 4}
+
+
+def limit_moments(path: Path, nside: int) -> str:
+    """The WMAP-like scan in the limit of endless time, as a file."""
+    model = scan.load_model(resources.scan_model("wmap"))
+    theta, _ = healpy.pix2ang(nside, np.arange(12 * nside**2))
+    rings, ring = np.unique(theta, return_inverse=True)
+    density, w = scan.limit_moments(model, rings, 4)
+    scan.write_moments_fits(path, scan.Moments(nside, "ecliptic", density[ring], w[:, ring]))
+    return str(path)
+
+
+def test_layout_is_that_of_the_summary(small_store: Path) -> None:
+    expected = prediction.predict(table())
+    summary = open_summary(small_store)
+    # How the paired difference scatters is not that of an isotropic sky, and not predicted.
+    assert set(summary.data_vars) - set(expected.data_vars) == {"biposh_difference_binned_covariance"}
+    for name in expected.variables:
+        variable = summary[name]
+        assert expected[name].dims == variable.dims
+        assert expected[name].attrs == variable.attrs
+    difference = (summary - expected).biposh_difference_binned_mean
+    assert difference.dims == ("pair", "mode", "bin")
+
+
+@pytest.mark.parametrize("kind", ["parallel_transport", "moments"])
+def test_exact_prediction_is_the_mean_of_an_ensemble(kind: str, client: Client, tmp_path: Path) -> None:
+    """Hotelling's T^2 of A^{20} (d = 0, 2, four bins) over 60 paired realizations, at a probability above 1e-3."""
+    spec = {"kind": kind}
+    if kind == "moments":
+        spec["path"] = limit_moments(tmp_path / "m.fits", 32)
+    run = config.load(
+        table(
+            map={"nside": 32, "pixel_window": "none"},
+            channel=[{"name": "W1", "beam": BEAM, "scan": spec}],
+            biposh={"L_max": 2, "summary_bin": 8},
+            **ensemble(60),
+        )
+    )
+    runner.run(run, tmp_path / "x.zarr", client=client)
+    stored, factor = open_ensemble(tmp_path / "x.zarr"), open_summary(tmp_path / "x.zarr").bin_factor
+    expected = prediction.predict(run, exact=True)
+
+    def vector(biposh: np.ndarray, mode: str) -> np.ndarray:
+        scaled = factor.sel(mode=mode).values * biposh
+        return np.stack([scaled[..., a : a + 7].real.mean(axis=-1) for a in (4, 11, 18, 25)], axis=-1)
+
+    modes = ("L2M0d0", "L2M0d2")
+    difference = (stored.biposh - stored.biposh_circular)[:, 0]
+    sample = np.concatenate([vector(difference.sel(mode=m).values, m) for m in modes], axis=-1)
+    mean = expected.biposh_difference_mean[0]
+    residual = sample.mean(axis=0) - np.concatenate([vector(mean.sel(mode=m).values, m) for m in modes])
+    n, p = sample.shape
+    t2 = n * residual @ np.linalg.solve(np.cov(sample.T), residual)
+    assert stats.f.sf((n - p) / (p * (n - 1)) * t2, p, n - p) > 1e-3
+    leading = prediction.predict(run).biposh_difference_mean[0]
+    # The test has teeth: a beam 20 % rounder is refused.
+    wrong = sample.mean(axis=0) - 0.8 * np.concatenate([vector(leading.sel(mode=m).values, m) for m in modes])
+    assert stats.f.sf((n - p) / (p * (n - 1)) * n * wrong @ np.linalg.solve(np.cov(sample.T), wrong), p, n - p) < 1e-6
+
+
+def test_hit_average_fitted_with_parallel_transport_gives_the_factor_of_a20(tmp_path: Path) -> None:
+    """0.6576: int w_2 sin^2 / int sin^2 of the scan, at every l."""
+    hit = table(
+        map={"nside": 64, "pixel_window": "none"},
+        channel=[
+            {"name": "W1", "beam": BEAM, "scan": {"kind": "moments", "path": limit_moments(tmp_path / "m.fits", 64)}}
+        ],
+    )
+    prediction.write(prediction.predict(hit), tmp_path / "hit.ecsv")
+    transported = table(channel=[{"name": "W1", "beam": BEAM, "scan": {"kind": "parallel_transport"}}])
+    found = fit.fit(tmp_path / "hit.ecsv", transported, "constant", kind="plain")
+    assert found.solution.parameters[0] == pytest.approx(0.6576, abs=1e-3)
+
+
+def test_what_predictions_do_not_cover_is_said() -> None:
+    differencing = {"kind": "differencing", "model": "wmap_focal_plane", "pair": "W1", "sample_period_s": 61.44}
+    with pytest.raises(InputError, match="which predictions do not cover"):
+        prediction.predict(table(channel=[{"name": "W1", "beam": BEAM, "scan": differencing}]))
