@@ -2,12 +2,13 @@
 
     python workflows/predictions/compare.py NAME.toml=NAME.zarr ... [-o predictions.png]
 
-For every channel the paired differences of all modes with L > 0 (real and imaginary parts) are binned in three ranges of ell;
-T^2 = N r' S^-1 r of their mean against the prediction, with the sample covariance S of N realizations, is Hotelling's:
+For every channel the paired differences of all modes with L > 0 (real and imaginary parts) are binned in three ranges
+of ell; T^2 = N r' S^-1 r of their mean against the prediction, with the sample covariance S of N realizations, is Hotelling's:
 (N - p) / (p (N - 1)) T^2 ~ F(p, N - p). The probabilities of all channels are then tested for uniformity.
 """
 
 import argparse
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ def vectors(biposh: np.ndarray, modes: list[Mode], edges: np.ndarray) -> np.ndar
         if mode.L == 0:
             continue
         scaled = bin_factor(mode, biposh.shape[-1] - 1) * biposh[..., index, :]
-        for a, b in zip(edges[:-1], edges[1:], strict=True):
+        for a, b in pairwise(edges):
             value = np.nanmean(scaled[..., a:b], axis=-1)
             if mode.M > 0 or mode.parity == "even":
                 columns.append(value.real)
@@ -96,7 +97,7 @@ def draw(panels: list) -> Figure:
             factor, index = bin_factor(mode, lmax), modes.index(mode)
 
             def binned(a: np.ndarray, factor: np.ndarray = factor, edges: np.ndarray = edges) -> np.ndarray:
-                bounds = zip(edges[:-1], edges[1:], strict=True)
+                bounds = pairwise(edges)
                 return np.stack([np.nanmean((factor * a)[..., i:j], axis=-1) for i, j in bounds], axis=-1).real
 
             sample = binned(difference[:, index])

@@ -1,4 +1,4 @@
-"""Write wmap-limit-moments.fits: the WMAP-like scan's orientation moments s = 1 ... 3 in the limit of endless time, nside 256.
+"""Write wmap-limit-moments.fits: moments s = 1 ... 3 of the WMAP-like scan in the limit of endless time, nside 256.
 
     python workflows/predictions/make_limit_moments.py
 
