@@ -3,8 +3,8 @@
     python workflows/predictions/compare.py NAME.toml=NAME.zarr ... [-o predictions.png]
 
 For every channel the paired differences of all modes with L > 0 (real and imaginary parts) are binned in three ranges
-of ell; T^2 = N r' S^-1 r of their mean against the prediction, with the sample covariance S of N realizations, is Hotelling's:
-(N - p) / (p (N - 1)) T^2 ~ F(p, N - p). The probabilities of all channels are then tested for uniformity.
+of ell; T^2 = N r' S^-1 r of their mean against the prediction, with the sample covariance S of N realizations, is
+Hotelling's: (N - p) / (p (N - 1)) T^2 ~ F(p, N - p). The probabilities of all channels are then tested for uniformity.
 """
 
 import argparse
