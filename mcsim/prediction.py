@@ -83,11 +83,11 @@ def predict(
     -----
     Signal: :mod:`mcsim.predict`, from b_lm, the spin harmonics of the moments w_s (exact ones for parallel transport)
     and C_l. The pixel window multiplies what enters a map and divides what its analysis gives: the scan couples
-    degrees in between, so it cancels in part only. Noise of variance v(n) per
-    pixel adds v_LM times the pixel area to the autos. Weights W(n) (masks, unobserved pixels) replace w_s by W^2 w_s:
-    so they act on the beam's part where l is far above their own scales; what they make of an isotropic sky is left
-    out, as in the paired difference. Variances are C_l1 C_l2 (1 + delta_l1l2) / f_sky, f_sky = <W_x W_y>^2 / <W_x^2
-    W_y^2>. Ensembles agree within their errors: tests/integration/test_prediction.py.
+    degrees in between, so it cancels in part only. Noise of variance v(n) per pixel adds v_LM times the pixel area to
+    the autos. Weights W(n) (masks, unobserved pixels) replace w_s by W^2 w_s: so they act on the beam's part where l is
+    far above their own scales; what they make of an isotropic sky is left out, as in the paired difference. Variances
+    are C_l1 C_l2 (1 + delta_l1l2) / f_sky, f_sky = <W_x W_y>^2 / <W_x^2 W_y^2>. Ensembles agree within their errors:
+    tests/integration/test_prediction.py, and test_prediction_pairs.py for pairs, noise and masks.
     """
     survey = survey_of(source, nthreads)
     if survey.cl is None:

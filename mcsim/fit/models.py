@@ -40,7 +40,7 @@ def model(name: str, ell_range: tuple[int, int], knots: int = 4) -> Model:
     Parameters
     ----------
     name
-        "constant": alpha. "linear": alpha + beta l. "spline": a natural cubic spline, constant outside, whose
+        "constant": alpha. "linear": alpha + beta l. "spline": a natural cubic spline, straight outside, whose
         parameters are its values at ``knots`` equidistant multipoles. "orientation": a complex constant, as
         :func:`mcsim.fit.orientation.orientation` reads it.
     ell_range
@@ -72,5 +72,10 @@ def model(name: str, ell_range: tuple[int, int], knots: int = 4) -> Model:
             raise InputError(f"{knots} knots do not fit into ell = {ell_range[0]} ... {ell_range[1]}; give fewer.")
         spline = CubicSpline(places, np.eye(knots), bc_type="natural")
         names = tuple(f"f({place:.0f})" for place in places)
-        return Model(name, names, lambda ell: spline(np.clip(ell, places[0], places[-1])).T)
+
+        def functions(ell: NDArray[np.float64]) -> NDArray[np.float64]:
+            inside = np.clip(ell, places[0], places[-1])
+            return (spline(inside) + (ell - inside)[:, None] * spline(inside, 1)).T
+
+        return Model(name, names, functions)
     raise InputError(f"there is no model {name!r} of f_l; choose among {', '.join(MODELS)}.")

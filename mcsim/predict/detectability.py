@@ -34,6 +34,7 @@ def isotropic_variance(
     Notes
     -----
     C^XX_l1 C^YY_l2 + (-1)^L delta_{l1 l2} (C^XY_l)^2; for one map C_l1 C_l2 (1 + delta_{l1 l2}), L even where l1 = l2.
+    Zero where it is less than 1e-12 of its first term.
     """
     check_modes(modes)
     if any(L == 0 for L, _, _ in modes):
@@ -47,7 +48,10 @@ def isotropic_variance(
     variance = np.full((len(modes), lmax + 1), np.nan)
     for row, (L, _, d) in zip(variance, modes, strict=True):
         l2 = np.flatnonzero(existing(L, d, lmax))
-        row[l2] = x[l2 - d] * y[l2] + ((-1) ** L * cross[l2] ** 2 if d == 0 else 0.0)
+        product = x[l2 - d] * y[l2]
+        row[l2] = product + ((-1) ** L * cross[l2] ** 2 if d == 0 else 0.0)
+        # Of maps without noise nothing is left for odd L but round-off of either sign.
+        row[l2[row[l2] < 1e-12 * product]] = 0.0
     return variance
 
 
@@ -82,8 +86,9 @@ def signal_to_noise(
 
     Notes
     -----
-    (S/N)^2 = f_sky sum_l2 (2 - delta_M0) |A|^2 / E|A|^2. Modes with d of both signs of one pair share noise (E A_{l1
-    l2} A*_{l2 l1} is not zero): their sum in quadrature is an approximation; :func:`fisher_information` is exact.
+    (S/N)^2 = f_sky sum_l2 (2 - delta_M0) |A|^2 / E|A|^2, over the l2 of nonzero variance. Modes with d of both signs of
+    one pair share noise (E A_{l1 l2} A*_{l2 l1} is not zero): their sum in quadrature is an approximation;
+    :func:`fisher_information` is exact.
     """
     if not 0.0 < f_sky <= 1.0:
         raise InputError(f"f_sky = {f_sky} is not a fraction of the sky; give 0 < f_sky <= 1.")

@@ -1,0 +1,156 @@
+"""Predictions of everything at once: pairs in both orders, noise of uneven hits, scans without symmetry, a mask."""
+
+from pathlib import Path
+from typing import Any
+
+import healpy
+import numpy as np
+import pytest
+import xarray as xr
+from scipy import stats
+
+from mcsim import config, prediction, scan, simulate
+from mcsim.fit.data import SUMMARY, Row, parts, project
+from mcsim.survey import Survey, survey
+
+NSIDE, LMAX, SKIES, BIN = 32, 64, 200, 16
+THETA, PHI = healpy.pix2ang(NSIDE, np.arange(12 * NSIDE**2))
+X, Y, Z = np.sin(THETA) * np.cos(PHI), np.sin(THETA) * np.sin(PHI), np.cos(THETA)
+
+
+def lopsided_moments(path: Path, psi0: float) -> str:
+    """A scan that treats neither the hemispheres nor the longitudes nor the senses of rotation alike."""
+    spread = 0.75 + 0.1 * np.cos(2 * THETA) + 0.12 * X * np.cos(psi0) + 0.1 * Y * Z
+    hits = 100.0 * (1.0 + 0.6 * Z**2 + 0.3 * X * Y + 0.2 * Y)
+    w = np.array([np.exp(-1j * s * (0.4 + psi0)) * spread**s for s in range(1, 5)])
+    scan.write_moments_fits(path, scan.Moments(NSIDE, "ecliptic", hits, w))
+    return str(path)
+
+
+def two_channels(folder: Path, noise: float, **maps: Any) -> Survey:
+    shapes = {"A": (300.0, 250.0, 0.0), "B": (330.0, 270.0, 0.7)}
+    channels = [
+        {
+            "name": name,
+            "beam": {
+                "kind": "elliptical_gaussian",
+                "fwhm_major_arcmin": major,
+                "fwhm_minor_arcmin": minor,
+                "angle_deg": 10.0,
+            },
+            "scan": {"kind": "moments", "path": lopsided_moments(folder / f"{name}.fits", psi0)},
+            "noise": {"sigma0_uk": noise},
+        }
+        for name, (major, minor, psi0) in shapes.items()
+    ]
+    run = {
+        "schema": 1,
+        "name": "two",
+        "sky": {"spectrum": "wmap7", "lmax": LMAX},
+        "map": {"nside": NSIDE, **maps},
+        "channel": channels,
+        "biposh": {"L_max": 2, "summary_bin": BIN},
+        "ensemble": {"realizations": SKIES, "seed": 3},
+    }
+    return survey(config.load(run))
+
+
+def vectors(shared: Survey, biposh: np.ndarray, pair: int, mode: int) -> np.ndarray:
+    """Binned real and imaginary parts of one mode, shape (..., 4 or 8)."""
+    one = shared.estimator.modes[mode]
+    rows = [Row(one, low, low + BIN - 1, part) for low in range(0, LMAX, BIN) for part in parts(one)]
+    return project(rows, SUMMARY, {one: biposh[..., pair, mode, :]})
+
+
+@pytest.fixture(scope="module")
+def noisy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Survey, dict[str, np.ndarray]]:
+    shared = two_channels(tmp_path_factory.mktemp("noisy"), 60.0)
+    skies = [simulate.realize(shared, r) for r in range(SKIES)]
+    return shared, {name: np.array([sky[name] for sky in skies]) for name in skies[0]}
+
+
+def probabilities(shared: Survey, skies: dict[str, np.ndarray], expected: xr.Dataset) -> np.ndarray:
+    """Hotelling's T^2 of each pair and mode with L > 0, of the plain mean and of the paired difference."""
+    found = []
+    for kind, sample in (("", skies["biposh"]), ("_difference", skies["biposh"] - skies["biposh_circular"])):
+        mean = expected[f"biposh{kind}_mean"].values
+        for pair in range(len(shared.pairs)):
+            for mode, one in enumerate(shared.estimator.modes):
+                if one.L == 0 or np.isnan(mean[pair, mode]).all():
+                    continue
+                drawn = vectors(shared, sample, pair, mode)
+                residual = drawn.mean(axis=0) - vectors(shared, mean, pair, mode)
+                n, p = drawn.shape
+                t2 = n * residual @ np.linalg.solve(np.cov(drawn.T), residual)
+                found.append(stats.f.sf((n - p) / (p * (n - 1)) * t2, p, n - p))
+    return np.array(found)
+
+
+def test_every_mode_of_every_pair_is_predicted(noisy) -> None:
+    """86 spectra (A,A; A,B in both orders; B,B): odd parity, M != 0, the noise's own anisotropy and the beams'."""
+    shared, skies = noisy
+    found = probabilities(shared, skies, prediction.predict(shared, exact=True, L_moments=24))
+    assert found.size == 86
+    assert found.min() > 1e-4
+    assert stats.kstest(found, "uniform").pvalue > 0.01
+
+
+def test_leading_order_and_an_even_noise_would_be_found_out(noisy) -> None:
+    shared, skies = noisy
+    assert probabilities(shared, skies, prediction.predict(shared)).min() < 1e-8
+    even = prediction.predict(shared, exact=True, L_moments=24)
+    even["biposh_mean"] = even["biposh_mean"] - even["biposh_circular_mean"].where(even["L"] > 0, 0.0)
+    assert probabilities(shared, skies, even).min() < 1e-8
+
+
+def test_spectra_and_scatter(noisy) -> None:
+    shared, skies = noisy
+    expected = prediction.predict(shared, exact=True, L_moments=24)
+    cl = skies["cl"][..., 2:]
+    z = (cl.mean(axis=0) - expected["cl_mean"].values[:, 2:]) / (cl.std(axis=0, ddof=1) / np.sqrt(SKIES))
+    # 63 nearly independent degrees of each pair.
+    assert np.all(np.abs(np.mean(z**2, axis=1) - 1.0) < 4.0 * np.sqrt(2.0 / z.shape[1]))
+    rows = [row for row, mode in enumerate(shared.estimator.modes) if mode.L > 0 and mode.in_auto]
+    measured = skies["biposh_circular"][:, :, rows, 10:].std(axis=0, ddof=1)
+    predicted = expected["biposh_circular_standard_deviation"].values[:, rows, 10:]
+    # Each standard deviation is known to about 1/sqrt(2 N) = 5 %; here the mean of 55 degrees, with room for the
+    # anisotropy of the noise, which is second order.
+    assert np.all(np.abs((measured / predicted).mean(axis=-1) - 1.0) < 0.04)
+
+
+def test_joint_signal_to_noise_is_at_least_that_of_every_mode_and_less_than_infinite(noisy, tmp_path: Path) -> None:
+    shared, _ = noisy
+    expected = prediction.predict(shared, snr=True)
+    each = expected["signal_to_noise"]
+    total = float(expected["signal_to_noise_total"])
+    autos = np.sqrt((each.sel(pair="A,A") ** 2).sum())
+    assert float(each.max()) < float(autos) < total < np.inf
+    bins = np.sqrt((expected["signal_to_noise_binned"] ** 2).sum("bin"))
+    xr.testing.assert_allclose(bins.where(np.isfinite(each)), each, rtol=1e-10)
+    assert "jointly" in prediction.describe(expected)
+    # Two maps of one sky without noise tell their beams apart from it at will.
+    quiet = prediction.predict(two_channels(tmp_path, 0.0), snr=True)
+    assert np.isinf(quiet["signal_to_noise_total"])
+
+
+def test_a_mask_acts_through_its_square(tmp_path: Path) -> None:
+    """Paired differences under a tilted cut: W^2 w_s leaves under half, in rms, of what ignoring it misses."""
+    sine = np.abs(np.stack([X, Y, Z], axis=-1) @ np.array([0.3, 0.5, 0.8])) / np.linalg.norm([0.3, 0.5, 0.8])
+    mask = np.sin(0.5 * np.pi * np.clip((np.degrees(np.arcsin(sine)) - 12.0) / 15.0, 0.0, 1.0)) ** 2
+    healpy.write_map(tmp_path / "mask.fits", mask, dtype=np.float64, coord="E")
+    shared = two_channels(tmp_path, 0.0, mask=str(tmp_path / "mask.fits"))
+    skies = [simulate.realize(shared, r) for r in range(60)]
+    sample = np.array([sky["biposh"] - sky["biposh_circular"] for sky in skies])
+    expected = prediction.predict(shared)
+    ignoring = prediction.predict(two_channels(tmp_path, 0.0))
+    assert 0.5 < expected.attrs["f_sky"] < 0.7
+    missed = {"with": 0.0, "without": 0.0}
+    for pair in range(3):
+        for mode, one in enumerate(shared.estimator.modes):
+            if one.L == 2 and one.in_auto:
+                drawn = vectors(shared, sample, pair, mode)
+                scatter = drawn.std(axis=0, ddof=1) / np.sqrt(len(drawn))
+                for name, model in (("with", expected), ("without", ignoring)):
+                    residual = drawn.mean(axis=0) - vectors(shared, model["biposh_difference_mean"].values, pair, mode)
+                    missed[name] += float(np.sum((residual**2 - scatter**2)[len(residual) // 4 :]))
+    assert missed["with"] < 0.25 * missed["without"]

@@ -1,0 +1,176 @@
+"""Effective beams: known factors and angles come back from synthetic data, and the templates are those of the beam."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from astropy.table import Table
+
+from mcsim import config, prediction
+from mcsim.beams import Beam, elliptical_gaussian
+from mcsim.errors import InputError
+from mcsim.fit import Measurement, comparisons, fit, orientation, report
+from mcsim.fit.data import SUMMARY, Row, parse_mode, parts, project
+from mcsim.plot.fit import fit_figure
+from mcsim.predict import ScannedBeam, cmb_biposh_leading
+from mcsim.survey import Survey, survey
+
+LMAX = 200
+BINS = [(low, low + 19) for low in range(20, 200, 20)]
+
+
+def configuration(**beam):
+    shape = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 70.0, "fwhm_minor_arcmin": 60.0} | beam
+    return {
+        "schema": 1,
+        "name": "synthetic",
+        "sky": {"spectrum": "wmap7", "lmax": LMAX},
+        "map": {"nside": 128},
+        "channel": [{"name": "W1", "beam": shape, "scan": {"kind": "parallel_transport"}}],
+    }
+
+
+@pytest.fixture(scope="module")
+def shared() -> Survey:
+    return survey(config.load(configuration()))
+
+
+def expected(shared: Survey, blm: np.ndarray, names=("L2M0d0", "L2M0d2"), error=0.01) -> Measurement:
+    """Leading-order data of a beam under the survey's scan."""
+    modes = [parse_mode(name) for name in names]
+    rows = tuple(Row(mode, a, b, part) for mode in modes for part in parts(mode) for a, b in BINS)
+    w = prediction.scanned_beams(shared, 2)[0].w
+    spectra = cmb_biposh_leading([(m.L, m.M, m.d) for m in modes], shared.cl, LMAX, ScannedBeam(blm, w))
+    value = project(rows, SUMMARY, dict(zip(modes, spectra, strict=True)))
+    return Measurement("synthetic", None, "plain", rows, SUMMARY, value, error**2 * np.eye(len(rows)), None)
+
+
+def rescaled(shared: Survey, factor) -> np.ndarray:
+    blm = shared.channels[0].beam.blm.copy()
+    blm[2] *= factor
+    return blm
+
+
+ELL = np.arange(LMAX + 1.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "truth"),
+    [
+        ("constant", 0.6575, [0.6575]),
+        ("linear", 0.4 + 0.002 * ELL, [0.4, 0.002]),
+        ("spline", 0.4 + 0.002 * ELL, None),
+    ],
+)
+def test_known_factors_come_back(shared, name, factor, truth):
+    found = fit(expected(shared, rescaled(shared, factor)), shared, name)
+    assert found.solution.chi2 < 1e-10
+    inside = (found.ell >= 20) & (found.ell < 180)
+    np.testing.assert_allclose(found.factor()[0][inside], (factor * np.ones(LMAX + 1))[20:180], rtol=1e-6)
+    if truth is not None:
+        np.testing.assert_allclose(found.solution.parameters, truth, rtol=1e-8)
+
+
+def test_a_constant_does_not_fit_a_slope_and_the_comparison_says_so(shared):
+    data = expected(shared, rescaled(shared, 0.4 + 0.002 * ELL), error=1.0)
+    fits = [fit(data, shared, name) for name in ("constant", "linear", "spline")]
+    assert fits[0].solution.probability < 1e-6
+    tests = {(small, large): test for small, large, test in comparisons(fits)}
+    assert tests["constant", "linear"].probability < 1e-6
+    assert tests["linear", "spline"].probability > 0.99
+    text = report(fits)
+    assert "linear over constant" in text
+    assert "correlation" in text
+
+
+def test_what_other_orders_of_the_beam_do_is_no_part_of_the_factor(shared):
+    """An m = 1 part feeds L = 2 too: it stays as configured and is not rescaled."""
+    blm = rescaled(shared, 0.5)
+    own = shared.channels[0].beam.blm.copy()
+    blm[1] = own[1] = 0.05 * np.abs(own[0])
+    beam = replace(shared.channels[0].beam, blm=own)
+    changed = replace(shared, channels=(replace(shared.channels[0], beam=beam),))
+    found = fit(expected(changed, blm), changed)
+    assert np.any(found.offset != 0.0)
+    np.testing.assert_allclose(found.solution.parameters, [0.5], rtol=1e-8)
+
+
+def test_angle_between_two_sides_and_their_common_turn(shared):
+    """Sides at 7 - 15 and 7 + 15 degrees, made by turning the Gaussian itself."""
+    sides = [elliptical_gaussian(70.0, 60.0, angle, LMAX).blm for angle in (-8.0, 22.0)]
+    names = ("L2M0d0", "L2M0d1", "L2M0d2")
+    angles = orientation(fit(expected(shared, 0.5 * (sides[0] + sides[1]), names), shared, "orientation", modes=names))
+    assert angles.symmetric_deg == pytest.approx(30.0, abs=1e-4)
+    assert angles.common_deg == pytest.approx(7.0, abs=1e-4)
+    assert 0.0 < angles.symmetric_error_deg < 1.0
+
+
+def test_even_parity_alone_leaves_the_common_turn_open(shared):
+    sides = [elliptical_gaussian(70.0, 60.0, angle, LMAX).blm for angle in (0.0, 30.0)]
+    found = fit(expected(shared, 0.5 * (sides[0] + sides[1])), shared, "orientation")
+    angles = orientation(found)
+    assert found.model.parameters == ("real",)
+    assert angles.common_deg is None
+    assert angles.one_sided_deg == pytest.approx(30.0, abs=1e-4)
+    assert "deg, one as configured" in report([found])
+
+
+def test_a_factor_above_one_is_the_angle_zero(shared):
+    angles = orientation(fit(expected(shared, rescaled(shared, 1.01)), shared, "orientation"))
+    assert angles.symmetric_deg == 0.0
+    assert angles.symmetric_error_deg > 0.0
+    with pytest.raises(InputError, match="model orientation"):
+        orientation(fit(expected(shared, rescaled(shared, 1.01)), shared))
+
+
+@pytest.mark.parametrize(("normalisation", "scaling"), [("WMAP", "l(l+1)/2pi"), ("Hajian-Souradeep", "none")])
+def test_a_users_table(shared, tmp_path, normalisation, scaling):
+    """The sign and size that a user's table means are those of its normalisation: 0.7 comes back from each."""
+    summary = prediction.predict(shared)
+    rows = []
+    for name, d in (("L2M0d0", 0), ("L2M0d2", 2)):
+        one = summary.sel(mode=name, pair="W1,W1")
+        raw = one["biposh_mean"].values.real
+        scaled = one["bin_factor"].values * raw if normalisation == "WMAP" else raw
+        rows += [(2, 0, d, a, b, 0.7 * scaled[a : b + 1].mean(), 0.1) for a, b in BINS]
+    names = ["L", "M", "d", "ell_min", "ell_max", "value", "error"]
+    table = Table(rows=rows, names=names, meta={"normalisation": normalisation, "scaling": scaling})
+    table["value"].unit = table["error"].unit = "uK2"
+    table.write(tmp_path / "t.ecsv", format="ascii.ecsv")
+    np.testing.assert_allclose(fit(tmp_path / "t.ecsv", shared).solution.parameters, [0.7], rtol=1e-8)
+
+
+def test_numbers_for_json_and_figure(shared, tmp_path):
+    fits = [fit(expected(shared, rescaled(shared, 0.7)), shared, name) for name in ("constant", "linear", "spline")]
+    plain = json.loads(json.dumps(fits[1].to_dict()))
+    assert plain["parameters"]["alpha"] == pytest.approx(0.7)
+    assert plain["modes"] == ["L2M0d0", "L2M0d2"]
+    figure = fit_figure(fits)
+    # Two modes and f_l, above residuals and text; every model is a line among the data.
+    assert len(figure.axes) == 6
+    drawn = [line.get_label() for line in figure.axes[0].get_lines()]
+    assert {"constant", "linear", "spline"} <= set(drawn)
+    figure.savefig(tmp_path / "fit.png")
+
+
+def test_refusals(shared):
+    data = expected(shared, rescaled(shared, 0.7))
+    with pytest.raises(InputError, match="circular"):
+        fit(data, configuration(fwhm_minor_arcmin=70.0))
+    with pytest.raises(InputError, match="ends at 100"):
+        fit(data, configuration() | {"biposh": {"lmax": 100}})
+    with pytest.raises(InputError, match="no ensemble"):
+        fit(data, shared, each=True)
+    with pytest.raises(InputError, match="no model"):
+        fit(data, shared, "quadratic")
+    two = configuration()
+    two["channel"] = [two["channel"][0], two["channel"][0] | {"name": "W2"}]
+    with pytest.raises(InputError, match="W1, W2, the data are of a pair without name"):
+        fit(data, two)
+    assert fit(replace(data, pair="W2,W2"), two).solution.parameters == pytest.approx([0.7])
+    # Circular beyond doubt: what is left has no template.
+    blm = rescaled(shared, 0.0)
+    flat = replace(shared, channels=(replace(shared.channels[0], beam=Beam(blm)),))
+    with pytest.raises(InputError, match="cannot tell the parameters"):
+        fit(data, flat)

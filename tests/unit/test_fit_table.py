@@ -1,0 +1,114 @@
+"""Tables of measured spectra: what they may leave open, and what they may not."""
+
+import numpy as np
+import pytest
+from astropy.table import Table
+
+from mcsim.biposh import Mode, bennett_factor
+from mcsim.errors import InputError
+from mcsim.fit import read_table
+
+META = {"normalisation": "Bennett", "scaling": "l(l+1)/2pi", "frame": "ecliptic"}
+
+
+def table(meta=META, unit="uK2", **columns):
+    base = {
+        "L": [2, 2, 2],
+        "M": [0, 0, 0],
+        "d": [0, 0, 2],
+        "ell_min": [10, 20, 10],
+        "ell_max": [19, 29, 19],
+        "value": [1.0, 2.0, 3.0],
+        "error": [0.1, 0.2, 0.3],
+    }
+    made = Table({name: column for name, column in (base | columns).items() if column is not None}, meta=meta)
+    for name in made.colnames:
+        if name.startswith(("value", "error")) and unit is not None:
+            made[name].unit = unit
+    return made
+
+
+def read(tmp_path, made, **arguments):
+    path = tmp_path / "table.ecsv"
+    made.write(path, format="ascii.ecsv", overwrite=True)
+    return read_table(path, "ecliptic", **arguments)
+
+
+def test_rows_values_and_independent_errors(tmp_path):
+    found = read(tmp_path, table())
+    assert [(row.mode.name, row.ell_min, row.ell_max, row.imaginary) for row in found.rows] == [
+        ("L2M0d0", 10, 19, False),
+        ("L2M0d0", 20, 29, False),
+        ("L2M0d2", 10, 19, False),
+    ]
+    np.testing.assert_array_equal(found.value, [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(found.covariance, np.diag([0.01, 0.04, 0.09]))
+    assert (found.simulations, found.kind, found.pair) == (None, "plain", None)
+
+
+def test_units_are_converted(tmp_path):
+    np.testing.assert_allclose(read(tmp_path, table(unit="mK2")).value, [1e6, 2e6, 3e6])
+
+
+@pytest.mark.parametrize("name", ["l(l+1)/2pi", "l(l+1)/(2π)", "ell(ell+1) / 2 pi A, mean over bins", "none"])
+@pytest.mark.parametrize("normalisation", ["Bennett", "WMAP", "Hajian-Souradeep"])
+def test_scalings(tmp_path, name, normalisation):
+    scaling = read(tmp_path, table(META | {"scaling": name, "normalisation": normalisation})).scaling
+    mode, ell = Mode(2, 0, 0), np.arange(31.0)
+    expected = np.ones(31) if name == "none" else ell * (ell + 1.0) / (2.0 * np.pi)
+    if normalisation != "Hajian-Souradeep":
+        expected = expected * bennett_factor(mode, 30)
+    np.testing.assert_allclose(scaling.factor(mode, 30), expected)
+
+
+def test_choice_of_modes_range_kind_and_pair(tmp_path):
+    made = table(value_difference=[4.0, 5.0, 6.0], error_difference=[0.4, 0.5, 0.6], pair=["W1,W1", "W1,W1", "V1,V1"])
+    assert read(tmp_path, made).value.tolist() == [4.0, 5.0]
+    assert read(tmp_path, made, kind="plain", ell_range=(15, 40)).value.tolist() == [2.0]
+    assert read(tmp_path, made, pair="V1,V1", modes=["L2M0d2"]).value.tolist() == [6.0]
+
+
+def test_parts_of_complex_modes_share_the_variance(tmp_path):
+    made = table(M=[1, 0, 0], value_imag=[7.0, 0.0, 0.0])
+    found = read(tmp_path, made, modes=["L2M1d0"])
+    assert found.value.tolist() == [1.0, 7.0]
+    assert [row.imaginary for row in found.rows] == [False, True]
+    np.testing.assert_allclose(np.diag(found.covariance), 0.5 * 0.1**2)
+
+
+@pytest.mark.parametrize(
+    ("made", "arguments", "message"),
+    [
+        (table(META | {"normalisation": ""}), {}, "does not say its normalisation"),
+        (table(META | {"normalisation": "unity"}), {}, "not known; write Bennett"),
+        (table(META | {"scaling": "l^2"}), {}, "scaling 'l\\^2'"),
+        (table({"normalisation": "Bennett"}), {}, "scaling ''"),
+        (table(META | {"frame": "galactic"}), {}, "galactic frame"),
+        (table(unit=None), {}, "no unit"),
+        (table(unit="K"), {}, "unit K; convert"),
+        (table(ell_min=None), {}, "no column ell_min"),
+        (table(error=None), {}, "no column error"),
+        (table(error=[0.1, 0.0, 0.1]), {}, "value 2, error 0"),
+        (table(value=[np.nan, 0.0, 0.1]), {}, "value nan"),
+        (table(ell_min=[10, 10, 10], ell_max=[19, 19, 19]), {}, "twice"),
+        (table(ell_min=[10, 40, 10]), {}, "is no range"),
+        (table(), {"modes": ["L1M0d1"]}, "no row of L1M0d1"),
+        (table(), {"modes": ["L2M3d0"]}, "does not exist"),
+        (table(), {"modes": ["quadrupole"]}, "no BipoSH mode"),
+        (table(), {"kind": "difference"}, "no column value_difference"),
+        (table(pair=["a,a", "a,a", "b,b"]), {"pair": "c,c"}, "no pair c,c"),
+        (table(value_imag=[0.0, 0.0, 0.0], d=[1, 0, 0]), {"modes": ["L2M0d1"]}, "odd parity"),
+        (table(M=[1, 0, 0]), {"modes": ["L2M1d0"]}, "no column value_imag"),
+    ],
+)
+def test_refusals(tmp_path, made, arguments, message):
+    with pytest.raises(InputError, match=message):
+        read(tmp_path, made, **arguments)
+
+
+def test_a_file_that_is_no_table(tmp_path):
+    (tmp_path / "x.ecsv").write_text("not a table\n1 2 3\n")
+    with pytest.raises(InputError, match="cannot be read as an ECSV table"):
+        read_table(tmp_path / "x.ecsv", "ecliptic")
+    with pytest.raises(InputError, match="cannot be read as an ECSV table"):
+        read_table(tmp_path / "none.ecsv", "ecliptic")
