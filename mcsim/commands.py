@@ -7,7 +7,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from mcsim import beams, config, resources, scan, survey
+from mcsim import beams, config, instrument, resources, scan
 from mcsim.errors import InputError
 from mcsim.plot.beam import beam_figure
 from mcsim.plot.scan import scan_figure
@@ -43,8 +43,8 @@ def look_at_beams(
         run = config.load(source)
         for channel in run.channels:
             spec = channel.beam
-            image = survey.load_beam_map(channel.name, spec) if isinstance(spec, config.BeamMap) else None
-            yield _look_at(channel.name, survey.load_beam(channel, lmax), image)
+            image = instrument.load_beam_map(channel.name, spec) if isinstance(spec, config.BeamMap) else None
+            yield _look_at(channel.name, instrument.load_beam(channel, lmax), image)
     elif beams.holds_image(path):
         image = beams.read_map(path, pixel_deg=pixel_deg)
         yield _look_at(path.name, image.beam(lmax, m_max), image)

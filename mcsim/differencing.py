@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim import config, mapmaking, rng
-from mcsim.survey import Channel, SideB, SurveyMap, scan_model
+from mcsim import config, convolve, mapmaking, rng
+from mcsim.instrument import scan_model
+from mcsim.survey import Channel, SideB, SurveyMap
 
 Map = NDArray[np.float64]
 
@@ -54,7 +55,13 @@ def seconds(run: config.RunConfig) -> float:
 
 
 def maps(
-    channel: Channel, sky: NDArray[np.complex128], nside: int, seed: int, realization: int, nthreads: int = 1
+    channel: Channel,
+    sky: NDArray[np.complex128],
+    dipole: NDArray[np.complex128] | None,
+    nside: int,
+    seed: int,
+    realization: int,
+    nthreads: int = 1,
 ) -> Iterator[tuple[SurveyMap, Solved]]:
     """Maps of a differencing channel, one for each split of its survey.
 
@@ -64,6 +71,8 @@ def maps(
         With ``side_b``.
     sky
         Coefficients up to the sky's lmax, uK.
+    dipole
+        What of the sky is taken off the differences again as believed, of the same shape; None: nothing.
     nside
         Of the maps.
     seed, realization
@@ -88,16 +97,28 @@ def maps(
     whole = [mapmaking.side_maps(sky, response, nside, nthreads) for response in (channel.response, side_b.response)]
     round_parts = [side[:, :1] for side in whole]
     start = 0.5 * (round_parts[0][:, 0] + round_parts[1][:, 0])
+    taken_off: list[mapmaking.SideMaps] = []
+    if dipole is not None:
+        believed = (channel.site.beam, side_b.believed)
+        responses = [convolve.response(beam, channel.site.lmax, channel.window) for beam in believed]
+        taken_off = [mapmaking.side_maps(dipole, response, nside, nthreads) for response in responses]
     for m in channel.maps:
         assert m.pairs is not None  # as of every map of such a channel
         circular, complete = mapmaking.rhs_from_maps(
             m.pairs,
             [(round_parts[0], round_parts[1]), (whole[0], whole[1])],
-            x=side_b.scan.transmission_imbalance,
+            x=side_b.imbalance,
+            x_assumed=side_b.scan.transmission_imbalance,
             noise_sigma0_uk=side_b.sigma0_uk,
             rng=rng.generator(seed, realization, f"noise/{m.name}"),
             nthreads=nthreads,
         )
+        if taken_off:
+            sides = (taken_off[0], taken_off[1])
+            known = mapmaking.rhs_from_maps(m.pairs, [sides], x=side_b.scan.transmission_imbalance, nthreads=nthreads)[
+                0
+            ]
+            circular, complete = circular - known, complete - known
         yield (
             m,
             Solved(
@@ -112,6 +133,9 @@ def _solve(m: SurveyMap, side_b: SideB, rhs: Map, start: Map | None, what: str, 
     chosen = side_b.scan
     x, limit = chosen.transmission_imbalance, chosen.max_iterations
     map_uk, report = mapmaking.solve(m.pairs, rhs, x, chosen.tolerance, limit, start, nthreads=nthreads)
+    if side_b.iterations_short > 0 and report.converged:
+        limit = max(report.iterations - side_b.iterations_short, 0)
+        map_uk, _ = mapmaking.solve(m.pairs, rhs, x, chosen.tolerance, limit, start, nthreads=nthreads)
     if not report.converged:
         raise RuntimeError(
             f"map {m.name}, {what}: the map-making reached a relative residual of {report.relative_residual:.2g} in "

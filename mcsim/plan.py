@@ -13,9 +13,10 @@ from mcsim import alm as alm_
 from mcsim import config, differencing, healpix, rng, spectra, store, summary
 from mcsim.biposh import Mode, estimate, estimator, modes
 from mcsim.errors import InputError
+from mcsim.layout import Layout
+from mcsim.instrument import load_beam
 from mcsim.sky import gaussian_alm
-from mcsim.store import Layout
-from mcsim.survey import Survey, load_beam
+from mcsim.survey import Survey
 
 CHUNKS = 128
 CHUNK_BYTES = 1 << 26

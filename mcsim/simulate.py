@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import alm as alm_
-from mcsim import biposh, config, convolve, differencing, healpix, rng
+from mcsim import biposh, config, convolve, differencing, healpix, rng, tod
 from mcsim.errors import InputError
 from mcsim.sky import gaussian_alm
 from mcsim.survey import Channel, Survey, SurveyMap
@@ -73,8 +73,18 @@ def _observe(survey: Survey, channel: Channel, sky: Alm, realization: int, nthre
     nside, lmax_sky = run.map.nside, run.sky.lmax
     if channel.side_b is not None:
         return _observe_differences(survey, channel, sky, realization, nthreads)
-    circular = convolve.circular_alm(sky, channel.response)
-    spins = convolve.spin_maps(sky, channel.response, nside, nthreads)
+    seen, dipole = _seen(survey, channel, sky, realization)
+    circular = convolve.circular_alm(seen, channel.response)
+    spins = convolve.spin_maps(seen, channel.response, nside, nthreads)
+    gained = None
+    if any(m.gain is not None for m in channel.maps):
+        gained = healpix.synthesis(circular[None], nside, lmax_sky, nthreads=nthreads)[0]
+    if dipole is not None:
+        # The survey takes it off as believed: what an effect makes of it stays.
+        believed = convolve.response(channel.site.beam, lmax_sky, channel.window)
+        circular = circular - convolve.circular_alm(dipole, believed)
+        for s, map_uk in convolve.spin_maps(dipole, believed, nside, nthreads).items():
+            spins[s] = spins[s] - map_uk if s in spins else -map_uk
     smooth = None
     if run.ensemble.keep_maps or not all(_is_exact(survey, m) for m in channel.maps):
         smooth = healpix.synthesis(circular[None], nside, lmax_sky, nthreads=nthreads)[0]
@@ -94,6 +104,8 @@ def _observe(survey: Survey, channel: Channel, sky: Alm, realization: int, nthre
                 m.noise_uk.size
             )
             extra = noise if extra is None else extra + noise
+        if m.gain is not None and gained is not None:
+            extra = m.gain * gained if extra is None else extra + m.gain * gained
         difference = convolve.noncircular_map(spins, m.moments) if spins else None
         if _is_exact(survey, m):
             exact = alm_.multiply(circular, 1.0 / channel.window, lmax_sky)
@@ -110,11 +122,27 @@ def _observe(survey: Survey, channel: Channel, sky: Alm, realization: int, nthre
     return results
 
 
+def _seen(survey: Survey, channel: Channel, sky: Alm, realization: int) -> tuple[Alm, Alm | None]:
+    """The sky that the channel looks at, and the dipole in it that is taken off again; None where none shows."""
+    for effect in channel.effects:
+
+        def draw(stage: str, name: str = effect.name) -> np.random.Generator:
+            return rng.generator(survey.config.ensemble.seed, realization, f"effect/{name}/{stage}")
+
+        sky = effect.sky(sky, channel.site, draw)
+    if not channel.effects or not channel.site.dipole_uk.any():
+        return sky, None
+    dipole = tod.dipole_alm(channel.site.dipole_uk, channel.site.lmax)
+    return sky + dipole, dipole
+
+
 def _observe_differences(survey: Survey, channel: Channel, sky: Alm, realization: int, nthreads: int) -> list[Observed]:
     """The channel's maps of one sky where two beams are read as a difference."""
     run = survey.config
     results = []
-    for m, solved in differencing.maps(channel, sky, run.map.nside, run.ensemble.seed, realization, nthreads):
+    seen, dipole = _seen(survey, channel, sky, realization)
+    seed = run.ensemble.seed
+    for m, solved in differencing.maps(channel, seen, dipole, run.map.nside, seed, realization, nthreads):
         # The two are analysed apart like those of other scans.
         twin = _analyse(survey, channel, solved.circular, m.weight, nthreads)
         alm = twin + _analyse(survey, channel, solved.difference, m.weight, nthreads)

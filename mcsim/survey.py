@@ -1,16 +1,17 @@
 """From a configuration to what a realization needs: spectrum, beam responses, moments, weights, estimator tables."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim import beams, config, convolve, healpix, mapmaking, resources, scan, spectra
-from mcsim.beams.turn import mirrored, rotated
+from mcsim import beams, config, convolve, healpix, mapmaking, scan, spectra, tod
 from mcsim.biposh import Estimator, estimator
+from mcsim.effects import Effect, Site, seen_through
 from mcsim.errors import InputError
+from mcsim.instrument import effects_on, load_beam_b, scan_model, site_of
 from mcsim.mask import read_mask
 
 Progress = Callable[[float], None]
@@ -32,6 +33,8 @@ class SurveyMap:
         Standard deviation of the noise per pixel, shape (npix,); ``None``: no noise, or noise of differences.
     pairs
         Pairs of pixels of a differencing scan; ``None``: any other scan.
+    gain
+        Mean relative error of the gain over the samples of a pixel, shape (npix,); ``None``: no error.
     """
 
     name: str
@@ -39,6 +42,7 @@ class SurveyMap:
     weight: NDArray[np.float64] | None
     noise_uk: NDArray[np.float64] | None
     pairs: mapmaking.DifferencingScan | None = None
+    gain: NDArray[np.float64] | None = None
 
     @property
     def sky_fraction(self) -> float:
@@ -53,24 +57,46 @@ class SideB:
     Attributes
     ----------
     beam, response
-        Beam of side B.
+        Beam of side B, effects included.
+    believed
+        The same without effects.
     scan
         Transmission imbalance, noise per difference, and convergence of the map-making.
     sigma0_uk
         White noise per difference.
+    imbalance
+        True transmission imbalance; map-making believes that of ``scan``.
+    iterations_short
+        How many iterations before convergence the map-making stops.
     """
 
     beam: beams.Beam
     response: convolve.Response
+    believed: beams.Beam
     scan: config.ScanDifferencing
     sigma0_uk: float
+    imbalance: float
+    iterations_short: int
 
 
 @dataclass(frozen=True)
 class Channel:
-    """A beam and the maps made with it; ``window`` is the pixel window, shape (lmax + 1,), ones where there is none.
+    """A beam and the maps made with it.
 
-    ``side_b``: the other beam of a differencing scan, None for any other scan.
+    Attributes
+    ----------
+    beam, response
+        What the sky is seen through, effects included.
+    window
+        Pixel window as believed, shape (lmax + 1,), ones where there is none.
+    maps
+        One for every split.
+    site
+        What effects may know of the channel, its beam as believed among it.
+    effects
+        Those that act in this channel, in the order of the configuration.
+    side_b
+        The other beam of a differencing scan, None for any other scan.
     """
 
     name: str
@@ -78,6 +104,8 @@ class Channel:
     response: convolve.Response
     window: NDArray[np.float64]
     maps: tuple[SurveyMap, ...]
+    site: Site
+    effects: tuple[Effect, ...] = ()
     side_b: SideB | None = None
 
 
@@ -135,47 +163,12 @@ def survey(run: config.RunConfig, nthreads: int = 1, progress: Progress | None =
     return Survey(run, cl, channels, lmax, tables, pairs, norm)
 
 
-def load_beam(channel: config.Channel, lmax: int) -> beams.Beam:
-    """The beam of a channel, up to lmax; of a differencing scan that of side A."""
-    return _beam(channel.name, channel.beam, lmax)
-
-
-def load_beam_b(channel: config.Channel, lmax: int) -> beams.Beam:
-    """The beam of side B of a differencing channel, up to lmax: its own, or side A's mirrored."""
-    if channel.beam_b is None:
-        return mirrored(load_beam(channel, lmax))
-    return _beam(channel.name, channel.beam_b, lmax)
-
-
-def _beam(channel: str, spec: config.Beam, lmax: int) -> beams.Beam:
-    match spec:
-        case config.BeamGaussian():
-            return beams.gaussian(spec.fwhm_arcmin, lmax)
-        case config.BeamEllipticalGaussian():
-            major, minor = spec.fwhm_major_arcmin, spec.fwhm_minor_arcmin
-            return beams.elliptical_gaussian(major, minor, spec.angle_deg, lmax, mmax=spec.m_max)
-        case config.BeamMap():
-            return rotated(load_beam_map(channel, spec).beam(lmax, spec.m_max), np.deg2rad(spec.angle_deg))
-        case config.BeamBlm():
-            file = config.channel_path(spec.path, channel)
-            return rotated(beams.from_blm_file(file, lmax, mmax=spec.m_max), np.deg2rad(spec.angle_deg))
-
-
-def load_beam_map(channel: str, spec: config.BeamMap) -> beams.BeamMap:
-    """The beam map of a channel."""
-    return beams.read_map(
-        config.channel_path(spec.path, channel),
-        pixel_deg=spec.pixel_deg,
-        cut_deg=spec.cut_deg,
-        centre=spec.centre_pixel,
-        plane=spec.plane,
-        projection=spec.projection,
-    )
-
-
 def _channel(run: config.RunConfig, spec: config.Channel, nthreads: int, progress: Progress | None) -> Channel:
-    beam = load_beam(spec, run.sky.lmax)
+    acting = effects_on(run, spec.name)
+    site = site_of(run, spec)
     window = _window(run, spec)
+    spread = float(np.prod([effect.spread() for effect in acting]))
+    beam = seen_through(acting, site)
     splits = run.map.splits or (None,)
     maps = []
     for index, split in enumerate(splits):
@@ -187,16 +180,65 @@ def _channel(run: config.RunConfig, spec: config.Channel, nthreads: int, progres
             moments = _hits_alone(pairs, max(beam.mmax, 1))
         else:
             moments = _moments(run, spec, split, share, beam.mmax, nthreads, progress)
-        maps.append(_survey_map(run, spec, split, name, moments, pairs))
-    response = convolve.response(beam, run.sky.lmax, window)
-    return Channel(spec.name, beam, response, window, tuple(maps), _side_b(run, spec, window))
+        m = _survey_map(run, spec, split, name, moments, pairs)
+        maps.append(_with_effects(m, acting, site, share, spread))
+    # A pixel whose samples keep closer to its centre blurs less; the window is a Gaussian in all but name.
+    response = convolve.response(beam, run.sky.lmax, window ** (spread * spread))
+    side_b = _side_b(run, spec, window, site, acting)
+    return Channel(spec.name, beam, response, window, tuple(maps), site, acting, side_b)
 
 
-def _side_b(run: config.RunConfig, spec: config.Channel, window: NDArray[np.float64]) -> SideB | None:
+def _side_b(
+    run: config.RunConfig,
+    spec: config.Channel,
+    window: NDArray[np.float64],
+    site: Site,
+    acting: tuple[Effect, ...],
+) -> SideB | None:
     if not isinstance(spec.scan, config.ScanDifferencing):
         return None
-    beam = load_beam_b(spec, run.sky.lmax)
-    return SideB(beam, convolve.response(beam, run.sky.lmax, window), spec.scan, spec.noise.sigma0_uk)
+    believed = load_beam_b(spec, run.sky.lmax)
+    beam = seen_through(acting, replace(site, beam=believed))
+    response = convolve.response(beam, run.sky.lmax, window)
+    imbalance, short = spec.scan.transmission_imbalance, 0
+    for effect in acting:
+        imbalance, short = effect.differencing(imbalance, short)
+    return SideB(beam, response, believed, spec.scan, spec.noise.sigma0_uk, imbalance, short)
+
+
+def _with_effects(
+    m: SurveyMap,
+    acting: tuple[Effect, ...],
+    site: Site,
+    share: tuple[float, float],
+    spread: float,
+) -> SurveyMap:
+    """The map with what effects make of its moments, noise and gain."""
+    moments, noise = m.moments, m.noise_uk
+    for effect in acting:
+        moments = effect.orientations(moments, site)
+        factor = effect.noise(site)
+        if factor is not None and noise is not None:
+            noise = noise * np.sqrt(np.clip(factor, 0.0, None))
+    if spread != 1.0 and moments.dtheta is not None and moments.dphi is not None:
+        moments = replace(moments, dtheta=spread * moments.dtheta, dphi=spread * moments.dphi)
+    return replace(m, moments=moments, noise_uk=noise, gain=_mean_gain(acting, site, share))
+
+
+def _mean_gain(acting: tuple[Effect, ...], site: Site, share: tuple[float, float]) -> NDArray[np.float64] | None:
+    """Mean relative error of the gain in every pixel, by a pass over the pointing."""
+    drifting = [effect for effect in acting if effect.gain(np.zeros(1), site) is not None]
+    if not drifting:
+        return None
+    pointing = site.pointed(drifting[0].name)
+
+    def errors() -> Iterator[tod.Samples]:
+        for chunk in tod.samples(pointing.model, pointing.line, site.nside, site.frame, share):
+            gains = [effect.gain(chunk.time_s, site) for effect in drifting]
+            yield replace(chunk, signal_uk=sum((g for g in gains if g is not None), start=chunk.signal_uk))
+
+    mean, hits = tod.bin_samples(errors(), site.nside)
+    return np.where(hits > 0, mean, 0.0)
 
 
 def _window(run: config.RunConfig, spec: config.Channel) -> NDArray[np.float64]:
@@ -236,15 +278,6 @@ def _moments(
             return scan.Moments.load(folder, mmap=True)
         case config.ScanDifferencing():
             raise TypeError("a differencing scan has pairs of pixels, no moments")
-
-
-def scan_model(
-    spec: config.Channel, chosen: config.ScanHitAveraged | config.ScanDifferencing, split: str | None
-) -> scan.ScanModel:
-    """The scan model of a channel, at the sampling that the channel asks for."""
-    template = config.channel_path(chosen.model, spec.name, split)
-    model = scan.load_model(resources.scan_model(str(template)))
-    return model if chosen.sample_period_s is None else model.with_sampling(chosen.sample_period_s)
 
 
 def _pairs(

@@ -13,8 +13,8 @@ from mcsim.config.schema import RunConfig, analysis_lmax, pixel_window
 def science(config: RunConfig) -> dict[str, Any]:
     """The part of a run that defines its numbers, with the contents of files in place of their names.
 
-    Sky, map, channels, biposh, seed and pairing; not name, compute, the number of realizations or keep_maps. A file
-    is stood for by the SHA-256 of its contents, a template by those of its files. Skies given one file per
+    Sky, map, channels, effects, biposh, seed and pairing; not name, compute, the number of realizations or keep_maps. A
+    file is stood for by the SHA-256 of its contents, a template by those of its files. Skies given one file per
     realization are stood for by the part of their template that has the placeholder and by the contents of
     realization 0: the others are not read.
 
@@ -37,7 +37,7 @@ def science(config: RunConfig) -> dict[str, Any]:
         table["pixel_window"] = pixel_window(config, channel) if window is None else window
     return {
         "schema": plain["schema"],
-        **{section: plain[section] for section in ("sky", "map", "channel", "biposh")},
+        **{section: plain[section] for section in ("sky", "map", "channel", "effect", "biposh") if section in plain},
         "ensemble": {key: plain["ensemble"][key] for key in ("seed", "paired")},
     }
 
@@ -52,8 +52,18 @@ def _leave_out_what_says_nothing(plain: dict[str, Any]) -> None:
         del section["mask_frame"]
     if section["mask_apodisation_deg"] == 0.0:
         del section["mask_apodisation_deg"]
+    if not plain["effect"]:
+        del plain["effect"]
+    if plain["sky"]["dipole_uk"] is None:
+        del plain["sky"]["dipole_uk"]
+    if (plain["sky"]["dipole_lon_deg"], plain["sky"]["dipole_lat_deg"]) == (264.0, 48.24):
+        del plain["sky"]["dipole_lon_deg"], plain["sky"]["dipole_lat_deg"]
     for channel in plain["channel"]:
         channel["scan"].pop("max_iterations", None)
+        if channel["scan"]["kind"] == "moments":
+            for key in ("model", "line_of_sight"):
+                if channel["scan"][key] is None:
+                    del channel["scan"][key]
         if channel["beam_b"] is None:
             del channel["beam_b"]
         for beam in (channel["beam"], channel.get("beam_b")):

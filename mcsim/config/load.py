@@ -48,9 +48,8 @@ def load(source: str | Path | Mapping[str, Any], base: str | Path | None = None)
         path = Path(source)
         where = str(source)
         plain, folder = _read(path if _is_file(path) else resources.workflow(source))
-    if "effect" in plain:
-        raise InputError(f"{where}: effects ([[effect]]) are not in this version of mcsim; remove them.")
     paths.make_absolute(plain, folder, where)
+    paths.find_descriptions(plain)
     config = _validate(plain, where)
     paths.check_files(config, plain, where)
     return config
@@ -64,6 +63,8 @@ def check_skies(config: RunConfig, realizations: range) -> None:
 def to_dict(config: RunConfig) -> dict[str, Any]:
     """Plain dict as in TOML: ``load(to_dict(config)) == config``; None marks what is left out."""
     plain: dict[str, Any] = _ADAPTER.dump_python(config, mode="json", by_alias=True)
+    for effect in plain["effect"]:
+        effect |= effect.pop("parameters")
     return plain
 
 
@@ -81,7 +82,7 @@ def resolved(config: RunConfig) -> dict[str, Any]:
 
 def to_json(config: RunConfig) -> str:
     """JSON from which :func:`from_json` rebuilds the same configuration."""
-    return _ADAPTER.dump_json(config, by_alias=True).decode()
+    return json.dumps(to_dict(config))
 
 
 def from_json(text: str) -> RunConfig:
@@ -137,9 +138,26 @@ def _plain(source: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def _validate(plain: dict[str, Any], where: str) -> RunConfig:
+    plain = _with_parameters(plain)
     # JSON mode is strict about numbers and text but takes lists for tuples, which TOML has and Python's strict mode
     # refuses.
     try:
         return _ADAPTER.validate_json(json.dumps(plain), by_alias=True, by_name=False)
     except ValidationError as error:
         raise InputError(sentence(error, plain, where)) from None
+
+
+def _with_parameters(plain: dict[str, Any]) -> dict[str, Any]:
+    """The same run with the parameters of effects in tables of their own, as the schema has them."""
+    tables = plain.get("effect")
+    if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+        return plain
+    own = ("name", "channel")
+    folded = [
+        {
+            **{key: value for key, value in table.items() if key in own},
+            "parameters": {key: value for key, value in table.items() if key not in own},
+        }
+        for table in tables
+    ]
+    return {**plain, "effect": folded}

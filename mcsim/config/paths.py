@@ -12,6 +12,9 @@ from mcsim.config.messages import label
 from mcsim.config.schema import RunConfig
 from mcsim.errors import InputError
 
+DESCRIPTION = "scan.toml"
+"""Name of the file beside moments that says how the survey was pointed."""
+
 _VARIABLE = re.compile(r"\$\{([A-Za-z_][A-Za-z0-9_]*)\}")
 _NUMBER_FORMAT = re.compile(r"(0?[1-9]?d)?")
 
@@ -34,6 +37,7 @@ _RULES = {
     "beam_b.path": _Rule(placeholders=("channel",)),
     "scan.path": _Rule(placeholders=("channel", "split")),
     "scan.model": _Rule(packaged="scan_models", placeholders=("channel", "split")),
+    "effect.template": _Rule(),
 }
 
 
@@ -73,6 +77,9 @@ def entries(plain: dict[str, Any]) -> Iterator[Entry]:
     for number, table in enumerate(tables):
         key = f"channel[{label(table, number)}]"
         sections += [(part, f"{key}.{part}", table.get(part), (every[number],)) for part in ("beam", "beam_b", "scan")]
+    effects = plain.get("effect")
+    for number, table in enumerate(effects if isinstance(effects, list) else []):
+        sections.append(("effect", f"effect[{number}]", table, every))
     for section, where, holder, speaks_of in sections:
         for path, rule in _RULES.items():
             table_name, field = path.split(".")
@@ -99,6 +106,21 @@ def make_absolute(plain: dict[str, Any], base: Path, where: str) -> None:
 
         path = _VARIABLE.sub(expand, entry.template)
         entry.holder[entry.field] = os.path.normpath(os.path.join(_literal(str(base.absolute()), entry.rule), path))
+
+
+def find_descriptions(plain: dict[str, Any]) -> None:
+    """Let channels whose moments have a ``scan.toml`` beside them, and name no model, name that, in place."""
+    channels = plain.get("channel")
+    for channel in channels if isinstance(channels, list) else []:
+        scan = channel.get("scan") if isinstance(channel, dict) else None
+        if not isinstance(scan, dict) or scan.get("kind") != "moments" or scan.get("model") is not None:
+            continue
+        beside = Path(str(scan.get("path"))).parent / DESCRIPTION
+        try:
+            if beside.is_file():
+                scan["model"] = str(beside)
+        except (OSError, ValueError):  # a name that no file system takes
+            continue
 
 
 def files(entry: Entry, splits: Sequence[str], where: str, realization: int = 0) -> dict[str, Path]:

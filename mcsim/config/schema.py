@@ -60,12 +60,19 @@ Frame = Literal["ecliptic", "galactic", "equatorial"]
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Sky:
-    """Isotropic Gaussian skies from ``spectrum``, or skies given as a_lm or map files (a template: {realization})."""
+    """Isotropic Gaussian skies from ``spectrum``, or skies given as a_lm or map files (a template: {realization}).
+
+    ``dipole_uk`` (towards galactic ``dipole_lon_deg``, ``dipole_lat_deg``) is seen by the survey and taken off as
+    believed, so that it shows only through effects; left out, it is what the description of the scan says, or none.
+    """
 
     lmax: Degree
     spectrum: PathText | None = None
     alm: PathText | None = None
     map: PathText | None = None
+    dipole_uk: Annotated[float, Field(ge=0.0)] | None = None
+    dipole_lon_deg: float = 264.0
+    dipole_lat_deg: Annotated[float, Field(ge=-90.0, le=90.0)] = 48.24
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
@@ -179,10 +186,16 @@ class ScanHitAveraged:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class ScanMoments:
-    """Orientation moments from a FITS file."""
+    """Orientation moments from a FITS file.
+
+    ``model``: how the survey was pointed, for effects that depend on time: a scan model, or a survey's description;
+    left out, it is ``scan.toml`` beside the file, if there is one. ``line_of_sight``: left out, the channel's name.
+    """
 
     kind: Literal["moments"] = "moments"
     path: PathText
+    model: PathText | None = None
+    line_of_sight: PathText | None = None
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -278,6 +291,15 @@ class Compute:
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
+class Effect:
+    """A named change of the simulation; in TOML ``parameters`` are further keys of the table ``[[effect]]``."""
+
+    name: PathText
+    channel: Label | None = None
+    parameters: dict[str, float | str | tuple[float, ...]] = Field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
 class RunConfig:
     """A whole run. In TOML ``schema_version`` is ``schema`` and ``channels`` are the tables ``[[channel]]``."""
 
@@ -286,6 +308,7 @@ class RunConfig:
     sky: Sky
     map: Map
     channels: Annotated[tuple[Channel, ...], Field(alias="channel", min_length=1)]
+    effects: Annotated[tuple[Effect, ...], Field(alias="effect")] = ()
     biposh: Biposh = Biposh()
     ensemble: Ensemble = Ensemble()
     compute: Compute = Compute()
@@ -308,6 +331,13 @@ class RunConfig:
             _different([channel.name for channel in self.channels])
         except ValueError as error:
             raise ValueError(f"channel {error}") from None
+        names = [channel.name for channel in self.channels]
+        for effect in self.effects:
+            if effect.channel is not None and effect.channel not in names:
+                raise ValueError(
+                    f"effect {effect.name}: channel = {effect.channel!r} is no channel of the run; use one of "
+                    f"{', '.join(names)}"
+                )
         for channel in self.channels:
             for key in ("beam", "beam_b"):
                 m_max = getattr(getattr(channel, key), "m_max", None)

@@ -177,7 +177,8 @@ WRONG = [
     ("name", "a/b", r'name = "a/b" is not a usable name: .* rename it'),
     ("name", REMOVED, r"the key name is missing; add it"),
     ("nmae", "x", r"the key nmae is unknown \(did you mean name\?\); remove it or correct it"),
-    ("effect", [], r"effects \(\[\[effect\]\]\) are not in this version of mcsim; remove them"),
+    ("effect", [{"name": "gain_drift", "channel": "X"}], r"effect gain_drift: channel = 'X' is no channel of the run"),
+    ("effect", [{"channel": "W1"}], r"name is missing"),
     ("sky", REMOVED, r"the key sky is missing; add it"),
     ("sky", 3, r"sky = 3 .* give a table of keys"),
     ("sky.lmx", 3, r"the key sky\.lmx is unknown \(did you mean lmax\?\)"),
@@ -383,7 +384,8 @@ def test_resolved_writes_the_defaults_out_and_loads_as_the_same_run(plain, folde
 
 def test_json_schema_names_every_table(plain):
     schema = config.json_schema()
-    assert set(schema["properties"]) == {"schema", "name", "sky", "map", "channel", "biposh", "ensemble", "compute"}
+    tables = {"schema", "name", "sky", "map", "channel", "effect", "biposh", "ensemble", "compute"}
+    assert set(schema["properties"]) == tables
     assert schema["additionalProperties"] is False
 
 

@@ -16,7 +16,8 @@ from matplotlib.figure import Figure
 
 import mcsim
 from mcsim import config, resources, scan, spectra
-from mcsim.survey import load_beam, survey
+from mcsim.instrument import load_beam
+from mcsim.survey import survey
 
 HERE = Path(__file__).parent
 RUNS = (

@@ -1,0 +1,19 @@
+"""The library of effects: one file each, found by name; other packages add theirs by entry points."""
+
+from mcsim.effects.base import Alm, Draw, Effect, Map, Pointing, Site
+from mcsim.effects.compose import seen_through
+from mcsim.effects.registry import build, describe, get, library
+
+__all__ = [
+    "Alm",
+    "Draw",
+    "Effect",
+    "Map",
+    "Pointing",
+    "Site",
+    "build",
+    "describe",
+    "get",
+    "library",
+    "seen_through",
+]
