@@ -1,5 +1,6 @@
 """One realization: sky -> beams under the scan -> maps -> a_lm -> BipoSH and power spectra."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -67,59 +68,112 @@ def draw_sky(survey: Survey, realization: int) -> Alm:
     return gaussian_alm(survey.cl, rng.generator(survey.config.ensemble.seed, realization, "sky"))
 
 
+def maps(survey: Survey, realization: int, nthreads: int = 1) -> NDArray[np.float64]:
+    """Maps of one realization, effects and noise included, uK, shape (map, npix); ``healpy.UNSEEN`` without a hit."""
+    sky = draw_sky(survey, realization)
+    found = []
+    for channel in survey.channels:
+        for m, layers in _layers(survey, channel, sky, realization, nthreads, smooth=True):
+            found.append(np.where(m.moments.hits > 0, layers.total, healpy.UNSEEN))
+    return np.stack(found)
+
+
+@dataclass(frozen=True)
+class Layers:
+    """What a map is the sum of, uK, shape (npix,) each.
+
+    They are analysed apart, so that the quadrature error of the circular twin cancels in the paired difference.
+
+    Attributes
+    ----------
+    smooth
+        The sky through the circular part of the beam at the pixels' centres; None where its a_lm stand for it.
+    extra
+        What the circular twin sees beyond that: centroids, noise, gain. None: nothing.
+    difference
+        What the rest of the beam adds. None: nothing.
+    """
+
+    smooth: NDArray[np.float64] | None
+    extra: NDArray[np.float64] | None
+    difference: NDArray[np.float64] | None
+
+    @property
+    def total(self) -> NDArray[np.float64]:
+        """The map."""
+        parts = [part for part in (self.smooth, self.extra, self.difference) if part is not None]
+        return np.sum(parts, axis=0)
+
+
 def _observe(survey: Survey, channel: Channel, sky: Alm, realization: int, nthreads: int) -> list[Observed]:
+    """The channel's maps of one sky, analysed."""
+    ensemble = survey.config.ensemble
+    known = None
+    smooth = ensemble.keep_maps or not all(_is_exact(survey, m) for m in channel.maps)
+    if channel.side_b is None:
+        seen, dipole = _seen(survey, channel, sky, realization)
+        known = _circular(survey, channel, seen, dipole)
+    results = []
+    for m, layers in _layers(survey, channel, sky, realization, nthreads, smooth):
+        if known is not None and _is_exact(survey, m):
+            exact = alm_.multiply(known, 1.0 / channel.window, survey.config.sky.lmax)
+            twin = exact if layers.extra is None else exact + _analyse(survey, channel, layers.extra, None, nthreads)
+        else:
+            assert layers.smooth is not None  # asked for above
+            circular = layers.smooth if layers.extra is None else layers.smooth + layers.extra
+            twin = _analyse(survey, channel, circular, m.weight, nthreads)
+        alm = twin
+        if layers.difference is not None:
+            alm = twin + _analyse(survey, channel, layers.difference, m.weight, nthreads)
+        kept = np.where(m.moments.hits > 0, layers.total, healpy.UNSEEN) if ensemble.keep_maps else None
+        results.append(Observed(alm, twin if ensemble.paired else None, kept))
+    return results
+
+
+def _layers(
+    survey: Survey, channel: Channel, sky: Alm, realization: int, nthreads: int, smooth: bool
+) -> Iterator[tuple[SurveyMap, Layers]]:
     """The channel's maps of one sky; transforms that splits share are made once."""
     run = survey.config
-    nside, lmax_sky = run.map.nside, run.sky.lmax
-    if channel.side_b is not None:
-        return _observe_differences(survey, channel, sky, realization, nthreads)
+    nside, seed = run.map.nside, run.ensemble.seed
     seen, dipole = _seen(survey, channel, sky, realization)
-    circular = convolve.circular_alm(seen, channel.response)
+    if channel.side_b is not None:
+        for m, solved in differencing.maps(channel, seen, dipole, nside, seed, realization, nthreads):
+            yield m, Layers(solved.circular, None, solved.difference)
+        return
+    circular = _circular(survey, channel, seen, dipole)
     spins = convolve.spin_maps(seen, channel.response, nside, nthreads)
-    gained = None
-    if any(m.gain is not None for m in channel.maps):
-        gained = healpix.synthesis(circular[None], nside, lmax_sky, nthreads=nthreads)[0]
     if dipole is not None:
-        # The survey takes it off as believed: what an effect makes of it stays.
-        believed = convolve.response(channel.site.beam, lmax_sky, channel.window)
-        circular = circular - convolve.circular_alm(dipole, believed)
-        for s, map_uk in convolve.spin_maps(dipole, believed, nside, nthreads).items():
+        for s, map_uk in convolve.spin_maps(dipole, _believed(channel), nside, nthreads).items():
             spins[s] = spins[s] - map_uk if s in spins else -map_uk
-    smooth = None
-    if run.ensemble.keep_maps or not all(_is_exact(survey, m) for m in channel.maps):
-        smooth = healpix.synthesis(circular[None], nside, lmax_sky, nthreads=nthreads)[0]
+    flat = healpix.synthesis(circular[None], nside, run.sky.lmax, nthreads=nthreads)[0] if smooth else None
+    whole = None
+    if any(m.gain is not None for m in channel.maps):
+        whole = convolve.circular_map(seen, channel.response, nside, nthreads)
     gradient = None
     if any(m.moments.dtheta is not None for m in channel.maps):
-        gradient = healpix.gradient(circular, nside, lmax_sky, nthreads)
-
-    results = []
+        gradient = healpix.gradient(circular, nside, run.sky.lmax, nthreads)
     for m in channel.maps:
-        # What the circular twin sees beyond its beam, and what the rest of the beam adds: they are analysed apart, so
-        # that the quadrature error of the twin cancels in the paired difference.
-        extra = None
+        extra = []
         if m.moments.dtheta is not None and gradient is not None:
-            extra = convolve.centroid_map(gradient, m.moments)
+            extra.append(convolve.centroid_map(gradient, m.moments))
         if m.noise_uk is not None:
-            noise = m.noise_uk * rng.generator(run.ensemble.seed, realization, f"noise/{m.name}").standard_normal(
-                m.noise_uk.size
-            )
-            extra = noise if extra is None else extra + noise
-        if m.gain is not None and gained is not None:
-            extra = m.gain * gained if extra is None else extra + m.gain * gained
+            draw = rng.generator(seed, realization, f"noise/{m.name}")
+            extra.append(m.noise_uk * draw.standard_normal(m.noise_uk.size))
+        if m.gain is not None and whole is not None:
+            extra.append(m.gain * whole)
         difference = convolve.noncircular_map(spins, m.moments) if spins else None
-        if _is_exact(survey, m):
-            exact = alm_.multiply(circular, 1.0 / channel.window, lmax_sky)
-            twin = exact if extra is None else exact + _analyse(survey, channel, extra, None, nthreads)
-        else:
-            assert smooth is not None
-            twin = _analyse(survey, channel, smooth if extra is None else smooth + extra, m.weight, nthreads)
-        alm = twin if difference is None else twin + _analyse(survey, channel, difference, m.weight, nthreads)
-        kept = None
-        if run.ensemble.keep_maps and smooth is not None:
-            kept = sum((part for part in (extra, difference) if part is not None), start=smooth)
-            kept = np.where(m.moments.hits > 0, kept, healpy.UNSEEN)
-        results.append(Observed(alm, twin if run.ensemble.paired else None, kept))
-    return results
+        yield m, Layers(flat, sum(extra[1:], start=extra[0]) if extra else None, difference)
+
+
+def _circular(survey: Survey, channel: Channel, seen: Alm, dipole: Alm | None) -> Alm:
+    """What the circular part of the beam sees, less the dipole as believed: what an effect makes of it stays."""
+    circular = convolve.circular_alm(seen, channel.response)
+    return circular if dipole is None else circular - convolve.circular_alm(dipole, _believed(channel))
+
+
+def _believed(channel: Channel) -> convolve.Response:
+    return convolve.response(channel.site.beam, channel.site.lmax, channel.window)
 
 
 def _seen(survey: Survey, channel: Channel, sky: Alm, realization: int) -> tuple[Alm, Alm | None]:
@@ -134,23 +188,6 @@ def _seen(survey: Survey, channel: Channel, sky: Alm, realization: int) -> tuple
         return sky, None
     dipole = tod.dipole_alm(channel.site.dipole_uk, channel.site.lmax)
     return sky + dipole, dipole
-
-
-def _observe_differences(survey: Survey, channel: Channel, sky: Alm, realization: int, nthreads: int) -> list[Observed]:
-    """The channel's maps of one sky where two beams are read as a difference."""
-    run = survey.config
-    results = []
-    seen, dipole = _seen(survey, channel, sky, realization)
-    seed = run.ensemble.seed
-    for m, solved in differencing.maps(channel, seen, dipole, run.map.nside, seed, realization, nthreads):
-        # The two are analysed apart like those of other scans.
-        twin = _analyse(survey, channel, solved.circular, m.weight, nthreads)
-        alm = twin + _analyse(survey, channel, solved.difference, m.weight, nthreads)
-        kept = None
-        if run.ensemble.keep_maps:
-            kept = np.where(m.moments.hits > 0, solved.circular + solved.difference, healpy.UNSEEN)
-        results.append(Observed(alm, twin if run.ensemble.paired else None, kept))
-    return results
 
 
 def _analyse(
