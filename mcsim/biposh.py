@@ -6,6 +6,7 @@ Stored at ell = l2 with d = l2 - l1, in the Hajian-Souradeep normalisation,
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numba
 import numpy as np
@@ -55,6 +56,7 @@ class Estimator:
     bands: tuple[Band, ...]
 
 
+@lru_cache(maxsize=4)
 def estimator(L_max: int, lmax: int, both_orders: bool = False) -> Estimator:
     """Clebsch-Gordan tables for all modes up to L_max at l1, l2 <= lmax.
 

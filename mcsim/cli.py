@@ -5,8 +5,10 @@ Exit codes: 0 done, 1 failed realizations, 2 bad input, 130 interrupted.
 
 import json
 import os
+import signal
 import sys
 from pathlib import Path
+from types import FrameType
 from typing import Annotated
 
 import typer
@@ -44,19 +46,26 @@ def run(
     store: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="STORE", help="Default: NAME.zarr here.")
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue a store; refuse to start a new one.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Check a store, repair it, and continue it.")] = False,
     realizations: Annotated[
         str | None, typer.Option(metavar="A:B", help="Only realizations A to B - 1, for slices that merge joins.")
     ] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Local processes; default: the configuration's.")] = None,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Running Dask scheduler, tcp://host:port.")
+        str | None, typer.Option(metavar="ADDRESS", help="Running Dask scheduler, tcp://host:port or tls://host:port.")
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say memory, disk, files and time; compute nothing.")
     ] = False,
 ) -> None:
-    """Run an ensemble; continue it if it was interrupted; extend it if more realizations are asked for."""
+    """Run an ensemble; continue it if it was interrupted; extend it if more realizations are asked for.
+
+    With --resume the store is read and checked first, and what is damaged is computed again. STORE.log beside the store
+    says what happened.
+
+    Exit codes: 0 done; 1 realizations failed, or the run could not go on: what is finished is stored, run again; 2 bad
+    input, nothing was computed; 130 interrupted by Ctrl-C or SIGTERM: run again to go on.
+    """
     if workers is not None and scheduler is not None:
         raise InputError("--workers and --scheduler exclude each other: workers of a running scheduler are its own.")
     part = _slice(realizations)
@@ -65,9 +74,10 @@ def run(
 
         out.print(plan.describe(config, part, workers), markup=False)
         return
-    from mcsim import runner
-
+    _interrupt_once()
     try:
+        from mcsim import runner
+
         result = runner.run(
             config, store, resume=resume, realizations=part, workers=workers, scheduler=scheduler, quiet=False
         )
@@ -95,8 +105,17 @@ def info(
         Path | None,
         typer.Option(metavar="FILE", help="Write the summary: .nc (NetCDF) or .ecsv (table of binned spectra)."),
     ] = None,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Read every file, name damaged realizations; exit code 1 if there are any.")
+    ] = False,
 ) -> None:
-    """Say what a store holds; export its summary."""
+    """Say what a store holds; export its summary; verify it."""
+    if verify:
+        from mcsim import repair
+
+        verdict = repair.verify(store, quiet=False)
+        out.print(verdict.text(), markup=False)
+        raise typer.Exit(0 if verdict.intact else 1)
     from mcsim import describe
 
     out.print(describe.describe(store), markup=False)
@@ -235,6 +254,18 @@ def config(
         print(json.dumps({"digest": config_.digest(loaded), **config_.resolved(loaded)}, indent=2))
     else:
         raise InputError("Nothing was asked for; give a configuration to check, or --schema.")
+
+
+def _interrupt_once() -> None:
+    """Ctrl-C, or the SIGTERM of a batch system, ends a run in order; a second one does not disturb that."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        for name in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(name, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    for name in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(name, interrupt)
 
 
 def _slice(text: str | None) -> slice | None:

@@ -1,10 +1,13 @@
 """One run at a time writes to a store."""
 
+import fcntl
 import os
 import socket
+import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import NoReturn
 
 from mcsim.errors import InputError
 
@@ -22,8 +25,7 @@ def locked(path: Path) -> Iterator[None]:
     while True:
         try:
             lock.parent.mkdir(parents=True, exist_ok=True)
-            with lock.open("x") as stream:
-                stream.write(f"{socket.gethostname()} {os.getpid()}")
+            _make(lock, path)
             break
         except FileExistsError:
             _take_over(lock, path)
@@ -36,17 +38,32 @@ def locked(path: Path) -> Iterator[None]:
         lock.unlink(missing_ok=True)
 
 
+def _make(lock: Path, path: Path) -> None:
+    """Make the lock with its contents in one step, so that a process that is killed leaves a lock that can be read."""
+    with tempfile.NamedTemporaryFile("w", prefix=f".{path.name}.", dir=path.parent) as stream:
+        stream.write(f"{socket.gethostname()} {os.getpid()}")
+        stream.flush()
+        os.link(stream.name, lock)
+
+
 def _take_over(lock: Path, path: Path) -> None:
     """Remove the lock of a dead process, or refuse."""
-    try:
-        host, process = lock.read_text().split()
-    except FileNotFoundError:
-        return
-    except ValueError:
-        host, process = "an unknown host", "0"
-    if host == socket.gethostname() and not _alive(int(process)):
-        lock.unlink(missing_ok=True)
-        return
+    with suppress(FileNotFoundError), lock.open() as stream:
+        try:
+            host, number = stream.read().split()
+            process = int(number)
+        except ValueError:
+            host, process = "an unknown host", 0
+        if host == socket.gethostname() and not _alive(process):
+            # Of several that find it so one removes it, and none the lock that another has made since.
+            fcntl.flock(stream, fcntl.LOCK_EX)
+            if os.fstat(stream.fileno()).st_ino == lock.stat().st_ino:
+                lock.unlink()
+            return
+        _refuse(lock, path, host, process)
+
+
+def _refuse(lock: Path, path: Path, host: str, process: int) -> NoReturn:
     raise InputError(
         f"Another run writes to {path} (process {process} on {host}); wait for it, or remove {lock} if it is gone."
     )
@@ -55,8 +72,10 @@ def _take_over(lock: Path, path: Path) -> None:
 def _alive(process: int) -> bool:
     try:
         os.kill(process, 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
         return True
+    with suppress(OSError):  # a process that has ended but that its parent has not asked after
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     return True

@@ -13,8 +13,8 @@ from mcsim import alm as alm_
 from mcsim import config, differencing, healpix, rng, spectra, store, summary
 from mcsim.biposh import Mode, estimate, estimator, modes
 from mcsim.errors import InputError
-from mcsim.layout import Layout
 from mcsim.instrument import load_beam
+from mcsim.layout import Layout
 from mcsim.sky import gaussian_alm
 from mcsim.survey import Survey
 

@@ -1,8 +1,13 @@
-"""Progress of long work: a bar on a terminal, a plain line a minute elsewhere."""
+"""Progress of long work: a bar on a terminal, a plain line a minute elsewhere; and a log beside the store."""
 
+import os
+import socket
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Protocol
 
 from rich.console import Console
@@ -46,6 +51,23 @@ def reporting(label: str, total: float, unit: str, quiet: bool = False, every_s:
             yield _Bar(bar, label, total, unit)
     else:
         yield _Lines(console, label, total, unit, every_s)
+
+
+@dataclass(frozen=True)
+class Journal:
+    """Log of the runs on one store: ``{store}.log`` beside it, a line per event, appended."""
+
+    store: Path
+    quiet: bool = True
+
+    def write(self, text: str, aloud: bool = False) -> None:
+        """Append a line; ``aloud`` says it on standard error, too, unless quiet. A full disk must not stop a run."""
+        line = " ".join(text.split())
+        with suppress(OSError), self.store.with_name(f"{self.store.name}.log").open("a") as stream:
+            now = datetime.now(UTC).isoformat(timespec="seconds")
+            stream.write(f"{now} {socket.gethostname()} {os.getpid()} {line}\n")
+        if aloud and not self.quiet:
+            Console(stderr=True, highlight=False, soft_wrap=True).print(line, markup=False)
 
 
 class _Silent:

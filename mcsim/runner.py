@@ -4,35 +4,38 @@ The only module that touches dask. Nothing large is in the graph: tasks carry th
 and moments on the worker, once.
 """
 
+import logging
 import os
 import tempfile
+from asyncio import CancelledError
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
+from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import dask
-import numpy as np
-from distributed import Client, KilledWorker, LocalCluster, as_completed
+from distributed import Client, Future, KilledWorker, LocalCluster, as_completed
+from distributed.comm.core import CommClosedError
 from numpy.typing import NDArray
 
-from mcsim import config, plan, simulate, statistics, store, summary
+from mcsim import config, plan, repair, simulate, statistics, store, summary
 from mcsim.errors import InputError, RunError
+from mcsim.layout import listed
 from mcsim.lock import locked
-from mcsim.progress import reporting
+from mcsim.progress import Journal, reporting
 from mcsim.statistics import Sums
 from mcsim.survey import Survey, survey
+from mcsim.tasks import ATTEMPTS, Failure, Job, check_same_packages, empty, packages, realize_chunk, summarise_node
 
-
-@dataclass(frozen=True)
-class Failure:
-    """A realization that could not be computed."""
-
-    realization: int
-    reason: str
+# Ctrl-C reaches all processes of a terminal, and it is the driver that ends the run; workers that lose it say nothing.
+_WORKER_SETUP = """
+import logging, signal
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+logging.getLogger("distributed").setLevel(logging.CRITICAL)
+"""
 
 
 @dataclass(frozen=True)
@@ -65,13 +68,14 @@ def run(
     path
         Store; default ``{name}.zarr`` in the working folder.
     resume
-        Demand that the store exists.
+        Demand that the store exists, read all of it first, and compute again what is damaged.
     realizations
         Only these of the ensemble, for slices that :func:`merge` joins.
     workers
         Processes of the local cluster; default: the configuration's.
     scheduler
-        Address of a running scheduler, ``tcp://host:port``, whose workers see the same files.
+        Address of a running scheduler, ``tcp://host:port`` (or ``tls://``, with the keys that Dask's configuration
+        names), whose workers see the same files.
     client
         An existing client, left open.
     quiet
@@ -85,13 +89,16 @@ def run(
     loaded = source if isinstance(source, config.RunConfig) else config.load(source)
     wanted = plan.wanted(loaded, realizations)
     target = Path(path) if path is not None else plan.default_store(loaded, realizations)
-    if not plan.exists(target):
-        if resume:
-            raise InputError(f"There is no store {target} to resume; leave out --resume to start it.")
-        store.check_writable(target)
-    elif _finished(target, loaded, wanted):
+    exists = plan.exists(target)
+    if resume and not exists:
+        raise InputError(f"There is no store {target} to resume; leave out --resume to start it.")
+    if exists and not resume and _finished(target, loaded, wanted):
         return Result(target, int(store.done(target).sum()), 0, ())
+    if exists:
+        plan.check_same(target, loaded)
+    store.check_writable(target)
     config.check_skies(loaded, wanted)
+    journal = Journal(target, quiet)
     with ExitStack() as stack:
         if client is None and scheduler is not None:
             client = stack.enter_context(_remote_client(scheduler))
@@ -99,9 +106,14 @@ def run(
             shared = survey(loaded, nthreads=os.cpu_count() or 1, progress=report)
         simulate.draw_sky(shared, wanted.start)  # bad files of skies are to be found before a store is made
         stack.enter_context(locked(target))
+        stack.enter_context(_written_down(journal, loaded, wanted))
+        if resume:
+            _mend(target, shared, journal, quiet)
+            if _finished(target, loaded, wanted):
+                return Result(target, int(store.done(target).sum()), 0, ())
         if client is None:
             client = stack.enter_context(local_client(workers or loaded.compute.workers))
-        return _run(client, shared, target, wanted, quiet)
+        return _run(client, shared, target, wanted, journal)
 
 
 def _finished(target: Path, run: config.RunConfig, wanted: range) -> bool:
@@ -111,22 +123,52 @@ def _finished(target: Path, run: config.RunConfig, wanted: range) -> bool:
     return wanted.stop <= len(done) and bool(done[wanted].all()) and store.summarised(target) == done.sum()
 
 
-def _run(client: Client, shared: Survey, target: Path, wanted: range, quiet: bool) -> Result:
+@contextmanager
+def _written_down(journal: Journal, run: config.RunConfig, wanted: range) -> Iterator[None]:
+    """Log how a run starts and what ends it."""
+    journal.write(
+        f"start: {run.name}, realizations {wanted.start} to {wanted.stop - 1}, mcsim {dict(packages())['mcsim']}"
+    )
+    try:
+        yield
+    except BaseException as error:
+        journal.write(f"end: {type(error).__name__}: {error}")
+        raise
+    journal.write("end: store released")
+
+
+def _mend(target: Path, shared: Survey, journal: Journal, quiet: bool) -> None:
+    verdict = repair.mend(target, plan.layout(shared), plan.attributes(shared.config), quiet)
+    for damage in verdict.damages:
+        if damage.lost:
+            journal.write(f"damaged, to be computed again: {listed(damage.lost)} ({damage.reason})", aloud=True)
+    for name, reason in verdict.broken.items():
+        journal.write(f"damaged, made again: {name} ({reason})", aloud=True)
+
+
+def _run(client: Client, shared: Survey, target: Path, wanted: range, journal: Journal) -> Result:
     """Make or extend the store, compute what is missing, summarise."""
     run = shared.config
     if not target.exists():
         store.create(target, plan.layout(shared), plan.attributes(run))
-    elif run.ensemble.realizations > store.size(target):
+    plan.check_same(target, run)
+    if run.ensemble.realizations > store.size(target):
         store.extend(target, run.ensemble.realizations, plan.attributes(run))
     before = int(store.done(target).sum())
     try:
-        failures = _simulate(client, target, run, wanted, quiet)
-        _summarise(client, target, plan.recipe(shared), quiet)
+        failures = _simulate(client, target, run, wanted, journal)
+        _summarise(client, target, plan.recipe(shared), journal.quiet)
     except KilledWorker as error:
         raise RunError(
             f"Workers died again and again on {error.task} (out of memory?); what is finished is stored in {target}."
         ) from error
+    except (CancelledError, CommClosedError) as error:
+        raise RunError(
+            f"The connection to the scheduler is lost; what is finished is stored in {target}, and the same command "
+            "goes on."
+        ) from error
     finished = int(store.done(target).sum())
+    journal.write(f"done: {finished} realizations stored, {finished - before} of them new, {len(failures)} failed")
     return Result(target, finished, finished - before, tuple(failures))
 
 
@@ -170,7 +212,7 @@ def _merge_chunk(sources: list[Path], target: Path, start: int, stop: int) -> No
         rows = store.read(source, start, stop, maps=True)
         present = rows["done"]
         if not merged:
-            merged = {name: _empty(stop - start, a) for name, a in rows.items()}
+            merged = {name: empty(stop - start, a) for name, a in rows.items()}
         for name, array in rows.items():
             merged[name][: len(present)][present] = array[present]
     done = merged.pop("done")
@@ -178,16 +220,15 @@ def _merge_chunk(sources: list[Path], target: Path, start: int, stop: int) -> No
         store.write(target, start, merged, done)
 
 
-def _empty(count: int, like: NDArray) -> NDArray:
-    """Rows of realizations that do not exist: not done, or NaN."""
-    return np.full((count, *like.shape[1:]), False if like.dtype == bool else np.nan, like.dtype)
-
-
 @contextmanager
 def local_client(workers: int) -> Iterator[Client]:
     """Client of a local cluster of single-threaded processes, whose ports are open to this machine alone."""
     single = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "DUCC0", "NUMBA")}
-    settings = {"distributed.nanny.pre-spawn-environ": single, "logging.distributed": "error"}
+    settings = {
+        "distributed.nanny.pre-spawn-environ": single,
+        "distributed.scheduler.allowed-failures": ATTEMPTS - 1,
+        "distributed.worker.preload": [_WORKER_SETUP],
+    }
     with (
         dask.config.set(settings),
         LocalCluster(
@@ -197,6 +238,7 @@ def local_client(workers: int) -> Iterator[Client]:
             host="127.0.0.1",
             dashboard_address="127.0.0.1:0",
             memory_limit=None,
+            silence_logs=logging.CRITICAL,
         ) as cluster,
         Client(cluster) as client,
     ):
@@ -207,106 +249,133 @@ def local_client(workers: int) -> Iterator[Client]:
 def _remote_client(scheduler: str) -> Iterator[Client]:
     try:
         client = Client(scheduler, timeout=5)
-    except (OSError, ValueError, TimeoutError) as error:
+    except (OSError, ValueError, TypeError, RuntimeError) as error:
         raise InputError(
             f"No Dask scheduler answers at {scheduler} within 5 s ({type(error).__name__}); "
             "start one or correct the address."
         ) from error
     with client:
+        _check_workers(client)
         yield client
 
 
-def _simulate(client: Client, target: Path, run: config.RunConfig, wanted: range, quiet: bool) -> list[Failure]:
-    """Compute what is missing, chunk by chunk, with a bounded number of tasks in flight."""
-    text, digest, chunk, done = config.to_json(run), config.digest(run), store.chunk(target), store.done(target)
-    starts = [
-        start
+def _check_workers(client: Client) -> None:
+    """Refuse workers that cannot do what this driver would; those that join later are checked by their first task."""
+    for address, answer in client.run(packages, on_error="return").items():
+        if isinstance(answer, Exception):
+            raise InputError(
+                f"The worker {address} cannot import mcsim ({type(answer).__name__}: {answer}); "
+                "start it from the driver's environment."
+            )
+        check_same_packages(f"The worker {address}", answer, packages())
+
+
+def completed(
+    client: Client, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]
+) -> Iterator[tuple[int, Any]]:
+    """Call a function on the workers of a cluster, with a bounded number of calls in flight.
+
+    Parameters
+    ----------
+    client
+        Such as :func:`local_client` gives, or one of any other cluster.
+    function
+        Importable on the workers; what it returns comes back to this process, so it should be small.
+    arguments
+        Tuples of positional arguments, one for every call; consumed as calls are sent, so it may be long, or lazy.
+
+    Yields
+    ------
+    tuple
+        Index of the call and its result, in the order of completion. Three calls are in flight for every worker thread
+        that there is by then, so workers may join and leave.
+
+    Raises
+    ------
+    Exception
+        What a call raised; ``distributed.KilledWorker`` where its worker died every time.
+    """
+    for index, future in _futures(client, function, arguments):
+        yield index, future.result()
+
+
+def _futures(
+    client: Client, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]
+) -> Iterator[tuple[int, Future]]:
+    waiting = enumerate(arguments)
+    flying = as_completed([], with_results=False)
+    numbers: dict[Future, int] = {}
+
+    def fill() -> None:
+        room = 3 * max(1, sum(client.nthreads().values())) - len(numbers)
+        for index, call in islice(waiting, max(room, 0)):
+            future = client.submit(function, *call, pure=False)
+            numbers[future] = index
+            flying.add(future)
+
+    fill()
+    for future in flying:
+        yield numbers.pop(future), future
+        fill()
+
+
+def _simulate(client: Client, target: Path, run: config.RunConfig, wanted: range, journal: Journal) -> list[Failure]:
+    """Compute what is missing, chunk by chunk."""
+    chunk, done = store.chunk(target), store.done(target)
+    path = str(target.absolute())
+    job = Job(config.to_json(run), config.digest(run), path, chunk, wanted.start, wanted.stop, packages())
+    missing = {
+        start: absent
         for start in range(wanted.start // chunk * chunk, wanted.stop, chunk)
-        if any(not done[r] for r in range(max(start, wanted.start), min(start + chunk, wanted.stop)))
-    ]
-    total = sum(not done[r] for r in wanted)
-    arguments = ((text, digest, str(target.absolute()), start, chunk, wanted.start, wanted.stop) for start in starts)
+        if (absent := [r for r in range(max(start, wanted.start), min(start + chunk, wanted.stop)) if not done[r]])
+    }
+    total = sum(map(len, missing.values()))
+    if total:
+        journal.write(f"{total} realizations to compute, {_workers(client)}", aloud=True)
     failures: list[Failure] = []
     finished = 0
-    with reporting("realizations", float(total), "realizations", quiet) as report:
-        for computed, failed in _bounded(client, realize_chunk, arguments):
+    with reporting("realizations", float(total), "realizations", journal.quiet) as report:
+        for computed, failed in _outcomes(client, job, missing, journal):
             finished += computed
             failures += failed
+            for failure in failed:
+                journal.write(f"failed: realization {failure.realization}: {failure.reason}")
             report(float(finished), len(failures))
     return sorted(failures, key=lambda failure: failure.realization)
 
 
-def _bounded(client: Client, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> Iterator[Any]:
-    """Results of calls in the order of completion, three tasks in flight for every worker thread there is by then."""
-    waiting = iter(arguments)
-    flying = as_completed([], with_results=False)
-    count = 0
+def _outcomes(
+    client: Client, job: Job, missing: dict[int, list[int]], journal: Journal
+) -> Iterator[tuple[int, list[Failure]]]:
+    """Results of the tasks of all chunks.
 
-    def fill() -> int:
-        room = 3 * max(1, sum(client.nthreads().values())) - count
-        calls = list(islice(waiting, max(room, 0)))
-        for call in calls:
-            flying.add(client.submit(function, *call, pure=False))
-        return len(calls)
-
-    count += fill()
-    for future in flying:
-        yield future.result()
-        count -= 1
-        count += fill()
-
-
-@lru_cache(maxsize=1)
-def _survey_of(text: str, digest: str) -> Survey:
-    """The survey of a configuration, made once per worker process and contents of its files."""
-    run = config.from_json(text)
-    found = config.digest(run)
-    if found != digest:
-        raise RunError("A worker sees other files than the driver does; let them share the files that the run names.")
-    return survey(run)
-
-
-def realize_chunk(
-    text: str, digest: str, path: str, start: int, chunk: int, wanted_start: int, wanted_stop: int
-) -> tuple[int, list[Failure]]:
-    """Task: compute what is missing of one chunk and write the chunk whole; returns the count and what failed."""
-    shared, target = _survey_of(text, digest), Path(path)
-    done = store.done(target, start, start + chunk)
-    stop = start + len(done)
-    rows: dict[str, NDArray] = store.read(target, start, stop, maps=True) if done.any() else {}
-    rows.pop("done", None)
-    computed, failures = 0, []
-    for r in range(max(start, wanted_start), min(stop, wanted_stop)):
-        if done[r - start]:
-            continue
+    Workers that die take the blame of all that they were given. What was blamed too often is tried again in the end,
+    realization by realization and one at a time: then only the guilty one fails.
+    """
+    starts, suspects = list(missing), []
+    for index, future in _futures(client, realize_chunk, ((job, start) for start in starts)):
         try:
-            values = simulate.realize(shared, r)
-            if not np.all(np.isfinite(values["cl"])):
-                raise FloatingPointError("its power spectrum is not finite")
-        except Exception as error:  # whatever one realization meets, the others are to finish
-            failures.append(Failure(r, f"{type(error).__name__}: {error}"))
-            continue
-        for name, value in values.items():
-            if name not in rows:
-                rows[name] = _empty(stop - start, value[None])
-            rows[name][r - start] = value
-        done[r - start] = True
-        computed += 1
-    if computed:
-        store.write(target, start, rows, done)
-    return computed, failures
+            yield future.result()
+        except KilledWorker:
+            suspects.append(starts[index])
+            journal.write(
+                f"workers died on {listed(missing[starts[index]])}; it is tried again, one by one", aloud=True
+            )
+    for start in suspects:
+        for r in missing[start]:
+            try:
+                yield client.submit(realize_chunk, job, start, r, pure=False).result()
+            except KilledWorker:
+                yield 0, [Failure(r, "each worker that computed it died (out of memory?)")]
 
 
-def summarise_node(path: str, recipe: summary.Recipe, start: int, stop: int, chunk: int) -> Sums | None:
-    """Task: statistics of the realizations of a node of the tree, read chunk by chunk."""
-    target = Path(path)
-    starts = range(start, stop, chunk)
-
-    def node(index: int) -> Sums | None:
-        first = starts[index]
-        return summary.reduce_rows(recipe, store.read(target, first, min(first + chunk, stop)), first)
-
-    return statistics.tree(node, len(starts))
+def _workers(client: Client) -> str:
+    """Who computes, in words, and where to watch them."""
+    threads = client.nthreads()
+    text = (
+        f"{len(threads)} workers with {sum(threads.values())} threads" if threads else "no worker yet: waiting for one"
+    )
+    return f"{text}; dashboard {client.dashboard_link}" if find_spec("bokeh") and client.dashboard_link else text
 
 
 def _summarise(client: Client, target: Path, recipe: summary.Recipe, quiet: bool) -> None:

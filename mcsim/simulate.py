@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mcsim import alm as alm_
 from mcsim import biposh, config, convolve, differencing, healpix, rng, tod
+from mcsim.effects import looked_at
 from mcsim.errors import InputError
 from mcsim.sky import gaussian_alm
 from mcsim.survey import Channel, Survey, SurveyMap
@@ -178,12 +179,7 @@ def _believed(channel: Channel) -> convolve.Response:
 
 def _seen(survey: Survey, channel: Channel, sky: Alm, realization: int) -> tuple[Alm, Alm | None]:
     """The sky that the channel looks at, and the dipole in it that is taken off again; None where none shows."""
-    for effect in channel.effects:
-
-        def draw(stage: str, name: str = effect.name) -> np.random.Generator:
-            return rng.generator(survey.config.ensemble.seed, realization, f"effect/{name}/{stage}")
-
-        sky = effect.sky(sky, channel.site, draw)
+    sky = looked_at(channel.effects, sky, channel.site, survey.config.ensemble.seed, realization)
     if not channel.effects or not channel.site.dipole_uk.any():
         return sky, None
     dipole = tod.dipole_alm(channel.site.dipole_uk, channel.site.lmax)

@@ -5,12 +5,13 @@ chunks, ``done`` last. Nothing but ``done`` says that a realization exists.
 """
 
 import os
+import re
 import shutil
 import tempfile
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,66 +21,25 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import ZstdCodec
 
-from mcsim.biposh import Mode
 from mcsim.errors import InputError, RunError
+from mcsim.layout import Layout, listed
+
+_CODECS: dict[str, Any] = {"compressors": (ZstdCodec(level=1, checksum=True),)}
+# Written even where all is the fill value, so that an array without its file is known as damaged.
+_WHOLE: dict[str, Any] = {"config": {"write_empty_chunks": True}, **_CODECS}
+_FAULTS = (OSError, KeyError, ValueError, RuntimeError, TypeError)
 
 
 @dataclass(frozen=True)
-class Layout:
-    """Shape of a store: realizations and how many of them one task owns, maps, pairs, modes, degrees."""
+class Damage:
+    """A chunk that cannot be trusted: the realizations whose numbers it took with it, and why.
 
-    realizations: int
-    chunk: int
-    maps: tuple[str, ...]
-    pairs: tuple[str, ...]
-    modes: tuple[Mode, ...]
-    lmax: int
-    paired: bool
-    kept_npix: int | None
+    ``lost`` is empty for leftovers, files of realizations that do not count as finished.
+    """
 
-    def variables(self) -> dict[str, tuple[tuple[str, ...], str, str, str]]:
-        """Dimensions, type, unit and long name of every array over realizations."""
-        spectra = {
-            "biposh": (
-                ("pair", "mode", "ell"),
-                "complex128",
-                "uK^2",
-                "BipoSH coefficient A^{LM}_{l2-d,l2} at ell = l2",
-            ),
-            "cl": (("pair", "ell"), "float64", "uK^2", "power spectrum C_l"),
-        }
-        found = dict(spectra)
-        if self.paired:
-            for name, (dims, dtype, unit, text) in spectra.items():
-                found[f"{name}_circular"] = (dims, dtype, unit, f"{text} of the circular twin")
-        if self.kept_npix is not None:
-            found["map"] = (("map_name", "pixel"), "float32", "uK", "simulated map, HEALPix RING")
-        return found
-
-    def sizes(self) -> dict[str, int]:
-        """Length of every dimension."""
-        return {
-            "realization": self.realizations,
-            "pair": len(self.pairs),
-            "mode": len(self.modes),
-            "ell": self.lmax + 1,
-            "map_name": len(self.maps),
-            "pixel": self.kept_npix or 0,
-        }
-
-    def realization_bytes(self) -> int:
-        """Uncompressed size of one realization."""
-        sizes = self.sizes()
-        return sum(
-            int(np.prod([sizes[dim] for dim in dims])) * np.dtype(dtype).itemsize
-            for dims, dtype, _, _ in self.variables().values()
-        )
-
-    def files(self) -> int:
-        """Number of data files of the finished store, coordinates and metadata included."""
-        chunks = -(-self.realizations // self.chunk)
-        # Coordinates and the summary's 32 variables or so come with metadata and one chunk each.
-        return (len(self.variables()) + 1) * (chunks + 1) + 100
+    start: int
+    lost: tuple[int, ...]
+    reason: str
 
 
 def check_writable(path: Path) -> Path:
@@ -93,8 +53,10 @@ def check_writable(path: Path) -> Path:
     folder = path.absolute().parent
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
-    with _refuse_unwritable(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=folder):
-        return folder
+    with _refuse_unwritable(path):
+        for place in (folder, path) if path.is_dir() else (folder,):
+            tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=place).cleanup()
+    return folder
 
 
 def create(path: Path, layout: Layout, attributes: Mapping[str, Any]) -> None:
@@ -154,7 +116,97 @@ def read(path: Path, start: int, stop: int, maps: bool = False) -> dict[str, NDA
         group = _open(path)
         left_out = {"realization"} if maps else {"realization", "map"}
         found = {name: array for name, array in group.arrays() if name not in left_out and _over_realizations(array)}
-        return {name: np.asarray(array[start:stop]) for name, array in found.items()}
+        rows = {name: np.asarray(array[start:stop]) for name, array in found.items()}
+    absent = _absent(rows)
+    if absent.any():
+        raise RunError(
+            f"{path} lacks numbers of realizations that count as finished ({listed(start + np.flatnonzero(absent))}); "
+            "mcsim run --resume computes them again."
+        )
+    return rows
+
+
+def examine(path: Path, start: int, leave_out: Collection[str] = ()) -> Damage | None:
+    """Read every file of one chunk of realizations, against its checksum; None if it is whole."""
+    with _faults_named(path):
+        group = _open(path)
+        last = _member(group, "done")
+        stop = min(start + last.chunks[0], last.shape[0])
+        names = [name for name in variables(path) if name not in ("realization", "done", *leave_out)]
+    try:
+        rows = {"done": np.asarray(last[start:stop])}
+    except _FAULTS as error:
+        return Damage(start, tuple(range(start, stop)), f"done: {_reason(error)}")
+    for name in names:
+        try:
+            rows[name] = np.asarray(_member(group, name)[start:stop])
+        except _FAULTS as error:
+            return Damage(start, _indices(start, rows["done"]), f"{name}: {_reason(error)}")
+    absent = _absent(rows)
+    return Damage(start, _indices(start, absent), "numbers are missing") if absent.any() else None
+
+
+def discard(path: Path, damage: Damage) -> None:
+    """Forget a damaged chunk: its ``done`` first, so that a call that was cut short leaves nothing that looks whole."""
+    with _faults_named(path):
+        group = _open(path)
+        for name in ("done", *(name for name in variables(path) if name not in ("realization", "done"))):
+            array = _member(group, name)
+            key = array.metadata.encode_chunk_key((damage.start // array.chunks[0], *(0,) * (array.ndim - 1)))
+            (path / name / key).unlink(missing_ok=True)
+
+
+def broken_parts(path: Path) -> dict[str, str]:
+    """What is wrong beside the realizations, by name: metadata, coordinates, summary. Empty if nothing is."""
+    with _faults_named(path):
+        group, remembered = _open(path), _remembered(path)
+    broken = {}
+    for name, metadata in remembered.items():
+        try:
+            found = group[name]
+            if isinstance(found, zarr.Array):
+                if _form(found.metadata.to_dict()) != _form(metadata.to_dict()):
+                    raise ValueError("its metadata are not those that the store was made with")
+                if name == "realization" or not _over_realizations(found):
+                    np.asarray(found[...])
+                    if found.nchunks_initialized < found.nchunks:
+                        raise ValueError("its file is missing")
+        except _FAULTS as error:
+            broken[name] = _reason(error)
+    return broken
+
+
+def restore(path: Path, layout: Layout, update: Mapping[str, Any]) -> None:
+    """Write metadata and coordinates anew, as those of a new store of this layout; drop the summary."""
+    with _faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
+        shutil.rmtree(path / "summary", ignore_errors=True)
+        made = _remembered(path)["done"]
+        layout = replace(layout, realizations=made.shape[0], chunk=made.chunk_grid.chunk_shape[0])
+        fresh = Path(scratch) / "fresh"
+        create(fresh, layout, {**attributes(path), **update})
+        for file in sorted(fresh.rglob("*")):
+            target = path / file.relative_to(fresh)
+            if file.is_file():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                os.replace(file, target)
+
+
+def sweep(path: Path) -> None:
+    """Remove what writers that were killed left: halves of files, and folders that never got their name."""
+    for left in path.rglob("*.partial"):
+        left.unlink(missing_ok=True)
+    scratch = re.compile(rf"\.{re.escape(path.name)}\.[a-z0-9_]{{8}}")  # as tempfile names them
+    for left in [entry for entry in path.absolute().parent.iterdir() if scratch.fullmatch(entry.name)]:
+        if left.is_dir():
+            shutil.rmtree(left, ignore_errors=True)
+        else:
+            left.unlink(missing_ok=True)
+
+
+def variables(path: Path) -> list[str]:
+    """Names of the arrays over realizations that the store was made with, whether their files exist or not."""
+    with _faults_named(path):
+        return [name for name, metadata in _remembered(path).items() if _over_realizations(metadata)]
 
 
 def done(path: Path, start: int = 0, stop: int | None = None) -> NDArray[np.bool_]:
@@ -214,7 +266,13 @@ def write_summary(path: Path, summary: xr.Dataset) -> None:
     with _faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", category=UserWarning)
-            summary.to_zarr(Path(scratch) / "summary", zarr_format=3, consolidated=False)
+            summary.to_zarr(
+                Path(scratch) / "summary",
+                zarr_format=3,
+                consolidated=False,
+                encoding=dict.fromkeys(summary.variables, _CODECS),
+                write_empty_chunks=True,
+            )
         shutil.rmtree(path / "summary", ignore_errors=True)
         os.replace(Path(scratch) / "summary", path / "summary")
         _consolidate(path)
@@ -288,7 +346,7 @@ def _array(  # type: ignore[no-untyped-def]
         dtype=dtype,
         fill_value=fill,
         dimension_names=dims,
-        compressors=[ZstdCodec(level=1, checksum=True)],
+        **_CODECS,
     )
     array.attrs.update({"units": unit, "long_name": text})
 
@@ -299,12 +357,12 @@ def _open(path: Path, mode: Literal["r", "r+"] = "r") -> zarr.Group:
 
 
 def _index(group: zarr.Group, name: str, values: NDArray[np.int64], text: str, dim: str | None = None) -> None:
-    array = group.create_array(name, data=values, chunks=values.shape, dimension_names=[dim or name])
+    array = group.create_array(name, data=values, chunks=values.shape, dimension_names=[dim or name], **_WHOLE)
     array.attrs.update({"units": "1", "long_name": text})
 
 
 def _labels(group: zarr.Group, name: str, values, text: str, dim: str | None = None) -> None:  # type: ignore[no-untyped-def]
-    array = group.create_array(name, shape=(len(values),), dtype=str, dimension_names=[dim or name])
+    array = group.create_array(name, shape=(len(values),), dtype=str, dimension_names=[dim or name], **_WHOLE)
     array[:] = np.array(values, dtype=object)
     array.attrs["long_name"] = text
 
@@ -316,8 +374,38 @@ def _member(group: zarr.Group, name: str) -> zarr.Array:
     return array
 
 
-def _over_realizations(array: zarr.Array) -> bool:
-    return (getattr(array.metadata, "dimension_names", None) or ("",))[0] == "realization"
+def _over_realizations(array: Any) -> bool:
+    return (getattr(getattr(array, "metadata", array), "dimension_names", None) or ("",))[0] == "realization"
+
+
+def _remembered(path: Path) -> dict[str, Any]:
+    """Metadata of everything in the store as they were when it was made or last summarised."""
+    consolidated = zarr.open_group(path, mode="r").metadata.consolidated_metadata
+    return {} if consolidated is None else dict(consolidated.flattened_metadata)
+
+
+def _form(metadata: dict[str, Any]) -> str:
+    """Metadata without the length, which an extension that was cut short may have changed."""
+    shape = metadata.pop("shape", ())
+    return repr((sorted(metadata.items(), key=lambda item: item[0]), len(shape), tuple(shape)[1:]))
+
+
+def _absent(rows: Mapping[str, NDArray]) -> NDArray[np.bool_]:
+    """Which rows count as finished though an array has nothing of them: its file is gone, or two runs wrote at once."""
+    absent = np.zeros(rows["done"].shape, dtype=bool)
+    for name, values in rows.items():
+        if name != "done" and values.size:
+            missing = np.isnan(values).reshape(len(values), -1)
+            absent |= missing.any(axis=1) if name.startswith("cl") else missing.all(axis=1)
+    return absent & rows["done"]
+
+
+def _indices(start: int, rows: NDArray[np.bool_]) -> tuple[int, ...]:
+    return tuple(int(start + row) for row in np.flatnonzero(rows))
+
+
+def _reason(error: BaseException) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def _consolidate(path: Path) -> None:
@@ -332,12 +420,13 @@ def _faults_named(path: Path) -> Iterator[None]:
     """Turn what a damaged or vanished store, or a full disk, makes of zarr's calls into one sentence."""
     try:
         yield
-    except (OSError, KeyError, ValueError, RuntimeError, TypeError) as error:
-        if isinstance(error, RunError):
+    except _FAULTS as error:
+        if isinstance(error, RunError | InputError):
             raise
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        remedy = "repair its disk" if isinstance(error, OSError) else "mcsim info --verify says what is damaged"
         raise RunError(
-            f"The store {path} cannot be used ({type(error).__name__}: {reason}); repair it or its disk."
+            f"The store {path} cannot be used ({type(error).__name__}: {_reason(error)}); {remedy}, and mcsim run "
+            "--resume goes on."
         ) from error
 
 

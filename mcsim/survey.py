@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -141,11 +142,12 @@ class Survey:
         return {m.name: m.sky_fraction for channel in self.channels for m in channel.maps}
 
 
-def survey(run: config.RunConfig, nthreads: int = 1, progress: Progress | None = None) -> Survey:
+def survey(run: config.RunConfig, nthreads: int = 1, progress: Progress | None = None, orders: int = 0) -> Survey:
     """Load or compute everything that the realizations of a run share.
 
     Moments of scan models, and pairs of pixels of differencing scans, are computed once, cached on disk and
-    memory-mapped, so that workers share them.
+    memory-mapped, so that workers share them. ``orders``: moments up to this order even where the beam needs fewer (of
+    a file of moments, all that it has).
 
     Raises
     ------
@@ -154,7 +156,7 @@ def survey(run: config.RunConfig, nthreads: int = 1, progress: Progress | None =
     """
     lmax = config.analysis_lmax(run)
     cl = None if run.sky.spectrum is None else spectra.load(run.sky.spectrum, run.sky.lmax)
-    channels = tuple(_channel(run, channel, nthreads, progress) for channel in run.channels)
+    channels = tuple(_channel(run, channel, nthreads, progress, orders) for channel in run.channels)
     maps = [m for channel in channels for m in channel.maps]
     both = run.biposh.pairs == "all"
     pairs = tuple((x, y) for x in range(len(maps)) for y in range(x, len(maps)) if both or x == y)
@@ -163,7 +165,9 @@ def survey(run: config.RunConfig, nthreads: int = 1, progress: Progress | None =
     return Survey(run, cl, channels, lmax, tables, pairs, norm)
 
 
-def _channel(run: config.RunConfig, spec: config.Channel, nthreads: int, progress: Progress | None) -> Channel:
+def _channel(
+    run: config.RunConfig, spec: config.Channel, nthreads: int, progress: Progress | None, orders: int
+) -> Channel:
     acting = effects_on(run, spec.name)
     site = site_of(run, spec)
     window = _window(run, spec)
@@ -179,7 +183,7 @@ def _channel(run: config.RunConfig, spec: config.Channel, nthreads: int, progres
             pairs = _pairs(run, spec, spec.scan, split, share, nthreads, progress)
             moments = _hits_alone(pairs, max(beam.mmax, 1))
         else:
-            moments = _moments(run, spec, split, share, beam.mmax, nthreads, progress)
+            moments = _moments(run, spec, split, share, max(beam.mmax, orders), nthreads, progress, beam.mmax)
         m = _survey_map(run, spec, split, name, moments, pairs)
         maps.append(_with_effects(m, acting, site, share, spread))
     # A pixel whose samples keep closer to its centre blurs less; the window is a Gaussian in all but name.
@@ -222,11 +226,11 @@ def _with_effects(
             noise = noise * np.sqrt(np.clip(factor, 0.0, None))
     if spread != 1.0 and moments.dtheta is not None and moments.dphi is not None:
         moments = replace(moments, dtheta=spread * moments.dtheta, dphi=spread * moments.dphi)
-    return replace(m, moments=moments, noise_uk=noise, gain=_mean_gain(acting, site, share))
+    return replace(m, moments=moments, noise_uk=noise, gain=mean_gain(acting, site, share))
 
 
-def _mean_gain(acting: tuple[Effect, ...], site: Site, share: tuple[float, float]) -> NDArray[np.float64] | None:
-    """Mean relative error of the gain in every pixel, by a pass over the pointing."""
+def mean_gain(acting: tuple[Effect, ...], site: Site, share: tuple[float, float]) -> NDArray[np.float64] | None:
+    """Mean relative error of the gain in every pixel of a part of the survey, by a pass over its pointing."""
     drifting = [effect for effect in acting if effect.gain(np.zeros(1), site) is not None]
     if not drifting:
         return None
@@ -258,6 +262,7 @@ def _moments(
     mmax: int,
     nthreads: int,
     progress: Progress | None,
+    needed: int,
 ) -> scan.Moments:
     nside, frame, smax = run.map.nside, run.map.frame, max(mmax, 1)
     match spec.scan:
@@ -265,7 +270,7 @@ def _moments(
             return scan.parallel_transport(np.deg2rad(spec.scan.psi0_deg), nside, smax, frame)
         case config.ScanMoments():
             path = config.channel_path(spec.scan.path, spec.name, split)
-            return scan.read_moments_fits(path, nside, mmax, frame)
+            return _moments_of_file(path, nside, needed if mmax == needed else None, frame)
         case config.ScanPointing():
             path = config.channel_path(spec.scan.path, spec.name, split)
             return scan.pointing_moments([path], nside, smax, frame)
@@ -278,6 +283,12 @@ def _moments(
             return scan.Moments.load(folder, mmap=True)
         case config.ScanDifferencing():
             raise TypeError("a differencing scan has pairs of pixels, no moments")
+
+
+@lru_cache(maxsize=16)
+def _moments_of_file(path: Path, nside: int, smax: int | None, frame: str) -> scan.Moments:
+    """Moments are shared by the surveys of a process that differ in effects alone."""
+    return scan.read_moments_fits(path, nside, smax, frame)
 
 
 def _pairs(

@@ -1,7 +1,7 @@
 """The library of effects: one file each, found by name; other packages add theirs by entry points."""
 
 from mcsim.effects.base import Alm, Draw, Effect, Map, Pointing, Site
-from mcsim.effects.compose import seen_through
+from mcsim.effects.compose import looked_at, seen_through
 from mcsim.effects.registry import build, describe, get, library
 
 __all__ = [
@@ -15,5 +15,6 @@ __all__ = [
     "describe",
     "get",
     "library",
+    "looked_at",
     "seen_through",
 ]

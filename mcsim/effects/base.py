@@ -104,6 +104,15 @@ class Effect:
         What makes it, how it shows, and where that is from: one sentence each, for people.
     step
         Amplitude at which responses are measured: small enough to be linear.
+    own_score
+        Whether a diagnosis should listen with a template of its own: not where a hook draws random numbers, nor where
+        what is always listened for (dipoles, variances, spectra, modulations) says it all.
+    draws
+        Whether a hook draws random numbers.
+    one_sided
+        Whether a negative coordinate of :meth:`basis` is no possible effect.
+    variants
+        Settings, fixed parameters, that a diagnosis proposes side by side.
     """
 
     name: ClassVar[str]
@@ -113,6 +122,10 @@ class Effect:
     signature: ClassVar[str]
     source: ClassVar[str] = ""
     step: ClassVar[float]
+    own_score: ClassVar[bool] = True
+    one_sided: ClassVar[bool] = False
+    draws: ClassVar[bool] = False
+    variants: ClassVar[tuple[Mapping[str, Any], ...]] = ({},)
 
     amplitude: float = 0.0
 

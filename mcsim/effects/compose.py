@@ -2,8 +2,11 @@
 
 from collections.abc import Iterable
 
+import numpy as np
+
+from mcsim import rng
 from mcsim.beams import Beam
-from mcsim.effects.base import Effect, Site
+from mcsim.effects.base import Alm, Effect, Site
 
 
 def seen_through(acting: Iterable[Effect], site: Site) -> Beam:
@@ -15,3 +18,14 @@ def seen_through(acting: Iterable[Effect], site: Site) -> Beam:
     for effect in acting:
         beam = effect.pointing(beam, site)
     return beam
+
+
+def looked_at(acting: Iterable[Effect], sky: Alm, site: Site, seed: int, realization: int) -> Alm:
+    """The sky that a channel looks at, uK: what an effect draws depends on its name alone, not on the channel."""
+    for effect in acting:
+
+        def draw(stage: str, name: str = effect.name) -> np.random.Generator:
+            return rng.generator(seed, realization, f"effect/{name}/{stage}")
+
+        sky = effect.sky(sky, site, draw)
+    return sky

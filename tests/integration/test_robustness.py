@@ -90,7 +90,7 @@ def test_merge_refuses_different_contents_and_leaves_nothing(small_store: Path, 
     for order in ([small_store, kept], [kept, small_store]):
         with pytest.raises(InputError, match="keep_maps"):
             runner.merge(order, tmp_path / "merged.zarr")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["kept.zarr"]
+    assert sorted(p.name for p in tmp_path.glob("*.zarr")) == ["kept.zarr"]
 
 
 def test_merge_of_a_short_and_a_long_ensemble_is_the_long_one(

@@ -1,0 +1,149 @@
+"""Where: BipoSH coefficients between what is left of each channel and the sky, of the sky itself, and spectra.
+
+Too many numbers for a covariance, so each is only compared with its own scatter and the largest with all the others.
+Between a residual and the sky, cosmic variance cancels: what shows here in one channel is noise-limited.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations_with_replacement
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim import alm as alm_
+from mcsim import biposh
+from mcsim.diagnose.blocks import Entry, bins
+from mcsim.diagnose.listen import Heard, Model, by_degree
+from mcsim.rotation import FRAMES, rotate_biposh
+
+Vector = NDArray[np.float64]
+
+Pick = tuple[Any, ...]
+
+L_MAX = 4
+RANGES = 3
+
+
+@dataclass(frozen=True)
+class Atlas:
+    """Maker of the atlas of one model."""
+
+    model: Model
+
+    @cached_property
+    def tables(self) -> biposh.Estimator:
+        """Clebsch-Gordan bands."""
+        return biposh.estimator(self.L_max, self.model.lmax, both_orders=True)
+
+    @property
+    def L_max(self) -> int:
+        """Highest L: four, or what the configuration asks for where that is less."""
+        return min(max(self.model.survey.config.biposh.L_max, 1), L_MAX, self.model.lmax)
+
+    @cached_property
+    def entries(self) -> tuple[Entry, ...]:
+        """Where each number was heard, in the order of :meth:`values`."""
+        return tuple(entry for entry, _ in self._layout)
+
+    def values(self, heard: Heard) -> Vector:
+        """All numbers of a set of maps, shape (entries,)."""
+        arrays = self._coefficients(heard)
+        own = self._powers(heard)
+        return np.array(
+            [own[pick[1]] if pick[0] == "power" else _binned(arrays[pick[0]], pick) for _, pick in self._layout]
+        )
+
+    @cached_property
+    def _layout(self) -> tuple[tuple[Entry, Pick], ...]:
+        """Entries, each with the array, row, range and part that it is taken from."""
+        frame = self.model.survey.config.map.frame
+        found: list[tuple[Entry, Pick]] = []
+        for key, entry in self._sources:
+            for view in FRAMES:
+                for row, mode in enumerate(self.tables.modes):
+                    if mode.L == 0 or (view != frame and mode.M > 0) or (key == "sky" and not mode.in_auto):
+                        continue
+                    parts = ("re", "im") if mode.M else (("re",) if mode.parity == "even" else ("im",))
+                    for low, high in bins(2, self.model.lmax, RANGES):
+                        for part in parts:
+                            where = replace(
+                                entry,
+                                name=f"biposh/{entry.name}/{view}/{mode.name}{part}/{low}-{high}",
+                                ell=(low, high),
+                                L=mode.L,
+                                M=mode.M,
+                                parity=mode.parity,
+                                frame=view,
+                            )
+                            found.append((where, ((key, view), row, (low, high), part)))
+        found += [(entry, ("power", number)) for number, entry in enumerate(self._power_entries)]
+        return tuple(found)
+
+    @cached_property
+    def _sources(self) -> tuple[tuple[str, Entry], ...]:
+        names = [channel.name for channel in self.model.survey.channels]
+        found = [("sky", Entry("sky", "biposh", tuple(names)))]
+        for number, name in enumerate(names):
+            found.append((f"{number}+", Entry(name, "biposh", (name,))))
+            if len(self.model.of(number)) > 1:
+                found.append((f"{number}-", Entry(f"{name} difference", "biposh", (name,), "difference")))
+        return tuple(found)
+
+    def _coefficients(self, heard: Heard) -> dict[tuple[str, str], NDArray[np.complex128]]:
+        lmax, frame = self.model.lmax, self.model.survey.config.map.frame
+        inverse = np.divide(1.0, self.model.cl, out=np.zeros(lmax + 1), where=self.model.cl > 0)
+        modes = [(mode.L, mode.M, mode.d) for mode in self.tables.modes]
+        found = {}
+        for key, _ in self._sources:
+            if key == "sky":
+                left = alm_.multiply(heard.sky, inverse, lmax)
+            else:
+                members = self.model.of(int(key[:-1]))
+                signs = [1.0 if key[-1] == "+" else (-1.0) ** place for place in range(len(members))]
+                total = sum(sign * heard.adjoint[i] for sign, i in zip(signs, members, strict=True))
+                left = alm_.multiply(total, self.model.response[int(key[:-1])], lmax)
+            coefficients = np.nan_to_num(biposh.estimate(self.tables, left, heard.sky))
+            for view in FRAMES:
+                found[key, view] = coefficients if view == frame else rotate_biposh(coefficients, modes, frame, view)
+        return found
+
+    @cached_property
+    def _power_entries(self) -> tuple[Entry, ...]:
+        frame = self.model.survey.config.map.frame
+        entries = []
+        for a, b in combinations_with_replacement(range(len(self.model.parts)), 2):
+            names = [self.model.parts[i].name.partition(":") for i in (a, b)]
+            splits = {name[2] for name in names if name[2]}
+            for low, high in ((2, 12), (13, 48), *bins(49, self.model.lmax, 2)):
+                entries.append(
+                    Entry(
+                        f"cl/{self.model.parts[a].name},{self.model.parts[b].name}/{low}-{high}",
+                        "cl",
+                        tuple(dict.fromkeys(name[0] for name in names)),
+                        splits.pop() if len(splits) == 1 else None,
+                        None,
+                        (low, high),
+                        L=0,
+                        M=0,
+                        parity="even",
+                        frame=frame,
+                    )
+                )
+        return tuple(entries)
+
+    def _powers(self, heard: Heard) -> Vector:
+        """Power that residuals have in common."""
+        found = []
+        for a, b in combinations_with_replacement(range(len(self.model.parts)), 2):
+            power = by_degree(heard.adjoint[a], heard.adjoint[b], self.model.lmax)
+            ranges = ((2, 12), (13, 48), *bins(49, self.model.lmax, 2))
+            found += [float(power[low : high + 1].sum()) for low, high in ranges]
+        return np.array(found)
+
+
+def _binned(coefficients: NDArray[np.complex128], pick: Pick) -> float:
+    _, row, (low, high), part = pick
+    total = coefficients[row, low : high + 1].sum()
+    return float(total.real if part == "re" else total.imag)

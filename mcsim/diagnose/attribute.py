@@ -1,0 +1,279 @@
+"""Which effect: all subsets of up to three candidates, those that suffice, and what would tell them apart."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.diagnose.detect import cosines
+from mcsim.diagnose.gaussian import Fit, Null, bases, fit
+from mcsim.diagnose.subsets import Subsets
+from mcsim.diagnose.trials import Calibration, Gap, gap
+
+Verdict = Literal["none", "effect", "mixture", "degenerate", "unknown"]
+
+# Subsets that are solved at once; bounds the memory to some 100 MB.
+CHUNK = 1000
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect on one channel, or common to all (``channel=None``), with fixed settings.
+
+    Attributes
+    ----------
+    name, channel, settings, unit
+        Of the effect.
+    columns
+        Of its linear components in the template matrix.
+    prior
+        Weight relative to the other candidates.
+    shape_error
+        Relative error of its templates in white length; ``None``: that of the search.
+    """
+
+    name: str
+    channel: str | None
+    columns: tuple[int, ...]
+    settings: Mapping[str, object] = field(default_factory=dict)
+    unit: str = ""
+    prior: float = 1.0
+    shape_error: float | None = None
+
+    @property
+    def identity(self) -> tuple[str, str | None]:
+        """Name and channel: candidates that share them differ only in settings and exclude each other."""
+        return self.name, self.channel
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A subset of candidates that suffices.
+
+    Attributes
+    ----------
+    members
+        Indices of the candidates.
+    fit
+        Amplitudes of the members' columns, one member after the other.
+    odds
+        Posterior odds against the best explanation, <= 1.
+    probability, further
+        Of the residual, model errors allowed for, and of the most significant further candidate, trials included.
+    """
+
+    members: tuple[int, ...]
+    fit: Fit
+    odds: float
+    probability: float
+    further: float
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """What would tell two explanations apart.
+
+    Attributes
+    ----------
+    first, second
+        Indices into the explanations.
+    separation
+        White distance of their fitted predictions.
+    entries, shares
+        Entries of the evidence, the most telling first, and their shares of the squared distance; shares add up to 1
+        and can be negative.
+    """
+
+    first: int
+    second: int
+    separation: float
+    entries: NDArray[np.int64]
+    shares: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Attribution:
+    """Verdict on evidence.
+
+    Attributes
+    ----------
+    verdict
+        "none" without a gap, "unknown" where no subset suffices, "degenerate" where several do, else "effect" or
+        "mixture".
+    explanations
+        Minimal subsets that suffice, the most probable first; empty for "none" and "unknown".
+    nearest, cosine
+        Candidate that lowers chi2 most, and the cosine of its best fit to what departs from the null, noise removed.
+    singles
+        Fit of each candidate alone.
+    correlation
+        Largest canonical correlation of each pair of candidates, shape (C, C).
+    """
+
+    verdict: Verdict
+    gap: Gap
+    explanations: tuple[Explanation, ...]
+    nearest: int
+    cosine: float
+    singles: tuple[Fit, ...]
+    correlation: NDArray[np.float64]
+    contrasts: tuple[Contrast, ...]
+
+
+def attribute(
+    null: Null,
+    x: NDArray[np.float64],
+    t: NDArray[np.float64],
+    candidates: Sequence[Candidate],
+    calibration: Calibration,
+    *,
+    alpha: float = 0.05,
+    levels: tuple[float, float] = (0.025, 0.025),
+    largest: int = 3,
+    odds_cut: float = 100.0,
+    shape_error: float = 0.01,
+) -> Attribution:
+    """Attribute a gap to the smallest sets of candidates that suffice.
+
+    Parameters
+    ----------
+    null, x
+        Null and evidence, shape (p_raw,).
+    t
+        Templates per unit amplitude, shape (p_raw, K).
+    candidates, calibration
+        Candidates on those templates, and :func:`~mcsim.diagnose.trials.calibrate` of them in this order.
+    alpha
+        Level of the gap.
+    levels
+        Of acceptance: a true set is refused as often as this by its residual, and by a further candidate. High levels
+        lose true sets, low ones miss that something is unknown.
+    largest
+        Number of candidates that may act together.
+    odds_cut
+        Explanations less probable than the best by this factor are dropped.
+    shape_error
+        Relative error of templates.
+
+    Notes
+    -----
+    A subset suffices when its residual passes and no candidate of another identity is significant beside it; it is
+    reported when no part of it suffices. One of several candidates must also be more probable than an unknown effect
+    of the same prior strength in an isotropic direction. Candidates of one identity compete by evidence alone. A
+    template that is wrong by a fraction eps of its white length leaves eps^2 s_c^2 in the residual, s_c the white
+    length of its fitted part (at most that of the whole fit); the sum over members makes both tests noncentral, in the
+    direction that hurts most.
+    The prior of a subset is k! times the product of its candidates' shares of the weight.
+    """
+    groups = bases(null, t, [candidate.columns for candidate in candidates])
+    errors = np.array([shape_error if c.shape_error is None else c.shape_error for c in candidates])
+    prior = np.array([candidate.prior for candidate in candidates])
+    names = [candidate.identity for candidate in candidates]
+    y = null.data(x)
+    search = Subsets(null, y, groups, names, prior, errors, calibration)
+    found = gap(null, x, groups, calibration)
+    drops = groups.drops(y)
+    nearest = int(np.argmax(drops))
+    signal = null.unbiased * drops[nearest] - groups.sizes[nearest]
+    excess = max(null.unbiased * search.total - null.dimension, signal, 1e-300)
+    explanations: tuple[Explanation, ...] = ()
+    if found.probability <= alpha:
+        accepted = _accepted(search, levels, largest, np.log(odds_cut))
+        explanations = tuple(_explanations(null, x, t, candidates, accepted, np.log(odds_cut)))
+    return Attribution(
+        verdict=_verdict(found.probability > alpha, explanations),
+        gap=found,
+        explanations=explanations,
+        nearest=nearest,
+        cosine=float(np.sqrt(max(signal, 0.0) / excess)),
+        singles=tuple(fit(null, x, t[:, list(candidate.columns)]) for candidate in candidates),
+        correlation=cosines(groups),
+        contrasts=tuple(_contrasts(null, t, candidates, explanations)),
+    )
+
+
+def _verdict(agrees: bool, explanations: Sequence[Explanation]) -> Verdict:
+    if agrees:
+        return "none"
+    if not explanations:
+        return "unknown"
+    if len(explanations) > 1:
+        return "degenerate"
+    return "mixture" if len(explanations[0].members) > 1 else "effect"
+
+
+@dataclass(frozen=True, order=True)
+class _Accepted:
+    """A minimal sufficient subset; ordered by evidence."""
+
+    evidence: float
+    members: tuple[int, ...]
+    probability: float
+    further: float
+
+
+def _accepted(search: Subsets, levels: tuple[float, float], largest: int, cut: float) -> list[_Accepted]:
+    """Minimal sufficient subsets, unless their evidence falls below the best one's by more than ``cut``."""
+    accepted: list[_Accepted] = []
+    best = -np.inf
+    for size in range(1, largest + 1):
+        fresh = []
+        # With thousands of sets to choose from, some triple comes close to anything.
+        least = max(best - cut, search.unknown if size > 1 else -np.inf)
+        for subsets in search.rows(size, [found.members for found in accepted]):
+            solved = search.solve(subsets)
+            possible = np.flatnonzero((solved.probability > levels[0]) & (solved.evidence >= least))
+            for first in range(0, len(possible), CHUNK):
+                rows = possible[first : first + CHUNK]
+                further = search.further(subsets[rows], solved.chi2[rows], solved.allowance[rows])
+                alone = further > levels[1]
+                for row, beside in zip(rows[alone], further[alone], strict=True):
+                    members = tuple(int(member) for member in subsets[row])
+                    fresh.append(
+                        _Accepted(float(solved.evidence[row]), members, float(solved.probability[row]), float(beside))
+                    )
+        accepted += fresh
+        best = max([best, *(found.evidence for found in fresh)])
+    return accepted
+
+
+def _explanations(
+    null: Null,
+    x: NDArray[np.float64],
+    t: NDArray[np.float64],
+    candidates: Sequence[Candidate],
+    accepted: Sequence[_Accepted],
+    cut: float,
+) -> Iterator[Explanation]:
+    """The most probable first; of those that differ only in settings the most probable one."""
+    seen: set[frozenset[tuple[str, str | None]]] = set()
+    ranked = sorted(accepted, reverse=True)
+    for found in ranked:
+        identity = frozenset(candidates[member].identity for member in found.members)
+        lost = ranked[0].evidence - found.evidence
+        if lost <= cut and identity not in seen:
+            seen.add(identity)
+            columns = [column for member in found.members for column in candidates[member].columns]
+            best = fit(null, x, t[:, columns])
+            yield Explanation(found.members, best, float(np.exp(-lost)), found.probability, found.further)
+
+
+def _contrasts(
+    null: Null, t: NDArray[np.float64], candidates: Sequence[Candidate], explanations: Sequence[Explanation]
+) -> Iterator[Contrast]:
+    """Each pair of explanations, and the entries in which their predictions differ by most of their distance."""
+    predictions = [
+        t[:, [column for member in explanation.members for column in candidates[member].columns]]
+        @ explanation.fit.amplitudes
+        for explanation in explanations
+    ]
+    for first, second in combinations(range(len(predictions)), 2):
+        difference = predictions[first] - predictions[second]
+        white = null.templates(difference[:, None])[:, 0]
+        squared = float(white @ white)
+        shares = difference * (null.whitening.T @ white) / np.sqrt(1.0 + 1.0 / null.count) / max(squared, 1e-300)
+        order = np.argsort(-shares)
+        yield Contrast(first, second, float(np.sqrt(squared)), order, shares[order])

@@ -1,0 +1,213 @@
+"""What a model is asked, and what its simulations answer: candidates, evidence, and the tasks that measure it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim import config, effects, sampled, simulate
+from mcsim.diagnose.atlas import Atlas
+from mcsim.diagnose.blocks import Block, Entry, blocks_of
+from mcsim.diagnose.listen import ORDERS, Model, listen, model_of
+from mcsim.diagnose.scores import Score, score_of
+from mcsim.effects import Effect
+from mcsim.errors import InputError
+from mcsim.survey import survey
+
+Map = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """An effect that might be there: one of the library in one channel (None: in all), with fixed settings.
+
+    Attributes
+    ----------
+    kind, channel, settings
+        Effect, name of the channel, and parameters that are not fitted.
+    basis
+        Effects whose responses span it.
+    """
+
+    kind: type[Effect]
+    channel: str | None
+    settings: dict[str, Any]
+    basis: tuple[Effect, ...]
+
+    @property
+    def label(self) -> str:
+        """Name, channel and settings, for people."""
+        settings = ", ".join(f"{key} = {value}" for key, value in self.settings.items())
+        where = self.channel or "all"
+        return f"{self.kind.name} ({where}{', ' + settings if settings else ''})"
+
+    def with_parameters(self, coordinates: NDArray[np.float64], precision: NDArray[np.float64]) -> Effect:
+        """The effect nearest to fitted coordinates."""
+        return replace(self.kind.nearest(coordinates, precision), **self.settings)
+
+    def table(self, effect: Effect) -> config.Effect:
+        """The effect as ``[[effect]]`` of a run."""
+        return config.Effect(
+            name=effect.name,
+            channel=self.channel,
+            parameters={"amplitude": effect.amplitude, **effect.parameters()},
+        )
+
+
+@dataclass(frozen=True)
+class Questions:
+    """A believed survey, what might be wrong with it, and what to listen for.
+
+    Attributes
+    ----------
+    model
+        Of the survey.
+    proposals
+        In order; ``columns[i]`` are those of proposal i among all basis effects.
+    blocks
+        That make up the evidence, the scores of the proposals last.
+    without
+        Effects of the library that were left out.
+    """
+
+    model: Model
+    proposals: tuple[Proposal, ...]
+    blocks: tuple[Block, ...]
+    without: tuple[str, ...] = ()
+
+    @property
+    def entries(self) -> tuple[Entry, ...]:
+        """Where every number of the evidence was heard."""
+        return tuple(entry for block in self.blocks for entry in block.entries)
+
+    @property
+    def columns(self) -> tuple[tuple[int, ...], ...]:
+        """Columns of every proposal in the matrix of templates."""
+        edges = np.cumsum([0, *(len(proposal.basis) for proposal in self.proposals)])
+        return tuple(tuple(range(int(a), int(b))) for a, b in pairwise(edges))
+
+    def answer(self, maps: Sequence[Map], nthreads: int = 1, atlas: bool = False) -> NDArray[np.float64]:
+        """Evidence of a set of maps, shape (entries,), and behind it the atlas, where it is asked for."""
+        heard = listen(self.model, maps, nthreads)
+        found = [block.values(self.model, heard) for block in self.blocks]
+        return np.concatenate([*found, self.atlas.values(heard)] if atlas else found)
+
+    @cached_property
+    def atlas(self) -> Atlas:
+        """What else is measured, to say where."""
+        return Atlas(self.model)
+
+
+def questions(run: config.RunConfig, without: Sequence[str] = (), nthreads: int = 1) -> Questions:
+    """What to ask of data that ``run`` claims to describe.
+
+    Parameters
+    ----------
+    run
+        What is believed, effects that are already modelled included.
+    without
+        Effects of the library that are not to be proposed.
+    nthreads
+        Threads for what is computed once.
+    """
+    model = model_of(survey(run, nthreads=nthreads, orders=ORDERS))
+    proposals = tuple(
+        Proposal(kind, channel, dict(settings), tuple(replace(basis, **settings) for basis in kind.basis()))
+        for name, kind in effects.library().items()
+        if name not in without
+        for channel in ([None] if kind.scope == "common" else [channel.name for channel in run.channels])
+        for settings in kind.variants
+        if _applies(model, kind, channel, settings)
+    )
+    return Questions(model, proposals, (*blocks_of(model), *_score_blocks(model, proposals)), tuple(without))
+
+
+def _applies(model: Model, kind: type[Effect], channel: str | None, settings: Mapping[str, Any]) -> bool:
+    """Whether an effect can be there at all: what it needs to know is known, and it changes something."""
+    if kind.differencing is not Effect.differencing:
+        return False
+    owners = [c for c in model.survey.channels if channel in (None, c.name)]
+    if kind.orientations is not Effect.orientations:
+        specs = {spec.name: spec for spec in model.survey.config.channels}
+        if not all(isinstance(specs[owner.name].scan, config.ScanParallelTransport) for owner in owners):
+            return False  # the believed orientations are those of a scan already
+    effect = replace(kind.basis()[0], **settings)
+    try:
+        for owner in owners:
+            effect.gain(np.zeros(1), owner.site)
+            effect.noise(owner.site)
+            effects.seen_through((effect,), owner.site)
+            effects.looked_at((effect,), np.zeros_like(model.dipole), replace(owner.site, lmax=model.lmax), 0, 0)
+            effect.orientations(owner.maps[0].moments, owner.site)
+    except InputError:
+        return False
+    quiet = all(m.noise_uk is None for owner in owners for m in owner.maps)
+    return not (quiet and kind.noise is not Effect.noise)
+
+
+def _score_blocks(model: Model, proposals: Sequence[Proposal]) -> list[Block]:
+    names = [channel.name for channel in model.survey.channels]
+    blocks = []
+    for proposal in proposals:
+        where = None if proposal.channel is None else names.index(proposal.channel)
+        for number, basis in enumerate(proposal.basis):
+            score = score_of(model, basis, where)
+            if score is not None:
+                blocks.append(_score_block(proposal, number, score, names))
+    return blocks
+
+
+def _score_block(proposal: Proposal, number: int, score: Score, names: Sequence[str]) -> Block:
+    channels = tuple(names) if proposal.channel is None else (proposal.channel,)
+    entry = Entry(f"score/{proposal.label}/{number}", "score", channels)
+    return Block((entry,), lambda model, heard: np.array([score(model, heard)]))
+
+
+@dataclass(frozen=True)
+class Job:
+    """Simulations that one task makes, small enough to travel.
+
+    Attributes
+    ----------
+    believed, simulated
+        JSON of the runs that listen and that are simulated; they differ in effects, noise and seed.
+    first, count
+        Realizations.
+    sample_by_sample
+        By the referee, not by the default route.
+    without
+        Effects that are not proposed.
+    atlas
+        Measure it too.
+    """
+
+    believed: str
+    simulated: str
+    first: int
+    count: int
+    sample_by_sample: bool = False
+    without: tuple[str, ...] = ()
+    atlas: bool = False
+
+
+def evidence_of(job: Job) -> NDArray[np.float64]:
+    """Task: evidence of simulations, shape (count, entries), with the atlas behind it where it is asked for."""
+    asked = _questions(job.believed, job.without)
+    shared = survey(config.from_json(job.simulated))
+    rows = []
+    for realization in range(job.first, job.first + job.count):
+        if job.sample_by_sample:
+            maps = [map_uk for _, map_uk in sampled.maps(shared, realization)]
+        else:
+            maps = list(simulate.maps(shared, realization))
+        rows.append(asked.answer(maps, atlas=job.atlas))
+    return np.stack(rows)
+
+
+@lru_cache(maxsize=1)
+def _questions(believed: str, without: tuple[str, ...]) -> Questions:
+    return questions(config.from_json(believed), without)

@@ -1,0 +1,224 @@
+"""What simulations of a model have taught: the scatter of its evidence, and how that responds to every proposal."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from mcsim import config
+from mcsim.diagnose.blocks import Entry
+from mcsim.diagnose.evidence import Job, Proposal, Questions
+from mcsim.diagnose.gaussian import Null, null
+
+Vector = NDArray[np.float64]
+
+PER_ENTRY = 10
+"""Simulations for every number of the evidence."""
+
+SKIES = 6
+"""Skies that a response is the mean of, at both signs of a step."""
+
+NOISY_SKIES = 24
+"""The same where the response itself is random, or has one sign."""
+
+REFEREE_SKIES = 6
+"""Skies seen sample by sample, that the default route is compared with."""
+
+ATLAS = 300
+"""Simulations with an atlas."""
+
+CHUNK = 10
+
+# Streams: the same seed is never used for two purposes, nor for the data of a run that counts from seed 0.
+_COVARIANCE, _RESPONSE = (0x6D63 * 1_000 + stream for stream in (1, 2))
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """What a model's simulations say, all that a diagnosis needs besides the data.
+
+    Attributes
+    ----------
+    simulations
+        Evidence of the model, shape (N, p).
+    offset
+        Mean of the referee's evidence less that of the default route for the same skies, shape (p,).
+    templates
+        Response to every basis effect per unit of its coordinate, shape (p, K).
+    curvature
+        Half its second derivative, shape (p, K).
+    template_error
+        Standard error of the templates, shape (p, K).
+    reference
+        Evidence of the model for the skies of the responses, shape (NOISY_SKIES, p).
+    atlas
+        Atlas of the first simulations, shape (n, numbers).
+    entries
+        Where every number was heard.
+    """
+
+    simulations: NDArray[np.float64]
+    offset: Vector
+    templates: NDArray[np.float64]
+    curvature: NDArray[np.float64]
+    template_error: NDArray[np.float64]
+    reference: NDArray[np.float64]
+    atlas: NDArray[np.float64]
+    entries: tuple[Entry, ...]
+
+    def null(self, where: Sequence[int] | NDArray[np.int64] | None = None) -> Null:
+        """Null of all entries, or of some."""
+        rows = slice(None) if where is None else np.asarray(where)
+        return null(self.simulations[:, rows], self.offset[rows])
+
+    def save(self, path: Path) -> None:
+        """Write to a new Zarr store."""
+        dataset = xr.Dataset(
+            {
+                "simulations": (("simulation", "entry"), self.simulations, {"long_name": "evidence of the model"}),
+                "offset": ("entry", self.offset, {"long_name": "referee less default route"}),
+                "templates": (("entry", "column"), self.templates, {"long_name": "response per unit coordinate"}),
+                "curvature": (("entry", "column"), self.curvature, {"long_name": "half the second derivative"}),
+                "template_error": (("entry", "column"), self.template_error, {"long_name": "standard error"}),
+                "reference": (("sky", "entry"), self.reference, {"long_name": "evidence of the responses' skies"}),
+                "atlas": (("drawn", "number"), self.atlas, {"long_name": "atlas of the model"}),
+            },
+            attrs={"entries": json.dumps([asdict(entry) for entry in self.entries])},
+        )
+        dataset.to_zarr(path, mode="w", consolidated=False)
+
+    @classmethod
+    def load(cls, path: Path) -> "Knowledge":
+        """Read what :meth:`save` wrote."""
+        with xr.open_zarr(path, consolidated=False) as dataset:
+            arrays = {str(name): np.asarray(values) for name, values in dataset.data_vars.items()}
+            entries = tuple(_entry(row) for row in json.loads(dataset.attrs["entries"]))
+        return cls(**arrays, entries=entries)
+
+
+def _entry(row: Mapping[str, Any]) -> Entry:
+    ell = row["ell"]
+    return Entry(**{**row, "channels": tuple(row["channels"]), "ell": None if ell is None else tuple(ell)})
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Jobs by what they are for, in order; the answer of each is an array (count, p)."""
+
+    jobs: tuple[Job, ...]
+    purposes: tuple[tuple[Any, ...], ...]
+
+
+def plan(run: config.RunConfig, asked: Questions, simulations: int | None = None, referee: bool = True) -> Plan:
+    """All simulations that :func:`learn` is made of.
+
+    Parameters
+    ----------
+    run
+        What is believed.
+    asked
+        Of that run.
+    simulations
+        For the scatter; default: PER_ENTRY for every number of the evidence.
+    referee
+        Compare with the sample-by-sample route where every channel's pointing is known.
+    """
+    believed = config.to_json(run)
+    wanted = PER_ENTRY * len(asked.entries) if simulations is None else simulations
+    jobs, purposes = [], []
+
+    def add(
+        purpose: tuple[Any, ...], simulated: config.RunConfig, first: int, count: int, samples: bool = False
+    ) -> None:
+        atlas = purpose[0] == "null" and first < ATLAS
+        jobs.append(Job(believed, config.to_json(simulated), first, count, samples, asked.without, atlas))
+        purposes.append(purpose)
+
+    for first in range(0, wanted, CHUNK):
+        add(("null", first), seeded(run, _COVARIANCE), first, min(CHUNK, wanted - first))
+    base = seeded(run, _RESPONSE)
+    for first in range(0, NOISY_SKIES, CHUNK):
+        add(("reference", first), base, first, min(CHUNK, NOISY_SKIES - first))
+    for number, column, sign, effect in _basis(asked):
+        count = NOISY_SKIES if _noisy(asked.proposals[number]) else SKIES
+        add(("response", column, sign), with_effects(base, [asked.proposals[number].table(effect)]), 0, count)
+    if referee and all(c.site.pointing is not None for c in asked.model.survey.channels):
+        quiet = replace(base, channels=tuple(replace(c, noise=config.Noise()) for c in base.channels))
+        for sky in range(REFEREE_SKIES):
+            add(("referee", sky), quiet, sky, 1, True)
+            add(("default", sky), quiet, sky, 1)
+    return Plan(tuple(jobs), tuple(purposes))
+
+
+def learned(asked: Questions, plan: Plan, answers: Sequence[NDArray[np.float64]]) -> Knowledge:
+    """Put the answers to the jobs of a plan together."""
+    by_purpose = dict(zip(plan.purposes, answers, strict=True))
+
+    size = len(asked.entries)
+
+    def stacked(kind: str) -> NDArray[np.float64]:
+        rows = [by_purpose[purpose][:, :size] for purpose in plan.purposes if purpose[0] == kind]
+        return np.concatenate(rows) if rows else np.zeros((0, size))
+
+    reference = stacked("reference")
+    columns = sum(len(proposal.basis) for proposal in asked.proposals)
+    shape = (size, columns)
+    templates, curvature, error = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    for number, column, sign, effect in _basis(asked):
+        if sign < 0:
+            continue
+        up = by_purpose["response", column, 1]
+        step = effect.coordinates()[asked.columns[number].index(column)]
+        same = reference[: len(up)]
+        if ("response", column, -1) in by_purpose:
+            down = by_purpose["response", column, -1]
+            each = (up - down) / (2.0 * step)
+            curvature[:, column] = np.mean(up + down - 2.0 * same, axis=0) / (2.0 * step**2)
+        else:
+            each = (up - same) / step
+        templates[:, column] = each.mean(axis=0)
+        error[:, column] = each.std(axis=0, ddof=1) / np.sqrt(len(each))
+    referee, default = stacked("referee"), stacked("default")
+    offset = np.mean(referee - default, axis=0) if len(referee) else np.zeros(size)
+    atlas = [answer[:, size:] for job, answer in zip(plan.jobs, answers, strict=True) if job.atlas]
+    return Knowledge(
+        stacked("null"), offset, templates, curvature, error, reference, np.concatenate(atlas), asked.entries
+    )
+
+
+def after_jobs(
+    run: config.RunConfig, asked: Questions, found: Sequence[config.Effect], skies: int = NOISY_SKIES
+) -> list[Job]:
+    """Simulations of the model with effects at frozen amplitudes, over the skies of the responses."""
+    believed = config.to_json(run)
+    simulated = config.to_json(with_effects(seeded(run, _RESPONSE), found))
+    half = -(-skies // 2)
+    return [Job(believed, simulated, first, min(half, skies - first), False, asked.without) for first in (0, half)]
+
+
+def _basis(asked: Questions) -> Iterator[tuple[int, int, int, Any]]:
+    """Proposal, column, sign and effect of every response."""
+    for number, (proposal, columns) in enumerate(zip(asked.proposals, asked.columns, strict=True)):
+        for column, effect in zip(columns, proposal.basis, strict=True):
+            yield number, column, 1, effect
+            if not proposal.kind.one_sided:
+                yield number, column, -1, effect.scaled(-1.0)
+
+
+def _noisy(proposal: Proposal) -> bool:
+    return proposal.kind.one_sided or proposal.kind.draws
+
+
+def with_effects(run: config.RunConfig, found: Sequence[config.Effect]) -> config.RunConfig:
+    """The run with further effects."""
+    return replace(run, effects=(*run.effects, *found))
+
+
+def seeded(run: config.RunConfig, seed: int) -> config.RunConfig:
+    """The run with another seed."""
+    return replace(run, ensemble=replace(run.ensemble, seed=seed))

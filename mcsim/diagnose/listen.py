@@ -1,0 +1,248 @@
+r"""What maps say against a model: the sky they share, what is left of them, and how that hangs on the sky and the scan.
+
+With d_i the maps, P_i the believed response of map i (beam, pixel window, centroids) and N_i its white noise,
+
+    s^ = (S^-1 + sum_i P_i^t N_i^-1 P_i)^-1 sum_i P_i^t N_i^-1 d_i,     r_i = N_i^-1 (d_i - P_i s^).
+
+The score of any small change dP_i of a response is <r_i, dP_i s^>: the sky of the *other* maps stands in for the sky,
+so that this is limited by noise where a single sky's spectra are limited by cosmic variance. A change of the beam,
+db_ls, acts as 2 Re[w_s db_ls ...] and its score is sum_l Re[conj(db_ls) D_s(l)]: one transform of w_s r for each
+order gives the score of every beam at once.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import ducc0
+import healpy
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim import alm as alm_
+from mcsim import convolve, healpix
+from mcsim.errors import InputError
+from mcsim.scan import Moments
+from mcsim.survey import Channel, Survey
+from mcsim.tod import dipole_alm
+
+Map = NDArray[np.float64]
+Alm = NDArray[np.complex128]
+
+ORDERS = 4
+"""Highest order of a beam that is listened for."""
+
+SPLIT_ORDERS = 2
+"""Highest order for which every map of a channel is heard by itself; above it the first stands for their sum."""
+
+NOISE_FLOOR = 1e-3
+"""Least noise per pixel over the rms of the sky: what the model of a map is good to."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One map of the data: where it is in the survey, and its weights.
+
+    Attributes
+    ----------
+    channel
+        Index of its channel.
+    name
+        As the survey names it.
+    moments
+        Orientation moments of its samples.
+    precision
+        Inverse variance of the noise of every pixel in uK^-2, shape (npix,), zero where unobserved or masked.
+    noise_power
+        Of the noise in the harmonic coefficients of the map when its pixels count alike, uK^2 sr.
+    """
+
+    channel: int
+    name: str
+    moments: Moments
+    precision: Map
+    noise_power: float
+
+
+@dataclass(frozen=True)
+class Model:
+    """What listening needs of the believed survey.
+
+    Attributes
+    ----------
+    survey
+        Without effects, with moments up to the orders that are listened for.
+    lmax, nside
+        Degree up to which sky and scores are taken, and pixels.
+    cl
+        Spectrum of the sky, shape (lmax + 1,), uK^2.
+    response
+        B_l w_l of every channel, shape (channel, lmax + 1).
+    parts
+        The maps in order.
+    dipole
+        The dipole that the survey sees besides, coefficients up to lmax, uK.
+    sky_power
+        Of s^, E|s^_lm|^2 / C_l = C_l / (C_l + N_l) in the isotropic approximation, shape (lmax + 1,).
+    """
+
+    survey: Survey
+    lmax: int
+    nside: int
+    cl: NDArray[np.float64]
+    response: NDArray[np.float64]
+    parts: tuple[Part, ...]
+    dipole: Alm
+    sky_power: NDArray[np.float64]
+
+    def of(self, channel: int) -> tuple[int, ...]:
+        """Indices of the channel's maps."""
+        return tuple(i for i, part in enumerate(self.parts) if part.channel == channel)
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What one set of maps says.
+
+    Attributes
+    ----------
+    sky
+        s^ up to the model's lmax, uK.
+    expected
+        P_i s^, shape (map, npix), uK.
+    residual
+        r_i, shape (map, npix), uK^-1.
+    adjoint
+        Spin-0 adjoint synthesis of every r_i, shape (map, size).
+    orders
+        D_s(l) of every map, shape (map, ORDERS + 1, lmax + 1), complex; s = 0 is real. The sky in it has the dipole.
+        Above SPLIT_ORDERS the channel's sum stands in its first map.
+    """
+
+    sky: Alm
+    expected: NDArray[np.float64]
+    residual: NDArray[np.float64]
+    adjoint: NDArray[np.complex128]
+    orders: NDArray[np.complex128]
+
+
+def model_of(survey: Survey) -> Model:
+    """What is believed of the maps, ready to listen with.
+
+    Raises
+    ------
+    InputError
+        If the sky has no spectrum, or a channel reads differences of two beams.
+    """
+    if survey.cl is None:
+        raise InputError("a diagnosis needs the spectrum of the sky; give sky.spectrum.")
+    lmax, nside = survey.lmax, survey.config.map.nside
+    cl = survey.cl[: lmax + 1]
+    response = np.stack([_response(channel, lmax) for channel in survey.channels])
+    parts = []
+    for index, channel in enumerate(survey.channels):
+        if channel.side_b is not None:
+            raise InputError(
+                f"channel {channel.name} reads differences of two beams, which a diagnosis cannot take yet; describe "
+                'the map by a scan of kind "hit_averaged" or "moments".'
+            )
+        power = np.sum((2 * np.arange(lmax + 1) + 1) / (4 * np.pi) * cl * response[index] ** 2)
+        floor = NOISE_FLOOR * float(np.sqrt(power))
+        for m in channel.maps:
+            seen = m.moments.hits > 0
+            if m.weight is not None:
+                seen = seen & (m.weight > 0)
+            variance = floor**2 + (0.0 if m.noise_uk is None else m.noise_uk**2)
+            precision = np.where(seen, 1.0 / np.broadcast_to(variance, seen.shape), 0.0)
+            noise_power = 4 * np.pi / seen.size * float(np.mean(1.0 / precision[seen]))
+            parts.append(Part(index, m.name, m.moments, precision, noise_power))
+    gain = sum(response[part.channel] ** 2 / part.noise_power for part in parts)
+    sky_power = cl * gain / (1.0 + cl * gain)
+    dipole = dipole_alm(survey.channels[0].site.dipole_uk, lmax)
+    return Model(survey, lmax, nside, cl, response, tuple(parts), dipole, sky_power)
+
+
+def _response(channel: Channel, lmax: int) -> NDArray[np.float64]:
+    response: NDArray[np.float64] = channel.response.factors[0, : lmax + 1].real
+    return response
+
+
+def listen(model: Model, maps: Sequence[Map], nthreads: int = 1) -> Heard:
+    """Sky, residuals and scores of a set of maps.
+
+    Parameters
+    ----------
+    model
+        From :func:`model_of`.
+    maps
+        One for every part, uK, shape (npix,); ``healpy.UNSEEN`` or NaN is not observed.
+    nthreads
+        Threads of the transforms.
+    """
+    lmax, nside = model.lmax, model.nside
+    total = np.zeros(alm_.size(lmax), dtype=np.complex128)
+    gain = np.zeros(lmax + 1)
+    clean, seen = [], []
+    for part, map_ in zip(model.parts, maps, strict=True):
+        observed = (part.precision > 0) & (map_ != healpy.UNSEEN) & np.isfinite(map_)
+        seen.append(observed)
+        clean.append(np.where(observed, map_, 0.0))
+        factor = model.response[part.channel] / part.noise_power
+        alm = healpix.analysis(clean[-1], lmax, nthreads=nthreads)
+        total += alm_.multiply(alm, factor, lmax)
+        gain += model.response[part.channel] * factor
+    sky = alm_.multiply(total, model.cl / (1.0 + model.cl * gain), lmax)
+
+    looked_at = sky + model.dipole
+    geometry = healpix.geometry(nside)
+    expected = np.empty((len(model.parts), seen[0].size))
+    residual, adjoint = np.empty_like(expected), np.empty((len(model.parts), sky.size), dtype=np.complex128)
+    orders = np.zeros((len(model.parts), ORDERS + 1, lmax + 1), dtype=np.complex128)
+    k = np.sqrt(4 * np.pi / (2 * np.arange(lmax + 1) + 1))
+    for channel in range(len(model.response)):
+        through = alm_.multiply(sky, model.response[channel], lmax)
+        smooth = healpix.synthesis(through[None], nside, lmax, nthreads=nthreads)[0]
+        members = model.of(channel)
+        gradient = None
+        if any(model.parts[i].moments.dtheta is not None for i in members):
+            gradient = healpix.gradient(through, nside, lmax, nthreads)
+        window = model.survey.channels[channel].window[: lmax + 1]
+        for i in members:
+            part = model.parts[i]
+            expected[i] = smooth
+            if gradient is not None and part.moments.dtheta is not None:
+                expected[i] += convolve.centroid_map(gradient, part.moments)
+            residual[i] = np.where(seen[i], part.precision * (clean[i] - expected[i]), 0.0)
+            adjoint[i] = ducc0.sht.adjoint_synthesis(
+                map=residual[i][None], spin=0, lmax=lmax, nthreads=nthreads, **geometry
+            )[0]
+            orders[i, 0] = window * k * by_degree(looked_at, adjoint[i], lmax)
+        for i, s, together in _transforms(model, members):
+            turned = sum(
+                np.stack([2.0 * residual[j] * w.real, -2.0 * residual[j] * w.imag])
+                for j, w in ((j, model.parts[j].moments.w[s - 1]) for j in together)
+            )
+            electric, magnetic = ducc0.sht.adjoint_synthesis(
+                map=turned, spin=s, lmax=lmax, nthreads=nthreads, **geometry
+            )
+            # ducc0's sign: S_s is minus the synthesis of E = Re(k b) a, B = Im(k b) a.
+            orders[i, s] = (
+                -window * k * (by_degree(looked_at, electric, lmax) + 1j * by_degree(looked_at, magnetic, lmax))
+            )
+    return Heard(sky, expected, residual, adjoint, orders)
+
+
+def _transforms(model: Model, members: tuple[int, ...]) -> Iterator[tuple[int, int, tuple[int, ...]]]:
+    """Map in whose place a transform is kept, its order, and the maps that it adds up."""
+    for s in range(1, ORDERS + 1):
+        heard = tuple(i for i in members if model.parts[i].moments.smax >= s)
+        if s <= SPLIT_ORDERS:
+            yield from ((i, s, (i,)) for i in heard)
+        elif heard:
+            yield heard[0], s, heard
+
+
+def by_degree(a: Alm, b: Alm, lmax: int) -> NDArray[np.float64]:
+    """Sum over all m of a_lm conj(b_lm) for two real fields, shape (lmax + 1,)."""
+    product = a.real * b.real + a.imag * b.imag
+    product[lmax + 1 :] *= 2.0
+    return np.asarray(np.bincount(alm_.degrees(lmax), weights=product, minlength=lmax + 1), dtype=np.float64)

@@ -1,0 +1,170 @@
+"""The matched score of every effect: how the maps would lean towards it, taken from what was heard.
+
+Which formula applies follows from the hooks that an effect defines, so that a user's effect is listened for like a
+built-in one. An effect that draws random numbers has no score of this kind: blocks of spectra hear it.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim import effects, healpix
+from mcsim.diagnose.listen import ORDERS, Heard, Model, by_degree
+from mcsim.effects import Effect
+from mcsim.survey import mean_gain
+from mcsim.tod import dipole_alm
+
+Map = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class BeamScore:
+    """Change of a beam: sum of Re[conj(db_ls) D_s(l)] over the channel's maps."""
+
+    parts: tuple[int, ...]
+    change: NDArray[np.complex128]
+
+    def __call__(self, model: Model, heard: Heard) -> float:
+        """The score."""
+        total = sum(heard.orders[i] for i in self.parts)
+        return float(np.sum(self.change.real * np.real(total) + self.change.imag * np.imag(total)))
+
+
+@dataclass(frozen=True)
+class GainScore:
+    """Change of the gain: every map times the mean error of its pixels, the dipole in it."""
+
+    parts: tuple[int, ...]
+    errors: tuple[Map, ...]
+    dipole: Map
+
+    def __call__(self, model: Model, heard: Heard) -> float:
+        """The score."""
+        return float(
+            sum(
+                np.dot(heard.residual[i], error * (heard.expected[i] + self.dipole))
+                for i, error in zip(self.parts, self.errors, strict=True)
+            )
+        )
+
+
+@dataclass(frozen=True)
+class SkyScore:
+    """Change of the sky that one channel looks at, or (all parts) that all do."""
+
+    effect: Effect
+    site: effects.Site
+    parts: tuple[int, ...]
+    common: bool
+
+    def __call__(self, model: Model, heard: Heard) -> float:
+        """The score."""
+        lmax = model.lmax
+        site = replace(self.site, lmax=lmax)
+        change = self.effect.sky(heard.sky, site, _no_draws) - heard.sky
+        if self.common:
+            # What all maps together say, sum_i P_i^t r_i, is S^-1 s^.
+            inverse = np.divide(1.0, model.cl, out=np.zeros(lmax + 1), where=model.cl > 0)
+            return float(np.dot(inverse, by_degree(heard.sky, change, lmax)))
+        return float(
+            sum(
+                np.dot(model.response[model.parts[i].channel], by_degree(change, heard.adjoint[i], lmax))
+                for i in self.parts
+            )
+        )
+
+
+@dataclass(frozen=True)
+class NoiseScore:
+    """Change of the noise's variance, heard in the difference of a channel's maps (or in the one that there is)."""
+
+    parts: tuple[int, ...]
+    change: Map
+
+    def __call__(self, model: Model, heard: Heard) -> float:
+        """The score."""
+        return float(np.dot(normalised_difference(model, heard, self.parts), self.change))
+
+
+Score = BeamScore | GainScore | SkyScore | NoiseScore
+
+
+def normalised_difference(model: Model, heard: Heard, parts: tuple[int, ...]) -> Map:
+    """u^2 - 1 of every pixel seen by the first two maps of a channel: u their difference over its noise; else 0."""
+    left = []
+    for i in parts[:2]:
+        precision = model.parts[i].precision
+        left.append((heard.residual[i], precision))
+    if len(left) == 1:
+        residual, precision = left[0]
+        seen = (precision > 0) & (residual != 0.0)
+        return np.where(seen, residual**2 / np.where(seen, precision, 1.0) - 1.0, 0.0)
+    (first, a), (second, b) = left
+    seen = (a > 0) & (b > 0) & (first != 0.0) & (second != 0.0)
+    a, b = np.where(seen, a, 1.0), np.where(seen, b, 1.0)
+    return np.where(seen, (first / a - second / b) ** 2 / (1.0 / a + 1.0 / b) - 1.0, 0.0)
+
+
+def score_of(model: Model, effect: Effect, channel: int | None) -> Score | None:
+    """The score of a small effect in a channel (None: in all); None where it has none of these kinds.
+
+    Parameters
+    ----------
+    model
+        What is believed.
+    effect
+        At the amplitude of a step: the score is that of this change.
+    channel
+        Index.
+    """
+    kind = type(effect)
+    where = 0 if channel is None else channel
+    owner = model.survey.channels[where]
+    parts = tuple(range(len(model.parts))) if channel is None else model.of(channel)
+    if not kind.own_score:
+        return None
+    if kind.sky is not Effect.sky:
+        return SkyScore(effect, owner.site, parts, channel is None)
+    if channel is None:
+        return None
+    if kind.beam is not Effect.beam or kind.pointing is not Effect.pointing or kind.spread is not Effect.spread:
+        return _beam_score(model, effect, channel, parts)
+    factor = effect.noise(owner.site)
+    if factor is not None:
+        return NoiseScore(parts, np.asarray(factor) - 1.0)
+    if effect.gain(np.zeros(1), owner.site) is not None:
+        splits = len(parts)
+        errors = [mean_gain((effect,), owner.site, (n / splits, (n + 1) / splits)) for n in range(splits)]
+        lmax = max(model.lmax, 1)
+        dipole = healpix.synthesis(dipole_alm(owner.site.dipole_uk, lmax)[None], model.nside, lmax)[0]
+        return GainScore(parts, tuple(error for error in errors if error is not None), dipole)
+    return None
+
+
+def _beam_score(model: Model, effect: Effect, channel: int, parts: tuple[int, ...]) -> BeamScore:
+    owner = model.survey.channels[channel]
+    lmax = model.lmax
+    changed, before = effects.seen_through((effect,), owner.site), owner.site.beam
+    change = np.zeros((ORDERS + 1, lmax + 1), dtype=np.complex128)
+    for beam, sign in ((changed, 1.0), (before, -1.0)):
+        rows = min(beam.mmax, ORDERS) + 1
+        change[:rows] += sign * beam.blm[:rows, : lmax + 1]
+    spread = effect.spread()
+    if spread != 1.0:
+        window = np.maximum(owner.window[: lmax + 1], np.finfo(float).tiny)
+        rows = min(before.mmax, ORDERS) + 1
+        change[:rows] += before.blm[:rows, : lmax + 1] * (window ** (spread * spread - 1.0) - 1.0)
+    return BeamScore(parts, change)
+
+
+def _no_draws(stage: str) -> np.random.Generator:
+    raise TypeError(f"an effect that draws ({stage}) has no score of its own: set own_score = False")
+
+
+def sky_of(model: Model, heard: Heard) -> NDArray[np.float64]:
+    """Spectrum of s^ over what is expected of it, minus one, shape (lmax + 1,); 0 where no power is expected."""
+    lmax = model.lmax
+    found = by_degree(heard.sky, heard.sky, lmax) / (2 * np.arange(lmax + 1) + 1)
+    expected = model.cl * model.sky_power
+    return np.divide(found, expected, out=np.ones(lmax + 1), where=expected > 0) - 1.0

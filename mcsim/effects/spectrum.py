@@ -1,0 +1,72 @@
+"""A sky whose power spectrum is not the believed one."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim import alm as alm_
+from mcsim.effects.base import Alm, Draw, Effect, Site, Vector
+from mcsim.errors import InputError
+
+BANDS = 6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spectrum(Effect):
+    """C_l times one plus the change of its band, in every channel.
+
+    Attributes
+    ----------
+    amplitude
+        Norm of the fractional changes of all bands.
+    bands
+        Their direction (its length does not matter): six bands of equal width from l = 2 to the sky's lmax, the
+        first numbers of which are 2 + i (lmax - 1) // 6.
+    """
+
+    name = "spectrum"
+    scope = "common"
+    unit = "fraction of C_l"
+    cause = "A cosmology that is not the one of the simulations."
+    signature = "L = 0, every channel alike."
+    source = "Follows from the definition"
+    step = 0.02
+    own_score = False
+
+    bands: tuple[float, ...] = (1.0,) * BANDS
+
+    def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
+        """Rescaled by the square root."""
+        if self.amplitude == 0.0:
+            return sky
+        change = self.coordinates()
+        if np.min(change) < -1.0:
+            raise InputError(
+                f"effect {self.name}: a band changes by {np.min(change):g}, leaving negative power; keep it above -1."
+            )
+        ell = np.arange(site.lmax + 1)
+        edges = 2 + np.arange(1, BANDS) * (site.lmax - 1) // BANDS
+        factor = np.sqrt(1.0 + change[np.searchsorted(edges, ell, side="right")])
+        factor[:2] = 1.0
+        return alm_.multiply(sky, factor, site.lmax)
+
+    @classmethod
+    def basis(cls) -> tuple[Self, ...]:
+        """The bands one by one."""
+        return tuple(cls(amplitude=cls.step, bands=tuple(map(float, row))) for row in np.eye(BANDS))
+
+    def coordinates(self) -> Vector:
+        """Fractional change of every band."""
+        vector = np.array(self.bands)
+        norm = float(np.linalg.norm(vector))
+        if norm == 0.0:
+            raise InputError(f"effect {self.name}: bands are all zero; give a direction, or amplitude = 0.")
+        return self.amplitude * vector / norm
+
+    @classmethod
+    def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
+        """Norm and direction."""
+        norm = float(np.linalg.norm(coordinates))
+        return cls(amplitude=norm, bands=tuple(map(float, coordinates / norm))) if norm else cls()

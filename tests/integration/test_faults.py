@@ -1,0 +1,212 @@
+"""Damage to a store, realizations and workers that fail every time, kills at awkward moments: nothing is lost."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from distributed import Client
+
+from mcsim import cli, config, repair, runner, simulate, store, tasks
+from mcsim.errors import InputError, RunError
+
+from .conftest import ensemble, table
+from .test_runner import assert_same
+
+
+@pytest.fixture
+def copy(small_store: Path, tmp_path: Path) -> Path:
+    path = tmp_path / "copy.zarr"
+    shutil.copytree(small_store, path)
+    return path
+
+
+def flip(file: Path) -> None:
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 0x10
+    file.write_bytes(bytes(data))
+
+
+def truncate(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[:-7])
+
+
+def remove(file: Path) -> None:
+    file.unlink()
+
+
+CHUNKS = {"biposh": "c/1/0/0/0", "biposh_circular": "c/0/0/0/0", "cl": "c/1/0/0", "done": "c/1"}
+LOST = {"c/1": range(4, 8), "c/0": range(4), "c/2": range(8, 10)}
+
+
+@pytest.mark.parametrize("harm", [flip, truncate, remove])
+@pytest.mark.parametrize("name", CHUNKS)
+def test_damaged_chunk_is_named(name: str, harm: Callable[[Path], None], copy: Path) -> None:
+    assert repair.verify(copy).intact
+    harm(copy / name / CHUNKS[name])
+    verdict = repair.verify(copy)
+    if (name, harm) == ("done", remove):  # nothing but done says that a realization exists
+        assert (verdict.finished, verdict.intact) == (6, True)
+        return
+    lost = LOST[CHUNKS[name][:3]]
+    assert verdict.lost == tuple(lost)
+    assert verdict.finished == 10 - len(lost)
+    assert f"realizations {lost[0]}-{lost[-1]}: " in verdict.text()
+
+
+def test_resume_computes_what_is_damaged_and_no_more(small_store: Path, client: Client, copy: Path) -> None:
+    flip(copy / "biposh" / "c/2/0/0/0")  # in the last, incomplete chunk
+    truncate(copy / "done" / "c/0")
+    (copy / "cl" / "c/1/0/0.0123.partial").write_bytes(b"half a file")
+    result = runner.run(table(), copy, resume=True, client=client)
+    assert (result.finished, result.computed) == (10, 6)
+    assert_same(copy, small_store)
+    assert {file.relative_to(copy) for file in copy.rglob("*")} == {
+        file.relative_to(small_store) for file in small_store.rglob("*")
+    }
+    log = copy.with_name("copy.zarr.log").read_text()
+    assert "damaged, to be computed again: realizations 8-9 (biposh: " in log
+    assert "damaged, to be computed again: realizations 0-3 (done: " in log
+
+
+PARTS = ["biposh/zarr.json", "L/c/0", "mode/c/0", "realization/zarr.json", "summary/count/c", "summary/cl_mean/c/0/0"]
+
+
+@pytest.mark.parametrize("harm", [truncate, remove])
+def test_metadata_coordinates_and_summary_are_made_again(
+    harm: Callable[[Path], None], small_store: Path, client: Client, copy: Path
+) -> None:
+    for part in PARTS:
+        harm(copy / part)
+    verdict = repair.verify(copy)
+    assert not verdict.intact
+    assert verdict.broken.keys() >= {"biposh", "L", "mode", "realization"}
+    assert any(name.startswith("summary") for name in verdict.broken)
+    result = runner.run(table(), copy, resume=True, client=client)
+    assert result.computed == 0
+    assert_same(copy, small_store)
+    assert repair.verify(copy).intact
+
+
+def test_hash_that_is_not_that_of_the_configuration_is_named(small_store: Path, client: Client, copy: Path) -> None:
+    root = json.loads((copy / "zarr.json").read_text())
+    root["attributes"]["digest"] = "0" * 64
+    (copy / "zarr.json").write_text(json.dumps(root))
+    assert "attributes" in repair.verify(copy).broken
+    runner.run(table(), copy, resume=True, client=client)
+    assert_same(copy, small_store)
+
+
+def test_every_bit_counts(copy: Path) -> None:
+    """Whichever bit of a file is flipped, its realizations are named, or its contents are what they were."""
+    file = copy / "done" / "c/1"
+    data = file.read_bytes()
+    named = 0
+    for bit in range(8 * len(data)):
+        changed = bytearray(data)
+        changed[bit // 8] ^= 1 << bit % 8
+        file.write_bytes(bytes(changed))
+        damage = store.examine(copy, 4)
+        if damage is None:
+            assert store.done(copy).all(), bit
+        else:
+            assert damage.lost == (4, 5, 6, 7)
+            named += 1
+    assert named > 7 * len(data)
+
+
+def test_rows_that_are_missing_are_never_summed(client: Client, copy: Path) -> None:
+    """A done that says more than there is, as two writers at once could leave it."""
+    (copy / "biposh" / "c/1/0/0/0").unlink()
+    shutil.rmtree(copy / "summary")
+    with pytest.raises(RunError, match=r"lacks numbers of realizations that count as finished \(realizations 4-7\)"):
+        runner.run(table(), copy, client=client)
+    assert runner.run(table(), copy, resume=True, client=client).computed == 4
+
+
+def test_verify_on_the_command_line(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def verify() -> int:
+        with pytest.raises(SystemExit) as end:
+            cli.app(["info", "--verify", str(copy)])
+        return int(end.value.code or 0)
+
+    assert verify() == 0
+    assert "copy.zarr is intact: 10 of 10 realizations" in capsys.readouterr().out
+    flip(copy / "cl" / "c/1/0/0")
+    assert verify() == 1
+    assert "realizations 4-7: cl: " in capsys.readouterr().out
+
+
+def test_attempts_are_bounded_and_the_others_finish(
+    small_store: Path, client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, attempts = simulate.realize, dict.fromkeys(range(10), 0)
+
+    def realize(shared: Any, r: int) -> Any:
+        attempts[r] += 1
+        if r == 4 or (r == 6 and attempts[r] < tasks.ATTEMPTS):
+            raise MemoryError("no room\nfor it")
+        return real(shared, r)
+
+    monkeypatch.setattr(simulate, "realize", realize)
+    result = runner.run(table(), tmp_path / "x.zarr", client=client)
+    assert [(f.realization, f.reason) for f in result.failures] == [(4, "MemoryError: no room for it")]
+    assert (attempts[4], attempts[6], attempts[5]) == (tasks.ATTEMPTS, tasks.ATTEMPTS, 1)
+    assert result.finished == 9
+    monkeypatch.undo()
+    runner.run(table(), tmp_path / "x.zarr", client=client)
+    assert_same(tmp_path / "x.zarr", small_store)
+
+
+def test_a_task_given_up_for_lost_does_not_undo_another(
+    small_store: Path, copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker that was cut off comes back, having computed part of a chunk that another has finished since."""
+    (copy / "done" / "c/1").unlink()
+    run = config.load(table())
+    real = simulate.realize
+
+    def realize(shared: Any, r: int) -> Any:
+        shutil.copy(small_store / "done" / "c/1", copy / "done" / "c/1")
+        return real(shared, r)
+
+    monkeypatch.setattr(simulate, "realize", realize)
+    job = tasks.Job(config.to_json(run), config.digest(run), str(copy), 4, 4, 6, tasks.packages())
+    assert tasks.realize_chunk(job, 4) == (2, [])
+    assert_same(copy, small_store)
+
+
+def test_other_packages_are_refused_by_name(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runner, "packages", lambda: (*tasks.packages()[:-1], ("numcodecs", "0.1")))
+    with pytest.raises(
+        InputError, match=r"A worker on .* has other packages than the driver \(numcodecs .* for 0\.1\)"
+    ):
+        runner.run(table(), tmp_path / "x.zarr", client=client)
+
+
+def test_completed_gives_every_result_once(client: Client) -> None:
+    calls = ((n, 2) for n in range(30))
+    assert dict(runner.completed(client, pow, calls)) == {n: n**2 for n in range(30)}
+
+
+def test_error_of_a_call_is_raised(client: Client) -> None:
+    with pytest.raises(ZeroDivisionError):
+        list(runner.completed(client, divmod, [(1, 0)]))
+
+
+def test_interrupted_slices_are_verified_by_what_they_hold(client: Client, tmp_path: Path) -> None:
+    path = tmp_path / "slice.zarr"
+    runner.run(table(), path, realizations=slice(0, 5), client=client)
+    verdict = repair.verify(path)
+    assert (verdict.finished, verdict.size, verdict.intact) == (5, 10, True)
+
+
+def test_second_half_of_an_extension_is_repaired(small_store: Path, client: Client, tmp_path: Path) -> None:
+    path = tmp_path / "x.zarr"
+    runner.run(table(**ensemble(3)), path, client=client)
+    truncate(path / "L" / "c/0")
+    runner.run(table(), path, resume=True, client=client)
+    assert_same(path, small_store)

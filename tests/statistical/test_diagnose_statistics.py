@@ -1,0 +1,230 @@
+"""The exact tests are exact, detection has its power, and shrink is what was forecast: Monte Carlo, k sigma."""
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.linalg import solve_triangular
+
+from mcsim.diagnose.detect import confusion, detectable, posterior, power, strength_needed, strength_to_isolate
+from mcsim.diagnose.gaussian import Null, bases, fit, null, residual_probability, score_probability
+from mcsim.diagnose.shrink import achieved, excess, predicted
+from mcsim.diagnose.trials import atlas, calibrate, gap
+
+SEED = 20121024
+# Of a uniform sample a Kolmogorov-Smirnov probability is below this once in a thousand seeds.
+KS = 1e-3
+
+
+def drawn_null(rng: np.random.Generator, p: int, count: int) -> Null:
+    """Null of ``count`` simulations of p independent unit normals: Bartlett's scatter instead of the simulations."""
+    n = count - 1
+    root = np.tril(rng.normal(size=(p, p)), -1) + np.diag(np.sqrt(rng.chisquare(n - np.arange(p))))
+    whitening = np.sqrt(n) * solve_triangular(root, np.eye(p), lower=True)
+    return Null(rng.normal(size=p) / np.sqrt(count), whitening, count)
+
+
+@pytest.fixture(scope="module")
+def few_simulations() -> dict[str, np.ndarray]:
+    """800 vectors of 12, each with its own 40 simulations of a common covariance."""
+    rng = np.random.default_rng(SEED)
+    p, count, draws = 12, 40, 800
+    root = np.tril(rng.normal(size=(p, p))) + 2.0 * np.eye(p)
+    t = rng.normal(size=(p, 5))
+    truth = np.array([3.0, -1.0, 0.0, 0.0, 0.0])
+    found: dict[str, list] = {
+        name: [] for name in ("omnibus", "one", "three", "residual", "further", "student", "pull")
+    }
+    for _ in range(draws):
+        believed = null(rng.normal(size=(count, p)) @ root.T)
+        noise = root @ rng.normal(size=p)
+        y = believed.data(noise)
+        found["omnibus"].append(residual_probability(y @ y, p, count - 1))
+        found["one"].append(fit(believed, noise, t[:, :1]).score)
+        found["three"].append(fit(believed, noise, t[:, 2:]).score)
+        x = noise + t @ truth
+        two, all_of_them = fit(believed, x, t[:, :2]), fit(believed, x, t)
+        found["residual"].append(two.probability)
+        found["further"].append(score_probability(two.chi2 - all_of_them.chi2, two.chi2, 3, p - 2, count - 1))
+        scale = two.errors / stats.t.std(two.dof)
+        found["student"].append(stats.t.cdf((two.amplitudes - truth[:2]) / scale, two.dof))
+        found["pull"].append((two.amplitudes - truth[:2]) / two.errors)
+    return {name: np.array(values) for name, values in found.items()}
+
+
+@pytest.mark.parametrize("name", ["omnibus", "one", "three", "residual", "further"])
+def test_probabilities_are_uniform(name, few_simulations):
+    assert stats.kstest(few_simulations[name], "uniform").pvalue > KS
+
+
+def test_amplitudes_are_student(few_simulations):
+    draws = few_simulations["student"]
+    for column in draws.T:
+        assert stats.kstest(column, "uniform").pvalue > KS
+    pulls = few_simulations["pull"]
+    # Kurtosis of the t is small: the standard error of the width is 0.025, of the mean 0.035.
+    assert np.all(np.abs(pulls.std(axis=0) - 1.0) < 0.1)
+    assert np.all(np.abs(pulls.mean(axis=0)) < 0.14)
+
+
+@pytest.mark.parametrize(("p", "count", "draws"), [(20, 200, 800), (100, 1000, 500)])
+def test_gap_is_uniform(p, count, draws):
+    """Two dozen candidates of one to three columns, half of them alike; the calibration has a scatter of its own."""
+    rng = np.random.default_rng(SEED + p)
+    t = rng.normal(size=(p, 40))
+    t[:, 20:] += 2.0 * t[:, :1]
+    groups = [(i,) for i in range(12)] + [(i, i + 1) for i in range(12, 30, 2)] + [(31, 32, 33), (35, 36, 37)]
+    believed = drawn_null(rng, p, count)
+    calibration = calibrate(believed, bases(believed, t, groups), seed=SEED)
+    found = []
+    for _ in range(draws):
+        believed = drawn_null(rng, p, count)
+        found.append(gap(believed, rng.normal(size=p), bases(believed, t, groups), calibration).probability)
+    assert stats.kstest(found, "uniform").pvalue > KS
+    low, high = stats.binom.interval(0.999, draws, 0.05)
+    assert low <= np.sum(np.array(found) < 0.05) <= high
+
+
+def test_atlas_is_calibrated_within_and_beyond_the_ranks():
+    """200 ensembles of 200 simulations of 60 correlated numbers, each met by 100 data."""
+    rng = np.random.default_rng(SEED)
+    mixing = np.exp(-np.abs(np.subtract.outer(np.arange(60), np.arange(60))) / 5.0)
+    found = []
+    for _ in range(200):
+        simulations = rng.normal(size=(200, 60)) @ mixing
+        found.append(atlas(rng.normal(size=(100, 60)) @ mixing, simulations)[1].min(axis=1))
+    smallest = np.concatenate(found)
+    # Data of one ensemble share its ranks: a level a errs by sqrt(1/(200 a))/sqrt(200), beside Poisson's error. The
+    # smallest rank is 1/201; 0.001 lies beyond it, where the fitted trials err by 1/sqrt(20).
+    for level in (0.05, 0.01, 0.001):
+        sigma = np.sqrt(1.0 / (level * 20_000) + max(1.0 / (200 * level), 1 / 20) / 200)
+        assert abs(np.mean(smallest <= level) / level - 1.0) < 4.0 * sigma
+
+
+def test_power_is_that_of_drawn_ensembles():
+    rng = np.random.default_rng(SEED)
+    p, count, threshold, draws = 15, 60, 0.01, 1500
+    for columns in (1, 3):
+        strength = strength_needed(columns, 5, p, count, alpha=0.05)
+        assert power(strength, columns, threshold, p, count) == pytest.approx(0.9, abs=1e-4)
+        t = np.eye(p)[:, :columns]
+        x = strength * np.sqrt(1 + 1 / count) * t[:, 0]
+        hits = sum(fit(drawn_null(rng, p, count), x + rng.normal(size=p), t).score < threshold for _ in range(draws))
+        assert abs(hits - 0.9 * draws) < 4.0 * np.sqrt(0.09 * draws)
+
+
+def test_detectable_amplitude_is_unbiased():
+    """Averaged over scatters, the amplitude found from S is that of the true covariance within 1 %."""
+    rng = np.random.default_rng(SEED)
+    p, count = 40, 400
+    t = np.eye(p)[:, :1] * 0.5
+    found = [detectable(drawn_null(rng, p, count), t, 20) for _ in range(60)]
+    # The relative scatter of one is 1/sqrt(2 (n - p)) = 0.037, of their mean 0.005.
+    assert np.mean([one.limit for one in found]) == pytest.approx(4.305 / 0.5, rel=0.02)
+    assert all(one.amplitude > one.limit for one in found)
+
+
+@pytest.mark.parametrize("cosine", [0.0, 0.7, -0.95])
+def test_confusion_is_that_of_drawn_scores(cosine):
+    rng = np.random.default_rng(SEED)
+    strength, draws = strength_to_isolate(cosine), 20_000
+    assert confusion(strength, cosine) == pytest.approx(0.05, abs=1e-6)
+    noise = rng.normal(size=(draws, 2)) @ np.linalg.cholesky([[1.0, cosine], [cosine, 1.0]]).T
+    scores = np.abs(strength * np.array([1.0, cosine]) + noise)
+    wrong = np.sum(scores[:, 1] > scores[:, 0])
+    assert abs(wrong - 0.05 * draws) < 4.0 * np.sqrt(0.0475 * draws)
+
+
+def test_posterior_is_calibrated():
+    """Of effects drawn from the prior, the probability given to the favourite is the fraction that is right."""
+    rng = np.random.default_rng(SEED)
+    p, count, draws = 20, 400, 3000
+    t = rng.normal(size=(p, 9))
+    t[:, 4] = t[:, 0] + 0.5 * rng.normal(size=p)
+    groups = [(0,), (1, 2), (3,), (4,), (5, 6, 7), (8,)]
+    strengths, prior = np.linspace(1.0, 7.0, 25), np.array([0.4, *[0.1] * 6])
+    exact = bases(Null(np.zeros(p), np.eye(p), 10**9), t, groups)
+    believed, right = [], []
+    for _ in range(draws // 20):
+        found = drawn_null(rng, p, count)
+        candidates = bases(found, t, groups)
+        truth = rng.choice(7, size=20, p=prior)
+        x = rng.normal(size=(20, p))
+        for row, index in zip(x, truth, strict=True):
+            if index:
+                basis = exact.basis[:, exact.start[index - 1] : exact.start[index]]
+                direction = rng.normal(size=basis.shape[1])
+                row += rng.choice(strengths) * basis @ direction / np.linalg.norm(direction)
+        probability = posterior(found, x, candidates, strengths, prior)
+        believed.append(probability.max(axis=1))
+        right.append(probability.argmax(axis=1) == truth)
+    confidence, hit = np.concatenate(believed), np.concatenate(right)
+    sigma = np.sqrt(np.sum(confidence * (1 - confidence)))
+    assert abs(np.sum(hit) - np.sum(confidence)) < 4.0 * sigma
+    for part in (confidence < 0.6, confidence > 0.9):
+        sigma = np.sqrt(np.sum((confidence * (1 - confidence))[part]))
+        assert abs(np.sum(hit[part]) - np.sum(confidence[part])) < 4.0 * sigma
+
+
+@pytest.fixture(scope="module", params=[0.0, 12.0])
+def frozen_fits(request) -> dict[str, np.ndarray]:
+    """Amplitudes fitted to 40 data and frozen for 30 others, where templates and gap are the effect's; 600 times."""
+    rng = np.random.default_rng(SEED)
+    count, p = 500, 30
+    t_fit, t_test = rng.normal(size=(40, 2)), rng.normal(size=(p, 2))
+    t_fit /= np.linalg.norm(t_fit, axis=0)
+    t_test /= np.linalg.norm(t_test, axis=0)
+    truth = np.array([request.param, 0.5 * request.param])
+    found: dict[str, list] = {
+        name: [] for name in ("drop", "sigma", "forecast", "forecast_sigma", "fraction", "pull", "before", "after")
+    }
+    signal = t_test @ truth
+    # What no candidate explains keeps the gap of the case without an effect well away from zero.
+    other = np.linalg.qr(np.column_stack([t_test, rng.normal(size=p)]))[0][:, 2] * 12.0
+    for _ in range(600):
+        best = fit(drawn_null(rng, 40, count), t_fit @ truth + rng.normal(size=40), t_fit)
+        before, after = drawn_null(rng, p, count), drawn_null(rng, p, count)
+        after = Null(after.mean + t_test @ best.amplitudes, after.whitening, count)
+        x = signal + other + rng.normal(size=p)
+        forecast = predicted(before, x, t_test, best.amplitudes, best.covariance)
+        shrink = achieved(before, after, x)
+        left = signal - t_test @ best.amplitudes
+        expected = 1.0 - (left @ left + other @ other) / (signal @ signal + other @ other)
+        found["forecast"].append(forecast.drop.value)
+        found["forecast_sigma"].append(forecast.drop.sigma)
+        found["drop"].append(shrink.before.value - shrink.after.value)
+        found["sigma"].append(shrink.fraction.sigma)
+        found["fraction"].append(shrink.fraction.value)
+        found["pull"].append((shrink.fraction.value - expected) / shrink.fraction.sigma)
+        found["before"].append(shrink.before.value)
+        found["after"].append(shrink.probability_after)
+    return {name: np.array(values) for name, values in found.items()} | {"gap": signal @ signal + other @ other}
+
+
+def test_forecast_drop_is_the_drop(frozen_fits):
+    difference = frozen_fits["drop"] - frozen_fits["forecast"]
+    assert abs(difference.mean()) < 4.0 * difference.std() / np.sqrt(len(difference))
+
+
+def test_gap_is_the_squared_distance(frozen_fits):
+    gaps = frozen_fits["before"]
+    assert abs(gaps.mean() - frozen_fits["gap"]) < 4.0 * gaps.std() / np.sqrt(len(gaps))
+
+
+def test_errors_of_the_achieved_fraction_are_right(frozen_fits):
+    pulls = frozen_fits["pull"]
+    # The gap is in the denominator: pulls are skew by some tenths, which a Gaussian's 0.03 of the width leaves aside.
+    assert abs(pulls.std() - 1.0) < 0.12
+    assert abs(pulls.mean()) < 0.2
+
+
+def test_gap_has_its_variance():
+    rng = np.random.default_rng(SEED)
+    p, count, draws = 20, 120, 2500
+    for length in (0.0, 10.0):
+        x = length * np.sqrt(1 + 1 / count) * np.eye(p)[0]
+        values = np.array([excess(drawn_null(rng, p, count), x + rng.normal(size=p)).value for _ in range(draws)])
+        d = count - p
+        sigma = np.sqrt(2.0 * ((p + length**2) ** 2 + (p + 2.0 * length**2) * (d - 2)) / (d - 4))
+        # Standard errors of the mean, and of the width with an excess kurtosis of about 1.
+        assert abs(values.mean() - length**2) < 4.0 * sigma / np.sqrt(draws)
+        assert abs(values.std() / sigma - 1.0) < 4.0 * np.sqrt(3.0 / (4.0 * draws))

@@ -1,0 +1,260 @@
+"""Attribution on constructed geometries: verdicts, minimal sets, twins, model errors; evidence by brute force."""
+
+import time
+
+import numpy as np
+import pytest
+from scipy import special, stats
+
+from mcsim.diagnose.attribute import Attribution, Candidate, attribute
+from mcsim.diagnose.detect import cosines, detectable, log_evidence, posterior, strength_needed, strength_to_isolate
+from mcsim.diagnose.gaussian import Null, bases, null
+from mcsim.diagnose.trials import calibrate
+
+P, N = 60, 800
+ALPHA = 0.05
+
+
+class Bench:
+    """Candidates on evidence of 60 unit normals with a believed ensemble of 800 simulations."""
+
+    def __init__(self, t: np.ndarray, candidates: list[Candidate]) -> None:
+        self.null = null(np.random.default_rng(7).normal(size=(N, P)))
+        self.t, self.candidates = t, candidates
+        self.bases = bases(self.null, t, [candidate.columns for candidate in candidates])
+        self.calibration = calibrate(self.null, self.bases)
+
+    def judge(self, signal: np.ndarray, seed: int, **options) -> Attribution:
+        x = signal + np.random.default_rng(seed).normal(size=P)
+        return attribute(self.null, x, self.t, self.candidates, self.calibration, **options)
+
+
+def directions(count: int, seed: int) -> np.ndarray:
+    t = np.random.default_rng(seed).normal(size=(P, count))
+    return t / np.linalg.norm(t, axis=0)
+
+
+def singles(count: int) -> list[Candidate]:
+    return [Candidate(f"effect{i}", None, (i,)) for i in range(count)]
+
+
+@pytest.fixture(scope="module")
+def bench() -> Bench:
+    """Twelve single templates, then a pair and a triple of columns."""
+    candidates = [*singles(12), Candidate("pair", "W1", (12, 13)), Candidate("triple", "W2", (14, 15, 16))]
+    return Bench(directions(17, 8), candidates)
+
+
+def verdicts(bench: Bench, signal: np.ndarray, draws: int, **options) -> list[Attribution]:
+    return [bench.judge(signal, seed, **options) for seed in range(draws)]
+
+
+def test_without_an_effect_one_in_twenty_is_named(bench):
+    found = [one.verdict != "none" for one in verdicts(bench, np.zeros(P), 160)]
+    low, high = stats.binom.interval(0.999, 160, ALPHA)
+    assert low <= sum(found) <= high
+
+
+@pytest.mark.parametrize(("member", "weights"), [(3, [12.0]), (12, [8.0, 8.0]), (13, [8.0, -8.0, 4.0])])
+def test_true_effect_is_accepted_as_often_as_promised(bench, member, weights):
+    signal = bench.t[:, list(bench.candidates[member].columns)] @ weights
+    found = verdicts(bench, signal, 60)
+    accepted = sum(any(e.members == (member,) for e in one.explanations) for one in found)
+    # At least 95 %: half of the level for either test.
+    assert accepted >= stats.binom.isf(0.999, 60, 1.0 - ALPHA)
+    best = [one.explanations[0] for one in found if one.explanations and one.explanations[0].members == (member,)]
+    pulls = np.concatenate([(e.fit.amplitudes - weights) / e.fit.errors for e in best])
+    # Of 60 pulls the standard errors are 0.13 and 0.09.
+    assert abs(pulls.mean()) < 0.45
+    assert abs(pulls.std() - 1.0) < 0.3
+
+
+@pytest.mark.parametrize("members", [(2, 5), (1, 12), (0, 4, 9)])
+def test_mixtures_are_minimal(bench, members):
+    columns = [column for member in members for column in bench.candidates[member].columns]
+    found = verdicts(bench, bench.t[:, columns] @ np.full(len(columns), 14.0), 25)
+    right = [one for one in found if one.verdict == "mixture" and set(one.explanations[0].members) == set(members)]
+    # 95 % less three sigma.
+    assert len(right) >= 20
+    assert right[0].explanations[0].odds == 1.0
+
+
+def test_what_is_not_in_the_library_is_unknown(bench):
+    stranger = directions(1, 99)[:, 0] + 0.9 * bench.t[:, 5]
+    found = verdicts(bench, 14.0 * stranger, 40)
+    assert sum(one.verdict == "unknown" for one in found) >= 38
+    cosine = stranger @ bench.t[:, 5] / np.linalg.norm(stranger)
+    assert all(one.nearest == 5 and not one.explanations for one in found)
+    assert np.mean([one.cosine for one in found]) == pytest.approx(cosine, abs=0.05)
+
+
+def test_twins_are_told_as_twins_with_what_parts_them():
+    """Templates that differ in one entry alone; a third is far away."""
+    t = directions(3, 10)
+    t[:, 1] = t[:, 0]
+    t[7, 1] += 0.1
+    twins = Bench(t, singles(3))
+    found = twins.judge(10.0 * t[:, 0], 1)
+    assert found.verdict == "degenerate"
+    assert {e.members for e in found.explanations} == {(0,), (1,)}
+    contrast = found.contrasts[0]
+    assert contrast.entries[0] == 7
+    assert contrast.shares.sum() == pytest.approx(1.0)
+    assert contrast.separation < 2.0
+    assert found.correlation[0, 1] > 0.99
+    assert twins.judge(300.0 * t[:, 0], 1, shape_error=0.0).verdict == "effect"
+
+
+def test_simpler_of_two_nested_effects_is_first():
+    """One column, and three that contain it."""
+    nested = Bench(directions(3, 11), [Candidate("large", None, (0, 1, 2)), Candidate("small", None, (0,))])
+    found = [nested.judge(10.0 * nested.t[:, 0], seed) for seed in range(40)]
+    first = [one.explanations[0].members for one in found if one.explanations]
+    assert first.count((1,)) >= 35
+    assert all(one.explanations[1].odds < 1.0 for one in found if len(one.explanations) > 1)
+
+
+def test_settings_of_one_effect_compete():
+    """They neither act together, nor make a mixture or an ambiguity of one effect."""
+    t = directions(4, 12)
+    t[:, 1] = t[:, 0] + 0.4 * t[:, 1]
+    candidates = [
+        Candidate("lobe", "W1", (0,), {"r0": 4.0}),
+        Candidate("lobe", "W1", (1,), {"r0": 5.0}),
+        Candidate("other", "W1", (2,)),
+        Candidate("lobe", "W2", (3,), {"r0": 5.0}),
+    ]
+    bench = Bench(t, candidates)
+    found = [bench.judge(14.0 * t[:, 1], seed) for seed in range(40)]
+    assert sum(one.verdict == "effect" and one.explanations[0].members == (1,) for one in found) >= 36
+    assert all({0, 1} - set(e.members) for one in found for e in one.explanations)
+
+
+@pytest.mark.parametrize("where", ["anywhere", "along another"])
+def test_a_template_one_percent_wrong_is_forgiven(bench, where):
+    """Even where the error is all of one other template, at a hundred sigma."""
+    t = bench.t[:, 3]
+    error = bench.t[:, 8] if where == "along another" else directions(1, 13)[:, 0]
+    found = verdicts(bench, 100.0 * (t + 0.01 * error), 25)
+    assert sum(any(e.members == (3,) for e in one.explanations) for one in found) >= 20
+
+
+def test_a_wrong_template_is_not_forgiven(bench):
+    stranger = directions(1, 14)[:, 0]
+    t = bench.t[:, 3]
+    stranger -= t * (t @ stranger)
+    truth = 0.95 * t + np.sqrt(1.0 - 0.95**2) * stranger / np.linalg.norm(stranger)
+    found = verdicts(bench, 100.0 * truth, 20)
+    assert all(one.verdict == "unknown" and one.nearest == 3 for one in found)
+    assert np.mean([one.cosine for one in found]) == pytest.approx(0.95, abs=0.02)
+
+
+def test_own_shape_error_replaces_that_of_the_search():
+    t = directions(2, 15)
+    signal = 100.0 * (t[:, 0] + 0.2 * directions(1, 16)[:, 0])
+    exact, vague = Bench(t, singles(2)), Bench(t, [Candidate("vague", None, (0,), shape_error=0.2), *singles(2)[1:]])
+    assert exact.judge(signal, 0).verdict == "unknown"
+    assert vague.judge(signal, 0).explanations[0].members == (0,)
+
+
+def test_prior_moves_the_odds():
+    t = directions(2, 17)
+    t[:, 1] = t[:, 0] + 0.05 * t[:, 1]
+    plain, favoured = Bench(t, singles(2)), Bench(t, [singles(2)[0], Candidate("effect1", None, (1,), prior=9.0)])
+    ratios = []
+    for bench in (plain, favoured):
+        odds = {e.members: e.odds for e in bench.judge(9.0 * t[:, 0], 3).explanations}
+        ratios.append(odds[(1,)] / odds[(0,)])
+    assert ratios[1] / ratios[0] == pytest.approx(9.0)
+
+
+def test_sixty_candidates_take_less_than_two_seconds():
+    t = np.random.default_rng(18).normal(size=(P, 90))
+    candidates = [Candidate(f"effect{i}", None, (i,) if i < 40 else (i, i + 30)) for i in range(60)]
+    bench = Bench(t, candidates)
+    start = time.process_time()
+    # Unknown and weak: nothing small suffices, and the residual of most triples passes.
+    bench.judge(7.0 * directions(1, 19)[:, 0], 4)
+    assert time.process_time() - start < 2.0
+
+
+def test_evidence_is_the_integral_over_its_prior():
+    """Against draws of the amplitudes, the covariance known."""
+    rng = np.random.default_rng(20)
+    known = Null(np.zeros(6), np.eye(6), 10**9)
+    y = rng.normal(size=6) + np.array([2.0, -1.0, 0.0, 0.0, 0.0, 0.0])
+    for K in (1, 2):
+        values = []
+        for width in (1.0, 3.0):
+            theta = np.zeros((400_000, 6))
+            theta[:, :K] = width * rng.normal(size=(400_000, K))
+            values.append(np.mean(np.exp(-0.5 * np.sum((y - theta) ** 2, axis=1))))
+        found = log_evidence(known, y @ y, y[:K] @ y[:K], K, (1.0, 3.0))
+        # Each mean of 400,000 draws is good to half a percent.
+        assert found == pytest.approx(np.log(np.mean(values)), abs=0.02)
+
+
+def test_posterior_is_bayes_theorem():
+    rng = np.random.default_rng(21)
+    t = rng.normal(size=(6, 5))
+    known = Null(np.zeros(6), np.eye(6), 10**9)
+    groups, prior, strengths = [(0,), (1, 2), (3, 4)], np.array([0.4, 0.3, 0.2, 0.1]), np.array([1.0, 3.0])
+    x = rng.normal(size=6) + t[:, 0]
+    candidates = bases(known, t, groups)
+    likelihood = [np.exp(-0.5 * x @ x)]
+    for i, group in enumerate(groups):
+        basis = candidates.basis[:, candidates.start[i] : candidates.start[i + 1]]
+        direction = rng.normal(size=(200_000, len(group)))
+        direction /= np.linalg.norm(direction, axis=1)[:, None]
+        models = [s * direction @ basis.T for s in strengths]
+        likelihood.append(np.mean([np.exp(-0.5 * np.sum((x - model) ** 2, axis=1)) for model in models]))
+    expected = prior * likelihood / np.sum(prior * likelihood)
+    np.testing.assert_allclose(posterior(known, x, candidates, strengths, prior), expected, rtol=0.02)
+    heavier = posterior(known, x, candidates, strengths, prior, np.array([1.0, 0.0]))
+    np.testing.assert_allclose(heavier, posterior(known, x, candidates, strengths[:1], prior), rtol=1e-9)
+    assert posterior(known, np.stack([x, -x]), candidates, strengths, prior)[1] == pytest.approx(
+        posterior(known, x, candidates, strengths, prior), rel=1e-9
+    )
+
+
+@pytest.mark.parametrize(("columns", "tests", "strength"), [(1, 1, 3.24), (1, 20, 4.30), (110, 1, 7.2)])
+def test_strengths_of_known_covariance(columns, tests, strength):
+    """The normal, Bonferroni's and the chi2's figures; few simulations need more."""
+    assert strength_needed(columns, tests, 110, None) == pytest.approx(strength, abs=0.05)
+    assert strength_needed(columns, tests, 110, 10**6) == pytest.approx(strength, abs=0.05)
+    assert strength_needed(columns, tests, 110, 600) > 1.05 * strength_needed(columns, tests, 110, None)
+
+
+def test_detectable_takes_the_least_favourable_direction():
+    known = Null(np.zeros(4), np.eye(4), 10**6)
+    t = np.zeros((4, 2))
+    t[0, 0], t[1, 1] = 2.0, 0.5
+    found = detectable(known, t, 1)
+    assert found.amplitude == pytest.approx(found.strength / 0.5, rel=1e-4)
+    assert found.typical == pytest.approx(found.strength / np.sqrt(2.125), rel=1e-4)
+    deaf = detectable(known, t * [1.0, 0.0], 1)
+    assert deaf.amplitude == deaf.limit == np.inf
+    assert np.isfinite(deaf.typical)
+
+
+def test_cosines_are_canonical_correlations():
+    rng = np.random.default_rng(22)
+    t = rng.normal(size=(9, 6))
+    t[:, 5] = 0.0
+    known = Null(np.zeros(9), np.eye(9), 10**6)
+    found = cosines(bases(known, t, [(0,), (1, 2), (3, 4), (5,)]))
+    one, two = np.linalg.qr(t[:, 1:3])[0], np.linalg.qr(t[:, 3:5])[0]
+    assert found[1, 2] == pytest.approx(np.linalg.svd(one.T @ two, compute_uv=False)[0])
+    assert found[0, 1] == pytest.approx(np.linalg.norm(one.T @ t[:, 0]) / np.linalg.norm(t[:, 0]))
+    assert np.all(found[3, :3] == 0.0)
+    assert np.all(np.diag(found) == 1.0)
+
+
+def test_isolation_needs_more_of_closer_effects():
+    cosine = np.array([[1.0, 0.5], [-0.9, 0.0]])
+    found = strength_to_isolate(cosine)
+    assert found[0, 0] == np.inf
+    assert found[1, 0] > found[0, 1] > found[1, 1]
+    # Close twins: only the difference counts, Q(a) = 0.05.
+    close = strength_to_isolate(0.99)
+    assert close * np.sqrt(0.005) == pytest.approx(-special.ndtri(0.05), rel=1e-3)

@@ -1,0 +1,163 @@
+"""Coordinates, fits and calibrations against explicit linear algebra."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from mcsim.diagnose.gaussian import bases, fit, null, residual_probability, score_probability
+from mcsim.diagnose.trials import Calibration, atlas, calibrate, gap
+from mcsim.errors import InputError
+
+P, N = 12, 60
+
+
+@pytest.fixture(scope="module")
+def ensemble() -> np.ndarray:
+    """Simulations with scales over six decades."""
+    rng = np.random.default_rng(1)
+    root = (np.tril(rng.normal(size=(P, P))) + 2.0 * np.eye(P)) * np.logspace(-3, 3, P)[:, None]
+    return 5.0 + rng.normal(size=(N, P)) @ root.T
+
+
+@pytest.fixture(scope="module")
+def evidence(ensemble) -> np.ndarray:
+    return ensemble.mean(axis=0) + np.random.default_rng(2).normal(size=P) * ensemble.std(axis=0)
+
+
+@pytest.fixture(scope="module")
+def templates(ensemble) -> np.ndarray:
+    return np.random.default_rng(3).normal(size=(P, 6)) * ensemble.std(axis=0)[:, None]
+
+
+def test_scatter_is_n_times_one(ensemble):
+    believed = null(ensemble)
+    white = believed.data(ensemble) * np.sqrt(1 + 1 / N)
+    np.testing.assert_allclose(white.T @ white, (N - 1) * np.eye(P), atol=1e-9)
+
+
+def test_offset_moves_the_mean(ensemble, evidence):
+    shift = np.arange(P, dtype=float)
+    np.testing.assert_allclose(null(ensemble, shift).data(evidence + shift), null(ensemble).data(evidence), rtol=1e-9)
+
+
+def test_statistics_equal_those_of_the_scatter(ensemble, evidence, templates):
+    """The formulas of Hotelling and Rao written with S itself."""
+    believed, n = null(ensemble), N - 1
+    inverse = np.linalg.inv(np.cov(ensemble.T) * n)
+    x = (evidence - ensemble.mean(axis=0)) / np.sqrt(1 + 1 / N)
+    t = templates[:, :3]
+    square = x @ inverse @ x
+    y = believed.data(evidence)
+    np.testing.assert_allclose(y @ y / n, square, rtol=1e-8)
+    score, normal = t.T @ inverse @ x, t.T @ inverse @ t
+    T = score @ np.linalg.solve(normal, score)
+    found = fit(believed, evidence, t)
+    expected = stats.f.sf((n - P + 1) / 3 * T / (1 + square - T), 3, n - P + 1)
+    assert found.score == pytest.approx(expected, rel=1e-7)
+    q = P - 3
+    assert found.probability == pytest.approx(stats.f.sf((n - q + 1) / q * (square - T), q, n - q + 1), rel=1e-7)
+    theta = np.linalg.solve(normal, score) * np.sqrt(1 + 1 / N)
+    np.testing.assert_allclose(found.amplitudes, theta, rtol=1e-7)
+    student = (1 + square - T) * np.linalg.inv(normal) * (1 + 1 / N) / (n - q) * stats.t.var(n - q)
+    np.testing.assert_allclose(found.covariance, student, rtol=1e-7)
+    assert found.errors == pytest.approx(np.sqrt(np.diag(student)), rel=1e-7)
+
+
+def test_repeated_entries_change_nothing(ensemble, evidence, templates):
+    """A sum of two entries, and a copy with rounding, carry nothing new."""
+    mixing = np.vstack([np.eye(P), np.eye(P)[0] * 3.0, np.eye(P)[1] + np.eye(P)[2]])
+    short, long = null(ensemble), null(ensemble @ mixing.T)
+    assert long.dimension == P
+    one, two = fit(short, evidence, templates[:, :2]), fit(long, mixing @ evidence, mixing @ templates[:, :2])
+    np.testing.assert_allclose(one.amplitudes, two.amplitudes, rtol=1e-6)
+    assert one.probability == pytest.approx(two.probability, rel=1e-6)
+
+
+def test_a_repeated_column_has_no_amplitude_of_its_own(ensemble, evidence, templates):
+    twice = np.column_stack([templates[:, 0], 2.0 * templates[:, 0]])
+    one, two = fit(null(ensemble), evidence, templates[:, :1]), fit(null(ensemble), evidence, twice)
+    assert two.dimension == one.dimension
+    assert two.amplitudes @ [1.0, 2.0] == pytest.approx(one.amplitudes[0], rel=1e-8)
+
+
+def test_probabilities_without_columns_or_dimensions_are_one():
+    assert score_probability(0.0, 5.0, 0, P, N) == 1.0
+    assert residual_probability(0.0, 0, N) == 1.0
+
+
+@pytest.mark.parametrize(("q", "allowance"), [(1, 4.0), (30, 9.0), (100, 100.0)])
+def test_forgiven_errors_make_the_tail_noncentral(q, allowance):
+    """Patnaik's approximation, within 10 % of the noncentral F at the 5 % level where it decides."""
+    n = 1200
+    chi2 = stats.ncf.isf(0.05, q, n - q + 1, allowance) * n * q / (n - q + 1)
+    assert residual_probability(chi2, q, n, allowance) == pytest.approx(0.05, rel=0.1)
+
+
+def test_bad_ensembles_say_what_to_do(ensemble):
+    with pytest.raises(InputError, match="at least 19"):
+        null(ensemble[:15])
+    flat = ensemble.copy()
+    flat[:, 4] = 1.0
+    with pytest.raises(InputError, match="evidence 4 has no finite scatter"):
+        null(flat)
+    flat[0, 5] = np.nan
+    with pytest.raises(InputError, match="evidence 5 has no finite scatter"):
+        null(flat)
+
+
+def test_gap_is_invariant_and_names_the_candidate(ensemble, evidence, templates):
+    groups = [(0,), (1, 2), (3, 4, 5)]
+    x = evidence + 20.0 * templates[:, 1]
+    results = []
+    for scale in (1.0, 1e-6):
+        believed = null(ensemble * scale)
+        candidates = bases(believed, templates * scale, groups)
+        results.append(gap(believed, x * scale, candidates, calibrate(believed, candidates, draws=2000)))
+    assert results[0].best == 1
+    assert results[0].probability == pytest.approx(results[1].probability, rel=1e-6)
+    assert results[0].chi2 == pytest.approx(results[1].chi2, rel=1e-8)
+
+
+def test_silent_candidates_count_for_nothing(ensemble, evidence, templates):
+    believed = null(ensemble)
+    silent = np.column_stack([templates, np.zeros(P)])
+    heard, all_of_them = bases(believed, templates, [(0,), (1, 2)]), bases(believed, silent, [(0,), (1, 2), (6,)])
+    one = gap(believed, evidence, heard, calibrate(believed, heard, draws=2000))
+    two = gap(believed, evidence, all_of_them, calibrate(believed, all_of_them, draws=2000))
+    assert one == two
+
+
+def test_calibration_goes_on_beyond_its_draws():
+    """Monotone, never above Bonferroni's bound, never zero."""
+    draws = np.sort(np.random.default_rng(4).uniform(size=1000))
+    calibration = Calibration(5, draws / 5, draws)
+    p = np.logspace(-30, 0, 400)
+    for values in (calibration.trials(p), calibration.combine(1.0, p), calibration.combine(p, 1.0)):
+        assert np.all(np.diff(values) >= 0.0)
+        assert values[0] > 0.0
+        assert values[-1] <= 1.0
+    assert np.all(calibration.trials(p) <= 5 * p)
+    assert calibration.trials(1e-20) == pytest.approx(5e-20)
+
+
+def test_atlas_deviations_are_those_of_left_out_simulations():
+    """The data put among the simulations and left out again have the same deviation."""
+    rng = np.random.default_rng(5)
+    simulations, x = rng.normal(size=(40, 7)) * np.arange(1, 8), rng.normal(size=7)
+    z, p = atlas(x, simulations)
+    t = (x - simulations.mean(axis=0)) / simulations.std(axis=0, ddof=1) / np.sqrt(1 + 1 / 40)
+    np.testing.assert_allclose(stats.norm.sf(z), stats.t.sf(t, 39), rtol=1e-9)
+    assert np.all(p >= 2.0 * stats.norm.sf(np.abs(z)) * 0.999)
+    order = np.argsort(np.abs(z))
+    assert np.all(np.diff(p[order]) <= 0.0)
+
+
+def test_atlas_reaches_beyond_the_ranks():
+    rng = np.random.default_rng(6)
+    simulations = rng.normal(size=(500, 20))
+    _, p = atlas(np.array([8.0] + [0.0] * 19), simulations)
+    # Student's tail with 499 degrees of freedom, times about 20 trials.
+    assert 5 < p[0] / (2.0 * stats.t.sf(8.0 / simulations[:, 0].std(ddof=1), 499)) < 80
+    assert p[1] == 1.0
+    with pytest.raises(InputError, match="at least 20"):
+        atlas(np.zeros(20), simulations[:10])

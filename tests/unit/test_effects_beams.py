@@ -1,0 +1,256 @@
+"""Effects on beams and pointing against closed forms, rotations of all orders, and quadrature of their definitions."""
+
+from dataclasses import replace
+
+import ducc0
+import numpy as np
+import pytest
+from scipy.special import sph_harm_y
+
+from mcsim import alm as alm_
+from mcsim import effects, resources, tod
+from mcsim.beams import Beam, elliptical_gaussian, gaussian
+from mcsim.beams.gaussian import SIGMA_PER_FWHM
+from mcsim.effects.shape import displaced, extended, shape, smeared, stretched
+from mcsim.errors import InputError
+from mcsim.scan import load_model
+from mcsim.sky import gaussian_alm
+from mcsim.spectra import load
+
+FWHM = 88.0
+
+
+def site_of(beam: Beam) -> effects.Site:
+    model = load_model(resources.scan_model("wmap"))
+    pointing = effects.Pointing(model, model.line_of_sight("A"))
+    return effects.Site(
+        channel="W1", frequency_ghz=94.0, frame="ecliptic", nside=8, lmax=beam.lmax, beam=beam, pointing=pointing
+    )
+
+
+def same(found: Beam, expected: Beam, tolerance: float) -> None:
+    """Coefficients within ``tolerance`` of the largest; an order that one of them lacks counts as zero."""
+    orders = max(found.mmax, expected.mmax) + 1
+    padded = [np.pad(beam.blm, ((0, orders - len(beam.blm)), (0, 0))) for beam in (found, expected)]
+    np.testing.assert_allclose(*padded, rtol=0.0, atol=tolerance * np.abs(expected.blm).max())
+
+
+# At lmax 192 the window is still 0.1: what lies beyond must not matter. At 512 it is all there.
+@pytest.mark.parametrize("lmax", [48, 192, 512])
+def test_a_round_gaussian_stretches_to_closed_forms(lmax):
+    beam = gaussian(FWHM, lmax)
+    ellipse = effects.get("beam_ellipticity")(amplitude=0.1, angle_deg=20.0).beam(beam, site_of(beam))
+    same(ellipse, elliptical_gaussian(FWHM * 1.1**0.5, FWHM / 1.1**0.5, 20.0, lmax, ellipse.mmax), 1e-9)
+    turned = effects.get("beam_ellipticity")(amplitude=-0.1, angle_deg=20.0).beam(beam, site_of(beam))
+    same(turned, elliptical_gaussian(FWHM * 1.1**0.5, FWHM / 1.1**0.5, 110.0, lmax, turned.mmax), 1e-9)
+    wide = effects.get("beam_width")(amplitude=0.02).beam(beam, site_of(beam))
+    same(wide, gaussian(FWHM * 1.02, lmax), 1e-9)
+
+
+@pytest.mark.parametrize("lmax", [192, 512])
+def test_an_elliptical_beam_stretches_further(lmax):
+    """What continues an ellipse beyond lmax is no closed form: 3e-7 there, 1e-8 where there is little to continue."""
+    beam = elliptical_gaussian(FWHM * 1.1**0.5, FWHM / 1.1**0.5, 20.0, lmax, 8)
+    found = effects.get("beam_ellipticity")(amplitude=0.05, angle_deg=20.0).beam(beam, site_of(beam))
+    ratio = 1.1 * 1.05
+    expected = elliptical_gaussian(FWHM * ratio**0.5, FWHM / ratio**0.5, 20.0, lmax, found.mmax)
+    same(found, expected, 1e-6 if lmax == 192 else 3e-8)
+
+
+def test_a_beam_map_stretches_as_its_values():
+    """A lopsided beam, by its values at the points that the stretch sends to each other."""
+    lmax = 400
+    beam = displaced(elliptical_gaussian(150.0, 120.0, 0.0, lmax, 8), 0.4, np.deg2rad(0.5))
+    found = stretched(beam, 1.1, 0.95, 0.3, 24, 12)
+    rng = np.random.default_rng(1)
+    x, y = np.deg2rad(rng.uniform(-2.0, 2.0, (2, 40)))
+    along, across = np.cos(0.3) * x + np.sin(0.3) * y, np.cos(0.3) * y - np.sin(0.3) * x
+    theta, origin = np.hypot(x, y), np.hypot(along / 1.1, across / 0.95)
+    scale = np.sqrt(np.sinc(origin / np.pi) / np.sinc(theta / np.pi)) / (1.1 * 0.95)
+    expected = scale * beam.values(origin, np.arctan2(across / 0.95, along / 1.1) + 0.3)
+    values = found.values(theta, np.arctan2(y, x))
+    # 1e-8 of the power is cut off with the highest orders: 1e-4 of its root.
+    assert np.abs(values - expected).max() < 1e-4 * beam.values(np.zeros(1), np.zeros(1))[0]
+
+
+def quadrature(values, lmax: int, order: int, reach: float) -> np.ndarray:
+    """int f conj(Y_lm) over the cap of radius ``reach``, for l = order .. lmax, with scipy's harmonics."""
+    nodes, weights = np.polynomial.legendre.leggauss(200)
+    theta = 0.5 * reach * (nodes + 1.0)
+    phi = np.arange(32) * 2.0 * np.pi / 32
+    weight = 0.5 * reach * weights * np.sin(theta) * 2.0 * np.pi / 32
+    around = (values(theta[:, None], phi[None, :]) * np.exp(-1j * order * phi)).sum(axis=1)
+    return np.array([np.sum(weight * around * sph_harm_y(ell, order, theta, 0.0)) for ell in range(order, lmax + 1)])
+
+
+def test_coma_by_quadrature():
+    lmax, angle = 128, np.deg2rad(35.0)
+    beam, sigma = gaussian(FWHM, lmax), np.deg2rad(FWHM / 60.0) * SIGMA_PER_FWHM
+    found = effects.get("beam_coma")(amplitude=0.02, angle_deg=35.0).beam(beam, site_of(beam))
+    assert found.mmax == 3
+
+    def leaning(theta, phi):
+        u = theta * np.cos(phi - angle) / sigma
+        round_beam = np.exp(-0.5 * (theta / sigma) ** 2) * np.sqrt(theta / np.sin(theta)) / (2.0 * np.pi * sigma**2)
+        return 0.02 * round_beam * (u**3 - 3.0 * u)
+
+    for order in (1, 3):
+        expected = quadrature(leaning, lmax, order, 10.0 * sigma)
+        # Sigma from the solid angle is sigma (1 + sigma^2 / 12), 1e-5 too large here, and enters cubed.
+        assert np.abs(found.blm[order, order:] - expected).max() < 5e-5 * np.abs(expected).max()
+    np.testing.assert_array_equal(found.blm[0], beam.blm[0])
+
+
+def test_sidelobe_by_quadrature():
+    lmax = 128
+    beam, sigma = gaussian(FWHM, lmax), np.deg2rad(FWHM / 60.0) * SIGMA_PER_FWHM
+    kind = effects.get("beam_sidelobe")
+    found = kind(amplitude=0.01, quadrupole=0.5, radius_sigmas=4.0, width_sigmas=0.8).beam(beam, site_of(beam))
+    assert shape(beam, 0).sigma == pytest.approx(sigma, rel=1e-4)
+
+    def ring(theta, phi):
+        ring = np.exp(-0.5 * ((theta / sigma - 4.0) / 0.8) ** 2) * (1.0 + 0.5 * np.cos(2.0 * phi))
+        return -0.01 * ring / (2.0 * np.pi * sigma**2)
+
+    for order in (0, 2):
+        expected = quadrature(ring, lmax, order, 12.0 * sigma)
+        change = found.blm[order, order:] - (beam.blm[0] if order == 0 else 0.0)
+        # Sigma from the solid angle is sigma (1 + sigma^2 / 12).
+        assert np.abs(change - expected).max() < 2e-4 * np.abs(expected).max()
+    assert found.window[0] < 1.0
+    calibrated = kind(amplitude=0.01, calibrated="dipole").beam(beam, site_of(beam))
+    assert calibrated.window[1] == pytest.approx(beam.window[1], rel=1e-14)
+    with pytest.raises(InputError, match="calibrated = 'monopole' must be one of none, dipole"):
+        kind(amplitude=0.01, calibrated="monopole").beam(beam, site_of(beam))
+
+
+def every_order(beam: Beam) -> np.ndarray:
+    full = np.zeros(alm_.size(beam.lmax), dtype=complex)
+    full[: beam.packed().size] = beam.packed()
+    return full
+
+
+def orders(full: np.ndarray, lmax: int, mmax: int) -> np.ndarray:
+    blm = np.zeros((mmax + 1, lmax + 1), dtype=complex)
+    for m in range(mmax + 1):
+        start = alm_.start(lmax, m)
+        blm[m, m:] = full[start + m : start + lmax + 1]
+    return blm
+
+
+def test_displaced_beam_is_a_rotated_one():
+    lmax = 192
+    distance, angle = np.deg2rad(0.5), np.deg2rad(-130.0)
+    round_beam = gaussian(FWHM, lmax)
+    found = displaced(round_beam, angle, distance)
+    ell = np.arange(1, lmax + 1)
+    expected = np.sqrt(4 * np.pi / (2 * ell + 1)) * round_beam.blm[0, 1:] * sph_harm_y(ell, 1, distance, angle).conj()
+    np.testing.assert_allclose(found.blm[1, 1:], expected, rtol=0.0, atol=1e-13)
+    ellipse = elliptical_gaussian(100.0, 80.0, 20.0, lmax, 4)
+    found = displaced(ellipse, angle, distance)
+    rotated = ducc0.sht.rotate_alm(every_order(ellipse), lmax, -angle, distance, angle)
+    np.testing.assert_allclose(found.blm, orders(rotated, lmax, found.mmax), rtol=0.0, atol=1e-12)
+    assert found.neglected_power <= 1e-8 + ellipse.neglected_power
+
+
+def test_smeared_beam_is_filtered_in_the_spin_frame():
+    """e_phi is the direction of motion, beam x: from the pole to the circle by R_y(boresight) R_z(90 deg)."""
+    lmax, boresight, lag = 192, np.deg2rad(70.5), 0.004
+    beam = elliptical_gaussian(100.0, 80.0, 20.0, lmax, 4)
+    for signed in (lag, -lag):
+        found = smeared(beam, boresight, signed)
+        spin = ducc0.sht.rotate_alm(every_order(beam), lmax, np.pi / 2, boresight, 0.0)
+        m = np.concatenate([np.full(lmax + 1 - order, order) for order in range(lmax + 1)])
+        back = ducc0.sht.rotate_alm(spin / (1.0 - 1j * m * signed), lmax, 0.0, -boresight, -np.pi / 2)
+        np.testing.assert_allclose(found.blm, orders(back, lmax, found.mmax), rtol=0.0, atol=1e-12)
+        # The centroid, at -sqrt(8 pi / 3) b_11, trails: it lies behind by the lag's arc.
+        offset = -np.sqrt(8.0 * np.pi / 3.0) * (found.blm[1, 1] - beam.blm[1, 1])
+        assert offset.real == pytest.approx(-signed * np.sin(boresight), rel=1e-3)
+
+
+def test_time_constant_is_the_mean_of_the_past():
+    """Quadrature over earlier positions of the beam on its circle, node by node, against the filter."""
+    lmax = 96
+    beam = elliptical_gaussian(200.0, 150.0, 20.0, lmax, 4)
+    effect = effects.get("time_constant")(amplitude=0.1)
+    site = site_of(beam)
+    found = effect.pointing(beam, site)
+    # The rate of WMAP's spin, 129.3 s, and the part along it of a precession of -3600 s at 22.5 degrees.
+    rate = 2.0 * np.pi * (1.0 / 129.3 - np.cos(np.deg2rad(22.5)) / 3600.0)
+    spin = ducc0.sht.rotate_alm(every_order(beam), lmax, np.pi / 2, np.deg2rad(70.5), 0.0)
+    m = np.concatenate([np.full(lmax + 1 - order, order) for order in range(lmax + 1)])
+    lags = effect.lags()
+    assert sum(weight for weight, _ in lags) == pytest.approx(1.0)
+    assert sum(weight * delay for weight, delay in lags) == pytest.approx(0.1)
+    past = sum(weight * np.exp(1j * m * rate * delay) * spin for weight, delay in lags)
+    back = ducc0.sht.rotate_alm(past, lmax, 0.0, -np.deg2rad(70.5), -np.pi / 2)
+    same(found, Beam(orders(back, lmax, found.mmax)), 1e-9)
+
+
+def test_moved_samples_see_what_a_displaced_beam_sees():
+    """Both hooks of the offset, by interpolated convolution at 200 directions and orientations."""
+    lmax, rng = 96, np.random.default_rng(3)
+    beam = elliptical_gaussian(200.0, 150.0, 20.0, lmax, 6)
+    sky = gaussian_alm(load("wmap7", lmax), rng)
+    theta, phi, psi = np.arccos(rng.uniform(-1, 1, 200)), rng.uniform(0, 2 * np.pi, 200), rng.uniform(-3, 3, 200)
+    effect = effects.get("pointing_offset")(amplitude=40.0, angle_deg=65.0)
+
+    def seen(beam, theta, phi, psi):
+        nothing = np.zeros(200)
+        chunk = tod.Samples(nothing, theta, phi, psi, nothing.astype(int), nothing)
+        return next(tod.sky_signal(sky, lmax, beam)([chunk])).signal_uk
+
+    moved = effect.moved(theta, phi, psi)
+    expected = seen(beam, *moved)
+    # All orders are kept here: what is cut off by default is 1e-8 of the power.
+    whole = displaced(replace(beam, blm=np.pad(beam.blm, ((0, 12), (0, 0)))), np.deg2rad(65.0), np.deg2rad(40.0 / 60))
+    found = seen(whole, theta, phi, psi)
+    assert np.abs(found - expected).max() < 1e-6 * np.std(expected)
+    cut = seen(effect.pointing(beam, site_of(beam)), theta, phi, psi)
+    assert np.abs(cut - expected).max() < 1e-3 * np.std(expected)
+    # The true direction lies where the offset is, as seen from the believed one.
+    along = np.cos(psi) * (moved[0] - theta) + np.sin(psi) * np.sin(theta) * (moved[1] - phi)
+    near_equator = (np.abs(theta - np.pi / 2) < 0.6) & (np.abs(moved[1] - phi) < 0.1)
+    expected_along = np.deg2rad(40.0 / 60) * np.cos(np.deg2rad(65.0))
+    np.testing.assert_allclose(along[near_equator], expected_along, atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    "name", ["beam_ellipticity", "beam_coma", "beam_sidelobe", "beam_width", "pointing_offset", "time_constant"]
+)
+def test_responses_are_linear_at_the_step(name):
+    """Half the step changes the beam half as much, to 2 %, in every component."""
+    beam = gaussian(44.0, 384)
+    site = site_of(beam)
+
+    def change(effect):
+        changed = effects.seen_through([effect], site).blm[:4]
+        return np.pad(changed, ((0, 4 - len(changed)), (0, 0))) - np.pad(beam.blm, ((0, 3), (0, 0)))
+
+    for effect in effects.get(name).basis():
+        whole, half, opposite = (change(effect.scaled(factor)) for factor in (1.0, 0.5, -1.0))
+        assert np.linalg.norm(whole - 2.0 * half) < 0.02 * np.linalg.norm(whole)
+        assert np.linalg.norm(whole + opposite) < 0.04 * np.linalg.norm(whole)
+
+
+def test_beams_without_a_falling_window_are_left_alone():
+    beam = gaussian(FWHM, 192)
+    blm = beam.blm.copy()
+    blm[0, 150:] *= -1.0
+    lopsided = replace(beam, blm=blm)
+    assert extended(lopsided) is lopsided
+    rising = beam.blm.copy()
+    rising[0] *= np.exp(1e-4 * np.arange(193.0) ** 2)
+    assert extended(replace(beam, blm=rising)).lmax == 192
+
+
+def test_what_is_no_beam_is_refused():
+    beam = gaussian(FWHM, 48)
+    site = site_of(beam)
+    for name, amplitude in (("beam_ellipticity", 2.5), ("beam_width", -0.95)):
+        with pytest.raises(InputError, match=rf"effect {name}: amplitude = {amplitude:g}"):
+            effects.get(name)(amplitude=amplitude).beam(beam, site)
+    with pytest.raises(InputError, match=r"width_sigmas = 0\.1"):
+        effects.get("beam_sidelobe")(amplitude=0.1, width_sigmas=0.1).beam(beam, site)
+    with pytest.raises(InputError, match="effect time_constant on channel W1 depends on when and how"):
+        effects.get("time_constant")(amplitude=0.1).pointing(beam, replace(site, pointing=None))

@@ -1,0 +1,188 @@
+"""Every effect: found by name, none at zero amplitude, and the same again from its linear components."""
+
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint
+
+import numpy as np
+import pytest
+
+from mcsim import effects, resources
+from mcsim.beams import elliptical_gaussian
+from mcsim.effects import registry
+from mcsim.errors import InputError
+from mcsim.scan import load_model, parallel_transport
+from mcsim.sky import gaussian_alm
+from mcsim.spectra import load
+
+LMAX, NSIDE = 48, 8
+NAMES = {
+    "beam_ellipticity",
+    "beam_coma",
+    "beam_sidelobe",
+    "beam_width",
+    "pointing_offset",
+    "time_constant",
+    "gain_drift",
+    "dipole_residual",
+    "transmission_imbalance",
+    "noise_anisotropy",
+    "noise_level",
+    "foreground_residual",
+    "point_sources",
+    "dipole_modulation",
+    "quadrupole_modulation",
+    "boost",
+    "pixelization",
+    "mapmaking_convergence",
+    "orientation_averaging",
+    "spectrum",
+}
+
+
+def draw(_: str) -> np.random.Generator:
+    return np.random.default_rng(5)
+
+
+@pytest.fixture(scope="module")
+def site() -> effects.Site:
+    model = load_model(resources.scan_model("wmap"))
+    return effects.Site(
+        channel="W1",
+        frequency_ghz=94.0,
+        frame="galactic",
+        nside=NSIDE,
+        lmax=LMAX,
+        beam=elliptical_gaussian(330.0, 300.0, 20.0, LMAX),
+        pointing=effects.Pointing(model, model.line_of_sight("A")),
+        dipole_uk=np.array([1.0, 2.0, 3.0]),
+    )
+
+
+def test_the_library_holds_what_is_named():
+    assert set(effects.library()) == NAMES
+    for entry in effects.describe():
+        assert entry["scope"] in ("channel", "common")
+        assert all(entry[key] for key in ("unit", "cause", "signature", "source"))
+        assert next(iter(entry["parameters"])) == "amplitude"
+        assert entry["parameters"]["amplitude"] == 0.0
+
+
+@pytest.mark.parametrize("name", sorted(NAMES))
+def test_zero_amplitude_changes_nothing(name, site):
+    effect = effects.get(name)()
+    sky = gaussian_alm(load("wmap7", LMAX), np.random.default_rng(1))
+    np.testing.assert_array_equal(effect.sky(sky, site, draw), sky)
+    for hook in (effect.beam, effect.pointing):
+        np.testing.assert_array_equal(hook(site.beam, site).blm, site.beam.blm)
+    assert effect.gain(np.arange(3.0), site) is None
+    assert effect.noise(site) is None
+    assert effect.spread() == 1.0
+    assert effect.differencing(0.01, 2) == (0.01, 2)
+    moments = parallel_transport(0.3, NSIDE, 2, "galactic")
+    assert effect.orientations(moments, site) is moments
+    here = tuple(np.array([value]) for value in (0.4, 1.0, 2.0))
+    moved = effect.moved(*here)
+    assert moved is None or moved == here
+    assert effect.lags() in (None, ((1.0, 0.0),))
+
+
+PARAMETERS = {
+    "beam_ellipticity": {"angle_deg": 70.0},
+    "beam_coma": {"angle_deg": 200.0},
+    "beam_sidelobe": {"quadrupole": -0.4},
+    "pointing_offset": {"angle_deg": -120.0},
+    "gain_drift": {"phase_deg": 100.0},
+    "dipole_residual": {"lon_deg": 200.0, "lat_deg": -35.0},
+    "dipole_modulation": {"lon_deg": 20.0, "lat_deg": 80.0},
+    "boost": {"lon_deg": 264.0, "lat_deg": 48.0},
+    "quadrupole_modulation": {"components": (0.1, -0.5, 0.7, 0.1, 0.48989794855663565)},
+    "spectrum": {"bands": (0.6, -0.8, 0.0, 0.0, 0.0, 0.0)},
+}
+
+
+@pytest.mark.parametrize("name", sorted(NAMES))
+def test_coordinates_lead_back_to_the_effect(name):
+    kind = effects.get(name)
+    basis = kind.basis()
+    for row, effect in enumerate(basis):
+        # Every element of the basis is a coordinate of its own.
+        assert effect.amplitude == kind.step
+        coordinates = effect.coordinates()
+        assert coordinates[row] > 0.0
+        np.testing.assert_allclose(np.delete(coordinates, row), 0.0, atol=1e-15 * kind.step)
+    effect = effects.build(name, {"amplitude": 2.5 * kind.step, **PARAMETERS.get(name, {})})
+    mixing = np.random.default_rng(2).standard_normal((len(basis), len(basis)))
+    again = kind.nearest(effect.coordinates(), mixing @ mixing.T + np.eye(len(basis)))
+    # A search for an angle ends at the square root of round-off.
+    assert again.amplitude == pytest.approx(effect.amplitude, rel=1e-6)
+    # Angles that differ by whole turns are the same effect.
+    np.testing.assert_allclose(again.coordinates(), effect.coordinates(), atol=1e-7 * effect.amplitude)
+
+
+def test_coma_off_the_possible_is_brought_to_the_nearest():
+    """Four components hold two parameters: the rest is taken off in the metric given, not in that of the components."""
+    kind = effects.get("beam_coma")
+    mixing = np.random.default_rng(3).standard_normal((4, 4))
+    precision = mixing @ mixing.T + 0.1 * np.eye(4)
+    measured = kind(amplitude=0.03, angle_deg=80.0).coordinates() + np.array([0.002, -0.001, 0.003, 0.001])
+
+    def distance(effect):
+        left = measured - effect.coordinates()
+        return left @ precision @ left
+
+    best = distance(kind.nearest(measured, precision))
+    tried = [
+        distance(kind(amplitude=amplitude, angle_deg=angle))
+        for amplitude in np.linspace(0.001, 0.06, 60)
+        for angle in np.arange(0.0, 360.0, 2.0)
+    ]
+    assert best <= min(tried)
+
+
+def test_unknown_effects_and_parameters_are_named():
+    with pytest.raises(InputError, match="did you mean gain_drift"):
+        effects.get("gain_drit")
+    with pytest.raises(InputError, match="choose from"):
+        effects.get("zzz")
+    with pytest.raises(InputError, match="it has amplitude, angle_deg"):
+        effects.build("beam_coma", {"angle": 3.0})
+    with pytest.raises(InputError, match="finite number"):
+        effects.build("beam_coma", {"amplitude": "large"})
+    with pytest.raises(InputError, match="list of 5 numbers"):
+        effects.build("quadrupole_modulation", {"components": [1.0]})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Foreign(effects.Effect):
+    name = "foreign"
+    scope = "channel"
+    unit = "-"
+    cause = signature = "a test"
+    step = 1.0
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    """Register entry points in place of what is installed."""
+    registry.library.cache_clear()
+    yield lambda *entries: monkeypatch.setattr(registry, "entry_points", lambda group: entries)
+    registry.library.cache_clear()
+
+
+def test_packages_add_effects(registered):
+    class Entry(EntryPoint):
+        def load(self):
+            return Foreign
+
+    registered(Entry("foreign", "package:Foreign", registry.ENTRY_POINTS))
+    assert effects.get("foreign") is Foreign
+
+
+def test_broken_packages_are_named(registered):
+    registered(EntryPoint("broken", "no_such_package:Thing", registry.ENTRY_POINTS))
+    with pytest.raises(InputError, match=r"effect broken of no_such_package:Thing cannot be loaded"):
+        effects.library()
+    registry.library.cache_clear()
+    registered(EntryPoint("beam", "mcsim.beams:Beam", registry.ENTRY_POINTS))
+    with pytest.raises(InputError, match="no class derived from"):
+        effects.library()

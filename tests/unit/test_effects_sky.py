@@ -1,0 +1,194 @@
+"""Effects on the sky, the noise, the gain and the moments, against their definitions at points and in counts."""
+
+from dataclasses import replace
+
+import ducc0
+import healpy
+import numpy as np
+import pytest
+
+from mcsim import alm as alm_
+from mcsim import effects, healpix, resources
+from mcsim.beams import gaussian
+from mcsim.errors import InputError
+from mcsim.rotation import rotate_alm, rotate_pixels
+from mcsim.scan import load_model, parallel_transport, stream_moments
+from mcsim.sky import gaussian_alm
+from mcsim.spectra import load
+
+LMAX, NSIDE = 64, 16
+TOWARDS = {"lon_deg": 200.0, "lat_deg": 30.0}
+AXIS = healpy.ang2vec(200.0, 30.0, lonlat=True)
+
+
+@pytest.fixture(scope="module")
+def site() -> effects.Site:
+    model = load_model(resources.scan_model("wmap")).with_sampling(600.0)
+    return effects.Site(
+        channel="W1",
+        frequency_ghz=94.0,
+        frame="ecliptic",
+        nside=NSIDE,
+        lmax=LMAX,
+        beam=gaussian(300.0, LMAX),
+        pointing=effects.Pointing(model, model.line_of_sight("A")),
+    )
+
+
+@pytest.fixture(scope="module")
+def sky() -> np.ndarray:
+    """Without power in the last two degrees, so that products keep within lmax."""
+    return alm_.resize(gaussian_alm(load("wmap7", LMAX - 2), np.random.default_rng(1)), LMAX - 2, LMAX)
+
+
+@pytest.fixture(scope="module")
+def points() -> np.ndarray:
+    """(theta, phi) of 50 directions."""
+    rng = np.random.default_rng(2)
+    return np.stack([np.arccos(rng.uniform(-1, 1, 50)), rng.uniform(0, 2 * np.pi, 50)], axis=1)
+
+
+def draw(stage: str) -> np.random.Generator:
+    return np.random.default_rng([7, *stage.encode()])
+
+
+def at(alm: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Values of a sky at directions (theta, phi)."""
+    return ducc0.sht.synthesis_general(alm=alm[None], lmax=LMAX, spin=0, loc=points, epsilon=1e-12)[0]
+
+
+def test_modulations_multiply_the_sky(site, sky, points):
+    x, y, z = healpy.ang2vec(*points.T).T
+    found = effects.get("dipole_modulation")(amplitude=0.1, **TOWARDS).sky(sky, site, draw)
+    along = AXIS @ np.stack([x, y, z])
+    np.testing.assert_allclose(at(found, points), at(sky, points) * (1.0 + 0.1 * along), atol=1e-8)
+    basis = [(3 * z**2 - 1) / 2, 3**0.5 * x * z, 3**0.5 * y * z, 3**0.5 / 2 * (x**2 - y**2), 3**0.5 * x * y]
+    for effect, factor in zip(effects.get("quadrupole_modulation").basis(), basis, strict=True):
+        found = effect.sky(sky, site, draw)
+        np.testing.assert_allclose(at(found, points), at(sky, points) * (1.0 + effect.amplitude * factor), atol=1e-8)
+    with pytest.raises(InputError, match="components are all zero"):
+        effects.get("quadrupole_modulation")(amplitude=0.1, components=(0.0,) * 5).sky(sky, site, draw)
+
+
+def test_boost_shifts_towards_the_motion_and_modulates(site, sky, points):
+    """(1 + beta . n) T at the direction that lies beta sin(angle) further from the motion."""
+    beta = 1e-5
+    found = effects.get("boost")(amplitude=beta, **TOWARDS).sky(sky, site, draw)
+    n = healpy.ang2vec(*points.T)
+    along = n @ AXIS
+    source = n - beta * (AXIS - along[:, None] * n)
+    assert np.all(source @ AXIS < along)
+    theta, phi = healpy.vec2ang(source)
+    expected = (1.0 + beta * along) * at(sky, np.stack([theta, phi], axis=1))
+    change = expected - at(sky, points)
+    # Second order: l beta = 6e-4 of the change.
+    assert np.abs(at(found, points) - expected).max() < 3e-3 * np.abs(change).max()
+
+
+def test_dipole_residual_adds_a_vector(site, sky, points):
+    found = effects.get("dipole_residual")(amplitude=5.0, **TOWARDS).sky(sky, site, draw)
+    expected = 5.0 * healpy.ang2vec(*points.T) @ AXIS
+    np.testing.assert_allclose(at(found - sky, points), expected, atol=1e-9)
+
+
+def test_spectrum_rescales_its_bands(site, sky):
+    effect = effects.get("spectrum")(amplitude=0.5, bands=(0.0, 3.0, 4.0, 0.0, 0.0, 0.0))
+    found, ell = effect.sky(sky, site, draw), alm_.degrees(LMAX)
+    edges = [2 + i * (LMAX - 1) // 6 for i in range(7)]
+    assert edges[-1] == LMAX + 1
+    factor = np.ones(LMAX + 1)
+    factor[edges[1] : edges[2]], factor[edges[2] : edges[3]] = np.sqrt(1.3), np.sqrt(1.4)
+    np.testing.assert_allclose(found, sky * factor[ell], rtol=1e-14)
+    with pytest.raises(InputError, match="a band changes by -2"):
+        effects.get("spectrum")(amplitude=2.0, bands=(-1.0, 0.0, 0.0, 0.0, 0.0, 0.0)).sky(sky, site, draw)
+
+
+def test_point_sources_are_a_flat_sky_of_their_own(site, sky):
+    kind = effects.get("point_sources")
+    drawn = kind(amplitude=0.01).sky(sky, site, draw) - sky
+    weight = np.where(np.arange(drawn.size) <= LMAX, 1.0, 2.0)
+    modes = (LMAX + 1) ** 2
+    # The mean square of modes is 0.01 with a relative scatter of sqrt(2 / modes): 4 sigma.
+    assert np.sum(weight * np.abs(drawn) ** 2) / modes == pytest.approx(0.01, rel=4 * np.sqrt(2 / modes))
+    again = kind(amplitude=0.04).sky(sky, replace(site, channel="V1", frequency_ghz=61.0), draw) - sky
+    np.testing.assert_allclose(again, 2.0 * drawn, atol=1e-10)
+
+
+def test_fewer_point_sources_take_power_away(site):
+    """On a sky of C_l = 1 a negative amplitude leaves 1 + amplitude of the power, band by band."""
+    sky = gaussian_alm(np.ones(LMAX + 1), np.random.default_rng(3))
+    found = effects.get("point_sources")(amplitude=-0.1).sky(sky, site, draw)
+    power, before = (np.bincount(alm_.degrees(LMAX), np.abs(alm) ** 2) for alm in (found, sky))
+    # What is divided by is the power of 11 degrees around: 2 % of scatter at l = 30, and it enters times 0.1.
+    np.testing.assert_allclose((power / before)[20:], 0.9, atol=0.012)
+
+
+def test_foregrounds_are_fixed_to_the_galaxy_and_grow_with_frequency(site, sky):
+    kind = effects.get("foreground_residual")
+    drawn = kind(amplitude=3.0).sky(sky, site, draw) - sky
+    values = healpix.synthesis(rotate_alm(drawn, LMAX, "ecliptic", "galactic")[None], NSIDE, LMAX)[0]
+    assert np.sqrt(np.mean(values**2)) == pytest.approx(3.0, rel=0.01)
+    latitude = np.abs(healpy.pix2ang(NSIDE, np.arange(values.size), lonlat=True)[1])
+    assert np.sqrt(np.mean(values[latitude < 10] ** 2)) > 10 * np.sqrt(np.mean(values[latitude > 40] ** 2))
+    assert values[latitude < 10].mean() > 0.0
+    low = kind(amplitude=3.0, spectral_index=1.0).sky(sky, replace(site, frequency_ghz=47.0), draw) - sky
+    np.testing.assert_allclose(low, 0.5 * drawn, atol=1e-12)
+    with pytest.raises(InputError, match="channel W1 has none; give its frequency_ghz"):
+        kind(amplitude=3.0).sky(sky, replace(site, frequency_ghz=None), draw)
+
+
+def test_foregrounds_after_a_template(site, sky, tmp_path):
+    template = healpix.synthesis(gaussian_alm(load("wmap7", 32), np.random.default_rng(4))[None], NSIDE, 32)[0]
+    path = str(tmp_path / "template.fits")
+    healpy.write_map(path, template, coord="E", dtype=np.float64)
+    found = effects.get("foreground_residual")(amplitude=2.0, template=path).sky(sky, site, draw) - sky
+    values = healpix.synthesis(found[None], NSIDE, LMAX)[0]
+    np.testing.assert_allclose(values, 2.0 * template / np.sqrt(np.mean(template**2)), rtol=0.0, atol=5e-3)
+    healpy.write_map(path.replace("template", "zero"), 0.0 * template, dtype=np.float64)
+    with pytest.raises(InputError, match="give a complete template"):
+        effects.get("foreground_residual")(amplitude=2.0, template=path.replace("template", "zero")).sky(
+            sky, site, draw
+        )
+
+
+def test_noise_is_strongest_at_the_ecliptic_poles_in_every_frame(site):
+    effect = effects.get("noise_anisotropy")(amplitude=0.2)
+    latitude = np.deg2rad(healpy.pix2ang(NSIDE, np.arange(12 * NSIDE**2), lonlat=True)[1])
+    factor = effect.noise(site)
+    np.testing.assert_allclose(factor, 1.0 + 0.2 * (3.0 * np.sin(latitude) ** 2 - 1.0))
+    assert factor.mean() == pytest.approx(1.0, abs=1e-3)
+    galactic = effect.noise(replace(site, frame="galactic"))
+    # A pixel's centre in the other frame is up to 0.055 rad off, half a diagonal, times a slope of 0.6.
+    np.testing.assert_allclose(galactic, rotate_pixels(factor, "ecliptic", "galactic"), atol=0.034)
+    assert np.ptp(galactic - factor) > 0.3
+    np.testing.assert_array_equal(effects.get("noise_level")(amplitude=0.1).noise(site), np.full(12 * NSIDE**2, 1.1**2))
+    for name, amplitude in (("noise_anisotropy", 1.5), ("noise_anisotropy", -0.5), ("noise_level", -1.0)):
+        with pytest.raises(InputError, match=f"effect {name}"):
+            effects.get(name)(amplitude=amplitude).noise(site)
+
+
+def test_gain_follows_the_year(site):
+    effect = effects.get("gain_drift")(amplitude=0.01, phase_deg=90.0)
+    year = site.pointing.model.orbit_period_s
+    np.testing.assert_allclose(effect.gain(year * np.array([0.0, 0.25, 0.75]), site), [0.0, 0.01, -0.01], atol=1e-15)
+    with pytest.raises(InputError, match="effect gain_drift on channel W1"):
+        effect.gain(np.zeros(1), replace(site, pointing=None))
+
+
+def test_orientations_are_mixed_with_those_of_the_scan(site):
+    believed = parallel_transport(0.3, NSIDE, 2)
+    effect = effects.get("orientation_averaging")(amplitude=0.25)
+    real = stream_moments(site.pointing.model, NSIDE, 2, lines_of_sight=["A"])
+    seen = real.hits > 0
+    assert seen.mean() > 0.5
+    found = effect.orientations(believed, site)
+    np.testing.assert_allclose(found.w[:, seen], (0.75 * believed.w + 0.25 * real.w)[:, seen])
+    np.testing.assert_array_equal(found.w[:, ~seen], believed.w[:, ~seen])
+    with pytest.raises(InputError, match="depends on when and how"):
+        effect.orientations(believed, replace(site, pointing=None))
+
+
+def test_a_differencing_scan_is_less_balanced_and_solved_for_less():
+    assert effects.get("transmission_imbalance")(amplitude=0.002).differencing(0.001, 3) == (0.003, 3)
+    assert effects.get("mapmaking_convergence")(amplitude=4.0).differencing(0.001, 3) == (0.001, 7)
+    assert effects.get("pixelization")(amplitude=0.3).spread() == pytest.approx(0.7)
