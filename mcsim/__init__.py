@@ -8,14 +8,16 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mcsim.diagnosis.session import diagnose
     from mcsim.errors import InputError
     from mcsim.runner import merge, run
     from mcsim.store import open_ensemble, open_summary
 
-__all__ = ["InputError", "merge", "open_ensemble", "open_summary", "run"]
+__all__ = ["InputError", "diagnose", "merge", "open_ensemble", "open_summary", "run"]
 
 _HOME = {
     "InputError": "mcsim.errors",
+    "diagnose": "mcsim.diagnosis.session",
     "merge": "mcsim.runner",
     "open_ensemble": "mcsim.store",
     "open_summary": "mcsim.store",

@@ -5,10 +5,10 @@ import pytest
 from scipy import stats
 from scipy.linalg import solve_triangular
 
-from mcsim.diagnose.detect import confusion, detectable, posterior, power, strength_needed, strength_to_isolate
-from mcsim.diagnose.gaussian import Null, bases, fit, null, residual_probability, score_probability
-from mcsim.diagnose.shrink import achieved, excess, predicted
-from mcsim.diagnose.trials import atlas, calibrate, gap
+from mcsim.diagnosis.detect import confusion, detectable, posterior, power, strength_needed, strength_to_isolate
+from mcsim.diagnosis.gaussian import Null, bases, fit, null, residual_probability, score_probability
+from mcsim.diagnosis.shrink import achieved, excess, predicted
+from mcsim.diagnosis.trials import atlas, calibrate, gap
 
 SEED = 20121024
 # Of a uniform sample a Kolmogorov-Smirnov probability is below this once in a thousand seeds.

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from mcsim.diagnose.attribute import Attribution, Candidate, attribute
-from mcsim.diagnose.detect import cosines, detectable, log_evidence, posterior, strength_needed, strength_to_isolate
-from mcsim.diagnose.gaussian import Null, bases, null
-from mcsim.diagnose.trials import calibrate
+from mcsim.diagnosis.attribute import Attribution, Candidate, attribute
+from mcsim.diagnosis.detect import cosines, detectable, log_evidence, posterior, strength_needed, strength_to_isolate
+from mcsim.diagnosis.gaussian import Null, bases, null
+from mcsim.diagnosis.trials import calibrate
 
 P, N = 60, 800
 ALPHA = 0.05

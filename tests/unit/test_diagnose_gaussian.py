@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mcsim.diagnose.gaussian import bases, fit, null, residual_probability, score_probability
-from mcsim.diagnose.trials import Calibration, atlas, calibrate, gap
+from mcsim.diagnosis.gaussian import bases, fit, null, residual_probability, score_probability
+from mcsim.diagnosis.trials import Calibration, atlas, calibrate, gap
 from mcsim.errors import InputError
 
 P, N = 12, 60

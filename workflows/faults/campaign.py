@@ -1,7 +1,7 @@
 """Kill workers, nannies, schedulers and drivers of runs at random times; count what is lost, doubled or different.
 
-Every store is filled by a chain of runs, each of which is hit at a time drawn uniformly over its duration: the driver or
-the scheduler ends with it and the next ``resume`` continues; a worker or its nanny is replaced. The last run of a
+Every store is filled by a chain of runs, each of which is hit at times drawn uniformly over its duration: with the
+driver or the scheduler it ends, and the next ``resume`` continues; a worker or its nanny is replaced. The last run of a
 chain is left alone. Then all arrays are compared bit for bit with those of an undisturbed run. Right before a kill the
 victim writes its stack, which says what it was doing.
 
@@ -349,13 +349,18 @@ def campaign(kills: int, kinds: list[str], seconds: float, seed: int, folder: Pa
             compare(path, reference, tally)
             shutil.rmtree(path)
             number += 1
-            print(
-                f"{len(tally.kills)} kills, lost {tally.lost}, doubled {tally.doubled}, differing {tally.differing}, trouble {len(tally.trouble)}",
-                flush=True,
-            )
+            print(summary(tally), flush=True)
     finally:
         cluster.stop()
     return tally
+
+
+def summary(tally: Tally) -> str:
+    """The campaign in a line."""
+    return (
+        f"{len(tally.kills)} kills, {tally.stores} stores of {REALIZATIONS} realizations: lost {tally.lost}, "
+        f"doubled {tally.doubled}, differing {tally.differing}, other trouble {len(tally.trouble)}."
+    )
 
 
 def report(tally: Tally) -> str:
@@ -367,8 +372,7 @@ def report(tally: Tally) -> str:
     ]
     return "\n".join(
         [
-            f"{len(tally.kills)} kills, {tally.stores} stores of {REALIZATIONS} realizations: "
-            f"lost {tally.lost}, doubled {tally.doubled}, differing {tally.differing}.",
+            summary(tally),
             "",
             *lines,
             *(f"\nTrouble: {text}" for text in tally.trouble),

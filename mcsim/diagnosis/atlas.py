@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from mcsim import alm as alm_
 from mcsim import biposh
-from mcsim.diagnose.blocks import Entry, bins
-from mcsim.diagnose.listen import Heard, Model, by_degree
+from mcsim.diagnosis.blocks import Entry, bins
+from mcsim.diagnosis.listen import Heard, Model, by_degree
 from mcsim.rotation import FRAMES, rotate_biposh
 
 Vector = NDArray[np.float64]

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 from scipy.linalg import solve_triangular
 
-from mcsim.diagnose.gaussian import COLLINEAR, Bases, Null, residual_probability, score_probability
+from mcsim.diagnosis.gaussian import COLLINEAR, Bases, Null, residual_probability, score_probability
 from mcsim.errors import InputError
 from mcsim.rng import generator
 

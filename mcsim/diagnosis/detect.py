@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special, stats
 from scipy.optimize import brentq
 
-from mcsim.diagnose.gaussian import Bases, Null
+from mcsim.diagnosis.gaussian import Bases, Null
 
 # Nodes of the average over the part of the data that no template hears.
 NODES = 40

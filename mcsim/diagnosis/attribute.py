@@ -8,10 +8,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnose.detect import cosines
-from mcsim.diagnose.gaussian import Fit, Null, bases, fit
-from mcsim.diagnose.subsets import Subsets
-from mcsim.diagnose.trials import Calibration, Gap, gap
+from mcsim.diagnosis.detect import cosines
+from mcsim.diagnosis.gaussian import Fit, Null, bases, fit
+from mcsim.diagnosis.subsets import Subsets
+from mcsim.diagnosis.trials import Calibration, Gap, gap
 
 Verdict = Literal["none", "effect", "mixture", "degenerate", "unknown"]
 
@@ -145,7 +145,7 @@ def attribute(
     t
         Templates per unit amplitude, shape (p_raw, K).
     candidates, calibration
-        Candidates on those templates, and :func:`~mcsim.diagnose.trials.calibrate` of them in this order.
+        Candidates on those templates, and :func:`~mcsim.diagnosis.trials.calibrate` of them in this order.
     alpha
         Level of the gap.
     levels

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from mcsim import alm as alm_
 from mcsim import healpix
-from mcsim.diagnose.listen import ORDERS, SPLIT_ORDERS, Heard, Model, by_degree
-from mcsim.diagnose.scores import normalised_difference, sky_of
+from mcsim.diagnosis.listen import ORDERS, SPLIT_ORDERS, Heard, Model, by_degree
+from mcsim.diagnosis.scores import normalised_difference, sky_of
 from mcsim.rotation import rotation_matrix
 
 Map = NDArray[np.float64]

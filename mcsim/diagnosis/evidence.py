@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config, effects, sampled, simulate
-from mcsim.diagnose.atlas import Atlas
-from mcsim.diagnose.blocks import Block, Entry, blocks_of
-from mcsim.diagnose.listen import ORDERS, Model, listen, model_of
-from mcsim.diagnose.scores import Score, score_of
+from mcsim.diagnosis.atlas import Atlas
+from mcsim.diagnosis.blocks import Block, Entry, blocks_of
+from mcsim.diagnosis.listen import ORDERS, Model, listen, model_of
+from mcsim.diagnosis.scores import Score, score_of
 from mcsim.effects import Effect
 from mcsim.errors import InputError
 from mcsim.survey import survey

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnose.gaussian import Null, residual_probability
+from mcsim.diagnosis.gaussian import Null, residual_probability
 
 
 @dataclass(frozen=True)

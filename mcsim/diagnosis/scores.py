@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import effects, healpix
-from mcsim.diagnose.listen import ORDERS, Heard, Model, by_degree
+from mcsim.diagnosis.listen import ORDERS, Heard, Model, by_degree
 from mcsim.effects import Effect
 from mcsim.survey import mean_gain
 from mcsim.tod import dipole_alm

@@ -11,9 +11,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.diagnose.blocks import Entry
-from mcsim.diagnose.evidence import Job, Proposal, Questions
-from mcsim.diagnose.gaussian import Null, null
+from mcsim.diagnosis.blocks import Entry
+from mcsim.diagnosis.evidence import Job, Proposal, Questions
+from mcsim.diagnosis.gaussian import Null, null
 
 Vector = NDArray[np.float64]
 

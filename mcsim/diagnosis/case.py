@@ -1,0 +1,230 @@
+"""One case: maps against a model and what its simulations have taught; verdict and all that it rests on."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from mcsim import config
+from mcsim.diagnosis.attribute import Attribution, Candidate
+from mcsim.diagnosis.data import exchanges
+from mcsim.diagnosis.evidence import Job, Questions
+from mcsim.diagnosis.gaussian import Null, bases, fit, residual_probability
+from mcsim.diagnosis.knowledge import NOISY_SKIES, Knowledge, after_jobs
+from mcsim.diagnosis.refine import Refined, effect_at, quiet_templates, refine
+from mcsim.diagnosis.shrink import Prediction, Shrink, achieved, predicted
+from mcsim.diagnosis.trials import Calibration, calibrate
+from mcsim.diagnosis.verdict import detectable_of, sentence, verdict_of
+from mcsim.diagnosis.where import Place, places
+
+Vector = NDArray[np.float64]
+Ask = Callable[[Sequence[Job]], list[NDArray[np.float64]]]
+"""From jobs to their answers, in order; in this process or on a cluster."""
+
+EXCHANGED = 0.01
+"""Probability above which maps in another order are said to fit the model."""
+
+
+@dataclass(frozen=True)
+class Court:
+    """What every case of a model is judged with.
+
+    Attributes
+    ----------
+    run, asked, known
+        What is believed, what is asked of it, what its simulations answered.
+    null
+        Of the whole evidence.
+    candidates, calibration
+        Of the proposals.
+    """
+
+    run: config.RunConfig
+    asked: Questions
+    known: Knowledge
+    null: Null
+    candidates: tuple[Candidate, ...]
+    calibration: Calibration
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Whether, where, which, how far: a verdict and the evidence that it rests on.
+
+    Attributes
+    ----------
+    verdict
+        As written to ``verdict.json``.
+    evidence
+        What was measured and what simulations say of it; dimensions entry, column, place.
+    attribution
+        Candidates, explanations and their fits.
+    """
+
+    verdict: dict[str, Any]
+    evidence: xr.Dataset
+    attribution: Attribution
+
+    @property
+    def sentence(self) -> str:
+        """The verdict for a busy person."""
+        return sentence(self.verdict)
+
+    def save(self, folder: str | Path) -> None:
+        """Write ``verdict.json`` and ``evidence.zarr`` into a folder, made where it does not exist."""
+        target = Path(folder)
+        target.mkdir(parents=True, exist_ok=True)
+        (target / "verdict.json").write_text(json.dumps(self.verdict, indent=1, allow_nan=False) + "\n")
+        self.evidence.to_zarr(target / "evidence.zarr", mode="w", consolidated=False)
+
+
+def court(run: config.RunConfig, asked: Questions, known: Knowledge) -> Court:
+    """Make ready for the cases of a model."""
+    null = known.null()
+    candidates = tuple(
+        Candidate(proposal.kind.name, proposal.channel, columns, settings=proposal.settings, unit=proposal.kind.unit)
+        for proposal, columns in zip(asked.proposals, asked.columns, strict=True)
+    )
+    groups = bases(null, quiet_templates(known), [candidate.columns for candidate in candidates])
+    return Court(run, asked, known, null, candidates, calibrate(null, groups))
+
+
+def judge(court: Court, case: str, maps: Sequence[NDArray[np.float64]], ask: Ask) -> Diagnosis:
+    """Judge a set of maps.
+
+    Parameters
+    ----------
+    court
+        Of the model.
+    case
+        Name of the case.
+    maps
+        In the order of the model's.
+    ask
+        Runs further simulations, with effects at the amplitudes that are found.
+    """
+    asked, known = court.asked, court.known
+    answer = asked.answer(maps, atlas=True)
+    x, numbers = answer[: len(asked.entries)], answer[len(asked.entries) :]
+
+    def respond(found: Sequence[config.Effect]) -> Vector:
+        after = np.concatenate(ask(after_jobs(court.run, asked, found)))
+        change: Vector = np.mean(after - known.reference[: len(after)], axis=0)
+        return change
+
+    refined = refine(known, court.null, x, court.candidates, asked.proposals, court.calibration, respond)
+    found = refined.attribution
+    notes = list(_exchanged(court, maps, found))
+    if notes:
+        # An order of the maps in which the model fits says more than any effect.
+        found = replace(found, verdict="unknown", explanations=(), contrasts=())
+    shrink = None
+    if found.explanations:
+        shrink = shrink_of(court, x, refined, respond)
+    where = _where(court, x, numbers)
+    able = detectable_of(court.null, refined.templates, court.candidates, asked.proposals)
+    verdict = verdict_of(case, found, court.candidates, asked.proposals, where, shrink, able, notes)
+    return Diagnosis(verdict, _dataset(court, x, refined, where, verdict), found)
+
+
+def shrink_of(
+    court: Court, x: Vector, refined: Refined, respond: Callable[[Sequence[config.Effect]], Vector]
+) -> tuple[Prediction, Shrink, str] | None:
+    """Fit one half of the evidence, freeze, add to the simulator, and look at the other half.
+
+    The best explanation is fitted to the entries of fold 0 alone; the ensemble is simulated again with its effects; the
+    gap of the entries of fold 1, whose noise is independent, is measured against both ensembles.
+    """
+    folds = np.array([-1 if entry.fold is None else entry.fold for entry in court.asked.entries])
+    used, fresh = np.flatnonzero(folds == 0), np.flatnonzero(folds == 1)
+    if not len(used) or not len(fresh):
+        return None
+    members = refined.attribution.explanations[0].members
+    columns = [column for member in members for column in court.candidates[member].columns]
+    frozen = fit(court.known.null(used), x[used], refined.templates[np.ix_(used, np.array(columns))])
+    tables, start = [], 0
+    for member in members:
+        stop = start + len(court.candidates[member].columns)
+        proposal = court.asked.proposals[member]
+        effect = effect_at(proposal, frozen.amplitudes[start:stop], frozen.covariance[start:stop, start:stop])
+        tables.append(proposal.table(effect))
+        start = stop
+    before = court.known.null(fresh)
+    after = replace(before, mean=before.mean + respond(tables)[fresh])
+    expected = predicted(
+        before, x[fresh], refined.templates[np.ix_(fresh, np.array(columns))], frozen.amplitudes, frozen.covariance
+    )
+    return expected, achieved(before, after, x[fresh]), _fresh_words(court)
+
+
+def _fresh_words(court: Court) -> str:
+    splits = court.run.map.splits
+    return f"{splits[1]} (frozen on {splits[0]})" if len(splits) > 1 else "alternate bins and pixels"
+
+
+def _exchanged(court: Court, maps: Sequence[NDArray[np.float64]], found: Attribution) -> list[str]:
+    """Orders of the maps in which the model fits, where it does not as they are and no single effect explains it."""
+    if found.verdict == "none" or (found.explanations and len(found.explanations[0].members) == 1):
+        return []
+    names = [part.name for part in court.asked.model.parts]
+    notes = []
+    for order in exchanges(names):
+        y = court.null.data(court.asked.answer([maps[i] for i in order]))
+        p = float(residual_probability(float(y @ y), court.null.dimension, court.null.dof))
+        if p > EXCHANGED:
+            moved = [f"{names[i]} as {name}" for name, i in zip(names, order, strict=True) if names[i] != name]
+            notes.append(f"The model fits (p = {p:.2g}) with maps exchanged: {', '.join(moved)}.")
+    return notes
+
+
+def _where(court: Court, x: Vector, numbers: Vector) -> list[Place]:
+    """Places in the atlas, and in what of the evidence is matched to no effect."""
+    own = [i for i, entry in enumerate(court.asked.entries) if entry.statistic != "score"]
+    count = len(court.known.atlas)
+    drawn = np.concatenate([court.known.atlas, court.known.simulations[:count][:, own]], axis=1)
+    shifted = x[own] - court.known.offset[own]
+    entries = (*court.asked.atlas.entries, *(court.asked.entries[i] for i in own))
+    return places(np.concatenate([numbers, shifted]), drawn, entries)
+
+
+def _dataset(court: Court, x: Vector, refined: Refined, where: Sequence[Place], verdict: dict[str, Any]) -> xr.Dataset:
+    """Everything measured, with names and units."""
+    known = court.known
+    spread = known.simulations.std(axis=0, ddof=1)
+    found = refined.attribution
+    entry = [e.name for e in court.asked.entries]
+    column = [f"{p.label}/{k}" for p in court.asked.proposals for k in range(len(p.basis))]
+    candidate = [p.label for p in court.asked.proposals]
+    best = np.zeros(len(entry))
+    if found.explanations:
+        columns = [c for member in found.explanations[0].members for c in court.candidates[member].columns]
+        best = refined.templates[:, columns] @ found.explanations[0].fit.amplitudes
+    return xr.Dataset(
+        {
+            "data": ("entry", x, {"long_name": "evidence of the data"}),
+            "mean": ("entry", court.null.mean, {"long_name": "mean of the model, referee's offset included"}),
+            "standard_deviation": ("entry", spread, {"long_name": "scatter of the model"}),
+            "z": ("entry", (x - court.null.mean) / spread, {"long_name": "data less mean, over scatter"}),
+            "explained": ("entry", best / spread, {"long_name": "best explanation, over scatter"}),
+            "templates": (("entry", "column"), refined.templates, {"long_name": "response per unit coordinate"}),
+            "correlation": (("candidate", "other"), found.correlation, {"long_name": "white canonical correlation"}),
+            "drop": ("candidate", [s.drop for s in found.singles], {"long_name": "fall of chi^2, fitted alone"}),
+            "calibration": ("draw", court.calibration.combined, {"long_name": "smaller probability, without a gap"}),
+            "place_z": ("place", [p.z for p in where], {"long_name": "deviate of a group"}),
+            "place_p": ("place", [p.p for p in where], {"long_name": "probability, trials included"}),
+        },
+        coords={"entry": entry, "column": column, "candidate": candidate, "other": candidate},
+        attrs={
+            "verdict": json.dumps(verdict),
+            "configuration": config.to_json(court.run),
+            "entries": json.dumps([asdict(e) for e in court.asked.entries]),
+            "places": json.dumps([asdict(p.entry) for p in where]),
+            "simulations": len(known.simulations),
+            "skies_of_responses": NOISY_SKIES,
+        },
+    )

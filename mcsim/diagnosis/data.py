@@ -1,0 +1,120 @@
+"""Observed maps from a folder, refused in one sentence where they cannot be what the model describes."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import healpy
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim import healpix
+from mcsim.diagnosis.listen import Model
+from mcsim.errors import InputError
+
+Map = NDArray[np.float64]
+
+MISSING = 0.01
+"""Largest fraction of the pixels that the believed scan hits which data may leave out."""
+
+RMS_RATIO = 5.0
+"""Largest ratio of the rms of a map to that of the model, either way: beyond it the unit is wrong."""
+
+
+def read_maps(model: Model, folder: str | Path) -> list[Map]:
+    """Maps of every channel and split, in the order of the model's.
+
+    Parameters
+    ----------
+    model
+        What is believed.
+    folder
+        With ``{channel}.fits``, or ``{channel}_{split}.fits`` where the model has splits; HEALPix in uK (or the unit
+        of its header), ``healpy.UNSEEN`` where not observed, in RING order or with an honest header.
+
+    Raises
+    ------
+    InputError
+        For a file that is missing or unreadable, has another nside, frame or unit, or values that are no map of this
+        survey: not finite, constant, without what the believed scan saw, or far from the size of the model.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder} is no folder; give one with the observed maps, {_file_name(model, 0)} and so on.")
+    return [_read(model, i, folder / _file_name(model, i)) for i in range(len(model.parts))]
+
+
+def _file_name(model: Model, part: int) -> str:
+    channel, _, split = model.parts[part].name.partition(":")
+    return f"{channel}_{split}.fits" if split else f"{channel}.fits"
+
+
+def _read(model: Model, part: int, path: Path) -> Map:
+    if not path.is_file():
+        raise InputError(
+            f"{path} does not exist; the model has a map {model.parts[part].name}, give it under that name."
+        )
+    map_, frame, unit = healpix.read_map(path)
+    expected = model.survey.config.map
+    nside = healpy.npix2nside(map_.size)
+    if nside != expected.nside:
+        raise InputError(f"{path} has nside {nside}, the model {expected.nside}; bring them to the same.")
+    if frame not in (None, expected.frame):
+        raise InputError(f"{path} is in {frame} coordinates, the model in {expected.frame}; rotate the map.")
+    unseen = map_ == healpy.UNSEEN
+    broken = int(np.sum(~np.isfinite(map_)))
+    if broken:
+        raise InputError(f"{path} has {broken} pixels that are not finite; mark what was not observed as UNSEEN.")
+    map_ = np.where(unseen, healpy.UNSEEN, healpix.to_uk(unit, path) * map_)
+    _check(model, part, map_, unseen, path)
+    return map_
+
+
+def _check(model: Model, part: int, map_: Map, unseen: NDArray[np.bool_], path: Path) -> None:
+    believed = model.parts[part].precision > 0
+    lost = float(np.mean(unseen[believed]))
+    if lost > MISSING:
+        raise InputError(
+            f"{path} leaves out {100 * lost:.0f} % of the pixels that the believed scan hits, at most "
+            f"{100 * MISSING:.0f} % may be; give the model a mask (map.mask) that leaves them out too."
+        )
+    seen = map_[believed & ~unseen]
+    rms = float(np.std(seen))
+    if rms == 0.0:
+        raise InputError(f"{path} is constant; give an observed map.")
+    ratio = rms / expected_rms(model, part)
+    if not 1.0 / RMS_RATIO < ratio < RMS_RATIO:
+        raise InputError(
+            f"{path} has an rms of {rms:.3g} uK where the model expects {rms / ratio:.3g} uK; is it in another unit? "
+            "Say so in its header (TUNIT1), or give it in uK."
+        )
+
+
+def expected_rms(model: Model, part: int) -> float:
+    """Rms over the sky of what the model expects in a map, sky and noise, uK."""
+    whole = model.survey
+    assert whole.cl is not None  # a model of a diagnosis has a spectrum
+    channel = whole.channels[model.parts[part].channel]
+    response = channel.response.factors[0].real
+    ell = np.arange(response.size)
+    sky = float(np.sum((2 * ell + 1) / (4 * np.pi) * whole.cl * response**2))
+    precision = model.parts[part].precision
+    return float(np.sqrt(sky + np.mean(1.0 / precision[precision > 0])))
+
+
+def exchanges(names: Sequence[str]) -> list[tuple[int, ...]]:
+    """Orders of the maps in which two channels, or two splits of all channels, are exchanged."""
+    places = {name: place for place, name in enumerate(names)}
+    channels = list(dict.fromkeys(name.partition(":")[0] for name in names))
+    splits = list(dict.fromkeys(name.partition(":")[2] for name in names))
+    found = []
+    for kind, values in ((0, channels), (2, splits)):
+        for i, one in enumerate(values):
+            for other in values[:i]:
+                swap = {one: other, other: one}
+                order = []
+                for name in names:
+                    parts = list(name.partition(":"))
+                    parts[kind] = swap.get(parts[kind], parts[kind])
+                    order.append(places["".join(parts)])
+                found.append(tuple(order))
+    return found

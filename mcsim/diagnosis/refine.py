@@ -1,0 +1,138 @@
+"""Responses at the amplitudes that were found, where they are too strong for a straight line."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim import config
+from mcsim.diagnosis.attribute import Attribution, Candidate, attribute
+from mcsim.diagnosis.evidence import Proposal
+from mcsim.diagnosis.gaussian import Null
+from mcsim.diagnosis.knowledge import Knowledge
+from mcsim.diagnosis.trials import Calibration
+from mcsim.effects import Effect
+from mcsim.errors import InputError
+
+Vector = NDArray[np.float64]
+Respond = Callable[[Sequence[config.Effect]], Vector]
+"""From effects to the mean change of the evidence, by simulation."""
+
+ROUNDS = 4
+STRAIGHT = 0.5
+"""Departure from a straight line, in standard deviations of the evidence, that is let pass."""
+
+NOISE_OF_TEMPLATES = 4.0
+"""A response smaller than this many of its own standard errors is none."""
+
+TRIED = 3
+"""Single candidates, those that lower chi^2 most, that are brought to their amplitude where no subset suffices."""
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A verdict with responses at the amplitudes that it speaks of.
+
+    Attributes
+    ----------
+    attribution
+        Final.
+    templates
+        As it used them, shape (p, K).
+    simulated
+        Candidates whose response was simulated at its amplitude.
+    """
+
+    attribution: Attribution
+    templates: NDArray[np.float64]
+    simulated: tuple[int, ...]
+
+
+def quiet_templates(known: Knowledge) -> NDArray[np.float64]:
+    """Templates without what is only their own noise, shape (p, K)."""
+    heard = np.abs(known.templates) > NOISE_OF_TEMPLATES * known.template_error
+    return np.where(heard, known.templates, 0.0)
+
+
+def effect_at(proposal: Proposal, coordinates: Vector, covariance: NDArray[np.float64]) -> Effect:
+    """The effect that is nearest to fitted coordinates."""
+    precision: NDArray[np.float64] = np.asarray(np.linalg.pinv(covariance), dtype=np.float64)
+    return proposal.with_parameters(coordinates, precision)
+
+
+def refine(
+    known: Knowledge,
+    null: Null,
+    x: Vector,
+    candidates: Sequence[Candidate],
+    proposals: Sequence[Proposal],
+    calibration: Calibration,
+    respond: Respond,
+) -> Refined:
+    """Attribute, simulate what was found at its amplitude, and attribute again until nothing changes.
+
+    Notes
+    -----
+    A response mu, simulated at coordinates theta, changes its templates t to t + (mu - t theta) theta'/theta'theta:
+    the secant, exact there.
+    """
+    t = quiet_templates(known)
+    done: dict[int, Vector] = {}
+    found = attribute(null, x, t, candidates, calibration)
+    for _ in range(ROUNDS):
+        changed = False
+        for index, coordinates, covariance in _to_try(found, candidates):
+            columns = list(candidates[index].columns)
+            if not _bent(known, null, columns, coordinates) or _close(done.get(index), coordinates, covariance):
+                continue
+            try:
+                effect = effect_at(proposals[index], coordinates, covariance)
+                response = respond([proposals[index].table(effect)])
+            except InputError:
+                continue  # an amplitude that the effect cannot have: the straight line is all there is
+            at = effect.coordinates()
+            size = float(at @ at)
+            if size == 0.0:
+                continue
+            t[:, columns] += np.outer(response - t[:, columns] @ at, at) / size
+            done[index] = coordinates
+            changed = True
+        if not changed:
+            break
+        found = attribute(null, x, t, candidates, calibration)
+    return Refined(found, t, tuple(done))
+
+
+def _to_try(found: Attribution, candidates: Sequence[Candidate]) -> list[tuple[int, Vector, NDArray[np.float64]]]:
+    """Candidates with fitted coordinates: those of the best explanations, or the best single ones."""
+    work: dict[int, tuple[int, Vector, NDArray[np.float64]]] = {}
+    if found.verdict == "none":
+        return []
+    for explanation in found.explanations[:2]:
+        start = 0
+        for member in explanation.members:
+            stop = start + len(candidates[member].columns)
+            fit = explanation.fit
+            work.setdefault(member, (member, fit.amplitudes[start:stop], fit.covariance[start:stop, start:stop]))
+            start = stop
+    # Singles too: a strong effect bends its response until only a mixture seems to do.
+    for index in np.argsort([-single.drop for single in found.singles])[:TRIED]:
+        single = found.singles[index]
+        if len(work) == 0 or any(len(explanation.members) > 1 for explanation in found.explanations[:1]):
+            work.setdefault(int(index), (int(index), single.amplitudes, single.covariance))
+    return list(work.values())
+
+
+def _bent(known: Knowledge, null: Null, columns: list[int], coordinates: Vector) -> bool:
+    """Whether the second derivative matters at these coordinates."""
+    shift = known.curvature[:, columns] @ coordinates**2
+    crossed = float(np.sum(np.abs(coordinates)) ** 2) / max(float(coordinates @ coordinates), 1e-300)
+    return crossed * float(np.linalg.norm(null.templates(shift[:, None]))) > STRAIGHT
+
+
+def _close(before: Vector | None, now: Vector, covariance: NDArray[np.float64]) -> bool:
+    if before is None:
+        return False
+    moved = now - before
+    return float(moved @ np.linalg.pinv(covariance) @ moved) < 0.3**2

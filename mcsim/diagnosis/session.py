@@ -1,0 +1,156 @@
+"""Diagnose maps against a run: learn the model on a cluster, once, and judge the case."""
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim import config, effects, runner
+from mcsim.diagnosis import knowledge
+from mcsim.diagnosis.case import Court, Diagnosis, court, judge
+from mcsim.diagnosis.data import read_maps
+from mcsim.diagnosis.evidence import Job, Questions, evidence_of, questions
+from mcsim.progress import reporting
+from mcsim.scan.cache import default_cache_dir
+
+METHOD = 1
+"""Raised whenever the same model would teach something else."""
+
+
+def diagnose(
+    model: str | Path | Mapping[str, Any] | config.RunConfig,
+    data: str | Path | Sequence[NDArray[np.float64]],
+    output: str | Path | None = None,
+    *,
+    case: str | None = None,
+    without: Sequence[str] = (),
+    simulations: int | None = None,
+    workers: int | None = None,
+    quiet: bool = True,
+) -> Diagnosis:
+    """Diagnose the gap between a simulation and data.
+
+    Parameters
+    ----------
+    model
+        A run: what is believed about sky, beams, scan and noise.
+    data
+        Folder with ``{channel}.fits`` or ``{channel}_{split}.fits``, uK; or the maps themselves, shape (npix,) each, in
+        the order channel by channel, split by split.
+    output
+        Folder for ``verdict.json``, ``evidence.zarr`` and ``report.html``; None: nothing is written.
+    case
+        Name; default: that of the run.
+    without
+        Effects of the library that are not to be proposed.
+    simulations
+        Number for the scatter of the evidence; default: ten for every number of it.
+    workers
+        Processes; default: the run's.
+    quiet
+        Report no progress.
+
+    Returns
+    -------
+    Diagnosis
+        Verdict, evidence, attribution.
+
+    Raises
+    ------
+    InputError
+        For a run or data that cannot be used.
+    """
+    run = model if isinstance(model, config.RunConfig) else config.load(model)
+    asked = questions(run, without, nthreads=os.cpu_count() or 1)
+    maps = read_maps(asked.model, data) if isinstance(data, str | Path) else list(data)
+    with _asking(workers or run.compute.workers, quiet) as ask:
+        sitting = court(run, asked, _learned(run, asked, simulations, ask))
+        found = judge(sitting, case or run.name, maps, ask)
+    if output is not None:
+        found.save(output)
+    return found
+
+
+def prepared(
+    run: config.RunConfig,
+    asked: Questions,
+    ask: Callable[[Sequence[Job]], list[NDArray[np.float64]]],
+    simulations: int | None = None,
+) -> Court:
+    """What every case of a run is judged with, learned or from the cache."""
+    return court(run, asked, _learned(run, asked, simulations, ask))
+
+
+@contextmanager
+def _asking(workers: int, quiet: bool) -> Iterator[Callable[[Sequence[Job]], list[NDArray[np.float64]]]]:
+    """A cluster of this machine that answers jobs, started with the first."""
+    opened: list[Any] = []
+
+    def ask(jobs: Sequence[Job]) -> list[NDArray[np.float64]]:
+        if not opened:
+            manager = runner.local_client(workers)
+            opened.extend((manager, manager.__enter__()))
+        answers: list[NDArray[np.float64]] = [np.empty(0)] * len(jobs)
+        done = 0
+        with reporting("simulations", float(sum(job.count for job in jobs)), "skies", quiet) as report:
+            for index, answer in runner.completed(opened[1], evidence_of, ((job,) for job in jobs)):
+                answers[index] = answer
+                done += jobs[index].count
+                report(float(done))
+        return answers
+
+    try:
+        yield ask
+    finally:
+        if opened:
+            opened[0].__exit__(None, None, None)
+
+
+def _learned(
+    run: config.RunConfig,
+    asked: Questions,
+    simulations: int | None,
+    ask: Callable[[Sequence[Job]], list[NDArray[np.float64]]],
+) -> knowledge.Knowledge:
+    folder = default_cache_dir() / "diagnose"
+    path = folder / f"{_key(run, asked, simulations)}.zarr"
+    if path.is_dir():
+        return knowledge.Knowledge.load(path)
+    plan = knowledge.plan(run, asked, simulations)
+    known = knowledge.learned(asked, plan, ask(plan.jobs))
+    folder.mkdir(parents=True, exist_ok=True)
+    scratch = Path(tempfile.mkdtemp(prefix=".learning.", dir=folder))
+    try:
+        known.save(scratch / "knowledge")
+        os.replace(scratch / "knowledge", path)
+    except OSError:
+        if not path.is_dir():  # another process was as quick, or the folder is full
+            raise
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    return known
+
+
+def _key(run: config.RunConfig, asked: Questions, simulations: int | None) -> str:
+    """Hash of what the simulations of a model depend on; its name, seed and number of realizations are not among it."""
+    science = config.science(run)
+    science["ensemble"] = {}
+    library = [[proposal.label, [repr(basis) for basis in proposal.basis]] for proposal in asked.proposals]
+    rest = [
+        METHOD,
+        simulations,
+        library,
+        [entry.name for entry in asked.entries],
+        version("ducc0"),
+        sorted(effects.library()),
+    ]
+    return hashlib.sha256(json.dumps([science, rest], sort_keys=True).encode()).hexdigest()[:32]

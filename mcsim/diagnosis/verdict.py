@@ -1,0 +1,158 @@
+"""The verdict as JSON of schema 1, and in a sentence."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.diagnosis.attribute import Attribution, Candidate, Explanation
+from mcsim.diagnosis.detect import detectable
+from mcsim.diagnosis.evidence import Proposal
+from mcsim.diagnosis.gaussian import Null
+from mcsim.diagnosis.refine import effect_at
+from mcsim.diagnosis.shrink import Prediction, Shrink
+from mcsim.diagnosis.where import Place
+
+SCHEMA = 1
+PLACES = 12
+
+
+def effects_of(
+    explanation: Explanation, candidates: Sequence[Candidate], proposals: Sequence[Proposal]
+) -> list[dict[str, Any]]:
+    """The effects of an explanation with amplitude, standard error, unit and parameters."""
+    found, start = [], 0
+    for member in explanation.members:
+        stop = start + len(candidates[member].columns)
+        theta = explanation.fit.amplitudes[start:stop]
+        covariance = explanation.fit.covariance[start:stop, start:stop]
+        effect = effect_at(proposals[member], theta, covariance)
+        found.append(
+            {
+                "name": effect.name,
+                "channel": proposals[member].channel,
+                "amplitude": effect.amplitude,
+                "sigma": _sigma(proposals[member], theta, covariance, effect.amplitude),
+                "unit": effect.unit,
+                "parameters": {key: _plain(value) for key, value in effect.parameters().items()},
+            }
+        )
+        start = stop
+    return found
+
+
+def _sigma(proposal: Proposal, theta: NDArray[np.float64], covariance: NDArray[np.float64], amplitude: float) -> float:
+    """Standard error of the amplitude, by its slopes in the coordinates."""
+    scale = np.sqrt(np.diag(covariance))
+    slopes: NDArray[np.float64] = np.zeros(len(theta))
+    for k in range(len(theta)):
+        step = np.zeros(len(theta))
+        step[k] = 0.05 * scale[k]
+        up = effect_at(proposal, theta + step, covariance).amplitude
+        down = effect_at(proposal, theta - step, covariance).amplitude
+        slopes[k] = (up - down) / (2.0 * step[k]) if step[k] > 0 else 0.0
+    return float(np.sqrt(max(float(slopes @ covariance @ slopes), 0.0)))
+
+
+def _plain(value: Any) -> Any:
+    return [float(item) for item in value] if isinstance(value, tuple) else value
+
+
+def where_of(place: Place) -> dict[str, Any]:
+    """A place, as JSON has it."""
+    e = place.entry
+    return {
+        "statistic": {"score": "map", "noise": "cl"}.get(e.statistic, e.statistic),
+        "channels": list(e.channels),
+        "split": e.split,
+        "L": e.L,
+        "M": e.M,
+        "parity": e.parity,
+        "ell": None if e.ell is None else list(e.ell),
+        "frame": e.frame,
+        "z": place.z,
+        "p": place.p,
+    }
+
+
+def detectable_of(
+    null: Null, t: NDArray[np.float64], candidates: Sequence[Candidate], proposals: Sequence[Proposal]
+) -> list[dict[str, Any]]:
+    """Smallest amplitude of every candidate that is found in nine cases of ten, root mean square over directions."""
+    found = []
+    for candidate, proposal in zip(candidates, proposals, strict=True):
+        size = detectable(null, t[:, list(candidate.columns)], len(candidates)).typical
+        if np.isfinite(size):
+            direction = np.zeros(len(candidate.columns))
+            direction[0] = size
+            amplitude = effect_at(proposal, direction, np.eye(len(direction))).amplitude
+            row = {"name": candidate.name, "channel": candidate.channel, "amplitude_90": abs(amplitude)}
+            found.append({**row, "unit": candidate.unit, "settings": dict(candidate.settings)})
+    return found
+
+
+def verdict_of(
+    case: str,
+    found: Attribution,
+    candidates: Sequence[Candidate],
+    proposals: Sequence[Proposal],
+    where: Sequence[Place],
+    shrink: tuple[Prediction, Shrink, str] | None,
+    able: Sequence[Mapping[str, Any]],
+    notes: Sequence[str],
+) -> dict[str, Any]:
+    """``verdict.json``, schema 1."""
+    sets = [effects_of(explanation, candidates, proposals) for explanation in found.explanations]
+    nearest = proposals[found.nearest]
+    result: dict[str, Any] = {
+        "schema": SCHEMA,
+        "case": case,
+        "gap": {"p_value": found.gap.probability, "statistic": found.gap.chi2, "dof": found.gap.dimension},
+        "verdict": found.verdict,
+        "effects": sets[0] if sets else [],
+        "alternatives": sets[1:],
+        "odds": [explanation.odds for explanation in found.explanations],
+        "where": [where_of(place) for place in where[:PLACES]],
+        "shrink": None,
+        "nearest": {"name": nearest.kind.name, "channel": nearest.channel, "cosine": found.cosine},
+        "detectable": list(able),
+        "notes": list(notes),
+    }
+    if shrink is not None:
+        predicted, achieved, data = shrink
+        result["shrink"] = {
+            "predicted": predicted.fraction.value,
+            "achieved": achieved.fraction.value,
+            "sigma": achieved.fraction.sigma,
+            "sigma_predicted": predicted.fraction.sigma,
+            "gap_before": achieved.before.value,
+            "gap_after": achieved.after.value,
+            "p_value_after": achieved.probability_after,
+            "data": data,
+        }
+    return result
+
+
+def sentence(verdict: Mapping[str, Any]) -> str:
+    """The verdict for a busy person."""
+    p = verdict["gap"]["p_value"]
+    kind = verdict["verdict"]
+    if kind == "none":
+        return f"The model describes the data (p = {p:.2g})."
+    start = f"The model does not describe the data (p = {p:.1g}): "
+    if kind == "unknown":
+        near = verdict["nearest"]
+        where = near["channel"] or "all channels"
+        nearest = f"nearest is {near['name']} in {where} (cosine {near['cosine']:.2f})"
+        return f"{start}no effect of the library explains it; {nearest}."
+    text = " and ".join(_words(effect) for effect in verdict["effects"])
+    if kind == "degenerate":
+        others = "; or ".join(" and ".join(_words(effect) for effect in one) for one in verdict["alternatives"])
+        return f"{start}{text}; or {others}."
+    return f"{start}{text}."
+
+
+def _words(effect: Mapping[str, Any]) -> str:
+    where = effect["channel"] or "all channels"
+    return f"{effect['name']} in {where}, {effect['amplitude']:.3g} +- {effect['sigma']:.2g} {effect['unit']}"

@@ -1,0 +1,69 @@
+"""Where a gap lies: groups of the atlas that depart from the model, ranked, corrected for looking at all of them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.diagnosis.blocks import Entry
+from mcsim.diagnosis.trials import atlas
+
+
+@dataclass(frozen=True)
+class Place:
+    """A group of numbers that belong together, and how far it departs.
+
+    Attributes
+    ----------
+    entry
+        The number of the group that departs most.
+    z
+        Normal deviate of the group.
+    p
+        Probability that the largest of all groups departs as far.
+    peak
+        Deviate of that number alone.
+    """
+
+    entry: Entry
+    z: float
+    p: float
+    peak: float
+
+
+def places(x: NDArray[np.float64], simulations: NDArray[np.float64], entries: Sequence[Entry]) -> list[Place]:
+    """Groups of entries, the one that departs most first.
+
+    Parameters
+    ----------
+    x, simulations
+        Shape (B,), (N, B).
+    entries
+        Where each number was heard; those that share statistic, channels, split, frame, L, M and parity are a group.
+
+    Notes
+    -----
+    The cube root of a group's sum of squared deviates is nearly normal (Wilson & Hilferty 1931); it is compared with
+    those of the simulations, each taken against the others.
+    """
+    count = len(simulations)
+    mean, spread = simulations.mean(axis=0), simulations.std(axis=0, ddof=1)
+    spread = np.where(spread > 0, spread, np.inf)
+    deviates = (x - mean) / spread / np.sqrt(1.0 + 1.0 / count)
+    others = (simulations - mean) / spread
+    groups: dict[tuple[object, ...], list[int]] = {}
+    for number, e in enumerate(entries):
+        groups.setdefault((e.statistic, e.channels, e.split, e.frame, e.L, e.M, e.parity), []).append(number)
+    rows = list(groups.values())
+    found = np.array([np.mean(deviates[row] ** 2) for row in rows])
+    drawn = np.stack([np.mean(others[:, row] ** 2, axis=1) for row in rows], axis=1)
+    z, p = atlas(np.cbrt(found), np.cbrt(drawn))
+    # Too quiet a group is no place of a gap.
+    p = np.where(z > 0, p, 1.0)
+    result = []
+    for group in np.argsort(-z):
+        row = rows[group]
+        peak = row[int(np.argmax(np.abs(deviates[row])))]
+        result.append(Place(entries[peak], float(z[group]), float(p[group]), float(deviates[peak])))
+    return result
