@@ -225,6 +225,52 @@ def scan(
 
 
 @app.command()
+def diagnose(
+    model: Config,
+    data: Annotated[Path, typer.Argument(metavar="DATA", help="Folder with CHANNEL.fits or CHANNEL_SPLIT.fits.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for verdict and report.")],
+    case: Annotated[str | None, typer.Option(help="Name of the case; default: that of the model.")] = None,
+    without: Annotated[list[str] | None, typer.Option(metavar="EFFECT", help="Do not propose it; repeatable.")] = None,
+    simulations: Annotated[
+        int | None, typer.Option(min=50, help="For the scatter of the evidence; default: ten for each number of it.")
+    ] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Local processes; default: the configuration's.")] = None,
+) -> None:
+    """Diagnose a gap between maps and a model: is there one, where, which effect, and how far it shrinks."""
+    from mcsim.diagnosis.session import diagnose as judge
+
+    _interrupt_once()
+    found = judge(
+        model,
+        data,
+        output,
+        case=case,
+        without=without or (),
+        simulations=simulations,
+        workers=workers,
+        quiet=False,
+    )
+    out.print(found.sentence, markup=False)
+    out.print(f"wrote {output / 'verdict.json'} and {output / 'report.html'}", markup=False)
+
+
+@app.command()
+def effects(name: Annotated[str | None, typer.Argument(metavar="EFFECT", help="Only this one.")] = None) -> None:
+    """List the library of effects: what a run can add and a diagnosis can find."""
+    from mcsim import effects as library
+
+    known = [library.get(name).name] if name is not None else None
+    for row in library.describe():
+        if known is not None and row["name"] not in known:
+            continue
+        parameters = ", ".join(f"{key} = {value!r}" for key, value in row["parameters"].items())
+        out.print(f"{row['name']} ({row['scope']}; amplitude in {row['unit']})", style="bold", markup=False)
+        out.print(f"  parameters  {parameters}", markup=False)
+        for key in ("cause", "signature", "source"):
+            out.print(f"  {key:<11} {row[key]}", markup=False)
+
+
+@app.command()
 def bench(
     nside: Annotated[int, typer.Option(help="Resolution of the maps.")] = 512,
     lmax: Annotated[int, typer.Option(min=2, help="Degree of the analysis.")] = 1024,

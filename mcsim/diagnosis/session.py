@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config, effects, runner
-from mcsim.diagnosis import knowledge
+from mcsim.diagnosis import knowledge, report
 from mcsim.diagnosis.case import Court, Diagnosis, court, judge
 from mcsim.diagnosis.data import read_maps
 from mcsim.diagnosis.evidence import Job, Questions, evidence_of, questions
@@ -77,6 +77,7 @@ def diagnose(
         found = judge(sitting, case or run.name, maps, ask)
     if output is not None:
         found.save(output)
+        report.write(found, Path(output) / "report.html")
     return found
 
 

@@ -6,6 +6,7 @@
 import argparse
 import contextlib
 import copy
+import faulthandler
 import io
 import json
 import math
@@ -59,10 +60,12 @@ def limited(seconds: float) -> Iterator[None]:
         raise Slow
 
     before = signal.signal(signal.SIGALRM, late)
+    faulthandler.dump_traceback_later(3.0 * seconds, exit=True)  # a call into C that never comes back
     signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
         yield
     finally:
+        faulthandler.cancel_dump_traceback_later()
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
 
@@ -317,7 +320,7 @@ def readers(folder: Path) -> dict[str, Callable[[], object]]:
         "spectrum.txt": using(with_("sky", spectrum="spectrum.txt")),
         "spectrum.fits": using(with_("sky", spectrum="spectrum.fits")),
         "model.toml": lambda: scan.load_model(folder / "model.toml"),
-        "data.ecsv": lambda: fit.measurement(folder / "data.ecsv", base(), nthreads=1),
+        "data.ecsv": lambda: fit.measurement(folder / "data.ecsv", base()),
     }
     for suffix in ("txt", "npy", "npz", "fits"):
         name = f"pointing.{suffix}"
