@@ -183,7 +183,10 @@ def _channel(
             pairs = _pairs(run, spec, spec.scan, split, share, nthreads, progress)
             moments = _hits_alone(pairs, max(beam.mmax, 1))
         else:
-            moments = _moments(run, spec, split, share, max(beam.mmax, orders), nthreads, progress, beam.mmax)
+            smax = max(beam.mmax, orders)
+            moments = _moments(run, spec, split, share, smax, nthreads, progress, site.beam.mmax)
+            # An effect may give the beam higher orders than a file of moments has: they are left out.
+            beam = beam.truncated(moments.smax) if acting and moments.smax < beam.mmax else beam
         m = _survey_map(run, spec, split, name, moments, pairs)
         maps.append(_with_effects(m, acting, site, share, spread))
     # A pixel whose samples keep closer to its centre blurs less; the window is a Gaussian in all but name.

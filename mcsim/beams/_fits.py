@@ -8,9 +8,6 @@ from pathlib import Path
 from astropy.io import fits
 from astropy.utils.exceptions import AstropyUserWarning
 
-READ_ERRORS = (OSError, EOFError, ValueError, TypeError, IndexError, KeyError, AstropyUserWarning)
-"""What astropy and healpy raise for a file that is not what it should be."""
-
 
 @contextmanager
 def opened(path: Path) -> Iterator[fits.HDUList]:

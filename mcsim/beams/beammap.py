@@ -12,7 +12,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from mcsim.beams._fits import READ_ERRORS, opened
+from mcsim.beams._fits import opened
 from mcsim.beams.beam import Beam, check_lmax, check_mmax, normalize
 from mcsim.errors import InputError
 
@@ -320,7 +320,7 @@ def holds_image(path: str | Path) -> bool:
     try:
         with opened(Path(path)) as hdus:
             return any(hdu.is_image and hdu.header.get("NAXIS", 0) >= 2 for hdu in hdus)
-    except READ_ERRORS as error:
+    except Exception as error:  # libraries raise whatever a broken file makes of them
         raise InputError(f"{path} cannot be read as a FITS file ({error}): give a beam map or b_lm") from error
 
 
@@ -332,7 +332,7 @@ def _read_image(path: Path, plane: int) -> tuple[NDArray[np.float64], fits.Heade
             images = [hdu for hdu in hdus if hdu.is_image and hdu.data is not None]
             image = np.array(images[0].data, dtype=np.float64) if images else np.zeros(0)
             header = images[0].header.copy() if images else fits.Header()
-    except READ_ERRORS as error:
+    except Exception as error:  # libraries raise whatever a broken file makes of them
         raise InputError(f"{path} cannot be read as a FITS image ({error}): it may be truncated") from error
     if not image.size:
         raise InputError(f"{path} holds no image: a beam map is a two-dimensional FITS image")

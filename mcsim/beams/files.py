@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import alm as alm_
-from mcsim.beams._fits import READ_ERRORS, opened
+from mcsim.beams._fits import opened
 from mcsim.beams.beam import Beam, check_lmax, check_mmax, normalize, power_by_order
 from mcsim.errors import InputError
 
@@ -78,7 +78,7 @@ def _read(path: Path) -> NDArray[np.complex128]:
         with opened(path) as hdus, np.errstate(invalid="ignore"):
             packed, mmax = healpy.read_alm(hdus, hdu=1, return_mmax=True)
         lmax = healpy.Alm.getlmax(len(packed), mmax)
-    except READ_ERRORS as error:
+    except Exception as error:  # libraries raise whatever a broken file makes of them
         raise InputError(
             f"{path} cannot be read as FITS coefficients with columns index, real, imaginary ({error})"
         ) from error

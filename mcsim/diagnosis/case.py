@@ -14,6 +14,7 @@ from mcsim import config
 from mcsim.diagnosis.attribute import Attribution, Candidate
 from mcsim.diagnosis.data import exchanges
 from mcsim.diagnosis.evidence import Job, Questions
+from mcsim.diagnosis.exhibits import exhibits
 from mcsim.diagnosis.gaussian import Null, bases, fit, residual_probability
 from mcsim.diagnosis.knowledge import NOISY_SKIES, Knowledge, after_jobs
 from mcsim.diagnosis.refine import Refined, effect_at, quiet_templates, refine
@@ -129,7 +130,9 @@ def judge(court: Court, case: str, maps: Sequence[NDArray[np.float64]], ask: Ask
     where = _where(court, x, numbers)
     able = detectable_of(court.null, refined.templates, court.candidates, asked.proposals)
     verdict = verdict_of(case, found, court.candidates, asked.proposals, where, shrink, able, notes)
-    return Diagnosis(verdict, _dataset(court, x, refined, where, verdict), found)
+    shown = exhibits(asked.model, maps, known.simulations, court.null, found, court.candidates, asked.proposals)
+    evidence = _dataset(court, x, refined, where, verdict).merge(shown, combine_attrs="no_conflicts")
+    return Diagnosis(verdict, evidence, found)
 
 
 def shrink_of(

@@ -23,14 +23,20 @@ PER_ENTRY = 10
 SKIES = 6
 """Skies that a response is the mean of, at both signs of a step."""
 
+COMMON_SKIES = 12
+"""The same for changes of the sky, whose response in a single sky is largely random."""
+
 NOISY_SKIES = 24
-"""The same where the response itself is random, or has one sign."""
+"""The same where the change itself is random, or has one sign."""
 
 REFEREE_SKIES = 6
 """Skies seen sample by sample, that the default route is compared with."""
 
 ATLAS = 300
 """Simulations with an atlas."""
+
+COLLINEAR = 1e-4
+"""Directions of the evidence whose variance is this fraction of the largest say nothing new: scores of near twins."""
 
 CHUNK = 10
 
@@ -74,7 +80,7 @@ class Knowledge:
     def null(self, where: Sequence[int] | NDArray[np.int64] | None = None) -> Null:
         """Null of all entries, or of some."""
         rows = slice(None) if where is None else np.asarray(where)
-        return null(self.simulations[:, rows], self.offset[rows])
+        return null(self.simulations[:, rows], self.offset[rows], COLLINEAR)
 
     def save(self, path: Path) -> None:
         """Write to a new Zarr store."""
@@ -145,7 +151,7 @@ def plan(run: config.RunConfig, asked: Questions, simulations: int | None = None
     for first in range(0, NOISY_SKIES, CHUNK):
         add(("reference", first), base, first, min(CHUNK, NOISY_SKIES - first))
     for number, column, sign, effect in _basis(asked):
-        count = NOISY_SKIES if _noisy(asked.proposals[number]) else SKIES
+        count = _skies(asked.proposals[number])
         add(("response", column, sign), with_effects(base, [asked.proposals[number].table(effect)]), 0, count)
     if referee and all(c.site.pointing is not None for c in asked.model.survey.channels):
         quiet = replace(base, channels=tuple(replace(c, noise=config.Noise()) for c in base.channels))
@@ -210,8 +216,10 @@ def _basis(asked: Questions) -> Iterator[tuple[int, int, int, Any]]:
                 yield number, column, -1, effect.scaled(-1.0)
 
 
-def _noisy(proposal: Proposal) -> bool:
-    return proposal.kind.one_sided or proposal.kind.draws
+def _skies(proposal: Proposal) -> int:
+    if proposal.kind.one_sided or proposal.kind.draws:
+        return NOISY_SKIES
+    return SKIES if proposal.channel is not None else COMMON_SKIES
 
 
 def with_effects(run: config.RunConfig, found: Sequence[config.Effect]) -> config.RunConfig:

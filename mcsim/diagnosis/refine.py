@@ -23,8 +23,11 @@ ROUNDS = 4
 STRAIGHT = 0.5
 """Departure from a straight line, in standard deviations of the evidence, that is let pass."""
 
-NOISE_OF_TEMPLATES = 4.0
-"""A response smaller than this many of its own standard errors is none."""
+NOISY = 0.01
+"""Share of noise in the square of a template, entries over their scatter, from which on it is cleaned."""
+
+CLEAN = 5.0
+"""Of a noisy template, what is smaller than this many of its standard errors is none."""
 
 TRIED = 3
 """Single candidates, those that lower chi^2 most, that are brought to their amplitude where no subset suffices."""
@@ -50,9 +53,12 @@ class Refined:
 
 
 def quiet_templates(known: Knowledge) -> NDArray[np.float64]:
-    """Templates without what is only their own noise, shape (p, K)."""
-    heard = np.abs(known.templates) > NOISE_OF_TEMPLATES * known.template_error
-    return np.where(heard, known.templates, 0.0)
+    """Templates, shape (p, K), those that are noisy without the entries that are only noise."""
+    scatter = known.simulations.std(axis=0)[:, None]
+    noise = np.sum((known.template_error / scatter) ** 2, axis=0)
+    noisy = noise > NOISY * np.sum((known.templates / scatter) ** 2, axis=0)
+    heard = np.abs(known.templates) > CLEAN * known.template_error
+    return np.where(noisy & ~heard, 0.0, known.templates)
 
 
 def effect_at(proposal: Proposal, coordinates: Vector, covariance: NDArray[np.float64]) -> Effect:

@@ -153,7 +153,7 @@ def load_model(path: str | Path) -> ScanModel:
             table = tomllib.load(stream)
     except OSError as error:
         raise InputError(f"scan model {str(path)!r} cannot be read: {error.strerror}; give a TOML file.") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"scan model {str(path)!r} is not valid TOML: {error}.") from None
     return model_from_table(table, str(path))
 

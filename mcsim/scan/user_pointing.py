@@ -64,7 +64,7 @@ def _blocks(path: Path) -> Iterator[tuple[NDArray[np.float64], ...]]:
             yield _checked([np.array(column[first : first + _ROWS], dtype=np.float64) for column in columns], where)
     except InputError:
         raise
-    except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
+    except Exception as error:  # libraries raise whatever a broken file makes of them
         raise InputError(
             f"{where} cannot be read: {error}; give theta, phi and psi as FITS, .npy, .npz or text."
         ) from None

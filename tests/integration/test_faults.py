@@ -1,15 +1,21 @@
 """Damage to a store, realizations and workers that fail every time, kills at awkward moments: nothing is lost."""
 
+import errno
 import json
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from distributed import Client
+from distributed.diagnostics.plugin import WorkerPlugin
+from zarr.storage import _local
 
+import mcsim
 from mcsim import cli, config, repair, runner, simulate, store, tasks
 from mcsim.errors import InputError, RunError
 
@@ -210,3 +216,83 @@ def test_second_half_of_an_extension_is_repaired(small_store: Path, client: Clie
     truncate(path / "L" / "c/0")
     runner.run(table(), path, resume=True, client=client)
     assert_same(path, small_store)
+
+
+def test_full_disk_stops_in_a_sentence_and_goes_on(
+    small_store: Path, client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "x.zarr"
+    written = []
+    real = store.write
+
+    def write(*arguments: Any) -> None:
+        if written:
+            monkeypatch.setattr(_local, "_put", full)
+        written.append(1)
+        real(*arguments)
+
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(store, "write", write)
+    with pytest.raises(RunError, match=r"No space left on device.*mcsim run --resume goes on"):
+        runner.run(table(), path, client=client)
+    monkeypatch.undo()
+    assert not (tmp_path / "x.zarr.lock").exists()
+    assert runner.run(table(), path, resume=True, client=client).finished == 10
+    assert_same(path, small_store)
+
+
+def test_store_that_is_deleted_during_the_run(
+    small_store: Path, client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "x.zarr"
+    real = simulate.realize
+
+    def realize(shared: Any, r: int) -> Any:
+        if r == 5:
+            path.rename(tmp_path / "gone.zarr")
+        return real(shared, r)
+
+    monkeypatch.setattr(simulate, "realize", realize)
+    with pytest.raises(RunError, match=r"x\.zarr cannot be used"):
+        runner.run(table(), path, client=client)
+    monkeypatch.undo()
+    shutil.rmtree(path, ignore_errors=True)
+    runner.run(table(), path, client=client)
+    assert_same(path, small_store)
+
+
+def test_worker_that_dies_every_time_costs_its_realization_alone(small_store: Path, tmp_path: Path) -> None:
+    path = tmp_path / "x.zarr"
+
+    class Poison(WorkerPlugin):
+        def setup(self, worker: Any) -> None:
+            from mcsim import simulate
+
+            real = simulate.realize
+
+            def realize(shared: Any, r: int) -> Any:
+                if r == 5:
+                    os._exit(1)
+                return real(shared, r)
+
+            simulate.realize = realize
+
+    with runner.local_client(2) as processes:
+        processes.register_plugin(Poison())
+        result = runner.run(table(), path, client=processes)
+    assert [failure.realization for failure in result.failures] == [5]
+    assert "died" in result.failures[0].reason
+    assert result.finished == 9
+    assert "realizations 4-7" in path.with_name("x.zarr.log").read_text()
+
+
+def test_kills_lose_nothing() -> None:
+    """The fault campaign in short; workflows/faults has the long one."""
+    script = Path(mcsim.__file__).parents[1] / "workflows" / "faults" / "campaign.py"
+    command = [sys.executable, script, "--kills", "5", "--clusters", "local", "--seed", "2"]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stdout + found.stderr
+    assert "5 kills, " in found.stdout
+    assert "lost 0, doubled 0, differing 0, other trouble 0." in found.stdout

@@ -137,7 +137,7 @@ def slow(folder: Path) -> str:
 
 def report(name: str, maps: Map) -> None:
     if len(maps) < 4:
-        print(f"{name:24s} {np.std(maps[0]):9.4f}   default route only")
+        print(f"{name:24s} {np.sqrt(np.mean(maps[0] ** 2)):9.4f}   default route only")
         return
     for half, (default, true) in enumerate(zip(maps[:2], maps[2:], strict=True), start=1):
         pairs = [(default, true)]
