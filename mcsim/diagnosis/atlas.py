@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mcsim import alm as alm_
 from mcsim import biposh
-from mcsim.diagnosis.blocks import Entry, bins
+from mcsim.diagnosis.blocks import Entry, bins, scales
 from mcsim.diagnosis.listen import Heard, Model, by_degree
 from mcsim.rotation import FRAMES, rotate_biposh
 
@@ -116,7 +116,7 @@ class Atlas:
         for a, b in combinations_with_replacement(range(len(self.model.parts)), 2):
             names = [self.model.parts[i].name.partition(":") for i in (a, b)]
             splits = {name[2] for name in names if name[2]}
-            for low, high in ((2, 12), (13, 48), *bins(49, self.model.lmax, 2)):
+            for low, high in scales(self.model.lmax):
                 entries.append(
                     Entry(
                         f"cl/{self.model.parts[a].name},{self.model.parts[b].name}/{low}-{high}",
@@ -138,8 +138,7 @@ class Atlas:
         found = []
         for a, b in combinations_with_replacement(range(len(self.model.parts)), 2):
             power = by_degree(heard.adjoint[a], heard.adjoint[b], self.model.lmax)
-            ranges = ((2, 12), (13, 48), *bins(49, self.model.lmax, 2))
-            found += [float(power[low : high + 1].sum()) for low, high in ranges]
+            found += [float(power[low : high + 1].sum()) for low, high in scales(self.model.lmax)]
         return np.array(found)
 
 

@@ -89,6 +89,12 @@ def bins(low: int, high: int, number: int) -> list[tuple[int, int]]:
     return [(int(a), int(b) - 1) for a, b in pairwise(edges)]
 
 
+def scales(lmax: int) -> list[tuple[int, int]]:
+    """Ranges of degrees for signals that fall steeply: each starts at about four times the one before."""
+    edges = [low for low in (2, 13, 49) if low < lmax] + [lmax + 1]
+    return [(a, b - 1) for a, b in pairwise(edges)]
+
+
 def _label(model: Model, part: int) -> tuple[str, str | None]:
     channel, _, split = model.parts[part].name.partition(":")
     return channel, split or None
@@ -210,7 +216,7 @@ def _repeated_block(model: Model, channel: int) -> Block:
     """Power of the residual that the channel's first two maps have in common, and of what they have not."""
     first, second = model.of(channel)[:2]
     name = model.survey.channels[channel].name
-    ranges = ((2, 12), (13, 48), (49, model.lmax))
+    ranges = scales(model.lmax)
     entries = tuple(
         Entry(f"{kind}/{name}/{low}-{high}", "cl", (name,), None, None, (low, high), L=0)
         for kind in ("common", "difference")
@@ -267,7 +273,8 @@ def _contrast_block(model: Model) -> Block | None:
 def _sky_block(model: Model) -> Block:
     """Spectrum of the sky over its expectation, minus one."""
     names = tuple(channel.name for channel in model.survey.channels)
-    ranges = [(2, 11), (12, 40), *bins(41, model.lmax, SKY_BINS - 2)]
+    large = [(2, 11), (12, 40)] if model.lmax > LARGE_SCALES else []
+    ranges = [*large, *bins(41 if large else 2, model.lmax, SKY_BINS - len(large))]
     ell = np.arange(model.lmax + 1)
     modes = 2 * ell + 1
     entries = tuple(

@@ -81,7 +81,11 @@ class Diagnosis:
         target = Path(folder)
         target.mkdir(parents=True, exist_ok=True)
         (target / "verdict.json").write_text(json.dumps(self.verdict, indent=1, allow_nan=False) + "\n")
-        self.evidence.to_zarr(target / "evidence.zarr", mode="w", consolidated=False)
+        # Text as objects: for numpy's fixed-length text Zarr 3 has no stable form.
+        texts = {
+            name: values.astype(object) for name, values in self.evidence.variables.items() if values.dtype.kind == "U"
+        }
+        self.evidence.assign(texts).to_zarr(target / "evidence.zarr", mode="w", consolidated=False)
 
 
 def court(run: config.RunConfig, asked: Questions, known: Knowledge) -> Court:

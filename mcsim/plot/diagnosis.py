@@ -144,7 +144,6 @@ def blocks_figure(reading: Reading) -> Figure:
 def entries_figure(reading: Reading) -> Figure:
     """Every deviate before and after the fit, kind by kind."""
     order = sorted(range(len(reading.entries)), key=lambda k: _family(reading.entries[k]["name"]))
-    # Stable: within a family the entries keep their order.
     families = [_family(reading.entries[k]["name"]) for k in order]
     figure = Figure(figsize=(10.5, 3.6), layout="constrained")
     axes = figure.subplots()

@@ -158,7 +158,7 @@ def draw(found: dict[str, Map], path: Path) -> None:
     figure = plt.figure(figsize=(17, 15.5))
     for place, (name, maps) in enumerate(found.items()):
         column, row = place % columns, place // columns
-        left, bottom = 0.045 + column * 0.191, 0.765 - row * 0.243
+        left, bottom = 0.045 + column * 0.191, 0.748 - row * 0.239
         shown = healpy.smoothing(maps[0], fwhm=np.deg2rad(1.5)) if len(maps) == 4 else maps[0]
         reach = np.percentile(np.abs(shown - (0.0 if name in NOISE else shown.mean())), 99.0)
         colours = {"cmap": "RdBu_r", "min": -reach, "max": reach}
@@ -183,7 +183,7 @@ def draw(found: dict[str, Map], path: Path) -> None:
         if column == 0:
             below.set_ylabel("l(l+1)C/2π, uK²", fontsize=8)
     figure.text(0.5, 0.99, TITLE, ha="center", va="top", fontsize=11)
-    figure.savefig(path, dpi=90)
+    figure.savefig(path, dpi=75)
     plt.close(figure)
 
 
