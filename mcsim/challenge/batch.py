@@ -20,9 +20,7 @@ def batch(workers: int) -> Iterator[Batch]:
     """Calls on a cluster of ``workers`` processes that starts with the first; with 0 in this process."""
     opened: list[Any] = []
 
-    def call(
-        function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]
-    ) -> Iterator[tuple[int, Any]]:
+    def call(function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> Iterator[tuple[int, Any]]:
         if workers == 0:
             yield from ((index, function(*each)) for index, each in enumerate(arguments))
             return

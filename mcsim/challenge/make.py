@@ -91,7 +91,11 @@ def make(
         For a run that cannot be used, or a folder with a challenge of other settings.
     """
     run = model if isinstance(model, config.RunConfig) else config.load(model)
-    target, prior, lent = Path(folder), prior or Prior(), None if inventions is None else str(Path(inventions).resolve())
+    target, prior, lent = (
+        Path(folder),
+        prior or Prior(),
+        None if inventions is None else str(Path(inventions).resolve()),
+    )
     settings = {
         "schema": 1,
         "model": config.to_dict(run),
@@ -163,12 +167,13 @@ def _responses(court: Court, inventions: str | None, call: Batch) -> dict[str, l
         for channel in [None] if kind.scope == "common" else [spec.name for spec in run.channels]:
             found.append((kind, channel, kind(amplitude=kind.step)))
     # An effect of no strength: the dipole is seen and taken off only where there is some effect.
-    tables = [(config.Effect(name="beam_width", channel=c.name, parameters={"amplitude": 0.0}),) for c in run.channels]
-    idle = tuple(row for table in tables for row in table)
-    jobs = [_samples(run, with_effects(quiet, idle))]
+    idle = tuple(config.Effect(name="beam_width", channel=c.name, parameters={"amplitude": 0.0}) for c in run.channels)
+    jobs = [_samples(run, with_effects(quiet, idle), inventions)]
     for kind, channel, effect in found:
-        table = config.Effect(kind.name, channel, {"amplitude": effect.amplitude, **effect.parameters()})
-        jobs.append(_samples(run, with_effects(quiet, (*idle, table))))
+        table = config.Effect(
+            name=kind.name, channel=channel, parameters={"amplitude": effect.amplitude, **effect.parameters()}
+        )
+        jobs.append(_samples(run, with_effects(quiet, (*idle, table)), inventions))
     answers: list[Vector] = [np.empty(0)] * len(jobs)
     for index, answer in call(evidence_with, ((job, inventions) for job in jobs)):
         answers[index] = answer.mean(axis=0)
@@ -178,8 +183,9 @@ def _responses(court: Court, inventions: str | None, call: Batch) -> dict[str, l
     return result
 
 
-def _samples(believed: config.RunConfig, simulated: config.RunConfig) -> Job:
-    return Job(config.to_json(believed), config.to_json(simulated), 0, INVENTED_SKIES, True)
+def _samples(believed: config.RunConfig, simulated: config.RunConfig, inventions: str) -> Job:
+    # Lent to the simulator, an invention must not be proposed either.
+    return Job(config.to_json(believed), config.to_json(simulated), 0, INVENTED_SKIES, True, tuple(load(inventions)))
 
 
 def make_case(

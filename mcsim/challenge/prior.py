@@ -102,12 +102,11 @@ class Urn:
     white_length: WhiteLength
     inventions: Mapping[str, Sequence[Invention]]
 
-    def draw(self, seed: int, case: int) -> Drawn:
-        """Case number ``case`` of a challenge; it does not depend on how many there are."""
-        kinds = self._kinds(seed, case + 1)
-        kind = KINDS[kinds[-1]]
+    def draw(self, kinds: Sequence[Kind], seed: int, case: int) -> Drawn:
+        """Case number ``case`` of a challenge with these :meth:`kinds`."""
+        kind = kinds[case]
         draw = rng.generator(seed, case, "challenge/effects")
-        turn = int(np.sum(kinds[:-1] == kinds[-1]))
+        turn = sum(other == kind for other in kinds[:case])
         if kind == "none":
             return Drawn(kind, (), ())
         if kind == "invented":
@@ -126,9 +125,17 @@ class Urn:
                 members.append(found)
         return Drawn(kind, tuple(members), ())
 
+    def kinds(self, seed: int, count: int, inventions: bool) -> list[Kind]:
+        """Kinds of the first cases of a challenge; a case's does not depend on how many there are."""
+        edges = np.cumsum(self.prior.shares(inventions))
+        drawn = rng.generator(seed, 0, "challenge/kinds").random(count)
+        return [KINDS[min(int(np.searchsorted(edges, value, side="right")), len(KINDS) - 1)] for value in drawn]
+
     def names(self) -> list[str]:
         """Effects that can be there and are heard at all."""
-        return list(dict.fromkeys(self.proposals[index].kind.name for index in range(len(self.proposals)) if self._heard(index)))
+        return list(
+            dict.fromkeys(self.proposals[index].kind.name for index in range(len(self.proposals)) if self._heard(index))
+        )
 
     def weights(self) -> Vector:
         """Prior probability of every proposal as the only effect."""
@@ -137,11 +144,6 @@ class Urn:
             for group in self._channels(name):
                 total[group] = 1.0 / len(self.names()) / len(self._channels(name)) / len(group)
         return total
-
-    def _kinds(self, seed: int, count: int) -> NDArray[np.int64]:
-        edges = np.cumsum(self.prior.shares(bool(self.inventions)))
-        drawn = rng.generator(seed, 0, "challenge/kinds").random(count)
-        return np.minimum(np.searchsorted(edges, drawn, side="right"), len(KINDS) - 1)
 
     def _heard(self, index: int) -> bool:
         return any(self.white_length(self.templates[:, column]) > 0.0 for column in self.columns[index])

@@ -144,7 +144,9 @@ def open_key(folder: Path, case: str) -> Truth:
     truth = Truth.read(path)
     seal = (folder / MAPS / case / SEAL).read_text().split()[0]
     if sealed(path) != seal:
-        raise InputError(f"{path} is not the key that was sealed: its SHA-256 is not that of {case}/{SEAL}; restore it.")
+        raise InputError(
+            f"{path} is not the key that was sealed: its SHA-256 is not that of {case}/{SEAL}; restore it."
+        )
     return truth
 
 

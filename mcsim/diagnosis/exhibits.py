@@ -1,7 +1,7 @@
 """What a report shows besides the evidence: residual maps, candidates alone, explanations, simulations held out."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import healpy
@@ -62,9 +62,9 @@ def exhibits(
             ),
         },
         coords={
-            "map": [part.name for part in model.parts],
-            "candidate": [proposal.label for proposal in proposals],
-            "unit": ("candidate", [proposal.kind.unit for proposal in proposals]),
+            "map": _texts(part.name for part in model.parts),
+            "candidate": _texts(proposal.label for proposal in proposals),
+            "unit": ("candidate", _texts(proposal.kind.unit for proposal in proposals)),
         },
         attrs={
             "frame": model.survey.config.map.frame,
@@ -112,8 +112,9 @@ def held_out(simulations: NDArray[np.float64], null: Null) -> NDArray[np.float64
 
     Notes
     -----
-    With c = x_i - mean, S the scatter of all N and a = c'S^-1 c, the scatter of the others is S - N/(N - 1) c c', and x_i
-    less their mean is N/(N - 1) c: its square, over 1 + 1/(N - 1), is N/(N - 1) a/(1 - N/(N - 1) a) (Sherman & Morrison).
+    With c = x_i - mean, S the scatter of all N and a = N/(N - 1) c'S^-1 c, the scatter of the others is
+    S - N/(N - 1) c c', and x_i less their mean is N/(N - 1) c: its square in their scatter, over 1 + 1/(N - 1), is
+    a/(1 - a) (Sherman & Morrison, Ann. Math. Stat. 21, 124, 1950).
     Against explicit refits: tests/unit/test_diagnosis_report.py.
     """
     count = len(simulations)
@@ -121,6 +122,11 @@ def held_out(simulations: NDArray[np.float64], null: Null) -> NDArray[np.float64
     a = np.sum(white**2, axis=1) / null.dof * count / (count - 1)
     square = (null.dof - 1) * a / np.maximum(1.0 - a, 1e-12)
     return residual_probability(square, null.dimension, null.dof - 1)
+
+
+def _texts(words: Iterable[str]) -> NDArray[np.object_]:
+    """As objects: Zarr 3 has no stable form for numpy's texts of fixed length."""
+    return np.array(list(words), dtype=object)
 
 
 def _alone(

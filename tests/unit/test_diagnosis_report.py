@@ -25,7 +25,7 @@ from mcsim.diagnosis.verdict import detectable_of, verdict_of
 from mcsim.diagnosis.where import Place
 from mcsim.plot import diagnosis as plots
 
-EVIL = "<script>alert('$x_')</script>"
+EVIL = "<script>alert('$x_')<img src=x onerror=alert(1)>"
 P, N = 30, 500
 VERDICTS = ("none", "effect", "mixture", "degenerate", "unknown")
 
@@ -49,20 +49,23 @@ def proposals() -> list[Proposal]:
 
 
 def templates(twins: bool) -> np.ndarray:
-    """Directions of unit length; those of the first two candidates all but agree where they are twins."""
+    """Directions of about unit length; those of the first two candidates all but agree where they are twins."""
     t = np.random.default_rng(3).normal(size=(P, sum(len(one.basis) for one in proposals())))
     if twins:
         t[:, 2:4] = t[:, :2] + 0.02 * t[:, 2:4]
-    return t / np.linalg.norm(t, axis=0)
+        t[:, 4:-1] *= 0.02
+    return t / np.linalg.norm(t[:, 0])
 
 
 SIGNALS = {
-    "none": [0.0, 0.0, 0.0, 0.0, 0.0],
-    "effect": [0.3, 0.0, 0.0, 0.0, 0.0],
-    "mixture": [0.3, 0.0, 0.0, 0.0, 0.4],
-    "degenerate": [0.3, 0.1, 0.0, 0.0, 0.0],
-    "unknown": [0.0, 0.0, 0.0, 0.0, 0.0],
+    "none": {},
+    "effect": {0: 0.3},
+    "mixture": {0: 0.3, -1: 0.4},
+    "degenerate": {0: 0.3, 1: 0.1},
+    "unknown": {-1: 0.15},
 }
+"""Coordinates of the templates in the data."""
+
 RESPONSE = 50.0
 """Standard deviations of an entry per unit of amplitude."""
 
@@ -88,10 +91,10 @@ def diagnosis(kind: str) -> Diagnosis:
         for one, own in zip(proposed, columns, strict=True)
     )
     calibration = calibrate(model, bases(model, t, [candidate.columns for candidate in candidates]), draws=2000)
-    x = t @ np.array(SIGNALS[kind]) + rng.normal(size=P)
+    x = sum((value * t[:, k] for k, value in SIGNALS[kind].items()), rng.normal(size=P))
     if kind == "unknown":
         strange = rng.normal(size=P)
-        x += 15.0 * (strange - t @ np.linalg.lstsq(t, strange, rcond=None)[0]) / np.sqrt(P) + 0.15 * t[:, 4]
+        x += 15.0 * (strange - t @ np.linalg.lstsq(t, strange, rcond=None)[0]) / np.sqrt(P)
     found = attribute(model, x, t, candidates, calibration)
     where = [Place(listed[0], 9.1, 1e-8, 8.0), Place(listed[-2], 1.0, 0.7, 1.2)]
     shrink = None

@@ -158,13 +158,13 @@ def draw(found: dict[str, Map], path: Path) -> None:
     figure = plt.figure(figsize=(17, 15.5))
     for place, (name, maps) in enumerate(found.items()):
         column, row = place % columns, place // columns
-        left, bottom = 0.045 + column * 0.191, 0.748 - row * 0.239
+        left, bottom = 0.045 + column * 0.191, 0.742 - row * 0.236
         shown = healpy.smoothing(maps[0], fwhm=np.deg2rad(1.5)) if len(maps) == 4 else maps[0]
         reach = np.percentile(np.abs(shown - (0.0 if name in NOISE else shown.mean())), 99.0)
         colours = {"cmap": "RdBu_r", "min": -reach, "max": reach}
         image = healpy.cartview(shown, return_projected_map=True, fig=99, xsize=500, **colours)
         plt.close(99)
-        axes = figure.add_axes((left, bottom + 0.105, 0.17, 0.1), projection="mollweide")
+        axes = figure.add_axes((left, bottom + 0.098, 0.17, 0.094), projection="mollweide")
         lon, lat = (
             np.linspace(-np.pi, np.pi, image.shape[1] + 1),
             np.linspace(-np.pi / 2, np.pi / 2, image.shape[0] + 1),
@@ -176,13 +176,13 @@ def draw(found: dict[str, Map], path: Path) -> None:
         unit = "of the variance" if name in NOISE else "uK"
         axes.set_title(f"{name}\n{PARAMETERS[name]['amplitude']:g} {effect.unit}", fontsize=9)
         axes.text(0.5, -0.07, f"±{reach:.2g} {unit}", transform=axes.transAxes, ha="center", va="top", fontsize=7.5)
-        below = figure.add_axes((left + 0.012, bottom, 0.158, 0.082))
+        below = figure.add_axes((left + 0.012, bottom, 0.158, 0.078))
         spectra(below, name, maps)
         if row == rows - 1 or place + columns >= len(found):
             below.set_xlabel("l", fontsize=8)
         if column == 0:
             below.set_ylabel("l(l+1)C/2π, uK²", fontsize=8)
-    figure.text(0.5, 0.99, TITLE, ha="center", va="top", fontsize=11)
+    figure.text(0.5, 0.997, TITLE, ha="center", va="top", fontsize=11)
     figure.savefig(path, dpi=75)
     plt.close(figure)
 
