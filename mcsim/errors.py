@@ -8,6 +8,10 @@ class InputError(ValueError):
     without a traceback and exits with code 2.
     """
 
+    def __init__(self, message: str) -> None:
+        """What a library said of a broken file may have several lines; here it becomes one."""
+        super().__init__(" ".join(message.split()) if "\n" in message else message)
+
 
 class RunError(RuntimeError):
     """A run that could not go on, though its input was right; what is finished is stored. Exit code 1."""

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import alm as alm_
-from mcsim import biposh, config, convolve, differencing, healpix, rng, tod
-from mcsim.effects import looked_at
+from mcsim import biposh, config, convolve, differencing, effects, healpix, rng, tod
 from mcsim.errors import InputError
 from mcsim.sky import gaussian_alm
 from mcsim.survey import Channel, Survey, SurveyMap
@@ -174,12 +173,14 @@ def _circular(survey: Survey, channel: Channel, seen: Alm, dipole: Alm | None) -
 
 
 def _believed(channel: Channel) -> convolve.Response:
-    return convolve.response(channel.site.beam, channel.site.lmax, channel.window)
+    """Response to the dipole that is taken off: the believed beam, at the samples' own places."""
+    spread = effects.spread_of(channel.effects)
+    return convolve.response(channel.site.beam, channel.site.lmax, channel.window ** (spread * spread))
 
 
 def _seen(survey: Survey, channel: Channel, sky: Alm, realization: int) -> tuple[Alm, Alm | None]:
     """The sky that the channel looks at, and the dipole in it that is taken off again; None where none shows."""
-    sky = looked_at(channel.effects, sky, channel.site, survey.config.ensemble.seed, realization)
+    sky = effects.looked_at(channel.effects, sky, channel.site, survey.config.ensemble.seed, realization)
     if not channel.effects or not channel.site.dipole_uk.any():
         return sky, None
     dipole = tod.dipole_alm(channel.site.dipole_uk, channel.site.lmax)

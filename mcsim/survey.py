@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mcsim import beams, config, convolve, healpix, mapmaking, scan, spectra, tod
 from mcsim.biposh import Estimator, estimator
-from mcsim.effects import Effect, Site, seen_through
+from mcsim.effects import Effect, Site, seen_through, spread_of
 from mcsim.errors import InputError
 from mcsim.instrument import effects_on, load_beam_b, scan_model, site_of
 from mcsim.mask import read_mask
@@ -171,7 +171,7 @@ def _channel(
     acting = effects_on(run, spec.name)
     site = site_of(run, spec)
     window = _window(run, spec)
-    spread = float(np.prod([effect.spread() for effect in acting]))
+    spread = spread_of(acting)
     beam = seen_through(acting, site)
     splits = run.map.splits or (None,)
     maps = []

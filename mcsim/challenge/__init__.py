@@ -1,1 +1,1 @@
-"""Challenges: effects that are drawn, hidden and sealed, diagnosed as one batch, and scored beside the best possible."""
+"""Challenges: effects drawn, hidden and sealed, diagnosed as one batch, and scored beside the best that is possible."""

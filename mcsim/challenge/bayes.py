@@ -1,4 +1,4 @@
-"""The best that any tool could do: the classifier that knows the prior of the challenge and the evidence's likelihood."""
+"""The best that any tool could do: the classifier that knows a challenge's prior and the likelihood of the evidence."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -38,10 +38,10 @@ class Bayes:
 
     Notes
     -----
-    One effect: :func:`mcsim.diagnosis.detect.posterior`. Two: the integral of likelihood times prior over the amplitudes
-    of both by importance sampling from the Gaussian about their joint best fit, 256 antithetic draws; the prior density of
-    K amplitudes with strength s, uniform in log s, is 1/(s^K A_K log(s_max/s_min)), A_K the area of the unit sphere.
-    Directions are isotropic in it, also where parameters reach only some.
+    One effect: :func:`mcsim.diagnosis.detect.posterior`. Two: the integral of likelihood times prior over the
+    amplitudes of both by importance sampling from the Gaussian about their joint best fit, 256 antithetic draws; the
+    prior density of K amplitudes with strength s, uniform in log s, is 1/(s^K A_K log(s_max/s_min)), A_K the area of
+    the unit sphere. Directions are isotropic in it, also where parameters reach only some.
     """
 
     null: Null
@@ -65,7 +65,7 @@ class Bayes:
         if self.prior.one > 0.0:
             for index, value in enumerate(self._singles(x, y)):
                 if np.isfinite(value):
-                    add(frozenset([self.identities[index]]), none + value + np.log(self.prior.one))
+                    add(frozenset([self.identities[int(index)]]), none + value + np.log(self.prior.one))
         if self.prior.two > 0.0:
             for (i, j), value in self._pairs(y, total):
                 add(frozenset([self.identities[i], self.identities[j]]), value + np.log(self.prior.two))
@@ -91,7 +91,7 @@ class Bayes:
     @cached_property
     def _pair_list(self) -> list[tuple[int, int]]:
         heard = np.flatnonzero((self.groups.sizes > 0) & (self.weights > 0.0))
-        return [(int(i), int(j)) for i, j in combinations(heard, 2) if self.identities[i] != self.identities[j]]
+        return [(i, j) for i, j in combinations(map(int, heard), 2) if self.identities[i] != self.identities[j]]
 
     @cached_property
     def _normals(self) -> Vector:

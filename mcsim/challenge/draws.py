@@ -15,7 +15,7 @@ from mcsim.diagnosis.attribute import Attribution, Candidate, attribute
 from mcsim.diagnosis.case import Court
 from mcsim.diagnosis.detect import power
 from mcsim.diagnosis.evidence import Proposal
-from mcsim.diagnosis.gaussian import Null, bases, fit, null
+from mcsim.diagnosis.gaussian import Null, bases, fit
 from mcsim.diagnosis.refine import effect_at, quiet_templates
 from mcsim.diagnosis.shrink import achieved, predicted
 from mcsim.diagnosis.trials import Calibration, calibrate, gap
@@ -116,9 +116,9 @@ def draws(
 
     Notes
     -----
-    x = evidence of a simulation without effects that the null has not seen, drawn again after as many draws as there are,
-    plus templates times coordinates: responses are straight lines here, and templates exact. What they are not, and
-    everything else that a map goes through, is tested by full skies.
+    x = evidence of a simulation without effects that the null has not seen (the first one again when all have been
+    used), plus templates times coordinates: responses are straight lines here, and templates exact. What they are not,
+    and everything else that a map goes through, is tested by full skies.
     """
     prior = prior or Prior()
     full = bench(court)
@@ -193,7 +193,7 @@ def judged(bench: Bench, prior: Prior, seed: int, cases: Sequence[Draw]) -> list
                 float(np.sqrt(bench.null.unbiased) * np.linalg.norm(white)),
                 len(members[0].coordinates) if len(members) == 1 else 0,
                 geometry.rival(draw.response, truth) if truth else 0.0,
-                geometry.distances(draw.response) if draw.drawn.kind == "left_out" else (),
+                geometry.distances(draw.response) if draw.drawn.kind in ("left_out", "invented") else (),
                 said.gap.probability,
                 said.gap.maximum,
                 said.verdict,
@@ -230,7 +230,7 @@ def shrunk(bench: Bench, x: Vector, members: Sequence[int]) -> tuple[float | Non
     """Shrink predicted and achieved, and its error: fitted to fold 0, frozen, and judged on fold 1."""
     if bench.used is None or bench.fresh is None:
         return None, None, None
-    columns = [column for member in members for column in bench.candidates[member].columns]
+    columns = np.array([column for member in members for column in bench.candidates[member].columns])
     here = bench.templates[np.ix_(bench.second, columns)]
     frozen = fit(bench.used, x[bench.first], bench.templates[np.ix_(bench.first, columns)])
     coordinates, start = np.zeros(len(columns)), 0

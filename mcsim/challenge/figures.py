@@ -62,15 +62,13 @@ def scored(title: str, records: Sequence[Record], power: Power | None = None) ->
     known = [record for record in records if record.bayes is not None]
     return Score(
         title,
-        tuple(
-            [
-                *_detection(records, power),
-                *_naming(records, known),
-                *_unknowns(records),
-                *_amplitudes(records),
-                *_shrinks(records),
-                *_placing(records),
-            ]
+        (
+            *_detection(records, power),
+            *_naming(records, known),
+            *_unknowns(records),
+            *_amplitudes(records),
+            *_shrinks(records),
+            *_placing(records),
         ),
         confusion(records),
         confusion(known),

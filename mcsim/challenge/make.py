@@ -238,7 +238,7 @@ def maps_of(run: config.RunConfig, truth: Truth, inventions: str | None) -> list
 
 
 def _measured(model: str, simulations: int | None, members: Sequence[Member]) -> tuple[Member, ...]:
-    """Members with the strengths that their amplitudes have, smaller ones where they cannot have the drawn amplitude."""
+    """Members with the strengths that their amplitudes have; smaller ones where the drawn amplitude is impossible."""
     seat = sitting(model, simulations)
     length = seat.court.null
     found = []

@@ -167,7 +167,7 @@ class Urn:
         heard = values > 1e-9 * values[-1]
         direction = draw.standard_normal(len(values))
         theta = vectors[:, heard] @ (direction[heard] / np.sqrt(values[heard]))
-        if proposal.kind.one_sided:
+        if proposal.kind.side:
             theta = np.abs(theta)
         effect = proposal.with_parameters(theta, gram)
         # The parameters reach only some directions, and coordinates need not be linear in the amplitude.

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mcsim.diagnosis.blocks import Block
 from mcsim.diagnosis.evidence import Questions
 from mcsim.diagnosis.knowledge import Knowledge
 
@@ -40,12 +41,14 @@ def without(asked: Questions, known: Knowledge, names: Collection[str]) -> Reduc
 
     Notes
     -----
-    An entry of the evidence does not depend on what else is asked, so the rest is what it would be had the effects never
-    been there; the simulations are the same ones, as they are with ``mcsim diagnose --without``.
+    An entry of the evidence does not depend on what else is asked, so the rest is what it would be had the effects
+    never been there; the simulations are the same ones, as they are with ``mcsim diagnose --without``.
     """
     kept = [index for index, proposal in enumerate(asked.proposals) if proposal.kind.name not in names]
     labels = {proposal.label for proposal in asked.proposals if proposal.kind.name in names}
-    blocks, rows, start = [], [], 0
+    blocks: list[Block] = []
+    rows: list[int] = []
+    start = 0
     for block in asked.blocks:
         stop = start + len(block.entries)
         matched = {entry.name.removeprefix("score/").rpartition("/")[0] for entry in block.entries}

@@ -176,17 +176,17 @@ def learned(asked: Questions, plan: Plan, answers: Sequence[NDArray[np.float64]]
     shape = (size, columns)
     templates, curvature, error = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     for number, column, sign, effect in _basis(asked):
-        if sign < 0:
-            continue
-        up = by_purpose["response", column, 1]
+        other = by_purpose.get(("response", column, -sign))
+        if sign < 0 and other is not None:
+            continue  # done with the other sign
+        here = by_purpose["response", column, sign]
         step = effect.coordinates()[asked.columns[number].index(column)]
-        same = reference[: len(up)]
-        if ("response", column, -1) in by_purpose:
-            down = by_purpose["response", column, -1]
-            each = (up - down) / (2.0 * step)
-            curvature[:, column] = np.mean(up + down - 2.0 * same, axis=0) / (2.0 * step**2)
+        same = reference[: len(here)]
+        if other is None:
+            each = (here - same) / step
         else:
-            each = (up - same) / step
+            each = (here - other) / (2.0 * step)
+            curvature[:, column] = np.mean(here + other - 2.0 * same, axis=0) / (2.0 * step**2)
         templates[:, column] = each.mean(axis=0)
         error[:, column] = each.std(axis=0, ddof=1) / np.sqrt(len(each))
     referee, default = stacked("referee"), stacked("default")
@@ -208,16 +208,16 @@ def after_jobs(
 
 
 def _basis(asked: Questions) -> Iterator[tuple[int, int, int, Any]]:
-    """Proposal, column, sign and effect of every response."""
+    """Proposal, column, sign and effect of every response that is simulated."""
     for number, (proposal, columns) in enumerate(zip(asked.proposals, asked.columns, strict=True)):
         for column, effect in zip(columns, proposal.basis, strict=True):
-            yield number, column, 1, effect
-            if not proposal.kind.one_sided:
-                yield number, column, -1, effect.scaled(-1.0)
+            for sign in (1, -1):
+                if proposal.kind.side in (0, sign):
+                    yield number, column, sign, effect.scaled(sign)
 
 
 def _skies(proposal: Proposal) -> int:
-    if proposal.kind.one_sided or proposal.kind.draws:
+    if proposal.kind.draws:
         return NOISY_SKIES
     return SKIES if proposal.channel is not None else COMMON_SKIES
 

@@ -45,8 +45,8 @@ class Ranked:
         Square root of the fall of chi^2.
     p
         Of such a fall, corrected for looking at all candidates (Bonferroni).
-    accepted
-        Whether the best explanation has it.
+    accepted, alternative
+        Whether the best explanation has it, or another one.
     """
 
     index: int
@@ -57,6 +57,7 @@ class Ranked:
     impact: float
     p: float
     accepted: bool
+    alternative: bool
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,7 @@ class Reading:
         rank = np.array([int(heard[self.columns([k])].sum()) for k in range(len(self.labels))])
         drop = evidence["drop"].values
         p = score_probability(drop, gap["statistic"], rank, gap["dof"], int(evidence.attrs["simulations"]) - 1)
-        best = self.explanations[0]["members"] if self.explanations else []
+        sets = [one["members"] for one in self.explanations]
         return [
             Ranked(
                 index=int(k),
@@ -149,7 +150,8 @@ class Reading:
                 sigma=float(evidence["alone_sigma"].values[k]),
                 impact=float(np.sqrt(max(drop[k], 0.0))),
                 p=min(1.0, float(p[k]) * int((rank > 0).sum())),
-                accepted=int(k) in best,
+                accepted=any(k in one for one in sets[:1]),
+                alternative=any(k in one for one in sets[1:]),
             )
             for k in np.argsort(-drop, kind="stable")
         ]
@@ -281,7 +283,8 @@ def entry_words(row: Mapping[str, Any]) -> str:
     if row["split"]:
         words.append(row["split"])
     if row["ell"]:
-        words.append(f"ℓ {row['ell'][0]}–{row['ell'][1]}")
+        low, high = row["ell"]
+        words.append(f"ℓ {low}–{high}" if high > low else f"ℓ {low}")
     elif "/" in rest:
         words.append(rest.partition("/")[2].replace("/", ", "))
     return ", ".join(words)

@@ -1,7 +1,7 @@
 """The library of effects: one file each, found by name; other packages add theirs by entry points."""
 
 from mcsim.effects.base import Alm, Draw, Effect, Map, Pointing, Site
-from mcsim.effects.compose import looked_at, seen_through
+from mcsim.effects.compose import looked_at, seen_through, spread_of
 from mcsim.effects.registry import build, describe, get, library
 
 __all__ = [
@@ -17,4 +17,5 @@ __all__ = [
     "library",
     "looked_at",
     "seen_through",
+    "spread_of",
 ]

@@ -109,8 +109,8 @@ class Effect:
         what is always listened for (dipoles, variances, spectra, modulations) says it all.
     draws
         Whether a hook draws random numbers.
-    one_sided
-        Whether a negative coordinate of :meth:`basis` is no possible effect.
+    side
+        Sign of the amplitudes at which responses are measured; 0: both, where both are possible.
     variants
         Settings, fixed parameters, that a diagnosis proposes side by side.
     """
@@ -123,7 +123,7 @@ class Effect:
     source: ClassVar[str] = ""
     step: ClassVar[float]
     own_score: ClassVar[bool] = True
-    one_sided: ClassVar[bool] = False
+    side: ClassVar[Literal[-1, 0, 1]] = 0
     draws: ClassVar[bool] = False
     variants: ClassVar[tuple[Mapping[str, Any], ...]] = ({},)
 

@@ -20,6 +20,11 @@ def seen_through(acting: Iterable[Effect], site: Site) -> Beam:
     return beam
 
 
+def spread_of(acting: Iterable[Effect]) -> float:
+    """By what factor the samples' offsets from the centre of their pixel shrink."""
+    return float(np.prod([effect.spread() for effect in acting]))
+
+
 def looked_at(acting: Iterable[Effect], sky: Alm, site: Site, seed: int, realization: int) -> Alm:
     """The sky that a channel looks at, uK: what an effect draws depends on its name alone, not on the channel."""
     for effect in acting:

@@ -52,7 +52,7 @@ class ForegroundResidual(Effect):
     )
     source = "Bennett et al. 2013, ApJS 208, 20, Sec. 5 (residuals of cleaned bands); the morphology is a model"
     step = 5.0
-    one_sided = True
+    side = 1
     own_score = False
     draws = True
 

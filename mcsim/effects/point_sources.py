@@ -30,8 +30,7 @@ class PointSources(Effect):
     source = "Tegmark & Efstathiou 1996, MNRAS 281, 1297; Wright et al. 2009, ApJS 180, 283"
     step = 1e-4
     own_score = False
-    draws = True
-    one_sided = True
+    side = -1
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
         """With the sources added."""

@@ -30,7 +30,6 @@ class TimeConstant(Effect):
     signature = "Lag and smear along beam x: a near twin of a pointing offset along the scan, and of m = 2."
     source = "Planck 2013 results VII, A&A 571, A7 (time response of bolometers)"
     step = 0.001
-    one_sided = True
 
     def pointing(self, beam: Beam, site: Site) -> Beam:
         """Trailing along the circle of the spin."""

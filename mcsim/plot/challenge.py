@@ -1,5 +1,6 @@
 """A score in one picture: calibration, power, confusion, pulls, shrink, what is unknown."""
 
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,7 +30,7 @@ def challenge_figure(score: "Score") -> Figure:
     """
     figure = Figure(figsize=(15.0, 16.0), layout="constrained")
     figure.suptitle(score.title, fontsize=12)
-    upper, lower = figure.subfigures(2, 1, height_ratios=(1.0, 1.05))
+    upper, lower = np.ravel(np.asarray(figure.subfigures(2, 1, height_ratios=(1.0, 1.05)), dtype=object))
     axes = upper.subplots(2, 3)
     _calibration(axes[0, 0], score)
     _power(axes[0, 1], score)
@@ -62,7 +63,7 @@ def _binned(axes: Axes, x: np.ndarray, hits: np.ndarray, colour: str, label: str
     if len(x) < 2:
         return
     edges = np.quantile(x, np.linspace(0.0, 1.0, min(bins, max(len(x) // 8, 1)) + 1))
-    for number, (low, high) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for number, (low, high) in enumerate(pairwise(edges)):
         here = hits[(x >= low) & ((x < high) | (high == edges[-1]))]
         if not len(here):
             continue
@@ -106,7 +107,7 @@ def _unknown(axes: Axes, score: "Score") -> None:
 def _pulls(axes: Axes, score: "Score") -> None:
     pulls = [pull for record in score.records if record.strength >= 5.0 for pull in record.pulls]
     if pulls:
-        axes.hist(np.clip(pulls, -5, 5), bins=np.linspace(-5, 5, 31), color=BLUE, alpha=0.7, density=True)
+        axes.hist(np.clip(pulls, -5, 5), bins=list(np.linspace(-5, 5, 31)), color=BLUE, alpha=0.7, density=True)
         axes.set_title(f"{len(pulls)} amplitudes: mean {np.mean(pulls):.2f}, width {np.std(pulls):.2f}")
     x = np.linspace(-5, 5, 200)
     axes.plot(x, np.exp(-0.5 * x * x) / np.sqrt(2 * np.pi), color=GREY)

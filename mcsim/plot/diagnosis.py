@@ -15,8 +15,8 @@ from mcsim.diagnosis.case import Diagnosis
 from mcsim.diagnosis.reading import APART, Gap, Reading
 
 # Okabe and Ito's palette: told apart with any colour vision.
-BLUE, RED, GREY, GREEN, AMBER = "#0072b2", "#d55e00", "#7a7a7a", "#009e73", "#e69f00"
-_VERDICTS = {"none": GREEN, "effect": BLUE, "mixture": BLUE, "degenerate": AMBER, "unknown": RED}
+BLUE, RED, GREEN, AMBER = "#0072b2", "#d55e00", "#00785a", "#e69f00"
+_VERDICTS = {"none": GREEN, "effect": BLUE, "mixture": BLUE, "degenerate": "#8a5c00", "unknown": "#b04a00"}
 
 TOP = 15
 """Candidates in the picture of impacts; the table has all."""
@@ -35,24 +35,26 @@ def first_screen(diagnosis: Diagnosis) -> Figure:
     """
     reading = Reading(diagnosis.verdict, diagnosis.evidence)
     kind = diagnosis.verdict["verdict"]
-    lines = textwrap.wrap(_plain(sentence_for_people(diagnosis)), 104)
-    top = 0.75 + 0.24 * len(lines)
-    figure = Figure(figsize=(9.6, 3.1 + top))
-    height = figure.get_figheight()
+    lines = textwrap.wrap(_plain(sentence_for_people(diagnosis)), 100)
+    top = 0.8 + 0.24 * len(lines)
+    height = 2.6 + top
+    figure = Figure(figsize=(9.6, height))
+    figure.set_layout_engine("constrained", rect=(0.0, 0.0, 1.0, 1.0 - top / height), w_pad=0.15)
     figure.text(
         0.02,
         1.0 - 0.3 / height,
-        f" {_plain(str(diagnosis.verdict['case']))}: {kind} ",
+        f" {_plain(_short(str(diagnosis.verdict['case']), 60))}: {kind} ",
         fontsize=13,
         fontweight="bold",
         color="white",
         va="center",
         bbox={"facecolor": _VERDICTS[kind], "edgecolor": "none", "boxstyle": "round,pad=0.3"},
-    )
-    figure.text(0.02, 1.0 - 0.6 / height, "\n".join(lines), fontsize=10.5, va="top", linespacing=1.35)
-    share = 1.0 - top / height
-    draw_gap(figure.add_axes((0.10, 0.62 / height, 0.36, share - 1.0 / height)), reading.gap)
-    draw_impacts(figure.add_axes((0.74, 0.62 / height, 0.24, share - 1.0 / height)), reading, 6)
+    ).set_in_layout(False)
+    words = figure.text(0.02, 1.0 - 0.6 / height, "\n".join(lines), fontsize=10.5, va="top", linespacing=1.35)
+    words.set_in_layout(False)
+    left, right = figure.subplots(1, 2)
+    draw_gap(left, reading.gap)
+    draw_impacts(right, reading, 6)
     return figure
 
 
@@ -109,12 +111,13 @@ def impacts_figure(reading: Reading) -> Figure:
 def draw_impacts(axes: Axes, reading: Reading, count: int) -> None:
     """Bars of the root of the fall of chi^2 of each candidate alone; those of the accepted set in colour."""
     rows = reading.ranked[:count]
-    colours = [BLUE if row.accepted else "#b5b5b5" for row in rows]
+    colours = [BLUE if row.accepted else AMBER if row.alternative else "#b5b5b5" for row in rows]
     axes.barh(range(len(rows)), [row.impact for row in rows], height=0.7, color=colours)
     axes.set_yticks(range(len(rows)), [_plain(_short(row.label, 34)) for row in rows], fontsize=8)
     axes.set_ylim(len(rows) - 0.4, -0.6)
-    colour_words = "\nblue: in the verdict" if any(row.accepted for row in rows) else ""
-    axes.set_xlabel(rf"fitted alone: $\sqrt{{\Delta\chi^2}}$ [sigmas]{colour_words}", fontsize=9)
+    shown = [("blue: best explanation", BLUE), ("amber: an alternative", AMBER)]
+    words = ", ".join(word for word, colour in shown if colour in colours)
+    axes.set_xlabel(rf"fitted alone: $\sqrt{{\Delta\chi^2}}$ [sigmas]" + (f"\n({words})" if words else ""), fontsize=9)
     _bare(axes)
 
 
@@ -122,22 +125,24 @@ def blocks_figure(reading: Reading) -> Figure:
     """Largest deviate of every block, before and after the fit."""
     kinds, columns, tables = reading.blocks
     width = 2.4 + len(tables) * (0.62 * len(columns) + 0.3)
-    figure = Figure(figsize=(width, 1.7 + 0.27 * len(kinds)), layout="constrained")
+    figure = Figure(figsize=(width, 2.6 + 0.27 * len(kinds)), layout="constrained")
     grid = figure.subplots(1, len(tables), sharey=True, squeeze=False)[0]
     titles = ["data against model", "left by the best explanation"]
     shown = None
     for axes, table, title in zip(grid, tables, titles, strict=False):
+        axes.set_facecolor("#e6e6e6")
         shown = axes.imshow(table, cmap="RdBu_r", vmin=-LIMIT, vmax=LIMIT, aspect="auto")
         for (row, column), value in np.ndenumerate(table):
             if np.isfinite(value):
                 colour = "white" if abs(value) > 0.62 * LIMIT else "black"
                 axes.text(column, row, f"{value:+.1f}", ha="center", va="center", fontsize=7, color=colour)
-        axes.set_xticks(range(len(columns)), [_plain(name) for name in columns], rotation=45, ha="right", fontsize=8)
-        axes.set_yticks(range(len(kinds)), [_plain(kind) for kind in kinds], fontsize=8)
+        axes.set_xticks(
+            range(len(columns)), [_plain(_short(name, 22)) for name in columns], rotation=45, ha="right", fontsize=8
+        )
+        axes.set_yticks(range(len(kinds)), [_plain(_short(kind, 36)) for kind in kinds], fontsize=8)
         axes.set_title(title, fontsize=10)
-    figure.colorbar(
-        shown, ax=list(grid), label="deviate of largest modulus in the block [sigmas]", extend="both", pad=0.02
-    )
+    words = "deviate of largest modulus in each block [sigmas]; grey: none"
+    figure.colorbar(shown, ax=list(grid), label=words, extend="both", location="bottom", shrink=0.6, aspect=40)
     return figure
 
 
@@ -158,14 +163,16 @@ def entries_figure(reading: Reading) -> Figure:
         axes.text(
             (start + stop - 1) / 2,
             1.01,
-            _plain(families[start][1]),
+            _plain(families[start][1].replace("score", "matched")),
             rotation=35,
             fontsize=8,
             transform=axes.get_xaxis_transform(),
             va="bottom",
         )
     axes.set_yscale("symlog", linthresh=5.0)
-    axes.set_yticks(*_ticks(float(np.max(np.abs(reading.z)))))
+    largest = max(float(np.max(np.abs(reading.z))), 5.0)
+    axes.set_yticks(*_ticks(largest))
+    axes.set_ylim(-1.2 * largest, 1.2 * largest)
     axes.set_xlim(-1.0, len(order))
     axes.set_xlabel("entry of the evidence (straight up to 5 sigmas, logarithmic beyond)")
     axes.set_ylabel("deviate [sigmas]")
@@ -181,14 +188,14 @@ def residual_figure(reading: Reading) -> Figure | None:
     names = [str(name) for name in maps["map"].values]
     columns = min(2, len(names))
     rows = -(-len(names) // columns)
-    figure = Figure(figsize=(4.9 * columns, 2.75 * rows + 0.5), layout="constrained")
+    figure = Figure(figsize=(4.9 * columns, 2.8 * rows + 0.8), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
     shown = None
     for axes, name, values in zip(grid, names, maps.values, strict=False):
         shown = _mollweide(axes, values)
-        axes.set_title(f"{_plain(name)}: rms {np.nanstd(values):.2f}", fontsize=10)
+        axes.set_title(f"{_plain(_short(name, 40))}: rms {np.nanstd(values):.2f}", fontsize=10)
     for axes in grid:
-        axes.set_axis_off()
+        axes.set(xticks=[], yticks=[], frame_on=False)
     figure.colorbar(
         shown,
         ax=list(grid),
@@ -224,17 +231,18 @@ def calibration_figure(reading: Reading) -> Figure:
     left, right = figure.subplots(1, 2)
     held = reading.evidence["held_out"].values
     bins = 20
-    left.hist(held, bins=bins, range=(0.0, 1.0), color=BLUE, alpha=0.75)
+    left.hist(held, bins=bins, range=(0.0, 1.0), histtype="step", color=BLUE, linewidth=1.6)
     low, high = stats.binom.interval(0.95, len(held), 1.0 / bins)
-    left.axhspan(low, high, color="0.75", zorder=0)
+    left.axhspan(low, high, color="0.88", zorder=0)
     left.axhline(len(held) / bins, color="black", linewidth=0.8)
     left.set_xlim(0.0, 1.0)
+    left.set_ylim(0.0, None)
     left.set_xlabel("omnibus probability of a simulation held out")
     left.set_ylabel(f"simulations of {len(held)}")
-    left.set_title("grey: 95 % of uniform bins", fontsize=9)
+    left.set_title("grey: where 95 % of the bins of a flat one are", fontsize=9)
     draws = np.maximum(reading.evidence["calibration"].values, 1e-12)
     rank = (1.0 + np.arange(len(draws))) / (1.0 + len(draws))
-    right.plot(draws, rank, color=GREY, label="draws without a gap")
+    right.plot(draws, rank, color=BLUE, label="draws without a gap")
     p = max(float(reading.verdict["gap"]["p_value"]), 1e-300)
     floor = rank[0] / 3.0
     inside = p >= rank[0]

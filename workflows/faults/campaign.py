@@ -147,11 +147,10 @@ def workers_of(parent: int) -> list[int]:
 
 
 def drive(path: Path, scheduler: str | None, answer: Path, resume: bool) -> int:
-    """Start a driver as a fork of this process, in a session of its own; its result is left in a file."""
+    """Start a driver as a fork of this process; its result is left in a file."""
     child = os.fork()
     if child:
         return child
-    os.setsid()
     code = 1
     try:
         sink = os.open(path.with_suffix(".noise"), os.O_WRONLY | os.O_CREAT | os.O_APPEND)

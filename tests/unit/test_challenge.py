@@ -1,0 +1,317 @@
+"""Challenges on toys: seals, draws, the best classifier, and what the score makes of records."""
+
+import tomllib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import integrate, stats
+
+from mcsim import config, effects
+from mcsim.challenge import intervals, toml
+from mcsim.challenge.draws import Draw, bench, draws, judged, powers, urn_of
+from mcsim.challenge.expected import SIGNATURES, places_right
+from mcsim.challenge.figures import confusion, scored
+from mcsim.challenge.prior import Drawn, Prior
+from mcsim.challenge.record import Geometry, Record
+from mcsim.challenge.reduced import without
+from mcsim.challenge.report import lines, write
+from mcsim.challenge.truth import MAPS, SEAL, Member, Truth, finished_cases, key_path, open_key, sealed, write_whole
+from mcsim.diagnosis.blocks import Block, Entry
+from mcsim.diagnosis.case import court
+from mcsim.diagnosis.evidence import Proposal, Questions
+from mcsim.diagnosis.knowledge import Knowledge
+from mcsim.errors import InputError
+
+ENTRIES = 24
+
+
+def toy(names, simulations=800, seed=1, common=0.0):
+    """A court of effects with random templates, alike in both folds, and unit noise; ``common``: their cosine."""
+    rng = np.random.default_rng(seed)
+    proposals = []
+    for name, channel in names:
+        kind = effects.get(name)
+        proposals.append(Proposal(kind, channel, {}, kind.basis()))
+    columns = sum(len(proposal.basis) for proposal in proposals)
+    directions = np.linalg.qr(rng.standard_normal((ENTRIES // 2, columns)))[0]
+    directions = np.sqrt(1.0 - common) * directions + np.sqrt(common) * directions[:, :1]
+    templates = np.repeat(directions, 2, axis=0)
+    entries = [Entry(f"entry{i}", "map", ("A",), None, i % 2) for i in range(ENTRIES)]
+    blocks = [Block(tuple(entries), lambda model, heard: np.zeros(ENTRIES))]
+    rows = [templates]
+    for number, proposal in enumerate(proposals):
+        score = Entry(f"score/{proposal.label}/0", "score", ("A",))
+        blocks.append(Block((score,), lambda model, heard: np.zeros(1)))
+        row = np.zeros((1, columns))
+        row[0, number] = 0.5
+        rows.append(row)
+    t = np.concatenate(rows)
+    p = len(t)
+    known = Knowledge(
+        rng.standard_normal((simulations, p)),
+        np.zeros(p),
+        t,
+        np.zeros_like(t),
+        np.zeros_like(t),
+        np.zeros((24, p)),
+        np.zeros((0, 0)),
+        tuple(entry for block in blocks for entry in block.entries),
+    )
+    return court(None, Questions(None, tuple(proposals), tuple(blocks)), known)
+
+
+NAMES = (("beam_width", "A"), ("noise_level", "A"), ("beam_ellipticity", "A"), ("beam_width", "B"), ("spectrum", None))
+
+
+@pytest.fixture(scope="module")
+def sitting():
+    return toy(NAMES[:4])
+
+
+def member(name="beam_width", channel="A", **changes):
+    values = {"parameters": {"amplitude": 0.01}, "coordinates": (0.01,), "strength": 6.0, "candidate": 0}
+    return Member(name, channel, **(values | changes))
+
+
+def truth(case="case-000", **changes):
+    values = {"kind": "one", "members": (member(),), "without": (), "seed": 5, "sampled": True, "nonce": "ab" * 32}
+    return Truth(case, **(values | changes))
+
+
+# Seals
+
+
+def test_a_key_that_was_changed_is_found(tmp_path):
+    key = key_path(tmp_path, "case-000")
+    write_whole(key, truth().text())
+    case = tmp_path / MAPS / "case-000"
+    case.mkdir(parents=True)
+    (case / SEAL).write_text(f"{sealed(key)}  keys/case-000.json\n")
+    assert finished_cases(tmp_path) == ["case-000"]
+    assert open_key(tmp_path, "case-000") == truth()
+    write_whole(key, truth(kind="none", members=()).text())
+    with pytest.raises(InputError, match="is not the key that was sealed"):
+        open_key(tmp_path, "case-000")
+    key.write_text("{}")
+    with pytest.raises(InputError, match="cannot be read as a key"):
+        open_key(tmp_path, "case-000")
+
+
+def test_no_challenge_is_said_so(tmp_path):
+    with pytest.raises(InputError, match="holds no challenge"):
+        finished_cases(tmp_path / "nothing")
+
+
+def test_toml_loads_as_the_same_run():
+    run = config.load("quickstart")
+    run = replace(run, effects=(config.Effect(name="beam_width", channel="W1", parameters={"amplitude": 0.01}),))
+    assert config.load(tomllib.loads(toml.text(config.to_dict(run)))) == run
+
+
+# Draws
+
+
+def test_cases_do_not_depend_on_how_many_there_are(sitting):
+    urn = urn_of(bench(sitting), Prior())
+    few, many = urn.kinds(3, 20, False), urn.kinds(3, 400, False)
+    assert many[:20] == few
+    assert [urn.draw(few, 3, case) for case in range(20)] == [urn.draw(many, 3, case) for case in range(20)]
+    assert "invented" not in many
+    # 20, 45, 15 and 12 of 92; 4 sigma.
+    for kind, part in (("none", 20), ("one", 45), ("two", 15), ("left_out", 12)):
+        share = part / 92
+        assert abs(many.count(kind) - 400 * share) < 4 * np.sqrt(400 * share * (1 - share))
+
+
+def test_what_is_left_out_rotates(sitting):
+    urn = urn_of(bench(sitting), Prior(none=0, one=0, two=0, left_out=1))
+    kinds = urn.kinds(1, 6, False)
+    names = [urn.draw(kinds, 1, case).without[0] for case in range(6)]
+    assert sorted(names[:3]) == sorted(names[3:]) == sorted(set(urn.names()))
+
+
+def test_strengths_are_the_drawn_ones(sitting):
+    """White length of the response, by the covariance that the toy was made with; known to 5 % from 600 simulations."""
+    urn = urn_of(bench(sitting), Prior(none=0, one=1, two=0, left_out=0))
+    kinds = urn.kinds(1, 200, False)
+    for case in range(200):
+        (found,) = urn.draw(kinds, 1, case).members
+        assert 3.0 * (1 - 1e-6) < found.strength < 20.0 * (1 + 1e-6)
+        columns = list(sitting.candidates[found.candidate].columns)
+        length = np.linalg.norm(sitting.known.templates[:, columns] @ found.coordinates)
+        assert length == pytest.approx(found.strength, rel=0.15)
+
+
+def test_prior_refuses_what_is_none():
+    with pytest.raises(InputError, match="are no range"):
+        Prior(weakest=5.0, strongest=2.0)
+    with pytest.raises(InputError, match="must not be negative"):
+        Prior(one=-0.1)
+
+
+def test_power_of_one_template_is_the_known_one():
+    """One candidate of one column: the score test's power is a noncentral F's, no trials."""
+    found = powers(toy(NAMES[:1], simulations=2400), 1500, 4)
+    expected = np.interp(found.strengths, found.grid, found.finite)
+    excess = np.sum(found.by_maximum) - expected.sum()
+    # Data are 600 held-out simulations, each used two or three times: their noise is common to the draws.
+    assert abs(excess) < 4.0 * np.sqrt(2.5 * np.sum(expected * (1.0 - expected)))
+    assert found.limit[-1] > 0.99
+    false = np.sum(found.null_maximum <= 0.05)
+    low, high = stats.binom.ppf((1e-4, 1 - 1e-4), len(found.null_maximum), 0.05)
+    assert low <= false <= high
+
+
+def test_draws_are_judged(sitting, tmp_path):
+    records = draws(sitting, 120, 2)
+    assert [record.case for record in records] == [f"draw-{number:05d}" for number in range(120)]
+    score = scored("toy", records, powers(sitting, 300, 2))
+    strong = [record for record in records if record.kind == "one" and record.strength > 6]
+    # Nearly orthogonal templates, far above the threshold: only the 5 % of true sets that are refused go wrong.
+    wrong = sum(not record.right for record in strong)
+    assert wrong <= stats.binom.ppf(1 - 1e-4, len(strong), 0.06)
+    assert sum(record.bayes != record.truth for record in strong) <= 2
+    assert all(record.distances[0] >= record.distances[-1] for record in records if record.kind == "left_out")
+    absent = [record.absent for record in records if record.absent is not None]
+    shrink = [record.achieved for record in strong if record.right and record.strength > 10]
+    assert np.mean(shrink) > 0.8
+    assert abs(np.mean(absent)) < 0.1
+    write([score], tmp_path / "score")
+    page = (tmp_path / "score" / "report.html").read_text()
+    assert "data:image/png;base64" in page
+    assert "http" not in page
+    assert any("false alarms" in line for line in lines(score))
+
+
+def test_an_invention_is_called_unknown(sitting):
+    """A response at right angles to every template, at ten sigmas, in 40 skies: no name, but where noise adds one."""
+    here = bench(sitting)
+    rng = np.random.default_rng(8)
+    left = here.null.templates(here.templates)
+    basis = np.linalg.qr(left)[0]
+    found = []
+    for case in range(40):
+        direction = rng.standard_normal(here.null.dimension)
+        direction -= basis @ (basis.T @ direction)
+        response = np.linalg.lstsq(here.null.templates(np.eye(len(here.templates))), direction, rcond=None)[0]
+        length = np.sqrt(here.null.unbiased) * np.linalg.norm(here.null.templates(response[:, None]))
+        invented = member("invented", candidate=None, response=tuple(10.0 / length * response))
+        found.append(Draw(case, Drawn("invented", (invented,), ()), 10.0 / length * response))
+    records = judged(here, Prior(), 0, found)
+    assert all(record.distances[-1] > 9.9 for record in records)
+    assert all(record.bayes is None for record in records)
+    assert sum(record.verdict == "unknown" for record in records) >= 38
+    assert sum(record.wrong_name for record in records) <= 1
+
+
+# The best classifier
+
+
+def test_pairs_have_the_evidence_of_brute_force():
+    """Likelihood times prior of two amplitudes on a grid, against importance sampling; many simulations: Gaussian."""
+    prior = Prior(none=0.2, one=0.5, two=0.3, left_out=0, invented=0, weakest=2.0, strongest=10.0)
+    here = bench(toy(NAMES[:2], simulations=20_000, common=0.3))
+    urn = urn_of(here, prior)
+    geometry = Geometry.of(here.null, here.templates, here.candidates, here.calibration)
+    bayes = geometry.bayes(urn)
+    white = here.null.templates(here.templates)
+    unit = white / np.linalg.norm(white, axis=0)
+    noise = np.random.default_rng(3).standard_normal(here.null.dimension)
+    s = np.concatenate([-np.linspace(10, 2, 1201), np.linspace(2, 10, 1201)])
+    density = 1.0 / (2.0 * np.abs(s) * np.log(5.0))
+
+    def area(values, axis=-1):
+        half = len(s) // 2
+        first, second = np.split(values, [half], axis=axis)
+        return integrate.simpson(first, x=s[:half], axis=axis) + integrate.simpson(second, x=s[half:], axis=axis)
+
+    for a, b in ((4.0, 3.0), (5.0, 0.0), (0.0, 0.0), (3.0, -2.5)):
+        y = noise + a * unit[:, 0] + b * unit[:, 1]
+        x = here.null.mean + np.linalg.lstsq(here.null.whitening, y * np.sqrt(1 + 1 / here.null.count), rcond=None)[0]
+        square = s[:, None] ** 2 + s[None, :] ** 2 + 2 * s[:, None] * s[None, :] * (unit[:, 0] @ unit[:, 1])
+        both = s[:, None] * (unit[:, 0] @ y) + s[None, :] * (unit[:, 1] @ y) - 0.5 * square
+        pair = area(area(np.exp(both) * density[:, None] * density[None, :]))
+        ones = [area(np.exp(s * (unit[:, i] @ y) - 0.5 * s**2) * density) for i in (0, 1)]
+        weights = np.array([0.2, 0.25 * ones[0], 0.25 * ones[1], 0.3 * pair])
+        names = [frozenset(), *(frozenset([NAMES[i]]) for i in (0, 1)), frozenset(NAMES[:2])]
+        found = bayes.probabilities(x)
+        # 256 draws of a density that varies by a few: 3 %.
+        for name, expected in zip(names, weights / weights.sum(), strict=True):
+            assert found.get(name, 0.0) == pytest.approx(expected, abs=0.03)
+
+
+# Without an effect
+
+
+def test_an_effect_leaves_its_columns_and_entries_only(sitting):
+    fewer = without(sitting.asked, sitting.known, ["beam_width"])
+    assert [proposal.kind.name for proposal in fewer.asked.proposals] == ["noise_level", "beam_ellipticity"]
+    assert fewer.asked.without == ("beam_width",)
+    names = [entry.name for entry in fewer.known.entries]
+    assert names == [entry.name for entry in fewer.asked.entries]
+    assert sorted(set(e.name for e in sitting.known.entries) - set(names)) == [
+        "score/beam_width (A)/0",
+        "score/beam_width (B)/0",
+    ]
+    for proposal, columns in zip(fewer.asked.proposals, fewer.asked.columns, strict=True):
+        index = sitting.asked.proposals.index(proposal)
+        full = sitting.known.templates[np.ix_(fewer.rows, sitting.asked.columns[index])]
+        np.testing.assert_array_equal(fewer.known.templates[:, columns], full)
+    same = without(sitting.asked, sitting.known, [])
+    assert same.known.templates.shape == sitting.known.templates.shape
+
+
+# Figures
+
+
+def test_intervals_cover_what_they_say():
+    low, high = intervals.binomial(0, 10)
+    assert (low, high) == (0.0, pytest.approx(1 - 0.025**0.1))
+    low, high = intervals.binomial(7, 7)
+    assert (low, high) == (pytest.approx(0.025 ** (1 / 7)), 1.0)
+    assert intervals.share("x", []).met is None
+    assert intervals.share("x", [True] * 19 + [False], least=0.95).met is True
+    rng = np.random.default_rng(0)
+    s = rng.uniform(1, 8, 3000)
+    hits = rng.random(3000) < stats.norm.cdf(s - 3.0)
+    value, low, high = intervals.strength_at(s, hits)
+    assert low < 3.0 + stats.norm.ppf(0.9) < high
+    assert value == pytest.approx(4.28, abs=0.2)
+
+
+def record(kind="one", verdict="effect", there=(("beam_width", "A"),), said=((("beam_width", "A"),),), **changes):
+    values = {"strength": 9.0, "columns": 1, "rival": 0.2, "distances": (), "p_value": 0.001, "maximum": 0.001}
+    answers = tuple(frozenset(one) for one in said)
+    return Record("case", kind, frozenset(there), verdict=verdict, answers=answers, **(values | changes))
+
+
+def test_what_counts_as_right():
+    other = ((("noise_level", "A"),),)
+    records = [
+        record(bayes=frozenset([("beam_width", "A")])),
+        record(said=((("beam_width", "B"),),), bayes=frozenset([("beam_width", "A")])),
+        record("none", "none", (), (), bayes=frozenset(), p_value=0.4),
+        record("left_out", "unknown", said=(), distances=(12.0, 11.0, 10.0)),
+        record("left_out", "effect", said=other, distances=(12.0, 11.0, 10.0)),
+        record("one", "degenerate", said=(*other, (("beam_width", "A"),)), rival=0.95),
+    ]
+    assert [one.right for one in records] == [True, False, True, True, False, False]
+    assert [one.wrong_name for one in records] == [False, True, False, False, True, False]
+    figures = {figure.name: figure for figure in scored("toy", records).figures}
+    assert figures["right effect, s >= 5, |rho| <= 0.7"].value == 0.5
+    assert figures["truth in the set, s >= 5, |rho| > 0.9"].value == 1.0
+    assert figures["unknown flagged, distance from every triple >= 8"].value == 0.5
+    assert figures["points behind Bayes"].value == pytest.approx(1 / 3)
+    matrix = confusion(records)
+    assert matrix.counts.sum() == len(records)
+    row = matrix.truths.index("beam_width")
+    assert matrix.counts[row, matrix.answers.index("beam_width, other channel")] == 1
+    assert matrix.counts[row, matrix.answers.index("set with the truth")] == 1
+
+
+def test_every_effect_has_a_signature():
+    assert set(SIGNATURES) == set(effects.library())
+    assert places_right(["beam_ellipticity"], [("galactic", 2, "even"), ("ecliptic", 2, "even")])
+    assert not places_right(["beam_ellipticity"], [("ecliptic", 1, "even"), (None, 0, "even")])
+    assert places_right(["invented"], []) is None
