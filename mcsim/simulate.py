@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import alm as alm_
-from mcsim import biposh, config, convolve, differencing, healpix, rng, tod
+from mcsim import biposh, config, convolve, differencing, healpix, rings, rng, tod
 from mcsim.errors import InputError
 from mcsim.sky import gaussian_alm
 from mcsim.survey import Channel, Survey, SurveyMap
@@ -70,7 +70,9 @@ def draw_sky(survey: Survey, realization: int) -> Alm:
 def _observe(survey: Survey, channel: Channel, sky: Alm, realization: int, nthreads: int) -> list[Observed]:
     """The channel's maps of one sky; transforms that splits share are made once."""
     run = survey.config
-    nside, lmax_sky = run.map.nside, run.sky.lmax
+    nside, lmax_sky = run.map.resolution, run.sky.lmax
+    if channel.rings is not None:
+        return [_observe_on_rings(survey, channel, channel.rings, sky, realization, nthreads)]
     if channel.side_b is not None:
         return _observe_differences(survey, channel, sky, realization, nthreads)
     seen, dipole = _seen(survey, channel, sky, realization)
@@ -122,6 +124,22 @@ def _observe(survey: Survey, channel: Channel, sky: Alm, realization: int, nthre
     return results
 
 
+def _observe_on_rings(
+    survey: Survey, channel: Channel, grid: tuple[rings.Rings, ...], sky: Alm, realization: int, nthreads: int
+) -> Observed:
+    """The channel's a_lm of one sky where no map is needed for them."""
+    lmax_sky, lmax = survey.config.sky.lmax, survey.lmax
+    seen, dipole = _seen(survey, channel, sky, realization)
+    circular = convolve.circular_alm(seen, channel.response)
+    difference = rings.noncircular_alm(seen, channel.response, grid, lmax, nthreads)
+    if dipole is not None:
+        believed = convolve.response(channel.site.beam, lmax_sky)
+        circular = circular - convolve.circular_alm(dipole, believed)
+        difference = difference - rings.noncircular_alm(dipole, believed, grid, lmax, nthreads)
+    twin = alm_.resize(circular, lmax_sky, lmax)
+    return Observed(twin + difference, twin if survey.config.ensemble.paired else None, None)
+
+
 def _seen(survey: Survey, channel: Channel, sky: Alm, realization: int) -> tuple[Alm, Alm | None]:
     """The sky that the channel looks at, and the dipole in it that is taken off again; None where none shows."""
     for effect in channel.effects:
@@ -142,7 +160,7 @@ def _observe_differences(survey: Survey, channel: Channel, sky: Alm, realization
     results = []
     seen, dipole = _seen(survey, channel, sky, realization)
     seed = run.ensemble.seed
-    for m, solved in differencing.maps(channel, seen, dipole, run.map.nside, seed, realization, nthreads):
+    for m, solved in differencing.maps(channel, seen, dipole, run.map.resolution, seed, realization, nthreads):
         # The two are analysed apart like those of other scans.
         twin = _analyse(survey, channel, solved.circular, m.weight, nthreads)
         alm = twin + _analyse(survey, channel, solved.difference, m.weight, nthreads)
