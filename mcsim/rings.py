@@ -33,6 +33,10 @@ _ROUND_OFF = 1e8
 """Loss of digits that the division by sin^s(theta) on the ring next to the pole may cost."""
 
 
+_FEW = 3e8
+"""Points times squared nodes up to which a rule is built by Lanczos steps: about a second."""
+
+
 @dataclass(frozen=True)
 class Rings:
     """Rings that integrate over the sphere what stands beside one moment.
@@ -83,11 +87,11 @@ def limit_rings(
     Notes
     -----
     The integrals are first sums over the many nodes of a double-exponential rule between the caustics. Where w_s has
-    one sign, the Gauss rule of the weight w_s says the same with degree/2 + 1 rings: its three-term recurrence is built
-    up point by point (Gragg & Harwood 1984, Numer. Math. 44, 317). Where it changes sign, as it does about every
-    caustic, each sign has rules of its own, over its intervals or altogether, whichever takes fewer rings: 1251 for
-    WMAP, s = 2 and degree 2048. Against brute-force spin transforms: 1e-5 of what the beam adds at worst, which is
-    round-off of the recurrence, and 1e-12 for parallel transport (tests/unit/test_rings.py).
+    one sign, the Gauss rule of the weight w_s says the same with degree/2 + 1 rings, from its three-term recurrence:
+    by Lanczos steps, or, where these are too many, point by point (Gragg & Harwood 1984, Numer. Math. 44, 317). Where
+    it changes sign, as it does about every caustic, each sign has rules of its own, over its intervals or altogether,
+    whichever takes fewer rings: 1251 for WMAP, s = 2 and degree 2048. Against brute-force spin transforms: better than
+    1e-5 of what the beam adds, 1e-11 for parallel transport (tests/unit/test_rings.py).
     """
     orders = tuple(orders)
     lines = model.default_lines if line_of_sight is None else (line_of_sight,)
@@ -214,7 +218,10 @@ def _rings(moments: Callable[[Vector], dict[int, Alm]], breaks: Vector, degree: 
 def _signed_rule(theta: Vector, measure: Vector, degree: int) -> tuple[Vector, Vector]:
     """Few nodes, and weights, that integrate polynomials in cos(theta) like the many of ``measure``."""
     counts = np.abs(measure) > 1e-17 * np.abs(measure).sum()
-    theta, measure = theta[counts], measure[counts]
+    x, theta, measure = np.cos(theta[counts]), theta[counts], measure[counts]
+    if np.abs(x + x[::-1]).max() < 1e-12 and np.abs(measure - measure[::-1]).max() < 1e-10 * np.abs(measure).max():
+        # Rings at exactly opposite latitudes share their Legendre functions.
+        x, measure = 0.5 * (x - x[::-1]), 0.5 * (measure + measure[::-1])
     rules = []
     for sign in (1.0, -1.0):
         of_sign = np.flatnonzero(sign * measure > 0.0)
@@ -225,16 +232,11 @@ def _signed_rule(theta: Vector, measure: Vector, degree: int) -> tuple[Vector, V
         if sum(enough) > degree // 2 + 1:
             runs, enough = [of_sign], [min(of_sign.size, degree // 2 + 1)]
         for run, count in zip(runs, enough, strict=True):
-            nodes, weights = _gauss(np.cos(theta[run]), sign * measure[run], count)
+            nodes, weights = _gauss(x[run], sign * measure[run], count)
             rules.append((nodes, sign * weights))
     nodes, weights = (np.concatenate(parts) for parts in zip(*rules, strict=True))
     order = np.argsort(nodes)
-    nodes, weights = np.maximum(nodes[order], 1e-9), weights[order]
-    mirrored = np.pi - nodes[::-1]
-    if np.abs(nodes - mirrored).max() < 1e-10:
-        # Rings at exactly opposite latitudes share their Legendre functions.
-        nodes = 0.5 * (nodes + mirrored)
-    return nodes, weights
+    return np.clip(nodes[order], 1e-9, np.pi - 1e-9), weights[order]
 
 
 def _nodes(length: float, degree: int) -> int:
@@ -261,9 +263,31 @@ def _fine_rule(breaks: Vector, degree: int) -> tuple[Vector, Vector]:
 
 def _gauss(x: Vector, weight: Vector, count: int) -> tuple[Vector, Vector]:
     """Gauss rule with ``count`` nodes, as colatitudes, for a sum of points with positive weights in x = cos(theta)."""
-    diagonal, squared = _recurrence(x, weight, count)
+    if x[0] + x[-1] < 0.0:
+        # The same steps as for its mirror image, so that round-off is the same as well.
+        nodes, weights = _gauss(-x[::-1], weight[::-1], count)
+        return np.pi - nodes, weights
+    few = x.size * count**2 < _FEW
+    diagonal, squared = (_lanczos if few else _recurrence)(x, weight, count)
+    if np.array_equal(x, -x[::-1]) and np.array_equal(weight, weight[::-1]):
+        diagonal[:] = 0.0
     nodes, vectors = eigh_tridiagonal(diagonal, np.sqrt(squared[1:]))
     return np.arccos(np.clip(nodes, -1.0, 1.0)), squared[0] * vectors[0] ** 2
+
+
+def _lanczos(x: Vector, weight: Vector, count: int) -> tuple[Vector, Vector]:
+    """As :func:`_recurrence`, free of its round-off, at a cost of count^2 points."""
+    basis = np.zeros((count, x.size))
+    diagonal, squared = np.empty(count), np.empty(count)
+    vector = np.sqrt(weight)
+    for k in range(count):
+        size = np.sqrt(vector @ vector)
+        squared[k], basis[k] = size**2, vector / size
+        vector = x * basis[k]
+        diagonal[k] = vector @ basis[k]
+        for _ in range(2):
+            vector = vector - (basis[: k + 1] @ vector) @ basis[: k + 1]
+    return diagonal, squared
 
 
 @numba.njit(cache=True, nogil=True)
