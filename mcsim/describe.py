@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -24,7 +25,7 @@ def describe(path: str | Path) -> str:
     run = attributes["configuration"]
     lines = [
         f"{target}: {run['name']}, {int(done.sum())} of {done.size} realizations finished",
-        f"  maps      nside {run['map']['nside']}, {run['map']['frame']} frame, lmax {sizes['ell'] - 1}",
+        f"  maps      {_grid(run['map'])}, {run['map']['frame']} frame, lmax {sizes['ell'] - 1}",
         f"  seed      {run['ensemble']['seed']}",
         f"  pairs     {'; '.join(pairs)}",
         f"  modes     {sizes['mode']}, L <= {run['biposh']['L_max']}{', with circular twins' if paired else ''}",
@@ -37,6 +38,10 @@ def describe(path: str | Path) -> str:
             strongest = _strongest(summary, paired)
             lines += ["  strongest binned spectra (mean over error):", *strongest] if strongest else []
     return "\n".join(lines)
+
+
+def _grid(section: dict[str, Any]) -> str:
+    return "rings without pixels" if section.get("grid") == "gl" else f"nside {section['nside']}"
 
 
 def _strongest(summary: xr.Dataset, paired: bool, count: int = 5) -> list[str]:

@@ -76,6 +76,17 @@ def effects_on(run: config.RunConfig, channel: str) -> tuple[effects.Effect, ...
     return tuple(acting)
 
 
+def refuse_pixel_effects(channel: str, acting: tuple[effects.Effect, ...]) -> None:
+    """Refuse effects that act on pixels, for a grid of rings."""
+    for effect in acting:
+        for hook in ("gain", "noise", "spread", "orientations"):
+            if getattr(type(effect), hook) is not getattr(effects.Effect, hook):
+                raise InputError(
+                    f'effect {effect.name} on channel {channel} acts on pixels, but grid = "gl" has none; remove it '
+                    'or set map.grid = "healpix".'
+                )
+
+
 def site_of(run: config.RunConfig, spec: config.Channel) -> effects.Site:
     """What effects may know of a channel."""
     pointing, dipole = _described(spec)
@@ -85,7 +96,7 @@ def site_of(run: config.RunConfig, spec: config.Channel) -> effects.Site:
         channel=spec.name,
         frequency_ghz=spec.frequency_ghz,
         frame=run.map.frame,
-        nside=run.map.nside,
+        nside=run.map.resolution,
         lmax=run.sky.lmax,
         beam=load_beam(spec, run.sky.lmax),
         pointing=pointing,

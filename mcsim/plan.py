@@ -81,7 +81,7 @@ def layout(survey: Survey) -> Layout:
         survey.estimator.modes,
         survey.lmax,
         run.ensemble.paired,
-        12 * run.map.nside**2 if run.ensemble.keep_maps else None,
+        12 * run.map.resolution**2 if run.ensemble.keep_maps else None,
     )
     return _chunked(bare, run.compute.chunk)
 
@@ -208,7 +208,9 @@ def cost(run: config.RunConfig, realizations: range) -> Cost:
     if run.sky.spectrum is not None:
         spectra.load(run.sky.spectrum, run.sky.lmax)
     mmax = [load_beam(channel, run.sky.lmax).mmax for channel in run.channels]
-    lmax, nside = config.analysis_lmax(run), run.map.nside
+    lmax = config.analysis_lmax(run)
+    # A grid of rings costs about what HEALPix with as many rings does.
+    nside = run.map.resolution or 1 + 3 * run.sky.lmax // 10
     names = config.map_names(run)
     both = run.biposh.pairs == "all"
     pairs = len(names) * (len(names) + 1) // 2 if both else len(names)
@@ -222,6 +224,8 @@ def cost(run: config.RunConfig, realizations: range) -> Cost:
     splits = len(run.map.splits) or 1
     transform, estimation = _timed(nside, run.sky.lmax, lmax, run.biposh.L_max)
     transforms = sum(1.0 + 2.0 * m + splits * (2.0 + 4.0 * run.biposh.iterations) for m in mmax)
+    if run.map.grid == "gl":
+        transforms = sum(2.0 * m for m in mmax)
     estimates = pairs * (2 if run.ensemble.paired else 1)
     largest = max(mmax)
     memory = 3e8 + 8.0 * npix * (6 + 2 * largest) + 16.0 * alm_.size(run.sky.lmax) * (6 + len(names) * 2)

@@ -29,6 +29,8 @@ from mcsim.predict import (
     parallel_transport_harmonics,
     signal_to_noise,
 )
+from mcsim.predict.harmonics import spin_functions
+from mcsim.rings import Rings
 from mcsim.statistics import Sums
 from mcsim.survey import Channel, Survey, SurveyMap
 
@@ -192,10 +194,22 @@ def _orientations(
     scan: config.Scan, channel: Channel, m: SurveyMap, L_max: int, nthreads: int
 ) -> NDArray[np.complex128]:
     smax = channel.beam.mmax
+    if channel.rings is not None:
+        return _orientations_on_rings(channel.rings, smax, L_max)
     if isinstance(scan, config.ScanParallelTransport) and m.weight is None:
         return parallel_transport_harmonics(smax, L_max, float(np.deg2rad(scan.psi0_deg)))
     w = np.asarray(m.moments.w[:smax])
     return orientation_harmonics(w if m.weight is None else w * m.weight**2, L_max, nthreads=nthreads)
+
+
+def _orientations_on_rings(grid: tuple[Rings, ...], smax: int, L_max: int) -> NDArray[np.complex128]:
+    """w_{s,LM} of moments that depend on colatitude alone, so M = 0; the rings integrate them without error."""
+    result = np.zeros((smax + 1, L_max + 1, 2 * L_max + 1), dtype=np.complex128)
+    result[0, 0, L_max] = np.sqrt(4.0 * np.pi)
+    for rings in grid:
+        harmonics = spin_functions(rings.s, L_max, rings.theta)[rings.s]
+        result[rings.s, :, L_max] = rings.phase * (harmonics @ rings.weight)
+    return result
 
 
 def _mean(survey: Survey, beams: tuple[ScannedBeam, ...], pair: tuple[int, int], exact: bool, nthreads: int) -> _Pair:
@@ -322,8 +336,12 @@ def _attributes(survey: Survey, L_moments: int | None) -> dict[str, Any]:
         "mask": "weights W act as w_s -> W^2 w_s and on the errors; their own mode coupling is left out"
         if weighted
         else "full sky",
-        "pixel_window": "divided out of a_lm by the analysis, so it cancels but for the noise",
-        "left_out": "centroid offsets of the samples in a pixel, quadrature error of the analysis",
+        "pixel_window": "divided out of a_lm by the analysis, so it cancels but for the noise"
+        if run.map.grid == "healpix"
+        else "none: rings without pixels",
+        "left_out": "centroid offsets of the samples in a pixel, quadrature error of the analysis"
+        if run.map.grid == "healpix"
+        else "nothing",
     }
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import alm as alm_
-from mcsim import biposh, config, convolve, differencing, effects, healpix, rng, tod
+from mcsim import biposh, config, convolve, differencing, effects, healpix, rings, rng, tod
 from mcsim.errors import InputError
 from mcsim.sky import gaussian_alm
 from mcsim.survey import Channel, Survey, SurveyMap
@@ -108,6 +108,8 @@ class Layers:
 def _observe(survey: Survey, channel: Channel, sky: Alm, realization: int, nthreads: int) -> list[Observed]:
     """The channel's maps of one sky, analysed."""
     ensemble = survey.config.ensemble
+    if channel.rings is not None:
+        return [_observe_on_rings(survey, channel, channel.rings, sky, realization, nthreads)]
     known = None
     smooth = ensemble.keep_maps or not all(_is_exact(survey, m) for m in channel.maps)
     if channel.side_b is None:
@@ -135,7 +137,7 @@ def _layers(
 ) -> Iterator[tuple[SurveyMap, Layers]]:
     """The channel's maps of one sky; transforms that splits share are made once."""
     run = survey.config
-    nside, seed = run.map.nside, run.ensemble.seed
+    nside, seed = run.map.resolution, run.ensemble.seed
     seen, dipole = _seen(survey, channel, sky, realization)
     if channel.side_b is not None:
         for m, solved in differencing.maps(channel, seen, dipole, nside, seed, realization, nthreads):
@@ -176,6 +178,21 @@ def _believed(channel: Channel) -> convolve.Response:
     """Response to the dipole that is taken off: the believed beam, at the samples' own places."""
     spread = effects.spread_of(channel.effects)
     return convolve.response(channel.site.beam, channel.site.lmax, channel.window ** (spread * spread))
+
+
+def _observe_on_rings(
+    survey: Survey, channel: Channel, grid: tuple[rings.Rings, ...], sky: Alm, realization: int, nthreads: int
+) -> Observed:
+    """The channel's a_lm of one sky where no map is needed for them."""
+    lmax_sky, lmax = survey.config.sky.lmax, survey.lmax
+    seen, dipole = _seen(survey, channel, sky, realization)
+    circular = convolve.circular_alm(seen, channel.response)
+    difference = rings.noncircular_alm(seen, channel.response, grid, lmax, nthreads)
+    if dipole is not None:
+        circular = circular - convolve.circular_alm(dipole, _believed(channel))
+        difference = difference - rings.noncircular_alm(dipole, _believed(channel), grid, lmax, nthreads)
+    twin = alm_.resize(circular, lmax_sky, lmax)
+    return Observed(twin + difference, twin if survey.config.ensemble.paired else None, None)
 
 
 def _seen(survey: Survey, channel: Channel, sky: Alm, realization: int) -> tuple[Alm, Alm | None]:

@@ -12,8 +12,9 @@ from mcsim import beams, config, convolve, healpix, mapmaking, scan, spectra, to
 from mcsim.biposh import Estimator, estimator
 from mcsim.effects import Effect, Site, seen_through, spread_of
 from mcsim.errors import InputError
-from mcsim.instrument import effects_on, load_beam_b, scan_model, site_of
+from mcsim.instrument import effects_on, load_beam_b, refuse_pixel_effects, scan_model, site_of
 from mcsim.mask import read_mask
+from mcsim.rings import Rings, limit_rings, parallel_transport_rings
 
 Progress = Callable[[float], None]
 
@@ -98,6 +99,8 @@ class Channel:
         Those that act in this channel, in the order of the configuration.
     side_b
         The other beam of a differencing scan, None for any other scan.
+    rings
+        The grid, where it is one of rings instead of pixels; the moments of the map then mean nothing and are NaN.
     """
 
     name: str
@@ -108,6 +111,7 @@ class Channel:
     site: Site
     effects: tuple[Effect, ...] = ()
     side_b: SideB | None = None
+    rings: tuple[Rings, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -170,6 +174,8 @@ def _channel(
 ) -> Channel:
     acting = effects_on(run, spec.name)
     site = site_of(run, spec)
+    if run.map.grid == "gl":
+        return _channel_on_rings(run, spec, site, acting)
     window = _window(run, spec)
     spread = spread_of(acting)
     beam = seen_through(acting, site)
@@ -193,6 +199,24 @@ def _channel(
     response = convolve.response(beam, run.sky.lmax, window ** (spread * spread))
     side_b = _side_b(run, spec, window, site, acting)
     return Channel(spec.name, beam, response, window, tuple(maps), site, acting, side_b)
+
+
+def _channel_on_rings(run: config.RunConfig, spec: config.Channel, site: Site, acting: tuple[Effect, ...]) -> Channel:
+    refuse_pixel_effects(spec.name, acting)
+    beam = seen_through(acting, site)
+    response = convolve.response(beam, run.sky.lmax)
+    orders = [s for s in range(1, response.mmax + 1) if response.factors[s].any()]
+    degree = run.sky.lmax + config.analysis_lmax(run)
+    match spec.scan:
+        case config.ScanParallelTransport():
+            grid = parallel_transport_rings(np.deg2rad(spec.scan.psi0_deg), orders, degree)
+        case config.ScanHitAveraged():
+            grid = limit_rings(scan_model(spec, spec.scan, None), orders, degree, spec.scan.line_of_sight)
+        case _:
+            raise TypeError("the configuration refuses other scans on rings")
+    unknown = scan.Moments(1, run.map.frame, np.full(12, np.nan), np.full((max(beam.mmax, 1), 12), np.nan + 0j))
+    m = SurveyMap(spec.name, unknown, None, None)
+    return Channel(spec.name, beam, response, np.ones(run.sky.lmax + 1), (m,), site, acting, rings=grid)
 
 
 def _side_b(
@@ -253,7 +277,7 @@ def _window(run: config.RunConfig, spec: config.Channel) -> NDArray[np.float64]:
     if choice == "none":
         return np.ones(run.sky.lmax + 1)
     if choice == "computed":
-        return healpix.pixel_window(run.map.nside, run.sky.lmax)
+        return healpix.pixel_window(run.map.resolution, run.sky.lmax)
     return healpix.read_pixel_window(Path(choice), run.sky.lmax)
 
 
@@ -267,7 +291,7 @@ def _moments(
     progress: Progress | None,
     needed: int,
 ) -> scan.Moments:
-    nside, frame, smax = run.map.nside, run.map.frame, max(mmax, 1)
+    nside, frame, smax = run.map.resolution, run.map.frame, max(mmax, 1)
     match spec.scan:
         case config.ScanParallelTransport():
             return scan.parallel_transport(np.deg2rad(spec.scan.psi0_deg), nside, smax, frame)
@@ -305,7 +329,7 @@ def _pairs(
 ) -> mapmaking.DifferencingScan:
     model = scan_model(spec, chosen, split)
     return mapmaking.prepare(
-        model, chosen.pair, run.map.nside, run.map.frame, share, nthreads=nthreads, progress=progress
+        model, chosen.pair, run.map.resolution, run.map.frame, share, nthreads=nthreads, progress=progress
     )
 
 

@@ -48,6 +48,10 @@ def _leave_out_what_says_nothing(plain: dict[str, Any]) -> None:
     A run that does not use a key so keeps the hash that it had before there was such a key.
     """
     section = plain["map"]
+    if section["grid"] == "healpix":
+        del section["grid"]
+    if section["nside"] is None:
+        del section["nside"]
     if section["mask_frame"] is None:
         del section["mask_frame"]
     if section["mask_apodisation_deg"] == 0.0:

@@ -87,19 +87,40 @@ class Sky:
 class Map:
     """Pixels, frame, mask, splits and pixel window.
 
+    ``grid``: "healpix", or "gl", Gauss quadrature on rings, several times faster and exact, for surveys whose
+    orientation moments depend on colatitude alone: parallel transport, and the exact long-time limit of a scan model
+    (``hit_averaged`` then stands for it) in the ecliptic frame. It has no pixels, so no ``nside``, mask, splits, noise.
     ``pixel_window``: "computed", "none" or a FITS file; left out, it is "computed" for scans whose samples spread over
     the pixels and "none" for parallel transport, whose samples stand at the centres.
     ``mask_frame``: frame of the mask, left out what its file says, or that of the maps; ``mask_apodisation_deg``: width
     of its soft edge.
     """
 
-    nside: Annotated[int, Field(ge=1, le=NSIDE_MAX), AfterValidator(_power_of_two)]
+    nside: Annotated[int, Field(ge=1, le=NSIDE_MAX), AfterValidator(_power_of_two)] | None = None
+    grid: Literal["healpix", "gl"] = "healpix"
     frame: Frame = "ecliptic"
     mask: PathText | None = None
     mask_frame: Frame | None = None
     mask_apodisation_deg: Annotated[float, Field(ge=0.0, le=90.0)] = 0.0
     splits: Annotated[tuple[Label, ...], AfterValidator(_unique)] = ()
     pixel_window: PathText | None = None
+
+    @property
+    def resolution(self) -> int:
+        """nside, 0 on a grid without pixels."""
+        return self.nside or 0
+
+    @model_validator(mode="after")
+    def _pixels_or_none(self) -> Self:
+        if self.grid == "healpix":
+            if self.nside is None:
+                raise ValueError("the key nside is missing; add it")
+            return self
+        given = {"nside": self.nside, "mask": self.mask, "splits": self.splits, "pixel_window": self.pixel_window}
+        for key, value in given.items():
+            if value and value != "none":
+                raise ValueError(f'{key} is given, but grid = "gl" has no pixels; remove {key} or set grid = "healpix"')
+        return self
 
     @model_validator(mode="after")
     def _mask_to_work_on(self) -> Self:
@@ -315,12 +336,14 @@ class RunConfig:
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        limit = 3 * self.map.nside - 1
+        limit = 3 * self.map.resolution - 1
         lmax = analysis_lmax(self)
         key = "biposh.lmax" if self.biposh.lmax is not None else "biposh.lmax (by default sky.lmax)"
         if lmax > self.sky.lmax:
             raise ValueError(f"{key} = {lmax} is above sky.lmax = {self.sky.lmax}; lower it or raise sky.lmax")
-        if lmax > limit:
+        if self.map.grid == "gl":
+            _check_rings(self)
+        elif lmax > limit:
             raise ValueError(
                 f"{key} = {lmax} is above 3 nside - 1 = {limit} of map.nside = {self.map.nside}; "
                 f"set biposh.lmax to at most {limit} or raise nside"
@@ -349,6 +372,35 @@ class RunConfig:
         return self
 
 
+def _check_rings(run: RunConfig) -> None:
+    """Refuse what needs pixels, or moments that depend on more than colatitude."""
+    remedy = 'or set map.grid = "healpix"'
+    for channel in run.channels:
+        kind = channel.scan.kind
+        if not isinstance(channel.scan, ScanParallelTransport | ScanHitAveraged):
+            raise ValueError(
+                f'channel[{channel.name}].scan is of kind "{kind}", which grid = "gl" cannot bear; use '
+                f'"parallel_transport" or "hit_averaged", {remedy}'
+            )
+        if isinstance(channel.scan, ScanHitAveraged) and run.map.frame != "ecliptic":
+            raise ValueError(
+                f'map.frame = "{run.map.frame}", but with grid = "gl" the limit of a scan depends on '
+                f'ecliptic colatitude alone; set frame = "ecliptic" {remedy}'
+            )
+        if channel.noise.sigma0_uk > 0.0:
+            raise ValueError(
+                f'channel[{channel.name}].noise.sigma0_uk = {channel.noise.sigma0_uk:g}, but grid = "gl" has no pixels '
+                f"to draw noise in; remove the noise {remedy}"
+            )
+    for key, given in (
+        ("ensemble.keep_maps = true", run.ensemble.keep_maps),
+        ('biposh.weighting = "hits"', run.biposh.weighting == "hits"),
+        (f"biposh.iterations = {run.biposh.iterations}", run.biposh.iterations > 0),
+    ):
+        if given:
+            raise ValueError(f'{key} needs pixels, but grid = "gl" has none; remove it {remedy}')
+
+
 def analysis_lmax(config: RunConfig) -> int:
     """Highest degree that the maps are analysed to."""
     return config.sky.lmax if config.biposh.lmax is None else config.biposh.lmax
@@ -356,6 +408,8 @@ def analysis_lmax(config: RunConfig) -> int:
 
 def pixel_window(config: RunConfig, channel: Channel) -> str:
     """Pixel window of a channel: "computed", "none" or the path of a FITS file."""
+    if config.map.grid == "gl":
+        return "none"
     if config.map.pixel_window is not None:
         return config.map.pixel_window
     return "none" if isinstance(channel.scan, ScanParallelTransport) else "computed"

@@ -135,7 +135,9 @@ def model_of(survey: Survey) -> Model:
     """
     if survey.cl is None:
         raise InputError("a diagnosis needs the spectrum of the sky; give sky.spectrum.")
-    lmax, nside = survey.lmax, survey.config.map.nside
+    if survey.config.map.grid == "gl":
+        raise InputError('a diagnosis compares maps of pixels; give the model map.grid = "healpix" and map.nside.')
+    lmax, nside = survey.lmax, survey.config.map.resolution
     cl = survey.cl[: lmax + 1]
     response = np.stack([_response(channel, lmax) for channel in survey.channels])
     parts = []

@@ -50,7 +50,7 @@ class Site:
     channel, frequency_ghz
         Name and frequency; None where the configuration gives none.
     frame, nside, lmax
-        Of the maps, and the highest degree of the sky.
+        Of the maps (nside 0: rings without pixels), and the highest degree of the sky.
     beam
         As believed, before any effect.
     pointing

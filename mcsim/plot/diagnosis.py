@@ -117,7 +117,7 @@ def draw_impacts(axes: Axes, reading: Reading, count: int) -> None:
     axes.set_ylim(len(rows) - 0.4, -0.6)
     shown = [("blue: best explanation", BLUE), ("amber: an alternative", AMBER)]
     words = ", ".join(word for word, colour in shown if colour in colours)
-    axes.set_xlabel(rf"fitted alone: $\sqrt{{\Delta\chi^2}}$ [sigmas]" + (f"\n({words})" if words else ""), fontsize=9)
+    axes.set_xlabel(r"fitted alone: $\sqrt{\Delta\chi^2}$ [sigmas]" + (f"\n({words})" if words else ""), fontsize=9)
     _bare(axes)
 
 
@@ -294,13 +294,13 @@ def telling_figure(contrast: dict[str, Any]) -> Figure:
 
 def _matrix(reading: Reading, values: NDArray[np.float64], label: str, scale: dict[str, Any]) -> Figure:
     labels = reading.labels
-    side = 2.6 + max(2.4, 0.165 * len(labels))
-    figure = Figure(figsize=(side + 0.6, side), layout="constrained")
+    side = 2.6 + max(3.0, 0.15 * len(labels))
+    figure = Figure(figsize=(side, side + 0.8), layout="constrained")
     axes = figure.subplots()
     shown = axes.imshow(values, interpolation="nearest", **scale)
     size = 6.5 if len(labels) > 12 else 9
     accepted = {row.label for row in reading.ranked if row.accepted}
-    words = [_plain(_short(name, 40)) for name in labels]
+    words = [_plain(_short(name, 36)) for name in labels]
     axes.set_xticks(range(len(labels)), words, rotation=90, fontsize=size)
     axes.set_yticks(range(len(labels)), words, fontsize=size)
     for ticks in (axes.get_xticklabels(), axes.get_yticklabels()):
@@ -308,7 +308,15 @@ def _matrix(reading: Reading, values: NDArray[np.float64], label: str, scale: di
             if name in accepted:
                 tick.set_color(RED)
                 tick.set_fontweight("bold")
-    figure.colorbar(shown, ax=axes, label=label, shrink=0.7, extend="neither" if "vmin" in scale else "both")
+    figure.colorbar(
+        shown,
+        ax=axes,
+        label=label,
+        location="top",
+        shrink=0.8,
+        aspect=30,
+        extend="neither" if "vmin" in scale else "both",
+    )
     return figure
 
 

@@ -35,6 +35,7 @@ SCIENCE = {
     "mcsim.mask",
     "mcsim.predict",
     "mcsim.resources",
+    "mcsim.rings",
     "mcsim.rng",
     "mcsim.rotation",
     "mcsim.scan",
