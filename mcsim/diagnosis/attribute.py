@@ -131,7 +131,7 @@ def attribute(
     calibration: Calibration,
     *,
     alpha: float = 0.05,
-    levels: tuple[float, float] = (0.025, 0.025),
+    levels: tuple[float, float] = (0.02, 0.005),
     largest: int = 3,
     odds_cut: float = 100.0,
     shape_error: float = 0.01,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config, effects, runner
-from mcsim.diagnosis import knowledge, report
+from mcsim.diagnosis import knowledge, report, tables
 from mcsim.diagnosis.case import Court, Diagnosis, court, judge
 from mcsim.diagnosis.data import read_maps
 from mcsim.diagnosis.evidence import Job, Questions, evidence_of, questions
@@ -45,7 +45,8 @@ def diagnose(
         A run: what is believed about sky, beams, scan and noise.
     data
         Folder with ``{channel}.fits`` or ``{channel}_{split}.fits``, uK; or the maps themselves, shape (npix,) each, in
-        the order channel by channel, split by split.
+        the order channel by channel, split by split; or a table of measured spectra
+        (:func:`mcsim.diagnosis.tables.read_spectra`).
     output
         Folder for ``verdict.json``, ``evidence.zarr`` and ``report.html``; None: nothing is written.
     case
@@ -70,15 +71,35 @@ def diagnose(
         For a run or data that cannot be used.
     """
     run = model if isinstance(model, config.RunConfig) else config.load(model)
-    asked = questions(run, without, nthreads=os.cpu_count() or 1)
-    maps = read_maps(asked.model, data) if isinstance(data, str | Path) else list(data)
-    with _asking(workers or run.compute.workers, quiet) as ask:
-        sitting = court(run, asked, _learned(run, asked, simulations, ask))
-        found = judge(sitting, case or run.name, maps, ask)
+    name, workers = case or run.name, workers or run.compute.workers
+    if isinstance(data, str | Path) and Path(data).is_file():
+        found = _of_table(run, data, name, without, simulations, workers, quiet)
+    else:
+        asked = questions(run, without, nthreads=os.cpu_count() or 1)
+        maps = read_maps(asked.model, data) if isinstance(data, str | Path) else list(data)
+        with _asking(workers, quiet) as ask:
+            found = judge(court(run, asked, _learned(run, asked, simulations, ask)), name, maps, ask)
     if output is not None:
         found.save(output)
         report.write(found, Path(output) / "report.html")
     return found
+
+
+def _of_table(
+    run: config.RunConfig,
+    path: str | Path,
+    case: str,
+    without: Sequence[str],
+    simulations: int | None,
+    workers: int,
+    quiet: bool,
+) -> Diagnosis:
+    measured = tables.read_spectra(path, run)
+    run = tables.listening(run, measured)
+    asked = tables.questions_of(run, measured, without, nthreads=os.cpu_count() or 1)
+    with _asking(workers, quiet, measured) as ask:
+        known = _learned(run, asked, simulations, ask, tables.plan)
+        return tables.judge(court(run, asked, tables.of_mean(known, measured.realizations)), case, measured, ask)
 
 
 def prepared(
@@ -92,7 +113,9 @@ def prepared(
 
 
 @contextmanager
-def _asking(workers: int, quiet: bool) -> Iterator[Callable[[Sequence[Job]], list[NDArray[np.float64]]]]:
+def _asking(
+    workers: int, quiet: bool, task: Callable[[Job], NDArray[np.float64]] = evidence_of
+) -> Iterator[Callable[[Sequence[Job]], list[NDArray[np.float64]]]]:
     """A cluster of this machine that answers jobs, started with the first."""
     opened: list[Any] = []
 
@@ -103,7 +126,7 @@ def _asking(workers: int, quiet: bool) -> Iterator[Callable[[Sequence[Job]], lis
         answers: list[NDArray[np.float64]] = [np.empty(0)] * len(jobs)
         done = 0
         with reporting("simulations", float(sum(job.count for job in jobs)), "skies", quiet) as report:
-            for index, answer in runner.completed(opened[1], evidence_of, ((job,) for job in jobs)):
+            for index, answer in runner.completed(opened[1], task, ((job,) for job in jobs)):
                 answers[index] = answer
                 done += jobs[index].count
                 report(float(done))
@@ -121,12 +144,13 @@ def _learned(
     asked: Questions,
     simulations: int | None,
     ask: Callable[[Sequence[Job]], list[NDArray[np.float64]]],
+    planned: Callable[[config.RunConfig, Questions, int | None], knowledge.Plan] = knowledge.plan,
 ) -> knowledge.Knowledge:
     folder = default_cache_dir() / "diagnose"
     path = folder / f"{_key(run, asked, simulations)}.zarr"
     if path.is_dir():
         return knowledge.Knowledge.load(path)
-    plan = knowledge.plan(run, asked, simulations)
+    plan = planned(run, asked, simulations)
     known = knowledge.learned(asked, plan, ask(plan.jobs))
     folder.mkdir(parents=True, exist_ok=True)
     scratch = Path(tempfile.mkdtemp(prefix=".learning.", dir=folder))

@@ -105,7 +105,9 @@ def test_no_challenge_is_said_so(tmp_path):
 
 def test_toml_loads_as_the_same_run():
     run = config.load("quickstart")
-    run = replace(run, effects=(config.Effect(name="beam_width", channel="W1", parameters={"amplitude": 0.01}),))
+    run = replace(
+        run, effects=(config.Effect(name="beam_width", channel=run.channels[0].name, parameters={"amplitude": 0.01}),)
+    )
     assert config.load(tomllib.loads(toml.text(config.to_dict(run)))) == run
 
 
@@ -250,7 +252,7 @@ def test_an_effect_leaves_its_columns_and_entries_only(sitting):
     assert fewer.asked.without == ("beam_width",)
     names = [entry.name for entry in fewer.known.entries]
     assert names == [entry.name for entry in fewer.asked.entries]
-    assert sorted(set(e.name for e in sitting.known.entries) - set(names)) == [
+    assert sorted({e.name for e in sitting.known.entries} - set(names)) == [
         "score/beam_width (A)/0",
         "score/beam_width (B)/0",
     ]

@@ -1,0 +1,209 @@
+"""Tables of measured spectra: named where an effect is in them, silent where none is, refused where they cannot be."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from astropy.table import Table
+
+from mcsim import biposh, config, effects, simulate
+from mcsim.diagnosis import knowledge, report, tables
+from mcsim.diagnosis.case import court
+from mcsim.diagnosis.knowledge import with_effects
+from mcsim.errors import InputError
+from mcsim.rotation import rotate_biposh
+from mcsim.survey import survey
+
+PROPOSED = ("beam_ellipticity", "beam_width", "dipole_modulation", "quadrupole_modulation")
+SKIES = 10
+"""Behind the mean of every table here."""
+BINS = [(2, 12), (13, 20), (21, 28), (29, 40)]
+RUN = config.load(
+    {
+        "schema": 1,
+        "name": "small",
+        "sky": {"spectrum": "wmap7", "lmax": 40},
+        "map": {"nside": 16},
+        "channel": [
+            {
+                "name": "W1",
+                "beam": {"kind": "gaussian", "fwhm_arcmin": 350.0},
+                "scan": {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 61.0, "line_of_sight": "B"},
+            }
+        ],
+    }
+)
+MODES = [(0, 0, 0), (2, 0, 0), (2, 0, 2), (2, 1, 0), (2, 2, 0)]
+
+
+def measured(run, seed=77):
+    """Table of the mean of SKIES skies, made of a_lm products by the formula of the coefficients."""
+    shared = survey(replace(run, ensemble=replace(run.ensemble, seed=seed, paired=False)))
+    total = np.mean([simulate.realize(shared, r)["biposh"][0] for r in range(SKIES)], axis=0)
+    modes = list(shared.estimator.modes)
+    ell = np.arange(41)
+    rows = []
+    for L, M, d in MODES:
+        mode = biposh.Mode(L, M, d)
+        spectrum = ell * (ell + 1) / (2 * np.pi) * biposh.bennett_factor(mode, 40) * total[modes.index(mode)]
+        for low, high in BINS:
+            value = np.nanmean(spectrum[low : high + 1])
+            rows.append((L, M, d, low, high, value.real, value.imag if M else np.nan))
+    found = Table(rows=rows, names=["L", "M", "d", "ell_min", "ell_max", "value", "value_imag"])
+    found["value"].unit = found["value_imag"].unit = "uK2"
+    found.meta = {"normalisation": "Bennett", "scaling": "l(l+1)/2pi", "frame": "ecliptic", "realizations": SKIES}
+    return found
+
+
+def read(folder, table, run=RUN):
+    path = folder / "table.ecsv"
+    table.write(path, format="ascii.ecsv", overwrite=True)
+    return tables.read_spectra(path, run)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """What tables of these rows are judged with."""
+    spectra = read(tmp_path_factory.mktemp("small"), measured(RUN))
+    run = tables.listening(RUN, spectra)
+    asked = tables.questions_of(run, spectra, [name for name in effects.library() if name not in PROPOSED])
+    plan = tables.plan(run, asked, 300)
+    known = knowledge.learned(asked, plan, [spectra(job) for job in plan.jobs])
+    return court(run, asked, tables.of_mean(known, SKIES))
+
+
+def judged(small, folder, table):
+    spectra = read(folder, table)
+    return tables.judge(small, "table", spectra, lambda jobs: [spectra(job) for job in jobs])
+
+
+def test_an_ellipticity_is_named_and_its_gap_shrinks(small, tmp_path):
+    truth = config.Effect(name="beam_ellipticity", channel="W1", parameters={"amplitude": 0.6})
+    found = judged(small, tmp_path, measured(with_effects(RUN, [truth])))
+    verdict = found.verdict
+    assert verdict["gap"]["p_value"] < 1e-3
+    (best,) = verdict["effects"]
+    assert (best["name"], best["channel"]) == ("beam_ellipticity", "W1")
+    assert abs(best["amplitude"] - 0.6) < 3 * best["sigma"]
+    assert verdict["shrink"]["achieved"] > 0.5
+    assert "alternate bins" in verdict["shrink"]["data"]
+    first = verdict["where"][0]
+    assert (first["statistic"], first["frame"], first["L"], first["M"]) == ("biposh", "ecliptic", 2, 0)
+    assert "BipoSH L2M0d0, real" in report.page(found)
+
+
+def test_tables_of_the_model_have_no_gap(small, tmp_path):
+    verdicts = [judged(small, tmp_path, measured(RUN, seed)).verdict for seed in range(100, 108)]
+    # Eight draws of a uniform number: three or more below 0.05 once in 170 cases.
+    assert np.sum([verdict["gap"]["p_value"] <= 0.05 for verdict in verdicts]) < 3
+    assert "none" in [verdict["verdict"] for verdict in verdicts]
+
+
+def test_the_mean_of_skies_scatters_as_the_tests_take_it_to(small):
+    raw = small.known.simulations
+    back = tables.of_mean(replace(small.known, simulations=np.random.default_rng(1).normal(size=raw.shape)), 50)
+    scale = back.simulations.std(axis=0) ** 2 * (1 + 1 / len(raw))
+    # C (1/R + 1/N), C measured with 300 simulations: 8 % each, 5 sigma.
+    np.testing.assert_allclose(scale, 1 / 50 + 1 / len(raw), rtol=0.4)
+    np.testing.assert_allclose(np.mean(scale), 1 / 50 + 1 / len(raw), rtol=0.1)
+
+
+def test_power_spectra_are_those_of_the_pair(tmp_path):
+    spectra = read(tmp_path, measured(RUN))
+    run = tables.listening(RUN, spectra)
+    cl = simulate.realize(survey(run), 3)["cl"][0]
+    ell = np.arange(41)
+    expected = [np.mean((ell * (ell + 1) / (2 * np.pi) * cl)[a : b + 1]) for a, b in BINS]
+    np.testing.assert_allclose(spectra.of(run, 3, 1)[0, : len(BINS)], expected, rtol=1e-12)
+    assert [entry.statistic for entry in spectra.entries[: len(BINS)]] == ["cl"] * len(BINS)
+    assert [entry.fold for entry in spectra.entries[: len(BINS)]] == [0, 1, 0, 1]
+
+
+def test_other_frames_are_those_of_rotated_coefficients(tmp_path):
+    spectra = read(tmp_path, measured(RUN))
+    views = list(tables._views(spectra))
+    # d = 2 lacks M > 0 and is not turned.
+    assert len(views) == 2 * len(BINS)
+    at = {(row.mode, row.ell_min, row.imaginary): value for row, value in zip(spectra.rows, spectra.value, strict=True)}
+    family = [biposh.Mode(2, M, 0) for M in range(3)]
+    for entry, matrix in views:
+        low = entry.ell[0]
+        own = np.array([at[mode, low, False] + 1j * at.get((mode, low, True), 0.0) for mode in family])
+        turned = rotate_biposh(own[:, None], [(2, M, 0) for M in range(3)], "ecliptic", entry.frame)
+        assert matrix @ spectra.value == pytest.approx(turned[0, 0].real, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"frame": "galactic"}, "is in the galactic frame, the model in the ecliptic one; set map.frame to galactic"),
+        ({"frame": ""}, "does not say its frame"),
+        ({"realizations": 0}, "is the mean of 0 realizations"),
+        ({"normalisation": "mine"}, "which is not known"),
+    ],
+)
+def test_headers_that_do_not_fit_are_refused(tmp_path, change, words):
+    table = measured(RUN)
+    table.meta |= change
+    with pytest.raises(InputError, match=words):
+        read(tmp_path, table)
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "words"),
+    [
+        ("ell_max", 50, "is not within 0 ... 40"),
+        ("M", 3, "does not exist"),
+        ("ell_min", 13, "gives a bin of one mode twice"),
+        ("value", np.nan, "leave the row out"),
+    ],
+)
+def test_rows_that_do_not_fit_are_refused(tmp_path, column, value, words):
+    table = measured(RUN)
+    table[column][0] = value
+    if column == "ell_min":
+        table["ell_max"][0] = 20
+    with pytest.raises(InputError, match=words):
+        read(tmp_path, table)
+
+
+def test_an_unknown_pair_is_refused(tmp_path):
+    table = measured(RUN)
+    table["pair"] = "V1,V1"
+    with pytest.raises(InputError, match="is no pair of the model's maps; use one of W1,W1"):
+        read(tmp_path, table)
+
+
+def test_numbers_in_another_unit_are_refused(small, tmp_path):
+    table = measured(RUN)
+    table["value"] *= 1e-6
+    with pytest.raises(InputError, match="times the model's, beyond 25; is the unit"):
+        judged(small, tmp_path, table)
+
+
+def test_a_mean_of_more_skies_than_it_says_is_refused(small, tmp_path):
+    table = measured(RUN)
+    spectra = read(tmp_path, table)
+    quiet = small.null.mean + 0.01 * (spectra.value - small.null.mean)
+    with pytest.raises(InputError, match="far less than a mean of 10 skies can"):
+        tables.judge(small, "quiet", replace(spectra, value=quiet), lambda jobs: [])
+
+
+def test_errors_that_the_model_does_not_have_are_noted(small, tmp_path):
+    spectra = read(tmp_path, measured(RUN))
+    spread = small.known.simulations.std(axis=0)
+    for factor, noted in ((1.0, 0), (3.0, 1)):
+        assert len(list(tables._notes(replace(spectra, error=factor * spread), small.known.simulations))) == noted
+
+
+def test_correlated_bins_are_freed_of_what_others_predict(small):
+    folds = np.array([entry.fold for entry in small.asked.entries])
+    rng = np.random.default_rng(5)
+    drawn = rng.normal(size=(300, len(folds)))
+    used, fresh = np.flatnonzero(folds == 0)[0], np.flatnonzero(folds == 1)[0]
+    drawn[:, fresh] += drawn[:, used]
+    turn, words = tables._independent(replace(small, known=replace(small.known, simulations=drawn)))
+    assert "what 1 of them predict is taken out" in words
+    left = np.corrcoef(drawn @ turn.T, rowvar=False)
+    assert abs(left[used, fresh]) < 1e-12
+    np.testing.assert_array_equal(turn[folds == 0], np.eye(len(folds))[folds == 0])
