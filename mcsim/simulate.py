@@ -68,9 +68,13 @@ def draw_sky(survey: Survey, realization: int) -> Alm:
     return gaussian_alm(survey.cl, rng.generator(survey.config.ensemble.seed, realization, "sky"))
 
 
-def maps(survey: Survey, realization: int, nthreads: int = 1) -> NDArray[np.float64]:
-    """Maps of one realization, effects and noise included, uK, shape (map, npix); ``healpy.UNSEEN`` without a hit."""
-    sky = draw_sky(survey, realization)
+def maps(survey: Survey, realization: int, nthreads: int = 1, sky: Alm | None = None) -> NDArray[np.float64]:
+    """Maps of one realization, effects and noise included, uK, shape (map, npix); ``healpy.UNSEEN`` without a hit.
+
+    ``sky``: coefficients up to the sky's lmax, in place of those that the realization would draw.
+    """
+    if sky is None:
+        sky = draw_sky(survey, realization)
     found = []
     for channel in survey.channels:
         for m, layers in _layers(survey, channel, sky, realization, nthreads, smooth=True):

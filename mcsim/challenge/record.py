@@ -148,10 +148,11 @@ class Geometry:
         names = [candidate.identity for candidate in self.candidates]
         ones = np.ones(len(names))
         search = Subsets(self.null, white, self.groups, names, ones, np.zeros(len(names)), self.calibration)
-        found = []
+        found, best = [], search.total
         for size in range(1, most + 1):
             left = [search.solve(rows).chi2.min() for rows in search.rows(size, ()) if len(rows)]
-            found.append(float(np.sqrt(self.null.unbiased * max(min(left, default=search.total), 0.0))))
+            best = min([best, *left])
+            found.append(float(np.sqrt(self.null.unbiased * max(best, 0.0))))
         return tuple(found)
 
 

@@ -16,16 +16,20 @@ from mcsim.diagnosis.data import exchanges
 from mcsim.diagnosis.evidence import Job, Questions
 from mcsim.diagnosis.exhibits import exhibits
 from mcsim.diagnosis.gaussian import Null, bases, fit, residual_probability
-from mcsim.diagnosis.knowledge import NOISY_SKIES, Knowledge, after_jobs
-from mcsim.diagnosis.refine import Refined, effect_at, quiet_templates, refine
+from mcsim.diagnosis.knowledge import CONSTRAINED_SKIES, Knowledge, constrained_jobs
+from mcsim.diagnosis.listen import show
+from mcsim.diagnosis.refine import Refined, effect_at, on_this_sky, quiet_templates, refine, scatter_of
 from mcsim.diagnosis.shrink import Prediction, Shrink, achieved, predicted
-from mcsim.diagnosis.trials import Calibration, calibrate
+from mcsim.diagnosis.trials import Calibration, calibrate, gap
 from mcsim.diagnosis.verdict import detectable_of, sentence, verdict_of
 from mcsim.diagnosis.where import Place, places
 
 Vector = NDArray[np.float64]
 Ask = Callable[[Sequence[Job]], list[NDArray[np.float64]]]
 """From jobs to their answers, in order; in this process or on a cluster."""
+
+ALPHA = 0.05
+"""Probability below which there is a gap."""
 
 EXCHANGED = 0.01
 """Probability above which maps in another order are said to fit the model."""
@@ -91,9 +95,18 @@ class Diagnosis:
 def court(run: config.RunConfig, asked: Questions, known: Knowledge) -> Court:
     """Make ready for the cases of a model."""
     null = known.null()
+    scatter = scatter_of(known, asked)
     candidates = tuple(
-        Candidate(proposal.kind.name, proposal.channel, columns, settings=proposal.settings, unit=proposal.kind.unit)
-        for proposal, columns in zip(asked.proposals, asked.columns, strict=True)
+        Candidate(
+            proposal.kind.name,
+            proposal.channel,
+            columns,
+            settings=proposal.settings,
+            unit=proposal.kind.unit,
+            # What an effect draws at random is not known even where the sky is.
+            shape_error=min(float(own), 1.0) if proposal.kind.draws else None,
+        )
+        for proposal, columns, own in zip(asked.proposals, asked.columns, scatter, strict=True)
     )
     groups = bases(null, quiet_templates(known), [candidate.columns for candidate in candidates])
     return Court(run, asked, known, null, candidates, calibrate(null, groups))
@@ -117,12 +130,21 @@ def judge(court: Court, case: str, maps: Sequence[NDArray[np.float64]], ask: Ask
     answer = asked.answer(maps, atlas=True)
     x, numbers = answer[: len(asked.entries)], answer[len(asked.entries) :]
 
+    observed = show(asked.model, maps)
+    without: list[NDArray[np.float64]] = []
+
     def respond(found: Sequence[config.Effect]) -> Vector:
-        after = np.concatenate(ask(after_jobs(court.run, asked, found)))
-        change: Vector = np.mean(after - known.reference[: len(after)], axis=0)
+        if not without:
+            without.append(np.concatenate(ask(constrained_jobs(court.run, asked, (), observed))))
+        after = np.concatenate(ask(constrained_jobs(court.run, asked, found, observed)))
+        change: Vector = np.mean(after - without[0], axis=0)
         return change
 
-    refined = refine(known, court.null, x, court.candidates, asked.proposals, court.calibration, respond)
+    t = quiet_templates(known)
+    groups = bases(court.null, t, [candidate.columns for candidate in court.candidates])
+    if gap(court.null, x, groups, court.calibration).probability <= ALPHA:
+        t = on_this_sky(known, asked, t, respond)
+    refined = refine(known, court.null, x, t, court.candidates, asked.proposals, court.calibration, respond)
     found = refined.attribution
     notes = list(_exchanged(court, maps, found))
     if notes:
@@ -232,6 +254,6 @@ def _dataset(court: Court, x: Vector, refined: Refined, where: Sequence[Place], 
             "entries": json.dumps([asdict(e) for e in court.asked.entries]),
             "places": json.dumps([asdict(p.entry) for p in where]),
             "simulations": len(known.simulations),
-            "skies_of_responses": NOISY_SKIES,
+            "skies_of_responses": CONSTRAINED_SKIES,
         },
     )

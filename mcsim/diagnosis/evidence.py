@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mcsim import alm as alm_
 from mcsim import config, effects, sampled, simulate
 from mcsim.diagnosis.atlas import Atlas
 from mcsim.diagnosis.blocks import Block, Entry, blocks_of
-from mcsim.diagnosis.listen import ORDERS, Model, listen, model_of
+from mcsim.diagnosis.listen import ORDERS, Model, listen, model_of, show
 from mcsim.diagnosis.scores import Score, score_of
 from mcsim.effects import Effect
 from mcsim.errors import InputError
@@ -183,6 +184,8 @@ class Job:
         Effects that are not proposed.
     atlas
         Measure it too.
+    observed
+        Coefficients of the sky that data show, shape (size,) of the model's lmax: the skies are then constrained by it.
     """
 
     believed: str
@@ -192,6 +195,7 @@ class Job:
     sample_by_sample: bool = False
     without: tuple[str, ...] = ()
     atlas: bool = False
+    observed: NDArray[np.complex128] | None = None
 
 
 def evidence_of(job: Job) -> NDArray[np.float64]:
@@ -203,9 +207,33 @@ def evidence_of(job: Job) -> NDArray[np.float64]:
         if job.sample_by_sample:
             maps = [map_uk for _, map_uk in sampled.maps(shared, realization)]
         else:
-            maps = list(simulate.maps(shared, realization))
+            sky = None
+            if job.observed is not None:
+                sky = _constrained(asked.model, job.observed, shared.config.ensemble.seed, realization)
+            maps = list(simulate.maps(shared, realization, sky=sky))
         rows.append(asked.answer(maps, atlas=job.atlas))
     return np.stack(rows)
+
+
+def _constrained(model: Model, observed: NDArray[np.complex128], seed: int, realization: int) -> NDArray[np.complex128]:
+    """A sky that data might have been taken of: what they show, and what they do not show drawn (Hoffman & Ribak 1991).
+
+    s + (s^_data - s^_drawn), where s^_drawn is what simulated data of the drawn sky s show.
+    """
+    key = (hash(observed.tobytes()), seed, realization)
+    if key not in _SKIES:
+        if len(_SKIES) >= _KEPT:
+            _SKIES.clear()
+        run = model.survey.config
+        drawn = replace(model.survey, config=replace(run, ensemble=replace(run.ensemble, seed=seed)))
+        sky = simulate.draw_sky(drawn, realization)
+        shown = show(model, list(simulate.maps(drawn, realization, sky=sky)))
+        _SKIES[key] = sky + alm_.resize(observed - shown, model.lmax, run.sky.lmax)
+    return _SKIES[key]
+
+
+_SKIES: dict[tuple[int, int, int], NDArray[np.complex128]] = {}
+_KEPT = 32
 
 
 @lru_cache(maxsize=1)

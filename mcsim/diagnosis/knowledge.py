@@ -29,6 +29,9 @@ COMMON_SKIES = 12
 NOISY_SKIES = 24
 """The same where the change itself is random, or has one sign."""
 
+CONSTRAINED_SKIES = 8
+"""Skies that agree with the observed one, on which what was found is simulated."""
+
 REFEREE_SKIES = 6
 """Skies seen sample by sample, that the default route is compared with."""
 
@@ -151,7 +154,7 @@ def plan(run: config.RunConfig, asked: Questions, simulations: int | None = None
     for first in range(0, NOISY_SKIES, CHUNK):
         add(("reference", first), base, first, min(CHUNK, NOISY_SKIES - first))
     for number, column, sign, effect in _basis(asked):
-        count = _skies(asked.proposals[number])
+        count = skies(asked.proposals[number])
         add(("response", column, sign), with_effects(base, [asked.proposals[number].table(effect)]), 0, count)
     if referee and all(c.site.pointing is not None for c in asked.model.survey.channels):
         quiet = replace(base, channels=tuple(replace(c, noise=config.Noise()) for c in base.channels))
@@ -207,6 +210,16 @@ def after_jobs(
     return [Job(believed, simulated, first, min(half, skies - first), False, asked.without) for first in (0, half)]
 
 
+def constrained_jobs(
+    run: config.RunConfig, asked: Questions, found: Sequence[config.Effect], observed: NDArray[np.complex128]
+) -> list[Job]:
+    """Simulations of the model with effects at frozen amplitudes, over skies that agree with an observed one."""
+    believed = config.to_json(run)
+    simulated = config.to_json(with_effects(seeded(run, _RESPONSE), found))
+    half = CONSTRAINED_SKIES // 2
+    return [Job(believed, simulated, first, half, False, asked.without, False, observed) for first in (0, half)]
+
+
 def _basis(asked: Questions) -> Iterator[tuple[int, int, int, Any]]:
     """Proposal, column, sign and effect of every response that is simulated."""
     for number, (proposal, columns) in enumerate(zip(asked.proposals, asked.columns, strict=True)):
@@ -216,7 +229,8 @@ def _basis(asked: Questions) -> Iterator[tuple[int, int, int, Any]]:
                     yield number, column, sign, effect.scaled(sign)
 
 
-def _skies(proposal: Proposal) -> int:
+def skies(proposal: Proposal) -> int:
+    """Number of skies that the response to a proposal is the mean of."""
     if proposal.kind.draws:
         return NOISY_SKIES
     return SKIES if proposal.channel is not None else COMMON_SKIES

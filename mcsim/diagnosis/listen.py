@@ -181,19 +181,8 @@ def listen(model: Model, maps: Sequence[Map], nthreads: int = 1) -> Heard:
         Threads of the transforms.
     """
     lmax, nside = model.lmax, model.nside
-    total = np.zeros(alm_.size(lmax), dtype=np.complex128)
-    gain = np.zeros(lmax + 1)
-    clean, seen = [], []
-    for part, map_ in zip(model.parts, maps, strict=True):
-        observed = (part.precision > 0) & (map_ != healpy.UNSEEN) & np.isfinite(map_)
-        seen.append(observed)
-        clean.append(np.where(observed, map_, 0.0))
-        factor = model.response[part.channel] / part.noise_power
-        alm = healpix.analysis(clean[-1], lmax, nthreads=nthreads)
-        total += alm_.multiply(alm, factor, lmax)
-        gain += model.response[part.channel] * factor
-    sky = alm_.multiply(total, model.cl / (1.0 + model.cl * gain), lmax)
-
+    clean, seen = _clean(model, maps)
+    sky = _sky(model, clean, nthreads)
     looked_at = sky + model.dipole
     geometry = healpix.geometry(nside)
     expected = np.empty((len(model.parts), seen[0].size))
@@ -231,6 +220,31 @@ def listen(model: Model, maps: Sequence[Map], nthreads: int = 1) -> Heard:
                 -window * k * (by_degree(looked_at, electric, lmax) + 1j * by_degree(looked_at, magnetic, lmax))
             )
     return Heard(sky, expected, residual, adjoint, orders)
+
+
+def show(model: Model, maps: Sequence[Map], nthreads: int = 1) -> Alm:
+    """The sky that a set of maps shows, s^ up to the model's lmax, uK."""
+    return _sky(model, _clean(model, maps)[0], nthreads)
+
+
+def _clean(model: Model, maps: Sequence[Map]) -> tuple[list[Map], list[NDArray[np.bool_]]]:
+    """Maps with zeros where nothing was observed, and where something was."""
+    seen = [
+        (part.precision > 0) & (map_ != healpy.UNSEEN) & np.isfinite(map_)
+        for part, map_ in zip(model.parts, maps, strict=True)
+    ]
+    return [np.where(observed, map_, 0.0) for observed, map_ in zip(seen, maps, strict=True)], seen
+
+
+def _sky(model: Model, clean: Sequence[Map], nthreads: int) -> Alm:
+    lmax = model.lmax
+    total = np.zeros(alm_.size(lmax), dtype=np.complex128)
+    gain = np.zeros(lmax + 1)
+    for part, map_ in zip(model.parts, clean, strict=True):
+        factor = model.response[part.channel] / part.noise_power
+        total += alm_.multiply(healpix.analysis(map_, lmax, nthreads=nthreads), factor, lmax)
+        gain += model.response[part.channel] * factor
+    return alm_.multiply(total, model.cl / (1.0 + model.cl * gain), lmax)
 
 
 def _transforms(model: Model, members: tuple[int, ...]) -> Iterator[tuple[int, int, tuple[int, ...]]]:

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.diagnosis.attribute import Attribution, Candidate, attribute
-from mcsim.diagnosis.evidence import Proposal
+from mcsim.diagnosis.evidence import Proposal, Questions
 from mcsim.diagnosis.gaussian import Null
-from mcsim.diagnosis.knowledge import Knowledge
+from mcsim.diagnosis.knowledge import Knowledge, skies
 from mcsim.diagnosis.trials import Calibration
 from mcsim.effects import Effect
 from mcsim.errors import InputError
@@ -25,6 +25,9 @@ STRAIGHT = 0.5
 
 NOISY = 0.01
 """Share of noise in the square of a template, entries over their scatter, from which on it is cleaned."""
+
+SCATTERED = 0.1
+"""Scatter of a response from sky to sky, over its mean, from which on it is simulated for the observed sky."""
 
 CLEAN = 5.0
 """Of a noisy template, what is smaller than this many of its standard errors is none."""
@@ -61,6 +64,40 @@ def quiet_templates(known: Knowledge) -> NDArray[np.float64]:
     return np.where(noisy & ~heard, 0.0, known.templates)
 
 
+def scatter_of(known: Knowledge, asked: Questions) -> NDArray[np.float64]:
+    """How far the response in one sky is from the mean response: rms of the ratio of their lengths, shape (proposals,).
+
+    Lengths of entries over their scatter, all columns of a proposal together.
+    """
+    spread = known.simulations.std(axis=0)[:, None]
+    noise = np.sum((known.template_error / spread) ** 2, axis=0)
+    size = np.sum((known.templates / spread) ** 2, axis=0)
+    found = []
+    for proposal, columns in zip(asked.proposals, asked.columns, strict=True):
+        rows = list(columns)
+        # A column of nothing but noise says nothing of the others.
+        heard = size[rows] > 2.0 * noise[rows]
+        ratio = skies(proposal) * noise[rows] / np.maximum(size[rows] - noise[rows], 1e-300)
+        found.append(float(np.sqrt(np.mean(ratio[heard]))) if heard.any() else np.inf)
+    return np.array(found)
+
+
+def on_this_sky(known: Knowledge, asked: Questions, t: NDArray[np.float64], respond: Respond) -> NDArray[np.float64]:
+    """Templates, those of effects whose response depends on the very sky measured on the one that was observed."""
+    result = t.copy()
+    for proposal, columns, scatter in zip(asked.proposals, asked.columns, scatter_of(known, asked), strict=True):
+        if scatter < SCATTERED or proposal.kind.draws:
+            continue
+        for column, basis in zip(columns, proposal.basis, strict=True):
+            try:
+                response = respond([proposal.table(basis)])
+            except InputError:
+                continue
+            step = basis.coordinates()[columns.index(column)]
+            result[:, column] = response / step - known.curvature[:, column] * step
+    return result
+
+
 def effect_at(proposal: Proposal, coordinates: Vector, covariance: NDArray[np.float64]) -> Effect:
     """The effect that is nearest to fitted coordinates."""
     precision: NDArray[np.float64] = np.asarray(np.linalg.pinv(covariance), dtype=np.float64)
@@ -71,6 +108,7 @@ def refine(
     known: Knowledge,
     null: Null,
     x: Vector,
+    t: NDArray[np.float64],
     candidates: Sequence[Candidate],
     proposals: Sequence[Proposal],
     calibration: Calibration,
@@ -83,7 +121,7 @@ def refine(
     A response mu, simulated at coordinates theta, changes its templates t to t + (mu - t theta) theta'/theta'theta:
     the secant, exact there.
     """
-    t = quiet_templates(known)
+    t = t.copy()
     done: dict[int, Vector] = {}
     found = attribute(null, x, t, candidates, calibration)
     for _ in range(ROUNDS):

@@ -17,7 +17,7 @@ from mcsim.diagnosis.evidence import Job, Questions, questions
 from mcsim.diagnosis.exhibits import exhibits
 from mcsim.diagnosis.gaussian import residual_probability
 from mcsim.diagnosis.knowledge import Knowledge, Plan
-from mcsim.diagnosis.refine import Refined, refine
+from mcsim.diagnosis.refine import Refined, quiet_templates, refine
 from mcsim.diagnosis.shrink import Prediction, Shrink
 from mcsim.diagnosis.verdict import detectable_of, verdict_of
 from mcsim.diagnosis.where import Place, places
@@ -109,8 +109,9 @@ class Spectra:
         for pair in dict.fromkeys(self.pairs):
             own = [i for i, name in enumerate(self.pairs) if name == pair]
             coefficients = biposh[:, labels.index(pair)]
-            spectra = {mode: coefficients[:, i] for i, mode in enumerate(shared.estimator.modes)}
-            result[:, own] = project([self.rows[i] for i in own], self.scaling, spectra)
+            rows = [self.rows[i] for i in own]
+            spectra = {row.mode: coefficients[:, shared.estimator.modes.index(row.mode)] for row in rows}
+            result[:, own] = project(rows, self.scaling, spectra)
         return result
 
     def __call__(self, job: Job) -> NDArray[np.float64]:
@@ -162,6 +163,15 @@ def read_spectra(path: str | Path, run: config.RunConfig) -> Spectra:
             raise InputError(
                 f"{path}: the bin ell = {low} ... {high} is not within 0 ... {lmax}, the model's analysis; leave the "
                 "row out or raise sky.lmax."
+            )
+        ell = np.arange(low, high + 1)
+        other = ell - mode.d
+        exists = (other >= 0) & (other <= lmax) & (other + ell >= mode.L)
+        alone = len(set(pair.split(","))) == 1
+        if not exists.any() or (alone and not mode.in_auto):
+            raise InputError(
+                f"{path}: there is no {mode.name} of {pair} at l2 = {low} ... {high}, or it repeats another; leave the "
+                "row out."
             )
         for imaginary in parts(mode):
             value = float((imag if imaginary else real)[number])
@@ -250,6 +260,16 @@ def plan(run: config.RunConfig, asked: Questions, simulations: int | None = None
     return Plan(tuple(job for job, _ in kept), tuple(purpose for _, purpose in kept))
 
 
+def _after(run: config.RunConfig, asked: Questions, found: Sequence[config.Effect]) -> list[Job]:
+    """Simulations with effects at frozen amplitudes, of the skies of the responses."""
+    planned = plan(run, asked, 0)
+    return [
+        replace(job, simulated=config.to_json(knowledge.with_effects(config.from_json(job.simulated), found)))
+        for job, purpose in zip(planned.jobs, planned.purposes, strict=True)
+        if purpose[0] == "reference"
+    ]
+
+
 def of_mean(known: Knowledge, realizations: int) -> Knowledge:
     """What simulations say of the mean of several skies.
 
@@ -295,11 +315,12 @@ def judge(court: Court, case: str, measured: Spectra, ask: Ask) -> Diagnosis:
     _check(measured, court)
 
     def respond(found: Sequence[config.Effect]) -> Vector:
-        after = np.concatenate(ask(knowledge.after_jobs(court.run, asked, found, SKIES)))
+        after = np.concatenate(ask(_after(court.run, asked, found)))
         change: Vector = np.mean(after - known.reference[: len(after)], axis=0)
         return change
 
-    refined = refine(known, court.null, x, court.candidates, asked.proposals, court.calibration, respond)
+    t = quiet_templates(known)
+    refined = refine(known, court.null, x, t, court.candidates, asked.proposals, court.calibration, respond)
     found = refined.attribution
     shrink = _shrink(court, x, refined, respond) if found.explanations else None
     where = _where(measured, known.simulations)
@@ -333,8 +354,8 @@ def _check(measured: Spectra, court: Court) -> None:
     if 1.0 - float(residual_probability(square, court.null.dimension, court.null.dof)) < TOO_QUIET:
         raise InputError(
             f"{measured.path} departs from the model by chi^2 = {square:.2g} in {court.null.dimension} numbers, far "
-            f"less than a mean of {measured.realizations} skies can; say of how many in its meta (realizations), or correct "
-            "its unit."
+            f"less than a mean of {measured.realizations} skies can; say of how many in its meta (realizations), or "
+            "correct its unit."
         )
 
 

@@ -35,7 +35,7 @@ def first_screen(diagnosis: Diagnosis) -> Figure:
     """
     reading = Reading(diagnosis.verdict, diagnosis.evidence)
     kind = diagnosis.verdict["verdict"]
-    lines = textwrap.wrap(_plain(sentence_for_people(diagnosis)), 100)
+    lines = textwrap.wrap(_plain(sentence_for_people(diagnosis)), 110)
     top = 0.8 + 0.24 * len(lines)
     height = 2.6 + top
     figure = Figure(figsize=(9.6, height))
@@ -128,7 +128,7 @@ def blocks_figure(reading: Reading) -> Figure:
     figure = Figure(figsize=(width, 2.6 + 0.27 * len(kinds)), layout="constrained")
     grid = figure.subplots(1, len(tables), sharey=True, squeeze=False)[0]
     titles = ["data against model", "left by the best explanation"]
-    shown = None
+    shown: Any = None
     for axes, table, title in zip(grid, tables, titles, strict=False):
         axes.set_facecolor("#e6e6e6")
         shown = axes.imshow(table, cmap="RdBu_r", vmin=-LIMIT, vmax=LIMIT, aspect="auto")
@@ -153,7 +153,7 @@ def entries_figure(reading: Reading) -> Figure:
     figure = Figure(figsize=(10.5, 3.6), layout="constrained")
     axes = figure.subplots()
     axes.axhspan(-2.0, 2.0, color="#e9e9e9", zorder=0)
-    place = np.arange(len(order))
+    place = list(range(len(order)))
     axes.plot(place, reading.z[order], "o", markersize=3.2, color=RED, label="data against model")
     if reading.left is not None:
         axes.plot(place, reading.left[order], "o", markersize=3.2, color=BLUE, label="left by the best explanation")
@@ -190,7 +190,7 @@ def residual_figure(reading: Reading) -> Figure | None:
     rows = -(-len(names) // columns)
     figure = Figure(figsize=(4.9 * columns, 2.8 * rows + 0.8), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
-    shown = None
+    shown: Any = None
     for axes, name, values in zip(grid, names, maps.values, strict=False):
         shown = _mollweide(axes, values)
         axes.set_title(f"{_plain(_short(name, 40))}: rms {np.nanstd(values):.2f}", fontsize=10)
@@ -308,15 +308,9 @@ def _matrix(reading: Reading, values: NDArray[np.float64], label: str, scale: di
             if name in accepted:
                 tick.set_color(RED)
                 tick.set_fontweight("bold")
-    figure.colorbar(
-        shown,
-        ax=axes,
-        label=label,
-        location="top",
-        shrink=0.8,
-        aspect=30,
-        extend="neither" if "vmin" in scale else "both",
-    )
+    extend = "neither" if "vmin" in scale else "both"
+    bar = figure.colorbar(shown, ax=axes, location="top", aspect=30, extend=extend)
+    bar.set_label(label, fontsize=9)
     return figure
 
 

@@ -1,6 +1,6 @@
 """Strange configurations and damaged files: each must end in a result or in one sentence, soon, and leave nothing.
 
-    python workflows/faults/fuzz.py --configurations 2000 --files 500
+python workflows/faults/fuzz.py --configurations 2000 --files 500
 """
 
 import argparse
@@ -127,18 +127,64 @@ def odd_value(rng: random.Random) -> Any:
         [
             lambda: rng.choice([0, 1, -1, 2, 3, 7, 2**31, 2**63, -(2**70), 10**300, True, False, None]),
             lambda: rng.choice([0.0, -0.0, 1e-320, 1e308, -1.5, 0.1, math.inf, -math.inf, math.nan, 1e-9]),
-            lambda: rng.choice(["", " ", "\0", "a\nb", "../../x", "/dev/null", "/dev/zero", "~", "${HOME}", "${NO_X}", "{channel}", "{0}", "{realization:09999999d}", "A" * 5000, "wmap", "wmap7", "%s%n", "🙂", "\ud800", "'; --", "__import__('os')", "!!python/object"]),
+            lambda: rng.choice(
+                [
+                    "",
+                    " ",
+                    "\0",
+                    "a\nb",
+                    "../../x",
+                    "/dev/null",
+                    "/dev/zero",
+                    "~",
+                    "${HOME}",
+                    "${NO_X}",
+                    "{channel}",
+                    "{0}",
+                    "{realization:09999999d}",
+                    "A" * 5000,
+                    "wmap",
+                    "wmap7",
+                    "%s%n",
+                    "🙂",
+                    "\ud800",
+                    "'; --",
+                    "__import__('os')",
+                    "!!python/object",
+                ]
+            ),
             lambda: "".join(rng.choice(string.printable) for _ in range(rng.randrange(30))),
             lambda: [odd_value(rng) for _ in range(rng.randrange(4))],
             lambda: {odd_key(rng): odd_value(rng) for _ in range(rng.randrange(4))},
             lambda: rng.choice([1.0, 2.0, 8, 16, 90.0, 180.0, -90.0]) * rng.choice([1, -1, 0.5, 1e3]),
         ]
-    )()  # fmt: skip
+    )()
 
 
 def odd_key(rng: random.Random) -> str:
     """A key that exists somewhere, or none."""
-    known = ["kind", "path", "lmax", "nside", "name", "mask", "beam", "scan", "model", "effect", "splits", "m_max", "alm", "map", "amplitude", "channel", "schema", "tolerance", "beam_b", "pair"]  # fmt: skip
+    known = [
+        "kind",
+        "path",
+        "lmax",
+        "nside",
+        "name",
+        "mask",
+        "beam",
+        "scan",
+        "model",
+        "effect",
+        "splits",
+        "m_max",
+        "alm",
+        "map",
+        "amplitude",
+        "channel",
+        "schema",
+        "tolerance",
+        "beam_b",
+        "pair",
+    ]
     return rng.choice([*known, "", "\0", "x" * 300, "unbekannt", "é"])
 
 
@@ -166,7 +212,11 @@ def mutated(rng: random.Random) -> Any:
         elif action == 1 and isinstance(holder, dict):
             holder[odd_key(rng)] = odd_value(rng)
         elif action == 2:
-            plain["channel"] = [*plain.get("channel", []), copy.deepcopy(rng.choice(base()["channel"]))] if isinstance(plain.get("channel", []), list) else odd_value(rng)  # fmt: skip
+            plain["channel"] = (
+                [*plain.get("channel", []), copy.deepcopy(rng.choice(base()["channel"]))]
+                if isinstance(plain.get("channel", []), list)
+                else odd_value(rng)
+            )
         elif action == 3 and isinstance(holder, dict):
             holder[rng.choice(["beam", "scan", "beam_b"])] = copy.deepcopy(rng.choice(KINDS))
         elif action == 4 and keys:
@@ -259,8 +309,12 @@ def write_files(folder: Path) -> None:
     """One valid file of every format that mcsim reads."""
     rng = np.random.default_rng(1)
     npix = 12 * NSIDE**2
-    healpy.write_map(folder / "mask.fits", (rng.random(npix) > 0.3).astype(float), coord="E", overwrite=True, dtype=np.float64)
-    healpy.write_map(folder / "sky.fits", rng.normal(size=npix), coord="E", column_units="uK", overwrite=True, dtype=np.float64)
+    healpy.write_map(
+        folder / "mask.fits", (rng.random(npix) > 0.3).astype(float), coord="E", overwrite=True, dtype=np.float64
+    )
+    healpy.write_map(
+        folder / "sky.fits", rng.normal(size=npix), coord="E", column_units="uK", overwrite=True, dtype=np.float64
+    )
     scan.write_moments_fits(folder / "moments.fits", scan.parallel_transport(0.3, NSIDE, 4))
     y, x = np.mgrid[:41, :41] - 20.0
     image = fits.PrimaryHDU(np.exp(-(x**2 / 40 + y**2 / 30)))
@@ -364,7 +418,35 @@ def damaged_bytes(data: bytes, rng: random.Random) -> bytes:
     return bytes(changed)
 
 
-CARDS: list[tuple[str, Any]] = [("NAXIS1", 10**12), ("NAXIS2", 10**12), ("NAXIS2", -1), ("TFORM1", "1000000000D"), ("TFORM1", "8A"), ("TFORM1", "PD(9)"), ("TTYPE1", "X"), ("NSIDE", 7), ("NSIDE", 10**9), ("NSIDE", -8), ("ORDERING", "NESTED"), ("ORDERING", 3), ("COORDSYS", "Q"), ("BITPIX", 7), ("BITPIX", 8), ("NAXIS", 99), ("TFIELDS", 999), ("CDELT1", 0.0), ("CDELT1", float("1e300")), ("TUNIT1", "Jy"), ("TUNIT1", "\x7f"), ("TSCAL1", 1e300), ("TZERO1", -1e300), ("PCOUNT", 10**10), ("MAX-LPOL", 10**6), ("BSCALE", 0.0), ("XTENSION", "IMAGE")]  # fmt: skip
+CARDS: list[tuple[str, Any]] = [
+    ("NAXIS1", 10**12),
+    ("NAXIS2", 10**12),
+    ("NAXIS2", -1),
+    ("TFORM1", "1000000000D"),
+    ("TFORM1", "8A"),
+    ("TFORM1", "PD(9)"),
+    ("TTYPE1", "X"),
+    ("NSIDE", 7),
+    ("NSIDE", 10**9),
+    ("NSIDE", -8),
+    ("ORDERING", "NESTED"),
+    ("ORDERING", 3),
+    ("COORDSYS", "Q"),
+    ("BITPIX", 7),
+    ("BITPIX", 8),
+    ("NAXIS", 99),
+    ("TFIELDS", 999),
+    ("CDELT1", 0.0),
+    ("CDELT1", float("1e300")),
+    ("TUNIT1", "Jy"),
+    ("TUNIT1", "\x7f"),
+    ("TSCAL1", 1e300),
+    ("TZERO1", -1e300),
+    ("PCOUNT", 10**10),
+    ("MAX-LPOL", 10**6),
+    ("BSCALE", 0.0),
+    ("XTENSION", "IMAGE"),
+]
 
 
 def damage(path: Path, rng: random.Random) -> None:
@@ -373,7 +455,13 @@ def damage(path: Path, rng: random.Random) -> None:
         data = bytearray(path.read_bytes())
         if rng.random() < 0.6:
             key, value = rng.choice(CARDS)
-            text = f"'{value}'" if isinstance(value, str) else f"{value:>20}" if not isinstance(value, float) else f"{value:>20E}"  # fmt: skip
+            text = (
+                f"'{value}'"
+                if isinstance(value, str)
+                else f"{value:>20}"
+                if not isinstance(value, float)
+                else f"{value:>20E}"
+            )
             place = data.rfind(f"{key:<8}=".encode())
             card = f"{key:<8}= {text}".ljust(80)[:80].encode()
             if place >= 0:
@@ -463,7 +551,9 @@ def fuzz_stores(count: int, seed: int, seconds: float, folder: Path) -> Outcome:
             repair.mend(path, plan.layout(shared), plan.attributes(run))
             rows = store.read(path, 0, store.size(path))
             for key, values in rows.items():
-                if key != "done" and not np.array_equal(values[rows["done"]], expected[key][rows["done"]], equal_nan=True):
+                if key != "done" and not np.array_equal(
+                    values[rows["done"]], expected[key][rows["done"]], equal_nan=True
+                ):
                     raise AssertionError(f"{key} is silently wrong")
 
         judge(f"{name} mended", mended, outcome)
