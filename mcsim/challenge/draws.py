@@ -71,8 +71,9 @@ def bench(court: Court, names: tuple[str, ...] = ()) -> Bench:
     seen = replace(known, simulations=known.simulations[:kept])
     folds = np.array([-1 if entry.fold is None else entry.fold for entry in asked.entries])
     first, second = np.flatnonzero(folds == 0), np.flatnonzero(folds == 1)
+    of = {proposal.label: one for proposal, one in zip(court.asked.proposals, court.candidates, strict=True)}
     candidates = tuple(
-        Candidate(proposal.kind.name, proposal.channel, columns, settings=proposal.settings, unit=proposal.kind.unit)
+        replace(of[proposal.label], columns=columns)
         for proposal, columns in zip(asked.proposals, asked.columns, strict=True)
     )
     whole, t = seen.null(), quiet_templates(known)

@@ -161,7 +161,8 @@ def attribute(
     Notes
     -----
     A subset suffices when its residual passes and no candidate of another identity is significant beside it; it is
-    reported when no part of it suffices. One of several candidates must also be more probable than an unknown effect
+    reported when no part of it suffices. Each of several candidates must be significant beside the others, or the
+    residual is that of something unknown; and one of several candidates must also be more probable than an unknown effect
     of the same prior strength in an isotropic direction. Candidates of one identity compete by evidence alone. A
     template that is wrong by a fraction eps of its white length leaves eps^2 s_c^2 in the residual, s_c the white
     length of its fitted part (at most that of the whole fit); the sum over members makes both tests noncentral, in the
@@ -230,6 +231,8 @@ def _accepted(search: Subsets, levels: tuple[float, float], largest: int, cut: f
                 rows = possible[first : first + CHUNK]
                 further = search.further(subsets[rows], solved.chi2[rows], solved.allowance[rows])
                 alone = further > levels[1]
+                if size > 1:
+                    alone &= search.least_needed(subsets[rows]) <= levels[1]
                 for row, beside in zip(rows[alone], further[alone], strict=True):
                     members = tuple(int(member) for member in subsets[row])
                     fresh.append(

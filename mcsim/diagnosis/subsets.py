@@ -109,6 +109,21 @@ class Subsets:
             allowance=allowance,
         )
 
+    def least_needed(self, subsets: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Probability, trials included, of the least significant member of each subset beside its others, shape (M,)."""
+        if not len(subsets):
+            return np.empty(0)
+        whole = self.solve(subsets)
+        largest = np.zeros(len(subsets))
+        for place in range(subsets.shape[1]):
+            others = self.solve(np.delete(subsets, place, axis=1))
+            rank = self.sizes[subsets[:, place]]
+            dimension = self.null.dimension - (self.sizes[subsets].sum(axis=1) - rank)
+            drop = others.chi2 - whole.chi2
+            scores = score_probability(drop, others.chi2, rank, dimension, self.null.dof, others.allowance)
+            largest = np.maximum(largest, self.calibration.trials(scores))
+        return largest
+
     def further(
         self, subsets: NDArray[np.int64], chi2: NDArray[np.float64], allowance: NDArray[np.float64]
     ) -> NDArray[np.float64]:

@@ -34,7 +34,7 @@ from distributed.utils import get_mp_context
 from mcsim import config, open_ensemble, open_summary, repair, runner, store, tasks
 
 HERE = Path(__file__).resolve().parent
-REALIZATIONS = 200
+REALIZATIONS = int(os.environ.get("MCSIM_FAULTS_REALIZATIONS", "200"))
 LIMIT_S = 120.0
 CHAIN = 4
 

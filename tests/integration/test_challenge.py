@@ -1,0 +1,135 @@
+"""A challenge from the draw to the score: a small instrument, few effects, both routes, an interruption."""
+
+import json
+from pathlib import Path
+
+import healpy
+import numpy as np
+import pytest
+
+from mcsim import config, effects
+from mcsim.challenge import make, run, score
+from mcsim.challenge.inventions import introduced, load
+from mcsim.challenge.prior import Prior
+from mcsim.challenge.truth import Truth, finished_cases, key_path
+from mcsim.diagnosis.data import read_maps
+from mcsim.diagnosis.evidence import questions
+from mcsim.errors import InputError
+
+INVENTIONS = Path(__file__).parents[1] / "inventions.py"
+LIBRARY = ("beam_ellipticity", "dipole_residual", "noise_level")
+MODEL = {
+    "schema": 1,
+    "name": "tiny",
+    "sky": {"spectrum": "wmap7", "lmax": 24, "dipole_uk": 3364.5},
+    "map": {"nside": 8, "splits": ["half1", "half2"]},
+    "biposh": {"L_max": 2, "lmax": 20},
+    "channel": [
+        {
+            "name": "W1",
+            "frequency_ghz": 94.0,
+            "beam": {"kind": "gaussian", "fwhm_arcmin": 500.0},
+            "noise": {"sigma0_uk": 300.0},
+            "scan": {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 311.0},
+        }
+    ],
+}
+# In this order of seed 3 there is one of each kind among the first cases.
+PRIOR = Prior(none=0.2, one=0.3, two=0.1, left_out=0.2, invented=0.2)
+CASES = 5
+SEED = 3
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_library():
+    """Few effects are learned quickly."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in [name for name in effects.library() if name not in (*LIBRARY, "beam_width")]:
+            patch.delitem(effects.library(), name)
+        yield
+
+
+def made(folder, cases=CASES, **changes):
+    values = {"prior": PRIOR, "inventions": INVENTIONS, "simulations": 150, "workers": 0}
+    return make.make(MODEL, folder, cases, SEED, **(values | changes))
+
+
+@pytest.fixture(scope="module")
+def challenge(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("challenge")
+    made(folder, 2)
+    first = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+    # A run that was interrupted left a key without maps, and a folder of its own beside them.
+    made(folder)
+    return folder, first
+
+
+def test_what_was_made_stays(challenge):
+    folder, first = challenge
+    assert finished_cases(folder) == [f"case-{number:03d}" for number in range(CASES)]
+    assert all(path.stat().st_mtime_ns == time for path, time in first.items())
+    assert not list(folder.glob("cases/.*"))
+    with pytest.raises(InputError, match="other settings"):
+        made(folder, sampled_share=0.9)
+
+
+def test_a_lost_case_is_made_again_with_the_same_key(challenge, tmp_path):
+    folder, _ = challenge
+    case = folder / "cases" / "case-001"
+    maps = healpy.read_map(case / "W1_half1.fits", dtype=float)
+    seal = (case / "SEAL").read_text()
+    case.rename(tmp_path / "lost")
+    made(folder)
+    assert (case / "SEAL").read_text() == seal
+    np.testing.assert_array_equal(healpy.read_map(case / "W1_half1.fits", dtype=float), maps)
+
+
+def test_cases_are_what_a_diagnosis_reads(challenge):
+    folder, _ = challenge
+    believed = config.load(folder / "cases" / "case-000" / "model.toml")
+    assert believed.name == "case-000"
+    assert believed.effects == ()
+    assert len(read_maps(questions(believed).model, folder / "cases" / "case-000")) == 2
+    public = [path.read_text() for path in folder.glob("c*/**/*") if path.suffix in (".json", ".toml")]
+    truths = [Truth.read(key_path(folder, case)) for case in finished_cases(folder)]
+    assert all(str(truth.seed) not in text for truth in truths for text in public)
+    assert len({truth.nonce for truth in truths}) == CASES
+    assert all(len(truth.nonce) == 64 for truth in truths)
+    invented = [truth for truth in truths if truth.kind == "invented"]
+    assert invented
+    assert all(truth.sampled and truth.members[0].response for truth in invented)
+
+
+def test_verdicts_are_scored(challenge, tmp_path):
+    folder, _ = challenge
+    assert run.run(folder, workers=0) == CASES
+    assert run.run(folder, workers=0) == 0
+    for case in finished_cases(folder):
+        verdict = json.loads((folder / "verdicts" / case / "verdict.json").read_text())
+        assert verdict["case"] == case
+    left_out = [Truth.read(key_path(folder, case)) for case in finished_cases(folder)]
+    for truth in left_out:
+        verdict = json.loads((folder / "verdicts" / truth.case / "verdict.json").read_text())
+        named = {effect["name"] for one in [verdict["effects"], *verdict["alternatives"]] for effect in one}
+        assert not named & set(truth.without)
+    found = score.score(folder, workers=0)
+    assert found.said.counts.sum() == CASES
+    # Noise, not luck: data without an effect are not far off.
+    assert all(record.p_value > 1e-4 for record in found.records if record.kind == "none")
+    for name in ("score.json", "report.html", "score.png"):
+        assert (folder / "score" / name).stat().st_size > 1000
+    key = key_path(folder, "case-000")
+    text = key.read_text()
+    key.write_text(text.replace('"sampled": ', '"sampled":  '))
+    with pytest.raises(InputError, match="not the key that was sealed"):
+        score.score(folder, workers=0)
+    key.write_text(text)
+
+
+def test_inventions_are_lent_only():
+    assert set(load(str(INVENTIONS))) == {"invented_square_beam", "invented_nonlinearity", "invented_crosstalk"}
+    with introduced(str(INVENTIONS)):
+        assert "invented_crosstalk" in effects.library()
+    assert "invented_crosstalk" not in effects.library()
+    with pytest.raises(InputError, match="no Python file"):
+        load("nowhere.py")
