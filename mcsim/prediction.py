@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mcsim import alm as alm_
 from mcsim import config, healpix, plan, summary
 from mcsim import survey as survey_
+from mcsim.biposh import estimator
 from mcsim.describe import table
 from mcsim.errors import InputError
 from mcsim.predict import (
@@ -97,13 +98,18 @@ def predict(
             f"{survey.config.name} takes its skies from files and names no spectrum; add sky.spectrum for a prediction."
         )
     beams = scanned_beams(survey, L_moments if exact else survey.config.biposh.L_max, nthreads)
-    maps = range(len(beams))
-    # The information of all maps jointly needs every pair, whatever pairs the ensemble keeps.
-    pairs = [(x, y) for x in maps for y in maps if x <= y] if snr else list(survey.pairs)
-    found = {pair: _mean(survey, beams, pair, exact, nthreads) for pair in pairs}
+    found = {pair: _mean(survey, beams, pair, exact, nthreads) for pair in survey.pairs}
     result = _dataset(survey, found)
     result.attrs |= _attributes(survey, L_moments if exact else None)
-    return result.assign(_detectability(survey, found)) if snr else result
+    if not snr:
+        return result
+    # The information of all maps jointly needs every pair and both its orders, whatever pairs the ensemble keeps.
+    every, whole = found, survey
+    if len(beams) > 1 and survey.config.biposh.pairs != "all":
+        whole = replace(survey, estimator=estimator(survey.config.biposh.L_max, survey.lmax, both_orders=True))
+        pairs = [(x, y) for x in range(len(beams)) for y in range(x, len(beams))]
+        every = {pair: _mean(whole, beams, pair, exact, nthreads) for pair in pairs}
+    return result.assign(_detectability(survey, found, _joint_signal_to_noise(whole, every)))
 
 
 def survey_of(source: Source, nthreads: int = 1) -> Survey:
@@ -345,8 +351,8 @@ def _attributes(survey: Survey, L_moments: int | None) -> dict[str, Any]:
     }
 
 
-def _detectability(survey: Survey, found: dict[tuple[int, int], _Pair]) -> dict[str, tuple[Any, ...]]:
-    """Signal to noise in one sky of what the beams add to their circular parts, L > 0."""
+def _detectability(survey: Survey, found: dict[tuple[int, int], _Pair], joint: float) -> dict[str, tuple[Any, ...]]:
+    """Signal to noise in one sky of what the beams add to their circular parts, L > 0; ``joint``: of all together."""
     modes, lmax = _modes(survey), survey.lmax
     rows = [row for row, (L, _, _) in enumerate(modes) if L > 0]
     anisotropic = [modes[row] for row in rows]
@@ -367,7 +373,7 @@ def _detectability(survey: Survey, found: dict[tuple[int, int], _Pair]) -> dict[
         "signal_to_noise_binned": (("pair", "mode", "bin"), binned, {"units": "1", "long_name": f"{text}, per bin"}),
         "signal_to_noise_total": (
             (),
-            _joint_signal_to_noise(survey, found),
+            joint,
             {"units": "1", "long_name": f"{text}, all maps and modes jointly (exact Fisher information)"},
         ),
     }

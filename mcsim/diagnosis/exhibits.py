@@ -18,8 +18,8 @@ from mcsim.errors import InputError
 
 Map = NDArray[np.float64]
 
-NSIDE = 32
-"""Of residual maps, where the data are not coarser."""
+NSIDE = 16
+"""Of residual maps, where the data are not coarser: finer pixels show noise and little else."""
 
 TELLING = 12
 """Entries that are named where two explanations differ."""

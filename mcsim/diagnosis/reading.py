@@ -18,6 +18,9 @@ Vector = NDArray[np.float64]
 APART = 3.29
 """Distance in standard deviations at which the nearer of two predictions is the right one in 95 cases of 100."""
 
+LEAST_SHRINK = 0.3
+"""Error of the shrink from which on it says nothing of use."""
+
 _KINDS = {
     "beam": "beam",
     "dipole": "dipole of the residual",
@@ -171,6 +174,12 @@ class Reading:
         one = self.explanations[0]
         after, after_sigma = _excess(one["chi2"], one["dimension"], n)
         return Gap(value, sigma, after, after_sigma, None, "fitted and judged on the same data")
+
+    @property
+    def shrink_is_measured(self) -> bool:
+        """Whether the data of the shrink have a gap to judge it by."""
+        shrink = self.verdict["shrink"]
+        return shrink is not None and shrink["gap_before"] > 0.0 and shrink["sigma"] < LEAST_SHRINK
 
     @cached_property
     def isolating(self) -> NDArray[np.float64]:

@@ -30,6 +30,9 @@ PARTS = 16
 """Parts of the survey that threads share out; fixed, so that sums do not depend on the number of threads."""
 
 _BAND = 1 << 27
+COUNTED = 1 << 24
+"""Samples that are counted at once."""
+
 _META = "pairs.json"
 
 
@@ -227,7 +230,7 @@ def _write(
         for done, job in enumerate(jobs):
             job.result()
             progress(0.5 * (done + 1) / len(jobs))
-        hits = [np.bincount(side, minlength=npix).astype(np.float64) for side in pixels]
+        hits = [_counted(side, npix) for side in pixels]
         row_start, count_type = _write_rows(folder, pixels, hits[0] + hits[1], nthreads, pool, progress)
     for name, array in (("row_start", row_start), ("hits_a", hits[0]), ("hits_b", hits[1])):
         np.save(folder / f"{name}.npy", array)
@@ -339,3 +342,11 @@ def _merge(edges, seen, partner, count, lengths):  # type: ignore[no-untyped-def
         lengths[row] = size
         out += size
     return out
+
+
+def _counted(pixel: NDArray[np.int32], npix: int) -> NDArray[np.float64]:
+    """Samples of every pixel, in pieces: numpy's count makes a copy of 8 bytes a sample."""
+    total = np.zeros(npix)
+    for first in range(0, pixel.size, COUNTED):
+        total += np.bincount(pixel[first : first + COUNTED], minlength=npix)
+    return total

@@ -21,6 +21,9 @@ _VERDICTS = {"none": GREEN, "effect": BLUE, "mixture": BLUE, "degenerate": "#8a5
 TOP = 15
 """Candidates in the picture of impacts; the table has all."""
 
+MAPS = 12
+"""Residual maps in the picture."""
+
 LIMIT = 8.0
 """Deviate at which the colours of the block picture end."""
 
@@ -91,10 +94,10 @@ def draw_gap(axes: Axes, gap: Gap) -> None:
     axes.set_ylim(len(values) - 0.45, -0.55)
     if gap.expected is not None:
         axes.plot([gap.expected] * 2, [0.6, 1.4], color="black", linestyle=":", linewidth=1.8, label="predicted")
-        axes.legend(frameon=False, fontsize=8, loc="lower right")
+        axes.legend(frameon=False, fontsize=8)
     reach = max(value + sigma for value, sigma, *_ in values)
     low = min(0.0, *(value - sigma for value, sigma, *_ in values), gap.expected or 0.0)
-    axes.set_xlim(1.1 * low, max(1.3 * reach, 1.0))
+    axes.set_xlim(1.1 * low, max(1.3 * reach, -0.35 * low, 1.0))
     axes.axvline(0.0, color="black", linewidth=0.8)
     axes.set_xlabel(f"gap: $\\chi^2$ above expectation\n({_plain(gap.words)})", fontsize=9)
     _bare(axes)
@@ -181,10 +184,13 @@ def entries_figure(reading: Reading) -> Figure:
 
 
 def residual_figure(reading: Reading) -> Figure | None:
-    """Residual of every map over its noise; None where the data were no maps."""
+    """Residual of every map, or of the most unusual ones, over its noise; None where the data were no maps."""
     if "residual_map" not in reading.evidence:
         return None
     maps = reading.evidence["residual_map"]
+    rms = np.sqrt(np.nanmean(maps.values**2, axis=1))
+    if len(rms) > MAPS:
+        maps = maps.isel(map=np.sort(np.argsort(-np.abs(rms - 1.0))[:MAPS]))
     names = [str(name) for name in maps["map"].values]
     columns = min(2, len(names))
     rows = -(-len(names) // columns)
@@ -338,7 +344,8 @@ def _ticks(largest: float) -> tuple[list[float], list[str]]:
 
 
 def _short(text: str, width: int) -> str:
-    return text if len(text) <= width else f"{text[: width - 1]}…"
+    """Text with its middle left out where it is long: labels differ at both ends."""
+    return text if len(text) <= width else f"{text[: width // 2]}…{text[len(text) - (width - 1) // 2 :]}"
 
 
 def _plain(text: str) -> str:

@@ -34,10 +34,10 @@ MODEL = {
         }
     ],
 }
-# In this order of seed 3 there is one of each kind among the first cases.
+# Of seed 0 the first five cases are one of each kind.
 PRIOR = Prior(none=0.2, one=0.3, two=0.1, left_out=0.2, invented=0.2)
 CASES = 5
-SEED = 3
+SEED = 0
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -59,7 +59,6 @@ def challenge(tmp_path_factory):
     folder = tmp_path_factory.mktemp("challenge")
     made(folder, 2)
     first = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
-    # A run that was interrupted left a key without maps, and a folder of its own beside them.
     made(folder)
     return folder, first
 

@@ -1,5 +1,6 @@
 """Predictions of everything at once: pairs in both orders, noise of uneven hits, scans without symmetry, a mask."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -128,6 +129,10 @@ def test_joint_signal_to_noise_is_at_least_that_of_every_mode_and_less_than_infi
     bins = np.sqrt((expected["signal_to_noise_binned"] ** 2).sum("bin"))
     xr.testing.assert_allclose(bins.where(np.isfinite(each)), each, rtol=1e-10)
     assert "jointly" in prediction.describe(expected)
+    # What all maps say together does not depend on which pairs the ensemble keeps.
+    run = shared.config
+    autos = prediction.predict(survey(replace(run, biposh=replace(run.biposh, pairs="auto"))), snr=True)
+    assert float(autos["signal_to_noise_total"]) == pytest.approx(total, rel=1e-12)
     # Two maps of one sky without noise tell their beams apart from it at will.
     quiet = prediction.predict(two_channels(tmp_path, 0.0), snr=True)
     assert np.isinf(quiet["signal_to_noise_total"])
