@@ -218,7 +218,9 @@ def evidence_of(job: Job) -> NDArray[np.float64]:
 def _constrained(model: Model, observed: NDArray[np.complex128], seed: int, realization: int) -> NDArray[np.complex128]:
     """A sky that data might have been taken of: what they show, and what they do not show drawn (Hoffman & Ribak 1991).
 
-    s + (s^_data - s^_drawn), where s^_drawn is what simulated data of the drawn sky s show.
+    s + (s^_data - s^_drawn), where s^_drawn is what simulated data of the drawn sky s show. Their noise is a draw of its
+    own: with that of the realization itself, sky and noise would be correlated, and every response too small by the
+    filter of s^.
     """
     key = (hash(observed.tobytes()), seed, realization)
     if key not in _SKIES:
@@ -227,13 +229,14 @@ def _constrained(model: Model, observed: NDArray[np.complex128], seed: int, real
         run = model.survey.config
         drawn = replace(model.survey, config=replace(run, ensemble=replace(run.ensemble, seed=seed)))
         sky = simulate.draw_sky(drawn, realization)
-        shown = show(model, list(simulate.maps(drawn, realization, sky=sky)))
+        shown = show(model, list(simulate.maps(drawn, realization + _OTHER_NOISE, sky=sky)))
         _SKIES[key] = sky + alm_.resize(observed - shown, model.lmax, run.sky.lmax)
     return _SKIES[key]
 
 
 _SKIES: dict[tuple[int, int, int], NDArray[np.complex128]] = {}
 _KEPT = 32
+_OTHER_NOISE = 1_000_000
 
 
 @lru_cache(maxsize=1)

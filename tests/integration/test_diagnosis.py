@@ -15,6 +15,7 @@ from mcsim.diagnosis.data import read_maps
 from mcsim.diagnosis.evidence import evidence_of, questions
 from mcsim.diagnosis.gaussian import bases
 from mcsim.diagnosis.knowledge import with_effects
+from mcsim.diagnosis.listen import show
 from mcsim.diagnosis.refine import quiet_templates
 from mcsim.diagnosis.trials import gap
 from mcsim.errors import InputError
@@ -169,3 +170,21 @@ def test_the_verdict_is_json_and_the_evidence_opens(small, tmp_path):
     found = judge(small, "saved", list(simulate.maps(data_of(small.run), 0)), ask)
     found.save(tmp_path / "out")
     assert json.loads((tmp_path / "out" / "verdict.json").read_text())["schema"] == 1
+
+
+def test_responses_on_the_observed_sky_have_the_mean_of_those_on_any(small):
+    """One sky's response scatters about the mean of many, by the strength of its own multipoles, but is not biased."""
+    asked, run = small.asked, small.run
+    effect = config.Effect(name="beam_ellipticity", channel="W1", parameters={"amplitude": 0.1})
+    members = next(c.columns for c in small.candidates if c.identity == ("beam_ellipticity", "W1"))
+    expected = small.null.templates(small.known.templates[:, members[:1]] * 0.1)[:, 0]
+    ratios = []
+    for realization in range(12):
+        observed = show(asked.model, list(simulate.maps(data_of(run, seed=5), realization)))
+        after = np.concatenate(ask(knowledge.constrained_jobs(run, asked, [effect], observed)))
+        before = np.concatenate(ask(knowledge.constrained_jobs(run, asked, [], observed)))
+        response = small.null.templates(np.mean(after - before, axis=0)[:, None])[:, 0]
+        ratios.append(response @ expected / (expected @ expected))
+    scatter = np.std(ratios, ddof=1) / np.sqrt(len(ratios))
+    assert abs(np.mean(ratios) - 1.0) < 4.0 * scatter
+    assert scatter < 0.03

@@ -156,7 +156,7 @@ def test_headers_that_do_not_fit_are_refused(tmp_path, change, words):
     [
         ("ell_max", 50, "is not within 0 ... 40"),
         ("M", 3, "does not exist"),
-        ("ell_min", 13, "gives a bin of one mode twice"),
+        ("ell_min", 11, "gives a bin of one mode twice"),
         ("value", np.nan, "leave the row out"),
     ],
 )
@@ -164,7 +164,7 @@ def test_rows_that_do_not_fit_are_refused(tmp_path, column, value, words):
     table = measured(RUN)
     table[column][0] = value
     if column == "ell_min":
-        table["ell_max"][0] = 20
+        table["ell_max"][0] = 16
     with pytest.raises(InputError, match=words):
         read(tmp_path, table)
 
