@@ -173,17 +173,43 @@ def fit(
     ell_min: Annotated[int, typer.Option(min=0, help="First ell of the data.")] = 2,
     ell_max: Annotated[int | None, typer.Option(min=2, help="Last ell of the data.")] = None,
     pair: Annotated[str | None, typer.Option(help="Pair of maps; default: the only one.")] = None,
+    mode: Annotated[
+        list[str] | None, typer.Option("--mode", help="Such as L2M0d0; may be repeated; default: A20 at d = 0 and 2.")
+    ] = None,
+    kind: Annotated[
+        str | None, typer.Option(help="plain, or difference to the circular twins; default: difference where known.")
+    ] = None,
+    covariance: Annotated[
+        Path | None, typer.Option(metavar="STORE", help="Take the covariance of one of its realizations.")
+    ] = None,
+    knots: Annotated[int, typer.Option(min=2, help="Of a spline.")] = 4,
+    each: Annotated[bool, typer.Option("--each", help="Fit every realization of a store too, for the pulls.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     output: Png = None,
 ) -> None:
     """Fit an effective beam, b_l2 f_l with f_l = alpha or alpha + beta l, to measured or simulated spectra."""
     from mcsim import fit as fit_
     from mcsim.plot.fit import fit_figure
 
+    if kind not in (None, "plain", "difference"):
+        raise InputError(f"--kind {kind} is not known; give plain or difference.")
     nthreads = os.cpu_count() or 1
     span = None if ell_max is None and ell_min == 2 else (ell_min, ell_max if ell_max is not None else 1 << 30)
-    measured = fit_.measurement(data, config, ell_range=span, pair=pair)
-    fits = [fit_.fit(measured, config, name, nthreads=nthreads) for name in model or ["constant", "linear"]]
-    out.print(fit_.report(fits), markup=False)
+    measured = fit_.measurement(
+        data,
+        config,
+        modes=mode or fit_.QUADRUPOLE,
+        ell_range=span,
+        kind=kind,  # type: ignore[arg-type]
+        pair=pair,
+        covariance=covariance,
+    )
+    names = model or ["constant", "linear"]
+    fits = [fit_.fit(measured, config, name, knots=knots, each=each, nthreads=nthreads) for name in names]
+    if as_json:
+        print(json.dumps([one.to_dict() for one in fits], indent=2))
+    else:
+        out.print(fit_.report(fits), markup=False)
     _save(fit_figure(fits), output or Path("fit.png"))
 
 

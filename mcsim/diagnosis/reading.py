@@ -235,6 +235,7 @@ class Reading:
                     "first": self.set_label(first),
                     "second": self.set_label(second),
                     "separation": separation,
+                    "odds": self.explanations[second]["odds"] / self.explanations[first]["odds"],
                     "factor": (APART / separation) ** 2 if separation > 0 else np.inf,
                     "entries": [
                         {

@@ -4,6 +4,7 @@ import base64
 import io
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -56,7 +57,12 @@ def page(diagnosis: Diagnosis) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"measured": measured, "number": number, "probability": probability}
+    environment.filters |= {
+        "measured": measured,
+        "number": number,
+        "parameters": parameters,
+        "probability": probability,
+    }
     return environment.get_template("report.html.j2").render(
         verdict=diagnosis.verdict,
         sentence=plots.sentence_for_people(diagnosis),
@@ -77,11 +83,16 @@ def measured(value: float, sigma: float) -> str:
         return number(value)
     power = math.floor(math.log10(max(sigma, abs(value))))
     if -5 <= power <= 5:
-        decimals = max(0, 1 - math.floor(math.log10(sigma)))
-        return f"{value:.{decimals}f} ± {sigma:.{decimals}f}"
-    decimals = max(0, 1 - math.floor(math.log10(sigma)) + power)
-    value, sigma = value / 10.0**power, sigma / 10.0**power
-    return f"({value:.{decimals}f} ± {sigma:.{decimals}f}) × {_power(power)}"
+        return _fixed(value, sigma)
+    return f"({_fixed(value / 10.0**power, sigma / 10.0**power)}) × {_power(power)}"
+
+
+def _fixed(value: float, sigma: float) -> str:
+    decimals = max(0, 1 - math.floor(math.log10(sigma)))
+    shown = f"{value:.{decimals}f}"
+    # Nothing is not negative.
+    sign = "−" if value < 0.0 and float(shown) != 0.0 else ""
+    return f"{sign}{shown.lstrip('-')} ± {sigma:.{decimals}f}"
 
 
 def number(value: float) -> str:
@@ -91,6 +102,17 @@ def number(value: float) -> str:
     if math.isinf(value):
         return "∞"
     return _typeset(f"{value:.3g}")
+
+
+def parameters(given: Mapping[str, Any]) -> str:
+    """Parameters of an effect that are set, in one line."""
+    return ", ".join(f"{key} = {_value(value)}" for key, value in given.items() if value not in (None, ""))
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return f"({', '.join(_value(item) for item in value)})"
+    return number(value) if isinstance(value, float) else str(value)
 
 
 def probability(value: float) -> str:

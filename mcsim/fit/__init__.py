@@ -1,6 +1,6 @@
 """Effective beams from measured or simulated BipoSH."""
 
-from mcsim.fit.data import Measurement, from_store, with_covariance_of
+from mcsim.fit.data import QUADRUPOLE, Measurement, from_store, with_covariance_of
 from mcsim.fit.effective_beam import Fit, comparisons, fit, measurement
 from mcsim.fit.likelihood import Comparison, Solution, compare, solve, solve_each
 from mcsim.fit.models import MODELS
@@ -10,6 +10,7 @@ from mcsim.fit.table import read_table
 
 __all__ = [
     "MODELS",
+    "QUADRUPOLE",
     "Comparison",
     "Fit",
     "Measurement",

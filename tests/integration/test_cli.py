@@ -189,6 +189,13 @@ def test_predict_plot_and_fit(mcsim: Command, small_store: Path, tmp_path: Path)
     assert code == 0
     assert "alpha = " in out
     assert (tmp_path / "fit.png").stat().st_size > 10_000
+    options = ("--model", "constant", "--ell-min", 10, "-o", "fit.png", "--mode", "L2M0d0", "--kind", "plain", "--json")
+    code, out, _ = mcsim("fit", small_store, "small.toml", *options)
+    assert code == 0
+    assert json.loads(out[: out.rindex("]") + 1])[0]["kind"] == "plain"
+    code, _, err = mcsim("fit", small_store, "small.toml", "--kind", "paired")
+    assert code == 2
+    assert "plain or difference" in err
     code, _, err = mcsim("fit", small_store, "small.toml", "--model", "cubic")
     assert code == 2
     assert "cubic" in err

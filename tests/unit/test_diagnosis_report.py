@@ -294,12 +294,18 @@ def test_residual_maps_are_in_units_of_noise(monkeypatch):
         (0.10034, 0.0098, "0.1003 ± 0.0098"),
         (123.4, 12.0, "123 ± 12"),
         (-2.5e-7, 3e-8, "(−2.50 ± 0.30) × 10⁻⁷"),
+        (-0.00001, 0.0039, "0.0000 ± 0.0039"),
         (0.3, 0.0, "0.3"),
         (float("nan"), 1.0, "–"),
     ],
 )
 def test_values_are_written_to_the_digits_of_their_errors(value, sigma, text):
     assert report.measured(value, sigma) == text
+
+
+def test_parameters_that_are_not_set_are_left_out():
+    given = {"angle_deg": -3.0, "template": "", "axis": [1.0, 0.5], "kind": "dipole", "other": None}
+    assert report.parameters(given) == "angle_deg = −3, axis = (1, 0.5), kind = dipole"
 
 
 def test_tiny_probabilities_are_powers_of_ten():
