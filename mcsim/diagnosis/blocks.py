@@ -26,6 +26,9 @@ BEAM_BINS = {0: 4, 1: 2, 2: 2, 3: 1, 4: 1}
 LATITUDES = (0.0, 0.25, 0.6, 1.0)
 """Edges in |sin latitude| of bands of the sky."""
 
+PLANE = 0.2
+"""Width in sin b of the profile of the galactic plane."""
+
 LARGE_SCALES = 64
 """Degree up to which signals fixed to the sky are compared between channels."""
 
@@ -75,6 +78,7 @@ def blocks_of(model: Model) -> tuple[Block, ...]:
     """What is listened for whatever the effect: about 30 numbers a channel, and some on the sky."""
     blocks = [_beam_block(model, i) for i in range(len(model.parts))]
     blocks += [_additive_block(model, i) for i in range(len(model.parts))]
+    blocks += [_plane_block(model, i) for i in range(len(model.parts))]
     for channel in range(len(model.response)):
         blocks += [_noise_block(model, channel), _linearity_block(model, channel)]
         if len(model.of(channel)) > 1:
@@ -168,6 +172,32 @@ def _additive_block(model: Model, part: int) -> Block:
         return np.array([-alm[two].real, alm[two].imag, alm[one].real])
 
     return Block(entries, values)
+
+
+def _plane_block(model: Model, part: int) -> Block:
+    """What is left along the galactic plane, against its mean over the sky."""
+    channel, split = _label(model, part)
+    matrix = rotation_matrix(_frame(model), "galactic")
+    height = matrix[2] @ np.stack(healpy.pix2vec(model.nside, np.arange(12 * model.nside**2)))
+    profile = 1.0 / (1.0 + (height / PLANE) ** 2)
+    profile -= profile.mean()
+    entry = Entry(
+        f"plane/{model.parts[part].name}",
+        "map",
+        (channel,),
+        split,
+        _fold(model, part),
+        (2, LARGE_SCALES),
+        L=2,
+        M=0,
+        parity="even",
+        frame="galactic",
+    )
+
+    def values(model: Model, heard: Heard) -> Vector:
+        return np.array([float(heard.residual[part] @ profile)])
+
+    return Block((entry,), values)
 
 
 def _noise_block(model: Model, channel: int) -> Block:

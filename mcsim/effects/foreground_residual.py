@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Self
 
 import healpy
 import numpy as np
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from mcsim import alm as alm_
 from mcsim import healpix
 from mcsim.effects import product
-from mcsim.effects.base import Alm, Draw, Effect, Site, Vector
+from mcsim.effects.base import Alm, Draw, Effect, Site
 from mcsim.errors import InputError
 from mcsim.rotation import rotate_alm
 from mcsim.sky import gaussian_alm
@@ -30,7 +29,7 @@ class ForegroundResidual(Effect):
     Attributes
     ----------
     amplitude
-        Root mean square over the full sky at 94 GHz, uK.
+        Root mean square over the full sky at 94 GHz, uK; negative where the cleaning took too much.
     spectral_index
         The signal grows as (nu / 94 GHz)^index, in thermodynamic temperature; 2 is near that of dust.
     template
@@ -52,21 +51,11 @@ class ForegroundResidual(Effect):
     )
     source = "Bennett et al. 2013, ApJS 208, 20, Sec. 5 (residuals of cleaned bands); the morphology is a model"
     step = 5.0
-    side = 1
     own_score = False
     draws = True
 
     spectral_index: float = 2.0
     template: str = ""
-
-    def coordinates(self) -> Vector:
-        """Its power: a residual of unknown morphology is heard in products of maps."""
-        return np.array([self.amplitude**2])
-
-    @classmethod
-    def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
-        """Root of the power, zero where it is negative."""
-        return cls(amplitude=float(np.sqrt(max(coordinates[0], 0.0))))
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
         """With the residual added."""
