@@ -162,11 +162,11 @@ def attribute(
     -----
     A subset suffices when its residual passes and no candidate of another identity is significant beside it; it is
     reported when no part of it suffices. Each of several candidates must be significant beside the others, or the
-    residual is that of something unknown; and one of several candidates must also be more probable than an unknown effect
-    of the same prior strength in an isotropic direction. Candidates of one identity compete by evidence alone. A
-    template that is wrong by a fraction eps of its white length leaves eps^2 s_c^2 in the residual, s_c the white
-    length of its fitted part (at most that of the whole fit); the sum over members makes both tests noncentral, in the
-    direction that hurts most.
+    residual is that of something unknown; and several must be more probable than an unknown effect of the same prior
+    strength in an isotropic direction. Candidates of one identity compete by evidence alone. A template that is wrong
+    by a fraction eps of its white length leaves eps^2 s_c^2 in the residual, s_c the white length of its fitted part
+    (at most that of the whole fit); the sum over members makes both tests noncentral, in the direction that hurts
+    most.
     The prior of a subset is k! times the product of its candidates' shares of the weight.
     """
     groups = bases(null, t, [candidate.columns for candidate in candidates])

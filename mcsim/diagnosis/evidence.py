@@ -218,8 +218,8 @@ def evidence_of(job: Job) -> NDArray[np.float64]:
 def _constrained(model: Model, observed: NDArray[np.complex128], seed: int, realization: int) -> NDArray[np.complex128]:
     """A sky that data might have been taken of: what they show, and what they do not show drawn (Hoffman & Ribak 1991).
 
-    s + (s^_data - s^_drawn), where s^_drawn is what simulated data of the drawn sky s show. Their noise is a draw of its
-    own: with that of the realization itself, sky and noise would be correlated, and every response too small by the
+    s + (s^_data - s^_drawn), where s^_drawn is what simulated data of the drawn sky s show. Their noise is a draw of
+    its own: with that of the realization itself, sky and noise would be correlated, and every response too small by the
     filter of s^.
     """
     key = (hash(observed.tobytes()), seed, realization)

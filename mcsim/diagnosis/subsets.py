@@ -110,7 +110,7 @@ class Subsets:
         )
 
     def least_needed(self, subsets: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Probability, trials included, of the least significant member of each subset beside its others, shape (M,)."""
+        """Probability, trials included, of each subset's least significant member beside its others, shape (M,)."""
         if not len(subsets):
             return np.empty(0)
         whole = self.solve(subsets)

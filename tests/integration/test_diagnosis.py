@@ -162,7 +162,7 @@ def test_data_in_mk_with_a_header_are_read(small, folder):
 
 def test_a_missing_file_is_named(small, folder):
     (folder / "W1_half2.fits").unlink()
-    with pytest.raises(InputError, match="W1_half2.fits does not exist"):
+    with pytest.raises(InputError, match=r"W1_half2\.fits does not exist"):
         read_maps(small.asked.model, folder)
 
 
