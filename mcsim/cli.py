@@ -253,7 +253,12 @@ def scan(
 @app.command()
 def diagnose(
     model: Config,
-    data: Annotated[Path, typer.Argument(metavar="DATA", help="Folder with CHANNEL.fits or CHANNEL_SPLIT.fits.")],
+    data: Annotated[
+        Path,
+        typer.Argument(
+            metavar="DATA", help="Folder with CHANNEL.fits or CHANNEL_SPLIT.fits, or an ECSV table of measured spectra."
+        ),
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for verdict and report.")],
     case: Annotated[str | None, typer.Option(help="Name of the case; default: that of the model.")] = None,
     without: Annotated[list[str] | None, typer.Option(metavar="EFFECT", help="Do not propose it; repeatable.")] = None,

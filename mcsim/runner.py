@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import dask
-from distributed import Client, Future, KilledWorker, LocalCluster, as_completed
+from distributed import Client, Future, KilledWorker, LocalCluster, wait
 from distributed.comm.core import CommClosedError
 from numpy.typing import NDArray
 
@@ -36,6 +36,11 @@ import logging, signal
 signal.signal(signal.SIGINT, signal.SIG_IGN)
 logging.getLogger("distributed").setLevel(logging.CRITICAL)
 """
+
+
+TURN_S = 30.0
+ALONE_S = 300.0
+"""How long a run waits for a worker when all are gone."""
 
 
 @dataclass(frozen=True)
@@ -303,7 +308,6 @@ def _futures(
     client: Client, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]
 ) -> Iterator[tuple[int, Future]]:
     waiting = enumerate(arguments)
-    flying = as_completed([], with_results=False)
     numbers: dict[Future, int] = {}
 
     def fill() -> None:
@@ -311,12 +315,29 @@ def _futures(
         for index, call in islice(waiting, max(room, 0)):
             future = client.submit(function, *call, pure=False)
             numbers[future] = index
-            flying.add(future)
 
     fill()
-    for future in flying:
-        yield numbers.pop(future), future
+    while numbers:
+        # Asked for in turns, for a call that no worker is left to answer would be waited for for ever.
+        done, _ = _first_of(client, list(numbers))
+        for future in done:
+            yield numbers.pop(future), future
         fill()
+
+
+def _first_of(client: Client, flying: list[Future]) -> tuple[set[Future], set[Future]]:
+    """Futures that are done, at least one, and the others; RunError when no worker has been there for a while."""
+    missed = 0
+    while True:
+        try:
+            return tuple(wait(flying, timeout=TURN_S, return_when="FIRST_COMPLETED"))
+        except TimeoutError:
+            missed = 0 if client.nthreads() else missed + 1
+        if missed * TURN_S >= ALONE_S:
+            raise RunError(
+                f"No worker has been there for {ALONE_S:g} s; start workers, then run the same command again: what is "
+                "finished is kept."
+            )
 
 
 def _simulate(client: Client, target: Path, run: config.RunConfig, wanted: range, journal: Journal) -> list[Failure]:

@@ -17,7 +17,7 @@ from mcsim.diagnosis.detect import power
 from mcsim.diagnosis.evidence import Proposal
 from mcsim.diagnosis.gaussian import Null, bases, fit
 from mcsim.diagnosis.refine import effect_at, quiet_templates
-from mcsim.diagnosis.shrink import achieved, predicted
+from mcsim.diagnosis.shrink import Prediction, Shrink, achieved, predicted
 from mcsim.diagnosis.trials import Calibration, calibrate, gap
 from mcsim.errors import InputError
 
@@ -182,9 +182,7 @@ def judged(bench: Bench, prior: Prior, seed: int, cases: Sequence[Draw]) -> list
         best, right = None, np.nan
         if draw.drawn.kind in ("none", "one", "two"):
             best, right = most_probable(bayes.probabilities(x))
-        expected = measured = sigma = None
-        if said.explanations:
-            expected, measured, sigma = shrunk(bench, x, said.explanations[0].members)
+        shrink = shrunk(bench, x, said.explanations[0].members) if said.explanations else None
         white = bench.null.templates(draw.response[:, None])
         found.append(
             Record(
@@ -202,9 +200,10 @@ def judged(bench: Bench, prior: Prior, seed: int, cases: Sequence[Draw]) -> list
                 best,
                 right,
                 _pulls(said, draw.drawn),
-                expected,
-                measured,
-                sigma,
+                None if shrink is None else shrink[0].fraction.value,
+                None if shrink is None else shrink[1].fraction.value,
+                None if shrink is None else shrink[1].fraction.sigma,
+                None if shrink is None else (shrink[1].before.value, shrink[1].after.value),
                 _absent(bench, geometry, draw, x, truth, seed),
             )
         )
@@ -227,10 +226,10 @@ def _pulls(said: Attribution, drawn: Drawn) -> tuple[float, ...]:
     return tuple(float(pull) for pull in (best.fit.amplitudes - np.array(member.coordinates)) / best.fit.errors)
 
 
-def shrunk(bench: Bench, x: Vector, members: Sequence[int]) -> tuple[float | None, float | None, float | None]:
-    """Shrink predicted and achieved, and its error: fitted to fold 0, frozen, and judged on fold 1."""
+def shrunk(bench: Bench, x: Vector, members: Sequence[int]) -> tuple[Prediction, Shrink] | None:
+    """Shrink predicted and achieved: fitted to fold 0, frozen, and judged on fold 1."""
     if bench.used is None or bench.fresh is None:
-        return None, None, None
+        return None
     columns = np.array([column for member in members for column in bench.candidates[member].columns])
     here = bench.templates[np.ix_(bench.second, columns)]
     frozen = fit(bench.used, x[bench.first], bench.templates[np.ix_(bench.first, columns)])
@@ -241,19 +240,18 @@ def shrunk(bench: Bench, x: Vector, members: Sequence[int]) -> tuple[float | Non
         try:
             effect = effect_at(bench.proposals[member], frozen.amplitudes[part], frozen.covariance[part, part])
         except InputError:
-            return None, None, None
+            return None
         coordinates[part] = effect.coordinates()
         start = stop
     expected = predicted(bench.fresh, x[bench.second], here, frozen.amplitudes, frozen.covariance)
     after = replace(bench.fresh, mean=bench.fresh.mean + here @ coordinates)
-    found = achieved(bench.fresh, after, x[bench.second])
-    return expected.fraction.value, found.fraction.value, found.fraction.sigma
+    return expected, achieved(bench.fresh, after, x[bench.second])
 
 
 def _absent(
     bench: Bench, geometry: Geometry, draw: Draw, x: Vector, truth: frozenset[tuple[str, str | None]], seed: int
-) -> float | None:
-    """Shrink that one effect achieves that is neither there nor like what is there."""
+) -> tuple[float, float] | None:
+    """Gap before and after one effect that is neither there nor like what is there."""
     if len(truth) != 1 or draw.drawn.kind != "one":
         return None
     white = bench.null.templates(draw.response[:, None])[:, 0]
@@ -269,7 +267,8 @@ def _absent(
     if not unlike:
         return None
     chosen = unlike[int(rng.generator(seed, draw.case, "challenge/absent").integers(len(unlike)))]
-    return shrunk(bench, x, (chosen,))[1]
+    shrink = shrunk(bench, x, (chosen,))
+    return None if shrink is None else (shrink[1].before.value, shrink[1].after.value)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ from scipy import stats
 
 from mcsim.challenge.draws import Power
 from mcsim.challenge.expected import places_right
-from mcsim.challenge.intervals import Figure, mean, nominal, share, slope, strength_at, strength_of, width
+from mcsim.challenge.intervals import Figure, mean, nominal, removed, share, slope, strength_at, strength_of, width
 from mcsim.challenge.record import Answer, Record
 
 NONE, MIXTURE, SET, UNKNOWN = "none", "mixture", "set", "unknown"
@@ -179,11 +179,10 @@ def _shrinks(records: Sequence[Record]) -> list[Figure]:
     x, y, sigma = (
         np.array([getattr(r, name) for r in strong], dtype=float) for name in ("predicted", "achieved", "sigma")
     )
-    removed = [float(r.achieved) for r in strong if r.achieved is not None]
-    absent = [r.absent for r in records if r.absent is not None]
-    least = mean(f"gap removed, s >= {SHRUNK:g}", removed, "at least 0.8")
+    least = removed(f"gap removed, s >= {SHRUNK:g}", [r.gaps for r in strong if r.gaps], "at least 0.8")
     met = bool(least.value >= 0.8) if np.isfinite(least.value) else None
-    none = mean("gap removed by an effect that is not there", absent, "0 within the interval")
+    absent = [r.absent for r in records if r.absent is not None]
+    none = removed("gap removed by an effect that is not there", absent, "0 within the interval")
     zero = bool(none.low <= 0.0 <= none.high) if np.isfinite(none.value) else None
     return [
         slope(f"achieved against predicted shrink: slope, s >= {SHRUNK:g}", x, y, sigma, "1 +- 0.05", 0.95, 1.05),

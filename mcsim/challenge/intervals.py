@@ -107,6 +107,23 @@ def slope(name: str, x: Vector, y: Vector, sigma: Vector, target: str, least: fl
     return Figure(name, value, float(low), float(high), n, target, bool(least <= value <= most))
 
 
+def removed(name: str, gaps: Sequence[tuple[float, float]], target: str) -> Figure:
+    """Share of the gaps, shape (n, 2), before and after, that is gone: 1 - sum after/sum before.
+
+    Of the sums, with the interval of resampled cases: the gap in fresh data can be compatible with zero, and the mean of
+    such ratios does not exist.
+    """
+    n = len(gaps)
+    if n < 3:
+        return Figure(name, np.nan, np.nan, np.nan, n, target)
+    values = np.array(gaps)
+    rows = np.random.default_rng(0).integers(0, n, (1000, n))
+    drawn = values[rows].sum(axis=1)
+    low, high = np.quantile(1.0 - drawn[:, 1] / drawn[:, 0], (0.025, 0.975))
+    before, after = values.sum(axis=0)
+    return Figure(name, float(1.0 - after / before), float(low), float(high), n, target)
+
+
 def strength_at(strengths: Vector, found: NDArray[np.bool_], power: float = 0.9) -> tuple[float, float, float]:
     """Strength at which effects are found with a power, and its 95 % interval: a probit of the strength by likelihood.
 

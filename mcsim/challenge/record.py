@@ -45,8 +45,8 @@ class Record:
         Fitted less true amplitudes over their errors, where the only effect was named.
     predicted, achieved, sigma
         Shrink of the gap; None where none was measured.
-    absent
-        Shrink that an effect achieves that is not there.
+    gaps, absent
+        Gap before and after, with what was named; and with an effect that is not there.
     places
         (frame, L, parity) of the first three places; None where they were not looked for.
     sampled
@@ -70,7 +70,8 @@ class Record:
     predicted: float | None = None
     achieved: float | None = None
     sigma: float | None = None
-    absent: float | None = None
+    gaps: tuple[float, float] | None = None
+    absent: tuple[float, float] | None = None
     places: tuple[tuple[str | None, int | None, str | None], ...] | None = None
     sampled: bool = False
 

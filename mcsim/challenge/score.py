@@ -141,6 +141,7 @@ class _Judge:
             shrink.get("predicted"),
             shrink.get("achieved"),
             shrink.get("sigma"),
+            (shrink["gap_before"], shrink["gap_after"]) if shrink else None,
             None,
             tuple((place["frame"], place["L"], place["parity"]) for place in verdict["where"][:3]),
             truth.sampled,

@@ -124,7 +124,7 @@ def _shrink(axes: Axes, score: "Score") -> None:
         axes.errorbar(
             x, y, error, fmt="o", color=BLUE, markersize=3, elinewidth=0.5, alpha=0.7, label="right effect, s >= 8"
         )
-    absent = [record.absent for record in score.records if record.absent is not None]
+    absent = [1.0 - r.absent[1] / r.absent[0] for r in score.records if r.absent is not None and r.absent[0] > 0]
     if absent:
         axes.plot(np.zeros(len(absent)), absent, "x", color=RED, markersize=4, label="effect that is not there")
     axes.set(xlabel="predicted share of the gap", ylabel="achieved", title="shrink", xlim=(-0.1, 1.2), ylim=(-0.6, 1.4))

@@ -199,7 +199,7 @@ def residual_figure(reading: Reading) -> Figure | None:
     shown: Any = None
     for axes, name, values in zip(grid, names, maps.values, strict=False):
         shown = _mollweide(axes, values)
-        axes.set_title(f"{_plain(_short(name, 40))}: rms {np.nanstd(values):.2f}", fontsize=10)
+        axes.set_title(f"{_plain(_short(name, 40))}: rms {np.sqrt(np.nanmean(values**2)):.2f}", fontsize=10)
     for axes in grid:
         axes.set(xticks=[], yticks=[], frame_on=False)
     figure.colorbar(

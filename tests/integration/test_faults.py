@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from distributed import Client
+from distributed import Client, LocalCluster
 from distributed.diagnostics.plugin import WorkerPlugin
 from zarr.storage import _local
 
@@ -196,6 +196,17 @@ def test_other_packages_are_refused_by_name(client: Client, tmp_path: Path, monk
 def test_completed_gives_every_result_once(client: Client) -> None:
     calls = ((n, 2) for n in range(30))
     assert dict(runner.completed(client, pow, calls)) == {n: n**2 for n in range(30)}
+
+
+def test_a_cluster_without_workers_is_not_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runner, "TURN_S", 0.2)
+    monkeypatch.setattr(runner, "ALONE_S", 0.4)
+    with (
+        LocalCluster(n_workers=0, processes=False, host="127.0.0.1", dashboard_address=None) as empty,
+        Client(empty) as alone,
+        pytest.raises(RunError, match=r"No worker has been there for 0\.4 s"),
+    ):
+        list(runner.completed(alone, pow, [(2, 2)]))
 
 
 def test_error_of_a_call_is_raised(client: Client) -> None:

@@ -175,10 +175,9 @@ def test_draws_are_judged(sitting, tmp_path):
     assert wrong <= stats.binom.ppf(1 - 1e-4, len(strong), 0.06)
     assert sum(record.bayes != record.truth for record in strong) <= 2
     assert all(record.distances[0] >= record.distances[-1] for record in records if record.kind == "left_out")
-    absent = [record.absent for record in records if record.absent is not None]
-    shrink = [record.achieved for record in strong if record.right and record.strength > 10]
-    assert np.mean(shrink) > 0.8
-    assert abs(np.mean(absent)) < 0.1
+    figures = {figure.name: figure for figure in score.figures}
+    assert figures["gap removed, s >= 8"].value > 0.8
+    assert abs(figures["gap removed by an effect that is not there"].value) < 0.1
     write([score], tmp_path / "score")
     page = (tmp_path / "score" / "report.html").read_text()
     assert "data:image/png;base64" in page
@@ -274,6 +273,8 @@ def test_intervals_cover_what_they_say():
     assert (low, high) == (pytest.approx(0.025 ** (1 / 7)), 1.0)
     assert intervals.share("x", []).met is None
     assert intervals.share("x", [True] * 19 + [False], least=0.95).met is True
+    gone = intervals.removed("x", [(10.0, 1.0), (20.0, 2.0), (1e-9, 3.0)], "")
+    assert gone.value == pytest.approx(0.8)
     rng = np.random.default_rng(0)
     s = rng.uniform(1, 8, 3000)
     hits = rng.random(3000) < stats.norm.cdf(s - 3.0)
