@@ -28,6 +28,10 @@ out = Console(highlight=False, soft_wrap=True)
 
 Config = Annotated[str, typer.Argument(metavar="CONFIG", help="TOML file, or a packaged workflow such as quickstart.")]
 Store = Annotated[Path, typer.Argument(metavar="STORE", help="Folder that mcsim run wrote.")]
+Workers = Annotated[int | None, typer.Option(min=0, help="Processes; 0: this one; default: the model's.")]
+Simulations = Annotated[
+    int | None, typer.Option(min=50, help="For the scatter of the evidence; default: ten for each number.")
+]
 Png = Annotated[Path | None, typer.Option("-o", "--output", metavar="PNG", help="Picture to write.")]
 
 
@@ -262,9 +266,7 @@ def diagnose(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for verdict and report.")],
     case: Annotated[str | None, typer.Option(help="Name of the case; default: that of the model.")] = None,
     without: Annotated[list[str] | None, typer.Option(metavar="EFFECT", help="Do not propose it; repeatable.")] = None,
-    simulations: Annotated[
-        int | None, typer.Option(min=50, help="For the scatter of the evidence; default: ten for each number of it.")
-    ] = None,
+    simulations: Simulations = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Local processes; default: the configuration's.")] = None,
 ) -> None:
     """Diagnose a gap between maps and a model: is there one, where, which effect, and how far it shrinks."""
@@ -283,6 +285,76 @@ def diagnose(
     )
     out.print(found.sentence, markup=False)
     out.print(f"wrote {output / 'verdict.json'} and {output / 'report.html'}", markup=False)
+
+
+challenge = typer.Typer(help="Effects drawn, hidden, diagnosed and scored.", no_args_is_help=True)
+app.add_typer(challenge, name="challenge")
+
+Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the challenge.")]
+Target = Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to fill.")]
+
+
+@challenge.command("make")
+def challenge_make(
+    model: Config,
+    output: Target,
+    cases: Annotated[int, typer.Option(min=1, help="Number of cases.")] = 200,
+    seed: Annotated[int, typer.Option(min=0, help="Of the draws; keep it as secret as the keys.")] = 0,
+    sampled_share: Annotated[float, typer.Option(min=0.0, max=1.0, help="Share made sample by sample.")] = 0.5,
+    inventions: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Python file with effects of no library.")
+    ] = None,
+    simulations: Simulations = None,
+    workers: Workers = None,
+) -> None:
+    """Draw effects, make maps, seal the keys."""
+    from mcsim.challenge.make import make
+
+    _interrupt_once()
+    make(
+        model,
+        output,
+        cases,
+        seed,
+        sampled_share=sampled_share,
+        inventions=inventions,
+        simulations=simulations,
+        workers=workers,
+        quiet=False,
+    )
+
+
+@challenge.command("run")
+def challenge_run(folder: Folder, workers: Workers = None) -> None:
+    """Diagnose all cases that have no verdict."""
+    from mcsim.challenge.run import run as diagnose_all
+
+    _interrupt_once()
+    out.print(f"{diagnose_all(folder, workers=workers, quiet=False)} cases diagnosed", markup=False)
+
+
+@challenge.command("score")
+def challenge_score(folder: Folder, workers: Workers = None) -> None:
+    """Open the keys and score the verdicts."""
+    from mcsim.challenge import report, score
+
+    out.print("\n".join(report.lines(score.score(folder, workers=workers, quiet=False))), markup=False)
+
+
+@challenge.command("draws")
+def challenge_draws(
+    model: Config,
+    output: Target,
+    number: Annotated[int, typer.Option(min=1, help="Number of draws.")] = 1000,
+    seed: Annotated[int, typer.Option(min=0, help="Of the draws.")] = 0,
+    simulations: Simulations = None,
+    workers: Workers = None,
+) -> None:
+    """Score draws of the compressed evidence, without maps."""
+    from mcsim.challenge import report, score
+
+    found = score.score_draws(model, number, seed, output, simulations=simulations, workers=workers, quiet=False)
+    out.print("\n".join(report.lines(found)), markup=False)
 
 
 @app.command()

@@ -110,7 +110,7 @@ def slope(name: str, x: Vector, y: Vector, sigma: Vector, target: str, least: fl
 def removed(name: str, gaps: Sequence[tuple[float, float]], target: str) -> Figure:
     """Share of the gaps, shape (n, 2), before and after, that is gone: 1 - sum after/sum before.
 
-    Of the sums, with the interval of resampled cases: the gap in fresh data can be compatible with zero, and the mean of
+    Of the sums, with the interval of resampled cases: a gap in fresh data can be compatible with zero, and the mean of
     such ratios does not exist.
     """
     n = len(gaps)

@@ -327,7 +327,7 @@ def _mollweide(axes: Axes, values: NDArray[np.float64]) -> Any:
     image = projector.projmap(values, lambda x, y, z: healpy.vec2pix(nside, x, y, z))
     image = np.ma.masked_invalid(np.where(np.isneginf(image), np.nan, image))
     # Sharp pixels: smoothed ones make the file three times as large.
-    style = {"cmap": "RdBu_r", "vmin": -4.0, "vmax": 4.0, "interpolation": "nearest"}
+    style: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -4.0, "vmax": 4.0, "interpolation": "nearest"}
     return axes.imshow(image, origin="lower", extent=projector.get_extent(), **style)
 
 
