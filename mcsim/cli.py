@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import sys
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Annotated
@@ -311,17 +312,8 @@ def challenge_make(
     from mcsim.challenge.make import make
 
     _interrupt_once()
-    make(
-        model,
-        output,
-        cases,
-        seed,
-        sampled_share=sampled_share,
-        inventions=inventions,
-        simulations=simulations,
-        workers=workers,
-        quiet=False,
-    )
+    made = partial(make, model, output, cases, seed, sampled_share=sampled_share, inventions=inventions)
+    made(simulations=simulations, workers=workers, quiet=False)
 
 
 @challenge.command("run")
