@@ -166,7 +166,8 @@ class Reading:
         if shrink is not None:
             before, after = shrink["gap_before"], shrink["gap_after"]
             expected = before * (1.0 - shrink["predicted"])
-            return Gap(before, 0.0, after, shrink["sigma"] * abs(before), expected, f"judged on {shrink['data']}")
+            errors = shrink["sigma_before"], shrink["sigma_after"]
+            return Gap(before, errors[0], after, errors[1], expected, f"judged on {shrink['data']}")
         n, p = int(self.evidence.attrs["simulations"]) - 1, self.verdict["gap"]["dof"]
         value, sigma = _excess(self.verdict["gap"]["statistic"], p, n)
         if not self.explanations:

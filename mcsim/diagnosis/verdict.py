@@ -127,7 +127,9 @@ def verdict_of(
             "sigma": achieved.fraction.sigma,
             "sigma_predicted": predicted.fraction.sigma,
             "gap_before": achieved.before.value,
+            "sigma_before": achieved.before.sigma,
             "gap_after": achieved.after.value,
+            "sigma_after": achieved.after.sigma,
             "p_value_after": achieved.probability_after,
             "data": data,
         }
