@@ -15,7 +15,6 @@ from distributed import Client
 from distributed.diagnostics.plugin import WorkerPlugin
 from zarr.storage import _local
 
-import mcsim
 from mcsim import cli, config, repair, runner, simulate, store, tasks
 from mcsim.errors import InputError, RunError
 
@@ -307,7 +306,7 @@ def test_worker_that_dies_every_time_costs_its_realization_alone(small_store: Pa
 
 def test_kills_lose_nothing() -> None:
     """The fault campaign in short; workflows/faults has the long one."""
-    script = Path(mcsim.__file__).parents[1] / "workflows" / "faults" / "campaign.py"
+    script = Path(__file__).parents[2] / "workflows" / "faults" / "campaign.py"
     command = [sys.executable, script, "--kills", "5", "--clusters", "local", "--seed", "2"]
     environment = os.environ | {"MCSIM_FAULTS_REALIZATIONS": "24"}
     found = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-import mcsim
 from mcsim import open_summary
 
-SCRIPT = Path(mcsim.__file__).parents[1] / "workflows" / "ensemble" / "walk.py"
+SCRIPT = Path(__file__).parents[2] / "workflows" / "ensemble" / "walk.py"
 spec = importlib.util.spec_from_file_location("walk", SCRIPT)
 assert spec is not None
 assert spec.loader is not None
