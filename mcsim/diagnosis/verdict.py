@@ -16,6 +16,8 @@ from mcsim.diagnosis.where import Place
 
 SCHEMA = 1
 PLACES = 12
+SETS = 2
+"""Alternatives that a sentence has room for."""
 
 
 def effects_of(
@@ -150,8 +152,10 @@ def sentence(verdict: Mapping[str, Any]) -> str:
         return f"{start}no effect of the library explains it; {nearest}."
     text = " and ".join(_words(effect) for effect in verdict["effects"])
     if kind == "degenerate":
-        others = "; or ".join(" and ".join(_words(effect) for effect in one) for one in verdict["alternatives"])
-        return f"{start}{text}; or {others}."
+        shown = verdict["alternatives"][:SETS]
+        others = "; or ".join(" and ".join(_words(effect) for effect in one) for one in shown)
+        more = len(verdict["alternatives"]) - len(shown)
+        return f"{start}{text}; or {others}" + (f"; or {more} more sets." if more else ".")
     return f"{start}{text}."
 
 
