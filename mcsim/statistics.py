@@ -102,3 +102,21 @@ def covariance(sums: Sums, name: str) -> Array:
         return np.full(sums.comoment[name].shape, np.nan)
     result: Array = sums.comoment[name] / (sums.count - 1)
     return result
+
+
+def jackknife(
+    statistic: Callable[..., NDArray[np.float64]], *samples: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A statistic of means over realizations, and its error by leaving out one realization after the other.
+
+    Parameters
+    ----------
+    statistic
+        Function of the mean of each sample.
+    samples
+        Shape (realization, ...), of the same realizations.
+    """
+    number = len(samples[0])
+    left_out = np.array([statistic(*(np.delete(s, r, axis=0).mean(axis=0) for s in samples)) for r in range(number)])
+    value = np.asarray(statistic(*(s.mean(axis=0) for s in samples)))
+    return value, np.sqrt((number - 1.0) * np.mean((left_out - left_out.mean(axis=0)) ** 2, axis=0))

@@ -36,7 +36,7 @@ def load(path: str) -> dict[str, type[Effect]]:
         for _, kind in inspect.getmembers(module, inspect.isclass)
         if issubclass(kind, Effect) and kind.__module__ == spec.name
     }
-    taken = sorted(set(found) & set(effects.library()))
+    taken = sorted(set(found) & set(effects.catalogue()))
     if not found or taken:
         wrong = f"{taken[0]}, which the library has" if taken else "no effect"
         raise InputError(f"{path} defines {wrong}; let it define effects of its own.")
@@ -46,7 +46,7 @@ def load(path: str) -> dict[str, type[Effect]]:
 @contextmanager
 def introduced(path: str | None) -> Iterator[None]:
     """Let runs be simulated with the inventions of a file; no diagnosis may be prepared meanwhile."""
-    library = effects.library()
+    library = effects.catalogue()
     added = {} if path is None else load(path)
     library.update(added)
     try:

@@ -118,7 +118,7 @@ def questions(run: config.RunConfig, without: Sequence[str] = (), nthreads: int 
     model = model_of(survey(run, nthreads=nthreads, orders=ORDERS))
     proposals = tuple(
         Proposal(kind, channel, dict(settings), tuple(replace(basis, **settings) for basis in kind.basis()))
-        for name, kind in effects.library().items()
+        for name, kind in effects.catalogue().items()
         if name not in without
         for channel in ([None] if kind.scope == "common" else [channel.name for channel in run.channels])
         for settings in kind.variants

@@ -235,7 +235,7 @@ def listening(run: config.RunConfig, measured: Spectra) -> config.RunConfig:
 
 def questions_of(run: config.RunConfig, measured: Spectra, without: Sequence[str] = (), nthreads: int = 1) -> Questions:
     """What to ask of a table: effects of the library that change spectra; the numbers of the table are the evidence."""
-    deaf = [name for name, kind in effects.library().items() if not _changes_spectra(kind)]
+    deaf = [name for name, kind in effects.catalogue().items() if not _changes_spectra(kind)]
     asked = questions(run, (*without, *deaf), nthreads)
     return replace(asked, blocks=(Block(measured.entries, lambda model, heard: measured.value),))
 

@@ -2,7 +2,7 @@
 
 from mcsim.effects.base import Alm, Draw, Effect, Map, Pointing, Site
 from mcsim.effects.compose import looked_at, seen_through, spread_of
-from mcsim.effects.registry import build, describe, get, library
+from mcsim.effects.registry import build, catalogue, describe, get
 
 __all__ = [
     "Alm",
@@ -12,9 +12,9 @@ __all__ = [
     "Pointing",
     "Site",
     "build",
+    "catalogue",
     "describe",
     "get",
-    "library",
     "looked_at",
     "seen_through",
     "spread_of",

@@ -1,19 +1,17 @@
 """Our motion: aberration and modulation of the sky."""
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim import alm as alm_
-from mcsim.effects.base import Alm, Draw, Effect, Site, Vector
+from mcsim.effects.base import Alm, Draw, Site
 from mcsim.effects.product import multiplied
-from mcsim.effects.vectors import lonlat_deg, towards
+from mcsim.effects.vectors import DirectedEffect
 
 
 @dataclass(frozen=True, kw_only=True)
-class Boost(Effect):
+class Boost(DirectedEffect):
     """The sky as an observer of velocity beta sees it: (1 + beta . n) T(n - grad(beta . n)), to first order.
 
     Attributes
@@ -41,9 +39,6 @@ class Boost(Effect):
     step = 1e-4
     own_score = False
 
-    lon_deg: float = 0.0
-    lat_deg: float = 0.0
-
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
         """Boosted."""
         if self.amplitude == 0.0:
@@ -58,18 +53,3 @@ class Boost(Effect):
         change = alm_.multiply(projected(sky), squared, site.lmax)
         change -= projected(alm_.multiply(sky, squared, site.lmax))
         return sky + 0.5 * change
-
-    @classmethod
-    def basis(cls) -> tuple[Self, ...]:
-        """Along x, y and z."""
-        return (cls(amplitude=cls.step), cls(amplitude=cls.step, lon_deg=90.0), cls(amplitude=cls.step, lat_deg=90.0))
-
-    def coordinates(self) -> Vector:
-        """Components x, y, z."""
-        return self.amplitude * towards(self.lon_deg, self.lat_deg)
-
-    @classmethod
-    def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
-        """Norm and direction."""
-        lon_deg, lat_deg = lonlat_deg(coordinates)
-        return cls(amplitude=float(np.linalg.norm(coordinates)), lon_deg=lon_deg, lat_deg=lat_deg)

@@ -1,18 +1,14 @@
 """A sky with more power on one side."""
 
 from dataclasses import dataclass
-from typing import Self
 
-import numpy as np
-from numpy.typing import NDArray
-
-from mcsim.effects.base import Alm, Draw, Effect, Site, Vector
+from mcsim.effects.base import Alm, Draw, Site
 from mcsim.effects.product import multiplied
-from mcsim.effects.vectors import lonlat_deg, towards
+from mcsim.effects.vectors import DirectedEffect
 
 
 @dataclass(frozen=True, kw_only=True)
-class DipoleModulation(Effect):
+class DipoleModulation(DirectedEffect):
     """The sky times 1 + A . n, in every channel.
 
     Attributes
@@ -32,27 +28,9 @@ class DipoleModulation(Effect):
     step = 0.01
     own_score = False
 
-    lon_deg: float = 0.0
-    lat_deg: float = 0.0
-
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
         """Modulated."""
         if self.amplitude == 0.0:
             return sky
         a, b, c = self.coordinates()
         return sky + multiplied(sky, site.lmax, lambda x, y, z: a * x + b * y + c * z, 1)
-
-    @classmethod
-    def basis(cls) -> tuple[Self, ...]:
-        """Along x, y and z."""
-        return (cls(amplitude=cls.step), cls(amplitude=cls.step, lon_deg=90.0), cls(amplitude=cls.step, lat_deg=90.0))
-
-    def coordinates(self) -> Vector:
-        """Components x, y, z."""
-        return self.amplitude * towards(self.lon_deg, self.lat_deg)
-
-    @classmethod
-    def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
-        """Norm and direction."""
-        lon_deg, lat_deg = lonlat_deg(coordinates)
-        return cls(amplitude=float(np.linalg.norm(coordinates)), lon_deg=lon_deg, lat_deg=lat_deg)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mcsim.effects.base import Alm, Draw, Effect, Site, Vector
 from mcsim.effects.product import multiplied
-from mcsim.errors import InputError
+from mcsim.effects.vectors import along
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,11 +55,7 @@ class QuadrupoleModulation(Effect):
 
     def coordinates(self) -> Vector:
         """Amplitude times the unit vector along the components."""
-        vector = np.array(self.components)
-        norm = float(np.linalg.norm(vector))
-        if norm == 0.0:
-            raise InputError(f"effect {self.name}: components are all zero; give a direction, or amplitude = 0.")
-        return self.amplitude * vector / norm
+        return along(self.name, "components", self.components, self.amplitude)
 
     @classmethod
     def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:

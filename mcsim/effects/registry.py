@@ -19,7 +19,7 @@ ENTRY_POINTS = "mcsim.effects"
 
 
 @cache
-def library() -> dict[str, type[Effect]]:
+def catalogue() -> dict[str, type[Effect]]:
     """Every effect by name: built in, then registered by other packages.
 
     Raises
@@ -31,7 +31,8 @@ def library() -> dict[str, type[Effect]]:
     package = base.__name__.rpartition(".")[0]
     for module in pkgutil.iter_modules(import_module(package).__path__):
         for _, kind in inspect.getmembers(import_module(f"{package}.{module.name}"), inspect.isclass):
-            if issubclass(kind, Effect) and kind is not Effect and kind.__module__ == f"{package}.{module.name}":
+            own = kind.__module__ == f"{package}.{module.name}"
+            if own and issubclass(kind, Effect) and hasattr(kind, "name"):  # a base of several effects has none
                 found[kind.name] = kind
     for entry in entry_points(group=ENTRY_POINTS):
         try:
@@ -50,7 +51,7 @@ def library() -> dict[str, type[Effect]]:
 
 def get(name: str) -> type[Effect]:
     """The effect called ``name``; InputError, with what comes close, if there is none."""
-    known = library()
+    known = catalogue()
     if name not in known:
         near = difflib.get_close_matches(name, known, n=1)
         hint = f"did you mean {near[0]}?" if near else f"choose from {', '.join(sorted(known))}."
@@ -75,5 +76,5 @@ def describe() -> list[dict[str, Any]]:
             "signature": kind.signature,
             "source": kind.source,
         }
-        for kind in library().values()
+        for kind in catalogue().values()
     ]

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from mcsim import alm as alm_
 from mcsim.effects.base import Alm, Draw, Effect, Site, Vector
+from mcsim.effects.vectors import along
 from mcsim.errors import InputError
 
 BANDS = 6
@@ -59,11 +60,7 @@ class Spectrum(Effect):
 
     def coordinates(self) -> Vector:
         """Fractional change of every band."""
-        vector = np.array(self.bands)
-        norm = float(np.linalg.norm(vector))
-        if norm == 0.0:
-            raise InputError(f"effect {self.name}: bands are all zero; give a direction, or amplitude = 0.")
-        return self.amplitude * vector / norm
+        return along(self.name, "bands", self.bands, self.amplitude)
 
     @classmethod
     def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:

@@ -1,9 +1,53 @@
-"""Directions in the frame of the maps, for effects whose parameter is a vector."""
+"""Effects whose parameter is a vector: of three components with a direction on the sky, or of any number."""
+
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-Vector = NDArray[np.float64]
+from mcsim.effects.base import Effect, Vector
+from mcsim.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class DirectedEffect(Effect):
+    """Base of effects whose parameter is a vector in the frame of the maps, fitted in its components x, y and z.
+
+    Attributes
+    ----------
+    amplitude
+        Length.
+    lon_deg, lat_deg
+        Direction.
+    """
+
+    lon_deg: float = 0.0
+    lat_deg: float = 0.0
+
+    @classmethod
+    def basis(cls) -> tuple[Self, ...]:
+        """Along x, y and z."""
+        return (cls(amplitude=cls.step), cls(amplitude=cls.step, lon_deg=90.0), cls(amplitude=cls.step, lat_deg=90.0))
+
+    def coordinates(self) -> Vector:
+        """Components x, y, z."""
+        return self.amplitude * towards(self.lon_deg, self.lat_deg)
+
+    @classmethod
+    def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
+        """Norm and direction."""
+        lon_deg, lat_deg = lonlat_deg(coordinates)
+        return cls(amplitude=float(np.linalg.norm(coordinates)), lon_deg=lon_deg, lat_deg=lat_deg)
+
+
+def along(effect: str, key: str, direction: tuple[float, ...], amplitude: float) -> Vector:
+    """``amplitude`` times the unit vector along a parameter of an effect; InputError where that is zero."""
+    vector = np.array(direction)
+    norm = float(np.linalg.norm(vector))
+    if norm == 0.0:
+        raise InputError(f"effect {effect}: {key} are all zero; give a direction, or amplitude = 0.")
+    return np.asarray(amplitude * vector / norm)
 
 
 def towards(lon_deg: float, lat_deg: float) -> Vector:

@@ -44,8 +44,8 @@ SEED = 0
 def small_library():
     """Few effects are learned quickly."""
     with pytest.MonkeyPatch.context() as patch:
-        for name in [name for name in effects.library() if name not in (*LIBRARY, "beam_width")]:
-            patch.delitem(effects.library(), name)
+        for name in [name for name in effects.catalogue() if name not in (*LIBRARY, "beam_width")]:
+            patch.delitem(effects.catalogue(), name)
         yield
 
 
@@ -128,7 +128,7 @@ def test_verdicts_are_scored(challenge, tmp_path):
 def test_inventions_are_lent_only():
     assert set(load(str(INVENTIONS))) == {"invented_square_beam", "invented_nonlinearity", "invented_crosstalk"}
     with introduced(str(INVENTIONS)):
-        assert "invented_crosstalk" in effects.library()
-    assert "invented_crosstalk" not in effects.library()
+        assert "invented_crosstalk" in effects.catalogue()
+    assert "invented_crosstalk" not in effects.catalogue()
     with pytest.raises(InputError, match="no Python file"):
         load("nowhere.py")

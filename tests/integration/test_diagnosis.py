@@ -48,7 +48,7 @@ def ask(jobs):
 @pytest.fixture(scope="module")
 def small():
     run = config.load(MODEL)
-    asked = questions(run, without=[name for name in effects.library() if name not in PROPOSED])
+    asked = questions(run, without=[name for name in effects.catalogue() if name not in PROPOSED])
     plan = knowledge.plan(run, asked, simulations=260, referee=False)
     return court(run, asked, knowledge.learned(asked, plan, ask(plan.jobs)))
 

@@ -314,7 +314,7 @@ def test_what_counts_as_right():
 
 
 def test_every_effect_has_a_signature():
-    assert set(SIGNATURES) == set(effects.library())
+    assert set(SIGNATURES) == set(effects.catalogue())
     assert places_right(["beam_ellipticity"], [("galactic", 2, "even"), ("ecliptic", 2, "even")])
     assert not places_right(["beam_ellipticity"], [("ecliptic", 1, "even"), (None, 0, "even")])
     assert places_right(["invented"], []) is None

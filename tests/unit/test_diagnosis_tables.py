@@ -66,7 +66,7 @@ def small(tmp_path_factory):
     """What tables of these rows are judged with."""
     spectra = read(tmp_path_factory.mktemp("small"), measured(RUN))
     run = tables.listening(RUN, spectra)
-    asked = tables.questions_of(run, spectra, [name for name in effects.library() if name not in PROPOSED])
+    asked = tables.questions_of(run, spectra, [name for name in effects.catalogue() if name not in PROPOSED])
     plan = tables.plan(run, asked, 300)
     known = knowledge.learned(asked, plan, [spectra(job) for job in plan.jobs])
     return court(run, asked, tables.of_mean(known, SKIES))

@@ -59,7 +59,7 @@ def site() -> effects.Site:
 
 
 def test_the_library_holds_what_is_named():
-    assert set(effects.library()) == NAMES
+    assert set(effects.catalogue()) == NAMES
     for entry in effects.describe():
         assert entry["scope"] in ("channel", "common")
         assert all(entry[key] for key in ("unit", "cause", "signature", "source"))
@@ -164,9 +164,9 @@ class Foreign(effects.Effect):
 @pytest.fixture
 def registered(monkeypatch):
     """Register entry points in place of what is installed."""
-    registry.library.cache_clear()
+    registry.catalogue.cache_clear()
     yield lambda *entries: monkeypatch.setattr(registry, "entry_points", lambda group: entries)
-    registry.library.cache_clear()
+    registry.catalogue.cache_clear()
 
 
 def test_packages_add_effects(registered):
@@ -181,8 +181,8 @@ def test_packages_add_effects(registered):
 def test_broken_packages_are_named(registered):
     registered(EntryPoint("broken", "no_such_package:Thing", registry.ENTRY_POINTS))
     with pytest.raises(InputError, match=r"effect broken of no_such_package:Thing cannot be loaded"):
-        effects.library()
-    registry.library.cache_clear()
+        effects.catalogue()
+    registry.catalogue.cache_clear()
     registered(EntryPoint("beam", "mcsim.beams:Beam", registry.ENTRY_POINTS))
     with pytest.raises(InputError, match="no class derived from"):
-        effects.library()
+        effects.catalogue()

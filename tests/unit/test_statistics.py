@@ -49,3 +49,10 @@ def test_empty_and_single() -> None:
     assert single is not None
     assert np.isnan(statistics.standard_deviation(single, "x")).all()
     assert np.isnan(statistics.covariance(single, "x")).all()
+
+
+def test_jackknife_of_a_mean_is_its_standard_error():
+    sample = np.random.default_rng(3).normal(size=(20, 4))
+    value, error = statistics.jackknife(lambda mean: mean, sample)
+    np.testing.assert_allclose(value, sample.mean(axis=0), rtol=1e-14)
+    np.testing.assert_allclose(error, sample.std(axis=0, ddof=1) / np.sqrt(20), rtol=1e-12)

@@ -15,8 +15,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import mcsim
-from mcsim import config, resources, scan, spectra
+from mcsim import config, fit, resources, scan, spectra
 from mcsim.instrument import load_beam
+from mcsim.statistics import jackknife
 from mcsim.survey import survey
 
 HERE = Path(__file__).parent
@@ -41,21 +42,9 @@ FIRST = 1  # the first bin, l < 25, is left out of overall ratios
 
 def binned_differences(folder: Path, run: str, mode: str) -> np.ndarray:
     """Paired difference of every realization, binned, shape (realization, bin), uK^2."""
-    ensemble = mcsim.open_ensemble(folder / f"{run}.zarr").sel(pair="W1,W1", mode=mode).load()
-    summary = mcsim.open_summary(folder / f"{run}.zarr").load()
-    scaled = (ensemble["biposh"] - ensemble["biposh_circular"]).values.real * summary["bin_factor"].sel(
-        mode=mode
-    ).values
-    bounds = zip(summary["bin_first"].values, summary["bin_last"].values, strict=True)
-    return np.stack([np.nanmean(scaled[:, a : b + 1], axis=1) for a, b in bounds], axis=1)
-
-
-def jackknife(statistic, *samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A statistic of means over realizations, and its error."""
-    number = len(samples[0])
-    left_out = np.array([statistic(*(np.delete(s, r, axis=0).mean(axis=0) for s in samples)) for r in range(number)])
-    value = np.asarray(statistic(*(s.mean(axis=0) for s in samples)))
-    return value, np.sqrt((number - 1.0) * np.mean((left_out - left_out.mean(axis=0)) ** 2, axis=0))
+    found = fit.from_store(folder / f"{run}.zarr", [mode], kind="difference", pair="W1,W1").realizations
+    assert found is not None  # as of every store
+    return found
 
 
 def overall(part: np.ndarray, whole: np.ndarray) -> tuple[float, float]:

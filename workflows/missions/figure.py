@@ -16,10 +16,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy import stats
 
-import mcsim
-from mcsim import config, prediction, scan
+from mcsim import config, fit, prediction, scan
 from mcsim.predict import orientation_harmonics
 from mcsim.scan.factors import ScanFactors
+from mcsim.statistics import jackknife
 from mcsim.survey import Survey, survey
 
 HERE = Path(__file__).parent
@@ -32,20 +32,9 @@ FIRST = 1  # the first bin, l < 32, is left out of overall ratios
 
 def binned_differences(store: Path, channel: str, mode: str) -> np.ndarray:
     """Paired difference of every realization, binned, shape (realization, bin), uK^2."""
-    ensemble = mcsim.open_ensemble(store).sel(pair=f"{channel},{channel}", mode=mode).load()
-    summary = mcsim.open_summary(store).load()
-    difference = (ensemble["biposh"] - ensemble["biposh_circular"]).values.real
-    scaled = difference * summary["bin_factor"].sel(mode=mode).values
-    bounds = zip(summary["bin_first"].values, summary["bin_last"].values, strict=True)
-    return np.stack([np.nanmean(scaled[:, a : b + 1], axis=1) for a, b in bounds], axis=1)
-
-
-def jackknife(statistic, *samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A statistic of means over realizations, and its error."""
-    number = len(samples[0])
-    left_out = np.array([statistic(*(np.delete(s, r, axis=0).mean(axis=0) for s in samples)) for r in range(number)])
-    value = np.asarray(statistic(*(s.mean(axis=0) for s in samples)))
-    return value, np.sqrt((number - 1.0) * np.mean((left_out - left_out.mean(axis=0)) ** 2, axis=0))
+    found = fit.from_store(store, [mode], kind="difference", pair=f"{channel},{channel}").realizations
+    assert found is not None  # as of every store
+    return found
 
 
 def hotelling(sample: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
