@@ -4,11 +4,12 @@
 
 First one sky through the paper's elliptical W beam and a year of the WMAP model, sample by sample, against the spin
 maps without corrections, with the pixel window, and with the centroids too; and with every sample moved to the centre
-of its pixel. Then w_2 of the scan's long-time limit at nside 128 against streamed moments at three sampling periods.
+of its pixel. Then w_2 of the scan's long-time limit at nside 128 against streamed moments, by sampling and duration.
 """
 
 import argparse
 import time
+from dataclasses import replace
 
 import healpy
 import numpy as np
@@ -18,8 +19,9 @@ from mcsim.scan.limit import caustics
 from mcsim.sky import gaussian_alm
 
 LIMIT_NSIDE = 128
-PERIODS_S = (3.2, 0.4, 0.1, 0.0512)
-CAUSTIC_DEG = 2.0
+AWAY_DEG = (2.0, 3.0)
+PARTS = 16
+"""Of a pixel's side, in an average over the pixel."""
 
 
 def against_samples(nside: int, period_s: float) -> None:
@@ -53,27 +55,47 @@ def against_samples(nside: int, period_s: float) -> None:
 
 
 def against_the_limit() -> None:
-    """Ring means and pixel scatter of streamed w_2 against the exact limit."""
+    """Ring means and pixel scatter of streamed w_2 against the exact limit, by sampling and by duration."""
     model = scan.load_model(resources.scan_model("wmap"))
     start = time.perf_counter()
     theta = healpy.pix2ang(LIMIT_NSIDE, np.arange(12 * LIMIT_NSIDE**2))[0]
     colatitude, rings = np.unique(np.round(theta, 10), return_inverse=True)
     exact = scan.limit_moments(model, colatitude, 2, "A")[1][1].real
-    took = time.perf_counter() - start
-    turns = caustics(model, "A")
-    far = np.min(np.abs(colatitude[:, None] - turns), axis=1) > np.radians(CAUSTIC_DEG)
-    print(f"limit at nside {LIMIT_NSIDE}: {took:.3f} s")
-    for period in PERIODS_S:
+    print(f"limit at nside {LIMIT_NSIDE}: {time.perf_counter() - start:.3f} s")
+    wide = over_pixels(model, rings)
+    distance = np.min(np.abs(colatitude[:, None] - caustics(model, "A")), axis=1)
+    for period, years in ((3.2, 1), (0.4, 1), (0.1, 0.25), (0.1, 1), (0.1, 4), (0.0512, 1)):
         start = time.perf_counter()
-        year = scan.stream_moments(model.with_sampling(period), LIMIT_NSIDE, 2, lines_of_sight=["A"], nthreads=2)
+        scanned = replace(model.with_sampling(period), duration_days=365.25 * years)
+        moments = scan.stream_moments(scanned, LIMIT_NSIDE, 2, lines_of_sight=["A"], nthreads=2)
         took = time.perf_counter() - start
-        mean = np.bincount(rings, year.hits * year.w[1].real) / np.bincount(rings, year.hits)
-        apart = np.abs(mean - exact)[far]
-        scatter = np.std((year.w[1].real - exact[rings])[far[rings]])
-        print(
-            f"  a sample every {period:g} s ({took:.1f} s): ring means differ by {np.sqrt(np.mean(apart**2)):.1e} rms, "
-            f"{apart.max():.1e} at most; pixels by {scatter:.1e} rms"
-        )
+        w = moments.w[1].real
+        mean = np.bincount(rings, moments.hits * w) / np.maximum(np.bincount(rings, moments.hits), 1)
+        print(f"  {years:g} years, a sample every {period:g} s ({took:.1f} s)")
+        for degrees in AWAY_DEG:
+            far = distance > np.radians(degrees)
+            centre, within = np.abs(mean - exact)[far], np.abs(mean - wide)[far]
+            scatter = np.std((w - exact[rings])[far[rings] & (moments.hits > 0)])
+            print(
+                f"    {degrees:g} deg and more from the caustics: ring means differ by {rms(centre):.1e} rms, "
+                f"{centre.max():.1e} at most; from the limit over the pixels {rms(within):.1e}, {within.max():.1e}; "
+                f"pixels scatter by {scatter:.1e}"
+            )
+
+
+def over_pixels(model: scan.ScanModel, rings: np.ndarray) -> np.ndarray:
+    """The limit's w_2 as samples see it that fall anywhere in the pixels of a ring, shape (rings,)."""
+    fine = LIMIT_NSIDE * PARTS
+    pixel = np.arange(12 * fine**2)
+    colatitude, row = np.unique(np.round(healpy.pix2ang(fine, pixel, nest=True)[0], 10), return_inverse=True)
+    density, w = scan.limit_moments(model, colatitude, 2, "A")
+    parent = rings[healpy.nest2ring(LIMIT_NSIDE, pixel // PARTS**2)]
+    return np.bincount(parent, (density * w[1].real)[row]) / np.bincount(parent, density[row])
+
+
+def rms(values: np.ndarray) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def main() -> None:
