@@ -108,7 +108,8 @@ def main() -> None:
             print(
                 f"{title}, lmax {lmax}, nside {nside}, {count} skies: A^20 apart by {(gap / error).max():.1e} of its "
                 f"error bar at most, {(gap / paired).max():.1e} of the paired one (median "
-                f"{np.median(gap / paired):.1e}); {times[0]:.3f} s against {times[1]:.3f} s, {times[0] / times[1]:.2f} times faster"
+                f"{np.median(gap / paired):.1e}); {times[0]:.3f} s against {times[1]:.3f} s, "
+                f"{times[0] / times[1]:.2f} times faster"
             )
 
 
