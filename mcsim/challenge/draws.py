@@ -199,7 +199,7 @@ def judged(bench: Bench, prior: Prior, seed: int, cases: Sequence[Draw]) -> list
                 answers_of(said, bench.candidates),
                 best,
                 right,
-                _pulls(said, draw.drawn),
+                *_pulls(said, draw.drawn),
                 None if shrink is None else shrink[0].fraction.value,
                 None if shrink is None else shrink[1].fraction.value,
                 None if shrink is None else shrink[1].fraction.sigma,
@@ -217,13 +217,16 @@ def answers_of(said: Attribution, candidates: Sequence[Candidate]) -> tuple[froz
     )
 
 
-def _pulls(said: Attribution, drawn: Drawn) -> tuple[float, ...]:
-    if drawn.kind != "one" or not said.explanations:
-        return ()
-    (member,), best = drawn.members, said.explanations[0]
-    if best.members != (member.candidate,):
-        return ()
-    return tuple(float(pull) for pull in (best.fit.amplitudes - np.array(member.coordinates)) / best.fit.errors)
+def _pulls(said: Attribution, drawn: Drawn) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Of the only effect, where it was named, and whether or not."""
+    if drawn.kind != "one":
+        return (), ()
+    (member,) = drawn.members
+    assert member.candidate is not None  # inventions are not drawn here
+    alone = said.singles[member.candidate]
+    pulls = tuple(float(pull) for pull in (alone.amplitudes - np.array(member.coordinates)) / alone.errors)
+    named = bool(said.explanations) and said.explanations[0].members == (member.candidate,)
+    return pulls if named else (), pulls
 
 
 def shrunk(bench: Bench, x: Vector, members: Sequence[int]) -> tuple[Prediction, Shrink] | None:

@@ -165,11 +165,20 @@ def _unknowns(records: Sequence[Record]) -> list[Figure]:
 
 
 def _amplitudes(records: Sequence[Record]) -> list[Figure]:
-    # Below this strength only upward fluctuations are found.
-    pulls = [pull for r in records if r.strength >= NAMED for pull in r.pulls]
+    strong = [r for r in records if r.strength >= NAMED]
+    named = [pull for r in strong for pull in r.pulls]
+    fitted = [pull for r in strong for pull in r.fitted]
+    if not fitted:
+        return _pulls("where named", named, True)
+    # What is named is a choice, which favours fluctuations upwards.
+    return [*_pulls("of the effect that is there", fitted, True), *_pulls("where named", named, False)]
+
+
+def _pulls(which: str, pulls: Sequence[float], asked: bool) -> list[Figure]:
+    title = f"pulls {which}, s >= {NAMED:g}"
     return [
-        mean(f"pulls: mean, s >= {NAMED:g}", pulls, "within 0.1", 0.1),
-        width(f"pulls: width, s >= {NAMED:g}", pulls, "0.9 to 1.1", 0.9, 1.1),
+        mean(f"{title}: mean", pulls, "within 0.1" if asked else "", 0.1 if asked else None),
+        width(f"{title}: width", pulls, "0.9 to 1.1" if asked else "", (0.9, 1.1) if asked else None),
     ]
 
 

@@ -80,15 +80,16 @@ def mean(name: str, values: Sequence[float], target: str = "", most: float | Non
     return Figure(name, value, value - half, value + half, n, target, None if most is None else abs(value) <= most)
 
 
-def width(name: str, values: Sequence[float], target: str, least: float, most: float) -> Figure:
-    """Standard deviation, with its interval from resampled cases."""
+def width(name: str, values: Sequence[float], target: str = "", within: tuple[float, float] | None = None) -> Figure:
+    """Standard deviation, with its interval from resampled cases; met where it lies ``within``."""
     n = len(values)
     if n < 3:
         return Figure(name, np.nan, np.nan, np.nan, n, target)
     value = float(np.std(values, ddof=1))
     resampled = np.random.default_rng(0).choice(np.asarray(values), (1000, n))
     low, high = np.quantile(resampled.std(axis=1, ddof=1), (0.025, 0.975))
-    return Figure(name, value, float(low), float(high), n, target, bool(least <= value <= most))
+    met = None if within is None else bool(within[0] <= value <= within[1])
+    return Figure(name, value, float(low), float(high), n, target, met)
 
 
 def slope(name: str, x: Vector, y: Vector, sigma: Vector, target: str, least: float, most: float) -> Figure:

@@ -43,6 +43,8 @@ class Record:
         Its probability of being right, by its own account.
     pulls
         Fitted less true amplitudes over their errors, where the only effect was named.
+    fitted
+        The same of the fit of the only effect, named or not; empty where it was not fitted for itself.
     predicted, achieved, sigma
         Shrink of the gap; None where none was measured.
     gaps, absent
@@ -67,6 +69,7 @@ class Record:
     bayes: Answer | None = None
     bayes_right: float = np.nan
     pulls: tuple[float, ...] = ()
+    fitted: tuple[float, ...] = ()
     predicted: float | None = None
     achieved: float | None = None
     sigma: float | None = None

@@ -138,6 +138,7 @@ class _Judge:
             best,
             right,
             self._pulls(truth, answer),
+            (),
             shrink.get("predicted"),
             shrink.get("achieved"),
             shrink.get("sigma"),

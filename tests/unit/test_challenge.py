@@ -178,6 +178,13 @@ def test_draws_are_judged(sitting, tmp_path):
     figures = {figure.name: figure for figure in score.figures}
     assert figures["gap removed, s >= 8"].value > 0.8
     assert abs(figures["gap removed by an effect that is not there"].value) < 0.1
+    # Named or not, so that choosing what to name has no say: unit normals, of n an error of their mean of 1/sqrt(n).
+    ones = [record for record in records if record.kind == "one"]
+    fitted = np.array([pull for record in ones for pull in record.fitted])
+    assert len(fitted) >= len(ones)
+    assert abs(fitted.mean()) < 4.0 / np.sqrt(len(fitted))
+    assert abs(fitted.std() - 1.0) < 4.0 / np.sqrt(2 * len(fitted))
+    assert all(set(record.pulls) <= set(record.fitted) for record in records)
     write([score], tmp_path / "score")
     page = (tmp_path / "score" / "report.html").read_text()
     assert "data:image/png;base64" in page
