@@ -1,9 +1,6 @@
 """Make a challenge: maps of surveys in which something may be wrong, and sealed keys that say what."""
 
 import json
-import os
-import shutil
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +23,7 @@ from mcsim.diagnosis.knowledge import after_jobs, seeded, with_effects
 from mcsim.diagnosis.refine import quiet_templates
 from mcsim.diagnosis.session import prepared
 from mcsim.errors import InputError
+from mcsim.folders import appearing
 from mcsim.progress import reporting
 from mcsim.survey import survey
 
@@ -210,9 +208,7 @@ def make_case(
         sample_by_sample = sample_by_sample or drawn.kind == "invented"
         truth = Truth(case, drawn.kind, members, drawn.without, seed, sample_by_sample, new_nonce())
         write_whole(key, truth.text())
-    (target / MAPS).mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(prefix=f".{case}.", dir=target / MAPS))
-    try:
+    with appearing(target / MAPS / case) as scratch:
         for name, map_uk in maps_of(run, truth, inventions):
             channel, _, split = name.partition(":")
             _write_map(scratch / f"{channel}{'_' if split else ''}{split}.fits", map_uk, run.map.frame)
@@ -220,10 +216,6 @@ def make_case(
         (scratch / "model.toml").write_text(toml.text(believed))
         (scratch / "question.json").write_text(json.dumps({"without": list(truth.without)}) + "\n")
         (scratch / SEAL).write_text(f"{sealed(key)}  {KEYS}/{case}.json\n")
-        scratch.chmod(0o755)
-        os.replace(scratch, target / MAPS / case)
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
     return case
 
 

@@ -1,9 +1,6 @@
 """Diagnose all cases of a challenge as one batch."""
 
 import json
-import os
-import shutil
-import tempfile
 from pathlib import Path
 
 from mcsim import config
@@ -16,6 +13,7 @@ from mcsim.diagnosis.data import read_maps
 from mcsim.diagnosis.evidence import questions
 from mcsim.diagnosis.session import prepared
 from mcsim.errors import InputError
+from mcsim.folders import appearing
 from mcsim.progress import reporting
 
 VERDICTS = "verdicts"
@@ -82,15 +80,9 @@ def judge_case(model: str, simulations: int | None, folder: str, case: str, name
             for explanation in said.explanations
         ],
     }
-    (target / VERDICTS).mkdir(exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(prefix=f".{case}.", dir=target / VERDICTS))
-    try:
+    with appearing(target / VERDICTS / case) as scratch:
         (scratch / "verdict.json").write_text(json.dumps(found.verdict, indent=1, allow_nan=False) + "\n")
         (scratch / "answer.json").write_text(json.dumps(answer) + "\n")
-        scratch.chmod(0o755)
-        os.replace(scratch, target / VERDICTS / case)
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
     return case
 
 

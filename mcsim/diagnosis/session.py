@@ -3,8 +3,6 @@
 import hashlib
 import json
 import os
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
@@ -14,13 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim import config, effects, runner
+from mcsim import config, effects, folders, runner
 from mcsim.diagnosis import knowledge, report, tables
 from mcsim.diagnosis.case import Court, Diagnosis, court, judge
 from mcsim.diagnosis.data import read_maps
 from mcsim.diagnosis.evidence import Job, Questions, evidence_of, questions
 from mcsim.progress import reporting
-from mcsim.scan.cache import default_cache_dir
 
 METHOD = 1
 """Raised whenever the same model would teach something else."""
@@ -146,22 +143,13 @@ def _learned(
     ask: Callable[[Sequence[Job]], list[NDArray[np.float64]]],
     planned: Callable[[config.RunConfig, Questions, int | None], knowledge.Plan] = knowledge.plan,
 ) -> knowledge.Knowledge:
-    folder = default_cache_dir() / "diagnose"
-    path = folder / f"{_key(run, asked, simulations)}.zarr"
+    path = folders.default_cache_dir() / "diagnose" / f"{_key(run, asked, simulations)}.zarr"
     if path.is_dir():
         return knowledge.Knowledge.load(path)
     plan = planned(run, asked, simulations)
     known = knowledge.learned(asked, plan, ask(plan.jobs))
-    folder.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(prefix=".learning.", dir=folder))
-    try:
-        known.save(scratch / "knowledge")
-        os.replace(scratch / "knowledge", path)
-    except OSError:
-        if not path.is_dir():  # another process was as quick, or the folder is full
-            raise
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+    with folders.appearing(path) as scratch:
+        known.save(scratch)
     return known
 
 

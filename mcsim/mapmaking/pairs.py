@@ -2,8 +2,6 @@
 
 import hashlib
 import json
-import shutil
-import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -16,8 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from mcsim import folders
 from mcsim.errors import InputError
-from mcsim.scan.cache import default_cache_dir
 from mcsim.scan.geometry import check_frame, check_nside
 from mcsim.scan.model import LineOfSight, ScanModel
 from mcsim.scan.pointing import BLOCK, PointingStream, fill_block, ring_pixel
@@ -102,7 +100,7 @@ def prepare(
     time_range
         Part of the survey, as fractions of its samples.
     cache_dir
-        Where to keep the pairs; None: the folder of :func:`mcsim.scan.cache.default_cache_dir`.
+        Where to keep the pairs; None: the folder of :func:`mcsim.folders.default_cache_dir`.
     nthreads
         Number of threads; the result does not depend on it, bit for bit.
     progress
@@ -129,39 +127,13 @@ def prepare(
             f"{model.period_of_samples(side_b):g} s, but a difference needs one rate; give both one sample_period_s."
         )
     sample_range(model, side_a, time_range)
-    root = default_cache_dir() if cache_dir is None else Path(cache_dir)
-    folder = root / f"pairs-{_key(model, side_a, side_b, nside, frame, time_range)}"
-    if not folder.is_dir():
-        try:
-            root.mkdir(parents=True, exist_ok=True)
-            temporary = Path(tempfile.mkdtemp(prefix="partial-", dir=root))
-        except OSError as error:
-            raise InputError(
-                f"cache folder {str(root)!r} cannot be written ({error.strerror}); set MCSIM_CACHE to one that can."
-            ) from None
-        try:
-            _write(
-                temporary,
-                model,
-                (side_a, side_b),
-                nside,
-                frame,
-                time_range,
-                max(1, nthreads),
-                progress or (lambda _: None),
-            )
-            try:
-                temporary.rename(folder)
-            except OSError:
-                # Another process was faster; its pairs are the same.
-                if not folder.is_dir():
-                    raise
-        except OSError as error:
-            raise InputError(
-                f"pairs cannot be written to {str(root)!r} ({error.strerror}); make room or set MCSIM_CACHE elsewhere."
-            ) from None
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+
+    def fill(folder: Path) -> None:
+        sides = (side_a, side_b)
+        _write(folder, model, sides, nside, frame, time_range, max(1, nthreads), progress or (lambda _: None))
+
+    name = f"pairs-{_key(model, side_a, side_b, nside, frame, time_range)}"
+    folder = folders.cached(name, fill, cache_dir)
     arrays = _load(folder, 12 * nside * nside)
     return DifferencingScan(model, side_a, side_b, nside, frame, time_range, **arrays)
 

@@ -2,26 +2,14 @@
 
 import hashlib
 import json
-import os
-import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from mcsim.errors import InputError
+from mcsim import folders
 from mcsim.scan.model import ScanModel
 
 ALGORITHM = 1
 """Raised whenever the same numbers would give other moments."""
-
-
-def default_cache_dir() -> Path:
-    """$MCSIM_CACHE, or $XDG_CACHE_HOME/mcsim, or ~/.cache/mcsim."""
-    if own := os.environ.get("MCSIM_CACHE"):
-        return Path(own)
-    if xdg := os.environ.get("XDG_CACHE_HOME"):
-        return Path(xdg) / "mcsim"
-    return Path.home() / ".cache" / "mcsim"
 
 
 def moments_key(
@@ -70,7 +58,7 @@ def cached_moments(
     model, nside, smax, frame, lines_of_sight, time_range, nthreads, progress
         As in :func:`mcsim.scan.accumulate.stream_moments`.
     cache_dir
-        Where to keep it; None: :func:`default_cache_dir`.
+        Where to keep it; None: :func:`mcsim.folders.default_cache_dir`.
 
     Returns
     -------
@@ -83,33 +71,11 @@ def cached_moments(
     InputError
         If the cache folder cannot be written, or as in ``stream_moments``.
     """
-    root = default_cache_dir() if cache_dir is None else Path(cache_dir)
-    folder = root / f"moments-{moments_key(model, nside, smax, frame, lines_of_sight, time_range)}"
-    if folder.is_dir():
-        return folder
-    from mcsim.scan.accumulate import stream_moments
 
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix="partial-", dir=root))
-    except OSError as error:
-        raise InputError(
-            f"cache folder {str(root)!r} cannot be written ({error.strerror}); set MCSIM_CACHE to one that can."
-        ) from None
-    try:
-        moments = stream_moments(model, nside, smax, frame, lines_of_sight, time_range, nthreads, progress)
-        try:
-            moments.save(temporary)
-        except OSError as error:
-            raise InputError(
-                f"moments cannot be written to {str(root)!r} ({error.strerror}); set MCSIM_CACHE elsewhere."
-            ) from None
-        try:
-            temporary.rename(folder)
-        except OSError:
-            # Another process was faster; its moments are the same.
-            if not folder.is_dir():
-                raise
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-    return folder
+    def fill(folder: Path) -> None:
+        from mcsim.scan.accumulate import stream_moments
+
+        stream_moments(model, nside, smax, frame, lines_of_sight, time_range, nthreads, progress).save(folder)
+
+    name = f"moments-{moments_key(model, nside, smax, frame, lines_of_sight, time_range)}"
+    return folders.cached(name, fill, cache_dir)

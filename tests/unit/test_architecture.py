@@ -30,6 +30,7 @@ SCIENCE = {
     "mcsim.convolve",
     "mcsim.effects",
     "mcsim.errors",
+    "mcsim.folders",
     "mcsim.healpix",
     "mcsim.mapmaking",
     "mcsim.mask",

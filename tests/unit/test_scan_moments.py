@@ -6,8 +6,9 @@ import pytest
 from astropy.io import fits
 
 from mcsim.errors import InputError
+from mcsim.folders import default_cache_dir
 from mcsim.scan.accumulate import stream_moments
-from mcsim.scan.cache import cached_moments, default_cache_dir, moments_key
+from mcsim.scan.cache import cached_moments, moments_key
 from mcsim.scan.model import LineOfSight, ScanModel
 from mcsim.scan.moments import Moments, parallel_transport, read_moments_fits, write_moments_fits
 from mcsim.scan.pointing import pointing

@@ -1,0 +1,70 @@
+"""Folders that appear complete or not at all, and the cache that all processes share."""
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from mcsim.errors import InputError
+
+
+@contextmanager
+def appearing(path: Path) -> Iterator[Path]:
+    """A scratch folder beside ``path`` that takes its name when the block ends, and vanishes where the block fails.
+
+    Another process may be quicker: then its folder stays.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    try:
+        yield scratch
+        scratch.chmod(0o755)  # the scratch folder was for its owner alone
+        try:
+            scratch.rename(path)
+        except OSError:
+            if not path.is_dir():
+                raise
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def default_cache_dir() -> Path:
+    """$MCSIM_CACHE, or $XDG_CACHE_HOME/mcsim, or ~/.cache/mcsim."""
+    if own := os.environ.get("MCSIM_CACHE"):
+        return Path(own)
+    if xdg := os.environ.get("XDG_CACHE_HOME"):
+        return Path(xdg) / "mcsim"
+    return Path.home() / ".cache" / "mcsim"
+
+
+def cached(name: str, fill: Callable[[Path], None], cache_dir: str | Path | None = None) -> Path:
+    """Folder of the cache, filled where it is not there yet.
+
+    Parameters
+    ----------
+    name
+        That says all that the content depends on.
+    fill
+        Writes the content into an empty folder.
+    cache_dir
+        None: :func:`default_cache_dir`.
+
+    Raises
+    ------
+    InputError
+        If the cache cannot be written.
+    """
+    root = default_cache_dir() if cache_dir is None else Path(cache_dir)
+    folder = root / name
+    if not folder.is_dir():
+        try:
+            with appearing(folder) as scratch:
+                fill(scratch)
+        except OSError as error:
+            raise InputError(
+                f"cache folder {str(root)!r} cannot be written ({error.strerror}); make room there, or set MCSIM_CACHE "
+                "to one that can."
+            ) from None
+    return folder

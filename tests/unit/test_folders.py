@@ -1,0 +1,40 @@
+"""Folders that appear complete or not at all."""
+
+import pytest
+
+from mcsim.folders import appearing
+
+
+def test_a_folder_appears_whole(tmp_path):
+    with appearing(tmp_path / "new" / "folder") as scratch:
+        (scratch / "file").write_text("all")
+        assert not (tmp_path / "new" / "folder").exists()
+    assert (tmp_path / "new" / "folder" / "file").read_text() == "all"
+    assert [entry.name for entry in (tmp_path / "new").iterdir()] == ["folder"]
+
+
+def test_nothing_is_left_of_a_block_that_fails(tmp_path):
+    def fail():
+        with appearing(tmp_path / "folder") as scratch:
+            (scratch / "file").write_text("half")
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_who_was_quicker_stays(tmp_path):
+    with appearing(tmp_path / "folder") as scratch:
+        (scratch / "file").write_text("second")
+        with appearing(tmp_path / "folder") as other:
+            (other / "file").write_text("first")
+    assert (tmp_path / "folder" / "file").read_text() == "first"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["folder"]
+
+
+def test_a_file_in_the_way_is_an_error(tmp_path):
+    (tmp_path / "folder").write_text("in the way")
+    with pytest.raises(NotADirectoryError), appearing(tmp_path / "folder"):
+        pass
+    assert [entry.name for entry in tmp_path.iterdir()] == ["folder"]
