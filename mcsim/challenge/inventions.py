@@ -3,8 +3,7 @@
 import importlib.util
 import inspect
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from functools import lru_cache
 from pathlib import Path
 
@@ -43,14 +42,6 @@ def load(path: str) -> dict[str, type[Effect]]:
     return found
 
 
-@contextmanager
-def introduced(path: str | None) -> Iterator[None]:
+def introduced(path: str | None) -> AbstractContextManager[None]:
     """Let runs be simulated with the inventions of a file; no diagnosis may be prepared meanwhile."""
-    library = effects.catalogue()
-    added = {} if path is None else load(path)
-    library.update(added)
-    try:
-        yield
-    finally:
-        for name in added:
-            library.pop(name, None)
+    return effects.lent({} if path is None else load(path))

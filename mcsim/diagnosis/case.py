@@ -157,7 +157,7 @@ def judge(court: Court, case: str, maps: Sequence[NDArray[np.float64]], ask: Ask
     able = detectable_of(court.null, refined.templates, court.candidates, asked.proposals)
     verdict = verdict_of(case, found, court.candidates, asked.proposals, where, shrink, able, notes)
     shown = exhibits(asked.model, maps, known.simulations, court.null, found, court.candidates, asked.proposals)
-    evidence = _dataset(court, x, refined, where, verdict).merge(shown, combine_attrs="no_conflicts")
+    evidence = dataset(court, x, refined, where, verdict).merge(shown, combine_attrs="no_conflicts")
     return Diagnosis(verdict, evidence, found)
 
 
@@ -221,7 +221,7 @@ def _where(court: Court, x: Vector, numbers: Vector) -> list[Place]:
     return places(np.concatenate([numbers, shifted]), drawn, entries)
 
 
-def _dataset(court: Court, x: Vector, refined: Refined, where: Sequence[Place], verdict: dict[str, Any]) -> xr.Dataset:
+def dataset(court: Court, x: Vector, refined: Refined, where: Sequence[Place], verdict: dict[str, Any]) -> xr.Dataset:
     """Everything measured, with names and units."""
     known = court.known
     spread = known.simulations.std(axis=0, ddof=1)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mcsim.diagnosis.detect import strength_needed, strength_to_isolate
 from mcsim.diagnosis.gaussian import score_probability
+from mcsim.diagnosis.shrink import excess_of
 
 Vector = NDArray[np.float64]
 
@@ -169,12 +170,12 @@ class Reading:
             errors = shrink["sigma_before"], shrink["sigma_after"]
             return Gap(before, errors[0], after, errors[1], expected, f"judged on {shrink['data']}")
         n, p = int(self.evidence.attrs["simulations"]) - 1, self.verdict["gap"]["dof"]
-        value, sigma = _excess(self.verdict["gap"]["statistic"], p, n)
+        found = excess_of(self.verdict["gap"]["statistic"], p, n)
         if not self.explanations:
-            return Gap(value, sigma, None, 0.0, None, "all of the evidence")
+            return Gap(found.value, found.sigma, None, 0.0, None, "all of the evidence")
         one = self.explanations[0]
-        after, after_sigma = _excess(one["chi2"], one["dimension"], n)
-        return Gap(value, sigma, after, after_sigma, None, "fitted and judged on the same data")
+        left = excess_of(one["chi2"], one["dimension"], n)
+        return Gap(found.value, found.sigma, left.value, left.sigma, None, "fitted and judged on the same data")
 
     @property
     def shrink_is_measured(self) -> bool:
@@ -305,10 +306,3 @@ def _label(row: Mapping[str, Any]) -> str:
     """Label of a candidate from its row among what is detectable."""
     settings = ", ".join(f"{key} = {value}" for key, value in row.get("settings", {}).items())
     return f"{row['name']} ({row['channel'] or 'all'}{', ' + settings if settings else ''})"
-
-
-def _excess(chi2: float, p: int, n: int) -> tuple[float, float]:
-    """Gap and its standard deviation: shrink.excess, from its square alone."""
-    value = (n - p - 1) / n * chi2 - p
-    length, d = max(value, 0.0), n - p + 1
-    return value, float(np.sqrt(2.0 * ((p + length) ** 2 + (p + 2.0 * length) * (d - 2)) / (d - 4)))

@@ -35,17 +35,20 @@ class Prediction:
 
 
 def excess(null: Null, x: NDArray[np.float64]) -> Measured:
-    """Gap G of evidence, shape (p_raw,): its white square above expectation.
+    """Gap G of evidence, shape (p_raw,): its white square above expectation; see :func:`excess_of`."""
+    return excess_of(_square(null, x), null.dimension, null.dof)
+
+
+def excess_of(chi2: float, p: int, n: int) -> Measured:
+    """Gap G of a white square in p dimensions, whitened by a scatter of n degrees of freedom.
 
     Notes
     -----
     (n - p - 1)/n chi2 - p, whose mean is the true squared distance lambda of the means, and whose variance that of a
     noncentral F: 2 ((p + lambda)^2 + (p + 2 lambda)(d - 2))/(d - 4), d = n - p + 1. sigma takes G for lambda.
     """
-    y = null.data(x)
-    value = null.unbiased * float(y @ y) - null.dimension
-    length = max(value, 0.0)
-    p, d = null.dimension, null.dof - null.dimension + 1
+    value = (n - p - 1) / n * chi2 - p
+    length, d = max(value, 0.0), n - p + 1
     return Measured(value, float(np.sqrt(2.0 * ((p + length) ** 2 + (p + 2.0 * length) * (d - 2)) / (d - 4))))
 
 

@@ -12,7 +12,7 @@ from mcsim import config, effects, simulate
 from mcsim.biposh import Mode
 from mcsim.diagnosis import knowledge
 from mcsim.diagnosis.blocks import Block, Entry
-from mcsim.diagnosis.case import Ask, Court, Diagnosis, _dataset, shrink_of
+from mcsim.diagnosis.case import Ask, Court, Diagnosis, dataset, shrink_of
 from mcsim.diagnosis.evidence import Job, Questions, questions
 from mcsim.diagnosis.exhibits import exhibits
 from mcsim.diagnosis.gaussian import residual_probability
@@ -24,7 +24,7 @@ from mcsim.diagnosis.where import Place, places
 from mcsim.effects import Effect
 from mcsim.errors import InputError
 from mcsim.fit.data import Row, Scaling, parts, project
-from mcsim.fit.table import _COLUMNS, _in_uk2, _read, _scaling
+from mcsim.fit.table import COLUMNS, in_uk2, read_ecsv, scaling_of
 from mcsim.rotation import FRAMES, rotate_biposh
 from mcsim.survey import survey
 
@@ -138,18 +138,18 @@ def read_spectra(path: str | Path, run: config.RunConfig) -> Spectra:
     InputError
         For a table that cannot be read, leaves open what its numbers are, or goes beyond the run.
     """
-    table = _read(path)
-    missing = [name for name in (*_COLUMNS, "value") if name not in table.colnames]
+    table = read_ecsv(path)
+    missing = [name for name in (*COLUMNS, "value") if name not in table.colnames]
     if missing:
-        raise InputError(f"{path} has no column {missing[0]}; give {', '.join(_COLUMNS)} and value.")
-    scaling = _scaling(path, table.meta)
+        raise InputError(f"{path} has no column {missing[0]}; give {', '.join(COLUMNS)} and value.")
+    scaling = scaling_of(path, table.meta)
     maps = config.map_names(run)
     known = [f"{x},{y}" for i, x in enumerate(maps) for y in maps[i:]]
     lmax = config.analysis_lmax(run)
-    real = _in_uk2(path, table, "value")
+    real = in_uk2(path, table, "value")
     unknown: Vector = np.full(len(table), np.nan)
-    imag = _in_uk2(path, table, "value_imag") if "value_imag" in table.colnames else unknown
-    stated = _in_uk2(path, table, "error") if "error" in table.colnames else unknown
+    imag = in_uk2(path, table, "value_imag") if "value_imag" in table.colnames else unknown
+    stated = in_uk2(path, table, "error") if "error" in table.colnames else unknown
     rows: list[Row] = []
     pairs: list[str] = []
     values: list[float] = []
@@ -330,7 +330,7 @@ def judge(court: Court, case: str, measured: Spectra, ask: Ask) -> Diagnosis:
     # Of no sky: a table has no maps to show.
     dark = [np.zeros(12 * asked.model.nside**2) for _ in asked.model.parts]
     shown = exhibits(asked.model, dark, known.simulations, court.null, found, court.candidates, asked.proposals)
-    evidence = _dataset(court, x, refined, where, verdict)
+    evidence = dataset(court, x, refined, where, verdict)
     evidence = evidence.merge(shown.drop_vars(["residual_map", "map"]), combine_attrs="no_conflicts")
     evidence.attrs |= {"table": measured.path, "skies_behind_the_mean": measured.realizations}
     return Diagnosis(verdict, evidence, found)

@@ -2,7 +2,7 @@
 
 from mcsim.effects.base import Alm, Draw, Effect, Map, Pointing, Site
 from mcsim.effects.compose import looked_at, seen_through, spread_of
-from mcsim.effects.registry import build, catalogue, describe, get
+from mcsim.effects.registry import build, catalogue, describe, get, lent
 
 __all__ = [
     "Alm",
@@ -15,6 +15,7 @@ __all__ = [
     "catalogue",
     "describe",
     "get",
+    "lent",
     "looked_at",
     "seen_through",
     "spread_of",

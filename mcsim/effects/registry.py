@@ -3,7 +3,8 @@
 import difflib
 import inspect
 import pkgutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields
 from functools import cache
 from importlib import import_module
@@ -47,6 +48,18 @@ def catalogue() -> dict[str, type[Effect]]:
             raise InputError(f"effect {kind.name} of {entry.value} has a name that is taken; rename it.")
         found[kind.name] = kind
     return found
+
+
+@contextmanager
+def lent(added: Mapping[str, type[Effect]]) -> Iterator[None]:
+    """Let further effects be known by name for as long as the block lasts."""
+    known = catalogue()
+    known.update(added)
+    try:
+        yield
+    finally:
+        for name in added:
+            known.pop(name, None)
 
 
 def get(name: str) -> type[Effect]:

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.fit.data import QUADRUPOLE, SUMMARY, Measurement, Row, Scaling, parse_mode, parts
 
-_COLUMNS = ("L", "M", "d", "ell_min", "ell_max")
+COLUMNS = ("L", "M", "d", "ell_min", "ell_max")
+"""That say what is in a row."""
 
 
 def read_table(
@@ -44,12 +45,12 @@ def read_table(
     InputError
         For a table that cannot be read, or leaves open what its numbers are.
     """
-    table = _read(path)
-    missing = [name for name in _COLUMNS if name not in table.colnames]
+    table = read_ecsv(path)
+    missing = [name for name in COLUMNS if name not in table.colnames]
     if missing:
-        raise InputError(f"{path} has no column {missing[0]}; give {', '.join(_COLUMNS)}, value and error.")
+        raise InputError(f"{path} has no column {missing[0]}; give {', '.join(COLUMNS)}, value and error.")
     suffix, chosen = _kind(path, table, kind)
-    scaling = _scaling(path, table.meta)
+    scaling = scaling_of(path, table.meta)
     found = str(table.meta.get("frame", frame)).lower()
     if found != frame:
         raise InputError(f"{path} is in the {found} frame, the configuration in the {frame} one; rotate one of them.")
@@ -58,13 +59,13 @@ def read_table(
         table = table[[str(name) == label for name in table["pair"]]]
     wanted = [parse_mode(name) for name in modes]
     first, last = ell_range or (0, int(np.max(table["ell_max"])))
-    real, error = (_in_uk2(path, table, f"{name}{suffix}") for name in ("value", "error"))
+    real, error = (in_uk2(path, table, f"{name}{suffix}") for name in ("value", "error"))
     rows: list[Row] = []
     values: list[float] = []
     errors: list[float] = []
     for mode in wanted:
         for imaginary in parts(mode):
-            part = _in_uk2(path, table, f"value_imag{suffix}") if imaginary else real
+            part = in_uk2(path, table, f"value_imag{suffix}") if imaginary else real
             if mode.parity == "odd" and not scaling.summary and scaling.bennett:
                 raise InputError(
                     f"{path}: {mode.name} has odd parity, which the Bennett normalisation does not have; leave it out."
@@ -98,7 +99,8 @@ def _check(path: str | Path, rows: Sequence[Row], values: Sequence[float], error
             )
 
 
-def _read(path: str | Path) -> Table:
+def read_ecsv(path: str | Path) -> Table:
+    """An ECSV table that has rows; InputError where it is none."""
     try:
         table = Table.read(path, format="ascii.ecsv")
     except Exception as error:  # libraries raise whatever a broken file makes of them
@@ -117,7 +119,8 @@ def _kind(path: str | Path, table: Table, kind: str | None) -> tuple[str, str]:
     return ("_difference" if chosen == "difference" else "", chosen)
 
 
-def _scaling(path: str | Path, meta: Any) -> Scaling:
+def scaling_of(path: str | Path, meta: Any) -> Scaling:
+    """What the header of a table says of its normalisation; InputError where it says nothing that is known."""
     normalisation, scaling = (str(meta.get(name, "")).lower() for name in ("normalisation", "scaling"))
     if not normalisation:
         raise InputError(
@@ -146,7 +149,8 @@ def _pair(path: str | Path, table: Table, pair: str | None) -> str | None:
     return label
 
 
-def _in_uk2(path: str | Path, table: Table, name: str) -> NDArray[np.float64]:
+def in_uk2(path: str | Path, table: Table, name: str) -> NDArray[np.float64]:
+    """A column in uK^2, NaN where it is masked; InputError where it is missing or has no such unit."""
     if name not in table.colnames:
         raise InputError(f"{path} has no column {name}; add it.")
     column = table[name]
