@@ -30,6 +30,16 @@ def appearing(path: Path) -> Iterator[Path]:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
+def writable(folder: Path) -> None:
+    """Make a folder; InputError where nothing can be written into it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"{folder} cannot be written ({error.strerror}); choose another folder.") from None
+
+
 def default_cache_dir() -> Path:
     """$MCSIM_CACHE, or $XDG_CACHE_HOME/mcsim, or ~/.cache/mcsim."""
     if own := os.environ.get("MCSIM_CACHE"):

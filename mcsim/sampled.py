@@ -63,7 +63,7 @@ def _channel(
     survey: Survey, channel: Channel, sky: NDArray[np.complex128], realization: int, nthreads: int, epsilon: float
 ) -> Iterator[tuple[str, Map]]:
     run, site, acting = survey.config, channel.site, channel.effects
-    _check(channel)
+    check(channel)
     seed, nside = run.ensemble.seed, site.nside
     seen = effects.looked_at(acting, sky, site, seed, realization)
     known = None
@@ -82,7 +82,8 @@ def _channel(
         yield m.name, tod.bin_samples(stream, nside)[0]
 
 
-def _check(channel: Channel) -> None:
+def check(channel: Channel) -> None:
+    """InputError for a channel that cannot be simulated sample by sample."""
     if channel.side_b is not None or channel.site.pointing is None:
         raise InputError(
             f"channel {channel.name} cannot be simulated sample by sample: its scan differences two beams, or when it "

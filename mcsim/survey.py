@@ -197,7 +197,7 @@ def _channel(
         maps.append(_with_effects(m, acting, site, share, spread))
     # A pixel whose samples keep closer to its centre blurs less; the window is a Gaussian in all but name.
     response = convolve.response(beam, run.sky.lmax, window ** (spread * spread))
-    side_b = _side_b(run, spec, window, site, acting)
+    side_b = _side_b(run, spec, window ** (spread * spread), site, acting)
     return Channel(spec.name, beam, response, window, tuple(maps), site, acting, side_b)
 
 

@@ -185,9 +185,9 @@ def _pulls(which: str, pulls: Sequence[float], asked: bool) -> list[Figure]:
 def _shrinks(records: Sequence[Record]) -> list[Figure]:
     right = [r for r in records if r.truth and r.best == r.truth and r.achieved is not None and r.predicted is not None]
     strong = [r for r in right if r.strength >= SHRUNK]
-    x, y, sigma = (
-        np.array([getattr(r, name) for r in strong], dtype=float) for name in ("predicted", "achieved", "sigma")
-    )
+    # Drops, not shares of the gap: those of small gaps are all noise.
+    before = np.array([r.gaps[0] if r.gaps else 0.0 for r in strong])
+    expected, found = (before * np.array([getattr(r, name) for r in strong]) for name in ("predicted", "achieved"))
     least = removed(f"gap removed, s >= {SHRUNK:g}", [r.gaps for r in strong if r.gaps], "at least 0.8")
     met = bool(least.value >= 0.8) if np.isfinite(least.value) else None
     absent = [r.absent for r in records if r.absent is not None]
@@ -195,7 +195,7 @@ def _shrinks(records: Sequence[Record]) -> list[Figure]:
     none = removed("gap removed by an effect that is not there", absent, "not above 0")
     zero = bool(none.low <= 0.0) if np.isfinite(none.value) else None
     return [
-        slope(f"achieved against predicted shrink: slope, s >= {SHRUNK:g}", x, y, sigma, "1 +- 0.05", 0.95, 1.05),
+        slope(f"achieved against predicted shrink: slope, s >= {SHRUNK:g}", expected, found, "1 +- 0.05", 0.95, 1.05),
         Figure(least.name, least.value, least.low, least.high, least.count, least.target, met),
         Figure(none.name, none.value, none.low, none.high, none.count, none.target, zero),
     ]

@@ -92,19 +92,17 @@ def width(name: str, values: Sequence[float], target: str = "", within: tuple[fl
     return Figure(name, value, float(low), float(high), n, target, met)
 
 
-def slope(name: str, x: Vector, y: Vector, sigma: Vector, target: str, least: float, most: float) -> Figure:
-    """Slope through the origin by least squares, with its interval from resampled cases."""
+def slope(name: str, x: Vector, y: Vector, target: str, least: float, most: float) -> Figure:
+    """Slope of y = k x where both are noisy about their means: sum y/sum x, with its interval from resampled cases.
+
+    Least squares would not do: the noise of x flattens its slope.
+    """
     n = len(x)
     if n < 3:
         return Figure(name, np.nan, np.nan, np.nan, n, target)
-    weight = 1.0 / np.maximum(sigma, 1e-6) ** 2
-
-    def fitted(rows: NDArray[np.int64]) -> float:
-        return float(np.sum((weight * x * y)[rows]) / np.sum((weight * x * x)[rows]))
-
-    value = fitted(np.arange(n))
-    draws = np.random.default_rng(0).integers(0, n, (1000, n))
-    low, high = np.quantile([fitted(rows) for rows in draws], (0.025, 0.975))
+    value = float(y.sum() / x.sum())
+    rows = np.random.default_rng(0).integers(0, n, (1000, n))
+    low, high = np.quantile(y[rows].sum(axis=1) / x[rows].sum(axis=1), (0.025, 0.975))
     return Figure(name, value, float(low), float(high), n, target, bool(least <= value <= most))
 
 

@@ -23,7 +23,7 @@ from mcsim.diagnosis.knowledge import after_jobs, seeded, with_effects
 from mcsim.diagnosis.refine import quiet_templates
 from mcsim.diagnosis.session import prepared
 from mcsim.errors import InputError
-from mcsim.folders import appearing
+from mcsim.folders import appearing, writable
 from mcsim.progress import reporting
 from mcsim.survey import survey
 
@@ -77,6 +77,8 @@ def make(
         That the scatter of the evidence is learned from; default: ten for every number of it.
     workers
         Processes; default: the model's; 0: this one.
+    quiet
+        Report no progress.
 
     Returns
     -------
@@ -94,6 +96,9 @@ def make(
         prior or Prior(),
         None if inventions is None else str(Path(inventions).resolve()),
     )
+    for channel in survey(run).channels if sampled_share > 0.0 or lent else ():
+        sampled.check(channel)
+    writable(target)
     settings = {
         "schema": 1,
         "model": config.to_dict(run),
@@ -182,7 +187,7 @@ def _responses(court: Court, inventions: str | None, call: Batch) -> dict[str, l
 
 
 def _samples(believed: config.RunConfig, simulated: config.RunConfig, inventions: str) -> Job:
-    # Lent to the simulator, an invention must not be proposed either.
+    # While they are lent inventions are in the catalogue; they must not be proposed.
     return Job(config.to_json(believed), config.to_json(simulated), 0, INVENTED_SKIES, True, tuple(load(inventions)))
 
 

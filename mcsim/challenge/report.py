@@ -88,7 +88,10 @@ def _page(scores: Sequence[Score], pictures: Sequence[bytes]) -> str:
     parts = []
     for one, picture in zip(scores, pictures, strict=True):
         short = [figure.name for figure in one.figures if figure.met is False]
-        said = f"Short of their targets: {'; '.join(short)}." if short else "All targets are met."
+        unknown = sum(bool(figure.target) and figure.met is None for figure in one.figures)
+        met = "All targets that could be judged are met." if unknown else "All targets are met."
+        said = f"Short of their targets: {'; '.join(short)}." if short else met
+        said += f" {unknown} could not be judged, for want of cases." if unknown else ""
         image = base64.b64encode(picture).decode()
         parts += [
             f"<h1>{html.escape(one.title)}</h1><p>{html.escape(said)} Intervals are 95 %.</p>",

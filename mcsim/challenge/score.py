@@ -24,6 +24,7 @@ from mcsim.diagnosis.evidence import questions
 from mcsim.diagnosis.refine import quiet_templates
 from mcsim.diagnosis.session import prepared
 from mcsim.errors import InputError
+from mcsim.folders import writable
 
 Vector = NDArray[np.float64]
 
@@ -91,6 +92,7 @@ def score_draws(
         Processes; default: the model's; 0: this one.
     """
     run = model if isinstance(model, config.RunConfig) else config.load(model)
+    writable(Path(folder))
     with batch(run.compute.workers if workers is None else workers) as call:
         court = prepared(run, questions(run), asking(call, quiet), simulations)
         records = draws(court, number, seed, prior=prior, call=call)

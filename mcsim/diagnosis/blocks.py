@@ -18,7 +18,7 @@ Map = NDArray[np.float64]
 Vector = NDArray[np.float64]
 
 SKY_BINS = 8
-"""Bins of the spectrum of the sky that the maps share."""
+"""Bins of the spectrum of the sky that the maps share, even and odd degrees apart."""
 
 BEAM_BINS = {0: 4, 1: 2, 2: 2, 3: 1, 4: 1}
 """Bins in l of what the sky says about the orders of a beam."""
@@ -42,7 +42,7 @@ class Entry:
     name
         Unique.
     statistic
-        "map": residual maps against the sky and the scan; "cl"; "noise"; "score": matched to an effect.
+        "map": residual maps against the sky and the scan; "cl"; "biposh"; "noise"; "score": matched to an effect.
     channels, split
         Whose; no split where all maps of a channel count.
     fold
@@ -208,10 +208,14 @@ def _noise_block(model: Model, channel: int) -> Block:
     x, y, z = healpy.pix2vec(model.nside, np.arange(12 * model.nside**2))
     height = np.abs(matrix[2] @ np.stack([x, y, z]))
     alternate = np.arange(height.size) % 2
+    seen = np.all([model.parts[i].precision > 0 for i in parts[:2]], axis=0)
     rows, entries = [], []
     for half in (0, 1):
         for low, high in pairwise(LATITUDES):
-            rows.append(((height >= low) & (height <= high) & (alternate == half)).astype(float))
+            band = seen & (height >= low) & (height <= high) & (alternate == half)
+            if not band.any():
+                continue  # behind a mask, or never scanned
+            rows.append(band.astype(float))
             entries.append(
                 Entry(
                     f"noise/{name}/{low:g}-{high:g}/pixels{half}",
@@ -301,22 +305,25 @@ def _contrast_block(model: Model) -> Block | None:
 
 
 def _sky_block(model: Model) -> Block:
-    """Spectrum of the sky over its expectation, minus one."""
+    """Spectrum of the sky over its expectation, minus one; odd degrees are fresh to even ones."""
     names = tuple(channel.name for channel in model.survey.channels)
     large = [(2, 11), (12, 40)] if model.lmax > LARGE_SCALES else []
     ranges = [*large, *bins(41 if large else 2, model.lmax, SKY_BINS - len(large))]
     ell = np.arange(model.lmax + 1)
-    modes = 2 * ell + 1
-    entries = tuple(
-        Entry(f"sky/{low}-{high}", "cl", names, None, number % 2, (low, high), L=0)
-        for number, (low, high) in enumerate(ranges)
-    )
+    rows, entries = [], []
+    for fold, parity in enumerate(("even", "odd")):
+        for low, high in ranges:
+            weight = np.where((ell >= low) & (ell <= high) & (ell % 2 == fold), 2.0 * ell + 1.0, 0.0)
+            if weight.any():
+                rows.append(weight / weight.sum())
+                entries.append(Entry(f"sky/{low}-{high}/{parity}", "cl", names, None, fold, (low, high), L=0))
+    means = np.stack(rows)
 
     def values(model: Model, heard: Heard) -> Vector:
-        found = sky_of(model, heard)
-        return np.array([np.average(found[a : b + 1], weights=modes[a : b + 1]) for a, b in ranges])
+        found: Vector = means @ sky_of(model, heard)
+        return found
 
-    return Block(entries, values)
+    return Block(tuple(entries), values)
 
 
 def _isotropy_block(model: Model) -> Block:

@@ -23,6 +23,7 @@ from mcsim.diagnosis.shrink import Prediction, Shrink, achieved, predicted
 from mcsim.diagnosis.trials import Calibration, calibrate, gap
 from mcsim.diagnosis.verdict import detectable_of, sentence, verdict_of
 from mcsim.diagnosis.where import Place, places
+from mcsim.errors import InputError
 
 Vector = NDArray[np.float64]
 Ask = Callable[[Sequence[Job]], list[NDArray[np.float64]]]
@@ -33,6 +34,10 @@ ALPHA = 0.05
 
 EXCHANGED = 0.01
 """Probability above which maps in another order are said to fit the model."""
+
+
+HEARD = 0.2
+"""Share of an effect's strength that either half of the evidence must hear for a shrink to be measured."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +162,8 @@ def judge(court: Court, case: str, maps: Sequence[NDArray[np.float64]], ask: Ask
     able = detectable_of(court.null, refined.templates, court.candidates, asked.proposals)
     verdict = verdict_of(case, found, court.candidates, asked.proposals, where, shrink, able, notes)
     shown = exhibits(asked.model, maps, known.simulations, court.null, found, court.candidates, asked.proposals)
-    evidence = dataset(court, x, refined, where, verdict).merge(shown, combine_attrs="no_conflicts")
+    told = dataset(court, x, replace(refined, attribution=found), where, verdict)
+    evidence = told.merge(shown, combine_attrs="no_conflicts")
     return Diagnosis(verdict, evidence, found)
 
 
@@ -167,7 +173,8 @@ def shrink_of(
     """Fit one half of the evidence, freeze, add to the simulator, and look at the other half.
 
     The best explanation is fitted to the entries of fold 0 alone; the ensemble is simulated again with its effects; the
-    gap of the entries of fold 1, whose noise is independent, is measured against both ensembles.
+    gap of the entries of fold 1, whose noise is independent, is measured against both ensembles. None where one half
+    hardly hears the effect: without splits the halves are degrees and pixels, which say little of beams and pointing.
     """
     folds = np.array([-1 if entry.fold is None else entry.fold for entry in court.asked.entries])
     used, fresh = np.flatnonzero(folds == 0), np.flatnonzero(folds == 1)
@@ -175,31 +182,46 @@ def shrink_of(
         return None
     members = refined.attribution.explanations[0].members
     columns = [column for member in members for column in court.candidates[member].columns]
+    change = refined.templates[:, columns] @ refined.attribution.explanations[0].fit.amplitudes
+    if min(_heard(court, change, used), _heard(court, change, fresh)) < HEARD:
+        return None
     frozen = fit(court.known.null(used), x[used], refined.templates[np.ix_(used, np.array(columns))])
-    tables, start = [], 0
-    for member in members:
-        stop = start + len(court.candidates[member].columns)
-        proposal = court.asked.proposals[member]
-        effect = effect_at(proposal, frozen.amplitudes[start:stop], frozen.covariance[start:stop, start:stop])
-        tables.append(proposal.table(effect))
-        start = stop
     before = court.known.null(fresh)
-    after = replace(before, mean=before.mean + respond(tables)[fresh])
+    try:
+        tables, start = [], 0
+        for member in members:
+            stop = start + len(court.candidates[member].columns)
+            proposal = court.asked.proposals[member]
+            effect = effect_at(proposal, frozen.amplitudes[start:stop], frozen.covariance[start:stop, start:stop])
+            tables.append(proposal.table(effect))
+            start = stop
+        after = replace(before, mean=before.mean + respond(tables)[fresh])
+    except InputError:
+        return None  # half of the evidence asks for an amplitude that the effect cannot have
     expected = predicted(
         before, x[fresh], refined.templates[np.ix_(fresh, np.array(columns))], frozen.amplitudes, frozen.covariance
     )
     return expected, achieved(before, after, x[fresh]), _fresh_words(court)
 
 
+def _heard(court: Court, change: Vector, rows: NDArray[np.int64]) -> float:
+    """Share of the strength of a change of the evidence that some entries hear by themselves."""
+    part, whole = court.known.null(rows), court.null
+    some = np.sqrt(part.unbiased) * np.linalg.norm(part.templates(change[rows, None]))
+    return float(some / max(np.sqrt(whole.unbiased) * np.linalg.norm(whole.templates(change[:, None])), 1e-300))
+
+
 def _fresh_words(court: Court) -> str:
     splits = court.run.map.splits
-    return f"{splits[1]} (frozen on {splits[0]})" if len(splits) > 1 else "alternate bins and pixels"
+    if len(splits) < 2:
+        return "odd degrees, alternate pixels"
+    return f"{' and '.join(splits[1::2])} (frozen on {' and '.join(splits[::2])})"
 
 
 def _exchanged(court: Court, maps: Sequence[NDArray[np.float64]], found: Attribution) -> list[str]:
     """Orders of the maps in which the model fits, where it does not as they are and no single effect explains it."""
-    if found.verdict == "none" or (found.explanations and len(found.explanations[0].members) == 1):
-        return []
+    if found.gap.omnibus > EXCHANGED or (found.explanations and len(found.explanations[0].members) == 1):
+        return []  # as they are the maps fit as well, or one effect says what is wrong
     names = [part.name for part in court.asked.model.parts]
     notes = []
     for order in exchanges(names):

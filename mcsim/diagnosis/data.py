@@ -43,6 +43,16 @@ def read_maps(model: Model, folder: str | Path) -> list[Map]:
     return [_read(model, i, folder / _file_name(model, i)) for i in range(len(model.parts))]
 
 
+def checked(model: Model, maps: Sequence[Map]) -> list[Map]:
+    """Maps given as arrays, in the order of the model's, uK; refused like those of a folder."""
+    if len(maps) != len(model.parts):
+        raise InputError(f"{len(maps)} maps were given, the model has {len(model.parts)}; give one for each.")
+    return [
+        _checked(model, i, np.asarray(map_, dtype=np.float64), f"map {model.parts[i].name}")
+        for i, map_ in enumerate(maps)
+    ]
+
+
 def _file_name(model: Model, part: int) -> str:
     channel, _, split = model.parts[part].name.partition(":")
     return f"{channel}_{split}.fits" if split else f"{channel}.fits"
@@ -54,39 +64,40 @@ def _read(model: Model, part: int, path: Path) -> Map:
             f"{path} does not exist; the model has a map {model.parts[part].name}, give it under that name."
         )
     map_, frame, unit = healpix.read_map(path)
-    expected = model.survey.config.map
-    nside = healpy.npix2nside(map_.size)
-    if nside != expected.nside:
-        raise InputError(f"{path} has nside {nside}, the model {expected.nside}; bring them to the same.")
-    if frame not in (None, expected.frame):
-        raise InputError(f"{path} is in {frame} coordinates, the model in {expected.frame}; rotate the map.")
-    unseen = map_ == healpy.UNSEEN
+    expected = model.survey.config.map.frame
+    if frame not in (None, expected):
+        raise InputError(f"{path} is in {frame} coordinates, the model in {expected}; rotate the map.")
+    return _checked(model, part, np.where(map_ == healpy.UNSEEN, map_, healpix.to_uk(unit, path) * map_), str(path))
+
+
+def _checked(model: Model, part: int, map_: Map, name: str) -> Map:
+    """The map, if it can be of the survey."""
+    if map_.shape != (12 * model.nside**2,):
+        size = healpy.npix2nside(map_.size) if map_.ndim == 1 and healpy.isnpixok(map_.size) else None
+        found = f"the shape {map_.shape}" if size is None else f"nside {size}"
+        raise InputError(f"{name} has {found}, the model {model.nside}; bring them to the same.")
     broken = int(np.sum(~np.isfinite(map_)))
     if broken:
-        raise InputError(f"{path} has {broken} pixels that are not finite; mark what was not observed as UNSEEN.")
-    map_ = np.where(unseen, healpy.UNSEEN, healpix.to_uk(unit, path) * map_)
-    _check(model, part, map_, unseen, path)
-    return map_
-
-
-def _check(model: Model, part: int, map_: Map, unseen: NDArray[np.bool_], path: Path) -> None:
+        raise InputError(f"{name} has {broken} pixels that are not finite; mark what was not observed as UNSEEN.")
+    unseen = map_ == healpy.UNSEEN
     believed = model.parts[part].precision > 0
     lost = float(np.mean(unseen[believed]))
     if lost > MISSING:
         raise InputError(
-            f"{path} leaves out {100 * lost:.0f} % of the pixels that the believed scan hits, at most "
+            f"{name} leaves out {100 * lost:.0f} % of the pixels that the believed scan hits, at most "
             f"{100 * MISSING:.0f} % may be; give the model a mask (map.mask) that leaves them out too."
         )
     seen = map_[believed & ~unseen]
     rms = float(np.std(seen))
     if rms == 0.0:
-        raise InputError(f"{path} is constant; give an observed map.")
+        raise InputError(f"{name} is constant; give an observed map.")
     ratio = rms / expected_rms(model, part)
     if not 1.0 / RMS_RATIO < ratio < RMS_RATIO:
         raise InputError(
-            f"{path} has an rms of {rms:.3g} uK where the model expects {rms / ratio:.3g} uK; is it in another unit? "
+            f"{name} has an rms of {rms:.3g} uK where the model expects {rms / ratio:.3g} uK; is it in another unit? "
             "Say so in its header (TUNIT1), or give it in uK."
         )
+    return map_
 
 
 def expected_rms(model: Model, part: int) -> float:

@@ -93,7 +93,8 @@ def detectable(null: Null, t: NDArray[np.float64], tests: int, alpha: float = 0.
     """
     white = null.templates(t)
     response = null.unbiased * np.linalg.eigvalsh(white.T @ white)
-    columns = t.shape[1]
+    # The evidence may have fewer numbers than the effect has components.
+    columns = max(int(np.sum(response > 1e-12 * response[-1])), 1)
     finite = strength_needed(columns, tests, null.dimension, null.count, alpha, target)
     limit = strength_needed(columns, tests, null.dimension, None, alpha, target)
     deaf = response[0] <= 1e-12 * response[-1] or response[-1] == 0.0

@@ -128,7 +128,11 @@ def questions(run: config.RunConfig, without: Sequence[str] = (), nthreads: int 
 
 
 def _applies(model: Model, kind: type[Effect], channel: str | None, settings: Mapping[str, Any]) -> bool:
-    """Whether an effect can be there at all: what it needs to know is known, and it changes something."""
+    """Whether an effect can be there at all: what it needs to know is known, and it changes something.
+
+    Not proposed: effects on differencing, which a diagnosis cannot hear, on noise where none is believed, and on
+    orientations that are a scan's already or that a circular beam does not show.
+    """
     if kind.differencing is not Effect.differencing:
         return False
     owners = [c for c in model.survey.channels if channel in (None, c.name)]
@@ -136,6 +140,8 @@ def _applies(model: Model, kind: type[Effect], channel: str | None, settings: Ma
         specs = {spec.name: spec for spec in model.survey.config.channels}
         if not all(isinstance(specs[owner.name].scan, config.ScanParallelTransport) for owner in owners):
             return False  # the believed orientations are those of a scan already
+        if not any(owner.beam.mmax for owner in owners):
+            return False  # nor does a circular beam show any
     effect = replace(kind.basis()[0], **settings)
     try:
         for owner in owners:

@@ -124,7 +124,7 @@ class Plan:
 
 
 def plan(run: config.RunConfig, asked: Questions, simulations: int | None = None, referee: bool = True) -> Plan:
-    """All simulations that :func:`learn` is made of.
+    """All simulations that :func:`learned` is made of.
 
     Parameters
     ----------

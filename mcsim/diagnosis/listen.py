@@ -38,6 +38,10 @@ NOISE_FLOOR = 1e-3
 """Least noise per pixel over the rms of the sky: what the model of a map is good to."""
 
 
+FILLINGS = 12
+"""Rounds in which pixels that the data lack are filled from the sky that the others show."""
+
+
 @dataclass(frozen=True)
 class Part:
     """One map of the data: where it is in the survey, and its weights.
@@ -181,7 +185,7 @@ def listen(model: Model, maps: Sequence[Map], nthreads: int = 1) -> Heard:
         Threads of the transforms.
     """
     lmax, nside = model.lmax, model.nside
-    clean, seen = _clean(model, maps)
+    clean, seen = _clean(model, maps, nthreads)
     sky = _sky(model, clean, nthreads)
     looked_at = sky + model.dipole
     geometry = healpix.geometry(nside)
@@ -224,16 +228,32 @@ def listen(model: Model, maps: Sequence[Map], nthreads: int = 1) -> Heard:
 
 def show(model: Model, maps: Sequence[Map], nthreads: int = 1) -> Alm:
     """The sky that a set of maps shows, s^ up to the model's lmax, uK."""
-    return _sky(model, _clean(model, maps)[0], nthreads)
+    return _sky(model, _clean(model, maps, nthreads)[0], nthreads)
 
 
-def _clean(model: Model, maps: Sequence[Map]) -> tuple[list[Map], list[NDArray[np.bool_]]]:
-    """Maps with zeros where nothing was observed, and where something was."""
+def _clean(model: Model, maps: Sequence[Map], nthreads: int) -> tuple[list[Map], list[NDArray[np.bool_]]]:
+    """Maps with zeros where nothing is believed to be observed, and where something was.
+
+    Pixels that the data lack and the simulations do not are filled with what the shared sky says of them: zeros there
+    would be a gap of their own.
+    """
     seen = [
         (part.precision > 0) & (map_ != healpy.UNSEEN) & np.isfinite(map_)
         for part, map_ in zip(model.parts, maps, strict=True)
     ]
-    return [np.where(observed, map_, 0.0) for observed, map_ in zip(seen, maps, strict=True)], seen
+    clean = [np.where(observed, map_, 0.0) for observed, map_ in zip(seen, maps, strict=True)]
+    holes = {
+        i: (part.precision > 0) & ~observed
+        for i, (part, observed) in enumerate(zip(model.parts, seen, strict=True))
+        if np.any((part.precision > 0) & ~observed)
+    }
+    for _ in range(FILLINGS if holes else 0):
+        sky = _sky(model, clean, nthreads)
+        for i, hole in holes.items():
+            through = alm_.multiply(sky, model.response[model.parts[i].channel], model.lmax)
+            smooth = healpix.synthesis(through[None], model.nside, model.lmax, nthreads=nthreads)[0]
+            clean[i] = np.where(hole, smooth, clean[i])
+    return clean, seen
 
 
 def _sky(model: Model, clean: Sequence[Map], nthreads: int) -> Alm:

@@ -195,8 +195,8 @@ class Reading:
         """Of every candidate the one most like it, and the amplitude from which they are told apart."""
         evidence = self.evidence
         labels = {_label(row): row for row in self.verdict["detectable"]}
-        heard = {label: len(self.columns([k])) for k, label in enumerate(self.labels)}
         p, N = self.verdict["gap"]["dof"], int(evidence.attrs["simulations"])
+        heard = {label: min(len(self.columns([k])), p) for k, label in enumerate(self.labels)}
         strengths = {k: strength_needed(k, len(self.labels), p, N) for k in set(heard.values())}
         found = []
         for k, label in enumerate(self.labels):

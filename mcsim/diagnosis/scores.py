@@ -142,7 +142,7 @@ def score_of(model: Model, effect: Effect, channel: int | None) -> Score | None:
     return None
 
 
-def _beam_score(model: Model, effect: Effect, channel: int, parts: tuple[int, ...]) -> BeamScore:
+def _beam_score(model: Model, effect: Effect, channel: int, parts: tuple[int, ...]) -> BeamScore | None:
     owner = model.survey.channels[channel]
     lmax = model.lmax
     changed, before = effects.seen_through((effect,), owner.site), owner.site.beam
@@ -155,7 +155,8 @@ def _beam_score(model: Model, effect: Effect, channel: int, parts: tuple[int, ..
         window = np.maximum(owner.window[: lmax + 1], np.finfo(float).tiny)
         rows = min(before.mmax, ORDERS) + 1
         change[:rows] += before.blm[:rows, : lmax + 1] * (window ** (spread * spread - 1.0) - 1.0)
-    return BeamScore(parts, change)
+    # Samples at the centres of their pixels, with no pixel window, cannot come closer.
+    return BeamScore(parts, change) if change.any() else None
 
 
 def _no_draws(stage: str) -> np.random.Generator:

@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from mcsim import config, effects, folders, runner
 from mcsim.diagnosis import knowledge, report, tables
 from mcsim.diagnosis.case import Court, Diagnosis, court, judge
-from mcsim.diagnosis.data import read_maps
+from mcsim.diagnosis.data import checked, read_maps
 from mcsim.diagnosis.evidence import Job, Questions, evidence_of, questions
+from mcsim.errors import InputError
 from mcsim.progress import reporting
 
-METHOD = 1
+METHOD = 2
 """Raised whenever the same model would teach something else."""
 
 
@@ -68,12 +69,16 @@ def diagnose(
         For a run or data that cannot be used.
     """
     run = model if isinstance(model, config.RunConfig) else config.load(model)
+    for effect in without:
+        effects.get(effect)
+    if output is not None:
+        folders.writable(Path(output))
     name, workers = case or run.name, workers or run.compute.workers
     if isinstance(data, str | Path) and Path(data).is_file():
         found = _of_table(run, data, name, without, simulations, workers, quiet)
     else:
         asked = questions(run, without, nthreads=os.cpu_count() or 1)
-        maps = read_maps(asked.model, data) if isinstance(data, str | Path) else list(data)
+        maps = read_maps(asked.model, data) if isinstance(data, str | Path) else checked(asked.model, data)
         with _asking(workers, quiet) as ask:
             found = judge(court(run, asked, _learned(run, asked, simulations, ask)), name, maps, ask)
     if output is not None:
@@ -143,14 +148,18 @@ def _learned(
     ask: Callable[[Sequence[Job]], list[NDArray[np.float64]]],
     planned: Callable[[config.RunConfig, Questions, int | None], knowledge.Plan] = knowledge.plan,
 ) -> knowledge.Knowledge:
-    path = folders.default_cache_dir() / "diagnose" / f"{_key(run, asked, simulations)}.zarr"
-    if path.is_dir():
-        return knowledge.Knowledge.load(path)
-    plan = planned(run, asked, simulations)
-    known = knowledge.learned(asked, plan, ask(plan.jobs))
-    with folders.appearing(path) as scratch:
-        known.save(scratch)
-    return known
+    if simulations is not None and simulations <= len(asked.entries):
+        raise InputError(
+            f"{simulations} simulations are too few for the {len(asked.entries)} numbers of the evidence; give at "
+            f"least {2 * len(asked.entries)}, better {knowledge.PER_ENTRY * len(asked.entries)}."
+        )
+
+    def fill(scratch: Path) -> None:
+        plan = planned(run, asked, simulations)
+        knowledge.learned(asked, plan, ask(plan.jobs)).save(scratch)
+
+    name = f"diagnose/{_key(run, asked, simulations)}.zarr"
+    return knowledge.Knowledge.load(folders.cached(name, fill))
 
 
 def _key(run: config.RunConfig, asked: Questions, simulations: int | None) -> str:

@@ -245,13 +245,7 @@ def _changes_spectra(kind: type[Effect]) -> bool:
 
 
 def plan(run: config.RunConfig, asked: Questions, simulations: int | None = None) -> Plan:
-    """All simulations that a table is judged with: of the model, and with and without every effect for the same skies.
-
-    Raises
-    ------
-    InputError
-        For fewer simulations than the numbers of the table need.
-    """
+    """All simulations that a table is judged with: of the model, and with every effect and without it, same skies."""
     whole = knowledge.plan(run, asked, simulations, referee=False)
     kept = [
         (replace(job, count=SKIES) if purpose[0] == "response" else job, purpose)

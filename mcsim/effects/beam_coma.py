@@ -68,6 +68,8 @@ class BeamComa(Effect):
     @classmethod
     def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
         """The best k and angle: k is linear, the angle is searched."""
+        if not precision.any():
+            return cls()  # not heard
         measured = precision @ coordinates
 
         def missed(angle: float) -> float:

@@ -17,7 +17,7 @@ class OrientationAveraging(Effect):
     ----------
     model
         A packaged scan model, or the path of one, that stands for the real scan; left out, it is the scan that the
-        channel's pointing is known from.
+        channel's pointing is known from. A diagnosis of a run with parallel transport proposes WMAP's.
 
     Notes
     -----
@@ -32,6 +32,7 @@ class OrientationAveraging(Effect):
     source = "Joshi et al. arXiv:1210.7318, Sec. V"
     step = 0.05
     side = 1
+    variants = ({"model": "wmap"},)
 
     model: str = ""
 

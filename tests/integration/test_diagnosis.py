@@ -59,6 +59,17 @@ def data_of(run, name=None, channel=None, seed=77, **parameters):
     return survey(changed)
 
 
+def test_both_folds_hear_every_range_of_the_sky(small):
+    sky = [entry for entry in small.asked.entries if entry.name.startswith("sky/")]
+    even, odd = ([entry.ell for entry in sky if entry.fold == fold] for fold in (0, 1))
+    assert even == odd
+    # The numbers are of different degrees, so that their noise, the sky itself, is independent.
+    rows = {entry.name: row for row, entry in enumerate(small.asked.entries)}
+    for entry in sky[: len(even)]:
+        pair = small.known.simulations[:, [rows[entry.name], rows[entry.name.replace("even", "odd")]]]
+        assert abs(np.corrcoef(pair.T)[0, 1]) < 4.0 / np.sqrt(len(pair))
+
+
 def test_no_gap_where_there_is_none(small):
     shared = data_of(small.run)
     groups = bases(small.null, quiet_templates(small.known), [c.columns for c in small.candidates])

@@ -283,6 +283,13 @@ def test_intervals_cover_what_they_say():
     gone = intervals.removed("x", [(10.0, 1.0), (20.0, 2.0), (1e-9, 3.0)], "")
     assert gone.value == pytest.approx(0.8)
     rng = np.random.default_rng(0)
+    x = rng.uniform(20, 100, 400)
+    drops = [0.9 * x, x] + 15 * rng.standard_normal((2, 400))
+    # The sums' errors, 15 sqrt(400) of some 24,000 each, are 1.8 % together.
+    found = intervals.slope("x", drops[1], drops[0], "", 0.8, 1.0)
+    assert found.value == pytest.approx(0.9, abs=4 * 0.018 * 0.9)
+    assert found.low < found.value < found.high
+    assert found.met is True
     s = rng.uniform(1, 8, 3000)
     hits = rng.random(3000) < stats.norm.cdf(s - 3.0)
     value, low, high = intervals.strength_at(s, hits)

@@ -162,7 +162,7 @@ def test_noise_is_strongest_at_the_ecliptic_poles_in_every_frame(site):
     np.testing.assert_allclose(galactic, rotate_pixels(factor, "ecliptic", "galactic"), atol=0.034)
     assert np.ptp(galactic - factor) > 0.3
     np.testing.assert_array_equal(effects.get("noise_level")(amplitude=0.1).noise(site), np.full(12 * NSIDE**2, 1.1**2))
-    for name, amplitude in (("noise_anisotropy", 1.5), ("noise_anisotropy", -0.5), ("noise_level", -1.0)):
+    for name, amplitude in (("noise_anisotropy", 1.5), ("noise_anisotropy", -0.6), ("noise_level", -1.0)):
         with pytest.raises(InputError, match=f"effect {name}"):
             effects.get(name)(amplitude=amplitude).noise(site)
 
