@@ -25,7 +25,7 @@ def leaked_map(shared: Survey, channel: Channel, sky: np.ndarray) -> np.ndarray:
     """What the non-circular part of the beam adds to the map of the dipole, uK."""
     nside = shared.config.map.nside
     if channel.side_b is not None:
-        ((_, solved),) = differencing.maps(channel, sky, nside, seed=0, realization=0, nthreads=2)
+        ((_, solved),) = differencing.maps(channel, sky, None, nside, seed=0, realization=0, nthreads=2)
         return solved.difference
     spins = convolve.spin_maps(sky, channel.response, nside, nthreads=2)
     return convolve.noncircular_map(spins, channel.maps[0].moments)
