@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
+import mcsim
 from mcsim import config, effects, sampled, simulate
 from mcsim.diagnosis import knowledge
 from mcsim.diagnosis.case import court, judge
@@ -99,17 +100,86 @@ def test_ellipticity_seen_sample_by_sample_is_named_and_shrinks(small):
 
 
 def test_a_broken_simulator_shrinks_nothing(small):
-    shared = data_of(small.run, "beam_ellipticity", "W1", amplitude=0.25)
-    maps = list(simulate.maps(shared, 0))
+    maps = list(simulate.maps(data_of(small.run, "beam_ellipticity", "W1", amplitude=0.25), 0))
+    asked = []
+
+    def working(jobs):
+        asked.append(jobs)
+        return ask(jobs)
+
+    works = judge(small, "works", maps, working).verdict
+    # The last simulations are those of the shrink: the effect at its frozen amplitude.
+    last = asked[-1]
+    assert config.from_json(last[0].simulated).effects
 
     def broken(jobs):
-        quiet = config.to_json(knowledge.seeded(small.run, config.from_json(jobs[0].simulated).ensemble.seed))
-        return ask([replace(job, simulated=quiet) for job in jobs])
+        if jobs[0].simulated != last[0].simulated:
+            return working(jobs)
+        quiet = replace(config.from_json(jobs[0].simulated), effects=())
+        return ask([replace(job, simulated=config.to_json(quiet)) for job in jobs])
 
-    working = judge(small, "works", maps, ask).verdict
-    found = judge(small, "broken", maps, broken).verdict
-    assert working["shrink"]["achieved"] > 0.5
-    assert found["shrink"] is None or abs(found["shrink"]["achieved"]) < 0.05
+    breaks = judge(small, "breaks", maps, broken).verdict
+    assert works["effects"] == breaks["effects"]
+    assert works["shrink"]["achieved"] > 0.5
+    assert abs(breaks["shrink"]["achieved"]) < 1e-6
+    assert breaks["shrink"]["predicted"] == works["shrink"]["predicted"]
+
+
+def test_no_shrink_is_said_of_an_amplitude_that_cannot_be_simulated(small):
+    maps = list(simulate.maps(data_of(small.run, "beam_ellipticity", "W1", amplitude=0.25), 0))
+
+    def refusing(jobs):
+        if config.from_json(jobs[0].simulated).effects:
+            raise InputError("no such amplitude")
+        return ask(jobs)
+
+    found = judge(small, "refused", maps, refusing).verdict
+    assert found["effects"][0]["name"] == "beam_ellipticity"
+    assert found["shrink"] is None
+
+
+def test_pixels_that_the_data_lack_are_no_gap(small):
+    maps = list(simulate.maps(data_of(small.run), 3))
+    holed = [map_uk.copy() for map_uk in maps]
+    for number, map_uk in enumerate(holed):
+        map_uk[100 + 31 * number :: 150] = healpy.UNSEEN  # 20 of 3072
+    whole, lacking = (float(y @ y) for y in (small.null.data(small.asked.answer(m)) for m in (maps, holed)))
+    # Zeros there would make chi^2 fall out of its distribution by tens of its width, sqrt(2 p).
+    assert abs(lacking - whole) < np.sqrt(2 * small.null.dimension)
+
+
+@pytest.mark.parametrize("kind", ["parallel transport", "mask"])
+def test_nothing_is_asked_that_has_no_answer(kind, tmp_path):
+    run = config.load(MODEL)
+    if kind == "mask":
+        path = tmp_path / "mask.fits"
+        height = healpy.pix2vec(16, np.arange(3072))[2]
+        healpy.write_map(path, (np.abs(height) < 0.55).astype(float), dtype=np.float64)
+        run = replace(run, map=replace(run.map, mask=str(path), mask_frame="ecliptic"))
+    else:
+        still = config.ScanParallelTransport()
+        run = replace(
+            run,
+            map=replace(run.map, splits=()),
+            channels=tuple(replace(channel, scan=still) for channel in run.channels),
+        )
+    asked = questions(run)
+    answers = evidence_of(knowledge.plan(run, asked, simulations=4, referee=False).jobs[0])[:, : len(asked.entries)]
+    dead = [entry.name for entry, spread in zip(asked.entries, np.ptp(answers, axis=0), strict=True) if spread == 0.0]
+    assert dead == []
+
+
+def test_what_cannot_be_done_is_said_before_anything_is_learned(small, folder):
+    (folder / "file").write_text("")
+    for changes, said in (
+        ({"output": folder / "file"}, "cannot be written"),
+        ({"without": ["beam_elipticity"]}, "did you mean beam_ellipticity"),
+        ({"data": [np.zeros(3072)]}, "1 maps were given, the model has 4"),
+        ({"data": [np.zeros(48)] * 4}, "nside 2, the model 16"),
+        ({"simulations": 20}, "too few"),
+    ):
+        with pytest.raises(InputError, match=said):
+            mcsim.diagnose(**({"model": small.run, "data": folder, "workers": 1} | changes))
 
 
 def test_exchanged_channels_are_noticed(small):

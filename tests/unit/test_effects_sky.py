@@ -137,6 +137,19 @@ def test_foregrounds_are_fixed_to_the_galaxy_and_grow_with_frequency(site, sky):
         kind(amplitude=3.0).sky(sky, replace(site, frequency_ghz=None), draw)
 
 
+def test_noise_after_a_template(site, tmp_path):
+    path = str(tmp_path / "pattern.fits")
+    pattern = healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2))[0]
+    healpy.write_map(path, pattern, coord="E", dtype=np.float64)
+    kind = effects.get("noise_anisotropy")
+    np.testing.assert_allclose(kind(amplitude=0.3, template=path).noise(site), 1.0 + 0.3 * pattern)
+    galactic = kind(amplitude=0.3, template=path).noise(replace(site, frame="galactic"))
+    # A pixel's centre in the other frame is up to 0.055 rad off, half a diagonal.
+    np.testing.assert_allclose(galactic, rotate_pixels(1.0 + 0.3 * pattern, "ecliptic", "galactic"), atol=0.034)
+    with pytest.raises(InputError, match="makes a variance negative"):
+        kind(amplitude=-1.1, template=path).noise(site)
+
+
 def test_foregrounds_after_a_template(site, sky, tmp_path):
     template = healpix.synthesis(gaussian_alm(load("wmap7", 32), np.random.default_rng(4))[None], NSIDE, 32)[0]
     path = str(tmp_path / "template.fits")
