@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import rng
-from mcsim.challenge.batch import Batch
 from mcsim.challenge.prior import Drawn, Prior, Urn
 from mcsim.challenge.record import Geometry, Record, most_probable
 from mcsim.challenge.reduced import without
 from mcsim.diagnosis.attribute import Attribution, Candidate, attribute
+from mcsim.diagnosis.batch import Batch
 from mcsim.diagnosis.case import Court
 from mcsim.diagnosis.detect import power
 from mcsim.diagnosis.evidence import Proposal

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from mcsim import config, rng, sampled, simulate
 from mcsim.challenge import toml
-from mcsim.challenge.batch import Batch, asking, batch
 from mcsim.challenge.inventions import introduced, load
 from mcsim.challenge.prior import Drawn, Invention, Prior, Urn
 from mcsim.challenge.sitting import evidence_with, sitting
 from mcsim.challenge.truth import KEYS, MAPS, SEAL, Member, Truth, key_path, new_nonce, sealed, write_whole
+from mcsim.diagnosis.batch import Batch, asking, batch
 from mcsim.diagnosis.case import Court
 from mcsim.diagnosis.evidence import Job, questions
 from mcsim.diagnosis.knowledge import after_jobs, seeded, with_effects

@@ -4,10 +4,10 @@ import json
 from pathlib import Path
 
 from mcsim import config
-from mcsim.challenge.batch import asking, batch
 from mcsim.challenge.make import SETTINGS
 from mcsim.challenge.sitting import lesser
 from mcsim.challenge.truth import MAPS, finished_cases
+from mcsim.diagnosis.batch import asking, batch
 from mcsim.diagnosis.case import judge
 from mcsim.diagnosis.data import read_maps
 from mcsim.diagnosis.evidence import questions

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.challenge import report
-from mcsim.challenge.batch import asking, batch
 from mcsim.challenge.bayes import Bayes
 from mcsim.challenge.draws import draws, powers
 from mcsim.challenge.figures import Score, scored
@@ -20,6 +19,7 @@ from mcsim.challenge.record import Answer, Geometry, Record, most_probable
 from mcsim.challenge.run import VERDICTS, settings_of
 from mcsim.challenge.sitting import Sitting, lesser
 from mcsim.challenge.truth import Truth, finished_cases, open_key
+from mcsim.diagnosis.batch import asking, batch
 from mcsim.diagnosis.evidence import questions
 from mcsim.diagnosis.refine import quiet_templates
 from mcsim.diagnosis.session import prepared

@@ -3,8 +3,7 @@
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -12,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim import config, effects, folders, runner
+from mcsim import config, effects, folders
 from mcsim.diagnosis import knowledge, report, tables
+from mcsim.diagnosis.batch import asking, batch
 from mcsim.diagnosis.case import Court, Diagnosis, court, judge
 from mcsim.diagnosis.data import checked, read_maps
-from mcsim.diagnosis.evidence import Job, Questions, evidence_of, questions
+from mcsim.diagnosis.evidence import Job, Questions, questions
 from mcsim.errors import InputError
-from mcsim.progress import reporting
 
 METHOD = 2
 """Raised whenever the same model would teach something else."""
@@ -79,8 +78,9 @@ def diagnose(
     else:
         asked = questions(run, without, nthreads=os.cpu_count() or 1)
         maps = read_maps(asked.model, data) if isinstance(data, str | Path) else checked(asked.model, data)
-        with _asking(workers, quiet) as ask:
-            found = judge(court(run, asked, _learned(run, asked, simulations, ask)), name, maps, ask)
+        with batch(workers) as call:
+            ask = asking(call, quiet)
+            found = judge(prepared(run, asked, ask, simulations), name, maps, ask)
     if output is not None:
         found.save(output)
         report.write(found, Path(output) / "report.html")
@@ -99,7 +99,8 @@ def _of_table(
     measured = tables.read_spectra(path, run)
     run = tables.listening(run, measured)
     asked = tables.questions_of(run, measured, without, nthreads=os.cpu_count() or 1)
-    with _asking(workers, quiet, measured) as ask:
+    with batch(workers) as call:
+        ask = asking(call, quiet, measured)
         known = _learned(run, asked, simulations, ask, tables.plan)
         return tables.judge(court(run, asked, tables.of_mean(known, measured.realizations)), case, measured, ask)
 
@@ -112,33 +113,6 @@ def prepared(
 ) -> Court:
     """What every case of a run is judged with, learned or from the cache."""
     return court(run, asked, _learned(run, asked, simulations, ask))
-
-
-@contextmanager
-def _asking(
-    workers: int, quiet: bool, task: Callable[[Job], NDArray[np.float64]] = evidence_of
-) -> Iterator[Callable[[Sequence[Job]], list[NDArray[np.float64]]]]:
-    """A cluster of this machine that answers jobs, started with the first."""
-    opened: list[Any] = []
-
-    def ask(jobs: Sequence[Job]) -> list[NDArray[np.float64]]:
-        if not opened:
-            manager = runner.local_client(workers)
-            opened.extend((manager, manager.__enter__()))
-        answers: list[NDArray[np.float64]] = [np.empty(0)] * len(jobs)
-        done = 0
-        with reporting("simulations", float(sum(job.count for job in jobs)), "skies", quiet) as report:
-            for index, answer in runner.completed(opened[1], task, ((job,) for job in jobs)):
-                answers[index] = answer
-                done += jobs[index].count
-                report(float(done))
-        return answers
-
-    try:
-        yield ask
-    finally:
-        if opened:
-            opened[0].__exit__(None, None, None)
 
 
 def _learned(

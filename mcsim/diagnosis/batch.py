@@ -1,6 +1,6 @@
 """Many calls, in this process or on a cluster of this machine."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -36,17 +36,18 @@ def batch(workers: int) -> Iterator[Batch]:
             opened[0].__exit__(None, None, None)
 
 
-def asking(call: Batch, quiet: bool) -> Callable[[Iterable[Job]], list[NDArray[np.float64]]]:
+def asking(
+    call: Batch, quiet: bool, task: Callable[[Job], NDArray[np.float64]] = evidence_of
+) -> Callable[[Sequence[Job]], list[NDArray[np.float64]]]:
     """Answers of jobs in their order."""
 
-    def ask(jobs: Iterable[Job]) -> list[NDArray[np.float64]]:
-        wanted = list(jobs)
-        answers: list[NDArray[np.float64]] = [np.empty(0)] * len(wanted)
+    def ask(jobs: Sequence[Job]) -> list[NDArray[np.float64]]:
+        answers: list[NDArray[np.float64]] = [np.empty(0)] * len(jobs)
         done = 0
-        with reporting("simulations", float(sum(job.count for job in wanted)), "skies", quiet) as report:
-            for index, answer in call(evidence_of, ((job,) for job in wanted)):
+        with reporting("simulations", float(sum(job.count for job in jobs)), "skies", quiet) as report:
+            for index, answer in call(task, ((job,) for job in jobs)):
                 answers[index] = answer
-                done += wanted[index].count
+                done += jobs[index].count
                 report(float(done))
         return answers
 
