@@ -209,3 +209,21 @@ def test_correlated_bins_are_freed_of_what_others_predict(small):
     left = np.corrcoef(drawn @ turn.T, rowvar=False)
     assert abs(left[used, fresh]) < 1e-12
     np.testing.assert_array_equal(turn[folds == 0], np.eye(len(folds))[folds == 0])
+
+
+def test_a_few_power_spectra_alone_are_judged(tmp_path):
+    table = measured(RUN)
+    few = table[(table["L"] == 0) & (table["ell_max"] < BINS[-1][1])]
+    few["value"] *= 1.0 + 0.3 * np.arange(len(few))
+    spectra = read(tmp_path, few)
+    run = tables.listening(RUN, spectra)
+    # Coma is not heard at all, and the spectrum has more components than there are numbers.
+    proposed = ("beam_coma", "beam_width", "spectrum")
+    asked = tables.questions_of(run, spectra, [name for name in effects.catalogue() if name not in proposed])
+    plan = tables.plan(run, asked, 60)
+    known = knowledge.learned(asked, plan, [spectra(job) for job in plan.jobs])
+    seat = court(run, asked, tables.of_mean(known, SKIES))
+    found = tables.judge(seat, "few", spectra, lambda jobs: [spectra(job) for job in jobs])
+    assert found.verdict["verdict"] != "none"
+    assert "beam_coma" not in [effect["name"] for effect in found.verdict["effects"]]
+    report.write(found, tmp_path / "report.html")
