@@ -16,7 +16,7 @@ Map = NDArray[np.float64]
 MISSING = 0.01
 """Largest fraction of the pixels that the believed scan hits which data may leave out."""
 
-RMS_RATIO = 5.0
+RMS_RATIO = 20.0
 """Largest ratio of the rms of a map to that of the model, either way: beyond it the unit is wrong."""
 
 
@@ -94,8 +94,8 @@ def _checked(model: Model, part: int, map_: Map, name: str) -> Map:
     ratio = rms / expected_rms(model, part)
     if not 1.0 / RMS_RATIO < ratio < RMS_RATIO:
         raise InputError(
-            f"{name} has an rms of {rms:.3g} uK where the model expects {rms / ratio:.3g} uK; is it in another unit? "
-            "Say so in its header (TUNIT1), or give it in uK."
+            f"{name} has an rms of {rms:.3g} uK where the model expects {rms / ratio:.3g} uK; is it in another "
+            "unit, or is the dipole still in it? Say the unit in its header (TUNIT1), or give it in uK."
         )
     return map_
 

@@ -119,7 +119,8 @@ def refine(
     Notes
     -----
     A response mu, simulated at coordinates theta, changes its templates t to t + (mu - t theta) theta'/theta'theta:
-    the secant, exact there.
+    the secant, exact there. A candidate that can have neither the fitted amplitude nor half of it is taken
+    out.
     """
     t = t.copy()
     done: dict[int, Vector] = {}
@@ -130,22 +131,38 @@ def refine(
             columns = list(candidates[index].columns)
             if not _bent(known, null, columns, coordinates) or _close(done.get(index), coordinates, covariance):
                 continue
-            try:
-                effect = effect_at(proposals[index], coordinates, covariance)
-                response = respond([proposals[index].table(effect)])
-            except InputError:
-                continue  # an amplitude that the effect cannot have: the straight line is all there is
-            at = effect.coordinates()
+            done[index] = coordinates
+            answer = _simulated(proposals[index], coordinates, covariance, respond)
+            changed = True
+            if answer is None:
+                t[:, columns] = 0.0
+                continue
+            at, response = answer
             size = float(at @ at)
             if size == 0.0:
                 continue
             t[:, columns] += np.outer(response - t[:, columns] @ at, at) / size
-            done[index] = coordinates
-            changed = True
         if not changed:
             break
         found = attribute(null, x, t, candidates, calibration)
     return Refined(found, t, tuple(done))
+
+
+def _simulated(
+    proposal: Proposal, coordinates: Vector, covariance: NDArray[np.float64], respond: Respond
+) -> tuple[Vector, Vector] | None:
+    """Coordinates and response, at the fitted amplitude or half of it; None where the effect can have neither.
+
+    What is fitted by a straight line may lie somewhat beyond what the effect can be, and the effect be there; what
+    would have to lie far beyond explains nothing.
+    """
+    for factor in (1.0, 0.5):
+        try:
+            effect = effect_at(proposal, factor * coordinates, covariance / factor**2)
+            return effect.coordinates(), respond([proposal.table(effect)])
+        except InputError:
+            continue
+    return None
 
 
 def _to_try(found: Attribution, candidates: Sequence[Candidate]) -> list[tuple[int, Vector, NDArray[np.float64]]]:

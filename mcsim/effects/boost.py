@@ -8,6 +8,10 @@ from mcsim import alm as alm_
 from mcsim.effects.base import Alm, Draw, Site
 from mcsim.effects.product import multiplied
 from mcsim.effects.vectors import DirectedEffect
+from mcsim.errors import InputError
+
+FARTHEST = 2.0
+"""Largest l beta: beyond it the change of the smallest scales is larger than they are themselves."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,8 +30,8 @@ class Boost(DirectedEffect):
     To first order T + f T - grad f . grad T with f = beta . n, and since Laplacian f = -2 f,
     2 grad f . grad T = Laplacian(f T) - f Laplacian T + 2 f T: the change is half of l(l+1) (f T)_lm less
     (f l'(l'+1) T)_lm, two products and no gradient. The dipole that the boost makes of the monopole is not in it: that
-    is ``sky.dipole_uk``. First order
-    means l beta well below one: at our beta and l = 1000 the change is as large as the sky, and more orders are needed.
+    is ``sky.dipole_uk``. First order means l beta well below one: at our beta and l = 1000 the change is as large as
+    the sky, and more orders are needed.
     """
 
     name = "boost"
@@ -43,6 +47,11 @@ class Boost(DirectedEffect):
         """Boosted."""
         if self.amplitude == 0.0:
             return sky
+        if abs(self.amplitude) * site.lmax > FARTHEST:
+            raise InputError(
+                f"effect {self.name}: amplitude = {self.amplitude:g} moves the sky by more than {FARTHEST:g} / l at "
+                f"l = {site.lmax}, which first order cannot say; choose at most {FARTHEST / site.lmax:.3g}."
+            )
         a, b, c = self.coordinates()
         ell = np.arange(site.lmax + 1)
         squared = ell * (ell + 1.0)

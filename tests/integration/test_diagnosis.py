@@ -125,16 +125,37 @@ def test_a_broken_simulator_shrinks_nothing(small):
     assert breaks["shrink"]["predicted"] == works["shrink"]["predicted"]
 
 
-def test_no_shrink_is_said_of_an_amplitude_that_cannot_be_simulated(small):
+def test_an_amplitude_that_cannot_be_simulated_is_no_explanation(small):
     maps = list(simulate.maps(data_of(small.run, "beam_ellipticity", "W1", amplitude=0.25), 0))
 
     def refusing(jobs):
-        if config.from_json(jobs[0].simulated).effects:
+        if any(effect.name == "beam_ellipticity" for effect in config.from_json(jobs[0].simulated).effects):
             raise InputError("no such amplitude")
         return ask(jobs)
 
     found = judge(small, "refused", maps, refusing).verdict
-    assert found["effects"][0]["name"] == "beam_ellipticity"
+    assert ("beam_ellipticity", "W1") not in [(effect["name"], effect["channel"]) for effect in found["effects"]]
+
+
+def test_no_shrink_is_said_of_what_cannot_be_simulated_again(small):
+    maps = list(simulate.maps(data_of(small.run, "beam_ellipticity", "W1", amplitude=0.25), 0))
+    simulated = []
+
+    def remembering(jobs):
+        simulated.append(jobs[0].simulated)
+        return ask(jobs)
+
+    works = judge(small, "works", maps, remembering).verdict
+    last = simulated[-1]
+
+    def refusing(jobs):
+        if jobs[0].simulated == last:
+            raise InputError("no such amplitude")
+        return ask(jobs)
+
+    found = judge(small, "refused", maps, refusing).verdict
+    assert found["effects"] == works["effects"]
+    assert works["shrink"] is not None
     assert found["shrink"] is None
 
 

@@ -83,6 +83,8 @@ def test_boost_shifts_towards_the_motion_and_modulates(site, sky, points):
     change = expected - at(sky, points)
     # Second order: l beta = 6e-4 of the change.
     assert np.abs(at(found, points) - expected).max() < 3e-3 * np.abs(change).max()
+    with pytest.raises(InputError, match="which first order cannot say"):
+        effects.get("boost")(amplitude=2.1 / site.lmax, **TOWARDS).sky(sky, site, draw)
 
 
 def test_dipole_residual_adds_a_vector(site, sky, points):
