@@ -38,7 +38,11 @@ EPSILON = 1e-7
 """Of the interpolation of samples, relative to the dipole: 0.3 nK."""
 
 SMALLER = 0.7
-ATTEMPTS = 12
+"""Factor between one trial of an amplitude and the next."""
+
+ATTEMPTS = 16
+LARGER = 1.5
+"""Most that an effect may be stronger than was drawn."""
 
 
 def make(
@@ -235,7 +239,10 @@ def maps_of(run: config.RunConfig, truth: Truth, inventions: str | None) -> list
 
 
 def _measured(model: str, simulations: int | None, members: Sequence[Member]) -> tuple[Member, ...]:
-    """Members with the strengths that their amplitudes have; smaller ones where the drawn amplitude is impossible."""
+    """Members with the strengths that their amplitudes have; smaller ones where the drawn amplitude is impossible.
+
+    So too where the effect, far beyond a straight line, is much stronger than was drawn.
+    """
     seat = sitting(model, simulations)
     length = seat.court.null
     found = []
@@ -256,6 +263,8 @@ def _measured(model: str, simulations: int | None, members: Sequence[Member]) ->
             halves = (one - reference[: len(one)], two - reference[len(one) : len(one) + len(two)])
             first, second = (length.templates(half.mean(axis=0)[:, None])[:, 0] for half in halves)
             strength = float(np.sqrt(max(length.unbiased * float(first @ second), 0.0)))
+            if strength > LARGER * member.strength and attempt + 1 < ATTEMPTS:
+                continue  # its response is no straight line
             coordinates = tuple(float(value) for value in effect.coordinates())
             found.append(replace(member, parameters=scaled, coordinates=coordinates, strength=strength))
             break
