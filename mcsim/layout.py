@@ -2,10 +2,12 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mcsim.biposh import Mode
+if TYPE_CHECKING:  # stored ensembles are opened without the numerics, which take long to load
+    from mcsim.biposh import Mode
 
 
 @dataclass(frozen=True)
@@ -16,7 +18,7 @@ class Layout:
     chunk: int
     maps: tuple[str, ...]
     pairs: tuple[str, ...]
-    modes: tuple[Mode, ...]
+    modes: "tuple[Mode, ...]"
     lmax: int
     paired: bool
     kept_npix: int | None

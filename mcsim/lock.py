@@ -11,6 +11,9 @@ from typing import NoReturn
 
 from mcsim.errors import InputError
 
+_held: set[Path] = set()
+"""Locks that this process holds, as whole paths."""
+
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
@@ -21,7 +24,7 @@ def locked(path: Path) -> Iterator[None]:
     InputError
         If another run holds it. The lock of a process of this host that is gone is taken over.
     """
-    lock = path.with_name(f"{path.name}.lock")
+    lock = path.absolute().with_name(f"{path.name}.lock")
     while True:
         try:
             lock.parent.mkdir(parents=True, exist_ok=True)
@@ -32,10 +35,13 @@ def locked(path: Path) -> Iterator[None]:
         except OSError as error:
             reason = error.strerror or str(error)
             raise InputError(f"{lock} cannot be written ({reason}); choose a writable folder with -o.") from error
+    _held.add(lock)
     try:
         yield
     finally:
-        lock.unlink(missing_ok=True)
+        _held.discard(lock)
+        with suppress(OSError):  # on a disk that has become read-only; then the next run takes it over
+            lock.unlink()
 
 
 def _make(lock: Path, path: Path) -> None:
@@ -54,7 +60,8 @@ def _take_over(lock: Path, path: Path) -> None:
             process = int(number)
         except ValueError:
             host, process = "an unknown host", 0
-        if host == socket.gethostname() and not _alive(process):
+        dead = lock not in _held if process == os.getpid() else not _alive(process)
+        if host == socket.gethostname() and dead:
             # Of several that find it so one removes it, and none the lock that another has made since.
             fcntl.flock(stream, fcntl.LOCK_EX)
             if os.fstat(stream.fileno()).st_ino == lock.stat().st_ino:

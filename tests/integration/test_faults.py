@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -10,13 +11,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import dask
 import pytest
-from distributed import Client
+from distributed import Client, KilledWorker, LocalCluster
+from distributed.comm.core import CommClosedError
 from distributed.diagnostics.plugin import WorkerPlugin
 from zarr.storage import _local
 
 from mcsim import cli, config, repair, runner, simulate, store, tasks
 from mcsim.errors import InputError, RunError
+from mcsim.progress import Journal
+from mcsim.runner import batch, cluster
 
 from .conftest import ensemble, table
 from .test_runner import assert_same
@@ -185,7 +190,7 @@ def test_a_task_given_up_for_lost_does_not_undo_another(
 
 
 def test_other_packages_are_refused_by_name(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runner, "packages", lambda: (*tasks.packages()[:-1], ("numcodecs", "0.1")))
+    monkeypatch.setattr(batch, "packages", lambda: (*tasks.packages()[:-1], ("numcodecs", "0.1")))
     with pytest.raises(
         InputError, match=r"A worker on .* has other packages than the driver \(numcodecs .* for 0\.1\)"
     ):
@@ -199,6 +204,8 @@ def test_completed_gives_every_result_once(client: Client) -> None:
 
 def test_a_cluster_without_workers_is_not_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     class Deserted:
+        cluster, dashboard_link = None, ""
+
         def nthreads(self) -> dict[str, int]:
             return {}
 
@@ -208,10 +215,120 @@ def test_a_cluster_without_workers_is_not_waited_for_for_ever(monkeypatch: pytes
     def nothing(*asked: Any, **options: Any) -> None:
         raise TimeoutError
 
-    monkeypatch.setattr(runner, "wait", nothing)
+    monkeypatch.setattr(cluster, "wait", nothing)
     client = Deserted()
     with pytest.raises(RunError, match=r"No worker has been there for 300 s"):
         list(runner.completed(client, pow, [(2, 2)]))
+
+
+def test_workers_that_join_and_leave_are_logged(tmp_path: Path) -> None:
+    class Changing:
+        cluster, dashboard_link = None, ""
+
+        def nthreads(self) -> dict[str, int]:
+            return dict.fromkeys(rounds.pop(0), 2)
+
+    rounds: list[list[str]] = [["a"], ["a"], ["a", *"fgbhc"], ["b"], [], ["c"]]
+    roll = cluster.Roll(Changing(), Journal(tmp_path / "x.zarr"))
+    assert roll.text() == "1 worker with 2 threads"
+    assert [roll.call() for _ in range(5)] == [2, 12, 2, 0, 2]
+    lines = [line.split(" ", 3)[-1] for line in (tmp_path / "x.zarr.log").read_text().splitlines()]
+    assert lines == [
+        "workers b, c, f, g, 1 more joined; 6 workers now",
+        "workers a, c, f, g, 1 more left; 1 worker now",
+        "worker b left; 0 workers now",
+        "worker c joined; 1 worker now",
+    ]
+    assert roll.text() == "1 worker with 2 threads"
+
+
+def test_worker_that_no_nanny_starts_again_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "TURN_S", 0.2)
+    with (
+        dask.config.set({"distributed.deploy.lost-worker-timeout": "100ms"}),
+        LocalCluster(n_workers=1, processes=False, dashboard_address="127.0.0.1:0") as own,
+        Client(own) as connected,
+    ):
+        own.sync(own.workers[0].close)
+        assert dict(runner.completed(connected, pow, [(2, 3), (2, 4)])) == {0: 8, 1: 16}
+
+
+def test_worker_that_leaves_while_it_is_asked_for_its_packages_is_no_foreign_one() -> None:
+    class Leaving:
+        def run(self, *_: Any, on_error: str) -> dict[str, Any]:
+            return {"tcp://a": CommClosedError("closed"), "tcp://b": answer}
+
+    answer: Any = tasks.packages()
+    cluster._check_workers(Leaving())
+    answer = ModuleNotFoundError("No module named 'mcsim'")
+    with pytest.raises(InputError, match=r"The worker tcp://b cannot import mcsim \(ModuleNotFoundError"):
+        cluster._check_workers(Leaving())
+
+
+@pytest.mark.parametrize("error", [RuntimeError("Nanny failed to start."), TimeoutError()])
+def test_workers_that_do_not_start_are_a_sentence(
+    error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def late(**_: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(cluster, "LocalCluster", late)
+    with pytest.raises(
+        RunError, match=rf"did not start \({type(error).__name__}: {error}\); run the same command again"
+    ):
+        runner.run(table(), tmp_path / "x.zarr")
+    assert not (tmp_path / "x.zarr").exists()
+    assert not (tmp_path / "x.zarr.lock").exists()
+
+
+def test_summary_whose_workers_die_is_a_sentence(
+    small_store: Path, copy: Path, client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Last:
+        address = "tcp://10.0.0.7:1"
+
+    def dying(*_: Any) -> None:
+        raise KilledWorker("summarise_node-0", Last(), 2)
+
+    shutil.rmtree(copy / "summary")
+    monkeypatch.setattr(batch, "summarise_node", dying)
+    with pytest.raises(RunError, match=r"cannot be made, for each of the 3 workers .* died, .*10\.0\.0\.7:1 \(out"):
+        runner.run(table(), copy, client=client)
+    monkeypatch.undo()
+    runner.run(table(), copy, client=client)
+    assert_same(copy, small_store)
+
+
+@pytest.mark.parametrize("status", ["pending", "error"])
+def test_result_that_is_lost_with_its_worker_is_waited_for_in_turns(
+    status: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker dies between the end of a call and the journey of its result; or the call itself gave up waiting."""
+
+    class Lost:
+        def result(self, timeout: float) -> int:
+            if turns.pop():
+                raise TimeoutError("late")
+            return 8
+
+    class Alone:
+        cluster, dashboard_link = None, ""
+
+        def nthreads(self) -> dict[str, int]:
+            return {"a": 1}
+
+        def submit(self, *call: Any, pure: bool) -> Lost:
+            return future
+
+    future, turns = Lost(), [False, True, True]
+    future.status = status
+    monkeypatch.setattr(cluster, "wait", lambda *asked, **options: ({future}, set()))
+    if status == "error":
+        with pytest.raises(TimeoutError, match="late"):
+            list(runner.completed(Alone(), pow, [(2, 3)]))
+    else:
+        assert list(runner.completed(Alone(), pow, [(2, 3)])) == [(0, 8)]
+        assert turns == []
 
 
 def test_error_of_a_call_is_raised(client: Client) -> None:
@@ -279,7 +396,10 @@ def test_store_that_is_deleted_during_the_run(
     assert_same(path, small_store)
 
 
-def test_worker_that_dies_every_time_costs_its_realization_alone(small_store: Path, tmp_path: Path) -> None:
+def test_worker_that_dies_every_time_costs_its_realization_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster, "ATTEMPTS", 2)  # a new worker takes seconds
     path = tmp_path / "x.zarr"
 
     class Poison(WorkerPlugin):
@@ -298,10 +418,17 @@ def test_worker_that_dies_every_time_costs_its_realization_alone(small_store: Pa
     with runner.local_client(2) as processes:
         processes.register_plugin(Poison())
         result = runner.run(table(), path, client=processes)
-    assert [failure.realization for failure in result.failures] == [5]
-    assert "died" in result.failures[0].reason
+    (failure,) = result.failures
+    assert failure.realization == 5
+    death = r"each of the 2 workers that computed it died, the last of them tcp://127\.0\.0\.1:\d+ \(out of memory\?\)"
+    assert re.fullmatch(death, failure.reason)
     assert result.finished == 9
-    assert "realizations 4-7" in path.with_name("x.zarr.log").read_text()
+    log = path.with_name("x.zarr.log").read_text()
+    assert re.search(f" tried again, one by one: realizations 4-7, for {death}\n", log)
+    assert re.search(f" failed: realization 5: {death}\n", log)
+    assert re.search(r" workers? tcp://127\.0\.0\.1:\d+.* left; [012] workers? now\n", log)
+    assert re.search(r" workers? tcp://127\.0\.0\.1:\d+.* joined; [12] workers? now\n", log)
+    assert log.count(" 1 failed (realization 5)\n") == 1
 
 
 def test_kills_lose_nothing() -> None:

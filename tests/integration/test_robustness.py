@@ -15,6 +15,7 @@ from distributed import Client
 
 from mcsim import config, open_ensemble, open_summary, runner, store
 from mcsim.errors import InputError, RunError
+from mcsim.lock import locked
 
 from .conftest import ensemble, table
 from .test_runner import assert_same
@@ -23,10 +24,14 @@ from .test_runner import assert_same
 def test_second_writer_is_refused_by_name(small_store: Path, client: Client, tmp_path: Path) -> None:
     path = tmp_path / "x.zarr"
     lock = tmp_path / "x.zarr.lock"
-    lock.write_text(f"{socket.gethostname()} {os.getpid()}")
-    with pytest.raises(InputError, match=f"process {os.getpid()} on {socket.gethostname()}"):
+    lock.write_text(f"{socket.gethostname()} {os.getppid()}")
+    with pytest.raises(InputError, match=f"process {os.getppid()} on {socket.gethostname()}"):
         runner.run(table(), path, client=client)
     assert not path.exists()
+    lock.unlink()
+    with locked(path), pytest.raises(InputError, match=f"process {os.getpid()} on {socket.gethostname()}"):
+        runner.run(table(), path, client=client)
+    assert not lock.exists()
     lock.write_text("another-host 1")
     with pytest.raises(InputError, match="process 1 on another-host"):
         runner.run(table(), path, client=client)
@@ -41,6 +46,9 @@ def test_lock_of_a_dead_process_is_taken_over(small_store: Path, client: Client,
     runner.run(table(), tmp_path / "x.zarr", client=client)
     assert_same(tmp_path / "x.zarr", small_store)
     assert not (tmp_path / "x.zarr.lock").exists()
+    (tmp_path / "x.zarr.lock").write_text(f"{socket.gethostname()} {os.getpid()}")  # a dead one of the same number
+    shutil.rmtree(tmp_path / "x.zarr" / "summary")
+    assert runner.run(table(), tmp_path / "x.zarr", client=client).computed == 0
 
 
 def test_worker_does_not_use_what_a_file_held_before(client: Client, tmp_path: Path) -> None:

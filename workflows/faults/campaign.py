@@ -3,7 +3,8 @@
 Every store is filled by a chain of runs, each of which is hit at times drawn uniformly over its duration: with the
 driver or the scheduler it ends, and the next ``resume`` continues; a worker or its nanny is replaced. The last run of a
 chain is left alone. Then all arrays are compared bit for bit with those of an undisturbed run. Right before a kill the
-victim writes its stack, which says what it was doing.
+victim writes its stack, which says what it was doing. Aimed kills, counted apart, hit a worker as soon as a chunk has
+all of its data and no ``done``; whether they did is seen on the disk when the worker is dead.
 
     python workflows/faults/campaign.py --kills 100
 """
@@ -14,7 +15,6 @@ import os
 import random
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -23,20 +23,22 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from multiprocessing import forkserver
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import psutil
 
 # Numba and the transforms are loaded here, once: drivers are forks of this process, which itself has no threads.
 from distributed.utils import get_mp_context
+from same import difference
+from separate import Cluster, workers_of
 
-from mcsim import config, open_ensemble, open_summary, repair, runner, store, tasks
+from mcsim import config, repair, runner, store, tasks
 
 HERE = Path(__file__).resolve().parent
 REALIZATIONS = int(os.environ.get("MCSIM_FAULTS_REALIZATIONS", "200"))
-LIMIT_S = 120.0
-CHAIN = 4
+LIMIT_S = 300.0
+CHAIN, HITS = 4, 3
+"""Runs of a chain that are hit, and workers that are killed in one of them: a new one takes longer than a chunk."""
 
 
 def configuration() -> config.RunConfig:
@@ -70,6 +72,7 @@ class Kill:
     after_s: float
     phase: str
     stored: int
+    aimed: bool = False
 
 
 @dataclass
@@ -84,69 +87,7 @@ class Tally:
     trouble: list[str] = field(default_factory=list)
 
 
-class Cluster:
-    """Scheduler and two workers as people start them; parts that were killed are started again."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.file = folder, folder / "scheduler.json"
-        self.processes: dict[str, subprocess.Popen[bytes]] = {}
-
-    def heal(self) -> str:
-        """Start what does not run; the address of the scheduler."""
-        scheduler = self.processes.get("scheduler")
-        if scheduler is None or scheduler.poll() is not None:
-            self.stop()
-            self.file.unlink(missing_ok=True)
-            self._start("scheduler", "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard")
-            wait_for(self.file.exists)
-        for name in ("node 0", "node 1"):
-            if name not in self.processes or self.processes[name].poll() is not None:
-                self._start(
-                    name, "worker", "--nthreads", "1", "--host", "127.0.0.1", "--no-dashboard", "--memory-limit", "0"
-                )
-        return str(json.loads(self.file.read_text())["address"])
-
-    def _start(self, name: str, *arguments: str) -> None:
-        command = [sys.executable, "-m", "dask", *arguments, "--scheduler-file", str(self.file)]
-        with (self.folder / f"{name}.log").open("ab") as log:
-            self.processes[name] = subprocess.Popen(command, stdout=log, stderr=log, cwd=self.folder)
-
-    def victims(self, kind: str) -> list[int]:
-        """Processes that are a scheduler, a nanny or a worker by now."""
-        if kind == "scheduler":
-            return [self.processes["scheduler"].pid]
-        nannies = [self.processes[name].pid for name in ("node 0", "node 1")]
-        return nannies if kind == "nanny" else [pid for nanny in nannies for pid in workers_of(nanny)]
-
-    def stop(self) -> None:
-        """End everything."""
-        for process in self.processes.values():
-            process.kill()
-            process.wait()
-        self.processes.clear()
-
-
-def wait_for(condition: Any, seconds: float = 60.0) -> None:
-    """Wait until something is so."""
-    end = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > end:
-            raise TimeoutError("the cluster does not start")
-        time.sleep(0.02)
-
-
-def workers_of(parent: int) -> list[int]:
-    """Worker processes of this process's drivers, or of a nanny: children of its fork server."""
-    try:
-        servers = [
-            p for p in psutil.Process(parent).children() if "multiprocessing.forkserver" in " ".join(p.cmdline())
-        ]
-        return [child.pid for server in servers for child in server.children()]
-    except psutil.Error:
-        return []
-
-
-def drive(path: Path, scheduler: str | None, answer: Path, resume: bool) -> int:
+def drive(path: Path, scheduler: str | None, answer: Path, resume: bool, workers: int = 2) -> int:
     """Start a driver as a fork of this process; its result is left in a file."""
     child = os.fork()
     if child:
@@ -157,7 +98,7 @@ def drive(path: Path, scheduler: str | None, answer: Path, resume: bool) -> int:
         os.dup2(sink, 1)
         os.dup2(sink, 2)
         try:
-            result = runner.run(configuration(), path, resume=resume, scheduler=scheduler)
+            result = runner.run(configuration(), path, resume=resume, scheduler=scheduler, workers=workers)
             found = {
                 "computed": result.computed,
                 "finished": result.finished,
@@ -199,7 +140,7 @@ def phase(pid: int, traces: Path) -> str:
         ("realize_chunk", "around a chunk"),
         ("_simulate", "waiting for chunks"),
         ("local_client", "starting or ending the cluster"),
-        ("_remote_client", "connecting"),
+        ("remote_client", "connecting"),
     ):
         if name in found:
             return meaning
@@ -230,7 +171,8 @@ def chain(
         driver = drive(path, scheduler, answer, resume=path.exists())
         start = time.monotonic()
         ended = False
-        while victim is not None and not ended:
+        hits = 0
+        while victim is not None and not ended and hits < HITS:
             moment = time.monotonic() + random.uniform(0.0, duration[-1])
             candidates: list[int] = []
             while (time.monotonic() < moment or not candidates) and not ended:
@@ -244,6 +186,7 @@ def chain(
             if not candidates:
                 break
             if not ended:
+                hits += 1
                 tally.kills.append(
                     kill(random.choice(candidates), victim, driver, time.monotonic() - start, path, cluster, traces)
                 )
@@ -284,28 +227,70 @@ def kill(
 
 def compare(path: Path, reference: Path, tally: Tally) -> None:
     """Count what a store has not, has otherwise, or counts twice."""
-    with open_ensemble(path) as found, open_ensemble(reference) as expected:
-        tally.lost += int((~found["done"].values).sum())
-        differing = np.zeros(REALIZATIONS, dtype=bool)
-        for name in expected.data_vars:
-            a, b = found[name].values, expected[name].values
-            differing |= (
-                (np.ascontiguousarray(a).view(np.uint8) != np.ascontiguousarray(b).view(np.uint8))
-                .reshape(REALIZATIONS, -1)
-                .any(axis=1)
-            )
-        tally.differing += int(differing.sum())
-    with open_summary(path) as found, open_summary(reference) as expected:
-        if not found.identical(expected):
-            tally.trouble.append(f"{path.name}: another summary")
-        tally.doubled += max(int(found["count"]) - REALIZATIONS, 0)
+    found = difference(path, reference)
+    tally.lost += found["lost"]
+    tally.doubled += found["doubled"]
+    tally.differing += found["differing"]
+    if not found["same_summary"]:
+        tally.trouble.append(f"{path.name}: another summary")
     verdict = repair.verify(path)
     if not verdict.intact:
         tally.trouble.append(verdict.text())
     tally.stores += 1
 
 
-def campaign(kills: int, kinds: list[str], seconds: float, seed: int, folder: Path) -> Tally:
+def between_data_and_done(path: Path) -> set[str]:
+    """Numbers of chunks whose data are all on the disk, but not their ``done``."""
+    try:
+        started = set(os.listdir(path / "biposh" / "c")) - set(listed_done(path))
+    except FileNotFoundError:
+        return set()
+    files = ("biposh/c/{}/0/0/0", "biposh_circular/c/{}/0/0/0", "cl/c/{}/0/0", "cl_circular/c/{}/0/0")
+    return {number for number in started if all((path / file.format(number)).exists() for file in files)}
+
+
+def listed_done(path: Path) -> list[str]:
+    """Numbers of chunks that have a ``done``."""
+    with suppress(FileNotFoundError):
+        return os.listdir(path / "done" / "c")
+    return []
+
+
+def aim(path: Path, count: int, tally: Tally) -> None:
+    """Run with one worker, which is killed between the data of ``count`` chunks and their done."""
+    hit, before = set[str](), 0
+    driver = drive(path, None, path.with_suffix(".json"), resume=False, workers=1)
+    with suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, 0, -10)  # who looks late misses; root may look first
+    start, ended, workers = time.monotonic(), False, list[int]()
+    while not ended and time.monotonic() - start < 4 * LIMIT_S:
+        ended = os.waitpid(driver, os.WNOHANG)[0] != 0
+        if len(hit) == count:
+            time.sleep(0.05)
+        elif not workers or not psutil.pid_exists(workers[0]):
+            time.sleep(0.01)
+            workers, before = workers_of(os.getpid()), len(listed_done(path))
+        # A nanny that does not yet know that its worker runs would not start another: it is to have done something.
+        elif len(listed_done(path)) > before and (target := between_data_and_done(path) - hit):
+            with suppress(ProcessLookupError, psutil.Error):
+                os.kill(workers[0], signal.SIGKILL)
+                while psutil.Process(workers[0]).status() != psutil.STATUS_ZOMBIE:
+                    time.sleep(0.01)
+            workers.clear()
+            hit |= target
+            doing = "between data and done" if target & between_data_and_done(path) else "done"
+            tally.kills.append(Kill("local", "worker", time.monotonic() - start, doing, len(stored(path)), aimed=True))
+        else:
+            time.sleep(0.001)
+    with suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, 0, 0)
+    if not ended:
+        tally.trouble.append(f"{path.name}: a driver did not end in {4 * LIMIT_S:g} s after aimed kills")
+        os.kill(driver, signal.SIGKILL)
+        os.waitpid(driver, 0)
+
+
+def campaign(kills: int, aimed: int, kinds: list[str], seconds: float, seed: int, folder: Path) -> Tally:
     """All kills, spread over the kinds of cluster and victims."""
     random.seed(seed)
     traces = folder / "traces"
@@ -340,6 +325,12 @@ def campaign(kills: int, kinds: list[str], seconds: float, seed: int, folder: Pa
                 shutil.rmtree(name, ignore_errors=True)
                 chain(name, [], cluster if kind == "separate" else None, traces, durations[kind], tally)
             compare(folder / f"timing-{kind}.zarr", reference, tally)
+        if aimed:
+            aim(folder / "aimed.zarr", aimed, tally)
+            chain(folder / "aimed.zarr", [], None, traces, [], tally)
+            compare(folder / "aimed.zarr", reference, tally)
+            print(summary(tally), flush=True)
+        kills += len(tally.kills)
         number = 0
         while len(tally.kills) < kills and time.monotonic() < end:
             kind = kinds[number % len(kinds)]
@@ -362,40 +353,40 @@ def campaign(kills: int, kinds: list[str], seconds: float, seed: int, folder: Pa
 
 def summary(tally: Tally) -> str:
     """The campaign in a line."""
+    aimed = sum(kill.aimed for kill in tally.kills)
+    kills = f"{len(tally.kills)} kills, " + (f"{aimed} of them aimed, " if aimed else "")
     return (
-        f"{len(tally.kills)} kills, {tally.stores} stores of {REALIZATIONS} realizations: lost {tally.lost}, "
-        f"doubled {tally.doubled}, differing {tally.differing}, other trouble {len(tally.trouble)}."
+        f"{kills}{tally.stores} stores of {REALIZATIONS} realizations: lost {tally.lost}, doubled {tally.doubled}, "
+        f"differing {tally.differing}, other trouble {len(tally.trouble)}."
     )
 
 
 def report(tally: Tally) -> str:
-    """The campaign as a Markdown table."""
-    rows = Counter((kill.cluster, kill.victim, kill.phase) for kill in tally.kills)
-    lines = ["| cluster | killed | while it was | kills |", "|---|---|---|---|"]
-    lines += [
-        f"| {cluster} | {victim} | {doing} | {count} |" for (cluster, victim, doing), count in sorted(rows.items())
-    ]
-    return "\n".join(
-        [
-            summary(tally),
-            "",
-            *lines,
-            *(f"\nTrouble: {text}" for text in tally.trouble),
-        ]
-    )
+    """The campaign as Markdown: what the victim was doing, or the driver where another was the victim, by victim."""
+    victims = ("worker", "nanny", "driver", "scheduler")
+    lines = [summary(tally)]
+    for aimed in (False, True):
+        counts = Counter((kill.phase, kill.victim) for kill in tally.kills if kill.aimed == aimed)
+        if counts:
+            title = "aimed kills" if aimed else "kills at random times"
+            lines += ["", f"| {title} | {' | '.join(victims)} |", "|---|---|---|---|---|"]
+            for phase in sorted({phase for phase, _ in counts}):
+                lines.append(f"| {phase} | {' | '.join(str(counts[phase, victim] or '') for victim in victims)} |")
+    return "\n".join([*lines, *(f"\nTrouble: {text}" for text in tally.trouble)])
 
 
 def main() -> int:
     """Run the campaign; exit code 1 if anything was lost, doubled, different, or otherwise wrong."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--aimed", type=int, default=0, help="more kills, between a chunk's data and its done")
     parser.add_argument("--clusters", nargs="+", choices=["local", "separate"], default=["local", "separate"])
-    parser.add_argument("--seconds", type=float, default=1200.0, help="start no further chain after that time")
+    parser.add_argument("--seconds", type=float, default=2400.0, help="start no further chain after that time")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--output", type=Path, help="write the kills as JSON")
     chosen = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="mcsim-faults-") as folder:
-        tally = campaign(chosen.kills, chosen.clusters, chosen.seconds, chosen.seed, Path(folder))
+        tally = campaign(chosen.kills, chosen.aimed, chosen.clusters, chosen.seconds, chosen.seed, Path(folder))
         if tally.trouble:
             for noise in Path(folder).glob("*.noise"):
                 print(noise.name, noise.read_text()[-2000:], sep="\n", file=sys.stderr)

@@ -1,0 +1,84 @@
+"""Disks that are really full or read-only, where this user may mount one: workflows/faults/disk.py in short."""
+
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from distributed import Client
+
+from mcsim import repair, runner, simulate, store
+from mcsim.errors import InputError, RunError
+
+from .conftest import table
+from .test_runner import assert_same
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 64 MB of its own."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    try:
+        mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64m", "mcsim", place], capture_output=True)
+    except OSError:
+        pytest.skip("no mount command")
+    if mounted.returncode:
+        pytest.skip("this user may not mount a disk")
+    yield place
+    subprocess.run(["umount", place], check=True)
+
+
+def remount(place: Path, *options: str) -> bool:
+    command = ["mount", "-o", ",".join(("remount", *options)), place]
+    return subprocess.run(command, capture_output=True).returncode == 0
+
+
+def test_full_disk(small_store: Path, client: Client, disk: Path) -> None:
+    path = disk / "x.zarr"
+    runner.run(table(), path, realizations=slice(0, 4), client=client)
+    used = os.statvfs(disk)
+    assert remount(disk, f"size={(used.f_blocks - used.f_bfree) * used.f_frsize + 8192}")
+    with pytest.raises(RunError, match=r"No space left on device.*mcsim run --resume goes on"):
+        runner.run(table(), path, client=client)
+    assert sorted(p.name for p in disk.iterdir()) == ["x.zarr", "x.zarr.log"]
+    verdict = repair.verify(path)
+    assert (verdict.intact, verdict.finished) == (True, 4)
+    assert remount(disk, "size=64m")
+    result = runner.run(table(), path, resume=True, client=client)
+    assert (result.finished, result.computed) == (10, 6)
+    assert_same(path, small_store)
+
+
+def test_disk_without_room_is_refused(client: Client, disk: Path) -> None:
+    (disk / "ballast").write_bytes(bytes(1 << 20))
+    assert remount(disk, "size=1m")
+    with pytest.raises(InputError, match=r"No space left on device"):
+        runner.run(table(), disk / "x.zarr", client=client)
+    assert sorted(p.name for p in disk.iterdir()) == ["ballast"]
+
+
+def test_disk_that_becomes_read_only(
+    small_store: Path, client: Client, disk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = disk / "x.zarr"
+    real = simulate.realize
+
+    def realize(shared: object, r: int) -> object:
+        while r == 5 and not remount(disk, "ro"):  # not while a file is being written
+            pass
+        return real(shared, r)
+
+    monkeypatch.setattr(simulate, "realize", realize)
+    with pytest.raises(RunError, match=r"Read-only file system.*mcsim run --resume goes on"):
+        runner.run(table(), path, client=client)
+    monkeypatch.undo()
+    finished = int(store.done(path).sum())
+    assert finished < 10
+    with pytest.raises(InputError, match=r"Read-only file system"):
+        runner.run(table(), path, client=client)
+    assert remount(disk, "rw")
+    result = runner.run(table(), path, resume=True, client=client)
+    assert (result.finished, result.computed) == (10, 10 - finished)
+    assert_same(path, small_store)
