@@ -103,7 +103,9 @@ class Atlas:
                 members = self.model.of(int(key[:-1]))
                 signs = [1.0 if key[-1] == "+" else (-1.0) ** place for place in range(len(members))]
                 total = sum(sign * heard.adjoint[i] for sign, i in zip(signs, members, strict=True))
-                left = alm_.multiply(total, self.model.response[int(key[:-1])], lmax)
+                # A dipole beside the sky's quadrupole would look like L = 3; it has a place of its own.
+                response = np.where(np.arange(lmax + 1) >= 2, self.model.response[int(key[:-1])][: lmax + 1], 0.0)
+                left = alm_.multiply(total, response, lmax)
             coefficients = np.nan_to_num(biposh.estimate(self.tables, left, heard.sky))
             for view in FRAMES:
                 found[key, view] = coefficients if view == frame else rotate_biposh(coefficients, modes, frame, view)
