@@ -73,6 +73,8 @@ def cached(name: str, fill: Callable[[Path], None], cache_dir: str | Path | None
             with appearing(folder) as scratch:
                 fill(scratch)
         except OSError as error:
+            if error.errno is None:  # of a connection or a limit of time, not of a file
+                raise
             raise InputError(
                 f"cache folder {str(root)!r} cannot be written ({error.strerror}); make room there, or set MCSIM_CACHE "
                 "to one that can."

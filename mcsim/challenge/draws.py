@@ -143,12 +143,8 @@ def draws(
 
 def urn_of(bench: Bench, prior: Prior) -> Urn:
     """What draws from the library of a bench."""
-
-    def length(change: Vector) -> float:
-        return float(np.sqrt(bench.null.unbiased) * np.linalg.norm(bench.null.templates(change[:, None])))
-
     columns = [candidate.columns for candidate in bench.candidates]
-    return Urn(prior, bench.proposals, columns, bench.templates, length, {})
+    return Urn(prior, bench.proposals, columns, bench.templates, bench.null.length, {})
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,13 +179,12 @@ def judged(bench: Bench, prior: Prior, seed: int, cases: Sequence[Draw]) -> list
         if draw.drawn.kind in ("none", "one", "two"):
             best, right = most_probable(bayes.probabilities(x))
         shrink = shrunk(bench, x, said.explanations[0].members) if said.explanations else None
-        white = bench.null.templates(draw.response[:, None])
         found.append(
             Record(
                 f"draw-{draw.case:05d}",
                 draw.drawn.kind,
                 truth,
-                float(np.sqrt(bench.null.unbiased) * np.linalg.norm(white)),
+                bench.null.length(draw.response),
                 len(members[0].coordinates) if len(members) == 1 else 0,
                 geometry.rival(draw.response, truth) if truth else 0.0,
                 geometry.distances(draw.response) if draw.drawn.kind in ("left_out", "invented") else (),
@@ -257,11 +252,10 @@ def _absent(
     """Gap before and after one effect that is neither there nor like what is there."""
     if len(truth) != 1 or draw.drawn.kind != "one":
         return None
-    white = bench.null.templates(draw.response[:, None])[:, 0]
-    size = float(np.linalg.norm(white))
-    if np.sqrt(bench.null.unbiased) * size < STRONG:
+    if bench.null.length(draw.response) < STRONG:
         return None
-    cosines = np.sqrt(geometry.groups.drops(white)) / size
+    white = bench.null.templates(draw.response[:, None])[:, 0]
+    cosines = np.sqrt(geometry.groups.drops(white)) / np.linalg.norm(white)
     unlike = [
         index
         for index, candidate in enumerate(bench.candidates)

@@ -126,8 +126,7 @@ def _naming(records: Sequence[Record], known: Sequence[Record]) -> list[Figure]:
         found.append(share("right answer, cases of the library", list(right > 0)))
         found.append(share("right answer, Bayes", list(best > 0)))
         behind = mean("points behind Bayes", list(best - right), "at most 0.02")
-        met = bool(behind.value <= 0.02) if np.isfinite(behind.value) else None
-        found.append(Figure(behind.name, behind.value, behind.low, behind.high, behind.count, behind.target, met))
+        found.append(behind.judged(behind.value <= 0.02))
         found.append(
             mean("Bayes' own account less its share", [r.bayes_right - float(r.bayes == r.truth) for r in known])
         )
@@ -189,15 +188,13 @@ def _shrinks(records: Sequence[Record]) -> list[Figure]:
     before = np.array([r.gaps[0] if r.gaps else 0.0 for r in strong])
     expected, found = (before * np.array([getattr(r, name) for r in strong]) for name in ("predicted", "achieved"))
     least = removed(f"gap removed, s >= {SHRUNK:g}", [r.gaps for r in strong if r.gaps], "at least 0.8")
-    met = bool(least.value >= 0.8) if np.isfinite(least.value) else None
     absent = [r.absent for r in records if r.absent is not None]
     # What is not there has an amplitude of noise, which opens a gap by one for every parameter.
     none = removed("gap removed by an effect that is not there", absent, "not above 0")
-    zero = bool(none.low <= 0.0) if np.isfinite(none.value) else None
     return [
         slope(f"achieved against predicted shrink: slope, s >= {SHRUNK:g}", expected, found, "1 +- 0.05", 0.95, 1.05),
-        Figure(least.name, least.value, least.low, least.high, least.count, least.target, met),
-        Figure(none.name, none.value, none.low, none.high, none.count, none.target, zero),
+        least.judged(least.value >= 0.8),
+        none.judged(none.low <= 0.0),
     ]
 
 

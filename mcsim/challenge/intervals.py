@@ -1,7 +1,7 @@
 """Numbers with their intervals: shares, means, widths, powers, slopes."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,10 @@ class Figure:
     count: int
     target: str = ""
     met: bool | None = None
+
+    def judged(self, met: bool) -> "Figure":
+        """With the target met or not; where there is no value, that cannot be said."""
+        return replace(self, met=bool(met) if np.isfinite(self.value) else None)
 
     def plain(self) -> dict[str, Any]:
         """For JSON, None in place of what is no number."""

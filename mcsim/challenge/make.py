@@ -1,7 +1,7 @@
 """Make a challenge: maps of surveys in which something may be wrong, and sealed keys that say what."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -137,18 +137,8 @@ def make(
 
 def urn_of(court: Court, prior: Prior) -> Urn:
     """What draws the cases of a model."""
-    return Urn(
-        prior, court.asked.proposals, court.asked.columns, quiet_templates(court.known), white_length_of(court), {}
-    )
-
-
-def white_length_of(court: Court) -> Callable[[Vector], float]:
-    """Length of a change of the evidence in standard deviations, less the bias of a scatter from few simulations."""
-
-    def length(change: Vector) -> float:
-        return float(np.sqrt(court.null.unbiased) * np.linalg.norm(court.null.templates(change[:, None])))
-
-    return length
+    asked = court.asked
+    return Urn(prior, asked.proposals, asked.columns, quiet_templates(court.known), court.null.length, {})
 
 
 def _settle(path: Path, settings: Mapping[str, Any]) -> None:
@@ -244,7 +234,7 @@ def _measured(model: str, simulations: int | None, members: Sequence[Member]) ->
     So too where the effect, far beyond a straight line, is much stronger than was drawn.
     """
     seat = sitting(model, simulations)
-    length = seat.court.null
+    null = seat.court.null
     found = []
     for member in members:
         for attempt in range(ATTEMPTS):
@@ -261,8 +251,8 @@ def _measured(model: str, simulations: int | None, members: Sequence[Member]) ->
             reference = seat.court.known.reference
             # Two halves of the skies, so that their noise does not count as strength.
             halves = (one - reference[: len(one)], two - reference[len(one) : len(one) + len(two)])
-            first, second = (length.templates(half.mean(axis=0)[:, None])[:, 0] for half in halves)
-            strength = float(np.sqrt(max(length.unbiased * float(first @ second), 0.0)))
+            first, second = (null.templates(half.mean(axis=0)[:, None])[:, 0] for half in halves)
+            strength = float(np.sqrt(max(null.unbiased * float(first @ second), 0.0)))
             if strength > LARGER * member.strength and attempt + 1 < ATTEMPTS:
                 continue  # its response is no straight line
             coordinates = tuple(float(value) for value in effect.coordinates())

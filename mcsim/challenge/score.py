@@ -123,13 +123,11 @@ class _Judge:
             best, right = most_probable(self.bayes.probabilities(np.array(answer["evidence"])))
         shrink = verdict["shrink"] or {}
         members = truth.members
-        null = self.full.court.null
-        white = np.sqrt(null.unbiased) * np.linalg.norm(null.templates(response[:, None]))
         return Record(
             truth.case,
             truth.kind,
             truth.identities,
-            members[0].strength if len(members) == 1 else float(white),
+            members[0].strength if len(members) == 1 else self.full.court.null.length(response),
             len(members[0].coordinates) if len(members) == 1 else 0,
             geometry.rival(response[seat.rows], truth.identities) if members else 0.0,
             geometry.distances(response[seat.rows]) if truth.kind in ("left_out", "invented") else (),

@@ -183,7 +183,8 @@ def shrink_of(
     members = refined.attribution.explanations[0].members
     columns = [column for member in members for column in court.candidates[member].columns]
     change = refined.templates[:, columns] @ refined.attribution.explanations[0].fit.amplitudes
-    if min(_heard(court, change, used), _heard(court, change, fresh)) < HEARD:
+    heard = min(court.known.null(rows).length(change[rows]) for rows in (used, fresh))
+    if heard < HEARD * court.null.length(change):
         return None
     frozen = fit(court.known.null(used), x[used], refined.templates[np.ix_(used, np.array(columns))])
     before = court.known.null(fresh)
@@ -202,13 +203,6 @@ def shrink_of(
         before, x[fresh], refined.templates[np.ix_(fresh, np.array(columns))], frozen.amplitudes, frozen.covariance
     )
     return expected, achieved(before, after, x[fresh]), _fresh_words(court)
-
-
-def _heard(court: Court, change: Vector, rows: NDArray[np.int64]) -> float:
-    """Share of the strength of a change of the evidence that some entries hear by themselves."""
-    part, whole = court.known.null(rows), court.null
-    some = np.sqrt(part.unbiased) * np.linalg.norm(part.templates(change[rows, None]))
-    return float(some / max(np.sqrt(whole.unbiased) * np.linalg.norm(whole.templates(change[:, None])), 1e-300))
 
 
 def _fresh_words(court: Court) -> str:

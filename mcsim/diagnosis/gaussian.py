@@ -54,6 +54,10 @@ class Null:
         """White coordinates of templates, shape (p_raw, K) to (p, K), on the scale of :meth:`data`."""
         return self.whitening @ t / np.sqrt(1.0 + 1.0 / self.count)
 
+    def length(self, change: NDArray[np.float64]) -> float:
+        """White length of a change of the evidence, shape (p_raw,), in standard deviations."""
+        return float(np.sqrt(self.unbiased) * np.linalg.norm(self.templates(change[:, None])))
+
 
 def null(simulations: NDArray[np.float64], offset: NDArray[np.float64] | None = None, floor: float = 1e-8) -> Null:
     """Null of an ensemble.

@@ -53,7 +53,7 @@ def diagnose(
     simulations
         Number for the scatter of the evidence; default: ten for every number of it.
     workers
-        Processes; default: the run's.
+        Processes; default: the run's; 0: this one.
     quiet
         Report no progress.
 
@@ -72,7 +72,7 @@ def diagnose(
         effects.get(effect)
     if output is not None:
         folders.writable(Path(output))
-    name, workers = case or run.name, workers or run.compute.workers
+    name, workers = case or run.name, run.compute.workers if workers is None else workers
     if isinstance(data, str | Path) and Path(data).is_file():
         found = _of_table(run, data, name, without, simulations, workers, quiet)
     else:

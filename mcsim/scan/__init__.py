@@ -4,7 +4,7 @@ from mcsim.scan.accumulate import stream_moments
 from mcsim.scan.cache import cached_moments
 from mcsim.scan.described import Described, read_described
 from mcsim.scan.factors import limit_factors, scan_factors, summary
-from mcsim.scan.limit import limit_moments
+from mcsim.scan.limit import limit_moments, limit_on_pixels
 from mcsim.scan.model import LineOfSight, ScanModel, load_model
 from mcsim.scan.moments import Moments, parallel_transport, read_moments_fits, write_moments_fits
 from mcsim.scan.user_pointing import pointing_moments
@@ -17,6 +17,7 @@ __all__ = [
     "cached_moments",
     "limit_factors",
     "limit_moments",
+    "limit_on_pixels",
     "load_model",
     "parallel_transport",
     "pointing_moments",

@@ -336,6 +336,11 @@ def test_error_of_a_call_is_raised(client: Client) -> None:
         list(runner.completed(client, divmod, [(1, 0)]))
 
 
+def test_sentence_of_a_call_stays_one_where_its_cause_cannot_be_unpickled(client: Client, tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"cannot be used \(GroupNotFoundError"):
+        list(runner.completed(client, store.done, [(tmp_path,)]))  # an empty folder
+
+
 def test_interrupted_slices_are_verified_by_what_they_hold(client: Client, tmp_path: Path) -> None:
     path = tmp_path / "slice.zarr"
     runner.run(table(), path, realizations=slice(0, 5), client=client)
@@ -351,8 +356,9 @@ def test_second_half_of_an_extension_is_repaired(small_store: Path, client: Clie
     assert_same(path, small_store)
 
 
-def test_full_disk_stops_in_a_sentence_and_goes_on(
-    small_store: Path, client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS])
+def test_disk_that_takes_no_more_stops_in_a_sentence_and_goes_on(
+    number: int, small_store: Path, client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "x.zarr"
     written = []
@@ -365,10 +371,10 @@ def test_full_disk_stops_in_a_sentence_and_goes_on(
         real(*arguments)
 
     def full(*_: Any, **__: Any) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
+        raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(store, "write", write)
-    with pytest.raises(RunError, match=r"No space left on device.*mcsim run --resume goes on"):
+    with pytest.raises(RunError, match=rf"{os.strerror(number)}.*mcsim run --resume goes on"):
         runner.run(table(), path, client=client)
     monkeypatch.undo()
     assert not (tmp_path / "x.zarr.lock").exists()

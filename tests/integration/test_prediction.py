@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import healpy
 import numpy as np
 import pytest
 from distributed import Client
@@ -19,10 +18,7 @@ BEAM = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 300.0, "fwhm_minor_a
 def limit_moments(path: Path, nside: int) -> str:
     """The WMAP-like scan in the limit of endless time, as a file."""
     model = scan.load_model(resources.scan_model("wmap"))
-    theta, _ = healpy.pix2ang(nside, np.arange(12 * nside**2))
-    rings, ring = np.unique(theta, return_inverse=True)
-    density, w = scan.limit_moments(model, rings, 4)
-    scan.write_moments_fits(path, scan.Moments(nside, "ecliptic", density[ring], w[:, ring]))
+    scan.write_moments_fits(path, scan.limit_on_pixels(model, nside, 4))
     return str(path)
 
 

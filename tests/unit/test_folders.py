@@ -1,8 +1,11 @@
 """Folders that appear complete or not at all."""
 
+import errno
+
 import pytest
 
-from mcsim.folders import appearing
+from mcsim.errors import InputError
+from mcsim.folders import appearing, cached
 
 
 def test_a_folder_appears_whole(tmp_path):
@@ -38,3 +41,20 @@ def test_a_file_in_the_way_is_an_error(tmp_path):
     with pytest.raises(NotADirectoryError), appearing(tmp_path / "folder"):
         pass
     assert [entry.name for entry in tmp_path.iterdir()] == ["folder"]
+
+
+def test_a_cache_that_is_full_is_said_to_be(tmp_path):
+    def full(folder):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(InputError, match="cannot be written"):
+        cached("name", full, tmp_path)
+
+
+def test_a_lost_connection_is_not_blamed_on_the_cache(tmp_path):
+    def lost(folder):
+        raise TimeoutError("nobody answers")
+
+    with pytest.raises(TimeoutError, match="nobody answers"):
+        cached("name", lost, tmp_path)
+    assert list(tmp_path.iterdir()) == []

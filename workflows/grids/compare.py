@@ -12,7 +12,6 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-import healpy
 import numpy as np
 
 from mcsim import config, resources, scan, simulate, survey
@@ -45,10 +44,8 @@ def believed(lmax: int, grid: dict[str, object], orientation: dict[str, object],
 
 def limit_file(nside: int, path: Path) -> Path:
     """Moments of the WMAP scan's long-time limit at the centres of pixels."""
-    theta = healpy.pix2ang(nside, np.arange(12 * nside**2))[0]
-    rings, inverse = np.unique(theta, return_inverse=True)
-    density, w = scan.limit_moments(scan.load_model(resources.scan_model("wmap")), rings, 2)
-    scan.write_moments_fits(path, scan.Moments(nside, "ecliptic", density[inverse], w[:, inverse]))
+    model = scan.load_model(resources.scan_model("wmap"))
+    scan.write_moments_fits(path, scan.limit_on_pixels(model, nside, 2))
     return path
 
 
