@@ -6,6 +6,7 @@ from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
 from itertools import islice
 from typing import Any
+from uuid import uuid4
 
 import dask
 from distributed import Client, Future, KilledWorker, LocalCluster, wait
@@ -208,7 +209,7 @@ def answers(
     def fill() -> None:
         room = 3 * max(1, roll.call()) - len(numbers)
         for index, call in islice(waiting, max(room, 0)):
-            future = roll.client.submit(function, *call, pure=False)
+            future = roll.client.submit(_in_words, function, *call, key=f"{function.__name__}-{uuid4().hex}")
             numbers[future] = index
 
     fill()
@@ -228,6 +229,15 @@ def answers(
                 error = raised
             yield numbers.pop(future), result, error
         fill()
+
+
+def _in_words(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Task: a call whose sentences travel without what caused them, for some libraries' errors cannot be unpickled."""
+    try:
+        return function(*arguments)
+    except (InputError, RunError) as error:
+        error.__cause__ = error.__context__ = None
+        raise
 
 
 def _first_of(roll: Roll, flying: list[Future]) -> tuple[set[Future], set[Future]]:
