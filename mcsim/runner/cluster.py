@@ -39,7 +39,7 @@ def local_client(workers: int) -> Iterator[Client]:
     """
     single = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "DUCC0", "NUMBA")}
     settings = {
-        "distributed.nanny.pre-spawn-environ": single,
+        "distributed.nanny.pre-spawn-environ": dask.config.get("distributed.nanny.pre-spawn-environ") | single,
         "distributed.scheduler.allowed-failures": ATTEMPTS - 1,
         "distributed.worker.preload": [_WORKER_SETUP],
     }

@@ -209,7 +209,7 @@ def test_a_cluster_without_workers_is_not_waited_for_for_ever(monkeypatch: pytes
         def nthreads(self) -> dict[str, int]:
             return {}
 
-        def submit(self, *call: Any, pure: bool) -> object:
+        def submit(self, *call: Any, key: str) -> object:
             return object()
 
     def nothing(*asked: Any, **options: Any) -> None:
@@ -317,7 +317,7 @@ def test_result_that_is_lost_with_its_worker_is_waited_for_in_turns(
         def nthreads(self) -> dict[str, int]:
             return {"a": 1}
 
-        def submit(self, *call: Any, pure: bool) -> Lost:
+        def submit(self, *call: Any, key: str) -> Lost:
             return future
 
     future, turns = Lost(), [False, True, True]
