@@ -1,7 +1,8 @@
 """Which effect: all subsets of up to three candidates, those that suffice, and what would tell them apart."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import combinations
 from typing import Literal
 
@@ -33,6 +34,8 @@ class Candidate:
         Weight relative to the other candidates.
     shape_error
         Relative error of its templates in white length; ``None``: that of the search.
+    positive
+        Whether an amplitude below zero is none: a set that asks for one explains nothing.
     """
 
     name: str
@@ -42,6 +45,7 @@ class Candidate:
     unit: str = ""
     prior: float = 1.0
     shape_error: float | None = None
+    positive: bool = False
 
     @property
     def identity(self) -> tuple[str, str | None]:
@@ -182,7 +186,8 @@ def attribute(
     excess = max(null.unbiased * search.total - null.dimension, signal, 1e-300)
     explanations: tuple[Explanation, ...] = ()
     if found.probability <= alpha:
-        accepted = _accepted(search, levels, largest, np.log(odds_cut))
+        possible = partial(_possible, null, x, t, candidates)
+        accepted = _accepted(search, levels, largest, np.log(odds_cut), possible)
         explanations = tuple(_explanations(null, x, t, candidates, accepted, np.log(odds_cut)))
     return Attribution(
         verdict=_verdict(found.probability > alpha, explanations),
@@ -216,8 +221,25 @@ class _Accepted:
     further: float
 
 
-def _accepted(search: Subsets, levels: tuple[float, float], largest: int, cut: float) -> list[_Accepted]:
-    """Minimal sufficient subsets, unless their evidence falls below the best one's by more than ``cut``."""
+def _possible(
+    null: Null,
+    x: NDArray[np.float64],
+    t: NDArray[np.float64],
+    candidates: Sequence[Candidate],
+    members: tuple[int, ...],
+) -> bool:
+    """Whether no member would need an amplitude that it cannot have."""
+    positive = [candidates[member].positive for member in members for _ in candidates[member].columns]
+    if not any(positive):
+        return True
+    columns = [column for member in members for column in candidates[member].columns]
+    return bool(np.all(fit(null, x, t[:, columns]).amplitudes[positive] >= 0.0))
+
+
+def _accepted(
+    search: Subsets, levels: tuple[float, float], largest: int, cut: float, possible: Callable[[tuple[int, ...]], bool]
+) -> list[_Accepted]:
+    """Minimal sufficient subsets that are possible, unless their evidence is below the best one's by over ``cut``."""
     accepted: list[_Accepted] = []
     best = -np.inf
     for size in range(1, largest + 1):
@@ -226,18 +248,21 @@ def _accepted(search: Subsets, levels: tuple[float, float], largest: int, cut: f
         least = max(best - cut, search.unknown if size > 1 else -np.inf)
         for subsets in search.rows(size, [found.members for found in accepted]):
             solved = search.solve(subsets)
-            possible = np.flatnonzero((solved.probability > levels[0]) & (solved.evidence >= least))
-            for first in range(0, len(possible), CHUNK):
-                rows = possible[first : first + CHUNK]
+            passing = np.flatnonzero((solved.probability > levels[0]) & (solved.evidence >= least))
+            for first in range(0, len(passing), CHUNK):
+                rows = passing[first : first + CHUNK]
                 further = search.further(subsets[rows], solved.chi2[rows], solved.allowance[rows])
                 alone = further > levels[1]
                 if size > 1:
                     alone &= search.least_needed(subsets[rows]) <= levels[1]
                 for row, beside in zip(rows[alone], further[alone], strict=True):
                     members = tuple(int(member) for member in subsets[row])
-                    fresh.append(
-                        _Accepted(float(solved.evidence[row]), members, float(solved.probability[row]), float(beside))
-                    )
+                    if possible(members):
+                        fresh.append(
+                            _Accepted(
+                                float(solved.evidence[row]), members, float(solved.probability[row]), float(beside)
+                            )
+                        )
         accepted += fresh
         best = max([best, *(found.evidence for found in fresh)])
     return accepted

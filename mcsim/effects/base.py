@@ -110,7 +110,8 @@ class Effect:
     draws
         Whether a hook draws random numbers.
     side
-        Sign of the amplitudes at which responses are measured; 0: both, where both are possible.
+        Sign of the amplitudes at which responses are measured; 0: both. Where it is not 0, a negative amplitude is not
+        one of nature, and a diagnosis does not name it.
     variants
         Settings, fixed parameters, that a diagnosis proposes side by side.
     """

@@ -105,6 +105,14 @@ def test_twins_are_told_as_twins_with_what_parts_them():
     assert twins.judge(300.0 * t[:, 0], 1, shape_error=0.0).verdict == "effect"
 
 
+def test_an_effect_of_one_sign_is_not_named_with_the_other():
+    t = directions(2, 13)
+    bench = Bench(t, [Candidate("positive", None, (0,), positive=True), singles(2)[1]])
+    assert bench.judge(8.0 * t[:, 0], 3).verdict == "effect"
+    assert bench.judge(-8.0 * t[:, 0], 3).verdict == "unknown"
+    assert bench.judge(-8.0 * t[:, 1], 3).verdict == "effect"
+
+
 def test_simpler_of_two_nested_effects_is_first():
     """One column, and three that contain it."""
     nested = Bench(directions(3, 11), [Candidate("large", None, (0, 1, 2)), Candidate("small", None, (0,))])
