@@ -63,6 +63,7 @@ def start(folder: Path, workers: int) -> tuple[list[subprocess.Popen[bytes]], st
     """Scheduler and workers by the ordinary commands."""
     file = folder / "scheduler.json"
     single = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "DUCC0", "NUMBA")}
+    single |= {"MALLOC_TRIM_THRESHOLD_": "65536"}  # as a nanny sets it: freed memory goes back
 
     def launch(*arguments: str) -> subprocess.Popen[bytes]:
         with (folder / f"{arguments[0]}.log").open("ab") as log:
