@@ -16,6 +16,9 @@ from mcsim.survey import Channel, Survey, SurveyMap
 
 Alm = NDArray[np.complex128]
 
+LARGEST_UK = 1e12
+"""Of a user's sky."""
+
 
 @dataclass(frozen=True)
 class Observed:
@@ -244,6 +247,7 @@ def _read_alm(path: Path, lmax: int) -> Alm:
         raise InputError(f"{path} holds a_lm up to l = {found}, m = {mmax}; the sky needs both up to {lmax}.")
     if not np.all(np.isfinite(alm)):
         raise InputError(f"{path} holds a_lm that are not finite; repair the file.")
+    _check_size(path, alm)
     return alm_.resize(alm.astype(np.complex128), found, lmax)
 
 
@@ -258,4 +262,13 @@ def _read_sky_map(path: Path, lmax: int, frame: str) -> Alm:
         raise InputError(f"{path} has pixels that are not finite or unseen; a sky must be complete.")
     if lmax > 3 * nside - 1:
         raise InputError(f"{path} has nside {nside}, good to l = {3 * nside - 1}; the sky's lmax {lmax} is above it.")
-    return healpix.analysis(healpix.to_uk(unit, path) * map_, lmax, iterations=3)
+    map_uk = healpix.to_uk(unit, path) * map_
+    _check_size(path, map_uk)
+    return healpix.analysis(map_uk, lmax, iterations=3)
+
+
+def _check_size(path: Path, sky: NDArray[np.generic]) -> None:
+    """Refuse what a flipped bit makes of a number: its power would overflow."""
+    largest = float(np.max(np.abs(sky)))
+    if largest > LARGEST_UK:
+        raise InputError(f"{path} holds {largest:.3g} uK, more than any sky ({LARGEST_UK:g} uK); repair the file.")

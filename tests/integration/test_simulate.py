@@ -182,6 +182,12 @@ def test_bad_skies(tmp_path: Path) -> None:
     healpy.write_map(tmp_path / "sky_0.fits", np.ones(192), overwrite=True, dtype=np.float64)
     with pytest.raises(InputError, match=r"nside 4, good to l = 11; the sky's lmax 32"):
         realize(sky={"lmax": 32, "map": sky}, **ensemble(1))
+    healpy.write_alm(tmp_path / "sky_0.fits", np.full(alm_.size(32), 1e200 + 0j), overwrite=True)
+    with pytest.raises(InputError, match=r"holds 1e\+200 uK, more than any sky \(1e\+12 uK\)"):
+        realize(sky={"lmax": 32, "alm": sky}, **ensemble(1))
+    healpy.write_map(tmp_path / "sky_0.fits", np.full(12 * 16**2, 2e12), overwrite=True, dtype=np.float64)
+    with pytest.raises(InputError, match=r"holds 2e\+12 uK, more than"):
+        realize(sky={"lmax": 32, "map": sky}, **ensemble(1))
     (tmp_path / "sky_0.fits").write_text("nothing")
     with pytest.raises(InputError, match="cannot be read as a HEALPix map"):
         realize(sky={"lmax": 32, "map": sky}, **ensemble(1))
