@@ -13,7 +13,7 @@ from mcsim import alm as alm_
 from mcsim import config, effects, sampled, simulate
 from mcsim.diagnosis.atlas import Atlas
 from mcsim.diagnosis.blocks import Block, Entry, blocks_of
-from mcsim.diagnosis.listen import ORDERS, Model, listen, model_of, show, trusting_no_dipole
+from mcsim.diagnosis.listen import ORDERS, Model, listen, model_of, show
 from mcsim.diagnosis.scores import Score, score_of
 from mcsim.effects import Effect
 from mcsim.errors import InputError
@@ -207,7 +207,7 @@ class Job:
 def evidence_of(job: Job) -> NDArray[np.float64]:
     """Task: evidence of simulations, shape (count, entries), with the atlas behind it where it is asked for."""
     asked = _questions(job.believed, job.without)
-    shared = trusting_no_dipole(survey(config.from_json(job.simulated)))
+    shared = survey(config.from_json(job.simulated))
     rows = []
     for realization in range(job.first, job.first + job.count):
         if job.sample_by_sample:

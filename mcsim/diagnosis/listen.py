@@ -11,7 +11,7 @@ order gives the score of every beam at once.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import ducc0
 import healpy
@@ -74,7 +74,7 @@ class Model:
     Attributes
     ----------
     survey
-        Without effects, with moments up to the orders that are listened for, see :func:`trusting_no_dipole`.
+        Without effects, with moments up to the orders that are listened for.
     lmax, nside
         Degree up to which sky and scores are taken, and pixels.
     cl
@@ -137,7 +137,6 @@ def model_of(survey: Survey) -> Model:
     InputError
         If the sky has no spectrum, or a channel reads differences of two beams.
     """
-    survey = trusting_no_dipole(survey)
     if survey.cl is None:
         raise InputError("a diagnosis needs the spectrum of the sky; give sky.spectrum.")
     if survey.config.map.grid == "gl":
@@ -166,19 +165,6 @@ def model_of(survey: Survey) -> Model:
     sky_power = cl * gain / (1.0 + cl * gain)
     dipole = dipole_alm(survey.channels[0].site.dipole_uk, lmax)
     return Model(survey, lmax, nside, cl, response, tuple(parts), dipole, sky_power)
-
-
-def trusting_no_dipole(survey: Survey) -> Survey:
-    """The survey of skies whose monopole and dipole are as large as their quadrupole.
-
-    Nobody knows them to the noise of a map, and whatever changes a sky, a modulation or faint sources, changes them
-    too: what the channels have of them in common is then taken for the sky's, and only what sets one apart is left.
-    """
-    if survey.cl is None or len(survey.cl) < 3:
-        return survey
-    cl = survey.cl.copy()
-    cl[:2] = np.maximum(cl[:2], cl[2])
-    return replace(survey, cl=cl)
 
 
 def _response(channel: Channel, lmax: int) -> NDArray[np.float64]:
