@@ -15,7 +15,7 @@ from mcsim.diagnosis.attribute import Attribution, Candidate
 from mcsim.diagnosis.data import exchanges
 from mcsim.diagnosis.evidence import Job, Questions
 from mcsim.diagnosis.exhibits import exhibits
-from mcsim.diagnosis.gaussian import Null, bases, fit, residual_probability
+from mcsim.diagnosis.gaussian import Null, bases, fit
 from mcsim.diagnosis.knowledge import CONSTRAINED_SKIES, Knowledge, constrained_jobs
 from mcsim.diagnosis.listen import show
 from mcsim.diagnosis.refine import Refined, effect_at, on_this_sky, quiet_templates, refine, scatter_of
@@ -220,8 +220,7 @@ def _exchanged(court: Court, maps: Sequence[NDArray[np.float64]], found: Attribu
     names = [part.name for part in court.asked.model.parts]
     notes = []
     for order in exchanges(names):
-        y = court.null.data(court.asked.answer([maps[i] for i in order]))
-        p = float(residual_probability(float(y @ y), court.null.dimension, court.null.dof))
+        p = court.null.probability(court.asked.answer([maps[i] for i in order]))
         if p > EXCHANGED:
             moved = [f"{names[i]} as {name}" for name, i in zip(names, order, strict=True) if names[i] != name]
             notes.append(f"The model fits (p = {p:.2g}) with maps exchanged: {', '.join(moved)}.")

@@ -54,6 +54,15 @@ class Null:
         """White coordinates of templates, shape (p_raw, K) to (p, K), on the scale of :meth:`data`."""
         return self.whitening @ t / np.sqrt(1.0 + 1.0 / self.count)
 
+    def square(self, x: NDArray[np.float64]) -> float:
+        """Square of evidence, shape (p_raw,), in white coordinates."""
+        y = self.data(x)
+        return float(y @ y)
+
+    def probability(self, x: NDArray[np.float64]) -> float:
+        """Probability of a square as large as that of evidence, shape (p_raw,): a test of everything at once."""
+        return float(residual_probability(self.square(x), self.dimension, self.dof))
+
     def length(self, change: NDArray[np.float64]) -> float:
         """White length of a change of the evidence, shape (p_raw,), in standard deviations."""
         return float(np.sqrt(self.unbiased) * np.linalg.norm(self.templates(change[:, None])))

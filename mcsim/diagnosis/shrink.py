@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.gaussian import Null, residual_probability
+from mcsim.diagnosis.gaussian import Null
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Prediction:
 
 def excess(null: Null, x: NDArray[np.float64]) -> Measured:
     """Gap G of evidence, shape (p_raw,): its white square above expectation; see :func:`excess_of`."""
-    return excess_of(_square(null, x), null.dimension, null.dof)
+    return excess_of(null.square(x), null.dimension, null.dof)
 
 
 def excess_of(chi2: float, p: int, n: int) -> Measured:
@@ -108,10 +108,4 @@ def achieved(before: Null, after: Null, x: NDArray[np.float64]) -> Shrink:
     data = (4.0 * mismatch + 2.0 * p * fraction**2) * (d2 - 2) / (d2 - 4)
     scatter = 2.0 * ((p + length) ** 2 + (1.0 - fraction) ** 2 * (p + distance) ** 2) / (d2 - 4)
     sigma = float(np.sqrt(data + scatter)) / abs(first.value)
-    probability = float(residual_probability(_square(after, x), after.dimension, after.dof))
-    return Shrink(first, last, Measured(fraction, sigma), probability)
-
-
-def _square(null: Null, x: NDArray[np.float64]) -> float:
-    y = null.data(x)
-    return float(y @ y)
+    return Shrink(first, last, Measured(fraction, sigma), after.probability(x))

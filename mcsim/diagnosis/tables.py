@@ -15,7 +15,6 @@ from mcsim.diagnosis.blocks import Block, Entry
 from mcsim.diagnosis.case import Ask, Court, Diagnosis, dataset, shrink_of
 from mcsim.diagnosis.evidence import Job, Questions, questions
 from mcsim.diagnosis.exhibits import exhibits
-from mcsim.diagnosis.gaussian import residual_probability
 from mcsim.diagnosis.knowledge import Knowledge, Plan
 from mcsim.diagnosis.refine import Refined, quiet_templates, refine
 from mcsim.diagnosis.shrink import Prediction, Shrink
@@ -343,13 +342,11 @@ def _check(measured: Spectra, court: Court) -> None:
             f"{measured.path}: BipoSH are {np.median(size[~power]):.2g} times as large as the simulations', beyond "
             f"{LARGEST:g}; {unit}"
         )
-    y = court.null.data(measured.value)
-    square = float(y @ y)
-    if 1.0 - float(residual_probability(square, court.null.dimension, court.null.dof)) < TOO_QUIET:
+    if 1.0 - court.null.probability(measured.value) < TOO_QUIET:
         raise InputError(
-            f"{measured.path} departs from the model by chi^2 = {square:.2g} in {court.null.dimension} numbers, far "
-            f"less than a mean of {measured.realizations} skies can; say of how many in its meta (realizations), or "
-            "correct its unit."
+            f"{measured.path} departs from the model by chi^2 = {court.null.square(measured.value):.2g} in "
+            f"{court.null.dimension} numbers, far less than a mean of {measured.realizations} skies can; say of how "
+            "many in its meta (realizations), or correct its unit."
         )
 
 

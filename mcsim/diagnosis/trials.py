@@ -104,7 +104,7 @@ def gap(null: Null, x: NDArray[np.float64], candidates: Bases, calibration: Cali
     """Test evidence, shape (p_raw,), against everything and against every candidate, as one probability."""
     y = null.data(x)
     chi2 = float(y @ y)
-    omnibus = float(residual_probability(chi2, null.dimension, null.dof))
+    omnibus = null.probability(x)
     scores = score_probability(candidates.drops(y), chi2, candidates.sizes, null.dimension, null.dof)
     best = int(np.argmin(scores))
     return Gap(

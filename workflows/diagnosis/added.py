@@ -16,7 +16,6 @@ from mcsim import config
 from mcsim.diagnosis.batch import asking, batch
 from mcsim.diagnosis.data import read_maps
 from mcsim.diagnosis.evidence import Job, questions
-from mcsim.diagnosis.gaussian import residual_probability
 from mcsim.diagnosis.knowledge import CHUNK, seeded
 from mcsim.diagnosis.session import prepared
 
@@ -44,9 +43,8 @@ def main() -> None:
         before, after = np.split(np.concatenate(ask(jobs)), 2)
     shift = np.mean(after - before, axis=0)
     for name, evidence in (("before", x), ("after", x - shift)):
-        chi2 = float(np.sum(null.data(evidence) ** 2))
-        p = float(residual_probability(chi2, null.dimension, null.dof))
-        print(f"{name}: chi^2 {chi2:.0f} for {null.dimension} numbers from {null.count} simulations, p = {p:.2g}")
+        numbers = f"{null.dimension} numbers from {null.count} simulations"
+        print(f"{name}: chi^2 {null.square(evidence):.0f} for {numbers}, p = {null.probability(evidence):.2g}")
 
 
 if __name__ == "__main__":
