@@ -36,6 +36,9 @@ class Candidate:
         Relative error of its templates in white length; ``None``: that of the search.
     positive
         Whether an amplitude below zero is none: a set that asks for one explains nothing.
+    scatter
+        Deviations of its response from the mean one, where it draws: :meth:`~mcsim.diagnosis.gaussian.Null.widened` by
+        them is what a set that has it is judged with. ``None``: no scatter is known.
     """
 
     name: str
@@ -46,6 +49,7 @@ class Candidate:
     prior: float = 1.0
     shape_error: float | None = None
     positive: bool = False
+    scatter: NDArray[np.float64] | None = field(default=None, compare=False)
 
     @property
     def identity(self) -> tuple[str, str | None]:
@@ -167,28 +171,26 @@ def attribute(
     A subset suffices when its residual passes and no candidate of another identity is significant beside it; it is
     reported when no part of it suffices. Each of several candidates must be significant beside the others, or the
     residual is that of something unknown; and several must be more probable than an unknown effect of the same prior
-    strength in an isotropic direction. Candidates of one identity compete by evidence alone. A template that is wrong
-    by a fraction eps of its white length leaves eps^2 s_c^2 in the residual, s_c the white length of its fitted part
-    (at most that of the whole fit); the sum over members makes both tests noncentral, in the direction that hurts
-    most.
+    strength in an isotropic direction. Candidates of one identity compete by evidence alone. An effect that draws
+    scatters the evidence: sets with such a member whose scatter is known are judged with a null that is widened by it,
+    and one alone has to be significant and probable like several. A template that is wrong by a fraction eps of its
+    white length leaves eps^2 s_c^2 in the residual, s_c the white length of its fitted part (at most that of the whole
+    fit); the sum over members makes both tests noncentral, in the direction that hurts most.
     The prior of a subset is k! times the product of its candidates' shares of the weight.
     """
     groups = bases(null, t, [candidate.columns for candidate in candidates])
-    errors = np.array([shape_error if c.shape_error is None else c.shape_error for c in candidates])
-    prior = np.array([candidate.prior for candidate in candidates])
-    names = [candidate.identity for candidate in candidates]
+    searches = list(_searches(null, x, t, candidates, calibration, shape_error, largest))
     y = null.data(x)
-    search = Subsets(null, y, groups, names, prior, errors, calibration)
     found = gap(null, x, groups, calibration)
     drops = groups.drops(y)
     nearest = int(np.argmax(drops))
     signal = null.unbiased * drops[nearest] - groups.sizes[nearest]
-    excess = max(null.unbiased * search.total - null.dimension, signal, 1e-300)
+    excess = max(null.unbiased * float(y @ y) - null.dimension, signal, 1e-300)
     explanations: tuple[Explanation, ...] = ()
     if found.probability <= alpha:
-        possible = partial(_possible, null, x, t, candidates)
-        accepted = _accepted(search, levels, largest, np.log(odds_cut), possible)
-        explanations = tuple(_explanations(null, x, t, candidates, accepted, np.log(odds_cut)))
+        possible = partial(_possible, x, t, candidates)
+        accepted = _accepted(searches, levels, largest, np.log(odds_cut), possible)
+        explanations = tuple(_explanations(x, t, candidates, accepted, np.log(odds_cut)))
     return Attribution(
         verdict=_verdict(found.probability > alpha, explanations),
         gap=found,
@@ -211,21 +213,47 @@ def _verdict(agrees: bool, explanations: Sequence[Explanation]) -> Verdict:
     return "mixture" if len(explanations[0].members) > 1 else "effect"
 
 
+def _searches(
+    null: Null,
+    x: NDArray[np.float64],
+    t: NDArray[np.float64],
+    candidates: Sequence[Candidate],
+    calibration: Calibration,
+    shape_error: float,
+    largest: int,
+) -> Iterator[Subsets]:
+    """One for subsets without a member whose scatter is known, first, and one for each combination of such members."""
+    columns, names = [c.columns for c in candidates], [c.identity for c in candidates]
+    prior = np.array([candidate.prior for candidate in candidates])
+    errors = np.array([shape_error if c.shape_error is None else c.shape_error for c in candidates])
+    scatters = {index: c.scatter for index, c in enumerate(candidates) if c.scatter is not None}
+    for size in range(largest + 1):
+        for drawn in combinations(scatters, size):
+            if len({names[index] for index in drawn}) < size:
+                continue
+            wide = null
+            for index in drawn:
+                wide = wide.widened(scatters[index])
+            groups = bases(wide, t, columns)
+            yield Subsets(wide, wide.data(x), groups, names, prior, errors, calibration, scatters, drawn)
+
+
 @dataclass(frozen=True, order=True)
 class _Accepted:
-    """A minimal sufficient subset; ordered by evidence."""
+    """A minimal sufficient subset, and the null that it was judged with; ordered by evidence."""
 
     evidence: float
     members: tuple[int, ...]
     probability: float
     further: float
+    null: Null = field(compare=False)
 
 
 def _possible(
-    null: Null,
     x: NDArray[np.float64],
     t: NDArray[np.float64],
     candidates: Sequence[Candidate],
+    null: Null,
     members: tuple[int, ...],
 ) -> bool:
     """Whether no member would need an amplitude that it cannot have."""
@@ -237,39 +265,53 @@ def _possible(
 
 
 def _accepted(
-    search: Subsets, levels: tuple[float, float], largest: int, cut: float, possible: Callable[[tuple[int, ...]], bool]
+    searches: Sequence[Subsets],
+    levels: tuple[float, float],
+    largest: int,
+    cut: float,
+    possible: Callable[[Null, tuple[int, ...]], bool],
 ) -> list[_Accepted]:
     """Minimal sufficient subsets that are possible, unless their evidence is below the best one's by over ``cut``."""
     accepted: list[_Accepted] = []
-    best = -np.inf
+    best, unknown = -np.inf, searches[0].unknown
     for size in range(1, largest + 1):
-        fresh = []
-        # With thousands of sets to choose from, some triple comes close to anything.
-        least = max(best - cut, search.unknown if size > 1 else -np.inf)
-        for subsets in search.rows(size, [found.members for found in accepted]):
-            solved = search.solve(subsets)
-            passing = np.flatnonzero((solved.probability > levels[0]) & (solved.evidence >= least))
-            for first in range(0, len(passing), CHUNK):
-                rows = passing[first : first + CHUNK]
-                further = search.further(subsets[rows], solved.chi2[rows], solved.allowance[rows])
-                alone = further > levels[1]
-                if size > 1:
-                    alone &= search.least_needed(subsets[rows]) <= levels[1]
-                for row, beside in zip(rows[alone], further[alone], strict=True):
-                    members = tuple(int(member) for member in subsets[row])
-                    if possible(members):
-                        fresh.append(
-                            _Accepted(
-                                float(solved.evidence[row]), members, float(solved.probability[row]), float(beside)
-                            )
-                        )
+        fresh: list[_Accepted] = []
+        for search in searches:
+            # With thousands of sets to choose from, some triple comes close to anything; so does a wide scatter.
+            doubted = size > 1 or bool(search.drawn)
+            least = max(best - cut, unknown if doubted else -np.inf)
+            for subsets in search.rows(size, [found.members for found in accepted]):
+                fresh += _sufficient(search, subsets, levels, least, doubted, possible)
         accepted += fresh
         best = max([best, *(found.evidence for found in fresh)])
     return accepted
 
 
+def _sufficient(
+    search: Subsets,
+    subsets: NDArray[np.int64],
+    levels: tuple[float, float],
+    least: float,
+    doubted: bool,
+    possible: Callable[[Null, tuple[int, ...]], bool],
+) -> Iterator[_Accepted]:
+    """Of subsets of the same ranks those that suffice; of doubted ones every member has to be significant."""
+    solved = search.solve(subsets)
+    passing = np.flatnonzero((solved.probability > levels[0]) & (solved.evidence >= least))
+    for first in range(0, len(passing), CHUNK):
+        rows = passing[first : first + CHUNK]
+        further = search.further(subsets[rows], solved.chi2[rows], solved.allowance[rows])
+        alone = further > levels[1]
+        if doubted:
+            alone &= search.least_needed(subsets[rows]) <= levels[1]
+        for row, beside in zip(rows[alone], further[alone], strict=True):
+            members = tuple(int(member) for member in subsets[row])
+            if possible(search.null, members):
+                numbers = float(solved.evidence[row]), members, float(solved.probability[row]), float(beside)
+                yield _Accepted(*numbers, search.null)
+
+
 def _explanations(
-    null: Null,
     x: NDArray[np.float64],
     t: NDArray[np.float64],
     candidates: Sequence[Candidate],
@@ -285,7 +327,7 @@ def _explanations(
         if lost <= cut and identity not in seen:
             seen.add(identity)
             columns = [column for member in found.members for column in candidates[member].columns]
-            best = fit(null, x, t[:, columns])
+            best = fit(found.null, x, t[:, columns])
             yield Explanation(found.members, best, float(np.exp(-lost)), found.probability, found.further)
 
 

@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.diagnosis.attribute import Attribution, Candidate
+from mcsim.diagnosis.closest import Closest, closest
 from mcsim.diagnosis.data import exchanges
 from mcsim.diagnosis.evidence import Job, Questions
 from mcsim.diagnosis.exhibits import exhibits
 from mcsim.diagnosis.gaussian import Null, bases, fit
 from mcsim.diagnosis.knowledge import CONSTRAINED_SKIES, Knowledge, constrained_jobs
 from mcsim.diagnosis.listen import show
-from mcsim.diagnosis.refine import Refined, effect_at, on_this_sky, quiet_templates, refine, scatter_of
-from mcsim.diagnosis.shrink import Prediction, Shrink, achieved, predicted
+from mcsim.diagnosis.refine import Refined, Respond, effect_at, on_this_sky, quiet_templates, refine, scatter_of
+from mcsim.diagnosis.shrink import Measured, Prediction, Shrink, achieved, excess, predicted
 from mcsim.diagnosis.trials import Calibration, calibrate, gap
 from mcsim.diagnosis.verdict import detectable_of, sentence, verdict_of
 from mcsim.diagnosis.where import Place, places
@@ -109,7 +110,7 @@ def court(run: config.RunConfig, asked: Questions, known: Knowledge) -> Court:
             settings=proposal.settings,
             unit=proposal.kind.unit,
             # What an effect draws at random is not known even where the sky is.
-            shape_error=min(float(own), 1.0) if proposal.kind.draws else None,
+            shape_error=min(float(own), 1.0) if proposal.drawn else None,
             positive=proposal.kind.side != 0,
         )
         for proposal, columns, own in zip(asked.proposals, asked.columns, scatter, strict=True)
@@ -139,12 +140,13 @@ def judge(court: Court, case: str, maps: Sequence[NDArray[np.float64]], ask: Ask
     observed = show(asked.model, maps)
     without: list[NDArray[np.float64]] = []
 
-    def respond(found: Sequence[config.Effect]) -> Vector:
-        if not without:
-            without.append(np.concatenate(ask(constrained_jobs(court.run, asked, (), observed))))
-        after = np.concatenate(ask(constrained_jobs(court.run, asked, found, observed)))
-        change: Vector = np.mean(after - without[0], axis=0)
-        return change
+    def respond(found: Sequence[config.Effect], skies: int) -> NDArray[np.float64]:
+        if len(without) < skies:
+            jobs = constrained_jobs(court.run, asked, (), observed, len(without), skies)
+            without.extend(np.concatenate(ask(jobs)))
+        after = np.concatenate(ask(constrained_jobs(court.run, asked, found, observed, 0, skies)))
+        changes: NDArray[np.float64] = after - np.stack(without[:skies])
+        return changes
 
     t = quiet_templates(known)
     groups = bases(court.null, t, [candidate.columns for candidate in court.candidates])
@@ -161,21 +163,28 @@ def judge(court: Court, case: str, maps: Sequence[NDArray[np.float64]], ask: Ask
         shrink = shrink_of(court, x, refined, respond)
     where = _where(court, x, numbers)
     able = detectable_of(court.null, refined.templates, court.candidates, asked.proposals)
-    verdict = verdict_of(case, found, court.candidates, asked.proposals, where, shrink, able, notes)
+    heard = None if notes else heard_of(court, x, refined, found)
+    verdict = verdict_of(case, found, court.candidates, asked.proposals, where, shrink, able, notes, heard)
     shown = exhibits(asked.model, maps, known.simulations, court.null, found, court.candidates, asked.proposals)
     told = dataset(court, x, replace(refined, attribution=found), where, verdict)
     evidence = told.merge(shown, combine_attrs="no_conflicts")
     return Diagnosis(verdict, evidence, found)
 
 
-def shrink_of(
-    court: Court, x: Vector, refined: Refined, respond: Callable[[Sequence[config.Effect]], Vector]
-) -> tuple[Prediction, Shrink, str] | None:
+def heard_of(court: Court, x: Vector, refined: Refined, found: Attribution) -> Closest | None:
+    """What of the library is heard in a gap that it does not explain."""
+    if found.verdict != "unknown":
+        return None
+    return closest(court.null, x, refined.templates, court.candidates, court.calibration)
+
+
+def shrink_of(court: Court, x: Vector, refined: Refined, respond: Respond) -> tuple[Prediction, Shrink, str] | None:
     """Fit one half of the evidence, freeze, add to the simulator, and look at the other half.
 
     The best explanation is fitted to the entries of fold 0 alone; the ensemble is simulated again with its effects; the
-    gap of the entries of fold 1, whose noise is independent, is measured against both ensembles. None where one half
-    hardly hears the effect: without splits the halves are degrees and pixels, which say little of beams and pointing.
+    gap of the entries of fold 1, whose noise is independent, is measured against both ensembles, the second one
+    scattered by what draws. None where one half hardly hears the effect: without splits the halves are degrees and
+    pixels, which say little of beams and pointing.
     """
     folds = np.array([-1 if entry.fold is None else entry.fold for entry in court.asked.entries])
     used, fresh = np.flatnonzero(folds == 0), np.flatnonzero(folds == 1)
@@ -187,8 +196,10 @@ def shrink_of(
     heard = min(court.known.null(rows).length(change[rows]) for rows in (used, fresh))
     if heard < HEARD * court.null.length(change):
         return None
-    frozen = fit(court.known.null(used), x[used], refined.templates[np.ix_(used, np.array(columns))])
-    before = court.known.null(fresh)
+    chosen = np.array(columns)
+    scatters = [one for one in (refined.candidates[member].scatter for member in members) if one is not None]
+    learning, before = court.known.null(used), court.known.null(fresh)
+    frozen = fit(_widened(learning, scatters, used), x[used], refined.templates[np.ix_(used, chosen)])
     try:
         tables, start = [], 0
         for member in members:
@@ -197,13 +208,29 @@ def shrink_of(
             effect = effect_at(proposal, frozen.amplitudes[start:stop], frozen.covariance[start:stop, start:stop])
             tables.append(proposal.table(effect))
             start = stop
-        after = replace(before, mean=before.mean + respond(tables)[fresh])
+        mean = before.mean + respond(tables, CONSTRAINED_SKIES).mean(axis=0)[fresh]
     except InputError:
         return None  # half of the evidence asks for an amplitude that the effect cannot have
-    expected = predicted(
-        before, x[fresh], refined.templates[np.ix_(fresh, np.array(columns))], frozen.amplitudes, frozen.covariance
-    )
+    after = _widened(replace(before, mean=mean), scatters, fresh)
+    here, left = refined.templates[np.ix_(fresh, chosen)], x - refined.templates[:, chosen] @ frozen.amplitudes
+    wider = None
+    if scatters:
+        # Both halves see the same draw: what the mean response leaves in one is in the other too.
+        share = _trace(before, scatters, fresh) / _trace(learning, scatters, used)
+        seen = excess(learning, left[used])
+        wider = Measured(share * max(seen.value, 0.0), share * seen.sigma)
+    expected = predicted(before, x[fresh], here, frozen.amplitudes, frozen.covariance, wider)
     return expected, achieved(before, after, x[fresh]), _fresh_words(court)
+
+
+def _widened(null: Null, scatters: Sequence[NDArray[np.float64]], rows: NDArray[np.int64]) -> Null:
+    for scatter in scatters:
+        null = null.widened(scatter[rows])
+    return null
+
+
+def _trace(null: Null, scatters: Sequence[NDArray[np.float64]], rows: NDArray[np.int64]) -> float:
+    return sum(null.length(draw) ** 2 for scatter in scatters for draw in scatter[rows].T)
 
 
 def _fresh_words(court: Court) -> str:

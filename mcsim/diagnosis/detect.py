@@ -156,7 +156,7 @@ def log_likelihood(null: Null, chi2: ArrayLike) -> NDArray[np.float64]:
     -(n - p + 2)/2 log(1 + chi2/n): the Student t that the exact tests imply, with the covariance marginalised under the
     prior whose intervals match them (Percival et al., MNRAS 510, 3207, 2022); Gaussian for infinitely many simulations.
     """
-    return -0.5 * (null.dof - null.dimension + 2.0) * np.log1p(np.asarray(chi2) / null.dof)
+    return null.log_volume - 0.5 * (null.dof - null.dimension + 2.0) * np.log1p(np.asarray(chi2) / null.dof)
 
 
 def _precision(null: Null, chi2: ArrayLike) -> NDArray[np.float64]:

@@ -46,6 +46,11 @@ class Proposal:
         where = self.channel or "all"
         return f"{self.kind.name} ({where}{', ' + settings if settings else ''})"
 
+    @property
+    def drawn(self) -> bool:
+        """Whether the responses that are measured of it are draws: not those of an effect that is only taken away."""
+        return self.kind.draws and self.kind.side >= 0
+
     def with_parameters(self, coordinates: NDArray[np.float64], precision: NDArray[np.float64]) -> Effect:
         """The effect nearest to fitted coordinates."""
         return replace(self.kind.nearest(coordinates, precision), **self.settings)

@@ -1,7 +1,7 @@
 """Exact tests of a vector against few simulations: everything, a template, several, and what they leave."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,11 +25,14 @@ class Null:
         Shape (p, p_raw), p <= p_raw: entries that repeat one another are compressed.
     count
         Number N of simulations; n = N - 1.
+    log_volume
+        Logarithm of the factor by which :meth:`widened` has shrunk volumes in white coordinates.
     """
 
     mean: NDArray[np.float64]
     whitening: NDArray[np.float64]
     count: int
+    log_volume: float = 0.0
 
     @property
     def dimension(self) -> int:
@@ -67,6 +70,27 @@ class Null:
         """White length of a change of the evidence, shape (p_raw,), in standard deviations."""
         return float(np.sqrt(self.unbiased) * np.linalg.norm(self.templates(change[:, None])))
 
+    def widened(self, deviations: NDArray[np.float64]) -> "Null":
+        """With a further Gaussian scatter R, known by draws.
+
+        Parameters
+        ----------
+        deviations
+            R = deviations @ deviations.T, shape (p_raw, draws): draws less their mean over sqrt(draws - 1).
+
+        Notes
+        -----
+        Draws are fewer than entries: R is drawn towards its mean eigenvalue as far as minimises the expected error
+        (Ledoit & Wolf, J. Multivariate Anal. 88, 365, 2004). White coordinates are turned by (1 + R)^(-1/2), so that
+        all tests stay what they are, and exact where R is.
+        """
+        white = np.sqrt(self.unbiased) * self.templates(deviations)
+        values, vectors = np.linalg.eigh(np.eye(self.dimension) + _shrunk(white))
+        turn = (vectors / np.sqrt(values)) @ vectors.T
+        return replace(
+            self, whitening=turn @ self.whitening, log_volume=self.log_volume - 0.5 * float(np.sum(np.log(values)))
+        )
+
 
 def null(simulations: NDArray[np.float64], offset: NDArray[np.float64] | None = None, floor: float = 1e-8) -> Null:
     """Null of an ensemble.
@@ -101,6 +125,19 @@ def null(simulations: NDArray[np.float64], offset: NDArray[np.float64] | None = 
         )
     whitening = np.sqrt(count - 1.0) * right[kept] / singular[kept, None] / scale
     return Null(mean if offset is None else mean + offset, whitening, count)
+
+
+def _shrunk(white: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Covariance of draws, shape (p, draws), between theirs and a multiple of one."""
+    p, draws = white.shape
+    found = white @ white.T
+    mean = float(np.trace(found)) / p
+    distance = float(np.sum(found**2)) - p * mean**2
+    # Sum over draws z of |z z' - R|^2, with z = sqrt(draws - 1) times a column.
+    sizes = np.sum(white**2, axis=0)
+    own = (draws - 1.0) ** 2 * float(np.sum(sizes**2)) - (draws - 2.0) * float(np.sum(found**2))
+    weight = min(max(own, 0.0) / draws**2 / distance, 1.0) if distance > 0.0 else 1.0
+    return (1.0 - weight) * found + weight * mean * np.eye(p)
 
 
 def residual_probability(

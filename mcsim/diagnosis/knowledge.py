@@ -32,6 +32,12 @@ NOISY_SKIES = 24
 CONSTRAINED_SKIES = 8
 """Skies that agree with the observed one, on which what was found is simulated."""
 
+SCATTER_SKIES = 24
+"""The same where the scatter of an effect that draws is wanted."""
+
+PIECE = 4
+"""Of those, in a task."""
+
 REFEREE_SKIES = 6
 """Skies seen sample by sample, that the default route is compared with."""
 
@@ -211,13 +217,20 @@ def after_jobs(
 
 
 def constrained_jobs(
-    run: config.RunConfig, asked: Questions, found: Sequence[config.Effect], observed: NDArray[np.complex128]
+    run: config.RunConfig,
+    asked: Questions,
+    found: Sequence[config.Effect],
+    observed: NDArray[np.complex128],
+    first: int = 0,
+    last: int = CONSTRAINED_SKIES,
 ) -> list[Job]:
     """Simulations of the model with effects at frozen amplitudes, over skies that agree with an observed one."""
     believed = config.to_json(run)
     simulated = config.to_json(with_effects(seeded(run, _RESPONSE), found))
-    half = CONSTRAINED_SKIES // 2
-    return [Job(believed, simulated, first, half, False, asked.without, False, observed) for first in (0, half)]
+    return [
+        Job(believed, simulated, start, min(PIECE, last - start), False, asked.without, False, observed)
+        for start in range(first, last, PIECE)
+    ]
 
 
 def _basis(asked: Questions) -> Iterator[tuple[int, int, int, Any]]:
@@ -231,7 +244,7 @@ def _basis(asked: Questions) -> Iterator[tuple[int, int, int, Any]]:
 
 def skies(proposal: Proposal) -> int:
     """Number of skies that the response to a proposal is the mean of."""
-    if proposal.kind.draws:
+    if proposal.drawn:
         return NOISY_SKIES
     return SKIES if proposal.channel is not None else COMMON_SKIES
 

@@ -1,7 +1,7 @@
 """Responses at the amplitudes that were found, where they are too strong for a straight line."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,14 +10,15 @@ from mcsim import config
 from mcsim.diagnosis.attribute import Attribution, Candidate, attribute
 from mcsim.diagnosis.evidence import Proposal, Questions
 from mcsim.diagnosis.gaussian import Null
-from mcsim.diagnosis.knowledge import Knowledge, skies
+from mcsim.diagnosis.knowledge import CONSTRAINED_SKIES, SCATTER_SKIES, Knowledge
+from mcsim.diagnosis.knowledge import skies as skies_of
 from mcsim.diagnosis.trials import Calibration
 from mcsim.effects import Effect
 from mcsim.errors import InputError
 
 Vector = NDArray[np.float64]
-Respond = Callable[[Sequence[config.Effect]], Vector]
-"""From effects to the mean change of the evidence, by simulation."""
+Respond = Callable[[Sequence[config.Effect], int], NDArray[np.float64]]
+"""From effects and a number of skies to the changes of the evidence in each of these, by simulation."""
 
 ROUNDS = 4
 STRAIGHT = 0.5
@@ -31,6 +32,9 @@ SCATTERED = 0.1
 
 CLEAN = 5.0
 """Of a noisy template, what is smaller than this many of its standard errors is none."""
+
+HEARD = 0.05
+"""Probability, trials included, from which on an effect that draws is tried where no single one suffices."""
 
 TRIED = 3
 """Single candidates, those that lower chi^2 most, that are brought to their amplitude where no subset suffices."""
@@ -46,12 +50,15 @@ class Refined:
         Final.
     templates
         As it used them, shape (p, K).
+    candidates
+        With the scatter of those that draw, at the amplitudes that they were tried at.
     simulated
         Candidates whose response was simulated at its amplitude.
     """
 
     attribution: Attribution
     templates: NDArray[np.float64]
+    candidates: tuple[Candidate, ...]
     simulated: tuple[int, ...]
 
 
@@ -77,7 +84,7 @@ def scatter_of(known: Knowledge, asked: Questions) -> NDArray[np.float64]:
         rows = list(columns)
         # A column of nothing but noise says nothing of the others.
         heard = size[rows] > 2.0 * noise[rows]
-        ratio = skies(proposal) * noise[rows] / np.maximum(size[rows] - noise[rows], 1e-300)
+        ratio = skies_of(proposal) * noise[rows] / np.maximum(size[rows] - noise[rows], 1e-300)
         found.append(float(np.sqrt(np.mean(ratio[heard]))) if heard.any() else np.inf)
     return np.array(found)
 
@@ -86,11 +93,11 @@ def on_this_sky(known: Knowledge, asked: Questions, t: NDArray[np.float64], resp
     """Templates, those of effects whose response depends on the very sky measured on the one that was observed."""
     result = t.copy()
     for proposal, columns, scatter in zip(asked.proposals, asked.columns, scatter_of(known, asked), strict=True):
-        if scatter < SCATTERED or proposal.kind.draws:
+        if scatter < SCATTERED or proposal.drawn:
             continue
         for column, basis in zip(columns, proposal.basis, strict=True):
             try:
-                response = respond([proposal.table(basis)])
+                response = respond([proposal.table(basis)], CONSTRAINED_SKIES).mean(axis=0)
             except InputError:
                 continue
             step = basis.coordinates()[columns.index(column)]
@@ -113,6 +120,7 @@ def refine(
     proposals: Sequence[Proposal],
     calibration: Calibration,
     respond: Respond,
+    skies: int = 1,
 ) -> Refined:
     """Attribute, simulate what was found at its amplitude, and attribute again until nothing changes.
 
@@ -120,38 +128,49 @@ def refine(
     -----
     A response mu, simulated at coordinates theta, changes its templates t to t + (mu - t theta) theta'/theta'theta:
     the secant, exact there. A candidate that can have neither the fitted amplitude nor half of it is taken
-    out.
+    out. Of one that draws the scatter of the response is kept, that of the mean of ``skies`` skies.
     """
-    t = t.copy()
+    t, tried = t.copy(), list(candidates)
     done: dict[int, Vector] = {}
-    found = attribute(null, x, t, candidates, calibration)
+    found = attribute(null, x, t, tried, calibration)
     for _ in range(ROUNDS):
         changed = False
-        for index, coordinates, covariance in _to_try(found, candidates):
-            columns = list(candidates[index].columns)
-            if not _bent(known, null, columns, coordinates) or _close(done.get(index), coordinates, covariance):
+        for index, coordinates, covariance in _to_try(found, tried, proposals, calibration):
+            columns, proposal = list(candidates[index].columns), proposals[index]
+            bent = _bent(known, null, columns, coordinates)
+            draws = proposal.kind.draws and (proposal.kind.side == 0 or coordinates[0] > 0.0)
+            if not (bent or draws) or _close(done.get(index), coordinates, covariance):
                 continue
             done[index] = coordinates
-            answer = _simulated(proposals[index], coordinates, covariance, respond)
+            answer = _simulated(
+                proposal, coordinates, covariance, respond, SCATTER_SKIES if draws else CONSTRAINED_SKIES
+            )
             changed = True
             if answer is None:
                 t[:, columns] = 0.0
                 continue
-            at, response = answer
+            at, changes = answer
             size = float(at @ at)
             if size == 0.0:
                 continue
-            t[:, columns] += np.outer(response - t[:, columns] @ at, at) / size
+            response = changes.mean(axis=0)
+            if draws:
+                # That of one draw about the mean of as many as there are.
+                share = (1.0 / skies + 1.0 / len(changes)) / (len(changes) - 1.0)
+                scatter = np.sqrt(share) * (changes - response).T
+                tried[index] = replace(tried[index], scatter=scatter, shape_error=None)
+            if bent:
+                t[:, columns] += np.outer(response - t[:, columns] @ at, at) / size
         if not changed:
             break
-        found = attribute(null, x, t, candidates, calibration)
-    return Refined(found, t, tuple(done))
+        found = attribute(null, x, t, tried, calibration)
+    return Refined(found, t, tuple(tried), tuple(done))
 
 
 def _simulated(
-    proposal: Proposal, coordinates: Vector, covariance: NDArray[np.float64], respond: Respond
-) -> tuple[Vector, Vector] | None:
-    """Coordinates and response, at the fitted amplitude or half of it; None where the effect can have neither.
+    proposal: Proposal, coordinates: Vector, covariance: NDArray[np.float64], respond: Respond, skies: int
+) -> tuple[Vector, NDArray[np.float64]] | None:
+    """Coordinates and responses, at the fitted amplitude or half of it; None where the effect can have neither.
 
     What is fitted by a straight line may lie somewhat beyond what the effect can be, and the effect be there; what
     would have to lie far beyond explains nothing.
@@ -159,13 +178,15 @@ def _simulated(
     for factor in (1.0, 0.5):
         try:
             effect = effect_at(proposal, factor * coordinates, covariance / factor**2)
-            return effect.coordinates(), respond([proposal.table(effect)])
+            return effect.coordinates(), respond([proposal.table(effect)], skies)
         except InputError:
             continue
     return None
 
 
-def _to_try(found: Attribution, candidates: Sequence[Candidate]) -> list[tuple[int, Vector, NDArray[np.float64]]]:
+def _to_try(
+    found: Attribution, candidates: Sequence[Candidate], proposals: Sequence[Proposal], calibration: Calibration
+) -> list[tuple[int, Vector, NDArray[np.float64]]]:
     """Candidates with fitted coordinates: those of the best explanations, or the best single ones."""
     work: dict[int, tuple[int, Vector, NDArray[np.float64]]] = {}
     if found.verdict == "none":
@@ -177,11 +198,18 @@ def _to_try(found: Attribution, candidates: Sequence[Candidate]) -> list[tuple[i
             fit = explanation.fit
             work.setdefault(member, (member, fit.amplitudes[start:stop], fit.covariance[start:stop, start:stop]))
             start = stop
-    # Singles too: a strong effect bends its response until only a mixture seems to do.
-    for index in np.argsort([-single.drop for single in found.singles])[:TRIED]:
-        single = found.singles[index]
-        if len(work) == 0 or any(len(explanation.members) > 1 for explanation in found.explanations[:1]):
-            work.setdefault(int(index), (int(index), single.amplitudes, single.covariance))
+    if found.explanations and len(found.explanations[0].members) == 1:
+        return list(work.values())
+    # Singles too: a strong effect bends its response, and one that draws scatters it, until only a mixture seems to do.
+    ranked = [int(index) for index in np.argsort([-single.drop for single in found.singles])]
+    drawing: set[tuple[str, str | None]] = {candidates[index].identity for index in work if proposals[index].kind.draws}
+    for place, index in enumerate(ranked):
+        single, candidate = found.singles[index], candidates[index]
+        heard = proposals[index].kind.draws and float(calibration.trials(single.score)) <= HEARD
+        if place < TRIED or (heard and candidate.identity not in drawing):
+            work.setdefault(index, (index, single.amplitudes, single.covariance))
+            if proposals[index].kind.draws:
+                drawing.add(candidate.identity)
     return list(work.values())
 
 

@@ -58,6 +58,7 @@ def predicted(
     t: NDArray[np.float64],
     amplitudes: NDArray[np.float64],
     covariance: NDArray[np.float64],
+    scatter: Measured | None = None,
 ) -> Prediction:
     """Shrink to expect on data that the fit did not use.
 
@@ -69,6 +70,8 @@ def predicted(
         Templates of the frozen parameters in that evidence, shape (p_test, K).
     amplitudes, covariance
         From the fit to other data, shape (K,), (K, K).
+    scatter
+        White square that a draw about the mean response adds to the gap, and that simulations will have too.
 
     Notes
     -----
@@ -81,6 +84,8 @@ def predicted(
     product = fisher @ covariance
     drop = float(amplitudes @ fisher @ amplitudes) - 2.0 * float(np.trace(product))
     variance = 4.0 * float(amplitudes @ product @ fisher @ amplitudes) + 4.0 * float(np.trace(product @ product))
+    if scatter is not None:
+        drop, variance = drop + scatter.value, variance + scatter.sigma**2
     before = excess(test, x)
     fraction = drop / before.value
     sigma = float(np.hypot(np.sqrt(variance), fraction * before.sigma)) / abs(before.value)

@@ -1,6 +1,6 @@
 """All subsets of the candidates: their fits, their evidence, and whether anything else is significant beside them."""
 
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Collection, Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -42,6 +42,9 @@ class Subsets:
         Identity of each: candidates that share it exclude each other.
     prior, errors
         Weight, and relative error of the templates, shape (C,).
+    drawing, drawn
+        Candidates that scatter the evidence, and those of them whose scatter is the null's: subsets are those that have
+        the latter and none of the others.
     """
 
     def __init__(
@@ -53,8 +56,11 @@ class Subsets:
         prior: NDArray[np.float64],
         errors: NDArray[np.float64],
         calibration: Calibration,
+        drawing: Collection[int] = (),
+        drawn: Collection[int] = (),
     ) -> None:
         self.null, self.calibration = null, calibration
+        self.drawing, self.drawn = drawing, drawn
         self.total = float(y @ y)
         self.start, self.sizes, self.errors = groups.start, groups.sizes, errors
         self.gram = groups.basis.T @ groups.basis
@@ -73,6 +79,8 @@ class Subsets:
         kept = np.ones(len(rows), dtype=bool)
         for i, j in combinations(range(size), 2):
             kept &= self.identity[rows[:, i]] != self.identity[rows[:, j]]
+        for member in self.drawing:
+            kept &= np.any(rows == member, axis=1) == (member in self.drawn)
         for part in accepted:
             kept &= ~np.all([np.any(rows == member, axis=1) for member in part], axis=0)
         rows = rows[kept]
@@ -116,11 +124,14 @@ class Subsets:
         whole = self.solve(subsets)
         largest = np.zeros(len(subsets))
         for place in range(subsets.shape[1]):
-            others = self.solve(np.delete(subsets, place, axis=1))
+            others = np.delete(subsets, place, axis=1)
+            chi2, allowance = np.full(len(subsets), self.total), np.zeros(len(subsets))
+            if others.shape[1]:
+                without = self.solve(others)
+                chi2, allowance = without.chi2, without.allowance
             rank = self.sizes[subsets[:, place]]
             dimension = self.null.dimension - (self.sizes[subsets].sum(axis=1) - rank)
-            drop = others.chi2 - whole.chi2
-            scores = score_probability(drop, others.chi2, rank, dimension, self.null.dof, others.allowance)
+            scores = score_probability(chi2 - whole.chi2, chi2, rank, dimension, self.null.dof, allowance)
             largest = np.maximum(largest, self.calibration.trials(scores))
         return largest
 

@@ -1,6 +1,6 @@
 """Measured spectra instead of maps: a table of binned BipoSH coefficients, or C_l, against simulations of the model."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,11 +12,11 @@ from mcsim import config, effects, simulate
 from mcsim.biposh import Mode
 from mcsim.diagnosis import knowledge
 from mcsim.diagnosis.blocks import Block, Entry
-from mcsim.diagnosis.case import Ask, Court, Diagnosis, dataset, shrink_of
+from mcsim.diagnosis.case import Ask, Court, Diagnosis, dataset, heard_of, shrink_of
 from mcsim.diagnosis.evidence import Job, Questions, questions
 from mcsim.diagnosis.exhibits import exhibits
 from mcsim.diagnosis.knowledge import Knowledge, Plan
-from mcsim.diagnosis.refine import Refined, quiet_templates, refine
+from mcsim.diagnosis.refine import Refined, Respond, quiet_templates, refine
 from mcsim.diagnosis.shrink import Prediction, Shrink
 from mcsim.diagnosis.verdict import detectable_of, verdict_of
 from mcsim.diagnosis.where import Place, places
@@ -307,19 +307,23 @@ def judge(court: Court, case: str, measured: Spectra, ask: Ask) -> Diagnosis:
     asked, known, x = court.asked, court.known, measured.value
     _check(measured, court)
 
-    def respond(found: Sequence[config.Effect]) -> Vector:
+    def respond(found: Sequence[config.Effect], skies: int) -> NDArray[np.float64]:
+        # Whatever number is asked for: each of these skies has its spectra already.
         after = np.concatenate(ask(_after(court.run, asked, found)))
-        change: Vector = np.mean(after - known.reference[: len(after)], axis=0)
-        return change
+        changes: NDArray[np.float64] = after - known.reference[: len(after)]
+        return changes
 
     t = quiet_templates(known)
-    refined = refine(known, court.null, x, t, court.candidates, asked.proposals, court.calibration, respond)
+    refined = refine(
+        known, court.null, x, t, court.candidates, asked.proposals, court.calibration, respond, measured.realizations
+    )
     found = refined.attribution
     shrink = _shrink(court, x, refined, respond) if found.explanations else None
     where = _where(measured, known.simulations)
     able = detectable_of(court.null, refined.templates, court.candidates, asked.proposals)
     notes = list(_notes(measured, known.simulations))
-    verdict = verdict_of(case, found, court.candidates, asked.proposals, where, shrink, able, notes)
+    heard = heard_of(court, x, refined, found)
+    verdict = verdict_of(case, found, court.candidates, asked.proposals, where, shrink, able, notes, heard)
     # Of no sky: a table has no maps to show.
     dark = [np.zeros(12 * asked.model.nside**2) for _ in asked.model.parts]
     shown = exhibits(asked.model, dark, known.simulations, court.null, found, court.candidates, asked.proposals)
@@ -359,17 +363,17 @@ def _notes(measured: Spectra, simulations: NDArray[np.float64]) -> Iterator[str]
         )
 
 
-def _shrink(
-    court: Court, x: Vector, refined: Refined, respond: Callable[[Sequence[config.Effect]], Vector]
-) -> tuple[Prediction, Shrink, str] | None:
+def _shrink(court: Court, x: Vector, refined: Refined, respond: Respond) -> tuple[Prediction, Shrink, str] | None:
     """As :func:`shrink_of`, with fresh entries from which the others predict nothing."""
     turn, words = _independent(court)
     known = replace(court.known, simulations=court.known.simulations @ turn.T, offset=turn @ court.known.offset)
+    turned = replace(
+        refined,
+        templates=turn @ refined.templates,
+        candidates=tuple(c if c.scatter is None else replace(c, scatter=turn @ c.scatter) for c in refined.candidates),
+    )
     found = shrink_of(
-        replace(court, known=known),
-        turn @ x,
-        replace(refined, templates=turn @ refined.templates),
-        lambda effects: turn @ respond(effects),
+        replace(court, known=known), turn @ x, turned, lambda effects, skies: respond(effects, skies) @ turn.T
     )
     return None if found is None else (found[0], found[1], words)
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.diagnosis.attribute import Attribution, Candidate, Explanation
+from mcsim.diagnosis.closest import Closest
 from mcsim.diagnosis.detect import detectable
 from mcsim.diagnosis.evidence import Proposal
 from mcsim.diagnosis.gaussian import Null
@@ -21,9 +22,9 @@ SETS = 2
 
 
 def effects_of(
-    explanation: Explanation, candidates: Sequence[Candidate], proposals: Sequence[Proposal]
+    explanation: Explanation | Closest, candidates: Sequence[Candidate], proposals: Sequence[Proposal]
 ) -> list[dict[str, Any]]:
-    """The effects of an explanation with amplitude, standard error, unit and parameters."""
+    """The effects of a set with amplitude, standard error, unit and parameters."""
     found, start = [], 0
     for member in explanation.members:
         stop = start + len(candidates[member].columns)
@@ -103,8 +104,9 @@ def verdict_of(
     shrink: tuple[Prediction, Shrink, str] | None,
     able: Sequence[Mapping[str, Any]],
     notes: Sequence[str],
+    heard: Closest | None = None,
 ) -> dict[str, Any]:
-    """``verdict.json``, schema 1."""
+    """``verdict.json``, schema 1; ``heard`` goes with "unknown"."""
     sets = [effects_of(explanation, candidates, proposals) for explanation in found.explanations]
     nearest = proposals[found.nearest]
     result: dict[str, Any] = {
@@ -118,6 +120,8 @@ def verdict_of(
         "where": [where_of(place) for place in where[:PLACES]],
         "shrink": None,
         "nearest": {"name": nearest.kind.name, "channel": nearest.channel, "cosine": found.cosine},
+        "heard": [] if heard is None else effects_of(heard, candidates, proposals),
+        "left": None if heard is None else heard.left,
         "detectable": list(able),
         "notes": list(notes),
     }
@@ -149,7 +153,7 @@ def sentence(verdict: Mapping[str, Any]) -> str:
         near = verdict["nearest"]
         where = near["channel"] or "all channels"
         nearest = f"nearest is {near['name']} in {where} (cosine {near['cosine']:.2f})"
-        return f"{start}no effect of the library explains it; {nearest}."
+        return f"{start}no effect of the library explains it; {nearest}.{_partly(verdict)}"
     text = " and ".join(_words(effect) for effect in verdict["effects"])
     if kind == "degenerate":
         shown = verdict["alternatives"][:SETS]
@@ -157,6 +161,13 @@ def sentence(verdict: Mapping[str, Any]) -> str:
         more = len(verdict["alternatives"]) - len(shown)
         return f"{start}{text}; or {others}" + (f"; or {more} more sets." if more else ".")
     return f"{start}{text}."
+
+
+def _partly(verdict: Mapping[str, Any]) -> str:
+    if len(verdict["heard"]) < 2:
+        return ""
+    names = [f"{effect['name']} in {effect['channel'] or 'all channels'}" for effect in verdict["heard"]]
+    return f" Heard in it are {', '.join(names[:-1])} and {names[-1]}, which leave {verdict['left']:.0%} of the gap."
 
 
 def _words(effect: Mapping[str, Any]) -> str:

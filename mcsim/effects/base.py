@@ -108,7 +108,7 @@ class Effect:
         Whether a diagnosis should listen with a template of its own: not where a hook draws random numbers, nor where
         what is always listened for (dipoles, variances, spectra, modulations) says it all.
     draws
-        Whether a hook draws random numbers.
+        Whether a hook draws random numbers, at positive amplitudes at least.
     side
         Sign of the amplitudes at which responses are measured; 0: both. Where it is not 0, a negative amplitude is not
         one of nature, and a diagnosis does not name it.

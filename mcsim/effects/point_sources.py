@@ -13,13 +13,10 @@ _NARROWEST = 5
 
 @dataclass(frozen=True, kw_only=True)
 class PointSources(Effect):
-    """A Gaussian sky with C_l = amplitude at l >= 2, the same in every channel.
+    """A Gaussian sky with C_l = amplitude, the same in every channel.
 
     Notes
     -----
-    Their monopole and dipole count as taken off the maps with everybody else's: drawn, they would be the first thing
-    that a diagnosis sees, where a map's dipole is believed to the noise, and say nothing of the sources.
-
     A negative amplitude, which no sources have, takes the power away, for templates: the sky's own coefficients are
     scaled by sqrt(1 + amplitude / C_l), C_l being the sky's own power around l (+-5, or a tenth of l). Its response is
     not the negative of that of sources, which are a sky of their own, but has the mean of it, and no scatter.
@@ -33,6 +30,7 @@ class PointSources(Effect):
     source = "Tegmark & Efstathiou 1996, MNRAS 281, 1297; Wright et al. 2009, ApJS 180, 283"
     step = 1e-4
     own_score = False
+    draws = True
     side = -1
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
@@ -40,9 +38,7 @@ class PointSources(Effect):
         if self.amplitude == 0.0:
             return sky
         if self.amplitude > 0.0:
-            cl = np.full(site.lmax + 1, self.amplitude)
-            cl[:2] = 0.0
-            return sky + gaussian_alm(cl, draw("sources"))
+            return sky + gaussian_alm(np.full(site.lmax + 1, self.amplitude), draw("sources"))
         power = _power_around(sky, site.lmax)
         scale = np.divide(self.amplitude, power, out=np.zeros_like(power), where=power > 0.0)
         return alm_.multiply(sky, np.sqrt(np.maximum(1.0 + scale, 0.0)), site.lmax)

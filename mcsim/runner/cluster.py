@@ -205,11 +205,13 @@ def answers(
     """As :func:`completed`, with what a call raised, if it did, as a third item."""
     waiting = enumerate(arguments)
     numbers: dict[Future, int] = {}
+    # An object that can be called has no name but its type's.
+    name = getattr(function, "__name__", type(function).__name__)
 
     def fill() -> None:
         room = 3 * max(1, roll.call()) - len(numbers)
         for index, call in islice(waiting, max(room, 0)):
-            future = roll.client.submit(_in_words, function, *call, key=f"{function.__name__}-{uuid4().hex}")
+            future = roll.client.submit(_in_words, function, *call, key=f"{name}-{uuid4().hex}")
             numbers[future] = index
 
     fill()

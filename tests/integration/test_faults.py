@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -334,6 +335,10 @@ def test_result_that_is_lost_with_its_worker_is_waited_for_in_turns(
 def test_error_of_a_call_is_raised(client: Client) -> None:
     with pytest.raises(ZeroDivisionError):
         list(runner.completed(client, divmod, [(1, 0)]))
+
+
+def test_what_can_be_called_need_not_be_a_function(client: Client) -> None:
+    assert list(runner.completed(client, partial(divmod, 7), [(2,)])) == [(0, (3, 1))]
 
 
 def test_sentence_of_a_call_stays_one_where_its_cause_cannot_be_unpickled(client: Client, tmp_path: Path) -> None:

@@ -1,12 +1,15 @@
 """Attribution on constructed geometries: verdicts, minimal sets, twins, model errors; evidence by brute force."""
 
+import copy
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy import special, stats
 
 from mcsim.diagnosis.attribute import Attribution, Candidate, attribute
+from mcsim.diagnosis.closest import closest
 from mcsim.diagnosis.detect import cosines, detectable, log_evidence, posterior, strength_needed, strength_to_isolate
 from mcsim.diagnosis.gaussian import Null, bases, null
 from mcsim.diagnosis.trials import calibrate
@@ -165,6 +168,51 @@ def test_own_shape_error_replaces_that_of_the_search():
     assert vague.judge(signal, 0).explanations[0].members == (0,)
 
 
+def drawing(bench: Bench, spread: np.ndarray) -> Bench:
+    """The first candidate draws, with the scatter of 24 draws in some directions known."""
+    draws = spread @ np.random.default_rng(20).normal(size=(spread.shape[1], 24))
+    scatter = (draws - draws.mean(axis=1, keepdims=True)) / np.sqrt(23.0)
+    wide = copy.copy(bench)
+    wide.candidates = [replace(bench.candidates[0], scatter=scatter), *bench.candidates[1:]]
+    return wide
+
+
+def test_effect_that_draws_is_named_once_its_scatter_is_known(bench):
+    spread = 6.0 * directions(5, 21)
+    wide = drawing(bench, spread)
+    named = {"plain": 0, "wide": 0}
+    for seed in range(40):
+        signal = 12.0 * bench.t[:, 0] + spread @ np.random.default_rng(1000 + seed).normal(size=5)
+        for kind, one in (("plain", bench), ("wide", wide)):
+            found = one.judge(signal, seed)
+            named[kind] += bool(found.explanations) and found.explanations[0].members == (0,)
+    # Levels of 2 and 0.5 %, and a scatter that is known by 24 draws.
+    assert named["wide"] >= 34
+    assert named["plain"] <= 4
+
+
+def test_a_wide_scatter_explains_nothing_by_itself(bench):
+    """Something unknown in just the directions in which a drawing effect scatters, without its mean."""
+    spread = 6.0 * directions(5, 21)
+    wide = drawing(bench, spread)
+    found = [wide.judge(spread @ np.random.default_rng(1000 + seed).normal(size=5), seed) for seed in range(20)]
+    assert not any((0,) in [one.members for one in each.explanations] for each in found)
+
+
+def test_amplitude_beside_a_scatter_is_honest(bench):
+    spread = 6.0 * (directions(5, 21) + 0.5 * bench.t[:, :1])
+    wide = drawing(bench, spread)
+    pulls = []
+    for seed in range(60):
+        signal = 60.0 * bench.t[:, 0] + spread @ np.random.default_rng(1000 + seed).normal(size=5)
+        found = wide.judge(signal, seed).explanations
+        if found and found[0].members == (0,):
+            pulls.append((found[0].fit.amplitudes[0] - 60.0) / found[0].fit.errors[0])
+    # A width of one, known to 1 / sqrt(2 * 50) = 0.1 from the pulls, and no better from 24 draws in five directions.
+    assert len(pulls) > 50
+    assert 0.6 < np.sqrt(np.mean(np.square(pulls))) < 1.4
+
+
 def test_prior_moves_the_odds():
     t = directions(2, 17)
     t[:, 1] = t[:, 0] + 0.05 * t[:, 1]
@@ -266,3 +314,25 @@ def test_isolation_needs_more_of_closer_effects():
     # Close twins: only the difference counts, Q(a) = 0.05.
     close = strength_to_isolate(0.99)
     assert close * np.sqrt(0.005) == pytest.approx(-special.ndtri(0.05), rel=1e-3)
+
+
+def test_four_effects_are_heard_where_no_set_of_three_suffices(bench):
+    """The four, the strongest first, and what is left is noise; without a gap there is nothing."""
+    weights = np.array([30.0, 20.0, 14.0, 10.0])
+    found = [
+        closest(
+            bench.null,
+            bench.t[:, :4] @ weights + np.random.default_rng(seed).normal(size=P),
+            bench.t,
+            bench.candidates,
+            bench.calibration,
+        )
+        for seed in range(10)
+    ]
+    # A fifth joins them by chance once in 200.
+    assert sum(one.members == (0, 1, 2, 3) for one in found) >= 9
+    pulls = np.concatenate([(one.fit.amplitudes[:4] - weights) / one.fit.errors[:4] for one in found])
+    assert np.mean(pulls**2) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 40))
+    # The square of 56 numbers scatters by sqrt(2 56) about them, beside a gap of 1,596.
+    assert max(one.left for one in found) < 4.0 * np.sqrt(2.0 * 56) / 1596
+    assert closest(bench.null, bench.null.mean, bench.t, bench.candidates, bench.calibration) is None

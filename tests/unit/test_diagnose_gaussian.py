@@ -40,6 +40,24 @@ def test_offset_moves_the_mean(ensemble, evidence):
     np.testing.assert_allclose(null(ensemble, shift).data(evidence + shift), null(ensemble).data(evidence), rtol=1e-9)
 
 
+def test_wider_null_is_that_of_both_scatters(ensemble):
+    """Against the covariance itself, where draws are so many that nothing is drawn towards anything."""
+    rng = np.random.default_rng(3)
+    believed = null(ensemble)
+    p = believed.dimension
+    root = rng.normal(size=(p, p)) * np.sqrt(np.var(ensemble, axis=0))[:, None]
+    draws = root @ rng.normal(size=(p, 400_000))
+    wide = believed.widened((draws - draws.mean(axis=1, keepdims=True)) / np.sqrt(399_999.0))
+    S = np.cov(ensemble.T)
+    scale = 1.0 + 1.0 / believed.count
+    x = rng.normal(size=p) * ensemble.std(axis=0) + believed.mean
+    # S is too small by the factor that makes squares unbiased.
+    expected = (x - believed.mean) @ np.linalg.solve(S + believed.unbiased / scale * root @ root.T, x - believed.mean)
+    assert wide.square(x) == pytest.approx(expected / scale, rel=0.01)
+    volume = np.linalg.slogdet(np.eye(p) + believed.unbiased / scale * np.linalg.solve(S, root @ root.T))[1]
+    assert wide.log_volume == pytest.approx(-0.5 * volume, rel=0.01)
+
+
 def test_statistics_equal_those_of_the_scatter(ensemble, evidence, templates):
     """The formulas of Hotelling and Rao written with S itself."""
     believed, n = null(ensemble), N - 1

@@ -127,7 +127,7 @@ def diagnosis(kind: str) -> Diagnosis:
     survey = SimpleNamespace(config=SimpleNamespace(map=SimpleNamespace(frame="ecliptic")))
     believed = SimpleNamespace(survey=survey, parts=[SimpleNamespace(name=name) for name in (EVIL, "V")])
     shown = exhibits.exhibits(believed, [], court.known.simulations, court.null, found, court.candidates, proposed)
-    evidence = case.dataset(court, x, Refined(found, t, ()), where, verdict)
+    evidence = case.dataset(court, x, Refined(found, t, (), ()), where, verdict)
     return Diagnosis(verdict, evidence.merge(shown, combine_attrs="no_conflicts"), found)
 
 
