@@ -175,7 +175,7 @@ def heard_of(court: Court, x: Vector, refined: Refined, found: Attribution) -> C
     """What of the library is heard in a gap that it does not explain."""
     if found.verdict != "unknown":
         return None
-    return closest(court.null, x, refined.templates, court.candidates, court.calibration)
+    return closest(court.null, x, refined.templates, court.known.curvature, court.candidates, court.calibration)
 
 
 def shrink_of(court: Court, x: Vector, refined: Refined, respond: Respond) -> tuple[Prediction, Shrink, str] | None:

@@ -15,6 +15,9 @@ LEVEL = 0.005
 
 MOST = 6
 
+BENT = 0.5
+"""Second order of a response over its first, from which on a fitted amplitude says nothing."""
+
 
 @dataclass(frozen=True)
 class Closest:
@@ -39,6 +42,7 @@ def closest(
     null: Null,
     x: NDArray[np.float64],
     t: NDArray[np.float64],
+    curvature: NDArray[np.float64],
     candidates: Sequence[Candidate],
     calibration: Calibration,
 ) -> Closest | None:
@@ -48,8 +52,8 @@ def closest(
     ----------
     null, x
         Null and evidence, shape (p_raw,).
-    t
-        Templates per unit amplitude, shape (p_raw, K).
+    t, curvature
+        Templates per unit amplitude, and half the second derivatives of the responses, shape (p_raw, K).
     candidates, calibration
         Candidates on those templates, and their calibration.
 
@@ -57,7 +61,8 @@ def closest(
     -------
     Closest
         None where nothing is significant. Each member was significant beside those before it; of two that are alike
-        the one that is not there may be the first.
+        the one that is not there may be the first. What would have to be so strong that its response is no straight
+        line any more is passed over.
     """
     members: tuple[int, ...] = ()
     columns: list[int] = []
@@ -72,6 +77,8 @@ def closest(
             after = fit(null, x, t[:, [*columns, *candidate.columns]])
             if candidate.positive and np.any(after.amplitudes[len(columns) :] < 0.0):
                 continue
+            if not _within_reach(null, t, curvature, [*columns, *candidate.columns], after.amplitudes):
+                continue
             rank = before.dimension - after.dimension
             score = float(score_probability(before.chi2 - after.chi2, before.chi2, rank, before.dimension, null.dof))
             if score < smallest or chosen < 0:
@@ -84,3 +91,17 @@ def closest(
     gap = null.unbiased * total - null.dimension
     left = null.unbiased * before.chi2 - before.dimension
     return Closest(members, before, min(max(left / gap, 0.0), 1.0) if gap > 0.0 else 1.0)
+
+
+def _within_reach(
+    null: Null,
+    t: NDArray[np.float64],
+    curvature: NDArray[np.float64],
+    columns: Sequence[int],
+    amplitudes: NDArray[np.float64],
+) -> bool:
+    """Whether the second order of every column is less than BENT times the first."""
+    used = list(columns)
+    first = null.templates(t[:, used] * amplitudes)
+    second = null.templates(curvature[:, used] * amplitudes**2)
+    return bool(np.all(np.linalg.norm(second, axis=0) <= BENT * np.linalg.norm(first, axis=0)))

@@ -109,6 +109,10 @@ class Effect:
         what is always listened for (dipoles, variances, spectra, modulations) says it all.
     draws
         Whether a hook draws random numbers, at positive amplitudes at least.
+    isotropic
+        Whether it changes the power of the sky and nothing else. In one sky such a change hangs on the fluctuations
+        that its spectra have anyway, so that a diagnosis holds to the mean response; other changes it takes from the
+        sky that was observed.
     side
         Sign of the amplitudes at which responses are measured; 0: both. Where it is not 0, a negative amplitude is not
         one of nature, and a diagnosis does not name it.
@@ -126,6 +130,7 @@ class Effect:
     own_score: ClassVar[bool] = True
     side: ClassVar[Literal[-1, 0, 1]] = 0
     draws: ClassVar[bool] = False
+    isotropic: ClassVar[bool] = False
     variants: ClassVar[tuple[Mapping[str, Any], ...]] = ({},)
 
     amplitude: float = 0.0

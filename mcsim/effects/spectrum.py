@@ -5,6 +5,7 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
 
 from mcsim import alm as alm_
 from mcsim.effects.base import Alm, Draw, Effect, Site, Vector
@@ -12,6 +13,9 @@ from mcsim.effects.vectors import along
 from mcsim.errors import InputError
 
 BANDS = 6
+
+LEAST = -0.99
+"""Smallest change of a band that is fitted: an error larger than the power itself asks for less than none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +39,7 @@ class Spectrum(Effect):
     source = "Follows from the definition"
     step = 0.02
     own_score = False
+    isotropic = True
 
     bands: tuple[float, ...] = (1.0,) * BANDS
 
@@ -64,6 +69,11 @@ class Spectrum(Effect):
 
     @classmethod
     def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
-        """Norm and direction."""
-        norm = float(np.linalg.norm(coordinates))
-        return cls(amplitude=norm, bands=tuple(map(float, coordinates / norm))) if norm else cls()
+        """Norm and direction, of what leaves every band some power."""
+        found = coordinates
+        if np.min(coordinates) < LEAST:
+            values, vectors = np.linalg.eigh(precision)
+            root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+            found = lsq_linear(root, root @ coordinates, bounds=(LEAST, np.inf)).x
+        norm = float(np.linalg.norm(found))
+        return cls(amplitude=norm, bands=tuple(map(float, found / norm))) if norm else cls()

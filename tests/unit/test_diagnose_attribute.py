@@ -9,7 +9,7 @@ import pytest
 from scipy import special, stats
 
 from mcsim.diagnosis.attribute import Attribution, Candidate, attribute
-from mcsim.diagnosis.closest import closest
+from mcsim.diagnosis.closest import Closest, closest
 from mcsim.diagnosis.detect import cosines, detectable, log_evidence, posterior, strength_needed, strength_to_isolate
 from mcsim.diagnosis.gaussian import Null, bases, null
 from mcsim.diagnosis.trials import calibrate
@@ -319,20 +319,20 @@ def test_isolation_needs_more_of_closer_effects():
 def test_four_effects_are_heard_where_no_set_of_three_suffices(bench):
     """The four, the strongest first, and what is left is noise; without a gap there is nothing."""
     weights = np.array([30.0, 20.0, 14.0, 10.0])
-    found = [
-        closest(
-            bench.null,
-            bench.t[:, :4] @ weights + np.random.default_rng(seed).normal(size=P),
-            bench.t,
-            bench.candidates,
-            bench.calibration,
-        )
-        for seed in range(10)
-    ]
+    straight = np.zeros_like(bench.t)
+
+    def heard(x: np.ndarray, curvature: np.ndarray = straight) -> Closest | None:
+        return closest(bench.null, x, bench.t, curvature, bench.candidates, bench.calibration)
+
+    signal = bench.t[:, :4] @ weights
+    found = [heard(signal + np.random.default_rng(seed).normal(size=P)) for seed in range(10)]
     # A fifth joins them by chance once in 200.
     assert sum(one.members == (0, 1, 2, 3) for one in found) >= 9
     pulls = np.concatenate([(one.fit.amplitudes[:4] - weights) / one.fit.errors[:4] for one in found])
     assert np.mean(pulls**2) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 40))
     # The square of 56 numbers scatters by sqrt(2 56) about them, beside a gap of 1,596.
     assert max(one.left for one in found) < 4.0 * np.sqrt(2.0 * 56) / 1596
-    assert closest(bench.null, bench.null.mean, bench.t, bench.candidates, bench.calibration) is None
+    assert heard(bench.null.mean) is None
+    bent = straight.copy()
+    bent[:, 0] = 0.1 * directions(1, 22)[:, 0]
+    assert 0 not in heard(signal, bent).members  # its second order would be three times its first

@@ -105,6 +105,18 @@ def test_spectrum_rescales_its_bands(site, sky):
         effects.get("spectrum")(amplitude=2.0, bands=(-1.0, 0.0, 0.0, 0.0, 0.0, 0.0)).sky(sky, site, draw)
 
 
+def test_spectrum_nearest_to_less_than_no_power_leaves_some():
+    """Of two correlated bands the other one makes up for what the first cannot be."""
+    kind = effects.get("spectrum")
+    precision = np.eye(6)
+    precision[0, 1] = precision[1, 0] = 0.5
+    wanted = np.array([-1.49, 0.3, 0.1, 0.0, 0.0, 0.0])
+    found = kind.nearest(wanted, precision).coordinates()
+    # The first is short by 0.5: the second is moved by - 0.5 * 0.5 / 1.
+    np.testing.assert_allclose(found, [-0.99, 0.05, 0.1, 0.0, 0.0, 0.0], atol=1e-8)
+    np.testing.assert_allclose(kind.nearest(0.5 * wanted, precision).coordinates(), 0.5 * wanted, rtol=1e-12)
+
+
 def test_point_sources_are_a_flat_sky_of_their_own(site, sky):
     kind = effects.get("point_sources")
     drawn = kind(amplitude=0.01).sky(sky, site, draw) - sky
