@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 from mcsim.diagnosis.blocks import Entry
 from mcsim.diagnosis.trials import atlas
 
+SIGNIFICANT = 0.01
+"""Probability, trials included, up to which a group is brought before others of a kind that is listed already."""
+
 
 @dataclass(frozen=True)
 class Place:
@@ -33,7 +36,7 @@ class Place:
 
 
 def places(x: NDArray[np.float64], simulations: NDArray[np.float64], entries: Sequence[Entry]) -> list[Place]:
-    """Groups of entries, the one that departs most first.
+    """Groups of entries, the one that departs most first, and of each kind one before the others of it.
 
     Parameters
     ----------
@@ -44,6 +47,8 @@ def places(x: NDArray[np.float64], simulations: NDArray[np.float64], entries: Se
 
     Notes
     -----
+    A kind is a frame, an L and a parity: one gap stands out in every channel and split that hears it, and a list of
+    these would hide what else it says. Groups that are not significant stay in the order of their deviates.
     The cube root of a group's sum of squared deviates is nearly normal (Wilson & Hilferty 1931); it is compared with
     those of the simulations, each taken against the others.
     """
@@ -61,9 +66,15 @@ def places(x: NDArray[np.float64], simulations: NDArray[np.float64], entries: Se
     z, p = atlas(np.cbrt(found), np.cbrt(drawn))
     # Too quiet a group is no place of a gap.
     p = np.where(z > 0, p, 1.0)
-    result = []
+    firsts: list[Place] = []
+    others_of_kind: list[Place] = []
+    seen: set[tuple[object, ...]] = set()
     for group in np.argsort(-z):
         row = rows[group]
         peak = row[int(np.argmax(np.abs(deviates[row])))]
-        result.append(Place(entries[peak], float(z[group]), float(p[group]), float(deviates[peak])))
-    return result
+        place = Place(entries[peak], float(z[group]), float(p[group]), float(deviates[peak]))
+        kind = (place.entry.frame, place.entry.L, place.entry.parity)
+        new = kind not in seen and (place.p <= SIGNIFICANT or not seen)
+        (firsts if new else others_of_kind).append(place)
+        seen.add(kind)
+    return firsts + others_of_kind
