@@ -14,7 +14,7 @@ from mcsim import config, rng, sampled, simulate
 from mcsim.challenge import toml
 from mcsim.challenge.inventions import introduced, load
 from mcsim.challenge.prior import Drawn, Invention, Prior, Urn
-from mcsim.challenge.sitting import evidence_with, sitting
+from mcsim.challenge.sitting import Sitting, evidence_with, sitting
 from mcsim.challenge.truth import KEYS, MAPS, SEAL, Member, Truth, key_path, new_nonce, sealed, write_whole
 from mcsim.diagnosis.batch import Batch, asking, batch
 from mcsim.diagnosis.case import Court
@@ -203,7 +203,7 @@ def make_case(
     else:
         members = drawn.members
         if drawn.kind not in ("none", "invented"):
-            members = _measured(model, simulations, members)
+            members = _measured(model, simulations, members, seed)
         sample_by_sample = sample_by_sample or drawn.kind == "invented"
         truth = Truth(case, drawn.kind, members, drawn.without, seed, sample_by_sample, new_nonce())
         write_whole(key, truth.text())
@@ -228,10 +228,11 @@ def maps_of(run: config.RunConfig, truth: Truth, inventions: str | None) -> list
         return list(zip(shared.map_names, simulate.maps(shared, 0), strict=True))
 
 
-def _measured(model: str, simulations: int | None, members: Sequence[Member]) -> tuple[Member, ...]:
+def _measured(model: str, simulations: int | None, members: Sequence[Member], seed: int) -> tuple[Member, ...]:
     """Members with the strengths that their amplitudes have; smaller ones where the drawn amplitude is impossible.
 
-    So too where the effect, far beyond a straight line, is much stronger than was drawn.
+    So too where the effect, far beyond a straight line, is much stronger than was drawn. What draws has the strength of
+    its mean response, any other effect that of its response in the sky and noise of the case.
     """
     seat = sitting(model, simulations)
     null = seat.court.null
@@ -256,11 +257,22 @@ def _measured(model: str, simulations: int | None, members: Sequence[Member]) ->
             if strength > LARGER * member.strength and attempt + 1 < ATTEMPTS:
                 continue  # its response is no straight line
             coordinates = tuple(float(value) for value in effect.coordinates())
+            if not proposal.kind.draws:
+                strength = _strength_here(seat, proposal.table(effect), seed)
             found.append(replace(member, parameters=scaled, coordinates=coordinates, strength=strength))
             break
         else:
             raise InputError(f"effect {member.name} can have no amplitude that is strong enough; leave it out.")
     return tuple(found)
+
+
+def _strength_here(seat: Sitting, effect: config.Effect, seed: int) -> float:
+    """White length of what an effect changes in one sky; a modulation, say, makes a dipole of its quadrupole."""
+    run = seeded(seat.court.run, seed)
+    believed = config.to_json(seat.court.run)
+    jobs = [Job(believed, config.to_json(with_effects(run, effects)), 0, 1) for effects in ((), (effect,))]
+    before, after = seat.ask(jobs)
+    return seat.court.null.length(after[0] - before[0])
 
 
 def _write_map(path: Path, map_uk: Vector, frame: str) -> None:

@@ -31,7 +31,7 @@ class Member:
     coordinates
         In the linear components of the effect.
     strength
-        White length of its response in the evidence.
+        White length of its response in the evidence of this very sky; of what draws, of the mean response.
     candidate
         Which proposal of the full library it is; None: an invention.
     response

@@ -1,0 +1,76 @@
+"""Responses of the evidence to effects: the templates' default route against the survey made sample by sample.
+
+    python workflows/effects/templates.py MODEL.toml [--channel W1] [--effects NAME ...] [--simulations N]
+
+A sky that made no template, without noise, is seen by both routes with each basis effect, up and down; what it changes
+in the numbers that `mcsim diagnose` weighs is compared in the metric of their scatter. Simulations of MODEL are those
+that `mcsim diagnose` with the same number has made and kept, or are made first.
+"""
+
+import argparse
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim import config
+from mcsim.diagnosis.batch import asking, batch
+from mcsim.diagnosis.evidence import Job, evidence_of, questions
+from mcsim.diagnosis.knowledge import seeded, with_effects
+from mcsim.diagnosis.session import prepared
+from mcsim.effects import Effect
+
+SEED = 20121026
+STEPS = 4.0
+"""Steps at which templates are measured, to be well above the referee's interpolation."""
+
+
+def main() -> None:
+    """Print cosine, ratio of amplitudes and length of every response."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("model", help="TOML file of what is believed")
+    parser.add_argument("--channel", help="of the effects of a channel; default: the model's last one")
+    parser.add_argument("--effects", nargs="*", help="default: all that do not draw; none of noise")
+    parser.add_argument("--simulations", type=int, help="as given to mcsim diagnose")
+    arguments = parser.parse_args()
+    run = config.load(arguments.model)
+    asked = questions(run, nthreads=os.cpu_count() or 1)
+    with batch(run.compute.workers) as call:
+        null = prepared(run, asked, asking(call, quiet=False), arguments.simulations).null
+    plain = seeded(run, SEED)
+    quiet = replace(plain, channels=tuple(replace(channel, noise=config.Noise()) for channel in plain.channels))
+    believed = config.to_json(run)
+
+    def seen(found: Sequence[config.Effect], samples: bool) -> NDArray[np.float64]:
+        answer: NDArray[np.float64] = evidence_of(
+            Job(believed, config.to_json(with_effects(quiet, found)), 0, 1, samples)
+        )[0]
+        return answer
+
+    without = {samples: seen([], samples) for samples in (False, True)}
+    channel = arguments.channel or run.channels[-1].name
+    for proposal in asked.proposals:
+        kind = proposal.kind
+        wanted = kind.name in arguments.effects if arguments.effects else not kind.draws
+        if not wanted or kind.noise is not Effect.noise or proposal.channel not in (None, channel):
+            continue
+        for number, basis in enumerate(proposal.basis):
+            # An effect of one sign is the whole of it, as pixelization is.
+            effect = basis.scaled(STEPS) if proposal.kind.side == 0 and STEPS * basis.amplitude < 1.0 else basis
+            changes = []
+            for samples in (False, True):
+                up = seen([proposal.table(effect)], samples)
+                down = seen([proposal.table(effect.scaled(-1.0))], samples) if proposal.kind.side == 0 else None
+                change = up - without[samples] if down is None else 0.5 * (up - down)
+                changes.append(null.templates(change[:, None])[:, 0])
+            default, referee = changes
+            size = float(np.linalg.norm(default))
+            cosine = float(default @ referee) / size / float(np.linalg.norm(referee))
+            ratio = float(default @ referee) / size**2
+            print(f"{proposal.label}/{number}: cosine {cosine:.4f}, sampled over default {ratio:.4f}, {size:.1f} sigma")
+
+
+if __name__ == "__main__":
+    main()
