@@ -144,7 +144,7 @@ def blocks_figure(reading: Reading) -> Figure:
         )
         axes.set_yticks(range(len(kinds)), [_plain(_short(kind, 36)) for kind in kinds], fontsize=8)
         axes.set_title(title, fontsize=10)
-    words = "deviate of largest modulus in each block [sigmas]; grey: none"
+    words = "largest deviate in a block\n[sigmas]; grey: none"
     figure.colorbar(shown, ax=list(grid), label=words, extend="both", location="bottom", shrink=0.6, aspect=40)
     return figure
 
