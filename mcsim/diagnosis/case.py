@@ -36,6 +36,8 @@ ALPHA = 0.05
 EXCHANGED = 0.01
 """Probability above which maps in another order are said to fit the model."""
 
+OPENED = 3.0
+"""Standard deviations below zero from which on an achieved shrink says that the gap was opened."""
 
 HEARD = 0.2
 """Share of an effect's strength that either half of the evidence must hear for a shrink to be measured."""
@@ -154,21 +156,36 @@ def judge(court: Court, case: str, maps: Sequence[NDArray[np.float64]], ask: Ask
         t = on_this_sky(known, asked, t, respond)
     refined = refine(known, court.null, x, t, court.candidates, asked.proposals, court.calibration, respond)
     found = refined.attribution
-    notes = list(_exchanged(court, maps, found))
-    if notes:
+    exchanged = list(_exchanged(court, maps, found))
+    notes = exchanged.copy()
+    if exchanged:
         # An order of the maps in which the model fits says more than any effect.
         found = replace(found, verdict="unknown", explanations=(), contrasts=())
     shrink = None
     if found.explanations:
-        shrink = shrink_of(court, x, refined, respond)
+        found, shrink = confirmed(court, found, shrink_of(court, x, refined, respond), notes)
     where = _where(court, x, numbers)
     able = detectable_of(court.null, refined.templates, court.candidates, asked.proposals)
-    heard = None if notes else heard_of(court, x, refined, found)
+    heard = None if exchanged else heard_of(court, x, refined, found)
     verdict = verdict_of(case, found, court.candidates, asked.proposals, where, shrink, able, notes, heard)
     shown = exhibits(asked.model, maps, known.simulations, court.null, found, court.candidates, asked.proposals)
     told = dataset(court, x, replace(refined, attribution=found), where, verdict)
     evidence = told.merge(shown, combine_attrs="no_conflicts")
     return Diagnosis(verdict, evidence, found)
+
+
+def confirmed(
+    court: Court, found: Attribution, shrink: tuple[Prediction, Shrink, str] | None, notes: list[str]
+) -> tuple[Attribution, tuple[Prediction, Shrink, str] | None]:
+    """The same, unless the set that fits best opens the gap once it is simulated: then it is not what is there."""
+    if shrink is None or shrink[1].fraction.value + OPENED * shrink[1].fraction.sigma >= 0.0:
+        return found, shrink
+    names = [court.asked.proposals[member].label for member in found.explanations[0].members]
+    notes.append(
+        f"What fits best, {' and '.join(names)}, is not named: simulated with its amplitude from one half, it opens "
+        f"the gap of the other from {shrink[1].before.value:.3g} to {shrink[1].after.value:.3g}."
+    )
+    return replace(found, verdict="unknown", explanations=(), contrasts=()), None
 
 
 def heard_of(court: Court, x: Vector, refined: Refined, found: Attribution) -> Closest | None:

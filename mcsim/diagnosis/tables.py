@@ -12,7 +12,7 @@ from mcsim import config, effects, simulate
 from mcsim.biposh import Mode
 from mcsim.diagnosis import knowledge
 from mcsim.diagnosis.blocks import Block, Entry
-from mcsim.diagnosis.case import Ask, Court, Diagnosis, dataset, heard_of, shrink_of
+from mcsim.diagnosis.case import Ask, Court, Diagnosis, confirmed, dataset, heard_of, shrink_of
 from mcsim.diagnosis.evidence import Job, Questions, questions
 from mcsim.diagnosis.exhibits import exhibits
 from mcsim.diagnosis.knowledge import Knowledge, Plan
@@ -318,16 +318,18 @@ def judge(court: Court, case: str, measured: Spectra, ask: Ask) -> Diagnosis:
         known, court.null, x, t, court.candidates, asked.proposals, court.calibration, respond, measured.realizations
     )
     found = refined.attribution
-    shrink = _shrink(court, x, refined, respond) if found.explanations else None
+    notes = list(_notes(measured, known.simulations))
+    shrink = None
+    if found.explanations:
+        found, shrink = confirmed(court, found, _shrink(court, x, refined, respond), notes)
     where = _where(measured, known.simulations)
     able = detectable_of(court.null, refined.templates, court.candidates, asked.proposals)
-    notes = list(_notes(measured, known.simulations))
     heard = heard_of(court, x, refined, found)
     verdict = verdict_of(case, found, court.candidates, asked.proposals, where, shrink, able, notes, heard)
     # Of no sky: a table has no maps to show.
     dark = [np.zeros(12 * asked.model.nside**2) for _ in asked.model.parts]
     shown = exhibits(asked.model, dark, known.simulations, court.null, found, court.candidates, asked.proposals)
-    evidence = dataset(court, x, refined, where, verdict)
+    evidence = dataset(court, x, replace(refined, attribution=found), where, verdict)
     evidence = evidence.merge(shown.drop_vars(["residual_map", "map"]), combine_attrs="no_conflicts")
     evidence.attrs |= {"table": measured.path, "skies_behind_the_mean": measured.realizations}
     return Diagnosis(verdict, evidence, found)

@@ -3,15 +3,18 @@
 import copy
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy import special, stats
 
 from mcsim.diagnosis.attribute import Attribution, Candidate, attribute
+from mcsim.diagnosis.case import confirmed
 from mcsim.diagnosis.closest import Closest, closest
 from mcsim.diagnosis.detect import cosines, detectable, log_evidence, posterior, strength_needed, strength_to_isolate
 from mcsim.diagnosis.gaussian import Null, bases, null
+from mcsim.diagnosis.shrink import Measured, Shrink
 from mcsim.diagnosis.trials import calibrate
 
 P, N = 60, 800
@@ -336,3 +339,19 @@ def test_four_effects_are_heard_where_no_set_of_three_suffices(bench):
     bent = straight.copy()
     bent[:, 0] = 0.1 * directions(1, 22)[:, 0]
     assert 0 not in heard(signal, bent).members  # its second order would be three times its first
+
+
+@pytest.mark.parametrize(("achieved", "named"), [(0.9, True), (-0.5, True), (-2.0, False)])
+def test_set_that_opens_the_gap_is_not_named(bench, achieved, named):
+    """Three standard deviations below zero: what fits best, simulated, made it worse."""
+    found = bench.judge(12.0 * bench.t[:, 3], 0)
+    assert found.verdict == "effect"
+    court = SimpleNamespace(asked=SimpleNamespace(proposals=[SimpleNamespace(label=c.name) for c in bench.candidates]))
+    after = Measured(100.0 * (1.0 - achieved), 10.0)
+    shrink = None, Shrink(Measured(100.0, 10.0), after, Measured(achieved, 0.5), 0.5), "half2"
+    notes: list[str] = []
+    judged, kept = confirmed(court, found, shrink, notes)
+    assert (judged.verdict, kept is shrink, bool(notes)) == (
+        ("effect", True, False) if named else ("unknown", False, True)
+    )
+    assert named or ("effect3" in notes[0] and "from 100 to 300" in notes[0])
