@@ -1,7 +1,7 @@
 """Which effect: all subsets of up to three candidates, those that suffice, and what would tell them apart."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import combinations
 from typing import Literal
@@ -130,6 +130,10 @@ class Attribution:
     correlation: NDArray[np.float64]
     contrasts: tuple[Contrast, ...]
 
+    def unexplained(self) -> "Attribution":
+        """The same as "unknown", where something else says that no set is to be named."""
+        return replace(self, verdict="unknown", explanations=(), contrasts=())
+
 
 def attribute(
     null: Null,
@@ -231,9 +235,7 @@ def _searches(
         for drawn in combinations(scatters, size):
             if len({names[index] for index in drawn}) < size:
                 continue
-            wide = null
-            for index in drawn:
-                wide = wide.widened(scatters[index])
+            wide = null.widened(*(scatters[index] for index in drawn))
             groups = bases(wide, t, columns)
             yield Subsets(wide, wide.data(x), groups, names, prior, errors, calibration, scatters, drawn)
 
@@ -249,6 +251,12 @@ class _Accepted:
     null: Null = field(compare=False)
 
 
+def allowed(candidates: Sequence[Candidate], members: Sequence[int], amplitudes: NDArray[np.float64]) -> bool:
+    """Whether amplitudes, one member after the other, are none that a member cannot have."""
+    positive = [candidates[member].positive for member in members for _ in candidates[member].columns]
+    return bool(np.all(amplitudes[positive] >= 0.0))
+
+
 def _possible(
     x: NDArray[np.float64],
     t: NDArray[np.float64],
@@ -257,11 +265,10 @@ def _possible(
     members: tuple[int, ...],
 ) -> bool:
     """Whether no member would need an amplitude that it cannot have."""
-    positive = [candidates[member].positive for member in members for _ in candidates[member].columns]
-    if not any(positive):
+    if not any(candidates[member].positive for member in members):
         return True
     columns = [column for member in members for column in candidates[member].columns]
-    return bool(np.all(fit(null, x, t[:, columns]).amplitudes[positive] >= 0.0))
+    return allowed(candidates, members, fit(null, x, t[:, columns]).amplitudes)
 
 
 def _accepted(

@@ -160,7 +160,7 @@ def judge(court: Court, case: str, maps: Sequence[NDArray[np.float64]], ask: Ask
     notes = exchanged.copy()
     if exchanged:
         # An order of the maps in which the model fits says more than any effect.
-        found = replace(found, verdict="unknown", explanations=(), contrasts=())
+        found = found.unexplained()
     shrink = None
     if found.explanations:
         found, shrink = confirmed(court, found, shrink_of(court, x, refined, respond), notes)
@@ -185,7 +185,7 @@ def confirmed(
         f"What fits best, {' and '.join(names)}, is not named: simulated with its amplitude from one half, it opens "
         f"the gap of the other from {shrink[1].before.value:.3g} to {shrink[1].after.value:.3g}."
     )
-    return replace(found, verdict="unknown", explanations=(), contrasts=()), None
+    return found.unexplained(), None
 
 
 def heard_of(court: Court, x: Vector, refined: Refined, found: Attribution) -> Closest | None:
@@ -216,7 +216,7 @@ def shrink_of(court: Court, x: Vector, refined: Refined, respond: Respond) -> tu
     chosen = np.array(columns)
     scatters = [one for one in (refined.candidates[member].scatter for member in members) if one is not None]
     learning, before = court.known.null(used), court.known.null(fresh)
-    frozen = fit(_widened(learning, scatters, used), x[used], refined.templates[np.ix_(used, chosen)])
+    frozen = fit(learning.widened(*(one[used] for one in scatters)), x[used], refined.templates[np.ix_(used, chosen)])
     try:
         tables, start = [], 0
         for member in members:
@@ -228,7 +228,7 @@ def shrink_of(court: Court, x: Vector, refined: Refined, respond: Respond) -> tu
         mean = before.mean + respond(tables, CONSTRAINED_SKIES).mean(axis=0)[fresh]
     except InputError:
         return None  # half of the evidence asks for an amplitude that the effect cannot have
-    after = _widened(replace(before, mean=mean), scatters, fresh)
+    after = replace(before, mean=mean).widened(*(one[fresh] for one in scatters))
     here, left = refined.templates[np.ix_(fresh, chosen)], x - refined.templates[:, chosen] @ frozen.amplitudes
     wider = None
     if scatters:
@@ -238,12 +238,6 @@ def shrink_of(court: Court, x: Vector, refined: Refined, respond: Respond) -> tu
         wider = Measured(share * max(seen.value, 0.0), share * seen.sigma)
     expected = predicted(before, x[fresh], here, frozen.amplitudes, frozen.covariance, wider)
     return expected, achieved(before, after, x[fresh]), _fresh_words(court)
-
-
-def _widened(null: Null, scatters: Sequence[NDArray[np.float64]], rows: NDArray[np.int64]) -> Null:
-    for scatter in scatters:
-        null = null.widened(scatter[rows])
-    return null
 
 
 def _trace(null: Null, scatters: Sequence[NDArray[np.float64]], rows: NDArray[np.int64]) -> float:

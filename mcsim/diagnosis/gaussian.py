@@ -70,13 +70,13 @@ class Null:
         """White length of a change of the evidence, shape (p_raw,), in standard deviations."""
         return float(np.sqrt(self.unbiased) * np.linalg.norm(self.templates(change[:, None])))
 
-    def widened(self, deviations: NDArray[np.float64]) -> "Null":
-        """With a further Gaussian scatter R, known by draws.
+    def widened(self, *scatters: NDArray[np.float64]) -> "Null":
+        """With further Gaussian scatters, each known by draws.
 
         Parameters
         ----------
-        deviations
-            R = deviations @ deviations.T, shape (p_raw, draws): draws less their mean over sqrt(draws - 1).
+        scatters
+            Deviations d with R = d @ d.T, shape (p_raw, draws): draws less their mean over sqrt(draws - 1).
 
         Notes
         -----
@@ -84,12 +84,14 @@ class Null:
         (Ledoit & Wolf, J. Multivariate Anal. 88, 365, 2004). White coordinates are turned by (1 + R)^(-1/2), so that
         all tests stay what they are, and exact where R is.
         """
-        white = np.sqrt(self.unbiased) * self.templates(deviations)
-        values, vectors = np.linalg.eigh(np.eye(self.dimension) + _shrunk(white))
-        turn = (vectors / np.sqrt(values)) @ vectors.T
-        return replace(
-            self, whitening=turn @ self.whitening, log_volume=self.log_volume - 0.5 * float(np.sum(np.log(values)))
-        )
+        wide = self
+        for deviations in scatters:
+            white = np.sqrt(self.unbiased) * wide.templates(deviations)
+            values, vectors = np.linalg.eigh(np.eye(self.dimension) + _shrunk(white))
+            turn = (vectors / np.sqrt(values)) @ vectors.T
+            volume = wide.log_volume - 0.5 * float(np.sum(np.log(values)))
+            wide = replace(wide, whitening=turn @ wide.whitening, log_volume=volume)
+        return wide
 
 
 def null(simulations: NDArray[np.float64], offset: NDArray[np.float64] | None = None, floor: float = 1e-8) -> Null:

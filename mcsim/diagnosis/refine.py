@@ -33,7 +33,7 @@ SCATTERED = 0.1
 CLEAN = 5.0
 """Of a noisy template, what is smaller than this many of its standard errors is none."""
 
-HEARD = 0.05
+TELLING = 0.05
 """Probability, trials included, from which on an effect that draws is tried where no single one suffices."""
 
 TRIED = 3
@@ -205,7 +205,7 @@ def _to_try(
     drawing: set[tuple[str, str | None]] = {candidates[index].identity for index in work if proposals[index].kind.draws}
     for place, index in enumerate(ranked):
         single, candidate = found.singles[index], candidates[index]
-        heard = proposals[index].kind.draws and float(calibration.trials(single.score)) <= HEARD
+        heard = proposals[index].kind.draws and float(calibration.trials(single.score)) <= TELLING
         if place < TRIED or (heard and candidate.identity not in drawing):
             work.setdefault(index, (index, single.amplitudes, single.covariance))
             if proposals[index].kind.draws:

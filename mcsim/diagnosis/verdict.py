@@ -148,7 +148,8 @@ def sentence(verdict: Mapping[str, Any]) -> str:
     kind = verdict["verdict"]
     if kind == "none":
         return f"The model describes the data (p = {p:.2g})."
-    start = f"The model does not describe the data (p {f'= {p:.1g}' if p > 0.0 else '< 1e-300'}): "
+    level = f"= {p:.1g}" if p > 0.0 else "< 1e-300"
+    start = f"The model does not describe the data (p {level}): "
     if kind == "unknown":
         near = verdict["nearest"]
         where = near["channel"] or "all channels"
