@@ -24,6 +24,14 @@ def degrees(lmax: int) -> NDArray[np.int64]:
     return ell
 
 
+@lru_cache(maxsize=8)
+def orders(lmax: int) -> NDArray[np.int64]:
+    """Order m of every coefficient, shape (size(lmax),), read-only."""
+    m = np.repeat(np.arange(lmax + 1), np.arange(lmax + 1, 0, -1))
+    m.setflags(write=False)
+    return m
+
+
 def multiply(alm: NDArray[np.complex128], factor: NDArray, lmax: int) -> NDArray[np.complex128]:
     """Coefficients f_l a_lm for a factor f_l of shape (>= lmax + 1,), real or complex."""
     return alm * factor[degrees(lmax)]

@@ -132,7 +132,7 @@ class Urn:
         return [KINDS[min(int(np.searchsorted(edges, value, side="right")), len(KINDS) - 1)] for value in drawn]
 
     def names(self) -> list[str]:
-        """Effects that can be there and are heard at all."""
+        """Effects that can be there and are heard, no larger than nature has them."""
         return list(
             dict.fromkeys(self.proposals[index].kind.name for index in range(len(self.proposals)) if self._heard(index))
         )
@@ -146,7 +146,9 @@ class Urn:
         return total
 
     def _heard(self, index: int) -> bool:
-        return any(self.white_length(self.templates[:, column]) > 0.0 for column in self.columns[index])
+        best = max(self.white_length(self.templates[:, column]) for column in self.columns[index])
+        most = self.proposals[index].kind.most
+        return best > 0.0 if np.isinf(most) else most * best >= self.prior.weakest
 
     def _channels(self, name: str) -> list[list[int]]:
         """Proposals of an effect, channel by channel."""

@@ -36,6 +36,8 @@ class Candidate:
         Relative error of its templates in white length; ``None``: that of the search.
     positive
         Whether an amplitude below zero is none: a set that asks for one explains nothing.
+    most
+        Length of the coordinates beyond which they are none either.
     scatter
         Deviations of its response from the mean one, where it draws: :meth:`~mcsim.diagnosis.gaussian.Null.widened` by
         them is what a set that has it is judged with. ``None``: no scatter is known.
@@ -49,6 +51,7 @@ class Candidate:
     prior: float = 1.0
     shape_error: float | None = None
     positive: bool = False
+    most: float = np.inf
     scatter: NDArray[np.float64] | None = field(default=None, compare=False)
 
     @property
@@ -253,8 +256,13 @@ class _Accepted:
 
 def allowed(candidates: Sequence[Candidate], members: Sequence[int], amplitudes: NDArray[np.float64]) -> bool:
     """Whether amplitudes, one member after the other, are none that a member cannot have."""
-    positive = [candidates[member].positive for member in members for _ in candidates[member].columns]
-    return bool(np.all(amplitudes[positive] >= 0.0))
+    start = 0
+    for candidate in (candidates[member] for member in members):
+        own = amplitudes[start : start + len(candidate.columns)]
+        if (candidate.positive and np.any(own < 0.0)) or np.linalg.norm(own) > candidate.most:
+            return False
+        start += len(own)
+    return True
 
 
 def _possible(
@@ -265,7 +273,7 @@ def _possible(
     members: tuple[int, ...],
 ) -> bool:
     """Whether no member would need an amplitude that it cannot have."""
-    if not any(candidates[member].positive for member in members):
+    if not any(candidates[member].positive or np.isfinite(candidates[member].most) for member in members):
         return True
     columns = [column for member in members for column in candidates[member].columns]
     return allowed(candidates, members, fit(null, x, t[:, columns]).amplitudes)

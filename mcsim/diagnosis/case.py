@@ -114,6 +114,7 @@ def court(run: config.RunConfig, asked: Questions, known: Knowledge) -> Court:
             # What an effect draws at random is not known even where the sky is.
             shape_error=min(float(own), 1.0) if proposal.drawn else None,
             positive=proposal.kind.side != 0,
+            most=proposal.kind.most,
         )
         for proposal, columns, own in zip(asked.proposals, asked.columns, scatter, strict=True)
     )

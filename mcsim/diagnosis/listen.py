@@ -12,6 +12,7 @@ order gives the score of every beam at once.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import ducc0
 import healpy
@@ -212,16 +213,13 @@ def listen(model: Model, maps: Sequence[Map], nthreads: int = 1) -> Heard:
             )[0]
             orders[i, 0] = window * k * by_degree(looked_at, adjoint[i], lmax)
         for i, s, together in _transforms(model, members):
-            turned = sum(
-                np.stack([2.0 * residual[j] * w.real, -2.0 * residual[j] * w.imag])
-                for j, w in ((j, model.parts[j].moments.w[s - 1]) for j in together)
-            )
+            turned = reduce(np.add, [residual[j] * np.conj(model.parts[j].moments.w[s - 1]) for j in together])
             electric, magnetic = ducc0.sht.adjoint_synthesis(
-                map=turned, spin=s, lmax=lmax, nthreads=nthreads, **geometry
+                map=turned.view(np.float64).reshape(-1, 2).T, spin=s, lmax=lmax, nthreads=nthreads, **geometry
             )
             # ducc0's sign: S_s is minus the synthesis of E = Re(k b) a, B = Im(k b) a.
             orders[i, s] = (
-                -window * k * (by_degree(looked_at, electric, lmax) + 1j * by_degree(looked_at, magnetic, lmax))
+                -2.0 * window * k * (by_degree(looked_at, electric, lmax) + 1j * by_degree(looked_at, magnetic, lmax))
             )
     return Heard(sky, expected, residual, adjoint, orders)
 
@@ -260,10 +258,11 @@ def _sky(model: Model, clean: Sequence[Map], nthreads: int) -> Alm:
     lmax = model.lmax
     total = np.zeros(alm_.size(lmax), dtype=np.complex128)
     gain = np.zeros(lmax + 1)
-    for part, map_ in zip(model.parts, clean, strict=True):
-        factor = model.response[part.channel] / part.noise_power
-        total += alm_.multiply(healpix.analysis(map_, lmax, nthreads=nthreads), factor, lmax)
-        gain += model.response[part.channel] * factor
+    for channel, response in enumerate(model.response):
+        members = model.of(channel)
+        together = reduce(np.add, [clean[i] / model.parts[i].noise_power for i in members])
+        total += alm_.multiply(healpix.analysis(together, lmax, nthreads=nthreads), response, lmax)
+        gain += response**2 * sum(1.0 / model.parts[i].noise_power for i in members)
     return alm_.multiply(total, model.cl / (1.0 + model.cl * gain), lmax)
 
 

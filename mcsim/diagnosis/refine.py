@@ -93,7 +93,7 @@ def on_this_sky(known: Knowledge, asked: Questions, t: NDArray[np.float64], resp
     """Templates, those of effects whose response depends on the very sky measured on the one that was observed."""
     result = t.copy()
     for proposal, columns, scatter in zip(asked.proposals, asked.columns, scatter_of(known, asked), strict=True):
-        if scatter < SCATTERED or proposal.drawn or proposal.kind.isotropic:
+        if scatter < SCATTERED or proposal.drawn or proposal.kind.mean_response:
             continue
         for column, basis in zip(columns, proposal.basis, strict=True):
             try:

@@ -109,13 +109,15 @@ class Effect:
         what is always listened for (dipoles, variances, spectra, modulations) says it all.
     draws
         Whether a hook draws random numbers, at positive amplitudes at least.
-    isotropic
-        Whether it changes the power of the sky and nothing else. In one sky such a change hangs on the fluctuations
-        that its spectra have anyway, so that a diagnosis holds to the mean response; other changes it takes from the
-        sky that was observed.
+    mean_response
+        Whether a diagnosis holds to the response in the mean over skies, and not to that in the sky that was observed.
+        So for a change of power alone, or one that makes a typical sky of another: in one sky it hangs on the
+        fluctuations that the spectra have anyway.
     side
         Sign of the amplitudes at which responses are measured; 0: both. Where it is not 0, a negative amplitude is not
         one of nature, and a diagnosis does not name it.
+    most
+        Largest amplitude, in absolute value, of nature; a diagnosis names no larger one.
     variants
         Settings, fixed parameters, that a diagnosis proposes side by side.
     """
@@ -130,7 +132,8 @@ class Effect:
     own_score: ClassVar[bool] = True
     side: ClassVar[Literal[-1, 0, 1]] = 0
     draws: ClassVar[bool] = False
-    isotropic: ClassVar[bool] = False
+    mean_response: ClassVar[bool] = False
+    most: ClassVar[float] = np.inf
     variants: ClassVar[tuple[Mapping[str, Any], ...]] = ({},)
 
     amplitude: float = 0.0

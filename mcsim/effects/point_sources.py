@@ -31,7 +31,7 @@ class PointSources(Effect):
     step = 1e-4
     own_score = False
     draws = True
-    isotropic = True
+    mean_response = True
     side = -1
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:

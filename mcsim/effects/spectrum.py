@@ -39,7 +39,7 @@ class Spectrum(Effect):
     source = "Follows from the definition"
     step = 0.02
     own_score = False
-    isotropic = True
+    mean_response = True
 
     bands: tuple[float, ...] = (1.0,) * BANDS
 

@@ -133,6 +133,22 @@ def test_what_is_left_out_rotates(sitting):
     assert sorted(names[:3]) == sorted(names[3:]) == sorted(set(urn.names()))
 
 
+def test_what_nature_has_too_little_of_is_not_drawn(sitting, monkeypatch):
+    urn = urn_of(bench(sitting), Prior())
+    name = urn.names()[0]
+    kind = next(one.kind for one in urn.proposals if one.kind.name == name)
+    strongest = max(
+        urn.white_length(urn.templates[:, column])
+        for proposal, columns in zip(urn.proposals, urn.columns, strict=True)
+        for column in columns
+        if proposal.kind is kind
+    )
+    monkeypatch.setattr(kind, "most", 1.01 * urn.prior.weakest / strongest)
+    assert name in urn.names()
+    monkeypatch.setattr(kind, "most", 0.99 * urn.prior.weakest / strongest)
+    assert name not in urn.names()
+
+
 def test_strengths_are_the_drawn_ones(sitting):
     """White length of the response, by the covariance that the toy was made with; known to 5 % from 600 simulations."""
     urn = urn_of(bench(sitting), Prior(none=0, one=1, two=0, left_out=0))

@@ -119,6 +119,14 @@ def test_an_effect_of_one_sign_is_not_named_with_the_other():
     assert bench.judge(-8.0 * t[:, 1], 3).verdict == "effect"
 
 
+def test_an_effect_larger_than_nature_has_it_is_not_named():
+    t = directions(3, 14)
+    bench = Bench(t, [Candidate("small", None, (0, 1), most=10.0), Candidate("other", None, (2,))])
+    assert bench.judge(t[:, :2] @ [5.0, 6.0], 3).verdict == "effect"
+    assert bench.judge(t[:, :2] @ [10.0, 12.0], 3).verdict == "unknown"
+    assert bench.judge(t @ [0.0, 0.0, 15.0], 3).verdict == "effect"
+
+
 def test_simpler_of_two_nested_effects_is_first():
     """One column, and three that contain it."""
     nested = Bench(directions(3, 11), [Candidate("large", None, (0, 1, 2)), Candidate("small", None, (0,))])
