@@ -20,7 +20,7 @@ from mcsim.diagnosis.gaussian import Null, bases, fit
 from mcsim.diagnosis.knowledge import CONSTRAINED_SKIES, Knowledge, constrained_jobs
 from mcsim.diagnosis.listen import show
 from mcsim.diagnosis.refine import Refined, Respond, effect_at, on_this_sky, quiet_templates, refine, scatter_of
-from mcsim.diagnosis.shrink import Measured, Prediction, Shrink, achieved, excess, predicted
+from mcsim.diagnosis.shrink import Prediction, Shrink, achieved, carried, excess, predicted
 from mcsim.diagnosis.trials import Calibration, calibrate, gap
 from mcsim.diagnosis.verdict import detectable_of, sentence, verdict_of
 from mcsim.diagnosis.where import Place, places
@@ -230,19 +230,21 @@ def shrink_of(court: Court, x: Vector, refined: Refined, respond: Respond) -> tu
     except InputError:
         return None  # half of the evidence asks for an amplitude that the effect cannot have
     after = replace(before, mean=mean).widened(*(one[fresh] for one in scatters))
-    here, left = refined.templates[np.ix_(fresh, chosen)], x - refined.templates[:, chosen] @ frozen.amplitudes
-    wider = None
+    here = refined.templates[np.ix_(fresh, chosen)]
     if scatters:
-        # Both halves see the same draw: what the mean response leaves in one is in the other too.
-        share = _trace(before, scatters, fresh) / _trace(learning, scatters, used)
-        seen = excess(learning, left[used])
-        wider = Measured(share * max(seen.value, 0.0), share * seen.sigma)
-    expected = predicted(before, x[fresh], here, frozen.amplitudes, frozen.covariance, wider)
+        response = refined.templates[:, chosen] @ frozen.amplitudes
+        share = _square(before, response, scatters, fresh) / _square(learning, response, scatters, used)
+        noise = fit(learning, x[used], refined.templates[np.ix_(used, chosen)]).covariance
+        expected = carried(before, x[fresh], here, noise, excess(learning, x[used]), share)
+    else:
+        expected = predicted(before, x[fresh], here, frozen.amplitudes, frozen.covariance)
     return expected, achieved(before, after, x[fresh]), _fresh_words(court)
 
 
-def _trace(null: Null, scatters: Sequence[NDArray[np.float64]], rows: NDArray[np.int64]) -> float:
-    return sum(null.length(draw) ** 2 for scatter in scatters for draw in scatter[rows].T)
+def _square(null: Null, response: Vector, scatters: Sequence[NDArray[np.float64]], rows: NDArray[np.int64]) -> float:
+    """Mean square of a response that scatters, over its draws."""
+    deviations = sum(null.length(draw) ** 2 for scatter in scatters for draw in scatter[rows].T)
+    return null.length(response[rows]) ** 2 + deviations
 
 
 def _fresh_words(court: Court) -> str:

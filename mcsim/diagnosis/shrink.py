@@ -58,7 +58,6 @@ def predicted(
     t: NDArray[np.float64],
     amplitudes: NDArray[np.float64],
     covariance: NDArray[np.float64],
-    scatter: Measured | None = None,
 ) -> Prediction:
     """Shrink to expect on data that the fit did not use.
 
@@ -70,8 +69,6 @@ def predicted(
         Templates of the frozen parameters in that evidence, shape (p_test, K).
     amplitudes, covariance
         From the fit to other data, shape (K,), (K, K).
-    scatter
-        White square that a draw about the mean response adds to the gap, and that simulations will have too.
 
     Notes
     -----
@@ -84,12 +81,43 @@ def predicted(
     product = fisher @ covariance
     drop = float(amplitudes @ fisher @ amplitudes) - 2.0 * float(np.trace(product))
     variance = 4.0 * float(amplitudes @ product @ fisher @ amplitudes) + 4.0 * float(np.trace(product @ product))
-    if scatter is not None:
-        drop, variance = drop + scatter.value, variance + scatter.sigma**2
-    before = excess(test, x)
-    fraction = drop / before.value
-    sigma = float(np.hypot(np.sqrt(variance), fraction * before.sigma)) / abs(before.value)
-    return Prediction(Measured(drop, float(np.sqrt(variance))), Measured(fraction, sigma))
+    return _of_gap(Measured(drop, float(np.sqrt(variance))), excess(test, x))
+
+
+def carried(
+    test: Null,
+    x: NDArray[np.float64],
+    t: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    seen: Measured,
+    share: float,
+) -> Prediction:
+    """Shrink to expect where what acts draws at random: all data see the same draw, whatever the mean response.
+
+    Parameters
+    ----------
+    test, x, t
+        As in :func:`predicted`.
+    covariance
+        Of the frozen parameters, from noise alone, shape (K, K).
+    seen
+        Gap of the data that were fitted.
+    share
+        Mean square of the response in the data that measure the shrink, over that in those that were fitted.
+
+    Notes
+    -----
+    The drop is share times the gap of the fitted data, less tr(F V) for the error of the frozen parameters.
+    """
+    white = test.templates(t)
+    lost = test.unbiased * float(np.trace(white.T @ white @ covariance))
+    return _of_gap(Measured(share * seen.value - lost, share * seen.sigma), excess(test, x))
+
+
+def _of_gap(drop: Measured, before: Measured) -> Prediction:
+    fraction = drop.value / before.value
+    sigma = float(np.hypot(drop.sigma, fraction * before.sigma)) / abs(before.value)
+    return Prediction(drop, Measured(fraction, sigma))
 
 
 def achieved(before: Null, after: Null, x: NDArray[np.float64]) -> Shrink:

@@ -27,6 +27,10 @@ TURN_S = 30.0
 ALONE_S = 300.0
 """How long a run waits for a worker when all are gone."""
 
+_KEPT_MEMORY = {f"MALLOC_{limit}_THRESHOLD_": str(2**28) for limit in ("TRIM", "MMAP")}
+"""For glibc, in bytes. A worker makes the same maps again and again; distributed's default gives their memory back to
+the system each time, and fetching its pages anew costs nearly as much as the transforms."""
+
 
 @contextmanager
 def local_client(workers: int) -> Iterator[Client]:
@@ -39,7 +43,9 @@ def local_client(workers: int) -> Iterator[Client]:
     """
     single = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "DUCC0", "NUMBA")}
     settings = {
-        "distributed.nanny.pre-spawn-environ": dask.config.get("distributed.nanny.pre-spawn-environ") | single,
+        "distributed.nanny.pre-spawn-environ": (
+            dask.config.get("distributed.nanny.pre-spawn-environ") | single | _KEPT_MEMORY
+        ),
         "distributed.scheduler.allowed-failures": ATTEMPTS - 1,
         "distributed.worker.preload": [_WORKER_SETUP],
     }

@@ -1,5 +1,7 @@
 """The exact tests are exact, detection has its power, and shrink is what was forecast: Monte Carlo, k sigma."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -7,7 +9,7 @@ from scipy.linalg import solve_triangular
 
 from mcsim.diagnosis.detect import confusion, detectable, posterior, power, strength_needed, strength_to_isolate
 from mcsim.diagnosis.gaussian import Null, bases, fit, null, residual_probability, score_probability
-from mcsim.diagnosis.shrink import achieved, excess, predicted
+from mcsim.diagnosis.shrink import achieved, carried, excess, predicted
 from mcsim.diagnosis.trials import atlas, calibrate, gap
 
 SEED = 20121024
@@ -225,6 +227,31 @@ def frozen_fits(request) -> dict[str, np.ndarray]:
 def test_forecast_drop_is_the_drop(frozen_fits):
     difference = frozen_fits["drop"] - frozen_fits["forecast"]
     assert abs(difference.mean()) < 4.0 * difference.std() / np.sqrt(len(difference))
+
+
+def test_forecast_drop_of_what_draws_is_the_drop():
+    """A response that scatters by 0.3 of itself: 40 data are fitted, and 30 others see the same draw."""
+    rng = np.random.default_rng(SEED)
+    fitted, p, count, draws = 40, 30, 500, 200
+    t = rng.normal(size=fitted + p)
+    t *= 15.0 / np.linalg.norm(t)
+    sideways = rng.normal(size=(fitted + p, 2))
+    root = 0.3 * np.column_stack([t, 15.0 * sideways / np.linalg.norm(sideways, axis=0)])
+    differences = []
+    for _ in range(400):
+        learning, before = drawn_null(rng, fitted, count), drawn_null(rng, p, count)
+        scatter = root @ rng.normal(size=(3, draws))
+        scatter = (scatter - scatter.mean(axis=1, keepdims=True)) / np.sqrt(draws - 1.0)
+        x = t + root @ rng.normal(size=3) + rng.normal(size=fitted + p)
+        frozen = fit(learning.widened(scatter[:fitted]), x[:fitted], t[:fitted, None])
+        noise = fit(learning, x[:fitted], t[:fitted, None]).covariance
+        after = replace(before, mean=before.mean + t[fitted:] * frozen.amplitudes[0]).widened(scatter[fitted:])
+        square = [np.sum(t[part] ** 2) + np.sum(scatter[part] ** 2) for part in (slice(fitted), slice(fitted, None))]
+        seen = excess(learning, x[:fitted])
+        forecast = carried(before, x[fitted:], t[fitted:, None], noise, seen, square[1] / square[0])
+        shrink = achieved(before, after, x[fitted:])
+        differences.append(shrink.before.value - shrink.after.value - forecast.drop.value)
+    assert abs(np.mean(differences)) < 4.0 * np.std(differences) / np.sqrt(len(differences))
 
 
 def test_gap_is_the_squared_distance(frozen_fits):

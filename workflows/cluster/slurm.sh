@@ -11,6 +11,7 @@
 
 file="scheduler-$SLURM_JOB_ID.json"
 export OMP_NUM_THREADS=1 DUCC0_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
+export MALLOC_TRIM_THRESHOLD_=268435456 MALLOC_MMAP_THRESHOLD_=268435456 # memory of maps is kept for the next ones
 
 # The scheduler has no password: it listens on the network of the cluster alone. See tls.yaml where that is shared.
 dask scheduler --scheduler-file "$file" --interface "${INTERFACE:-ib0}" --dashboard-address 127.0.0.1:0 &
