@@ -10,13 +10,14 @@ from mcsim import rng
 from mcsim.challenge.prior import Drawn, Prior, Urn
 from mcsim.challenge.record import Geometry, Record, most_probable
 from mcsim.challenge.reduced import without
-from mcsim.diagnosis.attribute import Attribution, Candidate, attribute
+from mcsim.diagnosis.attribute import Attribution, attribute
 from mcsim.diagnosis.batch import Batch
+from mcsim.diagnosis.candidate import Candidate, columns_of
 from mcsim.diagnosis.case import Court
 from mcsim.diagnosis.detect import power
 from mcsim.diagnosis.evidence import Proposal
 from mcsim.diagnosis.gaussian import Null, bases, fit
-from mcsim.diagnosis.refine import effect_at, quiet_templates
+from mcsim.diagnosis.refine import effects_at, quiet_templates
 from mcsim.diagnosis.shrink import Prediction, Shrink, achieved, predicted
 from mcsim.diagnosis.trials import Calibration, calibrate, gap
 from mcsim.errors import InputError
@@ -229,19 +230,14 @@ def shrunk(bench: Bench, x: Vector, members: Sequence[int]) -> tuple[Prediction,
     """Shrink predicted and achieved: fitted to fold 0, frozen, and judged on fold 1."""
     if bench.used is None or bench.fresh is None:
         return None
-    columns = np.array([column for member in members for column in bench.candidates[member].columns])
+    columns = np.array(columns_of(bench.candidates, members))
     here = bench.templates[np.ix_(bench.second, columns)]
     frozen = fit(bench.used, x[bench.first], bench.templates[np.ix_(bench.first, columns)])
-    coordinates, start = np.zeros(len(columns)), 0
-    for member in members:
-        stop = start + len(bench.candidates[member].columns)
-        part = slice(start, stop)
-        try:
-            effect = effect_at(bench.proposals[member], frozen.amplitudes[part], frozen.covariance[part, part])
-        except InputError:
-            return None
-        coordinates[part] = effect.coordinates()
-        start = stop
+    try:
+        effects = effects_at(bench.candidates, bench.proposals, members, frozen)
+    except InputError:
+        return None
+    coordinates = np.concatenate([effect.coordinates() for effect in effects])
     expected = predicted(bench.fresh, x[bench.second], here, frozen.amplitudes, frozen.covariance)
     after = replace(bench.fresh, mean=bench.fresh.mean + here @ coordinates)
     return expected, achieved(bench.fresh, after, x[bench.second])

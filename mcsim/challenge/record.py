@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mcsim.challenge.bayes import Bayes
 from mcsim.challenge.prior import Urn
 from mcsim.challenge.truth import Identity, Kind
-from mcsim.diagnosis.attribute import Candidate
+from mcsim.diagnosis.candidate import Candidate
 from mcsim.diagnosis.gaussian import Bases, Null, bases
 from mcsim.diagnosis.subsets import Subsets
 from mcsim.diagnosis.trials import Calibration

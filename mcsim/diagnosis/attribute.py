@@ -1,6 +1,6 @@
 """Which effect: all subsets of up to three candidates, those that suffice, and what would tell them apart."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import combinations
@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mcsim.diagnosis.candidate import Candidate, allowed, columns_of
 from mcsim.diagnosis.detect import cosines
 from mcsim.diagnosis.gaussian import Fit, Null, bases, fit
 from mcsim.diagnosis.subsets import Subsets
@@ -16,48 +17,11 @@ from mcsim.diagnosis.trials import Calibration, Gap, gap
 
 Verdict = Literal["none", "effect", "mixture", "degenerate", "unknown"]
 
+LARGEST = 3
+"""Candidates that may act together."""
+
 # Subsets that are solved at once; bounds the memory to some 100 MB.
 CHUNK = 1000
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """One effect on one channel, or common to all (``channel=None``), with fixed settings.
-
-    Attributes
-    ----------
-    name, channel, settings, unit
-        Of the effect.
-    columns
-        Of its linear components in the template matrix.
-    prior
-        Weight relative to the other candidates.
-    shape_error
-        Relative error of its templates in white length; ``None``: that of the search.
-    positive
-        Whether an amplitude below zero is none: a set that asks for one explains nothing.
-    most
-        Length of the coordinates beyond which they are none either.
-    scatter
-        Deviations of its response from the mean one, where it draws: :meth:`~mcsim.diagnosis.gaussian.Null.widened` by
-        them is what a set that has it is judged with. ``None``: no scatter is known.
-    """
-
-    name: str
-    channel: str | None
-    columns: tuple[int, ...]
-    settings: Mapping[str, object] = field(default_factory=dict)
-    unit: str = ""
-    prior: float = 1.0
-    shape_error: float | None = None
-    positive: bool = False
-    most: float = np.inf
-    scatter: NDArray[np.float64] | None = field(default=None, compare=False)
-
-    @property
-    def identity(self) -> tuple[str, str | None]:
-        """Name and channel: candidates that share them differ only in settings and exclude each other."""
-        return self.name, self.channel
 
 
 @dataclass(frozen=True)
@@ -147,7 +111,7 @@ def attribute(
     *,
     alpha: float = 0.05,
     levels: tuple[float, float] = (0.02, 0.005),
-    largest: int = 3,
+    largest: int = LARGEST,
     odds_cut: float = 100.0,
     shape_error: float = 0.01,
 ) -> Attribution:
@@ -254,17 +218,6 @@ class _Accepted:
     null: Null = field(compare=False)
 
 
-def allowed(candidates: Sequence[Candidate], members: Sequence[int], amplitudes: NDArray[np.float64]) -> bool:
-    """Whether amplitudes, one member after the other, are none that a member cannot have."""
-    start = 0
-    for candidate in (candidates[member] for member in members):
-        own = amplitudes[start : start + len(candidate.columns)]
-        if (candidate.positive and np.any(own < 0.0)) or np.linalg.norm(own) > candidate.most:
-            return False
-        start += len(own)
-    return True
-
-
 def _possible(
     x: NDArray[np.float64],
     t: NDArray[np.float64],
@@ -275,8 +228,7 @@ def _possible(
     """Whether no member would need an amplitude that it cannot have."""
     if not any(candidates[member].positive or np.isfinite(candidates[member].most) for member in members):
         return True
-    columns = [column for member in members for column in candidates[member].columns]
-    return allowed(candidates, members, fit(null, x, t[:, columns]).amplitudes)
+    return allowed(candidates, members, fit(null, x, t[:, columns_of(candidates, members)]))
 
 
 def _accepted(
@@ -341,8 +293,7 @@ def _explanations(
         lost = ranked[0].evidence - found.evidence
         if lost <= cut and identity not in seen:
             seen.add(identity)
-            columns = [column for member in found.members for column in candidates[member].columns]
-            best = fit(found.null, x, t[:, columns])
+            best = fit(found.null, x, t[:, columns_of(candidates, found.members)])
             yield Explanation(found.members, best, float(np.exp(-lost)), found.probability, found.further)
 
 
@@ -351,9 +302,7 @@ def _contrasts(
 ) -> Iterator[Contrast]:
     """Each pair of explanations, and the entries in which their predictions differ by most of their distance."""
     predictions = [
-        t[:, [column for member in explanation.members for column in candidates[member].columns]]
-        @ explanation.fit.amplitudes
-        for explanation in explanations
+        t[:, columns_of(candidates, explanation.members)] @ explanation.fit.amplitudes for explanation in explanations
     ]
     for first, second in combinations(range(len(predictions)), 2):
         difference = predictions[first] - predictions[second]

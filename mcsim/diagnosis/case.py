@@ -11,7 +11,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.diagnosis.attribute import Attribution, Candidate
+from mcsim.diagnosis.attribute import Attribution
+from mcsim.diagnosis.candidate import Candidate, columns_of
 from mcsim.diagnosis.closest import Closest, closest
 from mcsim.diagnosis.data import exchanges
 from mcsim.diagnosis.evidence import Job, Questions
@@ -19,7 +20,7 @@ from mcsim.diagnosis.exhibits import exhibits
 from mcsim.diagnosis.gaussian import Null, bases, fit
 from mcsim.diagnosis.knowledge import CONSTRAINED_SKIES, Knowledge, constrained_jobs
 from mcsim.diagnosis.listen import show
-from mcsim.diagnosis.refine import Refined, Respond, effect_at, on_this_sky, quiet_templates, refine, scatter_of
+from mcsim.diagnosis.refine import Refined, Respond, effects_at, on_this_sky, quiet_templates, refine, scatter_of
 from mcsim.diagnosis.shrink import Prediction, Shrink, achieved, carried, excess, predicted
 from mcsim.diagnosis.trials import Calibration, calibrate, gap
 from mcsim.diagnosis.verdict import detectable_of, sentence, verdict_of
@@ -209,7 +210,7 @@ def shrink_of(court: Court, x: Vector, refined: Refined, respond: Respond) -> tu
     if not len(used) or not len(fresh):
         return None
     members = refined.attribution.explanations[0].members
-    columns = [column for member in members for column in court.candidates[member].columns]
+    columns = columns_of(court.candidates, members)
     change = refined.templates[:, columns] @ refined.attribution.explanations[0].fit.amplitudes
     heard = min(court.known.null(rows).length(change[rows]) for rows in (used, fresh))
     if heard < HEARD * court.null.length(change):
@@ -219,13 +220,8 @@ def shrink_of(court: Court, x: Vector, refined: Refined, respond: Respond) -> tu
     learning, before = court.known.null(used), court.known.null(fresh)
     frozen = fit(learning.widened(*(one[used] for one in scatters)), x[used], refined.templates[np.ix_(used, chosen)])
     try:
-        tables, start = [], 0
-        for member in members:
-            stop = start + len(court.candidates[member].columns)
-            proposal = court.asked.proposals[member]
-            effect = effect_at(proposal, frozen.amplitudes[start:stop], frozen.covariance[start:stop, start:stop])
-            tables.append(proposal.table(effect))
-            start = stop
+        effects = effects_at(court.candidates, court.asked.proposals, members, frozen)
+        tables = [court.asked.proposals[member].table(effect) for member, effect in zip(members, effects, strict=True)]
         mean = before.mean + respond(tables, CONSTRAINED_SKIES).mean(axis=0)[fresh]
     except InputError:
         return None  # half of the evidence asks for an amplitude that the effect cannot have
@@ -288,7 +284,7 @@ def dataset(court: Court, x: Vector, refined: Refined, where: Sequence[Place], v
     candidate = [p.label for p in court.asked.proposals]
     best = np.zeros(len(entry))
     if found.explanations:
-        columns = [c for member in found.explanations[0].members for c in court.candidates[member].columns]
+        columns = columns_of(court.candidates, found.explanations[0].members)
         best = refined.templates[:, columns] @ found.explanations[0].fit.amplitudes
     return xr.Dataset(
         {

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.attribute import Candidate, allowed
+from mcsim.diagnosis.candidate import Candidate, allowed
 from mcsim.diagnosis.gaussian import Fit, Null, fit, score_probability
 from mcsim.diagnosis.trials import Calibration
 
@@ -75,7 +75,7 @@ def closest(
             if candidate.identity in taken:
                 continue
             after = fit(null, x, t[:, [*columns, *candidate.columns]])
-            if not allowed(candidates, (*members, index), after.amplitudes):
+            if not allowed(candidates, (*members, index), after):
                 continue
             if not _within_reach(null, t, curvature, [*columns, *candidate.columns], after.amplitudes):
                 continue

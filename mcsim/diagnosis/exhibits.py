@@ -9,7 +9,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.attribute import Attribution, Candidate, Explanation
+from mcsim.diagnosis.attribute import Attribution, Explanation
+from mcsim.diagnosis.candidate import Candidate
 from mcsim.diagnosis.evidence import Proposal
 from mcsim.diagnosis.gaussian import Fit, Null, residual_probability
 from mcsim.diagnosis.listen import Model, listen

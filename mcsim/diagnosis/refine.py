@@ -7,9 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.diagnosis.attribute import Attribution, Candidate, attribute
+from mcsim.diagnosis.attribute import LARGEST, Attribution, attribute
+from mcsim.diagnosis.candidate import Candidate, columns_of, parts_of
+from mcsim.diagnosis.closest import closest
 from mcsim.diagnosis.evidence import Proposal, Questions
-from mcsim.diagnosis.gaussian import Null
+from mcsim.diagnosis.gaussian import Fit, Null
 from mcsim.diagnosis.knowledge import CONSTRAINED_SKIES, SCATTER_SKIES, Knowledge
 from mcsim.diagnosis.knowledge import skies as skies_of
 from mcsim.diagnosis.trials import Calibration
@@ -111,6 +113,16 @@ def effect_at(proposal: Proposal, coordinates: Vector, covariance: NDArray[np.fl
     return proposal.with_parameters(coordinates, precision)
 
 
+def effects_at(
+    candidates: Sequence[Candidate], proposals: Sequence[Proposal], members: Sequence[int], found: Fit
+) -> list[Effect]:
+    """The effects that are nearest to a fit of several candidates; InputError where one can have no such amplitude."""
+    return [
+        effect_at(proposals[member], amplitudes, covariance)
+        for member, amplitudes, covariance in parts_of(candidates, members, found)
+    ]
+
+
 def refine(
     known: Knowledge,
     null: Null,
@@ -164,7 +176,46 @@ def refine(
         if not changed:
             break
         found = attribute(null, x, t, tried, calibration)
+    if found.verdict == "unknown":
+        joint = _together(known, null, x, t, tried, proposals, calibration, respond)
+        if joint is not None:
+            t, found = joint, attribute(null, x, joint, tried, calibration)
     return Refined(found, t, tuple(tried), tuple(done))
+
+
+def _together(
+    known: Knowledge,
+    null: Null,
+    x: Vector,
+    t: NDArray[np.float64],
+    candidates: Sequence[Candidate],
+    proposals: Sequence[Proposal],
+    calibration: Calibration,
+    respond: Respond,
+) -> NDArray[np.float64] | None:
+    """Templates that are exact for what is heard together, where strong effects change each other's responses.
+
+    None where a single effect is heard, or more than act together in an explanation. What the response of all of them
+    has beyond the sum is shared out by the squares of the white lengths of their parts.
+    """
+    heard = closest(null, x, t, known.curvature, candidates, calibration)
+    if heard is None or not 2 <= len(heard.members) <= LARGEST:
+        return None
+    columns = np.array(columns_of(candidates, heard.members))
+    draws = any(proposals[member].kind.draws for member in heard.members)
+    try:
+        effects = effects_at(candidates, proposals, heard.members, heard.fit)
+        tables = [proposals[member].table(effect) for member, effect in zip(heard.members, effects, strict=True)]
+        response = respond(tables, SCATTER_SKIES if draws else CONSTRAINED_SKIES).mean(axis=0)
+    except InputError:
+        return None
+    theta = np.concatenate([effect.coordinates() for effect in effects])
+    parts = t[:, columns] * theta
+    weights = np.sum(null.templates(parts) ** 2, axis=0)
+    there = weights > 0.0
+    result = t.copy()
+    result[:, columns[there]] += np.outer(response - parts.sum(axis=1), weights[there] / weights.sum() / theta[there])
+    return result
 
 
 def _simulated(
@@ -192,12 +243,8 @@ def _to_try(
     if found.verdict == "none":
         return []
     for explanation in found.explanations[:2]:
-        start = 0
-        for member in explanation.members:
-            stop = start + len(candidates[member].columns)
-            fit = explanation.fit
-            work.setdefault(member, (member, fit.amplitudes[start:stop], fit.covariance[start:stop, start:stop]))
-            start = stop
+        for part in parts_of(candidates, explanation.members, explanation.fit):
+            work.setdefault(part[0], part)
     if found.explanations and len(found.explanations[0].members) == 1:
         return list(work.values())
     # Singles too: a strong effect bends its response, and one that draws scatters it, until only a mixture seems to do.

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.attribute import Attribution, Candidate, Explanation
+from mcsim.diagnosis.attribute import Attribution, Explanation
+from mcsim.diagnosis.candidate import Candidate, parts_of
 from mcsim.diagnosis.closest import Closest
 from mcsim.diagnosis.detect import detectable
 from mcsim.diagnosis.evidence import Proposal
@@ -25,11 +26,8 @@ def effects_of(
     explanation: Explanation | Closest, candidates: Sequence[Candidate], proposals: Sequence[Proposal]
 ) -> list[dict[str, Any]]:
     """The effects of a set with amplitude, standard error, unit and parameters."""
-    found, start = [], 0
-    for member in explanation.members:
-        stop = start + len(candidates[member].columns)
-        theta = explanation.fit.amplitudes[start:stop]
-        covariance = explanation.fit.covariance[start:stop, start:stop]
+    found = []
+    for member, theta, covariance in parts_of(candidates, explanation.members, explanation.fit):
         effect = effect_at(proposals[member], theta, covariance)
         found.append(
             {
@@ -41,7 +39,6 @@ def effects_of(
                 "parameters": {key: _plain(value) for key, value in effect.parameters().items()},
             }
         )
-        start = stop
     return found
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from mcsim.diagnosis.attribute import Attribution, Candidate, attribute
+from mcsim.diagnosis.attribute import Attribution, attribute
+from mcsim.diagnosis.candidate import Candidate
 from mcsim.diagnosis.case import confirmed
 from mcsim.diagnosis.closest import Closest, closest
 from mcsim.diagnosis.detect import cosines, detectable, log_evidence, posterior, strength_needed, strength_to_isolate

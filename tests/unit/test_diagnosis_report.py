@@ -14,8 +14,9 @@ from scipy import stats
 
 from mcsim import config, effects, resources
 from mcsim.diagnosis import case, exhibits, report
-from mcsim.diagnosis.attribute import Candidate, attribute
+from mcsim.diagnosis.attribute import attribute
 from mcsim.diagnosis.blocks import Entry
+from mcsim.diagnosis.candidate import Candidate
 from mcsim.diagnosis.case import Diagnosis
 from mcsim.diagnosis.detect import confusion, strength_needed
 from mcsim.diagnosis.evidence import Proposal

@@ -1,0 +1,86 @@
+"""Responses at the amplitudes that were found: bent ones, and two that change each other's."""
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mcsim.diagnosis.attribute import attribute
+from mcsim.diagnosis.candidate import Candidate
+from mcsim.diagnosis.evidence import Proposal
+from mcsim.diagnosis.gaussian import bases, null
+from mcsim.diagnosis.refine import refine
+from mcsim.diagnosis.trials import calibrate
+from mcsim.effects import Effect
+
+P = 50
+
+
+@dataclass(frozen=True, kw_only=True)
+class Push(Effect):
+    """A response along a direction of its own."""
+
+    name = "push"
+    scope = "channel"
+    unit = "push"
+    cause = signature = ""
+    step = 1.0
+
+
+class Instrument:
+    """Three effects on evidence of unit normals, with a response that is no straight line."""
+
+    def __init__(self, bend: float, cross: float) -> None:
+        rng = np.random.default_rng(21)
+        directions = np.linalg.qr(rng.normal(size=(P, 5)))[0].T
+        self.t, self.sideways = directions[:3].T, directions[3:]
+        self.bend, self.cross = bend, cross
+        self.null = null(rng.normal(size=(900, P)))
+        self.candidates = [Candidate("push", name, (k,)) for k, name in enumerate("ABC")]
+        self.proposals = [Proposal(Push, name, {}, (Push(amplitude=1.0),)) for name in "ABC"]
+        self.calibration = calibrate(self.null, bases(self.null, self.t, [(0,), (1,), (2,)]))
+        self.known = SimpleNamespace(curvature=np.outer(bend * self.sideways[0], [1.0, 0.0, 0.0]))
+        self.asked: list[dict[str | None, float]] = []
+
+    def response(self, a: float, b: float) -> np.ndarray:
+        return self.t[:, :2] @ [a, b] + self.bend * a**2 * self.sideways[0] + self.cross * a * b * self.sideways[1]
+
+    def respond(self, tables, skies: int) -> np.ndarray:
+        amplitudes = {table.channel: float(table.parameters["amplitude"]) for table in tables}
+        self.asked.append(amplitudes)
+        return np.tile(self.response(amplitudes.get("A", 0.0), amplitudes.get("B", 0.0)), (skies, 1))
+
+    def refined(self, x: np.ndarray):
+        rest = (self.candidates, self.proposals, self.calibration, self.respond)
+        return refine(self.known, self.null, x, self.t, *rest)
+
+
+@pytest.mark.parametrize("amplitude", [15.0, -15.0])
+def test_a_bent_response_is_found_at_its_amplitude(amplitude):
+    instrument = Instrument(bend=0.04, cross=0.0)
+    x = instrument.response(amplitude, 0.0)
+    plain = attribute(instrument.null, x, instrument.t, instrument.candidates, instrument.calibration)
+    assert plain.verdict == "unknown"
+    found = instrument.refined(x).attribution
+    assert [explanation.members for explanation in found.explanations] == [(0,)]
+    assert found.explanations[0].fit.amplitudes == pytest.approx([amplitude], abs=0.3)
+
+
+def test_effects_that_change_each_other_are_simulated_together():
+    instrument = Instrument(bend=0.0, cross=0.06)
+    x = instrument.response(12.0, 14.0)
+    plain = attribute(instrument.null, x, instrument.t, instrument.candidates, instrument.calibration)
+    assert plain.verdict == "unknown"
+    found = instrument.refined(x).attribution
+    assert instrument.asked[-1].keys() == {"A", "B"}
+    assert (found.verdict, found.explanations[0].members) == ("mixture", (0, 1))
+    assert found.explanations[0].fit.amplitudes == pytest.approx([12.0, 14.0], abs=0.5)
+
+
+def test_what_is_none_of_the_library_stays_unknown_beside_two_that_are():
+    instrument = Instrument(bend=0.0, cross=0.0)
+    x = instrument.response(12.0, 14.0) + 10.0 * instrument.sideways[1]
+    found = instrument.refined(x).attribution
+    assert instrument.asked[-1].keys() == {"A", "B"}
+    assert found.verdict == "unknown"
