@@ -13,14 +13,23 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.diagnosis.attribute import Attribution
 from mcsim.diagnosis.candidate import Candidate, columns_of
-from mcsim.diagnosis.closest import Closest, closest
+from mcsim.diagnosis.closest import Closest
 from mcsim.diagnosis.data import exchanges
 from mcsim.diagnosis.evidence import Job, Questions
 from mcsim.diagnosis.exhibits import exhibits
 from mcsim.diagnosis.gaussian import Null, bases, fit
 from mcsim.diagnosis.knowledge import CONSTRAINED_SKIES, Knowledge, constrained_jobs
 from mcsim.diagnosis.listen import show
-from mcsim.diagnosis.refine import Refined, Respond, effects_at, on_this_sky, quiet_templates, refine, scatter_of
+from mcsim.diagnosis.refine import (
+    Refined,
+    Respond,
+    effects_at,
+    heard_in,
+    on_this_sky,
+    quiet_templates,
+    refine,
+    scatter_of,
+)
 from mcsim.diagnosis.shrink import Prediction, Shrink, achieved, carried, excess, predicted
 from mcsim.diagnosis.trials import Calibration, calibrate, gap
 from mcsim.diagnosis.verdict import detectable_of, sentence, verdict_of
@@ -168,7 +177,7 @@ def judge(court: Court, case: str, maps: Sequence[NDArray[np.float64]], ask: Ask
         found, shrink = confirmed(court, found, shrink_of(court, x, refined, respond), notes)
     where = _where(court, x, numbers)
     able = detectable_of(court.null, refined.templates, court.candidates, asked.proposals)
-    heard = None if exchanged else heard_of(court, x, refined, found)
+    heard = None if exchanged else heard_of(court, x, refined, found, respond)
     verdict = verdict_of(case, found, court.candidates, asked.proposals, where, shrink, able, notes, heard)
     shown = exhibits(asked.model, maps, known.simulations, court.null, found, court.candidates, asked.proposals)
     told = dataset(court, x, replace(refined, attribution=found), where, verdict)
@@ -190,11 +199,12 @@ def confirmed(
     return found.unexplained(), None
 
 
-def heard_of(court: Court, x: Vector, refined: Refined, found: Attribution) -> Closest | None:
+def heard_of(court: Court, x: Vector, refined: Refined, found: Attribution, respond: Respond) -> Closest | None:
     """What of the library is heard in a gap that it does not explain."""
-    if found.verdict != "unknown":
-        return None
-    return closest(court.null, x, refined.templates, court.known.curvature, court.candidates, court.calibration)
+    if found.verdict != "unknown" or refined.heard is not None:
+        return refined.heard
+    rest = court.asked.proposals, court.calibration, respond
+    return heard_in(court.null, x, refined.templates, refined.candidates, *rest)
 
 
 def shrink_of(court: Court, x: Vector, refined: Refined, respond: Respond) -> tuple[Prediction, Shrink, str] | None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,9 +10,9 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.diagnosis.attribute import LARGEST, Attribution, attribute
 from mcsim.diagnosis.candidate import Candidate, columns_of, parts_of
-from mcsim.diagnosis.closest import closest
+from mcsim.diagnosis.closest import Closest, closest
 from mcsim.diagnosis.evidence import Proposal, Questions
-from mcsim.diagnosis.gaussian import Fit, Null
+from mcsim.diagnosis.gaussian import Fit, Null, fit
 from mcsim.diagnosis.knowledge import CONSTRAINED_SKIES, SCATTER_SKIES, Knowledge
 from mcsim.diagnosis.knowledge import skies as skies_of
 from mcsim.diagnosis.trials import Calibration
@@ -23,6 +24,8 @@ Respond = Callable[[Sequence[config.Effect], int], NDArray[np.float64]]
 """From effects and a number of skies to the changes of the evidence in each of these, by simulation."""
 
 ROUNDS = 4
+"""In which responses are simulated anew, at most."""
+
 STRAIGHT = 0.5
 """Departure from a straight line, in standard deviations of the evidence, that is let pass."""
 
@@ -37,6 +40,9 @@ CLEAN = 5.0
 
 TELLING = 0.05
 """Probability, trials included, from which on an effect that draws is tried where no single one suffices."""
+
+JOINT_ROUNDS = 3
+"""The same for effects that act together."""
 
 TRIED = 3
 """Single candidates, those that lower chi^2 most, that are brought to their amplitude where no subset suffices."""
@@ -56,12 +62,15 @@ class Refined:
         With the scatter of those that draw, at the amplitudes that they were tried at.
     simulated
         Candidates whose response was simulated at its amplitude.
+    heard
+        What of the library is heard where no set of it suffices.
     """
 
     attribution: Attribution
     templates: NDArray[np.float64]
     candidates: tuple[Candidate, ...]
     simulated: tuple[int, ...]
+    heard: Closest | None
 
 
 def quiet_templates(known: Knowledge) -> NDArray[np.float64]:
@@ -176,15 +185,17 @@ def refine(
         if not changed:
             break
         found = attribute(null, x, t, tried, calibration)
+    heard = None
     if found.verdict == "unknown":
-        joint = _together(known, null, x, t, tried, proposals, calibration, respond)
-        if joint is not None:
-            t, found = joint, attribute(null, x, joint, tried, calibration)
-    return Refined(found, t, tuple(tried), tuple(done))
+        heard = heard_in(null, x, t, tried, proposals, calibration, respond)
+        if heard is not None and 1 < len(heard.members) <= LARGEST:
+            together = attribute(null, x, heard.templates, tried, calibration)
+            if together.explanations:
+                t, found, heard = heard.templates, together, None
+    return Refined(found, t, tuple(tried), tuple(done), heard)
 
 
-def _together(
-    known: Knowledge,
+def heard_in(
     null: Null,
     x: Vector,
     t: NDArray[np.float64],
@@ -192,30 +203,45 @@ def _together(
     proposals: Sequence[Proposal],
     calibration: Calibration,
     respond: Respond,
-) -> NDArray[np.float64] | None:
-    """Templates that are exact for what is heard together, where strong effects change each other's responses.
+) -> Closest | None:
+    """What of the library is heard in evidence, each set simulated together at its amplitudes."""
+    return closest(null, x, t, candidates, calibration, partial(_together, null, x, candidates, proposals, respond))
 
-    None where a single effect is heard, or more than act together in an explanation. What the response of all of them
-    has beyond the sum is shared out by the squares of the white lengths of their parts.
+
+def _together(
+    null: Null,
+    x: Vector,
+    candidates: Sequence[Candidate],
+    proposals: Sequence[Proposal],
+    respond: Respond,
+    t: NDArray[np.float64],
+    members: tuple[int, ...],
+    fitted: Fit,
+) -> NDArray[np.float64] | None:
+    """Templates that are exact for effects that act together, at about fitted amplitudes.
+
+    Strong effects bend their own responses and change each other's: what the simulated response has beyond the sum is
+    shared out by the squares of the white lengths of the parts. None where one can have no such amplitude.
     """
-    heard = closest(null, x, t, known.curvature, candidates, calibration)
-    if heard is None or not 2 <= len(heard.members) <= LARGEST:
-        return None
-    columns = np.array(columns_of(candidates, heard.members))
-    draws = any(proposals[member].kind.draws for member in heard.members)
-    try:
-        effects = effects_at(candidates, proposals, heard.members, heard.fit)
-        tables = [proposals[member].table(effect) for member, effect in zip(heard.members, effects, strict=True)]
-        response = respond(tables, SCATTER_SKIES if draws else CONSTRAINED_SKIES).mean(axis=0)
-    except InputError:
-        return None
-    theta = np.concatenate([effect.coordinates() for effect in effects])
-    parts = t[:, columns] * theta
-    weights = np.sum(null.templates(parts) ** 2, axis=0)
-    there = weights > 0.0
-    result = t.copy()
-    result[:, columns[there]] += np.outer(response - parts.sum(axis=1), weights[there] / weights.sum() / theta[there])
-    return result
+    columns = np.array(columns_of(candidates, members))
+    skies = SCATTER_SKIES if any(proposals[member].kind.draws for member in members) else CONSTRAINED_SKIES
+    for _ in range(JOINT_ROUNDS):
+        try:
+            effects = effects_at(candidates, proposals, members, fitted)
+            tables = [proposals[member].table(effect) for member, effect in zip(members, effects, strict=True)]
+            response = respond(tables, skies).mean(axis=0)
+        except InputError:
+            return None
+        theta = np.concatenate([effect.coordinates() for effect in effects])
+        parts = t[:, columns] * theta
+        weights = np.sum(null.templates(parts) ** 2, axis=0)
+        there = weights > 0.0
+        t = t.copy()
+        t[:, columns[there]] += np.outer(response - parts.sum(axis=1), weights[there] / weights.sum() / theta[there])
+        before, fitted = fitted, fit(null, x, t[:, columns])
+        if _close(before.amplitudes, fitted.amplitudes, fitted.covariance):
+            break
+    return t
 
 
 def _simulated(

@@ -324,7 +324,7 @@ def judge(court: Court, case: str, measured: Spectra, ask: Ask) -> Diagnosis:
         found, shrink = confirmed(court, found, _shrink(court, x, refined, respond), notes)
     where = _where(measured, known.simulations)
     able = detectable_of(court.null, refined.templates, court.candidates, asked.proposals)
-    heard = heard_of(court, x, refined, found)
+    heard = heard_of(court, x, refined, found, respond)
     verdict = verdict_of(case, found, court.candidates, asked.proposals, where, shrink, able, notes, heard)
     # Of no sky: a table has no maps to show.
     dark = [np.zeros(12 * asked.model.nside**2) for _ in asked.model.parts]

@@ -12,7 +12,7 @@ from scipy import special, stats
 from mcsim.diagnosis.attribute import Attribution, attribute
 from mcsim.diagnosis.candidate import Candidate
 from mcsim.diagnosis.case import confirmed
-from mcsim.diagnosis.closest import Closest, closest
+from mcsim.diagnosis.closest import Closest, Exact, closest
 from mcsim.diagnosis.detect import cosines, detectable, log_evidence, posterior, strength_needed, strength_to_isolate
 from mcsim.diagnosis.gaussian import Null, bases, null
 from mcsim.diagnosis.shrink import Measured, Shrink
@@ -331,10 +331,9 @@ def test_isolation_needs_more_of_closer_effects():
 def test_four_effects_are_heard_where_no_set_of_three_suffices(bench):
     """The four, the strongest first, and what is left is noise; without a gap there is nothing."""
     weights = np.array([30.0, 20.0, 14.0, 10.0])
-    straight = np.zeros_like(bench.t)
 
-    def heard(x: np.ndarray, curvature: np.ndarray = straight) -> Closest | None:
-        return closest(bench.null, x, bench.t, curvature, bench.candidates, bench.calibration)
+    def heard(x: np.ndarray, exact: Exact = lambda t, members, fitted: t) -> Closest | None:
+        return closest(bench.null, x, bench.t, bench.candidates, bench.calibration, exact)
 
     signal = bench.t[:, :4] @ weights
     found = [heard(signal + np.random.default_rng(seed).normal(size=P)) for seed in range(10)]
@@ -345,9 +344,11 @@ def test_four_effects_are_heard_where_no_set_of_three_suffices(bench):
     # The square of 56 numbers scatters by sqrt(2 56) about them, beside a gap of 1,596.
     assert max(one.left for one in found) < 4.0 * np.sqrt(2.0 * 56) / 1596
     assert heard(bench.null.mean) is None
-    bent = straight.copy()
-    bent[:, 0] = 0.1 * directions(1, 22)[:, 0]
-    assert 0 not in heard(signal, bent).members  # its second order would be three times its first
+    # What cannot have its amplitude, or says something else there, is passed over.
+    assert 0 not in heard(signal, lambda t, members, fitted: None if 0 in members else t).members
+    other = bench.t.copy()
+    other[:, 0] -= signal * (signal @ other[:, 0]) / (signal @ signal)
+    assert 0 not in heard(signal, lambda t, members, fitted: other if 0 in members else t).members
 
 
 @pytest.mark.parametrize(("achieved", "named"), [(0.9, True), (-0.5, True), (-2.0, False)])
