@@ -188,7 +188,7 @@ def refine(
     heard = None
     if found.verdict == "unknown":
         heard = heard_in(null, x, t, tried, proposals, calibration, respond)
-        if heard is not None and 1 < len(heard.members) <= LARGEST:
+        if heard is not None and len(heard.members) <= LARGEST:
             together = attribute(null, x, heard.templates, tried, calibration)
             if together.explanations:
                 t, found, heard = heard.templates, together, None
