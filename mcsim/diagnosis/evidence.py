@@ -17,7 +17,7 @@ from mcsim.diagnosis.listen import ORDERS, Model, listen, model_of, show
 from mcsim.diagnosis.scores import Score, score_of
 from mcsim.effects import Effect
 from mcsim.errors import InputError
-from mcsim.survey import survey
+from mcsim.survey import Survey, survey
 
 Map = NDArray[np.float64]
 
@@ -212,7 +212,7 @@ class Job:
 def evidence_of(job: Job) -> NDArray[np.float64]:
     """Task: evidence of simulations, shape (count, entries), with the atlas behind it where it is asked for."""
     asked = _questions(job.believed, job.without)
-    shared = survey(config.from_json(job.simulated))
+    shared = _survey(job.simulated)
     rows = []
     for realization in range(job.first, job.first + job.count):
         if job.sample_by_sample:
@@ -248,6 +248,12 @@ def _constrained(model: Model, observed: NDArray[np.complex128], seed: int, real
 _SKIES: dict[tuple[int, int, int], NDArray[np.complex128]] = {}
 _KEPT = 32
 _OTHER_NOISE = 1_000_000
+
+
+@lru_cache(maxsize=2)
+def _survey(simulated: str) -> Survey:
+    """Jobs of the same run follow each other; a drift of the gain takes a pass over its pointing."""
+    return survey(config.from_json(simulated))
 
 
 @lru_cache(maxsize=1)
