@@ -147,9 +147,9 @@ def refine(
 
     Notes
     -----
-    A response mu, simulated at coordinates theta, changes its templates t to t + (mu - t theta) theta'/theta'theta:
-    the secant, exact there. A candidate that can have neither the fitted amplitude nor half of it is taken
-    out. Of one that draws the scatter of the response is kept, that of the mean of ``skies`` skies.
+    A response that is simulated at its coordinates changes its templates to the secant, exact there. A candidate that
+    can have neither the fitted amplitude nor half of it is taken out. Of one that draws the scatter of the response is
+    kept, that of the mean of ``skies`` skies.
     """
     t, tried = t.copy(), list(candidates)
     done: dict[int, Vector] = {}
@@ -171,9 +171,6 @@ def refine(
                 t[:, columns] = 0.0
                 continue
             at, changes = answer
-            size = float(at @ at)
-            if size == 0.0:
-                continue
             response = changes.mean(axis=0)
             if draws:
                 # That of one draw about the mean of as many as there are.
@@ -181,7 +178,7 @@ def refine(
                 scatter = np.sqrt(share) * (changes - response).T
                 tried[index] = replace(tried[index], scatter=scatter, shape_error=None)
             if bent:
-                t[:, columns] += np.outer(response - t[:, columns] @ at, at) / size
+                t[:, columns] += _beyond(null, t[:, columns], at, response)
         if not changed:
             break
         found = attribute(null, x, t, tried, calibration)
@@ -220,8 +217,7 @@ def _together(
 ) -> NDArray[np.float64] | None:
     """Templates that are exact for effects that act together, at about fitted amplitudes.
 
-    Strong effects bend their own responses and change each other's: what the simulated response has beyond the sum is
-    shared out by the squares of the white lengths of the parts. None where one can have no such amplitude.
+    Strong effects bend their own responses and change each other's. None where one can have no such amplitude.
     """
     columns = np.array(columns_of(candidates, members))
     skies = SCATTER_SKIES if any(proposals[member].kind.draws for member in members) else CONSTRAINED_SKIES
@@ -232,16 +228,25 @@ def _together(
             response = respond(tables, skies).mean(axis=0)
         except InputError:
             return None
-        theta = np.concatenate([effect.coordinates() for effect in effects])
-        parts = t[:, columns] * theta
-        weights = np.sum(null.templates(parts) ** 2, axis=0)
-        there = weights > 0.0
         t = t.copy()
-        t[:, columns[there]] += np.outer(response - parts.sum(axis=1), weights[there] / weights.sum() / theta[there])
+        at = np.concatenate([effect.coordinates() for effect in effects])
+        t[:, columns] += _beyond(null, t[:, columns], at, response)
         before, fitted = fitted, fit(null, x, t[:, columns])
         if _close(before.amplitudes, fitted.amplitudes, fitted.covariance):
             break
     return t
+
+
+def _beyond(null: Null, t: NDArray[np.float64], at: Vector, response: Vector) -> NDArray[np.float64]:
+    """What makes templates, shape (p, k), exact at coordinates: what their simulated response has beyond the sum.
+
+    It is shared out by the squares of the white lengths of the parts, so that one that is hardly heard, whatever its
+    fitted coordinate, stays what it is.
+    """
+    parts = t * at
+    weights = np.sum(null.templates(parts) ** 2, axis=0)
+    shares = np.divide(weights, at * weights.sum(), out=np.zeros_like(at), where=weights > 0.0)
+    return np.outer(response - parts.sum(axis=1), shares)
 
 
 def _simulated(
