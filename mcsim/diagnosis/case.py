@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -239,18 +240,18 @@ def shrink_of(court: Court, x: Vector, refined: Refined, respond: Respond) -> tu
     here = refined.templates[np.ix_(fresh, chosen)]
     if scatters:
         response = refined.templates[:, chosen] @ frozen.amplitudes
-        share = _square(before, response, scatters, fresh) / _square(learning, response, scatters, used)
+        squares = _squares(before, response, scatters, fresh), _squares(learning, response, scatters, used)
         noise = fit(learning, x[used], refined.templates[np.ix_(used, chosen)]).covariance
-        expected = carried(before, x[fresh], here, noise, excess(learning, x[used]), share)
+        expected = carried(before, after, x[fresh], here, noise, excess(learning, x[used]), *squares)
     else:
         expected = predicted(before, x[fresh], here, frozen.amplitudes, frozen.covariance)
     return expected, achieved(before, after, x[fresh]), _fresh_words(court)
 
 
-def _square(null: Null, response: Vector, scatters: Sequence[NDArray[np.float64]], rows: NDArray[np.int64]) -> float:
-    """Mean square of a response that scatters, over its draws."""
-    deviations = sum(null.length(draw) ** 2 for scatter in scatters for draw in scatter[rows].T)
-    return null.length(response[rows]) ** 2 + deviations
+def _squares(null: Null, response: Vector, scatters: Sequence[NDArray[np.float64]], rows: NDArray[np.int64]) -> Vector:
+    """White squares of the draws of a response."""
+    deviations = reduce(np.add, [np.sqrt(scatter.shape[1]) * scatter for scatter in scatters])
+    return np.array([null.length(draw) ** 2 for draw in (response + deviations.T)[:, rows]])
 
 
 def _fresh_words(court: Court) -> str:

@@ -86,11 +86,13 @@ def predicted(
 
 def carried(
     test: Null,
+    wide: Null,
     x: NDArray[np.float64],
     t: NDArray[np.float64],
     covariance: NDArray[np.float64],
     seen: Measured,
-    share: float,
+    here: NDArray[np.float64],
+    there: NDArray[np.float64],
 ) -> Prediction:
     """Shrink to expect where what acts draws at random: all data see the same draw, whatever the mean response.
 
@@ -98,20 +100,27 @@ def carried(
     ----------
     test, x, t
         As in :func:`predicted`.
+    wide
+        Null of the same data with the scatter of what is drawn.
     covariance
         Of the frozen parameters, from noise alone, shape (K, K).
     seen
         Gap of the data that were fitted.
-    share
-        Mean square of the response in the data that measure the shrink, over that in those that were fitted.
+    here, there
+        White squares of draws of the response in the data that measure the shrink, and in those that were fitted,
+        shape (draws,).
 
     Notes
     -----
-    The drop is share times the gap of the fitted data, less tr(F V) for the error of the frozen parameters.
+    The drop is the gap of the fitted data times the ratio of the mean squares, less tr(F V) for the error of the frozen
+    parameters, F in the wide null that measures what is left. How closely the squares of a draw keep to that ratio is
+    part of its error.
     """
-    white = test.templates(t)
-    lost = test.unbiased * float(np.trace(white.T @ white @ covariance))
-    return _of_gap(Measured(share * seen.value - lost, share * seen.sigma), excess(test, x))
+    share = float(np.mean(here) / np.mean(there))
+    white = wide.templates(t)
+    lost = wide.unbiased * float(np.trace(white.T @ white @ covariance))
+    sigma = float(np.hypot(share * seen.sigma, np.std(here - share * there, ddof=1)))
+    return _of_gap(Measured(share * seen.value - lost, sigma), excess(test, x))
 
 
 def _of_gap(drop: Measured, before: Measured) -> Prediction:

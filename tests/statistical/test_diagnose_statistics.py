@@ -237,7 +237,7 @@ def test_forecast_drop_of_what_draws_is_the_drop():
     t *= 15.0 / np.linalg.norm(t)
     sideways = rng.normal(size=(fitted + p, 2))
     root = 0.3 * np.column_stack([t, 15.0 * sideways / np.linalg.norm(sideways, axis=0)])
-    differences = []
+    differences, errors = [], []
     for _ in range(400):
         learning, before = drawn_null(rng, fitted, count), drawn_null(rng, p, count)
         scatter = root @ rng.normal(size=(3, draws))
@@ -246,12 +246,24 @@ def test_forecast_drop_of_what_draws_is_the_drop():
         frozen = fit(learning.widened(scatter[:fitted]), x[:fitted], t[:fitted, None])
         noise = fit(learning, x[:fitted], t[:fitted, None]).covariance
         after = replace(before, mean=before.mean + t[fitted:] * frozen.amplitudes[0]).widened(scatter[fitted:])
-        square = [np.sum(t[part] ** 2) + np.sum(scatter[part] ** 2) for part in (slice(fitted), slice(fitted, None))]
+        drawn = (t + np.sqrt(draws) * scatter.T) ** 2
         seen = excess(learning, x[:fitted])
-        forecast = carried(before, x[fitted:], t[fitted:, None], noise, seen, square[1] / square[0])
+        forecast = carried(
+            before,
+            after,
+            x[fitted:],
+            t[fitted:, None],
+            noise,
+            seen,
+            drawn[:, fitted:].sum(axis=1),
+            drawn[:, :fitted].sum(axis=1),
+        )
         shrink = achieved(before, after, x[fitted:])
         differences.append(shrink.before.value - shrink.after.value - forecast.drop.value)
+        errors.append(forecast.drop.sigma)
     assert abs(np.mean(differences)) < 4.0 * np.std(differences) / np.sqrt(len(differences))
+    # Forecasts of the mean drop: the noise of the data that measure it is not in their error.
+    assert 0.7 < np.mean(errors) / np.std(differences) < 1.2
 
 
 def test_gap_is_the_squared_distance(frozen_fits):
