@@ -189,15 +189,28 @@ def judge(court: Court, case: str, maps: Sequence[NDArray[np.float64]], ask: Ask
 def confirmed(
     court: Court, found: Attribution, shrink: tuple[Prediction, Shrink, str] | None, notes: list[str]
 ) -> tuple[Attribution, tuple[Prediction, Shrink, str] | None]:
-    """The same, unless the set that fits best opens the gap once it is simulated: then it is not what is there."""
-    if shrink is None or shrink[1].fraction.value + OPENED * shrink[1].fraction.sigma >= 0.0:
-        return found, shrink
-    names = [court.asked.proposals[member].label for member in found.explanations[0].members]
-    notes.append(
-        f"What fits best, {' and '.join(names)}, is not named: simulated with its amplitude from one half, it opens "
-        f"the gap of the other from {shrink[1].before.value:.3g} to {shrink[1].after.value:.3g}."
-    )
-    return found.unexplained(), None
+    """Attribution and shrink, where they hold once the set that fits best is simulated.
+
+    What opens the gap is not what is there, and is not named. Half of the data that shows no gap beyond its own error
+    measures no share of it.
+    """
+    if shrink is None:
+        return found, None
+    before, fraction = shrink[1].before, shrink[1].fraction
+    if fraction.value * before.value + OPENED * fraction.sigma * abs(before.value) < 0.0:
+        names = [court.asked.proposals[member].label for member in found.explanations[0].members]
+        notes.append(
+            f"What fits best, {' and '.join(names)}, is not named: simulated with its amplitude from one half, it "
+            f"opens the gap of the other from {before.value:.3g} to {shrink[1].after.value:.3g}."
+        )
+        return found.unexplained(), None
+    if before.value < before.sigma:
+        notes.append(
+            f"No shrink is given: the half that would measure it shows no gap by itself ({before.value:.2g} +- "
+            f"{before.sigma:.2g})."
+        )
+        return found, None
+    return found, shrink
 
 
 def heard_of(court: Court, x: Vector, refined: Refined, found: Attribution, respond: Respond) -> Closest | None:

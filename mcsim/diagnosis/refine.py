@@ -70,7 +70,7 @@ class Refined:
     templates: NDArray[np.float64]
     candidates: tuple[Candidate, ...]
     simulated: tuple[int, ...]
-    heard: Closest | None
+    heard: Closest | None = None
 
 
 def quiet_templates(known: Knowledge) -> NDArray[np.float64]:

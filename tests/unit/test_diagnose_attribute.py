@@ -365,3 +365,17 @@ def test_set_that_opens_the_gap_is_not_named(bench, achieved, named):
         ("effect", True, False) if named else ("unknown", False, True)
     )
     assert named or ("effect3" in notes[0] and "from 100 to 300" in notes[0])
+
+
+@pytest.mark.parametrize("before", [1.0, -1.0])
+@pytest.mark.parametrize(("after", "named"), [(15.0, True), (80.0, False)])
+def test_half_without_a_gap_measures_no_shrink(bench, before, after, named):
+    """Shares of nothing are large, of either sign, and say nothing; a gap that is opened is one from nothing too."""
+    found = bench.judge(12.0 * bench.t[:, 3], 0)
+    court = SimpleNamespace(asked=SimpleNamespace(proposals=[SimpleNamespace(label=c.name) for c in bench.candidates]))
+    share = Measured(1.0 - after / before, 12.0)
+    notes: list[str] = []
+    shrink = None, Shrink(Measured(before, 12.0), Measured(after, 12.0), share, 0.5), "half2"
+    judged, kept = confirmed(court, found, shrink, notes)
+    assert (judged.verdict, kept) == ("effect" if named else "unknown", None)
+    assert ("shows no gap by itself" if named else "opens the gap") in notes[0]
