@@ -41,8 +41,14 @@ CLEAN = 5.0
 TELLING = 0.05
 """Probability, trials included, from which on an effect that draws is tried where no single one suffices."""
 
-JOINT_ROUNDS = 3
+JOINT_ROUNDS = 4
 """The same for effects that act together."""
+
+MOVED = 0.3
+"""Standard deviations that amplitudes may move and still be the same."""
+
+SETTLED = 0.05
+"""The same as a share of the amplitudes."""
 
 TRIED = 3
 """Single candidates, those that lower chi^2 most, that are brought to their amplitude where no subset suffices."""
@@ -217,7 +223,8 @@ def _together(
 ) -> NDArray[np.float64] | None:
     """Templates that are exact for effects that act together, at about fitted amplitudes.
 
-    Strong effects bend their own responses and change each other's. None where one can have no such amplitude.
+    Strong effects bend their own responses and change each other's. None where one can have no such amplitude, or
+    amplitudes run away from each other round by round.
     """
     columns = np.array(columns_of(candidates, members))
     skies = SCATTER_SKIES if any(proposals[member].kind.draws for member in members) else CONSTRAINED_SKIES
@@ -232,9 +239,9 @@ def _together(
         at = np.concatenate([effect.coordinates() for effect in effects])
         t[:, columns] += _beyond(null, t[:, columns], at, response)
         before, fitted = fitted, fit(null, x, t[:, columns])
-        if _close(before.amplitudes, fitted.amplitudes, fitted.covariance):
-            break
-    return t
+        if _settled(before.amplitudes, fitted):
+            return t
+    return None
 
 
 def _beyond(null: Null, t: NDArray[np.float64], at: Vector, response: Vector) -> NDArray[np.float64]:
@@ -298,8 +305,16 @@ def _bent(known: Knowledge, null: Null, columns: list[int], coordinates: Vector)
     return crossed * float(np.linalg.norm(null.templates(shift[:, None]))) > STRAIGHT
 
 
+def _settled(before: Vector, now: Fit) -> bool:
+    """Whether amplitudes have hardly moved: by their errors, or by a share of themselves where errors are tiny."""
+    precision = np.linalg.pinv(now.covariance)
+    moved = now.amplitudes - before
+    length = float(now.amplitudes @ precision @ now.amplitudes)
+    return float(moved @ precision @ moved) < max(MOVED**2, SETTLED**2 * length)
+
+
 def _close(before: Vector | None, now: Vector, covariance: NDArray[np.float64]) -> bool:
     if before is None:
         return False
     moved = now - before
-    return float(moved @ np.linalg.pinv(covariance) @ moved) < 0.3**2
+    return float(moved @ np.linalg.pinv(covariance) @ moved) < MOVED**2

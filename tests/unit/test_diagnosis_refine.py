@@ -84,3 +84,14 @@ def test_what_is_none_of_the_library_stays_unknown_beside_two_that_are():
     found = instrument.refined(x).attribution
     assert instrument.asked[-1].keys() == {"A", "B"}
     assert found.verdict == "unknown"
+
+
+def test_amplitudes_that_run_away_are_not_heard():
+    """Of a response that turns back upon itself no amplitude is the one that the fit asks for."""
+    instrument = Instrument(bend=0.0, cross=0.0)
+    saturated = instrument.response
+    instrument.response = lambda a, b: saturated(2.0 * np.tanh(a / 2.0), b)  # never more than 2 along A
+    x = instrument.t[:, :2] @ [14.0, 12.0] + 10.0 * instrument.sideways[1]
+    found = instrument.refined(x)
+    assert found.attribution.verdict == "unknown"
+    assert [instrument.candidates[member].channel for member in found.heard.members] == ["B"]
