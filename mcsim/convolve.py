@@ -6,6 +6,7 @@ r"""From a sky to the map of a survey: spin transforms of the beam's components,
 One transform per kept s, whatever the number of samples in the survey (paper, Sec. III and App. C).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numba
@@ -54,6 +55,40 @@ def circular_map(alm: NDArray[np.complex128], response: Response, nside: int, nt
     return healpix.synthesis(circular_alm(alm, response)[None], nside, response.lmax, nthreads=nthreads)[0]
 
 
+class CircularMaps:
+    """Maps of skies that a circular beam has smoothed; the last is kept, for the next channel with an equal beam.
+
+    Parameters
+    ----------
+    nside, lmax, nthreads
+        As in :func:`mcsim.healpix.synthesis`.
+    """
+
+    def __init__(self, nside: int, lmax: int, nthreads: int = 1) -> None:
+        self._grid = (nside, lmax)
+        self.nthreads = nthreads
+        self._alm: NDArray[np.complex128] | None = None
+        self._made: dict[str, NDArray[np.float64]] = {}
+
+    def map(self, alm: NDArray[np.complex128]) -> healpix.Map:
+        """The sky at pixel centres, uK, shape (npix,); read-only."""
+        return self._once(alm, "map", lambda: healpix.synthesis(alm[None], *self._grid, nthreads=self.nthreads)[0])
+
+    def gradient(self, alm: NDArray[np.complex128]) -> NDArray[np.float64]:
+        """Its gradient as of :func:`mcsim.healpix.gradient`, uK per radian, shape (2, npix); read-only."""
+        return self._once(alm, "gradient", lambda: healpix.gradient(alm, *self._grid, self.nthreads))
+
+    def _once(
+        self, alm: NDArray[np.complex128], name: str, make: Callable[[], NDArray[np.float64]]
+    ) -> NDArray[np.float64]:
+        if self._alm is None or not np.array_equal(self._alm, alm):
+            self._alm, self._made = alm, {}
+        if name not in self._made:
+            self._made[name] = make()
+            self._made[name].setflags(write=False)
+        return self._made[name]
+
+
 def spin_maps(
     alm: NDArray[np.complex128], response: Response, nside: int, nthreads: int = 1
 ) -> dict[int, NDArray[np.float64]]:
@@ -94,6 +129,19 @@ def _add_twice_real_part(w, real, imag, total):  # type: ignore[no-untyped-def]
     """total += 2 Re(w (real + i imag)) in one pass over memory, which is what this costs."""
     for pixel in range(total.size):
         total[pixel] += 2.0 * (w[pixel].real * real[pixel] - w[pixel].imag * imag[pixel])
+
+
+def turned(map_: healpix.Map, moments: Moments, s: int, total: NDArray[np.float64]) -> None:
+    """Add conj(w_s) times a map to ``total``, real and imaginary part, shape (2, npix): adjoint to w_s S_s."""
+    _add_turned(map_, moments.w[s - 1], total)
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_turned(map_, w, total):  # type: ignore[no-untyped-def]
+    """In one pass over memory."""
+    for pixel in range(map_.size):
+        total[0, pixel] += map_[pixel] * w[pixel].real
+        total[1, pixel] -= map_[pixel] * w[pixel].imag
 
 
 def centroid_map(gradient: NDArray[np.float64], moments: Moments) -> healpix.Map:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 
 import healpy
@@ -49,9 +50,8 @@ def realize(survey: Survey, realization: int, nthreads: int = 1) -> dict[str, ND
     """
     ensemble = survey.config.ensemble
     sky = draw_sky(survey, realization)
-    observed = [
-        result for channel in survey.channels for result in _observe(survey, channel, sky, realization, nthreads)
-    ]
+    made = _circular_maps(survey, nthreads)
+    observed = [result for channel in survey.channels for result in _observe(survey, channel, sky, realization, made)]
     result = _spectra(survey, [o.alm for o in observed], "")
     if ensemble.paired:
         result |= _spectra(survey, [o.circular for o in observed if o.circular is not None], "_circular")
@@ -79,8 +79,9 @@ def maps(survey: Survey, realization: int, nthreads: int = 1, sky: Alm | None = 
     if sky is None:
         sky = draw_sky(survey, realization)
     found = []
+    made = _circular_maps(survey, nthreads)
     for channel in survey.channels:
-        for m, layers in _layers(survey, channel, sky, realization, nthreads, smooth=True):
+        for m, layers in _layers(survey, channel, sky, realization, made, smooth=True):
             found.append(np.where(m.moments.hits > 0, layers.total, healpy.UNSEEN))
     return np.stack(found)
 
@@ -108,43 +109,50 @@ class Layers:
     @property
     def total(self) -> NDArray[np.float64]:
         """The map."""
-        parts = [part for part in (self.smooth, self.extra, self.difference) if part is not None]
-        return np.sum(parts, axis=0)
+        return reduce(np.add, [part for part in (self.smooth, self.extra, self.difference) if part is not None])
 
 
-def _observe(survey: Survey, channel: Channel, sky: Alm, realization: int, nthreads: int) -> list[Observed]:
+def _circular_maps(survey: Survey, nthreads: int) -> convolve.CircularMaps:
+    return convolve.CircularMaps(survey.config.map.resolution, survey.config.sky.lmax, nthreads)
+
+
+def _observe(
+    survey: Survey, channel: Channel, sky: Alm, realization: int, made: convolve.CircularMaps
+) -> list[Observed]:
     """The channel's maps of one sky, analysed."""
     ensemble = survey.config.ensemble
     if channel.rings is not None:
-        return [_observe_on_rings(survey, channel, channel.rings, sky, realization, nthreads)]
+        return [_observe_on_rings(survey, channel, channel.rings, sky, realization, made.nthreads)]
     known = None
     smooth = ensemble.keep_maps or not all(_is_exact(survey, m) for m in channel.maps)
     if channel.side_b is None:
         seen, dipole = _seen(survey, channel, sky, realization)
         known = _circular(survey, channel, seen, dipole)
     results = []
-    for m, layers in _layers(survey, channel, sky, realization, nthreads, smooth):
+    for m, layers in _layers(survey, channel, sky, realization, made, smooth):
         if known is not None and _is_exact(survey, m):
             exact = alm_.multiply(known, 1.0 / channel.window, survey.config.sky.lmax)
-            twin = exact if layers.extra is None else exact + _analyse(survey, channel, layers.extra, None, nthreads)
+            twin = (
+                exact if layers.extra is None else exact + _analyse(survey, channel, layers.extra, None, made.nthreads)
+            )
         else:
             assert layers.smooth is not None  # asked for above
             circular = layers.smooth if layers.extra is None else layers.smooth + layers.extra
-            twin = _analyse(survey, channel, circular, m.weight, nthreads)
+            twin = _analyse(survey, channel, circular, m.weight, made.nthreads)
         alm = twin
         if layers.difference is not None:
-            alm = twin + _analyse(survey, channel, layers.difference, m.weight, nthreads)
+            alm = twin + _analyse(survey, channel, layers.difference, m.weight, made.nthreads)
         kept = np.where(m.moments.hits > 0, layers.total, healpy.UNSEEN) if ensemble.keep_maps else None
         results.append(Observed(alm, twin if ensemble.paired else None, kept))
     return results
 
 
 def _layers(
-    survey: Survey, channel: Channel, sky: Alm, realization: int, nthreads: int, smooth: bool
+    survey: Survey, channel: Channel, sky: Alm, realization: int, made: convolve.CircularMaps, smooth: bool
 ) -> Iterator[tuple[SurveyMap, Layers]]:
     """The channel's maps of one sky; transforms that splits share are made once."""
     run = survey.config
-    nside, seed = run.map.resolution, run.ensemble.seed
+    nside, seed, nthreads = run.map.resolution, run.ensemble.seed, made.nthreads
     seen, dipole = _seen(survey, channel, sky, realization)
     if channel.side_b is not None:
         for m, solved in differencing.maps(channel, seen, dipole, nside, seed, realization, nthreads):
@@ -155,13 +163,13 @@ def _layers(
     if dipole is not None:
         for s, map_uk in convolve.spin_maps(dipole, _believed(channel), nside, nthreads).items():
             spins[s] = spins[s] - map_uk if s in spins else -map_uk
-    flat = healpix.synthesis(circular[None], nside, run.sky.lmax, nthreads=nthreads)[0] if smooth else None
+    flat = made.map(circular) if smooth else None
     whole = None
     if any(m.gain is not None for m in channel.maps):
         whole = convolve.circular_map(seen, channel.response, nside, nthreads)
     gradient = None
     if any(m.moments.dtheta is not None for m in channel.maps):
-        gradient = healpix.gradient(circular, nside, run.sky.lmax, nthreads)
+        gradient = made.gradient(circular)
     for m in channel.maps:
         extra = []
         if m.moments.dtheta is not None and gradient is not None:

@@ -194,28 +194,27 @@ def listen(model: Model, maps: Sequence[Map], nthreads: int = 1) -> Heard:
     residual, adjoint = np.empty_like(expected), np.empty((len(model.parts), sky.size), dtype=np.complex128)
     orders = np.zeros((len(model.parts), ORDERS + 1, lmax + 1), dtype=np.complex128)
     k = np.sqrt(4 * np.pi / (2 * np.arange(lmax + 1) + 1))
+    made = convolve.CircularMaps(nside, lmax, nthreads)
     for channel in range(len(model.response)):
         through = alm_.multiply(sky, model.response[channel], lmax)
-        smooth = healpix.synthesis(through[None], nside, lmax, nthreads=nthreads)[0]
         members = model.of(channel)
-        gradient = None
-        if any(model.parts[i].moments.dtheta is not None for i in members):
-            gradient = healpix.gradient(through, nside, lmax, nthreads)
         window = model.survey.channels[channel].window[: lmax + 1]
         for i in members:
             part = model.parts[i]
-            expected[i] = smooth
-            if gradient is not None and part.moments.dtheta is not None:
-                expected[i] += convolve.centroid_map(gradient, part.moments)
+            expected[i] = made.map(through)
+            if part.moments.dtheta is not None:
+                expected[i] += convolve.centroid_map(made.gradient(through), part.moments)
             residual[i] = np.where(seen[i], part.precision * (clean[i] - expected[i]), 0.0)
             adjoint[i] = ducc0.sht.adjoint_synthesis(
                 map=residual[i][None], spin=0, lmax=lmax, nthreads=nthreads, **geometry
             )[0]
             orders[i, 0] = window * k * by_degree(looked_at, adjoint[i], lmax)
         for i, s, together in _transforms(model, members):
-            turned = reduce(np.add, [residual[j] * np.conj(model.parts[j].moments.w[s - 1]) for j in together])
+            turned = np.zeros((2, residual.shape[1]))
+            for j in together:
+                convolve.turned(residual[j], model.parts[j].moments, s, turned)
             electric, magnetic = ducc0.sht.adjoint_synthesis(
-                map=turned.view(np.float64).reshape(-1, 2).T, spin=s, lmax=lmax, nthreads=nthreads, **geometry
+                map=turned, spin=s, lmax=lmax, nthreads=nthreads, **geometry
             )
             # ducc0's sign: S_s is minus the synthesis of E = Re(k b) a, B = Im(k b) a.
             orders[i, s] = (

@@ -4,14 +4,17 @@ Which formula applies follows from the hooks that an effect defines, so that a u
 built-in one. An effect that draws random numbers has no score of this kind: blocks of spectra hear it.
 """
 
+import hashlib
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim import effects, healpix
+from mcsim import effects, folders, healpix, tod
 from mcsim.diagnosis.listen import ORDERS, Heard, Model, by_degree
 from mcsim.effects import Effect
+from mcsim.scan.cache import moments_key
 from mcsim.survey import mean_gain
 from mcsim.tod import dipole_alm
 
@@ -135,11 +138,32 @@ def score_of(model: Model, effect: Effect, channel: int | None) -> Score | None:
         return NoiseScore(parts, np.asarray(factor) - 1.0)
     if effect.gain(np.zeros(1), owner.site) is not None:
         splits = len(parts)
-        errors = [mean_gain((effect,), owner.site, (n / splits, (n + 1) / splits)) for n in range(splits)]
+        errors = tuple(gain_of(effect, owner.site, (n / splits, (n + 1) / splits)) for n in range(splits))
         lmax = max(model.lmax, 1)
         dipole = healpix.synthesis(dipole_alm(owner.site.dipole_uk, lmax)[None], model.nside, lmax)[0]
-        return GainScore(parts, tuple(error for error in errors if error is not None), dipole)
+        return GainScore(parts, errors, dipole)
     return None
+
+
+def gain_of(effect: Effect, site: effects.Site, share: tuple[float, float]) -> Map:
+    """Mean error of the gain in every pixel, kept on disk: each process of each diagnosis of a model asks for it.
+
+    What an effect does is what it says it does at a few thousand times.
+    """
+    pointing = site.pointed(effect.name)
+    where = moments_key(pointing.model, site.nside, 0, site.frame, [pointing.line.name], share)
+    period = pointing.model.period_of_samples(pointing.line)
+    times = period * np.linspace(*tod.sample_range(pointing.model, pointing.line, share), _TIMES)
+    what = hashlib.sha256(np.asarray(effect.gain(times, site)).tobytes()).hexdigest()
+
+    def fill(folder: Path) -> None:
+        np.save(folder / "gain.npy", np.asarray(mean_gain((effect,), site, share), dtype=np.float64))
+
+    found: Map = np.load(folders.cached(f"gain-{where[:32]}-{what[:32]}", fill) / "gain.npy")
+    return found
+
+
+_TIMES = 4096
 
 
 def _beam_score(model: Model, effect: Effect, channel: int, parts: tuple[int, ...]) -> BeamScore | None:

@@ -19,7 +19,7 @@ from mcsim.diagnosis.data import checked, read_maps
 from mcsim.diagnosis.evidence import Job, Questions, questions
 from mcsim.errors import InputError
 
-METHOD = 6
+METHOD = 7
 """Raised whenever the same model would teach something else."""
 
 

@@ -114,3 +114,28 @@ def test_centroid_is_the_first_order_of_a_shift(sky: np.ndarray) -> None:
     first_order, second_order = np.std(at_sample - centre), np.std(at_sample - centre - found)
     # The neglected term is of relative size l d / 2 with l ~ 60.
     assert second_order < 60 * step * first_order
+
+
+def test_adjoint_of_the_turned_map(beam: Beam, sky: np.ndarray, psi: np.ndarray) -> None:
+    weight = np.random.default_rng(5).normal(size=12 * NSIDE**2)
+    response, scanned = convolve.response(beam, LMAX), moments(psi, MMAX)
+    maps = convolve.spin_maps(sky, response, NSIDE)
+    parts = {s: np.zeros((2, weight.size)) for s in maps}
+    for s, part in parts.items():
+        convolve.turned(weight, scanned, s, part)
+    found = sum(2.0 * np.sum(part * maps[s]) for s, part in parts.items())
+    assert found == pytest.approx(weight @ convolve.noncircular_map(maps, scanned), rel=1e-12)
+
+
+def test_channels_with_equal_beams_share_their_transforms(sky: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+    synthesis = healpix.synthesis
+    monkeypatch.setattr(healpix, "synthesis", lambda *a, **k: made.append(1) or synthesis(*a, **k))
+    maps = convolve.CircularMaps(NSIDE, LMAX)
+    first = maps.map(sky)
+    np.testing.assert_array_equal(maps.map(sky.copy()), first)
+    np.testing.assert_array_equal(maps.gradient(sky), healpix.gradient(sky, NSIDE, LMAX))
+    assert len(made) == 1
+    np.testing.assert_allclose(maps.map(2.0 * sky), 2.0 * first, rtol=1e-12, atol=1e-12 * np.abs(first).max())
+    np.testing.assert_allclose(maps.gradient(2.0 * sky), 2.0 * healpix.gradient(sky, NSIDE, LMAX), rtol=1e-9)
+    assert len(made) == 2

@@ -1,0 +1,41 @@
+"""What scores are made of, and that it is made once."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mcsim import effects, resources
+from mcsim.beams import elliptical_gaussian
+from mcsim.diagnosis import scores
+from mcsim.scan import load_model
+from mcsim.survey import mean_gain
+
+HALVES = ((0.0, 0.5), (0.5, 1.0))
+
+
+def test_gain_of_every_half_is_kept_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = replace(load_model(resources.scan_model("wmap")), sample_period_s=7.0, duration_days=365.0)
+    line = model.line_of_sight("A")
+    site = effects.Site(
+        channel="W1",
+        frequency_ghz=94.0,
+        frame="ecliptic",
+        nside=8,
+        lmax=8,
+        beam=elliptical_gaussian(330.0, 300.0, 20.0, 8),
+        pointing=effects.Pointing(model, replace(line, sample_period_s=None)),
+        dipole_uk=np.zeros(3),
+    )
+    drifts = [effects.get("gain_drift")(amplitude=0.01, phase_deg=phase) for phase in (0.0, 90.0)]
+    passes = []
+    monkeypatch.setattr(scores, "mean_gain", lambda *args: passes.append(args) or mean_gain(*args))
+    for _ in range(2):
+        for drift in drifts:
+            for share in HALVES:
+                np.testing.assert_array_equal(scores.gain_of(drift, site, share), mean_gain((drift,), site, share))
+    assert len(passes) == 4
+    # A sine of the year is positive in its first half and as negative in its second.
+    first, second = (scores.gain_of(drifts[1], site, share).mean() for share in HALVES)
+    assert first == pytest.approx(0.01 * 2 / np.pi, rel=0.1)
+    assert second == pytest.approx(-first, rel=0.1)
