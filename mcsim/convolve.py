@@ -154,5 +154,13 @@ def centroid_map(gradient: NDArray[np.float64], moments: Moments) -> healpix.Map
     moments
         With ``dtheta`` and ``dphi``.
     """
-    result: healpix.Map = moments.dtheta * gradient[0] + moments.dphi * gradient[1]
+    result = np.empty(gradient.shape[1])
+    _along(moments.dtheta, gradient[0], moments.dphi, gradient[1], result)
     return result
+
+
+@numba.njit(cache=True, nogil=True)
+def _along(dtheta, down, dphi, east, result):  # type: ignore[no-untyped-def]
+    """In one pass over memory."""
+    for pixel in range(result.size):
+        result[pixel] = dtheta[pixel] * down[pixel] + dphi[pixel] * east[pixel]

@@ -1,7 +1,7 @@
 """One case: maps against a model and what its simulations have taught; verdict and all that it rests on."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import reduce
 from pathlib import Path
@@ -16,10 +16,10 @@ from mcsim.diagnosis.attribute import Attribution
 from mcsim.diagnosis.candidate import Candidate, columns_of
 from mcsim.diagnosis.closest import Closest
 from mcsim.diagnosis.data import exchanges
-from mcsim.diagnosis.evidence import Job, Questions
+from mcsim.diagnosis.evidence import Questions
 from mcsim.diagnosis.exhibits import exhibits
 from mcsim.diagnosis.gaussian import Null, bases, fit
-from mcsim.diagnosis.knowledge import CONSTRAINED_SKIES, Knowledge, constrained_jobs
+from mcsim.diagnosis.knowledge import CONSTRAINED_SKIES, Ask, Knowledge, constrained_jobs
 from mcsim.diagnosis.listen import show
 from mcsim.diagnosis.refine import (
     Refined,
@@ -38,8 +38,6 @@ from mcsim.diagnosis.where import Place, places
 from mcsim.errors import InputError
 
 Vector = NDArray[np.float64]
-Ask = Callable[[Sequence[Job]], list[NDArray[np.float64]]]
-"""From jobs to their answers, in order; in this process or on a cluster."""
 
 ALPHA = 0.05
 """Probability below which there is a gap."""

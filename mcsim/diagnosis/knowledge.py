@@ -1,7 +1,7 @@
 """What simulations of a model have taught: the scatter of its evidence, and how that responds to every proposal."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,12 +16,20 @@ from mcsim.diagnosis.evidence import Job, Proposal, Questions
 from mcsim.diagnosis.gaussian import Null, null
 
 Vector = NDArray[np.float64]
+Ask = Callable[[Sequence[Job]], list[NDArray[np.float64]]]
+"""From jobs to their answers, in order; in this process or on a cluster."""
 
 PER_ENTRY = 10
-"""Simulations for every number of the evidence."""
+"""Simulations for every number of the evidence that is not the twin of others."""
 
-SKIES = 4
-"""Skies that a response is the mean of, at both signs of a step: 2e-4 of F is noise then, 3e-3 where it is most."""
+SOME = 3
+"""Simulations for every number, after which it is known which are twins."""
+
+MODES = 1 << 14
+"""Degrees squared, times skies, that a response is the mean of: noise is less than 3e-3 of its F then."""
+
+FEWEST_SKIES = 4
+"""Skies that a response is the mean of, at both signs of a step, at least."""
 
 COMMON_SKIES = 12
 """The same for changes of the sky, whose response in a single sky is largely random."""
@@ -139,7 +147,7 @@ def plan(run: config.RunConfig, asked: Questions, simulations: int | None = None
     asked
         Of that run.
     simulations
-        For the scatter; default: PER_ENTRY for every number of the evidence.
+        For the scatter; default: PER_ENTRY for every number of the evidence, of which :func:`answered` leaves some out.
     referee
         Compare with the sample-by-sample route where every channel's pointing is known.
     """
@@ -154,20 +162,41 @@ def plan(run: config.RunConfig, asked: Questions, simulations: int | None = None
         jobs.append(Job(believed, config.to_json(simulated), first, count, samples, asked.without, atlas))
         purposes.append(purpose)
 
-    for first in range(0, wanted, CHUNK):
-        add(("null", first), seeded(run, _COVARIANCE), first, min(CHUNK, wanted - first))
     base = seeded(run, _RESPONSE)
-    for first in range(0, NOISY_SKIES, CHUNK):
-        add(("reference", first), base, first, min(CHUNK, NOISY_SKIES - first))
-    for number, column, sign, effect in _basis(asked):
-        count = skies(asked.proposals[number])
-        add(("response", column, sign), with_effects(base, [asked.proposals[number].table(effect)]), 0, count)
     if referee and all(c.site.pointing is not None for c in asked.model.survey.channels):
         quiet = replace(base, channels=tuple(replace(c, noise=config.Noise()) for c in base.channels))
         for sky in range(REFEREE_SKIES):
             add(("referee", sky), quiet, sky, 1, True)
             add(("default", sky), quiet, sky, 1)
+    for first in range(0, wanted, CHUNK):
+        add(("null", first), seeded(run, _COVARIANCE), first, min(CHUNK, wanted - first))
+    for first in range(0, NOISY_SKIES, CHUNK):
+        add(("reference", first), base, first, min(CHUNK, NOISY_SKIES - first))
+    for number, column, sign, effect in _basis(asked):
+        count = skies(asked.proposals[number], asked.model.lmax)
+        add(("response", column, sign), with_effects(base, [asked.proposals[number].table(effect)]), 0, count)
     return Plan(tuple(jobs), tuple(purposes))
+
+
+def answered(plan: Plan, size: int, ask: Ask) -> tuple[Plan, list[NDArray[np.float64]]]:
+    """What of a plan is needed, and the answers.
+
+    Of ``size`` numbers some are twins; the first simulations tell how many are independent, and ten for each of those
+    are enough.
+    """
+    first = [k for k, job in enumerate(plan.jobs) if plan.purposes[k][0] == "null" and job.first < SOME * size]
+    answers = dict(zip(first, ask([plan.jobs[k] for k in first]), strict=True))
+    drawn = np.concatenate([answer[:, :size] for answer in answers.values()])
+    enough = PER_ENTRY * null(drawn, floor=COLLINEAR).dimension
+    rest = [
+        k
+        for k, job in enumerate(plan.jobs)
+        if k not in answers and (plan.purposes[k][0] != "null" or job.first < enough)
+    ]
+    answers |= zip(rest, ask([plan.jobs[k] for k in rest]), strict=True)
+    kept = sorted(answers)
+    needed = Plan(tuple(plan.jobs[k] for k in kept), tuple(plan.purposes[k] for k in kept))
+    return needed, [answers[k] for k in kept]
 
 
 def learned(asked: Questions, plan: Plan, answers: Sequence[NDArray[np.float64]]) -> Knowledge:
@@ -242,11 +271,12 @@ def _basis(asked: Questions) -> Iterator[tuple[int, int, int, Any]]:
                     yield number, column, sign, effect.scaled(sign)
 
 
-def skies(proposal: Proposal) -> int:
+def skies(proposal: Proposal, lmax: int) -> int:
     """Number of skies that the response to a proposal is the mean of."""
     if proposal.drawn:
         return NOISY_SKIES
-    return SKIES if proposal.channel is not None else COMMON_SKIES
+    fewest = FEWEST_SKIES if proposal.channel is not None else COMMON_SKIES
+    return min(max(fewest, -(-MODES // lmax**2)), NOISY_SKIES)
 
 
 def with_effects(run: config.RunConfig, found: Sequence[config.Effect]) -> config.RunConfig:

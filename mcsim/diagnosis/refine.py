@@ -101,7 +101,7 @@ def scatter_of(known: Knowledge, asked: Questions) -> NDArray[np.float64]:
         rows = list(columns)
         # A column of nothing but noise says nothing of the others.
         heard = size[rows] > 2.0 * noise[rows]
-        ratio = skies_of(proposal) * noise[rows] / np.maximum(size[rows] - noise[rows], 1e-300)
+        ratio = skies_of(proposal, asked.model.lmax) * noise[rows] / np.maximum(size[rows] - noise[rows], 1e-300)
         found.append(float(np.sqrt(np.mean(ratio[heard]))) if heard.any() else np.inf)
     return np.array(found)
 

@@ -95,18 +95,17 @@ Score = BeamScore | GainScore | SkyScore | NoiseScore
 
 def normalised_difference(model: Model, heard: Heard, parts: tuple[int, ...]) -> Map:
     """u^2 - 1 of every pixel seen by the first two maps of a channel: u their difference over its noise; else 0."""
-    left = []
-    for i in parts[:2]:
-        precision = model.parts[i].precision
-        left.append((heard.residual[i], precision))
-    if len(left) == 1:
-        residual, precision = left[0]
-        seen = (precision > 0) & (residual != 0.0)
-        return np.where(seen, residual**2 / np.where(seen, precision, 1.0) - 1.0, 0.0)
-    (first, a), (second, b) = left
-    seen = (a > 0) & (b > 0) & (first != 0.0) & (second != 0.0)
-    a, b = np.where(seen, a, 1.0), np.where(seen, b, 1.0)
-    return np.where(seen, (first / a - second / b) ** 2 / (1.0 / a + 1.0 / b) - 1.0, 0.0)
+    # Residuals are zero where nothing was seen, and come times their precision: (r/a - s/b)^2 / (1/a + 1/b).
+    first, a = heard.residual[parts[0]], model.parts[parts[0]].precision
+    seen = first != 0.0
+    if len(parts) == 1:
+        square, scale = first**2, a
+    else:
+        second, b = heard.residual[parts[1]], model.parts[parts[1]].precision
+        seen &= second != 0.0
+        square, scale = (first * b - second * a) ** 2, a * b * (a + b)
+    found = np.divide(square, scale, out=np.zeros_like(square), where=seen)
+    return found - seen
 
 
 def score_of(model: Model, effect: Effect, channel: int | None) -> Score | None:

@@ -16,7 +16,7 @@ from mcsim.diagnosis import knowledge, report, tables
 from mcsim.diagnosis.batch import asking, batch
 from mcsim.diagnosis.case import Court, Diagnosis, court, judge
 from mcsim.diagnosis.data import checked, read_maps
-from mcsim.diagnosis.evidence import Job, Questions, questions
+from mcsim.diagnosis.evidence import Questions, questions
 from mcsim.errors import InputError
 
 METHOD = 7
@@ -108,7 +108,7 @@ def _of_table(
 def prepared(
     run: config.RunConfig,
     asked: Questions,
-    ask: Callable[[Sequence[Job]], list[NDArray[np.float64]]],
+    ask: knowledge.Ask,
     simulations: int | None = None,
 ) -> Court:
     """What every case of a run is judged with, learned or from the cache."""
@@ -119,7 +119,7 @@ def _learned(
     run: config.RunConfig,
     asked: Questions,
     simulations: int | None,
-    ask: Callable[[Sequence[Job]], list[NDArray[np.float64]]],
+    ask: knowledge.Ask,
     planned: Callable[[config.RunConfig, Questions, int | None], knowledge.Plan] = knowledge.plan,
 ) -> knowledge.Knowledge:
     if simulations is not None and simulations <= len(asked.entries):
@@ -130,7 +130,11 @@ def _learned(
 
     def fill(scratch: Path) -> None:
         plan = planned(run, asked, simulations)
-        knowledge.learned(asked, plan, ask(plan.jobs)).save(scratch)
+        if simulations is None:
+            plan, answers = knowledge.answered(plan, len(asked.entries), ask)
+        else:
+            answers = ask(plan.jobs)
+        knowledge.learned(asked, plan, answers).save(scratch)
 
     name = f"diagnose/{_key(run, asked, simulations)}.zarr"
     return knowledge.Knowledge.load(folders.cached(name, fill))

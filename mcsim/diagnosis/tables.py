@@ -12,10 +12,10 @@ from mcsim import config, effects, simulate
 from mcsim.biposh import Mode
 from mcsim.diagnosis import knowledge
 from mcsim.diagnosis.blocks import Block, Entry
-from mcsim.diagnosis.case import Ask, Court, Diagnosis, confirmed, dataset, heard_of, shrink_of
+from mcsim.diagnosis.case import Court, Diagnosis, confirmed, dataset, heard_of, shrink_of
 from mcsim.diagnosis.evidence import Job, Questions, questions
 from mcsim.diagnosis.exhibits import exhibits
-from mcsim.diagnosis.knowledge import Knowledge, Plan
+from mcsim.diagnosis.knowledge import Ask, Knowledge, Plan
 from mcsim.diagnosis.refine import Refined, Respond, quiet_templates, refine
 from mcsim.diagnosis.shrink import Prediction, Shrink
 from mcsim.diagnosis.verdict import detectable_of, verdict_of
