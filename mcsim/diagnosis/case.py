@@ -1,7 +1,7 @@
 """One case: maps against a model and what its simulations have taught; verdict and all that it rests on."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import reduce
 from pathlib import Path
@@ -19,7 +19,7 @@ from mcsim.diagnosis.data import exchanges
 from mcsim.diagnosis.evidence import Questions
 from mcsim.diagnosis.exhibits import exhibits
 from mcsim.diagnosis.gaussian import Null, bases, fit
-from mcsim.diagnosis.knowledge import CONSTRAINED_SKIES, Ask, Knowledge, constrained_jobs
+from mcsim.diagnosis.knowledge import CONSTRAINED_SKIES, Ask, Knowledge, after_jobs, constrained_jobs
 from mcsim.diagnosis.listen import show
 from mcsim.diagnosis.refine import (
     Refined,
@@ -31,6 +31,7 @@ from mcsim.diagnosis.refine import (
     refine,
     scatter_of,
 )
+from mcsim.diagnosis.scattered import scattered
 from mcsim.diagnosis.shrink import Prediction, Shrink, achieved, carried, excess, predicted
 from mcsim.diagnosis.trials import Calibration, calibrate, gap
 from mcsim.diagnosis.verdict import detectable_of, sentence, verdict_of
@@ -160,6 +161,13 @@ def judge(court: Court, case: str, maps: Sequence[NDArray[np.float64]], ask: Ask
         changes: NDArray[np.float64] = after - np.stack(without[:skies])
         return changes
 
+    def seen(found: Sequence[config.Effect], typical: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        if typical:
+            return known.reference, np.concatenate(ask(after_jobs(court.run, asked, found)))
+        changes = respond(found, CONSTRAINED_SKIES)
+        before = np.stack(without[:CONSTRAINED_SKIES])
+        return before, before + changes
+
     t = quiet_templates(known)
     groups = bases(court.null, t, [candidate.columns for candidate in court.candidates])
     if gap(court.null, x, groups, court.calibration).probability <= ALPHA:
@@ -174,6 +182,7 @@ def judge(court: Court, case: str, maps: Sequence[NDArray[np.float64]], ask: Ask
     shrink = None
     if found.explanations:
         found, shrink = confirmed(court, found, shrink_of(court, x, refined, respond), notes)
+        found = _with_errors(court, refined, found, seen)
     where = _where(court, x, numbers)
     able = detectable_of(court.null, refined.templates, court.candidates, asked.proposals)
     heard = None if exchanged else heard_of(court, x, refined, found, respond)
@@ -209,6 +218,32 @@ def confirmed(
         )
         return found, None
     return found, shrink
+
+
+Seen = Callable[[Sequence[config.Effect], bool], tuple[NDArray[np.float64], NDArray[np.float64]]]
+"""From effects to the evidence of the same skies without and with them: of typical skies, or of ones as observed."""
+
+
+def _with_errors(court: Court, refined: Refined, found: Attribution, seen: Seen) -> Attribution:
+    """The attribution, the best set with the errors that its amplitudes have where its effects act.
+
+    Of effects that draw the scatter is known already: it has widened the null that they were fitted with.
+    """
+    if not found.explanations:
+        return found
+    best = found.explanations[0]
+    proposals = [court.asked.proposals[member] for member in best.members]
+    if any(refined.candidates[member].scatter is not None for member in best.members):
+        return found
+    try:
+        effects = effects_at(court.candidates, court.asked.proposals, best.members, best.fit)
+        tables = [proposal.table(effect) for proposal, effect in zip(proposals, effects, strict=True)]
+        before, after = seen(tables, any(proposal.kind.mean_response for proposal in proposals))
+    except InputError:
+        return found  # between what was fitted and what can be
+    t = refined.templates[:, columns_of(court.candidates, best.members)]
+    widened = replace(best, fit=scattered(court.null, t, best.fit, before, after))
+    return replace(found, explanations=(widened, *found.explanations[1:]))
 
 
 def heard_of(court: Court, x: Vector, refined: Refined, found: Attribution, respond: Respond) -> Closest | None:

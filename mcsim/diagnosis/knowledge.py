@@ -28,11 +28,11 @@ SOME = 3
 MODES = 1 << 14
 """Degrees squared, times skies, that a response is the mean of: noise is less than 3e-3 of its F then."""
 
-FEWEST_SKIES = 4
+FEWEST_SKIES = 3
 """Skies that a response is the mean of, at both signs of a step, at least."""
 
 COMMON_SKIES = 12
-"""The same for changes of the sky, whose response in a single sky is largely random."""
+"""The same for changes of the sky whose response in a single sky is largely random."""
 
 NOISY_SKIES = 24
 """The same where the change itself is random, or has one sign."""
@@ -275,7 +275,8 @@ def skies(proposal: Proposal, lmax: int) -> int:
     """Number of skies that the response to a proposal is the mean of."""
     if proposal.drawn:
         return NOISY_SKIES
-    fewest = FEWEST_SKIES if proposal.channel is not None else COMMON_SKIES
+    hangs_on_the_sky = proposal.channel is None and not proposal.kind.mean_response
+    fewest = COMMON_SKIES if hangs_on_the_sky else FEWEST_SKIES
     return min(max(fewest, -(-MODES // lmax**2)), NOISY_SKIES)
 
 
