@@ -181,8 +181,8 @@ def judge(court: Court, case: str, maps: Sequence[NDArray[np.float64]], ask: Ask
         found = found.unexplained()
     shrink = None
     if found.explanations:
-        found, shrink = confirmed(court, found, shrink_of(court, x, refined, respond), notes)
         found = _with_errors(court, refined, found, seen)
+        found, shrink = confirmed(court, found, shrink_of(court, x, refined, respond), notes)
     where = _where(court, x, numbers)
     able = detectable_of(court.null, refined.templates, court.candidates, asked.proposals)
     heard = None if exchanged else heard_of(court, x, refined, found, respond)
@@ -229,8 +229,6 @@ def _with_errors(court: Court, refined: Refined, found: Attribution, seen: Seen)
 
     Of effects that draw the scatter is known already: it has widened the null that they were fitted with.
     """
-    if not found.explanations:
-        return found
     best = found.explanations[0]
     proposals = [court.asked.proposals[member] for member in best.members]
     if any(refined.candidates[member].scatter is not None for member in best.members):
