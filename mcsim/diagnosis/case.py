@@ -1,7 +1,7 @@
 """One case: maps against a model and what its simulations have taught; verdict and all that it rests on."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import reduce
 from pathlib import Path
@@ -19,18 +19,19 @@ from mcsim.diagnosis.data import exchanges
 from mcsim.diagnosis.evidence import Questions
 from mcsim.diagnosis.exhibits import exhibits
 from mcsim.diagnosis.gaussian import Null, bases, fit
-from mcsim.diagnosis.knowledge import CONSTRAINED_SKIES, Ask, Knowledge, after_jobs, constrained_jobs
+from mcsim.diagnosis.knowledge import CONSTRAINED_SKIES, Ask, Knowledge
 from mcsim.diagnosis.listen import show
 from mcsim.diagnosis.refine import (
     Refined,
     Respond,
-    effects_at,
     heard_in,
     on_this_sky,
     quiet_templates,
     refine,
     scatter_of,
+    tables_at,
 )
+from mcsim.diagnosis.responses import Responses
 from mcsim.diagnosis.scattered import scattered
 from mcsim.diagnosis.shrink import Prediction, Shrink, achieved, carried, excess, predicted
 from mcsim.diagnosis.trials import Calibration, calibrate, gap
@@ -150,24 +151,7 @@ def judge(court: Court, case: str, maps: Sequence[NDArray[np.float64]], ask: Ask
     answer = asked.answer(maps, atlas=True)
     x, numbers = answer[: len(asked.entries)], answer[len(asked.entries) :]
 
-    observed = show(asked.model, maps)
-    without: list[NDArray[np.float64]] = []
-
-    def respond(found: Sequence[config.Effect], skies: int) -> NDArray[np.float64]:
-        if len(without) < skies:
-            jobs = constrained_jobs(court.run, asked, (), observed, len(without), skies)
-            without.extend(np.concatenate(ask(jobs)))
-        after = np.concatenate(ask(constrained_jobs(court.run, asked, found, observed, 0, skies)))
-        changes: NDArray[np.float64] = after - np.stack(without[:skies])
-        return changes
-
-    def seen(found: Sequence[config.Effect], typical: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        if typical:
-            return known.reference, np.concatenate(ask(after_jobs(court.run, asked, found)))
-        changes = respond(found, CONSTRAINED_SKIES)
-        before = np.stack(without[:CONSTRAINED_SKIES])
-        return before, before + changes
-
+    respond = Responses(court.run, asked, known, show(asked.model, maps), ask)
     t = quiet_templates(known)
     groups = bases(court.null, t, [candidate.columns for candidate in court.candidates])
     if gap(court.null, x, groups, court.calibration).probability <= ALPHA:
@@ -181,7 +165,7 @@ def judge(court: Court, case: str, maps: Sequence[NDArray[np.float64]], ask: Ask
         found = found.unexplained()
     shrink = None
     if found.explanations:
-        found = _with_errors(court, refined, found, seen)
+        found = _with_errors(court, refined, found, respond)
         found, shrink = confirmed(court, found, shrink_of(court, x, refined, respond), notes)
     where = _where(court, x, numbers)
     able = detectable_of(court.null, refined.templates, court.candidates, asked.proposals)
@@ -220,28 +204,22 @@ def confirmed(
     return found, shrink
 
 
-Seen = Callable[[Sequence[config.Effect], bool], tuple[NDArray[np.float64], NDArray[np.float64]]]
-"""From effects to the evidence of the same skies without and with them: of typical skies, or of ones as observed."""
-
-
-def _with_errors(court: Court, refined: Refined, found: Attribution, seen: Seen) -> Attribution:
+def _with_errors(court: Court, refined: Refined, found: Attribution, respond: Responses) -> Attribution:
     """The attribution, the best set with the errors that its amplitudes have where its effects act.
 
     Of effects that draw the scatter is known already: it has widened the null that they were fitted with.
     """
     best = found.explanations[0]
-    proposals = [court.asked.proposals[member] for member in best.members]
     if any(refined.candidates[member].scatter is not None for member in best.members):
         return found
     try:
-        effects = effects_at(court.candidates, court.asked.proposals, best.members, best.fit)
-        tables = [proposal.table(effect) for proposal, effect in zip(proposals, effects, strict=True)]
-        before, after = seen(tables, any(proposal.kind.mean_response for proposal in proposals))
+        acting = tables_at(court.candidates, court.asked.proposals, best.members, best.fit)
+        before, after = respond.pair(acting)
     except InputError:
         return found  # between what was fitted and what can be
     t = refined.templates[:, columns_of(court.candidates, best.members)]
-    widened = replace(best, fit=scattered(court.null, t, best.fit, before, after))
-    return replace(found, explanations=(widened, *found.explanations[1:]))
+    own = replace(best, fit=scattered(court.null, t, best.fit, before, after))
+    return replace(found, explanations=(own, *found.explanations[1:]))
 
 
 def heard_of(court: Court, x: Vector, refined: Refined, found: Attribution, respond: Respond) -> Closest | None:
@@ -275,9 +253,8 @@ def shrink_of(court: Court, x: Vector, refined: Refined, respond: Respond) -> tu
     learning, before = court.known.null(used), court.known.null(fresh)
     frozen = fit(learning.widened(*(one[used] for one in scatters)), x[used], refined.templates[np.ix_(used, chosen)])
     try:
-        effects = effects_at(court.candidates, court.asked.proposals, members, frozen)
-        tables = [court.asked.proposals[member].table(effect) for member, effect in zip(members, effects, strict=True)]
-        mean = before.mean + respond(tables, CONSTRAINED_SKIES).mean(axis=0)[fresh]
+        acting = tables_at(court.candidates, court.asked.proposals, members, frozen)
+        mean = before.mean + respond(acting, CONSTRAINED_SKIES).mean(axis=0)[fresh]
     except InputError:
         return None  # half of the evidence asks for an amplitude that the effect cannot have
     after = replace(before, mean=mean).widened(*(one[fresh] for one in scatters))

@@ -29,7 +29,10 @@ MODES = 1 << 14
 """Degrees squared, times skies, that a response is the mean of: noise is less than 3e-3 of its F then."""
 
 FEWEST_SKIES = 3
-"""Skies that a response is the mean of, at both signs of a step, at least."""
+"""Skies that the response of a channel is the mean of, at both signs of a step, at least."""
+
+TYPICAL_SKIES = 6
+"""The same for changes of the sky that are held to their mean response."""
 
 COMMON_SKIES = 12
 """The same for changes of the sky whose response in a single sky is largely random."""
@@ -275,8 +278,9 @@ def skies(proposal: Proposal, lmax: int) -> int:
     """Number of skies that the response to a proposal is the mean of."""
     if proposal.drawn:
         return NOISY_SKIES
-    hangs_on_the_sky = proposal.channel is None and not proposal.kind.mean_response
-    fewest = COMMON_SKIES if hangs_on_the_sky else FEWEST_SKIES
+    fewest = FEWEST_SKIES
+    if proposal.channel is None:
+        fewest = TYPICAL_SKIES if proposal.kind.mean_response else COMMON_SKIES
     return min(max(fewest, -(-MODES // lmax**2)), NOISY_SKIES)
 
 

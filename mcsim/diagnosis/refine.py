@@ -138,6 +138,14 @@ def effects_at(
     ]
 
 
+def tables_at(
+    candidates: Sequence[Candidate], proposals: Sequence[Proposal], members: Sequence[int], found: Fit
+) -> list[config.Effect]:
+    """The same as ``[[effect]]`` of a run."""
+    effects = effects_at(candidates, proposals, members, found)
+    return [proposals[member].table(effect) for member, effect in zip(members, effects, strict=True)]
+
+
 def refine(
     known: Knowledge,
     null: Null,
