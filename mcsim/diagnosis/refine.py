@@ -123,9 +123,9 @@ def on_this_sky(known: Knowledge, asked: Questions, t: NDArray[np.float64], resp
 
 
 def effect_at(proposal: Proposal, coordinates: Vector, covariance: NDArray[np.float64]) -> Effect:
-    """The effect that is nearest to fitted coordinates."""
+    """The effect that is nearest to fitted coordinates, as far as data tell them."""
     precision: NDArray[np.float64] = np.asarray(np.linalg.pinv(covariance), dtype=np.float64)
-    return proposal.with_parameters(coordinates, precision)
+    return proposal.with_parameters(proposal.kind.told(coordinates, precision), precision)
 
 
 def effects_at(

@@ -86,7 +86,7 @@ def detectable_of(
         if np.isfinite(size):
             direction = np.zeros(len(candidate.columns))
             direction[0] = size
-            amplitude = effect_at(proposal, direction, np.eye(len(direction))).amplitude
+            amplitude = proposal.with_parameters(direction, np.eye(len(direction))).amplitude
             row = {"name": candidate.name, "channel": candidate.channel, "amplitude_90": abs(amplitude)}
             found.append({**row, "unit": candidate.unit, "settings": dict(candidate.settings)})
     return found

@@ -194,6 +194,19 @@ class Effect:
         return np.array([self.amplitude])
 
     @classmethod
+    def told(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Vector:
+        """Of fitted coordinates what data tell: all of them, where an effect does not say which are beyond them.
+
+        Parameters
+        ----------
+        coordinates
+            Shape (basis,).
+        precision
+            Inverse of their covariance, shape (basis, basis).
+        """
+        return coordinates
+
+    @classmethod
     def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
         """The effect whose coordinates are nearest in the metric ``precision``, shape (k, k)."""
         return cls(amplitude=float(coordinates[0]))

@@ -18,6 +18,13 @@ LEAST = -0.99
 """Smallest change of a band that is fitted: an error larger than the power itself asks for less than none."""
 
 
+KNOWN = 0.25
+"""Error of a band up to which data tell its power."""
+
+HEARD = 3.0
+"""Errors by which a band that is known worse has to change, to be heard all the same."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Spectrum(Effect):
     """C_l times one plus the change of its band, in every channel.
@@ -66,6 +73,17 @@ class Spectrum(Effect):
     def coordinates(self) -> Vector:
         """Fractional change of every band."""
         return along(self.name, "bands", self.bands, self.amplitude)
+
+    @classmethod
+    def told(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Vector:
+        """Bands that are neither known nor heard, those beyond the degrees that are analysed, stay as believed."""
+        errors = np.sqrt(np.diag(np.linalg.pinv(precision)))
+        silent = (errors > KNOWN) & (np.abs(coordinates) < HEARD * errors)
+        found = np.where(silent, 0.0, coordinates)
+        rows = np.flatnonzero(~silent)
+        shift = precision[np.ix_(rows, np.flatnonzero(silent))] @ coordinates[silent]
+        found[rows] += np.linalg.lstsq(precision[np.ix_(rows, rows)], shift, rcond=None)[0]
+        return found
 
     @classmethod
     def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:

@@ -2,6 +2,7 @@
 
 import tomllib
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -58,7 +59,7 @@ def toy(names, simulations=800, seed=1, common=0.0):
         np.zeros((0, 0)),
         tuple(entry for block in blocks for entry in block.entries),
     )
-    return court(None, Questions(None, tuple(proposals), tuple(blocks)), known)
+    return court(None, Questions(SimpleNamespace(lmax=128), tuple(proposals), tuple(blocks)), known)
 
 
 NAMES = (("beam_width", "A"), ("noise_level", "A"), ("beam_ellipticity", "A"), ("beam_width", "B"), ("spectrum", None))
