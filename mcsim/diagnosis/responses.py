@@ -39,10 +39,12 @@ class Responses:
         """
         on_average = [effect for effect in found if _is_typical(effect)]
         others = [effect for effect in found if not _is_typical(effect)]
-        changes = self._typical(on_average) - self._known.reference if on_average else np.zeros(self._without.shape[1:])
+        shift = np.zeros((1, self._without.shape[1]))
+        if on_average:
+            shift = self._typical(on_average) - self._known.reference
         if not others:
-            return changes
-        return np.mean(np.atleast_2d(changes), axis=0) + self._constrained(others, skies) - self._before(skies)
+            return shift
+        return shift.mean(axis=0) + self._constrained(others, skies) - self._before(skies)
 
     def pair(self, found: Sequence[config.Effect]) -> tuple[Rows, Rows]:
         """Evidence of the same skies without effects and with them, shape (rows, entries) each."""

@@ -153,7 +153,8 @@ def gain_of(effect: Effect, site: effects.Site, share: tuple[float, float]) -> M
     where = moments_key(pointing.model, site.nside, 0, site.frame, [pointing.line.name], share)
     period = pointing.model.period_of_samples(pointing.line)
     times = period * np.linspace(*tod.sample_range(pointing.model, pointing.line, share), _TIMES)
-    what = hashlib.sha256(np.asarray(effect.gain(times, site)).tobytes()).hexdigest()
+    line = repr(pointing.line).encode()
+    what = hashlib.sha256(line + np.asarray(effect.gain(times, site)).tobytes()).hexdigest()
 
     def fill(folder: Path) -> None:
         np.save(folder / "gain.npy", np.asarray(mean_gain((effect,), site, share), dtype=np.float64))
