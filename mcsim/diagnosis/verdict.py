@@ -34,7 +34,7 @@ def effects_of(
                 "name": effect.name,
                 "channel": proposals[member].channel,
                 "amplitude": effect.amplitude,
-                "sigma": _sigma(proposals[member], theta, covariance, effect.amplitude),
+                "sigma": _sigma(proposals[member], theta, covariance),
                 "unit": effect.unit,
                 "parameters": {key: _plain(value) for key, value in effect.parameters().items()},
             }
@@ -42,13 +42,16 @@ def effects_of(
     return found
 
 
-def _sigma(proposal: Proposal, theta: NDArray[np.float64], covariance: NDArray[np.float64], amplitude: float) -> float:
-    """Standard error of the amplitude, by its slopes in the coordinates."""
+def _sigma(proposal: Proposal, theta: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:
+    """Standard error of the amplitude, by its slopes in the coordinates over their own errors.
+
+    Over less, what is at the edge of the possible would not move.
+    """
     scale = np.sqrt(np.diag(covariance))
     slopes: NDArray[np.float64] = np.zeros(len(theta))
     for k in range(len(theta)):
         step = np.zeros(len(theta))
-        step[k] = 0.05 * scale[k]
+        step[k] = scale[k]
         up = effect_at(proposal, theta + step, covariance).amplitude
         down = effect_at(proposal, theta - step, covariance).amplitude
         slopes[k] = (up - down) / (2.0 * step[k]) if step[k] > 0 else 0.0

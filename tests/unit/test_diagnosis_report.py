@@ -25,7 +25,7 @@ from mcsim.diagnosis.reading import Reading, entry_words
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.shrink import Measured, Prediction, Shrink
 from mcsim.diagnosis.trials import calibrate
-from mcsim.diagnosis.verdict import detectable_of, verdict_of
+from mcsim.diagnosis.verdict import detectable_of, effects_of, verdict_of
 from mcsim.diagnosis.where import Place
 from mcsim.plot import diagnosis as plots
 
@@ -349,3 +349,15 @@ def test_entries_in_words():
     assert "half1, ℓ 2–11" in words[4]
     assert words[-3] == "noise variance, V, 0-0.25, pixels1"
     assert words[-6] != words[-5] == "matched to pointing_offset (V), component 2"
+
+
+def test_an_amplitude_at_the_edge_of_the_possible_has_an_error():
+    kind = effects.get("spectrum")
+    errors = np.array([0.2, 0.02, 0.02, 0.02, 0.02, 0.02])
+    less_than_nothing = SimpleNamespace(amplitudes=np.array([-1.1, 0, 0, 0, 0, 0]), covariance=np.diag(errors**2))
+    explanation = SimpleNamespace(members=(0,), fit=less_than_nothing)
+    proposal = Proposal(kind, None, {}, kind.basis())
+    (found,) = effects_of(explanation, [Candidate("spectrum", None, tuple(range(6)))], [proposal])
+    assert found["amplitude"] == pytest.approx(0.99)
+    # One error up is -0.9.
+    assert found["sigma"] == pytest.approx((0.99 - 0.9) / 2.0, rel=1e-3)
