@@ -45,16 +45,16 @@ def effects_of(
 def _sigma(proposal: Proposal, theta: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:
     """Standard error of the amplitude, by its slopes in the coordinates over their own errors.
 
-    Over less, what is at the edge of the possible would not move.
+    Over less, what is at the edge of the possible would not move. What data do not tell is not varied.
     """
     scale = np.sqrt(np.diag(covariance))
+    precision = np.asarray(np.linalg.pinv(covariance), dtype=np.float64)
+    told = proposal.kind.told(theta, precision)
     slopes: NDArray[np.float64] = np.zeros(len(theta))
-    for k in range(len(theta)):
-        step = np.zeros(len(theta))
-        step[k] = scale[k]
-        up = effect_at(proposal, theta + step, covariance).amplitude
-        down = effect_at(proposal, theta - step, covariance).amplitude
-        slopes[k] = (up - down) / (2.0 * step[k]) if step[k] > 0 else 0.0
+    for k in np.flatnonzero((scale > 0.0) & ((told != 0.0) | (theta == 0.0))):
+        step = scale[k] * np.eye(len(theta))[k]
+        up, down = (proposal.with_parameters(told + side, precision).amplitude for side in (step, -step))
+        slopes[k] = (up - down) / (2.0 * scale[k])
     return float(np.sqrt(max(float(slopes @ covariance @ slopes), 0.0)))
 
 

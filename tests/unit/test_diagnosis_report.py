@@ -361,3 +361,14 @@ def test_an_amplitude_at_the_edge_of_the_possible_has_an_error():
     assert found["amplitude"] == pytest.approx(0.99)
     # One error up is -0.9.
     assert found["sigma"] == pytest.approx((0.99 - 0.9) / 2.0, rel=1e-3)
+
+
+def test_what_data_do_not_tell_is_no_part_of_an_error():
+    kind = effects.get("spectrum")
+    errors = np.array([0.02, 0.02, 0.02, 0.02, 0.02, 0.4])
+    fitted = SimpleNamespace(amplitudes=np.array([0.3, 0, 0, 0, 0, 1.0]), covariance=np.diag(errors**2))
+    proposal = Proposal(kind, None, {}, kind.basis())
+    explanation = SimpleNamespace(members=(0,), fit=fitted)
+    (found,) = effects_of(explanation, [Candidate("spectrum", None, tuple(range(6)))], [proposal])
+    assert found["amplitude"] == pytest.approx(0.3)
+    assert found["sigma"] == pytest.approx(0.02)
