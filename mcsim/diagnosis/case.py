@@ -48,7 +48,7 @@ EXCHANGED = 0.01
 """Probability above which maps in another order are said to fit the model."""
 
 OPENED = 3.0
-"""Standard deviations below zero from which on an achieved shrink says that the gap was opened."""
+"""Standard deviations below zero, or below what was forecast, from which on a gap that grows was opened."""
 
 HEARD = 0.2
 """Share of an effect's strength that either half of the evidence must hear for a shrink to be measured."""
@@ -187,8 +187,10 @@ def confirmed(
     """
     if shrink is None:
         return found, None
-    before, fraction = shrink[1].before, shrink[1].fraction
-    if fraction.value * before.value + OPENED * fraction.sigma * abs(before.value) < 0.0:
+    before, fraction, expected = shrink[1].before, shrink[1].fraction, shrink[0].fraction
+    opened = fraction.value * before.value + OPENED * fraction.sigma * abs(before.value) < 0.0
+    short = expected.value - fraction.value > OPENED * np.hypot(expected.sigma, fraction.sigma)
+    if opened or (short and fraction.value * before.value < 0.0):
         names = [court.asked.proposals[member].label for member in found.explanations[0].members]
         notes.append(
             f"What fits best, {' and '.join(names)}, is not named: simulated with its amplitude from one half, it "

@@ -15,7 +15,7 @@ from mcsim.diagnosis.case import confirmed
 from mcsim.diagnosis.closest import Closest, Exact, closest
 from mcsim.diagnosis.detect import cosines, detectable, log_evidence, posterior, strength_needed, strength_to_isolate
 from mcsim.diagnosis.gaussian import Null, bases, null
-from mcsim.diagnosis.shrink import Measured, Shrink
+from mcsim.diagnosis.shrink import Measured, Prediction, Shrink
 from mcsim.diagnosis.trials import calibrate
 
 P, N = 60, 800
@@ -351,6 +351,9 @@ def test_four_effects_are_heard_where_no_set_of_three_suffices(bench):
     assert 0 not in heard(signal, lambda t, members, fitted: other if 0 in members else t).members
 
 
+UNSURE = Prediction(Measured(0.0, 1e4), Measured(0.0, 100.0))
+
+
 @pytest.mark.parametrize(("achieved", "named"), [(0.9, True), (-0.5, True), (-2.0, False)])
 def test_set_that_opens_the_gap_is_not_named(bench, achieved, named):
     """Three standard deviations below zero: what fits best, simulated, made it worse."""
@@ -358,13 +361,24 @@ def test_set_that_opens_the_gap_is_not_named(bench, achieved, named):
     assert found.verdict == "effect"
     court = SimpleNamespace(asked=SimpleNamespace(proposals=[SimpleNamespace(label=c.name) for c in bench.candidates]))
     after = Measured(100.0 * (1.0 - achieved), 10.0)
-    shrink = None, Shrink(Measured(100.0, 10.0), after, Measured(achieved, 0.5), 0.5), "half2"
+    shrink = UNSURE, Shrink(Measured(100.0, 10.0), after, Measured(achieved, 0.5), 0.5), "half2"
     notes: list[str] = []
     judged, kept = confirmed(court, found, shrink, notes)
     assert (judged.verdict, kept is shrink, bool(notes)) == (
         ("effect", True, False) if named else ("unknown", False, True)
     )
     assert named or ("effect3" in notes[0] and "from 100 to 300" in notes[0])
+
+
+@pytest.mark.parametrize(("achieved", "forecast", "named"), [(-0.8, 0.9, False), (-0.8, 0.5, True), (0.1, 2.0, True)])
+def test_set_that_opens_a_gap_that_it_was_to_close_is_not_named(bench, achieved, forecast, named):
+    """Less than three standard deviations below zero, but more below its forecast."""
+    found = bench.judge(12.0 * bench.t[:, 3], 0)
+    court = SimpleNamespace(asked=SimpleNamespace(proposals=[SimpleNamespace(label=c.name) for c in bench.candidates]))
+    expected = Prediction(Measured(100.0 * forecast, 30.0), Measured(forecast, 0.3))
+    measured = Shrink(Measured(100.0, 10.0), Measured(100.0 * (1.0 - achieved), 10.0), Measured(achieved, 0.4), 0.5)
+    judged, _ = confirmed(court, found, (expected, measured, "half2"), [])
+    assert judged.verdict == ("effect" if named else "unknown")
 
 
 @pytest.mark.parametrize("before", [1.0, -1.0])
@@ -375,7 +389,7 @@ def test_half_without_a_gap_measures_no_shrink(bench, before, after, named):
     court = SimpleNamespace(asked=SimpleNamespace(proposals=[SimpleNamespace(label=c.name) for c in bench.candidates]))
     share = Measured(1.0 - after / before, 12.0)
     notes: list[str] = []
-    shrink = None, Shrink(Measured(before, 12.0), Measured(after, 12.0), share, 0.5), "half2"
+    shrink = UNSURE, Shrink(Measured(before, 12.0), Measured(after, 12.0), share, 0.5), "half2"
     judged, kept = confirmed(court, found, shrink, notes)
     assert (judged.verdict, kept) == ("effect" if named else "unknown", None)
     assert ("shows no gap by itself" if named else "opens the gap") in notes[0]
