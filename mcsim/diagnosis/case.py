@@ -182,8 +182,8 @@ def confirmed(
 ) -> tuple[Attribution, tuple[Prediction, Shrink, str] | None]:
     """Attribution and shrink, where they hold once the set that fits best is simulated.
 
-    What opens the gap is not what is there, and is not named. Half of the data that shows no gap beyond its own error
-    measures no share of it.
+    What opens the gap, by its own error or against a forecast that it would close, is not what is there, and is not
+    named. Half of the data that shows no gap beyond its own error measures no share of it.
     """
     if shrink is None:
         return found, None

@@ -164,6 +164,7 @@ def gain_of(effect: Effect, site: effects.Site, share: tuple[float, float]) -> M
 
 
 _TIMES = 4096
+"""At which a gain is looked at to know it again."""
 
 
 def _beam_score(model: Model, effect: Effect, channel: int, parts: tuple[int, ...]) -> BeamScore | None:
