@@ -1,5 +1,9 @@
 """What the channels of a configuration stand for: beams, scan models, pointing, and the effects that act in them."""
 
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
 import healpy
 import numpy as np
 
@@ -101,7 +105,42 @@ def site_of(run: config.RunConfig, spec: config.Channel) -> effects.Site:
         beam=load_beam(spec, run.sky.lmax),
         pointing=pointing,
         dipole_uk=amplitude * (rotation.rotation_matrix("galactic", run.map.frame) @ towards),
+        whole=partial(_whole, load_beam, spec, run.sky.lmax) if _is_cut(spec.beam) else None,
     )
+
+
+def site_b_of(site: effects.Site, spec: config.Channel) -> effects.Site:
+    """The same for side B of a differencing channel, from that of side A."""
+    whole = partial(_whole, load_beam_b, spec, site.lmax) if _is_cut(spec.beam_b or spec.beam) else None
+    return replace(site, beam=load_beam_b(spec, site.lmax), whole=whole)
+
+
+def _is_cut(spec: config.Beam) -> bool:
+    return not isinstance(spec, config.BeamGaussian) and spec.m_max is not None
+
+
+WHOLE = 4
+"""Orders that a beam has at least without its m_max, where its source has them."""
+
+
+def _whole(load: Callable[[config.Channel, int], beams.Beam], spec: config.Channel, lmax: int) -> beams.Beam:
+    """A beam of a channel without its m_max."""
+    chosen = load(_with_m_max(spec, None), lmax)
+    if chosen.mmax >= WHOLE:
+        return chosen
+    try:
+        return load(_with_m_max(spec, WHOLE), lmax)
+    except InputError:  # a file of coefficients with fewer orders
+        return chosen
+
+
+def _with_m_max(spec: config.Channel, m_max: int | None) -> config.Channel:
+    beam_b = None if spec.beam_b is None else _cut_at(spec.beam_b, m_max)
+    return replace(spec, beam=_cut_at(spec.beam, m_max), beam_b=beam_b)
+
+
+def _cut_at(spec: config.Beam, m_max: int | None) -> config.Beam:
+    return spec if isinstance(spec, config.BeamGaussian) else replace(spec, m_max=m_max)
 
 
 def _described(spec: config.Channel) -> tuple[effects.Pointing | None, float | None]:

@@ -12,7 +12,7 @@ from mcsim import beams, config, convolve, healpix, mapmaking, scan, spectra, to
 from mcsim.biposh import Estimator, estimator
 from mcsim.effects import Effect, Site, seen_through, spread_of
 from mcsim.errors import InputError
-from mcsim.instrument import effects_on, load_beam_b, refuse_pixel_effects, scan_model, site_of
+from mcsim.instrument import effects_on, refuse_pixel_effects, scan_model, site_b_of, site_of
 from mcsim.mask import read_mask
 from mcsim.rings import Rings, limit_rings, parallel_transport_rings
 
@@ -197,7 +197,7 @@ def _channel(
         maps.append(_with_effects(m, acting, site, share, spread))
     # A pixel whose samples keep closer to its centre blurs less; the window is a Gaussian in all but name.
     response = convolve.response(beam, run.sky.lmax, window ** (spread * spread))
-    side_b = _side_b(run, spec, window ** (spread * spread), site, acting)
+    side_b = _side_b(spec, window ** (spread * spread), site, acting)
     return Channel(spec.name, beam, response, window, tuple(maps), site, acting, side_b)
 
 
@@ -220,7 +220,6 @@ def _channel_on_rings(run: config.RunConfig, spec: config.Channel, site: Site, a
 
 
 def _side_b(
-    run: config.RunConfig,
     spec: config.Channel,
     window: NDArray[np.float64],
     site: Site,
@@ -228,13 +227,13 @@ def _side_b(
 ) -> SideB | None:
     if not isinstance(spec.scan, config.ScanDifferencing):
         return None
-    believed = load_beam_b(spec, run.sky.lmax)
-    beam = seen_through(acting, replace(site, beam=believed))
-    response = convolve.response(beam, run.sky.lmax, window)
+    other = site_b_of(site, spec)
+    beam = seen_through(acting, other)
+    response = convolve.response(beam, site.lmax, window)
     imbalance, short = spec.scan.transmission_imbalance, 0
     for effect in acting:
         imbalance, short = effect.differencing(imbalance, short)
-    return SideB(beam, response, believed, spec.scan, spec.noise.sigma0_uk, imbalance, short)
+    return SideB(beam, response, other.beam, spec.scan, spec.noise.sigma0_uk, imbalance, short)
 
 
 def _with_effects(

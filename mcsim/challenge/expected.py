@@ -41,6 +41,7 @@ SIGNATURES = {
     "beam_coma": _signature("ecliptic", (1, 3)),
     "beam_sidelobe": _signature("", (0, 1, 2)),
     "beam_width": _signature("", (0,), "even"),
+    "beam_noncircularity": _signature("ecliptic", (1, 2, 3, 4)),
     "pointing_offset": _signature("ecliptic", (1,)),
     "time_constant": _signature("ecliptic", (1, 2)),
     "gain_drift": _signature("ecliptic", (0, 1, 2)),

@@ -151,6 +151,5 @@ def _key(run: config.RunConfig, asked: Questions, simulations: int | None) -> st
         library,
         [entry.name for entry in asked.entries],
         version("ducc0"),
-        sorted(effects.catalogue()),
     ]
     return hashlib.sha256(json.dumps([science, rest], sort_keys=True).encode()).hexdigest()[:32]

@@ -57,6 +57,8 @@ class Site:
         Of the whole survey; None where only moments are known.
     dipole_uk
         The dipole that the survey sees and takes off as believed: a vector in the frame of the maps, zeros without.
+    whole
+        Gives the beam with the orders that it has without an m_max; None where they are not known.
     """
 
     channel: str
@@ -67,6 +69,7 @@ class Site:
     beam: Beam
     pointing: Pointing | None = None
     dipole_uk: Vector = field(default_factory=lambda: np.zeros(3))
+    whole: Callable[[], Beam] | None = None
 
     def pointed(self, effect: str) -> Pointing:
         """The pointing; InputError where it is not known."""
@@ -76,6 +79,17 @@ class Site:
                 'channel a scan of kind "hit_averaged", or moments with a scan model (scan.model).'
             )
         return self.pointing
+
+    def whole_beam(self, effect: str) -> Beam:
+        """The beam with the orders that are left out of ``beam``; InputError where none are."""
+        whole = None if self.whole is None else self.whole()
+        if whole is None or whole.mmax <= self.beam.mmax:
+            raise InputError(
+                f"effect {effect} on channel {self.channel} adds the orders of the beam that m_max leaves out, but the "
+                f"beam has none beyond m = {self.beam.mmax}; give a beam that is not circular, with beam.m_max below "
+                "its highest order."
+            )
+        return whole
 
     def frequency(self, effect: str) -> float:
         """The frequency in GHz; InputError where it is not known."""

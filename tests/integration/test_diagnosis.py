@@ -190,6 +190,16 @@ def test_nothing_is_asked_that_has_no_answer(kind, tmp_path):
     assert dead == []
 
 
+def test_orders_are_proposed_where_a_run_leaves_some_out(small):
+    """And in no other channel."""
+    ellipse = {"fwhm_major_arcmin": 380.0, "fwhm_minor_arcmin": 330.0}
+    cut, whole = (config.BeamEllipticalGaussian(**ellipse, m_max=m_max) for m_max in (0, None))
+    for beam, expected in ((cut, ["beam_noncircularity (V1)"]), (whole, [])):
+        run = replace(small.run, channels=(replace(small.run.channels[0], beam=beam), small.run.channels[1]))
+        asked = questions(run, without=[name for name in effects.catalogue() if name != "beam_noncircularity"])
+        assert [proposal.label for proposal in asked.proposals] == expected
+
+
 def test_what_cannot_be_done_is_said_before_anything_is_learned(small, folder):
     (folder / "file").write_text("")
     for changes, said in (

@@ -233,6 +233,17 @@ def test_scans_that_cannot_be(year, scan, message):
         survey(year(scan))
 
 
+@pytest.mark.parametrize("other", [{}, {"beam_b": LONG | {"angle_deg": 70.0, "m_max": 0}}])
+def test_orders_that_were_left_out_come_back_on_both_sides(year, other):
+    effect = config.Effect(name="beam_noncircularity", channel="W1", parameters={"amplitude": 1.0})
+    believed = year(channel={"beam": LONG | {"m_max": 0}} | other)
+    whole = year(channel={side: beam | {"m_max": 4} for side, beam in ({"beam": LONG} | other).items()})
+    found, expected = survey(replace(believed, effects=(effect,))), survey(whole)
+    for a, b in zip(found.channels, expected.channels, strict=True):
+        np.testing.assert_array_equal(a.beam.blm, b.beam.blm)
+        np.testing.assert_array_equal(a.side_b.beam.blm, b.side_b.beam.blm)
+
+
 def test_survey_of_another_scan_has_no_side_b():
     shared: Survey = survey(config.load(table()))
     assert shared.channels[0].side_b is None

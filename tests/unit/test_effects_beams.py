@@ -215,6 +215,25 @@ def test_moved_samples_see_what_a_displaced_beam_sees():
     np.testing.assert_allclose(along[near_equator], expected_along, atol=2e-4)
 
 
+def test_orders_that_were_left_out_come_back():
+    """Beside what other effects have made of the orders that were kept, and of orders that were not there."""
+    whole = elliptical_gaussian(FWHM * 1.1**0.5, FWHM / 1.1**0.5, 20.0, 64, 6)
+    believed = whole.truncated(2)
+    site = replace(site_of(believed), whole=lambda: whole)
+    kind = effects.get("beam_noncircularity")
+    same(kind(amplitude=1.0).beam(believed, site), whole, 1e-15)
+    shifted = displaced(believed, 0.4, np.deg2rad(0.1))
+    found = kind(amplitude=0.3).beam(shifted, site)
+    expected = np.zeros((max(len(shifted.blm), 7), 65), dtype=complex)
+    expected[: len(shifted.blm)] = shifted.blm
+    expected[3:7] += 0.3 * whole.blm[3:]
+    np.testing.assert_array_equal(found.blm, expected)
+    assert found.neglected_power == whole.neglected_power
+    for kept in (site_of(believed), replace(site_of(whole), whole=lambda: whole)):
+        with pytest.raises(InputError, match=r"on channel W1 adds the orders of the beam that m_max leaves out"):
+            kind(amplitude=1.0).beam(kept.beam, kept)
+
+
 @pytest.mark.parametrize(
     "name", ["beam_ellipticity", "beam_coma", "beam_sidelobe", "beam_width", "pointing_offset", "time_constant"]
 )

@@ -20,6 +20,7 @@ NAMES = {
     "beam_coma",
     "beam_sidelobe",
     "beam_width",
+    "beam_noncircularity",
     "pointing_offset",
     "time_constant",
     "gain_drift",

@@ -29,6 +29,7 @@ PARAMETERS: dict[str, dict[str, Any]] = {
     "beam_coma": {"amplitude": 0.02, "angle_deg": 20.0},
     "beam_sidelobe": {"amplitude": 0.001, "quadrupole": 0.5},
     "beam_width": {"amplitude": 0.02},
+    "beam_noncircularity": {"amplitude": 1.0},
     "pointing_offset": {"amplitude": 2.0, "angle_deg": 70.0},
     "time_constant": {"amplitude": 0.02},
     "gain_drift": {"amplitude": 0.001, "phase_deg": 30.0},
@@ -61,7 +62,7 @@ def main() -> None:
     arguments.output.mkdir(parents=True, exist_ok=True)
     store = arguments.output / "responses.npz"
     known = dict(np.load(store)) if store.exists() else {}
-    plain: dict[str, list[Map]] = {}
+    plain: dict[str | None, tuple[list[Map], list[Map]]] = {}
     print(f"{'effect':24s} {'rms, uK':>9s} {'cosine':>8s} {'l < 256':>8s} {'sampled/default':>16s}")
     for name in arguments.effects:
         if name not in known:
@@ -71,7 +72,7 @@ def main() -> None:
     draw({name: known[name] for name in PARAMETERS if name in known}, arguments.output / "effects.png")
 
 
-def response(name: str, arguments: argparse.Namespace, plain: dict[str, list[Map]]) -> Map:
+def response(name: str, arguments: argparse.Namespace, plain: dict[str | None, tuple[list[Map], list[Map]]]) -> Map:
     """Maps with the effect less those without, of the default route and, where it can, of the sampled one."""
     if name in NOISE:
         effect = effects.build(name, PARAMETERS[name])
@@ -79,12 +80,13 @@ def response(name: str, arguments: argparse.Namespace, plain: dict[str, list[Map
         return np.array([factor - 1.0])
     if name in DIFFERENCING or name == "orientation_averaging":
         return simulate.maps(prepared(name, arguments), 0)[:1] - simulate.maps(prepared(None, arguments, name), 0)[:1]
-    if not plain:
-        without = prepared(None, arguments)
-        plain["default"], plain["sampled"] = list(simulate.maps(without, 0, 2)), referee(without)
-    changed = prepared(name, arguments)
-    default = [m - p for m, p in zip(simulate.maps(changed, 0, 2), plain["default"], strict=True)]
-    true = [m - p for m, p in zip(referee(changed), plain["sampled"], strict=True)]
+    like = name if name == "beam_noncircularity" else None
+    if like not in plain:
+        without = prepared(None, arguments, like)
+        plain[like] = list(simulate.maps(without, 0, 2)), referee(without)
+    changed, (default_without, true_without) = prepared(name, arguments), plain[like]
+    default = [m - p for m, p in zip(simulate.maps(changed, 0, 2), default_without, strict=True)]
+    true = [m - p for m, p in zip(referee(changed), true_without, strict=True)]
     return np.array([*default, *true])
 
 
@@ -93,7 +95,7 @@ def referee(of: Survey) -> list[Map]:
 
 
 def prepared(name: str | None, arguments: argparse.Namespace, like: str | None = None) -> Survey:
-    """The survey with an effect, or without any, of the kind of scan that the effect ``like`` needs."""
+    """The survey with an effect, or without any, of the kind of beam and scan that the effect ``like`` needs."""
     folder, kind = arguments.instrument.resolve(), like or name
     nside, lmax, splits = NSIDE, LMAX, ["half1", "half2"]
     beam: dict[str, Any] = {"kind": "gaussian", "fwhm_arcmin": 44.0}
@@ -108,6 +110,8 @@ def prepared(name: str | None, arguments: argparse.Namespace, like: str | None =
         scan = {"kind": "parallel_transport", "psi0_deg": 90.0}
         if name:
             parameters["model"] = slow(arguments.output)
+    if kind == "beam_noncircularity":
+        beam = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 47.2, "fwhm_minor_arcmin": 41.0, "m_max": 0}
     if kind in DIFFERENCING:
         nside, lmax, splits = 32, 64, []
         beam = {"kind": "gaussian", "fwhm_arcmin": 200.0}
@@ -154,17 +158,17 @@ def report(name: str, maps: Map) -> None:
 
 def draw(found: dict[str, Map], path: Path) -> None:
     """A map of the response of the first half and the spectra of both routes, for every effect."""
-    columns, rows = 5, 4
-    figure = plt.figure(figsize=(17, 15.5))
+    columns, rows = 7, 3
+    figure = plt.figure(figsize=(23, 12))
     for place, (name, maps) in enumerate(found.items()):
         column, row = place % columns, place // columns
-        left, bottom = 0.045 + column * 0.191, 0.742 - row * 0.236
+        left, bottom = 0.03 + column * 0.139, 0.663 - row * 0.309
         shown = healpy.smoothing(maps[0], fwhm=np.deg2rad(1.5)) if len(maps) == 4 else maps[0]
         reach = np.percentile(np.abs(shown - (0.0 if name in NOISE else shown.mean())), 99.0)
         colours = {"cmap": "RdBu_r", "min": -reach, "max": reach}
         image = healpy.cartview(shown, return_projected_map=True, fig=99, xsize=500, **colours)
         plt.close(99)
-        axes = figure.add_axes((left, bottom + 0.098, 0.17, 0.094), projection="mollweide")
+        axes = figure.add_axes((left, bottom + 0.128, 0.124, 0.122), projection="mollweide")
         lon, lat = (
             np.linspace(-np.pi, np.pi, image.shape[1] + 1),
             np.linspace(-np.pi / 2, np.pi / 2, image.shape[0] + 1),
@@ -176,7 +180,7 @@ def draw(found: dict[str, Map], path: Path) -> None:
         unit = "of the variance" if name in NOISE else "uK"
         axes.set_title(f"{name}\n{PARAMETERS[name]['amplitude']:g} {effect.unit}", fontsize=9)
         axes.text(0.5, -0.07, f"±{reach:.2g} {unit}", transform=axes.transAxes, ha="center", va="top", fontsize=7.5)
-        below = figure.add_axes((left + 0.012, bottom, 0.158, 0.078))
+        below = figure.add_axes((left + 0.012, bottom, 0.112, 0.1))
         spectra(below, name, maps)
         if row == rows - 1 or place + columns >= len(found):
             below.set_xlabel("l", fontsize=8)
@@ -189,7 +193,7 @@ def draw(found: dict[str, Map], path: Path) -> None:
 
 TITLE = (
     "Response of a channel to every effect: W1, 44', the first half of a year, ecliptic. Below each map its spectrum, "
-    "in the default route (line)\nand sample by sample (dots). In the last row, without dots: scans of another kind, "
+    "in the default route (line)\nand sample by sample (dots). The last three, without dots: scans of another kind, "
     "in the default route alone"
 )
 
