@@ -16,12 +16,12 @@ class BeamNoncircularity(Effect):
     -----
     b_lm + amplitude b_lm of the whole beam at the orders m > m_max. With m_max = 0 that is all that makes the beam
     non-circular: its ellipse, its coma, and what no closed form has. The whole beam has the orders that it would have
-    without m_max, and four at least where its source has them.
+    without m_max, and four at least where its source has them. Of a differencing scan both sides' beams must be cut.
     """
 
     name = "beam_noncircularity"
     scope = "channel"
-    unit = "1 = the measured beam, m_max lifted"
+    unit = "of the orders beyond m_max"
     cause = "Simulations with the circular part of a measured beam, or with too few of its orders."
     signature = "L of the orders left out: 2 and 4 of an ellipse, 1 and 3 of a lopsided beam, in the scan's frame."
     source = "Joshi et al. arXiv:1210.7318, Sec. IV"

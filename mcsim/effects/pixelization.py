@@ -13,6 +13,7 @@ class Pixelization(Effect):
     -----
     The pixel window and the gradient along the mean offset, which the believed model has, go with them. A gap of this
     kind lies in the model and not in the instrument: data made of samples at the centres, or the other way round.
+    Beyond 2 the samples would stand outside of their pixels.
     """
 
     name = "pixelization"
@@ -22,6 +23,7 @@ class Pixelization(Effect):
     signature = "Small scales, depending on nside, and the gradient of the sky at pixels that are hit unevenly."
     source = "Gorski et al. 2005, ApJ 622, 759, Sec. 6 (window functions)"
     step = 0.1
+    most = 2.0
 
     def spread(self) -> float:
         """1 - amplitude."""
