@@ -173,4 +173,4 @@ def _partly(verdict: Mapping[str, Any]) -> str:
 
 def _words(effect: Mapping[str, Any]) -> str:
     where = effect["channel"] or "all channels"
-    return f"{effect['name']} in {where}, {effect['amplitude']:.3g} +- {effect['sigma']:.2g} {effect['unit']}"
+    return f"{effect['name']} in {where}, {effect['amplitude']:.3g} +- {effect['sigma']:.2g} ({effect['unit']})"
