@@ -48,7 +48,7 @@ EXCHANGED = 0.01
 """Probability above which maps in another order are said to fit the model."""
 
 OPENED = 3.0
-"""Standard deviations below zero, or below what was forecast, from which on a gap that grows was opened."""
+"""Standard deviations below zero, or below what was forecast, from which on a shrink speaks against what was added."""
 
 HEARD = 0.2
 """Share of an effect's strength that either half of the evidence must hear for a shrink to be measured."""
@@ -182,20 +182,20 @@ def confirmed(
 ) -> tuple[Attribution, tuple[Prediction, Shrink, str] | None]:
     """Attribution and shrink, where they hold once the set that fits best is simulated.
 
-    What opens the gap, by its own error or against a forecast that it would close, is not what is there, and is not
-    named. Half of the data that shows no gap beyond its own error measures no share of it.
+    What opens the gap, or closes less than half of what it was forecast to close, both beyond error, is not what is
+    there, and is not named. Half of the data that shows no gap beyond its own error measures no share of it.
     """
     if shrink is None:
         return found, None
     before, fraction, expected = shrink[1].before, shrink[1].fraction, shrink[0].fraction
     opened = fraction.value * before.value + OPENED * fraction.sigma * abs(before.value) < 0.0
     short = expected.value - fraction.value > OPENED * np.hypot(expected.sigma, fraction.sigma)
-    if opened or (short and fraction.value * before.value < 0.0):
-        names = [court.asked.proposals[member].label for member in found.explanations[0].members]
-        notes.append(
-            f"What fits best, {' and '.join(names)}, is not named: simulated with its amplitude from one half, it "
-            f"opens the gap of the other from {before.value:.3g} to {shrink[1].after.value:.3g}."
-        )
+    if opened or (short and before.value > 0.0 and fraction.value < 0.5 * min(expected.value, 1.0)):
+        best = " and ".join(court.asked.proposals[member].label for member in found.explanations[0].members)
+        does = f"opens the gap of the other from {before.value:.3g} to {shrink[1].after.value:.3g}"
+        if shrink[1].after.value < before.value:
+            does = f"takes {fraction.value:.0%} of the other's gap, where {expected.value:.0%} were forecast"
+        notes.append(f"What fits best, {best}, is not named: simulated with its amplitude from one half, it {does}.")
         return found.unexplained(), None
     if before.value < before.sigma:
         notes.append(

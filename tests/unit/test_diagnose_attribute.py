@@ -370,15 +370,26 @@ def test_set_that_opens_the_gap_is_not_named(bench, achieved, named):
     assert named or ("effect3" in notes[0] and "from 100 to 300" in notes[0])
 
 
-@pytest.mark.parametrize(("achieved", "forecast", "named"), [(-0.8, 0.9, False), (-0.8, 0.5, True), (0.1, 2.0, True)])
-def test_set_that_opens_a_gap_that_it_was_to_close_is_not_named(bench, achieved, forecast, named):
-    """Less than three standard deviations below zero, but more below its forecast."""
+@pytest.mark.parametrize(
+    ("achieved", "forecast", "error", "named"),
+    [
+        (-0.8, 0.9, 0.4, False),  # opened, if only by two standard deviations
+        (-0.8, 0.4, 0.4, True),
+        (0.35, 0.97, 0.1, False),
+        (0.35, 0.97, 0.3, True),
+        (0.6, 0.97, 0.01, True),  # more than half of what was forecast
+        (0.6, 2.5, 0.1, True),  # and of the gap
+    ],
+)
+def test_set_that_closes_less_than_half_of_what_was_forecast_is_not_named(bench, achieved, forecast, error, named):
     found = bench.judge(12.0 * bench.t[:, 3], 0)
     court = SimpleNamespace(asked=SimpleNamespace(proposals=[SimpleNamespace(label=c.name) for c in bench.candidates]))
-    expected = Prediction(Measured(100.0 * forecast, 30.0), Measured(forecast, 0.3))
-    measured = Shrink(Measured(100.0, 10.0), Measured(100.0 * (1.0 - achieved), 10.0), Measured(achieved, 0.4), 0.5)
-    judged, _ = confirmed(court, found, (expected, measured, "half2"), [])
+    expected = Prediction(Measured(100.0 * forecast, 15.0), Measured(forecast, 0.15))
+    measured = Shrink(Measured(100.0, 10.0), Measured(100.0 * (1.0 - achieved), 10.0), Measured(achieved, error), 0.5)
+    notes: list[str] = []
+    judged, _ = confirmed(court, found, (expected, measured, "half2"), notes)
     assert judged.verdict == ("effect" if named else "unknown")
+    assert named or ("opens the gap" if achieved < 0.0 else "takes 35% of the other's gap, where 97%") in notes[0]
 
 
 @pytest.mark.parametrize("before", [1.0, -1.0])
