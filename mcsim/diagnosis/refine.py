@@ -128,12 +128,20 @@ def effect_at(proposal: Proposal, coordinates: Vector, covariance: NDArray[np.fl
     return proposal.with_parameters(proposal.kind.told(coordinates, precision), precision)
 
 
+def _acting_at(proposal: Proposal, coordinates: Vector, covariance: NDArray[np.float64]) -> Effect:
+    """The same; InputError where data tell nothing of it."""
+    effect = effect_at(proposal, coordinates, covariance)
+    if effect.amplitude == 0.0:
+        raise InputError(f"the data tell nothing of {proposal.label} by itself; leave it out of what is added.")
+    return effect
+
+
 def effects_at(
     candidates: Sequence[Candidate], proposals: Sequence[Proposal], members: Sequence[int], found: Fit
 ) -> list[Effect]:
     """The effects that are nearest to a fit of several candidates; InputError where one can have no such amplitude."""
     return [
-        effect_at(proposals[member], amplitudes, covariance)
+        _acting_at(proposals[member], amplitudes, covariance)
         for member, amplitudes, covariance in parts_of(candidates, members, found)
     ]
 
@@ -274,7 +282,7 @@ def _simulated(
     """
     for factor in (1.0, 0.5):
         try:
-            effect = effect_at(proposal, factor * coordinates, covariance / factor**2)
+            effect = _acting_at(proposal, factor * coordinates, covariance / factor**2)
             return effect.coordinates(), respond([proposal.table(effect)], skies)
         except InputError:
             continue

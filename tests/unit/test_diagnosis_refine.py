@@ -95,3 +95,14 @@ def test_amplitudes_that_run_away_are_not_heard():
     found = instrument.refined(x)
     assert found.attribution.verdict == "unknown"
     assert [instrument.candidates[member].channel for member in found.heard.members] == ["B"]
+
+
+def test_what_data_tell_nothing_of_is_neither_heard_nor_simulated(monkeypatch):
+    """However significant: an effect without an amplitude is none."""
+    instrument = Instrument(bend=0.0, cross=0.0)
+    x = instrument.response(12.0, 14.0) + 10.0 * instrument.sideways[1]
+    monkeypatch.setattr(Push, "told", classmethod(lambda cls, coordinates, precision: 0.0 * coordinates))
+    found = instrument.refined(x)
+    assert found.attribution.verdict == "unknown"
+    assert found.heard is None
+    assert instrument.asked == []
