@@ -21,7 +21,7 @@ class BeamNoncircularity(Effect):
 
     name = "beam_noncircularity"
     scope = "channel"
-    unit = "of the orders beyond m_max"
+    unit = "share of the orders beyond m_max"
     cause = "Simulations with the circular part of a measured beam, or with too few of its orders."
     signature = "L of the orders left out: 2 and 4 of an ellipse, 1 and 3 of a lopsided beam, in the scan's frame."
     source = "Joshi et al. arXiv:1210.7318, Sec. IV"
