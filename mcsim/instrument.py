@@ -11,6 +11,9 @@ from mcsim import beams, config, effects, resources, rotation, scan
 from mcsim.beams.turn import mirrored, rotated
 from mcsim.errors import InputError
 
+WHOLE = 4
+"""Orders that a beam has at least without its m_max, where its source has them."""
+
 
 def load_beam(channel: config.Channel, lmax: int) -> beams.Beam:
     """The beam of a channel, up to lmax; of a differencing scan that of side A."""
@@ -117,10 +120,6 @@ def site_b_of(site: effects.Site, spec: config.Channel) -> effects.Site:
 
 def _is_cut(spec: config.Beam) -> bool:
     return not isinstance(spec, config.BeamGaussian) and spec.m_max is not None
-
-
-WHOLE = 4
-"""Orders that a beam has at least without its m_max, where its source has them."""
 
 
 def _whole(load: Callable[[config.Channel, int], beams.Beam], spec: config.Channel, lmax: int) -> beams.Beam:

@@ -129,7 +129,7 @@ def effect_at(proposal: Proposal, coordinates: Vector, covariance: NDArray[np.fl
 
 
 def _acting_at(proposal: Proposal, coordinates: Vector, covariance: NDArray[np.float64]) -> Effect:
-    """The same; InputError where data tell nothing of it."""
+    """As :func:`effect_at`; InputError where data tell nothing of the effect: its amplitude would be 0."""
     effect = effect_at(proposal, coordinates, covariance)
     if effect.amplitude == 0.0:
         raise InputError(f"the data tell nothing of {proposal.label} by itself; leave it out of what is added.")
