@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mcsim.diagnosis.session import diagnose
+    from mcsim.ensemble.runner import merge, run
+    from mcsim.ensemble.store import open_ensemble, open_summary
     from mcsim.errors import InputError
-    from mcsim.runner import merge, run
-    from mcsim.store import open_ensemble, open_summary
 
 __all__ = ["InputError", "diagnose", "merge", "open_ensemble", "open_summary", "run"]
 
 _HOME = {
     "InputError": "mcsim.errors",
     "diagnose": "mcsim.diagnosis.session",
-    "merge": "mcsim.runner",
-    "open_ensemble": "mcsim.store",
-    "open_summary": "mcsim.store",
-    "run": "mcsim.runner",
+    "merge": "mcsim.ensemble.runner",
+    "open_ensemble": "mcsim.ensemble.store",
+    "open_summary": "mcsim.ensemble.store",
+    "run": "mcsim.ensemble.runner",
 }
 
 

@@ -75,13 +75,13 @@ def run(
         raise InputError("--workers and --scheduler exclude each other: workers of a running scheduler are its own.")
     part = _slice(realizations)
     if dry_run:
-        from mcsim import plan
+        from mcsim.ensemble import plan
 
         out.print(plan.describe(config, part, workers), markup=False)
         return
     _interrupt_once()
     try:
-        from mcsim import runner
+        from mcsim.ensemble import runner
 
         result = runner.run(
             config, store, resume=resume, realizations=part, workers=workers, scheduler=scheduler, quiet=False
@@ -98,7 +98,7 @@ def merge(
     store: Annotated[Path, typer.Option("-o", "--output", metavar="STORE", help="Store to make.")],
 ) -> None:
     """Join slices that were run with --realizations A:B."""
-    from mcsim import runner
+    from mcsim.ensemble import runner
 
     _report(runner.merge(slices, store, quiet=False))
 
@@ -116,12 +116,12 @@ def info(
 ) -> None:
     """Say what a store holds; export its summary; verify it."""
     if verify:
-        from mcsim import repair
+        from mcsim.ensemble import repair
 
         verdict = repair.verify(store, quiet=False)
         out.print(verdict.text(), markup=False)
         raise typer.Exit(0 if verdict.intact else 1)
-    from mcsim import describe
+    from mcsim.ensemble import describe
 
     out.print(describe.describe(store), markup=False)
     if export is not None:
@@ -141,7 +141,7 @@ def plot(
     exact: Annotated[bool, typer.Option("--exact", help="The prediction to all orders in the beam.")] = False,
 ) -> None:
     """Draw the binned spectra of a store with their error bars, and a prediction over them."""
-    from mcsim import prediction
+    from mcsim.ensemble import prediction
     from mcsim.plot.spectra import ensemble_figure
 
     expected = None if predict is None else prediction.predict(predict, exact=exact, nthreads=os.cpu_count() or 1)
@@ -159,7 +159,7 @@ def predict(
     ] = None,
 ) -> None:
     """Predict the summary of a run without Monte Carlo."""
-    from mcsim import prediction
+    from mcsim.ensemble import prediction
 
     expected = prediction.predict(config, exact=exact, snr=snr, nthreads=os.cpu_count() or 1)
     out.print(prediction.describe(expected), markup=False)
@@ -193,28 +193,28 @@ def fit(
     output: Png = None,
 ) -> None:
     """Fit an effective beam, b_l2 f_l with f_l = alpha or alpha + beta l, to measured or simulated spectra."""
-    from mcsim import fit as fit_
+    from mcsim import beamfit
     from mcsim.plot.fit import fit_figure
 
     if kind not in (None, "plain", "difference"):
         raise InputError(f"--kind {kind} is not known; give plain or difference.")
     nthreads = os.cpu_count() or 1
     span = None if ell_max is None and ell_min == 2 else (ell_min, ell_max if ell_max is not None else 1 << 30)
-    measured = fit_.measurement(
+    measured = beamfit.measurement(
         data,
         config,
-        modes=mode or fit_.QUADRUPOLE,
+        modes=mode or beamfit.QUADRUPOLE,
         ell_range=span,
         kind=kind,  # type: ignore[arg-type]
         pair=pair,
         covariance=covariance,
     )
     names = model or ["constant", "linear"]
-    fits = [fit_.fit(measured, config, name, knots=knots, each=each, nthreads=nthreads) for name in names]
+    fits = [beamfit.fit(measured, config, name, knots=knots, each=each, nthreads=nthreads) for name in names]
     if as_json:
         print(json.dumps([one.to_dict() for one in fits], indent=2))
     else:
-        out.print(fit_.report(fits), markup=False)
+        out.print(beamfit.report(fits), markup=False)
     _save(fit_figure(fits), output or Path("fit.png"))
 
 
@@ -229,7 +229,7 @@ def beam(
     output: Png = None,
 ) -> None:
     """Say what a beam is like: solid angle, widths, B_l and b_lm; draw it."""
-    from mcsim.commands import look_at_beams
+    from mcsim.plot.look import look_at_beams
 
     for number, look in enumerate(look_at_beams(source, lmax, m_max, pixel_deg)):
         out.print(look.text, markup=False)
@@ -248,7 +248,7 @@ def scan(
     output: Png = None,
 ) -> None:
     """Say what a scan does to a beam: hits, orientation moments, the three factors; draw it."""
-    from mcsim.commands import look_at_scan
+    from mcsim.plot.look import look_at_scan
 
     look = look_at_scan(model, nside, smax, frame, sample_period_s, line_of_sight, quiet=False)
     out.print(look.text, markup=False)
@@ -309,7 +309,7 @@ def challenge_make(
     workers: Workers = None,
 ) -> None:
     """Draw effects, make maps, seal the keys."""
-    from mcsim.challenge.make import make
+    from mcsim.benchmark.make import make
 
     _interrupt_once()
     made = partial(make, model, output, cases, seed, sampled_share=sampled_share, inventions=inventions)
@@ -319,7 +319,7 @@ def challenge_make(
 @challenge.command("run")
 def challenge_run(folder: Folder, workers: Workers = None) -> None:
     """Diagnose all cases that have no verdict."""
-    from mcsim.challenge.run import run as diagnose_all
+    from mcsim.benchmark.run import run as diagnose_all
 
     _interrupt_once()
     out.print(f"{diagnose_all(folder, workers=workers, quiet=False)} cases diagnosed", markup=False)
@@ -328,7 +328,7 @@ def challenge_run(folder: Folder, workers: Workers = None) -> None:
 @challenge.command("score")
 def challenge_score(folder: Folder, workers: Workers = None) -> None:
     """Open the keys and score the verdicts."""
-    from mcsim.challenge import report, score
+    from mcsim.benchmark import report, score
 
     out.print("\n".join(report.lines(score.score(folder, workers=workers, quiet=False))), markup=False)
 
@@ -343,7 +343,7 @@ def challenge_draws(
     workers: Workers = None,
 ) -> None:
     """Score draws of the compressed evidence, without maps."""
-    from mcsim.challenge import report, score
+    from mcsim.benchmark import report, score
 
     found = score.score_draws(model, number, seed, output, simulations=simulations, workers=workers, quiet=False)
     out.print("\n".join(report.lines(found)), markup=False)
@@ -352,7 +352,7 @@ def challenge_draws(
 @app.command()
 def effects(name: Annotated[str | None, typer.Argument(metavar="EFFECT", help="Only this one.")] = None) -> None:
     """List the library of effects: what a run can add and a diagnosis can find."""
-    from mcsim import effects as library
+    from mcsim import systematics as library
 
     known = [library.get(name).name] if name is not None else None
     for row in library.describe():
@@ -372,7 +372,7 @@ def bench(
     repeats: Annotated[int, typer.Option(min=1, help="Pairs of timings.")] = 5,
 ) -> None:
     """Measure this machine: a realization over the transforms that it needs, workers, moments."""
-    from mcsim.bench import bench as measure
+    from mcsim.ensemble.bench import bench as measure
 
     for line in measure(nside, lmax, repeats):
         out.print(line, markup=False)

@@ -4,9 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mcsim import healpix
-from mcsim.effects import Effect
-from mcsim.tod import dipole_alm
+from mcsim.sphere import healpix
+from mcsim.sphere.sky import dipole_alm
+from mcsim.systematics import Effect
 
 
 @dataclass(frozen=True, kw_only=True)

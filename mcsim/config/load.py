@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from mcsim import resources
 from mcsim.config import paths
 from mcsim.config.messages import sentence, shown
 from mcsim.config.schema import RunConfig, analysis_lmax, pixel_window
 from mcsim.errors import InputError
+from mcsim.support import resources
 
 _ADAPTER = TypeAdapter(RunConfig)
 

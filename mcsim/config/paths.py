@@ -7,10 +7,10 @@ from pathlib import Path
 from string import Formatter
 from typing import Any, NamedTuple
 
-from mcsim import resources
 from mcsim.config.messages import label
 from mcsim.config.schema import RunConfig
 from mcsim.errors import InputError
+from mcsim.support import resources
 
 DESCRIPTION = "scan.toml"
 """Name of the file beside moments that says how the survey was pointed."""

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim import alm as alm_
-from mcsim import biposh
+from mcsim import bipolar
 from mcsim.diagnosis.blocks import Entry, bins, scales
 from mcsim.diagnosis.listen import Heard, Model, by_degree
-from mcsim.rotation import FRAMES, rotate_biposh
+from mcsim.sphere import alm as alm_
+from mcsim.sphere.rotation import FRAMES, rotate_biposh
 
 Vector = NDArray[np.float64]
 
@@ -33,9 +33,9 @@ class Atlas:
     model: Model
 
     @cached_property
-    def tables(self) -> biposh.Estimator:
+    def tables(self) -> bipolar.Estimator:
         """Clebsch-Gordan bands."""
-        return biposh.estimator(self.L_max, self.model.lmax, both_orders=True)
+        return bipolar.estimator(self.L_max, self.model.lmax, both_orders=True)
 
     @property
     def L_max(self) -> int:
@@ -106,7 +106,7 @@ class Atlas:
                 # A dipole beside the sky's quadrupole would look like L = 3; it has a place of its own.
                 response = np.where(np.arange(lmax + 1) >= 2, self.model.response[int(key[:-1])][: lmax + 1], 0.0)
                 left = alm_.multiply(total, response, lmax)
-            coefficients = np.nan_to_num(biposh.estimate(self.tables, left, heard.sky))
+            coefficients = np.nan_to_num(bipolar.estimate(self.tables, left, heard.sky))
             for view in FRAMES:
                 found[key, view] = coefficients if view == frame else rotate_biposh(coefficients, modes, frame, view)
         return found

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.diagnosis.candidate import Candidate, allowed, columns_of
-from mcsim.diagnosis.detect import cosines
-from mcsim.diagnosis.gaussian import Fit, Null, bases, fit
 from mcsim.diagnosis.subsets import Subsets
-from mcsim.diagnosis.trials import Calibration, Gap, gap
+from mcsim.stats.detection import cosines
+from mcsim.stats.gaussian import Fit, Null, bases, fit
+from mcsim.stats.look_elsewhere import Calibration, Gap, gap
 
 Verdict = Literal["none", "effect", "mixture", "degenerate", "unknown"]
 
@@ -124,7 +124,7 @@ def attribute(
     t
         Templates per unit amplitude, shape (p_raw, K).
     candidates, calibration
-        Candidates on those templates, and :func:`~mcsim.diagnosis.trials.calibrate` of them in this order.
+        Candidates on those templates, and :func:`~mcsim.stats.look_elsewhere.calibrate` of them in this order.
     alpha
         Level of the gap.
     levels

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim import runner
 from mcsim.diagnosis.evidence import Job, evidence_of
-from mcsim.progress import reporting
+from mcsim.ensemble import runner
+from mcsim.support.progress import reporting
 
 Batch = Callable[[Callable[..., Any], Iterable[tuple[Any, ...]]], Iterator[tuple[int, Any]]]
 """From a function and tuples of its arguments to (index, result), in the order of completion."""

@@ -8,11 +8,11 @@ import healpy
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim import alm as alm_
-from mcsim import healpix
 from mcsim.diagnosis.listen import ORDERS, SPLIT_ORDERS, Heard, Model, by_degree
 from mcsim.diagnosis.scores import normalised_difference, sky_of
-from mcsim.rotation import rotation_matrix
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix
+from mcsim.sphere.rotation import rotation_matrix
 
 Map = NDArray[np.float64]
 Vector = NDArray[np.float64]

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.gaussian import Fit
+from mcsim.stats.gaussian import Fit
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Candidate:
     most
         Length of the coordinates beyond which they are none either.
     scatter
-        Deviations of its response from the mean one, where it draws: :meth:`~mcsim.diagnosis.gaussian.Null.widened` by
+        Deviations of its response from the mean one, where it draws: :meth:`~mcsim.stats.gaussian.Null.widened` by
         them is what a set that has it is judged with. ``None``: no scatter is known.
     """
 

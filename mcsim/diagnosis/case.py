@@ -18,7 +18,6 @@ from mcsim.diagnosis.closest import Closest
 from mcsim.diagnosis.data import exchanges
 from mcsim.diagnosis.evidence import Questions
 from mcsim.diagnosis.exhibits import exhibits
-from mcsim.diagnosis.gaussian import Null, bases, fit
 from mcsim.diagnosis.knowledge import CONSTRAINED_SKIES, Ask, Knowledge
 from mcsim.diagnosis.listen import show
 from mcsim.diagnosis.refine import (
@@ -34,10 +33,11 @@ from mcsim.diagnosis.refine import (
 from mcsim.diagnosis.responses import Responses
 from mcsim.diagnosis.scattered import scattered
 from mcsim.diagnosis.shrink import Prediction, Shrink, achieved, carried, excess, predicted
-from mcsim.diagnosis.trials import Calibration, calibrate, gap
 from mcsim.diagnosis.verdict import detectable_of, sentence, verdict_of
 from mcsim.diagnosis.where import Place, places
 from mcsim.errors import InputError
+from mcsim.stats.gaussian import Null, bases, fit
+from mcsim.stats.look_elsewhere import Calibration, calibrate, gap
 
 Vector = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.diagnosis.candidate import Candidate, allowed, columns_of
-from mcsim.diagnosis.gaussian import Fit, Null, fit, score_probability
-from mcsim.diagnosis.trials import Calibration
+from mcsim.stats.gaussian import Fit, Null, fit, score_probability
+from mcsim.stats.look_elsewhere import Calibration
 
 Exact = Callable[[NDArray[np.float64], tuple[int, ...], Fit], NDArray[np.float64] | None]
 """From templates, members and their fit to templates that hold for these together at about these amplitudes."""

@@ -7,9 +7,9 @@ import healpy
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim import healpix
 from mcsim.diagnosis.listen import Model
 from mcsim.errors import InputError
+from mcsim.sphere import healpix
 
 Map = NDArray[np.float64]
 

@@ -9,15 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim import alm as alm_
-from mcsim import config, effects, sampled, simulate
+from mcsim import config, systematics
 from mcsim.diagnosis.atlas import Atlas
 from mcsim.diagnosis.blocks import Block, Entry, blocks_of
 from mcsim.diagnosis.listen import ORDERS, Model, listen, model_of, show
 from mcsim.diagnosis.scores import Score, score_of
-from mcsim.effects import Effect
 from mcsim.errors import InputError
-from mcsim.survey import Survey, survey
+from mcsim.simulation import sampled, simulate
+from mcsim.simulation.survey import Survey, survey
+from mcsim.sphere import alm as alm_
+from mcsim.systematics import Effect
 
 Map = NDArray[np.float64]
 
@@ -123,7 +124,7 @@ def questions(run: config.RunConfig, without: Sequence[str] = (), nthreads: int 
     model = model_of(survey(run, nthreads=nthreads, orders=ORDERS))
     proposals = tuple(
         Proposal(kind, channel, dict(settings), tuple(replace(basis, **settings) for basis in kind.basis()))
-        for name, kind in effects.catalogue().items()
+        for name, kind in systematics.catalogue().items()
         if name not in without
         for channel in ([None] if kind.scope == "common" else [channel.name for channel in run.channels])
         for settings in kind.variants
@@ -152,8 +153,8 @@ def _applies(model: Model, kind: type[Effect], channel: str | None, settings: Ma
         for owner in owners:
             effect.gain(np.zeros(1), owner.site)
             effect.noise(owner.site)
-            effects.seen_through((effect,), owner.site)
-            effects.looked_at((effect,), np.zeros_like(model.dipole), replace(owner.site, lmax=model.lmax), 0, 0)
+            systematics.seen_through((effect,), owner.site)
+            systematics.looked_at((effect,), np.zeros_like(model.dipole), replace(owner.site, lmax=model.lmax), 0, 0)
             effect.orientations(owner.maps[0].moments, owner.site)
     except InputError:
         return False

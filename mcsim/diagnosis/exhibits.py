@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from mcsim.diagnosis.attribute import Attribution, Explanation
 from mcsim.diagnosis.candidate import Candidate
 from mcsim.diagnosis.evidence import Proposal
-from mcsim.diagnosis.gaussian import Fit, Null, residual_probability
 from mcsim.diagnosis.listen import Model, listen
 from mcsim.diagnosis.verdict import effects_of
 from mcsim.errors import InputError
+from mcsim.stats.gaussian import Fit, Null, residual_probability
 
 Map = NDArray[np.float64]
 

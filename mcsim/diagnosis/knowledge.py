@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.diagnosis.blocks import Entry
 from mcsim.diagnosis.evidence import Job, Proposal, Questions
-from mcsim.diagnosis.gaussian import Null, null
+from mcsim.stats.gaussian import Null, null
 
 Vector = NDArray[np.float64]
 Ask = Callable[[Sequence[Job]], list[NDArray[np.float64]]]

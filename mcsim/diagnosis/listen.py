@@ -19,12 +19,13 @@ import healpy
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim import alm as alm_
-from mcsim import convolve, healpix
 from mcsim.errors import InputError
-from mcsim.scan import Moments
-from mcsim.survey import Channel, Survey
-from mcsim.tod import dipole_alm
+from mcsim.instrument.scan import Moments
+from mcsim.simulation import convolve
+from mcsim.simulation.survey import Channel, Survey
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix
+from mcsim.sphere.sky import dipole_alm
 
 Map = NDArray[np.float64]
 Alm = NDArray[np.complex128]

@@ -10,9 +10,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.detect import strength_needed, strength_to_isolate
-from mcsim.diagnosis.gaussian import score_probability
 from mcsim.diagnosis.shrink import excess_of
+from mcsim.stats.detection import strength_needed, strength_to_isolate
+from mcsim.stats.gaussian import score_probability
 
 Vector = NDArray[np.float64]
 

@@ -12,12 +12,12 @@ from mcsim.diagnosis.attribute import LARGEST, Attribution, attribute
 from mcsim.diagnosis.candidate import Candidate, columns_of, parts_of
 from mcsim.diagnosis.closest import Closest, closest
 from mcsim.diagnosis.evidence import Proposal, Questions
-from mcsim.diagnosis.gaussian import Fit, Null, fit
 from mcsim.diagnosis.knowledge import CONSTRAINED_SKIES, SCATTER_SKIES, Knowledge
 from mcsim.diagnosis.knowledge import skies as skies_of
-from mcsim.diagnosis.trials import Calibration
-from mcsim.effects import Effect
 from mcsim.errors import InputError
+from mcsim.stats.gaussian import Fit, Null, fit
+from mcsim.stats.look_elsewhere import Calibration
+from mcsim.systematics import Effect
 
 Vector = NDArray[np.float64]
 Respond = Callable[[Sequence[config.Effect], int], NDArray[np.float64]]

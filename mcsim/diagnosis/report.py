@@ -13,9 +13,9 @@ from typing import Any
 import jinja2
 from matplotlib.figure import Figure
 
+from mcsim.diagnosis import figures as plots
 from mcsim.diagnosis.case import Diagnosis
 from mcsim.diagnosis.reading import APART, Reading
-from mcsim.plot import diagnosis as plots
 
 DOTS_PER_INCH = 120
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim import config, effects
+from mcsim import config, systematics
 from mcsim.diagnosis.evidence import Questions
 from mcsim.diagnosis.knowledge import CONSTRAINED_SKIES, Ask, Knowledge, after_jobs, constrained_jobs
 
@@ -66,5 +66,5 @@ class Responses:
 
 
 def _is_typical(effect: config.Effect) -> bool:
-    kind = effects.get(effect.name)
+    kind = systematics.get(effect.name)
     return kind.mean_response and not kind.draws

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.gaussian import Fit, Null, orthonormal
+from mcsim.stats.gaussian import Fit, Null, orthonormal
 
 
 def scattered(

@@ -11,12 +11,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim import effects, folders, healpix, tod
+from mcsim import systematics
 from mcsim.diagnosis.listen import ORDERS, Heard, Model, by_degree
-from mcsim.effects import Effect
-from mcsim.scan.cache import moments_key
-from mcsim.survey import mean_gain
-from mcsim.tod import dipole_alm
+from mcsim.instrument.scan.cache import moments_key
+from mcsim.simulation import tod
+from mcsim.simulation.survey import mean_gain
+from mcsim.sphere import healpix
+from mcsim.sphere.sky import dipole_alm
+from mcsim.support import folders
+from mcsim.systematics import Effect
 
 Map = NDArray[np.float64]
 
@@ -57,7 +60,7 @@ class SkyScore:
     """Change of the sky that one channel looks at, or (all parts) that all do."""
 
     effect: Effect
-    site: effects.Site
+    site: systematics.Site
     parts: tuple[int, ...]
     common: bool
 
@@ -144,7 +147,7 @@ def score_of(model: Model, effect: Effect, channel: int | None) -> Score | None:
     return None
 
 
-def gain_of(effect: Effect, site: effects.Site, share: tuple[float, float]) -> Map:
+def gain_of(effect: Effect, site: systematics.Site, share: tuple[float, float]) -> Map:
     """Mean error of the gain in every pixel, kept on disk: each process of each diagnosis of a model asks for it.
 
     What an effect does is what it says it does at a few thousand times.
@@ -170,7 +173,7 @@ _TIMES = 4096
 def _beam_score(model: Model, effect: Effect, channel: int, parts: tuple[int, ...]) -> BeamScore | None:
     owner = model.survey.channels[channel]
     lmax = model.lmax
-    changed, before = effects.seen_through((effect,), owner.site), owner.site.beam
+    changed, before = systematics.seen_through((effect,), owner.site), owner.site.beam
     change = np.zeros((ORDERS + 1, lmax + 1), dtype=np.complex128)
     for beam, sign in ((changed, 1.0), (before, -1.0)):
         rows = min(beam.mmax, ORDERS) + 1

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim import config, effects, folders
+from mcsim import config, systematics
 from mcsim.diagnosis import knowledge, report, tables
 from mcsim.diagnosis.batch import asking, batch
 from mcsim.diagnosis.case import Court, Diagnosis, court, judge
 from mcsim.diagnosis.data import checked, read_maps
 from mcsim.diagnosis.evidence import Questions, questions
 from mcsim.errors import InputError
+from mcsim.support import folders
 
 METHOD = 7
 """Raised whenever the same model would teach something else."""
@@ -69,7 +70,7 @@ def diagnose(
     """
     run = model if isinstance(model, config.RunConfig) else config.load(model)
     for effect in without:
-        effects.get(effect)
+        systematics.get(effect)
     if output is not None:
         folders.writable(Path(output))
     name, workers = case or run.name, run.compute.workers if workers is None else workers

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.gaussian import Null
+from mcsim.stats.gaussian import Null
 
 
 @dataclass(frozen=True)

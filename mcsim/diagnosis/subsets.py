@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mcsim.diagnosis.detect import log_evidence
-from mcsim.diagnosis.gaussian import COLLINEAR, Bases, Null, residual_probability, score_probability
-from mcsim.diagnosis.trials import Calibration
+from mcsim.stats.detection import log_evidence
+from mcsim.stats.gaussian import COLLINEAR, Bases, Null, residual_probability, score_probability
+from mcsim.stats.look_elsewhere import Calibration
 
 # Widths of the amplitudes' prior in standard deviations: flat in the logarithm, from what can hardly be seen to what
 # outshines everything.

@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim import config, effects, simulate
-from mcsim.biposh import Mode
+from mcsim import config, systematics
+from mcsim.beamfit.data import Row, Scaling, parts, project
+from mcsim.beamfit.table import COLUMNS, in_uk2, read_ecsv, scaling_of
+from mcsim.bipolar import Mode
 from mcsim.diagnosis import knowledge
 from mcsim.diagnosis.blocks import Block, Entry
 from mcsim.diagnosis.case import Court, Diagnosis, confirmed, dataset, heard_of, shrink_of
@@ -20,12 +22,11 @@ from mcsim.diagnosis.refine import Refined, Respond, quiet_templates, refine
 from mcsim.diagnosis.shrink import Prediction, Shrink
 from mcsim.diagnosis.verdict import detectable_of, verdict_of
 from mcsim.diagnosis.where import Place, places
-from mcsim.effects import Effect
 from mcsim.errors import InputError
-from mcsim.fit.data import Row, Scaling, parts, project
-from mcsim.fit.table import COLUMNS, in_uk2, read_ecsv, scaling_of
-from mcsim.rotation import FRAMES, rotate_biposh
-from mcsim.survey import survey
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import survey
+from mcsim.sphere.rotation import FRAMES, rotate_biposh
+from mcsim.systematics import Effect
 
 Vector = NDArray[np.float64]
 
@@ -124,11 +125,11 @@ def read_spectra(path: str | Path, run: config.RunConfig) -> Spectra:
     Parameters
     ----------
     path
-        ECSV table as for :func:`mcsim.fit.read_table`, with rows L = M = d = 0 for power spectra, which in the Bennett
-        normalisation are C_l. Several pairs stand together; without a column ``pair`` the table belongs to the first
-        map. Without ``value_imag`` only real parts are used; ``error`` may be left out. The header's ``meta`` must give
-        ``normalisation``, ``scaling`` and, unless all rows have L = 0, ``frame``; ``realizations`` says of how many
-        skies the values are the mean (default: 1).
+        ECSV table as for :func:`mcsim.beamfit.read_table`, with rows L = M = d = 0 for power spectra, which in the
+        Bennett normalisation are C_l. Several pairs stand together; without a column ``pair`` the table belongs to the
+        first map. Without ``value_imag`` only real parts are used; ``error`` may be left out. The header's ``meta``
+        must give ``normalisation``, ``scaling`` and, unless all rows have L = 0, ``frame``; ``realizations`` says of
+        how many skies the values are the mean (default: 1).
     run
         What is believed.
 
@@ -234,7 +235,7 @@ def listening(run: config.RunConfig, measured: Spectra) -> config.RunConfig:
 
 def questions_of(run: config.RunConfig, measured: Spectra, without: Sequence[str] = (), nthreads: int = 1) -> Questions:
     """What to ask of a table: effects of the library that change spectra; the numbers of the table are the evidence."""
-    deaf = [name for name, kind in effects.catalogue().items() if not _changes_spectra(kind)]
+    deaf = [name for name, kind in systematics.catalogue().items() if not _changes_spectra(kind)]
     asked = questions(run, (*without, *deaf), nthreads)
     return replace(asked, blocks=(Block(measured.entries, lambda model, heard: measured.value),))
 

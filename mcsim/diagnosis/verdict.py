@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from mcsim.diagnosis.attribute import Attribution, Explanation
 from mcsim.diagnosis.candidate import Candidate, parts_of
 from mcsim.diagnosis.closest import Closest
-from mcsim.diagnosis.detect import detectable
 from mcsim.diagnosis.evidence import Proposal
-from mcsim.diagnosis.gaussian import Null
 from mcsim.diagnosis.refine import effect_at
 from mcsim.diagnosis.shrink import Prediction, Shrink
 from mcsim.diagnosis.where import Place
+from mcsim.stats.detection import detectable
+from mcsim.stats.gaussian import Null
 
 SCHEMA = 1
 PLACES = 12

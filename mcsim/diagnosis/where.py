@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.diagnosis.blocks import Entry
-from mcsim.diagnosis.trials import atlas
+from mcsim.stats.look_elsewhere import atlas
 
 SIGNIFICANT = 0.01
 """Probability, trials included, up to which a group is brought before others of a kind that is listed already."""

@@ -9,8 +9,8 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from mcsim.beams import Beam, BeamMap, BeamSummary, summarize
-from mcsim.beams.beammap import solid_angle_values
+from mcsim.instrument.beams import Beam, BeamMap, BeamSummary, summarize
+from mcsim.instrument.beams.beammap import solid_angle_values
 
 FLOOR_DB = 40.0
 _PIXELS = 361

@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mcsim.fit import Fit
-from mcsim.fit.data import Scaling
+from mcsim.beamfit import Fit
+from mcsim.beamfit.data import Scaling
 
 _COLOURS = {"constant": "#c44e22", "linear": "#1f5fa8", "spline": "#3c8c3c", "orientation": "#7b4fa3"}
 

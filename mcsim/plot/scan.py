@@ -9,10 +9,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
-from mcsim.scan.factors import ring_means
-from mcsim.scan.limit import limit_moments
-from mcsim.scan.model import ScanModel
-from mcsim.scan.moments import Moments
+from mcsim.instrument.scan.factors import ring_means
+from mcsim.instrument.scan.limit import limit_moments
+from mcsim.instrument.scan.model import ScanModel
+from mcsim.instrument.scan.moments import Moments
 
 
 def scan_figure(moments: Moments, title: str = "", model: ScanModel | None = None) -> Figure:

@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 from distributed import Client, LocalCluster
 
-from mcsim import config, runner
+from mcsim import config
+from mcsim.ensemble import runner
 
 
 @pytest.fixture(scope="session")

@@ -7,11 +7,11 @@ import healpy
 import numpy as np
 import pytest
 
-from mcsim import config, effects
-from mcsim.challenge import make, run, score
-from mcsim.challenge.inventions import introduced, load
-from mcsim.challenge.prior import Prior
-from mcsim.challenge.truth import Truth, finished_cases, key_path
+from mcsim import config, systematics
+from mcsim.benchmark import make, run, score
+from mcsim.benchmark.inventions import introduced, load
+from mcsim.benchmark.prior import Prior
+from mcsim.benchmark.truth import Truth, finished_cases, key_path
 from mcsim.diagnosis.data import read_maps
 from mcsim.diagnosis.evidence import questions
 from mcsim.errors import InputError
@@ -44,8 +44,8 @@ SEED = 0
 def small_library():
     """Few effects are learned quickly."""
     with pytest.MonkeyPatch.context() as patch:
-        for name in [name for name in effects.catalogue() if name not in (*LIBRARY, "beam_width")]:
-            patch.delitem(effects.catalogue(), name)
+        for name in [name for name in systematics.catalogue() if name not in (*LIBRARY, "beam_width")]:
+            patch.delitem(systematics.catalogue(), name)
         yield
 
 
@@ -128,7 +128,7 @@ def test_verdicts_are_scored(challenge, tmp_path):
 def test_inventions_are_lent_only():
     assert set(load(str(INVENTIONS))) == {"invented_square_beam", "invented_nonlinearity", "invented_crosstalk"}
     with introduced(str(INVENTIONS)):
-        assert "invented_crosstalk" in effects.catalogue()
-    assert "invented_crosstalk" not in effects.catalogue()
+        assert "invented_crosstalk" in systematics.catalogue()
+    assert "invented_crosstalk" not in systematics.catalogue()
     with pytest.raises(InputError, match="no Python file"):
         load("nowhere.py")

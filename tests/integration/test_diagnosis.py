@@ -9,18 +9,19 @@ import pytest
 from scipy.stats import kstest
 
 import mcsim
-from mcsim import config, effects, sampled, simulate
+from mcsim import config, systematics
 from mcsim.diagnosis import knowledge
 from mcsim.diagnosis.case import court, judge
 from mcsim.diagnosis.data import read_maps
 from mcsim.diagnosis.evidence import evidence_of, questions
-from mcsim.diagnosis.gaussian import bases
 from mcsim.diagnosis.knowledge import with_effects
 from mcsim.diagnosis.listen import show
 from mcsim.diagnosis.refine import quiet_templates
-from mcsim.diagnosis.trials import gap
 from mcsim.errors import InputError
-from mcsim.survey import survey
+from mcsim.simulation import sampled, simulate
+from mcsim.simulation.survey import survey
+from mcsim.stats.gaussian import bases
+from mcsim.stats.look_elsewhere import gap
 
 PROPOSED = ("beam_ellipticity", "pointing_offset", "noise_level", "dipole_modulation")
 MODEL = {
@@ -49,7 +50,7 @@ def ask(jobs):
 @pytest.fixture(scope="module")
 def small():
     run = config.load(MODEL)
-    asked = questions(run, without=[name for name in effects.catalogue() if name not in PROPOSED])
+    asked = questions(run, without=[name for name in systematics.catalogue() if name not in PROPOSED])
     plan = knowledge.plan(run, asked, simulations=260, referee=False)
     return court(run, asked, knowledge.learned(asked, plan, ask(plan.jobs)))
 
@@ -196,7 +197,7 @@ def test_orders_are_proposed_where_a_run_leaves_some_out(small):
     cut, whole = (config.BeamEllipticalGaussian(**ellipse, m_max=m_max) for m_max in (0, None))
     for beam, expected in ((cut, ["beam_noncircularity (V1)"]), (whole, [])):
         run = replace(small.run, channels=(replace(small.run.channels[0], beam=beam), small.run.channels[1]))
-        asked = questions(run, without=[name for name in effects.catalogue() if name != "beam_noncircularity"])
+        asked = questions(run, without=[name for name in systematics.catalogue() if name != "beam_noncircularity"])
         assert [proposal.label for proposal in asked.proposals] == expected
 
 

@@ -10,11 +10,14 @@ import pytest
 from distributed import Client
 
 import mcsim
-from mcsim import alm as alm_
-from mcsim import biposh, config, convolve, differencing, healpix, mapmaking, prediction, runner, simulate
-from mcsim.beams.turn import mirrored
+from mcsim import bipolar, config
+from mcsim.ensemble import prediction, runner
 from mcsim.errors import InputError
-from mcsim.survey import Survey, survey
+from mcsim.instrument.beams.turn import mirrored
+from mcsim.simulation import convolve, differencing, mapmaking, simulate
+from mcsim.simulation.survey import Survey, survey
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix
 
 from .conftest import ensemble, table
 
@@ -86,7 +89,7 @@ def test_equal_round_beams_recover_the_sky(year, x):
     # The monopole is not seen at x = 0, and to tol / 2 x^2 at others; this sky has none in its a_lm.
     np.testing.assert_allclose(values["map"][0], smooth - np.mean(smooth) * (x == 0.0), atol=1e-7 * smooth.std())
     seen = alm_.multiply(sky, shared.channels[0].beam.window, LMAX)
-    np.testing.assert_allclose(values["cl"][0, 2:], biposh.power_spectrum(seen, seen, LMAX)[2:], rtol=1e-5)
+    np.testing.assert_allclose(values["cl"][0, 2:], bipolar.power_spectrum(seen, seen, LMAX)[2:], rtol=1e-5)
     np.testing.assert_array_equal(values["biposh"], values["biposh_circular"])
 
 

@@ -12,8 +12,9 @@ from shutil import which
 import pytest
 from distributed import Client
 
-from mcsim import repair, runner, simulate, store
+from mcsim.ensemble import repair, runner, store
 from mcsim.errors import InputError, RunError
+from mcsim.simulation import simulate
 
 from .conftest import table
 from .test_runner import assert_same

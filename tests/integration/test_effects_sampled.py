@@ -6,9 +6,10 @@ import healpy
 import numpy as np
 import pytest
 
-from mcsim import config, effects, sampled, simulate
+from mcsim import config, systematics
 from mcsim.errors import InputError
-from mcsim.survey import Survey, survey
+from mcsim.simulation import sampled, simulate
+from mcsim.simulation.survey import Survey, survey
 
 NSIDE, LMAX = 32, 95
 EPSILON = 1e-7
@@ -44,7 +45,7 @@ def prepared(
         "ensemble": {"realizations": 1, "seed": 3},
     }
     if name is not None:
-        where = {"channel": "W1"} if effects.get(name).scope == "channel" else {}
+        where = {"channel": "W1"} if systematics.get(name).scope == "channel" else {}
         table["effect"] = [{"name": name, **where, **parameters}]
     return survey(config.load(table))
 

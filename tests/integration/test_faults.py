@@ -19,10 +19,12 @@ from distributed.comm.core import CommClosedError
 from distributed.diagnostics.plugin import WorkerPlugin
 from zarr.storage import _local
 
-from mcsim import cli, config, repair, runner, simulate, store, tasks
+from mcsim import cli, config
+from mcsim.ensemble import repair, runner, store, tasks
+from mcsim.ensemble.runner import batch, cluster
 from mcsim.errors import InputError, RunError
-from mcsim.progress import Journal
-from mcsim.runner import batch, cluster
+from mcsim.simulation import simulate
+from mcsim.support.progress import Journal
 
 from .conftest import ensemble, table
 from .test_runner import assert_same
@@ -415,7 +417,7 @@ def test_worker_that_dies_every_time_costs_its_realization_alone(
 
     class Poison(WorkerPlugin):
         def setup(self, worker: Any) -> None:
-            from mcsim import simulate
+            from mcsim.simulation import simulate
 
             real = simulate.realize
 

@@ -7,8 +7,11 @@ import pytest
 from distributed import Client
 from scipy import stats
 
-from mcsim import config, fit, open_ensemble, open_summary, prediction, resources, runner, scan
+from mcsim import beamfit, config, open_ensemble, open_summary
+from mcsim.ensemble import prediction, runner
 from mcsim.errors import InputError
+from mcsim.instrument import scan
+from mcsim.support import resources
 
 from .conftest import ensemble, table
 
@@ -81,7 +84,7 @@ def test_hit_average_fitted_with_parallel_transport_gives_the_factor_of_a20(tmp_
     )
     prediction.write(prediction.predict(hit), tmp_path / "hit.ecsv")
     transported = table(channel=[{"name": "W1", "beam": BEAM, "scan": {"kind": "parallel_transport"}}])
-    found = fit.fit(tmp_path / "hit.ecsv", transported, "constant", kind="plain")
+    found = beamfit.fit(tmp_path / "hit.ecsv", transported, "constant", kind="plain")
     assert found.solution.parameters[0] == pytest.approx(0.6576, abs=1e-3)
 
 

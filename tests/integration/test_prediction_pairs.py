@@ -10,9 +10,12 @@ import pytest
 import xarray as xr
 from scipy import stats
 
-from mcsim import config, prediction, scan, simulate
-from mcsim.fit.data import SUMMARY, Row, parts, project
-from mcsim.survey import Survey, survey
+from mcsim import config
+from mcsim.beamfit.data import SUMMARY, Row, parts, project
+from mcsim.ensemble import prediction
+from mcsim.instrument import scan
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import Survey, survey
 
 NSIDE, LMAX, SKIES, BIN = 32, 64, 200, 16
 THETA, PHI = healpy.pix2ang(NSIDE, np.arange(12 * NSIDE**2))

@@ -4,12 +4,14 @@ import healpy
 import numpy as np
 import pytest
 
-from mcsim import convolve, healpix, mapmaking, resources, tod
-from mcsim.beams import Beam, elliptical_gaussian
-from mcsim.scan import Moments, load_model
-from mcsim.scan.accumulate import stream_moments
-from mcsim.sky import gaussian_alm
-from mcsim.spectra import load
+from mcsim.instrument.beams import Beam, elliptical_gaussian
+from mcsim.instrument.scan import Moments, load_model
+from mcsim.instrument.scan.accumulate import stream_moments
+from mcsim.simulation import convolve, mapmaking, tod
+from mcsim.sphere import healpix
+from mcsim.sphere.sky import gaussian_alm
+from mcsim.sphere.spectra import load
+from mcsim.support import resources
 
 NSIDE, LMAX = 64, 192
 # Half a year, a sample every 8 seconds: 35 in the median pixel.

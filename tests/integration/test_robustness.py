@@ -13,9 +13,10 @@ import pytest
 import zarr
 from distributed import Client
 
-from mcsim import config, open_ensemble, open_summary, runner, store
+from mcsim import config, open_ensemble, open_summary
+from mcsim.ensemble import runner, store
+from mcsim.ensemble.lock import locked
 from mcsim.errors import InputError, RunError
-from mcsim.lock import locked
 
 from .conftest import ensemble, table
 from .test_runner import assert_same

@@ -8,9 +8,11 @@ import pytest
 import xarray as xr
 from distributed import Client
 
-from mcsim import config, open_ensemble, runner, simulate, store
+from mcsim import config, open_ensemble
+from mcsim.ensemble import runner, store
 from mcsim.errors import InputError
-from mcsim.survey import survey
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import survey
 
 from .conftest import ensemble, table
 

@@ -6,10 +6,13 @@ import healpy
 import numpy as np
 import pytest
 
-from mcsim import alm as alm_
-from mcsim import beams, biposh, config, healpix, mask, scan, simulate
+from mcsim import bipolar, config
 from mcsim.errors import InputError
-from mcsim.survey import survey
+from mcsim.instrument import beams, scan
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import survey
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix, mask
 
 from .conftest import ensemble, table
 
@@ -85,7 +88,7 @@ def test_pixel_window_is_in_the_map_and_taken_out_of_the_coefficients() -> None:
     window = healpix.pixel_window(16, 32)
     np.testing.assert_allclose(on["cl_circular"], off["cl_circular"], rtol=1e-12)
     maps = [healpix.analysis(values["map"][0], 32, iterations=8) for values in (on, off)]
-    power = [biposh.power_spectrum(a, a, 32) for a in maps]
+    power = [bipolar.power_spectrum(a, a, 32) for a in maps]
     np.testing.assert_allclose(power[0][2:] / power[1][2:], window[2:] ** 2, rtol=1e-3)
 
 

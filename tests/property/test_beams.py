@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mcsim.beams import blm_of_map, elliptical_gaussian
-from mcsim.beams.beam import normalize, power_by_order
+from mcsim.instrument.beams import blm_of_map, elliptical_gaussian
+from mcsim.instrument.beams.beam import normalize, power_by_order
 
 widths = st.floats(5.0, 300.0)
 ratios = st.floats(1.0, 3.0)

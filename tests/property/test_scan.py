@@ -4,10 +4,10 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numba import njit
 
-from mcsim.scan.accumulate import stream_moments
-from mcsim.scan.limit import caustics, limit_moments
-from mcsim.scan.model import LineOfSight, ScanModel
-from mcsim.scan.pointing import pointing, quarter_turns, ring_pixel
+from mcsim.instrument.scan.accumulate import stream_moments
+from mcsim.instrument.scan.limit import caustics, limit_moments
+from mcsim.instrument.scan.model import LineOfSight, ScanModel
+from mcsim.instrument.scan.pointing import pointing, quarter_turns, ring_pixel
 
 SETTINGS = settings(derandomize=True, deadline=None, max_examples=60)
 

@@ -3,24 +3,25 @@
 import numpy as np
 import pytest
 
-from mcsim import biposh, rng
-from mcsim.sky import gaussian_alm
+from mcsim import bipolar
+from mcsim.sphere import rng
+from mcsim.sphere.sky import gaussian_alm
 
 LMAX, N, SEED = 12, 3000, 20121024
 
 
 @pytest.fixture(scope="module")
-def ensemble() -> tuple[biposh.Estimator, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+def ensemble() -> tuple[bipolar.Estimator, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     cl = 1.0 / (1.0 + np.arange(LMAX + 1.0))
     cxy = 0.6 * cl
-    tables = biposh.estimator(2, LMAX, both_orders=True)
+    tables = bipolar.estimator(2, LMAX, both_orders=True)
     auto, cross = [], []
     for r in range(N):
         common = gaussian_alm(cxy, rng.generator(SEED, r, "sky"))
         x = common + gaussian_alm(cl - cxy, rng.generator(SEED, r, "noise/X"))
         y = common + gaussian_alm(cl - cxy, rng.generator(SEED, r, "noise/Y"))
-        auto.append(biposh.estimate(tables, x))
-        cross.append(biposh.estimate(tables, x, y))
+        auto.append(bipolar.estimate(tables, x))
+        cross.append(bipolar.estimate(tables, x, y))
     return tables, np.array(auto), np.array(cross), {"cl": cl, "cxy": cxy}
 
 

@@ -7,10 +7,10 @@ import pytest
 from scipy import stats
 from scipy.linalg import solve_triangular
 
-from mcsim.diagnosis.detect import confusion, detectable, posterior, power, strength_needed, strength_to_isolate
-from mcsim.diagnosis.gaussian import Null, bases, fit, null, residual_probability, score_probability
 from mcsim.diagnosis.shrink import achieved, carried, excess, predicted
-from mcsim.diagnosis.trials import atlas, calibrate, gap
+from mcsim.stats.detection import confusion, detectable, posterior, power, strength_needed, strength_to_isolate
+from mcsim.stats.gaussian import Null, bases, fit, null, residual_probability, score_probability
+from mcsim.stats.look_elsewhere import atlas, calibrate, gap
 
 SEED = 20121024
 # Of a uniform sample a Kolmogorov-Smirnov probability is below this once in a thousand seeds.

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mcsim import config, simulate
-from mcsim.fit import Measurement, compare, fit, solve
-from mcsim.fit.data import QUADRUPOLE, SUMMARY, Row, project
-from mcsim.survey import survey
+from mcsim import config
+from mcsim.beamfit import Measurement, compare, fit, solve
+from mcsim.beamfit.data import QUADRUPOLE, SUMMARY, Row, project
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import survey
 
 SEED = 20121024
 

@@ -2,7 +2,7 @@ import healpy
 import numpy as np
 import pytest
 
-from mcsim import alm
+from mcsim.sphere import alm
 
 
 @pytest.mark.parametrize("lmax", [0, 1, 7, 64])

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from mcsim.beams import MMAX_TOLERANCE, Beam, choose_mmax, elliptical_gaussian, gaussian
-from mcsim.beams.beam import normalize, power_by_order
 from mcsim.errors import InputError
+from mcsim.instrument.beams import MMAX_TOLERANCE, Beam, choose_mmax, elliptical_gaussian, gaussian
+from mcsim.instrument.beams.beam import normalize, power_by_order
 
 
 def random_blm(lmax: int, mmax: int) -> np.ndarray:

@@ -5,8 +5,8 @@ import pytest
 from astropy.io import fits
 from scipy.special import gammaln
 
-from mcsim.beams import blm_of_map, elliptical_gaussian, find_centre, from_map, read_map
 from mcsim.errors import InputError
+from mcsim.instrument.beams import blm_of_map, elliptical_gaussian, find_centre, from_map, read_map
 
 PIXEL_DEG = 0.04
 PIXEL = np.radians(PIXEL_DEG)

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from mcsim import alm as alm_
-from mcsim.beams import Beam, elliptical_gaussian, from_blm_file
 from mcsim.errors import InputError
+from mcsim.instrument.beams import Beam, elliptical_gaussian, from_blm_file
+from mcsim.sphere import alm as alm_
 
 
 def write(path, beam: Beam, scale: float = 1.0):

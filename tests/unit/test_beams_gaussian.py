@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from mcsim.beams import elliptical_gaussian, gaussian
 from mcsim.errors import InputError
+from mcsim.instrument.beams import elliptical_gaussian, gaussian
 
 SIGMA_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from mcsim.beams import BeamMap, elliptical_gaussian, format_summary, gaussian, summarize
+from mcsim.instrument.beams import BeamMap, elliptical_gaussian, format_summary, gaussian, summarize
 from mcsim.plot.beam import beam_figure
 
 SIGMA_PER_FWHM = 1 / np.sqrt(8 * np.log(2))

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mcsim.beams import Beam, elliptical_gaussian
-from mcsim.beams.turn import mirrored, rotated
+from mcsim.instrument.beams import Beam, elliptical_gaussian
+from mcsim.instrument.beams.turn import mirrored, rotated
 
 LMAX = 40
 

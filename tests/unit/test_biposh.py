@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import wignernj
 
-from mcsim import alm as alm_
-from mcsim import biposh
-from mcsim.biposh import Mode
+from mcsim import bipolar
+from mcsim.bipolar import Mode
 from mcsim.errors import InputError
-from mcsim.sky import gaussian_alm
+from mcsim.sphere import alm as alm_
+from mcsim.sphere.sky import gaussian_alm
 
 LMAX = 7
 
@@ -36,8 +36,8 @@ def explicit(x: np.ndarray, y: np.ndarray, mode: Mode, l2: int) -> complex:
 @pytest.mark.parametrize("cross", [False, True])
 def test_explicit_sum(cross: bool) -> None:
     x, y = draw(1), draw(2)
-    tables = biposh.estimator(4, LMAX, both_orders=cross)
-    found = biposh.estimate(tables, x, y if cross else None)
+    tables = bipolar.estimator(4, LMAX, both_orders=cross)
+    found = bipolar.estimate(tables, x, y if cross else None)
     for row, mode in enumerate(tables.modes):
         for l2 in range(LMAX + 1):
             l1 = l2 - mode.d
@@ -48,15 +48,15 @@ def test_explicit_sum(cross: bool) -> None:
 
 
 def test_modes_of_one_map_leave_out_what_vanishes_and_what_repeats() -> None:
-    names = [mode.name for mode in biposh.modes(2, both_orders=False)]
+    names = [mode.name for mode in bipolar.modes(2, both_orders=False)]
     assert names == ["L0M0d0", "L1M0d1", "L1M1d1"] + [f"L2M{M}d{d}" for M in range(3) for d in range(3)]
     assert Mode(2, 0, 1).parity == "odd"
-    assert len(biposh.modes(2, both_orders=True)) == 1 + 2 * 3 + 3 * 5
+    assert len(bipolar.modes(2, both_orders=True)) == 1 + 2 * 3 + 3 * 5
 
 
 def test_one_map_in_a_table_of_pairs_fills_only_its_own_modes() -> None:
-    tables = biposh.estimator(2, LMAX, both_orders=True)
-    found = biposh.estimate(tables, draw(1))
+    tables = bipolar.estimator(2, LMAX, both_orders=True)
+    found = bipolar.estimate(tables, draw(1))
     for row, mode in enumerate(tables.modes):
         assert np.isnan(found[row]).all() == (not mode.in_auto)
 
@@ -64,8 +64,8 @@ def test_one_map_in_a_table_of_pairs_fills_only_its_own_modes() -> None:
 def test_symmetries_of_one_map() -> None:
     """A_{l2 l1} = (-1)^{l1+l2-L} A_{l1 l2}; M = 0 is real for even parity, imaginary for odd (paper, Sec. II)."""
     x = draw(3)
-    tables = biposh.estimator(3, LMAX, both_orders=True)
-    pair = dict(zip((mode.name for mode in tables.modes), biposh.estimate(tables, x, x), strict=True))
+    tables = bipolar.estimator(3, LMAX, both_orders=True)
+    pair = dict(zip((mode.name for mode in tables.modes), bipolar.estimate(tables, x, x), strict=True))
     for mode in tables.modes:
         swapped = pair[Mode(mode.L, mode.M, -mode.d).name]
         sign = -1.0 if mode.parity == "odd" else 1.0
@@ -83,15 +83,15 @@ def test_monopole_is_the_power_spectrum() -> None:
     """A^{00}_ll = (-1)^l sqrt(2l+1) C_l, and C_l in the Bennett normalisation."""
     x, y = draw(4), draw(5)
     ell = np.arange(LMAX + 1)
-    found = biposh.estimate(biposh.estimator(0, LMAX, True), x, y)[0]
-    cl = biposh.power_spectrum(x, y, LMAX)
+    found = bipolar.estimate(bipolar.estimator(0, LMAX, True), x, y)[0]
+    cl = bipolar.power_spectrum(x, y, LMAX)
     np.testing.assert_allclose(found, (-1.0) ** ell * np.sqrt(2 * ell + 1) * cl, atol=1e-13)
-    np.testing.assert_allclose(found * biposh.bennett_factor(Mode(0, 0, 0), LMAX), cl, atol=1e-13)
+    np.testing.assert_allclose(found * bipolar.bennett_factor(Mode(0, 0, 0), LMAX), cl, atol=1e-13)
 
 
 @pytest.mark.parametrize("mode", [Mode(2, 0, 0), Mode(2, 1, 2), Mode(4, 0, -2), Mode(1, 0, 1)])
 def test_bennett_factor(mode: Mode) -> None:
-    factor = biposh.bennett_factor(mode, 6)
+    factor = bipolar.bennett_factor(mode, 6)
     for l2 in range(7):
         l1 = l2 - mode.d
         if l1 < 0 or l1 + l2 < mode.L:
@@ -104,9 +104,9 @@ def test_bennett_factor(mode: Mode) -> None:
 
 def test_bennett_factor_needs_even_parity() -> None:
     with pytest.raises(InputError, match="L2M0d1 has odd parity"):
-        biposh.bennett_factor(Mode(2, 0, 1), 4)
+        bipolar.bennett_factor(Mode(2, 0, 1), 4)
 
 
 def test_bad_l_max() -> None:
     with pytest.raises(InputError, match="L_max = 9 is outside 0"):
-        biposh.estimator(9, LMAX)
+        bipolar.estimator(9, LMAX)

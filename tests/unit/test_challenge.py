@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from mcsim import config, effects
-from mcsim.challenge import intervals, toml
-from mcsim.challenge.draws import Draw, bench, draws, judged, powers, urn_of
-from mcsim.challenge.expected import SIGNATURES, places_right
-from mcsim.challenge.figures import confusion, scored
-from mcsim.challenge.prior import Drawn, Prior
-from mcsim.challenge.record import Geometry, Record
-from mcsim.challenge.reduced import without
-from mcsim.challenge.report import lines, write
-from mcsim.challenge.truth import MAPS, SEAL, Member, Truth, finished_cases, key_path, open_key, sealed, write_whole
+from mcsim import config, systematics
+from mcsim.benchmark import intervals, toml
+from mcsim.benchmark.draws import Draw, bench, draws, judged, powers, urn_of
+from mcsim.benchmark.expected import SIGNATURES, places_right
+from mcsim.benchmark.figures import confusion, scored
+from mcsim.benchmark.prior import Drawn, Prior
+from mcsim.benchmark.record import Geometry, Record
+from mcsim.benchmark.reduced import without
+from mcsim.benchmark.report import lines, write
+from mcsim.benchmark.truth import MAPS, SEAL, Member, Truth, finished_cases, key_path, open_key, sealed, write_whole
 from mcsim.diagnosis.blocks import Block, Entry
 from mcsim.diagnosis.case import court
 from mcsim.diagnosis.evidence import Proposal, Questions
@@ -32,7 +32,7 @@ def toy(names, simulations=800, seed=1, common=0.0):
     rng = np.random.default_rng(seed)
     proposals = []
     for name, channel in names:
-        kind = effects.get(name)
+        kind = systematics.get(name)
         proposals.append(Proposal(kind, channel, {}, kind.basis()))
     columns = sum(len(proposal.basis) for proposal in proposals)
     directions = np.linalg.qr(rng.standard_normal((ENTRIES // 2, columns)))[0]
@@ -345,7 +345,7 @@ def test_what_counts_as_right():
 
 
 def test_every_effect_has_a_signature():
-    assert set(SIGNATURES) == set(effects.catalogue())
+    assert set(SIGNATURES) == set(systematics.catalogue())
     assert places_right(["beam_ellipticity"], [("galactic", 2, "even"), ("ecliptic", 2, "even")])
     assert not places_right(["beam_ellipticity"], [("ecliptic", 1, "even"), (None, 0, "even")])
     assert places_right(["invented"], []) is None

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from mcsim import config, resources
+from mcsim import config
+from mcsim.support import resources
 
 from .conftest import DIFFERENCING, changed
 

@@ -5,11 +5,12 @@ import healpy
 import numpy as np
 import pytest
 
-from mcsim import alm as alm_
-from mcsim import convolve, healpix
-from mcsim.beams import Beam
-from mcsim.scan import Moments
-from mcsim.sky import gaussian_alm
+from mcsim.instrument.beams import Beam
+from mcsim.instrument.scan import Moments
+from mcsim.simulation import convolve
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix
+from mcsim.sphere.sky import gaussian_alm
 
 NSIDE, LMAX, MMAX, SAMPLES = 32, 256, 4, 5
 

@@ -13,10 +13,10 @@ from mcsim.diagnosis.attribute import Attribution, attribute
 from mcsim.diagnosis.candidate import Candidate
 from mcsim.diagnosis.case import confirmed
 from mcsim.diagnosis.closest import Closest, Exact, closest
-from mcsim.diagnosis.detect import cosines, detectable, log_evidence, posterior, strength_needed, strength_to_isolate
-from mcsim.diagnosis.gaussian import Null, bases, null
 from mcsim.diagnosis.shrink import Measured, Prediction, Shrink
-from mcsim.diagnosis.trials import calibrate
+from mcsim.stats.detection import cosines, detectable, log_evidence, posterior, strength_needed, strength_to_isolate
+from mcsim.stats.gaussian import Null, bases, null
+from mcsim.stats.look_elsewhere import calibrate
 
 P, N = 60, 800
 ALPHA = 0.05

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mcsim.diagnosis.gaussian import bases, fit, null, residual_probability, score_probability
-from mcsim.diagnosis.trials import Calibration, atlas, calibrate, gap
 from mcsim.errors import InputError
+from mcsim.stats.gaussian import bases, fit, null, residual_probability, score_probability
+from mcsim.stats.look_elsewhere import Calibration, atlas, calibrate, gap
 
 P, N = 12, 60
 

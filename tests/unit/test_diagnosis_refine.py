@@ -9,10 +9,10 @@ import pytest
 from mcsim.diagnosis.attribute import attribute
 from mcsim.diagnosis.candidate import Candidate
 from mcsim.diagnosis.evidence import Proposal
-from mcsim.diagnosis.gaussian import bases, null
 from mcsim.diagnosis.refine import refine
-from mcsim.diagnosis.trials import calibrate
-from mcsim.effects import Effect
+from mcsim.stats.gaussian import bases, null
+from mcsim.stats.look_elsewhere import calibrate
+from mcsim.systematics import Effect
 
 P = 50
 

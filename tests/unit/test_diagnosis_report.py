@@ -12,22 +12,23 @@ import pytest
 import xarray as xr
 from scipy import stats
 
-from mcsim import config, effects, resources
+from mcsim import config, systematics
 from mcsim.diagnosis import case, exhibits, report
+from mcsim.diagnosis import figures as plots
 from mcsim.diagnosis.attribute import attribute
 from mcsim.diagnosis.blocks import Entry
 from mcsim.diagnosis.candidate import Candidate
 from mcsim.diagnosis.case import Diagnosis
-from mcsim.diagnosis.detect import confusion, strength_needed
 from mcsim.diagnosis.evidence import Proposal
-from mcsim.diagnosis.gaussian import bases, null, residual_probability
 from mcsim.diagnosis.reading import Reading, entry_words
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.shrink import Measured, Prediction, Shrink
-from mcsim.diagnosis.trials import calibrate
 from mcsim.diagnosis.verdict import detectable_of, effects_of, verdict_of
 from mcsim.diagnosis.where import Place
-from mcsim.plot import diagnosis as plots
+from mcsim.stats.detection import confusion, strength_needed
+from mcsim.stats.gaussian import bases, null, residual_probability
+from mcsim.stats.look_elsewhere import calibrate
+from mcsim.support import resources
 
 EVIL = "<script>alert('$x_')<img src=x onerror=alert(1)>"
 P, N = 30, 500
@@ -49,7 +50,7 @@ def entries() -> list[Entry]:
 
 def proposals() -> list[Proposal]:
     chosen = (("beam_ellipticity", EVIL), ("pointing_offset", "V"), ("point_sources", None))
-    return [Proposal(effects.get(name), channel, {}, effects.get(name).basis()) for name, channel in chosen]
+    return [Proposal(systematics.get(name), channel, {}, systematics.get(name).basis()) for name, channel in chosen]
 
 
 def templates(twins: bool) -> np.ndarray:
@@ -352,7 +353,7 @@ def test_entries_in_words():
 
 
 def test_an_amplitude_at_the_edge_of_the_possible_has_an_error():
-    kind = effects.get("spectrum")
+    kind = systematics.get("spectrum")
     errors = np.array([0.2, 0.02, 0.02, 0.02, 0.02, 0.02])
     less_than_nothing = SimpleNamespace(amplitudes=np.array([-1.1, 0, 0, 0, 0, 0]), covariance=np.diag(errors**2))
     explanation = SimpleNamespace(members=(0,), fit=less_than_nothing)
@@ -364,7 +365,7 @@ def test_an_amplitude_at_the_edge_of_the_possible_has_an_error():
 
 
 def test_what_data_do_not_tell_is_no_part_of_an_error():
-    kind = effects.get("spectrum")
+    kind = systematics.get("spectrum")
     errors = np.array([0.02, 0.02, 0.02, 0.02, 0.02, 0.4])
     fitted = SimpleNamespace(amplitudes=np.array([0.3, 0, 0, 0, 0, 1.0]), covariance=np.diag(errors**2))
     proposal = Proposal(kind, None, {}, kind.basis())

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mcsim.diagnosis.gaussian import fit, null
 from mcsim.diagnosis.scattered import scattered
+from mcsim.stats.gaussian import fit, null
 
 P, SKIES = 12, 4000
 

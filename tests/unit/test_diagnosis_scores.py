@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mcsim import effects, resources
-from mcsim.beams import elliptical_gaussian
+from mcsim import systematics
 from mcsim.diagnosis import scores
-from mcsim.scan import load_model
-from mcsim.survey import mean_gain
+from mcsim.instrument.beams import elliptical_gaussian
+from mcsim.instrument.scan import load_model
+from mcsim.simulation.survey import mean_gain
+from mcsim.support import resources
 
 HALVES = ((0.0, 0.5), (0.5, 1.0))
 
@@ -17,17 +18,17 @@ HALVES = ((0.0, 0.5), (0.5, 1.0))
 def test_gain_of_every_half_is_kept_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     model = replace(load_model(resources.scan_model("wmap")), sample_period_s=7.0, duration_days=365.0)
     line = model.line_of_sight("A")
-    site = effects.Site(
+    site = systematics.Site(
         channel="W1",
         frequency_ghz=94.0,
         frame="ecliptic",
         nside=8,
         lmax=8,
         beam=elliptical_gaussian(330.0, 300.0, 20.0, 8),
-        pointing=effects.Pointing(model, replace(line, sample_period_s=None)),
+        pointing=systematics.Pointing(model, replace(line, sample_period_s=None)),
         dipole_uk=np.zeros(3),
     )
-    drifts = [effects.get("gain_drift")(amplitude=0.01, phase_deg=phase) for phase in (0.0, 90.0)]
+    drifts = [systematics.get("gain_drift")(amplitude=0.01, phase_deg=phase) for phase in (0.0, 90.0)]
     passes = []
     monkeypatch.setattr(scores, "mean_gain", lambda *args: passes.append(args) or mean_gain(*args))
     for _ in range(2):

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from mcsim import biposh, config, effects, simulate
+from mcsim import bipolar, config, systematics
 from mcsim.diagnosis import knowledge, report, tables
 from mcsim.diagnosis.case import court
 from mcsim.diagnosis.knowledge import with_effects
 from mcsim.errors import InputError
-from mcsim.rotation import rotate_biposh
-from mcsim.survey import survey
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import survey
+from mcsim.sphere.rotation import rotate_biposh
 
 PROPOSED = ("beam_ellipticity", "beam_width", "dipole_modulation", "quadrupole_modulation")
 SKIES = 10
@@ -44,8 +45,8 @@ def measured(run, seed=77):
     ell = np.arange(41)
     rows = []
     for L, M, d in MODES:
-        mode = biposh.Mode(L, M, d)
-        spectrum = ell * (ell + 1) / (2 * np.pi) * biposh.bennett_factor(mode, 40) * total[modes.index(mode)]
+        mode = bipolar.Mode(L, M, d)
+        spectrum = ell * (ell + 1) / (2 * np.pi) * bipolar.bennett_factor(mode, 40) * total[modes.index(mode)]
         for low, high in BINS:
             value = np.nanmean(spectrum[low : high + 1])
             rows.append((L, M, d, low, high, value.real, value.imag if M else np.nan))
@@ -66,7 +67,7 @@ def small(tmp_path_factory):
     """What tables of these rows are judged with."""
     spectra = read(tmp_path_factory.mktemp("small"), measured(RUN))
     run = tables.listening(RUN, spectra)
-    asked = tables.questions_of(run, spectra, [name for name in effects.catalogue() if name not in PROPOSED])
+    asked = tables.questions_of(run, spectra, [name for name in systematics.catalogue() if name not in PROPOSED])
     plan = tables.plan(run, asked, 300)
     known = knowledge.learned(asked, plan, [spectra(job) for job in plan.jobs])
     return court(run, asked, tables.of_mean(known, SKIES))
@@ -127,7 +128,7 @@ def test_other_frames_are_those_of_rotated_coefficients(tmp_path):
     # d = 2 lacks M > 0 and is not turned.
     assert len(views) == 2 * len(BINS)
     at = {(row.mode, row.ell_min, row.imaginary): value for row, value in zip(spectra.rows, spectra.value, strict=True)}
-    family = [biposh.Mode(2, M, 0) for M in range(3)]
+    family = [bipolar.Mode(2, M, 0) for M in range(3)]
     for entry, matrix in views:
         low = entry.ell[0]
         own = np.array([at[mode, low, False] + 1j * at.get((mode, low, True), 0.0) for mode in family])
@@ -219,7 +220,7 @@ def test_a_few_power_spectra_alone_are_judged(tmp_path):
     run = tables.listening(RUN, spectra)
     # Coma is not heard at all, and the spectrum has more components than there are numbers.
     proposed = ("beam_coma", "beam_width", "spectrum")
-    asked = tables.questions_of(run, spectra, [name for name in effects.catalogue() if name not in proposed])
+    asked = tables.questions_of(run, spectra, [name for name in systematics.catalogue() if name not in proposed])
     plan = tables.plan(run, asked, 60)
     known = knowledge.learned(asked, plan, [spectra(job) for job in plan.jobs])
     seat = court(run, asked, tables.of_mean(known, SKIES))

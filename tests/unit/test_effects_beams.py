@@ -7,23 +7,25 @@ import numpy as np
 import pytest
 from scipy.special import sph_harm_y
 
-from mcsim import alm as alm_
-from mcsim import effects, resources, tod
-from mcsim.beams import Beam, elliptical_gaussian, gaussian
-from mcsim.beams.gaussian import SIGMA_PER_FWHM
-from mcsim.effects.shape import displaced, extended, shape, smeared, stretched
+from mcsim import systematics
 from mcsim.errors import InputError
-from mcsim.scan import load_model
-from mcsim.sky import gaussian_alm
-from mcsim.spectra import load
+from mcsim.instrument.beams import Beam, elliptical_gaussian, gaussian
+from mcsim.instrument.beams.gaussian import SIGMA_PER_FWHM
+from mcsim.instrument.scan import load_model
+from mcsim.simulation import tod
+from mcsim.sphere import alm as alm_
+from mcsim.sphere.sky import gaussian_alm
+from mcsim.sphere.spectra import load
+from mcsim.support import resources
+from mcsim.systematics.shape import displaced, extended, shape, smeared, stretched
 
 FWHM = 88.0
 
 
-def site_of(beam: Beam) -> effects.Site:
+def site_of(beam: Beam) -> systematics.Site:
     model = load_model(resources.scan_model("wmap"))
-    pointing = effects.Pointing(model, model.line_of_sight("A"))
-    return effects.Site(
+    pointing = systematics.Pointing(model, model.line_of_sight("A"))
+    return systematics.Site(
         channel="W1", frequency_ghz=94.0, frame="ecliptic", nside=8, lmax=beam.lmax, beam=beam, pointing=pointing
     )
 
@@ -39,11 +41,11 @@ def same(found: Beam, expected: Beam, tolerance: float) -> None:
 @pytest.mark.parametrize("lmax", [48, 192, 512])
 def test_a_round_gaussian_stretches_to_closed_forms(lmax):
     beam = gaussian(FWHM, lmax)
-    ellipse = effects.get("beam_ellipticity")(amplitude=0.1, angle_deg=20.0).beam(beam, site_of(beam))
+    ellipse = systematics.get("beam_ellipticity")(amplitude=0.1, angle_deg=20.0).beam(beam, site_of(beam))
     same(ellipse, elliptical_gaussian(FWHM * 1.1**0.5, FWHM / 1.1**0.5, 20.0, lmax, ellipse.mmax), 1e-9)
-    turned = effects.get("beam_ellipticity")(amplitude=-0.1, angle_deg=20.0).beam(beam, site_of(beam))
+    turned = systematics.get("beam_ellipticity")(amplitude=-0.1, angle_deg=20.0).beam(beam, site_of(beam))
     same(turned, elliptical_gaussian(FWHM * 1.1**0.5, FWHM / 1.1**0.5, 110.0, lmax, turned.mmax), 1e-9)
-    wide = effects.get("beam_width")(amplitude=0.02).beam(beam, site_of(beam))
+    wide = systematics.get("beam_width")(amplitude=0.02).beam(beam, site_of(beam))
     same(wide, gaussian(FWHM * 1.02, lmax), 1e-9)
 
 
@@ -51,7 +53,7 @@ def test_a_round_gaussian_stretches_to_closed_forms(lmax):
 def test_an_elliptical_beam_stretches_further(lmax):
     """What continues an ellipse beyond lmax is no closed form: 3e-7 there, 1e-8 where there is little to continue."""
     beam = elliptical_gaussian(FWHM * 1.1**0.5, FWHM / 1.1**0.5, 20.0, lmax, 8)
-    found = effects.get("beam_ellipticity")(amplitude=0.05, angle_deg=20.0).beam(beam, site_of(beam))
+    found = systematics.get("beam_ellipticity")(amplitude=0.05, angle_deg=20.0).beam(beam, site_of(beam))
     ratio = 1.1 * 1.05
     expected = elliptical_gaussian(FWHM * ratio**0.5, FWHM / ratio**0.5, 20.0, lmax, found.mmax)
     same(found, expected, 1e-6 if lmax == 192 else 3e-8)
@@ -86,7 +88,7 @@ def quadrature(values, lmax: int, order: int, reach: float) -> np.ndarray:
 def test_coma_by_quadrature():
     lmax, angle = 128, np.deg2rad(35.0)
     beam, sigma = gaussian(FWHM, lmax), np.deg2rad(FWHM / 60.0) * SIGMA_PER_FWHM
-    found = effects.get("beam_coma")(amplitude=0.02, angle_deg=35.0).beam(beam, site_of(beam))
+    found = systematics.get("beam_coma")(amplitude=0.02, angle_deg=35.0).beam(beam, site_of(beam))
     assert found.mmax == 3
 
     def leaning(theta, phi):
@@ -104,7 +106,7 @@ def test_coma_by_quadrature():
 def test_sidelobe_by_quadrature():
     lmax = 128
     beam, sigma = gaussian(FWHM, lmax), np.deg2rad(FWHM / 60.0) * SIGMA_PER_FWHM
-    kind = effects.get("beam_sidelobe")
+    kind = systematics.get("beam_sidelobe")
     found = kind(amplitude=0.01, quadrupole=0.5, radius_sigmas=4.0, width_sigmas=0.8).beam(beam, site_of(beam))
     assert shape(beam, 0).sigma == pytest.approx(sigma, rel=1e-4)
 
@@ -172,7 +174,7 @@ def test_time_constant_is_the_mean_of_the_past():
     """Quadrature over earlier positions of the beam on its circle, node by node, against the filter."""
     lmax = 96
     beam = elliptical_gaussian(200.0, 150.0, 20.0, lmax, 4)
-    effect = effects.get("time_constant")(amplitude=0.1)
+    effect = systematics.get("time_constant")(amplitude=0.1)
     site = site_of(beam)
     found = effect.pointing(beam, site)
     # The rate of WMAP's spin, 129.3 s, and the part along it of a precession of -3600 s at 22.5 degrees.
@@ -193,7 +195,7 @@ def test_moved_samples_see_what_a_displaced_beam_sees():
     beam = elliptical_gaussian(200.0, 150.0, 20.0, lmax, 6)
     sky = gaussian_alm(load("wmap7", lmax), rng)
     theta, phi, psi = np.arccos(rng.uniform(-1, 1, 200)), rng.uniform(0, 2 * np.pi, 200), rng.uniform(-3, 3, 200)
-    effect = effects.get("pointing_offset")(amplitude=40.0, angle_deg=65.0)
+    effect = systematics.get("pointing_offset")(amplitude=40.0, angle_deg=65.0)
 
     def seen(beam, theta, phi, psi):
         nothing = np.zeros(200)
@@ -220,7 +222,7 @@ def test_orders_that_were_left_out_come_back():
     whole = elliptical_gaussian(FWHM * 1.1**0.5, FWHM / 1.1**0.5, 20.0, 64, 6)
     believed = whole.truncated(2)
     site = replace(site_of(believed), whole=lambda: whole)
-    kind = effects.get("beam_noncircularity")
+    kind = systematics.get("beam_noncircularity")
     same(kind(amplitude=1.0).beam(believed, site), whole, 1e-15)
     shifted = displaced(believed, 0.4, np.deg2rad(0.1))
     found = kind(amplitude=0.3).beam(shifted, site)
@@ -243,10 +245,10 @@ def test_responses_are_linear_at_the_step(name):
     site = site_of(beam)
 
     def change(effect):
-        changed = effects.seen_through([effect], site).blm[:4]
+        changed = systematics.seen_through([effect], site).blm[:4]
         return np.pad(changed, ((0, 4 - len(changed)), (0, 0))) - np.pad(beam.blm, ((0, 3), (0, 0)))
 
-    for effect in effects.get(name).basis():
+    for effect in systematics.get(name).basis():
         whole, half, opposite = (change(effect.scaled(factor)) for factor in (1.0, 0.5, -1.0))
         assert np.linalg.norm(whole - 2.0 * half) < 0.02 * np.linalg.norm(whole)
         assert np.linalg.norm(whole + opposite) < 0.04 * np.linalg.norm(whole)
@@ -268,8 +270,8 @@ def test_what_is_no_beam_is_refused():
     site = site_of(beam)
     for name, amplitude in (("beam_ellipticity", 2.5), ("beam_width", -0.95)):
         with pytest.raises(InputError, match=rf"effect {name}: amplitude = {amplitude:g}"):
-            effects.get(name)(amplitude=amplitude).beam(beam, site)
+            systematics.get(name)(amplitude=amplitude).beam(beam, site)
     with pytest.raises(InputError, match=r"width_sigmas = 0\.1"):
-        effects.get("beam_sidelobe")(amplitude=0.1, width_sigmas=0.1).beam(beam, site)
+        systematics.get("beam_sidelobe")(amplitude=0.1, width_sigmas=0.1).beam(beam, site)
     with pytest.raises(InputError, match="effect time_constant on channel W1 depends on when and how"):
-        effects.get("time_constant")(amplitude=0.1).pointing(beam, replace(site, pointing=None))
+        systematics.get("time_constant")(amplitude=0.1).pointing(beam, replace(site, pointing=None))

@@ -6,13 +6,14 @@ from importlib.metadata import EntryPoint
 import numpy as np
 import pytest
 
-from mcsim import effects, resources
-from mcsim.beams import elliptical_gaussian
-from mcsim.effects import registry
+from mcsim import systematics
 from mcsim.errors import InputError
-from mcsim.scan import load_model, parallel_transport
-from mcsim.sky import gaussian_alm
-from mcsim.spectra import load
+from mcsim.instrument.beams import elliptical_gaussian
+from mcsim.instrument.scan import load_model, parallel_transport
+from mcsim.sphere.sky import gaussian_alm
+from mcsim.sphere.spectra import load
+from mcsim.support import resources
+from mcsim.systematics import registry
 
 LMAX, NSIDE = 48, 8
 NAMES = {
@@ -45,23 +46,23 @@ def draw(_: str) -> np.random.Generator:
 
 
 @pytest.fixture(scope="module")
-def site() -> effects.Site:
+def site() -> systematics.Site:
     model = load_model(resources.scan_model("wmap"))
-    return effects.Site(
+    return systematics.Site(
         channel="W1",
         frequency_ghz=94.0,
         frame="galactic",
         nside=NSIDE,
         lmax=LMAX,
         beam=elliptical_gaussian(330.0, 300.0, 20.0, LMAX),
-        pointing=effects.Pointing(model, model.line_of_sight("A")),
+        pointing=systematics.Pointing(model, model.line_of_sight("A")),
         dipole_uk=np.array([1.0, 2.0, 3.0]),
     )
 
 
 def test_the_library_holds_what_is_named():
-    assert set(effects.catalogue()) == NAMES
-    for entry in effects.describe():
+    assert set(systematics.catalogue()) == NAMES
+    for entry in systematics.describe():
         assert entry["scope"] in ("channel", "common")
         assert all(entry[key] for key in ("unit", "cause", "signature", "source"))
         assert next(iter(entry["parameters"])) == "amplitude"
@@ -70,7 +71,7 @@ def test_the_library_holds_what_is_named():
 
 @pytest.mark.parametrize("name", sorted(NAMES))
 def test_zero_amplitude_changes_nothing(name, site):
-    effect = effects.get(name)()
+    effect = systematics.get(name)()
     sky = gaussian_alm(load("wmap7", LMAX), np.random.default_rng(1))
     np.testing.assert_array_equal(effect.sky(sky, site, draw), sky)
     for hook in (effect.beam, effect.pointing):
@@ -103,7 +104,7 @@ PARAMETERS = {
 
 @pytest.mark.parametrize("name", sorted(NAMES))
 def test_coordinates_lead_back_to_the_effect(name):
-    kind = effects.get(name)
+    kind = systematics.get(name)
     basis = kind.basis()
     for row, effect in enumerate(basis):
         # Every element of the basis is a coordinate of its own.
@@ -111,7 +112,7 @@ def test_coordinates_lead_back_to_the_effect(name):
         coordinates = effect.coordinates()
         assert coordinates[row] > 0.0
         np.testing.assert_allclose(np.delete(coordinates, row), 0.0, atol=1e-15 * kind.step)
-    effect = effects.build(name, {"amplitude": 2.5 * kind.step, **PARAMETERS.get(name, {})})
+    effect = systematics.build(name, {"amplitude": 2.5 * kind.step, **PARAMETERS.get(name, {})})
     mixing = np.random.default_rng(2).standard_normal((len(basis), len(basis)))
     again = kind.nearest(effect.coordinates(), mixing @ mixing.T + np.eye(len(basis)))
     # A search for an angle ends at the square root of round-off.
@@ -122,7 +123,7 @@ def test_coordinates_lead_back_to_the_effect(name):
 
 def test_coma_off_the_possible_is_brought_to_the_nearest():
     """Four components hold two parameters: the rest is taken off in the metric given, not in that of the components."""
-    kind = effects.get("beam_coma")
+    kind = systematics.get("beam_coma")
     mixing = np.random.default_rng(3).standard_normal((4, 4))
     precision = mixing @ mixing.T + 0.1 * np.eye(4)
     measured = kind(amplitude=0.03, angle_deg=80.0).coordinates() + np.array([0.002, -0.001, 0.003, 0.001])
@@ -142,19 +143,19 @@ def test_coma_off_the_possible_is_brought_to_the_nearest():
 
 def test_unknown_effects_and_parameters_are_named():
     with pytest.raises(InputError, match="did you mean gain_drift"):
-        effects.get("gain_drit")
+        systematics.get("gain_drit")
     with pytest.raises(InputError, match="choose from"):
-        effects.get("zzz")
+        systematics.get("zzz")
     with pytest.raises(InputError, match="it has amplitude, angle_deg"):
-        effects.build("beam_coma", {"angle": 3.0})
+        systematics.build("beam_coma", {"angle": 3.0})
     with pytest.raises(InputError, match="finite number"):
-        effects.build("beam_coma", {"amplitude": "large"})
+        systematics.build("beam_coma", {"amplitude": "large"})
     with pytest.raises(InputError, match="list of 5 numbers"):
-        effects.build("quadrupole_modulation", {"components": [1.0]})
+        systematics.build("quadrupole_modulation", {"components": [1.0]})
 
 
 @dataclass(frozen=True, kw_only=True)
-class Foreign(effects.Effect):
+class Foreign(systematics.Effect):
     name = "foreign"
     scope = "channel"
     unit = "-"
@@ -176,14 +177,14 @@ def test_packages_add_effects(registered):
             return Foreign
 
     registered(Entry("foreign", "package:Foreign", registry.ENTRY_POINTS))
-    assert effects.get("foreign") is Foreign
+    assert systematics.get("foreign") is Foreign
 
 
 def test_broken_packages_are_named(registered):
     registered(EntryPoint("broken", "no_such_package:Thing", registry.ENTRY_POINTS))
     with pytest.raises(InputError, match=r"effect broken of no_such_package:Thing cannot be loaded"):
-        effects.catalogue()
+        systematics.catalogue()
     registry.catalogue.cache_clear()
-    registered(EntryPoint("beam", "mcsim.beams:Beam", registry.ENTRY_POINTS))
+    registered(EntryPoint("beam", "mcsim.instrument.beams:Beam", registry.ENTRY_POINTS))
     with pytest.raises(InputError, match="no class derived from"):
-        effects.catalogue()
+        systematics.catalogue()

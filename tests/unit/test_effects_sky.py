@@ -7,14 +7,16 @@ import healpy
 import numpy as np
 import pytest
 
-from mcsim import alm as alm_
-from mcsim import effects, healpix, resources
-from mcsim.beams import gaussian
+from mcsim import systematics
 from mcsim.errors import InputError
-from mcsim.rotation import rotate_alm, rotate_pixels
-from mcsim.scan import load_model, parallel_transport, stream_moments
-from mcsim.sky import gaussian_alm
-from mcsim.spectra import load
+from mcsim.instrument.beams import gaussian
+from mcsim.instrument.scan import load_model, parallel_transport, stream_moments
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix
+from mcsim.sphere.rotation import rotate_alm, rotate_pixels
+from mcsim.sphere.sky import gaussian_alm
+from mcsim.sphere.spectra import load
+from mcsim.support import resources
 
 LMAX, NSIDE = 64, 16
 TOWARDS = {"lon_deg": 200.0, "lat_deg": 30.0}
@@ -22,16 +24,16 @@ AXIS = healpy.ang2vec(200.0, 30.0, lonlat=True)
 
 
 @pytest.fixture(scope="module")
-def site() -> effects.Site:
+def site() -> systematics.Site:
     model = load_model(resources.scan_model("wmap")).with_sampling(600.0)
-    return effects.Site(
+    return systematics.Site(
         channel="W1",
         frequency_ghz=94.0,
         frame="ecliptic",
         nside=NSIDE,
         lmax=LMAX,
         beam=gaussian(300.0, LMAX),
-        pointing=effects.Pointing(model, model.line_of_sight("A")),
+        pointing=systematics.Pointing(model, model.line_of_sight("A")),
     )
 
 
@@ -59,21 +61,21 @@ def at(alm: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def test_modulations_multiply_the_sky(site, sky, points):
     x, y, z = healpy.ang2vec(*points.T).T
-    found = effects.get("dipole_modulation")(amplitude=0.1, **TOWARDS).sky(sky, site, draw)
+    found = systematics.get("dipole_modulation")(amplitude=0.1, **TOWARDS).sky(sky, site, draw)
     along = AXIS @ np.stack([x, y, z])
     np.testing.assert_allclose(at(found, points), at(sky, points) * (1.0 + 0.1 * along), atol=1e-8)
     basis = [(3 * z**2 - 1) / 2, 3**0.5 * x * z, 3**0.5 * y * z, 3**0.5 / 2 * (x**2 - y**2), 3**0.5 * x * y]
-    for effect, factor in zip(effects.get("quadrupole_modulation").basis(), basis, strict=True):
+    for effect, factor in zip(systematics.get("quadrupole_modulation").basis(), basis, strict=True):
         found = effect.sky(sky, site, draw)
         np.testing.assert_allclose(at(found, points), at(sky, points) * (1.0 + effect.amplitude * factor), atol=1e-8)
     with pytest.raises(InputError, match="components are all zero"):
-        effects.get("quadrupole_modulation")(amplitude=0.1, components=(0.0,) * 5).sky(sky, site, draw)
+        systematics.get("quadrupole_modulation")(amplitude=0.1, components=(0.0,) * 5).sky(sky, site, draw)
 
 
 def test_boost_is_what_a_moving_observer_sees(site, sky, points):
     """T(n) / (gamma (1 - beta . n')) at n', where cos = (cos' - beta) / (1 - beta cos'): to all orders."""
     beta, smooth = 0.2, alm_.multiply(sky, (np.arange(LMAX + 1) <= LMAX // 3).astype(float), LMAX)
-    found = effects.get("boost")(amplitude=beta, **TOWARDS).sky(smooth, site, draw)
+    found = systematics.get("boost")(amplitude=beta, **TOWARDS).sky(smooth, site, draw)
     seen = healpy.ang2vec(*points.T)
     along = seen @ AXIS
     assert np.ptp(along) > 1.0
@@ -86,7 +88,7 @@ def test_boost_is_what_a_moving_observer_sees(site, sky, points):
 
 
 def test_boost_keeps_the_power_and_is_undone_by_the_opposite_one(site, sky):
-    kind, weight = effects.get("boost"), np.where(alm_.orders(LMAX) == 0, 1.0, 2.0)
+    kind, weight = systematics.get("boost"), np.where(alm_.orders(LMAX) == 0, 1.0, 2.0)
     found = kind(amplitude=0.3, **TOWARDS).sky(sky, site, draw)
     assert np.sum(weight * np.abs(found) ** 2) == pytest.approx(np.sum(weight * np.abs(sky) ** 2), rel=1e-12)
     again = kind(amplitude=-0.3, **TOWARDS).sky(found, site, draw)
@@ -96,13 +98,13 @@ def test_boost_keeps_the_power_and_is_undone_by_the_opposite_one(site, sky):
 
 
 def test_dipole_residual_adds_a_vector(site, sky, points):
-    found = effects.get("dipole_residual")(amplitude=5.0, **TOWARDS).sky(sky, site, draw)
+    found = systematics.get("dipole_residual")(amplitude=5.0, **TOWARDS).sky(sky, site, draw)
     expected = 5.0 * healpy.ang2vec(*points.T) @ AXIS
     np.testing.assert_allclose(at(found - sky, points), expected, atol=1e-9)
 
 
 def test_spectrum_rescales_its_bands(site, sky):
-    effect = effects.get("spectrum")(amplitude=0.5, bands=(0.0, 3.0, 4.0, 0.0, 0.0, 0.0))
+    effect = systematics.get("spectrum")(amplitude=0.5, bands=(0.0, 3.0, 4.0, 0.0, 0.0, 0.0))
     found, ell = effect.sky(sky, site, draw), alm_.degrees(LMAX)
     edges = [2 + i * (LMAX - 1) // 6 for i in range(7)]
     assert edges[-1] == LMAX + 1
@@ -110,12 +112,12 @@ def test_spectrum_rescales_its_bands(site, sky):
     factor[edges[1] : edges[2]], factor[edges[2] : edges[3]] = np.sqrt(1.3), np.sqrt(1.4)
     np.testing.assert_allclose(found, sky * factor[ell], rtol=1e-14)
     with pytest.raises(InputError, match="a band changes by -2"):
-        effects.get("spectrum")(amplitude=2.0, bands=(-1.0, 0.0, 0.0, 0.0, 0.0, 0.0)).sky(sky, site, draw)
+        systematics.get("spectrum")(amplitude=2.0, bands=(-1.0, 0.0, 0.0, 0.0, 0.0, 0.0)).sky(sky, site, draw)
 
 
 def test_spectrum_nearest_to_less_than_no_power_leaves_some():
     """Of two correlated bands the other one makes up for what the first cannot be."""
-    kind = effects.get("spectrum")
+    kind = systematics.get("spectrum")
     precision = np.eye(6)
     precision[0, 1] = precision[1, 0] = 0.5
     wanted = np.array([-1.49, 0.3, 0.1, 0.0, 0.0, 0.0])
@@ -126,7 +128,7 @@ def test_spectrum_nearest_to_less_than_no_power_leaves_some():
 
 
 def test_bands_that_no_data_tell_stay_as_believed():
-    kind = effects.get("spectrum")
+    kind = systematics.get("spectrum")
     errors = np.array([0.05, 0.02, 0.01, 0.02, 0.4, 7.0])
     correlation = np.eye(6)
     correlation[3, 4] = correlation[4, 3] = 0.5
@@ -137,11 +139,11 @@ def test_bands_that_no_data_tell_stay_as_believed():
     np.testing.assert_allclose(kind.told(fitted, precision), given, atol=1e-9)
     fitted[4] = 1.5
     np.testing.assert_allclose(kind.told(fitted, precision), [0.3, -0.01, 0.0, 0.1, 1.5, 0.0], atol=1e-9)
-    np.testing.assert_array_equal(effects.get("beam_ellipticity").told(fitted[:2], precision[:2, :2]), fitted[:2])
+    np.testing.assert_array_equal(systematics.get("beam_ellipticity").told(fitted[:2], precision[:2, :2]), fitted[:2])
 
 
 def test_point_sources_are_a_flat_sky_of_their_own(site, sky):
-    kind = effects.get("point_sources")
+    kind = systematics.get("point_sources")
     drawn = kind(amplitude=0.01).sky(sky, site, draw) - sky
     weight = np.where(np.arange(drawn.size) <= LMAX, 1.0, 2.0)
     modes = (LMAX + 1) ** 2
@@ -154,14 +156,14 @@ def test_point_sources_are_a_flat_sky_of_their_own(site, sky):
 def test_fewer_point_sources_take_power_away(site):
     """On a sky of C_l = 1 a negative amplitude leaves 1 + amplitude of the power, band by band."""
     sky = gaussian_alm(np.ones(LMAX + 1), np.random.default_rng(3))
-    found = effects.get("point_sources")(amplitude=-0.1).sky(sky, site, draw)
+    found = systematics.get("point_sources")(amplitude=-0.1).sky(sky, site, draw)
     power, before = (np.bincount(alm_.degrees(LMAX), np.abs(alm) ** 2) for alm in (found, sky))
     # What is divided by is the power of 11 degrees around: 2 % of scatter at l = 30, and it enters times 0.1.
     np.testing.assert_allclose((power / before)[20:], 0.9, atol=0.012)
 
 
 def test_foregrounds_are_fixed_to_the_galaxy_and_grow_with_frequency(site, sky):
-    kind = effects.get("foreground_residual")
+    kind = systematics.get("foreground_residual")
     drawn = kind(amplitude=3.0).sky(sky, site, draw) - sky
     values = healpix.synthesis(rotate_alm(drawn, LMAX, "ecliptic", "galactic")[None], NSIDE, LMAX)[0]
     assert np.sqrt(np.mean(values**2)) == pytest.approx(3.0, rel=0.01)
@@ -178,7 +180,7 @@ def test_noise_after_a_template(site, tmp_path):
     path = str(tmp_path / "pattern.fits")
     pattern = healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2))[0]
     healpy.write_map(path, pattern, coord="E", dtype=np.float64)
-    kind = effects.get("noise_anisotropy")
+    kind = systematics.get("noise_anisotropy")
     np.testing.assert_allclose(kind(amplitude=0.3, template=path).noise(site), 1.0 + 0.3 * pattern)
     galactic = kind(amplitude=0.3, template=path).noise(replace(site, frame="galactic"))
     # A pixel's centre in the other frame is up to 0.055 rad off, half a diagonal.
@@ -191,18 +193,18 @@ def test_foregrounds_after_a_template(site, sky, tmp_path):
     template = healpix.synthesis(gaussian_alm(load("wmap7", 32), np.random.default_rng(4))[None], NSIDE, 32)[0]
     path = str(tmp_path / "template.fits")
     healpy.write_map(path, template, coord="E", dtype=np.float64)
-    found = effects.get("foreground_residual")(amplitude=2.0, template=path).sky(sky, site, draw) - sky
+    found = systematics.get("foreground_residual")(amplitude=2.0, template=path).sky(sky, site, draw) - sky
     values = healpix.synthesis(found[None], NSIDE, LMAX)[0]
     np.testing.assert_allclose(values, 2.0 * template / np.sqrt(np.mean(template**2)), rtol=0.0, atol=5e-3)
     healpy.write_map(path.replace("template", "zero"), 0.0 * template, dtype=np.float64)
     with pytest.raises(InputError, match="give a complete template"):
-        effects.get("foreground_residual")(amplitude=2.0, template=path.replace("template", "zero")).sky(
+        systematics.get("foreground_residual")(amplitude=2.0, template=path.replace("template", "zero")).sky(
             sky, site, draw
         )
 
 
 def test_noise_is_strongest_at_the_ecliptic_poles_in_every_frame(site):
-    effect = effects.get("noise_anisotropy")(amplitude=0.2)
+    effect = systematics.get("noise_anisotropy")(amplitude=0.2)
     latitude = np.deg2rad(healpy.pix2ang(NSIDE, np.arange(12 * NSIDE**2), lonlat=True)[1])
     factor = effect.noise(site)
     np.testing.assert_allclose(factor, 1.0 + 0.2 * (3.0 * np.sin(latitude) ** 2 - 1.0))
@@ -211,14 +213,16 @@ def test_noise_is_strongest_at_the_ecliptic_poles_in_every_frame(site):
     # A pixel's centre in the other frame is up to 0.055 rad off, half a diagonal, times a slope of 0.6.
     np.testing.assert_allclose(galactic, rotate_pixels(factor, "ecliptic", "galactic"), atol=0.034)
     assert np.ptp(galactic - factor) > 0.3
-    np.testing.assert_array_equal(effects.get("noise_level")(amplitude=0.1).noise(site), np.full(12 * NSIDE**2, 1.1**2))
+    np.testing.assert_array_equal(
+        systematics.get("noise_level")(amplitude=0.1).noise(site), np.full(12 * NSIDE**2, 1.1**2)
+    )
     for name, amplitude in (("noise_anisotropy", 1.5), ("noise_anisotropy", -0.6), ("noise_level", -1.0)):
         with pytest.raises(InputError, match=f"effect {name}"):
-            effects.get(name)(amplitude=amplitude).noise(site)
+            systematics.get(name)(amplitude=amplitude).noise(site)
 
 
 def test_gain_follows_the_year(site):
-    effect = effects.get("gain_drift")(amplitude=0.01, phase_deg=90.0)
+    effect = systematics.get("gain_drift")(amplitude=0.01, phase_deg=90.0)
     year = site.pointing.model.orbit_period_s
     np.testing.assert_allclose(effect.gain(year * np.array([0.0, 0.25, 0.75]), site), [0.0, 0.01, -0.01], atol=1e-15)
     with pytest.raises(InputError, match="effect gain_drift on channel W1"):
@@ -227,7 +231,7 @@ def test_gain_follows_the_year(site):
 
 def test_orientations_are_mixed_with_those_of_the_scan(site):
     believed = parallel_transport(0.3, NSIDE, 2)
-    effect = effects.get("orientation_averaging")(amplitude=0.25)
+    effect = systematics.get("orientation_averaging")(amplitude=0.25)
     real = stream_moments(site.pointing.model, NSIDE, 2, lines_of_sight=["A"])
     seen = real.hits > 0
     assert seen.mean() > 0.5
@@ -239,6 +243,6 @@ def test_orientations_are_mixed_with_those_of_the_scan(site):
 
 
 def test_a_differencing_scan_is_less_balanced_and_solved_for_less():
-    assert effects.get("transmission_imbalance")(amplitude=0.002).differencing(0.001, 3) == (0.003, 3)
-    assert effects.get("mapmaking_convergence")(amplitude=4.0).differencing(0.001, 3) == (0.001, 7)
-    assert effects.get("pixelization")(amplitude=0.3).spread() == pytest.approx(0.7)
+    assert systematics.get("transmission_imbalance")(amplitude=0.002).differencing(0.001, 3) == (0.003, 3)
+    assert systematics.get("mapmaking_convergence")(amplitude=4.0).differencing(0.001, 3) == (0.001, 7)
+    assert systematics.get("pixelization")(amplitude=0.3).spread() == pytest.approx(0.7)

@@ -7,14 +7,15 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from mcsim import config, prediction
-from mcsim.beams import Beam, elliptical_gaussian
+from mcsim import config
+from mcsim.beamfit import Measurement, comparisons, fit, orientation, report
+from mcsim.beamfit.data import SUMMARY, Row, parse_mode, parts, project
+from mcsim.bipolar.theory import ScannedBeam, cmb_biposh_leading
+from mcsim.ensemble import prediction
 from mcsim.errors import InputError
-from mcsim.fit import Measurement, comparisons, fit, orientation, report
-from mcsim.fit.data import SUMMARY, Row, parse_mode, parts, project
+from mcsim.instrument.beams import Beam, elliptical_gaussian
 from mcsim.plot.fit import fit_figure
-from mcsim.predict import ScannedBeam, cmb_biposh_leading
-from mcsim.survey import Survey, survey
+from mcsim.simulation.survey import Survey, survey
 
 LMAX = 200
 BINS = [(low, low + 19) for low in range(20, 200, 20)]

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from mcsim.beamfit import compare, solve, solve_each
 from mcsim.errors import InputError
-from mcsim.fit import compare, solve, solve_each
 
 RNG = np.random.default_rng(11)
 P, K = 8, 2

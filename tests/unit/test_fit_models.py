@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from mcsim.beamfit.models import MODELS, model
 from mcsim.errors import InputError
-from mcsim.fit.models import MODELS, model
 
 ELL = np.arange(0.0, 101.0)
 

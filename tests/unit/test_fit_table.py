@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from mcsim.biposh import Mode, bennett_factor
+from mcsim.beamfit import read_table
+from mcsim.bipolar import Mode, bennett_factor
 from mcsim.errors import InputError
-from mcsim.fit import read_table
 
 META = {"normalisation": "Bennett", "scaling": "l(l+1)/2pi", "frame": "ecliptic"}
 

@@ -5,7 +5,7 @@ import errno
 import pytest
 
 from mcsim.errors import InputError
-from mcsim.folders import appearing, cached
+from mcsim.support.folders import appearing, cached
 
 
 def test_a_folder_appears_whole(tmp_path):

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from mcsim import healpix
 from mcsim.errors import InputError
-from mcsim.sky import gaussian_alm
+from mcsim.sphere import healpix
+from mcsim.sphere.sky import gaussian_alm
 
 
 def smooth_sky(lmax: int) -> np.ndarray:

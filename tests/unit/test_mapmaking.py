@@ -7,15 +7,15 @@ import healpy
 import numpy as np
 import pytest
 
-from mcsim import convolve, mapmaking, tod
-from mcsim.beams import Beam, elliptical_gaussian, gaussian
 from mcsim.errors import InputError
-from mcsim.mapmaking import pairs
-from mcsim.mapmaking.solve import apply_normal
-from mcsim.scan import ScanModel
-from mcsim.scan.model import LineOfSight
-from mcsim.scan.pointing import pointing
-from mcsim.sky import gaussian_alm
+from mcsim.instrument.beams import Beam, elliptical_gaussian, gaussian
+from mcsim.instrument.scan import ScanModel
+from mcsim.instrument.scan.model import LineOfSight
+from mcsim.instrument.scan.pointing import pointing
+from mcsim.simulation import convolve, mapmaking, tod
+from mcsim.simulation.mapmaking import pairs
+from mcsim.simulation.mapmaking.solve import apply_normal
+from mcsim.sphere.sky import dipole_alm, gaussian_alm
 
 # Two sides that are no mirror images, and rates that see the whole sky at nside 32 in 400,000 samples.
 SIDES = (LineOfSight("A", 70.5, 2.0), LineOfSight("B", 68.0, 177.0))
@@ -134,7 +134,7 @@ def test_known_sky_is_recovered(x, fine_scan):
     """Equal circular beams, no noise, samples at pixel centres: the map is the smoothed sky."""
     lmax = 64
     sky = gaussian_alm(1000.0 / (1.0 + np.arange(lmax + 1)) ** 2, np.random.default_rng(2))
-    sky = sky + tod.dipole_alm([1200.0, -2500.0, 1900.0], lmax)
+    sky = sky + dipole_alm([1200.0, -2500.0, 1900.0], lmax)
     side = mapmaking.side_maps(sky, convolve.response(gaussian(180.0, lmax), lmax), 32)
     assert side.shape == (fine_scan.npix, 1)
     rhs = mapmaking.rhs_from_maps(fine_scan, [(side, side)], x=x)
@@ -148,7 +148,7 @@ def test_known_sky_is_recovered(x, fine_scan):
 
 def test_imbalance_taken_for_zero_leaves_the_dipole(fine_scan):
     """A wrong x is a signal of x (T_A + T_B): the dipole's part of it is not small."""
-    sky = tod.dipole_alm([0.0, 0.0, 3300.0], 8)
+    sky = dipole_alm([0.0, 0.0, 3300.0], 8)
     side = mapmaking.side_maps(sky, convolve.response(gaussian(180.0, 8), 8), 32)
     errors = []
     for believed in (0.01, 0.0):

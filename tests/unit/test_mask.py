@@ -4,8 +4,8 @@ import healpy
 import numpy as np
 import pytest
 
-from mcsim import mask, rotation
 from mcsim.errors import InputError
+from mcsim.sphere import mask, rotation
 
 
 def band(nside: int, half_width_deg: float = 20.0) -> np.ndarray:

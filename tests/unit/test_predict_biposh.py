@@ -7,12 +7,12 @@ import pytest
 from scipy.special import ive, sph_harm_y
 from wignernj import wigner3j
 
+from mcsim.bipolar.theory.beam_biposh import ScannedBeam, beam_biposh
+from mcsim.bipolar.theory.cmb_biposh import cmb_biposh_leading, noise_biposh
+from mcsim.bipolar.theory.exact import cmb_biposh_exact, power_spectrum_exact
+from mcsim.bipolar.theory.harmonics import parallel_transport_harmonics
+from mcsim.bipolar.theory.modes import bennett_factor, to_bennett
 from mcsim.errors import InputError
-from mcsim.predict.beam_biposh import ScannedBeam, beam_biposh
-from mcsim.predict.cmb_biposh import cmb_biposh_leading, noise_biposh
-from mcsim.predict.exact import cmb_biposh_exact, power_spectrum_exact
-from mcsim.predict.harmonics import parallel_transport_harmonics
-from mcsim.predict.modes import bennett_factor, to_bennett
 
 
 def elliptical_gaussian(fwhm_arcmin, eccentricity, lmax, mmax=4):

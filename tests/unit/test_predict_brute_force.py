@@ -8,10 +8,10 @@ import pytest
 from scipy.special import sph_harm_y
 from wignernj import wigner3j
 
-from mcsim.predict.beam_biposh import ScannedBeam, beam_biposh
-from mcsim.predict.cmb_biposh import cmb_biposh_leading
-from mcsim.predict.exact import cmb_biposh_exact, power_spectrum_exact
-from mcsim.predict.modes import existing
+from mcsim.bipolar.theory.beam_biposh import ScannedBeam, beam_biposh
+from mcsim.bipolar.theory.cmb_biposh import cmb_biposh_leading
+from mcsim.bipolar.theory.exact import cmb_biposh_exact, power_spectrum_exact
+from mcsim.bipolar.theory.modes import existing
 
 LMAX, MMAX = 6, 4
 CL = 1.0 / (1.0 + np.arange(LMAX + 1)) ** 2

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from wignernj import wigner3j
 
+from mcsim.bipolar.theory.detectability import fisher_information, isotropic_variance, signal_to_noise
+from mcsim.bipolar.theory.modes import existing
 from mcsim.errors import InputError
-from mcsim.predict.detectability import fisher_information, isotropic_variance, signal_to_noise
-from mcsim.predict.modes import existing
 
 LMAX = 4
 

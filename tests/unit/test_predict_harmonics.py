@@ -7,13 +7,13 @@ import healpy as hp
 import numpy as np
 import pytest
 
-from mcsim.errors import InputError
-from mcsim.predict.harmonics import (
+from mcsim.bipolar.theory.harmonics import (
     negative_spin,
     orientation_harmonics,
     parallel_transport_harmonics,
     ring_orientation_harmonics,
 )
+from mcsim.errors import InputError
 
 
 def spin_harmonic(s, ell, m, theta, phi):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from wignernj import wigner3j, wigner6j
 
-from mcsim.predict.wigner import sixj_family, threej_family
+from mcsim.sphere.wigner import sixj_family, threej_family
 
 # Round-off of a recursion of up to 160 steps: symbols are at most 1 in size.
 TOLERANCE = 1e-14

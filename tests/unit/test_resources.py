@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from mcsim import resources
 from mcsim.errors import InputError
+from mcsim.support import resources
 
 
 @pytest.fixture(params=["installed", "checkout"])

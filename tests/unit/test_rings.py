@@ -5,14 +5,17 @@ import healpy
 import numpy as np
 import pytest
 
-from mcsim import alm as alm_
-from mcsim import config, convolve, instrument, resources, rings, scan, simulate
-from mcsim import survey as survey_
-from mcsim.effects import Effect
+from mcsim import config
+from mcsim.ensemble.prediction import predict
 from mcsim.errors import InputError
-from mcsim.prediction import predict
-from mcsim.scan.limit import limit_harmonics, limit_moments, limit_quadrature
-from mcsim.sky import gaussian_alm
+from mcsim.instrument import scan
+from mcsim.instrument.scan.limit import limit_harmonics, limit_moments, limit_quadrature
+from mcsim.simulation import channels, convolve, rings, simulate
+from mcsim.simulation import survey as survey_
+from mcsim.sphere import alm as alm_
+from mcsim.sphere.sky import gaussian_alm
+from mcsim.support import resources
+from mcsim.systematics import Effect
 
 LMAX = 24
 WMAP = scan.load_model(resources.scan_model("wmap"))
@@ -178,9 +181,9 @@ class OnBeam(Effect):
 
 
 def test_effects_on_pixels_are_refused():
-    instrument.refuse_pixel_effects("W1", (OnBeam(),))
+    channels.refuse_pixel_effects("W1", (OnBeam(),))
     with pytest.raises(InputError, match="effect on_pixels on channel W1 acts on pixels"):
-        instrument.refuse_pixel_effects("W1", (OnBeam(), OnPixels()))
+        channels.refuse_pixel_effects("W1", (OnBeam(), OnPixels()))
 
 
 LIMIT = channel({"kind": "hit_averaged", "model": "wmap"})

@@ -1,6 +1,6 @@
 import numpy as np
 
-from mcsim import rng
+from mcsim.sphere import rng
 
 
 def test_stages_and_realizations_differ_and_repeat() -> None:

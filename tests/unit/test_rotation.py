@@ -9,10 +9,10 @@ from astropy import units
 from astropy.coordinates import SkyCoord
 from wignernj import wigner3j
 
-from mcsim import alm as alm_
+from mcsim.bipolar.theory.harmonics import orientation_harmonics
 from mcsim.errors import InputError
-from mcsim.predict.harmonics import orientation_harmonics
-from mcsim.rotation import (
+from mcsim.sphere import alm as alm_
+from mcsim.sphere.rotation import (
     euler_angles,
     rotate_alm,
     rotate_biposh,

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from mcsim.errors import InputError
+from mcsim.instrument.scan.accumulate import stream_moments
+from mcsim.instrument.scan.factors import latitude_means, limit_factors, ring_means, scan_factors, sky_means, summary
+from mcsim.instrument.scan.limit import limit_moments
+from mcsim.instrument.scan.model import load_model
+from mcsim.instrument.scan.moments import Moments, parallel_transport
 from mcsim.plot.scan import scan_figure
-from mcsim.scan.accumulate import stream_moments
-from mcsim.scan.factors import latitude_means, limit_factors, ring_means, scan_factors, sky_means, summary
-from mcsim.scan.limit import limit_moments
-from mcsim.scan.model import load_model
-from mcsim.scan.moments import Moments, parallel_transport
 
 WMAP = load_model(Path(__file__).parents[2] / "scan_models" / "wmap.toml")
 NSIDE = 64

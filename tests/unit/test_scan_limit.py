@@ -8,10 +8,10 @@ from scipy.integrate import quad
 from scipy.special import lpmv
 
 from mcsim.errors import InputError
-from mcsim.scan.accumulate import stream_moments
-from mcsim.scan.factors import ring_means
-from mcsim.scan.limit import caustics, limit_harmonics, limit_moments, limit_quadrature
-from mcsim.scan.model import LineOfSight, ScanModel
+from mcsim.instrument.scan.accumulate import stream_moments
+from mcsim.instrument.scan.factors import ring_means
+from mcsim.instrument.scan.limit import caustics, limit_harmonics, limit_moments, limit_quadrature
+from mcsim.instrument.scan.model import LineOfSight, ScanModel
 
 
 def survey(precession_deg, boresight_deg, **changes):

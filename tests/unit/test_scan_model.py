@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from mcsim.errors import InputError
-from mcsim.scan.model import LineOfSight, ScanModel, load_model
+from mcsim.instrument.scan.model import LineOfSight, ScanModel, load_model
 
 MODELS = Path(__file__).parents[2] / "scan_models"
 GOOD = """

@@ -6,13 +6,13 @@ import pytest
 from astropy.io import fits
 
 from mcsim.errors import InputError
-from mcsim.folders import default_cache_dir
-from mcsim.scan.accumulate import stream_moments
-from mcsim.scan.cache import cached_moments, moments_key
-from mcsim.scan.model import LineOfSight, ScanModel
-from mcsim.scan.moments import Moments, parallel_transport, read_moments_fits, write_moments_fits
-from mcsim.scan.pointing import pointing
-from mcsim.scan.user_pointing import pointing_moments
+from mcsim.instrument.scan.accumulate import stream_moments
+from mcsim.instrument.scan.cache import cached_moments, moments_key
+from mcsim.instrument.scan.model import LineOfSight, ScanModel
+from mcsim.instrument.scan.moments import Moments, parallel_transport, read_moments_fits, write_moments_fits
+from mcsim.instrument.scan.pointing import pointing
+from mcsim.instrument.scan.user_pointing import pointing_moments
+from mcsim.support.folders import default_cache_dir
 
 LINES = (LineOfSight("A", 70.5), LineOfSight("B", 69.0, 170.0, 3.0))
 MODEL = ScanModel("toy", 129.3, -3600.0, 22.5, 31557600.0, 2.0, 1.0, LINES, ("A",))

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from mcsim import spectra
 from mcsim.errors import InputError
+from mcsim.sphere import spectra
 
 CL = np.array([0.0, 0.0, 1200.0, 557.0, 310.5])
 

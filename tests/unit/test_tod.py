@@ -8,14 +8,14 @@ import healpy
 import numpy as np
 import pytest
 
-from mcsim import alm as alm_
-from mcsim import tod
-from mcsim.beams import Beam, gaussian
 from mcsim.errors import InputError
-from mcsim.scan import ScanModel
-from mcsim.scan.model import LineOfSight
-from mcsim.scan.pointing import pointing
-from mcsim.sky import gaussian_alm
+from mcsim.instrument.beams import Beam, gaussian
+from mcsim.instrument.scan import ScanModel
+from mcsim.instrument.scan.model import LineOfSight
+from mcsim.instrument.scan.pointing import pointing
+from mcsim.simulation import tod
+from mcsim.sphere import alm as alm_
+from mcsim.sphere.sky import dipole_alm, gaussian_alm
 
 LINE = LineOfSight("A", 70.5, 12.0)
 MODEL = ScanModel("toy", 129.3, -3600.0, 22.5, 31557600.0, 11.0, 10.0, (LINE,), ("A",))
@@ -99,14 +99,14 @@ def test_dipole_is_seen_through_the_beam():
     vector = np.array([1200.0, -2500.0, 1900.0])
     beam = gaussian(900.0, 8)
     stream = next(iter(tod.samples(MODEL, LINE, NSIDE)))
-    found = next(tod.sky_signal(tod.dipole_alm(vector, 8), 8, beam)([stream])).signal_uk
+    found = next(tod.sky_signal(dipole_alm(vector, 8), 8, beam)([stream])).signal_uk
     expected = beam.window[1] * healpy.ang2vec(stream.theta, stream.phi) @ vector
     assert beam.window[1] < 0.99
     np.testing.assert_allclose(found, expected, atol=1e-6)
     sky = gaussian_alm(np.ones(9), np.random.default_rng(3))
     kwargs = {"line_of_sight": "A", "time_range": (0.0, 0.1)}
     with_dipole, hits = tod.observe(sky, 8, beam, MODEL, 4, dipole_uk=vector, **kwargs)
-    summed, _ = tod.observe(sky + tod.dipole_alm(vector, 8), 8, beam, MODEL, 4, **kwargs)
+    summed, _ = tod.observe(sky + dipole_alm(vector, 8), 8, beam, MODEL, 4, **kwargs)
     np.testing.assert_array_equal(with_dipole[hits > 0], summed[hits > 0])
 
 
@@ -186,4 +186,4 @@ def test_bad_input_is_named(changes, message, sky, beam):
 
 def test_dipole_needs_its_degree():
     with pytest.raises(InputError, match="lmax is 0"):
-        tod.dipole_alm([0.0, 0.0, 1.0], 0)
+        dipole_alm([0.0, 0.0, 1.0], 0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import wignernj
 
-from mcsim.wigner import band, evaluate
+from mcsim.sphere.clebsch import band, evaluate
 
 
 def exact(L: int, M: int, l1: int, m1: int, l2: int) -> float:

@@ -13,8 +13,9 @@ from pathlib import Path
 import healpy
 import numpy as np
 
-from mcsim import config, sampled
-from mcsim.survey import survey
+from mcsim import config
+from mcsim.simulation import sampled
+from mcsim.simulation.survey import survey
 
 FRAMES = {"ecliptic": "E", "galactic": "G", "equatorial": "C"}
 

@@ -20,8 +20,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim import config, effects, healpix, resources, sampled, simulate
-from mcsim.survey import Survey, survey
+from mcsim import config, systematics
+from mcsim.simulation import sampled, simulate
+from mcsim.simulation.survey import Survey, survey
+from mcsim.sphere import healpix
+from mcsim.support import resources
 
 NSIDE, LMAX, SHOWN_LMAX = 128, 384, 256
 PARAMETERS: dict[str, dict[str, Any]] = {
@@ -75,7 +78,7 @@ def main() -> None:
 def response(name: str, arguments: argparse.Namespace, plain: dict[str | None, tuple[list[Map], list[Map]]]) -> Map:
     """Maps with the effect less those without, of the default route and, where it can, of the sampled one."""
     if name in NOISE:
-        effect = effects.build(name, PARAMETERS[name])
+        effect = systematics.build(name, PARAMETERS[name])
         factor = effect.noise(prepared(name, arguments).channels[0].site)
         return np.array([factor - 1.0])
     if name in DIFFERENCING or name == "orientation_averaging":
@@ -126,7 +129,7 @@ def prepared(name: str | None, arguments: argparse.Namespace, like: str | None =
         "ensemble": {"realizations": 1, "seed": 1},
     }
     if name is not None:
-        channel = {"channel": "W1"} if effects.get(name).scope == "channel" else {}
+        channel = {"channel": "W1"} if systematics.get(name).scope == "channel" else {}
         table["effect"] = [{"name": name, **channel, **parameters}]
     return survey(config.load(table), nthreads=2)
 
@@ -176,7 +179,7 @@ def draw(found: dict[str, Map], path: Path) -> None:
         axes.pcolormesh(lon, lat, np.asarray(image), cmap="RdBu_r", vmin=-reach, vmax=reach, rasterized=True)
         axes.set_xticks([])
         axes.set_yticks([])
-        effect = effects.get(name)
+        effect = systematics.get(name)
         unit = "of the variance" if name in NOISE else "uK"
         axes.set_title(f"{name}\n{PARAMETERS[name]['amplitude']:g} {effect.unit}", fontsize=9)
         axes.text(0.5, -0.07, f"±{reach:.2g} {unit}", transform=axes.transAxes, ha="center", va="top", fontsize=7.5)

@@ -20,7 +20,7 @@ from mcsim.diagnosis.batch import asking, batch
 from mcsim.diagnosis.evidence import Job, evidence_of, questions
 from mcsim.diagnosis.knowledge import seeded, with_effects
 from mcsim.diagnosis.session import prepared
-from mcsim.effects import Effect
+from mcsim.systematics import Effect
 
 SEED = 20121026
 STEPS = 4.0

@@ -32,7 +32,8 @@ from distributed.utils import get_mp_context
 from same import difference
 from separate import Cluster, workers_of
 
-from mcsim import config, repair, runner, store, tasks
+from mcsim import config
+from mcsim.ensemble import repair, runner, store, tasks
 
 HERE = Path(__file__).resolve().parent
 REALIZATIONS = int(os.environ.get("MCSIM_FAULTS_REALIZATIONS", "200"))
@@ -311,7 +312,7 @@ def campaign(kills: int, aimed: int, kinds: list[str], seconds: float, seed: int
 
     dask.config.refresh()
     # One fork server, with all loaded, makes the workers of all local clusters.
-    get_mp_context().set_forkserver_preload(["distributed", "mcsim.tasks"])
+    get_mp_context().set_forkserver_preload(["distributed", "mcsim.ensemble.tasks"])
     forkserver.ensure_running()
     forkserver._forkserver.ensure_running = lambda: None
     end = time.monotonic() + seconds

@@ -165,7 +165,7 @@ class Cluster:
             if node.worker is None or node.worker.poll() is not None:
                 options = ["--host", node.address, "--nthreads", "1", "--memory-limit", "0", "--no-dashboard"]
                 # Imports, which may take seconds, are to be over when the scheduler begins to count.
-                options += ["--preload", "mcsim.tasks", "--nanny" if self.nanny else "--no-nanny"]
+                options += ["--preload", "mcsim.ensemble.tasks", "--nanny" if self.nanny else "--no-nanny"]
                 node.worker = self.start(node, "dask", "worker", "--scheduler-file", str(self.file), *options)
 
     def drive(self, config: Path, store: Path) -> subprocess.Popen[bytes]:

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mcsim import open_summary, store
+from mcsim import open_summary
+from mcsim.ensemble import store
 
 
 def finished(path: Path) -> int:

@@ -14,9 +14,12 @@ from dataclasses import replace
 import healpy
 import numpy as np
 
-from mcsim import beams, convolve, healpix, resources, rng, scan, spectra, tod
-from mcsim.scan.limit import caustics
-from mcsim.sky import gaussian_alm
+from mcsim.instrument import beams, scan
+from mcsim.instrument.scan.limit import caustics
+from mcsim.simulation import convolve, tod
+from mcsim.sphere import healpix, rng, spectra
+from mcsim.sphere.sky import gaussian_alm
+from mcsim.support import resources
 
 LIMIT_NSIDE = 128
 AWAY_DEG = (2.0, 3.0)

@@ -14,8 +14,11 @@ from pathlib import Path
 import healpy
 import numpy as np
 
-from mcsim import biposh, config, convolve, differencing, healpix, rotation, spectra, tod
-from mcsim.survey import Channel, Survey, survey
+from mcsim import bipolar, config
+from mcsim.simulation import convolve, differencing
+from mcsim.simulation.survey import Channel, Survey, survey
+from mcsim.sphere import healpix, rotation, spectra
+from mcsim.sphere.sky import dipole_alm
 
 HERE = Path(__file__).parent
 AMPLITUDE_UK, LONGITUDE_DEG, LATITUDE_DEG = 3364.5, 263.99, 48.26
@@ -46,9 +49,9 @@ def main() -> None:
             print(f"mean of the whole beam off its centre: x {x:.3f}', y {y:.3f}'")
             own = spectra.load(shared.config.sky.spectrum, 6)
             print(f"{'CMB, D_l for l = 1 ... 5 [uK^2]':34s}" + " ".join(f"{v:11.4g}" for v in scale * own[ell]))
-        leaked = leaked_map(shared, channel, tod.dipole_alm(vector, shared.config.sky.lmax))
+        leaked = leaked_map(shared, channel, dipole_alm(vector, shared.config.sky.lmax))
         alm = healpix.analysis(leaked, 6, iterations=3)
-        power = biposh.power_spectrum(alm, alm, 6)
+        power = bipolar.power_spectrum(alm, alm, 6)
         print(f"{name:34s}" + " ".join(f"{v:11.4g}" for v in scale * power[ell]) + f"   rms {leaked.std():.4f} uK")
 
 

@@ -15,10 +15,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import mcsim
-from mcsim import config, fit, resources, scan, spectra
-from mcsim.instrument import load_beam
-from mcsim.statistics import jackknife
-from mcsim.survey import survey
+from mcsim import beamfit, config
+from mcsim.instrument import scan
+from mcsim.simulation.channels import load_beam
+from mcsim.simulation.survey import survey
+from mcsim.sphere import spectra
+from mcsim.stats.streaming import jackknife
+from mcsim.support import resources
 
 HERE = Path(__file__).parent
 RUNS = (
@@ -42,7 +45,7 @@ FIRST = 1  # the first bin, l < 25, is left out of overall ratios
 
 def binned_differences(folder: Path, run: str, mode: str) -> np.ndarray:
     """Paired difference of every realization, binned, shape (realization, bin), uK^2."""
-    found = fit.from_store(folder / f"{run}.zarr", [mode], kind="difference", pair="W1,W1").realizations
+    found = beamfit.from_store(folder / f"{run}.zarr", [mode], kind="difference", pair="W1,W1").realizations
     assert found is not None  # as of every store
     return found
 

@@ -14,7 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mcsim import config, resources, scan, simulate, survey
+from mcsim import config
+from mcsim.instrument import scan
+from mcsim.simulation import simulate, survey
+from mcsim.support import resources
 
 SEED = 5
 

@@ -16,11 +16,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy import stats
 
-from mcsim import config, fit, prediction, scan
-from mcsim.predict import orientation_harmonics
-from mcsim.scan.factors import ScanFactors
-from mcsim.statistics import jackknife
-from mcsim.survey import Survey, survey
+from mcsim import beamfit, config
+from mcsim.bipolar.theory import orientation_harmonics
+from mcsim.ensemble import prediction
+from mcsim.instrument import scan
+from mcsim.instrument.scan.factors import ScanFactors
+from mcsim.simulation.survey import Survey, survey
+from mcsim.stats.streaming import jackknife
 
 HERE = Path(__file__).parent
 MISSIONS = {"litebird": "LiteBIRD-like", "planck": "Planck-like"}
@@ -32,7 +34,7 @@ FIRST = 1  # the first bin, l < 32, is left out of overall ratios
 
 def binned_differences(store: Path, channel: str, mode: str) -> np.ndarray:
     """Paired difference of every realization, binned, shape (realization, bin), uK^2."""
-    found = fit.from_store(store, [mode], kind="difference", pair=f"{channel},{channel}").realizations
+    found = beamfit.from_store(store, [mode], kind="difference", pair=f"{channel},{channel}").realizations
     assert found is not None  # as of every store
     return found
 

@@ -19,8 +19,11 @@ import numpy as np
 from astropy.io import fits
 from matplotlib.figure import Figure
 
-from mcsim import healpix, mapmaking, resources, scan
-from mcsim.scan import ScanModel
+from mcsim.instrument import scan
+from mcsim.instrument.scan import ScanModel
+from mcsim.simulation import mapmaking
+from mcsim.sphere import healpix
+from mcsim.support import resources
 
 FRAGMENT = "wmap_maps/wmap_band_iqumap_r9_7yr_W_v4_first26264pix.fits"
 COARSE = "wmap_maps/wmap_band_iqumap_r9_7yr_W_v4_udgraded32.fits"

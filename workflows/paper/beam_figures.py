@@ -5,8 +5,8 @@ from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
-from mcsim import beams
-from mcsim.beams.beammap import solid_angle_values
+from mcsim.instrument import beams
+from mcsim.instrument.beams.beammap import solid_angle_values
 
 ARCMIN = np.degrees(1.0) * 60.0
 LMAX = 1024

@@ -7,7 +7,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mcsim.fit import Fit
+from mcsim.beamfit import Fit
 
 SPECTRUM = {0: r"A^{20}_{\ell\ell}", 2: r"A^{20}_{\ell-2,\ell}"}
 ENSEMBLE, EXACT, LEADING = "#c44e22", "#1f5fa8", "#3c8c3c"

@@ -21,7 +21,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import mcsim
-from mcsim import beams, config, fit, prediction, scan
+from mcsim import beamfit, config
+from mcsim.ensemble import prediction
+from mcsim.instrument import beams, scan
 
 WORKFLOWS = Path(__file__).resolve().parent.parent
 ELLIPTICAL = "predictions/elliptical.toml"
@@ -73,7 +75,7 @@ def effective(folder: Path | None) -> Figure:
     survey = prediction.survey_of(WORKFLOWS / TRANSPORTED)
     fits = {
         channel: [
-            fit.fit(store, survey, name, ell_range=ELL_RANGE, kind="plain", pair=f"{channel},{channel}")
+            beamfit.fit(store, survey, name, ell_range=ELL_RANGE, kind="plain", pair=f"{channel},{channel}")
             for name in ("constant", "linear")
         ]
         for channel in ("V2", "W1")

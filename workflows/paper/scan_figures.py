@@ -3,9 +3,10 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from mcsim import resources, scan
+from mcsim.instrument import scan
+from mcsim.instrument.scan.limit import limit_quadrature
 from mcsim.plot.scan import scan_figure
-from mcsim.scan.limit import limit_quadrature
+from mcsim.support import resources
 
 NSIDE = 128
 SAMPLE_PERIOD_S = 0.2048

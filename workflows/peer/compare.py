@@ -27,8 +27,11 @@ import healpy
 import litebird_sim as lbs
 import numpy as np
 
-from mcsim import convolve, healpix, resources, scan, sky, spectra
-from mcsim.beams import Beam, elliptical_gaussian
+from mcsim.instrument import scan
+from mcsim.instrument.beams import Beam, elliptical_gaussian
+from mcsim.simulation import convolve
+from mcsim.sphere import healpix, sky, spectra
+from mcsim.support import resources
 
 NSIDE, LMAX, M_MAX = 256, 512, 2
 FWHM_ARCMIN = (32.3, 29.4)

@@ -25,10 +25,12 @@ from astropy.io import fits
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mcsim import beams, resources, rotation, scan, spectra
-from mcsim.healpix import pixel_window
-from mcsim.predict import ScannedBeam, cmb_biposh_leading, orientation_harmonics
-from mcsim.predict.modes import to_bennett
+from mcsim.bipolar.theory import ScannedBeam, cmb_biposh_leading, orientation_harmonics
+from mcsim.bipolar.theory.modes import to_bennett
+from mcsim.instrument import beams, scan
+from mcsim.sphere import rotation, spectra
+from mcsim.sphere.healpix import pixel_window
+from mcsim.support import resources
 
 LMAX = 1024
 NSIDE, MAP_NSIDE = 128, 1024

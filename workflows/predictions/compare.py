@@ -16,9 +16,10 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 import mcsim
-from mcsim import config, prediction
-from mcsim.biposh import Mode
-from mcsim.summary import bin_factor
+from mcsim import config
+from mcsim.bipolar import Mode
+from mcsim.ensemble import prediction
+from mcsim.ensemble.summary import bin_factor
 
 BINS = 3
 

@@ -5,7 +5,8 @@
 A year leaves structure of its own at the scale of the scan's lines; the limit depends on colatitude alone.
 """
 
-from mcsim import resources, scan
+from mcsim.instrument import scan
+from mcsim.support import resources
 
 NSIDE, SMAX = 256, 3
 

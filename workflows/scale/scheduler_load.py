@@ -9,7 +9,8 @@ import time
 
 import psutil
 
-from mcsim import config, runner, tasks
+from mcsim import config
+from mcsim.ensemble import runner, tasks
 
 
 def nothing(job: tasks.Job, start: int) -> tuple[int, list[tasks.Failure]]:

@@ -10,9 +10,14 @@ import numpy as np
 from astropy.io import fits
 from astropy.table import Table
 
-from mcsim import beams, config, fit, plan, resources, scan, simulate, spectra, store
+from mcsim import beamfit, config
+from mcsim.ensemble import plan, store
 from mcsim.errors import RunError
-from mcsim.survey import survey
+from mcsim.instrument import beams, scan
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import survey
+from mcsim.sphere import spectra
+from mcsim.support import resources
 
 NSIDE, LMAX = 8, 16
 
@@ -152,7 +157,7 @@ def readers(folder: Path) -> dict[str, Callable[[], object]]:
         "spectrum.txt": using(with_("sky", spectrum="spectrum.txt")),
         "spectrum.fits": using(with_("sky", spectrum="spectrum.fits")),
         "model.toml": lambda: scan.load_model(folder / "model.toml"),
-        "data.ecsv": lambda: fit.measurement(folder / "data.ecsv", base()),
+        "data.ecsv": lambda: beamfit.measurement(folder / "data.ecsv", base()),
     }
     for suffix in ("txt", "npy", "npz", "fits"):
         name = f"pointing.{suffix}"

@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mcsim import config, describe, plan, repair, simulate, store
-from mcsim.survey import survey
+from mcsim import config
+from mcsim.ensemble import describe, plan, repair, store
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import survey
 
 from .damage import damaged_bytes
 from .judge import Outcome, judge

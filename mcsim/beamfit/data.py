@@ -1,0 +1,251 @@
+"""Binned BipoSH spectra as one vector of real data with its covariance, from the realizations of a store."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.bipolar import Mode, bennett_factor
+from mcsim.ensemble import store
+from mcsim.ensemble.summary import bin_factor
+from mcsim.errors import InputError
+
+Kind = Literal["plain", "difference"]
+
+QUADRUPOLE = ("L2M0d0", "L2M0d2")
+"""A^{20}_{l l} and A^{20}_{l-2,l}: the modes fitted by default."""
+
+
+class Row(NamedTuple):
+    """One datum: real or imaginary part of the mean of a mode over ell_min <= l2 <= ell_max."""
+
+    mode: Mode
+    ell_min: int
+    ell_max: int
+    imaginary: bool
+
+
+class Scaling(NamedTuple):
+    """What is binned: coefficients in the Bennett or the Hajian-Souradeep normalisation, times l(l+1)/2pi or not.
+
+    ``summary`` marks the scaling of an ensemble's summary, the only one that has odd parity beside Bennett's.
+    """
+
+    bennett: bool
+    spectrum: bool
+    summary: bool
+
+    def factor(self, mode: Mode, lmax: int) -> NDArray[np.float64]:
+        """Factor from raw coefficients, shape (lmax + 1,)."""
+        if self.summary:
+            return bin_factor(mode, lmax)
+        ell = np.arange(lmax + 1.0)
+        factor = ell * (ell + 1.0) / (2.0 * np.pi) if self.spectrum else np.ones(lmax + 1)
+        return factor * bennett_factor(mode, lmax) if self.bennett else factor
+
+
+SUMMARY = Scaling(bennett=True, spectrum=True, summary=True)
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What is fitted.
+
+    Attributes
+    ----------
+    origin, pair
+        Where the data are from, and the pair of maps that they belong to; ``None``: the only map.
+    kind
+        "plain", or "difference" to the circular twins.
+    rows, scaling
+        What each datum is.
+    value, covariance
+        uK^2 and uK^4, shape (p,) and (p, p).
+    simulations
+        Number of realizations behind the covariance; ``None``: it is known.
+    realizations
+        Data of every realization, shape (N, p), where they are known.
+    """
+
+    origin: str
+    pair: str | None
+    kind: str
+    rows: tuple[Row, ...]
+    scaling: Scaling
+    value: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    simulations: int | None
+    realizations: NDArray[np.float64] | None = None
+
+    @property
+    def modes(self) -> tuple[Mode, ...]:
+        """The modes, each once, in order."""
+        return tuple(dict.fromkeys(row.mode for row in self.rows))
+
+    @property
+    def lmax(self) -> int:
+        """Largest ell."""
+        return max(row.ell_max for row in self.rows)
+
+
+def parts(mode: Mode) -> tuple[bool, ...]:
+    """Which parts of a mode carry data: False for the real, True for the imaginary one."""
+    return (False, True) if mode.M > 0 else (mode.parity == "odd",)
+
+
+def parse_mode(name: str) -> Mode:
+    """A mode from its label, for example ``L2M0d-2``.
+
+    Raises
+    ------
+    InputError
+        For another form, or a mode that cannot exist.
+    """
+    try:
+        L, rest = name.removeprefix("L").split("M")
+        M, d = rest.split("d")
+        mode = Mode(int(L), int(M), int(d))
+    except ValueError:
+        raise InputError(f"{name!r} is no BipoSH mode; write it like L2M0d0.") from None
+    if not (0 <= mode.M <= mode.L and abs(mode.d) <= mode.L and mode.L > 0):
+        raise InputError(f"the mode {name} does not exist; it needs L > 0, 0 <= M <= L and |d| <= L.")
+    return mode
+
+
+def project(
+    rows: Sequence[Row], scaling: Scaling, spectra: Mapping[Mode, NDArray[np.complex128]]
+) -> NDArray[np.float64]:
+    """Data vectors, shape (..., rows), of spectra of shape (..., lmax + 1); NaN where a bin is empty."""
+    scaled = {mode: scaling.factor(mode, array.shape[-1] - 1) * array for mode, array in spectra.items()}
+    columns = []
+    for row in rows:
+        inside = scaled[row.mode][..., row.ell_min : row.ell_max + 1]
+        exists = np.isfinite(inside)
+        count = exists.sum(axis=-1)
+        total = np.where(exists, inside, 0.0).sum(axis=-1)
+        mean = np.divide(total, count, out=np.full(total.shape, np.nan + 0j), where=count > 0)
+        columns.append(mean.imag if row.imaginary else mean.real)
+    return np.stack(columns, axis=-1)
+
+
+def from_store(
+    path: str | Path,
+    modes: Sequence[str] = QUADRUPOLE,
+    ell_range: tuple[int, int] | None = None,
+    kind: Kind | None = None,
+    pair: str | None = None,
+) -> Measurement:
+    """Mean of an ensemble, with the covariance of its data vector over all modes and bins.
+
+    Parameters
+    ----------
+    path
+        Store.
+    modes
+        Labels of the modes.
+    ell_range
+        Only bins of the summary that lie within these multipoles.
+    kind
+        "difference" to the circular twins (default of a paired ensemble) or "plain".
+    pair
+        Label of the pair; by default the first.
+
+    Raises
+    ------
+    InputError
+        If the store does not hold what is asked for.
+    """
+    with store.open_ensemble(path) as ensemble:
+        width = int(ensemble.attrs["configuration"]["biposh"]["summary_bin"])
+        lmax = ensemble.sizes["ell"] - 1
+        paired = "biposh_circular" in ensemble
+        label = str(ensemble["pair"].values[0]) if pair is None else pair
+    chosen = ("difference" if paired else "plain") if kind is None else kind
+    first, last = ell_range or (0, lmax)
+    bins = [(a, min(a + width - 1, lmax)) for a in range(0, lmax + 1, width)]
+    rows = tuple(
+        Row(mode, a, b, imaginary)
+        for mode in map(parse_mode, modes)
+        for imaginary in parts(mode)
+        for a, b in bins
+        if a >= first and b <= last
+    )
+    if not rows:
+        raise InputError(f"no bin of {path} lies within ell = {first} ... {last}; its bins are {width} wide, widen it.")
+    drawn = realizations(path, rows, SUMMARY, chosen, label)
+    measured = np.atleast_1d(np.isfinite(drawn).all(axis=0))
+    if not measured.any():
+        raise InputError(f"{path} has none of the modes {', '.join(modes)} for the pair {label}; choose others.")
+    drawn = drawn[:, measured]
+    covariance = np.cov(drawn.T, ddof=1).reshape(drawn.shape[1], -1)
+    kept = tuple(row for row, keep in zip(rows, measured, strict=True) if keep)
+    value = drawn.mean(axis=0)
+    return Measurement(
+        str(path), label, chosen, kept, SUMMARY, value, covariance / len(drawn), len(drawn), realizations=drawn
+    )
+
+
+def with_covariance_of(measured: Measurement, path: str | Path, pair: str | None = None) -> Measurement:
+    """The data of a measurement with the covariance of one realization of an ensemble that models it.
+
+    Parameters
+    ----------
+    measured
+        Usually a table, whose errors are then not used.
+    path
+        Store with the modes and degrees of the measurement; its realizations are binned like the data.
+    pair
+        Label of the pair in the store; by default that of the measurement, or the store's first.
+
+    Raises
+    ------
+    InputError
+        If the store does not hold what the measurement does.
+    """
+    with store.open_ensemble(path) as ensemble:
+        labels = [str(name) for name in ensemble["pair"].values]
+    label = pair or (measured.pair if measured.pair in labels else labels[0])
+    drawn = realizations(path, measured.rows, measured.scaling, measured.kind, label)
+    covariance = np.cov(drawn.T, ddof=1).reshape(drawn.shape[1], -1)
+    return replace(measured, covariance=covariance, simulations=len(drawn))
+
+
+def realizations(path: str | Path, rows: Sequence[Row], scaling: Scaling, kind: str, pair: str) -> NDArray[np.float64]:
+    """Data vectors of all finished realizations of a store, shape (N, rows), read chunk by chunk.
+
+    Raises
+    ------
+    InputError
+        If the store has another lmax or lacks the pair, a mode or the circular twins.
+    """
+    target = Path(path)
+    with store.open_ensemble(target) as ensemble:
+        labels = {str(name): number for number, name in enumerate(ensemble["mode"].values)}
+        pairs = [str(name) for name in ensemble["pair"].values]
+        lmax, paired = ensemble.sizes["ell"] - 1, "biposh_circular" in ensemble
+    if pair not in pairs:
+        raise InputError(f"There is no pair {pair} in {path}; choose among {'; '.join(pairs)}.")
+    if kind == "difference" and not paired:
+        raise InputError(f"{path} has no circular twins; fit its plain spectra, or run it with ensemble.paired = true.")
+    missing = [row.mode.name for row in rows if row.mode.name not in labels]
+    if missing:
+        raise InputError(f"{path} has no mode {missing[0]}; it holds {', '.join(labels)}.")
+    if max(row.ell_max for row in rows) > lmax:
+        raise InputError(f"{path} ends at ell = {lmax}, below the last bin of the data; give narrower data.")
+    number, size, chunk = pairs.index(pair), len(store.done(target)), store.chunk(target)
+    found = []
+    for start in range(0, size, chunk):
+        arrays = store.read(target, start, min(start + chunk, size))
+        done = arrays["done"]
+        biposh = arrays["biposh"][done, number]
+        if kind == "difference":
+            biposh = biposh - arrays["biposh_circular"][done, number]
+        spectra = {row.mode: biposh[:, labels[row.mode.name]] for row in rows}
+        found.append(project(rows, scaling, spectra))
+    joined = np.concatenate(found)
+    if len(joined) < 3:
+        raise InputError(f"{path} has {len(joined)} finished realizations, too few for a covariance; run more.")
+    return joined

@@ -1,0 +1,161 @@
+"""How well a BipoSH signal can be seen: variances under isotropy, signal to noise and Fisher information."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.bipolar.theory.modes import Mode, check_modes, existing
+from mcsim.errors import InputError
+
+
+def isotropic_variance(
+    modes: Sequence[Mode],
+    cl_total_x: NDArray[np.float64],
+    cl_total_y: NDArray[np.float64] | None = None,
+    cl_cross: NDArray[np.float64] | None = None,
+) -> NDArray[np.float64]:
+    """E|A^{LM}_{l1 l2}|^2 of an isotropic sky.
+
+    Parameters
+    ----------
+    modes
+        (L, M, d) each, L > 0.
+    cl_total_x, cl_total_y
+        Total spectra (beam^2 signal + noise) of the maps X and Y, uK^2, shape (lmax + 1,).
+    cl_cross
+        C_l^{XY}, shape (lmax + 1,). For one map give ``cl_total_x`` alone.
+
+    Returns
+    -------
+    ndarray
+        uK^4, shape (n_mode, lmax + 1), NaN where the mode does not exist.
+
+    Notes
+    -----
+    C^XX_l1 C^YY_l2 + (-1)^L delta_{l1 l2} (C^XY_l)^2; for one map C_l1 C_l2 (1 + delta_{l1 l2}), L even where l1 = l2.
+    Zero where it is less than 1e-12 of its first term.
+    """
+    check_modes(modes)
+    if any(L == 0 for L, _, _ in modes):
+        raise InputError("the variance of L=0 is that of C_l, not of an anisotropy; give modes with L >= 1.")
+    lmax = len(cl_total_x) - 1
+    x = cl_total_x
+    y = x if cl_total_y is None else cl_total_y
+    cross = x if cl_total_y is None else cl_cross
+    if cross is None:
+        raise InputError("the cross spectrum of the two maps is missing; give cl_cross with cl_total_y.")
+    variance = np.full((len(modes), lmax + 1), np.nan)
+    for row, (L, _, d) in zip(variance, modes, strict=True):
+        l2 = np.flatnonzero(existing(L, d, lmax))
+        product = x[l2 - d] * y[l2]
+        row[l2] = product + ((-1) ** L * cross[l2] ** 2 if d == 0 else 0.0)
+        # Of maps without noise nothing is left for odd L but round-off of either sign.
+        row[l2[row[l2] < 1e-12 * product]] = 0.0
+    return variance
+
+
+def signal_to_noise(
+    biposh: NDArray[np.complex128],
+    modes: Sequence[Mode],
+    cl_total_x: NDArray[np.float64],
+    cl_total_y: NDArray[np.float64] | None = None,
+    cl_cross: NDArray[np.float64] | None = None,
+    f_sky: float = 1.0,
+    ell_range: tuple[int, int] | None = None,
+) -> NDArray[np.float64]:
+    """Signal to noise of each mode, all ell of a range together.
+
+    Parameters
+    ----------
+    biposh
+        Expected A^{LM}_{l1 l2} in uK^2 (Hajian-Souradeep), shape (n_mode, lmax + 1).
+    modes
+        (L, M, d) of each row, L > 0, M >= 0.
+    cl_total_x, cl_total_y, cl_cross
+        As for :func:`isotropic_variance`.
+    f_sky
+        Observed fraction of the sky, 0 < f_sky <= 1.
+    ell_range
+        First and last l2; all by default.
+
+    Returns
+    -------
+    ndarray
+        Shape (n_mode,). M > 0 includes its mirror -M.
+
+    Notes
+    -----
+    (S/N)^2 = f_sky sum_l2 (2 - delta_M0) |A|^2 / E|A|^2, over the l2 of nonzero variance. Modes with d of both signs of
+    one pair share noise (E A_{l1 l2} A*_{l2 l1} is not zero): their sum in quadrature is an approximation;
+    :func:`fisher_information` is exact.
+    """
+    if not 0.0 < f_sky <= 1.0:
+        raise InputError(f"f_sky = {f_sky} is not a fraction of the sky; give 0 < f_sky <= 1.")
+    first, last = (0, biposh.shape[1] - 1) if ell_range is None else ell_range
+    variance = isotropic_variance(modes, cl_total_x, cl_total_y, cl_cross)[:, first : last + 1]
+    signal = abs(biposh[:, first : last + 1]) ** 2
+    ratio = np.divide(signal, variance, out=np.zeros_like(variance), where=variance > 0.0)
+    weight = np.array([1.0 if M == 0 else 2.0 for _, M, _ in modes])
+    return np.sqrt(f_sky * weight * ratio.sum(axis=1))
+
+
+def fisher_information(
+    biposh: NDArray[np.complex128],
+    modes: Sequence[Mode],
+    cl_total: NDArray[np.float64],
+    f_sky: float = 1.0,
+) -> float:
+    """Information 1/2 Tr[C^-1 dC C^-1 dC] of a BipoSH signal in all maps jointly.
+
+    Parameters
+    ----------
+    biposh
+        dA^{LM}_{l1 l2} of every ordered pair of maps per unit of the parameter, uK^2, shape (n_map, n_map, n_mode,
+        lmax + 1).
+    modes
+        (L, M, d) with M >= 0 and d >= 0: d < 0 is the exchanged pair's. L = 0 is C_l's own part.
+    cl_total
+        Total spectra and cross-spectra of the maps, uK^2, shape (n_map, n_map, lmax + 1); degrees where this is
+        singular (such as l = 0, 1 without power) are left out.
+    f_sky
+        Observed fraction of the sky.
+
+    Returns
+    -------
+    float
+        1/variance of the best unbiased estimate of a small amplitude.
+
+    Raises
+    ------
+    InputError
+        f_sky outside (0, 1], or a mode with M < 0 or d < 0.
+
+    Notes
+    -----
+    f_sky sum_{L, M>=0, l1<=l2} (2 - delta_M0)/(1 + delta_l1l2) Tr[C_l1^-1 dA_l1l2 C_l2^-1 dA_l1l2^+], matrices over
+    maps. Equal to the trace over an explicit covariance to 1e-12 (tests/unit/test_predict_detectability.py).
+    """
+    check_modes(modes)
+    if not 0.0 < f_sky <= 1.0:
+        raise InputError(f"f_sky = {f_sky} is not a fraction of the sky; give 0 < f_sky <= 1.")
+    for L, M, d in modes:
+        if M < 0 or d < 0:
+            raise InputError(f"mode L={L}, M={M}, d={d} repeats information of M >= 0, d >= 0; leave it out.")
+    spectra = np.moveaxis(cl_total, -1, 0)
+    inverse = np.zeros_like(spectra)
+    diagonal = np.einsum("lxx->lx", spectra)
+    usable = np.flatnonzero((diagonal > 0.0).all(axis=1))
+    scale = np.sqrt(diagonal[usable])
+    correlation = spectra[usable] / (scale[:, :, None] * scale[:, None, :])
+    regular = np.linalg.eigvalsh(correlation)[:, 0] > 1e-12
+    usable, scale, correlation = usable[regular], scale[regular], correlation[regular]
+    inverse[usable] = np.linalg.inv(correlation) / (scale[:, :, None] * scale[:, None, :])
+    total = 0.0
+    lmax = cl_total.shape[-1] - 1
+    for i, (L, M, d) in enumerate(modes):
+        l2 = np.flatnonzero(existing(L, d, lmax))
+        signal = np.moveaxis(biposh[:, :, i, l2], -1, 0)
+        trace = np.einsum("lab,lbc,lcd,lad->", inverse[l2 - d], signal, inverse[l2], signal.conj(), optimize=True)
+        total += (1.0 if M == 0 else 2.0) / (2.0 if d == 0 else 1.0) * float(trace.real)
+    return f_sky * total

@@ -1,0 +1,1 @@
+"""Ensembles of realizations: planned, run on Dask, stored as Zarr, summarised, repaired, predicted."""

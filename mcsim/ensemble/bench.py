@@ -1,0 +1,121 @@
+"""How fast this machine runs mcsim, in ratios to the bare transforms that a realization needs."""
+
+import os
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from mcsim import config
+from mcsim.ensemble import runner
+from mcsim.instrument import scan
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import survey
+from mcsim.sphere import healpix, rng
+from mcsim.sphere.sky import gaussian_alm
+from mcsim.support import resources
+
+
+def bench(nside: int = 512, lmax: int = 1024, repeats: int = 5) -> Iterator[str]:
+    """Measure, line by line: transforms, a realization over what it needs, workers and their memory, moments.
+
+    Parameters
+    ----------
+    nside, lmax
+        Size of the maps and of the analysis.
+    repeats
+        Pairs of timings, of the bare transforms and of the realization in turn; medians of their ratios are given.
+    """
+    yield f"nside {nside}, lmax {lmax}, m_max 2, L_max 2, paired; one thread; medians of {repeats} interleaved pairs"
+    yield from _realization(nside, lmax, repeats)
+    yield from _workers(nside, lmax, 16 * repeats)
+    yield _moments(nside)
+
+
+def _realization(nside: int, lmax: int, repeats: int) -> Iterator[str]:
+    alms = np.stack([gaussian_alm(np.ones(lmax + 1), rng.generator(0, 0, stage)) for stage in ("E", "B")])
+    map_uk = np.random.default_rng(0).standard_normal(12 * nside**2)
+
+    def transforms(scalars: int, analyses: int) -> None:
+        for _ in range(scalars):
+            healpix.synthesis(alms[:1], nside, lmax)
+        healpix.synthesis(alms, nside, lmax, spin=2)
+        for _ in range(analyses):
+            healpix.analysis(map_uk, lmax)
+
+    transforms(1, 1)
+    yield (
+        f"  spin-0 synthesis {_seconds(healpix.synthesis, alms[:1], nside, lmax):.3f} s, "
+        f"spin-2 synthesis {_seconds(healpix.synthesis, alms, nside, lmax, 2):.3f} s, "
+        f"analysis {_seconds(healpix.analysis, map_uk, lmax):.3f} s (ring weights: 1 adjoint synthesis)"
+    )
+    for label, sigma0_uk, scalars, analyses in (
+        ("noise-free over spin-0 + spin-2 synthesis and 2 analyses", 0.0, 1, 2),
+        ("noise-free over what it runs, a spin-2 synthesis and 1 analysis", 0.0, 0, 1),
+        ("with noise over what it runs, spin-0 + spin-2 synthesis and 2 analyses", 10.0, 1, 2),
+    ):
+        shared = survey(_run(nside, lmax, sigma0_uk, 1))
+        simulate.realize(shared, 0)
+        pairs = [
+            (_seconds(transforms, scalars, analyses), _seconds(simulate.realize, shared, r)) for r in range(repeats)
+        ]
+        ratio = statistics.median(whole / bare for bare, whole in pairs)
+        yield f"  realization {label}: ratio {ratio:.2f}, {statistics.median(whole for _, whole in pairs):.2f} s"
+
+
+def _workers(nside: int, lmax: int, realizations: int) -> Iterator[str]:
+    rates = []
+    for workers in (1, 2):
+        with tempfile.TemporaryDirectory() as folder, runner.local_client(workers) as client:
+            warm = _run(nside, lmax, 0.0, 4 * workers)
+            runner.run(warm, Path(folder) / "bench.zarr", client=client)
+            run = _run(nside, lmax, 0.0, 4 * workers + realizations)
+            seconds = _seconds(runner.run, run, Path(folder) / "bench.zarr", client=client)
+            peak = max(client.run(_peak_bytes).values())
+            rates.append(realizations / seconds)
+        yield (
+            f"  {workers} worker{'s' if workers > 1 else ''}: {rates[-1]:.3g} realizations/s "
+            f"(start, store and summary included), peak memory of a worker {peak / 1e9:.2f} GB"
+        )
+    yield f"  2 workers over 1: {rates[1] / rates[0]:.2f}"
+
+
+def _moments(nside: int) -> str:
+    model = scan.load_model(resources.scan_model("wmap"))
+    threads = min(2, os.cpu_count() or 1)
+    part = (0.0, 0.05)
+    scan.stream_moments(model, nside, 2, time_range=(0.0, 1e-5), nthreads=threads)
+    seconds = _seconds(scan.stream_moments, model, nside, 2, time_range=part, nthreads=threads)
+    samples = part[1] * sum(model.samples(line) for line in model.select(None))
+    return f"  orientation moments, s <= 2: {samples / seconds / 1e6:.1f} million samples/s on {threads} threads"
+
+
+def _peak_bytes() -> int:
+    import resource
+
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def _run(nside: int, lmax: int, sigma0_uk: float, realizations: int) -> config.RunConfig:
+    beam = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 13.9, "fwhm_minor_arcmin": 12.7, "m_max": 2}
+    channel = {"name": "W1", "beam": beam, "scan": {"kind": "parallel_transport"}, "noise": {"sigma0_uk": sigma0_uk}}
+    return config.load(
+        {
+            "schema": 1,
+            "name": "bench",
+            "sky": {"spectrum": "wmap7", "lmax": lmax},
+            "map": {"nside": nside},
+            "channel": [channel],
+            "ensemble": {"realizations": realizations, "seed": 1},
+            "compute": {"chunk": 1},
+        }
+    )
+
+
+def _seconds(action: Callable[..., object], *args: object, **kwargs: object) -> float:
+    start = time.perf_counter()
+    action(*args, **kwargs)
+    return time.perf_counter() - start

@@ -1,0 +1,81 @@
+"""The shape of an ensemble store: dimensions, variables, how many realizations a chunk holds, and what that takes."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:  # stored ensembles are opened without the numerics, which take long to load
+    from mcsim.bipolar import Mode
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Shape of a store: realizations and how many of them one task owns, maps, pairs, modes, degrees."""
+
+    realizations: int
+    chunk: int
+    maps: tuple[str, ...]
+    pairs: tuple[str, ...]
+    modes: "tuple[Mode, ...]"
+    lmax: int
+    paired: bool
+    kept_npix: int | None
+
+    def variables(self) -> dict[str, tuple[tuple[str, ...], str, str, str]]:
+        """Dimensions, type, unit and long name of every array over realizations."""
+        spectra = {
+            "biposh": (
+                ("pair", "mode", "ell"),
+                "complex128",
+                "uK^2",
+                "BipoSH coefficient A^{LM}_{l2-d,l2} at ell = l2",
+            ),
+            "cl": (("pair", "ell"), "float64", "uK^2", "power spectrum C_l"),
+        }
+        found = dict(spectra)
+        if self.paired:
+            for name, (dims, dtype, unit, text) in spectra.items():
+                found[f"{name}_circular"] = (dims, dtype, unit, f"{text} of the circular twin")
+        if self.kept_npix is not None:
+            found["map"] = (("map_name", "pixel"), "float32", "uK", "simulated map, HEALPix RING")
+        return found
+
+    def sizes(self) -> dict[str, int]:
+        """Length of every dimension."""
+        return {
+            "realization": self.realizations,
+            "pair": len(self.pairs),
+            "mode": len(self.modes),
+            "ell": self.lmax + 1,
+            "map_name": len(self.maps),
+            "pixel": self.kept_npix or 0,
+        }
+
+    def realization_bytes(self) -> int:
+        """Uncompressed size of one realization."""
+        sizes = self.sizes()
+        return sum(
+            int(np.prod([sizes[dim] for dim in dims])) * np.dtype(dtype).itemsize
+            for dims, dtype, _, _ in self.variables().values()
+        )
+
+    def files(self) -> int:
+        """Number of data files of the finished store, coordinates and metadata included."""
+        chunks = -(-self.realizations // self.chunk)
+        # Coordinates and the summary's 32 variables or so come with metadata and one chunk each.
+        return (len(self.variables()) + 1) * (chunks + 1) + 100
+
+
+def listed(numbers: Iterable[int]) -> str:
+    """Whole numbers in words: ``realizations 3, 7-9``."""
+    ranges: list[list[int]] = []
+    for number in sorted(int(n) for n in numbers):
+        if ranges and number == ranges[-1][1] + 1:
+            ranges[-1][1] = number
+        else:
+            ranges.append([number, number])
+    found = [f"{a}" if a == b else f"{a}-{b}" for a, b in ranges]
+    shown = ", ".join(found[:8]) + (f" and {len(found) - 8} more ranges" if len(found) > 8 else "")
+    return f"{'realization' if len(ranges) == 1 and ranges[0][0] == ranges[0][1] else 'realizations'} {shown}"

@@ -1,0 +1,255 @@
+"""What a run will be before it is one: its realizations, chunks, attributes, and cost."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mcsim import config
+from mcsim.bipolar import Mode, estimate, estimator, modes
+from mcsim.ensemble import store, summary
+from mcsim.ensemble.layout import Layout
+from mcsim.errors import InputError
+from mcsim.simulation import differencing
+from mcsim.simulation.channels import load_beam
+from mcsim.simulation.survey import Survey
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix, rng, spectra
+from mcsim.sphere.sky import gaussian_alm
+
+CHUNKS = 128
+CHUNK_BYTES = 1 << 26
+
+CONVENTIONS = {
+    "temperature": "uK_CMB",
+    "alm": "healpy m-major order, analysis divided by the pixel window",
+    "psi": "rotation of the beam about its axis, from e_theta (south) towards e_phi (east)",
+    "beam": "b_lm of the beam at the pole, b_l0 = sqrt((2l+1)/4pi) B_l, B_0 = 1; x axis = spin axis x boresight",
+    "biposh": "A^{LM}_{l1 l2} = sum a_{l1 m1} conj(a_{l2 m2}) (-1)^{m2} C^{LM}_{l1 m1 l2 -m2}, ell = l2, d = l2 - l1",
+    "normalisation": "Hajian-Souradeep",
+    "weights": "maps times weights of unit mean square, spectra over the mean product of the two weights",
+}
+_PACKAGES = ("mcsim", "numpy", "healpy", "ducc0", "numba", "scipy", "dask", "distributed", "zarr", "xarray")
+
+
+def wanted(run: config.RunConfig, part: slice | None) -> range:
+    """Realizations to compute: all, or a slice ``A:B`` of them.
+
+    Raises
+    ------
+    InputError
+        If the slice is empty or reaches beyond the ensemble.
+    """
+    total = run.ensemble.realizations
+    if part is None:
+        return range(total)
+    start, stop = part.start or 0, total if part.stop is None else part.stop
+    if not 0 <= start < stop <= total:
+        raise InputError(
+            f"The slice {start}:{stop} of realizations is not within 0:{total} (ensemble.realizations); choose A < B."
+        )
+    return range(start, stop)
+
+
+def default_store(run: config.RunConfig, part: slice | None) -> Path:
+    """``{name}.zarr`` in the working folder; slices of an ensemble get stores of their own, ``{name}.{A}-{B}.zarr``."""
+    if part is None:
+        return Path(f"{run.name}.zarr")
+    realizations = wanted(run, part)
+    return Path(f"{run.name}.{realizations.start}-{realizations.stop}.zarr")
+
+
+def exists(path: Path) -> bool:
+    """Whether there is something at ``path``; refuses names that no file system takes."""
+    try:
+        return path.exists()
+    except OSError as error:
+        raise InputError(
+            f"{str(path)[:60]}... cannot be a store ({error.strerror}); give a shorter path with -o."
+        ) from error
+
+
+def layout(survey: Survey) -> Layout:
+    """Layout of a new store."""
+    run = survey.config
+    bare = Layout(
+        run.ensemble.realizations,
+        1,
+        survey.map_names,
+        survey.pair_names,
+        survey.estimator.modes,
+        survey.lmax,
+        run.ensemble.paired,
+        12 * run.map.resolution**2 if run.ensemble.keep_maps else None,
+    )
+    return _chunked(bare, run.compute.chunk)
+
+
+def _chunked(bare: Layout, chunk: int | None) -> Layout:
+    """About 128 chunks, which keeps files few and tasks many, unless a chunk would pass 64 MiB.
+
+    Powers of two, as the tree of sums needs.
+    """
+    if chunk is not None:
+        while chunk // 2 >= bare.realizations:
+            chunk //= 2
+    else:
+        chunk = 1
+        while chunk * CHUNKS < bare.realizations and 2 * chunk * bare.realization_bytes() <= CHUNK_BYTES:
+            chunk *= 2
+    return replace(bare, chunk=chunk)
+
+
+def recipe(survey: Survey) -> summary.Recipe:
+    """Recipe of the summary."""
+    run = survey.config
+    return summary.Recipe(
+        survey.pair_names, survey.estimator.modes, survey.lmax, run.biposh.summary_bin, run.ensemble.paired
+    )
+
+
+def attributes(run: config.RunConfig) -> dict[str, Any]:
+    """Attributes of a store: configuration (without what leaves the result alone), hash, conventions, versions."""
+    resolved = config.resolved(run)
+    del resolved["compute"]
+    return {
+        "configuration": resolved,
+        "science": config.science(run),
+        "digest": config.digest(run),
+        "conventions": CONVENTIONS,
+        "side_b": differencing.sides(run),
+        "packages": {name: version(name) for name in _PACKAGES},
+    }
+
+
+def check_same(path: Path, run: config.RunConfig) -> None:
+    """Refuse a store of another configuration, or one that has other variables.
+
+    Raises
+    ------
+    InputError
+        Naming the keys that differ.
+    """
+    found = store.attributes(path)
+    changes = _changes(found, attributes(run))
+    if changes:
+        raise InputError(
+            f"{path} was made with another configuration ({'; '.join(changes)}); "
+            "choose another store with -o, or restore the values."
+        )
+
+
+def check_mergeable(path: Path, first: Mapping[str, Any], other: Path, second: Mapping[str, Any]) -> None:
+    """Refuse to merge stores of different configurations."""
+    changes = _changes(first, second)
+    if changes:
+        raise InputError(f"{other} and {path} differ ({'; '.join(changes)}); merge slices of one configuration.")
+
+
+def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    """What keeps two stores' attributes from describing rows of one ensemble: science, kept maps, mcsim itself."""
+    changes = config.differences(old["science"], new["science"])
+    for key, before, after in (
+        ("ensemble.keep_maps", *(a["configuration"]["ensemble"]["keep_maps"] for a in (old, new))),
+        ("version of mcsim", *(a["packages"]["mcsim"] for a in (old, new))),
+    ):
+        if before != after:
+            changes.append(f"{key}: {before} -> {after}")
+    return changes
+
+
+def stored(path: Path, realizations: int) -> tuple[Layout, summary.Recipe]:
+    """Layout and recipe of an existing store, for a store of as many realizations with the same contents."""
+    with store.open_ensemble(path) as found:
+        attrs = found.attrs["configuration"]
+        pairs = tuple(str(pair) for pair in found["pair"].values)
+        kept = found.sizes.get("pixel")
+        maps = tuple(str(name) for name in found["map_name"].values) if kept else ()
+        lmax, paired = found.sizes["ell"] - 1, "biposh_circular" in found
+        stored_modes = tuple(
+            Mode(int(L), int(M), int(d)) for L, M, d in zip(found["L"], found["M"], found["d"], strict=True)
+        )
+    layout = Layout(realizations, store.chunk(path), maps, pairs, stored_modes, lmax, paired, kept)
+    return layout, summary.Recipe(pairs, stored_modes, lmax, attrs["biposh"]["summary_bin"], paired)
+
+
+def describe(source: str | Path, part: slice | None = None, workers: int | None = None) -> str:
+    """What a run will take, in words: realizations, tasks, memory, disk, files and time."""
+    run = config.load(source)
+    planned = cost(run, wanted(run, part))
+    count = workers or run.compute.workers
+    hours = planned.realizations * planned.seconds_per_realization / 3600.0
+    return "\n".join(
+        [
+            f"{run.name}: {planned.realizations} realizations in {planned.tasks} tasks",
+            f"  memory  {planned.worker_bytes / 1e9:.2f} GB per worker, {count} workers",
+            f"  disk    {planned.store_bytes / 1e6:.1f} MB in about {planned.files} files",
+            f"  time    {planned.seconds_per_realization:.3g} s per realization and core, {hours:.3g} core-hours,"
+            f" {60.0 * hours / count:.3g} minutes with {count} workers on as many idle cores",
+        ]
+    )
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a run will take: realizations, tasks, worker memory, disk, files, and processor time of the transforms."""
+
+    realizations: int
+    tasks: int
+    worker_bytes: float
+    store_bytes: float
+    files: int
+    seconds_per_realization: float
+
+
+def cost(run: config.RunConfig, realizations: range) -> Cost:
+    """Estimate the cost of a run from its sizes, its beams, and one timed transform."""
+    if run.sky.spectrum is not None:
+        spectra.load(run.sky.spectrum, run.sky.lmax)
+    mmax = [load_beam(channel, run.sky.lmax).mmax for channel in run.channels]
+    lmax = config.analysis_lmax(run)
+    # A grid of rings costs about what HEALPix with as many rings does.
+    nside = run.map.resolution or 1 + 3 * run.sky.lmax // 10
+    names = config.map_names(run)
+    both = run.biposh.pairs == "all"
+    pairs = len(names) * (len(names) + 1) // 2 if both else len(names)
+    found = modes(run.biposh.L_max, both and len(names) > 1)
+    npix = 12 * nside**2
+    bare = Layout(
+        run.ensemble.realizations, 1, names, ("",) * pairs, found, lmax, run.ensemble.paired,
+        npix if run.ensemble.keep_maps else None,
+    )  # fmt: skip
+    planned = _chunked(bare, run.compute.chunk)
+    splits = len(run.map.splits) or 1
+    transform, estimation = _timed(nside, run.sky.lmax, lmax, run.biposh.L_max)
+    transforms = sum(1.0 + 2.0 * m + splits * (2.0 + 4.0 * run.biposh.iterations) for m in mmax)
+    if run.map.grid == "gl":
+        transforms = sum(2.0 * m for m in mmax)
+    estimates = pairs * (2 if run.ensemble.paired else 1)
+    largest = max(mmax)
+    memory = 3e8 + 8.0 * npix * (6 + 2 * largest) + 16.0 * alm_.size(run.sky.lmax) * (6 + len(names) * 2)
+    memory += planned.chunk * planned.realization_bytes()
+    return Cost(
+        len(realizations),
+        -(-len(realizations) // planned.chunk),
+        memory,
+        float(planned.realization_bytes()) * len(realizations),
+        planned.files(),
+        transform * transforms + estimation * estimates + differencing.seconds(run),
+    )
+
+
+def _timed(nside: int, lmax_sky: int, lmax: int, L_max: int) -> tuple[float, float]:
+    """Seconds of one spin-0 synthesis and of one estimate of all coefficients, on one thread."""
+    alm = gaussian_alm(np.ones(lmax_sky + 1), rng.generator(0, 0, "timing"))
+    tables, cut = estimator(L_max, lmax), alm_.resize(alm, lmax_sky, lmax)
+    estimate(estimator(L_max, min(lmax, L_max + 2)), alm_.resize(alm, lmax_sky, min(lmax, L_max + 2)))  # compiles it
+    start = time.perf_counter()
+    healpix.synthesis(alm[None], nside, lmax_sky)
+    middle = time.perf_counter()
+    estimate(tables, cut)
+    return middle - start, time.perf_counter() - middle

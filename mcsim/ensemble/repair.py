@@ -1,0 +1,125 @@
+"""What is damaged in a store, and making room for it to be computed again."""
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mcsim.ensemble import store
+from mcsim.ensemble.layout import Layout, listed
+from mcsim.ensemble.store import Damage
+from mcsim.errors import RunError
+from mcsim.support.progress import reporting
+
+THREADS = 4
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What reading every file of a store has found.
+
+    Attributes
+    ----------
+    finished, size
+        Realizations that are whole, and those that the store has room for.
+    damages
+        Chunks of realizations that cannot be trusted.
+    broken
+        Other parts and what is wrong with them: metadata, coordinates, summary.
+    """
+
+    path: Path
+    finished: int
+    size: int
+    damages: tuple[Damage, ...]
+    broken: dict[str, str]
+
+    @property
+    def lost(self) -> tuple[int, ...]:
+        """Realizations that counted as finished and are not whole."""
+        return tuple(r for damage in self.damages for r in damage.lost)
+
+    @property
+    def intact(self) -> bool:
+        """Whether everything that counts as finished is whole."""
+        return not self.lost and not self.broken
+
+    def text(self) -> str:
+        """In words."""
+        if self.intact:
+            return f"{self.path} is intact: {self.finished} of {self.size} realizations, each file read and checked."
+        lines = [f"{self.path} is damaged."]
+        lines += [f"  {listed(damage.lost)}: {damage.reason}" for damage in self.damages if damage.lost]
+        lines += [f"  {name}: {reason}" for name, reason in self.broken.items()]
+        repair = "computes them again" if self.lost else "repairs this"
+        return "\n".join(
+            [*lines, f"  {self.finished} of {self.size} realizations are whole; mcsim run --resume {repair}."]
+        )
+
+
+def verify(path: str | Path, quiet: bool = True) -> Verdict:
+    """Read every chunk of every array, against its checksum.
+
+    Raises
+    ------
+    InputError
+        If there is no store at ``path``.
+    """
+    target = Path(path)
+    broken = broken_parts(target)
+    if "done" in broken:
+        return Verdict(target, 0, 0, (), broken)
+    finished = 0
+    damages = []
+    size, chunk = store.size(target), store.chunk(target)
+    with reporting("verification", float(size), "realizations", quiet) as report:
+        for start, count, damage in _examined(target, size, chunk, set(broken)):
+            if damage is not None:
+                damages.append(damage)
+            finished += count
+            report(float(min(start + chunk, size)), sum(len(d.lost) for d in damages))
+    return Verdict(target, finished, size, tuple(damages), broken)
+
+
+def _examined(path: Path, size: int, chunk: int, broken: set[str]) -> Iterator[tuple[int, int, Damage | None]]:
+    """Start, number of whole realizations, and damage of every chunk; a few at a time, for memory's sake."""
+
+    def one(start: int) -> tuple[int, int, Damage | None]:
+        damage = store.examine(path, start, broken)
+        try:
+            done = int(store.done(path, start, start + chunk).sum())
+        except RunError:
+            return start, 0, damage
+        return start, done - len(damage.lost if damage else ()), damage
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        yield from pool.map(one, range(0, size, chunk))
+
+
+def mend(path: Path, layout: Layout, attributes: Mapping[str, Any], quiet: bool = True) -> Verdict:
+    """Verify a store that no run writes to, and drop what is damaged, so that a run computes it again.
+
+    ``layout`` and ``attributes`` are what the store's configuration gives: what is broken beside the realizations is
+    made from them.
+    """
+    store.sweep(path)
+    broken = broken_parts(path)
+    if broken:
+        store.restore(path, layout, {name: attributes[name] for name in ("science", "digest")})
+    verdict = verify(path, quiet)
+    for damage in verdict.damages:
+        store.discard(path, damage)
+    return Verdict(path, verdict.finished, verdict.size, verdict.damages, broken | verdict.broken)
+
+
+def broken_parts(path: Path) -> dict[str, str]:
+    """What is wrong beside the realizations, by name."""
+    attributes = store.attributes(path)
+    broken = store.broken_parts(path)
+    canonical = json.dumps(attributes["science"], sort_keys=True, separators=(",", ":")).encode()
+    if hashlib.sha256(canonical).hexdigest() != attributes.get("digest"):
+        broken["attributes"] = "the configuration in them does not have the hash that they state"
+    return broken

@@ -1,0 +1,240 @@
+"""A run: make, continue or extend a store, compute what is missing, summarise."""
+
+import os
+from asyncio import CancelledError
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from distributed import Client, KilledWorker
+from distributed.comm.core import CommClosedError
+
+from mcsim import config
+from mcsim.ensemble import plan, repair, store, summary
+from mcsim.ensemble.layout import listed
+from mcsim.ensemble.lock import locked
+from mcsim.ensemble.runner.cluster import Roll, answers, death, local_client, remote_client
+from mcsim.ensemble.tasks import Failure, Job, packages, realize_chunk, summarise_node
+from mcsim.errors import InputError, RunError
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import Survey, survey
+from mcsim.stats import streaming
+from mcsim.stats.streaming import Sums
+from mcsim.support.progress import Journal, reporting
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a run left behind: the store, how many realizations it now holds, how many were computed, what failed."""
+
+    store: Path
+    finished: int
+    computed: int
+    failures: tuple[Failure, ...]
+
+
+def run(
+    source: str | Path | dict[str, Any] | config.RunConfig,
+    path: str | Path | None = None,
+    *,
+    resume: bool = False,
+    realizations: slice | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    client: Client | None = None,
+    quiet: bool = True,
+) -> Result:
+    """Run an ensemble, or continue or extend the one that is stored.
+
+    Parameters
+    ----------
+    source
+        Configuration: a TOML file, the name of a packaged workflow, a dict, or one that is loaded.
+    path
+        Store; default ``{name}.zarr`` in the working folder.
+    resume
+        Demand that the store exists, read all of it first, and compute again what is damaged.
+    realizations
+        Only these of the ensemble, for slices that :func:`merge` joins.
+    workers
+        Processes of the local cluster; default: the configuration's.
+    scheduler
+        Address of a running scheduler, ``tcp://host:port`` (or ``tls://``, with the keys that Dask's configuration
+        names), whose workers see the same files.
+    client
+        An existing client, left open.
+    quiet
+        Report no progress on standard error.
+
+    Raises
+    ------
+    InputError
+        For bad input, an unwritable or foreign store, a scheduler that does not answer. The store is then as it was.
+    """
+    loaded = source if isinstance(source, config.RunConfig) else config.load(source)
+    wanted = plan.wanted(loaded, realizations)
+    target = Path(path) if path is not None else plan.default_store(loaded, realizations)
+    exists = plan.exists(target)
+    if resume and not exists:
+        raise InputError(f"There is no store {target} to resume; leave out --resume to start it.")
+    if exists and not resume and _finished(target, loaded, wanted):
+        return Result(target, int(store.done(target).sum()), 0, ())
+    if exists:
+        plan.check_same(target, loaded)
+    store.check_writable(target)
+    config.check_skies(loaded, wanted)
+    journal = Journal(target, quiet)
+    with ExitStack() as stack:
+        if client is None and scheduler is not None:
+            client = stack.enter_context(remote_client(scheduler))
+        with reporting("orientation moments", 1.0, "", quiet) as report:
+            shared = survey(loaded, nthreads=os.cpu_count() or 1, progress=report)
+        simulate.draw_sky(shared, wanted.start)  # bad files of skies are to be found before a store is made
+        stack.enter_context(locked(target))
+        stack.enter_context(_written_down(journal, loaded, wanted))
+        if resume:
+            _mend(target, shared, journal, quiet)
+            if _finished(target, loaded, wanted):
+                return Result(target, int(store.done(target).sum()), 0, ())
+        if client is None:
+            client = stack.enter_context(local_client(workers or loaded.compute.workers))
+        return _run(client, shared, target, wanted, journal)
+
+
+def _finished(target: Path, run: config.RunConfig, wanted: range) -> bool:
+    """Whether a store of this configuration has all that is wanted, its summary included."""
+    plan.check_same(target, run)
+    done = store.done(target)
+    return wanted.stop <= len(done) and bool(done[wanted].all()) and store.summarised(target) == done.sum()
+
+
+@contextmanager
+def _written_down(journal: Journal, run: config.RunConfig, wanted: range) -> Iterator[None]:
+    """Log how a run starts and what ends it."""
+    journal.write(
+        f"start: {run.name}, realizations {wanted.start} to {wanted.stop - 1}, mcsim {dict(packages())['mcsim']}"
+    )
+    try:
+        yield
+    except BaseException as error:
+        journal.write(f"end: {type(error).__name__}: {error}")
+        raise
+    journal.write("end: store released")
+
+
+def _mend(target: Path, shared: Survey, journal: Journal, quiet: bool) -> None:
+    verdict = repair.mend(target, plan.layout(shared), plan.attributes(shared.config), quiet)
+    for damage in verdict.damages:
+        if damage.lost:
+            journal.write(f"damaged, to be computed again: {listed(damage.lost)} ({damage.reason})", aloud=True)
+    for name, reason in verdict.broken.items():
+        journal.write(f"damaged, made again: {name} ({reason})", aloud=True)
+
+
+def _run(client: Client, shared: Survey, target: Path, wanted: range, journal: Journal) -> Result:
+    """Make or extend the store, compute what is missing, summarise."""
+    run = shared.config
+    if not target.exists():
+        store.create(target, plan.layout(shared), plan.attributes(run))
+    plan.check_same(target, run)
+    if run.ensemble.realizations > store.size(target):
+        store.extend(target, run.ensemble.realizations, plan.attributes(run))
+    before = int(store.done(target).sum())
+    try:
+        roll = Roll(client, journal)
+        failures = _simulate(roll, target, run, wanted, journal)
+        _summarise(roll, target, plan.recipe(shared), journal.quiet)
+    except KilledWorker as error:
+        raise RunError(
+            f"The summary cannot be made, for {death(error)}; what is finished is stored in {target}, and the same "
+            "command goes on."
+        ) from error
+    except (CancelledError, CommClosedError) as error:
+        raise RunError(
+            f"The connection to the scheduler is lost; what is finished is stored in {target}, and the same command "
+            "goes on."
+        ) from error
+    finished = int(store.done(target).sum())
+    named = f" ({listed(failure.realization for failure in failures)})" if failures else ""
+    journal.write(
+        f"done: {finished} realizations stored, {finished - before} of them new, {len(failures)} failed{named}"
+    )
+    return Result(target, finished, finished - before, tuple(failures))
+
+
+def _simulate(roll: Roll, target: Path, run: config.RunConfig, wanted: range, journal: Journal) -> list[Failure]:
+    """Compute what is missing, chunk by chunk."""
+    chunk, done = store.chunk(target), store.done(target)
+    path = str(target.absolute())
+    job = Job(config.to_json(run), config.digest(run), path, chunk, wanted.start, wanted.stop, packages())
+    missing = {
+        start: absent
+        for start in range(wanted.start // chunk * chunk, wanted.stop, chunk)
+        if (absent := [r for r in range(max(start, wanted.start), min(start + chunk, wanted.stop)) if not done[r]])
+    }
+    total = sum(map(len, missing.values()))
+    if total:
+        journal.write(f"{total} realizations to compute, {roll.text()}", aloud=True)
+    failures: list[Failure] = []
+    finished = 0
+    with reporting("realizations", float(total), "realizations", journal.quiet) as report:
+        for computed, failed in _outcomes(roll, job, missing, journal):
+            finished += computed
+            failures += failed
+            for failure in failed:
+                journal.write(f"failed: realization {failure.realization}: {failure.reason}")
+            report(float(finished), len(failures))
+    return sorted(failures, key=lambda failure: failure.realization)
+
+
+def _outcomes(
+    roll: Roll, job: Job, missing: dict[int, list[int]], journal: Journal
+) -> Iterator[tuple[int, list[Failure]]]:
+    """Results of the tasks of all chunks.
+
+    Workers that die take the blame of all that they were given. What was blamed too often is tried again in the end,
+    realization by realization and one at a time: then only the guilty one fails.
+    """
+    starts, suspects = list(missing), []
+    for index, outcome, error in answers(roll, realize_chunk, ((job, start) for start in starts)):
+        if error is None:
+            yield outcome
+        elif not isinstance(error, KilledWorker):
+            raise error
+        else:
+            suspects.append(starts[index])
+            journal.write(f"tried again, one by one: {listed(missing[starts[index]])}, for {death(error)}", aloud=True)
+    for start in suspects:
+        for r in missing[start]:
+            for _, outcome, error in answers(roll, realize_chunk, [(job, start, r)]):
+                if error is None:
+                    yield outcome
+                elif not isinstance(error, KilledWorker):
+                    raise error
+                else:
+                    yield 0, [Failure(r, death(error))]
+
+
+def _summarise(roll: Roll, target: Path, recipe: summary.Recipe, quiet: bool) -> None:
+    chunk, size = store.chunk(target), store.size(target)
+    node = chunk
+    while node * 16 < size:
+        node *= 2
+    calls = [(str(target.absolute()), recipe, a, min(a + node, size), chunk) for a in range(0, size, node)]
+    arriving, arrived = answers(roll, summarise_node, calls), dict[int, Sums | None]()
+    with reporting("summary", float(len(calls)), "nodes", quiet) as report:
+
+        def result(index: int) -> Sums | None:
+            while index not in arrived:
+                number, sums, error = next(arriving)
+                if error is not None:
+                    raise error
+                arrived[number] = sums
+            report(index + 1.0)
+            return arrived.pop(index)
+
+        total = streaming.tree(result, len(calls))
+    if total is not None:
+        store.write_summary(target, summary.dataset(recipe, total, store.attributes(target)))

@@ -1,0 +1,64 @@
+"""Slices of an ensemble, run apart, become one store."""
+
+import os
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+
+from numpy.typing import NDArray
+
+from mcsim.ensemble import plan, store, summary
+from mcsim.ensemble.runner.batch import Result
+from mcsim.ensemble.tasks import empty, summarise_node
+from mcsim.errors import InputError
+from mcsim.support.progress import reporting
+
+
+def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> Result:
+    """Join stores of slices of one ensemble into a new store.
+
+    Raises
+    ------
+    InputError
+        If the stores are not of one configuration, or ``path`` exists.
+    """
+    sources = [Path(p) for p in paths]
+    target = Path(path)
+    if not sources:
+        raise InputError("There is nothing to merge; name the stores of the slices.")
+    if target.exists():
+        raise InputError(f"{target} exists already; merge into a new folder.")
+    first = store.attributes(sources[0])
+    for other in sources[1:]:
+        plan.check_mergeable(sources[0], first, other, store.attributes(other))
+    size = max(store.size(source) for source in sources)
+    layout, recipe = plan.stored(sources[0], size)
+    first["configuration"]["ensemble"]["realizations"] = size
+    with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=store.check_writable(target)) as folder:
+        scratch = Path(folder) / "merged"
+        store.create(scratch, layout, first)
+        with reporting("merge", float(size), "realizations", quiet) as report:
+            for start in range(0, size, layout.chunk):
+                stop = min(start + layout.chunk, size)
+                _merge_chunk(sources, scratch, start, stop)
+                report(float(stop))
+        total = summarise_node(str(scratch), recipe, 0, size, layout.chunk)
+        if total is not None:
+            store.write_summary(scratch, summary.dataset(recipe, total, first))
+        target.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(scratch, target)
+    return Result(target, int(store.done(target).sum()), 0, ())
+
+
+def _merge_chunk(sources: list[Path], target: Path, start: int, stop: int) -> None:
+    merged: dict[str, NDArray] = {}
+    for source in sources:
+        rows = store.read(source, start, stop, maps=True)
+        present = rows["done"]
+        if not merged:
+            merged = {name: empty(stop - start, a) for name, a in rows.items()}
+        for name, array in rows.items():
+            merged[name][: len(present)][present] = array[present]
+    done = merged.pop("done")
+    if done.any():
+        store.write(target, start, merged, done)

@@ -1,0 +1,439 @@
+"""The ensemble store: one Zarr 3 group per run, and the only module that touches zarr.
+
+Arrays have the dimensions (realization, pair, mode, ell) and are chunked along realization alone; one task writes whole
+chunks, ``done`` last. Nothing but ``done`` says that a realization exists.
+"""
+
+import os
+import re
+import shutil
+import tempfile
+import warnings
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import xarray as xr
+import zarr
+from numpy.typing import NDArray
+from zarr.codecs import ZstdCodec
+
+from mcsim.ensemble.layout import Layout, listed
+from mcsim.errors import InputError, RunError
+
+_CODECS: dict[str, Any] = {"compressors": (ZstdCodec(level=1, checksum=True),)}
+# Written even where all is the fill value, so that an array without its file is known as damaged.
+_WHOLE: dict[str, Any] = {"config": {"write_empty_chunks": True}, **_CODECS}
+_FAULTS = (OSError, KeyError, ValueError, RuntimeError, TypeError)
+
+
+@dataclass(frozen=True)
+class Damage:
+    """A chunk that cannot be trusted: the realizations whose numbers it took with it, and why.
+
+    ``lost`` is empty for leftovers, files of realizations that do not count as finished.
+    """
+
+    start: int
+    lost: tuple[int, ...]
+    reason: str
+
+
+def check_writable(path: Path) -> Path:
+    """Refuse a place where no store can be made, leave it as it was, and return the innermost folder that exists.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written.
+    """
+    folder = path.absolute().parent
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    with _refuse_unwritable(path):
+        for place in (folder, path) if path.is_dir() else (folder,):
+            tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=place).cleanup()
+    return folder
+
+
+def create(path: Path, layout: Layout, attributes: Mapping[str, Any]) -> None:
+    """Make an empty store at ``path``, whole or not at all.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written.
+    """
+    with _refuse_unwritable(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    try:
+        with _refuse_unwritable(path):
+            group = zarr.create_group(scratch / "new")
+            group.attrs.update({**attributes, "coordinates": "L M d parity"})
+            _write_coordinates(group, layout)
+            sizes = layout.sizes()
+            for name, (dims, dtype, unit, text) in layout.variables().items():
+                shape = tuple(sizes[dim] for dim in ("realization", *dims))
+                _array(group, name, shape, (layout.chunk, *shape[1:]), dtype, ("realization", *dims), unit, text)
+            _array(group, "done", (layout.realizations,), (layout.chunk,), "bool", ("realization",), "1", "finished")
+            _consolidate(scratch / "new")
+            os.replace(scratch / "new", path)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def write(path: Path, first: int, values: Mapping[str, NDArray], done: NDArray[np.bool_]) -> None:
+    """Write whole chunks of realizations from ``first`` on; ``done`` goes last.
+
+    ``values`` holds arrays of shape (n, ...); rows that are not done are stored as NaN.
+
+    Raises
+    ------
+    RunError
+        If the store cannot be written.
+    """
+    with _faults_named(path):
+        group = _open(path, "r+")
+        stop = first + len(done)
+        for name, rows in values.items():
+            _member(group, name)[first:stop] = rows
+        _member(group, "done")[first:stop] = done
+
+
+def read(path: Path, start: int, stop: int, maps: bool = False) -> dict[str, NDArray]:
+    """Arrays over realizations ``start`` to ``stop``, ``done`` among them; kept maps only if asked for.
+
+    Raises
+    ------
+    RunError
+        If an array is missing or damaged.
+    """
+    with _faults_named(path):
+        group = _open(path)
+        left_out = {"realization"} if maps else {"realization", "map"}
+        found = {name: array for name, array in group.arrays() if name not in left_out and _over_realizations(array)}
+        rows = {name: np.asarray(array[start:stop]) for name, array in found.items()}
+    absent = _absent(rows)
+    if absent.any():
+        raise RunError(
+            f"{path} lacks numbers of realizations that count as finished ({listed(start + np.flatnonzero(absent))}); "
+            "mcsim run --resume computes them again."
+        )
+    return rows
+
+
+def examine(path: Path, start: int, leave_out: Collection[str] = ()) -> Damage | None:
+    """Read every file of one chunk of realizations, against its checksum; None if it is whole."""
+    with _faults_named(path):
+        group = _open(path)
+        last = _member(group, "done")
+        stop = min(start + last.chunks[0], last.shape[0])
+        names = [name for name in variables(path) if name not in ("realization", "done", *leave_out)]
+    try:
+        rows = {"done": np.asarray(last[start:stop])}
+    except _FAULTS as error:
+        return Damage(start, tuple(range(start, stop)), f"done: {_reason(error)}")
+    for name in names:
+        try:
+            rows[name] = np.asarray(_member(group, name)[start:stop])
+        except _FAULTS as error:
+            return Damage(start, _indices(start, rows["done"]), f"{name}: {_reason(error)}")
+    absent = _absent(rows)
+    return Damage(start, _indices(start, absent), "numbers are missing") if absent.any() else None
+
+
+def discard(path: Path, damage: Damage) -> None:
+    """Forget a damaged chunk: its ``done`` first, so that a call that was cut short leaves nothing that looks whole."""
+    with _faults_named(path):
+        group = _open(path)
+        for name in ("done", *(name for name in variables(path) if name not in ("realization", "done"))):
+            array = _member(group, name)
+            key = array.metadata.encode_chunk_key((damage.start // array.chunks[0], *(0,) * (array.ndim - 1)))
+            (path / name / key).unlink(missing_ok=True)
+
+
+def broken_parts(path: Path) -> dict[str, str]:
+    """What is wrong beside the realizations, by name: metadata, coordinates, summary. Empty if nothing is."""
+    with _faults_named(path):
+        group, remembered = _open(path), _remembered(path)
+    broken = {}
+    for name, metadata in remembered.items():
+        try:
+            found = group[name]
+            if isinstance(found, zarr.Array):
+                if _form(found.metadata.to_dict()) != _form(metadata.to_dict()):
+                    raise ValueError("its metadata are not those that the store was made with")
+                if name == "realization" or not _over_realizations(found):
+                    np.asarray(found[...])
+                    if found.nchunks_initialized < found.nchunks:
+                        raise ValueError("its file is missing")
+        except _FAULTS as error:
+            broken[name] = _reason(error)
+    return broken
+
+
+def restore(path: Path, layout: Layout, update: Mapping[str, Any]) -> None:
+    """Write metadata and coordinates anew, as those of a new store of this layout; drop the summary."""
+    with _faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
+        shutil.rmtree(path / "summary", ignore_errors=True)
+        made = _remembered(path)["done"]
+        layout = replace(layout, realizations=made.shape[0], chunk=made.chunk_grid.chunk_shape[0])
+        fresh = Path(scratch) / "fresh"
+        create(fresh, layout, {**attributes(path), **update})
+        for file in sorted(fresh.rglob("*")):
+            target = path / file.relative_to(fresh)
+            if file.is_file():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                os.replace(file, target)
+
+
+def sweep(path: Path) -> None:
+    """Remove what writers that were killed left: halves of files, and folders that never got their name."""
+    for left in path.rglob("*.partial"):
+        left.unlink(missing_ok=True)
+    scratch = re.compile(rf"\.{re.escape(path.name)}\.[a-z0-9_]{{8}}")  # as tempfile names them
+    for left in [entry for entry in path.absolute().parent.iterdir() if scratch.fullmatch(entry.name)]:
+        if left.is_dir():
+            shutil.rmtree(left, ignore_errors=True)
+        else:
+            left.unlink(missing_ok=True)
+
+
+def variables(path: Path) -> list[str]:
+    """Names of the arrays over realizations that the store was made with, whether their files exist or not."""
+    with _faults_named(path):
+        return [name for name, metadata in _remembered(path).items() if _over_realizations(metadata)]
+
+
+def done(path: Path, start: int = 0, stop: int | None = None) -> NDArray[np.bool_]:
+    """Which realizations from ``start`` to ``stop`` are finished; by default all."""
+    with _faults_named(path):
+        return np.asarray(_member(_open(path), "done")[start:stop])
+
+
+def size(path: Path) -> int:
+    """Number of realizations that a store has room for."""
+    with _faults_named(path):
+        return int(_member(_open(path), "done").shape[0])
+
+
+def attributes(path: Path) -> dict[str, Any]:
+    """Attributes of a store.
+
+    Raises
+    ------
+    InputError
+        If there is no mcsim store at ``path``.
+    """
+    try:
+        found = dict(_open(path).attrs)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path} is not an ensemble store; name the folder that mcsim run wrote.") from error
+    if "science" not in found:
+        raise InputError(f"{path} is a Zarr group but not an ensemble store; name the folder that mcsim run wrote.")
+    return found
+
+
+def chunk(path: Path) -> int:
+    """Realizations that one task owns."""
+    with _faults_named(path):
+        return int(_member(_open(path), "done").chunks[0])
+
+
+def extend(path: Path, realizations: int, update: Mapping[str, Any]) -> None:
+    """Grow a store to more realizations; those that are finished stay.
+
+    ``done``, whose length is that of the store, grows last: a call that was cut short is made good by another.
+    """
+    with _refuse_unwritable(path):
+        group = _open(path, "r+")
+        growing = {name: array for name, array in group.arrays() if _over_realizations(array)}
+        last = growing.pop("done")
+        for array in (*growing.values(), last):
+            array.resize((realizations, *array.shape[1:]))
+            if array is growing["realization"]:
+                array[:] = np.arange(realizations)
+        group.attrs.update(update)
+        _consolidate(path)
+
+
+def write_summary(path: Path, summary: xr.Dataset) -> None:
+    """Put the summary group in place of the former one."""
+    with _faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", category=UserWarning)
+            summary.to_zarr(
+                Path(scratch) / "summary",
+                zarr_format=3,
+                consolidated=False,
+                encoding=dict.fromkeys(summary.variables, _CODECS),
+                write_empty_chunks=True,
+            )
+        shutil.rmtree(path / "summary", ignore_errors=True)
+        os.replace(Path(scratch) / "summary", path / "summary")
+        _consolidate(path)
+
+
+def summarised(path: Path) -> int:
+    """Number of realizations that the summary speaks of; 0 without one."""
+    if not (path / "summary").is_dir():
+        return 0
+    with _faults_named(path):
+        return int(np.asarray(_member(_open(path / "summary"), "count")[()]))
+
+
+def open_ensemble(path: str | Path) -> xr.Dataset:
+    """Open the realizations of a store lazily.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``biposh``, ``cl``, their circular twins, ``done``; coordinates realization, pair, mode (with L, M, d, parity),
+        ell.
+        ``.sel(mode="L2M0d0")`` picks a spectrum.
+
+    Raises
+    ------
+    InputError
+        If there is no store at ``path``.
+    """
+    attributes(Path(path))
+    with _faults_named(Path(path)):
+        return xr.open_zarr(path)
+
+
+def open_summary(path: str | Path) -> xr.Dataset:
+    """Open the summary of a store: means, standard errors, standard deviations, binned spectra and covariances.
+
+    Raises
+    ------
+    InputError
+        If there is no store at ``path``, or it has no summary yet.
+    """
+    attributes(Path(path))
+    if not (Path(path) / "summary").is_dir():
+        raise InputError(
+            f"{path} has no summary, because no run on it has ended yet; continue it with mcsim run --resume."
+        )
+    with _faults_named(Path(path)):
+        return xr.open_zarr(path, group="summary")
+
+
+def _write_coordinates(group: zarr.Group, layout: Layout) -> None:
+    _index(group, "realization", np.arange(layout.realizations), "index of the realization")
+    _index(group, "ell", np.arange(layout.lmax + 1), "degree l2")
+    _labels(group, "pair", layout.pairs, "ordered pair of maps X,Y: l1 is of X, l2 of Y")
+    _labels(group, "mode", [mode.name for mode in layout.modes], "BipoSH mode")
+    for name, text in (("L", "bipolar degree"), ("M", "bipolar order"), ("d", "l2 - l1")):
+        _index(group, name, np.array([getattr(mode, name) for mode in layout.modes]), text, "mode")
+    _labels(group, "parity", [mode.parity for mode in layout.modes], "parity of l1 + l2 + L", "mode")
+    if layout.kept_npix is not None:
+        _labels(group, "map_name", layout.maps, "map")
+
+
+def _array(  # type: ignore[no-untyped-def]
+    group: zarr.Group, name: str, shape, chunks, dtype: str, dims: tuple[str, ...], unit: str, text: str
+) -> None:
+    fill: Any = {"bool": False, "complex128": complex(np.nan, np.nan)}.get(dtype, np.nan)
+    array = group.create_array(
+        name,
+        shape=shape,
+        chunks=chunks,
+        dtype=dtype,
+        fill_value=fill,
+        dimension_names=dims,
+        **_CODECS,
+    )
+    array.attrs.update({"units": unit, "long_name": text})
+
+
+def _open(path: Path, mode: Literal["r", "r+"] = "r") -> zarr.Group:
+    """The group as it is, not as its consolidated metadata remember it."""
+    return zarr.open_group(path, mode=mode, use_consolidated=False)
+
+
+def _index(group: zarr.Group, name: str, values: NDArray[np.int64], text: str, dim: str | None = None) -> None:
+    array = group.create_array(name, data=values, chunks=values.shape, dimension_names=[dim or name], **_WHOLE)
+    array.attrs.update({"units": "1", "long_name": text})
+
+
+def _labels(group: zarr.Group, name: str, values, text: str, dim: str | None = None) -> None:  # type: ignore[no-untyped-def]
+    array = group.create_array(name, shape=(len(values),), dtype=str, dimension_names=[dim or name], **_WHOLE)
+    array[:] = np.array(values, dtype=object)
+    array.attrs["long_name"] = text
+
+
+def _member(group: zarr.Group, name: str) -> zarr.Array:
+    array = group[name]
+    if not isinstance(array, zarr.Array):
+        raise KeyError(name)
+    return array
+
+
+def _over_realizations(array: Any) -> bool:
+    return (getattr(getattr(array, "metadata", array), "dimension_names", None) or ("",))[0] == "realization"
+
+
+def _remembered(path: Path) -> dict[str, Any]:
+    """Metadata of everything in the store as they were when it was made or last summarised."""
+    consolidated = zarr.open_group(path, mode="r").metadata.consolidated_metadata
+    return {} if consolidated is None else dict(consolidated.flattened_metadata)
+
+
+def _form(metadata: dict[str, Any]) -> str:
+    """Metadata without the length, which an extension that was cut short may have changed."""
+    shape = metadata.pop("shape", ())
+    return repr((sorted(metadata.items(), key=lambda item: item[0]), len(shape), tuple(shape)[1:]))
+
+
+def _absent(rows: Mapping[str, NDArray]) -> NDArray[np.bool_]:
+    """Which rows count as finished though an array has nothing of them: its file is gone, or two runs wrote at once."""
+    absent = np.zeros(rows["done"].shape, dtype=bool)
+    for name, values in rows.items():
+        if name != "done" and values.size:
+            missing = np.isnan(values).reshape(len(values), -1)
+            absent |= missing.any(axis=1) if name.startswith("cl") else missing.all(axis=1)
+    return absent & rows["done"]
+
+
+def _indices(start: int, rows: NDArray[np.bool_]) -> tuple[int, ...]:
+    return tuple(int(start + row) for row in np.flatnonzero(rows))
+
+
+def _reason(error: BaseException) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
+
+
+def _consolidate(path: Path) -> None:
+    """Metadata in one file, so that xarray opens the store in one read; zarr warns that the format is young."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", category=UserWarning)
+        zarr.consolidate_metadata(path)
+
+
+@contextmanager
+def _faults_named(path: Path) -> Iterator[None]:
+    """Turn what a damaged or vanished store, or a full disk, makes of zarr's calls into one sentence."""
+    try:
+        yield
+    except _FAULTS as error:
+        if isinstance(error, RunError | InputError):
+            raise
+        remedy = "repair its disk" if isinstance(error, OSError) else "mcsim info --verify says what is damaged"
+        raise RunError(
+            f"The store {path} cannot be used ({type(error).__name__}: {_reason(error)}); {remedy}, and mcsim run "
+            "--resume goes on."
+        ) from error
+
+
+@contextmanager
+def _refuse_unwritable(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise InputError(f"The store {path} cannot be written ({reason}); choose a writable folder with -o.") from error

@@ -1,0 +1,167 @@
+"""What workers do: the realizations of a chunk, the sums of a node of the tree. Nothing here knows of Dask."""
+
+import platform
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim import config
+from mcsim.ensemble import store, summary
+from mcsim.errors import InputError, RunError
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import Survey, survey
+from mcsim.stats import streaming
+from mcsim.stats.streaming import Sums
+
+ATTEMPTS = 3
+PAUSE_S = 0.1
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A realization that could not be computed."""
+
+    realization: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Job:
+    """What all tasks of a run share; it travels with each of them, so it is small.
+
+    Attributes
+    ----------
+    text, digest
+        Configuration as JSON, and the hash of it and of the files that it names.
+    path
+        Store.
+    chunk
+        Realizations that one task owns.
+    first, stop
+        Realizations that are asked for: first ... stop - 1.
+    packages
+        Versions of the driver, see :func:`packages`.
+    """
+
+    text: str
+    digest: str
+    path: str
+    chunk: int
+    first: int
+    stop: int
+    packages: tuple[tuple[str, str], ...]
+
+
+def packages() -> tuple[tuple[str, str], ...]:
+    """Versions of all that a realization's bits, or the store's files, may depend on."""
+    names = ("mcsim", "numpy", "scipy", "ducc0", "healpy", "zarr", "numcodecs")
+    return ("python", ".".join(platform.python_version_tuple()[:2])), *((name, version(name)) for name in names)
+
+
+def check_same_packages(where: str, theirs: Iterable[tuple[str, str]], own: Iterable[tuple[str, str]]) -> None:
+    """Refuse a worker whose versions, ``theirs``, are not the driver's, ``own``.
+
+    Raises
+    ------
+    InputError
+        Naming the package and both versions.
+    """
+    found = dict(theirs)
+    wrong = [f"{name} {found.get(name)} for {number}" for name, number in own if found.get(name) != number]
+    if wrong:
+        raise InputError(
+            f"{where} has other packages than the driver ({', '.join(wrong)}); start it from the driver's environment."
+        )
+
+
+@lru_cache(maxsize=1)
+def _survey_of(text: str, digest: str, own: tuple[tuple[str, str], ...]) -> Survey:
+    """The survey of a configuration, made once per worker process and contents of its files."""
+    check_same_packages(f"A worker on {platform.node()}", packages(), own)
+    run = config.from_json(text)
+    found = config.digest(run)
+    if found != digest:
+        raise RunError("A worker sees other files than the driver does; let them share the files that the run names.")
+    return survey(run)
+
+
+def realize_chunk(job: Job, start: int, only: int | None = None) -> tuple[int, list[Failure]]:
+    """Task: compute what is missing of one chunk and write the chunk whole; returns the count and what failed.
+
+    ``only`` limits it to one realization.
+    """
+    shared, target = _survey_of(job.text, job.digest, job.packages), Path(job.path)
+    done = store.done(target, start, start + job.chunk)
+    first, stop = max(start, job.first), min(start + len(done), job.stop)
+    computed: dict[int, dict[str, NDArray]] = {}
+    failures = []
+    for r in range(first, stop) if only is None else (only,):
+        if done[r - start]:
+            continue
+        result = _attempt(shared, r)
+        if isinstance(result, Failure):
+            failures.append(result)
+        else:
+            computed[r - start] = result
+    if computed:
+        _write(target, start, len(done), computed)
+    return len(computed), failures
+
+
+def _attempt(shared: Survey, r: int) -> dict[str, NDArray] | Failure:
+    """A realization, or why it failed every time: the next attempt helps where a file system or memory was short."""
+    for attempt in range(ATTEMPTS):
+        try:
+            values = simulate.realize(shared, r)
+            if not np.all(np.isfinite(values["cl"])):
+                raise FloatingPointError("its power spectrum is not finite")
+            return values
+        except Exception as error:  # whatever one realization meets, the others are to finish
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            if isinstance(error, InputError):
+                break
+            time.sleep(PAUSE_S * attempt)
+    return Failure(r, reason)
+
+
+def _write(target: Path, start: int, count: int, computed: dict[int, dict[str, NDArray]]) -> None:
+    """Write a chunk whole: what it holds by now, and the new rows.
+
+    It is read again at the end, for a task that was given up for lost may have been done by another meanwhile.
+    """
+    done = store.done(target, start, start + count)
+    rows = store.read(target, start, start + count, maps=True) if done.any() else {}
+    rows.pop("done", None)
+    for row, values in computed.items():
+        for name, value in values.items():
+            if name not in rows:
+                rows[name] = empty(count, value[None])
+            rows[name][row] = value
+        done[row] = True
+    store.write(target, start, rows, done)
+
+
+def empty(count: int, like: NDArray) -> NDArray:
+    """Rows of realizations that do not exist: not done, or NaN."""
+    return np.full((count, *like.shape[1:]), False if like.dtype == bool else np.nan, like.dtype)
+
+
+def summarise_node(path: str, recipe: summary.Recipe, start: int, stop: int, chunk: int) -> Sums | None:
+    """Task: statistics of the realizations of a node of the tree, read chunk by chunk."""
+    target = Path(path)
+    starts = range(start, stop, chunk)
+
+    def node(index: int) -> Sums | None:
+        first = starts[index]
+        end = min(first + chunk, stop)
+        if not store.done(target, first, end).any():
+            return None
+        return summary.reduce_rows(recipe, store.read(target, first, end), first)
+
+    return streaming.tree(node, len(starts))

@@ -1,0 +1,1 @@
+"""The instrument: beams, scan models, pointing and the orientation moments of a scan."""

@@ -1,0 +1,222 @@
+"""The figures of a beam that people compare: solid angle, widths, asymmetry, sidelobes, coefficients."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import ducc0
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.instrument.beams.beam import Beam
+from mcsim.instrument.beams.beammap import BeamMap, solid_angle_values
+
+DEFAULT_ELLS = (50, 100, 200, 300, 500, 700, 1000, 1500, 2000, 3000)
+BAND_LIMITED_WINDOW = 1e-5
+CIRCULAR_AXIS_RATIO = 1e-3
+_LISTED_ORDERS = 6
+_RADII = 400
+_AZIMUTHS = 180
+_ARCMIN = np.degrees(1.0) * 60
+
+
+@dataclass(frozen=True, eq=False)
+class BeamSummary:
+    """Figures of a beam; from its map where there is one, else from its coefficients.
+
+    Parameters
+    ----------
+    source
+        ``"map"`` or ``"blm"``.
+    solid_angle_sr
+        Integral of the response over its peak, steradian.
+    fwhm_circular_arcmin
+        Full width at half maximum of the mean over azimuth.
+    fwhm_major_arcmin, fwhm_minor_arcmin, angle_deg
+        Axes of the ellipse that fits the half-power contour about the centre, and the direction of the major one, in
+        degrees from the beam's x axis towards y, -90 to 90.
+    negative_over_positive
+        Integral of the negative response over that of the positive (a number >= 0).
+    centroid_arcmin
+        Mean offset of the response from the centre along x and y, from b_11.
+    ells, window, ratios
+        Degrees, B_l there, and |b_lm / b_l0| there, shape (mmax + 1, len(ells)).
+    last_window
+        B_l at lmax.
+    lmax, mmax, neglected_power, integral
+        As in :class:`mcsim.instrument.beams.Beam`.
+    """
+
+    source: str
+    solid_angle_sr: float
+    fwhm_circular_arcmin: float
+    fwhm_major_arcmin: float
+    fwhm_minor_arcmin: float
+    angle_deg: float
+    negative_over_positive: float
+    centroid_arcmin: tuple[float, float]
+    ells: tuple[int, ...]
+    window: NDArray[np.float64]
+    ratios: NDArray[np.float64]
+    lmax: int
+    mmax: int
+    last_window: float
+    neglected_power: float
+    integral: float
+
+    @property
+    def solid_angle_arcmin2(self) -> float:
+        """Solid angle in square arcmin."""
+        return float(self.solid_angle_sr * _ARCMIN**2)
+
+    @property
+    def axis_ratio(self) -> float:
+        """Major over minor full width, >= 1."""
+        return float(self.fwhm_major_arcmin / self.fwhm_minor_arcmin)
+
+
+def summarize(beam: Beam, beam_map: BeamMap | None = None, ells: tuple[int, ...] = DEFAULT_ELLS) -> BeamSummary:
+    """Measure a beam.
+
+    Parameters
+    ----------
+    beam
+        The beam.
+    beam_map
+        The map that it comes from; without it the pattern is synthesised from the coefficients, and a beam whose
+        window is not yet small at lmax is then measured broader than it is, with the rings of the cut among its
+        negative response.
+    ells
+        Degrees at which to list the coefficients; those above lmax are left out.
+
+    Notes
+    -----
+    The half-power contour is where cubic interpolation first falls below half the peak, at 180 azimuths;
+    1/r^2 = a + b cos 2 phi + c sin 2 phi is fitted to it. Widths of elliptical Gaussians come back within 0.1 %
+    (tests/unit/test_beams_summary.py).
+    """
+    listed = [ell for ell in ells if ell <= beam.lmax]
+    # Half the width of a Gaussian of the same solid angle; sidelobes and elongation only make the search longer.
+    response: _Response
+    if beam_map is None:
+        total, negative, response = 1.0, _measure_blm(beam), beam.values
+        highest = float(beam.values(np.zeros(1), np.zeros(1))[0])
+    else:
+        total, negative = _measure_map(beam_map)
+        response = beam_map.values
+        highest = float(beam_map.image.max())
+    reach = min(8 * np.sqrt(total / highest * np.log(2) / np.pi), np.pi)
+    peak, circular, major, minor, angle_deg = _half_power(response, reach)
+    # b_11 = -sqrt(3/8pi) <sin(theta) exp(-i phi)>
+    offset = -np.sqrt(8 * np.pi / 3) * beam.blm[1, 1] if beam.mmax >= 1 else 0j
+    window = beam.window
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = np.abs(beam.blm[:, listed]) / np.abs(beam.blm[0, listed])
+    return BeamSummary(
+        source="blm" if beam_map is None else "map",
+        solid_angle_sr=total / peak,
+        fwhm_circular_arcmin=2 * circular * _ARCMIN,
+        fwhm_major_arcmin=2 * major * _ARCMIN,
+        fwhm_minor_arcmin=2 * minor * _ARCMIN,
+        angle_deg=angle_deg,
+        negative_over_positive=negative,
+        centroid_arcmin=(float(offset.real) * _ARCMIN, -float(offset.imag) * _ARCMIN),
+        ells=tuple(listed),
+        window=window[listed],
+        ratios=ratios,
+        lmax=beam.lmax,
+        mmax=beam.mmax,
+        last_window=float(window[-1]),
+        neglected_power=beam.neglected_power,
+        integral=beam.integral,
+    )
+
+
+def format_summary(summary: BeamSummary) -> str:
+    """Lay the figures of a beam out as plain text, one fact a line, then a table over l."""
+    if summary.axis_ratio - 1 < CIRCULAR_AXIS_RATIO:
+        orientation = "circular"
+    else:
+        orientation = f"major axis {summary.angle_deg:+.1f} deg from x towards y"
+    # Adding 0.0 turns a rounded -0.0 into 0.0.
+    x, y = (round(offset, 3) + 0.0 for offset in summary.centroid_arcmin)
+    lines = [
+        f"solid angle          {summary.solid_angle_sr:.4e} sr = {summary.solid_angle_arcmin2:.2f} arcmin^2",
+        f"FWHM, circular part  {summary.fwhm_circular_arcmin:.2f} arcmin",
+        f"FWHM, major x minor  {summary.fwhm_major_arcmin:.2f} x {summary.fwhm_minor_arcmin:.2f} arcmin",
+        f"axis ratio           {summary.axis_ratio:.4f}, {orientation}",
+        f"mean offset          ({x:+.3f}, {y:+.3f}) arcmin in (x, y)",
+        f"negative response    {summary.negative_over_positive:.2e} of the positive",
+        f"integral             {summary.integral:.6g} (unit of the source x sr), divided out so that B_0 = 1",
+        f"lmax, mmax           {summary.lmax}, {summary.mmax}: {summary.neglected_power:.1e} of the power beyond mmax",
+    ]
+    if summary.source == "blm" and abs(summary.last_window) > BAND_LIMITED_WINDOW:
+        lines.append(
+            f"note                 B_l is still {summary.last_window:.2g} at lmax = {summary.lmax}: widths, solid "
+            "angle and negative response are those of the beam cut there"
+        )
+    orders = [m for m in range(1, min(summary.mmax, _LISTED_ORDERS) + 1) if np.any(summary.ratios[m] > 0)]
+    lines += ["", "     l          B_l" + "".join(f"{f'|b_l{m}/b_l0|':>14}" for m in orders)]
+    for i, ell in enumerate(summary.ells):
+        ratios = "".join(f"{summary.ratios[m, i]:14.3e}" for m in orders)
+        lines.append(f"{ell:6d} {summary.window[i]:12.6f}{ratios}")
+    return "\n".join(lines)
+
+
+_Response = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
+
+
+def _measure_map(beam_map: BeamMap) -> tuple[float, float]:
+    """Integral, and negative over positive response, of a map."""
+    value, _, _ = solid_angle_values(
+        beam_map.image, beam_map.pixel_rad, beam_map.centre, beam_map.cut_rad, beam_map.projection
+    )
+    positive = value[value > 0].sum()
+    return float(value.sum()), float((positive - value.sum()) / positive)
+
+
+def _measure_blm(beam: Beam) -> float:
+    """Negative over positive response of coefficients."""
+    # Twice the rings and azimuths that the coefficients need: the negative part alone is not band-limited.
+    rings, azimuths = 2 * beam.lmax + 2, 4 * beam.mmax + 4
+    pattern = ducc0.sht.synthesis_2d(
+        alm=beam.packed()[None],
+        lmax=beam.lmax,
+        mmax=beam.mmax,
+        spin=0,
+        ntheta=rings,
+        nphi=azimuths,
+        geometry="F1",
+        nthreads=1,
+    )[0]
+    weighted = pattern * np.sin((np.arange(rings) + 0.5) * np.pi / rings)[:, None]
+    return float(-weighted[weighted < 0].sum() / weighted[weighted > 0].sum())
+
+
+def _half_power(response: _Response, reach: float) -> tuple[float, float, float, float, float]:
+    """Peak, half widths of the circular part, of the major and the minor axis (radians), major axis' angle (deg)."""
+    theta = np.linspace(0, reach, _RADII)
+    phi = np.arange(_AZIMUTHS) * 2 * np.pi / _AZIMUTHS
+    grid_phi, grid_theta = np.meshgrid(phi, theta, indexing="ij")
+    values = response(grid_theta, grid_phi)
+    peak = values.max()
+    mean = values.mean(axis=0)
+    circular = _first_crossing(theta, mean[None], mean.max() / 2)[0]
+    radius = _first_crossing(theta, values, peak / 2)
+    level = np.mean(radius**-2)
+    wave = 2 * np.mean(radius**-2 * np.exp(2j * phi))
+    minor, major = 1 / np.sqrt(level + abs(wave)), 1 / np.sqrt(level - abs(wave))
+    # 1/r^2 is least along the major axis.
+    angle_deg = np.degrees(np.angle(-wave)) / 2
+    return float(peak), float(circular), float(major), float(minor), float(angle_deg)
+
+
+def _first_crossing(theta: NDArray[np.float64], values: NDArray[np.float64], level: float) -> NDArray[np.float64]:
+    """Angle at which each row of ``values`` first falls below ``level``, linear in between; NaN where it never does."""
+    below = values < level
+    last = np.argmax(below, axis=1)
+    row = np.arange(len(values))
+    high, low = values[row, last - 1], values[row, last]
+    step = theta[1] - theta[0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossing = theta[last] - step * (level - low) / (high - low)
+    return np.where(below.any(axis=1) & (last > 0), crossing, np.nan)

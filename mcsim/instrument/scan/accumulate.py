@@ -1,0 +1,198 @@
+"""Streaming of a survey's samples into per-pixel sums, on all cores, never holding the pointing in memory."""
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import pairwise
+
+import healpy
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mcsim.errors import InputError
+from mcsim.instrument.scan.geometry import check_nside
+from mcsim.instrument.scan.model import LineOfSight, ScanModel
+from mcsim.instrument.scan.moments import Moments
+from mcsim.instrument.scan.pointing import BLOCK, PointingStream, fill_block, ring_pixel
+
+_RANGES = 16
+_CHUNK = 1 << 21
+_CACHE_LINE = 64
+
+
+def stream_moments(
+    model: ScanModel,
+    nside: int,
+    smax: int,
+    frame: str = "ecliptic",
+    lines_of_sight: list[str] | tuple[str, ...] | None = None,
+    time_range: tuple[float, float] = (0.0, 1.0),
+    nthreads: int = 1,
+    progress: Callable[[float], None] | None = None,
+) -> Moments:
+    """Orientation moments of a survey, by streaming every sample.
+
+    Parameters
+    ----------
+    model
+        The survey.
+    nside, smax
+        HEALPix resolution, and largest s of the moments (>= 1).
+    frame
+        Frame of the pixels: "ecliptic", "galactic" or "equatorial".
+    lines_of_sight
+        Names of the lines of sight to add up; None: the model's default ones.
+    time_range
+        Part of the survey, as fractions of its samples: (0, 0.5) is the first half.
+    nthreads
+        Number of threads. The result does not depend on it, bit for bit; the memory does: one accumulator of
+        8 (4 + 2 smax) bytes per pixel for each thread and one for the sum.
+    progress
+        Called with the fraction done.
+
+    Returns
+    -------
+    Moments
+
+    Raises
+    ------
+    InputError
+        If nside is not a power of two, smax < 1, the frame or a line of sight is unknown, or the time range is
+        empty.
+
+    Notes
+    -----
+    Time is cut into 16 ranges, whatever the number of threads; each is summed on its own and the sums are added
+    in the order of time. Besides e^{-i s psi} a pixel sums its samples' unit vectors: their mean against the
+    pixel's centre is the centroid offset. So at smax 2 a pixel is one cache line.
+    """
+    check_nside(nside)
+    if smax < 1:
+        raise InputError(f"smax is {smax}, but moments need smax >= 1.")
+    start, stop = time_range
+    if not 0.0 <= start < stop <= 1.0:
+        raise InputError(f"time_range is ({start:g}, {stop:g}), but it must be an increasing pair within 0 and 1.")
+    tasks = [task for line in model.select(lines_of_sight) for task in _tasks(model, line, frame, start, stop)]
+    if not tasks:
+        raise InputError(f"time_range ({start:g}, {stop:g}) of {model.name!r} contains no sample; widen it.")
+    sums = _sum_of_tasks(tasks, nside, smax, max(1, nthreads), progress)
+    return moments_from_sums(sums, nside, smax, frame)
+
+
+def pixel_sums(nside: int, smax: int) -> NDArray[np.float64]:
+    """Zeroed accumulator, shape (npix, 4 + 2 smax): hits, sums of the unit vector, of cos(s psi) and -sin(s psi)."""
+    columns = 4 + 2 * smax
+    memory = np.zeros(12 * nside * nside * columns + _CACHE_LINE // 8)
+    # At smax 2 each pixel is one cache line, if the first one starts at its boundary.
+    offset = (-memory.ctypes.data % _CACHE_LINE) // 8
+    return memory[offset : offset + 12 * nside * nside * columns].reshape(-1, columns)
+
+
+def moments_from_sums(sums: NDArray[np.float64], nside: int, smax: int, frame: str) -> Moments:
+    """Means of an accumulator of :func:`pixel_sums`."""
+    hits = sums[:, 0].copy()
+    inverse = np.divide(1.0, hits, out=np.zeros_like(hits), where=hits > 0.0)
+    w = np.empty((smax, hits.size), dtype=np.complex128)
+    for s in range(smax):
+        w[s].real = sums[:, 4 + 2 * s] * inverse
+        w[s].imag = sums[:, 5 + 2 * s] * inverse
+    dtheta, dphi = np.empty_like(hits), np.empty_like(hits)
+    for first in range(0, hits.size, 1 << 18):
+        part = slice(first, first + (1 << 18))
+        pixels = np.arange(first, min(first + (1 << 18), hits.size))
+        theta, phi = healpy.pix2ang(nside, pixels)
+        x, y, z = (sums[part, axis] * inverse[part] for axis in (1, 2, 3))
+        dtheta[part] = np.cos(theta) * (x * np.cos(phi) + y * np.sin(phi)) - np.sin(theta) * z
+        dphi[part] = y * np.cos(phi) - x * np.sin(phi)
+    return Moments(nside=nside, frame=frame, hits=hits, w=w, dtheta=dtheta, dphi=dphi)
+
+
+class _Task:
+    """One range of time of one line of sight."""
+
+    def __init__(self, stream: PointingStream, first: int, count: int) -> None:
+        self.stream, self.first, self.count = stream, first, count
+
+    def add_to(self, sums: NDArray[np.float64], nside: int, smax: int, report: Callable[[int], None]) -> None:
+        stream = self.stream
+        for first in range(self.first, self.first + self.count, _CHUNK):
+            count = min(_CHUNK, self.first + self.count - first)
+            start = stream.start_turns(first)
+            _add_samples(
+                start, stream.block_turns, stream.tables, stream.geometry, stream.to_frame, count, nside, smax, sums
+            )
+            report(count)
+
+
+def _tasks(model: ScanModel, line: LineOfSight, frame: str, start: float, stop: float) -> Iterable[_Task]:
+    stream = PointingStream(model, line, frame)
+    first, last = round(start * stream.samples), round(stop * stream.samples)
+    edges = [first + (last - first) * part // _RANGES for part in range(_RANGES + 1)]
+    return [_Task(stream, low, high - low) for low, high in pairwise(edges) if high > low]
+
+
+def _sum_of_tasks(
+    tasks: list[_Task], nside: int, smax: int, nthreads: int, progress: Callable[[float], None] | None
+) -> NDArray[np.float64]:
+    """Sum of all tasks, each into an accumulator of its own, added up in their order."""
+    done, everything = [0], sum(task.count for task in tasks)
+
+    def report(count: int) -> None:
+        done[0] += count
+        if progress is not None:
+            progress(done[0] / everything)
+
+    def run(task: _Task, sums: NDArray[np.float64]) -> NDArray[np.float64]:
+        task.add_to(sums, nside, smax, report)
+        return sums
+
+    total = pixel_sums(nside, smax)
+    waiting = deque(tasks)
+    running: deque[Future[NDArray[np.float64]]] = deque()
+    with ThreadPoolExecutor(nthreads) as pool:
+        for _ in range(min(nthreads, len(tasks))):
+            running.append(pool.submit(run, waiting.popleft(), pixel_sums(nside, smax)))
+        while running:
+            sums = running.popleft().result()
+            total += sums
+            if waiting:
+                sums[:] = 0.0
+                running.append(pool.submit(run, waiting.popleft(), sums))
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_sample(sums, pixel, x, y, z, cos_psi, sin_psi, smax):  # type: ignore[no-untyped-def]
+    """Add one sample to the accumulator; powers of e^{-i psi} by multiplication."""
+    sums[pixel, 0] += 1.0
+    sums[pixel, 1] += x
+    sums[pixel, 2] += y
+    sums[pixel, 3] += z
+    real, imag = cos_psi, -sin_psi
+    for s in range(smax):
+        sums[pixel, 4 + 2 * s] += real
+        sums[pixel, 5 + 2 * s] += imag
+        real, imag = real * cos_psi + imag * sin_psi, imag * cos_psi - real * sin_psi
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_samples(start, block_turns, tables, geometry, to_frame, count, nside, smax, sums):  # type: ignore[no-untyped-def]
+    work = np.empty((6, BLOCK))
+    pixels = np.empty(BLOCK, dtype=np.int64)
+    turns = np.empty(3)
+    touched = 0.0
+    for block in range((count + BLOCK - 1) // BLOCK):
+        size = min(BLOCK, count - block * BLOCK)
+        for axis in range(3):
+            turns[axis] = (start[axis] + block * block_turns[axis]) % 1.0
+        fill_block(turns, tables, geometry, to_frame, size, work)
+        for k in range(size):
+            pixels[k] = ring_pixel(nside, work[5, k], work[0, k], work[1, k], work[2, k])
+        # Reading ahead keeps many cache misses in flight at once: a third less time at nside 512. The value is
+        # returned so that the compiler cannot drop the reads.
+        for k in range(size):
+            touched += sums[pixels[k], 0]
+        for k in range(size):
+            add_sample(sums, pixels[k], work[0, k], work[1, k], work[2, k], work[3, k], work[4, k], smax)
+    return touched

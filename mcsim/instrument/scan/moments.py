@@ -1,0 +1,248 @@
+"""Orientation moments of a survey: what a pixel's map value needs to know about the scan."""
+
+import json
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.errors import InputError
+from mcsim.instrument.scan.geometry import FRAMES, check_frame, check_nside, nside_of
+
+_META = "moments.json"
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Hits, orientation moments and centroids of every pixel, in RING order.
+
+    Parameters
+    ----------
+    nside, frame
+        HEALPix resolution, and "ecliptic", "galactic" or "equatorial".
+    hits
+        Number of samples, shape (npix,).
+    w
+        w[s - 1] = mean of e^{-i s psi} over the pixel's samples, shape (smax, npix); 0 where nothing was observed.
+    dtheta, dphi
+        Mean offset of the samples from the pixel's centre along e_theta and e_phi, in radians (components of the
+        mean direction in the tangent plane at the centre), shape (npix,); None if zero or unknown.
+    """
+
+    nside: int
+    frame: str
+    hits: NDArray[np.float64]
+    w: NDArray[np.complex128]
+    dtheta: NDArray[np.float64] | None = None
+    dphi: NDArray[np.float64] | None = None
+
+    @property
+    def smax(self) -> int:
+        """Largest s."""
+        return int(self.w.shape[0])
+
+    @property
+    def npix(self) -> int:
+        """Number of pixels."""
+        return int(self.hits.shape[0])
+
+    def save(self, folder: str | Path) -> None:
+        """Write the arrays as .npy files into ``folder``, which is created."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in ("hits", "w", "dtheta", "dphi"):
+            array = getattr(self, name)
+            if array is not None:
+                np.save(folder / f"{name}.npy", array)
+        meta = {"nside": self.nside, "frame": self.frame, "offsets": self.dtheta is not None}
+        (folder / _META).write_text(json.dumps(meta))
+
+    @classmethod
+    def load(cls, folder: str | Path, mmap: bool = True) -> "Moments":
+        """Read what :meth:`save` wrote.
+
+        Parameters
+        ----------
+        folder
+            The folder.
+        mmap
+            Map the files into memory, read-only and shared by all processes that do so, instead of copying them.
+
+        Raises
+        ------
+        InputError
+            If the folder does not hold complete moments.
+        """
+        folder = Path(folder)
+        mode: Any = "r" if mmap else None
+        try:
+            meta = json.loads((folder / _META).read_text())
+            names = ("hits", "w", "dtheta", "dphi") if meta["offsets"] else ("hits", "w")
+            arrays = {name: np.load(folder / f"{name}.npy", mmap_mode=mode) for name in names}
+        except (OSError, ValueError, KeyError) as error:
+            raise InputError(
+                f"folder {str(folder)!r} does not hold complete moments ({error}); delete it and compute them again."
+            ) from None
+        return cls(nside=meta["nside"], frame=meta["frame"], **arrays)
+
+
+def parallel_transport(psi0: float, nside: int, smax: int, frame: str = "ecliptic") -> Moments:
+    """Moments of a survey that sees every pixel's centre once, with the beam's x axis at angle psi0.
+
+    Parameters
+    ----------
+    psi0
+        Angle of the beam's x axis from e_theta towards e_phi, in radians.
+    nside, smax
+        HEALPix resolution, and largest s (>= 1).
+    frame
+        "ecliptic", "galactic" or "equatorial".
+
+    Returns
+    -------
+    Moments
+        Read-only arrays that take no memory: hits 1, w_s = e^{-i s psi0}, no offsets.
+    """
+    check_nside(nside)
+    check_frame(frame)
+    if smax < 1:
+        raise InputError(f"smax is {smax}, but moments need smax >= 1.")
+    npix = 12 * nside * nside
+    w = np.exp(-1j * psi0 * np.arange(1, smax + 1))[:, np.newaxis]
+    return Moments(
+        nside=nside,
+        frame=frame,
+        hits=np.broadcast_to(np.float64(1.0), npix),
+        w=np.broadcast_to(w, (smax, npix)),
+    )
+
+
+def read_moments_fits(
+    path: str | Path, nside: int | None = None, smax: int | None = None, frame: str | None = None
+) -> Moments:
+    """Read moments from a HEALPix table with columns HITS, RE_s, IM_s[, DTHETA, DPHI].
+
+    Parameters
+    ----------
+    path
+        FITS file; the table is the first binary table. RE_s + i IM_s is the mean of e^{-i s psi}.
+    nside
+        Resolution that the file must have; None: any.
+    smax
+        Largest s to read, which the file must have; None: all columns that follow each other from s = 1.
+    frame
+        Frame that the file must have. Where the file has no COORDSYS it is taken as given here.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, is NESTED, lacks a column, has another nside or frame, negative hits,
+        non-finite numbers, or a modulus above 1.
+    """
+    columns, header = _read_table(path)
+    where = f"moments file {str(path)!r}"
+    if "HITS" not in columns:
+        raise InputError(f"{where} has no column HITS; the columns are {', '.join(columns)}.")
+    hits = columns["HITS"]
+    found = nside_of(hits.size, where)
+    if nside is not None and found != nside:
+        raise InputError(f"{where} has nside {found}, but the maps have nside {nside}; use moments at nside {nside}.")
+    if header["NSIDE"] not in (None, found):
+        raise InputError(f"{where} says NSIDE = {header['NSIDE']} but has {hits.size} pixels; write it again.")
+    if str(header["ORDERING"]).strip().upper() != "RING":
+        raise InputError(f"{where} has ORDERING = {header['ORDERING']!r}, but it must be RING; reorder it first.")
+    frame = _frame_of(header["COORDSYS"], frame, where)
+    if smax is None:
+        smax = 0
+        while f"RE_{smax + 1}" in columns and f"IM_{smax + 1}" in columns:
+            smax += 1
+        smax = max(smax, 1)
+    needed = [f"{part}_{s}" for s in range(1, smax + 1) for part in ("RE", "IM")]
+    for name in needed:
+        if name not in columns:
+            raise InputError(f"{where} has no column {name}, but moments up to s = {smax} are needed.")
+    offsets = [name for name in ("DTHETA", "DPHI") if name in columns]
+    if len(offsets) == 1:
+        raise InputError(f"{where} has {offsets[0]} alone; give both DTHETA and DPHI or neither.")
+    seen = hits > 0.0
+    for name in ("HITS", *needed, *offsets):
+        bad = ~np.isfinite(columns[name] if name == "HITS" else np.where(seen, columns[name], 0.0))
+        if bad.any():
+            raise InputError(f"{where}: column {name} is not finite in {bad.sum()} pixels, first {np.argmax(bad)}.")
+    if hits.min() < 0.0:
+        raise InputError(f"{where}: HITS is {hits.min():g} in pixel {hits.argmin()}, but it must be >= 0.")
+    w = np.empty((smax, hits.size), dtype=np.complex128)
+    for s in range(1, smax + 1):
+        w[s - 1] = np.where(seen, columns[f"RE_{s}"] + 1j * columns[f"IM_{s}"], 0.0)
+    # Single precision may exceed 1 by 6e-8.
+    largest = np.abs(w).max(initial=0.0)
+    if largest > 1.0 + 1e-6:
+        raise InputError(f"{where}: a moment has modulus {largest:g}, but means of e^(-i s psi) are <= 1.")
+    centroid = [np.where(seen, columns[name], 0.0) for name in offsets]
+    return Moments(found, frame, hits, w, *centroid)
+
+
+def write_moments_fits(path: str | Path, moments: Moments) -> None:
+    """Write moments as a HEALPix table that :func:`read_moments_fits` reads, overwriting ``path``."""
+    from astropy.io import fits
+
+    arrays = {"HITS": moments.hits}
+    for s in range(1, moments.smax + 1):
+        arrays[f"RE_{s}"], arrays[f"IM_{s}"] = moments.w[s - 1].real, moments.w[s - 1].imag
+    if moments.dtheta is not None and moments.dphi is not None:
+        arrays["DTHETA"], arrays["DPHI"] = moments.dtheta, moments.dphi
+    units = {"DTHETA": "rad", "DPHI": "rad"}
+    table = fits.BinTableHDU.from_columns(
+        [fits.Column(name=name, format="D", unit=units.get(name), array=array) for name, array in arrays.items()]
+    )
+    table.header["PIXTYPE"] = "HEALPIX"
+    table.header["ORDERING"] = "RING"
+    table.header["COORDSYS"] = FRAMES[moments.frame]
+    table.header["NSIDE"] = moments.nside
+    table.header["FIRSTPIX"], table.header["LASTPIX"] = 0, moments.npix - 1
+    table.header["INDXSCHM"] = "IMPLICIT"
+    table.header["COMMENT"] = "RE_s + i IM_s: mean of exp(-i s psi); psi from e_theta (south) towards e_phi (east)"
+    table.writeto(path, overwrite=True)
+
+
+def _frame_of(coordsys: Any, frame: str | None, where: str) -> str:
+    if frame is not None:
+        check_frame(frame)
+    if coordsys is None:
+        if frame is None:
+            raise InputError(f"{where} has no COORDSYS; write E, G or C there.")
+        return frame
+    letter = str(coordsys).strip().upper()[:1]
+    named = {value: key for key, value in FRAMES.items()}.get(letter)
+    if named is None:
+        raise InputError(f"{where} has COORDSYS = {coordsys!r}, but it must be E, G or C.")
+    if frame is not None and named != frame:
+        raise InputError(f"{where} is in {named} coordinates, but the maps are {frame}; use moments of that frame.")
+    return named
+
+
+def _read_table(path: str | Path) -> tuple[dict[str, NDArray[np.float64]], dict[str, Any]]:
+    """Columns (upper-case names, flattened, float64) and HEALPix keywords of a file's first binary table."""
+    from astropy.io import fits
+
+    try:
+        # A truncated file warns when opened and fails when read: one message is enough.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with fits.open(path) as hdus:
+                table = next((hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU)), None)
+                if table is None:
+                    raise ValueError("it has no binary table")
+                columns = {
+                    name.upper(): np.array(table.data[name], dtype=np.float64).ravel() for name in table.columns.names
+                }
+                header = {key: table.header.get(key) for key in ("NSIDE", "ORDERING", "COORDSYS")}
+    except Exception as error:  # libraries raise whatever a broken file makes of them
+        raise InputError(f"moments file {str(path)!r} cannot be read: {error}; give a complete FITS table.") from None
+    sizes = {array.size for array in columns.values()}
+    if len(sizes) != 1:
+        raise InputError(f"moments file {str(path)!r} has columns of different sizes {sorted(sizes)}; write it again.")
+    return columns, header

@@ -1,0 +1,102 @@
+"""What the commands that look at one thing show of it: a text and a figure of a beam or of a scan."""
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from mcsim import config
+from mcsim.errors import InputError
+from mcsim.instrument import beams, scan
+from mcsim.plot.beam import beam_figure
+from mcsim.plot.scan import scan_figure
+from mcsim.simulation import channels
+from mcsim.support import resources
+from mcsim.support.progress import reporting
+
+
+@dataclass(frozen=True)
+class Look:
+    """A name, a text for the terminal, and a figure."""
+
+    name: str
+    text: str
+    figure: Figure
+
+
+def look_at_beams(
+    source: str | Path, lmax: int = 2048, m_max: int | None = None, pixel_deg: float | None = None
+) -> Iterator[Look]:
+    """Look at the beams of a run configuration, at a beam map, or at a file of b_lm.
+
+    Parameters
+    ----------
+    source
+        A TOML configuration or packaged workflow (every channel is shown), or a FITS file: an image is a beam map, a
+        table holds b_lm.
+    lmax, m_max
+        Degree and order of the coefficients; m_max by default from the beam.
+    pixel_deg
+        Side of a pixel of a beam map, degrees; by default its header's.
+    """
+    path = Path(source)
+    if path.suffix == ".toml" or not path.exists():
+        run = config.load(source)
+        for channel in run.channels:
+            spec = channel.beam
+            image = channels.load_beam_map(channel.name, spec) if isinstance(spec, config.BeamMap) else None
+            yield _look_at(channel.name, channels.load_beam(channel, lmax), image)
+    elif beams.holds_image(path):
+        image = beams.read_map(path, pixel_deg=pixel_deg)
+        yield _look_at(path.name, image.beam(lmax, m_max), image)
+    else:
+        yield _look_at(path.name, beams.from_blm_file(path, lmax, m_max), None)
+
+
+def _look_at(name: str, shown: beams.Beam, image: beams.BeamMap | None) -> Look:
+    text = beams.format_summary(beams.summarize(shown, image))
+    return Look(name, f"{name}\n{text}", beam_figure(shown, image, title=name))
+
+
+def look_at_scan(
+    model: str | Path,
+    nside: int = 256,
+    smax: int = 4,
+    frame: str = "ecliptic",
+    sample_period_s: float | None = None,
+    line_of_sight: str | None = None,
+    quiet: bool = True,
+) -> Look:
+    """Look at a scan model: hits, orientation moments, and the factors by which it weakens a beam's ellipticity.
+
+    Parameters
+    ----------
+    model
+        Packaged name or TOML file.
+    nside, smax, frame
+        Of the moments, which are computed once and cached.
+    sample_period_s
+        Time between samples; by default the model's.
+    line_of_sight
+        One of the model's; by default its default ones.
+    quiet
+        Report no progress.
+
+    Raises
+    ------
+    InputError
+        For a model, a line of sight or a size that cannot be used.
+    """
+    if smax < 2:
+        raise InputError(f"smax = {smax} is too small for a look at a scan, which is about w_2; take 2 or more.")
+    loaded = scan.load_model(resources.scan_model(model))
+    if sample_period_s is not None:
+        loaded = loaded.with_sampling(sample_period_s)
+    lines = None if line_of_sight is None else [line_of_sight]
+    with reporting("orientation moments", 1.0, "", quiet) as report:
+        folder = scan.cached_moments(loaded, nside, smax, frame, lines, nthreads=os.cpu_count() or 1, progress=report)
+    moments = scan.Moments.load(folder)
+    alone = loaded if frame == "ecliptic" and lines is None and len(loaded.default_lines) == 1 else None
+    return Look(loaded.name, scan.summary(loaded.name, moments), scan_figure(moments, loaded.name, alone))

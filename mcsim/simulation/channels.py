@@ -1,0 +1,163 @@
+"""What the channels of a configuration stand for: beams, scan models, pointing, and the effects that act in them."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import healpy
+import numpy as np
+
+from mcsim import config, systematics
+from mcsim.errors import InputError
+from mcsim.instrument import beams, scan
+from mcsim.instrument.beams.turn import mirrored, rotated
+from mcsim.sphere import rotation
+from mcsim.support import resources
+
+WHOLE = 4
+"""Orders that a beam has at least without its m_max, where its source has them."""
+
+
+def load_beam(channel: config.Channel, lmax: int) -> beams.Beam:
+    """The beam of a channel, up to lmax; of a differencing scan that of side A."""
+    return _beam(channel.name, channel.beam, lmax)
+
+
+def load_beam_b(channel: config.Channel, lmax: int) -> beams.Beam:
+    """The beam of side B of a differencing channel, up to lmax: its own, or side A's mirrored."""
+    if channel.beam_b is None:
+        return mirrored(load_beam(channel, lmax))
+    return _beam(channel.name, channel.beam_b, lmax)
+
+
+def _beam(channel: str, spec: config.Beam, lmax: int) -> beams.Beam:
+    match spec:
+        case config.BeamGaussian():
+            return beams.gaussian(spec.fwhm_arcmin, lmax)
+        case config.BeamEllipticalGaussian():
+            major, minor = spec.fwhm_major_arcmin, spec.fwhm_minor_arcmin
+            return beams.elliptical_gaussian(major, minor, spec.angle_deg, lmax, mmax=spec.m_max)
+        case config.BeamMap():
+            return rotated(load_beam_map(channel, spec).beam(lmax, spec.m_max), np.deg2rad(spec.angle_deg))
+        case config.BeamBlm():
+            file = config.channel_path(spec.path, channel)
+            return rotated(beams.from_blm_file(file, lmax, mmax=spec.m_max), np.deg2rad(spec.angle_deg))
+
+
+def load_beam_map(channel: str, spec: config.BeamMap) -> beams.BeamMap:
+    """The beam map of a channel."""
+    return beams.read_map(
+        config.channel_path(spec.path, channel),
+        pixel_deg=spec.pixel_deg,
+        cut_deg=spec.cut_deg,
+        centre=spec.centre_pixel,
+        plane=spec.plane,
+        projection=spec.projection,
+    )
+
+
+def scan_model(
+    spec: config.Channel, chosen: config.ScanHitAveraged | config.ScanDifferencing, split: str | None
+) -> scan.ScanModel:
+    """The scan model of a channel, at the sampling that the channel asks for."""
+    template = config.channel_path(chosen.model, spec.name, split)
+    model = scan.load_model(resources.scan_model(str(template)))
+    return model if chosen.sample_period_s is None else model.with_sampling(chosen.sample_period_s)
+
+
+def effects_on(run: config.RunConfig, channel: str) -> tuple[systematics.Effect, ...]:
+    """The effects of a run that act in a channel, in their order.
+
+    Raises
+    ------
+    InputError
+        For an effect or a parameter that is not known, and for an effect that names a channel and is common to all,
+        or the other way round.
+    """
+    acting = []
+    for entry in run.effects:
+        effect = systematics.build(entry.name, entry.parameters)
+        if effect.scope == "channel" and entry.channel is None:
+            raise InputError(f'effect {entry.name} acts in one channel; say which: channel = "{run.channels[0].name}".')
+        if effect.scope == "common" and entry.channel is not None:
+            raise InputError(f"effect {entry.name} is common to all channels; remove its channel = {entry.channel!r}.")
+        if entry.channel in (None, channel):
+            acting.append(effect)
+    return tuple(acting)
+
+
+def refuse_pixel_effects(channel: str, acting: tuple[systematics.Effect, ...]) -> None:
+    """Refuse effects that act on pixels, for a grid of rings."""
+    for effect in acting:
+        for hook in ("gain", "noise", "spread", "orientations"):
+            if getattr(type(effect), hook) is not getattr(systematics.Effect, hook):
+                raise InputError(
+                    f'effect {effect.name} on channel {channel} acts on pixels, but grid = "gl" has none; remove it '
+                    'or set map.grid = "healpix".'
+                )
+
+
+def site_of(run: config.RunConfig, spec: config.Channel) -> systematics.Site:
+    """What effects may know of a channel."""
+    pointing, dipole = _described(spec)
+    amplitude = run.sky.dipole_uk if run.sky.dipole_uk is not None else dipole or 0.0
+    towards = healpy.ang2vec(run.sky.dipole_lon_deg, run.sky.dipole_lat_deg, lonlat=True)
+    return systematics.Site(
+        channel=spec.name,
+        frequency_ghz=spec.frequency_ghz,
+        frame=run.map.frame,
+        nside=run.map.resolution,
+        lmax=run.sky.lmax,
+        beam=load_beam(spec, run.sky.lmax),
+        pointing=pointing,
+        dipole_uk=amplitude * (rotation.rotation_matrix("galactic", run.map.frame) @ towards),
+        whole=partial(_whole, load_beam, spec, run.sky.lmax) if _is_cut(spec.beam) else None,
+    )
+
+
+def site_b_of(site: systematics.Site, spec: config.Channel) -> systematics.Site:
+    """The same for side B of a differencing channel, from that of side A."""
+    whole = partial(_whole, load_beam_b, spec, site.lmax) if _is_cut(spec.beam_b or spec.beam) else None
+    return replace(site, beam=load_beam_b(spec, site.lmax), whole=whole)
+
+
+def _is_cut(spec: config.Beam) -> bool:
+    return not isinstance(spec, config.BeamGaussian) and spec.m_max is not None
+
+
+def _whole(load: Callable[[config.Channel, int], beams.Beam], spec: config.Channel, lmax: int) -> beams.Beam:
+    """A beam of a channel without its m_max."""
+    chosen = load(_with_m_max(spec, None), lmax)
+    if chosen.mmax >= WHOLE:
+        return chosen
+    try:
+        return load(_with_m_max(spec, WHOLE), lmax)
+    except InputError:  # a file of coefficients with fewer orders
+        return chosen
+
+
+def _with_m_max(spec: config.Channel, m_max: int | None) -> config.Channel:
+    beam_b = None if spec.beam_b is None else _cut_at(spec.beam_b, m_max)
+    return replace(spec, beam=_cut_at(spec.beam, m_max), beam_b=beam_b)
+
+
+def _cut_at(spec: config.Beam, m_max: int | None) -> config.Beam:
+    return spec if isinstance(spec, config.BeamGaussian) else replace(spec, m_max=m_max)
+
+
+def _described(spec: config.Channel) -> tuple[systematics.Pointing | None, float | None]:
+    """How a channel was pointed, where one line of sight says it all, and the dipole that its description names."""
+    match spec.scan:
+        case config.ScanMoments() if spec.scan.model is not None:
+            file = resources.scan_model(str(config.channel_path(spec.scan.model, spec.name)))
+            known = scan.read_described(file)
+            names = [line.name for line in known.model.lines_of_sight]
+            wanted = spec.scan.line_of_sight or spec.name
+            if spec.scan.line_of_sight is None and wanted not in names:
+                return None, known.dipole_uk
+            return systematics.Pointing(known.model, known.model.line_of_sight(wanted)), known.dipole_uk
+        case config.ScanHitAveraged():
+            model = scan_model(spec, spec.scan, None)
+            lines = model.select(None if spec.scan.line_of_sight is None else [spec.scan.line_of_sight])
+            return (systematics.Pointing(model, lines[0]) if len(lines) == 1 else None), None
+    return None, None

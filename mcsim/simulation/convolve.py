@@ -1,0 +1,166 @@
+r"""From a sky to the map of a survey: spin transforms of the beam's components, combined with orientation moments.
+
+    T(n) = S_0(n) + 2 Re sum_{s > 0} w_s(n) S_s(n),
+    S_s(n) = sum_lm k_l a_lm b_ls sY_lm(n),   k_l = sqrt(4 pi / (2l + 1)).
+
+One transform per kept s, whatever the number of samples in the survey (paper, Sec. III and App. C).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.errors import InputError
+from mcsim.instrument.beams import Beam
+from mcsim.instrument.scan import Moments
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix
+
+
+@dataclass(frozen=True)
+class Response:
+    """A beam's components with the pixel window folded in: shape (mmax + 1, lmax + 1), k_l b_ls w_l."""
+
+    factors: NDArray[np.complex128]
+
+    @property
+    def lmax(self) -> int:
+        """Largest degree."""
+        return self.factors.shape[1] - 1
+
+    @property
+    def mmax(self) -> int:
+        """Largest order of the beam that is kept."""
+        return self.factors.shape[0] - 1
+
+
+def response(beam: Beam, lmax: int, window: NDArray[np.float64] | None = None) -> Response:
+    """Response of a beam known up to at least ``lmax``, times a pixel window of shape (>= lmax + 1,)."""
+    k = np.sqrt(4.0 * np.pi / (2.0 * np.arange(lmax + 1) + 1.0))
+    if window is not None:
+        k = k * window[: lmax + 1]
+    return Response(k * beam.blm[:, : lmax + 1])
+
+
+def circular_alm(alm: NDArray[np.complex128], response: Response) -> NDArray[np.complex128]:
+    """Coefficients of the sky seen through the circular part of the beam, shape as ``alm``."""
+    return alm_.multiply(alm, response.factors[0].real, response.lmax)
+
+
+def circular_map(alm: NDArray[np.complex128], response: Response, nside: int, nthreads: int = 1) -> healpix.Map:
+    """S_0: the sky through the circular part of the beam at pixel centres, uK, shape (npix,)."""
+    return healpix.synthesis(circular_alm(alm, response)[None], nside, response.lmax, nthreads=nthreads)[0]
+
+
+class CircularMaps:
+    """Maps of skies that a circular beam has smoothed; the last is kept, for the next channel with an equal beam.
+
+    Parameters
+    ----------
+    nside, lmax, nthreads
+        As in :func:`mcsim.sphere.healpix.synthesis`.
+    """
+
+    def __init__(self, nside: int, lmax: int, nthreads: int = 1) -> None:
+        self._grid = (nside, lmax)
+        self.nthreads = nthreads
+        self._alm: NDArray[np.complex128] | None = None
+        self._made: dict[str, NDArray[np.float64]] = {}
+
+    def map(self, alm: NDArray[np.complex128]) -> healpix.Map:
+        """The sky at pixel centres, uK, shape (npix,); read-only."""
+        return self._once(alm, "map", lambda: healpix.synthesis(alm[None], *self._grid, nthreads=self.nthreads)[0])
+
+    def gradient(self, alm: NDArray[np.complex128]) -> NDArray[np.float64]:
+        """Its gradient as of :func:`mcsim.sphere.healpix.gradient`, uK per radian, shape (2, npix); read-only."""
+        return self._once(alm, "gradient", lambda: healpix.gradient(alm, *self._grid, self.nthreads))
+
+    def _once(
+        self, alm: NDArray[np.complex128], name: str, make: Callable[[], NDArray[np.float64]]
+    ) -> NDArray[np.float64]:
+        if self._alm is None or not np.array_equal(self._alm, alm):
+            self._alm, self._made = alm, {}
+        if name not in self._made:
+            self._made[name] = make()
+            self._made[name].setflags(write=False)
+        return self._made[name]
+
+
+def spin_maps(
+    alm: NDArray[np.complex128], response: Response, nside: int, nthreads: int = 1
+) -> dict[int, NDArray[np.float64]]:
+    """S_s at pixel centres for every s > 0 that the beam has: real and imaginary parts, shape (2, npix), in uK.
+
+    Notes
+    -----
+    ducc0 returns -S_s from E = Re(k b_s) a, B = Im(k b_s) a. The test against ``ducc0.totalconvolve`` holds the sign
+    (``tests/unit/test_convolve.py``).
+    """
+    maps = {}
+    for s in range(1, response.mmax + 1):
+        factor = -response.factors[s]
+        if not factor.any():  # the odd orders of an ellipse, say
+            continue
+        electric_magnetic = np.stack(
+            [alm_.multiply(alm, factor.real, response.lmax), alm_.multiply(alm, factor.imag, response.lmax)]
+        )
+        maps[s] = healpix.synthesis(electric_magnetic, nside, response.lmax, spin=s, nthreads=nthreads)
+    return maps
+
+
+def noncircular_map(maps: dict[int, NDArray[np.float64]], moments: Moments) -> healpix.Map:
+    """2 Re sum_{s > 0} w_s S_s: what the non-circular part of the beam adds under a scan, uK, shape (npix,)."""
+    highest = max(maps, default=0)
+    if moments.smax < highest:
+        raise InputError(
+            f"The moments end at s = {moments.smax}, the beam has orders up to {highest}; lower its m_max."
+        )
+    total = np.zeros(12 * moments.nside**2)
+    for s, (real, imag) in maps.items():
+        _add_twice_real_part(moments.w[s - 1], real, imag, total)
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_twice_real_part(w, real, imag, total):  # type: ignore[no-untyped-def]
+    """total += 2 Re(w (real + i imag)) in one pass over memory, which is what this costs."""
+    for pixel in range(total.size):
+        total[pixel] += 2.0 * (w[pixel].real * real[pixel] - w[pixel].imag * imag[pixel])
+
+
+def turned(map_: healpix.Map, moments: Moments, s: int, total: NDArray[np.float64]) -> None:
+    """Add conj(w_s) times a map to ``total``, real and imaginary part, shape (2, npix): adjoint to w_s S_s."""
+    _add_turned(map_, moments.w[s - 1], total)
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_turned(map_, w, total):  # type: ignore[no-untyped-def]
+    """In one pass over memory."""
+    for pixel in range(map_.size):
+        total[0, pixel] += map_[pixel] * w[pixel].real
+        total[1, pixel] -= map_[pixel] * w[pixel].imag
+
+
+def centroid_map(gradient: NDArray[np.float64], moments: Moments) -> healpix.Map:
+    """d . grad S_0 for samples whose mean position is off the pixel centre by d, uK, shape (npix,).
+
+    Parameters
+    ----------
+    gradient
+        d/dtheta and 1/sin(theta) d/dphi of S_0, shape (2, npix), uK per radian.
+    moments
+        With ``dtheta`` and ``dphi``.
+    """
+    result = np.empty(gradient.shape[1])
+    _along(moments.dtheta, gradient[0], moments.dphi, gradient[1], result)
+    return result
+
+
+@numba.njit(cache=True, nogil=True)
+def _along(dtheta, down, dphi, east, result):  # type: ignore[no-untyped-def]
+    """In one pass over memory."""
+    for pixel in range(result.size):
+        result[pixel] = dtheta[pixel] * down[pixel] + dphi[pixel] * east[pixel]

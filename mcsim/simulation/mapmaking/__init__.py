@@ -1,0 +1,17 @@
+"""Maps from the differences of two beams: pairs of pixels, right-hand sides, conjugate gradients."""
+
+from mcsim.simulation.mapmaking.pairs import DifferencingScan, prepare
+from mcsim.simulation.mapmaking.rhs import SideMaps, rhs_from_maps, rhs_from_samples, side_maps
+from mcsim.simulation.mapmaking.solve import MapmakingReport, diagonal, solve
+
+__all__ = [
+    "DifferencingScan",
+    "MapmakingReport",
+    "SideMaps",
+    "diagonal",
+    "prepare",
+    "rhs_from_maps",
+    "rhs_from_samples",
+    "side_maps",
+    "solve",
+]

@@ -1,0 +1,195 @@
+"""Maps from differences: the normal equations by preconditioned conjugate gradients."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+
+import healpy
+import numpy as np
+from numba import njit
+
+from mcsim.errors import InputError
+from mcsim.simulation.mapmaking.pairs import DifferencingScan
+from mcsim.sphere.healpix import Map
+
+
+@dataclass(frozen=True)
+class MapmakingReport:
+    """How a solution was reached.
+
+    Parameters
+    ----------
+    iterations
+        Iterations made.
+    converged
+        Whether the residual asked for was reached.
+    relative_residual
+        |b - N m| / |b| of the map that is returned, computed afresh from it.
+    history
+        The same after each iteration, as the recurrence of the method has it.
+    """
+
+    iterations: int
+    converged: bool
+    relative_residual: float
+    history: tuple[float, ...]
+
+
+def solve(
+    scan: DifferencingScan,
+    rhs: Map,
+    x: float = 0.0,
+    tol: float = 1e-8,
+    max_iterations: int = 500,
+    start: Map | None = None,
+    callback: Callable[[int, Map, float], None] | None = None,
+    nthreads: int = 1,
+) -> tuple[Map, MapmakingReport]:
+    """Map that fits the differences best in the sense of least squares.
+
+    Parameters
+    ----------
+    scan
+        The pairs of pixels.
+    rhs
+        P^T d in uK, shape (npix,), as :mod:`mcsim.simulation.mapmaking.rhs` makes it for the same ``x``.
+    x
+        Transmission imbalance that the map-maker believes in, -1 < x < 1.
+    tol
+        Relative residual |b - N m| / |b| to reach, > 0.
+    max_iterations
+        Iterations after which to give up, >= 0; the report says whether the tolerance was reached.
+    start
+        Map to start from, in uK, shape (npix,); None: zero.
+    callback
+        Called after each iteration with its number from 1, the map as it would be returned, and the relative residual.
+    nthreads
+        Number of threads; the result does not depend on it, bit for bit.
+
+    Returns
+    -------
+    map, report
+        Map in uK, shape (npix,), ``healpy.UNSEEN`` where no sample fell. With x = 0 differences say nothing about the
+        monopole: the mean of the observed pixels is zero then.
+
+    Raises
+    ------
+    InputError
+        If x, tol or max_iterations is out of range, or the right-hand side or the start does not fit the scan.
+
+    Notes
+    -----
+    Conjugate gradients on N m = P^T d, N = P^T P = D - (1 - x^2) C, preconditioned by 1/D. For x != 0 the constant map
+    is the one direction that N nearly ignores, 1^T N 1 = 4 x^2 samples: it is added to the preconditioner and costs
+    nothing; the monopole's relative error is about tol / 2 x^2. For a year of W1 at nside 128 the residual falls by ten
+    in 3 iterations (1e-8 after 26, 1e-10 after 33), 0.1 s each on two cores; the binned A^{20}_ll are within 1 % of
+    what an axis ratio of 1.15 adds to them from 1e-7 on, within 3e-4 at 1e-8. A further solution on a coarse grid of
+    nside 8 saved 3 of 33 iterations and took more time than that, so there is none; on two weeks of data, which leave
+    half of the sky unobserved and take 120 iterations, nside 16 would save half of them. With samples at pixel centres
+    and equal circular beams the map is the sky itself (tests/unit/test_mapmaking.py).
+    """
+    _check(scan, x, tol, max_iterations, rhs, start)
+    weight = diagonal(scan, x)
+    seen = weight > 0.0
+    inverse = np.divide(1.0, weight, out=np.zeros_like(weight), where=seen)
+    constant = 0.0 if x == 0.0 else 1.0 / (4.0 * x * x * scan.samples)
+
+    def precondition(residual: Map) -> Map:
+        # A matrix product would be threaded by the BLAS and its rounding depend on that; np.sum does not.
+        return inverse * residual + np.where(seen, constant * np.sum(residual), 0.0)
+
+    def finished(map_uk: Map) -> Map:
+        offset = float(np.mean(map_uk[seen])) if x == 0.0 else 0.0
+        return np.where(seen, map_uk - offset, healpy.UNSEEN)
+
+    with ThreadPoolExecutor(max(1, nthreads)) as pool:
+        size = _norm(rhs)
+        map_uk = np.zeros(scan.npix) if start is None else np.where(seen, start, 0.0)
+        residual = rhs.copy() if start is None else rhs - apply_normal(scan, x, map_uk, pool, nthreads)
+        direction, slope, history = np.zeros(scan.npix), 1.0, [_norm(residual) / size if size > 0.0 else 0.0]
+        while history[-1] > tol and len(history) <= max_iterations:
+            conditioned = precondition(residual)
+            before, slope = slope, float(np.sum(residual * conditioned))
+            direction = conditioned + (slope / before if len(history) > 1 else 0.0) * direction
+            image = apply_normal(scan, x, direction, pool, nthreads)
+            step = slope / float(np.sum(direction * image))
+            map_uk += step * direction
+            residual -= step * image
+            history.append(_norm(residual) / size)
+            if callback is not None:
+                callback(len(history) - 1, finished(map_uk), history[-1])
+        found = _norm(rhs - apply_normal(scan, x, map_uk, pool, nthreads)) / size if size > 0.0 else 0.0
+    report = MapmakingReport(len(history) - 1, history[-1] <= tol, found, tuple(history[1:]))
+    return finished(map_uk), report
+
+
+def diagonal(scan: DifferencingScan, x: float) -> Map:
+    """Sum of the squared weights with which each pixel enters, (1+x)^2 hits_a + (1-x)^2 hits_b, shape (npix,)."""
+    weight: Map = (1.0 + x) ** 2 * scan.hits_a + (1.0 - x) ** 2 * scan.hits_b
+    return weight
+
+
+def apply_normal(scan: DifferencingScan, x: float, map_uk: Map, pool: ThreadPoolExecutor, parts: int = 1) -> Map:
+    """The normal matrix on a map: D m - (1 - x^2) C m, with C the counts of pairs; unobserved pixels give 0.
+
+    Parameters
+    ----------
+    scan, x
+        The pairs and the transmission imbalance, -1 < x < 1.
+    map_uk
+        Shape (npix,).
+    pool, parts
+        Threads that share out the rows, in ``parts`` pieces. Each row is summed by one of them: bit for bit the same
+        for any number.
+    """
+    result = np.empty(scan.npix)
+    edges = np.searchsorted(scan.row_start, np.linspace(0, scan.partner.size, parts + 1)[1:-1])
+    edges = np.concatenate([[0], edges, [scan.npix]])
+    weight, coupling = diagonal(scan, x), 1.0 - x * x
+    jobs = [
+        pool.submit(_rows, scan.row_start, scan.partner, scan.count, weight, coupling, map_uk, low, high, result)
+        for low, high in pairwise(edges)
+    ]
+    for job in jobs:
+        job.result()
+    return result
+
+
+def check_imbalance(x: float) -> None:
+    """Raise InputError unless -1 < x < 1."""
+    if not -1.0 < x < 1.0:
+        raise InputError(f"the transmission imbalance is {x:g}, but it must lie between -1 and 1.")
+
+
+def _check(scan: DifferencingScan, x: float, tol: float, max_iterations: int, rhs: Map, start: Map | None) -> None:
+    check_imbalance(x)
+    if not tol > 0.0:
+        raise InputError(f"tol is {tol:g}, but the relative residual to reach must be > 0.")
+    if max_iterations < 0:
+        raise InputError(f"max_iterations is {max_iterations}, but it must be >= 0.")
+    for name, array in (("right-hand side", rhs), ("starting map", start)):
+        if array is None:
+            continue
+        if array.shape != (scan.npix,):
+            raise InputError(f"the {name} has shape {array.shape}, but nside {scan.nside} needs ({scan.npix},).")
+        if not np.all(np.isfinite(array)):
+            raise InputError(f"the {name} has values that are not finite; leave such samples out.")
+
+
+def _norm(vector: Map) -> float:
+    return float(np.sqrt(np.sum(vector * vector)))
+
+
+@njit(cache=True, nogil=True)
+def _rows(row_start, partner, count, weight, coupling, map_uk, low, high, result):  # type: ignore[no-untyped-def]
+    for row in range(low, high):
+        first, last = row_start[row], row_start[row + 1]
+        even, odd = 0.0, 0.0
+        # Two sums, so that an addition need not wait for the one before.
+        for k in range(first, last - 1, 2):
+            even += count[k] * map_uk[partner[k]]
+            odd += count[k + 1] * map_uk[partner[k + 1]]
+        if (last - first) & 1:
+            even += count[last - 1] * map_uk[partner[last - 1]]
+        result[row] = weight[row] * map_uk[row] - coupling * (even + odd)

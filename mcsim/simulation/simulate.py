@@ -1,0 +1,284 @@
+"""One realization: sky -> beams under the scan -> maps -> a_lm -> BipoSH and power spectra."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import reduce
+from pathlib import Path
+
+import healpy
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim import bipolar, config, systematics
+from mcsim.errors import InputError
+from mcsim.simulation import convolve, differencing, rings
+from mcsim.simulation.survey import Channel, Survey, SurveyMap
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix, rng
+from mcsim.sphere.sky import dipole_alm, gaussian_alm
+
+Alm = NDArray[np.complex128]
+
+LARGEST_UK = 1e12
+"""Of a user's sky."""
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What one map of a realization gives: its a_lm, those of its circular twin, and the map itself where asked for."""
+
+    alm: Alm
+    circular: Alm | None
+    map_uk: NDArray[np.float64] | None
+
+
+def realize(survey: Survey, realization: int, nthreads: int = 1) -> dict[str, NDArray]:
+    """Spectra of one realization.
+
+    Parameters
+    ----------
+    survey
+        What all realizations share.
+    realization
+        Index, >= 0: with the run's seed it fixes every random number.
+    nthreads
+        Threads of the transforms.
+
+    Returns
+    -------
+    dict
+        ``biposh`` (pair, mode, lmax + 1) complex and ``cl`` (pair, lmax + 1), uK^2; with pairing the same of the
+        circular twin, ``biposh_circular`` and ``cl_circular``; with kept maps ``map`` (map, npix), uK.
+    """
+    ensemble = survey.config.ensemble
+    sky = draw_sky(survey, realization)
+    made = _circular_maps(survey, nthreads)
+    observed = [result for channel in survey.channels for result in _observe(survey, channel, sky, realization, made)]
+    result = _spectra(survey, [o.alm for o in observed], "")
+    if ensemble.paired:
+        result |= _spectra(survey, [o.circular for o in observed if o.circular is not None], "_circular")
+    if ensemble.keep_maps:
+        result["map"] = np.stack([o.map_uk for o in observed if o.map_uk is not None])
+    return result
+
+
+def draw_sky(survey: Survey, realization: int) -> Alm:
+    """Coefficients of the sky of one realization up to the sky's lmax, uK: drawn, or read from the user's files."""
+    sky = survey.config.sky
+    if sky.alm is not None:
+        return _read_alm(config.sky_path(sky.alm, realization), sky.lmax)
+    if sky.map is not None:
+        return _read_sky_map(config.sky_path(sky.map, realization), sky.lmax, survey.config.map.frame)
+    assert survey.cl is not None  # the configuration holds at least one of the three sources
+    return gaussian_alm(survey.cl, rng.generator(survey.config.ensemble.seed, realization, "sky"))
+
+
+def maps(survey: Survey, realization: int, nthreads: int = 1, sky: Alm | None = None) -> NDArray[np.float64]:
+    """Maps of one realization, effects and noise included, uK, shape (map, npix); ``healpy.UNSEEN`` without a hit.
+
+    ``sky``: coefficients up to the sky's lmax, in place of those that the realization would draw.
+    """
+    if sky is None:
+        sky = draw_sky(survey, realization)
+    found = []
+    made = _circular_maps(survey, nthreads)
+    for channel in survey.channels:
+        for m, layers in _layers(survey, channel, sky, realization, made, smooth=True):
+            found.append(np.where(m.moments.hits > 0, layers.total, healpy.UNSEEN))
+    return np.stack(found)
+
+
+@dataclass(frozen=True)
+class Layers:
+    """What a map is the sum of, uK, shape (npix,) each.
+
+    They are analysed apart, so that the quadrature error of the circular twin cancels in the paired difference.
+
+    Attributes
+    ----------
+    smooth
+        The sky through the circular part of the beam at the pixels' centres; None where its a_lm stand for it.
+    extra
+        What the circular twin sees beyond that: centroids, noise, gain. None: nothing.
+    difference
+        What the rest of the beam adds. None: nothing.
+    """
+
+    smooth: NDArray[np.float64] | None
+    extra: NDArray[np.float64] | None
+    difference: NDArray[np.float64] | None
+
+    @property
+    def total(self) -> NDArray[np.float64]:
+        """The map."""
+        return reduce(np.add, [part for part in (self.smooth, self.extra, self.difference) if part is not None])
+
+
+def _circular_maps(survey: Survey, nthreads: int) -> convolve.CircularMaps:
+    return convolve.CircularMaps(survey.config.map.resolution, survey.config.sky.lmax, nthreads)
+
+
+def _observe(
+    survey: Survey, channel: Channel, sky: Alm, realization: int, made: convolve.CircularMaps
+) -> list[Observed]:
+    """The channel's maps of one sky, analysed."""
+    ensemble = survey.config.ensemble
+    if channel.rings is not None:
+        return [_observe_on_rings(survey, channel, channel.rings, sky, realization, made.nthreads)]
+    known = None
+    smooth = ensemble.keep_maps or not all(_is_exact(survey, m) for m in channel.maps)
+    if channel.side_b is None:
+        seen, dipole = _seen(survey, channel, sky, realization)
+        known = _circular(survey, channel, seen, dipole)
+    results = []
+    for m, layers in _layers(survey, channel, sky, realization, made, smooth):
+        if known is not None and _is_exact(survey, m):
+            exact = alm_.multiply(known, 1.0 / channel.window, survey.config.sky.lmax)
+            twin = (
+                exact if layers.extra is None else exact + _analyse(survey, channel, layers.extra, None, made.nthreads)
+            )
+        else:
+            assert layers.smooth is not None  # asked for above
+            circular = layers.smooth if layers.extra is None else layers.smooth + layers.extra
+            twin = _analyse(survey, channel, circular, m.weight, made.nthreads)
+        alm = twin
+        if layers.difference is not None:
+            alm = twin + _analyse(survey, channel, layers.difference, m.weight, made.nthreads)
+        kept = np.where(m.moments.hits > 0, layers.total, healpy.UNSEEN) if ensemble.keep_maps else None
+        results.append(Observed(alm, twin if ensemble.paired else None, kept))
+    return results
+
+
+def _layers(
+    survey: Survey, channel: Channel, sky: Alm, realization: int, made: convolve.CircularMaps, smooth: bool
+) -> Iterator[tuple[SurveyMap, Layers]]:
+    """The channel's maps of one sky; transforms that splits share are made once."""
+    run = survey.config
+    nside, seed, nthreads = run.map.resolution, run.ensemble.seed, made.nthreads
+    seen, dipole = _seen(survey, channel, sky, realization)
+    if channel.side_b is not None:
+        for m, solved in differencing.maps(channel, seen, dipole, nside, seed, realization, nthreads):
+            yield m, Layers(solved.circular, None, solved.difference)
+        return
+    circular = _circular(survey, channel, seen, dipole)
+    spins = convolve.spin_maps(seen, channel.response, nside, nthreads)
+    if dipole is not None:
+        for s, map_uk in convolve.spin_maps(dipole, _believed(channel), nside, nthreads).items():
+            spins[s] = spins[s] - map_uk if s in spins else -map_uk
+    flat = made.map(circular) if smooth else None
+    whole = None
+    if any(m.gain is not None for m in channel.maps):
+        whole = convolve.circular_map(seen, channel.response, nside, nthreads)
+    gradient = None
+    if any(m.moments.dtheta is not None for m in channel.maps):
+        gradient = made.gradient(circular)
+    for m in channel.maps:
+        extra = []
+        if m.moments.dtheta is not None and gradient is not None:
+            extra.append(convolve.centroid_map(gradient, m.moments))
+        if m.noise_uk is not None:
+            draw = rng.generator(seed, realization, f"noise/{m.name}")
+            extra.append(m.noise_uk * draw.standard_normal(m.noise_uk.size))
+        if m.gain is not None and whole is not None:
+            extra.append(m.gain * whole)
+        difference = convolve.noncircular_map(spins, m.moments) if spins else None
+        yield m, Layers(flat, sum(extra[1:], start=extra[0]) if extra else None, difference)
+
+
+def _circular(survey: Survey, channel: Channel, seen: Alm, dipole: Alm | None) -> Alm:
+    """What the circular part of the beam sees, less the dipole as believed: what an effect makes of it stays."""
+    circular = convolve.circular_alm(seen, channel.response)
+    return circular if dipole is None else circular - convolve.circular_alm(dipole, _believed(channel))
+
+
+def _believed(channel: Channel) -> convolve.Response:
+    """Response to the dipole that is taken off: the believed beam, at the samples' own places."""
+    spread = systematics.spread_of(channel.effects)
+    return convolve.response(channel.site.beam, channel.site.lmax, channel.window ** (spread * spread))
+
+
+def _observe_on_rings(
+    survey: Survey, channel: Channel, grid: tuple[rings.Rings, ...], sky: Alm, realization: int, nthreads: int
+) -> Observed:
+    """The channel's a_lm of one sky where no map is needed for them."""
+    lmax_sky, lmax = survey.config.sky.lmax, survey.lmax
+    seen, dipole = _seen(survey, channel, sky, realization)
+    circular = convolve.circular_alm(seen, channel.response)
+    difference = rings.noncircular_alm(seen, channel.response, grid, lmax, nthreads)
+    if dipole is not None:
+        circular = circular - convolve.circular_alm(dipole, _believed(channel))
+        difference = difference - rings.noncircular_alm(dipole, _believed(channel), grid, lmax, nthreads)
+    twin = alm_.resize(circular, lmax_sky, lmax)
+    return Observed(twin + difference, twin if survey.config.ensemble.paired else None, None)
+
+
+def _seen(survey: Survey, channel: Channel, sky: Alm, realization: int) -> tuple[Alm, Alm | None]:
+    """The sky that the channel looks at, and the dipole in it that is taken off again; None where none shows."""
+    sky = systematics.looked_at(channel.effects, sky, channel.site, survey.config.ensemble.seed, realization)
+    if not channel.effects or not channel.site.dipole_uk.any():
+        return sky, None
+    dipole = dipole_alm(channel.site.dipole_uk, channel.site.lmax)
+    return sky + dipole, dipole
+
+
+def _analyse(
+    survey: Survey, channel: Channel, map_uk: NDArray[np.float64], weight: NDArray[np.float64] | None, nthreads: int
+) -> Alm:
+    """Coefficients of a weighted map, with the pixel window divided out."""
+    weighted = map_uk if weight is None else weight * map_uk
+    alm = healpix.analysis(weighted, survey.lmax, survey.config.biposh.iterations, nthreads)
+    return alm_.multiply(alm, 1.0 / channel.window[: survey.lmax + 1], survey.lmax)
+
+
+def _is_exact(survey: Survey, m: SurveyMap) -> bool:
+    """Whether the twin's a_lm are known without making its map: all sky, no noise, no power beyond the analysis."""
+    return m.weight is None and m.noise_uk is None and survey.config.sky.lmax == survey.lmax
+
+
+def _spectra(survey: Survey, alms: list[Alm], suffix: str) -> dict[str, NDArray]:
+    modes, lmax = len(survey.estimator.modes), survey.lmax
+    coefficients = np.empty((len(survey.pairs), modes, lmax + 1), dtype=np.complex128)
+    cl = np.empty((len(survey.pairs), lmax + 1))
+    for row, ((x, y), norm) in enumerate(zip(survey.pairs, survey.pair_norm, strict=True)):
+        coefficients[row] = norm * bipolar.estimate(survey.estimator, alms[x], None if x == y else alms[y])
+        cl[row] = norm * bipolar.power_spectrum(alms[x], alms[y], lmax)
+    return {f"biposh{suffix}": coefficients, f"cl{suffix}": cl}
+
+
+def _read_alm(path: Path, lmax: int) -> Alm:
+    try:
+        alm, mmax = healpy.read_alm(path, return_mmax=True)
+    except Exception as error:  # libraries raise whatever a broken file makes of them
+        raise InputError(
+            f"{path} cannot be read as a_lm ({error}); give a FITS file as healpy.write_alm makes it."
+        ) from error
+    found = healpy.Alm.getlmax(alm.size, mmax)
+    if mmax != found or found < lmax:
+        raise InputError(f"{path} holds a_lm up to l = {found}, m = {mmax}; the sky needs both up to {lmax}.")
+    if not np.all(np.isfinite(alm)):
+        raise InputError(f"{path} holds a_lm that are not finite; repair the file.")
+    _check_size(path, alm)
+    return alm_.resize(alm.astype(np.complex128), found, lmax)
+
+
+def _read_sky_map(path: Path, lmax: int, frame: str) -> Alm:
+    map_, found, unit = healpix.read_map(path)
+    nside = healpy.npix2nside(map_.size)
+    if nside & (nside - 1):
+        raise InputError(f"{path} has nside {nside}, which is not a power of two; bring the sky to one that is.")
+    if found not in (None, frame):
+        raise InputError(f"{path} is in {found} coordinates, the run's maps in {frame}; rotate the sky first.")
+    if not np.all(np.isfinite(map_)) or np.any(map_ == healpy.UNSEEN):
+        raise InputError(f"{path} has pixels that are not finite or unseen; a sky must be complete.")
+    if lmax > 3 * nside - 1:
+        raise InputError(f"{path} has nside {nside}, good to l = {3 * nside - 1}; the sky's lmax {lmax} is above it.")
+    map_uk = healpix.to_uk(unit, path) * map_
+    _check_size(path, map_uk)
+    return healpix.analysis(map_uk, lmax, iterations=3)
+
+
+def _check_size(path: Path, sky: NDArray[np.generic]) -> None:
+    """Refuse what a flipped bit makes of a number: its power would overflow."""
+    largest = float(np.max(np.abs(sky)))
+    if largest > LARGEST_UK:
+        raise InputError(f"{path} holds {largest:.3g} uK, more than any sky ({LARGEST_UK:g} uK); repair the file.")

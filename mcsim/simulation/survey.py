@@ -1,0 +1,382 @@
+"""From a configuration to what a realization needs: spectrum, beam responses, moments, weights, estimator tables."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim import config
+from mcsim.bipolar import Estimator, estimator
+from mcsim.errors import InputError
+from mcsim.instrument import beams, scan
+from mcsim.simulation import convolve, mapmaking, tod
+from mcsim.simulation.channels import effects_on, refuse_pixel_effects, scan_model, site_b_of, site_of
+from mcsim.simulation.rings import Rings, limit_rings, parallel_transport_rings
+from mcsim.sphere import healpix, spectra
+from mcsim.sphere.mask import read_mask
+from mcsim.systematics import Effect, Site, seen_through, spread_of
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class SurveyMap:
+    """One map of a realization.
+
+    Attributes
+    ----------
+    name
+        ``channel`` or ``channel:split``.
+    moments
+        Orientation moments of the samples in it; of a differencing scan the hits of both sides, and NaN.
+    weight
+        Weight before analysis, shape (npix,), mean square 1; ``None``: every pixel counts alike.
+    noise_uk
+        Standard deviation of the noise per pixel, shape (npix,); ``None``: no noise, or noise of differences.
+    pairs
+        Pairs of pixels of a differencing scan; ``None``: any other scan.
+    gain
+        Mean relative error of the gain over the samples of a pixel, shape (npix,); ``None``: no error.
+    """
+
+    name: str
+    moments: scan.Moments
+    weight: NDArray[np.float64] | None
+    noise_uk: NDArray[np.float64] | None
+    pairs: mapmaking.DifferencingScan | None = None
+    gain: NDArray[np.float64] | None = None
+
+    @property
+    def sky_fraction(self) -> float:
+        """<W^2>^2 / <W^4> of the weight W: the modes that are left, and what variances are divided by."""
+        return 1.0 if self.weight is None else float(np.mean(self.weight**2) ** 2 / np.mean(self.weight**4))
+
+
+@dataclass(frozen=True)
+class SideB:
+    """What a differencing channel has besides its side A.
+
+    Attributes
+    ----------
+    beam, response
+        Beam of side B, effects included.
+    believed
+        The same without effects.
+    scan
+        Transmission imbalance, noise per difference, and convergence of the map-making.
+    sigma0_uk
+        White noise per difference.
+    imbalance
+        True transmission imbalance; map-making believes that of ``scan``.
+    iterations_short
+        How many iterations before convergence the map-making stops.
+    """
+
+    beam: beams.Beam
+    response: convolve.Response
+    believed: beams.Beam
+    scan: config.ScanDifferencing
+    sigma0_uk: float
+    imbalance: float
+    iterations_short: int
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A beam and the maps made with it.
+
+    Attributes
+    ----------
+    beam, response
+        What the sky is seen through, effects included.
+    window
+        Pixel window as believed, shape (lmax + 1,), ones where there is none.
+    maps
+        One for every split.
+    site
+        What effects may know of the channel, its beam as believed among it.
+    effects
+        Those that act in this channel, in the order of the configuration.
+    side_b
+        The other beam of a differencing scan, None for any other scan.
+    rings
+        The grid, where it is one of rings instead of pixels; the moments of the map then mean nothing and are NaN.
+    """
+
+    name: str
+    beam: beams.Beam
+    response: convolve.Response
+    window: NDArray[np.float64]
+    maps: tuple[SurveyMap, ...]
+    site: Site
+    effects: tuple[Effect, ...] = ()
+    side_b: SideB | None = None
+    rings: tuple[Rings, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Everything that all realizations of a run share.
+
+    ``pairs`` are indices into the maps in order, with 1 / <w_x w_y> of their weights in ``pair_norm``.
+    """
+
+    config: config.RunConfig
+    cl: NDArray[np.float64] | None
+    channels: tuple[Channel, ...]
+    lmax: int
+    estimator: Estimator
+    pairs: tuple[tuple[int, int], ...]
+    pair_norm: tuple[float, ...]
+
+    @property
+    def map_names(self) -> tuple[str, ...]:
+        """Names of the maps, in order."""
+        return tuple(m.name for channel in self.channels for m in channel.maps)
+
+    @property
+    def pair_names(self) -> tuple[str, ...]:
+        """Labels of the pairs, for example ``W1:half1,W1:half2``."""
+        names = self.map_names
+        return tuple(f"{names[x]},{names[y]}" for x, y in self.pairs)
+
+    @property
+    def sky_fractions(self) -> dict[str, float]:
+        """Effective fraction of the sky of every map; see :attr:`SurveyMap.sky_fraction`."""
+        return {m.name: m.sky_fraction for channel in self.channels for m in channel.maps}
+
+
+def survey(run: config.RunConfig, nthreads: int = 1, progress: Progress | None = None, orders: int = 0) -> Survey:
+    """Load or compute everything that the realizations of a run share.
+
+    Moments of scan models, and pairs of pixels of differencing scans, are computed once, cached on disk and
+    memory-mapped, so that workers share them. ``orders``: moments up to this order even where the beam needs fewer (of
+    a file of moments, all that it has).
+
+    Raises
+    ------
+    InputError
+        For files that are missing, unreadable, or do not fit the configuration.
+    """
+    lmax = config.analysis_lmax(run)
+    cl = None if run.sky.spectrum is None else spectra.load(run.sky.spectrum, run.sky.lmax)
+    channels = tuple(_channel(run, channel, nthreads, progress, orders) for channel in run.channels)
+    maps = [m for channel in channels for m in channel.maps]
+    both = run.biposh.pairs == "all"
+    pairs = tuple((x, y) for x in range(len(maps)) for y in range(x, len(maps)) if both or x == y)
+    norm = tuple(1.0 / _overlap(maps[x], maps[y]) for x, y in pairs)
+    tables = estimator(run.biposh.L_max, lmax, both_orders=both and len(maps) > 1)
+    return Survey(run, cl, channels, lmax, tables, pairs, norm)
+
+
+def _channel(
+    run: config.RunConfig, spec: config.Channel, nthreads: int, progress: Progress | None, orders: int
+) -> Channel:
+    acting = effects_on(run, spec.name)
+    site = site_of(run, spec)
+    if run.map.grid == "gl":
+        return _channel_on_rings(run, spec, site, acting)
+    window = _window(run, spec)
+    spread = spread_of(acting)
+    beam = seen_through(acting, site)
+    splits = run.map.splits or (None,)
+    maps = []
+    for index, split in enumerate(splits):
+        share = (index / len(splits), (index + 1) / len(splits))
+        name = spec.name if split is None else f"{spec.name}:{split}"
+        pairs = None
+        if isinstance(spec.scan, config.ScanDifferencing):
+            pairs = _pairs(run, spec, spec.scan, split, share, nthreads, progress)
+            moments = _hits_alone(pairs, max(beam.mmax, 1))
+        else:
+            smax = max(beam.mmax, orders)
+            moments = _moments(run, spec, split, share, smax, nthreads, progress, site.beam.mmax)
+            # An effect may give the beam higher orders than a file of moments has: they are left out.
+            beam = beam.truncated(moments.smax) if acting and moments.smax < beam.mmax else beam
+        m = _survey_map(run, spec, split, name, moments, pairs)
+        maps.append(_with_effects(m, acting, site, share, spread))
+    # A pixel whose samples keep closer to its centre blurs less; the window is a Gaussian in all but name.
+    response = convolve.response(beam, run.sky.lmax, window ** (spread * spread))
+    side_b = _side_b(spec, window ** (spread * spread), site, acting)
+    return Channel(spec.name, beam, response, window, tuple(maps), site, acting, side_b)
+
+
+def _channel_on_rings(run: config.RunConfig, spec: config.Channel, site: Site, acting: tuple[Effect, ...]) -> Channel:
+    refuse_pixel_effects(spec.name, acting)
+    beam = seen_through(acting, site)
+    response = convolve.response(beam, run.sky.lmax)
+    orders = [s for s in range(1, response.mmax + 1) if response.factors[s].any()]
+    degree = run.sky.lmax + config.analysis_lmax(run)
+    match spec.scan:
+        case config.ScanParallelTransport():
+            grid = parallel_transport_rings(np.deg2rad(spec.scan.psi0_deg), orders, degree)
+        case config.ScanHitAveraged():
+            grid = limit_rings(scan_model(spec, spec.scan, None), orders, degree, spec.scan.line_of_sight)
+        case _:
+            raise TypeError("the configuration refuses other scans on rings")
+    unknown = scan.Moments(1, run.map.frame, np.full(12, np.nan), np.full((max(beam.mmax, 1), 12), np.nan + 0j))
+    m = SurveyMap(spec.name, unknown, None, None)
+    return Channel(spec.name, beam, response, np.ones(run.sky.lmax + 1), (m,), site, acting, rings=grid)
+
+
+def _side_b(
+    spec: config.Channel,
+    window: NDArray[np.float64],
+    site: Site,
+    acting: tuple[Effect, ...],
+) -> SideB | None:
+    if not isinstance(spec.scan, config.ScanDifferencing):
+        return None
+    other = site_b_of(site, spec)
+    beam = seen_through(acting, other)
+    response = convolve.response(beam, site.lmax, window)
+    imbalance, short = spec.scan.transmission_imbalance, 0
+    for effect in acting:
+        imbalance, short = effect.differencing(imbalance, short)
+    return SideB(beam, response, other.beam, spec.scan, spec.noise.sigma0_uk, imbalance, short)
+
+
+def _with_effects(
+    m: SurveyMap,
+    acting: tuple[Effect, ...],
+    site: Site,
+    share: tuple[float, float],
+    spread: float,
+) -> SurveyMap:
+    """The map with what effects make of its moments, noise and gain."""
+    moments, noise = m.moments, m.noise_uk
+    for effect in acting:
+        moments = effect.orientations(moments, site)
+        factor = effect.noise(site)
+        if factor is not None and noise is not None:
+            noise = noise * np.sqrt(np.clip(factor, 0.0, None))
+    if spread != 1.0 and moments.dtheta is not None and moments.dphi is not None:
+        moments = replace(moments, dtheta=spread * moments.dtheta, dphi=spread * moments.dphi)
+    return replace(m, moments=moments, noise_uk=noise, gain=mean_gain(acting, site, share))
+
+
+def mean_gain(acting: tuple[Effect, ...], site: Site, share: tuple[float, float]) -> NDArray[np.float64] | None:
+    """Mean relative error of the gain in every pixel of a part of the survey, by a pass over its pointing."""
+    drifting = [effect for effect in acting if effect.gain(np.zeros(1), site) is not None]
+    if not drifting:
+        return None
+    pointing = site.pointed(drifting[0].name)
+
+    def errors() -> Iterator[tod.Samples]:
+        for chunk in tod.samples(pointing.model, pointing.line, site.nside, site.frame, share):
+            gains = [effect.gain(chunk.time_s, site) for effect in drifting]
+            yield replace(chunk, signal_uk=sum((g for g in gains if g is not None), start=chunk.signal_uk))
+
+    mean, hits = tod.bin_samples(errors(), site.nside)
+    return np.where(hits > 0, mean, 0.0)
+
+
+def _window(run: config.RunConfig, spec: config.Channel) -> NDArray[np.float64]:
+    choice = config.pixel_window(run, spec)
+    if choice == "none":
+        return np.ones(run.sky.lmax + 1)
+    if choice == "computed":
+        return healpix.pixel_window(run.map.resolution, run.sky.lmax)
+    return healpix.read_pixel_window(Path(choice), run.sky.lmax)
+
+
+def _moments(
+    run: config.RunConfig,
+    spec: config.Channel,
+    split: str | None,
+    share: tuple[float, float],
+    mmax: int,
+    nthreads: int,
+    progress: Progress | None,
+    needed: int,
+) -> scan.Moments:
+    nside, frame, smax = run.map.resolution, run.map.frame, max(mmax, 1)
+    match spec.scan:
+        case config.ScanParallelTransport():
+            return scan.parallel_transport(np.deg2rad(spec.scan.psi0_deg), nside, smax, frame)
+        case config.ScanMoments():
+            path = config.channel_path(spec.scan.path, spec.name, split)
+            return _moments_of_file(path, nside, needed if mmax == needed else None, frame)
+        case config.ScanPointing():
+            path = config.channel_path(spec.scan.path, spec.name, split)
+            return scan.pointing_moments([path], nside, smax, frame)
+        case config.ScanHitAveraged():
+            model = scan_model(spec, spec.scan, split)
+            lines = None if spec.scan.line_of_sight is None else [spec.scan.line_of_sight]
+            folder = scan.cached_moments(
+                model, nside, smax, frame, lines, time_range=share, nthreads=nthreads, progress=progress
+            )
+            return scan.Moments.load(folder, mmap=True)
+        case config.ScanDifferencing():
+            raise TypeError("a differencing scan has pairs of pixels, no moments")
+
+
+@lru_cache(maxsize=16)
+def _moments_of_file(path: Path, nside: int, smax: int | None, frame: str) -> scan.Moments:
+    """Moments are shared by the surveys of a process that differ in effects alone."""
+    return scan.read_moments_fits(path, nside, smax, frame)
+
+
+def _pairs(
+    run: config.RunConfig,
+    spec: config.Channel,
+    chosen: config.ScanDifferencing,
+    split: str | None,
+    share: tuple[float, float],
+    nthreads: int,
+    progress: Progress | None,
+) -> mapmaking.DifferencingScan:
+    model = scan_model(spec, chosen, split)
+    return mapmaking.prepare(
+        model, chosen.pair, run.map.resolution, run.map.frame, share, nthreads=nthreads, progress=progress
+    )
+
+
+def _hits_alone(pairs: mapmaking.DifferencingScan, smax: int) -> scan.Moments:
+    """What weights and masks ask of a scan, its hits; whatever asks for moments, which mean nothing here, gets NaN."""
+    unknown = np.broadcast_to(np.complex128(np.nan), (smax, pairs.npix))
+    return scan.Moments(pairs.nside, pairs.frame, pairs.hits_a + pairs.hits_b, unknown)
+
+
+def _survey_map(
+    run: config.RunConfig,
+    spec: config.Channel,
+    split: str | None,
+    name: str,
+    moments: scan.Moments,
+    pairs: mapmaking.DifferencingScan | None,
+) -> SurveyMap:
+    observed = moments.hits > 0
+    if not observed.any():
+        raise InputError(
+            f"The scan of map {name} hits no pixel of nside {moments.nside}; check the scan of the channel."
+        )
+    weight = observed.astype(float)
+    if run.biposh.weighting == "hits":
+        weight *= moments.hits
+    if run.map.mask is not None:
+        path = config.channel_path(run.map.mask, spec.name, split)
+        weight *= read_mask(path, moments.nside, run.map.frame, run.map.mask_frame, run.map.mask_apodisation_deg)
+    if not weight.any():
+        raise InputError(f"The mask of map {name} leaves no observed pixel; widen it or observe more of the sky.")
+    noise = None
+    if spec.noise.sigma0_uk > 0 and pairs is None:
+        noise = np.divide(spec.noise.sigma0_uk, np.sqrt(moments.hits), out=np.zeros(weight.size), where=observed)
+    uniform = bool(np.all(weight == weight[0]))
+    return SurveyMap(name, moments, None if uniform else weight / np.sqrt(np.mean(weight**2)), noise, pairs)
+
+
+def _overlap(x: SurveyMap, y: SurveyMap) -> float:
+    """<w_x w_y>: by what the weights scale the spectra of the pair."""
+    if x.weight is None and y.weight is None:
+        return 1.0
+    product = (1.0 if x.weight is None else x.weight) * (1.0 if y.weight is None else y.weight)
+    overlap = float(np.mean(product))
+    if overlap <= 0.0:
+        raise InputError(
+            f'Maps {x.name} and {y.name} share no pixel, so they have no cross spectra; set pairs = "auto".'
+        )
+    return overlap

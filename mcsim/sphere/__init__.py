@@ -1,0 +1,1 @@
+"""The sphere: coefficients, pixels, rotations, masks, spectra, Gaussian skies, random streams, Wigner symbols."""

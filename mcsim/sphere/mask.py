@@ -1,0 +1,110 @@
+"""Masks: from a file to weights of the maps' pixels, in their frame, with a soft edge."""
+
+from pathlib import Path
+
+import healpy
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mcsim.errors import InputError
+from mcsim.sphere import healpix, rotation
+
+Mask = NDArray[np.float64]
+
+
+def read_mask(
+    path: Path, nside: int, frame: str = "ecliptic", mask_frame: str | None = None, apodisation_deg: float = 0.0
+) -> Mask:
+    """Weights of the pixels of a map from a HEALPix FITS file.
+
+    Parameters
+    ----------
+    path
+        HEALPix map of weights between 0 and 1 (1 where the sky is used), of any nside; RING or NESTED as it says.
+    nside, frame
+        Of the maps.
+    mask_frame
+        Frame of the mask; None: what the file's COORDSYS says, or that of the maps where it says nothing.
+    apodisation_deg
+        Width of the soft edge (:func:`apodise`), >= 0.
+
+    Returns
+    -------
+    ndarray
+        RING order, shape (12 nside^2,), between 0 and 1.
+
+    Raises
+    ------
+    InputError
+        If the file is no HEALPix map, has an nside that is no power of two, values outside 0 ... 1, or another frame
+        than the one given.
+
+    Notes
+    -----
+    Another nside is reached by ``healpy.ud_grade``: coarser pixels hand their value down, finer ones are averaged. The
+    frame is changed pixel by pixel (:func:`mcsim.sphere.rotation.rotate_pixels`) at the finer of the two resolutions.
+    The edge is softened last, so that its width is the same whatever the mask came from.
+    """
+    mask, stated, _ = healpix.read_map(path)
+    found = healpy.get_nside(mask)
+    if found & (found - 1):
+        raise InputError(f"{path} has nside {found}, which is not a power of two; bring the mask to one that is.")
+    if mask_frame is not None and stated not in (None, mask_frame):
+        raise InputError(
+            f"{path} says that it is in {stated} coordinates, map.mask_frame is {mask_frame}; correct one of them."
+        )
+    mask_frame = mask_frame or stated or frame
+    if not (np.all(np.isfinite(mask)) and mask.min() >= 0.0 and mask.max() <= 1.0):
+        raise InputError(f"{path} has values outside 0 ... 1; a mask is a map of weights, 1 where the sky is used.")
+    if found < nside:
+        mask = healpy.ud_grade(mask, nside)
+    if mask_frame != frame:
+        mask = rotation.rotate_pixels(mask, mask_frame, frame)
+    if found > nside:
+        mask = healpy.ud_grade(mask, nside)
+    return apodise(mask, np.deg2rad(apodisation_deg))
+
+
+def apodise(mask: Mask, width: float) -> Mask:
+    r"""Mask times a soft edge that rises from 0 at its zeros to 1 at the distance ``width`` from them.
+
+    Parameters
+    ----------
+    mask
+        Weights in RING order, shape (npix,).
+    width
+        In radians, >= 0.
+
+    Notes
+    -----
+    The edge is (1 - cos(pi d / width)) / 2 of the angle d from a pixel's centre to that of the nearest pixel of weight
+    0. Its slope is continuous: the mask's power at l > 3 pi / width is at most 1/64 of a sharp edge's. It takes sky
+    away and gives none back.
+    """
+    zeros = mask == 0.0
+    if width == 0.0 or not zeros.any() or zeros.all():
+        return mask
+    nside = healpy.get_nside(mask)
+    used = np.flatnonzero(~zeros)
+    nearest = cKDTree(_vectors(nside, _edge(zeros, nside)))
+    chord, _ = nearest.query(_vectors(nside, used), distance_upper_bound=2.0 * np.sin(min(width, np.pi) / 2.0))
+    # Beyond the bound the tree answers infinity.
+    distance = 2.0 * np.arcsin(np.minimum(chord, 2.0) / 2.0)
+    soft = mask.copy()
+    soft[used] *= np.where(distance < width, 0.5 - 0.5 * np.cos(np.pi * np.minimum(distance / width, 1.0)), 1.0)
+    return soft
+
+
+def _edge(zeros: NDArray[np.bool_], nside: int) -> NDArray[np.int64]:
+    """Pixels of weight 0 with a neighbour of another weight: one of them is the nearest zero of any used pixel."""
+    pixels = np.flatnonzero(zeros)
+    neighbours = healpy.get_all_neighbours(nside, pixels)
+    # Where a pixel has only seven neighbours the eighth is -1, and the last pixel stands in for it: at worst the edge
+    # has a pixel too many.
+    edge: NDArray[np.int64] = pixels[np.any(~zeros[neighbours], axis=0)]
+    return edge
+
+
+def _vectors(nside: int, pixels: NDArray[np.int64]) -> NDArray[np.float64]:
+    return np.stack(healpy.pix2vec(nside, pixels), axis=-1)

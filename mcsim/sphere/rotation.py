@@ -1,0 +1,180 @@
+"""Between the ecliptic, galactic and equatorial frames (J2000): a_lm, maps, BipoSH and orientation moments."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import ducc0
+import healpy as hp
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from mcsim.errors import InputError
+from mcsim.sphere import healpix
+
+FRAMES = {"ecliptic": "E", "galactic": "G", "equatorial": "C"}
+
+
+def rotation_matrix(frame_from: str, frame_to: str) -> NDArray[np.float64]:
+    """Matrix R with (components in ``frame_to``) = R (components in ``frame_from``), shape (3, 3).
+
+    Raises
+    ------
+    InputError
+        A frame other than ecliptic, galactic or equatorial.
+    """
+    for frame in (frame_from, frame_to):
+        if frame not in FRAMES:
+            raise InputError(f"frame {frame!r} is not known; use one of {', '.join(FRAMES)}.")
+    if frame_from == frame_to:
+        return np.eye(3)
+    return np.array(hp.Rotator(coord=[FRAMES[frame_from], FRAMES[frame_to]]).mat)
+
+
+def euler_angles(matrix: NDArray[np.float64]) -> tuple[float, float, float]:
+    """(alpha, beta, gamma) in radians with matrix = R_z(alpha) R_y(beta) R_z(gamma)."""
+    beta = float(np.arctan2(np.hypot(matrix[0, 2], matrix[1, 2]), matrix[2, 2]))
+    if np.hypot(matrix[0, 2], matrix[1, 2]) < 1e-12:
+        # Along the pole alpha and gamma only occur together.
+        return float(np.arctan2(-matrix[0, 1], matrix[1, 1])), beta, 0.0
+    return float(np.arctan2(matrix[1, 2], matrix[0, 2])), beta, float(np.arctan2(matrix[2, 1], -matrix[2, 0]))
+
+
+def wigner_D(L: int, matrix: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """D^L_{MM'} of a rotation, shape (2L + 1, 2L + 1), M and M' from -L to L: a'_{LM} = sum_M' D^L_{MM'} a_{LM'}.
+
+    Notes
+    -----
+    e^{-i M alpha} (e^{-i beta J_y})_{MM'} e^{-i M' gamma}, by the matrix exponential: meant for the L of BipoSH.
+    """
+    alpha, beta, gamma = euler_angles(matrix)
+    orders = np.arange(-L, L + 1)
+    ladder = np.diag(np.sqrt(L * (L + 1.0) - orders[:-1] * (orders[:-1] + 1.0)), -1)
+    small = expm(-0.5 * beta * (ladder - ladder.T))
+    return np.exp(-1j * alpha * orders)[:, None] * small * np.exp(-1j * gamma * orders)
+
+
+@lru_cache(maxsize=64)
+def _frame_D(L: int, frame_from: str, frame_to: str) -> NDArray[np.complex128]:
+    return wigner_D(L, rotation_matrix(frame_from, frame_to))
+
+
+def rotate_alm(
+    alm: NDArray[np.complex128], lmax: int, frame_from: str, frame_to: str, nthreads: int = 1
+) -> NDArray[np.complex128]:
+    """a_lm of a real field in another frame.
+
+    Parameters
+    ----------
+    alm
+        healpy order, shape (size(lmax),).
+    lmax
+        Highest degree.
+    frame_from, frame_to
+        "ecliptic", "galactic" or "equatorial".
+    nthreads
+        Threads of the transform.
+
+    Returns
+    -------
+    ndarray
+        Shape (size(lmax),).
+    """
+    alpha, beta, gamma = euler_angles(rotation_matrix(frame_from, frame_to))
+    return np.asarray(ducc0.sht.rotate_alm(alm, lmax, gamma, beta, alpha, nthreads=nthreads))
+
+
+def rotate_map(sky: NDArray[np.float64], frame_from: str, frame_to: str, nthreads: int = 1) -> NDArray[np.float64]:
+    """A full-sky HEALPix map (RING) in another frame, through its a_lm up to 2 nside.
+
+    Raises
+    ------
+    InputError
+        A map with unobserved pixels; for those, and for masks and hit counts, use :func:`rotate_pixels`.
+
+    Notes
+    -----
+    Multipoles above 2 nside are lost: a map that has power there, or sharp edges, rings.
+    """
+    if np.any(~np.isfinite(sky)) or np.any(sky == hp.UNSEEN):
+        raise InputError("the map has unobserved pixels, which a_lm cannot rotate; use rotate_pixels for it.")
+    nside = hp.get_nside(sky)
+    lmax = 2 * nside
+    alm = healpix.analysis(sky, lmax, iterations=3, nthreads=nthreads)
+    rotated = rotate_alm(alm, lmax, frame_from, frame_to, nthreads)
+    return healpix.synthesis(rotated[None], nside, lmax, nthreads=nthreads)[0]
+
+
+def rotate_pixels(values: NDArray, frame_from: str, frame_to: str) -> NDArray:
+    """A HEALPix map (RING) in another frame, each pixel taking the value found at its centre: for masks and hits."""
+    nside = hp.get_nside(values)
+    centres = np.array(hp.pix2vec(nside, np.arange(len(values))))
+    return values[hp.vec2pix(nside, *(rotation_matrix(frame_to, frame_from) @ centres))]
+
+
+def rotate_biposh(
+    biposh: NDArray[np.complex128], modes: Sequence[tuple[int, int, int]], frame_from: str, frame_to: str
+) -> NDArray[np.complex128]:
+    """A^{LM}_{l1 l2} in another frame.
+
+    Parameters
+    ----------
+    biposh
+        Shape (..., n_mode, lmax + 1), of one map or of an ordered pair, at ell = l2 with d = l2 - l1.
+    modes
+        (L, M, d) along the next-to-last axis: every M = 0..L of each (L, d), and no M < 0.
+    frame_from, frame_to
+        "ecliptic", "galactic" or "equatorial".
+
+    Returns
+    -------
+    ndarray
+        The same modes in ``frame_to``.
+
+    Raises
+    ------
+    InputError
+        An M of some (L, d) is missing.
+
+    Notes
+    -----
+    A^{LM} turns like a_{LM}: sum_M' D^L_{MM'} A^{LM'}, with A^{L,-M} = (-1)^{l1+l2-L+M} conj(A^{LM}), which holds for
+    pairs of maps too. Equal to rotating the sky first to round-off (tests/unit/test_rotation.py).
+    """
+    rows = {mode: i for i, mode in enumerate(modes)}
+    rotated = np.empty_like(biposh)
+    for L, d in sorted({(L, d) for L, _, d in modes}):
+        missing = [M for M in range(L + 1) if (L, M, d) not in rows]
+        if missing:
+            raise InputError(
+                f"rotation mixes all M of L={L}, d={d}, and M={missing[0]} is missing; give every M from 0 to {L}."
+            )
+        positive = [biposh[..., rows[L, M, d], :] for M in range(L + 1)]
+        negative = [(-1) ** (d + L + M) * positive[M].conj() for M in range(L, 0, -1)]
+        turned = np.einsum("mn,n...->m...", _frame_D(L, frame_from, frame_to)[L:], np.stack(negative + positive))
+        for M in range(L + 1):
+            rotated[..., rows[L, M, d], :] = turned[M]
+    return rotated
+
+
+def rotate_orientation_harmonics(w: NDArray[np.complex128], frame_from: str, frame_to: str) -> NDArray[np.complex128]:
+    """w_{s,LM} of the orientation moments in another frame, psi counted from the new frame's e_theta.
+
+    Parameters
+    ----------
+    w
+        Shape (smax + 1, L_max + 1, 2 L_max + 1), ``w[s, L, L_max + M]``.
+    frame_from, frame_to
+        "ecliptic", "galactic" or "equatorial".
+
+    Returns
+    -------
+    ndarray
+        The same shape.
+    """
+    L_max = w.shape[1] - 1
+    rotated = np.zeros_like(w)
+    for L in range(L_max + 1):
+        span = slice(L_max - L, L_max + L + 1)
+        rotated[:, L, span] = w[:, L, span] @ _frame_D(L, frame_from, frame_to).T
+    return rotated

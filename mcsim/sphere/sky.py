@@ -1,0 +1,43 @@
+"""Skies as coefficients: isotropic Gaussian ones, and the dipole."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.errors import InputError
+from mcsim.sphere import alm as alm_
+
+
+def gaussian_alm(cl: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.complex128]:
+    """Draw the coefficients of an isotropic Gaussian sky.
+
+    Parameters
+    ----------
+    cl
+        Power spectrum C_l in uK^2, shape (lmax + 1,), non-negative.
+    rng
+        Source of randomness: 2 * size(lmax) standard normal numbers are drawn.
+
+    Returns
+    -------
+    ndarray
+        a_lm in uK, shape (size(lmax),), with E|a_lm|^2 = C_l; a_l0 is real.
+    """
+    lmax = len(cl) - 1
+    alm = rng.standard_normal(2 * alm_.size(lmax)).view(np.complex128)
+    alm[: lmax + 1] = alm[: lmax + 1].real * np.sqrt(2.0)
+    alm *= np.sqrt(cl / 2.0)[alm_.degrees(lmax)]
+    return alm
+
+
+def dipole_alm(dipole_uk: Sequence[float] | NDArray[np.float64], lmax: int) -> NDArray[np.complex128]:
+    """Coefficients of the sky d . n of a vector d in the frame of the maps, in uK: l = 1 only, up to ``lmax`` >= 1."""
+    if lmax < 1:
+        raise InputError(f"lmax is {lmax}, but a dipole needs lmax >= 1.")
+    x, y, z = (float(component) for component in dipole_uk)
+    alm = np.zeros(alm_.size(lmax), dtype=np.complex128)
+    alm[alm_.start(lmax, 0) + 1] = math.sqrt(4.0 * math.pi / 3.0) * z
+    alm[alm_.start(lmax, 1) + 1] = -math.sqrt(2.0 * math.pi / 3.0) * complex(x, -y)
+    return alm

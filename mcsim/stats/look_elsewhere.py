@@ -1,0 +1,162 @@
+"""The best of many: one probability for a gap, and deviations corrected for looking at all of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import special
+from scipy.linalg import solve_triangular
+
+from mcsim.errors import InputError
+from mcsim.sphere.rng import generator
+from mcsim.stats.gaussian import COLLINEAR, Bases, Null, residual_probability, score_probability
+
+# Scatters drawn for a calibration; each serves many vectors, because a scatter costs a thousand times a vector.
+SCATTERS = 200
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Joint distribution, without any effect, of the omnibus probability and the smallest one of the candidates.
+
+    Attributes
+    ----------
+    tests
+        Number of candidates that the evidence hears.
+    smallest, combined
+        Sorted draws of the smallest probability of the candidates, and of the smaller one of the omnibus probability
+        and that, corrected for its trials.
+    """
+
+    tests: int
+    smallest: NDArray[np.float64]
+    combined: NDArray[np.float64]
+
+    def trials(self, smallest: ArrayLike) -> NDArray[np.float64]:
+        """Probability that the smallest probability of all candidates is this one or less.
+
+        Its rank among the draws, or Bonferroni's bound where that is lower, beyond the reach of the draws.
+        """
+        return np.minimum(_rank(self.smallest, smallest), self.tests * np.asarray(smallest))
+
+    def combine(self, omnibus: ArrayLike, smallest: ArrayLike) -> NDArray[np.float64]:
+        """Probability of the gap, from that of the omnibus test and the smallest one of the candidates."""
+        least = np.minimum(omnibus, self.trials(smallest))
+        return np.minimum(_rank(self.combined, least), 2.0 * least)
+
+
+def _rank(draws: NDArray[np.float64], value: ArrayLike) -> NDArray[np.float64]:
+    rank = np.searchsorted(draws, np.asarray(value), side="right")
+    return np.asarray((1.0 + rank) / (1.0 + len(draws)), dtype=np.float64)
+
+
+def calibrate(null: Null, candidates: Bases, draws: int = 20_000, seed: int = 0) -> Calibration:
+    """Draw pairs of data and scatter without any effect, for the geometry of the candidates.
+
+    Notes
+    -----
+    Let u be the data's part in the span of all templates, of rank r, and v the q = p - r others. Then v'S^-1 v ~
+    q/(n - q + 1) F(q, n - q + 1), u - S_uv S_vv^-1 v = sqrt(1 + v'S_vv^-1 v) z with z normal, and S_u.v ~ W_r(n - q),
+    all independent: r dimensions are drawn instead of p. The true metric is taken to be the estimated one. Uniform
+    for p = 20, N = 200 and p = 100, N = 1000: tests/statistical/test_diagnose_statistics.py.
+    """
+    n, p = null.dof, null.dimension
+    rng = generator(seed, 0, "diagnose/calibration")
+    sizes = candidates.sizes
+    _, singular, right = np.linalg.svd(candidates.basis, full_matrices=False)
+    r = int((singular > COLLINEAR).sum())
+    q, each = p - r, -(-draws // SCATTERS)
+    coordinates = singular[:r, None] * right[:r]
+    columns = {int(k): candidates.start[:-1][sizes == k, None] + np.arange(k) for k in np.unique(sizes[sizes > 0])}
+    omnibus, smallest = np.empty((SCATTERS, each)), np.ones((SCATTERS, each))
+    for row in range(SCATTERS):
+        rest = q / (n - q + 1) * rng.f(q, n - q + 1, each) if q else np.zeros(each)
+        root = np.tril(rng.normal(size=(r, r)), -1) + np.diag(np.sqrt(rng.chisquare(n - q - np.arange(r))))
+        y = solve_triangular(root, rng.normal(size=(r, each)), lower=True) * np.sqrt(1.0 + rest)
+        white = solve_triangular(root, coordinates, lower=True)
+        total = n * (rest + np.sum(y**2, axis=0))
+        omnibus[row] = residual_probability(total, p, n)
+        for k, index in columns.items():
+            basis = np.linalg.qr(np.moveaxis(white[:, index], 0, 1))[0]
+            drop = n * np.max(np.sum((np.swapaxes(basis, 1, 2) @ y) ** 2, axis=1), axis=0)
+            smallest[row] = np.minimum(smallest[row], score_probability(drop, total, k, p, n))
+    first = Calibration(int((sizes > 0).sum()), np.sort(smallest.ravel()), np.empty(0))
+    least = np.minimum(omnibus.ravel(), first.trials(smallest.ravel()))
+    return Calibration(first.tests, first.smallest, np.sort(least))
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Whether there is a gap: calibrated probability, its two parts, and the candidate that stands out most.
+
+    ``maximum`` is the probability of the most significant candidate, ``best``, corrected for trials.
+    """
+
+    probability: float
+    chi2: float
+    dimension: int
+    omnibus: float
+    maximum: float
+    best: int
+
+
+def gap(null: Null, x: NDArray[np.float64], candidates: Bases, calibration: Calibration) -> Gap:
+    """Test evidence, shape (p_raw,), against everything and against every candidate, as one probability."""
+    y = null.data(x)
+    chi2 = float(y @ y)
+    omnibus = null.probability(x)
+    scores = score_probability(candidates.drops(y), chi2, candidates.sizes, null.dimension, null.dof)
+    best = int(np.argmin(scores))
+    return Gap(
+        probability=float(calibration.combine(omnibus, scores[best])),
+        chi2=chi2,
+        dimension=null.dimension,
+        omnibus=omnibus,
+        maximum=float(calibration.trials(scores[best])),
+        best=best,
+    )
+
+
+def atlas(x: NDArray[np.float64], simulations: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Deviations of many correlated numbers, and their probabilities corrected for looking at all of them.
+
+    Parameters
+    ----------
+    x
+        Shape (..., B).
+    simulations
+        Shape (N, B), N >= 20.
+
+    Returns
+    -------
+    z, p
+        Shape (..., B): normal deviate of each, and the probability that the largest |z| of all is as large.
+
+    Notes
+    -----
+    Each simulation is compared with the others, so that it is as foreign to them as the data. p is the rank of |z|
+    among the maxima of the simulations; beyond the largest, 1 - (1 - p_1)^B_eff of the normal p_1, with B_eff fitted by
+    maximum likelihood to the upper tenth of the maxima.
+    """
+    count = len(simulations)
+    if count < 20:
+        raise InputError(f"{count} simulations are too few to rank deviations; give at least 20.")
+    centred = simulations - simulations.mean(axis=0)
+    variance = np.sum(centred**2, axis=0)
+    # Of N values without the i-th: mean moves by -c/(N-1), the sum of squares falls by c^2 N/(N-1).
+    others = np.sqrt(np.maximum(variance - centred**2 * count / (count - 1), 0.0) / (count - 2))
+    held_out = centred * np.sqrt(count / (count - 1)) / others
+    maxima = np.max(np.abs(_normal(held_out, count - 2)), axis=1)
+    z = _normal((x - simulations.mean(axis=0)) / np.sqrt(variance / (count - 1) * (1.0 + 1.0 / count)), count - 1)
+    exceeding = count - np.searchsorted(np.sort(maxima), np.abs(z), side="left")
+    waits = np.sort(-np.log1p(-2.0 * special.ndtr(-maxima)))
+    upper = max(10, count // 10)
+    trials = max(upper / (np.sum(waits[:upper]) + (count - upper) * waits[upper - 1]), 1.0)
+    beyond = -np.expm1(trials * np.log1p(-np.minimum(2.0 * special.ndtr(-np.abs(z)), 1.0 - 1e-12)))
+    ranked = (1.0 + exceeding) / (1.0 + count)
+    return z, np.where(exceeding > 0, ranked, np.minimum(ranked, beyond))
+
+
+def _normal(t: NDArray[np.float64], dof: int) -> NDArray[np.float64]:
+    """Normal deviate of the same probability as a Student t."""
+    return -np.sign(t) * special.ndtri(np.maximum(special.stdtr(dof, -np.abs(t)), 1e-300))

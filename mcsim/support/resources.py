@@ -1,0 +1,66 @@
+"""Files shipped with mcsim: scan models, workflows and power spectra.
+
+An installed wheel has them inside the package; a source checkout (or an editable installation of it) has
+``scan_models`` and ``workflows`` beside the package, where people look for them.
+"""
+
+from pathlib import Path
+
+from mcsim.errors import InputError
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def scan_model(name_or_path: str | Path, relative_to: str | Path | None = None) -> Path:
+    """Find a scan model.
+
+    Parameters
+    ----------
+    name_or_path
+        Name of a packaged model, for example ``"wmap"``, or the path of a TOML file. A packaged name wins: write
+        ``./wmap`` for a file of that name.
+    relative_to
+        Folder that a relative path starts from; default: the working folder.
+
+    Raises
+    ------
+    InputError
+        Neither a packaged name nor an existing file.
+    """
+    return _find("scan model", "scan_models", ".toml", name_or_path, relative_to)
+
+
+def workflow(name_or_path: str | Path, relative_to: str | Path | None = None) -> Path:
+    """Find a run configuration: a packaged name, for example ``"quickstart"``, or a path. See :func:`scan_model`."""
+    return _find("run configuration", "workflows", ".toml", name_or_path, relative_to)
+
+
+def spectrum(name_or_path: str | Path, relative_to: str | Path | None = None) -> Path:
+    """Find a power spectrum: a packaged name, for example ``"wmap7"``, or a path. See :func:`scan_model`."""
+    return _find("power spectrum", "data", ".txt", name_or_path, relative_to)
+
+
+def names(kind: str) -> tuple[str, ...]:
+    """Sorted names that are packaged; ``kind`` is ``"scan_models"``, ``"workflows"`` or ``"data"`` (power spectra)."""
+    suffix = ".txt" if kind == "data" else ".toml"
+    return tuple(sorted(path.stem for path in _folder(kind).glob(f"*{suffix}")))
+
+
+def _folder(kind: str) -> Path:
+    inside = _PACKAGE / kind
+    return inside if inside.is_dir() else _PACKAGE.parent / kind
+
+
+def _find(noun: str, kind: str, suffix: str, name_or_path: str | Path, relative_to: str | Path | None) -> Path:
+    if str(name_or_path) in names(kind):
+        return _folder(kind) / f"{name_or_path}{suffix}"
+    path = Path(relative_to or ".") / name_or_path
+    try:
+        if path.is_file():
+            return path.resolve()
+    except (OSError, ValueError):  # names that no file system takes: too long, or with a NUL
+        pass
+    raise InputError(
+        f"{noun} {str(name_or_path)!r} is neither a file (looked for {str(path)!r}) nor packaged with mcsim; "
+        f"give a path or one of: {', '.join(names(kind)) or 'none is packaged'}."
+    )

@@ -1,0 +1,22 @@
+"""The library of effects: one file each, found by name; other packages add theirs by entry points."""
+
+from mcsim.systematics.base import Alm, Draw, Effect, Map, Pointing, Site
+from mcsim.systematics.compose import looked_at, seen_through, spread_of
+from mcsim.systematics.registry import build, catalogue, describe, get, lent
+
+__all__ = [
+    "Alm",
+    "Draw",
+    "Effect",
+    "Map",
+    "Pointing",
+    "Site",
+    "build",
+    "catalogue",
+    "describe",
+    "get",
+    "lent",
+    "looked_at",
+    "seen_through",
+    "spread_of",
+]

@@ -1,0 +1,93 @@
+"""A beam that leans to one side."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from mcsim.instrument.beams import Beam
+from mcsim.systematics.base import Effect, Site, Vector
+from mcsim.systematics.shape import shape
+
+_WHOLE_SIGMAS = 7.0
+_FADED_SIGMAS = 9.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class BeamComa(Effect):
+    """The beam times 1 + k (u^3 - 3u), u the coordinate along the angle in sigmas.
+
+    Attributes
+    ----------
+    amplitude
+        k.
+    angle_deg
+        Direction of u, from beam x (along the scan) towards y.
+
+    Notes
+    -----
+    u^3 - 3u is the third Hermite polynomial: it moves neither the centroid of a Gaussian nor its width. Sigma is that
+    of the Gaussian with the beam's solid angle. Beyond 7 sigma the change fades out, to nothing at 9: there is no beam
+    there to lean, but a little noise of its coefficients that the cube would amplify. The change is
+    k sigma^-3 times c1 cos a + s1 sin a + c3 cos 3a + s3 sin 3a in the angle a, whatever the beam: m = 1 goes with the
+    angle and m = 3 with three times it, so that four components span it.
+    """
+
+    name = "beam_coma"
+    scope = "channel"
+    unit = "k of 1 + k (u^3 - 3u)"
+    cause = "Third-order aberration of optics off the axis."
+    signature = "L = 1 and 3, d = +-1, through w_1 and w_3; changes sign where the scan reverses (half1 - half2)."
+    source = "Born & Wolf, Principles of Optics, Sec. 5.3, in the lowest Hermite order that keeps the centroid"
+    step = 0.01
+
+    angle_deg: float = 0.0
+
+    def beam(self, beam: Beam, site: Site) -> Beam:
+        """Times the cubic polynomial."""
+        if self.amplitude == 0.0:
+            return beam
+        form = shape(beam, 4)
+        radius = form.theta / form.sigma
+        u = radius * np.cos(form.phi - np.deg2rad(self.angle_deg))
+        fading = np.clip((_FADED_SIGMAS - radius) / (_FADED_SIGMAS - _WHOLE_SIGMAS), 0.0, 1.0)
+        near = fading**3 * (10.0 - 15.0 * fading + 6.0 * fading**2)
+        return form.with_added(self.amplitude * form.values * near * (u**3 - 3.0 * u), 3)
+
+    @classmethod
+    def basis(cls) -> tuple[Self, ...]:
+        """At 0, 45, 90 and 135 degrees."""
+        return tuple(cls(amplitude=cls.step, angle_deg=angle) for angle in (0.0, 45.0, 90.0, 135.0))
+
+    def coordinates(self) -> Vector:
+        """Coefficients of the responses at 0, 45, 90 and 135 degrees that give the response at the angle."""
+        return self.amplitude * _weights(np.deg2rad(self.angle_deg))
+
+    @classmethod
+    def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
+        """The best k and angle: k is linear, the angle is searched."""
+        if not precision.any():
+            return cls()  # not heard
+        measured = precision @ coordinates
+
+        def missed(angle: float) -> float:
+            weights = _weights(angle)
+            return -(max(float(weights @ measured), 0.0) ** 2) / float(weights @ precision @ weights)
+
+        tried = np.linspace(0.0, 2.0 * np.pi, 181)
+        first = tried[int(np.argmin([missed(angle) for angle in tried]))]
+        angle = minimize_scalar(
+            missed, bounds=(first - 0.05, first + 0.05), method="bounded", options={"xatol": 1e-9}
+        ).x
+        weights = _weights(angle)
+        amplitude = max(float(weights @ measured), 0.0) / float(weights @ precision @ weights)
+        return cls(amplitude=amplitude, angle_deg=float(np.rad2deg(angle)) % 360.0)
+
+
+def _weights(angle: float) -> Vector:
+    """Of the responses at 0, 45, 90 and 135 degrees in that at ``angle`` radians, from their m = 1 and m = 3 parts."""
+    c1, s1, c3, s3 = np.cos(angle), np.sin(angle), np.cos(3.0 * angle), np.sin(3.0 * angle)
+    even, odd = (c1 - c3) / np.sqrt(2.0), (s1 + s3) / np.sqrt(2.0)
+    return 0.5 * np.array([c1 + c3, odd + even, s1 - s3, odd - even])

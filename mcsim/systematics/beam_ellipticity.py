@@ -1,0 +1,64 @@
+"""An elongated beam that is believed to be as drawn."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.errors import InputError
+from mcsim.instrument.beams import Beam
+from mcsim.systematics.base import Effect, Site, Vector, polar
+from mcsim.systematics.shape import stretched
+
+
+@dataclass(frozen=True, kw_only=True)
+class BeamEllipticity(Effect):
+    """The beam stretched to major/minor = 1 + amplitude at the same area; a negative amplitude turns it by 90 deg.
+
+    Attributes
+    ----------
+    amplitude
+        Ratio of the axes less one, of a beam that was round.
+    angle_deg
+        Direction of the major axis, from beam x (along the scan) towards y.
+    """
+
+    name = "beam_ellipticity"
+    scope = "channel"
+    unit = "major/minor - 1"
+    cause = "Optics off the axis: defocus, coma-free astigmatism, or a horn that looks past the centre of the mirror."
+    signature = "Even L, growing as l^2, fixed to the scan through w_2."
+    source = "Joshi et al. arXiv:1210.7318, Sec. IV; Fosalba et al. 2002, Phys. Rev. D 65, 063003"
+    step = 0.02
+
+    angle_deg: float = 0.0
+
+    def beam(self, beam: Beam, site: Site) -> Beam:
+        """Stretched along the angle and squeezed across it."""
+        if self.amplitude == 0.0:
+            return beam
+        if abs(self.amplitude) > 2.0:
+            raise InputError(
+                f"effect {self.name}: amplitude = {self.amplitude:g} is no beam to speak of; keep it within +-2."
+            )
+        ratio, angle = 1.0 + abs(self.amplitude), np.deg2rad(self.angle_deg)
+        if self.amplitude < 0.0:
+            angle += np.pi / 2
+        return stretched(beam, np.sqrt(ratio), 1.0 / np.sqrt(ratio), angle, 32, 2)
+
+    @classmethod
+    def basis(cls) -> tuple[Self, ...]:
+        """Along the scan, and at 45 degrees to it."""
+        return (cls(amplitude=cls.step), cls(amplitude=cls.step, angle_deg=45.0))
+
+    def coordinates(self) -> Vector:
+        """(e cos 2 angle, e sin 2 angle)."""
+        angle = 2.0 * np.deg2rad(self.angle_deg)
+        return self.amplitude * np.array([np.cos(angle), np.sin(angle)])
+
+    @classmethod
+    def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
+        """Norm and half the angle."""
+        amplitude, angle_deg = polar(coordinates, 2)
+        return cls(amplitude=amplitude, angle_deg=angle_deg)

@@ -1,0 +1,32 @@
+"""A beam wider than believed."""
+
+from dataclasses import dataclass
+
+from mcsim.errors import InputError
+from mcsim.instrument.beams import Beam
+from mcsim.systematics.base import Effect, Site
+from mcsim.systematics.shape import stretched
+
+
+@dataclass(frozen=True, kw_only=True)
+class BeamWidth(Effect):
+    """The beam 1 + amplitude times as wide in every direction, at the same integral: all its orders scale."""
+
+    name = "beam_width"
+    scope = "channel"
+    unit = "fraction of the FWHM"
+    cause = "A beam mapped with an error of its width, or a focus that drifts."
+    signature = "L = 0: the power falls off sooner, in this channel alone."
+    source = "Huffenberger et al. 2010, A&A 513, A23 (errors of measured beams)"
+    step = 0.005
+
+    def beam(self, beam: Beam, site: Site) -> Beam:
+        """Stretched."""
+        if self.amplitude == 0.0:
+            return beam
+        if not -0.9 <= self.amplitude <= 9.0:
+            raise InputError(
+                f"effect {self.name}: amplitude = {self.amplitude:g} leaves no beam to speak of; "
+                "choose one between -0.9 and 9."
+            )
+        return stretched(beam, 1.0 + self.amplitude, 1.0 + self.amplitude, 0.0, 2, 0)

@@ -1,0 +1,61 @@
+"""A gain that follows the year."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.systematics.base import Effect, Site, Vector, polar
+
+
+@dataclass(frozen=True, kw_only=True)
+class GainDrift(Effect):
+    """Gain 1 + amplitude cos(2 pi t / orbit period - phase), of sky and dipole alike.
+
+    Attributes
+    ----------
+    amplitude
+        Fraction.
+    phase_deg
+        Part of the year at which the gain is highest, as an angle from the start of the survey.
+
+    Notes
+    -----
+    The dipole is taken off with the believed gain, 1: what is left of it is most of the effect.
+    """
+
+    name = "gain_drift"
+    scope = "channel"
+    unit = "fraction"
+    cause = "Temperature of the receiver over the year, followed imperfectly by the calibration."
+    signature = (
+        "Sky and dipole modulated with the year: additive at low l, ordered by the scan, opposite in the halves."
+    )
+    source = "Jarosik et al. 2007, ApJS 170, 263, Sec. 2 (gain model and its residuals)"
+    step = 2e-4
+
+    phase_deg: float = 0.0
+
+    def gain(self, time_s: Vector, site: Site) -> Vector | None:
+        """A wave of the period of the orbit."""
+        if self.amplitude == 0.0:
+            return None
+        turns = time_s / site.pointed(self.name).model.orbit_period_s
+        return np.asarray(self.amplitude * np.cos(2.0 * np.pi * turns - np.deg2rad(self.phase_deg)))
+
+    @classmethod
+    def basis(cls) -> tuple[Self, ...]:
+        """Cosine and sine."""
+        return (cls(amplitude=cls.step), cls(amplitude=cls.step, phase_deg=90.0))
+
+    def coordinates(self) -> Vector:
+        """Amplitudes of the cosine and the sine of the year."""
+        phase = np.deg2rad(self.phase_deg)
+        return self.amplitude * np.array([np.cos(phase), np.sin(phase)])
+
+    @classmethod
+    def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
+        """Norm and phase."""
+        amplitude, phase_deg = polar(coordinates)
+        return cls(amplitude=amplitude, phase_deg=phase_deg)

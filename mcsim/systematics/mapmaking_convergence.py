@@ -1,0 +1,23 @@
+"""A map-making that stopped early."""
+
+from dataclasses import dataclass
+
+from mcsim.systematics.base import Effect
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapmakingConvergence(Effect):
+    """The map-making stops ``amplitude`` iterations (rounded) before it has converged."""
+
+    name = "mapmaking_convergence"
+    scope = "channel"
+    unit = "iterations short"
+    cause = "Conjugate gradients ended by a count, not by their residual."
+    signature = "Stripes in the frame of the scan, at the largest scales; acts on differencing scans only."
+    source = "Hinshaw et al. 2003, ApJS 148, 63, Sec. 3 (iterations of the map-making)"
+    step = 1.0
+    side = 1
+
+    def differencing(self, imbalance: float, iterations_short: int) -> tuple[float, int]:
+        """Fewer iterations."""
+        return imbalance, iterations_short + round(self.amplitude)

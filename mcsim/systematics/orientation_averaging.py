@@ -1,0 +1,51 @@
+"""A beam that is believed to keep its orientation while the scan turns it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mcsim.instrument.scan import Moments, cached_moments, load_model
+from mcsim.support.resources import scan_model
+from mcsim.systematics.base import Effect, Site
+
+
+@dataclass(frozen=True, kw_only=True)
+class OrientationAveraging(Effect):
+    """Orientation moments (1 - amplitude) w + amplitude w of the real scan; at 1 all of the real scan's.
+
+    Attributes
+    ----------
+    model
+        A packaged scan model, or the path of one, that stands for the real scan; left out, it is the scan that the
+        channel's pointing is known from. A diagnosis of a run with parallel transport proposes WMAP's.
+
+    Notes
+    -----
+    The real moments are those of the model's whole survey, in every split. Hits and centroids stay as believed.
+    """
+
+    name = "orientation_averaging"
+    scope = "channel"
+    unit = "1 = parallel transport assumed, scan real"
+    cause = "Parallel transport, or one orientation per pixel, in place of the survey's samples."
+    signature = "L = 2, M = 0 falls to 0.66 of what parallel transport gives, and other M appear."
+    source = "Joshi et al. arXiv:1210.7318, Sec. V"
+    step = 0.05
+    side = 1
+    variants = ({"model": "wmap"},)
+
+    model: str = ""
+
+    def orientations(self, moments: Moments, site: Site) -> Moments:
+        """Mixed; pixels that the real scan does not reach stay as they are."""
+        if self.amplitude == 0.0:
+            return moments
+        if self.model:
+            real, lines, part = load_model(scan_model(self.model)), None, (0.0, 1.0)
+        else:
+            pointed = site.pointed(self.name)
+            real, lines, part = pointed.model, (pointed.line.name,), pointed.time_range
+        folder = cached_moments(real, moments.nside, moments.smax, moments.frame, lines, part)
+        other = Moments.load(folder)
+        mixed = (1.0 - self.amplitude) * moments.w + self.amplitude * other.w
+        return replace(moments, w=np.where(other.hits > 0.0, mixed, moments.w))

@@ -1,0 +1,80 @@
+"""A line of sight that is not where it is believed to be."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.instrument.beams import Beam
+from mcsim.systematics.base import Effect, Site, Vector, polar
+from mcsim.systematics.shape import displaced
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointingOffset(Effect):
+    """The true direction is the believed one plus a vector fixed to the beam.
+
+    Attributes
+    ----------
+    amplitude
+        Length of the vector, arcmin.
+    angle_deg
+        Its direction, from beam x (along the scan) towards y (towards the spin axis).
+
+    Notes
+    -----
+    The beam is turned rigidly along the great circle, with its axes carried along: exact, in both routes.
+    """
+
+    name = "pointing_offset"
+    scope = "channel"
+    unit = "arcmin"
+    cause = "A boresight calibrated on planets, thermal bending, or an error of the time stamps (along the scan)."
+    signature = "The gradient of the sky along or across the scan, through w_1; acts on the dipole too."
+    source = "Jarosik et al. 2007, ApJS 170, 263 (boresights); Mitra et al. 2011, ApJS 193, 5"
+    step = 0.2
+
+    angle_deg: float = 0.0
+
+    def pointing(self, beam: Beam, site: Site) -> Beam:
+        """Displaced."""
+        if self.amplitude == 0.0:
+            return beam
+        return displaced(beam, np.deg2rad(self.angle_deg), np.deg2rad(self.amplitude / 60.0))
+
+    def moved(self, theta: Vector, phi: Vector, psi: Vector) -> tuple[Vector, Vector, Vector] | None:
+        """The same rotation of every sample's direction and axes."""
+        if self.amplitude == 0.0:
+            return theta, phi, psi
+        distance, angle = np.deg2rad(self.amplitude / 60.0), np.deg2rad(self.angle_deg)
+        sin_t, cos_t, sin_p, cos_p = np.sin(theta), np.cos(theta), np.sin(phi), np.cos(phi)
+        outward = np.stack([sin_t * cos_p, sin_t * sin_p, cos_t])
+        south = np.stack([cos_t * cos_p, cos_t * sin_p, -sin_t])
+        east = np.stack([-sin_p, cos_p, np.zeros_like(phi)])
+        # Along the displacement and to its left; the first turns down, the second stays.
+        forward = np.cos(psi + angle) * south + np.sin(psi + angle) * east
+        left = np.cos(psi + angle) * east - np.sin(psi + angle) * south
+        line = np.cos(distance) * outward + np.sin(distance) * forward
+        forward = np.cos(distance) * forward - np.sin(distance) * outward
+        axis = np.cos(angle) * forward - np.sin(angle) * left
+        width = np.hypot(line[0], line[1])
+        # x . e_theta = -x_z / sin(theta) and x . e_phi = (n x x)_z / sin(theta), as the two are orthogonal.
+        turned = np.arctan2(line[0] * axis[1] - line[1] * axis[0], -axis[2])
+        return np.arctan2(width, line[2]), np.arctan2(line[1], line[0]) % (2.0 * np.pi), turned
+
+    @classmethod
+    def basis(cls) -> tuple[Self, ...]:
+        """Along and across the scan."""
+        return (cls(amplitude=cls.step), cls(amplitude=cls.step, angle_deg=90.0))
+
+    def coordinates(self) -> Vector:
+        """Arcmin along x and y."""
+        angle = np.deg2rad(self.angle_deg)
+        return self.amplitude * np.array([np.cos(angle), np.sin(angle)])
+
+    @classmethod
+    def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
+        """Norm and angle."""
+        amplitude, angle_deg = polar(coordinates)
+        return cls(amplitude=amplitude, angle_deg=angle_deg)

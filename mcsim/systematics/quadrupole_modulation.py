@@ -1,0 +1,64 @@
+"""A sky with more power along some axes."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.systematics.base import Alm, Draw, Effect, Site, Vector
+from mcsim.systematics.product import multiplied
+from mcsim.systematics.vectors import along
+
+
+@dataclass(frozen=True, kw_only=True)
+class QuadrupoleModulation(Effect):
+    """The sky times 1 + Q(n), in every channel.
+
+    Attributes
+    ----------
+    amplitude
+        Norm of Q: its root mean square over the sky is amplitude / sqrt(5).
+    components
+        Direction of Q (its length does not matter) in the basis (3z^2 - 1)/2, sqrt(3) xz, sqrt(3) yz,
+        sqrt(3)/2 (x^2 - y^2), sqrt(3) xy of n = (x, y, z) in the frame of the maps, each of mean square 1/5.
+    """
+
+    name = "quadrupole_modulation"
+    scope = "common"
+    unit = "fraction"
+    cause = "A sky that is not statistically isotropic: a preferred axis, as of an anisotropic early expansion."
+    signature = "L = 2, the same in every channel and split: a near twin of m = 2 in one channel."
+    source = "Ackerman, Carroll & Wise 2007, Phys. Rev. D 75, 083502, with a modulation of the sky in place of P(k)"
+    step = 0.01
+    own_score = False
+
+    components: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 0.0)
+
+    def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
+        """Modulated."""
+        if self.amplitude == 0.0:
+            return sky
+        q = self.coordinates()
+
+        def field(x: Vector, y: Vector, z: Vector) -> Vector:
+            root = np.sqrt(3.0)
+            diagonal = q[0] * 0.5 * (3.0 * z**2 - 1.0) + q[3] * 0.5 * root * (x**2 - y**2)
+            return np.asarray(diagonal + root * (q[1] * x * z + q[2] * y * z + q[4] * x * y))
+
+        return sky + multiplied(sky, site.lmax, field, 2)
+
+    @classmethod
+    def basis(cls) -> tuple[Self, ...]:
+        """The five components one by one."""
+        return tuple(cls(amplitude=cls.step, components=tuple(map(float, row))) for row in np.eye(5))
+
+    def coordinates(self) -> Vector:
+        """Amplitude times the unit vector along the components."""
+        return along(self.name, "components", self.components, self.amplitude)
+
+    @classmethod
+    def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
+        """Norm and direction."""
+        norm = float(np.linalg.norm(coordinates))
+        return cls(amplitude=norm, components=tuple(map(float, coordinates / norm))) if norm else cls()

@@ -1,0 +1,22 @@
+"""Two sides of a radiometer that do not let through the same."""
+
+from dataclasses import dataclass
+
+from mcsim.systematics.base import Effect
+
+
+@dataclass(frozen=True, kw_only=True)
+class TransmissionImbalance(Effect):
+    """The true imbalance x of (1 + x) T_A - (1 - x) T_B is the believed one plus amplitude."""
+
+    name = "transmission_imbalance"
+    scope = "channel"
+    unit = "x"
+    cause = "Losses in the two arms of a differencing radiometer, measured with an error."
+    signature = "Stripes of the dipole along the scan; acts on differencing scans only."
+    source = "Jarosik et al. 2003, ApJS 145, 413; Hinshaw et al. 2003, ApJS 148, 63"
+    step = 1e-3
+
+    def differencing(self, imbalance: float, iterations_short: int) -> tuple[float, int]:
+        """More imbalance than believed."""
+        return imbalance + self.amplitude, iterations_short
