@@ -12,7 +12,7 @@ from scipy import special
 from mcsim.benchmark.prior import Prior
 from mcsim.benchmark.truth import Identity
 from mcsim.sphere import rng
-from mcsim.stats.detection import log_likelihood, posterior
+from mcsim.stats.detection import posterior
 from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates
 
 Vector = NDArray[np.float64]
@@ -59,7 +59,7 @@ class Bayes:
             logs[answer] = float(np.logaddexp(logs.get(answer, -np.inf), value))
 
         total = float(y @ y)
-        none = float(log_likelihood(self.null, total))
+        none = float(self.null.log_likelihood(total))
         if self.prior.none > 0.0:
             add(frozenset(), none + np.log(self.prior.none))
         if self.prior.one > 0.0:
@@ -76,7 +76,7 @@ class Bayes:
     @cached_property
     def _strengths(self) -> tuple[Vector, Vector]:
         edges = np.exp(np.linspace(np.log(self.prior.weakest), np.log(self.prior.strongest), 61))
-        return np.sqrt(edges[1:] * edges[:-1]) / np.sqrt(self.null.unbiased), np.ones(60)
+        return np.sqrt(edges[1:] * edges[:-1]) / np.sqrt(self.null.hartlap_factor), np.ones(60)
 
     def _singles(self, x: Vector, y: Vector) -> Vector:
         """Logarithm of evidence over that of none, prior weight included."""
@@ -116,7 +116,7 @@ class Bayes:
             fits.append((i, j, matrix, theta, max(total - float(score[columns] @ theta), 0.0)))
         if not fits:
             return []
-        likelihoods = log_likelihood(self.null, np.array([fit[4] for fit in fits]))
+        likelihoods = self.null.log_likelihood(np.array([fit[4] for fit in fits]))
         best = float(likelihoods.max())
         found = []
         for (i, j, matrix, theta, chi2), likelihood in zip(fits, likelihoods, strict=True):
@@ -145,7 +145,7 @@ class Bayes:
     def _density(self, theta: Vector) -> Vector:
         K = theta.shape[1]
         s = np.linalg.norm(theta, axis=1)
-        ends = np.array([self.prior.weakest, self.prior.strongest]) / np.sqrt(self.null.unbiased)
+        ends = np.array([self.prior.weakest, self.prior.strongest]) / np.sqrt(self.null.hartlap_factor)
         area = np.log(2.0) + 0.5 * K * np.log(np.pi) - special.gammaln(0.5 * K)
         inside = (s >= ends[0]) & (s <= ends[1])
         value = -K * np.log(np.maximum(s, 1e-300)) - area - np.log(np.log(ends[1] / ends[0]))

@@ -19,7 +19,7 @@ from mcsim.diagnosis.validation import Prediction, Shrink, achieved, predicted
 from mcsim.errors import InputError
 from mcsim.sphere import rng
 from mcsim.stats.detection import power
-from mcsim.stats.gaussian import SimulatedGaussian, fit, whitened_templates
+from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import Calibration, calibrate, global_test
 
 Vector = NDArray[np.float64]
@@ -79,7 +79,7 @@ def bench(context: DiagnosisContext, names: tuple[str, ...] = ()) -> Bench:
         for proposal, columns in zip(analysis.proposals, analysis.columns, strict=True)
     )
     whole, t = seen.null(), significant_templates(known)
-    groups = whitened_templates(whole, t, [candidate.columns for candidate in candidates])
+    groups = whole.whiten_groups(t, [candidate.columns for candidate in candidates])
     return Bench(
         whole,
         seen.null(first) if len(first) and len(second) else None,
@@ -232,7 +232,7 @@ def shrunk(bench: Bench, x: Vector, members: Sequence[int]) -> tuple[Prediction,
         return None
     columns = np.array(columns_of(bench.candidates, members))
     here = bench.templates[np.ix_(bench.second, columns)]
-    frozen = fit(bench.used, x[bench.first], bench.templates[np.ix_(bench.first, columns)])
+    frozen = bench.used.fit(x[bench.first], bench.templates[np.ix_(bench.first, columns)])
     try:
         effects = effects_at(bench.candidates, bench.proposals, members, frozen)
     except InputError:
@@ -318,7 +318,7 @@ def powers(context: DiagnosisContext, number: int, seed: int, *, alpha: float = 
                 for s in grid
             ]
         )
-        for simulations in (None, here.null.count)
+        for simulations in (None, here.null.n_sims)
     )
     return Power(
         strengths,

@@ -259,7 +259,7 @@ def _measured(model: str, simulations: int | None, members: Sequence[Member], se
             # Two halves of the skies, so that their noise does not count as strength.
             halves = (one - reference[: len(one)], two - reference[len(one) : len(one) + len(two)])
             first, second = (null.whiten_templates(half.mean(axis=0)[:, None])[:, 0] for half in halves)
-            strength = float(np.sqrt(max(null.unbiased * float(first @ second), 0.0)))
+            strength = float(np.sqrt(max(null.hartlap_factor * float(first @ second), 0.0)))
             if strength > LARGER * member.strength and attempt + 1 < ATTEMPTS:
                 continue  # its response is no straight line
             coordinates = tuple(float(value) for value in effect.coordinates())

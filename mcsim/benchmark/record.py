@@ -12,7 +12,7 @@ from mcsim.benchmark.prior import CaseSampler
 from mcsim.benchmark.truth import Identity, Kind
 from mcsim.diagnosis.candidate import Candidate
 from mcsim.diagnosis.subsets import Subsets
-from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates, whitened_templates
+from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration
 
 Vector = NDArray[np.float64]
@@ -130,7 +130,7 @@ class Geometry:
     ) -> "Geometry":
         """From templates."""
         return cls(
-            null, candidates, whitened_templates(null, t, [candidate.columns for candidate in candidates]), calibration
+            null, candidates, null.whiten_groups(t, [candidate.columns for candidate in candidates]), calibration
         )
 
     def bayes(self, sampler: CaseSampler) -> Bayes:
@@ -158,7 +158,7 @@ class Geometry:
         for size in range(1, max_amplitude + 1):
             left = [search.solve(rows).chi2.min() for rows in search.rows(size, ()) if len(rows)]
             best = min([best, *left])
-            found.append(float(np.sqrt(self.null.unbiased * max(best, 0.0))))
+            found.append(float(np.sqrt(self.null.hartlap_factor * max(best, 0.0))))
         return tuple(found)
 
 
