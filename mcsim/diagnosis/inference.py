@@ -36,7 +36,7 @@ from mcsim.diagnosis.where import Place, places
 from mcsim.diagnosis.wiener_filter import show
 from mcsim.diagnosis.with_scatter import with_scatter
 from mcsim.errors import InputError
-from mcsim.stats.gaussian import SimulatedGaussian, fit, whitened_templates
+from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import Calibration, calibrate, global_test
 
 Vector = NDArray[np.float64]
@@ -129,7 +129,7 @@ def context(run: config.RunConfig, analysis: Analysis, known: Knowledge) -> Diag
         )
         for proposal, columns, own in zip(analysis.proposals, analysis.columns, scatter, strict=True)
     )
-    groups = whitened_templates(null, significant_templates(known), [candidate.columns for candidate in candidates])
+    groups = null.whiten_groups(significant_templates(known), [candidate.columns for candidate in candidates])
     return DiagnosisContext(run, analysis, known, null, candidates, calibrate(null, groups))
 
 
@@ -153,7 +153,7 @@ def diagnose_maps(context: DiagnosisContext, case: str, maps: Sequence[NDArray[n
 
     respond = Responses(context.run, analysis, known, show(analysis.model, maps), ask)
     t = significant_templates(known)
-    groups = whitened_templates(context.null, t, [candidate.columns for candidate in context.candidates])
+    groups = context.null.whiten_groups(t, [candidate.columns for candidate in context.candidates])
     if global_test(context.null, x, groups, context.calibration).pvalue <= ALPHA:
         t = templates_on_sky(known, analysis, t, respond)
     refined = refine(known, context.null, x, t, context.candidates, analysis.proposals, context.calibration, respond)
@@ -259,8 +259,7 @@ def shrink_of(
     chosen = np.array(columns)
     scatters = [one for one in (refined.candidates[member].scatter for member in members) if one is not None]
     learning, before = context.known.null(used), context.known.null(fresh)
-    frozen = fit(
-        learning.with_extra_covariance(*(one[used] for one in scatters)),
+    frozen = learning.with_extra_covariance(*(one[used] for one in scatters)).fit(
         x[used],
         refined.templates[np.ix_(used, chosen)],
     )
@@ -274,7 +273,7 @@ def shrink_of(
     if scatters:
         response = refined.templates[:, chosen] @ frozen.amplitudes
         squares = _squares(before, response, scatters, fresh), _squares(learning, response, scatters, used)
-        noise = fit(learning, x[used], refined.templates[np.ix_(used, chosen)]).covariance
+        noise = learning.fit(x[used], refined.templates[np.ix_(used, chosen)]).covariance
         expected = carried(before, after, x[fresh], here, noise, excess(learning, x[used]), *squares)
     else:
         expected = predicted(before, x[fresh], here, frozen.amplitudes, frozen.covariance)

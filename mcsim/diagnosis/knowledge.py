@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.diagnosis.analysis import Analysis, Job, Proposal
 from mcsim.diagnosis.summaries import Element
-from mcsim.stats.gaussian import SimulatedGaussian, null
+from mcsim.stats.gaussian import SimulatedGaussian
 
 Vector = NDArray[np.float64]
 Ask = Callable[[Sequence[Job]], list[NDArray[np.float64]]]
@@ -100,7 +100,7 @@ class Knowledge:
     def null(self, where: Sequence[int] | NDArray[np.int64] | None = None) -> SimulatedGaussian:
         """Null of all entries, or of some."""
         rows = slice(None) if where is None else np.asarray(where)
-        return null(self.simulations[:, rows], self.offset[rows], COLLINEAR)
+        return SimulatedGaussian.from_simulations(self.simulations[:, rows], self.offset[rows], COLLINEAR)
 
     def save(self, path: Path) -> None:
         """Write to a new Zarr store."""
@@ -190,7 +190,7 @@ def answered(plan: Plan, size: int, ask: Ask) -> tuple[Plan, list[NDArray[np.flo
     first = [k for k, job in enumerate(plan.jobs) if plan.purposes[k][0] == "null" and job.first < SOME * size]
     answers = dict(zip(first, ask([plan.jobs[k] for k in first]), strict=True))
     drawn = np.concatenate([answer[:, :size] for answer in answers.values()])
-    enough = PER_ENTRY * null(drawn, floor=COLLINEAR).dimension
+    enough = PER_ENTRY * SimulatedGaussian.from_simulations(drawn, floor=COLLINEAR).dimension
     rest = [
         k
         for k, job in enumerate(plan.jobs)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.diagnosis.candidate import Candidate, allowed, columns_of
-from mcsim.stats.gaussian import Fit, SimulatedGaussian, fit, nested_pvalue
+from mcsim.stats.gaussian import Fit, SimulatedGaussian
 from mcsim.stats.look_elsewhere import Calibration
 
 Exact = Callable[[NDArray[np.float64], tuple[int, ...], Fit], NDArray[np.float64] | None]
@@ -72,19 +72,19 @@ def partial_explanation(
     """
     members: tuple[int, ...] = ()
     refused: set[int] = set()
-    before = fit(null, x, t[:, :0])
+    before = null.fit(x, t[:, :0])
     total = before.chi2
 
     def matched_filter(after: Fit) -> float:
         rank = before.dimension - after.dimension
-        return float(nested_pvalue(before.chi2 - after.chi2, before.chi2, rank, before.dimension, null.dof))
+        return float(null.nested_test(before.chi2 - after.chi2, before.chi2, rank, null.dimension - before.dimension))
 
     while len(members) < MOST and len(refused) < REFUSED:
         smallest, chosen = 1.0, -1
         taken = {candidates[member].identity for member in members}
         for index, candidate in enumerate(candidates):
             if candidate.identity not in taken and index not in refused:
-                after = fit(null, x, t[:, columns_of(candidates, (*members, index))])
+                after = null.fit(x, t[:, columns_of(candidates, (*members, index))])
                 score = matched_filter(after)
                 if allowed(candidates, (*members, index), after) and (score < smallest or chosen < 0):
                     smallest, best, chosen = score, after, index
@@ -93,7 +93,7 @@ def partial_explanation(
         together = (*members, chosen)
         straight = exact(t, together, best)
         if straight is not None:
-            after = fit(null, x, straight[:, columns_of(candidates, together)])
+            after = null.fit(x, straight[:, columns_of(candidates, together)])
             if (
                 allowed(candidates, together, after)
                 and float(calibration.global_pvalue(matched_filter(after))) <= LEVEL
@@ -103,6 +103,6 @@ def partial_explanation(
         refused.add(chosen)
     if not members:
         return None
-    gap = null.unbiased * total - null.dimension
-    left = null.unbiased * before.chi2 - before.dimension
+    gap = null.hartlap_factor * total - null.dimension
+    left = null.hartlap_factor * before.chi2 - before.dimension
     return PartialExplanation(members, before, min(max(left / gap, 0.0), 1.0) if gap > 0.0 else 1.0, t)

@@ -15,7 +15,7 @@ from mcsim.diagnosis.knowledge import skies as skies_of
 from mcsim.diagnosis.partial_explanation import PartialExplanation, partial_explanation
 from mcsim.diagnosis.selection import LARGEST, Attribution, attribute
 from mcsim.errors import InputError
-from mcsim.stats.gaussian import Fit, SimulatedGaussian, fit
+from mcsim.stats.gaussian import Fit, SimulatedGaussian
 from mcsim.stats.look_elsewhere import Calibration
 from mcsim.systematics import Effect
 
@@ -260,7 +260,7 @@ def _together(
         t = t.copy()
         at = np.concatenate([effect.coordinates() for effect in effects])
         t[:, columns] += _beyond(null, t[:, columns], at, response)
-        before, fitted = fitted, fit(null, x, t[:, columns])
+        before, fitted = fitted, null.fit(x, t[:, columns])
         if _settled(before.amplitudes, fitted):
             return t
     return None

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mcsim.diagnosis.candidate import Candidate, allowed, columns_of
 from mcsim.diagnosis.subsets import Subsets
 from mcsim.stats.detection import cosines
-from mcsim.stats.gaussian import Fit, SimulatedGaussian, fit, whitened_templates
+from mcsim.stats.gaussian import Fit, SimulatedGaussian
 from mcsim.stats.look_elsewhere import Calibration, GlobalTest, global_test
 
 Verdict = Literal["none", "effect", "mixture", "degenerate", "unknown"]
@@ -149,14 +149,14 @@ def attribute(
     fit); the sum over members makes both tests noncentral, in the direction that hurts most.
     The prior of a subset is k! times the product of its candidates' shares of the weight.
     """
-    groups = whitened_templates(null, t, [candidate.columns for candidate in candidates])
+    groups = null.whiten_groups(t, [candidate.columns for candidate in candidates])
     searches = list(_searches(null, x, t, candidates, calibration, shape_error, largest))
     y = null.whiten(x)
     found = global_test(null, x, groups, calibration)
     delta_chi2 = groups.delta_chi2(y)
     nearest = int(np.argmax(delta_chi2))
-    signal = null.unbiased * delta_chi2[nearest] - groups.sizes[nearest]
-    excess = max(null.unbiased * float(y @ y) - null.dimension, signal, 1e-300)
+    signal = null.hartlap_factor * delta_chi2[nearest] - groups.sizes[nearest]
+    excess = max(null.hartlap_factor * float(y @ y) - null.dimension, signal, 1e-300)
     explanations: tuple[Explanation, ...] = ()
     if found.pvalue <= alpha:
         possible = partial(_possible, x, t, candidates)
@@ -168,7 +168,7 @@ def attribute(
         explanations=explanations,
         nearest=nearest,
         cosine=float(np.sqrt(max(signal, 0.0) / excess)),
-        singles=tuple(fit(null, x, t[:, list(candidate.columns)]) for candidate in candidates),
+        singles=tuple(null.fit(x, t[:, list(candidate.columns)]) for candidate in candidates),
         correlation=cosines(groups),
         contrasts=tuple(_contrasts(null, t, candidates, explanations)),
     )
@@ -203,7 +203,7 @@ def _searches(
             if len({names[index] for index in drawn}) < size:
                 continue
             wide = null.with_extra_covariance(*(scatters[index] for index in drawn))
-            groups = whitened_templates(wide, t, columns)
+            groups = wide.whiten_groups(t, columns)
             yield Subsets(wide, wide.whiten(x), groups, names, prior, errors, calibration, scatters, drawn)
 
 
@@ -228,7 +228,7 @@ def _possible(
     """Whether no member would need an amplitude that it cannot have."""
     if not any(candidates[member].positive or np.isfinite(candidates[member].max_amplitude) for member in members):
         return True
-    return allowed(candidates, members, fit(null, x, t[:, columns_of(candidates, members)]))
+    return allowed(candidates, members, null.fit(x, t[:, columns_of(candidates, members)]))
 
 
 def _accepted(
@@ -293,7 +293,7 @@ def _explanations(
         lost = ranked[0].evidence - found.evidence
         if lost <= cut and identity not in seen:
             seen.add(identity)
-            best = fit(found.null, x, t[:, columns_of(candidates, found.members)])
+            best = found.null.fit(x, t[:, columns_of(candidates, found.members)])
             yield Explanation(found.members, best, float(np.exp(-lost)), found.pvalue, found.further)
 
 
@@ -311,6 +311,6 @@ def _contrasts(
         difference = predictions[first] - predictions[second]
         white = null.whiten_templates(difference[:, None])[:, 0]
         squared = float(white @ white)
-        shares = difference * (null.whitening.T @ white) / np.sqrt(1.0 + 1.0 / null.count) / max(squared, 1e-300)
+        shares = difference * (null.whitening.T @ white) / np.sqrt(1.0 + 1.0 / null.n_sims) / max(squared, 1e-300)
         order = np.argsort(-shares)
         yield Contrast(first, second, float(np.sqrt(squared)), order, shares[order])

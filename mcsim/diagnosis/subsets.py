@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mcsim.stats.detection import log_evidence
-from mcsim.stats.gaussian import COLLINEAR, SimulatedGaussian, WhitenedTemplates, nested_pvalue, residual_pvalue
+from mcsim.stats.gaussian import COLLINEAR, SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration
 
 # Widths of the amplitudes' prior in standard deviations: flat in the logarithm, from what can hardly be seen to what
@@ -112,7 +112,7 @@ class Subsets:
         prior = special.gammaln(size + 1) + self.log_prior[subsets].sum(axis=1)
         return Solved(
             chi2=self.total - delta_chi2,
-            pvalue=residual_pvalue(self.total - delta_chi2, null.dimension - K, null.dof, allowance),
+            pvalue=null.residual_test(self.total - delta_chi2, K, allowance),
             evidence=log_evidence(null, self.total, delta_chi2, K, WIDTHS) + prior,
             allowance=allowance,
         )
@@ -130,8 +130,8 @@ class Subsets:
                 without = self.solve(others)
                 chi2, allowance = without.chi2, without.allowance
             rank = self.sizes[subsets[:, place]]
-            dimension = self.null.dimension - (self.sizes[subsets].sum(axis=1) - rank)
-            scores = nested_pvalue(chi2 - whole.chi2, chi2, rank, dimension, self.null.dof, allowance)
+            fitted = self.sizes[subsets].sum(axis=1) - rank
+            scores = self.null.nested_test(chi2 - whole.chi2, chi2, rank, fitted, allowance)
             largest = np.maximum(largest, self.calibration.global_pvalue(scores))
         return largest
 
@@ -157,14 +157,8 @@ class Subsets:
             along = np.einsum("mcij,mci->mcj", vectors, left[:, index])
             filtered = values > COLLINEAR
             delta_chi2 = np.sum(np.where(filtered, along**2 / np.where(filtered, values, 1.0), 0.0), axis=-1)
-            scores = nested_pvalue(
-                delta_chi2,
-                chi2[:, None],
-                filtered.sum(axis=-1),
-                self.null.dimension - K,
-                self.null.dof,
-                allowance[:, None],
-            )
+            ranks = filtered.sum(axis=-1)
+            scores = self.null.nested_test(delta_chi2, chi2[:, None], ranks, K, allowance[:, None])
             rivals = np.any(self.identity[subsets][:, :, None] == self.identity[others], axis=1)
             smallest = np.minimum(smallest, np.where(rivals, 1.0, scores).min(axis=1))
         return self.calibration.global_pvalue(smallest)

@@ -77,7 +77,7 @@ def predicted(
     of the drop is its error as a forecast of the mean drop on fresh data: 2 sqrt(theta^'F V F theta^ + tr(F V F V)).
     """
     white = test.whiten_templates(t)
-    fisher = test.unbiased * white.T @ white
+    fisher = test.hartlap_factor * white.T @ white
     product = fisher @ covariance
     delta_chi2 = float(amplitudes @ fisher @ amplitudes) - 2.0 * float(np.trace(product))
     variance = 4.0 * float(amplitudes @ product @ fisher @ amplitudes) + 4.0 * float(np.trace(product @ product))
@@ -118,7 +118,7 @@ def carried(
     """
     share = float(np.mean(here) / np.mean(there))
     white = wide.whiten_templates(t)
-    lost = wide.unbiased * float(np.trace(white.T @ white @ covariance))
+    lost = wide.hartlap_factor * float(np.trace(white.T @ white @ covariance))
     sigma = float(np.hypot(share * seen.sigma, np.std(here - share * there, ddof=1)))
     return _of_gap(Measured(share * seen.value - lost, sigma), excess(test, x))
 
@@ -144,8 +144,8 @@ def achieved(before: SimulatedGaussian, after: SimulatedGaussian, x: NDArray[np.
     shift = before.whiten_templates((after.mean - before.mean)[:, None])[:, 0]
     distance, length = max(first.value, 0.0), max(last.value, 0.0)
     # The error of the two means adds to the square of their difference.
-    moved = max(before.unbiased * float(shift @ shift) - p * (1.0 / before.count + 1.0 / after.count), 0.0)
-    along = before.unbiased * float(shift @ before.whiten(x))
+    moved = max(before.hartlap_factor * float(shift @ shift) - p * (1.0 / before.n_sims + 1.0 / after.n_sims), 0.0)
+    along = before.hartlap_factor * float(shift @ before.whiten(x))
     mismatch = max(moved - 2.0 * fraction * along + fraction**2 * distance, 0.0)
     data = (4.0 * mismatch + 2.0 * p * fraction**2) * (d2 - 2) / (d2 - 4)
     scatter = 2.0 * ((p + length) ** 2 + (1.0 - fraction) ** 2 * (p + distance) ** 2) / (d2 - 4)

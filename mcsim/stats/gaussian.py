@@ -1,4 +1,8 @@
-"""Exact tests of a vector against few simulations: everything, a template, several, and what they leave."""
+"""Test and fit a Gaussian data vector whose mean and covariance are known from a limited number of simulations.
+
+With N simulations of p elements and S the scatter matrix (the sum of squares about their mean), the tests are those of
+Hotelling (1931) and Rao (1959): exact for every N > p, and the usual chi^2 tests for N -> infinity.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,214 +13,24 @@ from scipy import special
 
 from mcsim.errors import InputError
 
-# A direction counts as empty where its scatter, or its part outside a span, is less than this fraction of its size.
+# A direction is empty if its variance, or its part outside a span, is below this fraction of its size.
 COLLINEAR = 1e-6
 
 
 @dataclass(frozen=True)
-class SimulatedGaussian:
-    """What simulations without the effect say: a mean, and the coordinates in which their scatter is n times one.
-
-    Attributes
-    ----------
-    mean
-        Shape (p_raw,).
-    whitening
-        Shape (p, p_raw), p <= p_raw: entries that repeat one another are compressed.
-    count
-        Number N of simulations; n = N - 1.
-    log_volume
-        Logarithm of the factor by which :meth:`widened` has shrunk volumes in white coordinates.
-    """
-
-    mean: NDArray[np.float64]
-    whitening: NDArray[np.float64]
-    count: int
-    log_jacobian: float = 0.0
-
-    @property
-    def dimension(self) -> int:
-        """Number p of independent data."""
-        return len(self.whitening)
-
-    @property
-    def dof(self) -> int:
-        """n = N - 1."""
-        return self.count - 1
-
-    @property
-    def unbiased(self) -> float:
-        """(n - p - 1)/n: squares in white coordinates times this have the expectation of those in the true metric."""
-        return (self.dof - self.dimension - 1) / self.dof
-
-    def whiten(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """White coordinates of evidence, shape (..., p_raw) to (..., p), less the mean and its own error."""
-        return (x - self.mean) @ self.whitening.T / np.sqrt(1.0 + 1.0 / self.count)
-
-    def whiten_templates(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """White coordinates of templates, shape (p_raw, K) to (p, K), on the scale of :meth:`whiten`."""
-        return self.whitening @ t / np.sqrt(1.0 + 1.0 / self.count)
-
-    def chi2(self, x: NDArray[np.float64]) -> float:
-        """Square of evidence, shape (p_raw,), in white coordinates."""
-        y = self.whiten(x)
-        return float(y @ y)
-
-    def pvalue(self, x: NDArray[np.float64]) -> float:
-        """Probability of a square as large as that of evidence, shape (p_raw,): a test of everything at once."""
-        return float(residual_pvalue(self.chi2(x), self.dimension, self.dof))
-
-    def expected_snr(self, change: NDArray[np.float64]) -> float:
-        """White length of a change of the evidence, shape (p_raw,), in standard deviations."""
-        return float(np.sqrt(self.unbiased) * np.linalg.norm(self.whiten_templates(change[:, None])))
-
-    def with_extra_covariance(self, *scatters: NDArray[np.float64]) -> "SimulatedGaussian":
-        """With further Gaussian scatters, each known by draws.
-
-        Parameters
-        ----------
-        scatters
-            Deviations d with R = d @ d.T, shape (p_raw, draws): draws less their mean over sqrt(draws - 1).
-
-        Notes
-        -----
-        Draws are fewer than entries: R is drawn towards its mean eigenvalue as far as minimises the expected error
-        (Ledoit & Wolf, J. Multivariate Anal. 88, 365, 2004). White coordinates are turned by (1 + R)^(-1/2), so that
-        all tests stay what they are, and exact where R is.
-        """
-        wide = self
-        for deviations in scatters:
-            white = np.sqrt(self.unbiased) * wide.whiten_templates(deviations)
-            values, vectors = np.linalg.eigh(np.eye(self.dimension) + _shrunk(white))
-            turn = (vectors / np.sqrt(values)) @ vectors.T
-            volume = wide.log_jacobian - 0.5 * float(np.sum(np.log(values)))
-            wide = replace(wide, whitening=turn @ wide.whitening, log_jacobian=volume)
-        return wide
-
-
-def null(
-    simulations: NDArray[np.float64], offset: NDArray[np.float64] | None = None, floor: float = 1e-8
-) -> SimulatedGaussian:
-    """Null of an ensemble.
-
-    Parameters
-    ----------
-    simulations
-        Shape (N, p_raw).
-    offset
-        Known shift of the data's mean against that of the simulations, shape (p_raw,).
-    floor
-        Eigenvalues of the correlation matrix below this fraction of the largest are left out.
-
-    Raises
-    ------
-    InputError
-        An entry that is not finite or does not scatter, or fewer than p + 7 simulations.
-    """
-    mean = simulations.mean(axis=0)
-    centred = simulations - mean
-    scale = np.sqrt(np.mean(centred**2, axis=0))
-    if not (np.isfinite(scale).all() and (scale > 0.0).all()):
-        wrong = int(np.argmin(np.where(np.isfinite(scale), scale, -1.0)))
-        raise InputError(f"evidence {wrong} has no finite scatter in the simulations; leave it out.")
-    _, singular, right = np.linalg.svd(centred / scale, full_matrices=False)
-    kept = singular**2 > floor * singular[0] ** 2
-    count, dimension = len(simulations), int(kept.sum())
-    if count < dimension + 7:
-        raise InputError(
-            f"{count} simulations are too few for {dimension} independent data; give at least {dimension + 7}, better "
-            f"{10 * dimension}."
-        )
-    whitening = np.sqrt(count - 1.0) * right[kept] / singular[kept, None] / scale
-    return SimulatedGaussian(mean if offset is None else mean + offset, whitening, count)
-
-
-def _shrunk(white: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Covariance of draws, shape (p, draws), between theirs and a multiple of one."""
-    p, draws = white.shape
-    found = white @ white.T
-    mean = float(np.trace(found)) / p
-    distance = float(np.sum(found**2)) - p * mean**2
-    # Sum over draws z of |z z' - R|^2, with z = sqrt(draws - 1) times a column.
-    sizes = np.sum(white**2, axis=0)
-    own = (draws - 1.0) ** 2 * float(np.sum(sizes**2)) - (draws - 2.0) * float(np.sum(found**2))
-    weight = min(max(own, 0.0) / draws**2 / distance, 1.0) if distance > 0.0 else 1.0
-    return (1.0 - weight) * found + weight * mean * np.eye(p)
-
-
-def residual_pvalue(chi2: ArrayLike, dimension: ArrayLike, n: int, allowance: ArrayLike = 0.0) -> NDArray[np.float64]:
-    """Probability of a white square as large as this in ``dimension`` dimensions.
-
-    Parameters
-    ----------
-    chi2
-        Square of the residual in white coordinates, K columns fitted; of the data themselves for the omnibus test.
-    dimension
-        q = p - K.
-    n
-        Simulations less one.
-    allowance
-        Square of the white length of a model error that is forgiven.
-
-    Notes
-    -----
-    (n - q + 1)/q chi2/n ~ F(q, n - q + 1) (Hotelling, Ann. Math. Stat. 2, 360, 1931). An error of the model makes it
-    noncentral, whatever its direction; its tail is Patnaik's (Biometrika 36, 202, 1949), exact without the error.
-    """
-    q = np.asarray(dimension, dtype=float)
-    f = (n - q + 1.0) / np.maximum(q, 1.0) * np.asarray(chi2) / n
-    return np.where(q > 0.0, _tail(f, np.maximum(q, 1.0), n - q + 1.0, allowance), 1.0)
-
-
-def nested_pvalue(
-    delta_chi2: ArrayLike, chi2: ArrayLike, columns: ArrayLike, dimension: ArrayLike, n: int, allowance: ArrayLike = 0.0
-) -> NDArray[np.float64]:
-    """Probability that templates without a part in the data lower chi2 by as much as this.
-
-    Parameters
-    ----------
-    drop
-        Fall of the white square when ``columns`` further templates are fitted.
-    chi2
-        The square before.
-    columns
-        Number K of the further templates; the probability is 1 for none.
-    dimension
-        Dimensions before: p, less the templates that were fitted already.
-    n, allowance
-        As for :func:`residual_pvalue`.
-
-    Notes
-    -----
-    (n - p + 1)/K drop/(n + chi2 - drop) ~ F(K, n - p + 1): the residual acts as covariates (Rao, Biometrika 46, 49,
-    1959). Uniform: tests/statistical/test_diagnose_statistics.py.
-    """
-    K, T = np.asarray(columns, dtype=float), np.asarray(delta_chi2)
-    d2 = n - np.asarray(dimension, dtype=float) + 1.0
-    f = d2 / np.maximum(K, 1.0) * T / (n + np.maximum(np.asarray(chi2) - T, 0.0))
-    return np.where(K > 0.0, _tail(f, np.maximum(K, 1.0), d2, allowance), 1.0)
-
-
-def _tail(f: ArrayLike, d1: ArrayLike, d2: ArrayLike, noncentrality: ArrayLike) -> NDArray[np.float64]:
-    d1, extra = np.asarray(d1), np.asarray(noncentrality)
-    scale = (d1 + extra) / d1
-    return special.fdtrc((d1 + extra) ** 2 / (d1 + 2.0 * extra), d2, np.maximum(f, 0.0) / scale)
-
-
-@dataclass(frozen=True)
 class Fit:
-    """Templates fitted to evidence.
+    """Hold templates fitted to a data vector.
 
     Attributes
     ----------
     amplitudes, covariance
-        Shape (K,), (K, K). A combination that the evidence does not contain has amplitude 0 and no variance.
+        Shape (K,), (K, K). A combination to which the data do not respond has amplitude 0 and variance 0.
     dof
-        Of the Student t that each amplitude, less the truth, over its scale follows; the covariance is that t's.
-    drop, score
-        Fall of the white square, and the probability of such a fall without the templates.
-    chi2, dimension, probability
-        White square of what is left, its dimension, and the probability of a larger one.
+        Degrees of freedom of the Student t that (estimate - truth)/scale follows; ``covariance`` is that t's.
+    delta_chi2, nested_pvalue
+        Fall of chi^2 by the fit, and the probability of such a fall without the templates.
+    chi2, dimension, pvalue
+        Of the residual: its chi^2, its number of degrees of freedom, and the probability of a larger chi^2.
     """
 
     amplitudes: NDArray[np.float64]
@@ -230,59 +44,13 @@ class Fit:
 
     @property
     def errors(self) -> NDArray[np.float64]:
-        """Standard deviations, shape (K,)."""
+        """Return the standard deviations of the amplitudes, shape (K,)."""
         return np.sqrt(np.diag(self.covariance))
-
-
-def fit(null: SimulatedGaussian, x: NDArray[np.float64], t: NDArray[np.float64]) -> Fit:
-    """Fit templates with the weight S^-1.
-
-    Parameters
-    ----------
-    null
-        Of the evidence.
-    x
-        Evidence, shape (p_raw,).
-    t
-        Templates, shape (p_raw, K), per unit of each amplitude.
-
-    Notes
-    -----
-    With H = t'S^-1 t n and the residual's square chi2, (theta^ - theta)/sqrt((n + chi2) (H^-1)_kk/(n - q)) is a Student
-    t with n - q degrees of freedom; the covariance has its variance, (n + chi2)/(n - q - 2) H^-1. Pulls of unit width:
-    tests/statistical/test_diagnose_statistics.py.
-    """
-    y = null.whiten(x)
-    basis, back = orthonormal(null.whiten_templates(t))
-    along = basis.T @ y
-    total, n = float(y @ y), null.dof
-    delta_chi2 = float(along @ along)
-    chi2 = max(total - delta_chi2, 0.0)
-    q = null.dimension - basis.shape[1]
-    return Fit(
-        amplitudes=back @ along,
-        covariance=(n + chi2) / (n - q - 2) * back @ back.T,
-        dof=n - q,
-        delta_chi2=delta_chi2,
-        nested_pvalue=float(nested_pvalue(delta_chi2, total, basis.shape[1], null.dimension, n)),
-        chi2=chi2,
-        dimension=q,
-        pvalue=float(residual_pvalue(chi2, q, n)),
-    )
-
-
-def orthonormal(white: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Orthonormal basis (p, r) of the columns (p, K), and the matrix (K, r) from its coordinates to amplitudes."""
-    size = np.linalg.norm(white, axis=0)
-    inverse = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
-    left, singular, right = np.linalg.svd(white * inverse, full_matrices=False)
-    kept = singular > COLLINEAR
-    return left[:, kept], inverse[:, None] * right[kept].T / singular[kept]
 
 
 @dataclass(frozen=True)
 class WhitenedTemplates:
-    """White orthonormal bases of groups of templates, side by side.
+    """Hold orthonormal bases of groups of templates in white coordinates, side by side.
 
     Attributes
     ----------
@@ -300,23 +68,309 @@ class WhitenedTemplates:
 
     @property
     def sizes(self) -> NDArray[np.int64]:
-        """Rank r_c of each group; 0 where the evidence does not hear it."""
+        """Return the rank r_c of each group; 0 if the data do not respond to it."""
         return np.diff(self.start)
 
     def delta_chi2(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Fall of the white square when each group is fitted alone, shape (..., p) to (..., groups)."""
+        """Return the fall of chi^2 if each group is fitted alone, white data (..., p) to (..., groups)."""
         cumulative = np.cumsum((y @ self.basis) ** 2, axis=-1)
         padded = np.concatenate([np.zeros((*cumulative.shape[:-1], 1)), cumulative], axis=-1)
         return np.diff(padded[..., self.start], axis=-1)
 
 
-def whitened_templates(
-    null: SimulatedGaussian, t: NDArray[np.float64], groups: Sequence[Sequence[int]]
-) -> WhitenedTemplates:
-    """Bases of groups of columns of the templates ``t``, shape (p_raw, K)."""
-    white = null.whiten_templates(t)
-    pairs = [orthonormal(white[:, list(group)]) for group in groups]
-    start = np.cumsum([0] + [basis.shape[1] for basis, _ in pairs])
-    return WhitenedTemplates(
-        np.concatenate([basis for basis, _ in pairs], axis=1), start, tuple(back for _, back in pairs)
-    )
+@dataclass(frozen=True)
+class SimulatedGaussian:
+    """Describe a Gaussian data vector by the sample mean and sample covariance of simulations.
+
+    Attributes
+    ----------
+    mean
+        Shape (p_raw,).
+    whitening
+        Shape (p, p_raw), p <= p_raw: coordinates in which the sample covariance is one. Redundant elements are
+        compressed.
+    n_sims
+        Number N of simulations.
+    log_jacobian
+        Logarithm of the factor by which :meth:`with_extra_covariance` has shrunk volumes in white coordinates.
+    """
+
+    mean: NDArray[np.float64]
+    whitening: NDArray[np.float64]
+    n_sims: int
+    log_jacobian: float = 0.0
+
+    @classmethod
+    def from_simulations(
+        cls, simulations: NDArray[np.float64], offset: NDArray[np.float64] | None = None, floor: float = 1e-8
+    ) -> "SimulatedGaussian":
+        """Estimate mean and covariance.
+
+        Parameters
+        ----------
+        simulations
+            Shape (N, p_raw).
+        offset
+            Known difference between the mean of the data and that of the simulations, shape (p_raw,).
+        floor
+            Eigenvalues of the correlation matrix below this fraction of the largest are left out.
+
+        Raises
+        ------
+        InputError
+            If an element is not finite or constant, or there are fewer than p + 7 simulations.
+        """
+        mean = simulations.mean(axis=0)
+        centred = simulations - mean
+        scale = np.sqrt(np.mean(centred**2, axis=0))
+        if not (np.isfinite(scale).all() and (scale > 0.0).all()):
+            wrong = int(np.argmin(np.where(np.isfinite(scale), scale, -1.0)))
+            raise InputError(f"element {wrong} of the data vector has no finite variance in the simulations; omit it.")
+        _, singular, right = np.linalg.svd(centred / scale, full_matrices=False)
+        kept = singular**2 > floor * singular[0] ** 2
+        count, dimension = len(simulations), int(kept.sum())
+        if count < dimension + 7:
+            raise InputError(
+                f"{count} simulations are too few for {dimension} independent elements; give at least {dimension + 7}, "
+                f"better {10 * dimension}."
+            )
+        whitening = np.sqrt(count - 1.0) * right[kept] / singular[kept, None] / scale
+        return cls(mean if offset is None else mean + offset, whitening, count)
+
+    @property
+    def dimension(self) -> int:
+        """Return the number p of independent elements."""
+        return len(self.whitening)
+
+    @property
+    def dof(self) -> int:
+        """Return n = N - 1, the degrees of freedom of the sample covariance."""
+        return self.n_sims - 1
+
+    @property
+    def hartlap_factor(self) -> float:
+        """Return (n - p - 1)/n, which makes the inverse sample covariance unbiased.
+
+        Notes
+        -----
+        Hartlap, Simon & Schneider, A&A 464, 399 (2007), Eq. 17.
+        """
+        return (self.dof - self.dimension - 1) / self.dof
+
+    def whiten(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return data less the mean in white coordinates, shape (..., p_raw) to (..., p).
+
+        The factor (1 + 1/N)^(-1/2) accounts for the error of the mean.
+        """
+        return (x - self.mean) @ self.whitening.T / np.sqrt(1.0 + 1.0 / self.n_sims)
+
+    def whiten_templates(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return templates in white coordinates, shape (p_raw, K) to (p, K), on the scale of :meth:`whiten`."""
+        return self.whitening @ t / np.sqrt(1.0 + 1.0 / self.n_sims)
+
+    def whiten_groups(self, t: NDArray[np.float64], groups: Sequence[Sequence[int]]) -> WhitenedTemplates:
+        """Return orthonormal white bases of groups of columns of the templates ``t``, shape (p_raw, K)."""
+        white = self.whiten_templates(t)
+        pairs = [orthonormal(white[:, list(group)]) for group in groups]
+        start = np.cumsum([0] + [basis.shape[1] for basis, _ in pairs])
+        return WhitenedTemplates(
+            np.concatenate([basis for basis, _ in pairs], axis=1), start, tuple(back for _, back in pairs)
+        )
+
+    def chi2(self, x: NDArray[np.float64]) -> float:
+        """Return chi^2 of data, shape (p_raw,): n (x - mean)' S^-1 (x - mean)/(1 + 1/N)."""
+        y = self.whiten(x)
+        return float(y @ y)
+
+    def pvalue(self, x: NDArray[np.float64]) -> float:
+        """Return the probability of a larger chi^2 than that of data, shape (p_raw,): Hotelling's T^2 test."""
+        return float(self.residual_test(self.chi2(x)))
+
+    def residual_test(self, chi2: ArrayLike, fitted: ArrayLike = 0, allowance: ArrayLike = 0.0) -> NDArray[np.float64]:
+        """Return the p-value of chi^2 after ``fitted`` columns have been fitted; see :func:`residual_pvalue`."""
+        return residual_pvalue(chi2, self.dimension - np.asarray(fitted), self.dof, allowance)
+
+    def nested_test(
+        self,
+        delta_chi2: ArrayLike,
+        chi2: ArrayLike,
+        columns: ArrayLike,
+        fitted: ArrayLike = 0,
+        allowance: ArrayLike = 0.0,
+    ) -> NDArray[np.float64]:
+        """Return the p-value of ``columns`` further templates beside ``fitted`` ones; see :func:`nested_pvalue`."""
+        return nested_pvalue(delta_chi2, chi2, columns, self.dimension - np.asarray(fitted), self.dof, allowance)
+
+    def delta_chi2(self, x: NDArray[np.float64], t: NDArray[np.float64]) -> float:
+        """Return the fall of chi^2 if the templates ``t``, shape (p_raw, K), are fitted to ``x``."""
+        along = orthonormal(self.whiten_templates(t))[0].T @ self.whiten(x)
+        return float(along @ along)
+
+    def fit(self, x: NDArray[np.float64], t: NDArray[np.float64]) -> Fit:
+        """Fit templates by generalised least squares.
+
+        Parameters
+        ----------
+        x
+            Data, shape (p_raw,).
+        t
+            Templates, shape (p_raw, K), per unit of each amplitude.
+
+        Notes
+        -----
+        With H = n t'S^-1 t/(1 + 1/N), chi^2 of the residual and q = p - K, (estimate - truth)/sqrt((n + chi^2)
+        (H^-1)_kk/(n - q)) follows Student's t with n - q degrees of freedom (Rao, Biometrika 46, 49, 1959); the
+        covariance is its variance, (n + chi^2)/(n - q - 2) H^-1. Pulls of unit width:
+        tests/statistical/test_diagnose_statistics.py.
+        """
+        y = self.whiten(x)
+        basis, back = orthonormal(self.whiten_templates(t))
+        along = basis.T @ y
+        total, n, rank = float(y @ y), self.dof, basis.shape[1]
+        delta_chi2 = float(along @ along)
+        chi2 = max(total - delta_chi2, 0.0)
+        q = self.dimension - rank
+        return Fit(
+            amplitudes=back @ along,
+            covariance=(n + chi2) / (n - q - 2) * back @ back.T,
+            dof=n - q,
+            delta_chi2=delta_chi2,
+            nested_pvalue=float(self.nested_test(delta_chi2, total, rank)),
+            chi2=chi2,
+            dimension=q,
+            pvalue=float(self.residual_test(chi2, rank)),
+        )
+
+    def log_likelihood(self, chi2: ArrayLike) -> NDArray[np.float64]:
+        """Return the log-likelihood of chi^2, up to a constant.
+
+        Notes
+        -----
+        -(n - p + 2)/2 log(1 + chi^2/n): a multivariate Student t, the covariance marginalised under the prior whose
+        credible intervals match the frequentist ones (Percival et al., MNRAS 510, 3207, 2022). It is Gaussian for
+        infinitely many simulations.
+        """
+        return self.log_jacobian - 0.5 * (self.dof - self.dimension + 2.0) * np.log1p(np.asarray(chi2) / self.dof)
+
+    def curvature(self, chi2: ArrayLike) -> NDArray[np.float64]:
+        """Return -2 d log L/d chi^2 of :meth:`log_likelihood`; 1 for infinitely many simulations."""
+        return (self.dof - self.dimension + 2.0) / (self.dof + np.asarray(chi2))
+
+    def expected_snr(self, change: NDArray[np.float64]) -> float:
+        """Return sqrt(d'C^-1 d) of a change d of the mean, shape (p_raw,): its signal-to-noise ratio."""
+        return float(np.sqrt(self.hartlap_factor) * np.linalg.norm(self.whiten_templates(change[:, None])))
+
+    def shift(self, mean: NDArray[np.float64]) -> "SimulatedGaussian":
+        """Return the same covariance about another mean, shape (p_raw,)."""
+        return replace(self, mean=mean)
+
+    def with_extra_covariance(self, *draws: NDArray[np.float64]) -> "SimulatedGaussian":
+        """Add independent Gaussian covariances, each known from a few draws.
+
+        Parameters
+        ----------
+        draws
+            Deviations d with R = d @ d.T, shape (p_raw, n_draws): draws less their mean over sqrt(n_draws - 1).
+
+        Notes
+        -----
+        There are fewer draws than elements: R is shrunk towards its mean eigenvalue with the weight that minimises
+        the expected error (Ledoit & Wolf, J. Multivariate Anal. 88, 365, 2004). White coordinates are multiplied by
+        (1 + R)^(-1/2), so that all tests keep their form, and are exact if R is.
+        """
+        wide = self
+        for deviations in draws:
+            white = np.sqrt(self.hartlap_factor) * wide.whiten_templates(deviations)
+            values, vectors = np.linalg.eigh(np.eye(self.dimension) + ledoit_wolf(white))
+            turn = (vectors / np.sqrt(values)) @ vectors.T
+            volume = wide.log_jacobian - 0.5 * float(np.sum(np.log(values)))
+            wide = replace(wide, whitening=turn @ wide.whitening, log_jacobian=volume)
+        return wide
+
+
+def ledoit_wolf(white: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the shrunk covariance of normalised deviations, shape (p, draws) to (p, p).
+
+    Notes
+    -----
+    Ledoit & Wolf, J. Multivariate Anal. 88, 365 (2004). One degree of freedom has gone into the mean, unlike
+    in ``sklearn.covariance.ledoit_wolf``.
+    """
+    p, draws = white.shape
+    found = white @ white.T
+    mean = float(np.trace(found)) / p
+    distance = float(np.sum(found**2)) - p * mean**2
+    # Sum over draws z of |z z' - R|^2, with z = sqrt(draws - 1) times a column.
+    sizes = np.sum(white**2, axis=0)
+    own = (draws - 1.0) ** 2 * float(np.sum(sizes**2)) - (draws - 2.0) * float(np.sum(found**2))
+    weight = min(max(own, 0.0) / draws**2 / distance, 1.0) if distance > 0.0 else 1.0
+    return (1.0 - weight) * found + weight * mean * np.eye(p)
+
+
+def residual_pvalue(chi2: ArrayLike, dimension: ArrayLike, n: int, allowance: ArrayLike = 0.0) -> NDArray[np.float64]:
+    """Return the probability of a larger chi^2.
+
+    Parameters
+    ----------
+    chi2
+        Of the residual after K columns have been fitted, or of the data themselves.
+    dimension
+        q = p - K.
+    n
+        Number of simulations less one.
+    allowance
+        Squared signal-to-noise ratio of an error of the model that is tolerated.
+
+    Notes
+    -----
+    (n - q + 1)/q chi^2/n ~ F(q, n - q + 1) (Hotelling, Ann. Math. Stat. 2, 360, 1931). An error of the model
+    makes it noncentral, whatever its direction; the tail is Patnaik's approximation (Biometrika 36, 202, 1949),
+    exact without the error.
+    """
+    q = np.asarray(dimension, dtype=float)
+    f = (n - q + 1.0) / np.maximum(q, 1.0) * np.asarray(chi2) / n
+    return np.where(q > 0.0, _f_tail(f, np.maximum(q, 1.0), n - q + 1.0, allowance), 1.0)
+
+
+def nested_pvalue(
+    delta_chi2: ArrayLike, chi2: ArrayLike, columns: ArrayLike, dimension: ArrayLike, n: int, allowance: ArrayLike = 0.0
+) -> NDArray[np.float64]:
+    """Return the probability that templates absent from the data lower chi^2 by at least this much.
+
+    Parameters
+    ----------
+    delta_chi2
+        Fall of chi^2 when ``columns`` further templates are fitted.
+    chi2
+        Before that.
+    columns
+        Number K of the further templates; the probability is 1 for none.
+    dimension
+        Degrees of freedom before: p, less the templates that have been fitted already.
+    n, allowance
+        As for :func:`residual_pvalue`.
+
+    Notes
+    -----
+    (n - p + 1)/K delta/(n + chi^2 - delta) ~ F(K, n - p + 1): the residual acts as covariates (Rao, Biometrika 46, 49,
+    1959). Uniform: tests/statistical/test_diagnose_statistics.py.
+    """
+    K, T = np.asarray(columns, dtype=float), np.asarray(delta_chi2)
+    d2 = n - np.asarray(dimension, dtype=float) + 1.0
+    f = d2 / np.maximum(K, 1.0) * T / (n + np.maximum(np.asarray(chi2) - T, 0.0))
+    return np.where(K > 0.0, _f_tail(f, np.maximum(K, 1.0), d2, allowance), 1.0)
+
+
+def _f_tail(f: ArrayLike, d1: ArrayLike, d2: ArrayLike, noncentrality: ArrayLike) -> NDArray[np.float64]:
+    d1, extra = np.asarray(d1), np.asarray(noncentrality)
+    scale = (d1 + extra) / d1
+    return special.fdtrc((d1 + extra) ** 2 / (d1 + 2.0 * extra), d2, np.maximum(f, 0.0) / scale)
+
+
+def orthonormal(white: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return an orthonormal basis (p, r) of the columns (p, K), and the matrix (K, r) from it to amplitudes."""
+    size = np.linalg.norm(white, axis=0)
+    inverse = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
+    left, singular, right = np.linalg.svd(white * inverse, full_matrices=False)
+    kept = singular > COLLINEAR
+    return left[:, kept], inverse[:, None] * right[kept].T / singular[kept]

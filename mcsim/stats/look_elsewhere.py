@@ -1,4 +1,4 @@
-"""The best of many: one probability for a gap, and deviations corrected for looking at all of them."""
+"""Correct for the look-elsewhere effect: a global p-value for many tests, and for many correlated deviations."""
 
 from dataclasses import dataclass
 
@@ -11,21 +11,21 @@ from mcsim.errors import InputError
 from mcsim.sphere.rng import generator
 from mcsim.stats.gaussian import COLLINEAR, SimulatedGaussian, WhitenedTemplates, nested_pvalue, residual_pvalue
 
-# Scatters drawn for a calibration; each serves many vectors, because a scatter costs a thousand times a vector.
+# Scatter matrices drawn for a calibration. Each serves many data vectors: it costs a thousand times as much.
 SCATTERS = 200
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Joint distribution, without any effect, of the omnibus probability and the smallest one of the candidates.
+    """Hold the joint null distribution of the omnibus p-value and the smallest p-value of the candidates.
 
     Attributes
     ----------
     tests
-        Number of candidates that the evidence hears.
+        Number of candidates to which the data respond.
     smallest, combined
-        Sorted draws of the smallest probability of the candidates, and of the smaller one of the omnibus probability
-        and that, corrected for its trials.
+        Sorted draws of the smallest p-value of the candidates, and of the smaller one of the omnibus p-value and the
+        global p-value of the candidates.
     """
 
     tests: int
@@ -33,14 +33,14 @@ class Calibration:
     combined: NDArray[np.float64]
 
     def global_pvalue(self, smallest: ArrayLike) -> NDArray[np.float64]:
-        """Probability that the smallest probability of all candidates is this one or less.
+        """Return the probability that the smallest p-value of all candidates is this one or less.
 
-        Its rank among the draws, or Bonferroni's bound where that is lower, beyond the reach of the draws.
+        This is its rank among the draws, or Bonferroni's bound if that is lower, beyond the reach of the draws.
         """
         return np.minimum(_rank(self.smallest, smallest), self.tests * np.asarray(smallest))
 
     def combine(self, omnibus: ArrayLike, smallest: ArrayLike) -> NDArray[np.float64]:
-        """Probability of the gap, from that of the omnibus test and the smallest one of the candidates."""
+        """Return one p-value from that of the omnibus test and the smallest one of the candidates."""
         least = np.minimum(omnibus, self.global_pvalue(smallest))
         return np.minimum(_rank(self.combined, least), 2.0 * least)
 
@@ -53,7 +53,7 @@ def _rank(draws: NDArray[np.float64], value: ArrayLike) -> NDArray[np.float64]:
 def calibrate(
     null: SimulatedGaussian, candidates: WhitenedTemplates, draws: int = 20_000, seed: int = 0
 ) -> Calibration:
-    """Draw pairs of data and scatter without any effect, for the geometry of the candidates.
+    """Draw data and scatter matrices without any effect, for the geometry of the candidates.
 
     Notes
     -----
@@ -89,9 +89,16 @@ def calibrate(
 
 @dataclass(frozen=True)
 class GlobalTest:
-    """Whether there is a gap: calibrated probability, its two parts, and the candidate that stands out most.
+    """Hold the global p-value, its two parts, and the most significant candidate.
 
-    ``maximum`` is the probability of the most significant candidate, ``best``, corrected for trials.
+    Attributes
+    ----------
+    pvalue
+        Uniform if the model is right.
+    chi2, dimension, omnibus
+        chi^2 of the data, its degrees of freedom, and its p-value.
+    maximum, best
+        Global p-value of the most significant candidate, and its index.
     """
 
     pvalue: float
@@ -105,11 +112,11 @@ class GlobalTest:
 def global_test(
     null: SimulatedGaussian, x: NDArray[np.float64], candidates: WhitenedTemplates, calibration: Calibration
 ) -> GlobalTest:
-    """Test evidence, shape (p_raw,), against everything and against every candidate, as one probability."""
+    """Test data, shape (p_raw,), with chi^2 and with every candidate, and combine both into one p-value."""
     y = null.whiten(x)
     chi2 = float(y @ y)
     omnibus = null.pvalue(x)
-    scores = nested_pvalue(candidates.delta_chi2(y), chi2, candidates.sizes, null.dimension, null.dof)
+    scores = null.nested_test(candidates.delta_chi2(y), chi2, candidates.sizes)
     best = int(np.argmin(scores))
     return GlobalTest(
         pvalue=float(calibration.combine(omnibus, scores[best])),
@@ -124,7 +131,7 @@ def global_test(
 def scan_pvalues(
     x: NDArray[np.float64], simulations: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Deviations of many correlated numbers, and their probabilities corrected for looking at all of them.
+    """Return the deviations of many correlated numbers and their global p-values.
 
     Parameters
     ----------
@@ -136,13 +143,13 @@ def scan_pvalues(
     Returns
     -------
     z, p
-        Shape (..., B): normal deviate of each, and the probability that the largest |z| of all is as large.
+        Shape (..., B): normal deviate of each, and the probability that the largest |z| of all is at least as large.
 
     Notes
     -----
-    Each simulation is compared with the others, so that it is as foreign to them as the data. p is the rank of |z|
-    among the maxima of the simulations; beyond the largest, 1 - (1 - p_1)^B_eff of the normal p_1, with B_eff fitted by
-    maximum likelihood to the upper tenth of the maxima.
+    Each simulation is compared with the others (leave one out), as the data are. p is the rank of |z| among the maxima
+    of the simulations; beyond the largest, 1 - (1 - p_1)^B_eff of the normal p_1, with the effective number of trials
+    B_eff fitted by maximum likelihood to the upper tenth of the maxima.
     """
     count = len(simulations)
     if count < 20:
@@ -157,12 +164,12 @@ def scan_pvalues(
     exceeding = count - np.searchsorted(np.sort(maxima), np.abs(z), side="left")
     waits = np.sort(-np.log1p(-2.0 * special.ndtr(-maxima)))
     upper = max(10, count // 10)
-    global_pvalue = max(upper / (np.sum(waits[:upper]) + (count - upper) * waits[upper - 1]), 1.0)
-    beyond = -np.expm1(global_pvalue * np.log1p(-np.minimum(2.0 * special.ndtr(-np.abs(z)), 1.0 - 1e-12)))
+    trials = max(upper / (np.sum(waits[:upper]) + (count - upper) * waits[upper - 1]), 1.0)
+    beyond = -np.expm1(trials * np.log1p(-np.minimum(2.0 * special.ndtr(-np.abs(z)), 1.0 - 1e-12)))
     ranked = (1.0 + exceeding) / (1.0 + count)
     return z, np.where(exceeding > 0, ranked, np.minimum(ranked, beyond))
 
 
 def _normal(t: NDArray[np.float64], dof: int) -> NDArray[np.float64]:
-    """Normal deviate of the same probability as a Student t."""
+    """Return the normal deviate of the same probability as a Student t."""
     return -np.sign(t) * special.ndtri(np.maximum(special.stdtr(dof, -np.abs(t)), 1e-300))

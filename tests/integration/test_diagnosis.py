@@ -20,7 +20,6 @@ from mcsim.diagnosis.wiener_filter import show
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
-from mcsim.stats.gaussian import whitened_templates
 from mcsim.stats.look_elsewhere import global_test
 
 PROPOSED = ("beam_ellipticity", "pointing_offset", "noise_level", "dipole_modulation")
@@ -74,7 +73,7 @@ def test_both_folds_hear_every_range_of_the_sky(small):
 
 def test_no_gap_where_there_is_none(small):
     shared = data_of(small.run)
-    groups = whitened_templates(small.null, significant_templates(small.known), [c.columns for c in small.candidates])
+    groups = small.null.whiten_groups(significant_templates(small.known), [c.columns for c in small.candidates])
     skies = [list(simulate.maps(shared, r)) for r in range(40)]
     p = [global_test(small.null, small.analysis.answer(maps), groups, small.calibration).pvalue for maps in skies]
     # 40 draws of a uniform number: 7 or more below 0.05 once in 300 cases; and Kolmogorov-Smirnov.

@@ -9,7 +9,7 @@ from scipy.linalg import solve_triangular
 
 from mcsim.diagnosis.validation import achieved, carried, excess, predicted
 from mcsim.stats.detection import confusion, detectable, posterior, power, snr_needed, snr_to_separate
-from mcsim.stats.gaussian import SimulatedGaussian, fit, nested_pvalue, null, residual_pvalue, whitened_templates
+from mcsim.stats.gaussian import SimulatedGaussian, nested_pvalue, residual_pvalue
 from mcsim.stats.look_elsewhere import calibrate, global_test, scan_pvalues
 
 SEED = 20121024
@@ -37,14 +37,14 @@ def few_simulations() -> dict[str, np.ndarray]:
         name: [] for name in ("omnibus", "one", "three", "residual", "further", "student", "pull")
     }
     for _ in range(draws):
-        fiducial = null(rng.normal(size=(count, p)) @ root.T)
+        fiducial = SimulatedGaussian.from_simulations(rng.normal(size=(count, p)) @ root.T)
         noise = root @ rng.normal(size=p)
         y = fiducial.whiten(noise)
         found["omnibus"].append(residual_pvalue(y @ y, p, count - 1))
-        found["one"].append(fit(fiducial, noise, t[:, :1]).nested_pvalue)
-        found["three"].append(fit(fiducial, noise, t[:, 2:]).nested_pvalue)
+        found["one"].append(fiducial.fit(noise, t[:, :1]).nested_pvalue)
+        found["three"].append(fiducial.fit(noise, t[:, 2:]).nested_pvalue)
         x = noise + t @ truth
-        two, all_of_them = fit(fiducial, x, t[:, :2]), fit(fiducial, x, t)
+        two, all_of_them = fiducial.fit(x, t[:, :2]), fiducial.fit(x, t)
         found["residual"].append(two.pvalue)
         found["further"].append(nested_pvalue(two.chi2 - all_of_them.chi2, two.chi2, 3, p - 2, count - 1))
         scale = two.errors / stats.t.std(two.dof)
@@ -76,13 +76,11 @@ def test_gap_is_uniform(p, count, draws):
     t[:, 20:] += 2.0 * t[:, :1]
     groups = [(i,) for i in range(12)] + [(i, i + 1) for i in range(12, 30, 2)] + [(31, 32, 33), (35, 36, 37)]
     fiducial = drawn_null(rng, p, count)
-    calibration = calibrate(fiducial, whitened_templates(fiducial, t, groups), seed=SEED)
+    calibration = calibrate(fiducial, fiducial.whiten_groups(t, groups), seed=SEED)
     found = []
     for _ in range(draws):
         fiducial = drawn_null(rng, p, count)
-        found.append(
-            global_test(fiducial, rng.normal(size=p), whitened_templates(fiducial, t, groups), calibration).pvalue
-        )
+        found.append(global_test(fiducial, rng.normal(size=p), fiducial.whiten_groups(t, groups), calibration).pvalue)
     assert stats.kstest(found, "uniform").pvalue > KS
     low, high = stats.binom.interval(0.999, draws, 0.05)
     assert low <= np.sum(np.array(found) < 0.05) <= high
@@ -105,7 +103,7 @@ def test_scatter_known_by_few_draws_is_allowed_for(spectrum):
         wide = fiducial.with_extra_covariance(deviations * np.sqrt((1.0 + 1.0 / draws) / (draws - 1.0)))
         x = rng.normal(size=p) + root @ rng.normal(size=p)
         probabilities.append(wide.pvalue(x))
-        squares.append(wide.unbiased * wide.chi2(x) / p)
+        squares.append(wide.hartlap_factor * wide.chi2(x) / p)
     assert np.mean(np.array(probabilities) < 0.02) <= 0.10 + 3.0 * np.sqrt(0.1 * 0.9 / 200)
     assert 0.7 < np.mean(squares) < 1.1
 
@@ -135,7 +133,7 @@ def test_power_is_that_of_drawn_ensembles():
         t = np.eye(p)[:, :columns]
         x = strength * np.sqrt(1 + 1 / count) * t[:, 0]
         hits = sum(
-            fit(drawn_null(rng, p, count), x + rng.normal(size=p), t).nested_pvalue < threshold for _ in range(draws)
+            drawn_null(rng, p, count).fit(x + rng.normal(size=p), t).nested_pvalue < threshold for _ in range(draws)
         )
         assert abs(hits - 0.9 * draws) < 4.0 * np.sqrt(0.09 * draws)
 
@@ -170,11 +168,11 @@ def test_posterior_is_calibrated():
     t[:, 4] = t[:, 0] + 0.5 * rng.normal(size=p)
     groups = [(0,), (1, 2), (3,), (4,), (5, 6, 7), (8,)]
     strengths, prior = np.linspace(1.0, 7.0, 25), np.array([0.4, *[0.1] * 6])
-    exact = whitened_templates(SimulatedGaussian(np.zeros(p), np.eye(p), 10**9), t, groups)
+    exact = SimulatedGaussian(np.zeros(p), np.eye(p), 10**9).whiten_groups(t, groups)
     fiducial, right = [], []
     for _ in range(draws // 20):
         found = drawn_null(rng, p, count)
-        candidates = whitened_templates(found, t, groups)
+        candidates = found.whiten_groups(t, groups)
         truth = rng.choice(7, size=20, p=prior)
         x = rng.normal(size=(20, p))
         for row, index in zip(x, truth, strict=True):
@@ -209,7 +207,7 @@ def frozen_fits(request) -> dict[str, np.ndarray]:
     # What no candidate explains keeps the gap of the case without an effect well away from zero.
     other = np.linalg.qr(np.column_stack([t_test, rng.normal(size=p)]))[0][:, 2] * 12.0
     for _ in range(600):
-        best = fit(drawn_null(rng, 40, count), t_fit @ truth + rng.normal(size=40), t_fit)
+        best = drawn_null(rng, 40, count).fit(t_fit @ truth + rng.normal(size=40), t_fit)
         before, after = drawn_null(rng, p, count), drawn_null(rng, p, count)
         after = SimulatedGaussian(after.mean + t_test @ best.amplitudes, after.whitening, count)
         x = signal + other + rng.normal(size=p)
@@ -247,8 +245,8 @@ def test_forecast_drop_of_what_draws_is_the_drop():
         scatter = root @ rng.normal(size=(3, draws))
         scatter = (scatter - scatter.mean(axis=1, keepdims=True)) / np.sqrt(draws - 1.0)
         x = t + root @ rng.normal(size=3) + rng.normal(size=fitted + p)
-        frozen = fit(learning.with_extra_covariance(scatter[:fitted]), x[:fitted], t[:fitted, None])
-        noise = fit(learning, x[:fitted], t[:fitted, None]).covariance
+        frozen = learning.with_extra_covariance(scatter[:fitted]).fit(x[:fitted], t[:fitted, None])
+        noise = learning.fit(x[:fitted], t[:fitted, None]).covariance
         after = replace(before, mean=before.mean + t[fitted:] * frozen.amplitudes[0]).with_extra_covariance(
             scatter[fitted:]
         )

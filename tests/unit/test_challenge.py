@@ -220,7 +220,7 @@ def test_an_invention_is_called_unknown(learned_model):
         direction = rng.standard_normal(here.null.dimension)
         direction -= basis @ (basis.T @ direction)
         response = np.linalg.lstsq(here.null.whiten_templates(np.eye(len(here.templates))), direction, rcond=None)[0]
-        length = np.sqrt(here.null.unbiased) * np.linalg.norm(here.null.whiten_templates(response[:, None]))
+        length = np.sqrt(here.null.hartlap_factor) * np.linalg.norm(here.null.whiten_templates(response[:, None]))
         invented = member("invented", candidate=None, response=tuple(10.0 / length * response))
         found.append(Draw(case, Drawn("invented", (invented,), ()), 10.0 / length * response))
     records = judged(here, Prior(), 0, found)
@@ -253,7 +253,7 @@ def test_pairs_have_the_evidence_of_brute_force():
 
     for a, b in ((4.0, 3.0), (5.0, 0.0), (0.0, 0.0), (3.0, -2.5)):
         y = noise + a * unit[:, 0] + b * unit[:, 1]
-        x = here.null.mean + np.linalg.lstsq(here.null.whitening, y * np.sqrt(1 + 1 / here.null.count), rcond=None)[0]
+        x = here.null.mean + np.linalg.lstsq(here.null.whitening, y * np.sqrt(1 + 1 / here.null.n_sims), rcond=None)[0]
         square = s[:, None] ** 2 + s[None, :] ** 2 + 2 * s[:, None] * s[None, :] * (unit[:, 0] @ unit[:, 1])
         both = s[:, None] * (unit[:, 0] @ y) + s[None, :] * (unit[:, 1] @ y) - 0.5 * square
         pair = area(area(np.exp(both) * density[:, None] * density[None, :]))

@@ -15,7 +15,7 @@ from mcsim.diagnosis.partial_explanation import Exact, PartialExplanation, parti
 from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.diagnosis.validation import Measured, Prediction, Shrink
 from mcsim.stats.detection import cosines, detectable, log_evidence, posterior, snr_needed, snr_to_separate
-from mcsim.stats.gaussian import SimulatedGaussian, null, whitened_templates
+from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate
 
 P, N = 60, 800
@@ -26,9 +26,9 @@ class Bench:
     """Candidates on evidence of 60 unit normals with a believed ensemble of 800 simulations."""
 
     def __init__(self, t: np.ndarray, candidates: list[Candidate]) -> None:
-        self.null = null(np.random.default_rng(7).normal(size=(N, P)))
+        self.null = SimulatedGaussian.from_simulations(np.random.default_rng(7).normal(size=(N, P)))
         self.t, self.candidates = t, candidates
-        self.whitened_templates = whitened_templates(self.null, t, [candidate.columns for candidate in candidates])
+        self.whitened_templates = self.null.whiten_groups(t, [candidate.columns for candidate in candidates])
         self.calibration = calibrate(self.null, self.whitened_templates)
 
     def diagnose_maps(self, signal: np.ndarray, seed: int, **options) -> Attribution:
@@ -268,7 +268,7 @@ def test_posterior_is_bayes_theorem():
     known = SimulatedGaussian(np.zeros(6), np.eye(6), 10**9)
     groups, prior, strengths = [(0,), (1, 2), (3, 4)], np.array([0.4, 0.3, 0.2, 0.1]), np.array([1.0, 3.0])
     x = rng.normal(size=6) + t[:, 0]
-    candidates = whitened_templates(known, t, groups)
+    candidates = known.whiten_groups(t, groups)
     likelihood = [np.exp(-0.5 * x @ x)]
     for i, group in enumerate(groups):
         basis = candidates.basis[:, candidates.start[i] : candidates.start[i + 1]]
@@ -310,7 +310,7 @@ def test_cosines_are_canonical_correlations():
     t = rng.normal(size=(9, 6))
     t[:, 5] = 0.0
     known = SimulatedGaussian(np.zeros(9), np.eye(9), 10**6)
-    found = cosines(whitened_templates(known, t, [(0,), (1, 2), (3, 4), (5,)]))
+    found = cosines(known.whiten_groups(t, [(0,), (1, 2), (3, 4), (5,)]))
     one, two = np.linalg.qr(t[:, 1:3])[0], np.linalg.qr(t[:, 3:5])[0]
     assert found[1, 2] == pytest.approx(np.linalg.svd(one.T @ two, compute_uv=False)[0])
     assert found[0, 1] == pytest.approx(np.linalg.norm(one.T @ t[:, 0]) / np.linalg.norm(t[:, 0]))

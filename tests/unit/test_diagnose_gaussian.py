@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from mcsim.errors import InputError
-from mcsim.stats.gaussian import fit, nested_pvalue, null, residual_pvalue, whitened_templates
+from mcsim.stats.gaussian import SimulatedGaussian, nested_pvalue, residual_pvalue
 from mcsim.stats.look_elsewhere import Calibration, calibrate, global_test, scan_pvalues
 
 P, N = 12, 60
@@ -30,7 +30,7 @@ def templates(ensemble) -> np.ndarray:
 
 
 def test_scatter_is_n_times_one(ensemble):
-    fiducial = null(ensemble)
+    fiducial = SimulatedGaussian.from_simulations(ensemble)
     white = fiducial.whiten(ensemble) * np.sqrt(1 + 1 / N)
     np.testing.assert_allclose(white.T @ white, (N - 1) * np.eye(P), atol=1e-9)
 
@@ -38,31 +38,35 @@ def test_scatter_is_n_times_one(ensemble):
 def test_offset_moves_the_mean(ensemble, evidence):
     shift = np.arange(P, dtype=float)
     np.testing.assert_allclose(
-        null(ensemble, shift).whiten(evidence + shift), null(ensemble).whiten(evidence), rtol=1e-9
+        SimulatedGaussian.from_simulations(ensemble, shift).whiten(evidence + shift),
+        SimulatedGaussian.from_simulations(ensemble).whiten(evidence),
+        rtol=1e-9,
     )
 
 
 def test_wider_null_is_that_of_both_scatters(ensemble):
     """Against the covariance itself, where draws are so many that nothing is drawn towards anything."""
     rng = np.random.default_rng(3)
-    fiducial = null(ensemble)
+    fiducial = SimulatedGaussian.from_simulations(ensemble)
     p = fiducial.dimension
     root = rng.normal(size=(p, p)) * np.sqrt(np.var(ensemble, axis=0))[:, None]
     draws = root @ rng.normal(size=(p, 400_000))
     wide = fiducial.with_extra_covariance((draws - draws.mean(axis=1, keepdims=True)) / np.sqrt(399_999.0))
     S = np.cov(ensemble.T)
-    scale = 1.0 + 1.0 / fiducial.count
+    scale = 1.0 + 1.0 / fiducial.n_sims
     x = rng.normal(size=p) * ensemble.std(axis=0) + fiducial.mean
     # S is too small by the factor that makes squares unbiased.
-    expected = (x - fiducial.mean) @ np.linalg.solve(S + fiducial.unbiased / scale * root @ root.T, x - fiducial.mean)
+    expected = (x - fiducial.mean) @ np.linalg.solve(
+        S + fiducial.hartlap_factor / scale * root @ root.T, x - fiducial.mean
+    )
     assert wide.chi2(x) == pytest.approx(expected / scale, rel=0.01)
-    volume = np.linalg.slogdet(np.eye(p) + fiducial.unbiased / scale * np.linalg.solve(S, root @ root.T))[1]
+    volume = np.linalg.slogdet(np.eye(p) + fiducial.hartlap_factor / scale * np.linalg.solve(S, root @ root.T))[1]
     assert wide.log_jacobian == pytest.approx(-0.5 * volume, rel=0.01)
 
 
 def test_statistics_equal_those_of_the_scatter(ensemble, evidence, templates):
     """The formulas of Hotelling and Rao written with S itself."""
-    fiducial, n = null(ensemble), N - 1
+    fiducial, n = SimulatedGaussian.from_simulations(ensemble), N - 1
     inverse = np.linalg.inv(np.cov(ensemble.T) * n)
     x = (evidence - ensemble.mean(axis=0)) / np.sqrt(1 + 1 / N)
     t = templates[:, :3]
@@ -71,7 +75,7 @@ def test_statistics_equal_those_of_the_scatter(ensemble, evidence, templates):
     np.testing.assert_allclose(y @ y / n, square, rtol=1e-8)
     score, normal = t.T @ inverse @ x, t.T @ inverse @ t
     T = score @ np.linalg.solve(normal, score)
-    found = fit(fiducial, evidence, t)
+    found = fiducial.fit(evidence, t)
     expected = stats.f.sf((n - P + 1) / 3 * T / (1 + square - T), 3, n - P + 1)
     assert found.nested_pvalue == pytest.approx(expected, rel=1e-7)
     q = P - 3
@@ -86,16 +90,19 @@ def test_statistics_equal_those_of_the_scatter(ensemble, evidence, templates):
 def test_repeated_entries_change_nothing(ensemble, evidence, templates):
     """A sum of two entries, and a copy with rounding, carry nothing new."""
     mixing = np.vstack([np.eye(P), np.eye(P)[0] * 3.0, np.eye(P)[1] + np.eye(P)[2]])
-    short, long = null(ensemble), null(ensemble @ mixing.T)
+    short, long = SimulatedGaussian.from_simulations(ensemble), SimulatedGaussian.from_simulations(ensemble @ mixing.T)
     assert long.dimension == P
-    one, two = fit(short, evidence, templates[:, :2]), fit(long, mixing @ evidence, mixing @ templates[:, :2])
+    one, two = short.fit(evidence, templates[:, :2]), long.fit(mixing @ evidence, mixing @ templates[:, :2])
     np.testing.assert_allclose(one.amplitudes, two.amplitudes, rtol=1e-6)
     assert one.pvalue == pytest.approx(two.pvalue, rel=1e-6)
 
 
 def test_a_repeated_column_has_no_amplitude_of_its_own(ensemble, evidence, templates):
     twice = np.column_stack([templates[:, 0], 2.0 * templates[:, 0]])
-    one, two = fit(null(ensemble), evidence, templates[:, :1]), fit(null(ensemble), evidence, twice)
+    one, two = (
+        SimulatedGaussian.from_simulations(ensemble).fit(evidence, templates[:, :1]),
+        SimulatedGaussian.from_simulations(ensemble).fit(evidence, twice),
+    )
     assert two.dimension == one.dimension
     assert two.amplitudes @ [1.0, 2.0] == pytest.approx(one.amplitudes[0], rel=1e-8)
 
@@ -115,14 +122,14 @@ def test_forgiven_errors_make_the_tail_noncentral(q, allowance):
 
 def test_bad_ensembles_say_what_to_do(ensemble):
     with pytest.raises(InputError, match="at least 19"):
-        null(ensemble[:15])
+        SimulatedGaussian.from_simulations(ensemble[:15])
     flat = ensemble.copy()
     flat[:, 4] = 1.0
-    with pytest.raises(InputError, match="evidence 4 has no finite scatter"):
-        null(flat)
+    with pytest.raises(InputError, match="element 4 "):
+        SimulatedGaussian.from_simulations(flat)
     flat[0, 5] = np.nan
-    with pytest.raises(InputError, match="evidence 5 has no finite scatter"):
-        null(flat)
+    with pytest.raises(InputError, match="element 5 "):
+        SimulatedGaussian.from_simulations(flat)
 
 
 def test_gap_is_invariant_and_names_the_candidate(ensemble, evidence, templates):
@@ -130,8 +137,8 @@ def test_gap_is_invariant_and_names_the_candidate(ensemble, evidence, templates)
     x = evidence + 20.0 * templates[:, 1]
     results = []
     for scale in (1.0, 1e-6):
-        fiducial = null(ensemble * scale)
-        candidates = whitened_templates(fiducial, templates * scale, groups)
+        fiducial = SimulatedGaussian.from_simulations(ensemble * scale)
+        candidates = fiducial.whiten_groups(templates * scale, groups)
         results.append(global_test(fiducial, x * scale, candidates, calibrate(fiducial, candidates, draws=2000)))
     assert results[0].best == 1
     assert results[0].pvalue == pytest.approx(results[1].pvalue, rel=1e-6)
@@ -139,11 +146,11 @@ def test_gap_is_invariant_and_names_the_candidate(ensemble, evidence, templates)
 
 
 def test_silent_candidates_count_for_nothing(ensemble, evidence, templates):
-    fiducial = null(ensemble)
+    fiducial = SimulatedGaussian.from_simulations(ensemble)
     silent = np.column_stack([templates, np.zeros(P)])
     filtered, all_of_them = (
-        whitened_templates(fiducial, templates, [(0,), (1, 2)]),
-        whitened_templates(fiducial, silent, [(0,), (1, 2), (6,)]),
+        fiducial.whiten_groups(templates, [(0,), (1, 2)]),
+        fiducial.whiten_groups(silent, [(0,), (1, 2), (6,)]),
     )
     one = global_test(fiducial, evidence, filtered, calibrate(fiducial, filtered, draws=2000))
     two = global_test(fiducial, evidence, all_of_them, calibrate(fiducial, all_of_them, draws=2000))

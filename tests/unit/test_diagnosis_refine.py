@@ -10,7 +10,7 @@ from mcsim.diagnosis.analysis import Proposal
 from mcsim.diagnosis.candidate import Candidate
 from mcsim.diagnosis.refine import refine
 from mcsim.diagnosis.selection import attribute
-from mcsim.stats.gaussian import null, whitened_templates
+from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate
 from mcsim.systematics import Effect
 
@@ -36,10 +36,10 @@ class Instrument:
         directions = np.linalg.qr(rng.normal(size=(P, 5)))[0].T
         self.t, self.sideways = directions[:3].T, directions[3:]
         self.bend, self.cross = bend, cross
-        self.null = null(rng.normal(size=(900, P)))
+        self.null = SimulatedGaussian.from_simulations(rng.normal(size=(900, P)))
         self.candidates = [Candidate("push", name, (k,)) for k, name in enumerate("ABC")]
         self.proposals = [Proposal(Push, name, {}, (Push(amplitude=1.0),)) for name in "ABC"]
-        self.calibration = calibrate(self.null, whitened_templates(self.null, self.t, [(0,), (1,), (2,)]))
+        self.calibration = calibrate(self.null, self.null.whiten_groups(self.t, [(0,), (1,), (2,)]))
         self.known = SimpleNamespace(curvature=np.outer(bend * self.sideways[0], [1.0, 0.0, 0.0]))
         self.analysis: list[dict[str | None, float]] = []
 

@@ -26,7 +26,7 @@ from mcsim.diagnosis.verdict import detectable_of, effects_of, verdict_of
 from mcsim.diagnosis.view import ReportView, entry_words
 from mcsim.diagnosis.where import Place
 from mcsim.stats.detection import confusion, snr_needed
-from mcsim.stats.gaussian import null, residual_pvalue, whitened_templates
+from mcsim.stats.gaussian import SimulatedGaussian, residual_pvalue
 from mcsim.stats.look_elsewhere import calibrate
 from mcsim.support import resources
 
@@ -92,7 +92,7 @@ def bench(nearest_candidates: bool) -> SimpleNamespace:
     """What the five cases have in common."""
     proposed, t = proposals(), RESPONSE * templates(nearest_candidates)
     simulations = np.random.default_rng(10).normal(size=(N, P))
-    model = null(simulations)
+    model = SimulatedGaussian.from_simulations(simulations)
     columns = np.split(np.arange(t.shape[1]), np.cumsum([len(one.basis) for one in proposed])[:-1])
     candidates = tuple(
         Candidate(one.kind.name, one.channel, tuple(int(c) for c in own), unit=one.kind.unit)
@@ -105,7 +105,7 @@ def bench(nearest_candidates: bool) -> SimpleNamespace:
         null=model,
         candidates=candidates,
         calibration=calibrate(
-            model, whitened_templates(model, t, [candidate.columns for candidate in candidates]), draws=2000
+            model, model.whiten_groups(t, [candidate.columns for candidate in candidates]), draws=2000
         ),
         templates=t,
         detectable=detectable_of(model, t, candidates, proposed),
@@ -297,16 +297,21 @@ def test_first_screen_fits_its_picture(diagnoses, kind, tmp_path):
 
 def test_simulations_held_out_against_refits():
     simulations = np.random.default_rng(2).normal(size=(60, 8)) @ np.random.default_rng(3).normal(size=(8, 8))
-    found = report_arrays.held_out(simulations, null(simulations))
+    found = report_arrays.held_out(simulations, SimulatedGaussian.from_simulations(simulations))
     for i in range(5):
-        others = null(np.delete(simulations, i, axis=0))
+        others = SimulatedGaussian.from_simulations(np.delete(simulations, i, axis=0))
         y = others.whiten(simulations[i])
         assert found[i] == pytest.approx(residual_pvalue(y @ y, 8, others.dof), rel=1e-9)
 
 
 def test_simulations_held_out_are_uniform():
     simulations = np.random.default_rng(4).normal(size=(2000, 20))
-    assert stats.kstest(report_arrays.held_out(simulations, null(simulations)), "uniform").pvalue > 1e-3
+    assert (
+        stats.kstest(
+            report_arrays.held_out(simulations, SimulatedGaussian.from_simulations(simulations)), "uniform"
+        ).pvalue
+        > 1e-3
+    )
 
 
 def test_residual_maps_are_in_units_of_noise(monkeypatch):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mcsim.diagnosis.with_scatter import with_scatter
-from mcsim.stats.gaussian import fit, null
+from mcsim.stats.gaussian import SimulatedGaussian
 
 P, SKIES = 12, 4000
 
@@ -13,9 +13,9 @@ P, SKIES = 12, 4000
 def test_errors_grow_with_the_scatter_and_never_shrink(growth: float) -> None:
     rng = np.random.default_rng(3)
     mixing = rng.normal(size=(P, P))
-    model = null(rng.normal(size=(2000, P)) @ mixing)
+    model = SimulatedGaussian.from_simulations(rng.normal(size=(2000, P)) @ mixing)
     t = rng.normal(size=(P, 2))
-    found = fit(model, 30.0 * t[:, 0], t)
+    found = model.fit(30.0 * t[:, 0], t)
     before = rng.normal(size=(SKIES, P)) @ mixing
     # The response itself, the same in every sky, is no scatter.
     wide = with_scatter(model, t, found, before, 30.0 * t[:, 0] + growth * before)
@@ -31,6 +31,6 @@ def _correlation(covariance: np.ndarray) -> np.ndarray:
 
 def test_without_a_change_of_the_scatter_errors_stay() -> None:
     rng = np.random.default_rng(4)
-    model, t = null(rng.normal(size=(500, P))), rng.normal(size=(P, 1))
-    found, skies = fit(model, 5.0 * t[:, 0], t), rng.normal(size=(8, P))
+    model, t = SimulatedGaussian.from_simulations(rng.normal(size=(500, P))), rng.normal(size=(P, 1))
+    found, skies = model.fit(5.0 * t[:, 0], t), rng.normal(size=(8, P))
     np.testing.assert_allclose(with_scatter(model, t, found, skies, skies + t[:, 0]).covariance, found.covariance)
