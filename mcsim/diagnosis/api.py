@@ -4,7 +4,6 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +18,11 @@ from mcsim.diagnosis.inference import Diagnosis, DiagnosisContext, context, diag
 from mcsim.diagnosis.observed_maps import checked, read_maps
 from mcsim.errors import InputError
 from mcsim.support import folders
+from mcsim.support.code import class_digest, package_digest
 
-METHOD = 7
-"""Raised whenever the same model would teach something else."""
+CODE = ("config", "sphere", "stats", "instrument", "systematics", "bipolar", "simulation", "beamfit", "diagnosis")
+LIBRARIES = ("ducc0", "healpy", "numpy", "scipy")
+"""What the simulations of a model and their data vectors are computed with."""
 
 
 def diagnose(
@@ -144,15 +145,19 @@ def _learned(
 
 
 def _key(run: config.RunConfig, analysis: Analysis, simulations: int | None) -> str:
-    """Hash of what the simulations of a model depend on; its name, seed and number of realizations are not among it."""
+    """Return a hash of all that the simulations of a model depend on, the code that makes them included.
+
+    Its name, its seed and its number of realizations do not count.
+    """
     science = config.science(run)
     science["ensemble"] = {}
-    library = [[proposal.label, [repr(basis) for basis in proposal.basis]] for proposal in analysis.proposals]
+    effects = {proposal.kind for proposal in analysis.proposals}
+    effects |= {systematics.get(effect.name) for effect in run.effects}
     rest = [
-        METHOD,
         simulations,
-        library,
+        [[proposal.label, [repr(basis) for basis in proposal.basis]] for proposal in analysis.proposals],
         [element.name for element in analysis.elements],
-        version("ducc0"),
+        sorted(class_digest(kind) for kind in effects),
+        package_digest((f"mcsim.{name}" for name in CODE), LIBRARIES),
     ]
     return hashlib.sha256(json.dumps([science, rest], sort_keys=True).encode()).hexdigest()[:32]

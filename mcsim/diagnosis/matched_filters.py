@@ -19,6 +19,7 @@ from mcsim.simulation.survey import mean_gain
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
 from mcsim.support import folders
+from mcsim.support.code import class_digest, package_digest
 from mcsim.systematics import Effect
 
 Map = NDArray[np.float64]
@@ -148,16 +149,18 @@ def matched_filter(model: Model, effect: Effect, channel: int | None) -> Matched
 
 
 def gain_of(effect: Effect, site: systematics.Site, share: tuple[float, float]) -> Map:
-    """Mean error of the gain in every pixel, kept on disk: each process of each diagnosis of a model asks for it.
+    """Return the mean error of the gain in every pixel, kept on disk: each process of each diagnosis needs it.
 
-    What an effect does is what it says it does at a few thousand times.
+    The key has the effect, its code, and its gain at a few thousand times: what an effect takes from elsewhere shows
+    in these.
     """
     pointing = site.pointed(effect.name)
     where = moments_key(pointing.model, site.nside, 0, site.frame, [pointing.line.name], share)
     period = pointing.model.period_of_samples(pointing.line)
     times = period * np.linspace(*tod.sample_range(pointing.model, pointing.line, share), _TIMES)
-    line = repr(pointing.line).encode()
-    what = hashlib.sha256(line + np.asarray(effect.gain(times, site)).tobytes()).hexdigest()
+    code = class_digest(type(effect)) + package_digest(["mcsim.systematics", "mcsim.simulation"])
+    text = f"{effect!r} {pointing.line!r} {code}".encode()
+    what = hashlib.sha256(text + np.asarray(effect.gain(times, site)).tobytes()).hexdigest()
 
     def fill(folder: Path) -> None:
         np.save(folder / "gain.npy", np.asarray(mean_gain((effect,), site, share), dtype=np.float64))
@@ -167,7 +170,7 @@ def gain_of(effect: Effect, site: systematics.Site, share: tuple[float, float]) 
 
 
 _TIMES = 4096
-"""At which a gain is looked at to know it again."""
+"""At which a gain is evaluated for the key."""
 
 
 def _beam_filter(model: Model, effect: Effect, channel: int, parts: tuple[int, ...]) -> BeamFilter | None:

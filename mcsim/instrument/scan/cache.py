@@ -7,9 +7,7 @@ from pathlib import Path
 
 from mcsim.instrument.scan.model import ScanModel
 from mcsim.support import folders
-
-ALGORITHM = 1
-"""Raised whenever the same numbers would give other moments."""
+from mcsim.support.code import package_digest
 
 
 def moments_key(
@@ -20,13 +18,13 @@ def moments_key(
     lines_of_sight: list[str] | tuple[str, ...] | None = None,
     time_range: tuple[float, float] = (0.0, 1.0),
 ) -> str:
-    """SHA-256 of every number that the moments depend on, names and citations left out."""
+    """Return the SHA-256 of all numbers and all code that the moments depend on, names and citations left out."""
     lines = [
         [line.boresight_angle_deg, line.azimuth_deg, model.period_of_samples(line)]
         for line in model.select(lines_of_sight)
     ]
     everything = {
-        "algorithm": ALGORITHM,
+        "code": package_digest(["mcsim.instrument.scan"], ["healpy", "numpy"]),
         "spin": [model.spin_period_s, model.spin_phase_deg],
         "precession": [model.precession_period_s, model.precession_angle_deg, model.precession_phase_deg],
         "orbit": [model.orbit_period_s, model.orbit_phase_deg],

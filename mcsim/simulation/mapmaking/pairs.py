@@ -20,9 +20,7 @@ from mcsim.instrument.scan.model import LineOfSight, ScanModel
 from mcsim.instrument.scan.pointing import BLOCK, PointingStream, fill_block, ring_pixel
 from mcsim.simulation.tod import chunks, sample_range
 from mcsim.support import folders
-
-ALGORITHM = 1
-"""Raised whenever the same numbers would give other pairs."""
+from mcsim.support.code import package_digest
 
 PARTS = 16
 """Parts of the survey that threads share out; fixed, so that sums do not depend on the number of threads."""
@@ -150,7 +148,7 @@ def _key(
 ) -> str:
     """SHA-256 of every number that the pairs depend on."""
     everything = {
-        "algorithm": ALGORITHM,
+        "code": package_digest(["mcsim.instrument.scan", __name__], ["healpy", "numpy"]),
         "spin": [model.spin_period_s, model.spin_phase_deg],
         "precession": [model.precession_period_s, model.precession_angle_deg, model.precession_phase_deg],
         "orbit": [model.orbit_period_s, model.orbit_phase_deg],

@@ -1,0 +1,67 @@
+"""Identify code by its content, so that nothing in a cache is older than the code that made it."""
+
+import ast
+import hashlib
+import inspect
+import sys
+import uuid
+from collections.abc import Iterable
+from functools import lru_cache
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+
+
+def package_digest(packages: Iterable[str], libraries: Iterable[str] = ()) -> str:
+    """Return the SHA-256 of the code of packages or modules, and of the versions of libraries.
+
+    Comments, docstrings and the layout of the text do not count.
+    """
+    found = [_file_digest(*_stamp(path)) for name in sorted(packages) for path in _files(name)]
+    found += [f"{name} {version(name)}" for name in sorted(libraries)]
+    return hashlib.sha256("\n".join(found).encode()).hexdigest()
+
+
+def class_digest(kind: type) -> str:
+    """Return the SHA-256 of the packages of a user that define a class and its bases; those of mcsim do not count.
+
+    A class whose source cannot be read, typed at a prompt for instance, gets a new digest at every call.
+    """
+    found = [f"{kind.__module__}.{kind.__qualname__}"]
+    for base in kind.__mro__:
+        top = base.__module__.partition(".")[0]
+        if top == "mcsim" or (top in sys.stdlib_module_names and top != "__main__"):
+            continue
+        try:
+            found.append(inspect.getsource(base) if top == "__main__" else package_digest([top]))
+        except (ImportError, OSError, TypeError):
+            found.append(uuid.uuid4().hex)
+    return hashlib.sha256("\n".join(found).encode()).hexdigest()
+
+
+def _files(name: str) -> list[Path]:
+    module = sys.modules[name] if name in sys.modules else import_module(name)
+    if hasattr(module, "__path__"):
+        return sorted(path for folder in module.__path__ for path in Path(folder).rglob("*.py"))
+    if module.__file__ is None:
+        raise OSError(f"{name} has no file")
+    return [Path(module.__file__)]
+
+
+def _stamp(path: Path) -> tuple[str, int, int]:
+    status = path.stat()
+    return str(path), status.st_mtime_ns, status.st_size
+
+
+@lru_cache(maxsize=1024)
+def _file_digest(path: str, modified_ns: int, size: int) -> str:
+    tree = ast.parse(Path(path).read_bytes())
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list):
+            body[:] = [one for one in body if not _is_text(one)]
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
+
+
+def _is_text(node: ast.AST) -> bool:
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)

@@ -1,0 +1,66 @@
+"""Digests of code follow the code, and nothing else."""
+
+import importlib
+import os
+import sys
+
+import pytest
+
+from mcsim.support.code import class_digest, package_digest
+
+SOURCE = """
+class Base:
+    pass
+
+
+class Thing(Base):
+    \"\"\"Add one.\"\"\"
+
+    def __call__(self, x):
+        return x + 1
+"""
+
+
+@pytest.fixture
+def plugin(tmp_path, monkeypatch):
+    (tmp_path / "plugin_of_a_user").mkdir()
+    path = tmp_path / "plugin_of_a_user" / "__init__.py"
+    path.write_text(SOURCE)
+    monkeypatch.syspath_prepend(tmp_path)
+    importlib.invalidate_caches()
+    yield path
+    sys.modules.pop("plugin_of_a_user", None)
+
+
+def write(path, text):
+    stamp = path.stat().st_mtime_ns
+    path.write_text(text)
+    os.utime(path, ns=(stamp + 10**9, stamp + 10**9))
+
+
+def test_a_class_is_known_by_its_code(plugin):
+    kind = importlib.import_module("plugin_of_a_user").Thing
+    before = class_digest(kind)
+    assert class_digest(kind) == before
+    write(plugin, SOURCE.replace("Add one.", "Add 1.") + "# a remark\n")
+    assert class_digest(kind) == before
+    write(plugin, SOURCE.replace("x + 1", "x + 2"))
+    assert class_digest(kind) != before
+
+
+def test_a_module_beside_it_counts(plugin):
+    kind = importlib.import_module("plugin_of_a_user").Thing
+    before = class_digest(kind)
+    (plugin.parent / "constants.py").write_text("E = 0.1\n")
+    assert class_digest(kind) != before
+
+
+def test_versions_count():
+    assert package_digest(["mcsim.stats"], ["numpy"]) != package_digest(["mcsim.stats"])
+    assert package_digest(["mcsim.stats"]) != package_digest(["mcsim.stats.gaussian"])
+
+
+def test_a_class_without_source_is_never_the_same():
+    space = {"__name__": "no_such_module"}
+    exec("class Typed: pass", space)
+    assert class_digest(space["Typed"]) != class_digest(space["Typed"])
