@@ -9,17 +9,15 @@ from numpy.typing import NDArray
 from mcsim.benchmark.prior import CaseSampler, Drawn, Prior
 from mcsim.benchmark.record import Geometry, Record, most_probable
 from mcsim.benchmark.reduced import without
-from mcsim.diagnosis.analysis import Proposal
 from mcsim.diagnosis.batch import Batch
-from mcsim.diagnosis.candidate import Candidate, columns_of
-from mcsim.diagnosis.inference import DiagnosisContext
-from mcsim.diagnosis.refine import effects_at, significant_templates
+from mcsim.diagnosis.candidate import Candidate, columns_of, effects_at
+from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.selection import Attribution, attribute
-from mcsim.diagnosis.validation import Prediction, Shrink, achieved, predicted
+from mcsim.diagnosis.validation import Halves, Prediction, Shrink
 from mcsim.errors import InputError
 from mcsim.sphere import rng
 from mcsim.stats.detection import power
-from mcsim.stats.gaussian import SimulatedGaussian
+from mcsim.stats.gaussian import Fit, SimulatedGaussian
 from mcsim.stats.look_elsewhere import Calibration, calibrate, global_test
 
 Vector = NDArray[np.float64]
@@ -40,58 +38,36 @@ class Bench:
 
     Attributes
     ----------
-    null, used, fresh
-        Of the whole evidence, of its fold 0, of its fold 1; None where it has none.
-    first, second
-        Entries of both folds.
+    null, halves
+        Of the whole data vector, and of its two folds; None if it has none.
     templates
         Shape (p, K).
-    candidates, proposals, calibration
+    candidates, calibration
         Of the library.
     data
         Evidence of simulations that the null has not seen, shape (n, p).
     """
 
     null: SimulatedGaussian
-    used: SimulatedGaussian | None
-    fresh: SimulatedGaussian | None
-    first: NDArray[np.int64]
-    second: NDArray[np.int64]
+    halves: Halves | None
     templates: NDArray[np.float64]
     candidates: tuple[Candidate, ...]
-    proposals: tuple[Proposal, ...]
     calibration: Calibration
     data: NDArray[np.float64]
 
 
 def bench(context: DiagnosisContext, names: tuple[str, ...] = ()) -> Bench:
     """Of a court, without some effects; a quarter of its simulations become data."""
-    fewer = without(context.analysis, context.known, names)
-    known, analysis = fewer.known, fewer.analysis
-    kept = len(known.simulations) - int(HELD_OUT * len(known.simulations))
-    seen = replace(known, simulations=known.simulations[:kept])
-    folds = np.array([-1 if element.fold is None else element.fold for element in analysis.elements])
-    first, second = np.flatnonzero(folds == 0), np.flatnonzero(folds == 1)
-    of = {proposal.label: one for proposal, one in zip(context.analysis.proposals, context.candidates, strict=True)}
-    # Templates are exact here, also those of what draws: its scatter, which a diagnosis would measure, is none.
-    candidates = tuple(
-        replace(of[proposal.label], columns=columns, shape_error=None)
-        for proposal, columns in zip(analysis.proposals, analysis.columns, strict=True)
-    )
-    whole, t = seen.null(), significant_templates(known)
+    fewer = without(context.analysis, context.ensemble, context.bank, names)
+    ensemble, analysis = fewer.ensemble, fewer.analysis
+    kept = len(ensemble.simulations) - int(HELD_OUT * len(ensemble.simulations))
+    seen = replace(ensemble, simulations=ensemble.simulations[:kept])
+    # Templates are exact here, also those of stochastic effects: the scatter, which a diagnosis would measure, is none.
+    candidates = tuple(replace(candidate, shape_error=None) for candidate in analysis.candidates)
+    whole, t = seen.gaussian, fewer.bank.significant(ensemble.spread, context.settings)
     groups = whole.whiten_groups(t, [candidate.columns for candidate in candidates])
-    return Bench(
-        whole,
-        seen.null(first) if len(first) and len(second) else None,
-        seen.null(second) if len(first) and len(second) else None,
-        first,
-        second,
-        t,
-        candidates,
-        analysis.proposals,
-        calibrate(whole, groups),
-        known.simulations[kept:] + known.offset,
-    )
+    data = ensemble.simulations[kept:] + ensemble.offset
+    return Bench(whole, Halves.of(seen, np.zeros(len(t))), t, candidates, calibrate(whole, groups), data)
 
 
 def draws(
@@ -134,7 +110,7 @@ def draws(
     tasks = []
     for names, cases in by_library.items():
         here = bench(context, names) if names else full
-        rows = without(context.analysis, context.known, names).rows
+        rows = without(context.analysis, context.ensemble, context.bank, names).rows
         posed = [Draw(case, one, response_of(full, one)[rows]) for case, one in cases]
         tasks += [(here, prior, seed, posed[start : start + TASK]) for start in range(0, len(posed), TASK)]
     records: list[Record] = []
@@ -146,7 +122,7 @@ def draws(
 def sampler_of(bench: Bench, prior: Prior) -> CaseSampler:
     """What draws from the library of a bench."""
     columns = [candidate.columns for candidate in bench.candidates]
-    return CaseSampler(prior, bench.proposals, columns, bench.templates, bench.null.expected_snr, {})
+    return CaseSampler(prior, bench.candidates, columns, bench.templates, bench.null.expected_snr, {})
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,19 +204,18 @@ def _pulls(said: Attribution, drawn: Drawn) -> tuple[tuple[float, ...], tuple[fl
 
 def shrunk(bench: Bench, x: Vector, members: Sequence[int]) -> tuple[Prediction, Shrink] | None:
     """Shrink predicted and achieved: fitted to fold 0, frozen, and judged on fold 1."""
-    if bench.used is None or bench.fresh is None:
+    if bench.halves is None:
         return None
-    columns = np.array(columns_of(bench.candidates, members))
-    here = bench.templates[np.ix_(bench.second, columns)]
-    frozen = bench.used.fit(x[bench.first], bench.templates[np.ix_(bench.first, columns)])
+    t = bench.templates[:, columns_of(bench.candidates, members)]
+
+    def respond(frozen: Fit) -> Vector:
+        effects = effects_at(bench.candidates, members, frozen)
+        return np.asarray(t @ np.concatenate([effect.coordinates() for effect in effects]))
+
     try:
-        effects = effects_at(bench.candidates, bench.proposals, members, frozen)
+        return replace(bench.halves, x=x).reduction(t, respond)
     except InputError:
         return None
-    coordinates = np.concatenate([effect.coordinates() for effect in effects])
-    expected = predicted(bench.fresh, x[bench.second], here, frozen.amplitudes, frozen.covariance)
-    after = replace(bench.fresh, mean=bench.fresh.mean + here @ coordinates)
-    return expected, achieved(bench.fresh, after, x[bench.second])
 
 
 def _absent(

@@ -12,7 +12,7 @@ from mcsim.benchmark.out_of_library import introduced
 from mcsim.benchmark.reduced import without
 from mcsim.diagnosis.analysis import Job, analysis_of, data_vectors
 from mcsim.diagnosis.api import prepared
-from mcsim.diagnosis.inference import DiagnosisContext, context
+from mcsim.diagnosis.context import DiagnosisContext, context
 from mcsim.errors import RunError
 
 Vector = NDArray[np.float64]
@@ -44,8 +44,8 @@ def without_effects(model: str, simulations: int | None, names: tuple[str, ...])
     full = learned_model(model, simulations)
     if not names:
         return full
-    fewer = without(full.context.analysis, full.context.known, names)
-    return LearnedModel(context(full.context.run, fewer.analysis, fewer.known), fewer.rows)
+    fewer = without(full.context.analysis, full.context.ensemble, full.context.bank, names)
+    return LearnedModel(context(full.context.run, fewer.analysis, fewer.ensemble, fewer.bank), fewer.rows)
 
 
 def evidence_with(job: Job, out_of_library: str | None) -> Vector:

@@ -19,9 +19,8 @@ from mcsim.benchmark.truth import KEYS, MAPS, SEAL, Member, Truth, key_path, new
 from mcsim.diagnosis.analysis import Job, analysis_of
 from mcsim.diagnosis.api import prepared
 from mcsim.diagnosis.batch import Batch, asking, batch
-from mcsim.diagnosis.inference import DiagnosisContext
-from mcsim.diagnosis.knowledge import after_jobs, seeded, with_effects
-from mcsim.diagnosis.refine import significant_templates
+from mcsim.diagnosis.campaign import after_jobs, seeded, with_effects
+from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
@@ -120,7 +119,8 @@ def make(
     if not missing:
         return target
     with batch(run.compute.workers if workers is None else workers) as call:
-        context = prepared(run, analysis_of(run), asking(call, quiet), simulations)
+        with asking(call, quiet) as ask:
+            context = prepared(run, analysis_of(run), ask, simulations)
         sampler = sampler_of(context, prior)
         kinds = sampler.kinds(seed, cases, lent is not None)
         if any(kinds[number] == "invented" for number in missing):
@@ -139,9 +139,13 @@ def make(
 
 def sampler_of(context: DiagnosisContext, prior: Prior) -> CaseSampler:
     """What draws the cases of a model."""
-    analysis = context.analysis
     return CaseSampler(
-        prior, analysis.proposals, analysis.columns, significant_templates(context.known), context.null.expected_snr, {}
+        prior,
+        context.candidates,
+        [one.columns for one in context.candidates],
+        context.templates,
+        context.null.expected_snr,
+        {},
     )
 
 
@@ -247,15 +251,15 @@ def _measured(model: str, simulations: int | None, members: Sequence[Member], se
         for attempt in range(ATTEMPTS):
             factor = SMALLER**attempt
             assert member.candidate is not None  # it is of the library
-            proposal = learned.context.analysis.proposals[member.candidate]
+            proposal = learned.context.candidates[member.candidate]
             scaled = {**member.parameters, "amplitude": factor * member.parameters["amplitude"]}
-            effect = proposal.kind(**scaled)
+            effect = proposal.effect(**scaled)
             try:
                 jobs = after_jobs(learned.context.run, learned.context.analysis, [proposal.table(effect)], SKIES)
                 one, two = (answer for answer in learned.ask(jobs))
             except InputError:
                 continue
-            reference = learned.context.known.reference
+            reference = learned.context.ensemble.reference
             # Two halves of the skies, so that their noise does not count as strength.
             halves = (one - reference[: len(one)], two - reference[len(one) : len(one) + len(two)])
             first, second = (null.whiten_templates(half.mean(axis=0)[:, None])[:, 0] for half in halves)
@@ -263,7 +267,7 @@ def _measured(model: str, simulations: int | None, members: Sequence[Member], se
             if strength > LARGER * member.strength and attempt + 1 < ATTEMPTS:
                 continue  # its response is no straight line
             coordinates = tuple(float(value) for value in effect.coordinates())
-            if not proposal.kind.draws:
+            if not proposal.effect.stochastic:
                 strength = _strength_here(learned, proposal.table(effect), seed)
             found.append(replace(member, parameters=scaled, coordinates=coordinates, strength=strength))
             break

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.benchmark.truth import Identity, Kind, Member
-from mcsim.diagnosis.analysis import Proposal
+from mcsim.diagnosis.candidate import Candidate
 from mcsim.errors import InputError
 from mcsim.sphere import rng
 from mcsim.systematics import Effect
@@ -96,7 +96,7 @@ class CaseSampler:
     """
 
     prior: Prior
-    proposals: Sequence[Proposal]
+    proposals: Sequence[Candidate]
     columns: Sequence[tuple[int, ...]]
     templates: NDArray[np.float64]
     white_length: WhiteLength
@@ -134,7 +134,9 @@ class CaseSampler:
     def names(self) -> list[str]:
         """Effects that can be there and are heard, no larger than nature has them."""
         return list(
-            dict.fromkeys(self.proposals[index].kind.name for index in range(len(self.proposals)) if self._heard(index))
+            dict.fromkeys(
+                self.proposals[index].effect.name for index in range(len(self.proposals)) if self._heard(index)
+            )
         )
 
     def weights(self) -> Vector:
@@ -147,14 +149,14 @@ class CaseSampler:
 
     def _heard(self, index: int) -> bool:
         best = max(self.white_length(self.templates[:, column]) for column in self.columns[index])
-        max_amplitude = self.proposals[index].kind.max_amplitude
+        max_amplitude = self.proposals[index].effect.max_amplitude
         return best > 0.0 if np.isinf(max_amplitude) else max_amplitude * best >= self.prior.weakest
 
     def _channels(self, name: str) -> list[list[int]]:
         """Proposals of an effect, channel by channel."""
         groups: dict[Identity, list[int]] = {}
         for index, proposal in enumerate(self.proposals):
-            if proposal.kind.name == name and self._heard(index):
+            if proposal.effect.name == name and self._heard(index):
                 groups.setdefault((name, proposal.channel), []).append(index)
         return list(groups.values())
 
@@ -169,9 +171,9 @@ class CaseSampler:
         filtered = values > 1e-9 * values[-1]
         direction = draw.standard_normal(len(values))
         theta = vectors[:, filtered] @ (direction[filtered] / np.sqrt(values[filtered]))
-        if proposal.kind.sign:
+        if proposal.effect.sign:
             theta = np.abs(theta)
-        effect = proposal.with_parameters(theta, gram)
+        effect = proposal.with_coordinates(theta, gram)
         # The parameters reach only some directions, and coordinates need not be linear in the amplitude.
         for _ in range(30):
             length = self.white_length(t @ effect.coordinates())

@@ -151,9 +151,7 @@ class Geometry:
     def distances(self, response: Vector, max_amplitude: int = 3) -> tuple[float, ...]:
         """White length that is left of a response by the best 1, 2, ... candidates of this library."""
         white = self.null.whiten_templates(response[:, None])[:, 0]
-        names = [candidate.identity for candidate in self.candidates]
-        ones = np.ones(len(names))
-        search = Subsets(self.null, white, self.groups, names, ones, np.zeros(len(names)), self.calibration)
+        search = Subsets(self.null, white, self.groups, self.candidates, self.calibration)
         found, best = [], search.total
         for size in range(1, max_amplitude + 1):
             left = [search.solve(rows).chi2.min() for rows in search.rows(size, ()) if len(rows)]

@@ -10,8 +10,8 @@ from mcsim.benchmark.truth import MAPS, finished_cases
 from mcsim.diagnosis.analysis import analysis_of
 from mcsim.diagnosis.api import prepared
 from mcsim.diagnosis.batch import asking, batch
-from mcsim.diagnosis.inference import diagnose_maps
-from mcsim.diagnosis.observed_maps import read_maps
+from mcsim.diagnosis.inference import diagnose_data
+from mcsim.diagnosis.observed_maps import ObservedMaps, read_maps
 from mcsim.errors import InputError
 from mcsim.support.folders import appearing
 from mcsim.support.progress import reporting
@@ -41,7 +41,8 @@ def run(folder: str | Path, *, workers: int | None = None, quiet: bool = True) -
     if not missing:
         return 0
     with batch(fiducial.compute.workers if workers is None else workers) as call:
-        prepared(fiducial, analysis_of(fiducial), asking(call, quiet), simulations)
+        with asking(call, quiet) as ask:
+            prepared(fiducial, analysis_of(fiducial), ask, simulations)
         text = config.to_json(fiducial)
         # Cases of one library follow each other, so that a worker seldom changes its court.
         analysis = sorted((_without(target, case), case) for case in missing)
@@ -66,16 +67,15 @@ def judge_case(model: str, simulations: int | None, folder: str, case: str, name
     """Task: verdict of one case; its folder appears complete or not at all."""
     target = Path(folder)
     learned = without_effects(model, simulations, names)
-    found = diagnose_maps(
-        learned.context, case, read_maps(learned.context.analysis.model, target / MAPS / case), learned.ask
-    )
+    maps = read_maps(learned.context.analysis.model, target / MAPS / case)
+    found = diagnose_data(ObservedMaps(learned.context, maps, learned.ask), case)
     said = found.attribution
     answer = {
         "evidence": [float(value) for value in found.evidence["data"].values],
         "maximum": said.gap.maximum,
         "explanations": [
             {
-                "proposals": [learned.context.analysis.proposals[member].label for member in explanation.members],
+                "proposals": [learned.context.candidates[member].label for member in explanation.members],
                 "amplitudes": explanation.fit.amplitudes.tolist(),
                 "errors": explanation.fit.errors.tolist(),
             }

@@ -22,7 +22,6 @@ from mcsim.benchmark.truth import Truth, finished_cases, open_key
 from mcsim.diagnosis.analysis import analysis_of
 from mcsim.diagnosis.api import prepared
 from mcsim.diagnosis.batch import asking, batch
-from mcsim.diagnosis.refine import significant_templates
 from mcsim.errors import InputError
 from mcsim.support.folders import writable
 
@@ -50,8 +49,8 @@ def score(folder: str | Path, *, workers: int | None = None, quiet: bool = True)
     if not cases:
         raise InputError(f"{folder} has no verdicts; run mcsim challenge run {folder} first.")
     truths = [open_key(target, case) for case in cases]
-    with batch(fiducial.compute.workers if workers is None else workers) as call:
-        prepared(fiducial, analysis_of(fiducial), asking(call, quiet), simulations)
+    with batch(fiducial.compute.workers if workers is None else workers) as call, asking(call, quiet) as ask:
+        prepared(fiducial, analysis_of(fiducial), ask, simulations)
     text = config.to_json(fiducial)
     full = without_effects(text, simulations, ())
     prior = Prior(**json.loads((target / SETTINGS).read_text())["prior"])
@@ -94,7 +93,8 @@ def score_draws(
     run = model if isinstance(model, config.RunConfig) else config.load(model)
     writable(Path(folder))
     with batch(run.compute.workers if workers is None else workers) as call:
-        context = prepared(run, analysis_of(run), asking(call, quiet), simulations)
+        with asking(call, quiet) as ask:
+            context = prepared(run, analysis_of(run), ask, simulations)
         records = draws(context, number, seed, prior=prior, call=call)
     power = powers(context, detections, seed)
     result = scored(f"{number} draws of the evidence", records, power)
@@ -107,7 +107,7 @@ class _Judge:
 
     def __init__(self, model: str, simulations: int | None, full: LearnedModel, prior: Prior) -> None:
         self.model, self.simulations, self.full = model, simulations, full
-        self.templates = significant_templates(full.context.known)
+        self.templates = full.context.templates
         self.geometry = _geometry(full)
         self.bayes: Bayes = self.geometry.bayes(sampler_of(full.context, prior))
 
@@ -163,7 +163,7 @@ class _Judge:
             return ()
         (member,), best = truth.members, answer["explanations"][0]
         assert member.candidate is not None  # it is of the library
-        if best["proposals"] != [self.full.context.analysis.proposals[member.candidate].label]:
+        if best["proposals"] != [self.full.context.candidates[member.candidate].label]:
             return ()
         fitted = zip(best["amplitudes"], member.coordinates, best["errors"], strict=True)
         return tuple(float((value - true) / error) for value, true, error in fitted)
@@ -171,7 +171,7 @@ class _Judge:
 
 def _geometry(learned: LearnedModel) -> Geometry:
     context = learned.context
-    return Geometry.of(context.null, significant_templates(context.known), context.candidates, context.calibration)
+    return Geometry.of(context.null, context.templates, context.candidates, context.calibration)
 
 
 def _answers(verdict: Mapping[str, Any]) -> tuple[Answer, ...]:
