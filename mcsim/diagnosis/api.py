@@ -1,9 +1,10 @@
-"""Diagnose maps against a run: learn the model on a cluster, once, and judge the case."""
+"""Diagnose data against a run: simulate the model once, keep the result, and test each data set."""
 
 import hashlib
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config, systematics
-from mcsim.diagnosis import knowledge, report, spectra
-from mcsim.diagnosis.analysis import Analysis, analysis_of
+from mcsim.diagnosis import campaign, measured_spectra, null_ensemble, report
+from mcsim.diagnosis.analysis import Analysis, analysis_of, data_vectors
 from mcsim.diagnosis.batch import asking, batch
-from mcsim.diagnosis.inference import Diagnosis, DiagnosisContext, context, diagnose_maps
-from mcsim.diagnosis.observed_maps import checked, read_maps
+from mcsim.diagnosis.context import DataSet, DiagnosisContext, context
+from mcsim.diagnosis.inference import Diagnosis, diagnose_data
+from mcsim.diagnosis.null_ensemble import NullEnsemble
+from mcsim.diagnosis.observed_maps import ObservedMaps, checked, read_maps
+from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.diagnosis.spectra import read_spectra
+from mcsim.diagnosis.templates import TemplateBank
 from mcsim.errors import InputError
 from mcsim.support import folders
 from mcsim.support.code import class_digest, package_digest
+
+Plan = Callable[[config.RunConfig, Analysis, int | None], campaign.Plan]
 
 CODE = ("config", "sphere", "stats", "instrument", "systematics", "bipolar", "simulation", "beamfit", "diagnosis")
 LIBRARIES = ("ducc0", "healpy", "numpy", "scipy")
@@ -33,6 +41,7 @@ def diagnose(
     case: str | None = None,
     without: Sequence[str] = (),
     simulations: int | None = None,
+    settings: DiagnosisSettings | None = None,
     workers: int | None = None,
     quiet: bool = True,
 ) -> Diagnosis:
@@ -41,7 +50,7 @@ def diagnose(
     Parameters
     ----------
     model
-        A run: what is believed about sky, beams, scan and noise.
+        Fiducial model of sky, beams, scan and noise: a run.
     data
         Folder with ``{channel}.fits`` or ``{channel}_{split}.fits``, uK; or the maps themselves, shape (npix,) each, in
         the order channel by channel, split by split; or a table of measured spectra
@@ -51,9 +60,11 @@ def diagnose(
     case
         Name; default: that of the run.
     without
-        Effects of the library that are not to be proposed.
+        Effects of the library that are no candidates.
     simulations
-        Number for the scatter of the evidence; default: ten for every number of it.
+        Number for the covariance of the data vector; default: ten for every independent element.
+    settings
+        Levels, cuts, bins and numbers of simulations; default: those of :class:`DiagnosisSettings`.
     workers
         Processes; default: the run's; 0: this one.
     quiet
@@ -62,86 +73,77 @@ def diagnose(
     Returns
     -------
     Diagnosis
-        Verdict, evidence, attribution.
+        Verdict, and all that it rests on.
 
     Raises
     ------
     InputError
-        For a run or data that cannot be used.
+        If a run or data cannot be used.
     """
     run = model if isinstance(model, config.RunConfig) else config.load(model)
     for effect in without:
         systematics.get(effect)
     if output is not None:
         folders.writable(Path(output))
-    name, workers = case or run.name, run.compute.workers if workers is None else workers
-    if isinstance(data, str | Path) and Path(data).is_file():
-        found = _of_table(run, data, name, without, simulations, workers, quiet)
+    threads, task = os.cpu_count() or 1, data_vectors
+    table = read_spectra(data, run) if isinstance(data, str | Path) and Path(data).is_file() else None
+    if table is not None:
+        run, task = measured_spectra.estimator_for(run, table), table
+        analysis = measured_spectra.analysis_of_spectra(run, table, without, threads, settings)
     else:
-        analysis = analysis_of(run, without, nthreads=os.cpu_count() or 1)
+        analysis = analysis_of(run, without, threads, settings)
         maps = read_maps(analysis.model, data) if isinstance(data, str | Path) else checked(analysis.model, data)
-        with batch(workers) as call:
-            ask = asking(call, quiet)
-            found = diagnose_maps(prepared(run, analysis, ask, simulations), name, maps, ask)
+    with batch(run.compute.workers if workers is None else workers) as call:
+        with asking(call, quiet, task, "simulations of the model and of each effect") as ask:
+            plan = campaign.plan if table is None else measured_spectra.plan
+            ensemble, bank = _learned(run, analysis, simulations, ask, plan)
+        with asking(call, quiet, task, "simulations of fitted effects") as ask:
+            known = context(run, analysis, ensemble if table is None else ensemble.of_mean(table.realizations), bank)
+            found: DataSet
+            if table is not None:
+                found = measured_spectra.MeasuredSpectra(known, table, ask)
+            else:
+                found = ObservedMaps(known, maps, ask)
+            diagnosis = diagnose_data(found, case or run.name)
     if output is not None:
-        found.save(output)
-        report.write(found, Path(output) / "report.html")
-    return found
-
-
-def _of_table(
-    run: config.RunConfig,
-    path: str | Path,
-    case: str,
-    without: Sequence[str],
-    simulations: int | None,
-    workers: int,
-    quiet: bool,
-) -> Diagnosis:
-    measured = spectra.read_spectra(path, run)
-    run = spectra.estimator_for(run, measured)
-    analysis = spectra.analysis_of_spectra(run, measured, without, nthreads=os.cpu_count() or 1)
-    with batch(workers) as call:
-        ask = asking(call, quiet, measured)
-        known = _learned(run, analysis, simulations, ask, spectra.plan)
-        return spectra.diagnose_maps(
-            context(run, analysis, spectra.of_mean(known, measured.realizations)), case, measured, ask
-        )
+        diagnosis.save(output)
+        report.write(diagnosis, Path(output) / "report.html")
+    return diagnosis
 
 
 def prepared(
     run: config.RunConfig,
     analysis: Analysis,
-    ask: knowledge.Ask,
+    ask: campaign.Ask,
     simulations: int | None = None,
 ) -> DiagnosisContext:
-    """What every case of a run is judged with, learned or from the cache."""
-    return context(run, analysis, _learned(run, analysis, simulations, ask))
+    """Return what every set of maps is tested with, simulated or from the cache."""
+    return context(run, analysis, *_learned(run, analysis, simulations, ask))
 
 
 def _learned(
     run: config.RunConfig,
     analysis: Analysis,
     simulations: int | None,
-    ask: knowledge.Ask,
-    planned: Callable[[config.RunConfig, Analysis, int | None], knowledge.Plan] = knowledge.plan,
-) -> knowledge.Knowledge:
-    if simulations is not None and simulations <= len(analysis.elements):
+    ask: campaign.Ask,
+    planned: Plan = campaign.plan,
+) -> tuple[NullEnsemble, TemplateBank]:
+    size = len(analysis.elements)
+    if simulations is not None and simulations <= size:
         raise InputError(
-            f"{simulations} simulations are too few for the {len(analysis.elements)} numbers of the evidence; give at "
-            f"least {2 * len(analysis.elements)}, better {knowledge.PER_ENTRY * len(analysis.elements)}."
+            f"{simulations} simulations are too few for the {size} elements of the data vector; give at least "
+            f"{2 * size}, better {analysis.settings.sims_per_element * size}."
         )
 
     def fill(scratch: Path) -> None:
         plan = planned(run, analysis, simulations)
         if simulations is None:
-            plan, answers = knowledge.answered(plan, len(analysis.elements), ask)
+            plan, results = campaign.simulated(plan, analysis, ask)
         else:
-            answers = ask(plan.jobs)
-        knowledge.learned(analysis, plan, answers).save(scratch)
+            results = ask(plan.jobs)
+        null_ensemble.save(scratch, *campaign.learned(analysis, plan, results))
 
-    name = f"diagnose/{_key(run, analysis, simulations)}.zarr"
-    return knowledge.Knowledge.load(folders.cached(name, fill))
+    return null_ensemble.load(folders.cached(f"diagnose/{_key(run, analysis, simulations)}.zarr", fill))
 
 
 def _key(run: config.RunConfig, analysis: Analysis, simulations: int | None) -> str:
@@ -151,11 +153,12 @@ def _key(run: config.RunConfig, analysis: Analysis, simulations: int | None) -> 
     """
     science = config.science(run)
     science["ensemble"] = {}
-    effects = {proposal.kind for proposal in analysis.proposals}
+    effects = {candidate.effect for candidate in analysis.candidates}
     effects |= {systematics.get(effect.name) for effect in run.effects}
     rest = [
         simulations,
-        [[proposal.label, [repr(basis) for basis in proposal.basis]] for proposal in analysis.proposals],
+        [[candidate.label, [repr(basis) for basis in candidate.basis]] for candidate in analysis.candidates],
+        asdict(analysis.settings),
         [element.name for element in analysis.elements],
         sorted(class_digest(kind) for kind in effects),
         package_digest((f"mcsim.{name}" for name in CODE), LIBRARIES),

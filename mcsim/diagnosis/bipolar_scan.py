@@ -1,7 +1,7 @@
-"""Where: BipoSH coefficients between what is left of each channel and the sky, of the sky itself, and spectra.
+"""Scan BipoSH coefficients of residuals and sky, of the sky itself, and power spectra, to localise a departure.
 
-Too many numbers for a covariance, so each is only compared with its own scatter and the largest with all the others.
-Between a residual and the sky, cosmic variance cancels: what shows here in one channel is noise-limited.
+There are too many numbers for a covariance: each is compared with its own scatter, and corrected for looking at all.
+Cosmic variance cancels between a residual and the sky, so that noise limits the coefficients of one channel.
 """
 
 from dataclasses import dataclass, replace
@@ -22,33 +22,30 @@ Vector = NDArray[np.float64]
 
 Pick = tuple[Any, ...]
 
-L_MAX = 4
-RANGES = 3
-
 
 @dataclass(frozen=True)
 class BipolarScan:
-    """Maker of the atlas of one model."""
+    """Compute the bipolar scan of one model."""
 
     model: Model
 
     @cached_property
     def tables(self) -> bipolar.Estimator:
-        """Clebsch-Gordan bands."""
+        """Return the estimator with its Clebsch-Gordan coefficients."""
         return bipolar.estimator(self.L_max, self.model.lmax, both_orders=True)
 
     @property
     def L_max(self) -> int:
-        """Highest L: four, or what the configuration asks for where that is less."""
-        return min(max(self.model.survey.config.biposh.L_max, 1), L_MAX, self.model.lmax)
+        """Return the highest L: that of the settings, or of the configuration if that is less."""
+        return min(max(self.model.survey.config.biposh.L_max, 1), self.model.settings.scan_L_max, self.model.lmax)
 
     @cached_property
     def elements(self) -> tuple[Element, ...]:
-        """Where each number was heard, in the order of :meth:`values`."""
+        """Return the description of each number, in the order of :meth:`values`."""
         return tuple(element for element, _ in self._layout)
 
     def values(self, filtered: FilteredMaps) -> Vector:
-        """All numbers of a set of maps, shape (entries,)."""
+        """Return all numbers of a set of maps, shape (numbers,)."""
         arrays = self._coefficients(filtered)
         own = self._powers(filtered)
         return np.array(
@@ -57,7 +54,7 @@ class BipolarScan:
 
     @cached_property
     def _layout(self) -> tuple[tuple[Element, Pick], ...]:
-        """Entries, each with the array, row, range and part that it is taken from."""
+        """Return the numbers, each with the array, row, range and part that it is taken from."""
         frame = self.model.survey.config.map.frame
         found: list[tuple[Element, Pick]] = []
         for key, element in self._sources:
@@ -66,7 +63,7 @@ class BipolarScan:
                     if mode.L == 0 or (view != frame and mode.M > 0) or (key == "sky" and not mode.in_auto):
                         continue
                     parts = ("re", "im") if mode.M else (("re",) if mode.parity == "even" else ("im",))
-                    for low, high in bins(2, self.model.lmax, RANGES):
+                    for low, high in bins(2, self.model.lmax, self.model.settings.scan_bins):
                         for part in parts:
                             where = replace(
                                 element,
@@ -78,7 +75,7 @@ class BipolarScan:
                                 frame=view,
                             )
                             found.append((where, ((key, view), row, (low, high), part)))
-        found += [(element, ("power", number)) for number, element in enumerate(self._power_entries)]
+        found += [(element, ("power", number)) for number, element in enumerate(self._power_elements)]
         return tuple(found)
 
     @cached_property
@@ -112,7 +109,7 @@ class BipolarScan:
         return found
 
     @cached_property
-    def _power_entries(self) -> tuple[Element, ...]:
+    def _power_elements(self) -> tuple[Element, ...]:
         frame = self.model.survey.config.map.frame
         elements = []
         for a, b in combinations_with_replacement(range(len(self.model.parts)), 2):
@@ -136,7 +133,7 @@ class BipolarScan:
         return tuple(elements)
 
     def _powers(self, filtered: FilteredMaps) -> Vector:
-        """Power that residuals have in common."""
+        """Return the cross power of residuals."""
         found = []
         for a, b in combinations_with_replacement(range(len(self.model.parts)), 2):
             power = by_degree(filtered.adjoint[a], filtered.adjoint[b], self.model.lmax)

@@ -1,7 +1,7 @@
-"""The matched score of every effect: how the maps would lean towards it, taken from what was heard.
+"""Matched filters: the derivative of the log-likelihood of filtered maps in the amplitude of each effect.
 
-Which formula applies follows from the hooks that an effect defines, so that a user's effect is listened for like a
-built-in one. An effect that draws random numbers has no score of this kind: blocks of spectra hear it.
+The formula follows from the hooks that an effect defines, so that a user's effect is treated like a built-in one. A
+stochastic effect has no matched filter: it shows in the spectra.
 """
 
 import hashlib
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import systematics
-from mcsim.diagnosis.wiener_filter import BEAM_ORDERS, FilteredMaps, Model, by_degree
+from mcsim.diagnosis.wiener_filter import FilteredMaps, Model, by_degree
 from mcsim.instrument.scan.cache import moments_key
 from mcsim.simulation import tod
 from mcsim.simulation.survey import mean_gain
@@ -27,27 +27,27 @@ Map = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class BeamFilter:
-    """Change of a beam: sum of Re[conj(db_ls) D_s(l)] over the channel's maps."""
+    """Change the beam: sum of Re[conj(db_ls) D_s(l)] over the channel's maps."""
 
     parts: tuple[int, ...]
     change: NDArray[np.complex128]
 
     def __call__(self, model: Model, filtered: FilteredMaps) -> float:
-        """The score."""
+        """Return the matched filter of filtered maps."""
         total = sum(filtered.orders[i] for i in self.parts)
         return float(np.sum(self.change.real * np.real(total) + self.change.imag * np.imag(total)))
 
 
 @dataclass(frozen=True)
 class GainFilter:
-    """Change of the gain: every map times the mean error of its pixels, the dipole in it."""
+    """Change the gain: correlate residuals with sky and dipole times the mean gain error of every pixel."""
 
     parts: tuple[int, ...]
     errors: tuple[Map, ...]
     dipole: Map
 
     def __call__(self, model: Model, filtered: FilteredMaps) -> float:
-        """The score."""
+        """Return the matched filter of filtered maps."""
         return float(
             sum(
                 np.dot(filtered.residual[i], error * (filtered.expected[i] + self.dipole))
@@ -58,7 +58,7 @@ class GainFilter:
 
 @dataclass(frozen=True)
 class SkyFilter:
-    """Change of the sky that one channel looks at, or (all parts) that all do."""
+    """Change the sky that one channel sees, or (``common``) that all see."""
 
     effect: Effect
     site: systematics.Site
@@ -66,7 +66,7 @@ class SkyFilter:
     common: bool
 
     def __call__(self, model: Model, filtered: FilteredMaps) -> float:
-        """The score."""
+        """Return the matched filter of filtered maps."""
         lmax = model.lmax
         site = replace(self.site, lmax=lmax)
         change = self.effect.sky(filtered.sky, site, _no_draws) - filtered.sky
@@ -84,13 +84,13 @@ class SkyFilter:
 
 @dataclass(frozen=True)
 class NoiseFilter:
-    """Change of the noise's variance, heard in the difference of a channel's maps (or in the one that there is)."""
+    """Change the noise variance: correlate it with the squared difference of a channel's maps, or the only residual."""
 
     parts: tuple[int, ...]
     change: Map
 
     def __call__(self, model: Model, filtered: FilteredMaps) -> float:
-        """The score."""
+        """Return the matched filter of filtered maps."""
         return float(np.dot(normalised_difference(model, filtered, self.parts), self.change))
 
 
@@ -98,7 +98,7 @@ MatchedFilter = BeamFilter | GainFilter | SkyFilter | NoiseFilter
 
 
 def normalised_difference(model: Model, filtered: FilteredMaps, parts: tuple[int, ...]) -> Map:
-    """u^2 - 1 of every pixel seen by the first two maps of a channel: u their difference over its noise; else 0."""
+    """Return u^2 - 1 of every pixel seen by a channel's first two maps, u their difference over its noise; else 0."""
     # Residuals are zero where nothing was seen, and come times their precision: (r/a - s/b)^2 / (1/a + 1/b).
     first, a = filtered.residual[parts[0]], model.parts[parts[0]].precision
     seen = first != 0.0
@@ -113,14 +113,14 @@ def normalised_difference(model: Model, filtered: FilteredMaps, parts: tuple[int
 
 
 def matched_filter(model: Model, effect: Effect, channel: int | None) -> MatchedFilter | None:
-    """The score of a small effect in a channel (None: in all); None where it has none of these kinds.
+    """Return the matched filter of a small effect in a channel (None: in all); None if it has none.
 
     Parameters
     ----------
     model
-        What is believed.
+        Fiducial model.
     effect
-        At the amplitude of a step: the score is that of this change.
+        At the amplitude of a step: the filter is that of this change.
     channel
         Index.
     """
@@ -175,27 +175,27 @@ _TIMES = 4096
 
 def _beam_filter(model: Model, effect: Effect, channel: int, parts: tuple[int, ...]) -> BeamFilter | None:
     owner = model.survey.channels[channel]
-    lmax = model.lmax
+    lmax, top = model.lmax, model.settings.beam_orders
     changed, before = systematics.seen_through((effect,), owner.site), owner.site.beam
-    change = np.zeros((BEAM_ORDERS + 1, lmax + 1), dtype=np.complex128)
+    change = np.zeros((top + 1, lmax + 1), dtype=np.complex128)
     for beam, sign in ((changed, 1.0), (before, -1.0)):
-        rows = min(beam.mmax, BEAM_ORDERS) + 1
+        rows = min(beam.mmax, top) + 1
         change[:rows] += sign * beam.blm[:rows, : lmax + 1]
     spread = effect.spread()
     if spread != 1.0:
         window = np.maximum(owner.window[: lmax + 1], np.finfo(float).tiny)
-        rows = min(before.mmax, BEAM_ORDERS) + 1
+        rows = min(before.mmax, top) + 1
         change[:rows] += before.blm[:rows, : lmax + 1] * (window ** (spread * spread - 1.0) - 1.0)
     # Samples at the centres of their pixels, with no pixel window, cannot come closer.
     return BeamFilter(parts, change) if change.any() else None
 
 
 def _no_draws(stage: str) -> np.random.Generator:
-    raise TypeError(f"an effect that draws ({stage}) has no score of its own: set own_score = False")
+    raise TypeError(f"a stochastic effect ({stage}) has no matched filter; set matched_filter = False.")
 
 
 def sky_of(model: Model, filtered: FilteredMaps) -> NDArray[np.float64]:
-    """Spectrum of s^ over what is expected of it, minus one, shape (lmax + 1,); 0 where no power is expected."""
+    """Return the spectrum of s^ over its expectation, minus one, shape (lmax + 1,); 0 if none is expected."""
     lmax = model.lmax
     found = by_degree(filtered.sky, filtered.sky, lmax) / (2 * np.arange(lmax + 1) + 1)
     expected = model.cl * model.sky_power

@@ -1,41 +1,140 @@
-"""Observed maps from a folder, refused in one sentence where they cannot be what the model describes."""
+"""Observed maps: read them, refuse what the model cannot describe, and prepare them for a diagnosis."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import healpy
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.wiener_filter import Model
+from mcsim.diagnosis.campaign import Ask
+from mcsim.diagnosis.context import DiagnosisContext
+from mcsim.diagnosis.places import Place, places
+from mcsim.diagnosis.responses import Responses
+from mcsim.diagnosis.selection import Attribution
+from mcsim.diagnosis.wiener_filter import Model, shared_sky
 from mcsim.errors import InputError
 from mcsim.sphere import healpix
+from mcsim.stats.look_elsewhere import global_test
 
 Map = NDArray[np.float64]
+Vector = NDArray[np.float64]
 
-MISSING = 0.01
-"""Largest fraction of the pixels that the believed scan hits which data may leave out."""
 
-RMS_RATIO = 20.0
-"""Largest ratio of the rms of a map to that of the model, either way: beyond it the unit is wrong."""
+@dataclass(frozen=True, eq=False)
+class ObservedMaps:
+    """Observed maps as a data set; see :class:`mcsim.diagnosis.context.DataSet`.
+
+    Attributes
+    ----------
+    context
+        Model, simulations and templates.
+    observed
+        Maps in the order of the model's, from :func:`read_maps` or :func:`checked`.
+    ask
+        Runs further simulations, with effects at the amplitudes that are found.
+    """
+
+    context: DiagnosisContext
+    observed: Sequence[Map]
+    ask: Ask
+
+    realizations = 1
+
+    @cached_property
+    def _measured(self) -> Vector:
+        return self.context.analysis.data_vector(self.observed, bipolar_scan=True)
+
+    @property
+    def x(self) -> Vector:
+        """Return the data vector."""
+        return self._measured[: len(self.context.analysis.elements)]
+
+    @cached_property
+    def respond(self) -> Responses:
+        """Return what simulates responses in skies that are constrained by these maps."""
+        context = self.context
+        sky = shared_sky(context.analysis.model, self.observed)
+        return Responses(context.run, context.analysis, context.ensemble.reference, sky, self.ask)
+
+    def templates(self) -> NDArray[np.float64]:
+        """Return the templates; those that depend on the very sky are measured on the observed one if it departs."""
+        context, t = self.context, self.context.templates
+        settings = context.settings
+        groups = context.null.whiten_groups(t, [candidate.columns for candidate in context.candidates])
+        if global_test(context.null, self.x, groups, context.calibration).pvalue > settings.alpha:
+            return t
+        random = [
+            index
+            for index, candidate in enumerate(context.candidates)
+            if context.sky_scatter[index] >= settings.sky_scatter
+            and not (candidate.random_response or candidate.effect.mean_response)
+        ]
+        return context.bank.on_sky(t, context.candidates, random, self.respond, settings.constrained_skies)
+
+    def exchanged(self, found: Attribution) -> list[str]:
+        """Return orders of the maps in which the model fits, unless it fits as they are or one effect explains it."""
+        context, level = self.context, self.context.settings.exchanged_pvalue
+        if found.gap.omnibus > level or (found.explanations and len(found.explanations[0].members) == 1):
+            return []
+        names = [part.name for part in context.analysis.model.parts]
+        notes = []
+        for order in exchanges(names):
+            p = context.null.pvalue(context.analysis.data_vector([self.observed[i] for i in order]))
+            if p > level:
+                moved = [f"{names[i]} as {name}" for name, i in zip(names, order, strict=True) if names[i] != name]
+                notes.append(f"The model fits (p = {p:.2g}) with maps exchanged: {', '.join(moved)}.")
+        return notes
+
+    def notes(self) -> list[str]:
+        """Return nothing: maps need no note."""
+        return []
+
+    def halves(self) -> tuple[None, str]:
+        """Return no matrix, since the noise of the folds is independent, and the folds in words."""
+        splits = self.context.run.map.splits
+        if len(splits) < 2:
+            return None, "odd degrees, alternate pixels"
+        return None, f"{' and '.join(splits[1::2])} (frozen on {' and '.join(splits[::2])})"
+
+    def places(self) -> list[Place]:
+        """Rank the bipolar scan, and those elements of the data vector that are no matched filters."""
+        ensemble, analysis = self.context.ensemble, self.context.analysis
+        own = [i for i, element in enumerate(analysis.elements) if element.statistic != "score"]
+        count = len(ensemble.bipolar_scan)
+        drawn = np.concatenate([ensemble.bipolar_scan, ensemble.simulations[:count][:, own]], axis=1)
+        shifted = self.x[own] - ensemble.offset[own]
+        elements = (*analysis.bipolar_scan.elements, *(analysis.elements[i] for i in own))
+        scan = self._measured[len(analysis.elements) :]
+        return places(np.concatenate([scan, shifted]), drawn, elements, self.context.settings.place_pvalue)
+
+    def maps(self) -> list[Map]:
+        """Return the maps."""
+        return list(self.observed)
+
+    def attrs(self) -> dict[str, str | int]:
+        """Return nothing."""
+        return {}
 
 
 def read_maps(model: Model, folder: str | Path) -> list[Map]:
-    """Maps of every channel and split, in the order of the model's.
+    """Read the maps of every channel and split, in the order of the model's.
 
     Parameters
     ----------
     model
-        What is believed.
+        Fiducial model.
     folder
         With ``{channel}.fits``, or ``{channel}_{split}.fits`` where the model has splits; HEALPix in uK (or the unit
-        of its header), ``healpy.UNSEEN`` where not observed, in RING order or with an honest header.
+        of its header), ``healpy.UNSEEN`` if not observed, in RING order or with a header that says another.
 
     Raises
     ------
     InputError
-        For a file that is missing or unreadable, has another nside, frame or unit, or values that are no map of this
-        survey: not finite, constant, without what the believed scan saw, or far from the size of the model.
+        If a file is missing or unreadable, has another nside, frame or unit, or values that are no map of this survey:
+        not finite, constant, without what the fiducial scan hits, or far from the size of the model.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -44,7 +143,7 @@ def read_maps(model: Model, folder: str | Path) -> list[Map]:
 
 
 def checked(model: Model, maps: Sequence[Map]) -> list[Map]:
-    """Maps given as arrays, in the order of the model's, uK; refused like those of a folder."""
+    """Check maps given as arrays, in the order of the model's, uK, like those of a folder."""
     if len(maps) != len(model.parts):
         raise InputError(f"{len(maps)} maps were given, the model has {len(model.parts)}; give one for each.")
     return [
@@ -71,7 +170,7 @@ def _read(model: Model, part: int, path: Path) -> Map:
 
 
 def _checked(model: Model, part: int, map_: Map, name: str) -> Map:
-    """The map, if it can be of the survey."""
+    """Return the map if it can be of the survey."""
     if map_.shape != (12 * model.nside**2,):
         size = healpy.npix2nside(map_.size) if map_.ndim == 1 and healpy.isnpixok(map_.size) else None
         found = f"the shape {map_.shape}" if size is None else f"nside {size}"
@@ -82,17 +181,18 @@ def _checked(model: Model, part: int, map_: Map, name: str) -> Map:
     unseen = map_ == healpy.UNSEEN
     fiducial = model.parts[part].precision > 0
     lost = float(np.mean(unseen[fiducial]))
-    if lost > MISSING:
+    limits = model.settings
+    if lost > limits.missing_share:
         raise InputError(
-            f"{name} leaves out {100 * lost:.0f} % of the pixels that the believed scan hits, at most "
-            f"{100 * MISSING:.0f} % may be; give the model a mask (map.mask) that leaves them out too."
+            f"{name} leaves out {100 * lost:.0f} % of the pixels that the fiducial scan hits, at most "
+            f"{100 * limits.missing_share:.0f} % may be; give the model a mask (map.mask) that leaves them out too."
         )
     seen = map_[fiducial & ~unseen]
     rms = float(np.std(seen))
     if rms == 0.0:
         raise InputError(f"{name} is constant; give an observed map.")
     ratio = rms / expected_rms(model, part)
-    if not 1.0 / RMS_RATIO < ratio < RMS_RATIO:
+    if not 1.0 / limits.rms_ratio < ratio < limits.rms_ratio:
         raise InputError(
             f"{name} has an rms of {rms:.3g} uK where the model expects {rms / ratio:.3g} uK; is it in another "
             "unit, or is the dipole still in it? Say the unit in its header (TUNIT1), or give it in uK."
@@ -101,7 +201,7 @@ def _checked(model: Model, part: int, map_: Map, name: str) -> Map:
 
 
 def expected_rms(model: Model, part: int) -> float:
-    """Rms over the sky of what the model expects in a map, sky and noise, uK."""
+    """Return the rms over the sky that the model expects in a map, sky and noise, uK."""
     whole = model.survey
     assert whole.cl is not None  # a model of a diagnosis has a spectrum
     channel = whole.channels[model.parts[part].channel]
@@ -113,7 +213,7 @@ def expected_rms(model: Model, part: int) -> float:
 
 
 def exchanges(names: Sequence[str]) -> list[tuple[int, ...]]:
-    """Orders of the maps in which two channels, or two splits of all channels, are exchanged."""
+    """Return the orders of the maps in which two channels, or two splits of all channels, are exchanged."""
     places = {name: place for place, name in enumerate(names)}
     channels = list(dict.fromkeys(name.partition(":")[0] for name in names))
     splits = list(dict.fromkeys(name.partition(":")[2] for name in names))

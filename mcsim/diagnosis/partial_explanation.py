@@ -1,4 +1,4 @@
-"""What of a library is heard in a gap that no set of it explains."""
+"""Detect effects of the library in data that no set of them explains."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -6,33 +6,28 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.candidate import Candidate, allowed, columns_of
+from mcsim.diagnosis.candidate import Candidate, columns_of, within_bounds
+from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.stats.gaussian import Fit, SimulatedGaussian
 from mcsim.stats.look_elsewhere import Calibration
 
-Exact = Callable[[NDArray[np.float64], tuple[int, ...], Fit], NDArray[np.float64] | None]
-"""From templates, members and their fit to templates that hold for these together at about these amplitudes."""
-
-LEVEL = 0.005
-"""Probability, trials included, up to which a further effect is heard."""
-
-MOST = 6
-REFUSED = 6
-"""Candidates that seem to be heard and then are not, before nothing more is tried."""
+Matrix = NDArray[np.float64]
+Exact = Callable[[Matrix, tuple[int, ...], Fit], Matrix | None]
+"""Return templates that hold for members together at about their fitted amplitudes, from templates, members, fit."""
 
 
 @dataclass(frozen=True)
 class PartialExplanation:
-    """Effects that are heard in a gap without being all of it.
+    """Hold effects that are detected without explaining all of the excess chi^2.
 
     Attributes
     ----------
     members
-        Indices of the candidates, in the order in which they were found.
+        Indices of the candidates, in the order in which they were detected.
     fit
         Amplitudes of the members' columns, one member after the other.
     left
-        Share of the gap that they leave.
+        Share of the excess chi^2 that they leave.
     templates
         That hold for the members together, shape (p_raw, K).
     """
@@ -40,69 +35,82 @@ class PartialExplanation:
     members: tuple[int, ...]
     fit: Fit
     left: float
-    templates: NDArray[np.float64]
+    templates: Matrix
 
 
-def partial_explanation(
-    null: SimulatedGaussian,
-    x: NDArray[np.float64],
-    t: NDArray[np.float64],
-    candidates: Sequence[Candidate],
-    calibration: Calibration,
-    exact: Exact,
-) -> PartialExplanation | None:
-    """Add the most significant candidate beside those that are heard already, as long as one is significant.
+@dataclass(frozen=True)
+class Detection:
+    """Add the most significant candidate beside those that are detected already, until none is significant.
 
-    Parameters
+    Attributes
     ----------
     null, x
-        Null and evidence, shape (p_raw,).
-    t
-        Templates per unit amplitude, shape (p_raw, K).
+        Distribution of the data vector without an effect, and the data, shape (p_raw,).
     candidates, calibration
-        Candidates on those templates, and their calibration.
+        Candidates, and their calibration.
     exact
-        What members are brought to their amplitudes with; None from it says that they cannot have them.
-
-    Returns
-    -------
-    Closest
-        None where nothing is significant. Each member was significant beside those before it, both before and after it
-        was brought to its amplitude; of two that are alike the one that is not there may be the first.
+        Simulates members at their amplitudes; None from it says that they cannot have them.
+    settings
+        Of the diagnosis.
     """
-    members: tuple[int, ...] = ()
-    refused: set[int] = set()
-    before = null.fit(x, t[:, :0])
-    total = before.chi2
 
-    def matched_filter(after: Fit) -> float:
-        rank = before.dimension - after.dimension
-        return float(null.nested_test(before.chi2 - after.chi2, before.chi2, rank, null.dimension - before.dimension))
+    null: SimulatedGaussian
+    x: NDArray[np.float64]
+    candidates: Sequence[Candidate]
+    calibration: Calibration
+    exact: Exact
+    settings: DiagnosisSettings
 
-    while len(members) < MOST and len(refused) < REFUSED:
-        smallest, chosen = 1.0, -1
-        taken = {candidates[member].identity for member in members}
-        for index, candidate in enumerate(candidates):
+    def run(self, t: Matrix) -> PartialExplanation | None:
+        """Return what is detected with templates ``t``, shape (p_raw, K); None if nothing is significant.
+
+        Each member is significant beside those before it, before and after it is simulated at its amplitude; of two
+        similar effects the one that is not there may be the first.
+        """
+        null, settings = self.null, self.settings
+        members: tuple[int, ...] = ()
+        refused: set[int] = set()
+        before = null.fit(self.x, t[:, :0])
+        total = before.chi2
+        while len(members) < settings.partial_effects and len(refused) < settings.partial_refusals:
+            chosen = self._most_significant(t, members, refused, before)
+            if chosen is None:
+                break
+            together = (*members, chosen[0])
+            straight = self.exact(t, together, chosen[1])
+            if straight is not None:
+                after = self._fit(straight, together)
+                if within_bounds(self.candidates, together, after) and self._significant(self._pvalue(before, after)):
+                    members, t, before = together, straight, after
+                    continue
+            refused.add(chosen[0])
+        if not members:
+            return None
+        excess = null.hartlap_factor * total - null.dimension
+        left = null.hartlap_factor * before.chi2 - before.dimension
+        return PartialExplanation(members, before, min(max(left / excess, 0.0), 1.0) if excess > 0.0 else 1.0, t)
+
+    def _most_significant(
+        self, t: Matrix, members: tuple[int, ...], refused: set[int], before: Fit
+    ) -> tuple[int, Fit] | None:
+        """Return the most significant candidate beside the members, and their fit; None if none is significant."""
+        smallest, chosen = 1.0, None
+        taken = {self.candidates[member].identity for member in members}
+        for index, candidate in enumerate(self.candidates):
             if candidate.identity not in taken and index not in refused:
-                after = null.fit(x, t[:, columns_of(candidates, (*members, index))])
-                score = matched_filter(after)
-                if allowed(candidates, (*members, index), after) and (score < smallest or chosen < 0):
-                    smallest, best, chosen = score, after, index
-        if chosen < 0 or float(calibration.global_pvalue(smallest)) > LEVEL:
-            break
-        together = (*members, chosen)
-        straight = exact(t, together, best)
-        if straight is not None:
-            after = null.fit(x, straight[:, columns_of(candidates, together)])
-            if (
-                allowed(candidates, together, after)
-                and float(calibration.global_pvalue(matched_filter(after))) <= LEVEL
-            ):
-                members, t, before = together, straight, after
-                continue
-        refused.add(chosen)
-    if not members:
-        return None
-    gap = null.hartlap_factor * total - null.dimension
-    left = null.hartlap_factor * before.chi2 - before.dimension
-    return PartialExplanation(members, before, min(max(left / gap, 0.0), 1.0) if gap > 0.0 else 1.0, t)
+                after = self._fit(t, (*members, index))
+                pvalue = self._pvalue(before, after)
+                allowed = within_bounds(self.candidates, (*members, index), after)
+                if allowed and (pvalue < smallest or chosen is None):
+                    smallest, chosen = pvalue, (index, after)
+        return chosen if chosen is not None and self._significant(smallest) else None
+
+    def _fit(self, t: Matrix, members: tuple[int, ...]) -> Fit:
+        return self.null.fit(self.x, t[:, columns_of(self.candidates, members)])
+
+    def _pvalue(self, before: Fit, after: Fit) -> float:
+        columns, fitted = before.dimension - after.dimension, self.null.dimension - before.dimension
+        return float(self.null.nested_test(before.chi2 - after.chi2, before.chi2, columns, fitted))
+
+    def _significant(self, pvalue: float) -> bool:
+        return float(self.calibration.global_pvalue(pvalue)) <= self.settings.partial_level

@@ -1,4 +1,4 @@
-"""Where a gap lies: groups of the atlas that depart from the model, ranked, corrected for looking at all of them."""
+"""Localise a departure from the model: groups of numbers, ranked, corrected for the look-elsewhere effect."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,24 +9,21 @@ from numpy.typing import NDArray
 from mcsim.diagnosis.summaries import Element
 from mcsim.stats.look_elsewhere import scan_pvalues
 
-SIGNIFICANT = 0.01
-"""Probability, trials included, up to which a group is brought before others of a kind that is listed already."""
-
 
 @dataclass(frozen=True)
 class Place:
-    """A group of numbers that belong together, and how far it departs.
+    """Describe a group of numbers that belong together, and how far it departs from the model.
 
     Attributes
     ----------
-    entry
+    element
         The number of the group that departs most.
     z
         Normal deviate of the group.
     p
-        Probability that the largest of all groups departs as far.
+        Global p-value: that the largest departure of all groups is as large.
     peak
-        Deviate of that number alone.
+        Normal deviate of that number alone.
     """
 
     element: Element
@@ -35,22 +32,26 @@ class Place:
     peak: float
 
 
-def places(x: NDArray[np.float64], simulations: NDArray[np.float64], elements: Sequence[Element]) -> list[Place]:
-    """Groups of entries, the one that departs most first, and of each kind one before the others of it.
+def places(
+    x: NDArray[np.float64], simulations: NDArray[np.float64], elements: Sequence[Element], level: float = 0.01
+) -> list[Place]:
+    """Rank groups of numbers by their departure, one group of each kind before the others of it.
 
     Parameters
     ----------
     x, simulations
         Shape (B,), (N, B).
-    entries
-        Where each number was heard; those that share statistic, channels, split, frame, L, M and parity are a group.
+    elements
+        Descriptions; those that share statistic, channels, split, frame, L, M and parity are a group.
+    level
+        Global p-value up to which a group is listed before others of a kind that is listed already.
 
     Notes
     -----
-    A kind is a frame, an L and a parity: one gap stands out in every channel and split that hears it, and a list of
-    these would hide what else it says. Groups that are not significant stay in the order of their deviates.
-    The cube root of a group's sum of squared deviates is nearly normal (Wilson & Hilferty 1931); it is compared with
-    those of the simulations, each taken against the others.
+    A kind is a frame, an L and a parity: one effect shows in every channel and split that it acts on, and a list of
+    these would hide all else. Groups that are not significant stay in the order of their deviates. The cube root of a
+    group's sum of squared deviates is nearly normal (Wilson & Hilferty, PNAS 17, 684, 1931); it is compared with those
+    of the simulations, each taken against the others.
     """
     count = len(simulations)
     mean, spread = simulations.mean(axis=0), simulations.std(axis=0, ddof=1)
@@ -64,7 +65,7 @@ def places(x: NDArray[np.float64], simulations: NDArray[np.float64], elements: S
     found = np.array([np.mean(deviates[row] ** 2) for row in rows])
     drawn = np.stack([np.mean(others[:, row] ** 2, axis=1) for row in rows], axis=1)
     z, p = scan_pvalues(np.cbrt(found), np.cbrt(drawn))
-    # Too quiet a group is no place of a gap.
+    # A group with too small deviates is no departure.
     p = np.where(z > 0, p, 1.0)
     firsts: list[Place] = []
     others_of_kind: list[Place] = []
@@ -74,7 +75,7 @@ def places(x: NDArray[np.float64], simulations: NDArray[np.float64], elements: S
         peak = row[int(np.argmax(np.abs(deviates[row])))]
         place = Place(elements[peak], float(z[group]), float(p[group]), float(deviates[peak]))
         kind = (place.element.frame, place.element.L, place.element.parity)
-        new = kind not in seen and (place.p <= SIGNIFICANT or not seen)
+        new = kind not in seen and (place.p <= level or not seen)
         (firsts if new else others_of_kind).append(place)
         seen.add(kind)
     return firsts + others_of_kind

@@ -19,7 +19,7 @@ from mcsim.diagnosis.view import APART, ReportView
 
 DOTS_PER_INCH = 120
 
-_DATA = {"verdict", "configuration", "entries", "places", "explanations", "contrasts"}
+_DATA = {"verdict", "configuration", "settings", "entries", "places", "explanations", "contrasts"}
 """Attributes of the evidence that hold data; the others are settings."""
 
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

@@ -9,7 +9,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.analysis import Proposal
 from mcsim.diagnosis.candidate import Candidate
 from mcsim.diagnosis.selection import Attribution, Explanation
 from mcsim.diagnosis.verdict import effects_of
@@ -33,7 +32,6 @@ def report_arrays(
     null: SimulatedGaussian,
     found: Attribution,
     candidates: Sequence[Candidate],
-    proposals: Sequence[Proposal],
 ) -> xr.Dataset:
     """Pictures and fits as arrays, to be merged with the evidence.
 
@@ -43,10 +41,10 @@ def report_arrays(
         What is believed, and the data.
     simulations, null
         Evidence of the model, shape (N, p_raw), and its null.
-    found, candidates, proposals
+    found, candidates
         The verdict, and what it was chosen from.
     """
-    alone = [_alone(index, single, candidates, proposals) for index, single in enumerate(found.singles)]
+    alone = [_alone(index, single, candidates) for index, single in enumerate(found.singles)]
     return xr.Dataset(
         {
             "residual_map": (
@@ -64,8 +62,8 @@ def report_arrays(
         },
         coords={
             "map": _texts(part.name for part in model.parts),
-            "candidate": _texts(proposal.label for proposal in proposals),
-            "unit": ("candidate", _texts(proposal.kind.unit for proposal in proposals)),
+            "candidate": _texts(candidate.label for candidate in candidates),
+            "unit": ("candidate", _texts(candidate.unit for candidate in candidates)),
         },
         attrs={
             "frame": model.survey.config.map.frame,
@@ -130,12 +128,10 @@ def _texts(words: Iterable[str]) -> NDArray[np.object_]:
     return np.array(list(words), dtype=object)
 
 
-def _alone(
-    index: int, single: Fit, candidates: Sequence[Candidate], proposals: Sequence[Proposal]
-) -> tuple[float, float]:
+def _alone(index: int, single: Fit, candidates: Sequence[Candidate]) -> tuple[float, float]:
     """Amplitude and standard error of a candidate; NaN where no effect has such an amplitude."""
     try:
-        (effect,) = effects_of(Explanation((index,), single, 1.0, single.pvalue, single.pvalue), candidates, proposals)
+        (effect,) = effects_of(Explanation((index,), single, 1.0, single.pvalue, single.pvalue), candidates)
     except InputError:
         return float("nan"), float("nan")
     return effect["amplitude"], effect["sigma"]

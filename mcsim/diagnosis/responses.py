@@ -1,70 +1,72 @@
-"""How evidence changes when effects act, simulated over skies that are like the one that was observed."""
+"""Simulate how the data vector responds to effects, over skies that agree with the observed one."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim import config, systematics
+from mcsim import config
 from mcsim.diagnosis.analysis import Analysis
-from mcsim.diagnosis.knowledge import CONSTRAINED_SKIES, Ask, Knowledge, after_jobs, constrained_jobs
+from mcsim.diagnosis.campaign import Ask, after_jobs, constrained_jobs
 
 Rows = NDArray[np.float64]
 
 
 class Responses:
-    """Responses to effects, for one set of data.
+    """Simulate responses to effects for one set of maps.
 
     Parameters
     ----------
-    run, asked, known
-        What is believed, what is asked of it, what its simulations answered.
+    run, analysis
+        Fiducial model and its analysis.
+    reference
+        Data vectors of the skies with which templates are measured, shape (skies, p).
     observed
-        The sky that the data show.
+        Filtered sky of the data.
     ask
         Runs simulations.
     """
 
     def __init__(
-        self, run: config.RunConfig, analysis: Analysis, known: Knowledge, observed: NDArray[np.complex128], ask: Ask
+        self, run: config.RunConfig, analysis: Analysis, reference: Rows, observed: NDArray[np.complex128], ask: Ask
     ) -> None:
-        self._run, self._asked, self._known, self._observed, self._ask = run, analysis, known, observed, ask
+        self._run, self._analysis, self._reference, self._observed, self._ask = run, analysis, reference, observed, ask
         self._without: Rows = np.zeros((0, len(analysis.elements)))
 
     def __call__(self, found: Sequence[config.Effect], skies: int) -> Rows:
-        """Changes of the evidence, a row for every sky, shape (rows, entries).
+        """Return changes of the data vector in ``skies`` constrained skies, shape (rows, p).
 
-        ``skies`` that agree with the observed one; of effects whose mean response counts, the mean of typical skies:
-        the observed one has the power that it was given already.
+        Effects with a mean response are simulated in typical skies instead: the observed sky has its power already.
         """
-        on_average = [effect for effect in found if _is_typical(effect)]
-        others = [effect for effect in found if not _is_typical(effect)]
+        typical = [effect for effect in found if self._is_typical(effect)]
+        others = [effect for effect in found if not self._is_typical(effect)]
         shift = np.zeros((1, self._without.shape[1]))
-        if on_average:
-            shift = self._typical(on_average) - self._known.reference
+        if typical:
+            shift = self._typical(typical) - self._reference
         if not others:
             return shift
-        return shift.mean(axis=0) + self._constrained(others, skies) - self._before(skies)
+        return shift.mean(axis=0) + self._constrained(others, range(skies)) - self._before(skies)
 
     def pair(self, found: Sequence[config.Effect]) -> tuple[Rows, Rows]:
-        """Evidence of the same skies without effects and with them, shape (rows, entries) each."""
-        if any(_is_typical(effect) for effect in found):
-            return self._known.reference, self._typical(found)
-        return self._before(CONSTRAINED_SKIES), self._constrained(found, CONSTRAINED_SKIES)
+        """Return data vectors of the same skies without the effects and with them, shape (rows, p) each."""
+        if any(self._is_typical(effect) for effect in found):
+            return self._reference, self._typical(found)
+        skies = self._analysis.settings.constrained_skies
+        return self._before(skies), self._constrained(found, range(skies))
 
     def _typical(self, found: Sequence[config.Effect]) -> Rows:
-        return np.concatenate(self._ask(after_jobs(self._run, self._asked, found)))
+        return np.concatenate(self._ask(after_jobs(self._run, self._analysis, found)))
 
-    def _constrained(self, found: Sequence[config.Effect], last: int, first: int = 0) -> Rows:
-        return np.concatenate(self._ask(constrained_jobs(self._run, self._asked, found, self._observed, first, last)))
+    def _constrained(self, found: Sequence[config.Effect], realizations: range) -> Rows:
+        jobs = constrained_jobs(self._run, self._analysis, found, self._observed, realizations)
+        return np.concatenate(self._ask(jobs))
 
     def _before(self, skies: int) -> Rows:
         if len(self._without) < skies:
-            more = self._constrained((), skies, len(self._without))
+            more = self._constrained((), range(len(self._without), skies))
             self._without = np.concatenate([self._without, more])
         return self._without[:skies]
 
-
-def _is_typical(effect: config.Effect) -> bool:
-    kind = systematics.get(effect.name)
-    return kind.mean_response and not kind.draws
+    def _is_typical(self, effect: config.Effect) -> bool:
+        kind = next(one.effect for one in self._analysis.candidates if one.name == effect.name)
+        return kind.mean_response and not kind.stochastic

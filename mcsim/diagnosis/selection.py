@@ -1,4 +1,4 @@
-"""Which effect: all subsets of up to three candidates, those that suffice, and what would tell them apart."""
+"""Select the smallest sets of candidates that explain the data, and what would tell these sets apart."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -9,7 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.candidate import Candidate, allowed, columns_of
+from mcsim.diagnosis.candidate import Candidate, columns_of, within_bounds
+from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.subsets import Subsets
 from mcsim.stats.detection import cosines
 from mcsim.stats.gaussian import Fit, SimulatedGaussian
@@ -17,16 +18,13 @@ from mcsim.stats.look_elsewhere import Calibration, GlobalTest, global_test
 
 Verdict = Literal["none", "effect", "mixture", "degenerate", "unknown"]
 
-LARGEST = 3
-"""Candidates that may act together."""
-
 # Subsets that are solved at once; bounds the memory to some 100 MB.
 CHUNK = 1000
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """A subset of candidates that suffices.
+    """Describe an accepted set of candidates.
 
     Attributes
     ----------
@@ -35,9 +33,10 @@ class Explanation:
     fit
         Amplitudes of the members' columns, one member after the other.
     odds
-        Posterior odds against the best explanation, <= 1.
-    probability, further
-        Of the residual, model errors allowed for, and of the most significant further candidate, trials included.
+        Posterior odds relative to the best explanation, <= 1.
+    pvalue, further
+        p-value of the residual, with errors of the templates tolerated, and global p-value of the most significant
+        further candidate.
     """
 
     members: tuple[int, ...]
@@ -49,17 +48,17 @@ class Explanation:
 
 @dataclass(frozen=True)
 class Contrast:
-    """What would tell two explanations apart.
+    """Say what would tell two explanations apart.
 
     Attributes
     ----------
     first, second
         Indices into the explanations.
     separation
-        White distance of their fitted predictions.
-    entries, shares
-        Entries of the evidence, the most telling first, and their shares of the squared distance; shares add up to 1
-        and can be negative.
+        White norm of the difference of their fitted predictions.
+    elements, shares
+        Elements of the data vector, the most discriminating first, and their shares of the squared norm; shares add up
+        to 1 and can be negative.
     """
 
     first: int
@@ -71,17 +70,20 @@ class Contrast:
 
 @dataclass(frozen=True)
 class Attribution:
-    """Verdict on evidence.
+    """Hold the verdict on a data vector.
 
     Attributes
     ----------
     verdict
-        "none" without a gap, "unknown" where no subset suffices, "degenerate" where several do, else "effect" or
-        "mixture".
+        "none" if the model describes the data, "unknown" if no set is accepted, "degenerate" if several are, else
+        "effect" or "mixture".
+    gap
+        Global test of the data against the model.
     explanations
-        Minimal subsets that suffice, the most probable first; empty for "none" and "unknown".
+        Minimal accepted sets, the most probable first; empty for "none" and "unknown".
     nearest, cosine
-        Candidate that lowers chi2 most, and the cosine of its best fit to what departs from the null, noise removed.
+        Candidate that lowers chi^2 most, and the cosine between its best fit and the departure from the model, without
+        noise.
     singles
         Fit of each candidate alone.
     correlation
@@ -98,7 +100,7 @@ class Attribution:
     contrasts: tuple[Contrast, ...]
 
     def unexplained(self) -> "Attribution":
-        """The same as "unknown", where something else says that no set is to be named."""
+        """Return the same attribution with the verdict "unknown" and no explanation."""
         return replace(self, verdict="unknown", explanations=(), contrasts=())
 
 
@@ -108,49 +110,36 @@ def attribute(
     t: NDArray[np.float64],
     candidates: Sequence[Candidate],
     calibration: Calibration,
-    *,
-    alpha: float = 0.05,
-    levels: tuple[float, float] = (0.02, 0.005),
-    largest: int = LARGEST,
-    odds_cut: float = 100.0,
-    shape_error: float = 0.01,
+    settings: DiagnosisSettings | None = None,
 ) -> Attribution:
-    """Attribute a gap to the smallest sets of candidates that suffice.
+    """Attribute a departure from the model to the smallest sets of candidates that explain it.
 
     Parameters
     ----------
     null, x
-        Null and evidence, shape (p_raw,).
+        Distribution of the data vector without an effect, and the data, shape (p_raw,).
     t
         Templates per unit amplitude, shape (p_raw, K).
     candidates, calibration
         Candidates on those templates, and :func:`~mcsim.stats.look_elsewhere.calibrate` of them in this order.
-    alpha
-        Level of the gap.
-    levels
-        Of acceptance: a true set is refused as often as this by its residual, and by a further candidate. High levels
-        lose true sets, low ones miss that something is unknown.
-    largest
-        Number of candidates that may act together.
-    odds_cut
-        Explanations less probable than the best by this factor are dropped.
-    shape_error
-        Relative error of templates.
+    settings
+        Levels; default: those of :class:`DiagnosisSettings`.
 
     Notes
     -----
-    A subset suffices when its residual passes and no candidate of another identity is significant beside it; it is
-    reported when no part of it suffices. Each of several candidates must be significant beside the others, or the
-    residual is that of something unknown; and several must be more probable than an unknown effect of the same prior
-    strength in an isotropic direction. Candidates of one identity compete by evidence alone. An effect that draws
-    scatters the evidence: sets with such a member whose scatter is known are judged with a null that is widened by it,
-    and one alone has to be significant and probable like several. A template that is wrong by a fraction eps of its
-    white length leaves eps^2 s_c^2 in the residual, s_c the white length of its fitted part (at most that of the whole
-    fit); the sum over members makes both tests noncentral, in the direction that hurts most.
-    The prior of a subset is k! times the product of its candidates' shares of the weight.
+    A set is sufficient if its residual passes (``residual_level``) and no candidate of another identity is significant
+    beside it (``further_level``); it is reported if no part of it is sufficient. Each of several candidates must be
+    significant beside the others, or the residual is that of something unknown; and several must be more probable than
+    an unknown effect of the same prior S/N in an isotropic direction. Candidates of one identity compete by evidence
+    alone. A stochastic effect scatters the data: sets with a member whose scatter is known are tested with a null
+    distribution to which it is added, and such a member alone has to be significant and probable like several. A
+    template that is wrong by a fraction eps of its white norm leaves eps^2 s_c^2 in the residual, s_c the white norm of
+    its fitted part (at most that of the whole fit); the sum over members makes both tests noncentral, in the least
+    favourable direction. The prior of a set is k! times the product of its candidates' shares of the weight.
     """
+    settings = settings or DiagnosisSettings()
     groups = null.whiten_groups(t, [candidate.columns for candidate in candidates])
-    searches = list(_searches(null, x, t, candidates, calibration, shape_error, largest))
+    searches = list(_searches(null, x, t, candidates, calibration, settings))
     y = null.whiten(x)
     found = global_test(null, x, groups, calibration)
     delta_chi2 = groups.delta_chi2(y)
@@ -158,12 +147,12 @@ def attribute(
     signal = null.hartlap_factor * delta_chi2[nearest] - groups.sizes[nearest]
     excess = max(null.hartlap_factor * float(y @ y) - null.dimension, signal, 1e-300)
     explanations: tuple[Explanation, ...] = ()
-    if found.pvalue <= alpha:
+    if found.pvalue <= settings.alpha:
         possible = partial(_possible, x, t, candidates)
-        accepted = _accepted(searches, levels, largest, np.log(odds_cut), possible)
-        explanations = tuple(_explanations(x, t, candidates, accepted, np.log(odds_cut)))
+        cut = float(np.log(settings.odds_cut))
+        explanations = tuple(_explanations(x, t, candidates, _accepted(searches, possible), cut))
     return Attribution(
-        verdict=_verdict(found.pvalue > alpha, explanations),
+        verdict=_verdict(found.pvalue > settings.alpha, explanations),
         gap=found,
         explanations=explanations,
         nearest=nearest,
@@ -190,26 +179,22 @@ def _searches(
     t: NDArray[np.float64],
     candidates: Sequence[Candidate],
     calibration: Calibration,
-    shape_error: float,
-    largest: int,
+    settings: DiagnosisSettings,
 ) -> Iterator[Subsets]:
-    """One for subsets without a member whose scatter is known, first, and one for each combination of such members."""
-    columns, names = [c.columns for c in candidates], [c.identity for c in candidates]
-    prior = np.array([candidate.prior for candidate in candidates])
-    errors = np.array([shape_error if c.shape_error is None else c.shape_error for c in candidates])
+    """Yield a search of sets without a member whose scatter is known, and one for each combination of such members."""
     scatters = {index: c.scatter for index, c in enumerate(candidates) if c.scatter is not None}
-    for size in range(largest + 1):
-        for drawn in combinations(scatters, size):
-            if len({names[index] for index in drawn}) < size:
+    for size in range(settings.max_effects + 1):
+        for members in combinations(scatters, size):
+            if len({candidates[index].identity for index in members}) < size:
                 continue
-            wide = null.with_extra_covariance(*(scatters[index] for index in drawn))
-            groups = wide.whiten_groups(t, columns)
-            yield Subsets(wide, wide.whiten(x), groups, names, prior, errors, calibration, scatters, drawn)
+            wide = null.with_extra_covariance(*(scatters[index] for index in members))
+            groups = wide.whiten_groups(t, [c.columns for c in candidates])
+            yield Subsets(wide, wide.whiten(x), groups, candidates, calibration, settings, members)
 
 
 @dataclass(frozen=True, order=True)
 class _Accepted:
-    """A minimal sufficient subset, and the null that it was judged with; ordered by evidence."""
+    """Hold a minimal sufficient set and the distribution that it was tested with; ordered by evidence."""
 
     evidence: float
     members: tuple[int, ...]
@@ -225,57 +210,48 @@ def _possible(
     null: SimulatedGaussian,
     members: tuple[int, ...],
 ) -> bool:
-    """Whether no member would need an amplitude that it cannot have."""
-    if not any(candidates[member].positive or np.isfinite(candidates[member].max_amplitude) for member in members):
+    """Return True if the fitted amplitudes of all members are within their bounds."""
+    effects = [candidates[member].effect for member in members]
+    if not any(effect.sign or np.isfinite(effect.max_amplitude) for effect in effects):
         return True
-    return allowed(candidates, members, null.fit(x, t[:, columns_of(candidates, members)]))
+    return within_bounds(candidates, members, null.fit(x, t[:, columns_of(candidates, members)]))
 
 
 def _accepted(
-    searches: Sequence[Subsets],
-    levels: tuple[float, float],
-    largest: int,
-    cut: float,
-    possible: Callable[[SimulatedGaussian, tuple[int, ...]], bool],
+    searches: Sequence[Subsets], possible: Callable[[SimulatedGaussian, tuple[int, ...]], bool]
 ) -> list[_Accepted]:
-    """Minimal sufficient subsets that are possible, unless their evidence is below the best one's by over ``cut``."""
+    """Return minimal sufficient sets that are possible, unless their evidence is below the best one's by the cut."""
     accepted: list[_Accepted] = []
-    best, unknown = -np.inf, searches[0].unknown
-    for size in range(1, largest + 1):
+    settings = searches[0].settings
+    best, unknown, cut = -np.inf, searches[0].unknown, np.log(settings.odds_cut)
+    for size in range(1, settings.max_effects + 1):
         fresh: list[_Accepted] = []
         for search in searches:
             # With thousands of sets to choose from, some triple comes close to anything; so does a wide scatter.
-            doubted = size > 1 or bool(search.drawn)
+            doubted = size > 1 or bool(search.scattered)
             least = max(best - cut, unknown if doubted else -np.inf)
             for subsets in search.rows(size, [found.members for found in accepted]):
-                fresh += _sufficient(search, subsets, levels, least, doubted, possible)
+                sufficient = _sufficient(search, subsets, least, doubted)
+                fresh += [one for one in sufficient if possible(one.null, one.members)]
         accepted += fresh
         best = max([best, *(found.evidence for found in fresh)])
     return accepted
 
 
-def _sufficient(
-    search: Subsets,
-    subsets: NDArray[np.int64],
-    levels: tuple[float, float],
-    least: float,
-    doubted: bool,
-    possible: Callable[[SimulatedGaussian, tuple[int, ...]], bool],
-) -> Iterator[_Accepted]:
-    """Of subsets of the same ranks those that suffice; of doubted ones every member has to be significant."""
-    solved = search.solve(subsets)
-    passing = np.flatnonzero((solved.pvalue > levels[0]) & (solved.evidence >= least))
+def _sufficient(search: Subsets, subsets: NDArray[np.int64], least: float, doubted: bool) -> Iterator[_Accepted]:
+    """Yield the sufficient ones of subsets of the same ranks; each member of doubted ones has to be significant."""
+    solved, settings = search.solve(subsets), search.settings
+    passing = np.flatnonzero((solved.pvalue > settings.residual_level) & (solved.evidence >= least))
     for first in range(0, len(passing), CHUNK):
         rows = passing[first : first + CHUNK]
         further = search.further(subsets[rows], solved.chi2[rows], solved.allowance[rows])
-        alone = further > levels[1]
+        alone = further > settings.further_level
         if doubted:
-            alone &= search.least_needed(subsets[rows]) <= levels[1]
+            alone &= search.least_needed(subsets[rows]) <= settings.further_level
         for row, beside in zip(rows[alone], further[alone], strict=True):
             members = tuple(int(member) for member in subsets[row])
-            if possible(search.null, members):
-                numbers = float(solved.evidence[row]), members, float(solved.pvalue[row]), float(beside)
-                yield _Accepted(*numbers, search.null)
+            numbers = float(solved.evidence[row]), members, float(solved.pvalue[row]), float(beside)
+            yield _Accepted(*numbers, search.null)
 
 
 def _explanations(
@@ -285,7 +261,7 @@ def _explanations(
     accepted: Sequence[_Accepted],
     cut: float,
 ) -> Iterator[Explanation]:
-    """The most probable first; of those that differ only in settings the most probable one."""
+    """Yield the most probable first; of those that differ only in settings the most probable one."""
     seen: set[frozenset[tuple[str, str | None]]] = set()
     ranked = sorted(accepted, reverse=True)
     for found in ranked:
@@ -303,7 +279,7 @@ def _contrasts(
     candidates: Sequence[Candidate],
     explanations: Sequence[Explanation],
 ) -> Iterator[Contrast]:
-    """Each pair of explanations, and the entries in which their predictions differ by most of their distance."""
+    """Yield each pair of explanations with the elements in which their predictions differ most."""
     predictions = [
         t[:, columns_of(candidates, explanation.members)] @ explanation.fit.amplitudes for explanation in explanations
     ]

@@ -1,27 +1,27 @@
-"""All subsets of the candidates: their fits, their evidence, and whether anything else is significant beside them."""
+"""Fit and test all subsets of the candidates."""
 
-from collections.abc import Collection, Hashable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from mcsim.diagnosis.candidate import Candidate
+from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.stats.detection import log_evidence
 from mcsim.stats.gaussian import COLLINEAR, SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration
 
-# Widths of the amplitudes' prior in standard deviations: flat in the logarithm, from what can hardly be seen to what
-# outshines everything.
-WIDTHS = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0, 512.0, 1024.0)
-# Relative to columns of length one: keeps the normal equations of twins solvable, and is far below any noise.
+# Relative to columns of norm one: keeps the normal equations of degenerate effects solvable, far below any noise.
 RIDGE = 1e-9
 
 
 @dataclass(frozen=True)
 class Solved:
-    """Fits of many subsets, shape (M,) each."""
+    """Hold the fits of M subsets, shape (M,) each."""
 
     chi2: NDArray[np.float64]
     pvalue: NDArray[np.float64]
@@ -29,58 +29,91 @@ class Solved:
     allowance: NDArray[np.float64]
 
 
+@dataclass(frozen=True, eq=False)
 class Subsets:
-    """Normal equations of all candidates, in white orthonormal coordinates, and the tests of subsets of them.
+    """Solve the normal equations of subsets of the candidates, in white orthonormal coordinates.
 
-    Parameters
+    Attributes
     ----------
     null, y
-        Null, and the evidence's white coordinates, shape (p,).
-    groups, calibration
-        Bases of the C candidates, and their calibration.
-    names
-        Identity of each: candidates that share it exclude each other.
-    prior, errors
-        Weight, and relative error of the templates, shape (C,).
-    drawing, drawn
-        Candidates that scatter the evidence, and those of them whose scatter is the null's: subsets are those that have
-        the latter and none of the others.
+        Distribution of the data vector, with the scatter of the candidates ``scattered``, and the data in its white
+        coordinates, shape (p,).
+    groups, candidates, calibration
+        Bases of the C candidates, the candidates, and their calibration.
+    settings
+        Of the diagnosis.
+    scattered
+        Candidates whose scatter is in ``null``: subsets contain these, and no other one whose scatter is known.
     """
 
-    def __init__(
-        self,
-        null: SimulatedGaussian,
-        y: NDArray[np.float64],
-        groups: WhitenedTemplates,
-        names: Sequence[Hashable],
-        prior: NDArray[np.float64],
-        errors: NDArray[np.float64],
-        calibration: Calibration,
-        drawing: Collection[int] = (),
-        drawn: Collection[int] = (),
-    ) -> None:
-        self.null, self.calibration = null, calibration
-        self.drawing, self.drawn = drawing, drawn
-        self.total = float(y @ y)
-        self.start, self.sizes, self.errors = groups.start, groups.sizes, errors
-        self.gram = groups.basis.T @ groups.basis
-        self.score = groups.basis.T @ y
-        self.identity = np.array([names.index(name) for name in names])
-        self.log_prior = np.log(prior / prior.sum())
-        # Something of the same strengths in any direction.
-        spread = np.array(WIDTHS) / np.sqrt(null.dimension)
-        self.unknown = float(log_evidence(null, self.total, self.total, null.dimension, tuple(spread)))
+    null: SimulatedGaussian
+    y: NDArray[np.float64]
+    groups: WhitenedTemplates
+    candidates: Sequence[Candidate]
+    calibration: Calibration
+    settings: DiagnosisSettings = field(default_factory=DiagnosisSettings)
+    scattered: tuple[int, ...] = ()
+
+    @cached_property
+    def total(self) -> float:
+        """Return chi^2 of the data."""
+        return float(self.y @ self.y)
+
+    @cached_property
+    def unknown(self) -> float:
+        """Return the log-evidence of an unknown effect of the same prior S/N in an isotropic direction."""
+        spread = np.array(self.settings.prior_snr) / np.sqrt(self.null.dimension)
+        return float(log_evidence(self.null, self.total, self.total, self.null.dimension, tuple(spread)))
+
+    @cached_property
+    def start(self) -> NDArray[np.int64]:
+        """Return the first column of each candidate."""
+        return self.groups.start
+
+    @cached_property
+    def sizes(self) -> NDArray[np.int64]:
+        """Return the rank of each candidate."""
+        return self.groups.sizes
+
+    @cached_property
+    def gram(self) -> NDArray[np.float64]:
+        """Return the matrix of the normal equations."""
+        return np.asarray(self.groups.basis.T @ self.groups.basis)
+
+    @cached_property
+    def score(self) -> NDArray[np.float64]:
+        """Return their right-hand side."""
+        return np.asarray(self.groups.basis.T @ self.y)
+
+    @cached_property
+    def errors(self) -> NDArray[np.float64]:
+        """Return the relative error of each candidate's templates."""
+        default = self.settings.template_error
+        return np.array([default if c.shape_error is None else c.shape_error for c in self.candidates])
+
+    @cached_property
+    def identity(self) -> NDArray[np.int64]:
+        """Return a number for each candidate; those that exclude each other share it."""
+        names = [candidate.identity for candidate in self.candidates]
+        return np.array([names.index(name) for name in names])
+
+    @cached_property
+    def log_prior(self) -> NDArray[np.float64]:
+        """Return the logarithm of each candidate's share of the prior weight."""
+        prior = np.array([candidate.prior for candidate in self.candidates])
+        return np.asarray(np.log(prior / prior.sum()))
 
     def rows(self, size: int, accepted: Sequence[tuple[int, ...]]) -> Iterator[NDArray[np.int64]]:
-        """Subsets without rivals or an accepted part, shape (M, size), all of the same ranks."""
-        filtered = np.flatnonzero(self.sizes > 0)
-        filtered = filtered[np.argsort(self.sizes[filtered], kind="stable")]
-        rows = np.array(list(combinations(filtered, size)), dtype=np.int64).reshape(-1, size)
+        """Yield subsets without exclusive members or an accepted part, shape (M, size), all of the same ranks."""
+        present = np.flatnonzero(self.sizes > 0)
+        present = present[np.argsort(self.sizes[present], kind="stable")]
+        rows = np.array(list(combinations(present, size)), dtype=np.int64).reshape(-1, size)
         kept = np.ones(len(rows), dtype=bool)
         for i, j in combinations(range(size), 2):
             kept &= self.identity[rows[:, i]] != self.identity[rows[:, j]]
-        for member in self.drawing:
-            kept &= np.any(rows == member, axis=1) == (member in self.drawn)
+        for member, candidate in enumerate(self.candidates):
+            if candidate.scatter is not None:
+                kept &= np.any(rows == member, axis=1) == (member in self.scattered)
         for part in accepted:
             kept &= ~np.all([np.any(rows == member, axis=1) for member in part], axis=0)
         rows = rows[kept]
@@ -90,7 +123,7 @@ class Subsets:
                 yield rows[which.ravel() == index]
 
     def _columns(self, subsets: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Columns of each subset, shape (M, K), and the place in the subset to which each belongs, shape (K,)."""
+        """Return the columns of each subset, shape (M, K), and the member to which each belongs, shape (K,)."""
         ranks = self.sizes[subsets[0]]
         parts = [self.start[subsets[:, i], None] + np.arange(rank) for i, rank in enumerate(ranks)]
         return np.concatenate(parts, axis=1), np.repeat(np.arange(len(ranks)), ranks)
@@ -113,12 +146,12 @@ class Subsets:
         return Solved(
             chi2=self.total - delta_chi2,
             pvalue=null.residual_test(self.total - delta_chi2, K, allowance),
-            evidence=log_evidence(null, self.total, delta_chi2, K, WIDTHS) + prior,
+            evidence=log_evidence(null, self.total, delta_chi2, K, self.settings.prior_snr) + prior,
             allowance=allowance,
         )
 
     def least_needed(self, subsets: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Probability, trials included, of each subset's least significant member beside its others, shape (M,)."""
+        """Return the global p-value of each subset's least significant member beside its others, shape (M,)."""
         if not len(subsets):
             return np.empty(0)
         whole = self.solve(subsets)
@@ -131,14 +164,14 @@ class Subsets:
                 chi2, allowance = without.chi2, without.allowance
             rank = self.sizes[subsets[:, place]]
             fitted = self.sizes[subsets].sum(axis=1) - rank
-            scores = self.null.nested_test(chi2 - whole.chi2, chi2, rank, fitted, allowance)
-            largest = np.maximum(largest, self.calibration.global_pvalue(scores))
+            pvalues = self.null.nested_test(chi2 - whole.chi2, chi2, rank, fitted, allowance)
+            largest = np.maximum(largest, self.calibration.global_pvalue(pvalues))
         return largest
 
     def further(
         self, subsets: NDArray[np.int64], chi2: NDArray[np.float64], allowance: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Probability, trials included, of the most significant candidate beside each subset, shape (M,)."""
+        """Return the global p-value of the most significant candidate beside each subset, shape (M,)."""
         if not len(subsets):
             return np.empty(0)
         columns, _ = self._columns(subsets)
@@ -155,10 +188,10 @@ class Subsets:
             )
             values, vectors = np.linalg.eigh(block)
             along = np.einsum("mcij,mci->mcj", vectors, left[:, index])
-            filtered = values > COLLINEAR
-            delta_chi2 = np.sum(np.where(filtered, along**2 / np.where(filtered, values, 1.0), 0.0), axis=-1)
-            ranks = filtered.sum(axis=-1)
-            scores = self.null.nested_test(delta_chi2, chi2[:, None], ranks, K, allowance[:, None])
-            rivals = np.any(self.identity[subsets][:, :, None] == self.identity[others], axis=1)
-            smallest = np.minimum(smallest, np.where(rivals, 1.0, scores).min(axis=1))
+            kept = values > COLLINEAR
+            delta_chi2 = np.sum(np.where(kept, along**2 / np.where(kept, values, 1.0), 0.0), axis=-1)
+            ranks = kept.sum(axis=-1)
+            pvalues = self.null.nested_test(delta_chi2, chi2[:, None], ranks, K, allowance[:, None])
+            exclusive = np.any(self.identity[subsets][:, :, None] == self.identity[others], axis=1)
+            smallest = np.minimum(smallest, np.where(exclusive, 1.0, pvalues).min(axis=1))
         return self.calibration.global_pvalue(smallest)

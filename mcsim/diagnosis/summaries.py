@@ -1,4 +1,4 @@
-"""The evidence: one short vector of numbers, each of which says where it was heard."""
+"""The data vector: a short vector of summary statistics, each with a description."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.diagnosis.matched_filters import normalised_difference, sky_of
-from mcsim.diagnosis.wiener_filter import BEAM_ORDERS, SPLIT_BEAM_ORDERS, FilteredMaps, Model, by_degree
+from mcsim.diagnosis.wiener_filter import FilteredMaps, Model, by_degree
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotation_matrix
@@ -17,41 +17,26 @@ from mcsim.sphere.rotation import rotation_matrix
 Map = NDArray[np.float64]
 Vector = NDArray[np.float64]
 
-SKY_BINS = 8
-"""Bins of the spectrum of the sky that the maps share, even and odd degrees apart."""
-
-BEAM_BINS = {0: 4, 1: 2, 2: 2, 3: 1, 4: 1}
-"""Bins in l of what the sky says about the orders of a beam."""
-
-LATITUDES = (0.0, 0.25, 0.6, 1.0)
-"""Edges in |sin latitude| of bands of the sky."""
-
-PLANE = 0.2
-"""Width in sin b of the profile of the galactic plane."""
-
-LARGE_SCALES = 64
-"""Degree up to which signals fixed to the sky are compared between channels."""
-
 
 @dataclass(frozen=True)
 class Element:
-    """Where one number of the evidence was heard.
+    """Describe one element of the data vector.
 
     Attributes
     ----------
     name
         Unique.
     statistic
-        "map": residual maps against the sky and the scan; "cl"; "biposh"; "noise"; "score": matched to an effect.
+        "map": residual maps against the sky and the scan; "cl"; "biposh"; "noise"; "score": matched filter.
     channels, split
-        Whose; no split where all maps of a channel count.
+        Whose; no split if all maps of a channel count.
     fold
-        0 or 1 where there is an entry like it whose noise is independent: a fit may use the one and be judged by the
-        other. None where there is none.
+        0 or 1 if there is a similar element whose noise is independent: a fit may use the one and be tested with the
+        other. None if there is none.
     ell
-        Range of degrees, None where all or none.
+        Range of degrees, None if all or none.
     L, M, parity, frame
-        As for BipoSH coefficients, where they apply.
+        As for BipoSH coefficients, if they apply.
     """
 
     name: str
@@ -68,14 +53,14 @@ class Element:
 
 @dataclass(frozen=True)
 class Block:
-    """Entries that are computed together."""
+    """Elements that are computed together."""
 
     elements: tuple[Element, ...]
     values: Callable[[Model, FilteredMaps], Vector] = field(repr=False)
 
 
 def blocks_of(model: Model) -> tuple[Block, ...]:
-    """What is listened for whatever the effect: about 30 numbers a channel, and some on the sky."""
+    """Return the blocks that do not depend on a candidate: about 30 elements a channel, and some of the sky."""
     blocks = [_beam_block(model, i) for i in range(len(model.parts))]
     blocks += [_additive_block(model, i) for i in range(len(model.parts))]
     blocks += [_plane_block(model, i) for i in range(len(model.parts))]
@@ -88,13 +73,13 @@ def blocks_of(model: Model) -> tuple[Block, ...]:
 
 
 def bins(low: int, high: int, number: int) -> list[tuple[int, int]]:
-    """Ranges of degrees, both ends included, with about the same number of modes."""
+    """Return ranges of degrees, both ends included, with about the same number of modes."""
     edges = np.sqrt(np.linspace(low**2, (high + 1) ** 2, number + 1)).astype(int)
     return [(int(a), int(b) - 1) for a, b in pairwise(edges)]
 
 
 def scales(lmax: int) -> list[tuple[int, int]]:
-    """Ranges of degrees for signals that fall steeply: each starts at about four times the one before."""
+    """Return ranges of degrees for steep spectra: each starts at about four times the one before."""
     edges = [low for low in (2, 13, 49) if low < lmax] + [lmax + 1]
     return [(a, b - 1) for a, b in pairwise(edges)]
 
@@ -109,16 +94,16 @@ def _frame(model: Model) -> str:
 
 
 def _beam_block(model: Model, part: int) -> Block:
-    """D_s(l) with the kernels of a beam's change at order s, B_l l^s, in few bins."""
+    """Project D_s(l) on B_l l^s, the change of a beam at order s, in few bins."""
     channel, split = _label(model, part)
     frame, lmax = _frame(model), model.lmax
     ell = np.arange(lmax + 1)
     beam = model.survey.channels[model.parts[part].channel].site.beam
     kernels, elements = [], []
-    first = part == model.of(model.parts[part].channel)[0]
-    for s in range(min(BEAM_ORDERS if first else SPLIT_BEAM_ORDERS, model.parts[part].moments.smax) + 1):
+    first, split_orders = part == model.of(model.parts[part].channel)[0], model.settings.split_beam_orders
+    for s in range(min(model.settings.beam_orders if first else split_orders, model.parts[part].moments.smax) + 1):
         shape = beam.blm[0, : lmax + 1].real * (ell / lmax) ** max(s, 1)
-        for low, high in bins(2, lmax, BEAM_BINS[s]):
+        for low, high in bins(2, lmax, model.settings.beam_bins[s]):
             kernel = np.where((ell >= low) & (ell <= high), shape, 0.0)
             for quadrature in ("re", "im") if s else ("re",):
                 kernels.append((s, quadrature, kernel))
@@ -127,8 +112,8 @@ def _beam_block(model: Model, part: int) -> Block:
                         f"beam/{model.parts[part].name}/m{s}{quadrature}/{low}-{high}",
                         "map",
                         (channel,),
-                        split if s <= SPLIT_BEAM_ORDERS else None,
-                        _fold(model, part) if s <= SPLIT_BEAM_ORDERS else None,
+                        split if s <= split_orders else None,
+                        _fold(model, part) if s <= split_orders else None,
                         (low, high),
                         L=s,
                         M=0,
@@ -150,7 +135,7 @@ _PARTS = {"re": "real", "im": "imag"}
 
 
 def _additive_block(model: Model, part: int) -> Block:
-    """The dipole of the residual: x, y, z."""
+    """Measure the dipole of the residual: x, y, z."""
     channel, split = _label(model, part)
     elements = tuple(
         Element(
@@ -175,11 +160,11 @@ def _additive_block(model: Model, part: int) -> Block:
 
 
 def _plane_block(model: Model, part: int) -> Block:
-    """What is left along the galactic plane, against its mean over the sky."""
+    """Measure the residual along the Galactic plane, against its mean over the sky."""
     channel, split = _label(model, part)
     matrix = rotation_matrix(_frame(model), "galactic")
     height = matrix[2] @ np.stack(healpy.pix2vec(model.nside, np.arange(12 * model.nside**2)))
-    profile = 1.0 / (1.0 + (height / PLANE) ** 2)
+    profile = 1.0 / (1.0 + (height / model.settings.plane_width) ** 2)
     profile -= profile.mean()
     element = Element(
         f"plane/{model.parts[part].name}",
@@ -187,7 +172,7 @@ def _plane_block(model: Model, part: int) -> Block:
         (channel,),
         split,
         _fold(model, part),
-        (2, LARGE_SCALES),
+        (2, model.settings.large_scales),
         L=2,
         M=0,
         parity="even",
@@ -201,7 +186,7 @@ def _plane_block(model: Model, part: int) -> Block:
 
 
 def _noise_block(model: Model, channel: int) -> Block:
-    """Variance over expectation in bands of ecliptic latitude; alternate pixels are fresh to the others."""
+    """Measure variance over expectation in bands of ecliptic latitude, alternate pixels apart."""
     parts = model.of(channel)
     name = model.survey.channels[channel].name
     matrix = rotation_matrix(_frame(model), "ecliptic")
@@ -211,7 +196,7 @@ def _noise_block(model: Model, channel: int) -> Block:
     seen = np.all([model.parts[i].precision > 0 for i in parts[:2]], axis=0)
     rows, elements = [], []
     for half in (0, 1):
-        for low, high in pairwise(LATITUDES):
+        for low, high in pairwise(model.settings.latitude_edges):
             band = seen & (height >= low) & (height <= high) & (alternate == half)
             if not band.any():
                 continue  # behind a mask, or never scanned
@@ -237,7 +222,7 @@ def _noise_block(model: Model, channel: int) -> Block:
 
 
 def _linearity_block(model: Model, channel: int) -> Block:
-    """What is left against the square of the sky: a gain that depends on the signal."""
+    """Correlate the residual with the square of the sky: a gain that depends on the signal."""
     parts, name = model.of(channel), model.survey.channels[channel].name
 
     def values(model: Model, filtered: FilteredMaps) -> Vector:
@@ -247,7 +232,7 @@ def _linearity_block(model: Model, channel: int) -> Block:
 
 
 def _repeated_block(model: Model, channel: int) -> Block:
-    """Power of the residual that the channel's first two maps have in common, and of what they have not."""
+    """Measure the residual power common to the channel's first two maps, and that of their difference."""
     first, second = model.of(channel)[:2]
     name = model.survey.channels[channel].name
     ranges = scales(model.lmax)
@@ -266,22 +251,24 @@ def _repeated_block(model: Model, channel: int) -> Block:
 
 
 def _contrast_block(model: Model) -> Block | None:
-    """Power common to two maps of the contrast between the lowest and the highest frequency, by galactic latitude."""
+    """Measure the power of the contrast of lowest and highest frequency, common to two splits, by Galactic latitude."""
     channels = model.survey.channels
     frequencies = [channel.site.frequency_ghz for channel in channels]
     known = sorted({f for f in frequencies if f is not None})
     if len(known) < 2 or any(len(model.of(c)) < 2 for c in range(len(channels))):
         return None
     groups = [[c for c, f in enumerate(frequencies) if f == end] for end in (known[0], known[-1])]
-    top = min(LARGE_SCALES, model.lmax)
+    top = min(model.settings.large_scales, model.lmax)
     nside = max(1, 1 << (top // 3).bit_length() - 1) * 2
     matrix = rotation_matrix(_frame(model), "galactic")
     height = np.abs(matrix[2] @ np.stack(healpy.pix2vec(nside, np.arange(12 * nside * nside))))
-    bands = np.stack([(height >= low) & (height <= high) for low, high in pairwise(LATITUDES)]).astype(float)
+    bands = np.stack(
+        [(height >= low) & (height <= high) for low, high in pairwise(model.settings.latitude_edges)]
+    ).astype(float)
     names = tuple(channels[c].name for group in groups for c in group)
     elements = tuple(
         Element(f"contrast/{low:g}-{high:g}", "map", names, None, None, (2, top), L=0, frame="galactic")
-        for low, high in pairwise(LATITUDES)
+        for low, high in pairwise(model.settings.latitude_edges)
     )
 
     def smoothed(model: Model, filtered: FilteredMaps, split: int) -> Map:
@@ -305,10 +292,10 @@ def _contrast_block(model: Model) -> Block | None:
 
 
 def _sky_block(model: Model) -> Block:
-    """Spectrum of the sky over its expectation, minus one; odd degrees are fresh to even ones."""
+    """Measure the spectrum of the sky over its expectation, minus one, odd and even degrees apart."""
     names = tuple(channel.name for channel in model.survey.channels)
-    large = [(2, 11), (12, 40)] if model.lmax > LARGE_SCALES else []
-    ranges = [*large, *bins(41 if large else 2, model.lmax, SKY_BINS - len(large))]
+    large = [(2, 11), (12, 40)] if model.lmax > model.settings.large_scales else []
+    ranges = [*large, *bins(41 if large else 2, model.lmax, model.settings.sky_bins - len(large))]
     ell = np.arange(model.lmax + 1)
     rows, elements = [], []
     for fold, parity in enumerate(("even", "odd")):
@@ -327,9 +314,9 @@ def _sky_block(model: Model) -> Block:
 
 
 def _isotropy_block(model: Model) -> Block:
-    """Modulation of the sky that the maps share, real L = 1 and L = 2: the integral of (S^-1 s^) s^ times a form.
+    """Measure the modulation of the shared sky, real L = 1 and L = 2: the integral of (S^-1 s^) s^ times a form.
 
-    Two ranges of degrees, with S^-1 s^ cut to them, the one fresh to the other.
+    S^-1 s^ is cut to two ranges of degrees, one for each fold.
     """
     names = tuple(channel.name for channel in model.survey.channels)
     lmax, nside = model.lmax, model.nside
@@ -364,6 +351,6 @@ def _isotropy_block(model: Model) -> Block:
 
 
 def _fold(model: Model, part: int) -> int | None:
-    """Place of a map among its channel's, alternately 0 and 1; None for the only one."""
+    """Return the place of a map among its channel's, alternately 0 and 1; None for the only one."""
     members = model.of(model.parts[part].channel)
     return members.index(part) % 2 if len(members) > 1 else None

@@ -6,13 +6,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.analysis import Proposal
 from mcsim.diagnosis.candidate import Candidate, parts_of
 from mcsim.diagnosis.partial_explanation import PartialExplanation
-from mcsim.diagnosis.refine import effect_at
+from mcsim.diagnosis.places import Place
 from mcsim.diagnosis.selection import Attribution, Explanation
 from mcsim.diagnosis.validation import Prediction, Shrink
-from mcsim.diagnosis.where import Place
 from mcsim.stats.detection import detectable
 from mcsim.stats.gaussian import SimulatedGaussian
 
@@ -22,19 +20,17 @@ SETS = 2
 """Alternatives that a sentence has room for."""
 
 
-def effects_of(
-    explanation: Explanation | PartialExplanation, candidates: Sequence[Candidate], proposals: Sequence[Proposal]
-) -> list[dict[str, Any]]:
+def effects_of(explanation: Explanation | PartialExplanation, candidates: Sequence[Candidate]) -> list[dict[str, Any]]:
     """The effects of a set with amplitude, standard error, unit and parameters."""
     found = []
     for member, theta, covariance in parts_of(candidates, explanation.members, explanation.fit):
-        effect = effect_at(proposals[member], theta, covariance)
+        effect = candidates[member].fitted(theta, covariance)
         found.append(
             {
                 "name": effect.name,
-                "channel": proposals[member].channel,
+                "channel": candidates[member].channel,
                 "amplitude": effect.amplitude,
-                "sigma": _sigma(proposals[member], theta, covariance),
+                "sigma": _sigma(candidates[member], theta, covariance),
                 "unit": effect.unit,
                 "parameters": {key: _plain(value) for key, value in effect.parameters().items()},
             }
@@ -42,18 +38,18 @@ def effects_of(
     return found
 
 
-def _sigma(proposal: Proposal, theta: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:
+def _sigma(candidate: Candidate, theta: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:
     """Standard error of the amplitude, by its slopes in the coordinates over their own errors.
 
     Over less, what is at the edge of the possible would not move. What data do not tell is not varied.
     """
     scale = np.sqrt(np.diag(covariance))
     precision = np.asarray(np.linalg.pinv(covariance), dtype=np.float64)
-    constrained = proposal.kind.constrained(theta, precision)
+    constrained = candidate.effect.constrained(theta, precision)
     slopes: NDArray[np.float64] = np.zeros(len(theta))
     for k in np.flatnonzero((scale > 0.0) & ((constrained != 0.0) | (theta == 0.0))):
         step = scale[k] * np.eye(len(theta))[k]
-        up, down = (proposal.with_parameters(constrained + sign, precision).amplitude for sign in (step, -step))
+        up, down = (candidate.with_coordinates(constrained + sign, precision).amplitude for sign in (step, -step))
         slopes[k] = (up - down) / (2.0 * scale[k])
     return float(np.sqrt(max(float(slopes @ covariance @ slopes), 0.0)))
 
@@ -80,16 +76,16 @@ def where_of(place: Place) -> dict[str, Any]:
 
 
 def detectable_of(
-    null: SimulatedGaussian, t: NDArray[np.float64], candidates: Sequence[Candidate], proposals: Sequence[Proposal]
+    null: SimulatedGaussian, t: NDArray[np.float64], candidates: Sequence[Candidate]
 ) -> list[dict[str, Any]]:
     """Smallest amplitude of every candidate that is found in nine cases of ten, root mean square over directions."""
     found = []
-    for candidate, proposal in zip(candidates, proposals, strict=True):
+    for candidate in candidates:
         size = detectable(null, t[:, list(candidate.columns)], len(candidates)).typical
         if np.isfinite(size):
             direction = np.zeros(len(candidate.columns))
             direction[0] = size
-            amplitude = proposal.with_parameters(direction, np.eye(len(direction))).amplitude
+            amplitude = candidate.with_coordinates(direction, np.eye(len(direction))).amplitude
             row = {"name": candidate.name, "channel": candidate.channel, "amplitude_90": abs(amplitude)}
             found.append({**row, "unit": candidate.unit, "settings": dict(candidate.settings)})
     return found
@@ -99,7 +95,6 @@ def verdict_of(
     case: str,
     found: Attribution,
     candidates: Sequence[Candidate],
-    proposals: Sequence[Proposal],
     where: Sequence[Place],
     shrink: tuple[Prediction, Shrink, str] | None,
     able: Sequence[Mapping[str, Any]],
@@ -107,8 +102,8 @@ def verdict_of(
     filtered: PartialExplanation | None = None,
 ) -> dict[str, Any]:
     """``verdict.json``, schema 1; ``heard`` goes with "unknown"."""
-    sets = [effects_of(explanation, candidates, proposals) for explanation in found.explanations]
-    nearest = proposals[found.nearest]
+    sets = [effects_of(explanation, candidates) for explanation in found.explanations]
+    nearest = candidates[found.nearest]
     result: dict[str, Any] = {
         "schema": SCHEMA,
         "case": case,
@@ -119,8 +114,8 @@ def verdict_of(
         "odds": [explanation.odds for explanation in found.explanations],
         "where": [where_of(place) for place in where[:PLACES]],
         "shrink": None,
-        "nearest": {"name": nearest.kind.name, "channel": nearest.channel, "cosine": found.cosine},
-        "heard": [] if filtered is None else effects_of(filtered, candidates, proposals),
+        "nearest": {"name": nearest.name, "channel": nearest.channel, "cosine": found.cosine},
+        "heard": [] if filtered is None else effects_of(filtered, candidates),
         "left": None if filtered is None else filtered.left,
         "detectable": list(able),
         "notes": list(notes),

@@ -1,13 +1,13 @@
-r"""What maps say against a model: the sky they share, what is left of them, and how that hangs on the sky and the scan.
+r"""Wiener-filter maps: the sky that they share, the residuals, and the residuals' correlation with sky and scan.
 
-With d_i the maps, P_i the believed response of map i (beam, pixel window, centroids) and N_i its white noise,
+With d_i the maps, P_i the fiducial response of map i (beam, pixel window, centroids) and N_i its white noise,
 
     s^ = (S^-1 + sum_i P_i^t N_i^-1 P_i)^-1 sum_i P_i^t N_i^-1 d_i,     r_i = N_i^-1 (d_i - P_i s^).
 
-The score of any small change dP_i of a response is <r_i, dP_i s^>: the sky of the *other* maps stands in for the sky,
-so that this is limited by noise where a single sky's spectra are limited by cosmic variance. A change of the beam,
-db_ls, acts as 2 Re[w_s db_ls ...] and its score is sum_l Re[conj(db_ls) D_s(l)]: one transform of w_s r for each
-order gives the score of every beam at once.
+The matched filter of any small change dP_i of a response is <r_i, dP_i s^>: the filtered sky of *all* maps stands in
+for the sky, so that noise limits it, not cosmic variance as for the spectra of a single sky. A change of the beam,
+db_ls, acts as 2 Re[w_s db_ls ...] and its matched filter is sum_l Re[conj(db_ls) D_s(l)]: one transform of w_s r for
+each order gives that of every beam.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,6 +19,7 @@ import healpy
 import numpy as np
 from numpy.typing import NDArray
 
+from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.errors import InputError
 from mcsim.instrument.scan import Moments
 from mcsim.simulation import convolve
@@ -30,23 +31,10 @@ from mcsim.sphere.sky import dipole_alm
 Map = NDArray[np.float64]
 Alm = NDArray[np.complex128]
 
-BEAM_ORDERS = 4
-"""Highest order of a beam that is listened for."""
-
-SPLIT_BEAM_ORDERS = 2
-"""Highest order for which every map of a channel is heard by itself; above it the first stands for their sum."""
-
-NOISE_FLOOR = 1e-3
-"""Least noise per pixel over the rms of the sky: what the model of a map is good to."""
-
-
-FILLINGS = 12
-"""Rounds in which pixels that the data lack are filled from the sky that the others show."""
-
 
 @dataclass(frozen=True)
 class Part:
-    """One map of the data: where it is in the survey, and its weights.
+    """Describe one map of the data: its place in the survey, and its weights.
 
     Attributes
     ----------
@@ -71,14 +59,14 @@ class Part:
 
 @dataclass(frozen=True)
 class Model:
-    """What listening needs of the believed survey.
+    """Describe the fiducial survey for the filter.
 
     Attributes
     ----------
     survey
-        Without effects, with moments up to the orders that are listened for.
+        Without effects, with moments up to the orders that are measured.
     lmax, nside
-        Degree up to which sky and scores are taken, and pixels.
+        Highest degree of the sky and the matched filters, and resolution of the maps.
     cl
         Spectrum of the sky, shape (lmax + 1,), uK^2.
     response
@@ -86,9 +74,11 @@ class Model:
     parts
         The maps in order.
     dipole
-        The dipole that the survey sees besides, coefficients up to lmax, uK.
+        Dipole that the survey sees besides, coefficients up to lmax, uK.
     sky_power
         Of s^, E|s^_lm|^2 / C_l = C_l / (C_l + N_l) in the isotropic approximation, shape (lmax + 1,).
+    settings
+        Of the diagnosis.
     """
 
     survey: Survey
@@ -99,15 +89,16 @@ class Model:
     parts: tuple[Part, ...]
     dipole: Alm
     sky_power: NDArray[np.float64]
+    settings: DiagnosisSettings
 
     def of(self, channel: int) -> tuple[int, ...]:
-        """Indices of the channel's maps."""
+        """Return the indices of the channel's maps."""
         return tuple(i for i, part in enumerate(self.parts) if part.channel == channel)
 
 
 @dataclass(frozen=True)
 class FilteredMaps:
-    """What one set of maps says.
+    """Hold one set of maps after the filter.
 
     Attributes
     ----------
@@ -120,8 +111,8 @@ class FilteredMaps:
     adjoint
         Spin-0 adjoint synthesis of every r_i, shape (map, size).
     orders
-        D_s(l) of every map, shape (map, ORDERS + 1, lmax + 1), complex; s = 0 is real. The sky in it has the dipole.
-        Above SPLIT_ORDERS the channel's sum stands in its first map.
+        D_s(l) of every map, shape (map, beam_orders + 1, lmax + 1), complex; s = 0 is real. The sky in it has the
+        dipole. Above split_beam_orders the channel's sum stands in its first map.
     """
 
     sky: Alm
@@ -131,8 +122,8 @@ class FilteredMaps:
     orders: NDArray[np.complex128]
 
 
-def model_of(survey: Survey) -> Model:
-    """What is believed of the maps, ready to listen with.
+def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
+    """Prepare a survey for the filter.
 
     Raises
     ------
@@ -154,7 +145,7 @@ def model_of(survey: Survey) -> Model:
                 'the map by a scan of kind "hit_averaged" or "moments".'
             )
         power = np.sum((2 * np.arange(lmax + 1) + 1) / (4 * np.pi) * cl * response[index] ** 2)
-        floor = NOISE_FLOOR * float(np.sqrt(power))
+        floor = settings.noise_floor * float(np.sqrt(power))
         for m in channel.maps:
             seen = m.moments.hits > 0
             if m.weight is not None:
@@ -166,7 +157,7 @@ def model_of(survey: Survey) -> Model:
     gain = sum(response[part.channel] ** 2 / part.noise_power for part in parts)
     sky_power = cl * gain / (1.0 + cl * gain)
     dipole = dipole_alm(survey.channels[0].site.dipole_uk, lmax)
-    return Model(survey, lmax, nside, cl, response, tuple(parts), dipole, sky_power)
+    return Model(survey, lmax, nside, cl, response, tuple(parts), dipole, sky_power, settings)
 
 
 def _response(channel: Channel, lmax: int) -> NDArray[np.float64]:
@@ -175,7 +166,7 @@ def _response(channel: Channel, lmax: int) -> NDArray[np.float64]:
 
 
 def wiener_filter(model: Model, maps: Sequence[Map], nthreads: int = 1) -> FilteredMaps:
-    """Sky, residuals and scores of a set of maps.
+    """Filter a set of maps.
 
     Parameters
     ----------
@@ -186,14 +177,14 @@ def wiener_filter(model: Model, maps: Sequence[Map], nthreads: int = 1) -> Filte
     nthreads
         Threads of the transforms.
     """
-    lmax, nside = model.lmax, model.nside
+    lmax, nside, top = model.lmax, model.nside, model.settings.beam_orders
     clean, seen = _clean(model, maps, nthreads)
     sky = _sky(model, clean, nthreads)
     looked_at = sky + model.dipole
     geometry = healpix.geometry(nside)
     expected = np.empty((len(model.parts), seen[0].size))
     residual, adjoint = np.empty_like(expected), np.empty((len(model.parts), sky.size), dtype=np.complex128)
-    orders = np.zeros((len(model.parts), BEAM_ORDERS + 1, lmax + 1), dtype=np.complex128)
+    orders = np.zeros((len(model.parts), top + 1, lmax + 1), dtype=np.complex128)
     k = np.sqrt(4 * np.pi / (2 * np.arange(lmax + 1) + 1))
     made = convolve.CircularMaps(nside, lmax, nthreads)
     for channel in range(len(model.response)):
@@ -224,16 +215,16 @@ def wiener_filter(model: Model, maps: Sequence[Map], nthreads: int = 1) -> Filte
     return FilteredMaps(sky, expected, residual, adjoint, orders)
 
 
-def show(model: Model, maps: Sequence[Map], nthreads: int = 1) -> Alm:
-    """The sky that a set of maps shows, s^ up to the model's lmax, uK."""
+def shared_sky(model: Model, maps: Sequence[Map], nthreads: int = 1) -> Alm:
+    """Return the filtered sky s^ of a set of maps, up to the model's lmax, uK."""
     return _sky(model, _clean(model, maps, nthreads)[0], nthreads)
 
 
 def _clean(model: Model, maps: Sequence[Map], nthreads: int) -> tuple[list[Map], list[NDArray[np.bool_]]]:
-    """Maps with zeros where nothing is believed to be observed, and where something was.
+    """Return maps with zeros in pixels that the fiducial scan does not hit, and where something was observed.
 
-    Pixels that the data lack and the simulations do not are filled with what the shared sky says of them: zeros there
-    would be a gap of their own.
+    Pixels that the data lack and the simulations have are filled with the filtered sky: zeros would be a departure of
+    their own.
     """
     seen = [
         (part.precision > 0) & (map_ != healpy.UNSEEN) & np.isfinite(map_)
@@ -245,7 +236,7 @@ def _clean(model: Model, maps: Sequence[Map], nthreads: int) -> tuple[list[Map],
         for i, (part, observed) in enumerate(zip(model.parts, seen, strict=True))
         if np.any((part.precision > 0) & ~observed)
     }
-    for _ in range(FILLINGS if holes else 0):
+    for _ in range(model.settings.hole_iterations if holes else 0):
         sky = _sky(model, clean, nthreads)
         for i, hole in holes.items():
             through = alm_.multiply(sky, model.response[model.parts[i].channel], model.lmax)
@@ -267,17 +258,17 @@ def _sky(model: Model, clean: Sequence[Map], nthreads: int) -> Alm:
 
 
 def _transforms(model: Model, members: tuple[int, ...]) -> Iterator[tuple[int, int, tuple[int, ...]]]:
-    """Map in whose place a transform is kept, its order, and the maps that it adds up."""
-    for s in range(1, BEAM_ORDERS + 1):
+    """Yield the map in whose place a transform is kept, its order, and the maps that it adds up."""
+    for s in range(1, model.settings.beam_orders + 1):
         filtered = tuple(i for i in members if model.parts[i].moments.smax >= s)
-        if s <= SPLIT_BEAM_ORDERS:
+        if s <= model.settings.split_beam_orders:
             yield from ((i, s, (i,)) for i in filtered)
         elif filtered:
             yield filtered[0], s, filtered
 
 
 def by_degree(a: Alm, b: Alm, lmax: int) -> NDArray[np.float64]:
-    """Sum over all m of a_lm conj(b_lm) for two real fields, shape (lmax + 1,)."""
+    """Return the sum over all m of a_lm conj(b_lm) for two real fields, shape (lmax + 1,)."""
     product = a.real * b.real + a.imag * b.imag
     product[lmax + 1 :] *= 2.0
     return np.asarray(np.bincount(alm_.degrees(lmax), weights=product, minlength=lmax + 1), dtype=np.float64)

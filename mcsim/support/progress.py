@@ -20,6 +20,9 @@ class Reporter(Protocol):
     def __call__(self, finished: float, failed: int = 0) -> None:
         """``finished`` units are done, ``failed`` of them in vain."""
 
+    def expect(self, more: float) -> None:
+        """Add ``more`` units to the total."""
+
 
 @contextmanager
 def reporting(label: str, total: float, unit: str, quiet: bool = False, every_s: float = 60.0) -> Iterator[Reporter]:
@@ -30,7 +33,7 @@ def reporting(label: str, total: float, unit: str, quiet: bool = False, every_s:
     label, unit
         What is done, and what is counted.
     total
-        Number of units.
+        Number of units; 0 if :meth:`Reporter.expect` says later how many there are.
     quiet
         Report nothing.
     every_s
@@ -50,7 +53,9 @@ def reporting(label: str, total: float, unit: str, quiet: bool = False, every_s:
         with Progress(*columns, console=console) as bar:
             yield _Bar(bar, label, total, unit)
     else:
-        yield _Lines(console, label, total, unit, every_s)
+        lines = _Lines(console, label, total, unit, every_s)
+        yield lines
+        lines.close()
 
 
 @dataclass(frozen=True)
@@ -72,6 +77,9 @@ class Journal:
 
 class _Silent:
     def __call__(self, finished: float, failed: int = 0) -> None:
+        pass
+
+    def expect(self, more: float) -> None:
         pass
 
 
@@ -99,18 +107,32 @@ class _Bar:
     def __call__(self, finished: float, failed: int = 0) -> None:
         self.bar.update(self.task, completed=finished, rate=self.rate.text(finished, failed))
 
+    def expect(self, more: float) -> None:
+        self.rate.total += more
+        self.bar.update(self.task, total=self.rate.total)
+
 
 class _Lines:
     def __init__(self, console: Console, label: str, total: float, unit: str, every_s: float) -> None:
-        self.console, self.label, self.total, self.unit, self.every_s = console, label, total, unit, every_s
-        self.rate, self.last = _Rate(total, unit), time.monotonic()
+        self.console, self.label, self.unit, self.every_s, self.grows = console, label, unit, every_s, total == 0.0
+        self.rate, self.last, self.state = _Rate(total, unit), time.monotonic(), (0.0, 0)
 
     def __call__(self, finished: float, failed: int = 0) -> None:
-        now = time.monotonic()
-        if now - self.last < self.every_s and finished < self.total:
-            return
-        self.last = now
-        share = f"{finished:g}/{self.total:g} {self.unit}" if self.unit else f"{100 * finished / self.total:.0f} %"
+        now, self.state = time.monotonic(), (finished, failed)
+        if now - self.last >= self.every_s or (finished >= self.rate.total and not self.grows):
+            self.last = now
+            self._print(finished, failed)
+
+    def expect(self, more: float) -> None:
+        self.rate.total += more
+
+    def close(self) -> None:
+        if self.grows and self.rate.total:
+            self._print(*self.state)
+
+    def _print(self, finished: float, failed: int) -> None:
+        total = self.rate.total
+        share = f"{finished:g}/{total:g} {self.unit}" if self.unit else f"{100 * finished / total:.0f} %"
         speed, left = self.rate.text(finished, failed), self.rate.left_s(finished)
         parts = [share, speed, f"{left:.0f} s left" if 0 < left < float("inf") else ""]
         self.console.print(

@@ -145,7 +145,7 @@ class Effect:
     step: ClassVar[float]
     matched_filter: ClassVar[bool] = True
     sign: ClassVar[Literal[-1, 0, 1]] = 0
-    draws: ClassVar[bool] = False
+    stochastic: ClassVar[bool] = False
     mean_response: ClassVar[bool] = False
     max_amplitude: ClassVar[float] = np.inf
     variants: ClassVar[tuple[Mapping[str, Any], ...]] = ({},)

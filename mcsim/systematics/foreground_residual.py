@@ -52,7 +52,7 @@ class ForegroundResidual(Effect):
     source = "Bennett et al. 2013, ApJS 208, 20, Sec. 5 (residuals of cleaned bands); the morphology is a model"
     step = 5.0
     matched_filter = False
-    draws = True
+    stochastic = True
 
     spectral_index: float = 2.0
     template: str = ""

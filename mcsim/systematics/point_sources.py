@@ -30,7 +30,7 @@ class PointSources(Effect):
     source = "Tegmark & Efstathiou 1996, MNRAS 281, 1297; Wright et al. 2009, ApJS 180, 283"
     step = 1e-4
     matched_filter = False
-    draws = True
+    stochastic = True
     mean_response = True
     sign = -1
 

@@ -10,13 +10,13 @@ from scipy.stats import kstest
 
 import mcsim
 from mcsim import config, systematics
-from mcsim.diagnosis import knowledge
+from mcsim.diagnosis import campaign
 from mcsim.diagnosis.analysis import analysis_of, data_vectors
-from mcsim.diagnosis.inference import context, diagnose_maps
-from mcsim.diagnosis.knowledge import with_effects
-from mcsim.diagnosis.observed_maps import read_maps
-from mcsim.diagnosis.refine import significant_templates
-from mcsim.diagnosis.wiener_filter import show
+from mcsim.diagnosis.campaign import with_effects
+from mcsim.diagnosis.context import context
+from mcsim.diagnosis.inference import diagnose_data
+from mcsim.diagnosis.observed_maps import ObservedMaps, read_maps
+from mcsim.diagnosis.wiener_filter import shared_sky
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
@@ -50,8 +50,8 @@ def ask(jobs):
 def small():
     run = config.load(MODEL)
     analysis = analysis_of(run, without=[name for name in systematics.catalogue() if name not in PROPOSED])
-    plan = knowledge.plan(run, analysis, simulations=260, time_ordered=False)
-    return context(run, analysis, knowledge.learned(analysis, plan, ask(plan.jobs)))
+    plan = campaign.plan(run, analysis, simulations=260, time_ordered=False)
+    return context(run, analysis, *campaign.learned(analysis, plan, ask(plan.jobs)))
 
 
 def data_of(run, name=None, channel=None, seed=77, **parameters):
@@ -67,19 +67,19 @@ def test_both_folds_hear_every_range_of_the_sky(small):
     # The numbers are of different degrees, so that their noise, the sky itself, is independent.
     rows = {element.name: row for row, element in enumerate(small.analysis.elements)}
     for element in sky[: len(even)]:
-        pair = small.known.simulations[:, [rows[element.name], rows[element.name.replace("even", "odd")]]]
+        pair = small.ensemble.simulations[:, [rows[element.name], rows[element.name.replace("even", "odd")]]]
         assert abs(np.corrcoef(pair.T)[0, 1]) < 4.0 / np.sqrt(len(pair))
 
 
 def test_no_gap_where_there_is_none(small):
     shared = data_of(small.run)
-    groups = small.null.whiten_groups(significant_templates(small.known), [c.columns for c in small.candidates])
+    groups = small.null.whiten_groups(small.templates, [c.columns for c in small.candidates])
     skies = [list(simulate.maps(shared, r)) for r in range(40)]
-    p = [global_test(small.null, small.analysis.answer(maps), groups, small.calibration).pvalue for maps in skies]
+    p = [global_test(small.null, small.analysis.data_vector(maps), groups, small.calibration).pvalue for maps in skies]
     # 40 draws of a uniform number: 7 or more below 0.05 once in 300 cases; and Kolmogorov-Smirnov.
     assert np.sum(np.array(p) <= 0.05) < 7
     assert kstest(p, "uniform").pvalue > 1e-3
-    found = diagnose_maps(small, "null", skies[int(np.argsort(p)[20])], ask)
+    found = diagnose_data(ObservedMaps(small, skies[int(np.argsort(p)[20])], ask), "null")
     assert found.verdict["verdict"] == "none"
     assert found.verdict["effects"] == []
 
@@ -88,7 +88,7 @@ def test_ellipticity_seen_sample_by_sample_is_named_and_shrinks(small):
     truth = 0.25
     shared = data_of(small.run, "beam_ellipticity", "W1", amplitude=truth, angle_deg=20.0)
     maps = [map_uk for _, map_uk in sampled.maps(shared, 0)]
-    found = diagnose_maps(small, "ellipse", maps, ask)
+    found = diagnose_data(ObservedMaps(small, maps, ask), "ellipse")
     verdict = found.verdict
     assert verdict["gap"]["p_value"] < 1e-3
     best = verdict["effects"][0]
@@ -107,7 +107,7 @@ def test_a_broken_simulator_shrinks_nothing(small):
         analysis.append(jobs)
         return ask(jobs)
 
-    works = diagnose_maps(small, "works", maps, working).verdict
+    works = diagnose_data(ObservedMaps(small, maps, working), "works").verdict
     # The last simulations are those of the shrink: the effect at its frozen amplitude.
     last = analysis[-1]
     assert config.from_json(last[0].simulated).effects
@@ -118,7 +118,7 @@ def test_a_broken_simulator_shrinks_nothing(small):
         quiet = replace(config.from_json(jobs[0].simulated), effects=())
         return ask([replace(job, simulated=config.to_json(quiet)) for job in jobs])
 
-    breaks = diagnose_maps(small, "breaks", maps, broken).verdict
+    breaks = diagnose_data(ObservedMaps(small, maps, broken), "breaks").verdict
     assert works["effects"] == breaks["effects"]
     assert works["shrink"]["achieved"] > 0.5
     assert abs(breaks["shrink"]["achieved"]) < 1e-6
@@ -133,7 +133,7 @@ def test_an_amplitude_that_cannot_be_simulated_is_no_explanation(small):
             raise InputError("no such amplitude")
         return ask(jobs)
 
-    found = diagnose_maps(small, "refused", maps, refusing).verdict
+    found = diagnose_data(ObservedMaps(small, maps, refusing), "refused").verdict
     assert ("beam_ellipticity", "W1") not in [(effect["name"], effect["channel"]) for effect in found["effects"]]
 
 
@@ -145,7 +145,7 @@ def test_no_shrink_is_said_of_what_cannot_be_simulated_again(small):
         simulated.append(jobs[0].simulated)
         return ask(jobs)
 
-    works = diagnose_maps(small, "works", maps, remembering).verdict
+    works = diagnose_data(ObservedMaps(small, maps, remembering), "works").verdict
     last = simulated[-1]
 
     def refusing(jobs):
@@ -153,7 +153,7 @@ def test_no_shrink_is_said_of_what_cannot_be_simulated_again(small):
             raise InputError("no such amplitude")
         return ask(jobs)
 
-    found = diagnose_maps(small, "refused", maps, refusing).verdict
+    found = diagnose_data(ObservedMaps(small, maps, refusing), "refused").verdict
     assert found["effects"] == works["effects"]
     assert works["shrink"] is not None
     assert found["shrink"] is None
@@ -164,7 +164,7 @@ def test_pixels_that_the_data_lack_are_no_gap(small):
     holed = [map_uk.copy() for map_uk in maps]
     for number, map_uk in enumerate(holed):
         map_uk[100 + 31 * number :: 150] = healpy.UNSEEN  # 20 of 3072
-    whole, lacking = (float(y @ y) for y in (small.null.whiten(small.analysis.answer(m)) for m in (maps, holed)))
+    whole, lacking = (float(y @ y) for y in (small.null.whiten(small.analysis.data_vector(m)) for m in (maps, holed)))
     # Zeros there would make chi^2 fall out of its distribution by tens of its width, sqrt(2 p).
     assert abs(lacking - whole) < np.sqrt(2 * small.null.dimension)
 
@@ -185,7 +185,7 @@ def test_nothing_is_asked_that_has_no_answer(kind, tmp_path):
             channels=tuple(replace(channel, scan=still) for channel in run.channels),
         )
     analysis = analysis_of(run)
-    answers = data_vectors(knowledge.plan(run, analysis, simulations=4, time_ordered=False).jobs[0])[
+    answers = data_vectors(campaign.plan(run, analysis, simulations=4, time_ordered=False).jobs[0])[
         :, : len(analysis.elements)
     ]
     dead = [
@@ -203,7 +203,7 @@ def test_orders_are_proposed_where_a_run_leaves_some_out(small):
     for beam, expected in ((cut, ["beam_noncircularity (V1)"]), (whole, [])):
         run = replace(small.run, channels=(replace(small.run.channels[0], beam=beam), small.run.channels[1]))
         analysis = analysis_of(run, without=[name for name in systematics.catalogue() if name != "beam_noncircularity"])
-        assert [proposal.label for proposal in analysis.proposals] == expected
+        assert [candidate.label for candidate in analysis.candidates] == expected
 
 
 def test_what_cannot_be_done_is_said_before_anything_is_learned(small, folder):
@@ -225,7 +225,7 @@ def test_exchanged_channels_are_noticed(small):
         channels=(small.run.channels[0], replace(small.run.channels[1], beam=config.BeamGaussian(fwhm_arcmin=500.0))),
     )
     maps = list(simulate.maps(data_of(run), 0))
-    found = diagnose_maps(small, "wide", maps, ask).verdict
+    found = diagnose_data(ObservedMaps(small, maps, ask), "wide").verdict
     # No effect of this library widens a beam: whatever is said, it is no single confident name.
     assert found["verdict"] in ("unknown", "mixture", "degenerate")
 
@@ -285,7 +285,7 @@ def test_a_missing_file_is_named(small, folder):
 
 
 def test_the_verdict_is_json_and_the_evidence_opens(small, tmp_path):
-    found = diagnose_maps(small, "saved", list(simulate.maps(data_of(small.run), 0)), ask)
+    found = diagnose_data(ObservedMaps(small, list(simulate.maps(data_of(small.run), 0)), ask), "saved")
     found.save(tmp_path / "out")
     assert json.loads((tmp_path / "out" / "verdict.json").read_text())["schema"] == 1
 
@@ -295,12 +295,12 @@ def test_responses_on_the_observed_sky_have_the_mean_of_those_on_any(small):
     analysis, run = small.analysis, small.run
     effect = config.Effect(name="beam_ellipticity", channel="W1", parameters={"amplitude": 0.1})
     members = next(c.columns for c in small.candidates if c.identity == ("beam_ellipticity", "W1"))
-    expected = small.null.whiten_templates(small.known.templates[:, members[:1]] * 0.1)[:, 0]
+    expected = small.null.whiten_templates(small.bank.matrix[:, members[:1]] * 0.1)[:, 0]
     ratios = []
     for realization in range(12):
-        observed = show(analysis.model, list(simulate.maps(data_of(run, seed=5), realization)))
-        after = np.concatenate(ask(knowledge.constrained_jobs(run, analysis, [effect], observed)))
-        before = np.concatenate(ask(knowledge.constrained_jobs(run, analysis, [], observed)))
+        observed = shared_sky(analysis.model, list(simulate.maps(data_of(run, seed=5), realization)))
+        after = np.concatenate(ask(campaign.constrained_jobs(run, analysis, [effect], observed, range(8))))
+        before = np.concatenate(ask(campaign.constrained_jobs(run, analysis, [], observed, range(8))))
         response = small.null.whiten_templates(np.mean(after - before, axis=0)[:, None])[:, 0]
         ratios.append(response @ expected / (expected @ expected))
     scatter = np.std(ratios, ddof=1) / np.sqrt(len(ratios))

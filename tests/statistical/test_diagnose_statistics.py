@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from scipy.linalg import solve_triangular
 
-from mcsim.diagnosis.validation import achieved, carried, excess, predicted
+from mcsim.diagnosis.validation import SharedDraw, achieved, carried, excess, predicted
 from mcsim.stats.detection import confusion, detectable, posterior, power, snr_needed, snr_to_separate
 from mcsim.stats.gaussian import SimulatedGaussian, nested_pvalue, residual_pvalue
 from mcsim.stats.look_elsewhere import calibrate, global_test, scan_pvalues
@@ -258,9 +258,7 @@ def test_forecast_drop_of_what_draws_is_the_drop():
             x[fitted:],
             t[fitted:, None],
             noise,
-            seen,
-            drawn[:, fitted:].sum(axis=1),
-            drawn[:, :fitted].sum(axis=1),
+            SharedDraw(seen, drawn[:, fitted:].sum(axis=1), drawn[:, :fitted].sum(axis=1)),
         )
         shrink = achieved(before, after, x[fitted:])
         differences.append(shrink.before.value - shrink.after.value - forecast.delta_chi2.value)

@@ -18,10 +18,13 @@ from mcsim.benchmark.record import Geometry, Record
 from mcsim.benchmark.reduced import without
 from mcsim.benchmark.report import lines, write
 from mcsim.benchmark.truth import MAPS, SEAL, Member, Truth, finished_cases, key_path, open_key, sealed, write_whole
-from mcsim.diagnosis.analysis import Analysis, Proposal
-from mcsim.diagnosis.inference import context
-from mcsim.diagnosis.knowledge import Knowledge
+from mcsim.diagnosis.analysis import Analysis
+from mcsim.diagnosis.candidate import Candidate, numbered
+from mcsim.diagnosis.context import context
+from mcsim.diagnosis.null_ensemble import NullEnsemble
+from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Block, Element
+from mcsim.diagnosis.templates import TemplateBank
 from mcsim.errors import InputError
 
 ENTRIES = 24
@@ -30,10 +33,8 @@ ENTRIES = 24
 def toy(names, simulations=800, seed=1, common=0.0):
     """A court of effects with random templates, alike in both folds, and unit noise; ``common``: their cosine."""
     rng = np.random.default_rng(seed)
-    proposals = []
-    for name, channel in names:
-        kind = systematics.get(name)
-        proposals.append(Proposal(kind, channel, {}, kind.basis()))
+    kinds = [(systematics.get(name), channel) for name, channel in names]
+    proposals = numbered([Candidate(kind, channel, tuple(range(len(kind.basis())))) for kind, channel in kinds])
     columns = sum(len(proposal.basis) for proposal in proposals)
     directions = np.linalg.qr(rng.standard_normal((ENTRIES // 2, columns)))[0]
     directions = np.sqrt(1.0 - common) * directions + np.sqrt(common) * directions[:, :1]
@@ -49,17 +50,13 @@ def toy(names, simulations=800, seed=1, common=0.0):
         rows.append(row)
     t = np.concatenate(rows)
     p = len(t)
-    known = Knowledge(
-        rng.standard_normal((simulations, p)),
-        np.zeros(p),
-        t,
-        np.zeros_like(t),
-        np.zeros_like(t),
-        np.zeros((24, p)),
-        np.zeros((0, 0)),
-        tuple(element for block in blocks for element in block.elements),
+    described = tuple(element for block in blocks for element in block.elements)
+    ensemble = NullEnsemble(
+        rng.standard_normal((simulations, p)), np.zeros(p), described, np.zeros((24, p)), np.zeros((0, 0))
     )
-    return context(None, Analysis(SimpleNamespace(lmax=128), tuple(proposals), tuple(blocks)), known)
+    model = SimpleNamespace(lmax=128, settings=DiagnosisSettings())
+    bank = TemplateBank(t, np.zeros_like(t), np.zeros_like(t))
+    return context(None, Analysis(model, proposals, tuple(blocks)), ensemble, bank)
 
 
 NAMES = (("beam_width", "A"), ("noise_level", "A"), ("beam_ellipticity", "A"), ("beam_width", "B"), ("spectrum", None))
@@ -137,12 +134,12 @@ def test_what_is_left_out_rotates(learned_model):
 def test_what_nature_has_too_little_of_is_not_drawn(learned_model, monkeypatch):
     sampler = sampler_of(bench(learned_model), Prior())
     name = sampler.names()[0]
-    kind = next(one.kind for one in sampler.proposals if one.kind.name == name)
+    kind = next(one.effect for one in sampler.proposals if one.name == name)
     strongest = max(
         sampler.white_length(sampler.templates[:, column])
         for proposal, columns in zip(sampler.proposals, sampler.columns, strict=True)
         for column in columns
-        if proposal.kind is kind
+        if proposal.effect is kind
     )
     monkeypatch.setattr(kind, "max_amplitude", 1.01 * sampler.prior.weakest / strongest)
     assert name in sampler.names()
@@ -158,7 +155,7 @@ def test_strengths_are_the_drawn_ones(learned_model):
         (found,) = sampler.draw(kinds, 1, case).members
         assert 3.0 * (1 - 1e-6) < found.strength < 20.0 * (1 + 1e-6)
         columns = list(learned_model.candidates[found.candidate].columns)
-        length = np.linalg.norm(learned_model.known.templates[:, columns] @ found.coordinates)
+        length = np.linalg.norm(learned_model.bank.matrix[:, columns] @ found.coordinates)
         assert length == pytest.approx(found.strength, rel=0.15)
 
 
@@ -270,21 +267,21 @@ def test_pairs_have_the_evidence_of_brute_force():
 
 
 def test_an_effect_leaves_its_columns_and_entries_only(learned_model):
-    fewer = without(learned_model.analysis, learned_model.known, ["beam_width"])
-    assert [proposal.kind.name for proposal in fewer.analysis.proposals] == ["noise_level", "beam_ellipticity"]
+    fewer = without(learned_model.analysis, learned_model.ensemble, learned_model.bank, ["beam_width"])
+    assert [candidate.name for candidate in fewer.analysis.candidates] == ["noise_level", "beam_ellipticity"]
     assert fewer.analysis.without == ("beam_width",)
-    names = [element.name for element in fewer.known.elements]
+    names = [element.name for element in fewer.ensemble.elements]
     assert names == [element.name for element in fewer.analysis.elements]
-    assert sorted({e.name for e in learned_model.known.elements} - set(names)) == [
+    assert sorted({e.name for e in learned_model.ensemble.elements} - set(names)) == [
         "score/beam_width (A)/0",
         "score/beam_width (B)/0",
     ]
-    for proposal, columns in zip(fewer.analysis.proposals, fewer.analysis.columns, strict=True):
-        index = learned_model.analysis.proposals.index(proposal)
-        full = learned_model.known.templates[np.ix_(fewer.rows, learned_model.analysis.columns[index])]
-        np.testing.assert_array_equal(fewer.known.templates[:, columns], full)
-    same = without(learned_model.analysis, learned_model.known, [])
-    assert same.known.templates.shape == learned_model.known.templates.shape
+    before = {candidate.label: candidate.columns for candidate in learned_model.analysis.candidates}
+    for candidate in fewer.analysis.candidates:
+        full = learned_model.bank.matrix[np.ix_(fewer.rows, before[candidate.label])]
+        np.testing.assert_array_equal(fewer.bank.matrix[:, candidate.columns], full)
+    same = without(learned_model.analysis, learned_model.ensemble, learned_model.bank, [])
+    assert same.bank.matrix.shape == learned_model.bank.matrix.shape
 
 
 # Figures

@@ -1,15 +1,14 @@
 """Responses at the amplitudes that were found: bent ones, and two that change each other's."""
 
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from mcsim.diagnosis.analysis import Proposal
 from mcsim.diagnosis.candidate import Candidate
-from mcsim.diagnosis.refine import refine
+from mcsim.diagnosis.refine import Refiner
 from mcsim.diagnosis.selection import attribute
+from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate
 from mcsim.systematics import Effect
@@ -37,10 +36,9 @@ class Instrument:
         self.t, self.sideways = directions[:3].T, directions[3:]
         self.bend, self.cross = bend, cross
         self.null = SimulatedGaussian.from_simulations(rng.normal(size=(900, P)))
-        self.candidates = [Candidate("push", name, (k,)) for k, name in enumerate("ABC")]
-        self.proposals = [Proposal(Push, name, {}, (Push(amplitude=1.0),)) for name in "ABC"]
+        self.candidates = [Candidate(Push, name, (k,)) for k, name in enumerate("ABC")]
         self.calibration = calibrate(self.null, self.null.whiten_groups(self.t, [(0,), (1,), (2,)]))
-        self.known = SimpleNamespace(curvature=np.outer(bend * self.sideways[0], [1.0, 0.0, 0.0]))
+        self.curvature = np.outer(bend * self.sideways[0], [1.0, 0.0, 0.0])
         self.analysis: list[dict[str | None, float]] = []
 
     def response(self, a: float, b: float) -> np.ndarray:
@@ -52,8 +50,9 @@ class Instrument:
         return np.tile(self.response(amplitudes.get("A", 0.0), amplitudes.get("B", 0.0)), (skies, 1))
 
     def refined(self, x: np.ndarray):
-        rest = (self.candidates, self.proposals, self.calibration, self.respond)
-        return refine(self.known, self.null, x, self.t, *rest)
+        settings = DiagnosisSettings()
+        refiner = Refiner(self.null, x, self.calibration, self.curvature, self.respond, settings)
+        return refiner.run(self.t, self.candidates)
 
 
 @pytest.mark.parametrize("amplitude", [15.0, -15.0])
@@ -94,7 +93,7 @@ def test_amplitudes_that_run_away_are_not_heard():
     x = instrument.t[:, :2] @ [14.0, 12.0] + 10.0 * instrument.sideways[1]
     found = instrument.refined(x)
     assert found.attribution.verdict == "unknown"
-    assert [instrument.candidates[member].channel for member in found.filtered.members] == ["B"]
+    assert [instrument.candidates[member].channel for member in found.partial.members] == ["B"]
 
 
 def test_what_data_tell_nothing_of_is_neither_heard_nor_simulated(monkeypatch):
@@ -104,5 +103,5 @@ def test_what_data_tell_nothing_of_is_neither_heard_nor_simulated(monkeypatch):
     monkeypatch.setattr(Push, "constrained", classmethod(lambda cls, coordinates, precision: 0.0 * coordinates))
     found = instrument.refined(x)
     assert found.attribution.verdict == "unknown"
-    assert found.filtered is None
+    assert found.partial is None
     assert instrument.analysis == []

@@ -15,16 +15,16 @@ from scipy import stats
 from mcsim import config, systematics
 from mcsim.diagnosis import figures as plots
 from mcsim.diagnosis import inference, report, report_arrays
-from mcsim.diagnosis.analysis import Proposal
-from mcsim.diagnosis.candidate import Candidate
+from mcsim.diagnosis.candidate import Candidate, numbered
 from mcsim.diagnosis.inference import Diagnosis
+from mcsim.diagnosis.places import Place
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.selection import attribute
+from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Element
 from mcsim.diagnosis.validation import Measured, Prediction, Shrink
 from mcsim.diagnosis.verdict import detectable_of, effects_of, verdict_of
 from mcsim.diagnosis.view import ReportView, entry_words
-from mcsim.diagnosis.where import Place
 from mcsim.stats.detection import confusion, snr_needed
 from mcsim.stats.gaussian import SimulatedGaussian, residual_pvalue
 from mcsim.stats.look_elsewhere import calibrate
@@ -52,9 +52,10 @@ def elements() -> list[Element]:
     return [*found, Element("mine/&<b>", "other", ("V",)), Element("square/V", "map", ("V",))]
 
 
-def proposals() -> list[Proposal]:
+def proposals() -> tuple[Candidate, ...]:
     chosen = (("beam_ellipticity", EVIL), ("pointing_offset", "V"), ("point_sources", None))
-    return [Proposal(systematics.get(name), channel, {}, systematics.get(name).basis()) for name, channel in chosen]
+    kinds = [(systematics.get(name), channel) for name, channel in chosen]
+    return numbered([Candidate(kind, channel, tuple(range(len(kind.basis())))) for kind, channel in kinds])
 
 
 def templates(nearest_candidates: bool) -> np.ndarray:
@@ -90,32 +91,28 @@ def diagnoses() -> dict[str, Diagnosis]:
 @lru_cache
 def bench(nearest_candidates: bool) -> SimpleNamespace:
     """What the five cases have in common."""
-    proposed, t = proposals(), RESPONSE * templates(nearest_candidates)
+    candidates, t = proposals(), RESPONSE * templates(nearest_candidates)
     simulations = np.random.default_rng(10).normal(size=(N, P))
     model = SimulatedGaussian.from_simulations(simulations)
-    columns = np.split(np.arange(t.shape[1]), np.cumsum([len(one.basis) for one in proposed])[:-1])
-    candidates = tuple(
-        Candidate(one.kind.name, one.channel, tuple(int(c) for c in own), unit=one.kind.unit)
-        for one, own in zip(proposed, columns, strict=True)
-    )
     return SimpleNamespace(
         run=replace(config.load(resources.workflow("quickstart")), name=EVIL),
-        analysis=SimpleNamespace(elements=elements(), proposals=proposed),
-        known=SimpleNamespace(simulations=simulations),
+        analysis=SimpleNamespace(elements=elements()),
+        settings=DiagnosisSettings(),
+        ensemble=SimpleNamespace(simulations=simulations),
         null=model,
         candidates=candidates,
         calibration=calibrate(
             model, model.whiten_groups(t, [candidate.columns for candidate in candidates]), draws=2000
         ),
         templates=t,
-        detectable=detectable_of(model, t, candidates, proposed),
+        detectable=detectable_of(model, t, candidates),
     )
 
 
 def diagnosis(kind: str) -> Diagnosis:
     """Through the code that makes the evidence, on constructed simulations and data."""
     context = bench(kind == "degenerate")
-    t, proposed, rng = context.templates, context.analysis.proposals, np.random.default_rng(11)
+    t, rng = context.templates, np.random.default_rng(11)
     x = sum((value * t[:, k] for k, value in SIGNALS[kind].items()), rng.normal(size=P))
     if kind == "unknown":
         strange = rng.normal(size=P)
@@ -131,11 +128,11 @@ def diagnosis(kind: str) -> Diagnosis:
         )
     notes = ["a <b>note</b> & so"]
     name = f"case <i>{kind}</i>"
-    verdict = verdict_of(name, found, context.candidates, proposed, where, shrink, context.detectable, notes)
+    verdict = verdict_of(name, found, context.candidates, where, shrink, context.detectable, notes)
     survey = SimpleNamespace(config=SimpleNamespace(map=SimpleNamespace(frame="ecliptic")))
     fiducial = SimpleNamespace(survey=survey, parts=[SimpleNamespace(name=name) for name in (EVIL, "V")])
     shown = report_arrays.report_arrays(
-        fiducial, [], context.known.simulations, context.null, found, context.candidates, proposed
+        fiducial, [], context.ensemble.simulations, context.null, found, context.candidates
     )
     evidence = inference.dataset(context, x, Refined(found, t, (), ()), where, verdict)
     return Diagnosis(verdict, evidence.merge(shown, combine_attrs="no_conflicts"), found)
@@ -370,8 +367,7 @@ def test_an_amplitude_at_the_edge_of_the_possible_has_an_error():
     errors = np.array([0.2, 0.02, 0.02, 0.02, 0.02, 0.02])
     less_than_nothing = SimpleNamespace(amplitudes=np.array([-1.1, 0, 0, 0, 0, 0]), covariance=np.diag(errors**2))
     explanation = SimpleNamespace(members=(0,), fit=less_than_nothing)
-    proposal = Proposal(kind, None, {}, kind.basis())
-    (found,) = effects_of(explanation, [Candidate("spectrum", None, tuple(range(6)))], [proposal])
+    (found,) = effects_of(explanation, [Candidate(kind, None, tuple(range(6)))])
     assert found["amplitude"] == pytest.approx(0.99)
     # One error up is -0.9.
     assert found["sigma"] == pytest.approx((0.99 - 0.9) / 2.0, rel=1e-3)
@@ -381,8 +377,7 @@ def test_what_data_do_not_tell_is_no_part_of_an_error():
     kind = systematics.get("spectrum")
     errors = np.array([0.02, 0.02, 0.02, 0.02, 0.02, 0.4])
     fitted = SimpleNamespace(amplitudes=np.array([0.3, 0, 0, 0, 0, 1.0]), covariance=np.diag(errors**2))
-    proposal = Proposal(kind, None, {}, kind.basis())
     explanation = SimpleNamespace(members=(0,), fit=fitted)
-    (found,) = effects_of(explanation, [Candidate("spectrum", None, tuple(range(6)))], [proposal])
+    (found,) = effects_of(explanation, [Candidate(kind, None, tuple(range(6)))])
     assert found["amplitude"] == pytest.approx(0.3)
     assert found["sigma"] == pytest.approx(0.02)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mcsim.diagnosis.with_scatter import with_scatter
+from mcsim.diagnosis.refine import with_scatter
 from mcsim.stats.gaussian import SimulatedGaussian
 
 P, SKIES = 12, 4000

@@ -7,10 +7,12 @@ import pytest
 from astropy.table import Table
 
 from mcsim import bipolar, config, systematics
-from mcsim.diagnosis import knowledge, report
-from mcsim.diagnosis import spectra as tables
-from mcsim.diagnosis.inference import context
-from mcsim.diagnosis.knowledge import with_effects
+from mcsim.diagnosis import campaign, report
+from mcsim.diagnosis import measured_spectra as tables
+from mcsim.diagnosis.campaign import with_effects
+from mcsim.diagnosis.context import context
+from mcsim.diagnosis.inference import diagnose_data
+from mcsim.diagnosis.spectra import read_spectra
 from mcsim.errors import InputError
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
@@ -60,7 +62,7 @@ def measured(run, seed=77):
 def read(folder, table, run=RUN):
     path = folder / "table.ecsv"
     table.write(path, format="ascii.ecsv", overwrite=True)
-    return tables.read_spectra(path, run)
+    return read_spectra(path, run)
 
 
 @pytest.fixture(scope="module")
@@ -72,13 +74,13 @@ def small(tmp_path_factory):
         run, spectra, [name for name in systematics.catalogue() if name not in PROPOSED]
     )
     plan = tables.plan(run, analysis, 300)
-    known = knowledge.learned(analysis, plan, [spectra(job) for job in plan.jobs])
-    return context(run, analysis, tables.of_mean(known, SKIES))
+    ensemble, bank = campaign.learned(analysis, plan, [spectra(job) for job in plan.jobs])
+    return context(run, analysis, ensemble.of_mean(SKIES), bank)
 
 
 def judged(small, folder, table):
     spectra = read(folder, table)
-    return tables.diagnose_maps(small, "table", spectra, lambda jobs: [spectra(job) for job in jobs])
+    return diagnose_data(tables.MeasuredSpectra(small, spectra, lambda jobs: [spectra(job) for job in jobs]), "table")
 
 
 def test_an_ellipticity_is_named_and_its_gap_shrinks(small, tmp_path):
@@ -106,8 +108,8 @@ def test_tables_of_the_model_have_no_gap(small, tmp_path):
 
 
 def test_the_mean_of_skies_scatters_as_the_tests_take_it_to(small):
-    raw = small.known.simulations
-    back = tables.of_mean(replace(small.known, simulations=np.random.default_rng(1).normal(size=raw.shape)), 50)
+    raw = small.ensemble.simulations
+    back = replace(small.ensemble, simulations=np.random.default_rng(1).normal(size=raw.shape)).of_mean(50)
     scale = back.simulations.std(axis=0) ** 2 * (1 + 1 / len(raw))
     # C (1/R + 1/N), C measured with 300 simulations: 8 % each, 5 sigma.
     np.testing.assert_allclose(scale, 1 / 50 + 1 / len(raw), rtol=0.4)
@@ -192,24 +194,28 @@ def test_a_mean_of_more_skies_than_it_says_is_refused(small, tmp_path):
     spectra = read(tmp_path, table)
     quiet = small.null.mean + 0.01 * (spectra.value - small.null.mean)
     with pytest.raises(InputError, match="far less than a mean of 10 skies can"):
-        tables.diagnose_maps(small, "quiet", replace(spectra, value=quiet), lambda jobs: [])
+        diagnose_data(tables.MeasuredSpectra(small, replace(spectra, value=quiet), lambda jobs: []), "quiet")
 
 
 def test_errors_that_the_model_does_not_have_are_noted(small, tmp_path):
     spectra = read(tmp_path, measured(RUN))
-    spread = small.known.simulations.std(axis=0)
+    spread = small.ensemble.simulations.std(axis=0)
     for factor, noted in ((1.0, 0), (3.0, 1)):
-        assert len(list(tables._notes(replace(spectra, error=factor * spread), small.known.simulations))) == noted
+        found = tables.MeasuredSpectra(small, replace(spectra, error=factor * spread), lambda jobs: [])
+        assert len(found.notes()) == noted
 
 
-def test_correlated_bins_are_freed_of_what_others_predict(small):
+def test_correlated_bins_are_freed_of_what_others_predict(small, tmp_path):
     folds = np.array([element.fold for element in small.analysis.elements])
     rng = np.random.default_rng(5)
     drawn = rng.normal(size=(300, len(folds)))
     used, fresh = np.flatnonzero(folds == 0)[0], np.flatnonzero(folds == 1)[0]
     drawn[:, fresh] += drawn[:, used]
-    turn, words = tables._independent(replace(small, known=replace(small.known, simulations=drawn)))
-    assert "what 1 of them predict is taken out" in words
+    correlated = replace(small, ensemble=replace(small.ensemble, simulations=drawn))
+    spectra = replace(read(tmp_path, measured(RUN)), value=drawn[0])
+    found = tables.MeasuredSpectra(correlated, spectra, lambda jobs: [])
+    turn, words = found.halves()
+    assert "1 of them" in words
     left = np.corrcoef(drawn @ turn.T, rowvar=False)
     assert abs(left[used, fresh]) < 1e-12
     np.testing.assert_array_equal(turn[folds == 0], np.eye(len(folds))[folds == 0])
@@ -227,9 +233,9 @@ def test_a_few_power_spectra_alone_are_judged(tmp_path):
         run, spectra, [name for name in systematics.catalogue() if name not in proposed]
     )
     plan = tables.plan(run, analysis, 60)
-    known = knowledge.learned(analysis, plan, [spectra(job) for job in plan.jobs])
-    learned = context(run, analysis, tables.of_mean(known, SKIES))
-    found = tables.diagnose_maps(learned, "few", spectra, lambda jobs: [spectra(job) for job in jobs])
+    ensemble, bank = campaign.learned(analysis, plan, [spectra(job) for job in plan.jobs])
+    learned = context(run, analysis, ensemble.of_mean(SKIES), bank)
+    found = diagnose_data(tables.MeasuredSpectra(learned, spectra, lambda jobs: [spectra(job) for job in jobs]), "few")
     assert found.verdict["verdict"] != "none"
     assert "beam_coma" not in [effect["name"] for effect in found.verdict["effects"]]
     report.write(found, tmp_path / "report.html")

@@ -13,13 +13,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from mcsim.diagnosis.knowledge import seeded, with_effects
 from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.diagnosis.analysis import Job, analysis_of, data_vectors
 from mcsim.diagnosis.api import prepared
 from mcsim.diagnosis.batch import asking, batch
-from mcsim.diagnosis.knowledge import seeded, with_effects
 from mcsim.systematics import Effect
 
 SEED = 20121026
@@ -53,7 +53,7 @@ def main() -> None:
     channel = arguments.channel or run.channels[-1].name
     for proposal in analysis.proposals:
         kind = proposal.kind
-        wanted = kind.name in arguments.effects if arguments.effects else not kind.draws
+        wanted = kind.name in arguments.effects if arguments.effects else not kind.stochastic
         if not wanted or kind.noise is not Effect.noise or proposal.channel not in (None, channel):
             continue
         for number, basis in enumerate(proposal.basis):

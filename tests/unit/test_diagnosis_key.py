@@ -1,0 +1,68 @@
+"""The cache of a model's simulations: what changes them changes its key."""
+
+import importlib
+import os
+import sys
+from dataclasses import fields, replace
+from types import SimpleNamespace
+
+import pytest
+
+from mcsim import config
+from mcsim.diagnosis import api
+from mcsim.diagnosis.candidate import Candidate
+from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.support import resources
+
+SOURCE = """
+from mcsim.systematics import Effect
+
+
+class Tilt(Effect):
+    name, scope, unit, step = "tilt", "common", "K", 0.1
+
+    def sky(self, sky, site, draw):
+        return sky * (1.0 + self.amplitude)
+"""
+RUN = config.load(resources.workflow("quickstart"))
+
+
+def key(effect, settings=None, simulations=100, run=RUN):
+    analysis = SimpleNamespace(
+        candidates=(Candidate(effect, None, (0,)),), elements=(), settings=settings or DiagnosisSettings()
+    )
+    return api._key(run, analysis, simulations)
+
+
+@pytest.fixture
+def plugin(tmp_path, monkeypatch):
+    path = tmp_path / "effects_of_a_user.py"
+    path.write_text(SOURCE)
+    monkeypatch.syspath_prepend(tmp_path)
+    importlib.invalidate_caches()
+    yield path
+    sys.modules.pop("effects_of_a_user", None)
+
+
+def test_an_effect_with_other_code_is_learned_anew(plugin):
+    effect = importlib.import_module("effects_of_a_user").Tilt
+    before = key(effect)
+    assert key(effect) == before
+    plugin.write_text(SOURCE.replace("1.0 + self", "1.0 - self"))
+    os.utime(plugin, (0, 0))
+    assert key(effect) != before
+
+
+@pytest.mark.parametrize("field", fields(DiagnosisSettings), ids=lambda field: field.name)
+def test_every_setting_has_a_part_in_the_key(plugin, field):
+    effect = importlib.import_module("effects_of_a_user").Tilt
+    value = getattr(DiagnosisSettings(), field.name)
+    other = replace(DiagnosisSettings(), **{field.name: (1.0,) if isinstance(value, tuple) else value + 1})
+    assert key(effect, other) != key(effect)
+
+
+def test_name_seed_and_number_of_realizations_do_not_count(plugin):
+    effect = importlib.import_module("effects_of_a_user").Tilt
+    other = replace(RUN, name="other", ensemble=replace(RUN.ensemble, seed=9, realizations=3))
+    assert key(effect, run=other) == key(effect)
+    assert key(effect, simulations=None) != key(effect)
