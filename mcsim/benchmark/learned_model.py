@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.benchmark.out_of_library import introduced
+from mcsim.benchmark.out_of_library import library_with
 from mcsim.benchmark.reduced import without
 from mcsim.diagnosis.analysis import Job, analysis_of, data_vectors
 from mcsim.diagnosis.api import prepared
@@ -50,8 +50,7 @@ def without_effects(model: str, simulations: int | None, names: tuple[str, ...])
 
 def evidence_with(job: Job, out_of_library: str | None) -> Vector:
     """Task: evidence of simulations that may contain inventions."""
-    with introduced(out_of_library):
-        return data_vectors(job)
+    return data_vectors(job, library_with(out_of_library))
 
 
 def _refuse(jobs: Sequence[Job]) -> list[Vector]:

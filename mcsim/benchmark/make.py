@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.benchmark import toml
 from mcsim.benchmark.learned_model import LearnedModel, evidence_with, learned_model
-from mcsim.benchmark.out_of_library import introduced, load
+from mcsim.benchmark.out_of_library import library_with, load
 from mcsim.benchmark.prior import CaseSampler, Drawn, OutOfLibrary, Prior
 from mcsim.benchmark.truth import KEYS, MAPS, SEAL, Member, Truth, key_path, new_nonce, sealed, write_whole
 from mcsim.diagnosis.analysis import Job, analysis_of
@@ -173,12 +173,12 @@ def _responses(context: DiagnosisContext, out_of_library: str | None, call: Batc
             found.append((kind, channel, kind(amplitude=kind.step)))
     # An effect of no strength: the dipole is seen and taken off only where there is some effect.
     idle = tuple(config.Effect(name="beam_width", channel=c.name, parameters={"amplitude": 0.0}) for c in run.channels)
-    jobs = [_samples(run, with_effects(quiet, idle), out_of_library)]
+    jobs = [_samples(run, with_effects(quiet, idle))]
     for kind, channel, effect in found:
         table = config.Effect(
             name=kind.name, channel=channel, parameters={"amplitude": effect.amplitude, **effect.parameters()}
         )
-        jobs.append(_samples(run, with_effects(quiet, (*idle, table)), out_of_library))
+        jobs.append(_samples(run, with_effects(quiet, (*idle, table))))
     answers: list[Vector] = [np.empty(0)] * len(jobs)
     for index, answer in call(evidence_with, ((job, out_of_library) for job in jobs)):
         answers[index] = answer.mean(axis=0)
@@ -188,11 +188,8 @@ def _responses(context: DiagnosisContext, out_of_library: str | None, call: Batc
     return result
 
 
-def _samples(fiducial: config.RunConfig, simulated: config.RunConfig, out_of_library: str) -> Job:
-    # While they are lent inventions are in the catalogue; they must not be proposed.
-    return Job(
-        config.to_json(fiducial), config.to_json(simulated), 0, INVENTED_SKIES, True, tuple(load(out_of_library))
-    )
+def _samples(fiducial: config.RunConfig, simulated: config.RunConfig) -> Job:
+    return Job(config.to_json(fiducial), config.to_json(simulated), 0, INVENTED_SKIES, True)
 
 
 def make_case(
@@ -231,11 +228,10 @@ def make_case(
 def maps_of(run: config.RunConfig, truth: Truth, out_of_library: str | None) -> list[tuple[str, Vector]]:
     """Maps of a truth, by name."""
     data = with_effects(seeded(run, truth.seed), [member.table() for member in truth.members])
-    with introduced(out_of_library):
-        shared = survey(data)
-        if truth.sampled:
-            return sampled.maps(shared, 0, epsilon=EPSILON)
-        return list(zip(shared.map_names, simulate.maps(shared, 0), strict=True))
+    shared = survey(data, library=library_with(out_of_library))
+    if truth.sampled:
+        return sampled.maps(shared, 0, epsilon=EPSILON)
+    return list(zip(shared.map_names, simulate.maps(shared, 0), strict=True))
 
 
 def _measured(model: str, simulations: int | None, members: Sequence[Member], seed: int) -> tuple[Member, ...]:

@@ -1,15 +1,14 @@
-"""Effects that no library has: classes of a file of the challenger's, lent to the simulator while data are made."""
+"""Effects that no library has: classes of a file of the challenger's."""
 
 import importlib.util
 import inspect
 import sys
-from contextlib import AbstractContextManager
 from functools import lru_cache
 from pathlib import Path
 
 from mcsim import systematics
 from mcsim.errors import InputError
-from mcsim.systematics import Effect
+from mcsim.systematics import Effect, Library
 
 
 @lru_cache(maxsize=4)
@@ -42,6 +41,6 @@ def load(path: str) -> dict[str, type[Effect]]:
     return found
 
 
-def introduced(path: str | None) -> AbstractContextManager[None]:
-    """Let runs be simulated with the inventions of a file; no diagnosis may be prepared meanwhile."""
-    return systematics.lent({} if path is None else load(path))
+def library_with(path: str | None) -> Library | None:
+    """Return the catalogue with the effects of a file; None, the catalogue itself, without a file."""
+    return None if path is None else {**systematics.catalogue(), **load(path)}
