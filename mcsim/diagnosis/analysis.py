@@ -19,7 +19,7 @@ from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import Survey, survey
 from mcsim.sphere import alm as alm_
-from mcsim.systematics import Effect
+from mcsim.systematics import Effect, Library
 
 Map = NDArray[np.float64]
 
@@ -183,13 +183,13 @@ class Job:
     settings: DiagnosisSettings = field(default_factory=DiagnosisSettings)
 
 
-def data_vectors(job: Job) -> NDArray[np.float64]:
+def data_vectors(job: Job, library: Library | None = None) -> NDArray[np.float64]:
     """Return the data vectors of simulations, shape (count, p), each followed by its bipolar scan if it is asked for.
 
-    This is the task that a worker runs.
+    This is the task that a worker runs. ``library``: effects that the simulated run may name; default: the catalogue.
     """
     analysis = _analysis(job.fiducial, job.without, job.settings)
-    shared = _survey(job.simulated)
+    shared = _survey(job.simulated) if library is None else survey(config.from_json(job.simulated), library=library)
     rows = []
     for realization in range(job.first, job.first + job.count):
         if job.sample_by_sample:

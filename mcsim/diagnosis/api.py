@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mcsim import config, systematics
 from mcsim.diagnosis import campaign, measured_spectra, null_ensemble, report
-from mcsim.diagnosis.analysis import Analysis, analysis_of, data_vectors
+from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, data_vectors
 from mcsim.diagnosis.batch import asking, batch
 from mcsim.diagnosis.context import DataSet, DiagnosisContext, context
 from mcsim.diagnosis.inference import Diagnosis, diagnose_data
@@ -85,7 +85,8 @@ def diagnose(
         systematics.get(effect)
     if output is not None:
         folders.writable(Path(output))
-    threads, task = os.cpu_count() or 1, data_vectors
+    threads = os.cpu_count() or 1
+    task: Callable[[Job], NDArray[np.float64]] = data_vectors
     table = read_spectra(data, run) if isinstance(data, str | Path) and Path(data).is_file() else None
     if table is not None:
         run, task = measured_spectra.estimator_for(run, table), table

@@ -65,8 +65,10 @@ def scan_model(
     return model if chosen.sample_period_s is None else model.with_sampling(chosen.sample_period_s)
 
 
-def effects_on(run: config.RunConfig, channel: str) -> tuple[systematics.Effect, ...]:
-    """The effects of a run that act in a channel, in their order.
+def effects_on(
+    run: config.RunConfig, channel: str, library: systematics.Library | None = None
+) -> tuple[systematics.Effect, ...]:
+    """Return the effects of a run that act in a channel, in their order.
 
     Raises
     ------
@@ -76,7 +78,7 @@ def effects_on(run: config.RunConfig, channel: str) -> tuple[systematics.Effect,
     """
     acting = []
     for entry in run.effects:
-        effect = systematics.build(entry.name, entry.parameters)
+        effect = systematics.build(entry.name, entry.parameters, library)
         if effect.scope == "channel" and entry.channel is None:
             raise InputError(f'effect {entry.name} acts in one channel; say which: channel = "{run.channels[0].name}".')
         if effect.scope == "common" and entry.channel is not None:

@@ -17,7 +17,7 @@ from mcsim.simulation.channels import effects_on, refuse_pixel_effects, scan_mod
 from mcsim.simulation.rings import Rings, limit_rings, parallel_transport_rings
 from mcsim.sphere import healpix, spectra
 from mcsim.sphere.mask import read_mask
-from mcsim.systematics import Effect, Site, seen_through, spread_of
+from mcsim.systematics import Effect, Library, Site, seen_through, spread_of
 
 Progress = Callable[[float], None]
 
@@ -149,12 +149,18 @@ class Survey:
         return {m.name: m.sky_fraction for channel in self.channels for m in channel.maps}
 
 
-def survey(run: config.RunConfig, nthreads: int = 1, progress: Progress | None = None, orders: int = 0) -> Survey:
+def survey(
+    run: config.RunConfig,
+    nthreads: int = 1,
+    progress: Progress | None = None,
+    orders: int = 0,
+    library: Library | None = None,
+) -> Survey:
     """Load or compute everything that the realizations of a run share.
 
     Moments of scan models, and pairs of pixels of differencing scans, are computed once, cached on disk and
     memory-mapped, so that workers share them. ``orders``: moments up to this order even where the beam needs fewer (of
-    a file of moments, all that it has).
+    a file of moments, all that it has). ``library``: the effects that the run may name; default: the catalogue.
 
     Raises
     ------
@@ -163,7 +169,7 @@ def survey(run: config.RunConfig, nthreads: int = 1, progress: Progress | None =
     """
     lmax = config.analysis_lmax(run)
     cl = None if run.sky.spectrum is None else spectra.load(run.sky.spectrum, run.sky.lmax)
-    channels = tuple(_channel(run, channel, nthreads, progress, orders) for channel in run.channels)
+    channels = tuple(_channel(run, channel, nthreads, progress, orders, library) for channel in run.channels)
     maps = [m for channel in channels for m in channel.maps]
     both = run.biposh.pairs == "all"
     pairs = tuple((x, y) for x in range(len(maps)) for y in range(x, len(maps)) if both or x == y)
@@ -173,9 +179,14 @@ def survey(run: config.RunConfig, nthreads: int = 1, progress: Progress | None =
 
 
 def _channel(
-    run: config.RunConfig, spec: config.Channel, nthreads: int, progress: Progress | None, orders: int
+    run: config.RunConfig,
+    spec: config.Channel,
+    nthreads: int,
+    progress: Progress | None,
+    orders: int,
+    library: Library | None,
 ) -> Channel:
-    acting = effects_on(run, spec.name)
+    acting = effects_on(run, spec.name, library)
     site = site_of(run, spec)
     if run.map.grid == "gl":
         return _channel_on_rings(run, spec, site, acting)

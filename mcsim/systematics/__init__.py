@@ -2,12 +2,13 @@
 
 from mcsim.systematics.base import Alm, Draw, Effect, Map, Pointing, Site
 from mcsim.systematics.compose import looked_at, seen_through, spread_of
-from mcsim.systematics.registry import build, catalogue, describe, get, lent
+from mcsim.systematics.registry import Library, build, catalogue, describe, get
 
 __all__ = [
     "Alm",
     "Draw",
     "Effect",
+    "Library",
     "Map",
     "Pointing",
     "Site",
@@ -15,7 +16,6 @@ __all__ = [
     "catalogue",
     "describe",
     "get",
-    "lent",
     "looked_at",
     "seen_through",
     "spread_of",

@@ -3,12 +3,12 @@
 import difflib
 import inspect
 import pkgutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import fields
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from types import MappingProxyType
 from typing import Any
 
 from mcsim.errors import InputError
@@ -18,10 +18,13 @@ from mcsim.systematics.base import Effect
 ENTRY_POINTS = "mcsim.effects"
 """Group of entry points under which a package names its effects."""
 
+Library = Mapping[str, type[Effect]]
+"""Effects by name."""
+
 
 @cache
-def catalogue() -> dict[str, type[Effect]]:
-    """Every effect by name: built in, then registered by other packages.
+def catalogue() -> Library:
+    """Return every effect by name, read-only: built in, then registered by other packages.
 
     Raises
     ------
@@ -47,24 +50,15 @@ def catalogue() -> dict[str, type[Effect]]:
         if kind.name in found:
             raise InputError(f"effect {kind.name} of {entry.value} has a name that is taken; rename it.")
         found[kind.name] = kind
-    return found
+    return MappingProxyType(found)
 
 
-@contextmanager
-def lent(added: Mapping[str, type[Effect]]) -> Iterator[None]:
-    """Let further effects be known by name for as long as the block lasts."""
-    known = catalogue()
-    known.update(added)
-    try:
-        yield
-    finally:
-        for name in added:
-            known.pop(name, None)
+def get(name: str, library: Library | None = None) -> type[Effect]:
+    """Return the effect called ``name``; InputError, with what comes close, if there is none.
 
-
-def get(name: str) -> type[Effect]:
-    """The effect called ``name``; InputError, with what comes close, if there is none."""
-    known = catalogue()
+    ``library``: default: :func:`catalogue`.
+    """
+    known = catalogue() if library is None else library
     if name not in known:
         near = difflib.get_close_matches(name, known, n=1)
         hint = f"did you mean {near[0]}?" if near else f"choose from {', '.join(sorted(known))}."
@@ -72,13 +66,13 @@ def get(name: str) -> type[Effect]:
     return known[name]
 
 
-def build(name: str, parameters: Mapping[str, Any]) -> Effect:
-    """The effect called ``name`` with these parameters; those left out have their defaults."""
-    return base.build(get(name), parameters)
+def build(name: str, parameters: Mapping[str, Any], library: Library | None = None) -> Effect:
+    """Return the effect called ``name`` with these parameters; those left out have their defaults."""
+    return base.build(get(name, library), parameters)
 
 
 def describe() -> list[dict[str, Any]]:
-    """What people need to know of every effect, and the defaults of its parameters."""
+    """Describe every effect, with the defaults of its parameters."""
     return [
         {
             "name": kind.name,
