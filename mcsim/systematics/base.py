@@ -1,9 +1,9 @@
-"""What an effect is: a named change of the simulation, which is none where its amplitude is zero.
+"""Effects: named changes of the simulation, each absent at zero amplitude.
 
 An effect acts through hooks, one for each stage of a survey, composed in the order sky, beam, pointing, gain, noise,
 map. A hook that an effect does not define changes nothing. Every hook serves both routes: the default one (spin maps
-and orientation moments) and the sample-by-sample one, so that adding an effect to a run, proposing it in a diagnosis
-and putting it into the referee are one act.
+and orientation moments) and the sample-by-sample one, so that an effect that is added to a run, is
+a candidate of a diagnosis, or acts in the time-ordered reference is one and the same.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,7 +26,7 @@ Draw = Callable[[str], np.random.Generator]
 
 @dataclass(frozen=True)
 class Pointing:
-    """How one channel of a survey was pointed, as a function of time.
+    """Describe how one channel of a survey was pointed, as a function of time.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Pointing:
 
 @dataclass(frozen=True)
 class Site:
-    """What an effect may know of where it acts: one channel of a survey.
+    """Describe the channel of a survey in which an effect acts.
 
     Attributes
     ----------
@@ -52,13 +52,13 @@ class Site:
     frame, nside, lmax
         Of the maps (nside 0: rings without pixels), and the highest degree of the sky.
     beam
-        As believed, before any effect.
+        Fiducial beam, before any effect.
     pointing
-        Of the whole survey; None where only moments are known.
+        Of the whole survey; None if only moments are known.
     dipole_uk
-        The dipole that the survey sees and takes off as believed: a vector in the frame of the maps, zeros without.
+        Dipole that the survey sees and subtracts with the fiducial gain: a vector in the frame of the maps.
     whole
-        Gives the beam with the orders that it has without an m_max; None where they are not known.
+        Returns the beam with the orders that it has without an m_max; None if they are not known.
     """
 
     channel: str
@@ -72,7 +72,7 @@ class Site:
     whole: Callable[[], Beam] | None = None
 
     def pointed(self, effect: str) -> Pointing:
-        """The pointing; InputError where it is not known."""
+        """Return the pointing; raise InputError if it is not known."""
         if self.pointing is None:
             raise InputError(
                 f"effect {effect} on channel {self.channel} depends on when and how the survey was pointed; give the "
@@ -81,7 +81,7 @@ class Site:
         return self.pointing
 
     def whole_beam(self, effect: str) -> Beam:
-        """The beam with the orders that are left out of ``beam``; InputError where none are."""
+        """Return the beam with the orders that are left out of ``beam``; raise InputError if none are."""
         whole = None if self.whole is None else self.whole()
         if whole is None or whole.mmax <= self.beam.mmax:
             raise InputError(
@@ -92,7 +92,7 @@ class Site:
         return whole
 
     def frequency(self, effect: str) -> float:
-        """The frequency in GHz; InputError where it is not known."""
+        """Return the frequency in GHz; raise InputError if it is not known."""
         if self.frequency_ghz is None:
             raise InputError(
                 f"effect {effect} depends on frequency, but channel {self.channel} has none; give its frequency_ghz."
@@ -102,7 +102,7 @@ class Site:
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
-    """Base class: what every effect has, and hooks that change nothing.
+    """Derive an effect from this class, whose hooks change nothing.
 
     A subclass is a frozen dataclass whose fields are its parameters, ``amplitude`` first; zero amplitude is no effect.
 
@@ -118,22 +118,21 @@ class Effect:
         What makes it, how it shows, and where that is from: one sentence each, for people.
     step
         Amplitude at which responses are measured: small enough to be linear.
-    own_score
-        Whether a diagnosis should listen with a template of its own: not where a hook draws random numbers, nor where
-        what is always listened for (dipoles, variances, spectra, modulations) says it all.
-    draws
-        Whether a hook draws random numbers, at positive amplitudes at least.
+    matched_filter
+        True if the data vector of a diagnosis has a matched filter for it: not if a hook draws random numbers, nor if
+        dipoles, variances, spectra and modulations, which are always measured, contain all of it.
+    stochastic
+        True if a hook draws random numbers, at positive amplitudes at least.
     mean_response
-        Whether a diagnosis holds to the response in the mean over skies, and not to that in the sky that was observed.
-        So for a change of power alone, or one that makes a typical sky of another: in one sky it hangs on the
-        fluctuations that the spectra have anyway.
-    side
-        Sign of the amplitudes at which responses are measured; 0: both. Where it is not 0, a negative amplitude is not
-        one of nature, and a diagnosis does not name it.
-    most
-        Largest amplitude, in absolute value, of nature; a diagnosis names no larger one.
+        True if a diagnosis uses the mean response over skies, not that of the observed sky: for a change of power
+        alone, whose response in one sky depends on fluctuations that the spectra have anyway.
+    sign
+        Sign of the amplitudes at which responses are measured; 0: both. If it is not 0, a negative amplitude is
+        unphysical, and a diagnosis does not name it.
+    max_amplitude
+        Largest physical amplitude, in absolute value; a diagnosis names no larger one.
     variants
-        Settings, fixed parameters, that a diagnosis proposes side by side.
+        Fixed parameters with which the effect is a candidate, one candidate for each.
     """
 
     name: ClassVar[str]
@@ -155,61 +154,61 @@ class Effect:
     # Stages, in the order in which they act.
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Coefficients of the sky that the channel looks at, uK, up to ``site.lmax``."""
+        """Return coefficients of the sky that the channel sees, uK, up to ``site.lmax``."""
         return sky
 
     def beam(self, beam: Beam, site: Site) -> Beam:
-        """The beam about the line of sight."""
+        """Return the beam about the line of sight."""
         return beam
 
     def pointing(self, beam: Beam, site: Site) -> Beam:
-        """The beam about the *believed* line of sight, where the true one is displaced or smeared."""
+        """Return the beam about the *fiducial* line of sight, from which the true one is displaced."""
         return beam
 
     def gain(self, time_s: Vector, site: Site) -> Vector | None:
-        """Relative error of the gain at these times since the start, shape (n,); None: no error."""
+        """Return the relative error of the gain at times since the start, shape (n,); None: no error."""
         return None
 
     def noise(self, site: Site) -> Map | None:
-        """Factor of the variance of every pixel's samples, shape (npix,); None: one."""
+        """Return the factor of the variance of every pixel's samples, shape (npix,); None: one."""
         return None
 
     def spread(self) -> float:
-        """By what factor the samples' offsets from the centre of their pixel shrink."""
+        """Return the factor by which samples move towards the centre of their pixel."""
         return 1.0
 
     def orientations(self, moments: Moments, site: Site) -> Moments:
-        """Orientation moments of the true scan from the believed ones."""
+        """Return the orientation moments of the true scan from the fiducial ones."""
         return moments
 
     def differencing(self, imbalance: float, iterations_short: int) -> tuple[float, int]:
-        """True transmission imbalance of a differencing scan, and by how many iterations its map-making falls short."""
+        """Return the true imbalance of a differencing scan, and the iterations by which map-making falls short."""
         return imbalance, iterations_short
 
     # The same in the sample-by-sample route, where it can be said more directly than by a hook above.
 
     def moved(self, theta: Vector, phi: Vector, psi: Vector) -> tuple[Vector, Vector, Vector] | None:
-        """True direction and orientation of samples from the believed ones; None: :meth:`pointing` says it all."""
+        """Return true direction and orientation of samples from the fiducial ones; None: see :meth:`pointing`."""
         return None
 
     def lags(self) -> tuple[tuple[float, float], ...] | None:
-        """(weight, delay in seconds) of the earlier signals that make up a sample; None: as :meth:`moved`."""
+        """Return (weight, delay in seconds) of the earlier signals in a sample; None: as :meth:`moved`."""
         return None
 
-    # What the diagnosis asks for.
+    # How the effect is parametrised for a linear fit.
 
     @classmethod
     def basis(cls) -> tuple[Self, ...]:
-        """Effects of amplitude ``step`` whose responses span those of all its parameters, to first order."""
+        """Return effects of amplitude ``step`` whose responses span those of all parameters, to first order."""
         return (cls(amplitude=cls.step),)
 
     def coordinates(self) -> Vector:
-        """The effect in its linear components: its response is the sum of coordinates times the basis' per step."""
+        """Return the linear components: the response is the sum of coordinates times that of the basis per step."""
         return np.array([self.amplitude])
 
     @classmethod
     def constrained(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Vector:
-        """Of fitted coordinates what data tell: all of them, where an effect does not say which are beyond them.
+        """Return the fitted coordinates that the data constrain, and zeros; by default all of them.
 
         Parameters
         ----------
@@ -222,26 +221,26 @@ class Effect:
 
     @classmethod
     def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
-        """The effect whose coordinates are nearest in the metric ``precision``, shape (k, k)."""
+        """Return the effect whose coordinates are nearest in the metric ``precision``, shape (k, k)."""
         return cls(amplitude=float(coordinates[0]))
 
     def parameters(self) -> dict[str, Any]:
-        """All parameters but the amplitude, by name."""
+        """Return all parameters but the amplitude, by name."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "amplitude"}
 
     def scaled(self, factor: float) -> Self:
-        """The same effect with ``factor`` times the amplitude."""
+        """Return the same effect with ``factor`` times the amplitude."""
         return replace(self, amplitude=factor * self.amplitude)
 
 
 def polar(coordinates: Vector, multiple: int = 1) -> tuple[float, float]:
-    """Norm, and angle in degrees, of a (cos, sin) pair whose angle counts ``multiple`` times."""
+    """Return norm, and angle in degrees, of a (cos, sin) pair whose angle counts ``multiple`` times."""
     x, y = (float(value) for value in coordinates)
     return float(np.hypot(x, y)), float(np.rad2deg(np.arctan2(y, x)) / multiple)
 
 
 def build(kind: type[Effect], parameters: Mapping[str, Any]) -> Effect:
-    """An effect from a table of parameters.
+    """Build an effect from a table of parameters.
 
     Raises
     ------

@@ -69,7 +69,7 @@ class BeamComa(Effect):
     def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
         """The best k and angle: k is linear, the angle is searched."""
         if not precision.any():
-            return cls()  # not heard
+            return cls()  # the data do not respond to it
         measured = precision @ coordinates
 
         def missed(angle: float) -> float:

@@ -1,4 +1,4 @@
-"""An elongated beam that is believed to be as drawn."""
+"""A beam that is more elongated than the fiducial one."""
 
 from dataclasses import dataclass
 from typing import Self

@@ -1,4 +1,4 @@
-"""A beam wider than believed."""
+"""A beam wider than the fiducial one."""
 
 from dataclasses import dataclass
 

@@ -10,7 +10,7 @@ from mcsim.systematics.base import Alm, Effect, Site
 
 
 def seen_through(acting: Iterable[Effect], site: Site) -> Beam:
-    """The beam about the believed line of sight: every effect on its shape first, then all that displaces it."""
+    """Return the beam about the fiducial line of sight: every effect on its shape first, then all that displaces it."""
     acting = tuple(acting)
     beam = site.beam
     for effect in acting:

@@ -22,7 +22,7 @@ class GainDrift(Effect):
 
     Notes
     -----
-    The dipole is taken off with the believed gain, 1: what is left of it is most of the effect.
+    The dipole is subtracted with the fiducial gain, 1: what is left of it is most of the effect.
     """
 
     name = "gain_drift"

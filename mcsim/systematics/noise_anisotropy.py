@@ -1,4 +1,4 @@
-"""Noise that is stronger at the ecliptic poles, or at the equator, than believed."""
+"""Noise that is stronger at the ecliptic poles, or at the equator, than in the model."""
 
 from dataclasses import dataclass
 from pathlib import Path

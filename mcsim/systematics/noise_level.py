@@ -1,4 +1,4 @@
-"""More noise than believed."""
+"""More noise than in the model."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ class NoiseLevel(Effect):
     name = "noise_level"
     scope = "channel"
     unit = "fraction of sigma0"
-    cause = "Noise estimated on other data, or a gain that is not the believed one."
+    cause = "Noise estimated on other data, or a gain that is not the fiducial one."
     signature = "Autos only, flat in l, as the hits."
     source = "Jarosik et al. 2011, ApJS 192, 14 (sigma0 per channel, and its error)"
     step = 0.01

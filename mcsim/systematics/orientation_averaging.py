@@ -1,4 +1,4 @@
-"""A beam that is believed to keep its orientation while the scan turns it."""
+"""A beam that keeps its orientation in the model while the scan turns it."""
 
 from dataclasses import dataclass, replace
 
@@ -21,7 +21,7 @@ class OrientationAveraging(Effect):
 
     Notes
     -----
-    The real moments are those of the model's whole survey, in every split. Hits and centroids stay as believed.
+    The real moments are those of the model's whole survey, in every split. Hits and centroids stay those of the model.
     """
 
     name = "orientation_averaging"

@@ -1,4 +1,4 @@
-"""Samples believed to stand where they do not: at the centres of their pixels."""
+"""Samples that stand at the centres of their pixels, unlike those of the model."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ class Pixelization(Effect):
 
     Notes
     -----
-    The pixel window and the gradient along the mean offset, which the believed model has, go with them. A gap of this
+    The pixel window and the gradient along the mean offset, which the fiducial model has, go with them. A gap of this
     kind lies in the model and not in the instrument: data made of samples at the centres, or the other way round.
     Beyond 2 the samples would stand outside of their pixels.
     """

@@ -1,4 +1,4 @@
-"""A line of sight that is not where it is believed to be."""
+"""A line of sight that is displaced from the fiducial one."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -13,7 +13,7 @@ from mcsim.systematics.shape import displaced
 
 @dataclass(frozen=True, kw_only=True)
 class PointingOffset(Effect):
-    """The true direction is the believed one plus a vector fixed to the beam.
+    """The true direction is the fiducial one plus a vector fixed to the beam.
 
     Attributes
     ----------

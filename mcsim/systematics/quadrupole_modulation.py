@@ -28,7 +28,7 @@ class QuadrupoleModulation(Effect):
     scope = "common"
     unit = "fraction"
     cause = "A sky that is not statistically isotropic: a preferred axis, as of an anisotropic early expansion."
-    signature = "L = 2, the same in every channel and split: a near twin of m = 2 in one channel."
+    signature = "L = 2, the same in every channel and split: nearly degenerate with m = 2 in one channel."
     source = "Ackerman, Carroll & Wise 2007, Phys. Rev. D 75, 083502, with a modulation of the sky in place of P(k)"
     step = 0.01
     matched_filter = False

@@ -1,4 +1,4 @@
-"""A sky whose power spectrum is not the believed one."""
+"""A sky whose power spectrum is not the fiducial one."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -19,10 +19,10 @@ LEAST = -0.99
 
 
 KNOWN = 0.25
-"""Error of a band up to which data tell its power."""
+"""Error of a band up to which the data constrain its power."""
 
-HEARD = 3.0
-"""Errors by which a band that is known worse has to change, to be heard all the same."""
+DETECTED = 3.0
+"""Standard errors by which a band that is constrained worse has to change to be fitted all the same."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,9 +76,9 @@ class Spectrum(Effect):
 
     @classmethod
     def constrained(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Vector:
-        """Bands that are neither known nor heard, those beyond the degrees that are analysed, stay as believed."""
+        """Set bands to zero that are neither constrained nor detected, such as those beyond the analysed degrees."""
         errors = np.sqrt(np.diag(np.linalg.pinv(precision)))
-        silent = (errors > KNOWN) & (np.abs(coordinates) < HEARD * errors)
+        silent = (errors > KNOWN) & (np.abs(coordinates) < DETECTED * errors)
         found = np.where(silent, 0.0, coordinates)
         rows = np.flatnonzero(~silent)
         shift = precision[np.ix_(rows, np.flatnonzero(silent))] @ coordinates[silent]

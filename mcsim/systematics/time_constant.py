@@ -27,7 +27,7 @@ class TimeConstant(Effect):
     scope = "channel"
     unit = "s"
     cause = "Heat capacity of a bolometer, or a filter in the electronics, not deconvolved."
-    signature = "Lag and smear along beam x: a near twin of a pointing offset along the scan, and of m = 2."
+    signature = "Lag and smear along beam x: nearly degenerate with a pointing offset along the scan, and with m = 2."
     source = "Planck 2013 results VII, A&A 571, A7 (time response of bolometers)"
     step = 0.001
 

@@ -7,7 +7,7 @@ from mcsim.systematics.base import Effect
 
 @dataclass(frozen=True, kw_only=True)
 class TransmissionImbalance(Effect):
-    """The true imbalance x of (1 + x) T_A - (1 - x) T_B is the believed one plus amplitude."""
+    """The true imbalance x of (1 + x) T_A - (1 - x) T_B is the fiducial one plus amplitude."""
 
     name = "transmission_imbalance"
     scope = "channel"
@@ -18,5 +18,5 @@ class TransmissionImbalance(Effect):
     step = 1e-3
 
     def differencing(self, imbalance: float, iterations_short: int) -> tuple[float, int]:
-        """More imbalance than believed."""
+        """Add to the imbalance."""
         return imbalance + self.amplitude, iterations_short
