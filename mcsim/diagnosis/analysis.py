@@ -227,7 +227,7 @@ def _constrained_sky(
 
 @lru_cache(maxsize=2)
 def _survey(simulated: str) -> Survey:
-    """Jobs of the same run follow each other; a drift of the gain takes a pass over its pointing."""
+    """Keep the last surveys: jobs of a run follow each other, and a gain drift takes a pass over the pointing."""
     return survey(config.from_json(simulated))
 
 

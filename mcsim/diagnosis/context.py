@@ -87,7 +87,7 @@ class Responder(Protocol):
 
 
 class DataSet(Protocol):
-    """Data that can be diagnosed: observed maps, or measured spectra."""
+    """Offer data to a diagnosis: observed maps, or measured spectra."""
 
     @property
     def context(self) -> DiagnosisContext:

@@ -93,7 +93,7 @@ class TableResponses:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredSpectra:
-    """A table of spectra as a data set; see :class:`mcsim.diagnosis.context.DataSet`.
+    """Offer a table of spectra as a data set; see :class:`mcsim.diagnosis.context.DataSet`.
 
     Attributes
     ----------

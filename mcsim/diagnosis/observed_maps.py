@@ -25,7 +25,7 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ObservedMaps:
-    """Observed maps as a data set; see :class:`mcsim.diagnosis.context.DataSet`.
+    """Offer observed maps as a data set; see :class:`mcsim.diagnosis.context.DataSet`.
 
     Attributes
     ----------

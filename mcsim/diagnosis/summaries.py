@@ -53,7 +53,7 @@ class Element:
 
 @dataclass(frozen=True)
 class Block:
-    """Elements that are computed together."""
+    """Compute some elements together."""
 
     elements: tuple[Element, ...]
     values: Callable[[Model, FilteredMaps], Vector] = field(repr=False)

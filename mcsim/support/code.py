@@ -1,23 +1,19 @@
 """Identify code by its content, so that nothing in a cache is older than the code that made it."""
 
-import ast
 import hashlib
 import inspect
 import sys
 import uuid
 from collections.abc import Iterable
-from functools import lru_cache
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 
 
 def package_digest(packages: Iterable[str], libraries: Iterable[str] = ()) -> str:
-    """Return the SHA-256 of the code of packages or modules, and of the versions of libraries.
-
-    Comments, docstrings and the layout of the text do not count.
-    """
-    found = [_file_digest(*_stamp(path)) for name in sorted(packages) for path in _files(name)]
+    """Return the SHA-256 of the source files of packages or modules, and of the versions of libraries."""
+    files = [path for name in sorted(packages) for path in _files(name)]
+    found = [hashlib.sha256(path.read_bytes()).hexdigest() for path in files]
     found += [f"{name} {version(name)}" for name in sorted(libraries)]
     return hashlib.sha256("\n".join(found).encode()).hexdigest()
 
@@ -46,22 +42,3 @@ def _files(name: str) -> list[Path]:
     if module.__file__ is None:
         raise OSError(f"{name} has no file")
     return [Path(module.__file__)]
-
-
-def _stamp(path: Path) -> tuple[str, int, int]:
-    status = path.stat()
-    return str(path), status.st_mtime_ns, status.st_size
-
-
-@lru_cache(maxsize=1024)
-def _file_digest(path: str, modified_ns: int, size: int) -> str:
-    tree = ast.parse(Path(path).read_bytes())
-    for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list):
-            body[:] = [one for one in body if not _is_text(one)]
-    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
-
-
-def _is_text(node: ast.AST) -> bool:
-    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
