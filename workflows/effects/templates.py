@@ -1,9 +1,9 @@
-"""Responses of the evidence to effects: the templates' default route against the survey made sample by sample.
+"""Compare the responses of the data vector to effects: default route against time-ordered reference.
 
     python workflows/effects/templates.py MODEL.toml [--channel W1] [--effects NAME ...] [--simulations N]
 
 A sky that made no template, without noise, is seen by both routes with each basis effect, up and down; what it changes
-in the numbers that `mcsim diagnose` weighs is compared in the metric of their scatter. Simulations of MODEL are those
+in the data vector of `mcsim diagnose` is compared in the metric of its covariance. Simulations of MODEL are those
 that `mcsim diagnose` with the same number has made and kept, or are made first.
 """
 
@@ -13,32 +13,32 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from mcsim.diagnosis.knowledge import seeded, with_effects
 from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.diagnosis.analysis import Job, analysis_of, data_vectors
 from mcsim.diagnosis.api import prepared
 from mcsim.diagnosis.batch import asking, batch
+from mcsim.diagnosis.campaign import seeded, with_effects
 from mcsim.systematics import Effect
 
 SEED = 20121026
 STEPS = 4.0
-"""Steps at which templates are measured, to be well above the referee's interpolation."""
+"""Steps at which templates are measured, to be well above the interpolation error of the time-ordered reference."""
 
 
 def main() -> None:
     """Print cosine, ratio of amplitudes and length of every response."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("model", help="TOML file of what is believed")
+    parser.add_argument("model", help="TOML file of the fiducial model")
     parser.add_argument("--channel", help="of the effects of a channel; default: the model's last one")
-    parser.add_argument("--effects", nargs="*", help="default: all that do not draw; none of noise")
+    parser.add_argument("--effects", nargs="*", help="default: all that are not stochastic; none of noise")
     parser.add_argument("--simulations", type=int, help="as given to mcsim diagnose")
     arguments = parser.parse_args()
     run = config.load(arguments.model)
     analysis = analysis_of(run, nthreads=os.cpu_count() or 1)
-    with batch(run.compute.workers) as call:
-        null = prepared(run, analysis, asking(call, quiet=False), arguments.simulations).null
+    with batch(run.compute.workers) as call, asking(call, quiet=False) as ask:
+        null = prepared(run, analysis, ask, arguments.simulations).null
     plain = seeded(run, SEED)
     quiet = replace(plain, channels=tuple(replace(channel, noise=config.Noise()) for channel in plain.channels))
     fiducial = config.to_json(run)
@@ -51,25 +51,27 @@ def main() -> None:
 
     without = {samples: seen([], samples) for samples in (False, True)}
     channel = arguments.channel or run.channels[-1].name
-    for proposal in analysis.proposals:
-        kind = proposal.kind
+    for candidate in analysis.candidates:
+        kind = candidate.effect
         wanted = kind.name in arguments.effects if arguments.effects else not kind.stochastic
-        if not wanted or kind.noise is not Effect.noise or proposal.channel not in (None, channel):
+        if not wanted or kind.noise is not Effect.noise or candidate.channel not in (None, channel):
             continue
-        for number, basis in enumerate(proposal.basis):
+        for number, basis in enumerate(candidate.basis):
             # An effect of one sign is the whole of it, as pixelization is.
-            effect = basis.scaled(STEPS) if proposal.kind.sign == 0 and STEPS * basis.amplitude < 1.0 else basis
+            effect = basis.scaled(STEPS) if kind.sign == 0 and STEPS * basis.amplitude < 1.0 else basis
             changes = []
             for samples in (False, True):
-                up = seen([proposal.table(effect)], samples)
-                down = seen([proposal.table(effect.scaled(-1.0))], samples) if proposal.kind.sign == 0 else None
+                up = seen([candidate.table(effect)], samples)
+                down = seen([candidate.table(effect.scaled(-1.0))], samples) if kind.sign == 0 else None
                 change = up - without[samples] if down is None else 0.5 * (up - down)
                 changes.append(null.whiten_templates(change[:, None])[:, 0])
             default, time_ordered = changes
             size = float(np.linalg.norm(default))
             cosine = float(default @ time_ordered) / size / float(np.linalg.norm(time_ordered))
             ratio = float(default @ time_ordered) / size**2
-            print(f"{proposal.label}/{number}: cosine {cosine:.4f}, sampled over default {ratio:.4f}, {size:.1f} sigma")
+            print(
+                f"{candidate.label}/{number}: cosine {cosine:.4f}, sampled over default {ratio:.4f}, {size:.1f} sigma"
+            )
 
 
 if __name__ == "__main__":
