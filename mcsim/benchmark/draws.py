@@ -12,7 +12,7 @@ from mcsim.benchmark.reduced import without
 from mcsim.diagnosis.analysis import Proposal
 from mcsim.diagnosis.batch import Batch
 from mcsim.diagnosis.candidate import Candidate, columns_of
-from mcsim.diagnosis.inference import DiagnosisContext
+from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.refine import effects_at, significant_templates
 from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.diagnosis.validation import Prediction, Shrink, achieved, predicted

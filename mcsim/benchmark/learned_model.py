@@ -12,7 +12,8 @@ from mcsim.benchmark.out_of_library import introduced
 from mcsim.benchmark.reduced import without
 from mcsim.diagnosis.analysis import Job, analysis_of, data_vectors
 from mcsim.diagnosis.api import prepared
-from mcsim.diagnosis.inference import DiagnosisContext, context
+from mcsim.diagnosis.context import DiagnosisContext
+from mcsim.diagnosis.inference import context
 from mcsim.errors import RunError
 
 Vector = NDArray[np.float64]

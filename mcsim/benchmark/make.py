@@ -19,7 +19,7 @@ from mcsim.benchmark.truth import KEYS, MAPS, SEAL, Member, Truth, key_path, new
 from mcsim.diagnosis.analysis import Job, analysis_of
 from mcsim.diagnosis.api import prepared
 from mcsim.diagnosis.batch import Batch, asking, batch
-from mcsim.diagnosis.inference import DiagnosisContext
+from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.knowledge import after_jobs, seeded, with_effects
 from mcsim.diagnosis.refine import significant_templates
 from mcsim.errors import InputError

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mcsim import config, systematics
 from mcsim.diagnosis.bipolar_scan import BipolarScan
 from mcsim.diagnosis.matched_filters import MatchedFilter, matched_filter
+from mcsim.diagnosis.residual_maps import coarse_residuals
 from mcsim.diagnosis.summaries import Block, Element, blocks_of
 from mcsim.diagnosis.wiener_filter import BEAM_ORDERS, Model, model_of, show, wiener_filter
 from mcsim.errors import InputError
@@ -46,6 +47,12 @@ class Proposal:
         settings = ", ".join(f"{key} = {value}" for key, value in self.settings.items())
         where = self.channel or "all"
         return f"{self.kind.name} ({where}{', ' + settings if settings else ''})"
+
+    @property
+    def title(self) -> str:
+        """Return the effect as people read it, with channel and settings."""
+        settings = [f"{key} = {value}" for key, value in self.settings.items()]
+        return ", ".join((self.kind.label(self.channel), *settings))
 
     @property
     def drawn(self) -> bool:
@@ -98,10 +105,12 @@ class Analysis:
         return tuple(tuple(range(int(a), int(b))) for a, b in pairwise(edges))
 
     def answer(self, maps: Sequence[Map], nthreads: int = 1, bipolar_scan: bool = False) -> NDArray[np.float64]:
-        """Evidence of a set of maps, shape (entries,), and behind it the atlas, where it is asked for."""
+        """Return the data vector, shape (p,), and on request the bipolar scan and coarse residuals behind it."""
         filtered = wiener_filter(self.model, maps, nthreads)
         found = [block.values(self.model, filtered) for block in self.blocks]
-        return np.concatenate([*found, self.bipolar_scan.values(filtered)] if bipolar_scan else found)
+        if bipolar_scan:
+            found += [self.bipolar_scan.values(filtered), coarse_residuals(self.model, filtered).ravel()]
+        return np.concatenate(found)
 
     @cached_property
     def bipolar_scan(self) -> BipolarScan:
@@ -176,7 +185,14 @@ def _matched_blocks(model: Model, proposals: Sequence[Proposal]) -> list[Block]:
 
 def _matched_block(proposal: Proposal, number: int, score: MatchedFilter, names: Sequence[str]) -> Block:
     channels = tuple(names) if proposal.channel is None else (proposal.channel,)
-    element = Element(f"score/{proposal.label}/{number}", "score", channels)
+    element = Element(
+        f"score/{proposal.label}/{number}",
+        "score",
+        channels,
+        kind="matched",
+        component=f"component {number + 1}" if len(proposal.basis) > 1 else None,
+        effect=proposal.title,
+    )
     return Block((element,), lambda model, filtered: np.array([score(model, filtered)]))
 
 

@@ -15,12 +15,14 @@ from mcsim import config, systematics
 from mcsim.diagnosis import knowledge, report, spectra
 from mcsim.diagnosis.analysis import Analysis, analysis_of
 from mcsim.diagnosis.batch import asking, batch
-from mcsim.diagnosis.inference import Diagnosis, DiagnosisContext, context, diagnose_maps
+from mcsim.diagnosis.context import DiagnosisContext
+from mcsim.diagnosis.inference import context, diagnose_maps
 from mcsim.diagnosis.observed_maps import checked, read_maps
+from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.errors import InputError
 from mcsim.support import folders
 
-METHOD = 7
+METHOD = 8
 """Raised whenever the same model would teach something else."""
 
 
@@ -34,7 +36,7 @@ def diagnose(
     simulations: int | None = None,
     workers: int | None = None,
     quiet: bool = True,
-) -> Diagnosis:
+) -> DiagnosisResult:
     """Diagnose the gap between a simulation and data.
 
     Parameters
@@ -46,7 +48,7 @@ def diagnose(
         the order channel by channel, split by split; or a table of measured spectra
         (:func:`mcsim.diagnosis.spectra.read_spectra`).
     output
-        Folder for ``verdict.json``, ``evidence.zarr`` and ``report.html``; None: nothing is written.
+        Folder for ``verdict.json``, ``diagnosis.zarr`` and ``report.html``; None: nothing is written.
     case
         Name; default: that of the run.
     without
@@ -60,8 +62,8 @@ def diagnose(
 
     Returns
     -------
-    Diagnosis
-        Verdict, evidence, attribution.
+    DiagnosisResult
+        Verdict, fits, tests, and the arrays behind them.
 
     Raises
     ------
@@ -96,7 +98,7 @@ def _of_table(
     simulations: int | None,
     workers: int,
     quiet: bool,
-) -> Diagnosis:
+) -> DiagnosisResult:
     measured = spectra.read_spectra(path, run)
     run = spectra.estimator_for(run, measured)
     analysis = spectra.analysis_of_spectra(run, measured, without, nthreads=os.cpu_count() or 1)

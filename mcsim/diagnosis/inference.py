@@ -1,19 +1,17 @@
 """One case: maps against a model and what its simulations have taught; verdict and all that it rests on."""
 
-import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from functools import reduce
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.diagnosis.analysis import Analysis
+from mcsim.diagnosis.assemble import Findings, result_of
 from mcsim.diagnosis.candidate import Candidate, columns_of
+from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.knowledge import CONSTRAINED_SKIES, Ask, Knowledge
 from mcsim.diagnosis.observed_maps import exchanges
 from mcsim.diagnosis.partial_explanation import PartialExplanation
@@ -27,17 +25,18 @@ from mcsim.diagnosis.refine import (
     tables_at,
     templates_on_sky,
 )
-from mcsim.diagnosis.report_arrays import report_arrays
+from mcsim.diagnosis.residual_maps import standardised
 from mcsim.diagnosis.responses import Responses
+from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import Attribution
 from mcsim.diagnosis.validation import Prediction, Shrink, achieved, carried, excess, predicted
-from mcsim.diagnosis.verdict import detectable_of, sentence, verdict_of
 from mcsim.diagnosis.where import Place, places
 from mcsim.diagnosis.wiener_filter import show
 from mcsim.diagnosis.with_scatter import with_scatter
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import SimulatedGaussian, fit, whitened_templates
-from mcsim.stats.look_elsewhere import Calibration, calibrate, global_test
+from mcsim.stats.look_elsewhere import calibrate, global_test
+from mcsim.support.numbers import measured
 
 Vector = NDArray[np.float64]
 
@@ -52,63 +51,6 @@ OPENED = 3.0
 
 MEASURED = 0.2
 """Share of an effect's strength that either half of the evidence must hear for a shrink to be measured."""
-
-
-@dataclass(frozen=True)
-class DiagnosisContext:
-    """What every case of a model is judged with.
-
-    Attributes
-    ----------
-    run, asked, known
-        What is believed, what is asked of it, what its simulations answered.
-    null
-        Of the whole evidence.
-    candidates, calibration
-        Of the proposals.
-    """
-
-    run: config.RunConfig
-    analysis: Analysis
-    known: Knowledge
-    null: SimulatedGaussian
-    candidates: tuple[Candidate, ...]
-    calibration: Calibration
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """Whether, where, which, how far: a verdict and the evidence that it rests on.
-
-    Attributes
-    ----------
-    verdict
-        As written to ``verdict.json``.
-    evidence
-        What was measured and what simulations say of it; dimensions entry, column, place.
-    attribution
-        Candidates, explanations and their fits.
-    """
-
-    verdict: dict[str, Any]
-    evidence: xr.Dataset
-    attribution: Attribution
-
-    @property
-    def sentence(self) -> str:
-        """The verdict for a busy person."""
-        return sentence(self.verdict)
-
-    def save(self, folder: str | Path) -> None:
-        """Write ``verdict.json`` and ``evidence.zarr`` into a folder, made where it does not exist."""
-        target = Path(folder)
-        target.mkdir(parents=True, exist_ok=True)
-        (target / "verdict.json").write_text(json.dumps(self.verdict, indent=1, allow_nan=False) + "\n")
-        # Text as objects: for numpy's fixed-length text Zarr 3 has no stable form.
-        texts = {
-            name: values.astype(object) for name, values in self.evidence.variables.items() if values.dtype.kind == "U"
-        }
-        self.evidence.assign(texts).to_zarr(target / "evidence.zarr", mode="w", consolidated=False)
 
 
 def context(run: config.RunConfig, analysis: Analysis, known: Knowledge) -> DiagnosisContext:
@@ -133,7 +75,9 @@ def context(run: config.RunConfig, analysis: Analysis, known: Knowledge) -> Diag
     return DiagnosisContext(run, analysis, known, null, candidates, calibrate(null, groups))
 
 
-def diagnose_maps(context: DiagnosisContext, case: str, maps: Sequence[NDArray[np.float64]], ask: Ask) -> Diagnosis:
+def diagnose_maps(
+    context: DiagnosisContext, case: str, maps: Sequence[NDArray[np.float64]], ask: Ask
+) -> DiagnosisResult:
     """Judge a set of maps.
 
     Parameters
@@ -149,7 +93,8 @@ def diagnose_maps(context: DiagnosisContext, case: str, maps: Sequence[NDArray[n
     """
     analysis, known = context.analysis, context.known
     answer = analysis.answer(maps, bipolar_scan=True)
-    x, numbers = answer[: len(analysis.elements)], answer[len(analysis.elements) :]
+    drawn, size = len(known.bipolar_scan), len(analysis.elements)
+    x, numbers, coarse = np.split(answer, [size, size + known.bipolar_scan.shape[1]])
 
     respond = Responses(context.run, analysis, known, show(analysis.model, maps), ask)
     t = significant_templates(known)
@@ -168,15 +113,12 @@ def diagnose_maps(context: DiagnosisContext, case: str, maps: Sequence[NDArray[n
         found = _with_errors(context, refined, found, respond)
         found, shrink = confirmed(context, found, shrink_of(context, x, refined, respond), notes)
     where = _where(context, x, numbers)
-    able = detectable_of(context.null, refined.templates, context.candidates, analysis.proposals)
     filtered = None if exchanged else partial_explanation_of(context, x, refined, found, respond)
-    verdict = verdict_of(case, found, context.candidates, analysis.proposals, where, shrink, able, notes, filtered)
-    shown = report_arrays(
-        analysis.model, maps, known.simulations, context.null, found, context.candidates, analysis.proposals
+    seen = standardised(coarse.reshape(known.residual_mean.shape), known.residual_mean, known.residual_scatter, drawn)
+    findings = Findings(
+        x, replace(refined, attribution=found), where, shrink, filtered, notes, seen, known.residual_rms
     )
-    constrained = dataset(context, x, replace(refined, attribution=found), where, verdict)
-    evidence = constrained.merge(shown, combine_attrs="no_conflicts")
-    return Diagnosis(verdict, evidence, found)
+    return result_of(context, case, findings)
 
 
 def confirmed(
@@ -193,16 +135,17 @@ def confirmed(
     opened = fraction.value * before.value + OPENED * fraction.sigma * abs(before.value) < 0.0
     short = expected.value - fraction.value > OPENED * np.hypot(expected.sigma, fraction.sigma)
     if opened or (short and before.value > 0.0 and fraction.value < 0.5 * min(expected.value, 1.0)):
-        best = " and ".join(context.analysis.proposals[member].label for member in found.explanations[0].members)
-        does = f"opens the gap of the other from {before.value:.3g} to {shrink[1].after.value:.3g}"
+        best = " and ".join(context.analysis.proposals[member].title for member in found.explanations[0].members)
+        does = f"raises the excess χ² of the other half from {before.value:.3g} to {shrink[1].after.value:.3g}"
         if shrink[1].after.value < before.value:
-            does = f"takes {fraction.value:.0%} of the other's gap, where {expected.value:.0%} were forecast"
-        notes.append(f"What fits best, {best}, is not named: simulated with its amplitude from one half, it {does}.")
+            removed, forecast = 100.0 * fraction.value, 100.0 * expected.value
+            does = f"removes {removed:.0f} % of the excess χ² of the other half, where {forecast:.0f} % were predicted"
+        notes.append(f"The best fit, {best}, is not named: simulated with its amplitude from one half, it {does}.")
         return found.unexplained(), None
     if before.value < before.sigma:
         notes.append(
-            f"No shrink is given: the half that would measure it shows no gap by itself ({before.value:.2g} +- "
-            f"{before.sigma:.2g})."
+            "No reduction on held-out data is given: they show no excess χ² by themselves "
+            f"({measured(before.value, before.sigma)})."
         )
         return found, None
     return found, shrink
@@ -318,43 +261,3 @@ def _where(context: DiagnosisContext, x: Vector, numbers: Vector) -> list[Place]
     shifted = x[own] - context.known.offset[own]
     elements = (*context.analysis.bipolar_scan.elements, *(context.analysis.elements[i] for i in own))
     return places(np.concatenate([numbers, shifted]), drawn, elements)
-
-
-def dataset(
-    context: DiagnosisContext, x: Vector, refined: Refined, where: Sequence[Place], verdict: dict[str, Any]
-) -> xr.Dataset:
-    """Everything measured, with names and units."""
-    known = context.known
-    spread = known.simulations.std(axis=0, ddof=1)
-    found = refined.attribution
-    element = [e.name for e in context.analysis.elements]
-    column = [f"{p.label}/{k}" for p in context.analysis.proposals for k in range(len(p.basis))]
-    candidate = [p.label for p in context.analysis.proposals]
-    best = np.zeros(len(element))
-    if found.explanations:
-        columns = columns_of(context.candidates, found.explanations[0].members)
-        best = refined.templates[:, columns] @ found.explanations[0].fit.amplitudes
-    return xr.Dataset(
-        {
-            "data": ("entry", x, {"long_name": "evidence of the data"}),
-            "mean": ("entry", context.null.mean, {"long_name": "mean of the model, referee's offset included"}),
-            "standard_deviation": ("entry", spread, {"long_name": "scatter of the model"}),
-            "z": ("entry", (x - context.null.mean) / spread, {"long_name": "data less mean, over scatter"}),
-            "explained": ("entry", best / spread, {"long_name": "best explanation, over scatter"}),
-            "templates": (("entry", "column"), refined.templates, {"long_name": "response per unit coordinate"}),
-            "correlation": (("candidate", "other"), found.correlation, {"long_name": "white canonical correlation"}),
-            "drop": ("candidate", [s.delta_chi2 for s in found.singles], {"long_name": "fall of chi^2, fitted alone"}),
-            "calibration": ("draw", context.calibration.combined, {"long_name": "smaller probability, without a gap"}),
-            "place_z": ("place", [p.z for p in where], {"long_name": "deviate of a group"}),
-            "place_p": ("place", [p.p for p in where], {"long_name": "probability, trials included"}),
-        },
-        coords={"entry": element, "column": column, "candidate": candidate, "other": candidate},
-        attrs={
-            "verdict": json.dumps(verdict),
-            "configuration": config.to_json(context.run),
-            "entries": json.dumps([asdict(e) for e in context.analysis.elements]),
-            "places": json.dumps([asdict(p.element) for p in where]),
-            "simulations": len(known.simulations),
-            "skies_of_responses": CONSTRAINED_SKIES,
-        },
-    )

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.diagnosis.analysis import Analysis, Job, Proposal
+from mcsim.diagnosis.residual_maps import rms
 from mcsim.diagnosis.summaries import Element
 from mcsim.stats.gaussian import SimulatedGaussian, null
 
@@ -86,6 +87,9 @@ class Knowledge:
         Atlas of the first simulations, shape (n, numbers).
     entries
         Where every number was heard.
+    residual_mean, residual_scatter, residual_rms
+        Mean and standard deviation of the coarse residual maps of the same, shape (map, npix), and the rms of each over
+        this scatter, shape (n, map).
     """
 
     simulations: NDArray[np.float64]
@@ -96,6 +100,9 @@ class Knowledge:
     reference: NDArray[np.float64]
     bipolar_scan: NDArray[np.float64]
     elements: tuple[Element, ...]
+    residual_mean: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    residual_scatter: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    residual_rms: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
 
     def null(self, where: Sequence[int] | NDArray[np.int64] | None = None) -> SimulatedGaussian:
         """Null of all entries, or of some."""
@@ -113,7 +120,12 @@ class Knowledge:
                 "template_error": (("entry", "column"), self.template_error, {"long_name": "standard error"}),
                 "reference": (("sky", "entry"), self.reference, {"long_name": "evidence of the responses' skies"}),
                 "bipolar_scan": (("drawn", "number"), self.bipolar_scan, {"long_name": "atlas of the model"}),
-            },
+            }
+            | {
+                name: (("map", "pixel"), getattr(self, name), {"long_name": f"{words} of coarse residual maps"})
+                for name, words in (("residual_mean", "mean"), ("residual_scatter", "standard deviation"))
+            }
+            | {"residual_rms": (("drawn", "map"), self.residual_rms, {"long_name": "rms of coarse residual maps"})},
             attrs={"entries": json.dumps([asdict(element) for element in self.elements])},
         )
         dataset.to_zarr(path, mode="w", consolidated=False)
@@ -232,9 +244,22 @@ def learned(analysis: Analysis, plan: Plan, answers: Sequence[NDArray[np.float64
         error[:, column] = each.std(axis=0, ddof=1) / np.sqrt(len(each))
     time_ordered, default = stacked("referee"), stacked("default")
     offset = np.mean(time_ordered - default, axis=0) if len(time_ordered) else np.zeros(size)
-    bipolar_scan = [answer[:, size:] for job, answer in zip(plan.jobs, answers, strict=True) if job.bipolar_scan]
+    drawn = np.concatenate([rest[:, size:] for job, rest in zip(plan.jobs, answers, strict=True) if job.bipolar_scan])
+    # Tables of spectra have neither bipolar scan nor residual maps.
+    numbers = len(analysis.bipolar_scan.elements) if drawn.shape[1] else 0
+    coarse = drawn[:, numbers:].reshape(len(drawn), len(analysis.model.parts), -1)
     return Knowledge(
-        stacked("null"), offset, templates, curvature, error, reference, np.concatenate(bipolar_scan), analysis.elements
+        stacked("null"),
+        offset,
+        templates,
+        curvature,
+        error,
+        reference,
+        drawn[:, :numbers],
+        analysis.elements,
+        coarse.mean(axis=0),
+        coarse.std(axis=0, ddof=1),
+        rms(coarse) if coarse.size else np.zeros((0, 0)),
     )
 
 

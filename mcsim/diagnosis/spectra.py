@@ -14,13 +14,14 @@ from mcsim.beamfit.table import COLUMNS, in_uk2, read_ecsv, scaling_of
 from mcsim.bipolar import Mode
 from mcsim.diagnosis import knowledge
 from mcsim.diagnosis.analysis import Analysis, Job, analysis_of
-from mcsim.diagnosis.inference import Diagnosis, DiagnosisContext, confirmed, dataset, partial_explanation_of, shrink_of
+from mcsim.diagnosis.assemble import Findings, result_of
+from mcsim.diagnosis.context import DiagnosisContext
+from mcsim.diagnosis.inference import confirmed, partial_explanation_of, shrink_of
 from mcsim.diagnosis.knowledge import Ask, Knowledge, Plan
 from mcsim.diagnosis.refine import Refined, Respond, refine, significant_templates
-from mcsim.diagnosis.report_arrays import report_arrays
+from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.summaries import Block, Element
 from mcsim.diagnosis.validation import Prediction, Shrink
-from mcsim.diagnosis.verdict import detectable_of, verdict_of
 from mcsim.diagnosis.where import Place, places
 from mcsim.errors import InputError
 from mcsim.simulation import simulate
@@ -98,6 +99,8 @@ class Spectra:
             mode.M,
             mode.parity,
             self.frame,
+            "table",
+            f"{kind}, {_words(self.scaling)}",
         )
 
     def of(self, simulated: config.RunConfig, first: int, count: int) -> NDArray[np.float64]:
@@ -280,7 +283,7 @@ def of_mean(known: Knowledge, realizations: int) -> Knowledge:
     return replace(known, simulations=mean + scale * (known.simulations - mean))
 
 
-def diagnose_maps(context: DiagnosisContext, case: str, measured: Spectra, ask: Ask) -> Diagnosis:
+def diagnose_maps(context: DiagnosisContext, case: str, measured: Spectra, ask: Ask) -> DiagnosisResult:
     """Judge a table of spectra.
 
     Parameters
@@ -334,18 +337,9 @@ def diagnose_maps(context: DiagnosisContext, case: str, measured: Spectra, ask: 
     if found.explanations:
         found, shrink = confirmed(context, found, _shrink(context, x, refined, respond), notes)
     where = _where(measured, known.simulations)
-    able = detectable_of(context.null, refined.templates, context.candidates, analysis.proposals)
     filtered = partial_explanation_of(context, x, refined, found, respond)
-    verdict = verdict_of(case, found, context.candidates, analysis.proposals, where, shrink, able, notes, filtered)
-    # Of no sky: a table has no maps to show.
-    dark = [np.zeros(12 * analysis.model.nside**2) for _ in analysis.model.parts]
-    shown = report_arrays(
-        analysis.model, dark, known.simulations, context.null, found, context.candidates, analysis.proposals
-    )
-    evidence = dataset(context, x, replace(refined, attribution=found), where, verdict)
-    evidence = evidence.merge(shown.drop_vars(["residual_map", "map"]), combine_attrs="no_conflicts")
-    evidence.attrs |= {"table": measured.path, "skies_behind_the_mean": measured.realizations}
-    return Diagnosis(verdict, evidence, found)
+    findings = Findings(x, replace(refined, attribution=found), where, shrink, filtered, notes)
+    return result_of(context, case, findings, {"table": measured.path, "skies behind the mean": measured.realizations})
 
 
 def _check(measured: Spectra, context: DiagnosisContext) -> None:
