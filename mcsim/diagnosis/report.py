@@ -96,9 +96,10 @@ def _pictures(result: DiagnosisResult) -> dict[str, Picture]:
         "separation": (figures.separation_figure(result), "Matrix: strength needed to choose between candidates."),
         "calibration": (figures.calibration_figure(result), "Histogram and curve: p-values of simulations."),
     }
-    for k, one in enumerate(result.contrasts):
-        names = " and ".join(result.sets[i].label for i in (one.first, one.second))
-        drawn[f"contrast{k}"] = (figures.contrast_figure(result, k), f"Points: elements in which {names} differ.")
+    for one in result.contrasts:
+        if one.first == 0:
+            text = f"Points: elements in which {result.sets[0].label} and {result.sets[one.second].label} differ."
+            drawn[f"contrast{one.second}"] = (figures.contrast_figure(result, one), text)
     return {name: _picture(figure, text) for name, (figure, text) in drawn.items() if figure is not None}
 
 

@@ -1,4 +1,4 @@
-"""The evidence: one short vector of numbers, each of which says where it was heard."""
+"""The data vector: a few hundred numbers, each of which says what it measures, and on which data."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -35,19 +35,19 @@ LARGE_SCALES = 64
 
 @dataclass(frozen=True)
 class Element:
-    """Where one number of the evidence was heard.
+    """One element of the data vector: what it measures, and on which data.
 
     Attributes
     ----------
     name
         Unique.
     statistic
-        "map": residual maps against the sky and the scan; "cl"; "biposh"; "noise"; "score": matched to an effect.
+        "map": residual maps against the sky and the scan; "cl"; "biposh"; "noise"; "score": matched filter.
     channels, split
         Whose; no split where all maps of a channel count.
     fold
-        0 or 1 where there is an entry like it whose noise is independent: a fit may use the one and be judged by the
-        other. None where there is none.
+        0 or 1 where an element like it has independent noise: a fit may use the one and be tested on the other. None
+        where there is none.
     ell
         Range of degrees, None where all or none.
     L, M, parity, frame
@@ -110,14 +110,14 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Block:
-    """Entries that are computed together."""
+    """Elements that are computed together."""
 
     elements: tuple[Element, ...]
     values: Callable[[Model, FilteredMaps], Vector] = field(repr=False)
 
 
 def blocks_of(model: Model) -> tuple[Block, ...]:
-    """What is listened for whatever the effect: about 30 numbers a channel, and some on the sky."""
+    """Return what is measured whatever the effect: about 30 elements for a channel, and some of the sky."""
     blocks = [_beam_block(model, i) for i in range(len(model.parts))]
     blocks += [_additive_block(model, i) for i in range(len(model.parts))]
     blocks += [_plane_block(model, i) for i in range(len(model.parts))]

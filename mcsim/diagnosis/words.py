@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from mcsim.diagnosis.result import DiagnosisResult, EffectResult, HeldOut
+from mcsim.diagnosis.result import ContrastResult, DiagnosisResult, EffectResult, HeldOut
 from mcsim.diagnosis.validation import Measured
 from mcsim.support.numbers import measured, number, p_equals
 
@@ -31,7 +31,9 @@ def sentence(result: DiagnosisResult) -> str:
     if result.kind == "degenerate":
         shown = [_effects(one.effects) for one in result.sets[: SETS + 1]]
         more = len(result.sets) - len(shown)
-        return f"{start}. It does with {'; or with '.join(shown)}" + (f"; or with {more} more sets." if more else ".")
+        return f"{start}. It does with {'; or with '.join(shown)}" + (
+            f"; or with {more} more set{'s' * (more > 1)}." if more else "."
+        )
     return f"{start}. It does with {_effects(result.effects)}."
 
 
@@ -133,14 +135,13 @@ def percent(fraction: Measured) -> str:
     return measured(100.0 * fraction.value, 100.0 * fraction.sigma, " %")
 
 
-def apart(result: DiagnosisResult, index: int) -> str:
+def apart(result: DiagnosisResult, one: ContrastResult) -> str:
     """Return how far the predictions of two sets are apart, and what would tell them apart."""
-    one = result.contrasts[index]
     start = f"The predictions differ by {one.separation:.1f} standard deviations. "
     factor = (SEPARATION / one.separation) ** 2 if one.separation > 0.0 else float("inf")
     if factor <= 1.0:
         odds = result.sets[one.second].odds / result.sets[one.first].odds
-        return f"{start}That is enough to choose in most cases; here the odds of the second are {number(odds)}."
+        return f"{start}That is enough in most cases; here the second has odds {number(odds)} against the first."
     if one.separation < 0.03:
         return f"{start}More data of this kind cannot tell them apart; another scan, frequency or beam can."
     most = f" of {result.elements[one.elements[0]].words}" if one.elements else ""

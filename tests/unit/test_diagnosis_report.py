@@ -134,7 +134,7 @@ def diagnosis(kind: str) -> DiagnosisResult:
         )
     sky = np.random.default_rng(5).normal(size=(2, 12 * 8**2))
     sky[:, :60] = np.nan
-    rms = 1.0 + 0.1 * rng.normal(size=(5, 2))
+    spread = 1.0 + 0.1 * rng.normal(size=(5, 2))
     findings = Findings(
         x,
         Refined(found, t, (), ()),
@@ -143,7 +143,7 @@ def diagnosis(kind: str) -> DiagnosisResult:
         None,
         ["a <b>note</b> & so"],
         sky,
-        np.ones((5, 2)) + 0.1 * rng.normal(size=(5, 2)),
+        spread,
     )
     return result_of(context, f"case <i>{kind}</i>", findings, {"level": 0.05})
 
