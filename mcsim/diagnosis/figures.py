@@ -187,7 +187,14 @@ def elements_figure(result: DiagnosisResult) -> Figure:
             rotation=35,
             rotation_mode="anchor",
             fontsize=8,
-            arrowprops={"arrowstyle": "-", "color": "0.6", "linewidth": 0.6, "shrinkA": 0.0, "shrinkB": 0.0},
+            arrowprops={
+                "arrowstyle": "-",
+                "color": "0.6",
+                "linewidth": 0.6,
+                "shrinkA": 0.0,
+                "shrinkB": 0.0,
+                "relpos": (0.0, 0.0),
+            },
         )
     axes.set_yscale("symlog", linthresh=5.0)
     largest = max(float(np.max(np.abs(result.z))), 5.0)
