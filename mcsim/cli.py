@@ -270,8 +270,9 @@ def diagnose(
     simulations: Simulations = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Local processes; default: the configuration's.")] = None,
 ) -> None:
-    """Diagnose a gap between maps and a model: is there one, where, which effect, and how far it shrinks."""
+    """Test maps against a model, and find the effect that the model lacks: where, how large, and if adding it helps."""
     from mcsim.diagnosis.api import diagnose as judge
+    from mcsim.diagnosis.words import summary
 
     _interrupt_once()
     found = judge(
@@ -284,8 +285,7 @@ def diagnose(
         workers=workers,
         quiet=False,
     )
-    out.print(found.sentence, markup=False)
-    out.print(f"wrote {output / 'verdict.json'} and {output / 'report.html'}", markup=False)
+    out.print("\n".join(summary(found, output)), markup=False, highlight=False, soft_wrap=True)
 
 
 challenge = typer.Typer(help="Effects drawn, hidden, diagnosed and scored.", no_args_is_help=True)

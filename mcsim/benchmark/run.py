@@ -69,21 +69,20 @@ def judge_case(model: str, simulations: int | None, folder: str, case: str, name
     learned = without_effects(model, simulations, names)
     maps = read_maps(learned.context.analysis.model, target / MAPS / case)
     found = diagnose_data(ObservedMaps(learned.context, maps, learned.ask), case)
-    said = found.attribution
     answer = {
-        "evidence": [float(value) for value in found.evidence["data"].values],
-        "maximum": said.gap.maximum,
+        "evidence": [float(value) for value in found.data],
+        "maximum": found.test.best_candidate,
         "explanations": [
             {
-                "proposals": [learned.context.candidates[member].label for member in explanation.members],
-                "amplitudes": explanation.fit.amplitudes.tolist(),
-                "errors": explanation.fit.errors.tolist(),
+                "proposals": [learned.context.candidates[member].label for member in one.candidates],
+                "amplitudes": list(one.coordinates),
+                "errors": list(one.errors),
             }
-            for explanation in said.explanations
+            for one in found.sets
         ],
     }
     with appearing(target / VERDICTS / case) as scratch:
-        (scratch / "verdict.json").write_text(json.dumps(found.verdict, indent=1, allow_nan=False) + "\n")
+        (scratch / "verdict.json").write_text(json.dumps(found.to_json(), indent=1, allow_nan=False) + "\n")
         (scratch / "answer.json").write_text(json.dumps(answer) + "\n")
     return case
 

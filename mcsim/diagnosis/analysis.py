@@ -12,6 +12,7 @@ from mcsim import config, systematics
 from mcsim.diagnosis.bipolar_scan import BipolarScan
 from mcsim.diagnosis.candidate import Candidate, numbered
 from mcsim.diagnosis.matched_filters import MatchedFilter, matched_filter
+from mcsim.diagnosis.residual_maps import coarse_residuals
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Block, Element, blocks_of
 from mcsim.diagnosis.wiener_filter import Model, model_of, shared_sky, wiener_filter
@@ -58,10 +59,12 @@ class Analysis:
         return tuple(element for block in self.blocks for element in block.elements)
 
     def data_vector(self, maps: Sequence[Map], nthreads: int = 1, bipolar_scan: bool = False) -> NDArray[np.float64]:
-        """Return the data vector of a set of maps, shape (p,), followed by the bipolar scan if it is asked for."""
+        """Return the data vector, shape (p,), and on request the bipolar scan and coarse residuals behind it."""
         filtered = wiener_filter(self.model, maps, nthreads)
         found = [block.values(self.model, filtered) for block in self.blocks]
-        return np.concatenate([*found, self.bipolar_scan.values(filtered)] if bipolar_scan else found)
+        if bipolar_scan:
+            found += [self.bipolar_scan.values(filtered), coarse_residuals(self.model, filtered).ravel()]
+        return np.concatenate(found)
 
     @cached_property
     def bipolar_scan(self) -> BipolarScan:
@@ -146,7 +149,14 @@ def _matched_blocks(model: Model, candidates: Sequence[Candidate]) -> list[Block
 
 def _matched_block(candidate: Candidate, number: int, matched: MatchedFilter, names: Sequence[str]) -> Block:
     channels = tuple(names) if candidate.channel is None else (candidate.channel,)
-    element = Element(f"score/{candidate.label}/{number}", "score", channels)
+    element = Element(
+        f"score/{candidate.label}/{number}",
+        "score",
+        channels,
+        kind="matched",
+        component=f"component {number + 1}" if len(candidate.columns) > 1 else None,
+        effect=candidate.title,
+    )
     return Block((element,), lambda model, filtered: np.array([matched(model, filtered)]))
 
 
@@ -165,7 +175,7 @@ class Job:
     without
         Effects that are no candidates.
     bipolar_scan
-        Measure the bipolar scan as well.
+        Measure the bipolar scan and the coarse residual maps as well.
     observed
         Filtered sky of the data, coefficients up to the model's lmax: the skies are then constrained by it.
     settings
@@ -184,7 +194,7 @@ class Job:
 
 
 def data_vectors(job: Job, library: Library | None = None) -> NDArray[np.float64]:
-    """Return the data vectors of simulations, shape (count, p), each followed by its bipolar scan if it is asked for.
+    """Return the data vectors of simulations, shape (count, p), with bipolar scan and coarse residuals if asked for.
 
     This is the task that a worker runs. ``library``: effects that the simulated run may name; default: the catalogue.
     """

@@ -16,9 +16,10 @@ from mcsim.diagnosis import campaign, measured_spectra, null_ensemble, report
 from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, data_vectors
 from mcsim.diagnosis.batch import asking, batch
 from mcsim.diagnosis.context import DataSet, DiagnosisContext, context
-from mcsim.diagnosis.inference import Diagnosis, diagnose_data
+from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.observed_maps import ObservedMaps, checked, read_maps
+from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.spectra import read_spectra
 from mcsim.diagnosis.templates import TemplateBank
@@ -44,7 +45,7 @@ def diagnose(
     settings: DiagnosisSettings | None = None,
     workers: int | None = None,
     quiet: bool = True,
-) -> Diagnosis:
+) -> DiagnosisResult:
     """Diagnose the gap between a simulation and data.
 
     Parameters
@@ -56,7 +57,7 @@ def diagnose(
         the order channel by channel, split by split; or a table of measured spectra
         (:func:`mcsim.diagnosis.spectra.read_spectra`).
     output
-        Folder for ``verdict.json``, ``evidence.zarr`` and ``report.html``; None: nothing is written.
+        Folder for ``verdict.json``, ``diagnosis.zarr`` and ``report.html``; None: nothing is written.
     case
         Name; default: that of the run.
     without
@@ -72,8 +73,8 @@ def diagnose(
 
     Returns
     -------
-    Diagnosis
-        Verdict, and all that it rests on.
+    DiagnosisResult
+        Verdict, fits, tests, and the arrays behind them.
 
     Raises
     ------

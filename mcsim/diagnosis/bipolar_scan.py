@@ -81,11 +81,12 @@ class BipolarScan:
     @cached_property
     def _sources(self) -> tuple[tuple[str, Element], ...]:
         names = [channel.name for channel in self.model.survey.channels]
-        found = [("sky", Element("sky", "biposh", tuple(names)))]
+        found = [("sky", Element("sky", "biposh", tuple(names), kind="biposh"))]
         for number, name in enumerate(names):
-            found.append((f"{number}+", Element(name, "biposh", (name,))))
+            found.append((f"{number}+", Element(name, "biposh", (name,), kind="biposh")))
             if len(self.model.of(number)) > 1:
-                found.append((f"{number}-", Element(f"{name} difference", "biposh", (name,), "difference")))
+                own = Element(f"{name} difference", "biposh", (name,), "difference", kind="biposh")
+                found.append((f"{number}-", own))
         return tuple(found)
 
     def _coefficients(self, filtered: FilteredMaps) -> dict[tuple[str, str], NDArray[np.complex128]]:
@@ -128,6 +129,7 @@ class BipolarScan:
                         M=0,
                         parity="even",
                         frame=frame,
+                        kind="cross",
                     )
                 )
         return tuple(elements)

@@ -11,6 +11,7 @@ from mcsim import config
 from mcsim.diagnosis.analysis import Analysis, Job
 from mcsim.diagnosis.candidate import Candidate
 from mcsim.diagnosis.null_ensemble import NullEnsemble
+from mcsim.diagnosis.residual_maps import rms
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.templates import TemplateBank
 from mcsim.stats.gaussian import SimulatedGaussian
@@ -129,12 +130,29 @@ def learned(
         error[:, column] = each.std(axis=0, ddof=1) / np.sqrt(len(each))
     time_ordered, default = stacked("time-ordered"), stacked("default")
     offset = np.mean(time_ordered - default, axis=0) if len(time_ordered) else np.zeros(size)
-    scan = [result[:, size:] for job, result in zip(plan.jobs, results, strict=True) if job.bipolar_scan]
-    redundant = analysis.settings.redundant
+    rest = [result[:, size:] for job, result in zip(plan.jobs, results, strict=True) if job.bipolar_scan]
+    scan, coarse = _scanned(analysis, np.concatenate(rest))
     ensemble = NullEnsemble(
-        stacked("null"), offset, analysis.elements, reference, np.concatenate(scan), redundant=redundant
+        stacked("null"),
+        offset,
+        analysis.elements,
+        reference,
+        scan,
+        coarse.mean(axis=0),
+        coarse.std(axis=0, ddof=1),
+        rms(coarse),
+        analysis.settings.redundant,
     )
     return ensemble, TemplateBank(matrix, error, curvature)
+
+
+def _scanned(analysis: Analysis, rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Split what follows the data vectors into bipolar scan, shape (n, numbers), and coarse residuals, (n, map, npix).
+
+    Measured spectra have neither.
+    """
+    numbers = len(analysis.bipolar_scan.elements) if rows.shape[1] else 0
+    return rows[:, :numbers], rows[:, numbers:].reshape(len(rows), len(analysis.model.parts), -1)
 
 
 def after_jobs(

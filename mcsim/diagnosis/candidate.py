@@ -68,6 +68,12 @@ class Candidate:
         return f"{self.name} ({self.channel or 'all'}{', ' + settings if settings else ''})"
 
     @property
+    def title(self) -> str:
+        """Return the effect in words, with channel and settings."""
+        settings = (f"{key} = {value}" for key, value in self.settings.items())
+        return ", ".join((self.effect.label(self.channel), *settings))
+
+    @property
     def basis(self) -> tuple[Effect, ...]:
         """Return the effects whose responses span it, one for each column."""
         return tuple(replace(one, **self.settings) for one in self.effect.basis())

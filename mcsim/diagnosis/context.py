@@ -120,8 +120,8 @@ class DataSet(Protocol):
     def places(self) -> list[Place]:
         """Return where the data depart from the model, the largest departure first."""
 
-    def maps(self) -> list[Vector] | None:
-        """Return the maps; None if there are none."""
+    def residual_maps(self) -> Matrix | None:
+        """Return the residual maps over the scatter of those of simulations, shape (map, npix); None without maps."""
 
-    def attrs(self) -> dict[str, str | int]:
-        """Return attributes of the data for the stored dataset."""
+    def provenance(self) -> dict[str, str | int]:
+        """Return what the result states of the data, by name."""

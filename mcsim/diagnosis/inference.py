@@ -1,67 +1,25 @@
 """Infer from one data set whether, where, by which effects and how far it departs from the model."""
 
-import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
-from mcsim import config
+from mcsim.diagnosis.assemble import Findings, Reduction, result_of
 from mcsim.diagnosis.candidate import columns_of, tables_at
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
-from mcsim.diagnosis.places import Place
 from mcsim.diagnosis.refine import Refined, Refiner, with_scatter
-from mcsim.diagnosis.report_arrays import report_arrays
+from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import Attribution
-from mcsim.diagnosis.validation import Halves, Prediction, Shrink
-from mcsim.diagnosis.verdict import detectable_of, sentence, verdict_of
+from mcsim.diagnosis.validation import Halves
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import Fit
+from mcsim.support.numbers import measured
 
 Vector = NDArray[np.float64]
-Reduction = tuple[Prediction, Shrink, str]
 
 
-@dataclass(frozen=True)
-class Diagnosis:
-    """Whether, where, which, how far: a verdict and the evidence that it rests on.
-
-    Attributes
-    ----------
-    verdict
-        As written to ``verdict.json``.
-    evidence
-        What was measured and what simulations say of it; dimensions entry, column, place.
-    attribution
-        Candidates, explanations and their fits.
-    """
-
-    verdict: dict[str, Any]
-    evidence: xr.Dataset
-    attribution: Attribution
-
-    @property
-    def sentence(self) -> str:
-        """The verdict for a busy person."""
-        return sentence(self.verdict)
-
-    def save(self, folder: str | Path) -> None:
-        """Write ``verdict.json`` and ``evidence.zarr`` into a folder, made where it does not exist."""
-        target = Path(folder)
-        target.mkdir(parents=True, exist_ok=True)
-        (target / "verdict.json").write_text(json.dumps(self.verdict, indent=1, allow_nan=False) + "\n")
-        # Text as objects: for numpy's fixed-length text Zarr 3 has no stable form.
-        texts = {
-            name: values.astype(object) for name, values in self.evidence.variables.items() if values.dtype.kind == "U"
-        }
-        self.evidence.assign(texts).to_zarr(target / "evidence.zarr", mode="w", consolidated=False)
-
-
-def diagnose_data(data: DataSet, case: str) -> Diagnosis:
+def diagnose_data(data: DataSet, case: str) -> DiagnosisResult:
     """Diagnose observed maps or measured spectra.
 
     Parameters
@@ -78,12 +36,11 @@ def diagnose_data(data: DataSet, case: str) -> Diagnosis:
         If the data cannot be what they claim to be.
     """
     context = data.context
-    analysis, candidates = context.analysis, context.candidates
     refiner = Refiner(
         context.null, data.x, context.calibration, context.bank.curvature, data.respond, context.settings,
         data.realizations,
     )  # fmt: skip
-    refined = refiner.run(data.templates(), candidates)
+    refined = refiner.run(data.templates(), context.candidates)
     found = refined.attribution
     exchanged = data.exchanged(found)
     notes = [*exchanged, *data.notes()]
@@ -94,21 +51,13 @@ def diagnose_data(data: DataSet, case: str) -> Diagnosis:
     if found.explanations:
         found = _with_errors(data, refined, found)
         found, reduction = confirmed(context, found, reduction_of(data, refined), notes)
-    where = data.places()
-    able = detectable_of(context.null, refined.templates, candidates)
     partial = None if exchanged else refined.partial
     if partial is None and not exchanged and found.verdict == "unknown":
         partial = refiner.detected_in(refined.templates, refined.candidates)
-    verdict = verdict_of(case, found, candidates, where, reduction, able, notes, partial)
-    maps = data.maps()
-    # Measured spectra have no maps to show.
-    shown = maps or [np.zeros(12 * analysis.model.nside**2) for _ in analysis.model.parts]
-    arrays = report_arrays(analysis.model, shown, context.ensemble.simulations, context.null, found, candidates)
-    if maps is None:
-        arrays = arrays.drop_vars(["residual_map", "map"])
-    evidence = dataset(context, data.x, replace(refined, attribution=found), where, verdict)
-    evidence = evidence.merge(arrays, combine_attrs="no_conflicts").assign_attrs(data.attrs())
-    return Diagnosis(verdict, evidence, found)
+    findings = Findings(
+        data.x, replace(refined, attribution=found), data.places(), reduction, partial, notes, data.residual_maps()
+    )
+    return result_of(context, case, findings, data.provenance())
 
 
 def confirmed(
@@ -127,16 +76,17 @@ def confirmed(
     increased = fraction.value * before.value + limit * fraction.sigma * abs(before.value) < 0.0
     short = expected.value - fraction.value > limit * np.hypot(expected.sigma, fraction.sigma)
     if increased or (short and before.value > 0.0 and fraction.value < 0.5 * min(expected.value, 1.0)):
-        best = " and ".join(context.candidates[member].label for member in found.explanations[0].members)
-        does = f"increases the excess chi^2 of the other from {before.value:.3g} to {reduction[1].after.value:.3g}"
+        best = " and ".join(context.candidates[member].title for member in found.explanations[0].members)
+        does = f"raises the excess χ² of the other half from {before.value:.3g} to {reduction[1].after.value:.3g}"
         if reduction[1].after.value < before.value:
-            does = f"removes {fraction.value:.0%} of the other's excess chi^2, not the predicted {expected.value:.0%}"
+            removed, forecast = 100.0 * fraction.value, 100.0 * expected.value
+            does = f"removes {removed:.0f} % of the excess χ² of the other half, where {forecast:.0f} % were predicted"
         notes.append(f"The best fit, {best}, is not named: simulated with its amplitude from one half, it {does}.")
         return found.unexplained(), None
     if before.value < before.sigma:
         notes.append(
-            f"No reduction is given: the half that would measure it has no excess chi^2 by itself ({before.value:.2g} "
-            f"+- {before.sigma:.2g})."
+            "No reduction on held-out data is given: they show no excess χ² by themselves "
+            f"({measured(before.value, before.sigma)})."
         )
         return found, None
     return found, reduction
@@ -189,48 +139,3 @@ def reduction_of(data: DataSet, refined: Refined) -> Reduction | None:
         return *halves.reduction(t, respond, scatters), words
     except InputError:
         return None
-
-
-def dataset(
-    context: DiagnosisContext, x: Vector, refined: Refined, where: Sequence[Place], verdict: dict[str, Any]
-) -> xr.Dataset:
-    """Everything measured, with names and units."""
-    known = context.ensemble
-    spread = known.simulations.std(axis=0, ddof=1)
-    found = refined.attribution
-    element = [e.name for e in context.analysis.elements]
-    column = [f"{p.label}/{k}" for p in context.candidates for k in range(len(p.columns))]
-    candidate = [p.label for p in context.candidates]
-    best = np.zeros(len(element))
-    if found.explanations:
-        columns = columns_of(context.candidates, found.explanations[0].members)
-        best = refined.templates[:, columns] @ found.explanations[0].fit.amplitudes
-    return xr.Dataset(
-        {
-            "data": ("entry", x, {"long_name": "evidence of the data"}),
-            "mean": (
-                "entry",
-                context.null.mean,
-                {"long_name": "mean of the model, with the offset of the reference"},
-            ),
-            "standard_deviation": ("entry", spread, {"long_name": "scatter of the model"}),
-            "z": ("entry", (x - context.null.mean) / spread, {"long_name": "data less mean, over scatter"}),
-            "explained": ("entry", best / spread, {"long_name": "best explanation, over scatter"}),
-            "templates": (("entry", "column"), refined.templates, {"long_name": "response per unit coordinate"}),
-            "correlation": (("candidate", "other"), found.correlation, {"long_name": "white canonical correlation"}),
-            "drop": ("candidate", [s.delta_chi2 for s in found.singles], {"long_name": "fall of chi^2, fitted alone"}),
-            "calibration": ("draw", context.calibration.combined, {"long_name": "smaller probability, without a gap"}),
-            "place_z": ("place", [p.z for p in where], {"long_name": "deviate of a group"}),
-            "place_p": ("place", [p.p for p in where], {"long_name": "probability, trials included"}),
-        },
-        coords={"entry": element, "column": column, "candidate": candidate, "other": candidate},
-        attrs={
-            "verdict": json.dumps(verdict),
-            "configuration": config.to_json(context.run),
-            "entries": json.dumps([asdict(e) for e in context.analysis.elements]),
-            "places": json.dumps([asdict(p.element) for p in where]),
-            "simulations": len(known.simulations),
-            "skies_of_responses": context.settings.constrained_skies,
-            "settings": json.dumps(asdict(context.settings)),
-        },
-    )

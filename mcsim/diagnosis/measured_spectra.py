@@ -190,12 +190,12 @@ class MeasuredSpectra:
         values = np.concatenate([measured.value, matrix @ measured.value])
         return places(values, drawn, elements, self.context.settings.place_pvalue)
 
-    def maps(self) -> None:
-        """Return None: there are no maps to show."""
+    def residual_maps(self) -> None:
+        """Return None: there are no maps."""
 
-    def attrs(self) -> dict[str, str | int]:
+    def provenance(self) -> dict[str, str | int]:
         """Return the file of the table, and the number of skies."""
-        return {"table": self.measured.path, "skies_behind_the_mean": self.realizations}
+        return {"table": self.measured.path, "skies behind the mean": self.realizations}
 
 
 def _check(measured: Spectra, context: DiagnosisContext) -> None:

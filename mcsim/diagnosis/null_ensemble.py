@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,9 @@ class NullEnsemble:
         Data vectors of the skies with which responses are measured, shape (skies, p).
     bipolar_scan
         Bipolar scan of the first simulations, shape (n, numbers).
+    residual_mean, residual_scatter, residual_rms
+        Mean and standard deviation of the coarse residual maps of the same, shape (map, npix), and the rms of each over
+        this scatter, shape (n, map); without any element for measured spectra.
     redundant
         Directions with less than this fraction of the largest variance are left out.
     """
@@ -41,6 +44,9 @@ class NullEnsemble:
     elements: tuple[Element, ...]
     reference: NDArray[np.float64]
     bipolar_scan: NDArray[np.float64]
+    residual_mean: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    residual_scatter: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    residual_rms: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
     redundant: float = 1e-4
 
     @cached_property
@@ -97,6 +103,13 @@ def save(path: Path, ensemble: NullEnsemble, bank: TemplateBank) -> None:
             "error": (("element", "column"), bank.error, {"long_name": "standard error of the response"}),
             "reference": (("sky", "element"), ensemble.reference, {"long_name": "data vector of the responses' skies"}),
             "bipolar_scan": (("scanned", "number"), ensemble.bipolar_scan, {"long_name": "bipolar scan of the model"}),
+            "residual_mean": (("map", "pixel"), ensemble.residual_mean, {"long_name": "mean of coarse residual maps"}),
+            "residual_scatter": (
+                ("map", "pixel"),
+                ensemble.residual_scatter,
+                {"long_name": "scatter of the same"},
+            ),
+            "residual_rms": (("scanned", "map"), ensemble.residual_rms, {"long_name": "rms of coarse residual maps"}),
         },
         attrs={
             "elements": json.dumps([asdict(element) for element in ensemble.elements]),

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mcsim.diagnosis.campaign import Ask
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.places import Place, places
+from mcsim.diagnosis.residual_maps import standardised
 from mcsim.diagnosis.responses import Responses
 from mcsim.diagnosis.selection import Attribution
 from mcsim.diagnosis.wiener_filter import Model, shared_sky
@@ -44,13 +45,18 @@ class ObservedMaps:
     realizations = 1
 
     @cached_property
-    def _measured(self) -> Vector:
-        return self.context.analysis.data_vector(self.observed, bipolar_scan=True)
+    def _measured(self) -> tuple[Vector, Vector, Vector]:
+        """Data vector, bipolar scan and coarse residuals."""
+        analysis, ensemble = self.context.analysis, self.context.ensemble
+        size = len(analysis.elements)
+        found = analysis.data_vector(self.observed, bipolar_scan=True)
+        x, scan, coarse = np.split(found, [size, size + ensemble.bipolar_scan.shape[1]])
+        return x, scan, coarse.reshape(ensemble.residual_mean.shape)
 
     @property
     def x(self) -> Vector:
         """Return the data vector."""
-        return self._measured[: len(self.context.analysis.elements)]
+        return self._measured[0]
 
     @cached_property
     def respond(self) -> Responses:
@@ -107,14 +113,15 @@ class ObservedMaps:
         drawn = np.concatenate([ensemble.bipolar_scan, ensemble.simulations[:count][:, own]], axis=1)
         shifted = self.x[own] - ensemble.offset[own]
         elements = (*analysis.bipolar_scan.elements, *(analysis.elements[i] for i in own))
-        scan = self._measured[len(analysis.elements) :]
-        return places(np.concatenate([scan, shifted]), drawn, elements, self.context.settings.place_pvalue)
+        return places(np.concatenate([self._measured[1], shifted]), drawn, elements, self.context.settings.place_pvalue)
 
-    def maps(self) -> list[Map]:
-        """Return the maps."""
-        return list(self.observed)
+    def residual_maps(self) -> NDArray[np.float64]:
+        """Return the residual maps over the scatter of those of simulations, shape (map, npix)."""
+        ensemble = self.context.ensemble
+        drawn = len(ensemble.bipolar_scan)
+        return standardised(self._measured[2], ensemble.residual_mean, ensemble.residual_scatter, drawn)
 
-    def attrs(self) -> dict[str, str | int]:
+    def provenance(self) -> dict[str, str | int]:
         """Return nothing."""
         return {}
 

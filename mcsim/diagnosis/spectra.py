@@ -72,6 +72,8 @@ class Spectra:
             mode.M,
             mode.parity,
             self.frame,
+            "table",
+            f"{kind}, {_words(self.scaling)}",
         )
 
     def of(self, simulated: config.RunConfig, first: int, count: int) -> NDArray[np.float64]:

@@ -37,6 +37,12 @@ class Element:
         Range of degrees, None if all or none.
     L, M, parity, frame
         As for BipoSH coefficients, if they apply.
+    kind
+        What is measured, one of the keys of :data:`KINDS`.
+    component
+        Which of the numbers that are alike in all else, in words: "real", "x", "even pixels".
+    effect
+        Of a matched filter, the effect that it is matched to, in words.
     """
 
     name: str
@@ -49,6 +55,42 @@ class Element:
     M: int | None = None
     parity: str | None = None
     frame: str | None = None
+    kind: str = "other"
+    component: str | None = None
+    effect: str | None = None
+
+    @property
+    def family(self) -> str:
+        """Return what is measured in words, with the order of a beam's kernel."""
+        if self.effect is not None:
+            return f"matched filter: {self.effect}"
+        return KINDS.get(self.kind, self.kind) + (f", order {self.L}" if self.kind == "beam" else "")
+
+    @property
+    def words(self) -> str:
+        """Return what was measured, where and in which component, in words."""
+        degrees = "" if self.ell is None else f"ℓ {self.ell[0]}" + f"–{self.ell[1]}" * (self.ell[1] > self.ell[0])
+        whose = () if self.effect is not None else (", ".join(self.channels), self.split)
+        return ", ".join(filter(None, (self.family, *whose, degrees, self.component)))
+
+
+KINDS = {
+    "beam": "residual × sky through the beam",
+    "dipole": "dipole of the residual",
+    "plane": "Galactic plane in the residual",
+    "noise": "noise variance",
+    "square": "residual × sky²",
+    "common": "residual power common to splits",
+    "difference": "power of the split difference",
+    "contrast": "contrast of frequencies",
+    "sky": "power spectrum of the shared sky",
+    "isotropy": "modulation of the shared sky",
+    "matched": "matched filter",
+    "biposh": "BipoSH of residual × sky",
+    "cross": "cross power of residuals",
+    "table": "measured spectrum",
+}
+"""What the elements of the data vector measure, in words."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +161,8 @@ def _beam_block(model: Model, part: int) -> Block:
                         M=0,
                         parity="even",
                         frame=frame,
+                        kind="beam",
+                        component={"re": "real" if s else None, "im": "imaginary"}[quadrature],
                     )
                 )
 
@@ -147,6 +191,8 @@ def _additive_block(model: Model, part: int) -> Block:
             (1, 1),
             L=1,
             frame=_frame(model),
+            kind="dipole",
+            component=axis,
         )
         for axis in "xyz"
     )
@@ -177,6 +223,7 @@ def _plane_block(model: Model, part: int) -> Block:
         M=0,
         parity="even",
         frame="galactic",
+        kind="plane",
     )
 
     def values(model: Model, filtered: FilteredMaps) -> Vector:
@@ -210,6 +257,8 @@ def _noise_block(model: Model, channel: int) -> Block:
                     half,
                     L=0,
                     frame="ecliptic",
+                    kind="noise",
+                    component=f"|sin β| {low:g}–{high:g}, {'odd' if half else 'even'} pixels",
                 )
             )
     bands = np.stack(rows)
@@ -228,7 +277,7 @@ def _linearity_block(model: Model, channel: int) -> Block:
     def values(model: Model, filtered: FilteredMaps) -> Vector:
         return np.array([sum(np.dot(filtered.residual[i], filtered.expected[i] ** 2) for i in parts)])
 
-    return Block((Element(f"square/{name}", "map", (name,)),), values)
+    return Block((Element(f"square/{name}", "map", (name,), kind="square"),), values)
 
 
 def _repeated_block(model: Model, channel: int) -> Block:
@@ -237,7 +286,7 @@ def _repeated_block(model: Model, channel: int) -> Block:
     name = model.survey.channels[channel].name
     ranges = scales(model.lmax)
     elements = tuple(
-        Element(f"{kind}/{name}/{low}-{high}", "cl", (name,), None, None, (low, high), L=0)
+        Element(f"{kind}/{name}/{low}-{high}", "cl", (name,), None, None, (low, high), L=0, kind=kind)
         for kind in ("common", "difference")
         for low, high in ranges
     )
@@ -267,7 +316,16 @@ def _contrast_block(model: Model) -> Block | None:
     ).astype(float)
     names = tuple(channels[c].name for group in groups for c in group)
     elements = tuple(
-        Element(f"contrast/{low:g}-{high:g}", "map", names, None, None, (2, top), L=0, frame="galactic")
+        Element(
+            f"contrast/{low:g}-{high:g}",
+            "map",
+            names,
+            ell=(2, top),
+            L=0,
+            frame="galactic",
+            kind="contrast",
+            component=f"|sin b| {low:g}–{high:g}",
+        )
         for low, high in pairwise(model.settings.latitude_edges)
     )
 
@@ -303,7 +361,9 @@ def _sky_block(model: Model) -> Block:
             weight = np.where((ell >= low) & (ell <= high) & (ell % 2 == fold), 2.0 * ell + 1.0, 0.0)
             if weight.any():
                 rows.append(weight / weight.sum())
-                elements.append(Element(f"sky/{low}-{high}/{parity}", "cl", names, None, fold, (low, high), L=0))
+                name, which = f"sky/{low}-{high}/{parity}", f"{parity} degrees"
+                own = Element(name, "cl", names, None, fold, (low, high), L=0, kind="sky", component=which)
+                elements.append(own)
     means = np.stack(rows)
 
     def values(model: Model, filtered: FilteredMaps) -> Vector:
@@ -311,6 +371,9 @@ def _sky_block(model: Model) -> Block:
         return found
 
     return Block(tuple(elements), values)
+
+
+_FORMS = {"zz": "3z² − 1", "xx": "x² − y²"}
 
 
 def _isotropy_block(model: Model) -> Block:
@@ -334,7 +397,20 @@ def _isotropy_block(model: Model) -> Block:
     )
     ranges = bins(2, lmax, 2)
     elements = tuple(
-        Element(f"isotropy/{form}/{low}-{high}", "biposh", names, None, fold, (low, high), L, M, "even", _frame(model))
+        Element(
+            f"isotropy/{form}/{low}-{high}",
+            "biposh",
+            names,
+            None,
+            fold,
+            (low, high),
+            L,
+            M,
+            "even",
+            _frame(model),
+            kind="isotropy",
+            component=_FORMS.get(form, form),
+        )
         for fold, (low, high) in enumerate(ranges)
         for form, L, M in named
     )

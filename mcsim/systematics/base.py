@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import LineOfSight, Moments, ScanModel
+from mcsim.support.numbers import measured
 
 Alm = NDArray[np.complex128]
 Map = NDArray[np.float64]
@@ -100,6 +101,27 @@ class Site:
         return self.frequency_ghz
 
 
+@dataclass(frozen=True)
+class Wording:
+    """How an amplitude is printed.
+
+    Attributes
+    ----------
+    text
+        Sentence with {} for scale * amplitude + offset, its error and symbol.
+    symbol
+        Of the unit in which it is printed.
+    negative
+        Sentence for the absolute value of a negative amplitude; None: ``text``, with the sign.
+    """
+
+    text: str = "{}"
+    symbol: str = ""
+    scale: float = 1.0
+    offset: float = 0.0
+    negative: str | None = None
+
+
 @dataclass(frozen=True, kw_only=True)
 class Effect:
     """Derive an effect from this class, whose hooks change nothing.
@@ -114,6 +136,8 @@ class Effect:
         "channel": acts in one channel; "common": alike in all of them.
     unit
         Of the amplitude.
+    title, wording
+        Name and amplitude as people read them; left out: the name with spaces, and the amplitude with its unit.
     cause, signature, source
         What makes it, how it shows, and where that is from: one sentence each, for people.
     step
@@ -138,6 +162,8 @@ class Effect:
     name: ClassVar[str]
     scope: ClassVar[Literal["channel", "common"]]
     unit: ClassVar[str]
+    title: ClassVar[str] = ""
+    wording: ClassVar[Wording | None] = None
     cause: ClassVar[str]
     signature: ClassVar[str]
     source: ClassVar[str] = ""
@@ -228,9 +254,52 @@ class Effect:
         """Return all parameters but the amplitude, by name."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "amplitude"}
 
+    @classmethod
+    def label(cls, channel: str | None = None) -> str:
+        """Return the effect's name as people read it, with the channel that it acts in."""
+        return (cls.title or cls.name.replace("_", " ")) + (f" of {channel}" if channel else "")
+
+    @classmethod
+    def format_amplitude(cls, amplitude: float, sigma: float = 0.0) -> str:
+        """Return an amplitude with its error (0: none) and unit as people read it.
+
+        Examples
+        --------
+        >>> from mcsim.systematics.beam_ellipticity import BeamEllipticity
+        >>> BeamEllipticity.format_amplitude(0.159, 0.008)
+        'axis ratio 1.159 ± 0.008'
+        """
+        how = cls.wording or Wording(symbol=f" ({cls.unit})")
+        if amplitude < 0.0 and how.negative is not None:
+            return how.negative.format(measured(-how.scale * amplitude, how.scale * sigma, how.symbol))
+        return how.text.format(measured(how.scale * amplitude + how.offset, how.scale * sigma, how.symbol))
+
+    def direction(self) -> str:
+        """Return where the amplitude points, in words; empty for an effect without a direction."""
+        return ""
+
+    def describe(self, sigma: float = 0.0) -> str:
+        """Return amplitude, error and direction as people read them."""
+        return " ".join(filter(None, (self.format_amplitude(self.amplitude, sigma), self.direction())))
+
     def scaled(self, factor: float) -> Self:
         """Return the same effect with ``factor`` times the amplitude."""
         return replace(self, amplitude=factor * self.amplitude)
+
+
+def scan_direction(angle_deg: float, period_deg: float = 360.0) -> str:
+    """Return a direction in the frame of the beam, x along the scan, in words."""
+    angle = (angle_deg + period_deg / 2.0) % period_deg - period_deg / 2.0
+    named = {0.0: "along the scan", 90.0: "across the scan"}
+    if period_deg > 180.0:
+        named |= {180.0: "against the scan"}
+    for at, words in named.items():
+        if abs(abs(angle) - at) < _NAMED_WITHIN_DEG:
+            return words
+    return f"at {angle:.0f}° to the scan".replace("-", "−")
+
+
+_NAMED_WITHIN_DEG = 5.0
 
 
 def polar(coordinates: Vector, multiple: int = 1) -> tuple[float, float]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from mcsim.instrument.beams import Beam
-from mcsim.systematics.base import Effect, Site, Vector
+from mcsim.systematics.base import Effect, Site, Vector, Wording
 from mcsim.systematics.shape import shape
 
 _WHOLE_SIGMAS = 7.0
@@ -38,6 +38,8 @@ class BeamComa(Effect):
     name = "beam_coma"
     scope = "channel"
     unit = "k of 1 + k (u^3 - 3u)"
+    title = "beam coma"
+    wording = Wording("k = {}")
     cause = "Third-order aberration of optics off the axis."
     signature = "L = 1 and 3, d = +-1, through w_1 and w_3; changes sign where the scan reverses (half1 - half2)."
     source = "Born & Wolf, Principles of Optics, Sec. 5.3, in the lowest Hermite order that keeps the centroid"

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
-from mcsim.systematics.base import Effect, Site, Vector, polar
+from mcsim.systematics.base import Effect, Site, Vector, Wording, polar, scan_direction
 from mcsim.systematics.shape import stretched
 
 
@@ -27,6 +27,8 @@ class BeamEllipticity(Effect):
     name = "beam_ellipticity"
     scope = "channel"
     unit = "major/minor - 1"
+    title = "beam ellipticity"
+    wording = Wording("axis ratio {}", offset=1.0)
     cause = "Optics off the axis: defocus, coma-free astigmatism, or a horn that looks past the centre of the mirror."
     signature = "Even L, growing as l^2, fixed to the scan through w_2."
     source = "Joshi et al. arXiv:1210.7318, Sec. IV; Fosalba et al. 2002, Phys. Rev. D 65, 063003"
@@ -62,3 +64,7 @@ class BeamEllipticity(Effect):
         """Norm and half the angle."""
         amplitude, angle_deg = polar(coordinates, 2)
         return cls(amplitude=amplitude, angle_deg=angle_deg)
+
+    def direction(self) -> str:
+        """Return the direction in the frame of the beam."""
+        return "with the major axis " + scan_direction(self.angle_deg, 180.0)

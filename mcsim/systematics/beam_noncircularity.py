@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mcsim.instrument.beams import Beam
-from mcsim.systematics.base import Effect, Site
+from mcsim.systematics.base import Effect, Site, Wording
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,6 +22,8 @@ class BeamNoncircularity(Effect):
     name = "beam_noncircularity"
     scope = "channel"
     unit = "share of the orders beyond m_max"
+    title = "beam non-circularity"
+    wording = Wording("{} of the orders beyond m_max", " %", 100.0)
     cause = "Simulations with the circular part of a measured beam, or with too few of its orders."
     signature = "L of the orders left out: 2 and 4 of an ellipse, 1 and 3 of a lopsided beam, in the scan's frame."
     source = "Joshi et al. arXiv:1210.7318, Sec. IV"

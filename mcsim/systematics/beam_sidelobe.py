@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
-from mcsim.systematics.base import Effect, Site, Vector
+from mcsim.systematics.base import Effect, Site, Vector, Wording
 from mcsim.systematics.shape import shape
 
 CALIBRATIONS = ("none", "dipole")
@@ -34,6 +34,8 @@ class BeamSidelobe(Effect):
     name = "beam_sidelobe"
     scope = "channel"
     unit = "fraction of the peak"
+    title = "beam sidelobe"
+    wording = Wording("negative ring of {} of the peak", " %", 100.0, negative="ring of {} of the peak")
     cause = "Spill-over, struts or panels of the mirror; negative where two horns are subtracted."
     signature = "A halo at low l, pick-up of the plane and the dipole, and with q the m = 2 part of b_lm."
     source = "Barnes et al. 2003, ApJS 148, 51 (WMAP's sidelobes, negative and positive); the shape is a model"

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
-from mcsim.systematics.base import Effect, Site
+from mcsim.systematics.base import Effect, Site, Wording
 from mcsim.systematics.shape import stretched
 
 
@@ -15,6 +15,8 @@ class BeamWidth(Effect):
     name = "beam_width"
     scope = "channel"
     unit = "fraction of the FWHM"
+    title = "beam width"
+    wording = Wording("FWHM {} larger", " %", 100.0, negative="FWHM {} smaller")
     cause = "A beam mapped with an error of its width, or a focus that drifts."
     signature = "L = 0: the power falls off sooner, in this channel alone."
     source = "Huffenberger et al. 2010, A&A 513, A23 (errors of measured beams)"

@@ -10,7 +10,7 @@ from scipy.sparse.linalg import expm_multiply
 
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
-from mcsim.systematics.base import Alm, Draw, Site
+from mcsim.systematics.base import Alm, Draw, Site, Wording
 from mcsim.systematics.vectors import DirectedEffect
 
 
@@ -37,6 +37,8 @@ class Boost(DirectedEffect):
     name = "boost"
     scope = "common"
     unit = "v/c"
+    title = "Doppler boost"
+    wording = Wording("v/c = {}")
     cause = "The Solar System moves against the cosmic background."
     signature = "L = 1, d = 1, growing as l: to be seen from l of about 1000 on."
     source = "Challinor & van Leeuwen 2002, Phys. Rev. D 65, 103001; Planck 2013 results XXVII"

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from mcsim.systematics.base import Alm, Draw, Site
+from mcsim.systematics.base import Alm, Draw, Site, Wording
 from mcsim.systematics.product import multiplied
 from mcsim.systematics.vectors import DirectedEffect
 
@@ -22,6 +22,8 @@ class DipoleModulation(DirectedEffect):
     name = "dipole_modulation"
     scope = "common"
     unit = "fraction"
+    title = "dipole modulation of the sky"
+    wording = Wording("{} of the signal", " %", 100.0)
     cause = "A sky that is not statistically isotropic: a hemispherical power asymmetry."
     signature = "L = 1, d = 1, the same in every channel and split, at all l."
     source = "Gordon et al. 2005, Phys. Rev. D 72, 103002"

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from mcsim.sphere.sky import dipole_alm
-from mcsim.systematics.base import Alm, Draw, Site
+from mcsim.systematics.base import Alm, Draw, Site, Wording
 from mcsim.systematics.vectors import DirectedEffect
 
 
@@ -22,6 +22,8 @@ class DipoleResidual(DirectedEffect):
     name = "dipole_residual"
     scope = "channel"
     unit = "uK"
+    title = "residual dipole"
+    wording = Wording("{}", " µK")
     cause = "Error of the dipole that was subtracted, or of the channel's absolute calibration."
     signature = "l = 1, the same in both halves."
     source = "Hinshaw et al. 2009, ApJS 180, 225 (the dipole and its error)"

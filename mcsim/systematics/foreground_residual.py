@@ -14,7 +14,7 @@ from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotate_alm
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.systematics import product
-from mcsim.systematics.base import Alm, Draw, Effect, Site
+from mcsim.systematics.base import Alm, Draw, Effect, Site, Wording
 
 REFERENCE_GHZ = 94.0
 _SLOPE = -2.5
@@ -45,6 +45,8 @@ class ForegroundResidual(Effect):
     name = "foreground_residual"
     scope = "common"
     unit = "uK rms at 94 GHz"
+    title = "residual foreground"
+    wording = Wording("{} rms at 94 GHz", " µK")
     cause = "Synchrotron, free-free or dust emission that the templates of the cleaning do not follow."
     signature = (
         "Additive and fixed to the sky, along the Galactic plane, different from channel to channel in size alone."

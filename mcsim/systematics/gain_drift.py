@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.systematics.base import Effect, Site, Vector, polar
+from mcsim.systematics.base import Effect, Site, Vector, Wording, polar
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +28,8 @@ class GainDrift(Effect):
     name = "gain_drift"
     scope = "channel"
     unit = "fraction"
+    title = "annual gain drift"
+    wording = Wording("{} of the gain", " %", 100.0)
     cause = "Temperature of the receiver over the year, followed imperfectly by the calibration."
     signature = (
         "Sky and dipole modulated with the year: additive at low l, ordered by the scan, opposite in the halves."

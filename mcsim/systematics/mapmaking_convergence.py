@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from mcsim.systematics.base import Effect
+from mcsim.systematics.base import Effect, Wording
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -12,6 +12,8 @@ class MapmakingConvergence(Effect):
     name = "mapmaking_convergence"
     scope = "channel"
     unit = "iterations short"
+    title = "map-making convergence"
+    wording = Wording("{} iterations short")
     cause = "Conjugate gradients ended by a count, not by their residual."
     signature = "Stripes in the frame of the scan, at the largest scales; acts on differencing scans only."
     source = "Hinshaw et al. 2003, ApJS 148, 63, Sec. 3 (iterations of the map-making)"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotation_matrix
-from mcsim.systematics.base import Effect, Map, Site
+from mcsim.systematics.base import Effect, Map, Site, Wording
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +28,8 @@ class NoiseAnisotropy(Effect):
     name = "noise_anisotropy"
     scope = "channel"
     unit = "fraction of the variance"
+    title = "noise anisotropy"
+    wording = Wording("{} of the variance", " %", 100.0)
     cause = "Hits that are not those of the survey, flagged or lost samples, or noise that varies through the year."
     signature = "Autos only, L = 2, M = 0 of the ecliptic frame; the variance map of half differences."
     source = "The pattern is the lowest one that a scan symmetric about the ecliptic makes"

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mcsim.errors import InputError
-from mcsim.systematics.base import Effect, Map, Site
+from mcsim.systematics.base import Effect, Map, Site, Wording
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,6 +15,8 @@ class NoiseLevel(Effect):
     name = "noise_level"
     scope = "channel"
     unit = "fraction of sigma0"
+    title = "noise level"
+    wording = Wording("{} more noise", " %", 100.0, negative="{} less noise")
     cause = "Noise estimated on other data, or a gain that is not the fiducial one."
     signature = "Autos only, flat in l, as the hits."
     source = "Jarosik et al. 2011, ApJS 192, 14 (sigma0 per channel, and its error)"

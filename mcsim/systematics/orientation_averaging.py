@@ -6,7 +6,7 @@ import numpy as np
 
 from mcsim.instrument.scan import Moments, cached_moments, load_model
 from mcsim.support.resources import scan_model
-from mcsim.systematics.base import Effect, Site
+from mcsim.systematics.base import Effect, Site, Wording
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +27,8 @@ class OrientationAveraging(Effect):
     name = "orientation_averaging"
     scope = "channel"
     unit = "1 = parallel transport assumed, scan real"
+    title = "orientations of the scan"
+    wording = Wording("{} of the step from parallel transport to the real scan", " %", 100.0)
     cause = "Parallel transport, or one orientation per pixel, in place of the survey's samples."
     signature = "L = 2, M = 0 falls to 0.66 of what parallel transport gives, and other M appear."
     source = "Joshi et al. arXiv:1210.7318, Sec. V"

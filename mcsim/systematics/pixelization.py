@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from mcsim.systematics.base import Effect
+from mcsim.systematics.base import Effect, Wording
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,6 +19,8 @@ class Pixelization(Effect):
     name = "pixelization"
     scope = "channel"
     unit = "1 = window and centroid ignored"
+    title = "pixelization"
+    wording = Wording("{} of the window and the centroids of pixels left out", " %", 100.0)
     cause = "Simulations at the pixels' centres, where the survey has samples all over the pixels."
     signature = "Small scales, depending on nside, and the gradient of the sky at pixels that are hit unevenly."
     source = "Gorski et al. 2005, ApJ 622, 759, Sec. 6 (window functions)"

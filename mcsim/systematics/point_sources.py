@@ -6,7 +6,7 @@ import numpy as np
 
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.sky import gaussian_alm
-from mcsim.systematics.base import Alm, Draw, Effect, Site
+from mcsim.systematics.base import Alm, Draw, Effect, Site, Wording
 
 _NARROWEST = 5
 
@@ -25,6 +25,8 @@ class PointSources(Effect):
     name = "point_sources"
     scope = "common"
     unit = "uK^2 sr"
+    title = "point sources"
+    wording = Wording("C_ℓ = {}", " µK² sr")
     cause = "Radio galaxies below the limit of the catalogue."
     signature = "Flat C_l, in autos and crosses of all channels alike."
     source = "Tegmark & Efstathiou 1996, MNRAS 281, 1297; Wright et al. 2009, ApJS 180, 283"

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.instrument.beams import Beam
-from mcsim.systematics.base import Effect, Site, Vector, polar
+from mcsim.systematics.base import Effect, Site, Vector, Wording, polar, scan_direction
 from mcsim.systematics.shape import displaced
 
 
@@ -30,6 +30,8 @@ class PointingOffset(Effect):
     name = "pointing_offset"
     scope = "channel"
     unit = "arcmin"
+    title = "pointing offset"
+    wording = Wording("{}", "′")
     cause = "A boresight calibrated on planets, thermal bending, or an error of the time stamps (along the scan)."
     signature = "The gradient of the sky along or across the scan, through w_1; acts on the dipole too."
     source = "Jarosik et al. 2007, ApJS 170, 263 (boresights); Mitra et al. 2011, ApJS 193, 5"
@@ -78,3 +80,7 @@ class PointingOffset(Effect):
         """Norm and angle."""
         amplitude, angle_deg = polar(coordinates)
         return cls(amplitude=amplitude, angle_deg=angle_deg)
+
+    def direction(self) -> str:
+        """Return the direction in the frame of the beam."""
+        return scan_direction(self.angle_deg)

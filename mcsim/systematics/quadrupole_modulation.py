@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.systematics.base import Alm, Draw, Effect, Site, Vector
+from mcsim.systematics.base import Alm, Draw, Effect, Site, Vector, Wording
 from mcsim.systematics.product import multiplied
 from mcsim.systematics.vectors import along
 
@@ -27,6 +27,8 @@ class QuadrupoleModulation(Effect):
     name = "quadrupole_modulation"
     scope = "common"
     unit = "fraction"
+    title = "quadrupole modulation of the sky"
+    wording = Wording("{} of the signal", " %", 100.0)
     cause = "A sky that is not statistically isotropic: a preferred axis, as of an anisotropic early expansion."
     signature = "L = 2, the same in every channel and split: nearly degenerate with m = 2 in one channel."
     source = "Ackerman, Carroll & Wise 2007, Phys. Rev. D 75, 083502, with a modulation of the sky in place of P(k)"

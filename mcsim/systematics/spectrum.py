@@ -9,7 +9,7 @@ from scipy.optimize import lsq_linear
 
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
-from mcsim.systematics.base import Alm, Draw, Effect, Site, Vector
+from mcsim.systematics.base import Alm, Draw, Effect, Site, Vector, Wording
 from mcsim.systematics.vectors import along
 
 BANDS = 6
@@ -41,6 +41,8 @@ class Spectrum(Effect):
     name = "spectrum"
     scope = "common"
     unit = "fraction of C_l"
+    title = "power spectrum of the sky"
+    wording = Wording("{} of C_ℓ (norm over bands)", " %", 100.0)
     cause = "A cosmology that is not the one of the simulations."
     signature = "L = 0, every channel alike."
     source = "Follows from the definition"

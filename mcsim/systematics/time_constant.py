@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mcsim.instrument.beams import Beam
-from mcsim.systematics.base import Effect, Site
+from mcsim.systematics.base import Effect, Site, Wording
 from mcsim.systematics.shape import smeared
 
 _NODES = 7
@@ -26,6 +26,8 @@ class TimeConstant(Effect):
     name = "time_constant"
     scope = "channel"
     unit = "s"
+    title = "time constant"
+    wording = Wording("{}", " ms", 1000.0)
     cause = "Heat capacity of a bolometer, or a filter in the electronics, not deconvolved."
     signature = "Lag and smear along beam x: nearly degenerate with a pointing offset along the scan, and with m = 2."
     source = "Planck 2013 results VII, A&A 571, A7 (time response of bolometers)"

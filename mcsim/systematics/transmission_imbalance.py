@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from mcsim.systematics.base import Effect
+from mcsim.systematics.base import Effect, Wording
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -12,6 +12,8 @@ class TransmissionImbalance(Effect):
     name = "transmission_imbalance"
     scope = "channel"
     unit = "x"
+    title = "transmission imbalance"
+    wording = Wording("x = {}")
     cause = "Losses in the two arms of a differencing radiometer, measured with an error."
     signature = "Stripes of the dipole along the scan; acts on differencing scans only."
     source = "Jarosik et al. 2003, ApJS 145, 413; Hinshaw et al. 2003, ApJS 148, 63"

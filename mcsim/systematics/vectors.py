@@ -40,6 +40,10 @@ class DirectedEffect(Effect):
         lon_deg, lat_deg = lonlat_deg(coordinates)
         return cls(amplitude=float(np.linalg.norm(coordinates)), lon_deg=lon_deg, lat_deg=lat_deg)
 
+    def direction(self) -> str:
+        """Return longitude and latitude in the frame of the maps."""
+        return f"towards longitude {self.lon_deg:.0f}°, latitude {self.lat_deg:.0f}°".replace("-", "−")
+
 
 def along(effect: str, key: str, direction: tuple[float, ...], amplitude: float) -> Vector:
     """``amplitude`` times the unit vector along a parameter of an effect; InputError where that is zero."""

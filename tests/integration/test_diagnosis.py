@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import healpy
 import numpy as np
@@ -10,13 +11,13 @@ from scipy.stats import kstest
 
 import mcsim
 from mcsim import config, systematics
-from mcsim.diagnosis import campaign
+from mcsim.diagnosis import campaign, residual_maps
 from mcsim.diagnosis.analysis import analysis_of, data_vectors
 from mcsim.diagnosis.campaign import with_effects
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps, read_maps
-from mcsim.diagnosis.wiener_filter import shared_sky
+from mcsim.diagnosis.wiener_filter import shared_sky, wiener_filter
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
@@ -97,6 +98,57 @@ def test_ellipticity_seen_sample_by_sample_is_named_and_shrinks(small):
     assert abs(best["amplitude"] - truth) < 3 * best["sigma"]
     assert verdict["shrink"]["achieved"] > 0.5
     assert abs(verdict["shrink"]["achieved"] - verdict["shrink"]["predicted"]) < 4 * verdict["shrink"]["sigma"]
+
+
+def mean_squares(learned, name=None, channel=None, skies=20, **parameters):
+    """Mean square of the standardised residual of every map, shape (sky, map)."""
+    shared, ensemble = data_of(learned.run, name, channel, **parameters), learned.ensemble
+    count, rows = len(ensemble.bipolar_scan), []
+    for realization in range(skies):
+        filtered = wiener_filter(learned.analysis.model, list(simulate.maps(shared, realization)))
+        x = residual_maps.coarse_residuals(learned.analysis.model, filtered)
+        z = residual_maps.standardised(x, ensemble.residual_mean, ensemble.residual_scatter, count)
+        rows.append(np.nanmean(z**2, axis=1))
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_residual_maps_of_the_model_have_unit_rms(small, masked, tmp_path):
+    learned, pixels = small, 3072
+    if masked:
+        path = tmp_path / "mask.fits"
+        seen = np.abs(healpy.pix2vec(16, np.arange(3072))[2]) < 0.55
+        healpy.write_map(path, seen.astype(float), dtype=np.float64)
+        run = replace(small.run, map=replace(small.run.map, mask=str(path), mask_frame="ecliptic"))
+        analysis = analysis_of(run, without=list(systematics.catalogue()))
+        plan = campaign.plan(run, analysis, simulations=260, time_ordered=False)
+        ensemble, _ = campaign.learned(analysis, plan, ask(plan.jobs))
+        learned = SimpleNamespace(run=run, analysis=analysis, ensemble=ensemble)
+        pixels = int(seen.sum())
+        # Not the noise alone: the filter leaves much of the sky behind a mask.
+        filtered = wiener_filter(analysis.model, list(simulate.maps(data_of(run), 0)))
+        x = residual_maps.coarse_residuals(analysis.model, filtered)[:, seen]
+        noise = np.sqrt([part.precision[seen] for part in analysis.model.parts])
+        assert np.sqrt(np.mean((x / noise) ** 2)) > 1.2
+    found = mean_squares(learned)
+    error = np.std(found.mean(axis=1), ddof=1) / np.sqrt(len(found))
+    if not masked:  # independent pixels
+        assert error < 2.0 * np.sqrt(2.0 / (pixels * found.size))
+    # The scatter of the simulations has an error like that of 260 skies.
+    assert abs(found.mean() - 1.0) < 4.0 * error * np.sqrt(1.0 + len(found) / 260)
+    low, high = np.quantile(learned.ensemble.residual_rms, [0.025, 0.975], axis=0)
+    outside = np.sum((np.sqrt(found) < low) | (np.sqrt(found) > high), axis=0)
+    # 7 or more of 20 outside of the range of 95 %: once in 30,000.
+    assert np.all(outside < 7)
+
+
+def test_an_effect_stands_out_in_the_residual_maps_of_its_channel(small):
+    names = [part.name.partition(":")[0] for part in small.analysis.model.parts]
+    found = mean_squares(small, "noise_level", "W1", skies=4, amplitude=0.2).mean(axis=0)
+    for name, value in zip(names, found, strict=True):
+        # Noise of W1 is 1.2 times larger, and little of it gets into the sky that V1 is compared with.
+        expected = 1.2**2 if name == "W1" else 1.0
+        assert abs(value - expected) < 5.0 * expected * np.sqrt(2.0 / 3072 / 4) + 0.02
 
 
 def test_a_broken_simulator_shrinks_nothing(small):

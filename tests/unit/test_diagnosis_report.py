@@ -1,7 +1,9 @@
 """The report of every verdict: complete, self-contained, safe; and the numbers that it alone computes."""
 
+import json
+import re
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import lru_cache
 from html.parser import HTMLParser
 from types import SimpleNamespace
@@ -9,26 +11,26 @@ from types import SimpleNamespace
 import healpy
 import numpy as np
 import pytest
-import xarray as xr
 from scipy import stats
 
 from mcsim import config, systematics
 from mcsim.diagnosis import figures as plots
-from mcsim.diagnosis import inference, report, report_arrays
+from mcsim.diagnosis import report, residual_maps, words
+from mcsim.diagnosis.assemble import Findings, effects_of, held_out_pvalues, result_of
 from mcsim.diagnosis.candidate import Candidate, numbered
-from mcsim.diagnosis.inference import Diagnosis
 from mcsim.diagnosis.places import Place
 from mcsim.diagnosis.refine import Refined
+from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import attribute
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Element
 from mcsim.diagnosis.validation import Measured, Prediction, Shrink
-from mcsim.diagnosis.verdict import detectable_of, effects_of, verdict_of
-from mcsim.diagnosis.view import ReportView, entry_words
+from mcsim.errors import InputError
 from mcsim.stats.detection import confusion, snr_needed
 from mcsim.stats.gaussian import SimulatedGaussian, residual_pvalue
 from mcsim.stats.look_elsewhere import calibrate
 from mcsim.support import resources
+from mcsim.support.numbers import measured, number, p_equals, probability
 
 EVIL = "<script>alert('$x_')<img src=x onerror=alert(1)>"
 P, N = 30, 500
@@ -37,19 +39,23 @@ VERDICTS = ("none", "effect", "mixture", "degenerate", "unknown")
 
 def elements() -> list[Element]:
     found = [
-        Element(f"beam/{EVIL}:half{half + 1}/m{s}{part}/{low}-{low + 9}", "map", (EVIL,), f"half{half + 1}", half,
-              (low, low + 9), s, 0, "even", "ecliptic")
-        for half in (0, 1) for s, part in ((0, "re"), (2, "re"), (2, "im")) for low in (2, 12)
+        Element(f"beam/{half}/{s}{part}/{low}", "map", (EVIL,), f"half{half + 1}", half, (low, low + 9), s, 0, "even",
+              "ecliptic", "beam", part)
+        for half in (0, 1) for s, part in ((0, None), (2, "real"), (2, "imaginary")) for low in (2, 12)
     ]  # fmt: skip
     found += [
-        Element(f"dipole/V:half1/{axis}", "map", ("V",), "half1", 0, (1, 1), 1, frame="ecliptic") for axis in "xyz"
+        Element(f"dipole/{axis}", "map", ("V",), "half1", 0, (1, 1), 1, frame="ecliptic", kind="dipole", component=axis)
+        for axis in "xyz"
     ]
     found += [
-        Element(f"sky/{low}-{low + 9}", "cl", (EVIL, "V"), None, 0, (low, low + 9), 0) for low in range(2, 92, 10)
+        Element(f"sky/{low}", "cl", (EVIL, "V"), None, 0, (low, low + 9), 0, kind="sky") for low in range(2, 92, 10)
     ]
-    found += [Element(f"score/pointing_offset (V)/{k}", "score", ("V",)) for k in (0, 1)]
-    found += [Element(f"noise/V/0-0.25/pixels{k}", "noise", ("V",), None, k, L=0, frame="ecliptic") for k in (0, 1)]
-    return [*found, Element("mine/&<b>", "other", ("V",)), Element("square/V", "map", ("V",))]
+    found += [
+        Element(f"score/{k}", "score", ("V",), kind="matched", component=f"component {k + 1}", effect="offset of V")
+        for k in (0, 1)
+    ]
+    found += [Element(f"noise/{k}", "noise", ("V",), None, k, L=0, frame="ecliptic", kind="noise") for k in (0, 1)]
+    return [*found, Element("mine/&<b>", "other", ("V",)), Element("square/V", "map", ("V",), kind="square")]
 
 
 def proposals() -> tuple[Candidate, ...]:
@@ -80,12 +86,8 @@ RESPONSE = 50.0
 
 
 @pytest.fixture(scope="module")
-def diagnoses() -> dict[str, Diagnosis]:
-    with pytest.MonkeyPatch.context() as patch:
-        sky = np.random.default_rng(5).normal(size=(2, 12 * 8**2))
-        sky[:, :60] = np.nan
-        patch.setattr(report_arrays, "residual_maps", lambda model, maps: sky)
-        return {kind: diagnosis(kind) for kind in VERDICTS}
+def diagnoses() -> dict[str, DiagnosisResult]:
+    return {kind: diagnosis(kind) for kind in VERDICTS}
 
 
 @lru_cache
@@ -94,22 +96,24 @@ def bench(nearest_candidates: bool) -> SimpleNamespace:
     candidates, t = proposals(), RESPONSE * templates(nearest_candidates)
     simulations = np.random.default_rng(10).normal(size=(N, P))
     model = SimulatedGaussian.from_simulations(simulations)
+    spread = np.random.default_rng(12).normal(size=(5, 2))
+    survey = SimpleNamespace(config=SimpleNamespace(map=SimpleNamespace(frame="ecliptic")))
+    fiducial = SimpleNamespace(survey=survey, parts=[SimpleNamespace(name=name) for name in (EVIL, "V")])
     return SimpleNamespace(
         run=replace(config.load(resources.workflow("quickstart")), name=EVIL),
-        analysis=SimpleNamespace(elements=elements()),
-        settings=DiagnosisSettings(),
-        ensemble=SimpleNamespace(simulations=simulations),
+        analysis=SimpleNamespace(elements=tuple(elements()), model=fiducial),
+        settings=DiagnosisSettings(beam_bins=(5, 2, 2, 1, 1), place_pvalue=0.0123),
+        ensemble=SimpleNamespace(simulations=simulations, residual_rms=1.0 + 0.1 * spread),
         null=model,
         candidates=candidates,
         calibration=calibrate(
             model, model.whiten_groups(t, [candidate.columns for candidate in candidates]), draws=2000
         ),
         templates=t,
-        detectable=detectable_of(model, t, candidates),
     )
 
 
-def diagnosis(kind: str) -> Diagnosis:
+def diagnosis(kind: str) -> DiagnosisResult:
     """Through the code that makes the evidence, on constructed simulations and data."""
     context = bench(kind == "degenerate")
     t, rng = context.templates, np.random.default_rng(11)
@@ -126,16 +130,10 @@ def diagnosis(kind: str) -> Diagnosis:
             Shrink(Measured(215.0, 30.0), Measured(20.0, 9.0), Measured(0.907, 0.051), 0.4),
             "half2 (frozen on half1)",
         )
-    notes = ["a <b>note</b> & so"]
-    name = f"case <i>{kind}</i>"
-    verdict = verdict_of(name, found, context.candidates, where, shrink, context.detectable, notes)
-    survey = SimpleNamespace(config=SimpleNamespace(map=SimpleNamespace(frame="ecliptic")))
-    fiducial = SimpleNamespace(survey=survey, parts=[SimpleNamespace(name=name) for name in (EVIL, "V")])
-    shown = report_arrays.report_arrays(
-        fiducial, [], context.ensemble.simulations, context.null, found, context.candidates
-    )
-    evidence = inference.dataset(context, x, Refined(found, t, (), ()), where, verdict)
-    return Diagnosis(verdict, evidence.merge(shown, combine_attrs="no_conflicts"), found)
+    sky = np.random.default_rng(5).normal(size=(2, 12 * 8**2))
+    sky[:, :60] = np.nan
+    findings = Findings(x, Refined(found, t, (), ()), where, shrink, None, ["a <b>note</b> & so"], sky)
+    return result_of(context, f"case <i>{kind}</i>", findings, {"level": 0.05})
 
 
 class Page(HTMLParser):
@@ -177,7 +175,7 @@ def pages(diagnoses) -> Iterator[dict[str, str]]:
 
 @pytest.mark.parametrize("kind", VERDICTS)
 def test_page_is_sound_and_needs_nothing_else(diagnoses, pages, kind):
-    assert diagnoses[kind].verdict["verdict"] == kind
+    assert diagnoses[kind].to_json()["verdict"] == kind
     text = pages[kind]
     page = Page(text)
     assert page.open == []
@@ -200,84 +198,147 @@ def test_names_from_configurations_stay_text(pages, kind):
 
 
 @pytest.mark.parametrize("kind", VERDICTS)
-def test_first_screen_says_the_verdict(diagnoses, pages, kind):
+def test_first_screen_says_what_was_tested_and_found(diagnoses, pages, kind):
     header = Page(pages[kind].partition("</header>")[0].partition("<body>")[2]).text
-    verdict = diagnoses[kind].verdict
-    assert " ".join(diagnoses[kind].sentence.replace("+-", "±").split()) in header
-    for effect in verdict["effects"]:
-        assert report.measured(effect["amplitude"], effect["sigma"]) in header
-        assert effect["unit"] in header
-    assert ("90.7 ± 5.1 % of the gap" in header) == (kind in ("effect", "mixture", "degenerate"))
+    result = diagnoses[kind]
+    for text in (words.sentence(result), words.status(result), words.tested(result), words.chi2(result)):
+        assert " ".join(text.split()) in header
+    assert f"{P} elements" in header
+    assert f"{N} simulations" in header
+    for effect in result.effects:
+        assert effect.words in header
+        assert effect.label in header
+    assert (words.held_out(result) in header) == (kind in ("effect", "mixture", "degenerate"))
+    assert ("91 % ± 5 %" in header) == (kind in ("effect", "mixture", "degenerate"))
     assert ("cosine" in header) == (kind == "unknown")
 
 
-def test_explanations_stand_side_by_side_with_what_tells_them_apart(diagnoses, pages):
-    text = Page(pages["degenerate"]).text
-    sets = [diagnoses["degenerate"].verdict["effects"], *diagnoses["degenerate"].verdict["alternatives"]]
-    assert len(sets) == 2
-    assert all(report.measured(one[0]["amplitude"], one[0]["sigma"]) in text for one in sets)
-    (contrast,) = ReportView(diagnoses["degenerate"].verdict, diagnoses["degenerate"].evidence).contrasts
-    assert f"differ by {contrast['separation']:.1f} sigmas" in text
-    assert contrast["entries"][0]["words"] in text
+def test_global_chi2_is_near_its_degrees_of_freedom_where_the_model_is_right(diagnoses):
+    test = diagnoses["none"].test
+    # The raw statistic is larger by (N - 1)/(N - 2 - p).
+    assert test.excess.value + test.dof == pytest.approx(test.chi2 * (N - 2 - P) / (N - 1))
+    assert abs(test.excess.value) < 4.0 * test.excess.sigma
 
 
-def test_best_explanation_is_taken_from_what_is_left(diagnoses):
+MARGINAL, AGREES = "marginally compatible", "agrees with the simulations"
+
+
+@pytest.mark.parametrize("kind", ["effect", "mixture", "degenerate"])
+@pytest.mark.parametrize("fitted", [0.9, 0.03, 0.001])
+@pytest.mark.parametrize("fresh", [0.9, 0.0079, 1e-9])
+def test_sentences_agree_with_the_p_values_beside_them(diagnoses, kind, fitted, fresh):
+    one = diagnoses[kind]
+    best = replace(one.sets[0], pvalue=fitted)
+    result = replace(one, sets=(best, *one.sets[1:]), held_out=replace(one.held_out, pvalue_after=fresh))
+    for text, p in ((words.status(result), fitted), (words.held_out(result), fresh)):
+        assert p_equals(p) in text
+        assert (AGREES in text) == (p > words.AGREES)
+        assert (MARGINAL in text) == (words.DISAGREES < p <= words.AGREES)
+        assert ("does not agree" in text) == (p <= words.DISAGREES)
+    if kind != "degenerate":
+        assert ("reservation" in words.status(result)) == (min(fitted, best.further) <= words.AGREES)
+
+
+def test_a_reduction_that_is_not_measured_is_not_quoted(diagnoses):
+    one = diagnoses["effect"]
+    vague = replace(one, held_out=replace(one.held_out, achieved=Measured(0.5, 2.0)))
+    assert "50" not in words.held_out(vague)
+    assert "215 ± 30" in words.held_out(vague)
+    assert "Not measured" in words.held_out(replace(one, held_out=None))
+
+
+@pytest.mark.parametrize("kind", VERDICTS)
+def test_the_summary_has_about_ten_lines(diagnoses, kind, tmp_path):
+    lines = words.summary(diagnoses[kind], tmp_path)
+    assert 5 <= len(lines) <= 12
+    assert str(tmp_path) in lines[-1]
+    assert all(any(effect.words in line for line in lines) for effect in diagnoses[kind].effects)
+
+
+MADE_UP = r"\b(heard|hears?|listen\w*|twins?|court|exhibits?|sitting|urn|believed|referee|atlas|gap|shrinks?)\b"
+
+
+@pytest.mark.parametrize("kind", VERDICTS)
+def test_pages_are_in_the_words_of_the_field(pages, kind):
+    text = Page(pages[kind]).text.replace("sim-to-real gap", "")
+    assert re.findall(MADE_UP, text, flags=re.IGNORECASE) == []
+
+
+def test_sets_stand_side_by_side_with_what_tells_them_apart(diagnoses, pages):
+    text, result = Page(pages["degenerate"]).text, diagnoses["degenerate"]
+    assert len(result.sets) == 2
+    assert all(one.effects[0].words in text for one in result.sets)
+    (contrast,) = result.contrasts
+    assert f"differ by {contrast.separation:.1f} standard deviations" in text
+    assert result.elements[contrast.elements[0]].words in text
+
+
+def test_best_set_is_taken_from_what_is_left(diagnoses):
     for kind in ("effect", "mixture"):
-        view = ReportView(diagnoses[kind].verdict, diagnoses[kind].evidence)
-        np.testing.assert_allclose(view.prediction(0), view.evidence["explained"].values, atol=1e-12)
+        result = diagnoses[kind]
+        t = result.templates[:, list(result.sets[0].columns)] @ np.array(result.sets[0].coordinates)
+        np.testing.assert_allclose(result.prediction(0), t / result.standard_deviation)
         # 30 unit normals: their square exceeds 80 once in a million.
-        assert np.sum(view.left**2) < 80.0 < np.sum(view.z**2)
-        _, _, (before, after) = view.blocks
-        assert np.nanmax(np.abs(before)) == np.abs(view.z).max()
-        assert np.nanmax(np.abs(after)) == np.abs(view.left).max()
+        assert np.sum(result.z_after**2) < 80.0 < np.sum(result.z**2)
 
 
 def test_ranked_candidates_have_their_amplitudes(diagnoses):
-    view = ReportView(diagnoses["effect"].verdict, diagnoses["effect"].evidence)
-    first = view.ranked[0]
-    (effect,) = diagnoses["effect"].verdict["effects"]
-    assert (first.accepted, first.unit) == (True, effect["unit"])
-    assert (first.amplitude, first.sigma) == (effect["amplitude"], effect["sigma"])
-    assert first.p < 1e-6
-    assert not any(row.accepted for row in view.ranked[1:])
+    result = diagnoses["effect"]
+    first, (effect,) = result.ranked[0], result.effects
+    assert (first.label, first.unit) == (effect.label, effect.unit)
+    assert (first.amplitude, first.sigma) == (effect.amplitude, effect.sigma)
+    assert first.pvalue < 1e-6
 
 
-def test_detectable_amplitude_and_isolating_amplitude_agree_in_strength(diagnoses):
-    view = ReportView(diagnoses["none"].verdict, diagnoses["none"].evidence)
-    assert [row["label"] for row in view.nearest_candidates] == view.labels
-    for row, proposal in zip(view.nearest_candidates, proposals(), strict=True):
-        assert confusion(row["strength"], row["cosine"]) == pytest.approx(0.05)
+def test_detectable_and_separable_amplitudes_agree_in_strength(diagnoses):
+    for row, proposal in zip(diagnoses["none"].candidates, proposals(), strict=True):
+        assert confusion(row.strength, row.correlation) == pytest.approx(0.05)
         found = snr_needed(len(proposal.basis), 3, P, N)
-        assert row["isolated"] / row["detectable"] == pytest.approx(row["strength"] / found)
+        assert row.separable / row.detectable == pytest.approx(row.strength / found)
 
 
-def test_report_is_a_function_of_what_is_stored(diagnoses, pages, tmp_path):
-    one = diagnoses["degenerate"]
+def test_settings_are_stored_and_printed(diagnoses, pages, tmp_path):
+    diagnoses["none"].save(tmp_path)
+    assert DiagnosisResult.open(tmp_path).settings == DiagnosisSettings(beam_bins=(5, 2, 2, 1, 1), place_pvalue=0.0123)
+    text = Page(pages["none"]).text
+    assert "place_pvalue 0.0123" in text
+    assert "level 0.05" in text
+
+
+@pytest.mark.parametrize("kind", VERDICTS)
+def test_result_comes_back_from_disk_as_it_was(diagnoses, pages, tmp_path, kind):
+    one = diagnoses[kind]
     one.save(tmp_path)
-    with xr.open_zarr(tmp_path / "evidence.zarr", consolidated=False) as evidence:
-        again = report.page(Diagnosis(one.verdict, evidence.load(), one.attribution))
-    assert again == pages["degenerate"]
-    report.write(one, tmp_path / "report.html")
-    assert (tmp_path / "report.html").read_text(encoding="utf-8") == again
+    again = DiagnosisResult.open(tmp_path)
+    assert again.to_dataset().identical(one.to_dataset())
+    assert again.to_json() == json.loads((tmp_path / "verdict.json").read_text())
+    for field in fields(one):
+        if field.name not in ("candidates", "residual_maps"):  # with NaN
+            np.testing.assert_equal(getattr(again, field.name), getattr(one, field.name))
+    assert report.page(again) == pages[kind]
 
 
-def test_evidence_without_maps_has_no_map_pictures(diagnoses):
-    one = diagnoses["effect"]
-    text = report.page(replace(one, evidence=one.evidence.drop_vars("residual_map")))
-    assert "longitude" not in Page(text).text
+def test_a_folder_without_a_diagnosis_is_named(tmp_path):
+    with pytest.raises(InputError, match=tmp_path.name):
+        DiagnosisResult.open(tmp_path)
+
+
+def test_tables_of_spectra_have_no_map_pictures(diagnoses, tmp_path):
+    one = replace(diagnoses["effect"], residual_maps=None, residual_range=None)
+    assert "longitude" not in Page(report.page(one)).text
+    one.save(tmp_path)
+    assert DiagnosisResult.open(tmp_path).residual_maps is None
 
 
 def test_largest_picture_leaves_the_page_small(diagnoses):
-    one = diagnoses["effect"]
-    sky = np.random.default_rng(1).normal(size=(20, 12 * report_arrays.NSIDE**2))
+    sky = np.random.default_rng(1).normal(size=(20, 12 * residual_maps.NSIDE**2))
     sky[3] *= 2.0
-    maps = xr.Dataset({"residual_map": (("map", "pixel"), sky)}, coords={"map": [f"W:{k}" for k in range(20)]})
-    view = ReportView(one.verdict, one.evidence.drop_dims("map").merge(maps))
-    figure = plots.residual_figure(view)
+    names, ends = tuple(f"W:{k}" for k in range(20)), np.tile([0.97, 1.03], (20, 1))
+    figure = plots.residual_figure(replace(diagnoses["effect"], residual_maps=sky, maps=names, residual_range=ends))
     titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
     assert len(titles) == plots.MAPS
-    assert f"W:3: rms {np.sqrt(np.mean(sky[3] ** 2)):.2f}" in titles
-    # With 1 MB for all others of 42 candidates and 222 entries the page stays below 3 MB.
+    assert f"W 3: rms {np.sqrt(np.mean(sky[3] ** 2)):.2f} (simulations 0.97 to 1.03)" in titles
+    # With 1 MB for all others of 42 candidates and 222 elements the page stays below 3 MB.
     assert len(report._picture(figure, "").data) < 1_800_000
 
 
@@ -294,7 +355,7 @@ def test_first_screen_fits_its_picture(diagnoses, kind, tmp_path):
 
 def test_simulations_held_out_against_refits():
     simulations = np.random.default_rng(2).normal(size=(60, 8)) @ np.random.default_rng(3).normal(size=(8, 8))
-    found = report_arrays.held_out(simulations, SimulatedGaussian.from_simulations(simulations))
+    found = held_out_pvalues(simulations, SimulatedGaussian.from_simulations(simulations))
     for i in range(5):
         others = SimulatedGaussian.from_simulations(np.delete(simulations, i, axis=0))
         y = others.whiten(simulations[i])
@@ -303,45 +364,44 @@ def test_simulations_held_out_against_refits():
 
 def test_simulations_held_out_are_uniform():
     simulations = np.random.default_rng(4).normal(size=(2000, 20))
-    assert (
-        stats.kstest(
-            report_arrays.held_out(simulations, SimulatedGaussian.from_simulations(simulations)), "uniform"
-        ).pvalue
-        > 1e-3
-    )
+    found = held_out_pvalues(simulations, SimulatedGaussian.from_simulations(simulations))
+    assert stats.kstest(found, "uniform").pvalue > 1e-3
 
 
-def test_residual_maps_are_in_units_of_noise(monkeypatch):
+def test_coarse_residuals_add_up_the_pixels_of_each_coarse_one():
     nside, rng = 64, np.random.default_rng(6)
-    precision = rng.uniform(1.0, 4.0, 12 * nside**2)
-    residual = np.sqrt(precision) * rng.normal(size=precision.size)
-    blind = healpy.query_disc(nside, (0.0, 0.0, 1.0), 0.3)
-    residual[blind] = 0.0
-    part = SimpleNamespace(precision=precision)
-    monkeypatch.setattr(report_arrays, "wiener_filter", lambda model, maps: SimpleNamespace(residual=residual[None]))
-    (coarse,) = report_arrays.residual_maps(SimpleNamespace(nside=nside, parts=[part]), [])
-    assert healpy.npix2nside(coarse.size) == report_arrays.NSIDE
-    assert np.isnan(coarse[0])
-    # Variance of 3,000 unit normals, five sigmas.
-    assert np.nanvar(coarse) == pytest.approx(1.0, abs=5 * np.sqrt(2 / np.isfinite(coarse).sum()))
-    ring = healpy.ang2pix(report_arrays.NSIDE, *healpy.pix2ang(nside, np.arange(precision.size)))
-    seen = (ring == 2000) & (residual != 0.0)
-    assert coarse[2000] == pytest.approx(residual[seen].sum() / np.sqrt(precision[seen].sum()))
+    residual = rng.normal(size=(2, 12 * nside**2))
+    found = residual_maps.coarse_residuals(SimpleNamespace(nside=nside), SimpleNamespace(residual=residual))
+    assert healpy.npix2nside(found.shape[1]) == residual_maps.NSIDE
+    inside = healpy.ang2pix(residual_maps.NSIDE, *healpy.pix2ang(nside, np.arange(residual.shape[1]))) == 2000
+    np.testing.assert_allclose(found[:, 2000], residual[:, inside].sum(axis=1))
+
+
+def test_standardised_maps_have_unit_variance_for_any_number_of_simulations():
+    rng, count, pixels = np.random.default_rng(7), 12, 40_000
+    drawn = 3.0 + 2.0 * rng.normal(size=(count + 1, 1, pixels))
+    drawn[:, :, :10] = 0.0
+    mean, scatter = drawn[1:].mean(axis=0), drawn[1:].std(axis=0, ddof=1)
+    z = residual_maps.standardised(drawn[0], mean, scatter, count)
+    assert np.all(np.isnan(z[:, :10]))
+    # Student's t with 11 degrees of freedom over its scatter: kurtosis 3 + 6/7; five standard errors.
+    assert np.nanmean(z**2) == pytest.approx(1.0, abs=5.0 * np.sqrt((2.0 + 6.0 / 7.0) / pixels))
 
 
 @pytest.mark.parametrize(
     ("value", "sigma", "text"),
     [
-        (0.10034, 0.0098, "0.1003 ± 0.0098"),
+        (0.10034, 0.0098, "0.100 ± 0.010"),
+        (1.1592, 0.0081, "1.159 ± 0.008"),
         (123.4, 12.0, "123 ± 12"),
         (-2.5e-7, 3e-8, "(−2.50 ± 0.30) × 10⁻⁷"),
-        (-0.00001, 0.0039, "0.0000 ± 0.0039"),
+        (-0.00001, 0.0039, "0.000 ± 0.004"),
         (0.3, 0.0, "0.3"),
         (float("nan"), 1.0, "–"),
     ],
 )
 def test_values_are_written_to_the_digits_of_their_errors(value, sigma, text):
-    assert report.measured(value, sigma) == text
+    assert measured(value, sigma) == text
 
 
 def test_parameters_that_are_not_set_are_left_out():
@@ -350,16 +410,36 @@ def test_parameters_that_are_not_set_are_left_out():
 
 
 def test_tiny_probabilities_are_powers_of_ten():
-    assert report.probability(1.04e-8) == "1 × 10⁻⁸"
-    assert report.number(float("inf")) == "∞"
+    assert probability(1.04e-8) == "1 × 10⁻⁸"
+    assert number(float("inf")) == "∞"
 
 
-def test_entries_in_words():
-    words = [entry_words({**vars(element), "ell": element.ell}) for element in elements()]
-    assert "beam, order 2, imaginary, " in words[4]
-    assert "half1, ℓ 2–11" in words[4]
-    assert words[-3] == "noise variance, V, 0-0.25, pixels1"
-    assert words[-6] != words[-5] == "matched to pointing_offset (V), component 2"
+def test_elements_in_words():
+    found = [element.words for element in elements()]
+    assert found[4].startswith("residual × sky through the beam, order 2, ")
+    assert found[4].endswith("half1, ℓ 2–11, imaginary")
+    assert found[-6] != found[-5] == "matched filter: offset of V, component 2"
+    assert found[-2] == "other, V"
+
+
+@pytest.mark.parametrize("name", systematics.catalogue())
+def test_amplitudes_of_every_effect_are_printed_with_their_error(name):
+    kind = systematics.get(name)
+    effect = kind.basis()[0]
+    assert "±" in effect.describe(0.1 * kind.step)
+    assert "±" not in effect.describe()
+    assert "_" not in kind.label("W1").replace("C_ℓ", "")
+
+
+def test_amplitudes_have_the_units_that_people_read():
+    ellipse, offset = (systematics.get(name) for name in ("beam_ellipticity", "pointing_offset"))
+    assert ellipse(amplitude=0.1592, angle_deg=2.0).describe(0.0081) == (
+        "axis ratio 1.159 ± 0.008 with the major axis along the scan"
+    )
+    assert offset(amplitude=1.53, angle_deg=178.0).describe(0.041) == "1.53′ ± 0.04′ against the scan"
+    assert offset(amplitude=1.53, angle_deg=-37.0).direction() == "at −37° to the scan"
+    assert systematics.get("noise_level").format_amplitude(-0.095, 0.01) == "9.5 % ± 1.0 % less noise"
+    assert ellipse.label("W1") == "beam ellipticity of W1"
 
 
 def test_an_amplitude_at_the_edge_of_the_possible_has_an_error():
@@ -368,9 +448,9 @@ def test_an_amplitude_at_the_edge_of_the_possible_has_an_error():
     less_than_nothing = SimpleNamespace(amplitudes=np.array([-1.1, 0, 0, 0, 0, 0]), covariance=np.diag(errors**2))
     explanation = SimpleNamespace(members=(0,), fit=less_than_nothing)
     (found,) = effects_of(explanation, [Candidate(kind, None, tuple(range(6)))])
-    assert found["amplitude"] == pytest.approx(0.99)
+    assert found.amplitude == pytest.approx(0.99)
     # One error up is -0.9.
-    assert found["sigma"] == pytest.approx((0.99 - 0.9) / 2.0, rel=1e-3)
+    assert found.sigma == pytest.approx((0.99 - 0.9) / 2.0, rel=1e-3)
 
 
 def test_what_data_do_not_tell_is_no_part_of_an_error():
@@ -379,5 +459,5 @@ def test_what_data_do_not_tell_is_no_part_of_an_error():
     fitted = SimpleNamespace(amplitudes=np.array([0.3, 0, 0, 0, 0, 1.0]), covariance=np.diag(errors**2))
     explanation = SimpleNamespace(members=(0,), fit=fitted)
     (found,) = effects_of(explanation, [Candidate(kind, None, tuple(range(6)))])
-    assert found["amplitude"] == pytest.approx(0.3)
-    assert found["sigma"] == pytest.approx(0.02)
+    assert found.amplitude == pytest.approx(0.3)
+    assert found.sigma == pytest.approx(0.02)

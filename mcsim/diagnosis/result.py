@@ -1,0 +1,447 @@
+"""The result of a diagnosis: one typed object that the report, the figures and the command line read."""
+
+import json
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from functools import cached_property
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, get_args, get_origin, get_type_hints
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from mcsim.diagnosis.places import Place
+from mcsim.diagnosis.selection import Verdict
+from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.diagnosis.summaries import Element
+from mcsim.diagnosis.validation import Measured
+from mcsim.errors import InputError
+
+Vector = NDArray[np.float64]
+
+SCHEMA = 1
+STORE = "diagnosis.zarr"
+PLACES = 12
+"""Groups in the localisation table of ``verdict.json`` and of the report."""
+
+
+@dataclass(frozen=True)
+class GlobalResult:
+    """Result of the test of the whole data vector.
+
+    Attributes
+    ----------
+    pvalue
+        Calibrated combination of the next two; uniform where the model is right.
+    omnibus, best_candidate
+        p-value of chi^2, and of the most significant candidate with the look-elsewhere effect.
+    chi2, dof
+        Of the data against the simulations, in the independent directions of the data vector; with a covariance from
+        few simulations chi^2 is larger than dof on average.
+    excess
+        chi^2 - dof without that bias: zero on average where the model is right.
+    simulations
+        Number that mean and covariance come from.
+    """
+
+    pvalue: float
+    omnibus: float
+    best_candidate: float
+    chi2: float
+    dof: int
+    excess: Measured
+    simulations: int
+
+
+@dataclass(frozen=True)
+class EffectResult:
+    """One fitted effect: amplitude, standard error and parameters; ``label`` and ``words`` as people read them."""
+
+    name: str
+    channel: str | None
+    amplitude: float
+    sigma: float
+    unit: str
+    parameters: dict[str, Any]
+    label: str
+    words: str
+
+
+@dataclass(frozen=True)
+class EffectSet:
+    """A smallest set of effects that describes the data.
+
+    Attributes
+    ----------
+    effects, candidates
+        The effects, and their indices among the candidates.
+    columns, coordinates, errors
+        Columns of the templates that belong to them, fitted linear coordinates and standard errors.
+    odds
+        Posterior odds against the best set.
+    pvalue
+        Of the residual that the fit leaves.
+    further
+        Of the most significant further candidate, with the look-elsewhere effect.
+    excess
+        Excess chi^2 that the fit leaves.
+    """
+
+    effects: tuple[EffectResult, ...]
+    candidates: tuple[int, ...]
+    columns: tuple[int, ...]
+    coordinates: tuple[float, ...]
+    errors: tuple[float, ...]
+    odds: float
+    pvalue: float
+    further: float
+    excess: Measured
+
+    @property
+    def label(self) -> str:
+        """Return the names of the effects."""
+        return " and ".join(effect.label for effect in self.effects)
+
+
+@dataclass(frozen=True)
+class ContrastResult:
+    """Two sets, the distance of their predictions in standard deviations, and the elements that make it up."""
+
+    first: int
+    second: int
+    separation: float
+    elements: tuple[int, ...]
+    shares: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Excess chi^2 of data that the fit did not use, before and after the effects are added to the simulator.
+
+    ``predicted`` and ``achieved`` are fractional reductions; ``data`` names the held-out data; ``pvalue_after`` is that
+    of what remains there.
+    """
+
+    predicted: Measured
+    achieved: Measured
+    before: Measured
+    after: Measured
+    pvalue_after: float
+    data: str
+
+    @property
+    def expected_after(self) -> float:
+        """Return the excess that the prediction leaves."""
+        return self.before.value * (1.0 - self.predicted.value)
+
+
+@dataclass(frozen=True)
+class CandidateResult:
+    """A candidate effect: its fit alone, the amplitude that would be detected, and the candidate most like it.
+
+    Attributes
+    ----------
+    name, channel, settings, unit, label
+        Of the effect; ``channel`` None: acts in all.
+    columns
+        Of the templates.
+    amplitude, sigma, words
+        Fitted alone, NaN where no effect has such an amplitude; and as people read it.
+    delta_chi2, pvalue
+        Unbiased fall of chi^2, and its p-value over all candidates (Bonferroni).
+    detectable, detectable_words
+        Amplitude that is found with 90 % power at 5 % false alarms; None where the data vector does not respond.
+    similar, correlation
+        Index of the other effect with the most similar response, None without one, and their canonical correlation.
+    strength, separable, separable_words
+        Amplitude over its error, and amplitude, at which the right one of the two is chosen in 95 cases of 100.
+    """
+
+    name: str
+    channel: str | None
+    settings: dict[str, Any]
+    unit: str
+    label: str
+    columns: tuple[int, ...]
+    amplitude: float
+    sigma: float
+    words: str
+    delta_chi2: float
+    pvalue: float
+    detectable: float | None
+    detectable_words: str
+    similar: int | None
+    correlation: float
+    strength: float
+    separable: float
+    separable_words: str
+
+    @property
+    def significance(self) -> float:
+        """Return the square root of the fall of chi^2."""
+        return float(np.sqrt(max(self.delta_chi2, 0.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class DiagnosisResult:
+    """All that a diagnosis says: the verdict, and what it rests on.
+
+    Attributes
+    ----------
+    case, kind
+        Name of the case; "none", "effect", "mixture", "degenerate" or "unknown".
+    test
+        Test of the whole data vector.
+    sets, contrasts
+        Sets of effects that describe the data, the most probable first, and what would tell them apart.
+    nearest, cosine
+        Index of the candidate that lowers chi^2 most, and the cosine between its best fit and the departure.
+    partial, partial_left
+        Effects that are detected where no set describes the data, and the fraction of the excess chi^2 that they leave.
+    held_out
+        Reduction of the excess on held-out data; None where it was not measured.
+    places
+        Groups of elements, the one that departs most first.
+    candidates, elements, maps
+        Candidate effects, elements of the data vector, names of the maps.
+    data, mean, standard_deviation
+        Data vector, and mean and scatter of the simulations, shape (p,).
+    templates
+        Response per unit coordinate, shape (p, K).
+    correlation
+        Canonical correlation of the responses of each pair of candidates, shape (C, C).
+    held_out_pvalues, calibration
+        p-value of each simulation against the others; smaller of the two p-values of draws of the model.
+    residual_maps
+        Residual of each map in coarse pixels, less the mean and over the scatter of the simulations, RING, NaN where
+        nothing was observed, shape (map, npix); None without maps.
+    residual_range
+        Smallest and largest rms of such maps in 95 % of the simulations, shape (map, 2).
+    frame, notes
+        Of the maps; remarks.
+    settings, provenance
+        Settings of the diagnosis; numbers of simulations, the seed and the data, by name.
+    configuration
+        The run that is the model, as JSON.
+    """
+
+    case: str
+    kind: Verdict
+    test: GlobalResult
+    sets: tuple[EffectSet, ...]
+    contrasts: tuple[ContrastResult, ...]
+    nearest: int
+    cosine: float
+    partial: tuple[EffectResult, ...]
+    partial_left: float | None
+    held_out: HeldOut | None
+    places: tuple[Place, ...]
+    candidates: tuple[CandidateResult, ...]
+    elements: tuple[Element, ...]
+    maps: tuple[str, ...]
+    data: Vector
+    mean: Vector
+    standard_deviation: Vector
+    templates: Vector
+    correlation: Vector
+    held_out_pvalues: Vector
+    calibration: Vector
+    residual_maps: Vector | None
+    residual_range: Vector | None
+    frame: str
+    notes: tuple[str, ...]
+    settings: DiagnosisSettings
+    provenance: dict[str, Any]
+    configuration: str
+
+    @property
+    def verdict(self) -> dict[str, Any]:
+        """Return ``verdict.json`` as a dictionary."""
+        return self.to_json()
+
+    @property
+    def effects(self) -> tuple[EffectResult, ...]:
+        """Return the effects of the most probable set."""
+        return self.sets[0].effects if self.sets else ()
+
+    @property
+    def z(self) -> Vector:
+        """Return data less mean over scatter, shape (p,)."""
+        return np.asarray((self.data - self.mean) / self.standard_deviation)
+
+    def prediction(self, index: int) -> Vector:
+        """Return the change of every element by a set of effects over the scatter, shape (p,)."""
+        one = self.sets[index]
+        change: Vector = self.templates[:, list(one.columns)] @ np.array(one.coordinates) / self.standard_deviation
+        return change
+
+    @property
+    def z_after(self) -> Vector | None:
+        """Return what the best set leaves of :attr:`z`; None without one."""
+        return self.z - self.prediction(0) if self.sets else None
+
+    @cached_property
+    def ranked(self) -> tuple[CandidateResult, ...]:
+        """Return the candidates, the largest fall of chi^2 first."""
+        return tuple(sorted(self.candidates, key=lambda one: -one.delta_chi2))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return ``verdict.json`` of schema 1."""
+        near = self.candidates[self.nearest]
+        sets = [[_effect_json(effect) for effect in one.effects] for one in self.sets]
+        return {
+            "schema": SCHEMA,
+            "case": self.case,
+            "gap": {"p_value": self.test.pvalue, "statistic": self.test.chi2, "dof": self.test.dof},
+            "verdict": self.kind,
+            "effects": sets[0] if sets else [],
+            "alternatives": sets[1:],
+            "odds": [one.odds for one in self.sets],
+            "where": [_place_json(place) for place in self.places[:PLACES]],
+            "shrink": None if self.held_out is None else _shrink_json(self.held_out),
+            "nearest": {"name": near.name, "channel": near.channel, "cosine": self.cosine},
+            "heard": [_effect_json(effect) for effect in self.partial],
+            "left": self.partial_left,
+            "detectable": [
+                {
+                    "name": one.name,
+                    "channel": one.channel,
+                    "amplitude_90": one.detectable,
+                    "unit": one.unit,
+                    "settings": one.settings,
+                }
+                for one in self.candidates
+                if one.detectable is not None
+            ],
+            "notes": list(self.notes),
+        }
+
+    def to_dataset(self) -> xr.Dataset:
+        """Return the numbers as a dataset over the elements, candidates and maps.
+
+        Attribute ``result`` holds, as JSON, all that is no array.
+        """
+        rest = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ARRAYS}
+        named = {name: (dims, getattr(self, name), {"long_name": words}) for name, (dims, words) in _ARRAYS.items()}
+        return xr.Dataset(
+            {name: row for name, row in named.items() if row[1] is not None}
+            | {
+                "z": ("element", self.z, {"long_name": "data less mean, over scatter", "units": "1"}),
+                "amplitude": ("candidate", [c.amplitude for c in self.candidates], {"long_name": "fitted alone"}),
+                "sigma": (
+                    "candidate",
+                    [c.sigma for c in self.candidates],
+                    {"long_name": "standard error"},
+                ),
+                "delta_chi2": ("candidate", [c.delta_chi2 for c in self.candidates], {"long_name": "fall of chi^2"}),
+                "place_z": ("place", [p.z for p in self.places], {"long_name": "normal deviate of a group"}),
+                "place_p": ("place", [p.p for p in self.places], {"long_name": "p-value, look-elsewhere included"}),
+            },
+            coords={
+                "element": _texts(one.name for one in self.elements),
+                "description": ("element", _texts(one.words for one in self.elements)),
+                "candidate": _texts(one.label for one in self.candidates),
+                "unit": ("candidate", _texts(one.unit for one in self.candidates)),
+            }
+            | ({} if self.residual_maps is None else {"map": _texts(self.maps)}),
+            attrs={"result": json.dumps({key: _plain(value) for key, value in rest.items()})},
+        )
+
+    def save(self, folder: str | Path) -> None:
+        """Write ``verdict.json`` and ``diagnosis.zarr`` into a folder, made where it does not exist."""
+        target = Path(folder)
+        target.mkdir(parents=True, exist_ok=True)
+        (target / "verdict.json").write_text(json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n")
+        self.to_dataset().to_zarr(target / STORE, mode="w", consolidated=False)
+
+    @classmethod
+    def open(cls, folder: str | Path) -> "DiagnosisResult":
+        """Read what :meth:`save` wrote.
+
+        Raises
+        ------
+        InputError
+            If the folder holds no diagnosis.
+        """
+        path = Path(folder) / STORE
+        if not path.is_dir():
+            raise InputError(f"{path} does not exist; give the output folder of mcsim diagnose.")
+        with xr.open_zarr(path, consolidated=False) as stored:
+            arrays: dict[str, Any] = {name: np.asarray(stored[name]) if name in stored else None for name in _ARRAYS}
+            rest = json.loads(stored.attrs["result"])
+        hints = get_type_hints(cls)
+        return cls(**arrays, **{key: _typed(hints[key], value) for key, value in rest.items()})
+
+
+_ARRAYS = {
+    "data": ("element", "data vector"),
+    "mean": ("element", "mean of the simulations, corrected by the time-ordered reference"),
+    "standard_deviation": ("element", "scatter of the simulations"),
+    "templates": (("element", "column"), "response per unit coordinate"),
+    "correlation": (("candidate", "other"), "canonical correlation of responses"),
+    "held_out_pvalues": ("simulation", "p-value of each simulation against the others"),
+    "calibration": ("draw", "smaller of the two p-values of draws of the model"),
+    "residual_maps": (("map", "pixel"), "residual over the scatter of simulations, RING"),
+    "residual_range": (("map", "end"), "smallest and largest rms of 95 % of the simulations"),
+}
+
+
+def _effect_json(effect: EffectResult) -> dict[str, Any]:
+    return {f.name: getattr(effect, f.name) for f in fields(effect) if f.name not in ("label", "words")}
+
+
+def _place_json(place: Place) -> dict[str, Any]:
+    e = place.element
+    return {
+        "statistic": {"score": "map", "noise": "cl"}.get(e.statistic, e.statistic),
+        "channels": list(e.channels),
+        "split": e.split,
+        "L": e.L,
+        "M": e.M,
+        "parity": e.parity,
+        "ell": None if e.ell is None else list(e.ell),
+        "frame": e.frame,
+        "z": place.z,
+        "p": place.p,
+    }
+
+
+def _shrink_json(found: HeldOut) -> dict[str, Any]:
+    return {
+        "predicted": found.predicted.value,
+        "achieved": found.achieved.value,
+        "sigma": found.achieved.sigma,
+        "sigma_predicted": found.predicted.sigma,
+        "gap_before": found.before.value,
+        "sigma_before": found.before.sigma,
+        "gap_after": found.after.value,
+        "sigma_after": found.after.sigma,
+        "p_value_after": found.pvalue_after,
+        "data": found.data,
+    }
+
+
+def _texts(words: Any) -> NDArray[np.object_]:
+    """Return texts as objects: Zarr 3 has no stable form for numpy's texts of fixed length."""
+    return np.array(list(words), dtype=object)
+
+
+def _plain(value: Any) -> Any:
+    """Return dataclasses as dictionaries, also inside tuples."""
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
+
+
+def _typed(kind: Any, value: Any) -> Any:
+    """Return a value from JSON as the type that a field declares: dataclasses, tuples, optional ones."""
+    if isinstance(kind, UnionType):
+        return None if value is None else _typed(next(k for k in get_args(kind) if k is not NoneType), value)
+    if get_origin(kind) is tuple:
+        inner = get_args(kind)
+        return tuple(_typed(inner[0] if inner[-1] is Ellipsis else inner[i], item) for i, item in enumerate(value))
+    if isinstance(kind, type) and is_dataclass(kind):
+        hints = get_type_hints(kind)
+        return kind(**{key: _typed(hints[key], item) for key, item in value.items()})
+    return value

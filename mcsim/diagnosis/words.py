@@ -1,0 +1,178 @@
+"""A result in sentences, the same in the report, in pictures and on the command line."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from mcsim.diagnosis.result import ContrastResult, DiagnosisResult, EffectResult, HeldOut
+from mcsim.diagnosis.validation import Measured
+from mcsim.support.numbers import measured, number, p_equals
+
+AGREES, DISAGREES = 0.05, 0.005
+"""p-value above which a residual agrees with the simulations, and below which it does not; marginal between."""
+
+SEPARATION = 3.29
+"""Distance in standard deviations at which the nearer of two predictions is the right one in 95 cases of 100."""
+
+LARGEST_ERROR = 0.3
+"""Error of a fractional reduction above which it is not quoted."""
+
+SETS = 2
+"""Alternatives that a sentence has room for."""
+
+
+def sentence(result: DiagnosisResult) -> str:
+    """Return the verdict in one sentence."""
+    p = p_equals(result.test.pvalue)
+    if result.kind == "none":
+        return f"The model describes the data ({p})."
+    start = f"The model does not describe the data ({p})"
+    if result.kind == "unknown":
+        return f"{start}, and no effect of the library explains why.{_partly(result)}"
+    if result.kind == "degenerate":
+        shown = [_effects(one.effects) for one in result.sets[: SETS + 1]]
+        more = len(result.sets) - len(shown)
+        return f"{start}. It does with {'; or with '.join(shown)}" + (
+            f"; or with {more} more set{'s' * (more > 1)}." if more else "."
+        )
+    return f"{start}. It does with {_effects(result.effects)}."
+
+
+def _effects(effects: Sequence[EffectResult]) -> str:
+    return " and ".join(f"{effect.label} ({effect.words})" for effect in effects)
+
+
+def _partly(result: DiagnosisResult) -> str:
+    if len(result.partial) < 2 or result.partial_left is None:
+        return ""
+    return f" Detected are {_effects(result.partial)}; they leave {100 * result.partial_left:.0f} % of the excess χ²."
+
+
+def tested(result: DiagnosisResult) -> str:
+    """Return what was tested: elements, maps, simulations and candidates."""
+    test, splits = result.test, len({one.split for one in result.elements if one.split})
+    source = f"{len(result.maps)} maps" + (f" ({splits} splits)" if splits > 1 else "")
+    if result.residual_maps is None:
+        source = "a table of spectra"
+    return (
+        f"{len(result.elements)} elements of the data vector, {test.dof} of them independent, measured from {source}; "
+        f"{test.simulations} simulations of the model; {len(result.candidates)} candidate effects, alone and up to "
+        f"{result.settings.max_effects} together"
+    )
+
+
+def status(result: DiagnosisResult) -> str:
+    """Return what the verdict means, in agreement with the p-values of what is left."""
+    if result.kind == "none":
+        return (
+            "Neither χ² nor any candidate departs from the simulations. An effect below its detectable amplitude can "
+            "still be there."
+        )
+    if result.kind == "unknown":
+        near = result.candidates[result.nearest]
+        return (
+            f"The most similar candidate is {near.label}: cosine {result.cosine:.2f} with the departure, so that it "
+            f"accounts for {100 * result.cosine**2:.0f} % of the excess χ². It is a hint and not the cause."
+        )
+    best = result.sets[0]
+    if result.kind == "degenerate":
+        return (
+            f"{len(result.sets)} sets of effects describe the data and the data cannot choose between them. The "
+            f"residual of the most probable one {residual(best.pvalue)}."
+        )
+    many = len(best.effects) > 1
+    start = f"These {len(best.effects)} effects are needed together" if many else "One effect is enough"
+    beside = "no further candidate is significant"
+    if min(best.pvalue, best.further) <= AGREES:
+        start += ", with a reservation"
+    if best.further <= AGREES:
+        beside = "the most significant further candidate is marginal"
+    return (
+        f"{start}: the residual of the fit {residual(best.pvalue)}, and {beside} beside {'them' if many else 'it'} "
+        f"({p_equals(best.further)}, look-elsewhere effect included)."
+    )
+
+
+def chi2(result: DiagnosisResult) -> str:
+    """Return the unbiased chi^2 of the data vector, its degrees of freedom and the global p-value."""
+    test = result.test
+    value = number(test.excess.value + test.dof, 4)
+    return f"χ² = {value} for {test.dof} degrees of freedom; global {p_equals(test.pvalue)}"
+
+
+def residual(pvalue: float) -> str:
+    """Return how a residual with this p-value compares with the simulations."""
+    if pvalue > AGREES:
+        return f"agrees with the simulations ({p_equals(pvalue)})"
+    if pvalue > DISAGREES:
+        return f"is only marginally compatible with the simulations ({p_equals(pvalue)})"
+    return f"does not agree with the simulations ({p_equals(pvalue)})"
+
+
+def held_out(result: DiagnosisResult) -> str:
+    """Return what adding the effects to the simulator does to data that the fit did not use."""
+    found = result.held_out
+    if found is None:
+        if result.sets:
+            return "Not measured: the held-out data hardly respond to the effects, or show no excess χ² by themselves."
+        return "Not measured: no effect was added to the simulator."
+    left = f"what remains there {residual(found.pvalue_after)}"
+    if not quotable(found):
+        before, after = (measured(one.value, one.sigma) for one in (found.before, found.after))
+        return f"Excess χ² of {found.data} too small to measure a reduction: {before} before, {after} after; {left}."
+    return (
+        f"Adding the best fit to the simulator removes {percent(found.achieved)} of the excess χ² of {found.data}; "
+        f"{percent(found.predicted)} was predicted; {left}."
+    )
+
+
+def quotable(found: HeldOut) -> bool:
+    """Return True if the fractional reduction is measured well enough to be quoted."""
+    return found.before.value > 0.0 and found.achieved.sigma < LARGEST_ERROR
+
+
+def percent(fraction: Measured) -> str:
+    """Return a fraction with its error in per cent."""
+    return measured(100.0 * fraction.value, 100.0 * fraction.sigma, " %")
+
+
+def apart(result: DiagnosisResult, one: ContrastResult) -> str:
+    """Return how far the predictions of two sets are apart, and what would tell them apart."""
+    start = f"The predictions differ by {one.separation:.1f} standard deviations. "
+    factor = (SEPARATION / one.separation) ** 2 if one.separation > 0.0 else float("inf")
+    if factor <= 1.0:
+        odds = result.sets[one.second].odds / result.sets[one.first].odds
+        return f"{start}That is enough in most cases; here the second has odds {number(odds)} against the first."
+    if one.separation < 0.03:
+        return f"{start}More data of this kind cannot tell them apart; another scan, frequency or beam can."
+    most = f" of {result.elements[one.elements[0]].words}" if one.elements else ""
+    return f"{start}To choose rightly in 95 cases of 100 takes {SEPARATION}: {number(factor)} times as much data{most}."
+
+
+def summary(result: DiagnosisResult, folder: Path) -> list[str]:
+    """Return a summary for the command line, about ten lines."""
+    rows = [
+        ("case", result.case),
+        ("tested", tested(result)),
+        ("global test", chi2(result)),
+        ("verdict", f"{result.kind}. {status(result)}"),
+    ]
+    shown = result.sets[: SETS + 1]
+    for one in shown:
+        rows += [("or" if one is not shown[0] else "effect", _numbered(one.effects))]
+    if result.partial:
+        rows += [("detected", _numbered(result.partial))]
+    if result.sets:
+        rows.append(("held-out data", held_out(result)))
+    if result.kind != "none":
+        first = result.places[0]
+        rows.append(("where", f"{first.element.words}; z = {first.z:.1f}, {p_equals(first.p)}"))
+    rows += [("note", note) for note in result.notes]
+    rows.append(("written", f"{folder}: verdict.json, report.html, diagnosis.zarr"))
+    return [f"{name:<14}{text}" for name, text in rows]
+
+
+def _numbered(effects: Sequence[EffectResult]) -> str:
+    def strength(effect: EffectResult) -> str:
+        return f"; amplitude/error {number(effect.amplitude / effect.sigma, 2)}" if effect.sigma > 0.0 else ""
+
+    return "; ".join(f"{effect.label}: {effect.words}{strength(effect)}" for effect in effects)
