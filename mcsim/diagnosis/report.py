@@ -1,7 +1,5 @@
 """One self-contained page about a diagnosis: the verdict for a busy person, then all that it rests on."""
 
-import base64
-import io
 import json
 import math
 from collections.abc import Mapping
@@ -10,12 +8,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import jinja2
 from matplotlib.figure import Figure
 
 from mcsim.diagnosis import figures as plots
 from mcsim.diagnosis.inference import Diagnosis
 from mcsim.diagnosis.view import APART, ReportView
+from mcsim.support import page as page_
 
 DOTS_PER_INCH = 120
 
@@ -50,20 +48,9 @@ def write(diagnosis: Diagnosis, path: str | Path) -> None:
 def page(diagnosis: Diagnosis) -> str:
     """The page as text; whatever comes from configurations or data is escaped."""
     view = ReportView(diagnosis.verdict, diagnosis.evidence)
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {
-        "measured": measured,
-        "number": number,
-        "parameters": parameters,
-        "probability": probability,
-    }
-    return environment.get_template("report.html.j2").render(
+    return page_.render(
+        Path(__file__).with_name("report.html.j2"),
+        {"measured": measured, "number": number, "parameters": parameters, "probability": probability},
         verdict=diagnosis.verdict,
         sentence=plots.sentence_for_people(diagnosis),
         sets=_sets(view),
@@ -176,7 +163,4 @@ def _telling_words(contrast: dict[str, Any]) -> str:
 
 
 def _picture(figure: Figure, words: str) -> Picture:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DOTS_PER_INCH, facecolor="white", metadata={"Software": None})
-    data = base64.b64encode(buffer.getvalue()).decode("ascii")
-    return Picture(data, words, round(72 * figure.get_figwidth()))
+    return Picture(page_.embedded(page_.png(figure, DOTS_PER_INCH)), words, round(72 * figure.get_figwidth()))
