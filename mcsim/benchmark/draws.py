@@ -37,9 +37,7 @@ class Draw:
     response: Vector
 
 
-def draws(
-    context: DiagnosisContext, number: int, seed: int, *, prior: Prior | None = None, call: Batch | None = None
-) -> list[Record]:
+def draws(context: DiagnosisContext, number: int, seed: int, prior: Prior, call: Batch | None = None) -> list[Record]:
     """Draw data vectors and judge them.
 
     Parameters
@@ -66,7 +64,6 @@ def draws(
     been used), plus templates times coordinates: responses are straight lines here, and templates exact. What they are
     not, and everything else that a map goes through, is tested by full skies.
     """
-    prior = prior or Prior()
     full = linear_model(context)
     sampler = CaseSampler(prior, full.library)
     kinds = sampler.kinds(seed, number)
@@ -78,10 +75,7 @@ def draws(
     for names, cases in by_library.items():
         model = linear_model(context, names) if names else full
         posed = [Draw(case, drawn, full.library.response(drawn.members)[model.rows]) for case, drawn in cases]
-        tasks += [
-            (model, prior, seed, posed[start : start + CASES_PER_TASK])
-            for start in range(0, len(posed), CASES_PER_TASK)
-        ]
+        tasks += [(model, prior, seed, posed[i : i + CASES_PER_TASK]) for i in range(0, len(posed), CASES_PER_TASK)]
     found = call(judge, tasks) if call else enumerate(judge(*task) for task in tasks)
     return sorted((record for _, records in found for record in records), key=lambda record: record.case)
 

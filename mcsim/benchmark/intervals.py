@@ -1,7 +1,7 @@
 """Estimate shares, means, widths and ratios with 95 % intervals, and compare them with targets."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -44,13 +44,6 @@ class Metric:
     def within(self, target: str, low: float = -np.inf, high: float = np.inf) -> "Metric":
         """Return the metric with a target that is met if the value is in a range."""
         return self.against(target, low <= self.value <= high)
-
-    def plain(self) -> dict[str, Any]:
-        """Return the metric as JSON has it, None in place of NaN."""
-        return {
-            key: None if isinstance(value, float) and not np.isfinite(value) else value
-            for key, value in asdict(self).items()
-        }
 
 
 def binomial_interval(k: int, n: int) -> tuple[float, float]:

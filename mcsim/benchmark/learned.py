@@ -23,7 +23,7 @@ from mcsim.diagnosis.observed_maps import read_maps
 from mcsim.errors import RunError
 from mcsim.support.progress import reporting
 
-__all__ = ["Batch", "LearnedModel", "each_case", "learned", "learned_model", "seeded", "simulated", "with_effects"]
+__all__ = ["Batch", "LearnedModel", "each_case", "learned_model", "simulated", "workers_of"]
 
 Vector = NDArray[np.float64]
 
@@ -76,8 +76,8 @@ class LearnedModel:
 
 
 @contextmanager
-def learned(settings: Settings, workers: int | None, quiet: bool) -> Iterator[tuple[LearnedModel, Batch]]:
-    """Learn a model, or read it from the cache, and keep its workers as long as the block lasts.
+def workers_of(settings: Settings, workers: int | None, quiet: bool) -> Iterator[Batch]:
+    """Start workers for as long as the block lasts, and learn the model with them if it is not in the cache.
 
     Parameters
     ----------
@@ -90,8 +90,8 @@ def learned(settings: Settings, workers: int | None, quiet: bool) -> Iterator[tu
     """
     run = settings.model
     with batch(run.compute.workers if workers is None else workers) as call:
-        found = prepared(run, analysis_of(run), asking(call, quiet), settings.simulations)
-        yield LearnedModel(found, np.arange(len(found.analysis.elements))), call
+        prepared(run, analysis_of(run), asking(call, quiet), settings.simulations)
+        yield call
 
 
 def each_case(call: Batch, task: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], quiet: bool) -> None:
@@ -102,13 +102,7 @@ def each_case(call: Batch, task: Callable[..., Any], arguments: Sequence[tuple[A
 
 
 def learned_model(settings: Settings, without: tuple[str, ...] = ()) -> LearnedModel:
-    """Return a model that was learned before, without some effects, in a worker.
-
-    Raises
-    ------
-    RunError
-        If the model is not in the cache of the worker.
-    """
+    """Return a model that was learned before, without some effects; RunError if it is not in the cache."""
     return _without(config.to_json(settings.model), settings.simulations, without)
 
 
@@ -124,8 +118,8 @@ def _without(model: str, simulations: int | None, names: tuple[str, ...]) -> Lea
     full = _full(model, simulations)
     if not names:
         return full
-    fewer = reduced(full.context.analysis, full.context.known, names)
-    return LearnedModel(context(full.context.run, fewer.analysis, fewer.known), fewer.rows)
+    analysis, known, rows = reduced(full.context, names)
+    return LearnedModel(context(full.context.run, analysis, known), rows)
 
 
 def _refuse(jobs: Sequence[Job]) -> list[Vector]:

@@ -155,8 +155,7 @@ def linear_model(context: DiagnosisContext, without: Sequence[str] = ()) -> Line
 
     Templates are exact here: neither their errors nor the scatter of stochastic effects play a part.
     """
-    fewer = reduced(context.analysis, context.known, without)
-    analysis, known = fewer.analysis, fewer.known
+    analysis, known, rows = reduced(context, without)
     kept = len(known.simulations) - int(HELD_OUT * len(known.simulations))
     seen = replace(known, simulations=known.simulations[:kept])
     full = {proposal.label: one for proposal, one in zip(context.analysis.proposals, context.candidates, strict=True)}
@@ -169,25 +168,21 @@ def linear_model(context: DiagnosisContext, without: Sequence[str] = ()) -> Line
     library = Library(null, templates, analysis.proposals, candidates, calibrate(null, groups))
     halves = [np.flatnonzero([element.fold == number for element in analysis.elements]) for number in (0, 1)]
     folds = tuple((half, seen.null(half)) for half in halves) if all(len(half) for half in halves) else None
-    return LinearModel(library, fewer.rows, folds, known.simulations[kept:] + known.offset)
+    return LinearModel(library, rows, folds, known.simulations[kept:] + known.offset)
 
 
-@dataclass(frozen=True, eq=False)
-class Reduced:
-    """Analysis and null ensemble without some effects, and the elements of the full data vector that it keeps."""
-
-    analysis: Analysis
-    known: Knowledge
-    rows: NDArray[np.int64]
-
-
-def reduced(analysis: Analysis, known: Knowledge, names: Collection[str]) -> Reduced:
+def reduced(context: DiagnosisContext, names: Collection[str]) -> tuple[Analysis, Knowledge, NDArray[np.int64]]:
     """Leave effects out of a library without learning anything again.
 
     Their candidates, the columns of their templates and the elements that are matched filters of them go. An element
     does not depend on the others, so the rest is what ``mcsim diagnose --without`` learns from the same simulations.
-    Names that are not proposed are ignored.
+
+    Returns
+    -------
+    tuple
+        Analysis and null ensemble without the effects, and the elements of the full data vector that they keep.
     """
+    analysis, known = context.analysis, context.known
     kept = [index for index, proposal in enumerate(analysis.proposals) if proposal.kind.name not in names]
     gone = {proposal.label for proposal in analysis.proposals if proposal.kind.name in names}
 
@@ -198,19 +193,9 @@ def reduced(analysis: Analysis, known: Knowledge, names: Collection[str]) -> Red
     blocks = tuple(block for block in analysis.blocks if not all(map(matched_to_gone, block.elements)))
     rows = np.flatnonzero([not matched_to_gone(element) for element in analysis.elements])
     columns = np.array([column for index in kept for column in analysis.columns[index]], dtype=np.int64)
-    cut = np.ix_(rows, columns)
-    without = tuple(sorted({*analysis.without, *names}))
-    return Reduced(
-        Analysis(analysis.model, tuple(analysis.proposals[index] for index in kept), blocks, without),
-        replace(
-            known,
-            simulations=known.simulations[:, rows],
-            offset=known.offset[rows],
-            templates=known.templates[cut],
-            curvature=known.curvature[cut],
-            template_error=known.template_error[cut],
-            reference=known.reference[:, rows],
-            elements=tuple(known.elements[index] for index in rows),
-        ),
-        rows,
-    )
+    proposals, without = tuple(analysis.proposals[index] for index in kept), (*analysis.without, *names)
+    cut = {name: getattr(known, name)[np.ix_(rows, columns)] for name in ("templates", "curvature", "template_error")}
+    same = {name: getattr(known, name)[:, rows] for name in ("simulations", "reference")}
+    elements = tuple(known.elements[index] for index in rows)
+    fewer = replace(known, offset=known.offset[rows], elements=elements, **cut, **same)
+    return Analysis(analysis.model, proposals, blocks, tuple(sorted(set(without)))), fewer, rows

@@ -23,16 +23,7 @@ from mcsim.benchmark.folder import (
     read_key,
     write_key,
 )
-from mcsim.benchmark.learned import (
-    Batch,
-    LearnedModel,
-    each_case,
-    learned,
-    learned_model,
-    seeded,
-    simulated,
-    with_effects,
-)
+from mcsim.benchmark.learned import Batch, LearnedModel, each_case, learned_model, simulated, workers_of
 from mcsim.benchmark.out_of_library import introduced, load
 from mcsim.benchmark.sampler import CaseSampler, OutOfLibrary
 from mcsim.errors import InputError
@@ -96,8 +87,8 @@ def make(
     missing = [number for number in range(cases) if not (target / MAPS / _name(number)).is_dir()]
     if not missing:
         return target
-    with learned(settings, workers, quiet) as (model, call):
-        sampler = CaseSampler(settings.prior, model.library)
+    with workers_of(settings, workers, quiet) as call:
+        sampler = CaseSampler(settings.prior, learned_model(settings).library)
         kinds = sampler.kinds(seed, cases, file is not None)
         if file is not None and any(kinds[number] == "invented" for number in missing):
             sampler = replace(sampler, out_of_library=_responses(settings.model, file, call))
@@ -162,7 +153,8 @@ def make_case(settings: Settings, folder: str, truth: Truth) -> None:
 
 def maps_of(run: config.RunConfig, truth: Truth, file: str | None = None) -> list[tuple[str, Vector]]:
     """Simulate the maps of a case, uK, by name."""
-    data = with_effects(seeded(run, truth.seed), [member.table() for member in truth.members])
+    effects = (*run.effects, *(member.table() for member in truth.members))
+    data = replace(run, effects=effects, ensemble=replace(run.ensemble, seed=truth.seed))
     with introduced(file):
         shared = survey(data)
         if truth.sampled:

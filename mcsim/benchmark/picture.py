@@ -1,6 +1,5 @@
 """Draw a score in one picture."""
 
-from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -140,10 +139,6 @@ def _matrix(axes: Axes, matrix: Confusion, title: str) -> None:
         if count:
             colour = "w" if shares[i, j] > 0.5 else "k"
             axes.text(j, i, str(count), ha="center", va="center", fontsize=8, color=colour)
-    _ticks(axes, matrix.answers, matrix.truths)
+    axes.set_xticks(range(len(matrix.answers)), matrix.answers, rotation=90, fontsize=8)
+    axes.set_yticks(range(len(matrix.truths)), matrix.truths, fontsize=8)
     axes.set(xlabel="Answer", ylabel="Truth")
-
-
-def _ticks(axes: Axes, columns: Sequence[str], rows: Sequence[str]) -> None:
-    axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=8)
-    axes.set_yticks(range(len(rows)), rows, fontsize=8)

@@ -1,6 +1,6 @@
 """Put together what is known of a case once its key is open: the truth, the answer, and the best possible answer."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -93,20 +93,6 @@ class Record:
     def wrong_name(self) -> bool:
         """True if one effect is named, without an alternative, that does not act."""
         return self.verdict == "effect" and self.best is not None and not self.best <= self.truth
-
-    def plain(self) -> dict[str, Any]:
-        """Return the record as JSON has it."""
-        row = asdict(self)
-        row["truth"] = _sorted(self.truth)
-        row["answers"] = [_sorted(answer) for answer in self.answers]
-        row["bayes"] = None if self.bayes is None else _sorted(self.bayes)
-        return {
-            key: None if isinstance(value, float) and not np.isfinite(value) else value for key, value in row.items()
-        }
-
-
-def _sorted(answer: Answer) -> list[list[str | None]]:
-    return [list(identity) for identity in sorted(answer, key=lambda i: (i[0], i[1] or ""))]
 
 
 def facts(drawn: Drawn, response: Vector, library: Library) -> dict[str, Any]:

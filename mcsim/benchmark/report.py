@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import is_dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ DOTS_PER_INCH = 110
 def write(score: Score, folder: Path) -> None:
     """Write ``score.json``, ``report.html`` and ``score.png`` into a folder, which is made if it does not exist."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "score.json").write_text(json.dumps([_plain(score)], indent=1, allow_nan=False) + "\n")
+    (folder / "score.json").write_text(json.dumps([_plain(_content(score))], indent=1, allow_nan=False) + "\n")
     picture = page.png(score_figure(score), DOTS_PER_INCH)
     (folder / "score.png").write_bytes(picture)
     text = page.render(
@@ -50,18 +50,33 @@ def lines(score: Score) -> list[str]:
     ]
 
 
-def _plain(score: Score) -> dict[str, Any]:
+def _content(score: Score) -> dict[str, Any]:
     return {
         "schema": 1,
         "version": version("mcsim"),
         "title": score.title,
-        "figures": [metric.plain() for metric in score.metrics],
-        "confusion": score.all_cases.plain(),
-        "confusion_library": score.library_cases.plain(),
-        "confusion_bayes": score.bayes.plain(),
-        "left_out": [asdict(one) for one in score.unlisted],
-        "cases": [record.plain() for record in score.records],
+        "figures": score.metrics,
+        "confusion": score.all_cases,
+        "confusion_library": score.library_cases,
+        "confusion_bayes": score.bayes,
+        "left_out": score.unlisted,
+        "cases": score.records,
     }
+
+
+def _plain(value: Any) -> Any:
+    """Return nested dataclasses, arrays and sets as JSON has them, None in place of NaN."""
+    if isinstance(value, dict):
+        return {key: _plain(one) for key, one in value.items()}
+    if isinstance(value, frozenset):  # effects by name and channel, which can be None
+        return [list(one) for one in sorted(value, key=lambda one: (one[0], one[1] or ""))]
+    if isinstance(value, tuple):
+        return [_plain(one) for one in value]
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return _plain(vars(value)) if is_dataclass(value) else value
 
 
 def _ordered(metrics: Sequence[Metric]) -> list[Metric]:

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 from mcsim.benchmark.folder import MAPS, VERDICTS, Settings, finished_cases, read_json
-from mcsim.benchmark.learned import each_case, learned, learned_model
+from mcsim.benchmark.learned import each_case, learned_model, workers_of
 from mcsim.errors import InputError
 from mcsim.support.folders import appearing
 
@@ -38,7 +38,7 @@ def run(folder: str | Path, *, workers: int | None = None, quiet: bool = True) -
     if missing:
         # Cases of one library follow each other, so that a worker seldom changes its library.
         ordered = sorted((_without(target, case), case) for case in missing)
-        with learned(settings, workers, quiet) as (_, call):
+        with workers_of(settings, workers, quiet) as call:
             each_case(call, diagnose_case, [(settings, str(target), case, names) for names, case in ordered], quiet)
     return len(missing)
 

@@ -11,7 +11,7 @@ from mcsim.benchmark.bayes import BayesClassifier
 from mcsim.benchmark.case import Truth
 from mcsim.benchmark.draws import draws, powers
 from mcsim.benchmark.folder import VERDICTS, Settings, finished_cases, open_key, read_json
-from mcsim.benchmark.learned import learned, learned_model
+from mcsim.benchmark.learned import learned_model, workers_of
 from mcsim.benchmark.library import Library, linear_model
 from mcsim.benchmark.record import Record, best_possible, facts
 from mcsim.benchmark.sampler import CaseSampler
@@ -45,8 +45,8 @@ def score(folder: str | Path, *, workers: int | None = None, quiet: bool = True)
     if not cases:
         raise InputError(f"{folder} has no verdicts; run mcsim challenge run {folder} first.")
     settings, truths = Settings.read(target), [open_key(target, case) for case in cases]
-    with learned(settings, workers, quiet):
-        pass  # now it is in the cache
+    with workers_of(settings, workers, quiet):
+        pass  # now the model is in the cache
     library = learned_model(settings).library
     bayes = BayesClassifier(CaseSampler(settings.prior, library))
     # Cases of one library after each other: a smaller library takes a second.
@@ -80,9 +80,10 @@ def score_draws(
     if number < 1:
         raise InputError(f"a score of {number} draws is none; ask for at least 1.")
     writable(Path(folder))
-    with learned(settings, workers, quiet) as (model, call):
-        records = draws(model.context, number, seed, prior=settings.prior, call=call)
-    power = powers(linear_model(model.context), DETECTIONS, seed)
+    with workers_of(settings, workers, quiet) as call:
+        context = learned_model(settings).context
+        records = draws(context, number, seed, settings.prior, call)
+    power = powers(linear_model(context), DETECTIONS, seed)
     result = summarise(f"{number} draws of the data vector", records, power)
     report.write(result, Path(folder))
     return result

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,10 +31,6 @@ class Confusion:
     truths: tuple[str, ...]
     answers: tuple[str, ...]
     counts: NDArray[np.int64]
-
-    def plain(self) -> dict[str, Any]:
-        """Return the matrix as JSON has it."""
-        return {"truths": self.truths, "answers": self.answers, "counts": self.counts.tolist()}
 
 
 @dataclass(frozen=True)
