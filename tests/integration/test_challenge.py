@@ -16,7 +16,7 @@ from mcsim.diagnosis.analysis import analysis_of
 from mcsim.diagnosis.observed_maps import read_maps
 from mcsim.errors import InputError
 
-OUT_OF_LIBRARY = str(Path(__file__).parents[1] / "inventions.py")
+OUT_OF_LIBRARY = str(Path(__file__).parents[1] / "out_of_library.py")
 LIBRARY = ("beam_ellipticity", "dipole_residual", "noise_level")
 MODEL = {
     "schema": 1,
