@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mcsim.benchmark.bayes import BayesClassifier
 from mcsim.benchmark.case import Drawn, Prior
 from mcsim.benchmark.library import LinearModel, linear_model
-from mcsim.benchmark.record import Record, best_possible, facts
+from mcsim.benchmark.record import Record, best_possible, facts, pulls
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.diagnosis.batch import Batch
 from mcsim.diagnosis.inference import DiagnosisContext
@@ -114,9 +114,9 @@ def _pulls(said: Attribution, drawn: Drawn) -> dict[str, Any]:
     (member,) = drawn.members
     assert member.candidate is not None  # it is of the library
     alone = said.singles[member.candidate]
-    pulls = tuple(float(pull) for pull in (alone.amplitudes - np.array(member.coordinates)) / alone.errors)
+    fitted = pulls(alone.amplitudes, member.coordinates, alone.errors)
     named = bool(said.explanations) and said.explanations[0].members == (member.candidate,)
-    return {"pulls": pulls if named else (), "fitted": pulls}
+    return {"pulls": fitted if named else (), "fitted": fitted}
 
 
 def _reduction(model: LinearModel, x: Vector, said: Attribution) -> dict[str, Any]:

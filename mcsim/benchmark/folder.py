@@ -3,7 +3,6 @@
 import hashlib
 import json
 import os
-import secrets
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,6 @@ from mcsim.benchmark.out_of_library import load
 from mcsim.errors import InputError
 
 SETTINGS, MAPS, KEYS, SEAL, VERDICTS = "challenge.json", "cases", "keys", "SEAL", "verdicts"
-NONCE_BYTES = 32
 
 
 @dataclass(frozen=True)
@@ -89,11 +87,6 @@ def write_whole(path: Path, text: str) -> None:
     scratch = path.with_name(f".{path.name}.{os.getpid()}")
     scratch.write_text(text)
     os.replace(scratch, path)
-
-
-def new_nonce() -> str:
-    """Draw 256 bits from the system's source of randomness."""
-    return secrets.token_hex(NONCE_BYTES)
 
 
 def key_path(folder: Path, case: str) -> Path:

@@ -92,8 +92,7 @@ def removed(name: str, before_after: Sequence[tuple[float, float]]) -> Metric:
 
 def _bootstrapped(name: str, statistic: Callable[..., Any], *samples: ArrayLike) -> Metric:
     arrays = [np.asarray(sample, dtype=float) for sample in samples]
-    n = len(arrays[0])
-    if n < 3:
+    if (n := len(arrays[0])) < 3:
         return Metric(name, np.nan, np.nan, np.nan, n)
     return Metric(name, float(statistic(*arrays)), *_percentiles(statistic, arrays, RESAMPLED), n)
 
@@ -117,8 +116,8 @@ def snr_at_power(
         return Metric(name, np.nan, np.nan, np.nan, len(strengths))
 
     def solved(s: Vector, hit: Vector) -> float:
-        if hit.all() or not hit.any():
-            return np.nan
+        if hit.all() or not hit.any():  # of resampled cases: the S/N is outside the drawn ones
+            return float(s.min() if hit.all() else s.max())
         sign = np.where(hit, 1.0, -1.0)
 
         def loss(parameters: Vector) -> float:

@@ -1,6 +1,7 @@
 """Make a challenge: maps of surveys in which effects may act, and sealed keys that say which."""
 
 import json
+import secrets
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,6 @@ from mcsim.benchmark.folder import (
     Settings,
     key_hash,
     key_path,
-    new_nonce,
     read_key,
     write_key,
 )
@@ -41,6 +41,7 @@ SMALLER = 0.7
 """Factor between one trial of an amplitude and the next."""
 
 ATTEMPTS = 16
+NONCE_BYTES = 32
 STRONGER = 1.5
 """Largest ratio of the simulated to the drawn expected S/N."""
 
@@ -140,7 +141,7 @@ def make_case(settings: Settings, folder: str, truth: Truth) -> None:
         if truth.kind != "invented":
             model = learned_model(settings)
             members = tuple(_measured(model, member, truth.seed) for member in members)
-        truth = replace(truth, members=members, nonce=new_nonce())
+        truth = replace(truth, members=members, nonce=secrets.token_hex(NONCE_BYTES))
         write_key(target, truth)
     with appearing(target / MAPS / case) as scratch:
         for name, map_uk in maps_of(settings.model, truth, settings.out_of_library):

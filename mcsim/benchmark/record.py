@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mcsim.benchmark.bayes import BayesClassifier
 from mcsim.benchmark.case import IN_LIBRARY, Answer, Drawn, Kind
@@ -93,6 +93,12 @@ class Record:
     def wrong_name(self) -> bool:
         """True if one effect is named, without an alternative, that does not act."""
         return self.verdict == "effect" and self.best is not None and not self.best <= self.truth
+
+
+def pulls(fitted: ArrayLike, true: ArrayLike, errors: ArrayLike) -> tuple[float, ...]:
+    """Return fitted less true components over their errors, without components that the data do not constrain."""
+    difference, sigma = np.asarray(fitted) - np.asarray(true), np.asarray(errors)
+    return tuple(float(value) for value in difference[sigma > 0.0] / sigma[sigma > 0.0])
 
 
 def facts(drawn: Drawn, response: Vector, library: Library) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from mcsim.benchmark.draws import draws, powers
 from mcsim.benchmark.folder import VERDICTS, Settings, finished_cases, open_key, read_json
 from mcsim.benchmark.learned import learned_model, workers_of
 from mcsim.benchmark.library import Library, linear_model
-from mcsim.benchmark.record import Record, best_possible, facts
+from mcsim.benchmark.record import Record, best_possible, facts, pulls
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.benchmark.summary import Score, summarise
 from mcsim.errors import InputError
@@ -133,5 +133,4 @@ def _pulls(truth: Truth, answer: Mapping[str, Any], library: Library) -> tuple[f
     assert member.candidate is not None  # it is of the library
     if best["proposals"] != [library.proposals[member.candidate].label]:
         return ()
-    fitted = zip(best["amplitudes"], member.coordinates, best["errors"], strict=True)
-    return tuple(float((value - true) / error) for value, true, error in fitted)
+    return pulls(best["amplitudes"], member.coordinates, best["errors"])

@@ -32,7 +32,7 @@ from mcsim.benchmark.folder import (
 )
 from mcsim.benchmark.library import linear_model, reduced
 from mcsim.benchmark.make import _without_none, make
-from mcsim.benchmark.record import Record
+from mcsim.benchmark.record import Record, pulls
 from mcsim.benchmark.report import lines, write
 from mcsim.benchmark.run import run
 from mcsim.benchmark.sampler import CaseSampler
@@ -431,6 +431,14 @@ def test_the_snr_at_a_power_is_that_of_the_probit():
     assert found.low < truth < found.high
     assert found.value == pytest.approx(truth, abs=0.1)
     assert np.isnan(intervals.snr_at_power("", s, s > 0).value)
+    # Of one in twenty, a third of the resampled cases have none.
+    few = intervals.snr_at_power("", s[:20], s[:20] == s[:20].max())
+    assert few.low <= few.high
+    assert np.isfinite([few.value, few.low, few.high]).all()
+
+
+def test_pulls_are_those_of_constrained_components():
+    assert pulls([1.0, 0.0, 3.0], (0.5, 2.0, 4.0), [0.5, 0.0, 2.0]) == (1.0, -0.5)
 
 
 def record(kind="one", verdict="effect", there=(("beam_width", "A"),), said=((("beam_width", "A"),),), **changes):
