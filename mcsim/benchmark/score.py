@@ -41,7 +41,8 @@ def score(folder: str | Path, *, workers: int | None = None, quiet: bool = True)
         If there is no verdict, or one cannot be read, or a key is not the sealed one.
     """
     target = Path(folder)
-    cases = [case for case in finished_cases(target) if (target / VERDICTS / case).is_dir()]
+    made = finished_cases(target)
+    cases = [case for case in made if (target / VERDICTS / case).is_dir()]
     if not cases:
         raise InputError(f"{folder} has no verdicts; run mcsim challenge run {folder} first.")
     settings, truths = Settings.read(target), [open_key(target, case) for case in cases]
@@ -52,7 +53,10 @@ def score(folder: str | Path, *, workers: int | None = None, quiet: bool = True)
     # Cases of one library after each other: a smaller library takes a second.
     order = sorted(truths, key=lambda truth: truth.without)
     records = [_record(settings, truth, target / VERDICTS / truth.case, bayes) for truth in order]
-    result = summarise(f"{len(cases)} full skies", sorted(records, key=lambda record: record.case))
+    title = f"{len(cases)} full skies" + (
+        f" of {len(made)}; the others have no verdict" if len(cases) < len(made) else ""
+    )
+    result = summarise(title, sorted(records, key=lambda record: record.case))
     report.write(result, target / "score")
     return result
 

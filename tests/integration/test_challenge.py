@@ -135,7 +135,17 @@ def test_a_damaged_verdict_is_refused(challenge):
         with pytest.raises(InputError, match="case-000"):
             score.score(folder, workers=0)
     path.write_text(text)
-    assert score.score(folder, workers=0).all_cases.counts.sum() == CASES
+    assert score.score(folder, workers=0).title == f"{CASES} full skies"
+
+
+def test_a_case_without_a_verdict_is_counted(challenge, tmp_path):
+    folder, _ = challenge
+    run.run(folder, workers=0)
+    (folder / "verdicts" / "case-003").rename(tmp_path / "case-003")
+    found = score.score(folder, workers=0)
+    assert found.title.startswith(f"{CASES - 1} full skies of {CASES}")
+    assert [record.case for record in found.records] == ["case-000", "case-001", "case-002", "case-004"]
+    (tmp_path / "case-003").rename(folder / "verdicts" / "case-003")
 
 
 def test_out_of_library_effects_are_known_for_a_while_only():
