@@ -30,7 +30,7 @@ Config = Annotated[str, typer.Argument(metavar="CONFIG", help="TOML file, or a p
 Store = Annotated[Path, typer.Argument(metavar="STORE", help="Folder that mcsim run wrote.")]
 Workers = Annotated[int | None, typer.Option(min=0, help="Processes; 0: this one; default: the model's.")]
 Simulations = Annotated[
-    int | None, typer.Option(min=50, help="For the scatter of the evidence; default: ten for each number.")
+    int | None, typer.Option(min=50, help="For the covariance of the data vector; default: ten per element.")
 ]
 Png = Annotated[Path | None, typer.Option("-o", "--output", metavar="PNG", help="Picture to write.")]
 
@@ -300,7 +300,7 @@ def challenge_make(
     output: Target,
     cases: Annotated[int, typer.Option(min=1, help="Number of cases.")] = 200,
     seed: Annotated[int, typer.Option(min=0, help="Of the draws; keep it as secret as the keys.")] = 0,
-    sampled_share: Annotated[float, typer.Option(min=0.0, max=1.0, help="Share made sample by sample.")] = 0.5,
+    sampled_share: Annotated[float, typer.Option(min=0.0, max=1.0, help="Share of maps made sample by sample.")] = 0.5,
     inventions: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Python file with effects that no library has.")
     ] = None,
