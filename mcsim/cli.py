@@ -7,7 +7,6 @@ import json
 import os
 import signal
 import sys
-from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Annotated
@@ -31,7 +30,7 @@ Config = Annotated[str, typer.Argument(metavar="CONFIG", help="TOML file, or a p
 Store = Annotated[Path, typer.Argument(metavar="STORE", help="Folder that mcsim run wrote.")]
 Workers = Annotated[int | None, typer.Option(min=0, help="Processes; 0: this one; default: the model's.")]
 Simulations = Annotated[
-    int | None, typer.Option(min=50, help="For the scatter of the evidence; default: ten for each number.")
+    int | None, typer.Option(min=50, help="For the covariance of the data vector; default: ten per element.")
 ]
 Png = Annotated[Path | None, typer.Option("-o", "--output", metavar="PNG", help="Picture to write.")]
 
@@ -288,7 +287,7 @@ def diagnose(
     out.print("\n".join(summary(found, output)), markup=False, highlight=False, soft_wrap=True)
 
 
-challenge = typer.Typer(help="Effects drawn, hidden, diagnosed and scored.", no_args_is_help=True)
+challenge = typer.Typer(help="Benchmark the diagnosis on effects that are drawn and sealed.", no_args_is_help=True)
 app.add_typer(challenge, name="challenge")
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the challenge.")]
@@ -301,19 +300,22 @@ def challenge_make(
     output: Target,
     cases: Annotated[int, typer.Option(min=1, help="Number of cases.")] = 200,
     seed: Annotated[int, typer.Option(min=0, help="Of the draws; keep it as secret as the keys.")] = 0,
-    sampled_share: Annotated[float, typer.Option(min=0.0, max=1.0, help="Share made sample by sample.")] = 0.5,
+    sampled_share: Annotated[float, typer.Option(min=0.0, max=1.0, help="Share of maps made sample by sample.")] = 0.5,
     inventions: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Python file with effects of no library.")
+        Path | None, typer.Option(metavar="FILE", help="Python file with effects that no library has.")
     ] = None,
     simulations: Simulations = None,
     workers: Workers = None,
 ) -> None:
     """Draw effects, make maps, seal the keys."""
+    from mcsim import config
+    from mcsim.benchmark.folder import Settings
     from mcsim.benchmark.make import make
 
     _interrupt_once()
-    made = partial(make, model, output, cases, seed, sampled_share=sampled_share, out_of_library=inventions)
-    made(simulations=simulations, workers=workers, quiet=False)
+    file = None if inventions is None else str(inventions)
+    shared = Settings(config.load(model), sampled_share=sampled_share, out_of_library=file, simulations=simulations)
+    make(shared, output, cases, seed, workers=workers, quiet=False)
 
 
 @challenge.command("run")
@@ -342,10 +344,13 @@ def challenge_draws(
     simulations: Simulations = None,
     workers: Workers = None,
 ) -> None:
-    """Score draws of the compressed evidence, without maps."""
+    """Score draws of the data vector, without maps."""
+    from mcsim import config
     from mcsim.benchmark import report, score
+    from mcsim.benchmark.folder import Settings
 
-    found = score.score_draws(model, number, seed, output, simulations=simulations, workers=workers, quiet=False)
+    shared = Settings(config.load(model), simulations=simulations)
+    found = score.score_draws(shared, output, number, seed, workers=workers, quiet=False)
     out.print("\n".join(report.lines(found)), markup=False)
 
 

@@ -1,1 +1,1 @@
-"""Challenges: effects drawn, hidden and sealed, diagnosed as one batch, and scored beside the best that is possible."""
+"""Benchmark a diagnosis on sealed cases: draw effects, make maps, diagnose them, and score beside the Bayes optimum."""

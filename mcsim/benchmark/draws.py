@@ -1,259 +1,167 @@
-"""Draws of the compressed evidence, without maps: thousands of cases that are judged like full skies."""
+"""Draw data vectors without maps: thousands of cases that are judged like full skies."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.benchmark.prior import CaseSampler, Drawn, Prior
-from mcsim.benchmark.record import Geometry, Record, most_probable
-from mcsim.benchmark.reduced import without
+from mcsim.benchmark.bayes import BayesClassifier
+from mcsim.benchmark.case import Drawn, Prior
+from mcsim.benchmark.library import LinearModel, linear_model
+from mcsim.benchmark.record import Record, best_possible, facts, pulls
+from mcsim.benchmark.sampler import CaseSampler
 from mcsim.diagnosis.batch import Batch
-from mcsim.diagnosis.candidate import Candidate, columns_of, effects_at
 from mcsim.diagnosis.context import DiagnosisContext
-from mcsim.diagnosis.selection import Attribution, attribute
-from mcsim.diagnosis.validation import Halves, Prediction, Shrink
-from mcsim.errors import InputError
+from mcsim.diagnosis.selection import Attribution
 from mcsim.sphere import rng
 from mcsim.stats.detection import power
-from mcsim.stats.gaussian import Fit, SimulatedGaussian
-from mcsim.stats.look_elsewhere import Calibration, calibrate, global_test
 
 Vector = NDArray[np.float64]
 
-HELD_OUT = 0.25
-"""Share of the simulations that serve as data and not for the scatter."""
-
-TASK = 20
-FAR = 0.3
-"""Cosine below which an effect that is not there is unlike what is."""
+CASES_PER_TASK = 20
+UNLIKE = 0.3
+"""Cosine below which an effect that does not act is unlike those that do."""
 
 STRONG = 8.0
+"""Expected S/N from which on an effect that does not act is added as well."""
 
 
 @dataclass(frozen=True, eq=False)
-class Bench:
-    """What draws are judged with: a court's numbers, small enough to travel.
+class Draw:
+    """Number of a draw, what it is, and the response of the data vector of its library, shape (p_raw,)."""
 
-    Attributes
-    ----------
-    null, halves
-        Of the whole data vector, and of its two folds; None if it has none.
-    templates
-        Shape (p, K).
-    candidates, calibration
-        Of the library.
-    data
-        Evidence of simulations that the null has not seen, shape (n, p).
-    """
-
-    null: SimulatedGaussian
-    halves: Halves | None
-    templates: NDArray[np.float64]
-    candidates: tuple[Candidate, ...]
-    calibration: Calibration
-    data: NDArray[np.float64]
+    number: int
+    drawn: Drawn
+    response: Vector
 
 
-def bench(context: DiagnosisContext, names: tuple[str, ...] = ()) -> Bench:
-    """Of a court, without some effects; a quarter of its simulations become data."""
-    fewer = without(context.analysis, context.ensemble, context.bank, names)
-    ensemble, analysis = fewer.ensemble, fewer.analysis
-    kept = len(ensemble.simulations) - int(HELD_OUT * len(ensemble.simulations))
-    seen = replace(ensemble, simulations=ensemble.simulations[:kept])
-    # Templates are exact here, also those of stochastic effects: the scatter, which a diagnosis would measure, is none.
-    candidates = tuple(replace(candidate, shape_error=None) for candidate in analysis.candidates)
-    whole, t = seen.gaussian, fewer.bank.significant(ensemble.spread, context.settings)
-    groups = whole.whiten_groups(t, [candidate.columns for candidate in candidates])
-    data = ensemble.simulations[kept:] + ensemble.offset
-    return Bench(whole, Halves.of(seen, np.zeros(len(t))), t, candidates, calibrate(whole, groups), data)
-
-
-def draws(
-    context: DiagnosisContext, number: int, seed: int, *, prior: Prior | None = None, call: Batch | None = None
-) -> list[Record]:
-    """Draw evidence and judge it.
+def draws(context: DiagnosisContext, number: int, seed: int, prior: Prior, call: Batch | None = None) -> list[Record]:
+    """Draw data vectors and judge them.
 
     Parameters
     ----------
-    court
-        Of the model.
+    context
+        What a diagnosis of the model has learned.
     number
-        Of draws.
+        Number of draws.
     seed
-        Of what is drawn.
+        Of the draws.
     prior
-        What is drawn; inventions have no template and are not among it.
+        Distribution that is drawn from; out-of-library effects have no template and are not drawn.
     call
         Runs tasks; default: in this process.
 
     Returns
     -------
     list
-        One record for every draw, judged by :func:`mcsim.diagnosis.selection.attribute`.
+        One record for each draw, judged by :func:`mcsim.diagnosis.selection.attribute`.
 
     Notes
     -----
-    x = evidence of a simulation without effects that the null has not seen (the first one again when all have been
-    used), plus templates times coordinates: responses are straight lines here, and templates exact. What they are not,
-    and everything else that a map goes through, is tested by full skies.
+    x = data vector of a simulation without effects that is not in the covariance (the first one again when all have
+    been used), plus templates times coordinates: responses are straight lines here, and templates exact. What they are
+    not, and everything else that a map goes through, is tested by full skies.
     """
-    prior = prior or Prior()
-    full = bench(context)
-    sampler = sampler_of(full, prior)
-    kinds = sampler.kinds(seed, number, False)
+    full = linear_model(context)
+    sampler = CaseSampler(prior, full.library)
+    kinds = sampler.kinds(seed, number)
     by_library: dict[tuple[str, ...], list[tuple[int, Drawn]]] = {}
     for case in range(number):
-        one = sampler.draw(kinds, seed, case)
-        by_library.setdefault(one.without, []).append((case, one))
+        drawn = sampler.draw(kinds, seed, case)
+        by_library.setdefault(drawn.without, []).append((case, drawn))
     tasks = []
     for names, cases in by_library.items():
-        here = bench(context, names) if names else full
-        rows = without(context.analysis, context.ensemble, context.bank, names).rows
-        posed = [Draw(case, one, response_of(full, one)[rows]) for case, one in cases]
-        tasks += [(here, prior, seed, posed[start : start + TASK]) for start in range(0, len(posed), TASK)]
-    records: list[Record] = []
-    for _, found in call(judged, tasks) if call else ((0, judged(*task)) for task in tasks):
-        records += found
-    return sorted(records, key=lambda record: record.case)
+        model = linear_model(context, names) if names else full
+        posed = [Draw(case, drawn, full.library.response(drawn.members)[model.rows]) for case, drawn in cases]
+        tasks += [(model, prior, seed, posed[i : i + CASES_PER_TASK]) for i in range(0, len(posed), CASES_PER_TASK)]
+    found = call(judge, tasks) if call else enumerate(judge(*task) for task in tasks)
+    return sorted((record for _, records in found for record in records), key=lambda record: record.case)
 
 
-def sampler_of(bench: Bench, prior: Prior) -> CaseSampler:
-    """What draws from the library of a bench."""
-    columns = [candidate.columns for candidate in bench.candidates]
-    return CaseSampler(prior, bench.candidates, columns, bench.templates, bench.null.expected_snr, {})
-
-
-@dataclass(frozen=True, eq=False)
-class Draw:
-    """Number of a draw, what it is, and how the evidence of its bench responds to that."""
-
-    case: int
-    drawn: Drawn
-    response: Vector
-
-
-def response_of(bench: Bench, drawn: Drawn) -> Vector:
-    """Change of the evidence by all that was drawn, shape (p,)."""
-    total = np.zeros(len(bench.templates))
-    for member in drawn.members:
-        assert member.candidate is not None  # inventions are not drawn here
-        columns = list(bench.candidates[member.candidate].columns)
-        total += bench.templates[:, columns] @ np.array(member.coordinates)
-    return total
-
-
-def judged(bench: Bench, prior: Prior, seed: int, cases: Sequence[Draw]) -> list[Record]:
-    """Task: judge draws."""
-    geometry = Geometry.of(bench.null, bench.templates, bench.candidates, bench.calibration)
-    bayes = geometry.bayes(sampler_of(bench, prior))
+def judge(model: LinearModel, prior: Prior, seed: int, cases: Sequence[Draw]) -> list[Record]:
+    """Judge draws of one library."""
+    library = model.library
+    bayes = BayesClassifier(CaseSampler(prior, library))
     found = []
     for draw in cases:
-        x = bench.data[draw.case % len(bench.data)] + draw.response
-        members, truth = draw.drawn.members, frozenset(member.identity for member in draw.drawn.members)
-        said = attribute(bench.null, x, bench.templates, bench.candidates, bench.calibration)
-        best, right = None, np.nan
-        if draw.drawn.kind in ("none", "one", "two"):
-            best, right = most_probable(bayes.probabilities(x))
-        shrink = shrunk(bench, x, said.explanations[0].members) if said.explanations else None
+        drawn, x = draw.drawn, model.data[draw.number % len(model.data)] + draw.response
+        said = library.attribute(x)
+        identities = library.identities
         found.append(
             Record(
-                f"draw-{draw.case:05d}",
-                draw.drawn.kind,
-                truth,
-                bench.null.expected_snr(draw.response),
-                len(members[0].coordinates) if len(members) == 1 else 0,
-                geometry.rival(draw.response, truth) if truth else 0.0,
-                geometry.distances(draw.response) if draw.drawn.kind in ("left_out", "invented") else (),
-                said.gap.pvalue,
-                said.gap.maximum,
-                said.verdict,
-                answers_of(said, bench.candidates),
-                best,
-                right,
-                *_pulls(said, draw.drawn),
-                None if shrink is None else shrink[0].fraction.value,
-                None if shrink is None else shrink[1].fraction.value,
-                None if shrink is None else shrink[1].fraction.sigma,
-                None if shrink is None else (shrink[1].before.value, shrink[1].after.value),
-                _absent(bench, geometry, draw, x, truth, seed),
+                case=f"draw-{draw.number:05d}",
+                strength=library.null.expected_snr(draw.response),
+                p_value=said.gap.pvalue,
+                maximum=said.gap.maximum,
+                verdict=said.verdict,
+                answers=tuple(frozenset(identities[m] for m in one.members) for one in said.explanations),
+                absent=_absent(model, draw, x, seed),
+                **facts(drawn, draw.response, library),
+                **best_possible(drawn, x, bayes),
+                **_pulls(said, drawn),
+                **_reduction(model, x, said),
             )
         )
     return found
 
 
-def answers_of(said: Attribution, candidates: Sequence[Candidate]) -> tuple[frozenset[tuple[str, str | None]], ...]:
-    """Accepted sets by name and channel, the best first."""
-    return tuple(
-        frozenset(candidates[member].identity for member in explanation.members) for explanation in said.explanations
-    )
-
-
-def _pulls(said: Attribution, drawn: Drawn) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Of the only effect, where it was named, and whether or not."""
+def _pulls(said: Attribution, drawn: Drawn) -> dict[str, Any]:
+    """Return the pulls of the only effect, where it was named, and named or not."""
     if drawn.kind != "one":
-        return (), ()
+        return {}
     (member,) = drawn.members
-    assert member.candidate is not None  # inventions are not drawn here
+    assert member.candidate is not None  # it is of the library
     alone = said.singles[member.candidate]
-    pulls = tuple(float(pull) for pull in (alone.amplitudes - np.array(member.coordinates)) / alone.errors)
+    fitted = pulls(alone.amplitudes, member.coordinates, alone.errors)
     named = bool(said.explanations) and said.explanations[0].members == (member.candidate,)
-    return pulls if named else (), pulls
+    return {"pulls": fitted if named else (), "fitted": fitted}
 
 
-def shrunk(bench: Bench, x: Vector, members: Sequence[int]) -> tuple[Prediction, Shrink] | None:
-    """Shrink predicted and achieved: fitted to fold 0, frozen, and judged on fold 1."""
-    if bench.halves is None:
+def _reduction(model: LinearModel, x: Vector, said: Attribution) -> dict[str, Any]:
+    found = model.held_out_reduction(x, said.explanations[0].members) if said.explanations else None
+    if found is None:
+        return {}
+    predicted, measured = found
+    return {
+        "predicted": predicted.fraction.value,
+        "achieved": measured.fraction.value,
+        "sigma": measured.fraction.sigma,
+        "gaps": (measured.before.value, measured.after.value),
+    }
+
+
+def _absent(model: LinearModel, draw: Draw, x: Vector, seed: int) -> tuple[float, float] | None:
+    """Return the excess chi^2 before and after one effect that neither acts nor is like the one that does."""
+    library, truth = model.library, draw.drawn.identities
+    if draw.drawn.kind != "one" or library.null.expected_snr(draw.response) < STRONG:
         return None
-    t = bench.templates[:, columns_of(bench.candidates, members)]
-
-    def respond(frozen: Fit) -> Vector:
-        effects = effects_at(bench.candidates, members, frozen)
-        return np.asarray(t @ np.concatenate([effect.coordinates() for effect in effects]))
-
-    try:
-        return replace(bench.halves, x=x).reduction(t, respond)
-    except InputError:
-        return None
-
-
-def _absent(
-    bench: Bench, geometry: Geometry, draw: Draw, x: Vector, truth: frozenset[tuple[str, str | None]], seed: int
-) -> tuple[float, float] | None:
-    """Gap before and after one effect that is neither there nor like what is there."""
-    if len(truth) != 1 or draw.drawn.kind != "one":
-        return None
-    if bench.null.expected_snr(draw.response) < STRONG:
-        return None
-    white = bench.null.whiten_templates(draw.response[:, None])[:, 0]
-    cosines = np.sqrt(geometry.groups.delta_chi2(white)) / np.linalg.norm(white)
     unlike = [
         index
-        for index, candidate in enumerate(bench.candidates)
-        if candidate.identity not in truth and cosines[index] < FAR and geometry.groups.sizes[index] > 0
+        for index, cosine in enumerate(library.cosines(draw.response))
+        if library.identities[index] not in truth and cosine < UNLIKE and library.groups.sizes[index] > 0
     ]
     if not unlike:
         return None
-    chosen = unlike[int(rng.generator(seed, draw.case, "challenge/absent").integers(len(unlike)))]
-    shrink = shrunk(bench, x, (chosen,))
-    return None if shrink is None else (shrink[1].before.value, shrink[1].after.value)
+    chosen = unlike[int(rng.generator(seed, draw.number, "challenge/absent").integers(len(unlike)))]
+    found = model.held_out_reduction(x, (chosen,))
+    return None if found is None else (found[1].before.value, found[1].after.value)
 
 
 @dataclass(frozen=True, eq=False)
 class Power:
-    """Single effects of given strengths, whether they were found, and the power that the same trials allow at best.
+    """Detection of single effects against their expected S/N.
 
     Attributes
     ----------
     strengths, by_maximum, by_gap
-        Of every draw: white length, and whether the largest of the templates, and the whole test, found it at 5 %.
-    grid, limit
-        Strengths, and the mean power with infinitely many simulations after Bonferroni over the library.
-    finite
-        The same with the simulations that there are.
+        Of every draw: expected S/N, and whether the largest matched filter and the global test detect it at 5 %.
+    grid, limit, finite
+        Grid of S/N, and the mean power after Bonferroni over the library with infinitely many simulations and with
+        those that there are.
     null_maximum, null_gap
-        Probabilities of evidence without an effect.
+        p-values of data vectors without an effect.
     """
 
     strengths: Vector
@@ -266,42 +174,29 @@ class Power:
     null_gap: Vector
 
 
-def powers(context: DiagnosisContext, number: int, seed: int, *, alpha: float = 0.05) -> Power:
-    """Detection of single effects against strength, from 1 to 9, without attribution."""
-    here = bench(context)
-    sampler = sampler_of(
-        here, Prior(none=0.0, one=1.0, two=0.0, left_out=0.0, invented=0.0, weakest=1.0, strongest=9.0)
-    )
-    geometry = Geometry.of(here.null, here.templates, here.candidates, here.calibration)
-    kinds = sampler.kinds(seed, number, False)
-    strengths, columns, found = np.empty(number), np.zeros(number, dtype=int), np.empty((number, 2))
-    for case in range(number):
-        drawn = sampler.draw(kinds, seed, case)
-        strengths[case], columns[case] = drawn.members[0].strength, len(drawn.members[0].coordinates)
-        said = global_test(
-            here.null, here.data[case % len(here.data)] + response_of(here, drawn), geometry.groups, here.calibration
-        )
-        found[case] = said.maximum, said.pvalue
-    quiet = [global_test(here.null, x, geometry.groups, here.calibration) for x in here.data]
-    grid = np.linspace(0.5, 9.0, 35)
-    tests, p = here.calibration.tests, here.null.dimension
-    kinds_of_columns, counts = np.unique(columns, return_counts=True)
-    limit, finite = (
-        np.array(
-            [
-                np.average([power(s, int(k), alpha / tests, p, simulations) for k in kinds_of_columns], weights=counts)
-                for s in grid
-            ]
-        )
-        for simulations in (None, here.null.n_sims)
-    )
+def powers(model: LinearModel, number: int, seed: int, *, alpha: float = 0.05) -> Power:
+    """Test draws of single effects with an expected S/N from 1 to 9 for detection, without attribution."""
+    library, data = model.library, model.data
+    only = Prior(none=0.0, one=1.0, two=0.0, left_out=0.0, invented=0.0, weakest=1.0, strongest=9.0)
+    sampler = CaseSampler(only, library)
+    kinds = sampler.kinds(seed, number)
+    drawn = [sampler.draw(kinds, seed, case).members for case in range(number)]
+    tested = [library.test(data[case % len(data)] + library.response(members)) for case, members in enumerate(drawn)]
+    quiet = [library.test(x) for x in data]
+    grid, tests = np.linspace(0.5, 9.0, 35), library.calibration.tests
+    columns, counts = np.unique([len(members[0].coordinates) for members in drawn], return_counts=True)
+
+    def mean_power(simulations: int | None) -> Vector:
+        rest = alpha / tests, library.null.dimension, simulations
+        return np.average([[power(s, int(k), *rest) for s in grid] for k in columns], axis=0, weights=counts)
+
     return Power(
-        strengths,
-        found[:, 0] <= alpha,
-        found[:, 1] <= alpha,
-        grid,
-        limit,
-        finite,
-        np.array([one.maximum for one in quiet]),
-        np.array([one.pvalue for one in quiet]),
+        strengths=np.array([members[0].strength for members in drawn]),
+        by_maximum=np.array([one.maximum <= alpha for one in tested]),
+        by_gap=np.array([one.pvalue <= alpha for one in tested]),
+        grid=grid,
+        limit=mean_power(None),
+        finite=mean_power(library.null.n_sims),
+        null_maximum=np.array([one.maximum for one in quiet]),
+        null_gap=np.array([one.pvalue for one in quiet]),
     )

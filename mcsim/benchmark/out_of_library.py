@@ -1,4 +1,4 @@
-"""Effects that no library has: classes of a file of the challenger's."""
+"""Load effects that no library has from a Python file."""
 
 import importlib.util
 import inspect
@@ -13,16 +13,16 @@ from mcsim.systematics import Effect, Library
 
 @lru_cache(maxsize=4)
 def load(path: str) -> dict[str, type[Effect]]:
-    """Effects that a Python file defines, by name.
+    """Load the effects that a Python file defines, by name.
 
     Raises
     ------
     InputError
-        A file that cannot be run, defines no effect, or one whose name the library has.
+        If the file cannot be run, or defines no effect, or one whose name the library has.
     """
-    spec = importlib.util.spec_from_file_location(f"mcsim_inventions_{Path(path).stem}", path)
+    spec = importlib.util.spec_from_file_location(f"mcsim_out_of_library_{Path(path).stem}", path)
     if spec is None or spec.loader is None or not Path(path).is_file():
-        raise InputError(f"{path} is no Python file with inventions; name one that defines classes of mcsim.Effect.")
+        raise InputError(f"{path} is no Python file with effects; name one that defines classes of mcsim.Effect.")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     try:

@@ -1,163 +1,144 @@
-"""A score in one picture: calibration, power, confusion, pulls, shrink, what is unknown."""
+"""Draw a score in one picture."""
 
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
 from scipy import stats
 
-if TYPE_CHECKING:
-    from mcsim.benchmark.figures import Confusion, Score
+from mcsim.benchmark.intervals import binomial_interval
+from mcsim.benchmark.summary import ALPHA, FAR, NAMED, REDUCED, Confusion, Score, null_pvalues
 
-BLUE, RED, GREY = "#1f5fa8", "#c44e22", "0.55"
+BLUE, RED, GREY = "#1f5fa8", "#c44e22", "0.45"
 
 
-def challenge_figure(score: "Score") -> Figure:
-    """Draw a score.
-
-    Parameters
-    ----------
-    score
-        Of full skies, or of draws of the evidence.
+def score_figure(score: Score) -> Figure:
+    """Draw a score of full skies, or of draws of the data vector.
 
     Returns
     -------
     Figure
-        p-values without an effect, power against strength beside the limit, unknowns against distance; pulls, achieved
-        against predicted shrink, right answers against strength beside Bayes'; the confusion matrices of both.
+        p-values without an effect, power against expected S/N, unknown effects against their S/N beyond the library;
+        pulls, measured against predicted reduction of the excess chi^2, right answers against S/N beside those of the
+        Bayes classifier; the confusion matrices of both.
     """
     figure = Figure(figsize=(15.0, 16.0), layout="constrained")
-    figure.suptitle(score.title, fontsize=12)
+    figure.suptitle(score.title, fontsize=13)
     upper, lower = np.ravel(np.asarray(figure.subfigures(2, 1, height_ratios=(1.0, 1.05)), dtype=object))
-    axes = upper.subplots(2, 3)
-    _calibration(axes[0, 0], score)
-    _power(axes[0, 1], score)
-    _unknown(axes[0, 2], score)
-    _pulls(axes[1, 0], score)
-    _shrink(axes[1, 1], score)
-    _right(axes[1, 2], score)
-    said, best = lower.subplots(1, 2, width_ratios=(max(len(score.said.answers), 1), max(len(score.best.answers), 1)))
-    _matrix(said, score.said, "diagnosis")
-    _matrix(best, score.best, "Bayes, cases of its library")
+    panels = (_calibration, _power, _unknown, _pulls, _reduction, _right)
+    for axes, panel in zip(upper.subplots(2, 3).flat, panels, strict=True):
+        panel(axes, score)
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(fontsize=8, framealpha=0.8, edgecolor="none")
+    widths = [max(len(matrix.answers), 1) for matrix in (score.all_cases, score.bayes)]
+    left, right = lower.subplots(1, 2, width_ratios=widths)
+    _matrix(left, score.all_cases, "Answers of the diagnosis, all cases")
+    _matrix(right, score.bayes, "Answers of the Bayes classifier,\ncases whose truth is in the library")
     return figure
 
 
-def _calibration(axes: Axes, score: "Score") -> None:
-    p = np.sort([record.p_value for record in score.records if record.kind == "none"])
-    if score.power is not None:
-        p = np.sort(score.power.null_gap)
-    axes.plot([0, 1], [0, 1], color=GREY, linewidth=0.8)
+def _calibration(axes: Axes, score: Score) -> None:
+    p = np.sort(null_pvalues(score.records, score.power))
+    axes.plot([0, 1], [0, 1], color=GREY, linewidth=0.8, label="uniform")
     if len(p):
-        rank = np.arange(1, len(p) + 1) / len(p)
-        axes.step(p, rank, where="post", color=BLUE)
-        half = 1.36 / np.sqrt(len(p))
-        axes.fill_between([0, 1], [-half, 1 - half], [half, 1 + half], color=GREY, alpha=0.2, linewidth=0)
-    axes.set(
-        xlabel="p of the gap, nothing there", ylabel="share of cases", title=f"{len(p)} cases", xlim=(0, 1), ylim=(0, 1)
-    )
+        axes.step(p, np.arange(1, len(p) + 1) / len(p), where="post", color=BLUE, label="measured")
+        half = stats.kstwo.isf(0.05, len(p))
+        axes.fill_between([0, 1], [-half, 1 - half], [half, 1 + half], color=GREY, alpha=0.2, linewidth=0, label="95 %")
+    axes.set(xlabel="p-value of the global test", ylabel="Fraction of cases at or below", xlim=(0, 1), ylim=(0, 1))
+    axes.set_title(f"{len(p)} cases without an effect")
 
 
-def _binned(axes: Axes, x: np.ndarray, hits: np.ndarray, colour: str, label: str, bins: int = 8) -> None:
+def _binned(axes: Axes, x: ArrayLike, hits: ArrayLike, label: str, colour: str = BLUE, bins: int = 8) -> None:
+    """Draw the share of hits in bins of equal numbers of cases, with its 95 % interval."""
+    x, hits = np.asarray(x), np.asarray(hits)
     if len(x) < 2:
         return
     edges = np.quantile(x, np.linspace(0.0, 1.0, min(bins, max(len(x) // 8, 1)) + 1))
-    for number, (low, high) in enumerate(pairwise(edges)):
-        here = hits[(x >= low) & ((x < high) | (high == edges[-1]))]
-        if not len(here):
-            continue
-        k, n = int(here.sum()), len(here)
-        bottom = stats.beta.ppf(0.025, k, n - k + 1) if k else 0.0
-        top = stats.beta.ppf(0.975, k + 1, n - k) if k < n else 1.0
-        error = [[max(k / n - bottom, 0.0)], [max(top - k / n, 0.0)]]
-        axes.errorbar(
-            0.5 * (low + high), k / n, error, fmt="o", color=colour, markersize=4, capsize=2,
-            label=label if number == 0 else None,
-        )  # fmt: skip
+    inside = [(x >= low) & ((x < high) | (high == edges[-1])) for low, high in pairwise(edges)]
+    middle = np.array(
+        [0.5 * (low + high) for (low, high), here in zip(pairwise(edges), inside, strict=True) if here.any()]
+    )
+    counts = [(int(hits[here].sum()), int(here.sum())) for here in inside if here.any()]
+    value = np.array([k / n for k, n in counts])
+    low, high = np.transpose([binomial_interval(k, n) for k, n in counts])
+    error = np.maximum([value - low, high - value], 0.0)
+    axes.errorbar(middle, value, error, fmt="o", color=colour, markersize=4, capsize=2, label=label)
 
 
-def _power(axes: Axes, score: "Score") -> None:
+def _power(axes: Axes, score: Score) -> None:
     if score.power is not None:
         power = score.power
-        axes.plot(power.grid, power.limit, color=GREY, label="limit, Bonferroni")
-        axes.plot(power.grid, power.finite, color=GREY, linestyle="--", label="with the simulations that there are")
-        _binned(axes, power.strengths, power.by_maximum, BLUE, "templates' maximum", 16)
-        _binned(axes, power.strengths, power.by_gap, RED, "whole test", 16)
+        axes.plot(power.grid, power.limit, color=GREY, label="limit, known covariance")
+        axes.plot(power.grid, power.finite, color=GREY, linestyle="--", label="limit, covariance of the simulations")
+        _binned(axes, power.strengths, power.by_maximum, "largest matched filter", BLUE, 16)
+        _binned(axes, power.strengths, power.by_gap, "global test", RED, 16)
     else:
         ones = [record for record in score.records if record.kind == "one"]
-        s = np.array([record.strength for record in ones])
-        _binned(axes, s, np.array([record.maximum <= 0.05 for record in ones]), BLUE, "templates' maximum")
-        _binned(axes, s, np.array([record.p_value <= 0.05 for record in ones]), RED, "whole test")
+        s = [record.strength for record in ones]
+        _binned(axes, s, [record.maximum <= ALPHA for record in ones], "largest matched filter")
+        _binned(axes, s, [record.p_value <= ALPHA for record in ones], "global test", RED)
     axes.axhline(0.9, color=GREY, linewidth=0.6, linestyle=":")
-    axes.set(xlabel="strength s", ylabel="found at 5 %", title="single effects", ylim=(-0.03, 1.03))
-    _legend(axes)
+    axes.set(xlabel="Expected S/N", ylabel="Fraction detected at 5 %", title="Single effects", ylim=(-0.03, 1.03))
 
 
-def _unknown(axes: Axes, score: "Score") -> None:
-    foreign = [record for record in score.records if record.distances]
-    d = np.array([record.distances[-1] for record in foreign])
-    _binned(axes, d, np.array([record.verdict == "unknown" for record in foreign]), BLUE, "unknown", 6)
-    _binned(axes, d, np.array([record.wrong_name for record in foreign]), RED, "wrong single name", 6)
-    axes.axvline(8.0, color=GREY, linewidth=0.6, linestyle=":")
-    axes.set(xlabel="distance from every triple", ylabel="share", title="not in the library", ylim=(-0.03, 1.03))
-    _legend(axes)
+def _unknown(axes: Axes, score: Score) -> None:
+    rows = [record for record in score.records if record.distances]
+    beyond = [record.distances[-1] for record in rows]
+    _binned(axes, beyond, [record.verdict == "unknown" for record in rows], "called unknown", BLUE, 6)
+    _binned(axes, beyond, [record.wrong_name for record in rows], "wrong single name", RED, 6)
+    axes.axvline(FAR, color=GREY, linewidth=0.6, linestyle=":")
+    axes.set(xlabel="Expected S/N beyond every three effects of the library", ylabel="Fraction of cases")
+    axes.set(title="Effects that the library does not have", ylim=(-0.03, 1.03))
 
 
-def _pulls(axes: Axes, score: "Score") -> None:
-    pulls = [pull for record in score.records if record.strength >= 5.0 for pull in record.pulls]
+def _pulls(axes: Axes, score: Score) -> None:
+    pulls = [pull for record in score.records if record.strength >= NAMED for pull in record.pulls]
     if pulls:
-        axes.hist(np.clip(pulls, -5, 5), bins=list(np.linspace(-5, 5, 31)), color=BLUE, alpha=0.7, density=True)
-        axes.set_title(f"{len(pulls)} amplitudes: mean {np.mean(pulls):.2f}, width {np.std(pulls):.2f}")
+        bins = list(np.linspace(-5, 5, 31))
+        axes.hist(np.clip(pulls, -5, 5), bins=bins, color=BLUE, alpha=0.7, density=True, label="measured")
+    title = f"{len(pulls)} components of named effects, S/N ≥ {NAMED:g}"
+    axes.set_title(f"{title}\nmean {np.mean(pulls):.2f}, width {np.std(pulls):.2f}" if pulls else title)
     x = np.linspace(-5, 5, 200)
-    axes.plot(x, np.exp(-0.5 * x * x) / np.sqrt(2 * np.pi), color=GREY)
-    axes.set(xlabel="fitted less true, over the error", ylabel="density")
+    axes.plot(x, stats.norm.pdf(x), color=GREY, label="unit normal")
+    axes.set(xlabel="Pull: fitted less true amplitude, over its error", ylabel="Density")
 
 
-def _shrink(axes: Axes, score: "Score") -> None:
-    rows = [r for r in score.records if r.truth and r.best == r.truth and r.achieved is not None and r.strength >= 8.0]
-    axes.plot([0, 1.2], [0, 1.2], color=GREY, linewidth=0.8)
+def _reduction(axes: Axes, score: Score) -> None:
+    strong = [r for r in score.records if r.truth and r.best == r.truth and r.strength >= REDUCED]
+    rows = [(r.predicted, r.achieved, r.sigma) for r in strong if r.achieved is not None]
+    axes.plot([0, 1.2], [0, 1.2], color=GREY, linewidth=0.8, label="equal")
     if rows:
-        x, y, error = (
-            np.array([getattr(r, key) for r in rows], dtype=float) for key in ("predicted", "achieved", "sigma")
-        )
-        axes.errorbar(
-            x, y, error, fmt="o", color=BLUE, markersize=3, elinewidth=0.5, alpha=0.7, label="right effect, s >= 8"
-        )
+        x, y, error = np.array(rows, dtype=float).T
+        name = f"right effect, S/N ≥ {REDUCED:g}"
+        axes.errorbar(x, y, error, fmt="o", color=BLUE, markersize=3, elinewidth=0.5, alpha=0.7, label=name)
     absent = [1.0 - r.absent[1] / r.absent[0] for r in score.records if r.absent is not None and r.absent[0] > 0]
     if absent:
-        axes.plot(np.zeros(len(absent)), absent, "x", color=RED, markersize=4, label="effect that is not there")
-    axes.set(xlabel="predicted share of the gap", ylabel="achieved", title="shrink", xlim=(-0.1, 1.2), ylim=(-0.6, 1.4))
-    _legend(axes)
+        axes.plot(np.zeros(len(absent)), absent, "x", color=RED, markersize=4, label="effect that does not act")
+    axes.set(xlabel="Predicted fractional reduction", ylabel="Measured fractional reduction")
+    axes.set(title=r"Reduction of the excess $\chi^2$ of held-out data", xlim=(-0.1, 1.2), ylim=(-0.6, 1.4))
 
 
-def _right(axes: Axes, score: "Score") -> None:
+def _right(axes: Axes, score: Score) -> None:
     known = [record for record in score.records if record.bayes is not None and record.truth]
     s = np.array([record.strength for record in known])
-    _binned(axes, s, np.array([record.right for record in known]), BLUE, "diagnosis")
-    _binned(axes, s * 1.01, np.array([record.bayes == record.truth for record in known]), RED, "Bayes")
-    axes.set(xlabel="strength s", ylabel="right answer", title="one and two effects", ylim=(-0.03, 1.03))
-    _legend(axes)
+    _binned(axes, s, [record.right for record in known], "diagnosis")
+    _binned(axes, 1.01 * s, [record.bayes == record.truth for record in known], "Bayes classifier", RED)
+    axes.set(xlabel="Expected S/N", ylabel="Fraction answered rightly", title="One and two effects", ylim=(-0.03, 1.03))
 
 
-def _legend(axes: Axes) -> None:
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(fontsize=8, frameon=False)
-
-
-def _matrix(axes: Axes, matrix: "Confusion", title: str) -> None:
+def _matrix(axes: Axes, matrix: Confusion, title: str) -> None:
     axes.set_title(title)
     if not matrix.truths:
         axes.axis("off")
         return
-    shares = matrix.counts / np.maximum(matrix.counts.sum(axis=1, keepdims=True), 1)
+    shares = matrix.counts / matrix.counts.sum(axis=1, keepdims=True)
     axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
-    for i, row in enumerate(matrix.counts):
-        for j, count in enumerate(row):
-            if count:
-                axes.text(
-                    j, i, str(count), ha="center", va="center", fontsize=7, color="w" if shares[i, j] > 0.5 else "k"
-                )
-    axes.set_xticks(range(len(matrix.answers)), matrix.answers, rotation=90, fontsize=7)
-    axes.set_yticks(range(len(matrix.truths)), matrix.truths, fontsize=7)
-    axes.set(xlabel="said", ylabel="there")
+    for (i, j), count in np.ndenumerate(matrix.counts):
+        if count:
+            colour = "w" if shares[i, j] > 0.5 else "k"
+            axes.text(j, i, str(count), ha="center", va="center", fontsize=8, color=colour)
+    axes.set_xticks(range(len(matrix.answers)), matrix.answers, rotation=90, fontsize=8)
+    axes.set_yticks(range(len(matrix.truths)), matrix.truths, fontsize=8)
+    axes.set(xlabel="Answer", ylabel="Truth")

@@ -1,58 +1,52 @@
-"""One case as the score sees it: what was there, what was said, and what could have been said."""
+"""Put together what is known of a case once its key is open: the truth, the answer, and the best possible answer."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from mcsim.benchmark.bayes import Bayes
-from mcsim.benchmark.prior import CaseSampler
-from mcsim.benchmark.truth import Identity, Kind
-from mcsim.diagnosis.candidate import Candidate
-from mcsim.diagnosis.subsets import Subsets
-from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates
-from mcsim.stats.look_elsewhere import Calibration
+from mcsim.benchmark.bayes import BayesClassifier
+from mcsim.benchmark.case import IN_LIBRARY, Answer, Drawn, Kind
+from mcsim.benchmark.library import Library
 
 Vector = NDArray[np.float64]
-Answer = frozenset[Identity]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Record:
-    """What is known of a case after its key is opened.
+    """One case after its key is opened; the names are keys of ``score.json``.
 
     Attributes
     ----------
-    kind, truth
-        Kind of the case, and what was there.
+    case, kind, truth
+        Name and kind of the case, and the effects that act.
     strength, columns
-        White length of all that was there, and number of amplitudes of an only effect.
+        Expected S/N of all effects together, and number of linear components of a single one.
     rival
-        Largest cosine of the response with a candidate that was not there.
+        Largest cosine of the response with a candidate that does not act.
     distances
-        White length that the best one, two and three candidates, none of them there, leave of the response.
+        S/N that the best one, two and three candidates, none of them acting, leave of the response.
     p_value, maximum
-        Of the gap, and of the most significant candidate alone, trials included.
+        p-value of the global test, and of the most significant candidate alone, look-elsewhere effect included.
     verdict, answers
-        What was said: the verdict, and the accepted sets, the best first.
-    bayes
-        The most probable set, of cases whose truth the classifier knows; else None.
-    bayes_right
-        Its probability of being right, by its own account.
+        Verdict, and the accepted sets of effects, the best first.
+    bayes, bayes_right
+        Most probable set of the Bayes-optimal classifier, and the probability that this gives it; None and NaN where
+        the truth is none of its hypotheses.
     pulls
-        Fitted less true amplitudes over their errors, where the only effect was named.
+        Fitted less true components over their errors, where the only effect was named.
     fitted
-        The same of the fit of the only effect, named or not; empty where it was not fitted for itself.
+        The same of a fit of the only effect, named or not.
     predicted, achieved, sigma
-        Shrink of the gap; None where none was measured.
+        Fractional reduction of the excess chi^2 on held-out data, and the error of the measured one; None: not
+        measured.
     gaps, absent
-        Gap before and after, with what was named; and with an effect that is not there.
+        Excess chi^2 of held-out data before and after the named effects are added; after one that does not act.
     places
-        (frame, L, parity) of the first three places; None where they were not looked for.
+        (frame, L, parity) of the three most significant places; None: not looked for.
     sampled
-        Data made sample by sample.
+        True if the maps were made sample by sample.
     """
 
     case: str
@@ -80,87 +74,44 @@ class Record:
 
     @property
     def best(self) -> Answer | None:
-        """The set that is named first."""
+        """Set of effects that is named first."""
         return self.answers[0] if self.answers else None
 
     @property
-    def known(self) -> bool:
-        """Whether the library has all that was there."""
-        return self.kind in ("none", "one", "two")
+    def in_library(self) -> bool:
+        """True if the library has all effects that act."""
+        return self.kind in IN_LIBRARY
 
     @property
     def right(self) -> bool:
-        """Named first, or none where there is none; of what the library does not have, "unknown"."""
-        if not self.known:
+        """True if the truth is named first, or called unknown where the library does not have it."""
+        if not self.in_library:
             return self.verdict == "unknown"
         return self.verdict == "none" if not self.truth else self.best == self.truth
 
     @property
     def wrong_name(self) -> bool:
-        """One effect named, without an alternative, that was not there."""
+        """True if one effect is named, without an alternative, that does not act."""
         return self.verdict == "effect" and self.best is not None and not self.best <= self.truth
 
-    def plain(self) -> dict[str, Any]:
-        """For JSON."""
-        row = asdict(self)
-        row["truth"] = _sorted(self.truth)
-        row["answers"] = [_sorted(answer) for answer in self.answers]
-        row["bayes"] = None if self.bayes is None else _sorted(self.bayes)
-        return {
-            key: None if isinstance(value, float) and not np.isfinite(value) else value for key, value in row.items()
-        }
+
+def pulls(fitted: ArrayLike, true: ArrayLike, errors: ArrayLike) -> tuple[float, ...]:
+    """Return fitted less true components over their errors, without components that the data do not constrain."""
+    difference, sigma = np.asarray(fitted) - np.asarray(true), np.asarray(errors)
+    return tuple(float(value) for value in difference[sigma > 0.0] / sigma[sigma > 0.0])
 
 
-def _sorted(answer: Answer) -> list[list[str | None]]:
-    return [list(identity) for identity in sorted(answer, key=lambda i: (i[0], i[1] or ""))]
+def facts(drawn: Drawn, response: Vector, library: Library) -> dict[str, Any]:
+    """Return what a record says of the truth, from the response of the data vector of the case's library."""
+    return {
+        "kind": drawn.kind,
+        "truth": drawn.identities,
+        "columns": len(drawn.members[0].coordinates) if len(drawn.members) == 1 else 0,
+        "rival": library.rival(response, drawn.identities) if drawn.members else 0.0,
+        "distances": () if drawn.in_library else library.distances(response),
+    }
 
 
-@dataclass(frozen=True, eq=False)
-class Geometry:
-    """Responses of a library in white coordinates."""
-
-    null: SimulatedGaussian
-    candidates: Sequence[Candidate]
-    groups: WhitenedTemplates
-    calibration: Calibration
-
-    @classmethod
-    def of(
-        cls, null: SimulatedGaussian, t: NDArray[np.float64], candidates: Sequence[Candidate], calibration: Calibration
-    ) -> "Geometry":
-        """From templates."""
-        return cls(
-            null, candidates, null.whiten_groups(t, [candidate.columns for candidate in candidates]), calibration
-        )
-
-    def bayes(self, sampler: CaseSampler) -> Bayes:
-        """The classifier that knows what the urn draws."""
-        identities = [candidate.identity for candidate in self.candidates]
-        return Bayes(self.null, self.groups, identities, sampler.weights(), sampler.prior)
-
-    def rival(self, response: Vector, truth: Iterable[Identity]) -> float:
-        """Largest cosine of a response with the candidates that are not of the truth."""
-        white = self.null.whiten_templates(response[:, None])[:, 0]
-        size = float(np.linalg.norm(white))
-        there = set(truth)
-        others = [index for index, candidate in enumerate(self.candidates) if candidate.identity not in there]
-        if size == 0.0 or not others:
-            return 0.0
-        return float(np.sqrt(np.max(self.groups.delta_chi2(white)[others])) / size)
-
-    def distances(self, response: Vector, max_amplitude: int = 3) -> tuple[float, ...]:
-        """White length that is left of a response by the best 1, 2, ... candidates of this library."""
-        white = self.null.whiten_templates(response[:, None])[:, 0]
-        search = Subsets(self.null, white, self.groups, self.candidates, self.calibration)
-        found, best = [], search.total
-        for size in range(1, max_amplitude + 1):
-            left = [search.solve(rows).chi2.min() for rows in search.rows(size, ()) if len(rows)]
-            best = min([best, *left])
-            found.append(float(np.sqrt(self.null.hartlap_factor * max(best, 0.0))))
-        return tuple(found)
-
-
-def most_probable(probabilities: dict[Answer, float]) -> tuple[Answer, float]:
-    """The most probable set, and its probability."""
-    answer = max(probabilities, key=lambda one: probabilities[one])
-    return answer, probabilities[answer]
+def best_possible(drawn: Drawn, x: Vector, bayes: BayesClassifier) -> dict[str, Any]:
+    """Return what a record says of the best possible answer to a data vector."""
+    return dict(zip(("bayes", "bayes_right"), bayes.best(x), strict=True)) if drawn.in_library else {}

@@ -3,78 +3,56 @@
 import json
 from pathlib import Path
 
-from mcsim import config
-from mcsim.benchmark.learned_model import without_effects
-from mcsim.benchmark.make import SETTINGS
-from mcsim.benchmark.truth import MAPS, finished_cases
-from mcsim.diagnosis.analysis import analysis_of
-from mcsim.diagnosis.api import prepared
-from mcsim.diagnosis.batch import asking, batch
-from mcsim.diagnosis.inference import diagnose_data
-from mcsim.diagnosis.observed_maps import ObservedMaps, read_maps
+from mcsim.benchmark.folder import MAPS, VERDICTS, Settings, finished_cases, read_json
+from mcsim.benchmark.learned import each_case, learned_model, workers_of
 from mcsim.errors import InputError
 from mcsim.support.folders import appearing
-from mcsim.support.progress import reporting
-
-VERDICTS = "verdicts"
 
 
 def run(folder: str | Path, *, workers: int | None = None, quiet: bool = True) -> int:
-    """Diagnose the cases of a challenge that have no verdict yet.
+    """Diagnose the cases of a challenge that have no verdict yet, without looking at the keys.
 
     Parameters
     ----------
     folder
-        As :func:`mcsim.benchmark.make` fills it; gets ``verdicts/case-NNN`` with ``verdict.json`` and ``answer.json``
-        (the evidence and the fit behind it). Keys are not looked at.
+        As :func:`mcsim.benchmark.make.make` fills it. It gets ``verdicts/case-NNN`` with ``verdict.json`` and
+        ``answer.json`` (the data vector and the fits behind the verdict).
     workers
-        Processes; default: the model's; 0: this one.
+        Number of processes; default: the model's; 0: this process.
+    quiet
+        Report no progress.
 
     Returns
     -------
     int
         Number of cases that were diagnosed.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no challenge.
     """
     target = Path(folder)
-    fiducial, simulations = settings_of(target)
     missing = [case for case in finished_cases(target) if not (target / VERDICTS / case).is_dir()]
-    if not missing:
-        return 0
-    with batch(fiducial.compute.workers if workers is None else workers) as call:
-        with asking(call, quiet) as ask:
-            prepared(fiducial, analysis_of(fiducial), ask, simulations)
-        text = config.to_json(fiducial)
-        # Cases of one library follow each other, so that a worker seldom changes its court.
-        analysis = sorted((_without(target, case), case) for case in missing)
-        with reporting("cases", float(len(missing)), "cases", quiet) as report:
-            tasks = ((text, simulations, str(target), case, names) for names, case in analysis)
-            for done, _ in enumerate(call(judge_case, tasks)):
-                report(float(done + 1))
+    settings = Settings.read(target)
+    if missing:
+        # Cases of one library follow each other, so that a worker seldom changes its library.
+        ordered = sorted((_without(target, case), case) for case in missing)
+        with workers_of(settings, workers, quiet) as call:
+            each_case(call, diagnose_case, [(settings, str(target), case, names) for names, case in ordered], quiet)
     return len(missing)
 
 
-def settings_of(folder: Path) -> tuple[config.RunConfig, int | None]:
-    """What a challenge's cases are told to believe, and the number of simulations to learn from."""
-    path = folder / SETTINGS
-    try:
-        plain = json.loads(path.read_text())
-        return config.load(plain["model"]), plain["simulations"]
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"{path} cannot be read ({error}); make the challenge with mcsim challenge make.") from error
-
-
-def judge_case(model: str, simulations: int | None, folder: str, case: str, names: tuple[str, ...]) -> str:
-    """Task: verdict of one case; its folder appears complete or not at all."""
-    target = Path(folder)
-    learned = without_effects(model, simulations, names)
-    maps = read_maps(learned.context.analysis.model, target / MAPS / case)
-    found = diagnose_data(ObservedMaps(learned.context, maps, learned.ask), case)
+def diagnose_case(settings: Settings, folder: str, case: str, without: tuple[str, ...]) -> None:
+    """Write the verdict of one case; its folder appears complete or not at all."""
+    target, model = Path(folder), learned_model(settings, without)
+    found = model.diagnose(case, target / MAPS / case)
     answer = {
         "evidence": [float(value) for value in found.data],
         "maximum": found.test.best_candidate,
         "explanations": [
             {
-                "proposals": [learned.context.candidates[member].label for member in one.candidates],
+                "proposals": [model.library.candidates[member].label for member in one.candidates],
                 "amplitudes": list(one.coordinates),
                 "errors": list(one.errors),
             }
@@ -84,8 +62,11 @@ def judge_case(model: str, simulations: int | None, folder: str, case: str, name
     with appearing(target / VERDICTS / case) as scratch:
         (scratch / "verdict.json").write_text(json.dumps(found.to_json(), indent=1, allow_nan=False) + "\n")
         (scratch / "answer.json").write_text(json.dumps(answer) + "\n")
-    return case
 
 
 def _without(folder: Path, case: str) -> tuple[str, ...]:
-    return tuple(json.loads((folder / MAPS / case / "question.json").read_text())["without"])
+    path = folder / MAPS / case / "question.json"
+    try:
+        return tuple(read_json(path, "restore it")["without"])
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path} does not say which effects are left out ({error}); restore it.") from error

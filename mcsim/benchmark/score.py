@@ -1,179 +1,140 @@
-"""Open the keys and score the verdicts; score draws of the evidence by the same figures."""
+"""Open the keys and score the verdicts; score draws of the data vector by the same metrics."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mcsim import config
 from mcsim.benchmark import report
-from mcsim.benchmark.bayes import Bayes
+from mcsim.benchmark.bayes import BayesClassifier
+from mcsim.benchmark.case import Truth
 from mcsim.benchmark.draws import draws, powers
-from mcsim.benchmark.figures import Score, scored
-from mcsim.benchmark.learned_model import LearnedModel, without_effects
-from mcsim.benchmark.make import SETTINGS, sampler_of
-from mcsim.benchmark.prior import Prior
-from mcsim.benchmark.record import Answer, Geometry, Record, most_probable
-from mcsim.benchmark.run import VERDICTS, settings_of
-from mcsim.benchmark.truth import Truth, finished_cases, open_key
-from mcsim.diagnosis.analysis import analysis_of
-from mcsim.diagnosis.api import prepared
-from mcsim.diagnosis.batch import asking, batch
+from mcsim.benchmark.folder import VERDICTS, Settings, finished_cases, open_key, read_json
+from mcsim.benchmark.learned import learned_model, workers_of
+from mcsim.benchmark.library import Library, linear_model
+from mcsim.benchmark.record import Record, best_possible, facts, pulls
+from mcsim.benchmark.sampler import CaseSampler
+from mcsim.benchmark.summary import Score, summarise
 from mcsim.errors import InputError
 from mcsim.support.folders import writable
 
-Vector = NDArray[np.float64]
+DETECTIONS = 4000
+"""Draws of single effects that are tested for detection alone."""
 
 
 def score(folder: str | Path, *, workers: int | None = None, quiet: bool = True) -> Score:
-    """Score a challenge: check the seals, open the keys, and compare.
+    """Check the seals of a challenge, open the keys, and compare them with the verdicts.
 
     Parameters
     ----------
     folder
-        With cases, keys and verdicts; gets ``score/score.json``, ``score/report.html`` and ``score/score.png``.
+        With cases, keys and verdicts. It gets ``score/score.json``, ``score/report.html`` and ``score/score.png``.
     workers
-        Processes that learn the model again, should it not be in the cache; default: the model's; 0: this one.
+        Processes that learn the model again, should it not be in the cache; default: the model's; 0: this process.
+    quiet
+        Report no progress.
 
     Raises
     ------
     InputError
-        A key that is not the sealed one, or no verdict.
+        If there is no verdict, or one cannot be read, or a key is not the sealed one.
     """
     target = Path(folder)
-    fiducial, simulations = settings_of(target)
-    cases = [case for case in finished_cases(target) if (target / VERDICTS / case).is_dir()]
+    made = finished_cases(target)
+    cases = [case for case in made if (target / VERDICTS / case).is_dir()]
     if not cases:
         raise InputError(f"{folder} has no verdicts; run mcsim challenge run {folder} first.")
-    truths = [open_key(target, case) for case in cases]
-    with batch(fiducial.compute.workers if workers is None else workers) as call, asking(call, quiet) as ask:
-        prepared(fiducial, analysis_of(fiducial), ask, simulations)
-    text = config.to_json(fiducial)
-    full = without_effects(text, simulations, ())
-    prior = Prior(**json.loads((target / SETTINGS).read_text())["prior"])
-    diagnose_maps = _Judge(text, simulations, full, prior)
-    # Cases of one library after each other: a lesser court takes a second.
-    order = sorted(range(len(cases)), key=lambda index: truths[index].without)
-    records = {index: diagnose_maps.record(truths[index], target / VERDICTS / cases[index]) for index in order}
-    result = scored(f"{len(cases)} full skies", [records[index] for index in range(len(cases))])
-    report.write([result], target / "score")
+    settings, truths = Settings.read(target), [open_key(target, case) for case in cases]
+    with workers_of(settings, workers, quiet):
+        pass  # now the model is in the cache
+    library = learned_model(settings).library
+    bayes = BayesClassifier(CaseSampler(settings.prior, library))
+    # Cases of one library after each other: a smaller library takes a second.
+    order = sorted(truths, key=lambda truth: truth.without)
+    records = [_record(settings, truth, target / VERDICTS / truth.case, bayes) for truth in order]
+    title = f"{len(cases)} full skies" + (
+        f" of {len(made)}; the others have no verdict" if len(cases) < len(made) else ""
+    )
+    result = summarise(title, sorted(records, key=lambda record: record.case))
+    report.write(result, target / "score")
     return result
 
 
 def score_draws(
-    model: str | Path | Mapping[str, Any] | config.RunConfig,
-    number: int,
-    seed: int,
-    folder: str | Path,
-    *,
-    prior: Prior | None = None,
-    simulations: int | None = None,
-    detections: int = 4000,
-    workers: int | None = None,
-    quiet: bool = True,
+    settings: Settings, folder: str | Path, number: int, seed: int, *, workers: int | None = None, quiet: bool = True
 ) -> Score:
-    """Score draws of a model's compressed evidence; see :func:`mcsim.benchmark.draws.draws`.
+    """Score draws of a model's data vector; see :func:`mcsim.benchmark.draws.draws`.
 
     Parameters
     ----------
-    model, simulations
-        As for :func:`mcsim.benchmark.make.make`.
-    number, detections
-        Of draws that are judged, and of further ones whose detection alone is looked at.
-    seed, prior
-        Of the draws.
+    settings
+        Model, prior and number of simulations.
     folder
         Gets ``score.json``, ``report.html`` and ``score.png``.
+    number
+        Number of draws; :data:`DETECTIONS` more are tested for detection alone.
+    seed
+        Of the draws.
     workers
-        Processes; default: the model's; 0: this one.
+        Number of processes; default: the model's; 0: this process.
+    quiet
+        Report no progress.
     """
-    run = model if isinstance(model, config.RunConfig) else config.load(model)
+    if number < 1:
+        raise InputError(f"a score of {number} draws is none; ask for at least 1.")
     writable(Path(folder))
-    with batch(run.compute.workers if workers is None else workers) as call:
-        with asking(call, quiet) as ask:
-            context = prepared(run, analysis_of(run), ask, simulations)
-        records = draws(context, number, seed, prior=prior, call=call)
-    power = powers(context, detections, seed)
-    result = scored(f"{number} draws of the evidence", records, power)
-    report.write([result], Path(folder))
+    with workers_of(settings, workers, quiet) as call:
+        context = learned_model(settings).context
+        records = draws(context, number, seed, settings.prior, call)
+    power = powers(linear_model(context), DETECTIONS, seed)
+    result = summarise(f"{number} draws of the data vector", records, power)
+    report.write(result, Path(folder))
     return result
 
 
-class _Judge:
-    """From a key and a verdict to a record."""
-
-    def __init__(self, model: str, simulations: int | None, full: LearnedModel, prior: Prior) -> None:
-        self.model, self.simulations, self.full = model, simulations, full
-        self.templates = full.context.templates
-        self.geometry = _geometry(full)
-        self.bayes: Bayes = self.geometry.bayes(sampler_of(full.context, prior))
-
-    def record(self, truth: Truth, folder: Path) -> Record:
-        """Of one case."""
-        verdict = json.loads((folder / "verdict.json").read_text())
-        answer = json.loads((folder / "answer.json").read_text())
-        learned = without_effects(self.model, self.simulations, truth.without)
-        geometry = self.geometry if not truth.without else _geometry(learned)
-        response = self._response(truth)
-        best, right = None, np.nan
-        if truth.kind in ("none", "one", "two"):
-            best, right = most_probable(self.bayes.probabilities(np.array(answer["evidence"])))
-        shrink = verdict["shrink"] or {}
-        members = truth.members
-        return Record(
-            truth.case,
-            truth.kind,
-            truth.identities,
-            members[0].strength if len(members) == 1 else self.full.context.null.expected_snr(response),
-            len(members[0].coordinates) if len(members) == 1 else 0,
-            geometry.rival(response[learned.rows], truth.identities) if members else 0.0,
-            geometry.distances(response[learned.rows]) if truth.kind in ("left_out", "invented") else (),
-            verdict["gap"]["p_value"],
-            answer["maximum"],
-            verdict["verdict"],
-            _answers(verdict),
-            best,
-            right,
-            self._pulls(truth, answer),
-            (),
-            shrink.get("predicted"),
-            shrink.get("achieved"),
-            shrink.get("sigma"),
-            (shrink["gap_before"], shrink["gap_after"]) if shrink else None,
-            None,
-            tuple((place["frame"], place["L"], place["parity"]) for place in verdict["where"][:3]),
-            truth.sampled,
-        )
-
-    def _response(self, truth: Truth) -> Vector:
-        total = np.zeros(len(self.templates))
-        for member in truth.members:
-            if member.candidate is None:
-                total += np.array(member.response)
-            else:
-                columns = list(self.full.context.candidates[member.candidate].columns)
-                total += self.templates[:, columns] @ np.array(member.coordinates)
-        return total
-
-    def _pulls(self, truth: Truth, answer: Mapping[str, Any]) -> tuple[float, ...]:
-        if truth.kind != "one" or not answer["explanations"]:
-            return ()
-        (member,), best = truth.members, answer["explanations"][0]
-        assert member.candidate is not None  # it is of the library
-        if best["proposals"] != [self.full.context.candidates[member.candidate].label]:
-            return ()
-        fitted = zip(best["amplitudes"], member.coordinates, best["errors"], strict=True)
-        return tuple(float((value - true) / error) for value, true, error in fitted)
+def _record(settings: Settings, truth: Truth, folder: Path, bayes: BayesClassifier) -> Record:
+    """Compare the key of a case with the verdict in a folder."""
+    model, full = learned_model(settings, truth.without), bayes.sampler.library
+    remedy = f"delete {folder} and run mcsim challenge run again"
+    verdict, answer = (read_json(folder / name, remedy) for name in ("verdict.json", "answer.json"))
+    try:
+        said, x = _said(truth, verdict, answer, full), np.array(answer["evidence"], dtype=float)
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{folder} holds no verdict ({error}); {remedy}.") from error
+    response, members = full.response(truth.members), truth.members
+    return Record(
+        case=truth.case,
+        strength=members[0].strength if len(members) == 1 else full.null.expected_snr(response),
+        sampled=truth.sampled,
+        **said,
+        **facts(truth, response[model.rows], model.library),
+        **best_possible(truth, x, bayes),
+    )
 
 
-def _geometry(learned: LearnedModel) -> Geometry:
-    context = learned.context
-    return Geometry.of(context.null, context.templates, context.candidates, context.calibration)
-
-
-def _answers(verdict: Mapping[str, Any]) -> tuple[Answer, ...]:
+def _said(truth: Truth, verdict: Mapping[str, Any], answer: Mapping[str, Any], library: Library) -> dict[str, Any]:
+    """Return what a record says of the verdict."""
     sets = [verdict["effects"], *verdict["alternatives"]] if verdict["effects"] else []
-    return tuple(frozenset((effect["name"], effect["channel"]) for effect in one) for one in sets)
+    reduction = verdict["shrink"] or {}
+    return {
+        "p_value": verdict["gap"]["p_value"],
+        "maximum": answer["maximum"],
+        "verdict": verdict["verdict"],
+        "answers": tuple(frozenset((effect["name"], effect["channel"]) for effect in one) for one in sets),
+        "pulls": _pulls(truth, answer, library),
+        **{key: reduction.get(key) for key in ("predicted", "achieved", "sigma")},
+        "gaps": (reduction["gap_before"], reduction["gap_after"]) if reduction else None,
+        "places": tuple((place["frame"], place["L"], place["parity"]) for place in verdict["where"][:3]),
+    }
+
+
+def _pulls(truth: Truth, answer: Mapping[str, Any], library: Library) -> tuple[float, ...]:
+    """Return fitted less true components over their errors, where the only effect is named first."""
+    if truth.kind != "one" or not answer["explanations"]:
+        return ()
+    (member,), best = truth.members, answer["explanations"][0]
+    assert member.candidate is not None  # it is of the library
+    if best["proposals"] != [library.candidates[member.candidate].label]:
+        return ()
+    return pulls(best["amplitudes"], member.coordinates, best["errors"])

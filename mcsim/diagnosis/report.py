@@ -1,7 +1,5 @@
 """One self-contained page about a diagnosis: the verdict, then all that it rests on."""
 
-import base64
-import io
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -9,11 +7,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import jinja2
 from matplotlib.figure import Figure
 
 from mcsim.diagnosis import figures, words
 from mcsim.diagnosis.result import PLACES, DiagnosisResult
+from mcsim.support import page as page_
 from mcsim.support.numbers import measured, number, p_equals, probability
 
 DOTS_PER_INCH = 120
@@ -43,21 +41,15 @@ def write(result: DiagnosisResult, path: str | Path) -> None:
 
 def page(result: DiagnosisResult) -> str:
     """Return the page as text; whatever comes from configurations or data is escaped."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {
-        "measured": measured,
-        "number": number,
-        "parameters": parameters,
-        "probability": probability,
-        "p_equals": p_equals,
-    }
-    return environment.get_template("report.html.j2").render(
+    return page_.render(
+        Path(__file__).with_name("report.html.j2"),
+        {
+            "measured": measured,
+            "number": number,
+            "parameters": parameters,
+            "probability": probability,
+            "p_equals": p_equals,
+        },
         result=result,
         words=words,
         settings=asdict(result.settings),
@@ -105,7 +97,4 @@ def _pictures(result: DiagnosisResult) -> dict[str, Picture]:
 
 
 def _picture(figure: Figure, text: str) -> Picture:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DOTS_PER_INCH, facecolor="white", metadata={"Software": None})
-    data = base64.b64encode(buffer.getvalue()).decode("ascii")
-    return Picture(data, text, round(72 * figure.get_figwidth()))
+    return Picture(page_.embedded(page_.png(figure, DOTS_PER_INCH)), text, round(72 * figure.get_figwidth()))

@@ -10,14 +10,14 @@ import pytest
 
 from mcsim import config, systematics
 from mcsim.benchmark import make, run, score
+from mcsim.benchmark.case import Prior
+from mcsim.benchmark.folder import Settings, finished_cases, key_path, read_key
 from mcsim.benchmark.out_of_library import library_with, load
-from mcsim.benchmark.prior import Prior
-from mcsim.benchmark.truth import Truth, finished_cases, key_path
 from mcsim.diagnosis.analysis import analysis_of
 from mcsim.diagnosis.observed_maps import read_maps
 from mcsim.errors import InputError
 
-INVENTIONS = Path(__file__).parents[1] / "inventions.py"
+OUT_OF_LIBRARY = str(Path(__file__).parents[1] / "out_of_library.py")
 LIBRARY = ("beam_ellipticity", "dipole_residual", "noise_level")
 MODEL = {
     "schema": 1,
@@ -51,8 +51,8 @@ def small_library():
 
 
 def made(folder, cases=CASES, **changes):
-    values = {"prior": PRIOR, "out_of_library": INVENTIONS, "simulations": 150, "workers": 0}
-    return make.make(MODEL, folder, cases, SEED, **(values | changes))
+    values = {"prior": PRIOR, "out_of_library": OUT_OF_LIBRARY, "simulations": 150}
+    return make.make(Settings(config.load(MODEL), **(values | changes)), folder, cases, SEED, workers=0)
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +91,7 @@ def test_cases_are_what_a_diagnosis_reads(challenge):
     assert fiducial.effects == ()
     assert len(read_maps(analysis_of(fiducial).model, folder / "cases" / "case-000")) == 2
     public = [path.read_text() for path in folder.glob("c*/**/*") if path.suffix in (".json", ".toml")]
-    truths = [Truth.read(key_path(folder, case)) for case in finished_cases(folder)]
+    truths = [read_key(folder, case) for case in finished_cases(folder)]
     assert all(str(truth.seed) not in text for truth in truths for text in public)
     assert len({truth.nonce for truth in truths}) == CASES
     assert all(len(truth.nonce) == 64 for truth in truths)
@@ -107,13 +107,13 @@ def test_verdicts_are_scored(challenge, tmp_path):
     for case in finished_cases(folder):
         verdict = json.loads((folder / "verdicts" / case / "verdict.json").read_text())
         assert verdict["case"] == case
-    left_out = [Truth.read(key_path(folder, case)) for case in finished_cases(folder)]
+    left_out = [read_key(folder, case) for case in finished_cases(folder)]
     for truth in left_out:
         verdict = json.loads((folder / "verdicts" / truth.case / "verdict.json").read_text())
         named = {effect["name"] for one in [verdict["effects"], *verdict["alternatives"]] for effect in one}
         assert not named & set(truth.without)
     found = score.score(folder, workers=0)
-    assert found.said.counts.sum() == CASES
+    assert found.all_cases.counts.sum() == CASES
     # Noise, not luck: data without an effect are not far off.
     assert all(record.p_value > 1e-4 for record in found.records if record.kind == "none")
     for name in ("score.json", "report.html", "score.png"):
@@ -121,14 +121,37 @@ def test_verdicts_are_scored(challenge, tmp_path):
     key = key_path(folder, "case-000")
     text = key.read_text()
     key.write_text(text.replace('"sampled": ', '"sampled":  '))
-    with pytest.raises(InputError, match="not the key that was sealed"):
+    with pytest.raises(InputError, match="SHA-256"):
         score.score(folder, workers=0)
     key.write_text(text)
 
 
+def test_a_damaged_verdict_is_refused(challenge):
+    folder, _ = challenge
+    run.run(folder, workers=0)
+    path = folder / "verdicts" / "case-000" / "verdict.json"
+    text = path.read_text()
+    for wrong in ("{}", "no verdict", None):
+        path.unlink() if wrong is None else path.write_text(wrong)
+        with pytest.raises(InputError, match="case-000"):
+            score.score(folder, workers=0)
+    path.write_text(text)
+    assert score.score(folder, workers=0).title == f"{CASES} full skies"
+
+
+def test_a_case_without_a_verdict_is_counted(challenge, tmp_path):
+    folder, _ = challenge
+    run.run(folder, workers=0)
+    (folder / "verdicts" / "case-003").rename(tmp_path / "case-003")
+    found = score.score(folder, workers=0)
+    assert found.title.startswith(f"{CASES - 1} full skies of {CASES}")
+    assert [record.case for record in found.records] == ["case-000", "case-001", "case-002", "case-004"]
+    (tmp_path / "case-003").rename(folder / "verdicts" / "case-003")
+
+
 def test_the_catalogue_stays_what_it_is():
-    assert set(load(str(INVENTIONS))) == {"invented_square_beam", "invented_nonlinearity", "invented_crosstalk"}
-    assert "invented_crosstalk" in library_with(str(INVENTIONS))
+    assert set(load(OUT_OF_LIBRARY)) == {"invented_square_beam", "invented_nonlinearity", "invented_crosstalk"}
+    assert "invented_crosstalk" in library_with(OUT_OF_LIBRARY)
     assert "invented_crosstalk" not in systematics.catalogue()
     with pytest.raises(TypeError):
         systematics.catalogue()["invented_crosstalk"] = systematics.Effect

@@ -199,3 +199,22 @@ def test_predict_plot_and_fit(mcsim: Command, small_store: Path, tmp_path: Path)
     code, _, err = mcsim("fit", small_store, "small.toml", "--model", "cubic")
     assert code == 2
     assert "cubic" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("make", "quickstart", "-o", "made", "--cases", "-3"), "--cases"),
+        (("make", "quickstart", "-o", "made", "--sampled-share", "1.5"), "--sampled-share"),
+        (("make", "quickstart", "-o", "made", "--inventions", "nowhere.py"), "nowhere.py"),
+        (("make", "nowhere.toml", "-o", "made"), "nowhere.toml"),
+        (("draws", "quickstart", "-o", "made", "--number", "0"), "--number"),
+        (("run", "nowhere"), "nowhere"),
+        (("score", "nowhere"), "nowhere"),
+    ],
+)
+def test_a_challenge_refuses_wrong_options(mcsim: Command, tmp_path: Path, words: tuple[str, ...], named: str) -> None:
+    code, _, error = mcsim("challenge", *words)
+    assert code == 2
+    assert named in error
+    assert not list((tmp_path / "made").rglob("*.json"))

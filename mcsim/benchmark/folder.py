@@ -1,0 +1,145 @@
+"""Read and write the folder of a challenge; the SHA-256 of each key is published with the maps."""
+
+import hashlib
+import json
+import os
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mcsim import config
+from mcsim.benchmark.case import Member, Prior, Truth
+from mcsim.benchmark.out_of_library import load
+from mcsim.errors import InputError
+
+SETTINGS, MAPS, KEYS, SEAL, VERDICTS = "challenge.json", "cases", "keys", "SEAL", "verdicts"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings that all cases of a challenge share.
+
+    Attributes
+    ----------
+    model
+        Run that the diagnosis takes for a description of the data.
+    prior
+        Distribution that the effects are drawn from.
+    sampled_share
+        Share of the maps that are made sample by sample, by another route than that which the diagnosis simulates with.
+        Maps with out-of-library effects always are.
+    out_of_library
+        Python file with classes of effects that no library has; None: there are none. Not known of a challenge that was
+        read from its folder.
+    simulations
+        Number of simulations for the covariance of the data vector; default: ten for each element.
+    """
+
+    model: config.RunConfig
+    prior: Prior = field(default_factory=Prior)
+    sampled_share: float = 0.5
+    out_of_library: str | None = None
+    simulations: int | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.sampled_share <= 1.0:
+            raise InputError(f"a share of {self.sampled_share:g} made sample by sample is none; give 0 to 1.")
+
+    def write(self, folder: Path, seed: int) -> None:
+        """Write the settings, and the seed among the keys; InputError if the folder has others."""
+        plain = {
+            "schema": 1,
+            "model": config.to_dict(self.model),
+            "prior": asdict(self.prior),
+            "sampled_share": self.sampled_share,
+            "inventions": None if self.out_of_library is None else sorted(load(self.out_of_library)),
+            "simulations": self.simulations,
+        }
+        for path, content in ((folder / SETTINGS, plain), (folder / KEYS / SETTINGS, {"seed": seed})):
+            text = json.dumps(content, indent=1, sort_keys=True) + "\n"
+            if not path.is_file():
+                write_whole(path, text)
+            elif path.read_text() != text:
+                raise InputError(f"{path} is of a challenge with other settings; use those again, or another folder.")
+
+    @classmethod
+    def read(cls, folder: Path) -> "Settings":
+        """Read what :meth:`write` wrote; InputError if that is not possible."""
+        plain = read_json(folder / SETTINGS, "make the challenge with mcsim challenge make")
+        try:
+            prior, share = Prior(**plain["prior"]), plain["sampled_share"]
+            return cls(config.load(plain["model"]), prior, share, None, plain["simulations"])
+        except (KeyError, TypeError) as error:
+            raise InputError(f"{folder / SETTINGS} lacks what a challenge needs ({error}); make it again.") from error
+
+
+def read_json(path: Path, remedy: str) -> Any:
+    """Read a JSON file; InputError with the remedy if it is missing or malformed."""
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read ({error}); {remedy}.") from error
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file that appears complete or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    scratch = path.with_name(f".{path.name}.{os.getpid()}")
+    scratch.write_text(text)
+    os.replace(scratch, path)
+
+
+def key_path(folder: Path, case: str) -> Path:
+    """Return the path of the key of a case."""
+    return folder / KEYS / f"{case}.json"
+
+
+def write_key(folder: Path, truth: Truth) -> None:
+    """Write the key of a case."""
+    write_whole(key_path(folder, truth.case), json.dumps({"schema": 1, **asdict(truth)}, indent=1) + "\n")
+
+
+def read_key(folder: Path, case: str) -> Truth:
+    """Read what :func:`write_key` wrote; InputError if it is no key."""
+    path = key_path(folder, case)
+    plain = read_json(path, "restore the key, or make the challenge again")
+    try:
+        del plain["schema"]
+        members = tuple(
+            Member(**{**row, "coordinates": tuple(row["coordinates"]), "response": tuple(row["response"])})
+            for row in plain.pop("members")
+        )
+        return Truth(members=members, without=tuple(plain.pop("without")), **plain)
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path} cannot be read as a key ({error}); make the challenge again.") from error
+
+
+def key_hash(folder: Path, case: str) -> str:
+    """Return the SHA-256 of the key of a case, in hexadecimal."""
+    return hashlib.sha256(key_path(folder, case).read_bytes()).hexdigest()
+
+
+def open_key(folder: Path, case: str) -> Truth:
+    """Read the key of a case that has not changed since it was sealed.
+
+    Raises
+    ------
+    InputError
+        If the key is missing or unreadable, or if its hash is not the one published with the maps.
+    """
+    truth = read_key(folder, case)
+    seal = (folder / MAPS / case / SEAL).read_text().split()
+    if seal[:1] != [key_hash(folder, case)]:
+        raise InputError(
+            f"{key_path(folder, case)} is not the key that was sealed: its SHA-256 is not that of {case}/{SEAL}; "
+            "restore it."
+        )
+    return truth
+
+
+def finished_cases(folder: Path) -> list[str]:
+    """Return the cases whose maps are complete, in order; InputError if the folder holds no challenge."""
+    cases = folder / MAPS
+    if not cases.is_dir():
+        raise InputError(f"{folder} holds no challenge; make one with mcsim challenge make.")
+    return sorted(path.name for path in cases.iterdir() if (path / SEAL).is_file() and not path.name.startswith("."))

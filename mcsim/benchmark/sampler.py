@@ -1,0 +1,138 @@
+"""Draw cases: how many effects act, which, how strong, and in which direction."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.benchmark.case import KINDS, Drawn, Kind, Member, Prior
+from mcsim.benchmark.library import Library
+from mcsim.sphere import rng
+from mcsim.systematics import Effect
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class OutOfLibrary:
+    """An effect that no library has, in one channel, and the response of the data vector per unit of its amplitude."""
+
+    kind: type[Effect]
+    channel: str | None
+    response: Vector
+
+
+@dataclass(frozen=True)
+class CaseSampler:
+    """Draws of cases.
+
+    Attributes
+    ----------
+    prior
+        Distribution that is drawn from.
+    library
+        All effects that can be named.
+    out_of_library
+        Effects that no library has, by name, channel by channel.
+    """
+
+    prior: Prior
+    library: Library
+    out_of_library: Mapping[str, Sequence[OutOfLibrary]] = field(default_factory=dict)
+
+    def draw(self, kinds: Sequence[Kind], seed: int, case: int) -> Drawn:
+        """Draw case number ``case`` of a challenge with these :meth:`kinds`."""
+        kind = kinds[case]
+        draw = rng.generator(seed, case, "challenge/effects")
+        turn = sum(other == kind for other in kinds[:case])
+        if kind == "invented":
+            names = sorted(self.out_of_library)
+            return Drawn(kind=kind, members=(self._out_of_library(draw, names[turn % len(names)]),))
+        if kind == "left_out":
+            order = rng.generator(seed, 0, "challenge/rotation").permutation(len(self.names))
+            name = self.names[order[turn % len(order)]]
+            return Drawn(kind=kind, members=(self._member(draw, name),), without=(name,))
+        members: list[Member] = []
+        while len(members) < {"none": 0, "one": 1, "two": 2}[kind]:
+            found = self._member(draw, self.names[int(draw.integers(len(self.names)))])
+            if found.identity not in [member.identity for member in members]:
+                members.append(found)
+        return Drawn(kind=kind, members=tuple(members))
+
+    def kinds(self, seed: int, count: int, out_of_library: bool = False) -> list[Kind]:
+        """Draw the kinds of the first cases of a challenge; that of a case does not depend on their number."""
+        edges = np.cumsum(self.prior.shares(out_of_library))
+        drawn = rng.generator(seed, 0, "challenge/kinds").random(count)
+        return [KINDS[min(int(np.searchsorted(edges, value, side="right")), len(KINDS) - 1)] for value in drawn]
+
+    @property
+    def names(self) -> list[str]:
+        """Effects that can reach the smallest expected S/N at an amplitude that is possible."""
+        return list(self._groups)
+
+    def weights(self) -> Vector:
+        """Return the prior probability of each candidate as the only effect, shape (candidates,)."""
+        total = np.zeros(len(self.library.candidates))
+        for channels in self._groups.values():
+            for group in channels:
+                total[group] = 1.0 / len(self._groups) / len(channels) / len(group)
+        return total
+
+    @cached_property
+    def _groups(self) -> dict[str, list[list[int]]]:
+        """Candidates that can be drawn: name by name, channel by channel."""
+        found: dict[str, dict[str | None, list[int]]] = {}
+        for index, candidate in enumerate(self.library.candidates):
+            if self._can_be_drawn(index):
+                found.setdefault(candidate.name, {}).setdefault(candidate.channel, []).append(index)
+        return {name: list(channels.values()) for name, channels in found.items()}
+
+    def _white(self, index: int) -> NDArray[np.float64]:
+        """Templates of a candidate in units of their standard deviations, shape (p, k)."""
+        null = self.library.null
+        t = self.library.templates[:, list(self.library.candidates[index].columns)]
+        return np.sqrt(null.hartlap_factor) * null.whiten_templates(t)
+
+    def _can_be_drawn(self, index: int) -> bool:
+        largest = float(np.max(np.linalg.norm(self._white(index), axis=0)))
+        most = self.library.candidates[index].effect.max_amplitude
+        return largest > 0.0 if np.isinf(most) else most * largest >= self.prior.weakest
+
+    def _member(self, draw: np.random.Generator, name: str) -> Member:
+        channels = self._groups[name]
+        group = channels[int(draw.integers(len(channels)))]
+        index = group[int(draw.integers(len(group)))]
+        candidate, white, strength = self.library.candidates[index], self._white(index), self.prior.strength(draw)
+        gram = white.T @ white
+        values, vectors = np.linalg.eigh(gram)
+        constrained = values > 1e-9 * values[-1]
+        direction = draw.standard_normal(len(values))
+        theta = vectors[:, constrained] @ (direction[constrained] / np.sqrt(values[constrained]))
+        effect = candidate.with_coordinates(np.abs(theta) if candidate.effect.sign else theta, gram)
+        # The parameters reach only some directions, and coordinates need not be linear in the amplitude.
+        for _ in range(30):
+            snr = np.linalg.norm(white @ effect.coordinates())
+            slope = np.log(np.linalg.norm(white @ effect.scaled(1.01).coordinates()) / snr) / np.log(1.01)
+            effect = effect.scaled(float((strength / snr) ** (1.0 / slope)))
+            if abs(snr / strength - 1.0) < 1e-9:
+                break
+        return Member(
+            name,
+            candidate.channel,
+            {"amplitude": effect.amplitude, **effect.parameters()},
+            tuple(float(value) for value in effect.coordinates()),
+            float(np.linalg.norm(white @ effect.coordinates())),
+            index,
+        )
+
+    def _out_of_library(self, draw: np.random.Generator, name: str) -> Member:
+        group = self.out_of_library[name]
+        one = group[int(draw.integers(len(group)))]
+        strength = self.prior.strength(draw)
+        amplitude = strength / self.library.null.expected_snr(one.response)
+        effect = one.kind(amplitude=amplitude)
+        parameters = {"amplitude": effect.amplitude, **effect.parameters()}
+        response = tuple(float(value) for value in amplitude * one.response)
+        return Member(name, one.channel, parameters, (amplitude,), strength, response=response)

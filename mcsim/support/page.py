@@ -1,0 +1,41 @@
+"""Write self-contained HTML pages: templates filled in, pictures inside."""
+
+import base64
+import io
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import jinja2
+
+
+class Drawing(Protocol):
+    """A figure of matplotlib."""
+
+    def savefig(self, fname: Any, **settings: Any) -> None:
+        """Write it."""
+
+
+def png(figure: Drawing, dpi: int) -> bytes:
+    """Return a figure as PNG, the same bytes for the same figure."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi, facecolor="white", metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def embedded(picture: bytes) -> str:
+    """Return a PNG as base64, for ``src="data:image/png;base64,..."``."""
+    return base64.b64encode(picture).decode("ascii")
+
+
+def render(template: Path, filters: Mapping[str, Callable[..., Any]], **values: Any) -> str:
+    """Fill in a jinja2 template; whatever comes from outside it is escaped, and a name that it lacks is an error."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(template.parent),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= filters
+    return environment.get_template(template.name).render(**values)
