@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.instrument.scan.accumulate import add_sample, moments_from_sums, pixel_sums
-from mcsim.instrument.scan.geometry import check_frame, check_nside
+from mcsim.instrument.scan.geometry import check_frame
 from mcsim.instrument.scan.moments import Moments
 from mcsim.instrument.scan.pointing import quarter_turns, ring_pixel
+from mcsim.sphere.checks import check_nside, check_whole
 
 _ROWS = 1 << 20
 _NAMES = ("theta", "phi", "psi")
@@ -44,8 +45,7 @@ def pointing_moments(
     """
     check_nside(nside)
     check_frame(frame)
-    if smax < 1:
-        raise InputError(f"smax is {smax}, but moments need smax >= 1.")
+    check_whole(smax, "smax", 1)
     sums = pixel_sums(nside, smax)
     for path in [paths] if isinstance(paths, str | Path) else paths:
         for theta, phi, psi in _blocks(Path(path)):
