@@ -1,5 +1,6 @@
 """Wrong input of the science core: each ends in the right number or in an InputError, never in another number."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import healpy
@@ -11,6 +12,7 @@ from mcsim import bipolar
 from mcsim.bipolar import theory
 from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
+from mcsim.instrument.beams.turn import rotated
 from mcsim.instrument.scan.limit import limit_moments
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
 from mcsim.instrument.scan.pointing import pointing
@@ -118,6 +120,11 @@ WRONG = {
     "sky_signal: another lmax": lambda: tod.sky_signal(BIGGER, LMAX, BEAM),
     "sky_signal: real": lambda: tod.sky_signal(REAL, LMAX, BEAM),
     "bin_samples: another nside": lambda: tod.bin_samples(at_pixels(NSIDE), NSIDE // 2),
+    "ScanModel: NaN": lambda: replace(MODEL, spin_period_s=np.nan),
+    "ScanModel: year in days": lambda: replace(MODEL, orbit_period_s=365.25),
+    "ScanModel: negative angle": lambda: replace(MODEL, precession_angle_deg=-22.5),
+    "with_sampling: zero": lambda: MODEL.with_sampling(0.0),
+    "rotated: degrees": lambda: rotated(BEAM, 45.0),
     "pointing: negative": lambda: pointing(MODEL, MODEL.lines_of_sight[0], -1, 5),
     "parallel_transport: degrees": lambda: scan.parallel_transport(45.0, NSIDE, 2),
     "parallel_transport: exchanged": lambda: scan.parallel_transport(8, 0.3, 2),
@@ -174,6 +181,7 @@ def test_what_the_checks_must_accept():
     np.testing.assert_allclose(found[np.isfinite(found)], reference[np.isfinite(found)], atol=1e-4)
     counts = np.arange(12, dtype=np.int16)
     np.testing.assert_allclose(healpix.analysis(counts, 2), healpix.analysis(counts.astype(float), 2))
+    assert MODEL.select("A") == MODEL.lines_of_sight
     assert convolve.noncircular_map(SPINS, moments()).shape == MAP.shape
     assert tod.bin_samples(at_pixels(NSIDE), NSIDE)[1].sum() == MODEL.samples(MODEL.lines_of_sight[0])
     assert theory.cmb_biposh_exact(MODES, np.ones(30), LMAX, SCANNED).shape == (2, LMAX + 1)
