@@ -88,7 +88,8 @@ def check_map(map_: Any, nside: int | None = None, name: str = "the map") -> int
 
 def check_complete(map_: NDArray, name: str = "the map") -> None:
     """Raise InputError if a pixel of a map is NaN, infinite or unseen."""
-    if not (map_.min() > UNSEEN_BELOW and map_.max() < math.inf):
+    # One pass in the good case: a pixel that is NaN, infinite or unseen shows in the sum.
+    if not abs(map_.sum()) < -0.1 * UNSEEN_BELOW and not (map_.min() > UNSEEN_BELOW and map_.max() < math.inf):
         raise InputError(f"{name} has pixels that are not finite or unseen (UNSEEN); set them to 0 by a mask first.")
 
 
