@@ -180,6 +180,8 @@ def sky_signal(
 
 def white_noise(sigma0_uk: float, rng: np.random.Generator) -> Stage:
     """Stage that adds white noise of ``sigma0_uk`` per sample, drawn in the order of time: chunks do not matter."""
+    if not 0.0 <= sigma0_uk < math.inf:
+        raise InputError(f"the noise per sample is {sigma0_uk:g} uK, but it must be finite and >= 0.")
 
     def stage(stream: Iterable[Samples]) -> Iterator[Samples]:
         for chunk in stream:
@@ -272,7 +274,7 @@ def observe(
         alm = alm + dipole_alm(dipole_uk, lmax)
     line = model.line_of_sight(line_of_sight)
     stages = [*pointing_stages, sky_signal(alm, lmax, beam, epsilon, nthreads), *signal_stages]
-    if noise_sigma0_uk > 0.0:
+    if noise_sigma0_uk != 0.0:
         stages.append(white_noise(noise_sigma0_uk, given(rng, noise_sigma0_uk)))
     return bin_samples(through(samples(model, line, nside, frame, time_range, at_pixel_centres), stages), nside)
 

@@ -119,6 +119,16 @@ WRONG = {
     "rings: degrees": lambda: rings.parallel_transport_rings(45.0, (2,), 32),
     "sky_signal: another lmax": lambda: tod.sky_signal(BIGGER, LMAX, BEAM),
     "sky_signal: real": lambda: tod.sky_signal(REAL, LMAX, BEAM),
+    "white_noise: negative": lambda: tod.white_noise(-1.0, np.random.default_rng(1)),
+    "white_noise: NaN": lambda: tod.white_noise(np.nan, np.random.default_rng(1)),
+    "observe: negative noise": lambda: tod.observe(
+        ALM, LMAX, BEAM, MODEL, NSIDE, line_of_sight="A", noise_sigma0_uk=-1.0, rng=np.random.default_rng(1)
+    ),
+    "BeamMap: cut in degrees": lambda: beams.BeamMap(np.ones((9, 9)), 0.01, (4.0, 4.0), 3.5),
+    "BeamMap: centre outside": lambda: beams.BeamMap(np.ones((9, 5)), 0.01, (4.0, 9.0), 0.03),
+    "BeamMap: cube": lambda: beams.BeamMap(np.ones((4, 9, 9)), 0.01, (4.0, 4.0), 0.03),
+    "BeamMap: complex": lambda: beams.BeamMap(np.ones((9, 9), complex), 0.01, (4.0, 4.0), 0.03),
+    "BeamMap: NaN": lambda: beams.BeamMap(np.full((9, 9), np.nan), 0.01, (4.0, 4.0), 0.03),
     "bin_samples: another nside": lambda: tod.bin_samples(at_pixels(NSIDE), NSIDE // 2),
     "ScanModel: NaN": lambda: replace(MODEL, spin_period_s=np.nan),
     "ScanModel: year in days": lambda: replace(MODEL, orbit_period_s=365.25),

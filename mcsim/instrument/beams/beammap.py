@@ -15,6 +15,7 @@ from scipy.ndimage import map_coordinates
 from mcsim.errors import InputError
 from mcsim.instrument.beams._fits import opened
 from mcsim.instrument.beams.beam import Beam, check_lmax, check_mmax, normalize
+from mcsim.sphere.checks import check_finite
 
 Projection = Literal["equidistant", "orthographic", "equal_area"]
 PEAK_BOX = 8
@@ -46,6 +47,16 @@ class BeamMap:
     centre: tuple[float, float]
     cut_rad: float
     projection: Projection = "equidistant"
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless the image is finite and its centre and cut can be used."""
+        image = self.image
+        if not isinstance(image, np.ndarray) or image.ndim != 2 or image.dtype.kind not in "fiu":
+            raise InputError(f"a beam map has shape {np.shape(image)}, but it must be a real two-dimensional array")
+        check_finite(image, "the beam map")
+        if not 0.0 < self.cut_rad <= pi / 2:
+            raise InputError(f"cut_rad = {self.cut_rad:g} of a beam map must be above 0 and at most pi/2: give radians")
+        _check_centre(image, self.centre)
 
     def beam(self, lmax: int, mmax: int | None = None, nthreads: int = 1) -> Beam:
         """Return the beam normalised to B_0 = 1; ``mmax=None`` chooses the largest order."""
@@ -174,27 +185,25 @@ def read_map(
         )
     if centre is None:
         centre = find_centre(image, str(path))
-    else:
-        _check_centre(image, centre, path)
     if pixel_average:
         image = _divide_pixel_window(image)
     return BeamMap(image, float(pixel), centre, float(np.radians(cut_deg)), projection)
 
 
-def _check_centre(image: NDArray[np.float64], centre: tuple[float, float], path: str | Path) -> None:
+def _check_centre(image: NDArray[np.float64], centre: tuple[float, float]) -> None:
     """Raise InputError for a centre outside the map, or one that is far from the peak until row and column change."""
     rows, columns = image.shape
     column, row = centre
     if not (0 <= column <= columns - 1 and 0 <= row <= rows - 1):
         raise InputError(
-            f"centre = {tuple(centre)} lies outside the {columns} columns and {rows} rows of {path}: give "
+            f"centre = {tuple(centre)} lies outside the {columns} columns and {rows} rows of the map: give "
             "(column, row), counted from 0"
         )
     peak = float(image.max())
     here = image[round(row), round(column)]
     if column < rows and row < columns and here < 0.01 * peak and image[round(column), round(row)] > 0.5 * peak:
         raise InputError(
-            f"centre = {tuple(centre)} of {path} has less than 1 % of the peak, and {(row, column)} more than half of "
+            f"centre = {tuple(centre)} of a beam map has less than 1 % of the peak, and {(row, column)} more than half of "
             "it: give (column, row), in this order"
         )
 
