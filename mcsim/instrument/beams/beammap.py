@@ -203,8 +203,8 @@ def _check_centre(image: NDArray[np.float64], centre: tuple[float, float]) -> No
     here = image[round(row), round(column)]
     if column < rows and row < columns and here < 0.01 * peak and image[round(column), round(row)] > 0.5 * peak:
         raise InputError(
-            f"centre = {tuple(centre)} of a beam map has less than 1 % of the peak, and {(row, column)} more than half of "
-            "it: give (column, row), in this order"
+            f"centre = {tuple(centre)} of a beam map has less than 1 % of the peak, and {(row, column)} more than "
+            "half of it: give (column, row), in this order"
         )
 
 
