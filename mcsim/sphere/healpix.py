@@ -32,7 +32,7 @@ def synthesis(alm: Alm, nside: int, lmax: int, spin: int = 0, nthreads: int = 1)
     Raises
     ------
     InputError
-        If the coefficients do not fit ``lmax`` and ``spin``, or nside is no whole number. It need not be a power of two.
+        If the coefficients do not fit ``lmax`` and ``spin``, or nside is no whole number (any will do).
     """
     check_whole(nside, "nside", 1)
     check_alm(alm, lmax, shape=(2 if spin else 1,))
