@@ -32,9 +32,9 @@ def synthesis(alm: Alm, nside: int, lmax: int, spin: int = 0, nthreads: int = 1)
     Raises
     ------
     InputError
-        If the coefficients do not fit ``lmax`` and ``spin``, or nside is no power of two.
+        If the coefficients do not fit ``lmax`` and ``spin``, or nside is no whole number (any will do).
     """
-    check_nside(nside)
+    check_whole(nside, "nside", 1)
     check_alm(alm, lmax, shape=(2 if spin else 1,))
     maps = ducc0.sht.synthesis(alm=alm, spin=spin, lmax=lmax, nthreads=nthreads, **geometry(nside))
     return np.asarray(maps)
@@ -42,7 +42,7 @@ def synthesis(alm: Alm, nside: int, lmax: int, spin: int = 0, nthreads: int = 1)
 
 def gradient(alm: Alm, nside: int, lmax: int, nthreads: int = 1) -> NDArray[np.float64]:
     """(d/dtheta, 1/sin(theta) d/dphi) of a spin-0 map of a_lm of shape (size,): shape (2, npix)."""
-    check_nside(nside)
+    check_whole(nside, "nside", 1)
     check_alm(alm, lmax)
     maps = ducc0.sht.synthesis_deriv1(alm=alm[None], lmax=lmax, nthreads=nthreads, **geometry(nside))
     return np.asarray(maps)
