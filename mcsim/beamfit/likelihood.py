@@ -49,7 +49,7 @@ class Solution:
 
     @property
     def chi2(self) -> float:
-        """Chi^2, with expectation ``dof``: a covariance of n + 1 simulations makes ``square`` n/(n - dof - 1) larger."""
+        """Chi^2, with expectation ``dof``; that of ``square`` is n/(n - dof - 1) larger for n + 1 simulations."""
         if self.simulations is None:
             return self.square
         n = self.simulations - 1
@@ -117,7 +117,7 @@ def solve(
 def whitening(
     data: NDArray[np.float64], design: NDArray[np.float64], covariance: NDArray[np.float64], simulations: int | None
 ) -> NDArray[np.float64]:
-    """Return the inverse of the Cholesky factor of a covariance, shape (p, p), after a check of what :func:`solve` takes.
+    """Return the inverse Cholesky factor of a covariance, shape (p, p), and check what :func:`solve` is given.
 
     Raises
     ------
@@ -141,13 +141,22 @@ def whitening(
         )
     variance = np.diag(covariance)
     if not np.all(variance > 0.0):
-        raise InputError(f"datum {int(np.argmin(variance))} has no scatter, so it cannot be weighted; leave its bin out.")
+        raise InputError(
+            f"datum {int(np.argmin(variance))} has no scatter, so it cannot be weighted; leave its bin out."
+        )
     scale = np.sqrt(variance)
     try:
         root = cholesky(covariance / np.outer(scale, scale), lower=True)
     except LinAlgError:
         raise InputError("the covariance of the data is not positive definite; leave out bins that repeat.") from None
     return solve_triangular(root, np.diag(1.0 / scale), lower=True)
+
+
+def size(change: NDArray[np.float64], covariance: NDArray[np.float64], simulations: int | None) -> float:
+    """Return the length of a change of the data, shape (p,), in sigma: no parameter shifts by more of its errors."""
+    white = whitening(change, np.zeros((len(change), 0)), covariance, simulations) @ change
+    n = np.inf if simulations is None else simulations - 1.0
+    return float(np.linalg.norm(white) * np.sqrt(1.0 - (len(change) + 1.0) / n))
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from mcsim.beamfit import read_table
+from mcsim.beamfit import Selection, read_table
 from mcsim.bipolar import Mode, bennett_factor
 from mcsim.errors import InputError
 
@@ -31,7 +31,7 @@ def table(meta=META, unit="uK2", **columns):
 def read(tmp_path, made, **arguments):
     path = tmp_path / "table.ecsv"
     made.write(path, format="ascii.ecsv", overwrite=True)
-    return read_table(path, "ecliptic", **arguments)
+    return read_table(path, "ecliptic", Selection(**arguments))
 
 
 def test_rows_values_and_independent_errors(tmp_path):

@@ -16,7 +16,7 @@ from mcsim.sphere.healpix import geometry
 def orientation_harmonics(
     w: NDArray[np.complex128], L_max: int, observed: NDArray[np.bool_] | None = None, nthreads: int = 1
 ) -> NDArray[np.complex128]:
-    """w_{s,LM} of moment maps, for every M.
+    """Return w_{s,LM} of moment maps, for every M.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def _fill_spin(
 
 
 def ring_orientation_harmonics(w: NDArray[np.complex128], L_max: int) -> NDArray[np.complex128]:
-    """w_{s,L0} of moments that depend on colatitude alone.
+    """Return w_{s,L0} of moments that depend on colatitude alone.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def ring_orientation_harmonics(w: NDArray[np.complex128], L_max: int) -> NDArray
 
 
 def parallel_transport_harmonics(smax: int, L_max: int, psi0: float = 0.0) -> NDArray[np.complex128]:
-    """w_{s,L0} of w_s = e^{-i s psi0} everywhere, exactly.
+    """Return w_{s,L0} of w_s = e^{-i s psi0} everywhere, exactly.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def _isotropic_zero(smax: int, L_max: int) -> NDArray[np.complex128]:
 
 
 def spin_functions(smax: int, L_max: int, theta: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(-s)Y_L0(theta) = sqrt((2L+1)/4pi) d^L_{0s}(theta) for s = 0..smax, shape (smax + 1, L_max + 1, ntheta).
+    """Return (-s)Y_L0(theta) = sqrt((2L+1)/4pi) d^L_{0s}(theta) for s = 0..smax, shape (smax + 1, L_max + 1, ntheta).
 
     Notes
     -----
@@ -175,7 +175,7 @@ def spin_functions(smax: int, L_max: int, theta: NDArray[np.float64]) -> NDArray
 
 
 def negative_spin(w: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """w_{-s,LM} = (-1)^{s+M} conj(w_{s,L,-M}), in the same layout."""
+    """Return w_{-s,LM} = (-1)^{s+M} conj(w_{s,L,-M}), in the same layout."""
     smax, width = w.shape[0] - 1, w.shape[2]
     sign_s = (-1.0) ** np.arange(smax + 1)
     sign_m = (-1.0) ** np.arange(-(width // 2), width // 2 + 1)
