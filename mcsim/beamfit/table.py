@@ -51,6 +51,10 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING) 
     if label is not None:
         table = table[[str(name) == label for name in table["pair"]]]
     L, M, d, low, high = (_integers(path, table, name) for name in COLUMNS)
+    wrong = np.flatnonzero((low < 0) | (low > high))
+    if len(wrong):
+        a, b = low[wrong[0]], high[wrong[0]]
+        raise InputError(f"{path}: ell_min = {a}, ell_max = {b} is no range; correct the row.")
     first, last = selection.ell_range or (0, int(high.max()))
     real, error = (in_uk2(path, table, f"{name}{suffix}") for name in ("value", "error"))
     rows: list[Row] = []
@@ -65,10 +69,7 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING) 
                 )
             same = (L == mode.L) & (M == mode.M) & (d == mode.d) & (low >= first) & (high <= last)
             for number in np.flatnonzero(same).tolist():
-                a, b = int(low[number]), int(high[number])
-                if not 0 <= a <= b:
-                    raise InputError(f"{path}: ell_min = {a}, ell_max = {b} is no range; correct the row.")
-                rows.append(Row(mode, a, b, imaginary))
+                rows.append(Row(mode, int(low[number]), int(high[number]), imaginary))
                 values.append(float(part[number]))
                 # The error of a mode with M > 0 is that of its modulus; its two parts share the variance.
                 errors.append(float(error[number]) * (1.0 if mode.M == 0 else np.sqrt(0.5)))

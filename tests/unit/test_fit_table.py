@@ -99,6 +99,17 @@ def test_parts_of_complex_modes_share_the_variance(tmp_path):
         (table(pair=["a,a", "a,a", "b,b"]), {"pair": "c,c"}, "no pair c,c"),
         (table(value_imag=[0.0, 0.0, 0.0], d=[1, 0, 0]), {"modes": ["L2M0d1"]}, "odd parity"),
         (table(M=[1, 0, 0]), {"modes": ["L2M1d0"]}, "no column value_imag"),
+        (table(ell_min=[10.5, 20.0, 10.0]), {}, "column ell_min"),
+        (table(ell_max=[np.nan, 29.0, 19.0]), {}, "column ell_max"),
+        (table(L=["two", "2", "2"]), {}, "column L"),
+        (table(L=np.ma.array([2, 2, 2], mask=[True, False, False])), {}, "column L"),
+        (table(ell_min=[-5, 20, 10]), {}, "is no range"),
+        (table(value=[0.1, 0.2, 0.3], error=[-1.0, -2.0, -3.0]), {}, "error -1"),
+        (table(error=[np.inf, 0.2, 0.3]), {}, "error inf"),
+        (table(value=np.ma.array([1.0, 2.0, 3.0], mask=[True, False, False])), {}, "value nan"),
+        (table(value=["a", "b", "c"]), {}, "column value"),
+        (table(unit="uK"), {}, "unit uK; convert"),
+        (table(unit="uK_RJ2"), {}, "unit uK_RJ2; convert"),
     ],
 )
 def test_refusals(tmp_path, made, arguments, message):

@@ -129,5 +129,11 @@ def test_user_errors():
         fisher_information(signal[None, None], [(2, 0, -1)], cl[None, None])
     with pytest.raises(InputError, match="L=0"):
         isotropic_variance([(0, 0, 0)], Spectra(cl))
+    with pytest.raises(InputError, match=r"\(1, 4\)"):
+        signal_to_noise(signal[:, :4], [(2, 0, 0)], Spectra(cl))
+    with pytest.raises(InputError, match="spectrum y"):
+        isotropic_variance([(2, 0, 0)], Spectra(cl, cl[:3], cl))
+    with pytest.raises(InputError, match="spectrum x"):
+        isotropic_variance([(2, 0, 0)], Spectra(np.nan * cl))
     with pytest.raises(InputError, match="cross spectrum"):
         isotropic_variance([(2, 0, 0)], Spectra(cl, cl))
