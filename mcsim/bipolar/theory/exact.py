@@ -1,4 +1,4 @@
-"""Mean CMB BipoSH and C_l to all orders in the beam."""
+"""Mean CMB BipoSH to all orders in the beam."""
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -32,7 +32,7 @@ def cmb_biposh_exact(
     Parameters
     ----------
     modes
-        (L, M, d) each, with |M|, |d| <= L; L = 0 gives C_l with the second-order beam correction.
+        (L, M, d) each, with |M|, |d| <= L; L = 0 gives (-1)^l sqrt(2l+1) C_l with the second order of the beam.
     cl
         C_l of the sky without beam, uK^2, shape (> lmax,). Skies often end above ``lmax``; power there leaks down, so
         give it.
@@ -96,18 +96,6 @@ def cmb_biposh_exact(
     with ThreadPoolExecutor(nthreads) as pool:
         list(pool.map(work, range(0, lmax + 1, _BLOCK)))
     return result
-
-
-def power_spectrum_exact(
-    cl: NDArray[np.float64], lmax: int, x: ScannedBeam, y: ScannedBeam | None = None, nthreads: int = 1
-) -> NDArray[np.float64]:
-    """Return the mean pseudo-C_l of one map or a pair: (-1)^l A^{00}_ll / sqrt(2l+1), uK^2, shape (lmax + 1,).
-
-    Arguments as in :func:`cmb_biposh_exact`; circular part C_l B^X_l B^Y_l plus the terms of second order in b_ls.
-    """
-    monopole = cmb_biposh_exact([(0, 0, 0)], cl, lmax, x, y, nthreads=nthreads)[0]
-    ell = np.arange(lmax + 1)
-    return (-1.0) ** ell * monopole.real / np.sqrt(2.0 * ell + 1)
 
 
 class _Seen(NamedTuple):
