@@ -221,3 +221,18 @@ def test_user_errors():
         cmb_biposh_leading([(2, 0, 0)], np.ones(4), 4, beam)
     with pytest.raises(InputError, match="ends at ell = 3"):
         cmb_biposh_exact([(2, 0, 0)], np.ones(4), 4, beam)
+    for kind in (cmb_biposh_leading, cmb_biposh_exact):
+        for wrong in (np.array([1.0, 1.0, np.nan, 1.0, 1.0]), np.array([1.0, -1.0, 1.0, 1.0, 1.0])):
+            with pytest.raises(InputError, match="spectrum is"):
+                kind([(2, 0, 0)], wrong, 4, beam)
+    for blm, w in [(beam.blm[0], beam.w), (beam.blm, beam.w[0]), (beam.w, beam.blm), (beam.blm, beam.w[:, :, 1:])]:
+        with pytest.raises(InputError, match="scanned beam"):
+            ScannedBeam(blm, w)
+    with pytest.raises(InputError, match="finite"):
+        ScannedBeam(np.nan * beam.blm, beam.w)
+    with pytest.raises(InputError, match=r"\(3, 3\)"):
+        noise_biposh([(2, 0, 0)], np.zeros((3, 3), dtype=complex), 4)
+    with pytest.raises(InputError, match="odd parity"):
+        to_bennett(np.zeros((1, 5)), [(2, 0, 1)])
+    with pytest.raises(InputError, match="d=3"):
+        bennett_factor((2, 0, 3), 4)

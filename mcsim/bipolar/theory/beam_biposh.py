@@ -1,6 +1,6 @@
 """Beam-BipoSH B^{LM}_{l1 l2}: a non-circular beam under any scan in the bipolar spherical-harmonic basis."""
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -8,10 +8,12 @@ from numpy.typing import NDArray
 
 from mcsim.bipolar.modes import Indices, check_modes, existing
 from mcsim.bipolar.theory.harmonics import negative_spin
+from mcsim.errors import InputError
 from mcsim.sphere.wigner import threej_family
 
 
-class ScannedBeam(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class ScannedBeam:
     """A beam and the orientations under which it saw the sky.
 
     Attributes
@@ -20,10 +22,24 @@ class ScannedBeam(NamedTuple):
         b_lm of the beam at the pole, complex, shape (mmax + 1, lmax + 1), ``blm[m, l]``.
     w
         w_{s,LM}, shape (smax + 1, L_max + 1, 2 L_max + 1), as :mod:`mcsim.bipolar.theory.harmonics` makes them.
+
+    Raises
+    ------
+    InputError
+        For arrays of other shapes, or that are not finite.
     """
 
     blm: NDArray[np.complex128]
     w: NDArray[np.complex128]
+
+    def __post_init__(self) -> None:
+        if self.blm.ndim != 2 or self.w.ndim != 3 or self.w.shape[2] != 2 * self.w.shape[1] - 1:
+            raise InputError(
+                f"b_lm of shape {self.blm.shape} and w of {self.w.shape} are no scanned beam; give (mmax + 1, "
+                "lmax + 1) and (smax + 1, L_max + 1, 2 L_max + 1)."
+            )
+        if not (np.isfinite(self.blm).all() and np.isfinite(self.w).all()):
+            raise InputError("b_lm or w hold values that are not finite; give the beam and the moments without gaps.")
 
     @property
     def smax(self) -> int:

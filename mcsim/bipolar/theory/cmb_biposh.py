@@ -11,11 +11,14 @@ from mcsim.errors import InputError
 
 
 def check_spectrum(cl: NDArray[np.float64], lmax: int) -> None:
-    """Raise InputError when C_l ends below lmax."""
+    """Raise InputError where C_l ends below lmax, is negative or not finite."""
     if len(cl) <= lmax:
         raise InputError(
             f"the spectrum ends at ell = {len(cl) - 1}, below lmax {lmax}; lower lmax or extend the spectrum."
         )
+    wrong = np.flatnonzero(~(np.isfinite(cl) & (cl >= 0.0)))
+    if len(wrong):
+        raise InputError(f"the spectrum is {cl[wrong[0]]:g} at ell = {wrong[0]}; give finite values of at least 0.")
 
 
 def cmb_biposh_leading(
@@ -102,6 +105,8 @@ def noise_biposh(modes: Sequence[Indices], variance: NDArray[np.complex128], lma
     """
     check_modes(modes)
     L_max = len(variance) - 1
+    if variance.shape != (L_max + 1, 2 * L_max + 1):
+        raise InputError(f"the noise variance has shape {variance.shape}; give (L_max + 1, 2 L_max + 1).")
     result = np.full((len(modes), lmax + 1), np.nan, dtype=np.complex128)
     for row, (L, M, d) in zip(result, modes, strict=True):
         v = variance[L, L_max + M] if L_max >= L else 0.0
