@@ -182,8 +182,11 @@ def fit(
         list[str] | None, typer.Option("--mode", help="Such as L2M0d0; may be repeated; default: A20 at d = 0 and 2.")
     ] = None,
     kind: Annotated[
-        str | None, typer.Option(help="plain, or difference to the circular twins; default: difference where known.")
+        str | None, typer.Option(help="plain, or difference to the circular-beam controls; default: that, where known.")
     ] = None,
+    order: Annotated[
+        str, typer.Option(help="leading or exact (all orders in the beam); auto: exact where the data tell them apart.")
+    ] = "auto",
     covariance: Annotated[
         Path | None, typer.Option(metavar="STORE", help="Take the covariance of one of its realizations.")
     ] = None,
@@ -194,23 +197,18 @@ def fit(
 ) -> None:
     """Fit an effective beam, b_l2 f_l with f_l = alpha or alpha + beta l, to measured or simulated spectra."""
     from mcsim import beamfit
+    from mcsim.ensemble.expectation import survey_of
     from mcsim.plot.fit import fit_figure
 
-    if kind not in (None, "plain", "difference"):
-        raise InputError(f"--kind {kind} is not known; give plain or difference.")
     nthreads = os.cpu_count() or 1
     span = None if ell_max is None and ell_min == 2 else (ell_min, ell_max if ell_max is not None else 1 << 30)
-    measured = beamfit.measurement(
-        data,
-        config,
-        modes=mode or beamfit.QUADRUPOLE,
-        ell_range=span,
-        kind=kind,  # type: ignore[arg-type]
-        pair=pair,
-        covariance=covariance,
-    )
+    selection = beamfit.Selection(tuple(mode or beamfit.QUADRUPOLE), span, kind, pair)  # type: ignore[arg-type]
+    survey = survey_of(config, nthreads)
+    measured = beamfit.measurement(data, survey, selection, covariance)
     names = model or ["constant", "linear"]
-    fits = [beamfit.fit(measured, config, name, knots=knots, each=each, nthreads=nthreads) for name in names]
+    fits = beamfit.fit_models(measured, survey, names, knots=knots, order=order, nthreads=nthreads)  # type: ignore[arg-type]
+    if each:
+        fits = [beamfit.fit_each(one) for one in fits]
     if as_json:
         print(json.dumps([one.to_dict() for one in fits], indent=2))
     else:

@@ -66,14 +66,16 @@ def check_shape(values: Any, shape: tuple[int, ...], name: str) -> None:
         raise InputError(f"{name} has shape {np.shape(values)}, but {shape} is needed.")
 
 
-def check_cl(cl: Any, lmax: int, name: str = "the spectrum") -> None:
-    """Raise InputError unless ``cl`` is real and finite, of shape (> lmax,)."""
+def check_cl(cl: Any, lmax: int, name: str = "the spectrum", cross: bool = False) -> None:
+    """Raise InputError unless ``cl`` is real, finite and, but for a cross spectrum, >= 0, of shape (> lmax,)."""
     check_whole(lmax, "lmax")
     if not isinstance(cl, np.ndarray) or cl.ndim != 1 or cl.dtype.kind not in "fiu":
         raise InputError(f"{name} has shape {np.shape(cl)}, but it must be a real numpy array, one value for each ell.")
     if len(cl) <= lmax:
         raise InputError(f"{name} ends at ell = {len(cl) - 1}, below lmax {lmax}; lower lmax or extend the spectrum.")
     check_finite(cl, name)
+    if not cross and cl.min() < 0.0:
+        raise InputError(f"{name} is {cl.min():g} at ell = {int(cl.argmin())}, but power is not negative; repair it.")
 
 
 def check_map(map_: Any, nside: int | None = None, name: str = "the map") -> int:

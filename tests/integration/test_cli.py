@@ -193,9 +193,42 @@ def test_predict_plot_and_fit(mcsim: Command, small_store: Path, tmp_path: Path)
     code, out, _ = mcsim("fit", small_store, "small.toml", *options)
     assert code == 0
     assert json.loads(out[: out.rindex("]") + 1])[0]["kind"] == "plain"
-    code, _, err = mcsim("fit", small_store, "small.toml", "--kind", "paired")
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--kind", "paired"), "paired"),
+        (("--model", "cubic"), "cubic"),
+        (("--model", "linear", "--model", "linear"), "linear, linear"),
+        (("--model", "spline", "--knots", 2), "2 knots"),
+        (("--order", "second"), "second"),
+        (("--mode", "L2M0"), "L2M0"),
+        (("--mode", "L2M3d0"), "L2M3d0"),
+        (("--mode", "L2M0d-2"), "L2M0d-2"),
+        (("--mode", "L3M0d1"), "L3M0d1"),
+        (("--mode", "L2M0d0", "--mode", "L2M0d0"), "L2M0d0"),
+        (("--pair", "V1,V1"), "V1,V1"),
+        (("--ell-min", 20, "--ell-max", 15), "20"),
+        (("--ell-min", 900), "900"),
+        (("--covariance", "nothing.zarr"), "nothing.zarr"),
+    ],
+)
+def test_options_of_fit_that_mean_nothing(
+    options: tuple[object, ...], named: str, mcsim: Command, small_store: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "small.toml").write_text(SMALL)
+    code, _, err = mcsim("fit", small_store, "small.toml", *options)
     assert code == 2
-    assert "plain or difference" in err
-    code, _, err = mcsim("fit", small_store, "small.toml", "--model", "cubic")
+    assert named in err
+    assert err.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["small.toml"]
+
+
+@pytest.mark.parametrize("words", [("small.toml", "STORE"), ("nothing.zarr", "small.toml"), ("STORE", "nothing.toml")])
+def test_files_of_fit_that_are_none(words: tuple[str, str], mcsim: Command, small_store: Path, tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(SMALL)
+    code, _, err = mcsim("fit", *(small_store if word == "STORE" else word for word in words))
     assert code == 2
-    assert "cubic" in err
+    assert err.count("\n") == 1
+    assert "Traceback" not in err

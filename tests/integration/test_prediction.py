@@ -84,7 +84,8 @@ def test_hit_average_fitted_with_parallel_transport_gives_the_factor_of_a20(tmp_
     )
     prediction.write(prediction.predict(hit), tmp_path / "hit.ecsv")
     transported = table(channel=[{"name": "W1", "beam": BEAM, "scan": {"kind": "parallel_transport"}}])
-    found = beamfit.fit(tmp_path / "hit.ecsv", transported, "constant", kind="plain")
+    measured = beamfit.measurement(tmp_path / "hit.ecsv", transported, beamfit.Selection(kind="plain"))
+    found = beamfit.fit(measured, transported, "constant")
     assert found.solution.parameters[0] == pytest.approx(0.6576, abs=1e-3)
 
 

@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 from scipy import stats
 
-from mcsim import config
+from mcsim import beamfit, config
 from mcsim.beamfit.data import SUMMARY, Row, parts, project
 from mcsim.ensemble import prediction
 from mcsim.instrument import scan
@@ -162,3 +162,13 @@ def test_a_mask_acts_through_its_square(tmp_path: Path) -> None:
                     residual = drawn.mean(axis=0) - vectors(shared, model["biposh_difference_mean"].values, pair, mode)
                     missed[name] += float(np.sum((residual**2 - scatter**2)[len(residual) // 4 :]))
     assert missed["with"] < 0.25 * missed["without"]
+
+
+def test_a_plain_spectrum_is_fitted_with_its_noise(tmp_path: Path) -> None:
+    """Noise of uneven hits has a quadrupole of its own, which is no part of the factor."""
+    shared = two_channels(tmp_path, 60.0)
+    prediction.write(prediction.predict(shared), tmp_path / "two.ecsv")
+    for pair in ("A,A", "A,B"):
+        measured = beamfit.measurement(tmp_path / "two.ecsv", shared, beamfit.Selection(kind="plain", pair=pair))
+        found = beamfit.fit(measured, shared, order="leading")
+        assert found.solution.parameters == pytest.approx([1.0], abs=1e-6)

@@ -163,17 +163,14 @@ WRONG = {
         theory.ScannedBeam(BEAM.blm, SCANNED.w[:, :, :3]), (2, 0, 0), LMAX
     ),
     "noise_biposh: shape": lambda: theory.noise_biposh(MODES, np.zeros((3, 3), complex), LMAX),
-    "isotropic_variance: two sizes": lambda: theory.isotropic_variance(MODES, CL, CL[:-1], CL),
-    "signal_to_noise: lmax": lambda: theory.signal_to_noise(np.zeros((2, 9), complex), MODES, CL),
-    "signal_to_noise: modes": lambda: theory.signal_to_noise(np.zeros((1, 17), complex), MODES, CL),
+    "isotropic_variance: two sizes": lambda: theory.isotropic_variance(MODES, theory.Spectra(CL, CL[:-1], CL)),
+    "signal_to_noise: lmax": lambda: theory.signal_to_noise(np.zeros((2, 9), complex), MODES, theory.Spectra(CL)),
+    "signal_to_noise: modes": lambda: theory.signal_to_noise(np.zeros((1, 17), complex), MODES, theory.Spectra(CL)),
     "fisher_information: maps": lambda: theory.fisher_information(
         np.zeros((1, 1, 2, 17), complex), MODES, np.ones((2, 2, 17))
     ),
     "orientation_harmonics: exchanged": lambda: theory.orientation_harmonics(np.zeros((12, 2), complex), 2),
     "orientation_harmonics: one map": lambda: theory.orientation_harmonics(np.zeros(12, complex), 2),
-    "orientation_harmonics: observed": lambda: theory.orientation_harmonics(
-        np.zeros((1, 12), complex), 2, np.ones(48, bool)
-    ),
     "parallel_transport_harmonics: degrees": lambda: theory.parallel_transport_harmonics(2, 4, 45.0),
 }
 

@@ -45,7 +45,9 @@ FIRST = 1  # the first bin, l < 25, is left out of overall ratios
 
 def binned_differences(folder: Path, run: str, mode: str) -> np.ndarray:
     """Paired difference of every realization, binned, shape (realization, bin), uK^2."""
-    found = beamfit.from_store(folder / f"{run}.zarr", [mode], kind="difference", pair="W1,W1").realizations
+    found = beamfit.from_store(
+        folder / f"{run}.zarr", beamfit.Selection((mode,), kind="difference", pair="W1,W1")
+    ).realizations
     assert found is not None  # as of every store
     return found
 

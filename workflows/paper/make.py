@@ -23,6 +23,7 @@ from PIL import Image
 import mcsim
 from mcsim import beamfit, config
 from mcsim.ensemble import prediction
+from mcsim.ensemble.expectation import survey_of
 from mcsim.instrument import beams, scan
 
 WORKFLOWS = Path(__file__).resolve().parent.parent
@@ -72,12 +73,15 @@ def against(toml: str, folder: Path | None, channels: dict[str, str]) -> Figure:
 def effective(folder: Path | None) -> Figure:
     """Effective beams of the hit average in terms of the beams under parallel transport."""
     store = store_of(SCANNED, folder)
-    survey = prediction.survey_of(WORKFLOWS / TRANSPORTED)
+    survey = survey_of(WORKFLOWS / TRANSPORTED)
+    measured = {
+        channel: beamfit.measurement(
+            store, survey, beamfit.Selection(ell_range=ELL_RANGE, kind="plain", pair=f"{channel},{channel}")
+        )
+        for channel in ("V2", "W1")
+    }
     fits = {
-        channel: [
-            beamfit.fit(store, survey, name, ell_range=ELL_RANGE, kind="plain", pair=f"{channel},{channel}")
-            for name in ("constant", "linear")
-        ]
+        channel: [beamfit.fit(measured[channel], survey, name) for name in ("constant", "linear")]
         for channel in ("V2", "W1")
     }
     for channel, models in fits.items():

@@ -25,8 +25,8 @@ from astropy.io import fits
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from mcsim.bipolar import to_bennett
 from mcsim.bipolar.theory import ScannedBeam, cmb_biposh_leading, orientation_harmonics
-from mcsim.bipolar.theory.modes import to_bennett
 from mcsim.instrument import beams, scan
 from mcsim.sphere import rotation, spectra
 from mcsim.sphere.healpix import pixel_window

@@ -10,14 +10,12 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
-from mcsim.sphere.checks import check_angle, check_finite, check_shape, check_whole, nside_of
+from mcsim.sphere.checks import check_angle, check_finite, check_whole, nside_of
 from mcsim.sphere.healpix import geometry
 
 
-def orientation_harmonics(
-    w: NDArray[np.complex128], L_max: int, observed: NDArray[np.bool_] | None = None, nthreads: int = 1
-) -> NDArray[np.complex128]:
-    """w_{s,LM} of moment maps, for every M.
+def orientation_harmonics(w: NDArray[np.complex128], L_max: int, nthreads: int = 1) -> NDArray[np.complex128]:
+    """Return w_{s,LM} of moment maps, for every M.
 
     Parameters
     ----------
@@ -25,15 +23,18 @@ def orientation_harmonics(
         w_s(n) = <e^{-i s psi}> for s = 1..smax, HEALPix RING, shape (smax, npix).
     L_max
         Highest degree.
-    observed
-        Where w_0 = 1 (elsewhere 0), shape (npix,); all pixels by default.
     nthreads
         Threads of the transforms.
 
     Returns
     -------
     ndarray
-        Shape (smax + 1, L_max + 1, 2 L_max + 1), as the module describes.
+        Shape (smax + 1, L_max + 1, 2 L_max + 1), as the module describes; w_0 = 1 everywhere.
+
+    Raises
+    ------
+    InputError
+        For maps that are not finite or not of 12 nside^2 pixels.
 
     Notes
     -----
@@ -46,30 +47,14 @@ def orientation_harmonics(
     nside = nside_of(npix, "a moment map")
     check_whole(L_max, "L_max")
     check_finite(w, "w")
-    if observed is not None:
-        check_shape(observed, (npix,), "observed")
     grid = geometry(nside)
     area = 4 * np.pi / npix
-    result = np.zeros((smax + 1, L_max + 1, 2 * L_max + 1), dtype=np.complex128)
-    if observed is None or observed.all():
-        result[0, 0, L_max] = np.sqrt(4 * np.pi)
-    else:
-        scalar = ducc0.sht.adjoint_synthesis(
-            map=observed.astype(np.float64)[None] * area, spin=0, lmax=L_max, nthreads=nthreads, **grid
-        )
-        _fill_scalar(result[0], scalar[0], L_max)
+    result = _isotropic_zero(smax, L_max)
     for s in range(1, min(smax, L_max) + 1):
         conjugate = np.stack([w[s - 1].real, -w[s - 1].imag]) * area
         gradient, curl = ducc0.sht.adjoint_synthesis(map=conjugate, spin=s, lmax=L_max, nthreads=nthreads, **grid)
         _fill_spin(result[s], s, gradient, curl, L_max)
     return result
-
-
-def _fill_scalar(target: NDArray[np.complex128], alm: NDArray[np.complex128], L_max: int) -> None:
-    for M in range(L_max + 1):
-        column = alm[alm_.start(L_max, M) + M : alm_.start(L_max, M) + L_max + 1]
-        target[M:, L_max - M] = (-1) ** M * column.conj()
-        target[M:, L_max + M] = column
 
 
 def _fill_spin(
@@ -88,40 +73,8 @@ def _fill_spin(
         target[low:, L_max + M] = -((-1) ** s) * (gradient[span] - 1j * curl[span])
 
 
-def ring_orientation_harmonics(w: NDArray[np.complex128], L_max: int) -> NDArray[np.complex128]:
-    """w_{s,L0} of moments that depend on colatitude alone.
-
-    Parameters
-    ----------
-    w
-        w_s(theta) for s = 1..smax at the Gauss-Legendre colatitudes (north to south) of
-        ``ducc0.misc.GL_thetas(ntheta)``, shape (smax, ntheta).
-    L_max
-        Highest degree; only M = 0 is filled.
-
-    Returns
-    -------
-    ndarray
-        Shape (smax + 1, L_max + 1, 2 L_max + 1), as the module describes.
-
-    Notes
-    -----
-    w_{s,L0} = 2 pi int w_s (-s)Y_L0 sin(theta) d theta. Odd s are not polynomials in cos(theta): their error falls as
-    ntheta^-3 (for w_s = 1, 5e-6 with 200 rings, tests/unit/test_predict_harmonics.py).
-    """
-    if np.ndim(w) != 2:
-        raise InputError(f"w has shape {np.shape(w)}, but moments on rings are (smax, ntheta).")
-    check_finite(w, "w")
-    smax, ntheta = w.shape
-    result = _isotropic_zero(smax, L_max)
-    weights = ducc0.misc.GL_weights(ntheta, 1)  # of the sphere: 2 pi is in them
-    functions = spin_functions(smax, L_max, ducc0.misc.GL_thetas(ntheta))
-    result[1:, :, L_max] = np.einsum("slt,st->sl", functions[1:], w * weights)
-    return result
-
-
 def parallel_transport_harmonics(smax: int, L_max: int, psi0: float = 0.0) -> NDArray[np.complex128]:
-    """w_{s,L0} of w_s = e^{-i s psi0} everywhere, exactly.
+    """Return w_{s,L0} of w_s = e^{-i s psi0} everywhere, exactly.
 
     Parameters
     ----------
@@ -165,7 +118,7 @@ def _isotropic_zero(smax: int, L_max: int) -> NDArray[np.complex128]:
 
 
 def spin_functions(smax: int, L_max: int, theta: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(-s)Y_L0(theta) = sqrt((2L+1)/4pi) d^L_{0s}(theta) for s = 0..smax, shape (smax + 1, L_max + 1, ntheta).
+    """Return (-s)Y_L0(theta) = sqrt((2L+1)/4pi) d^L_{0s}(theta) for s = 0..smax, shape (smax + 1, L_max + 1, ntheta).
 
     Notes
     -----
@@ -186,7 +139,7 @@ def spin_functions(smax: int, L_max: int, theta: NDArray[np.float64]) -> NDArray
 
 
 def negative_spin(w: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """w_{-s,LM} = (-1)^{s+M} conj(w_{s,L,-M}), in the same layout."""
+    """Return w_{-s,LM} = (-1)^{s+M} conj(w_{s,L,-M}), in the same layout."""
     smax, width = w.shape[0] - 1, w.shape[2]
     sign_s = (-1.0) ** np.arange(smax + 1)
     sign_m = (-1.0) ** np.arange(-(width // 2), width // 2 + 1)
