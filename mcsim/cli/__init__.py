@@ -139,7 +139,7 @@ def scan(
     """Say what a scan does to a beam: hits, orientation moments, the three factors; draw it."""
     from mcsim.plot.look import look_at_scan
 
-    look = look_at_scan(model, nside, smax, frame, sample_period_s, line_of_sight, quiet=False)
+    look = look_at_scan(model, nside, smax, frame, sample_period_s, line_of_sight)
     out.print(look.text, markup=False)
     save(look.figure, output or Path(f"scan-{look.name}.png"))
 

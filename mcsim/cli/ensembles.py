@@ -183,7 +183,9 @@ def _slice(text: str | None) -> slice | None:
 
 
 def _report(result) -> None:  # type: ignore[no-untyped-def]
-    if result.computed == 0 and not result.failures:
+    if result.computed == 0 and not result.failures and result.summarised:
+        out.print(f"{result.store} is finished: {result.finished} realizations; its summary is new.", markup=False)
+    elif result.computed == 0 and not result.failures:
         out.print(f"{result.store} is finished: {result.finished} realizations, nothing to do.", markup=False)
     else:
         out.print(f"{result.store}: {result.finished} realizations, {result.computed} of them new.", markup=False)

@@ -78,12 +78,22 @@ def create(path: Path, layout: Layout, attributes: Mapping[str, Any]) -> None:
             group.attrs.update({**attributes, "coordinates": "L M d parity"})
             _write_coordinates(group, layout)
             sizes = layout.sizes()
-            for name, (dims, dtype, unit, text) in layout.variables().items():
+            whole = {**layout.variables(), "done": ((), "bool", "1", "finished")}
+            for name, (dims, dtype, unit, text) in whole.items():
                 shape = tuple(sizes[dim] for dim in ("realization", *dims))
-                _array(group, name, shape, (layout.chunk, *shape[1:]), dtype, ("realization", *dims), unit, text)
+                fill: Any = {"bool": False, "complex128": complex(np.nan, np.nan)}.get(dtype, np.nan)
+                array = group.create_array(
+                    name,
+                    shape=shape,
+                    chunks=(layout.chunk, *shape[1:]),
+                    dtype=dtype,
+                    fill_value=fill,
+                    dimension_names=("realization", *dims),
+                    **_CODECS,
+                )
+                array.attrs.update({"units": unit, "long_name": text})
             if layout.kept_npix is not None:
                 group[layout.kept_name].attrs.update(layout.kept_attributes())
-            _array(group, "done", (layout.realizations,), (layout.chunk,), "bool", ("realization",), "1", "finished")
             _consolidate(scratch / "new")
             os.replace(scratch / "new", path)
     finally:
@@ -342,22 +352,6 @@ def _write_coordinates(group: zarr.Group, layout: Layout) -> None:
     _labels(group, "parity", [mode.parity for mode in layout.modes], "parity of l1 + l2 + L", "mode")
     if layout.kept_npix is not None:
         _labels(group, "map_name", layout.maps, "map")
-
-
-def _array(  # type: ignore[no-untyped-def]
-    group: zarr.Group, name: str, shape, chunks, dtype: str, dims: tuple[str, ...], unit: str, text: str
-) -> None:
-    fill: Any = {"bool": False, "complex128": complex(np.nan, np.nan)}.get(dtype, np.nan)
-    array = group.create_array(
-        name,
-        shape=shape,
-        chunks=chunks,
-        dtype=dtype,
-        fill_value=fill,
-        dimension_names=dims,
-        **_CODECS,
-    )
-    array.attrs.update({"units": unit, "long_name": text})
 
 
 def _open(path: Path, mode: Literal["r", "r+"] = "r") -> zarr.Group:

@@ -1,6 +1,7 @@
 """The command line as a user meets it: outputs, exit codes, one sentence for bad input, nothing left behind."""
 
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -13,7 +14,7 @@ import xarray as xr
 from astropy.io import fits
 from astropy.table import Table
 
-from mcsim import cli, config
+from mcsim import cli, config, open_summary
 from mcsim.ensemble import tables
 from mcsim.ensemble.prediction import predict
 
@@ -93,6 +94,17 @@ def test_finished_store_says_so(mcsim: Command, small_store: Path, tmp_path: Pat
     code, out, _ = mcsim("run", toml, "-o", small_store)
     assert code == 0
     assert "is finished: 10 realizations, nothing to do" in out
+
+
+def test_other_bins_of_a_finished_store_need_no_realization(mcsim: Command, small_store: Path, tmp_path: Path) -> None:
+    shutil.copytree(small_store, tmp_path / "small.zarr")
+    (tmp_path / "small.toml").write_text(SMALL.replace("summary_bin = 10", "summary_bin = 16"))
+    code, out, _ = mcsim("run", "small.toml", "--workers", 1)
+    assert code == 0
+    assert "nothing to do" not in out
+    assert "summary" in out
+    assert open_summary(tmp_path / "small.zarr")["bin_first"].values.tolist() == [0, 16, 32]
+    assert "nothing to do" in mcsim("run", "small.toml")[1]
 
 
 SMALL = """\

@@ -27,12 +27,16 @@ from mcsim.support.progress import Journal, reporting
 
 @dataclass(frozen=True)
 class Result:
-    """What a run left behind: the store, how many realizations it now holds, how many were computed, what failed."""
+    """What a run left behind: the store, how many realizations it now holds, how many were computed, what failed.
+
+    ``summarised``: whether the summary was made anew, for more realizations or for other bins.
+    """
 
     store: Path
     finished: int
     computed: int
     failures: tuple[Failure, ...]
+    summarised: bool = False
 
 
 def run(
@@ -166,7 +170,7 @@ def _run(client: Client, shared: Survey, target: Path, wanted: range, journal: J
     journal.write(
         f"done: {finished} realizations stored, {finished - before} of them new, {len(failures)} failed{named}"
     )
-    return Result(target, finished, finished - before, tuple(failures))
+    return Result(target, finished, finished - before, tuple(failures), summarised=True)
 
 
 def _simulate(roll: Roll, target: Path, run: config.RunConfig, wanted: range, journal: Journal) -> list[Failure]:
