@@ -15,7 +15,7 @@ from mcsim.ensemble import store, summary
 from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError
 from mcsim.simulation import differencing
-from mcsim.simulation.channels import load_beam
+from mcsim.simulation.channels import check_effects, load_beam
 from mcsim.simulation.survey import Survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rng, spectra
@@ -188,6 +188,7 @@ def stored(path: Path, realizations: int) -> tuple[Layout, summary.Recipe]:
 def describe(source: str | Path, part: slice | None = None, workers: int | None = None) -> str:
     """What a run will take, in words: realizations, tasks, memory, disk, files and time."""
     run = config.load(source)
+    check_effects(run)
     planned = cost(run, wanted(run, part))
     count = workers or run.compute.workers
     hours = planned.realizations * planned.seconds_per_realization / 3600.0

@@ -185,9 +185,10 @@ def read_prediction(path: str | Path) -> xr.Dataset:
     if not source.exists():
         raise InputError(f"{source} does not exist; give what mcsim predict -o wrote, or a configuration.")
     try:
-        found = xr.load_dataset(source, engine="zarr") if source.is_dir() else _from_table(source)
+        found = xr.open_zarr(source) if source.is_dir() else _from_table(source)
         if "biposh_binned_mean" not in found:
             raise KeyError("biposh_binned_mean")
+        found = found.load()
     except Exception as error:  # libraries raise whatever a foreign file makes of them
         raise InputError(
             f"{source} cannot be read as a prediction ({type(error).__name__}: {' '.join(str(error).split())}); give "
