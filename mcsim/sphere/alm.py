@@ -5,6 +5,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from mcsim.errors import InputError
+
 
 def size(lmax: int) -> int:
     """Number of coefficients with 0 <= m <= l <= lmax."""
@@ -33,15 +35,30 @@ def orders(lmax: int) -> NDArray[np.int64]:
 
 
 def multiply(alm: NDArray[np.complex128], factor: NDArray, lmax: int) -> NDArray[np.complex128]:
-    """Coefficients f_l a_lm for a factor f_l of shape (>= lmax + 1,), real or complex."""
+    """Coefficients f_l a_lm for a factor f_l of shape (>= lmax + 1,), real or complex.
+
+    Raises
+    ------
+    InputError
+        If the sizes do not fit ``lmax``.
+    """
+    _check_size(alm, lmax)
+    if np.ndim(factor) != 1 or len(factor) <= lmax:
+        raise InputError(f"the factor f_l has shape {np.shape(factor)}, but lmax = {lmax} needs (>= {lmax + 1},).")
     return alm * factor[degrees(lmax)]
 
 
 def resize(alm: NDArray[np.complex128], lmax: int, new_lmax: int) -> NDArray[np.complex128]:
-    """Coefficients up to ``new_lmax``: cut, or padded with zeros."""
+    """Coefficients up to ``new_lmax``: cut, or padded with zeros; InputError if they are not of ``lmax``."""
+    _check_size(alm, lmax)
     resized = np.zeros(size(new_lmax), dtype=np.complex128)
     top = min(lmax, new_lmax)
     for m in range(top + 1):
         source, target = start(lmax, m), start(new_lmax, m)
         resized[target + m : target + top + 1] = alm[source + m : source + top + 1]
     return resized
+
+
+def _check_size(alm: NDArray[np.complex128], lmax: int) -> None:
+    if np.shape(alm) != (size(lmax),):
+        raise InputError(f"the coefficients have shape {np.shape(alm)}, but lmax = {lmax} needs ({size(lmax)},).")

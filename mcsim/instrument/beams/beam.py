@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
+from mcsim.sphere.checks import check_finite
 
 MMAX_TOLERANCE = 4e-4
 """Largest fraction of a beam's power that :func:`choose_mmax` leaves beyond m_max."""
@@ -40,6 +41,16 @@ class Beam:
     blm: NDArray[np.complex128]
     neglected_power: float = 0.0
     integral: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless the coefficients are finite and stand at ``blm[m, l]``, zero for l < m."""
+        blm = self.blm
+        if not isinstance(blm, np.ndarray) or not np.iscomplexobj(blm) or blm.ndim != 2 or not blm.size:
+            raise InputError(f"blm has shape {np.shape(blm)}, but it must be complex, (mmax + 1, lmax + 1).")
+        check_mmax(self.mmax, self.lmax)
+        check_finite(blm, "blm")
+        if any(blm[m, :m].any() for m in range(1, len(blm))):
+            raise InputError("blm has coefficients with l < m, which do not exist: give blm[m, l].")
 
     @property
     def lmax(self) -> int:
@@ -89,6 +100,8 @@ class Beam:
         ndarray
             B in sr^-1, in the shape of ``theta``.
         """
+        if np.any((theta < 0.0) | (theta > np.pi)):
+            raise InputError("theta must lie between 0 and pi radians: give the angle from the centre of the beam.")
         direction = np.stack([np.ravel(theta), np.ravel(phi) % (2 * np.pi)], axis=1)
         values: NDArray[np.float64] = ducc0.sht.synthesis_general(
             alm=self.packed()[None],
@@ -104,14 +117,16 @@ class Beam:
 
 def check_lmax(lmax: int) -> None:
     """Refuse a degree that is no degree."""
-    if lmax < 1:
-        raise InputError(f"lmax = {lmax} must be 1 or more for a beam")
+    if not isinstance(lmax, int | np.integer) or lmax < 1:
+        raise InputError(f"lmax = {lmax} must be a whole number of 1 or more for a beam")
 
 
 def check_mmax(mmax: int, lmax: int) -> None:
     """Refuse an order that no coefficient up to ``lmax`` has."""
-    if not 0 <= mmax <= lmax:
-        raise InputError(f"mmax = {mmax} of a beam must lie between 0 and its lmax = {lmax}: lower mmax or raise lmax")
+    if not isinstance(mmax, int | np.integer) or not 0 <= mmax <= lmax:
+        raise InputError(
+            f"mmax = {mmax} of a beam must be whole and lie between 0 and its lmax = {lmax}: lower mmax or raise lmax"
+        )
 
 
 def power_by_order(blm: NDArray[np.complex128]) -> NDArray[np.float64]:

@@ -10,6 +10,7 @@ from scipy.special import ellipj, ellipkm1
 from mcsim.errors import InputError
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
 from mcsim.instrument.scan.moments import Moments
+from mcsim.sphere.checks import check_nside, check_whole
 
 _NODES = 128
 _FAST_PRECESSION = 50.0
@@ -58,7 +59,10 @@ def limit_moments(
     Measured against adaptive quadrature: 4e-11 at 0.01 degrees from a caustic, 1e-13 elsewhere
     (tests/unit/test_scan_limit.py).
     """
+    check_whole(smax, "smax", 1)
     line = _line(model, line_of_sight)
+    if not np.all((np.asarray(theta) >= 0.0) & (np.asarray(theta) <= math.pi)):
+        raise InputError("theta must lie between 0 and pi; give ecliptic colatitudes in radians.")
     theta = np.atleast_1d(np.asarray(theta, dtype=np.float64))
     # At the poles the orientations are all equally frequent: take them as limits.
     theta = np.clip(theta, 1e-6, math.pi - 1e-6)
@@ -91,6 +95,7 @@ def limit_on_pixels(model: ScanModel, nside: int, smax: int, line_of_sight: str 
 
     Hits are 1 on the mean. Parameters and errors as of :func:`limit_moments`.
     """
+    check_nside(nside)
     theta, _ = healpy.pix2ang(nside, np.arange(12 * nside * nside))
     rings, ring = np.unique(theta, return_inverse=True)
     density, w = limit_moments(model, rings, smax, line_of_sight)

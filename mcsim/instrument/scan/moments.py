@@ -6,11 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import healpy
 import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
-from mcsim.instrument.scan.geometry import FRAMES, check_frame, check_nside, nside_of
+from mcsim.instrument.scan.geometry import FRAMES, check_frame
+from mcsim.sphere.checks import check_angle, check_nside, check_shape, check_whole, nside_of
+from mcsim.sphere.header import frame_named, radians
 
 _META = "moments.json"
 
@@ -38,6 +41,21 @@ class Moments:
     w: NDArray[np.complex128]
     dtheta: NDArray[np.float64] | None = None
     dphi: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless frame, nside and the sizes of the arrays agree."""
+        check_nside(self.nside)
+        check_frame(self.frame)
+        npix = 12 * self.nside**2
+        check_shape(self.hits, (npix,), f"hits of moments of nside {self.nside}")
+        check_shape(self.w, (max(np.shape(self.w)[:1], default=0), npix), f"w of moments of nside {self.nside}")
+        if not np.iscomplexobj(self.w):
+            raise InputError("w is real, but moments are complex, the means of e^(-i s psi).")
+        if (self.dtheta is None) != (self.dphi is None):
+            raise InputError("dtheta and dphi belong together; give both or neither.")
+        for name, offset in (("dtheta", self.dtheta), ("dphi", self.dphi)):
+            if offset is not None:
+                check_shape(offset, (npix,), f"{name} of moments of nside {self.nside}")
 
     @property
     def smax(self) -> int:
@@ -82,11 +100,11 @@ class Moments:
             meta = json.loads((folder / _META).read_text())
             names = ("hits", "w", "dtheta", "dphi") if meta["offsets"] else ("hits", "w")
             arrays = {name: np.load(folder / f"{name}.npy", mmap_mode=mode) for name in names}
+            return cls(nside=meta["nside"], frame=meta["frame"], **arrays)
         except (OSError, ValueError, KeyError) as error:
             raise InputError(
                 f"folder {str(folder)!r} does not hold complete moments ({error}); delete it and compute them again."
             ) from None
-        return cls(nside=meta["nside"], frame=meta["frame"], **arrays)
 
 
 def parallel_transport(psi0: float, nside: int, smax: int, frame: str = "ecliptic") -> Moments:
@@ -108,8 +126,8 @@ def parallel_transport(psi0: float, nside: int, smax: int, frame: str = "eclipti
     """
     check_nside(nside)
     check_frame(frame)
-    if smax < 1:
-        raise InputError(f"smax is {smax}, but moments need smax >= 1.")
+    check_whole(smax, "smax", 1)
+    check_angle(psi0, "psi0")
     npix = 12 * nside * nside
     w = np.exp(-1j * psi0 * np.arange(1, smax + 1))[:, np.newaxis]
     return Moments(
@@ -182,6 +200,12 @@ def read_moments_fits(
     if largest > 1.0 + 1e-6:
         raise InputError(f"{where}: a moment has modulus {largest:g}, but means of e^(-i s psi) are <= 1.")
     centroid = [np.where(seen, columns[name], 0.0) for name in offsets]
+    farthest = max((float(np.abs(offset).max()) for offset in centroid), default=0.0)
+    if farthest > 2.0 * healpy.max_pixrad(found):
+        raise InputError(
+            f"{where}: samples lie {farthest:g} rad from their pixel's centre, but a pixel of nside {found} "
+            f"reaches {healpy.max_pixrad(found):.3g}; give DTHETA and DPHI in radians, or their unit in TUNIT."
+        )
     return Moments(found, frame, hits, w, *centroid)
 
 
@@ -211,14 +235,11 @@ def write_moments_fits(path: str | Path, moments: Moments) -> None:
 def _frame_of(coordsys: Any, frame: str | None, where: str) -> str:
     if frame is not None:
         check_frame(frame)
-    if coordsys is None:
+    named = frame_named(coordsys, where)
+    if named is None:
         if frame is None:
             raise InputError(f"{where} has no COORDSYS; write E, G or C there.")
         return frame
-    letter = str(coordsys).strip().upper()[:1]
-    named = {value: key for key, value in FRAMES.items()}.get(letter)
-    if named is None:
-        raise InputError(f"{where} has COORDSYS = {coordsys!r}, but it must be E, G or C.")
     if frame is not None and named != frame:
         raise InputError(f"{where} is in {named} coordinates, but the maps are {frame}; use moments of that frame.")
     return named
@@ -239,6 +260,9 @@ def _read_table(path: str | Path) -> tuple[dict[str, NDArray[np.float64]], dict[
                 columns = {
                     name.upper(): np.array(table.data[name], dtype=np.float64).ravel() for name in table.columns.names
                 }
+                for column in table.columns:
+                    if column.unit and column.name.upper() in ("DTHETA", "DPHI"):
+                        columns[column.name.upper()] *= radians(column.unit)
                 header = {key: table.header.get(key) for key in ("NSIDE", "ORDERING", "COORDSYS")}
     except Exception as error:  # libraries raise whatever a broken file makes of them
         raise InputError(f"moments file {str(path)!r} cannot be read: {error}; give a complete FITS table.") from None
