@@ -63,7 +63,8 @@ class Sky:
     """Isotropic Gaussian skies from ``spectrum``, or skies given as a_lm or map files (a template: {realization}).
 
     ``dipole_uk`` (towards galactic ``dipole_lon_deg``, ``dipole_lat_deg``) is seen by the survey and taken off with
-    the fiducial beam and gain, so that it shows only through effects; left out, it is what the description of the scan says, or none.
+    the fiducial beam and gain, so that it shows only through effects; left out, it is what the description of the scan
+    says, or none.
     """
 
     lmax: Degree
