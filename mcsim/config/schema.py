@@ -62,8 +62,9 @@ Frame = Literal["ecliptic", "galactic", "equatorial"]
 class Sky:
     """Isotropic Gaussian skies from ``spectrum``, or skies given as a_lm or map files (a template: {realization}).
 
-    ``dipole_uk`` (towards galactic ``dipole_lon_deg``, ``dipole_lat_deg``) is seen by the survey and taken off as
-    believed, so that it shows only through effects; left out, it is what the description of the scan says, or none.
+    ``dipole_uk`` (towards galactic ``dipole_lon_deg``, ``dipole_lat_deg``) is seen by the survey and taken off with
+    the fiducial beam and gain, so that it shows only through effects; left out, it is what the description of the scan
+    says, or none.
     """
 
     lmax: Degree
@@ -295,7 +296,7 @@ class Biposh:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Ensemble:
-    """Realizations 0 .. realizations - 1 of the seed; ``paired`` adds the circular twin of every one."""
+    """Realizations 0 .. realizations - 1 of the seed; ``paired`` adds the circular-beam control of every one."""
 
     realizations: Annotated[int, Field(ge=1, le=10_000_000)] = 100
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0

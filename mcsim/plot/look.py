@@ -42,8 +42,13 @@ def look_at_beams(
         Side of a pixel of a beam map, degrees; by default its header's.
     """
     path = Path(source)
+    if path.is_dir() or (not path.exists() and path.suffix not in ("", ".toml")):
+        what = "is a folder" if path.is_dir() else "does not exist"
+        raise InputError(f"{path} {what}; give a beam map or b_lm (FITS), or a configuration.")
     if path.suffix == ".toml" or not path.exists():
         run = config.load(source)
+        if pixel_deg is not None:
+            raise InputError(f"{source} is a configuration, which says pixel_deg itself; leave out --pixel-deg.")
         for channel in run.channels:
             spec = channel.beam
             image = channels.load_beam_map(channel.name, spec) if isinstance(spec, config.BeamMap) else None
@@ -67,9 +72,10 @@ def look_at_scan(
     frame: str = "ecliptic",
     sample_period_s: float | None = None,
     line_of_sight: str | None = None,
-    quiet: bool = True,
 ) -> Look:
     """Look at a scan model: hits, orientation moments, and the factors by which it weakens a beam's ellipticity.
+
+    Progress is reported on standard error.
 
     Parameters
     ----------
@@ -81,8 +87,6 @@ def look_at_scan(
         Time between samples; by default the model's.
     line_of_sight
         One of the model's; by default its default ones.
-    quiet
-        Report no progress.
 
     Raises
     ------
@@ -95,7 +99,7 @@ def look_at_scan(
     if sample_period_s is not None:
         loaded = loaded.with_sampling(sample_period_s)
     lines = None if line_of_sight is None else [line_of_sight]
-    with reporting("orientation moments", 1.0, "", quiet) as report:
+    with reporting("orientation moments", 1.0, "", quiet=False) as report:
         folder = scan.cached_moments(loaded, nside, smax, frame, lines, nthreads=os.cpu_count() or 1, progress=report)
     moments = scan.Moments.load(folder)
     alone = loaded if frame == "ecliptic" and lines is None and len(loaded.default_lines) == 1 else None

@@ -47,7 +47,7 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
             store.write_summary(scratch, summary.dataset(recipe, total, first))
         target.parent.mkdir(parents=True, exist_ok=True)
         os.replace(scratch, target)
-    return Result(target, int(store.done(target).sum()), 0, ())
+    return Result(target, int(store.done(target).sum()), 0, (), summarised=total is not None)
 
 
 def _merge_chunk(sources: list[Path], target: Path, start: int, stop: int) -> None:
