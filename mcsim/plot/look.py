@@ -50,9 +50,9 @@ def look_at_beams(
             yield _look_at(channel.name, channels.load_beam(channel, lmax), image)
     elif beams.holds_image(path):
         image = beams.read_map(path, pixel_deg=pixel_deg)
-        yield _look_at(path.name, image.beam(lmax, m_max), image)
+        yield _look_at(path.name, beams.Beam.from_map(image, lmax, m_max), image)
     else:
-        yield _look_at(path.name, beams.from_blm_file(path, lmax, m_max), None)
+        yield _look_at(path.name, beams.Beam.from_blm(path, lmax, m_max), None)
 
 
 def _look_at(name: str, shown: beams.Beam, image: beams.BeamMap | None) -> Look:

@@ -33,15 +33,17 @@ def load_beam_b(channel: config.Channel, lmax: int) -> beams.Beam:
 def _beam(channel: str, spec: config.Beam, lmax: int) -> beams.Beam:
     match spec:
         case config.BeamGaussian():
-            return beams.gaussian(spec.fwhm_arcmin, lmax)
+            return beams.Beam.gaussian(spec.fwhm_arcmin, lmax)
         case config.BeamEllipticalGaussian():
             major, minor = spec.fwhm_major_arcmin, spec.fwhm_minor_arcmin
-            return beams.elliptical_gaussian(major, minor, spec.angle_deg, lmax, mmax=spec.m_max)
+            return beams.Beam.elliptical(major, minor, spec.angle_deg, lmax, mmax=spec.m_max)
         case config.BeamMap():
-            return rotated(load_beam_map(channel, spec).beam(lmax, spec.m_max), np.deg2rad(spec.angle_deg))
+            return rotated(
+                beams.Beam.from_map(load_beam_map(channel, spec), lmax, spec.m_max), np.deg2rad(spec.angle_deg)
+            )
         case config.BeamBlm():
             file = config.channel_path(spec.path, channel)
-            return rotated(beams.from_blm_file(file, lmax, mmax=spec.m_max), np.deg2rad(spec.angle_deg))
+            return rotated(beams.Beam.from_blm(file, lmax, mmax=spec.m_max), np.deg2rad(spec.angle_deg))
 
 
 def load_beam_map(channel: str, spec: config.BeamMap) -> beams.BeamMap:

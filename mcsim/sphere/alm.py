@@ -1,5 +1,6 @@
 """Harmonic coefficients in healpy's m-major order: a_00, a_10, ..., a_lmax0, a_11, a_21, ..."""
 
+import math
 from functools import lru_cache
 
 import numpy as np
@@ -9,6 +10,12 @@ from numpy.typing import NDArray
 def size(lmax: int) -> int:
     """Number of coefficients with 0 <= m <= l <= lmax."""
     return (lmax + 1) * (lmax + 2) // 2
+
+
+def lmax_of(count: int) -> int | None:
+    """Degree whose coefficients with 0 <= m <= l <= lmax are ``count``; None where there is none."""
+    lmax = (math.isqrt(8 * count + 1) - 3) // 2
+    return lmax if lmax >= 0 and size(lmax) == count else None
 
 
 def start(lmax: int, m: int) -> int:

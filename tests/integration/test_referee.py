@@ -4,7 +4,7 @@ import healpy
 import numpy as np
 import pytest
 
-from mcsim.instrument.beams import Beam, elliptical_gaussian
+from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments, load_model
 from mcsim.instrument.scan.accumulate import stream_moments
 from mcsim.simulation import convolve, mapmaking, tod
@@ -26,7 +26,7 @@ def sky() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def beam() -> Beam:
-    return elliptical_gaussian(88.0 * 1.15**0.5, 88.0 / 1.15**0.5, 20.0, LMAX)
+    return Beam.elliptical(88.0 * 1.15**0.5, 88.0 / 1.15**0.5, 20.0, LMAX)
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pytest
 
 from mcsim import systematics
 from mcsim.diagnosis import scores
-from mcsim.instrument.beams import elliptical_gaussian
+from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import load_model
 from mcsim.simulation.survey import mean_gain
 from mcsim.support import resources
@@ -24,7 +24,7 @@ def test_gain_of_every_half_is_kept_apart(monkeypatch: pytest.MonkeyPatch) -> No
         frame="ecliptic",
         nside=8,
         lmax=8,
-        beam=elliptical_gaussian(330.0, 300.0, 20.0, 8),
+        beam=Beam.elliptical(330.0, 300.0, 20.0, 8),
         pointing=systematics.Pointing(model, replace(line, sample_period_s=None)),
         dipole_uk=np.zeros(3),
     )

@@ -8,7 +8,7 @@ import pytest
 
 from mcsim import systematics
 from mcsim.errors import InputError
-from mcsim.instrument.beams import elliptical_gaussian
+from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import load_model, parallel_transport
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.sphere.spectra import load
@@ -54,7 +54,7 @@ def site() -> systematics.Site:
         frame="galactic",
         nside=NSIDE,
         lmax=LMAX,
-        beam=elliptical_gaussian(330.0, 300.0, 20.0, LMAX),
+        beam=Beam.elliptical(330.0, 300.0, 20.0, LMAX),
         pointing=systematics.Pointing(model, model.line_of_sight("A")),
         dipole_uk=np.array([1.0, 2.0, 3.0]),
     )

@@ -9,7 +9,7 @@ import pytest
 
 from mcsim import systematics
 from mcsim.errors import InputError
-from mcsim.instrument.beams import gaussian
+from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import load_model, parallel_transport, stream_moments
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
@@ -32,7 +32,7 @@ def site() -> systematics.Site:
         frame="ecliptic",
         nside=NSIDE,
         lmax=LMAX,
-        beam=gaussian(300.0, LMAX),
+        beam=Beam.gaussian(300.0, LMAX),
         pointing=systematics.Pointing(model, model.line_of_sight("A")),
     )
 

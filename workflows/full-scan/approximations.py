@@ -31,7 +31,7 @@ def against_samples(nside: int, period_s: float) -> None:
     """Residual of the default route against the referee, uK."""
     lmax = 2 * nside + nside // 2
     model = scan.load_model(resources.scan_model("wmap")).with_sampling(period_s)
-    beam = beams.elliptical_gaussian(13.9, 12.7, 0.0, lmax, 2)
+    beam = beams.Beam.elliptical(13.9, 12.7, 0.0, lmax, 2)
     sky = gaussian_alm(spectra.load("wmap7", lmax), rng.generator(1, 0, "sky"))
     moments = scan.stream_moments(model, nside, 2, lines_of_sight=["A"], nthreads=2)
     truth, hits = tod.observe(sky, lmax, beam, model, nside, line_of_sight="A", nthreads=2)

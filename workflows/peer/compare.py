@@ -28,7 +28,7 @@ import litebird_sim as lbs
 import numpy as np
 
 from mcsim.instrument import scan
-from mcsim.instrument.beams import Beam, elliptical_gaussian
+from mcsim.instrument.beams import Beam
 from mcsim.simulation import convolve
 from mcsim.sphere import healpix, sky, spectra
 from mcsim.support import resources
@@ -57,7 +57,7 @@ BORESIGHT_DEG = MODEL.line_of_sight("A").boresight_angle_deg
 def horn_sky() -> tuple[np.ndarray, Beam]:
     """The sky's a_lm in uK, and the beam."""
     alm = sky.gaussian_alm(spectra.load("planck2018", LMAX), np.random.default_rng(1))
-    return alm, elliptical_gaussian(*FWHM_ARCMIN, 0.0, LMAX, M_MAX)
+    return alm, Beam.elliptical(*FWHM_ARCMIN, 0.0, LMAX, M_MAX)
 
 
 def observation(days: float, quaternion_step_s: float, dtype: type) -> lbs.Simulation:
