@@ -13,7 +13,6 @@ from mcsim.instrument import beams, scan
 from mcsim.plot.beam import beam_figure
 from mcsim.plot.scan import scan_figure
 from mcsim.simulation import channels
-from mcsim.support import resources
 from mcsim.support.progress import reporting
 
 
@@ -91,7 +90,7 @@ def look_at_scan(
     """
     if smax < 2:
         raise InputError(f"smax = {smax} is too small for a look at a scan, which is about w_2; take 2 or more.")
-    loaded = scan.load_model(resources.scan_model(model))
+    loaded = scan.ScanModel.load(model)
     if sample_period_s is not None:
         loaded = loaded.with_sampling(sample_period_s)
     lines = None if line_of_sight is None else [line_of_sight]

@@ -63,7 +63,7 @@ def scan_model(
 ) -> scan.ScanModel:
     """The scan model of a channel, at the sampling that the channel asks for."""
     template = config.channel_path(chosen.model, spec.name, split)
-    model = scan.load_model(resources.scan_model(str(template)))
+    model = scan.ScanModel.load(str(template))
     return model if chosen.sample_period_s is None else model.with_sampling(chosen.sample_period_s)
 
 

@@ -5,17 +5,15 @@ import numpy as np
 import pytest
 
 from mcsim.instrument.beams import Beam
-from mcsim.instrument.scan import Moments, load_model
-from mcsim.instrument.scan.accumulate import stream_moments
+from mcsim.instrument.scan import Moments, ScanModel
 from mcsim.simulation import convolve, mapmaking, tod
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.sphere.spectra import load
-from mcsim.support import resources
 
 NSIDE, LMAX = 64, 192
 # Half a year, a sample every 8 seconds: 35 in the median pixel.
-MODEL = load_model(resources.scan_model("wmap")).with_sampling(8.0)
+MODEL = ScanModel.load("wmap").with_sampling(8.0)
 HALF = (0.0, 0.5)
 
 
@@ -31,7 +29,7 @@ def beam() -> Beam:
 
 @pytest.fixture(scope="module")
 def moments(beam: Beam) -> Moments:
-    return stream_moments(MODEL, NSIDE, beam.mmax, time_range=HALF)
+    return Moments.from_model(MODEL, NSIDE, beam.mmax, time_range=HALF)
 
 
 def default_route(sky: np.ndarray, beam: Beam, moments: Moments, window: np.ndarray | None) -> tuple[np.ndarray, ...]:

@@ -8,15 +8,14 @@ import pytest
 from mcsim import systematics
 from mcsim.diagnosis import scores
 from mcsim.instrument.beams import Beam
-from mcsim.instrument.scan import load_model
+from mcsim.instrument.scan import ScanModel
 from mcsim.simulation.survey import mean_gain
-from mcsim.support import resources
 
 HALVES = ((0.0, 0.5), (0.5, 1.0))
 
 
 def test_gain_of_every_half_is_kept_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    model = replace(load_model(resources.scan_model("wmap")), sample_period_s=7.0, duration_days=365.0)
+    model = replace(ScanModel.load("wmap"), sample_period_s=7.0, duration_days=365.0)
     line = model.line_of_sight("A")
     site = systematics.Site(
         channel="W1",

@@ -11,19 +11,18 @@ from mcsim import systematics
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.beams.gaussian import SIGMA_PER_FWHM
-from mcsim.instrument.scan import load_model
+from mcsim.instrument.scan import ScanModel
 from mcsim.simulation import tod
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.sphere.spectra import load
-from mcsim.support import resources
 from mcsim.systematics.shape import displaced, extended, shape, smeared, stretched
 
 FWHM = 88.0
 
 
 def site_of(beam: Beam) -> systematics.Site:
-    model = load_model(resources.scan_model("wmap"))
+    model = ScanModel.load("wmap")
     pointing = systematics.Pointing(model, model.line_of_sight("A"))
     return systematics.Site(
         channel="W1", frequency_ghz=94.0, frame="ecliptic", nside=8, lmax=beam.lmax, beam=beam, pointing=pointing
