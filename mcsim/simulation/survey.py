@@ -317,7 +317,7 @@ def _moments(
 @lru_cache(maxsize=16)
 def _moments_of_file(path: Path, nside: int, smax: int | None, frame: str) -> scan.Moments:
     """Moments are shared by the surveys of a process that differ in effects alone."""
-    return scan.read_moments_fits(path, nside, smax, frame)
+    return scan.read_moments(path, nside, smax, frame)
 
 
 def _pairs(

@@ -14,6 +14,7 @@ from mcsim.instrument.beams.beammap import DEFAULT_CUT_DEG, BeamMap, placed, rea
 from mcsim.instrument.beams.coefficients import check_mmax, choose_mmax, power_by_order
 from mcsim.instrument.beams.files import checked_blm
 from mcsim.instrument.beams.gaussian import elliptical_blm
+from mcsim.support.npy import read_npz
 
 DEFAULT_LMAX = 2048
 """Largest degree of a beam where none is asked for."""
@@ -184,7 +185,8 @@ class Beam:
         ----------
         source
             b_lm in healpy's m-major order with every m up to lmax, or [m, l] of shape (mmax + 1, lmax + 1); or a FITS
-            file as healpy reads it, whose first table is the temperature beam. The beam points at the pole.
+            file as healpy reads it, whose first table is the temperature beam. The beam points at the pole. Or what
+            :meth:`save` wrote, which is taken as it is.
         lmax
             Largest degree, no more than the source's; ``None``: the source's.
         mmax
@@ -217,8 +219,34 @@ class Beam:
         >>> Beam.from_blm(blm).mmax
         0
         """
+        if isinstance(source, str | Path) and Path(source).suffix == ".npz":
+            return cls._saved(source, lmax, mmax)
         blm, origin = checked_blm(source, lmax, mmax)
         return cls.normalized(blm, mmax, origin)
+
+    @classmethod
+    def _saved(cls, path: str | Path, lmax: int | None, mmax: int | None) -> Self:
+        arrays = read_npz(path)
+        try:
+            beam = cls(arrays["blm"], float(arrays["neglected_power"]), float(arrays["integral"]))
+        except (KeyError, TypeError) as error:
+            raise InputError(f"{path} holds no beam ({error}): write it with Beam.save") from None
+        if beam.lmax < (lmax or 0):
+            raise InputError(f"{path} stops at lmax = {beam.lmax}, below the lmax = {lmax} asked for: lower lmax")
+        if beam.mmax < (mmax or 0):
+            raise InputError(f"{path} stops at mmax = {beam.mmax}, below the mmax = {mmax} asked for: lower mmax")
+        if lmax is not None and lmax < beam.lmax:
+            beam = cls(beam.blm[: lmax + 1, : lmax + 1].copy(), beam.neglected_power, beam.integral)
+        return beam if mmax is None else beam.truncated(mmax)
+
+    def save(self, path: str | Path) -> None:
+        """Write the beam as a .npz file, from which :meth:`from_blm` reads the same beam, bit for bit."""
+        np.savez(path, blm=self.blm, neglected_power=self.neglected_power, integral=self.integral)
+
+    def as_table(self, folder: Path) -> dict[str, str]:
+        """Write the beam into a folder; return the table that stands for it in a run."""
+        self.save(folder / "beam.npz")
+        return {"kind": "blm", "path": "beam.npz"}
 
     @classmethod
     def normalized(

@@ -15,6 +15,7 @@ from scipy.ndimage import map_coordinates
 from mcsim.errors import InputError
 from mcsim.instrument.beams._fits import opened
 from mcsim.instrument.beams.coefficients import check_lmax, check_mmax
+from mcsim.support.npy import read_npy
 
 Projection = Literal["equidistant", "orthographic", "equal_area"]
 PEAK_BOX = 8
@@ -306,6 +307,8 @@ def holds_image(path: str | Path) -> bool:
 def _read_image(path: Path, plane: int) -> tuple[NDArray[np.float64], fits.Header]:
     if not path.is_file():
         raise InputError(f"beam map {path} does not exist: give the path of a FITS image")
+    if path.suffix == ".npy":
+        return read_npy(path, "iuf", (2,)).astype(np.float64), fits.Header()
     try:
         with opened(path) as hdus:
             images = [hdu for hdu in hdus if hdu.is_image and hdu.data is not None]

@@ -10,6 +10,7 @@ from mcsim.errors import InputError
 from mcsim.instrument.beams._fits import opened
 from mcsim.instrument.beams.coefficients import check_lmax, check_mmax, power_by_order
 from mcsim.sphere import alm as alm_
+from mcsim.support.npy import read_npy
 
 LEAST_CIRCULAR_POWER = 0.5
 REALITY_TOLERANCE = 1e-6
@@ -34,7 +35,8 @@ def checked_blm(
         b_l0, or is not pointed at the pole.
     """
     if isinstance(source, str | Path):
-        origin, blm = str(source), _read(Path(source))
+        path, origin = Path(source), str(source)
+        blm = _of_array(read_npy(path, ndims=(1, 2))) if path.suffix == ".npy" else _read(path)
     else:
         origin = "the array of b_lm"
         blm = _of_array(np.asarray(source))

@@ -1,5 +1,6 @@
 """Spin-precession-orbit scan models, read from TOML."""
 
+import json
 import math
 import tomllib
 from dataclasses import dataclass, field, fields, replace
@@ -132,6 +133,19 @@ class ScanModel:
             raise InputError(f"scan model {str(path)!r} is not valid TOML: {error}.") from None
         return model_from_table(table, str(path))
 
+    def as_table(self, folder: Path) -> dict[str, str]:
+        """Write the model as TOML into a folder; return the table that stands for it in a run."""
+        own = ("lines_of_sight", "pairs", "source")
+        lines = ["schema = 1"]
+        lines += [f"{f.name} = {_toml(getattr(self, f.name))}" for f in fields(self) if f.name not in own]
+        for key in ("pairs", "source"):
+            lines += [f"[{key}]", *(f"{_toml(name)} = {_toml(value)}" for name, value in getattr(self, key).items())]
+        for line in self.lines_of_sight:
+            given = {f.name: getattr(line, f.name) for f in fields(line)}
+            lines += ["[[line_of_sight]]", *(f"{key} = {_toml(v)}" for key, v in given.items() if v is not None)]
+        (folder / "scan-model.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        return {"kind": "hit_averaged", "model": "scan-model.toml"}
+
     def line_of_sight(self, name: str) -> LineOfSight:
         """The line of sight called ``name``; InputError if there is none."""
         for line in self.lines_of_sight:
@@ -169,6 +183,11 @@ class ScanModel:
     def with_lines_of_sight(self, *names: str) -> "ScanModel":
         """Return the same survey with these lines of sight as the default ones; InputError if one is unknown."""
         return replace(self, default_lines=tuple(line.name for line in self.select(names)))
+
+
+def _toml(value: str | float | tuple[str, ...]) -> str:
+    """Text, number or list of texts as TOML, from which the same value is read, bit for bit."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 _TABLES = {"schema", "line_of_sight", "lines_of_sight", "default_lines", "pairs", "source"}

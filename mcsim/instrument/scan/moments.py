@@ -19,6 +19,7 @@ from mcsim.instrument.scan.model import ScanModel
 from mcsim.instrument.scan.user_pointing import blocks_of_files, checked_samples, sums_of_samples
 
 _META = "moments.json"
+_ARRAYS = ("hits", "w", "dtheta", "dphi")
 
 
 @dataclass(frozen=True)
@@ -251,11 +252,17 @@ class Moments:
         """Number of pixels."""
         return int(self.hits.shape[0])
 
+    def as_table(self, folder: Path) -> dict[str, str]:
+        """Write the moments into a folder; return the table that stands for them in a run."""
+        arrays = {name: value for name in _ARRAYS if (value := getattr(self, name)) is not None}
+        np.savez(folder / "moments.npz", nside=self.nside, frame=self.frame, **arrays)
+        return {"kind": "moments", "path": "moments.npz"}
+
     def save(self, folder: str | Path) -> None:
         """Write the arrays as .npy files into ``folder``, which is created."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        for name in ("hits", "w", "dtheta", "dphi"):
+        for name in _ARRAYS:
             array = getattr(self, name)
             if array is not None:
                 np.save(folder / f"{name}.npy", array)
@@ -282,7 +289,7 @@ class Moments:
         mode: Any = "r" if mmap else None
         try:
             meta = json.loads((folder / _META).read_text())
-            names = ("hits", "w", "dtheta", "dphi") if meta["offsets"] else ("hits", "w")
+            names = _ARRAYS if meta["offsets"] else _ARRAYS[:2]
             arrays = {name: np.load(folder / f"{name}.npy", mmap_mode=mode) for name in names}
         except (OSError, ValueError, KeyError) as error:
             raise InputError(
