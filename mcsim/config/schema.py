@@ -320,7 +320,33 @@ class Effect:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class RunConfig:
-    """A whole run. In TOML ``schema_version`` is ``schema`` and ``channels`` are the tables ``[[channel]]``."""
+    """A whole run, as :func:`mcsim.load_config` reads it; frozen, ``dataclasses.replace`` makes another one.
+
+    Parameters
+    ----------
+    schema_version
+        1; in TOML ``schema``.
+    name
+        Of the run, and of its store.
+    sky, map
+        The skies, and the pixels and frame of the maps.
+    channels
+        Beams under scans; in TOML the tables ``[[channel]]``.
+    effects
+        Changes of the simulation, such as :func:`mcsim.effects` lists; in TOML the tables ``[[effect]]``.
+    biposh, ensemble, compute
+        What is estimated, how many realizations of which seed, and how they are computed.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> import mcsim
+    >>> run = mcsim.load_config("tiny")
+    >>> isinstance(run, mcsim.RunConfig), run.sky.lmax
+    (True, 48)
+    >>> replace(run, ensemble=replace(run.ensemble, realizations=200)).ensemble.realizations
+    200
+    """
 
     schema_version: Annotated[int, Field(alias="schema", ge=1, le=1)] = 1
     name: Label

@@ -47,7 +47,7 @@ class Beam:
     >>> beam.lmax, beam.mmax
     (300, 2)
     >>> print(f"{beam.window[100]:.4f}")
-    0.7142
+    0.7909
     """
 
     blm: NDArray[np.complex128]
@@ -74,7 +74,7 @@ class Beam:
         --------
         >>> from mcsim import Beam
         >>> print(f"{Beam.gaussian(30.0, lmax=200).window[200]:.4f}")
-        0.7599
+        0.7588
         """
         return cls.elliptical(fwhm_arcmin, fwhm_arcmin, 0.0, lmax, 0)
 
@@ -114,7 +114,7 @@ class Beam:
         >>> from mcsim import Beam
         >>> beam = Beam.elliptical(13.9, 12.7, angle_deg=30.0, lmax=1024)
         >>> print(f"{abs(beam.blm[2, 600] / beam.blm[0, 600]):.3f}")
-        0.067
+        0.022
         """
         blm = elliptical_blm(fwhm_major_arcmin, fwhm_minor_arcmin, angle_deg, lmax, mmax)
         whole = cls.normalized(blm, mmax, f"an elliptical Gaussian of {fwhm_major_arcmin} x {fwhm_minor_arcmin} arcmin")
@@ -163,7 +163,7 @@ class Beam:
         >>> image = np.exp(-(x**2) / 2 / 0.5**2 - y**2 / 2 / 0.4**2)
         >>> beam = Beam.from_map(image, 200, pixel_deg=0.1)
         >>> print(f"{abs(beam.blm[2, 100] / beam.blm[0, 100]):.4f}")
-        0.0340
+        0.0346
         """
         if isinstance(source, BeamMap):
             beam_map = source

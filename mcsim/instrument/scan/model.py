@@ -66,6 +66,8 @@ class ScanModel:
         Differencing pairs: name of the assembly and the names of its two lines of sight.
     spin_phase_deg, precession_phase_deg, orbit_phase_deg
         Angles at t = 0.
+    description
+        In words.
     source
         Citation of each number, by key.
 

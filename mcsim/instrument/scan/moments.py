@@ -43,7 +43,7 @@ class Moments:
     >>> from mcsim import Moments
     >>> moments = Moments.parallel_transport(nside=16, psi0_deg=30.0)
     >>> moments.nside, moments.smax, moments.npix
-    (16, 2, 3072)
+    (16, 4, 3072)
     """
 
     nside: int
@@ -58,7 +58,7 @@ class Moments:
         cls,
         model: ScanModel | str | Path,
         nside: int,
-        smax: int = 2,
+        smax: int = 4,
         frame: str = "ecliptic",
         time_range: tuple[float, float] = (0.0, 1.0),
         nthreads: int = 1,
@@ -71,7 +71,7 @@ class Moments:
             The survey, or what :meth:`ScanModel.load` reads one from. ``model.with_sampling`` and
             ``model.with_lines_of_sight`` choose its samples.
         nside, smax
-            HEALPix resolution, and largest s of the moments (>= 1): a beam needs its mmax.
+            HEALPix resolution, and largest s of the moments (>= 1): at least the mmax of the beam.
         frame
             Frame of the pixels: "ecliptic", "galactic" or "equatorial".
         time_range
@@ -95,7 +95,7 @@ class Moments:
         >>> from mcsim import Moments, ScanModel
         >>> moments = Moments.from_model(ScanModel.load("wmap").with_sampling(60.0), nside=8)
         >>> moments.w.shape
-        (2, 768)
+        (4, 768)
         >>> print(f"{np.mean(moments.w[1].real):.2f}")
         0.55
         """
@@ -105,7 +105,7 @@ class Moments:
 
     @classmethod
     def from_pointing(
-        cls, theta: ArrayLike, phi: ArrayLike, psi: ArrayLike, nside: int, smax: int = 2, frame: str = "ecliptic"
+        cls, theta: ArrayLike, phi: ArrayLike, psi: ArrayLike, nside: int, smax: int = 4, frame: str = "ecliptic"
     ) -> Self:
         """Return the moments of samples that are given one by one.
 
@@ -144,7 +144,7 @@ class Moments:
 
     @classmethod
     def from_pointing_files(
-        cls, paths: str | Path | Sequence[str | Path], nside: int, smax: int = 2, frame: str = "ecliptic"
+        cls, paths: str | Path | Sequence[str | Path], nside: int, smax: int = 4, frame: str = "ecliptic"
     ) -> Self:
         """Return the moments of samples that are given one by one in files.
 
@@ -167,7 +167,7 @@ class Moments:
         return cls(nside, frame, **means(sums_of_samples(blocks_of_files(paths), nside, smax), nside, smax))
 
     @classmethod
-    def parallel_transport(cls, nside: int, psi0_deg: float = 0.0, smax: int = 2, frame: str = "ecliptic") -> Self:
+    def parallel_transport(cls, nside: int, psi0_deg: float = 0.0, smax: int = 4, frame: str = "ecliptic") -> Self:
         """Return the moments of a survey that sees every pixel's centre once, at a fixed angle to the meridian.
 
         Parameters
@@ -194,7 +194,7 @@ class Moments:
         Examples
         --------
         >>> from mcsim import Moments
-        >>> Moments.parallel_transport(nside=4, psi0_deg=90.0).w[:, 0].round(12)
+        >>> Moments.parallel_transport(nside=4, psi0_deg=90.0, smax=2).w[:, 0].round(12)
         array([ 0.-1.j, -1.-0.j])
         """
         check_nside(nside)
@@ -206,7 +206,7 @@ class Moments:
         return cls(nside, frame, np.broadcast_to(np.float64(1.0), npix), np.broadcast_to(w, (smax, npix)))
 
     @classmethod
-    def limit(cls, model: ScanModel | str | Path, nside: int, smax: int = 2, line_of_sight: str | None = None) -> Self:
+    def limit(cls, model: ScanModel | str | Path, nside: int, smax: int = 4, line_of_sight: str | None = None) -> Self:
         """Return the exact long-time limit of a scan at the pixels' centres, in ecliptic coordinates.
 
         Parameters
@@ -232,8 +232,8 @@ class Moments:
         --------
         >>> import numpy as np
         >>> from mcsim import Moments
-        >>> print(f"{np.mean(Moments.limit('wmap', nside=32).w[1].real):.3f}")
-        0.555
+        >>> print(f"{np.mean(Moments.limit('wmap', nside=32).w[1].real):.2f}")
+        0.55
         """
         check_nside(nside)
         survey = model if isinstance(model, ScanModel) else ScanModel.load(model)
