@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mcsim.bipolar.dataset import biposh
     from mcsim.config import RunConfig
     from mcsim.config import load as load_config
-    from mcsim.diagnosis.session import diagnose
+    from mcsim.diagnosis.api import diagnose
     from mcsim.ensemble.prediction import predict
     from mcsim.ensemble.runner import merge, run
     from mcsim.ensemble.store import open_ensemble, open_summary
@@ -63,7 +63,7 @@ _HOME = {
     "RunConfig": "mcsim.config",
     "ScanModel": "mcsim.instrument.scan",
     "biposh": "mcsim.bipolar.dataset",
-    "diagnose": "mcsim.diagnosis.session",
+    "diagnose": "mcsim.diagnosis.api",
     "effects": "mcsim.systematics.library",
     "fit": "mcsim.beamfit.api",
     "load_config": "mcsim.config:load",

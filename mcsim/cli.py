@@ -271,7 +271,7 @@ def diagnose(
     workers: Annotated[int | None, typer.Option(min=1, help="Local processes; default: the configuration's.")] = None,
 ) -> None:
     """Diagnose a gap between maps and a model: is there one, where, which effect, and how far it shrinks."""
-    from mcsim.diagnosis.session import diagnose as judge
+    from mcsim.diagnosis.api import diagnose as judge
 
     _interrupt_once()
     found = judge(
@@ -312,7 +312,7 @@ def challenge_make(
     from mcsim.benchmark.make import make
 
     _interrupt_once()
-    made = partial(make, model, output, cases, seed, sampled_share=sampled_share, inventions=inventions)
+    made = partial(make, model, output, cases, seed, sampled_share=sampled_share, out_of_library=inventions)
     made(simulations=simulations, workers=workers, quiet=False)
 
 
