@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import header, healpix
+from mcsim.support.npy import read_npy
 
 Alm = NDArray[np.complex128]
 
@@ -21,7 +22,7 @@ SMALLEST_UK = 0.01
 
 
 def read_alm(path: Path, lmax: int, frame: str) -> Alm:
-    """Read the coefficients of a sky up to ``lmax``, uK, from a file as ``healpy.write_alm`` makes it.
+    """Read the coefficients of a sky up to ``lmax``, uK, from a file of ``healpy.write_alm`` or ``numpy.save``.
 
     Raises
     ------
@@ -29,13 +30,12 @@ def read_alm(path: Path, lmax: int, frame: str) -> Alm:
         If the file cannot be read, ends below ``lmax``, states another frame or a unit that is no CMB temperature, or
         has values that are not finite or of no sky in uK.
     """
-    try:
-        alm, mmax = healpy.read_alm(path, return_mmax=True)
-        keywords = fits.getheader(path, 1)
-    except Exception as error:  # libraries raise whatever a broken file makes of them
-        raise InputError(
-            f"{path} cannot be read as a_lm ({error}); give a FITS file as healpy.write_alm makes it."
-        ) from error
+    if path.suffix == ".npy":
+        given = read_npy(path)
+        mmax, keywords = healpy.Alm.getlmax(given.size), fits.Header()
+    else:
+        given, mmax, keywords = _read_fits_alm(path)
+    alm = given.astype(np.complex128)
     found = healpy.Alm.getlmax(alm.size, mmax)
     if mmax != found or found < lmax:
         raise InputError(f"{path} holds a_lm up to l = {found}, m = {mmax}; the sky needs both up to {lmax}.")
@@ -44,11 +44,20 @@ def read_alm(path: Path, lmax: int, frame: str) -> Alm:
     if np.abs(alm[: found + 1].imag).max() > 1e-6 * np.abs(alm).max():
         raise InputError(f"{path} has complex a_l0, where a real sky has real ones; check the order of its a_lm.")
     _check_frame(path, header.frame_named(keywords.get("COORDSYS"), str(path)), frame)
-    alm = alm.astype(np.complex128)
     factor = header.to_uk(str(keywords.get("TUNIT2", "")), path)
     alm = alm if factor == 1.0 else factor * alm
     _check_size(path, alm)
     return alm_.resize(alm, found, lmax)
+
+
+def _read_fits_alm(path: Path) -> tuple[Alm, int, fits.Header]:
+    try:
+        alm, mmax = healpy.read_alm(path, return_mmax=True)
+        return alm, int(mmax), fits.getheader(path, 1)
+    except Exception as error:  # libraries raise whatever a broken file makes of them
+        raise InputError(
+            f"{path} cannot be read as a_lm ({error}); give a FITS file as healpy.write_alm makes it."
+        ) from error
 
 
 def read_map(path: Path, lmax: int, frame: str, frequency_ghz: float | None = None) -> Alm:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.sphere.checks import check_alm, check_complete, check_map, check_nside, check_whole
 from mcsim.sphere.header import frame_named
+from mcsim.support.npy import read_npy
 
 Map = NDArray[np.float64]
 Alm = NDArray[np.complex128]
@@ -154,12 +155,19 @@ def _mean_legendre(pixels: NDArray[np.int64], nside: int, split: int, lmax: int)
 def read_map(path: Path) -> tuple[Map, str | None, str | None]:
     """First map of a HEALPix FITS file in RING order, its frame and its unit as far as the header tells them.
 
+    Of a .npy file, an array of shape (npix,) in RING order, neither is known.
+
     Raises
     ------
     InputError
         If the file cannot be read as a HEALPix map, does not say whether it is RING or NESTED, or names a frame that
         is not known.
     """
+    if path.suffix == ".npy":
+        array = read_npy(path, "biuf").astype(np.float64)
+        if not healpy.isnpixok(array.size):
+            raise InputError(f"{path} has {array.size} pixels, which is no HEALPix map; give all 12 nside^2 pixels.")
+        return array, None, None
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", category=AstropyUserWarning)
@@ -178,22 +186,17 @@ def read_map(path: Path) -> tuple[Map, str | None, str | None]:
 
 
 def read_pixel_window(path: Path, lmax: int, nside: int | None = None) -> NDArray[np.float64]:
-    """Temperature pixel window of a FITS file in the HEALPix format, shape (lmax + 1,).
+    """Temperature pixel window of a FITS file in the HEALPix format, or of a .npy file, shape (lmax + 1,).
 
     Raises
     ------
     InputError
         If the file cannot be read, ends below lmax, says that it is of another ``nside``, or is no window.
     """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", category=AstropyUserWarning)
-            table, header = fits.getdata(path, 1, header=True)
-            window = np.asarray(table.field(0), dtype=float).ravel()
-    except Exception as error:  # libraries raise whatever a broken file makes of them
-        raise InputError(f"{path} is not a FITS pixel window ({error}); give a HEALPix pixel_window file.") from error
-    if nside is not None and header.get("NSIDE") not in (None, nside):
-        raise InputError(f"{path} holds the pixel window of nside {header['NSIDE']}; give that of {nside}.")
+    window, found = (read_npy(path, "iuf"), None) if path.suffix == ".npy" else _fits_pixel_window(path)
+    window = window.astype(np.float64)
+    if nside is not None and found not in (None, nside):
+        raise InputError(f"{path} holds the pixel window of nside {found}; give that of {nside}.")
     if window.size <= lmax:
         raise InputError(f"{path} holds a pixel window up to l = {window.size - 1}, below the lmax {lmax} of the sky.")
     if not np.all(window[: lmax + 1] > 0.0):
@@ -204,3 +207,13 @@ def read_pixel_window(path: Path, lmax: int, nside: int | None = None) -> NDArra
             "1 and stays below; give w_l from l = 0."
         )
     return window[: lmax + 1]
+
+
+def _fits_pixel_window(path: Path) -> tuple[NDArray, int | None]:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", category=AstropyUserWarning)
+            table, header = fits.getdata(path, 1, header=True)
+            return np.asarray(table.field(0), dtype=float).ravel(), header.get("NSIDE")
+    except Exception as error:  # libraries raise whatever a broken file makes of them
+        raise InputError(f"{path} is not a FITS pixel window ({error}); give a HEALPix pixel_window file.") from error

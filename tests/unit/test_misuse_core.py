@@ -30,7 +30,7 @@ def drawn(lmax: int = LMAX) -> np.ndarray:
 
 
 def moments(nside: int = NSIDE, smax: int = 2) -> scan.Moments:
-    return scan.parallel_transport(0.3, nside, smax)
+    return scan.Moments.parallel_transport(nside, 17.0, smax)
 
 
 def centred(nside: int) -> scan.Moments:
@@ -48,7 +48,7 @@ HOLED = np.where(np.arange(ALM.size) == 7, np.nan, ALM)
 MAP = np.random.default_rng(1).normal(size=12 * NSIDE**2)
 UNSEEN = np.where(np.arange(MAP.size) == 5, healpy.UNSEEN, MAP)
 CL = np.ones(LMAX + 1)
-BEAM = beams.elliptical_gaussian(600.0, 500.0, 0.0, LMAX, 2)
+BEAM = beams.Beam.elliptical(600.0, 500.0, 0.0, LMAX, 2)
 RESPONSE = convolve.response(BEAM, LMAX)
 TABLES = bipolar.estimator(2, LMAX)
 SCANNED = theory.ScannedBeam(BEAM.blm, theory.parallel_transport_harmonics(2, 2))
@@ -136,10 +136,10 @@ WRONG = {
     "with_sampling: zero": lambda: MODEL.with_sampling(0.0),
     "rotated: degrees": lambda: rotated(BEAM, 45.0),
     "pointing: negative": lambda: pointing(MODEL, MODEL.lines_of_sight[0], -1, 5),
-    "parallel_transport: degrees": lambda: scan.parallel_transport(45.0, NSIDE, 2),
-    "parallel_transport: exchanged": lambda: scan.parallel_transport(8, 0.3, 2),
+    "parallel_transport: NaN": lambda: scan.Moments.parallel_transport(NSIDE, np.nan),
+    "parallel_transport: exchanged": lambda: scan.Moments.parallel_transport(45.0, NSIDE),
     "limit_moments: degrees": lambda: limit_moments(MODEL, np.array([30.0, 90.0]), 2),
-    "limit_on_pixels: nside": lambda: scan.limit_on_pixels(MODEL, 12, 2),
+    "limit_on_pixels: nside": lambda: scan.Moments.limit(MODEL, 12, 2),
     "Moments: hits of another nside": lambda: scan.Moments(4, "ecliptic", np.ones(12), np.zeros((2, 192), complex)),
     "Moments: w of another nside": lambda: scan.Moments(4, "ecliptic", np.ones(192), np.zeros((2, 12), complex)),
     "Moments: w exchanged": lambda: scan.Moments(1, "ecliptic", np.ones(12), np.zeros((12, 2), complex)),
@@ -151,8 +151,8 @@ WRONG = {
     "Beam: NaN": lambda: beams.Beam(np.nan * BEAM.blm),
     "Beam: l below m": lambda: beams.Beam(np.ones((3, 5), complex)),
     "Beam.values: degrees": lambda: BEAM.values(np.array([20.0]), np.array([0.0])),
-    "gaussian: lmax no int": lambda: beams.gaussian(60.0, 16.5),
-    "gaussian: exchanged": lambda: beams.gaussian(16, 0.5),
+    "gaussian: lmax no int": lambda: beams.Beam.gaussian(60.0, 16.5),
+    "gaussian: exchanged": lambda: beams.Beam.gaussian(16, 0.5),
     "theory: beam below lmax": lambda: theory.cmb_biposh_leading(MODES, np.ones(30), 20, SCANNED),
     "theory, exact: beam below lmax": lambda: theory.cmb_biposh_exact(MODES, np.ones(30), 20, SCANNED),
     "theory: exchanged": lambda: theory.cmb_biposh_leading(MODES, CL, LMAX, theory.ScannedBeam(SCANNED.w, SCANNED.blm)),

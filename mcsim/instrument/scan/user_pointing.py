@@ -1,9 +1,9 @@
-"""Orientation moments of a user's own pointing: files of theta, phi, psi and, if they like, time."""
+"""A user's own pointing, theta, phi and psi from files and arrays, and its sums per pixel."""
 
 import math
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
-from mcsim.instrument.scan.accumulate import add_sample, moments_from_sums, pixel_sums
-from mcsim.instrument.scan.geometry import check_frame
-from mcsim.instrument.scan.moments import Moments
+from mcsim.instrument.scan.accumulate import add_sample, pixel_sums
 from mcsim.instrument.scan.pointing import quarter_turns, ring_pixel
 from mcsim.sphere.checks import LARGEST_ANGLE, check_nside, check_whole
 from mcsim.sphere.header import frame_named, radians
@@ -26,38 +24,33 @@ _ENOUGH_ROWS = 10
 """To tell a column of time from angles."""
 
 
-def pointing_moments(
-    paths: str | Path | Sequence[str | Path], nside: int, smax: int, frame: str = "ecliptic"
-) -> Moments:
-    """Orientation moments of samples that are given one by one in files.
+def sums_of_samples(blocks: Iterable[Sequence[NDArray]], nside: int, smax: int) -> NDArray[np.float64]:
+    """Return the sums per pixel, as of :func:`mcsim.instrument.scan.accumulate.pixel_sums`, of blocks of samples.
 
     Parameters
     ----------
-    paths
-        One file or several, added up. Columns theta, phi, psi in radians (FITS: in the unit that TUNIT states, if it
-        does), in the frame of the maps, and optionally time, which the moments do not need: a FITS binary table or a
-        .npz file with these names, a .npy file (structured with these names, or of shape (n, 3) or (n, 4)), or text of
-        3 or 4 columns.
+    blocks
+        theta, phi, psi in radians, shape (n,) each, as :func:`blocks_of_files` and :func:`checked_samples` give them.
     nside, smax
         HEALPix resolution, and largest s (>= 1).
-    frame
-        Frame of the pointing and of the maps.
 
     Raises
     ------
     InputError
-        If a file cannot be read, lacks a column, has columns of several lengths or in another order, is in another
-        frame, is empty, or has a value that is not real and finite, a theta outside 0 to pi, or a phi or psi beyond
-        two turns.
+        If nside or smax is out of range.
     """
     check_nside(nside)
-    check_frame(frame)
     check_whole(smax, "smax", 1)
     sums = pixel_sums(nside, smax)
+    for theta, phi, psi in blocks:
+        _add_angles(theta, phi, psi, nside, smax, sums)
+    return sums
+
+
+def blocks_of_files(paths: str | Path | Sequence[str | Path], frame: str) -> Iterator[tuple[NDArray[np.float64], ...]]:
+    """Read theta, phi, psi from one file or several, block by block; InputError where they cannot be used."""
     for path in [paths] if isinstance(paths, str | Path) else paths:
-        for theta, phi, psi in _blocks(Path(path), frame):
-            _add_angles(theta, phi, psi, nside, smax, sums)
-    return moments_from_sums(sums, nside, smax, frame)
+        yield from _blocks(Path(path), frame)
 
 
 def _blocks(path: Path, frame: str) -> Iterator[tuple[NDArray[np.float64], ...]]:
@@ -71,7 +64,7 @@ def _blocks(path: Path, frame: str) -> Iterator[tuple[NDArray[np.float64], ...]]
             raise ValueError("its columns are not real and of one length")
         for first in range(0, size, _ROWS):
             block = [np.array(column[first : first + _ROWS], dtype=np.float64) for column in columns]
-            yield _checked([f * column for f, column in zip(factors, block, strict=True)], where)
+            yield checked_samples([f * column for f, column in zip(factors, block, strict=True)], where)
     except InputError:
         raise
     except Exception as error:  # libraries raise whatever a broken file makes of them
@@ -133,7 +126,8 @@ def _rises(column: NDArray[np.float64]) -> bool:
     return bool(np.all(np.diff(np.asarray(column[:_ROWS], dtype=np.float64)) > 0.0))
 
 
-def _checked(columns: list[NDArray[np.float64]], where: str) -> tuple[NDArray[np.float64], ...]:
+def checked_samples(columns: Sequence[NDArray[np.float64]], where: str) -> tuple[NDArray[np.float64], ...]:
+    """Return theta, phi, psi if they are finite and theta is a colatitude in radians; ``where`` names them."""
     for name, column in zip(_NAMES, columns, strict=True):
         if not np.isfinite(column).all():
             raise InputError(f"{where}: {name} has values that are not finite; leave such samples out.")
