@@ -1,7 +1,6 @@
 """Configuration of the documentation; ``python -m sphinx -W --keep-going -b html docs docs/_build/html`` builds it.
 
-Nothing is read from the network: equations are MathML, the theme has its own search, and no other project's index is
-asked for.
+Nothing is read from the network: the site has its own MathJax, the theme its own search, and no other index is read.
 """
 
 import os
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE / "_ext"), str(HERE.parent)]
+sys.path.insert(0, str(HERE.parent))
 # The kernels of the tutorials import the same package as this file.
 os.environ["PYTHONPATH"] = os.pathsep.join([str(HERE.parent), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
 
@@ -25,12 +24,13 @@ copyright = "the mcsim authors; GPL-2.0-or-later"
 html_title = "mcsim"
 
 extensions = [
-    "mathml",
     "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
+    "sphinx.ext.mathjax",
     "sphinx.ext.viewcode",
+    "sphinx-mathjax-offline",  # MathJax itself, copied into the site
 ]
 exclude_patterns = ["_build", "README.md", "tutorials/_*"]
 templates_path = ["_templates"]
@@ -39,7 +39,6 @@ html_theme = "furo"
 html_static_path = ["_static"]
 html_css_files = ["mcsim.css"]
 html_theme_options = {"navigation_with_keys": True}
-html_math_renderer = "mathml"
 
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "colon_fence", "attrs_inline"]
 myst_heading_anchors = 3
@@ -130,11 +129,18 @@ def _described(kind: Any) -> str:
 
 
 def _plain(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Keep bars of absolute values and stars from being read as markup: docstrings are plain text first."""
-    inside = False
+    """Keep bars of absolute values from being read as markup, but for what is quoted and for literal blocks."""
+    literal = -1  # indentation of the line that began a literal block
     for number, line in enumerate(lines):
-        inside = inside or line.strip().endswith("::")
-        lines[number] = line.replace("|", r"\|") if "|" in line and "``" not in line else line
+        indentation = len(line) - len(line.lstrip())
+        if literal >= 0 and line.strip() and indentation <= literal:
+            literal = -1
+        if literal < 0:
+            parts = line.split("``")
+            parts[::2] = [part.replace("|", r"\|") for part in parts[::2]]
+            lines[number] = "``".join(parts)
+        if line.rstrip().endswith("::"):
+            literal = indentation
 
 
 def setup(app: Any) -> None:
