@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mcsim.diagnosis.session import diagnose
+    from mcsim.diagnosis.api import diagnose
     from mcsim.ensemble.runner import merge, run
     from mcsim.ensemble.store import open_ensemble, open_summary
     from mcsim.errors import InputError
@@ -17,7 +17,7 @@ __all__ = ["InputError", "diagnose", "merge", "open_ensemble", "open_summary", "
 
 _HOME = {
     "InputError": "mcsim.errors",
-    "diagnose": "mcsim.diagnosis.session",
+    "diagnose": "mcsim.diagnosis.api",
     "merge": "mcsim.ensemble.runner",
     "open_ensemble": "mcsim.ensemble.store",
     "open_summary": "mcsim.ensemble.store",

@@ -13,7 +13,7 @@ from mcsim.benchmark.prior import Prior
 from mcsim.benchmark.truth import Identity
 from mcsim.sphere import rng
 from mcsim.stats.detection import log_likelihood, posterior
-from mcsim.stats.gaussian import Bases, Null
+from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates
 
 Vector = NDArray[np.float64]
 Answer = frozenset[Identity]
@@ -44,15 +44,15 @@ class Bayes:
     the unit sphere. Directions are isotropic in it, also where parameters reach only some.
     """
 
-    null: Null
-    groups: Bases
+    null: SimulatedGaussian
+    groups: WhitenedTemplates
     identities: Sequence[Identity]
     weights: Vector
     prior: Prior
 
     def probabilities(self, x: Vector) -> dict[Answer, float]:
         """Posterior of sets of effects, those without any chance left out; the empty set is none."""
-        y = self.null.data(x)
+        y = self.null.whiten(x)
         logs: dict[Answer, float] = {}
 
         def add(answer: Answer, value: float) -> None:
@@ -81,7 +81,7 @@ class Bayes:
     def _singles(self, x: Vector, y: Vector) -> Vector:
         """Logarithm of evidence over that of none, prior weight included."""
         # Where an effect is strong, none would underflow: its scale is free.
-        boost = min(0.5 * float(np.max(self.groups.drops(y), initial=0.0)), 600.0)
+        boost = min(0.5 * float(np.max(self.groups.delta_chi2(y), initial=0.0)), 600.0)
         strengths, shares = self._strengths
         scale = np.concatenate([[np.exp(boost)], self.weights])
         found = posterior(self.null, x, self.groups, strengths, scale, shares)
@@ -90,8 +90,8 @@ class Bayes:
 
     @cached_property
     def _pair_list(self) -> list[tuple[int, int]]:
-        heard = np.flatnonzero((self.groups.sizes > 0) & (self.weights > 0.0))
-        return [(i, j) for i, j in combinations(map(int, heard), 2) if self.identities[i] != self.identities[j]]
+        filtered = np.flatnonzero((self.groups.sizes > 0) & (self.weights > 0.0))
+        return [(i, j) for i, j in combinations(map(int, filtered), 2) if self.identities[i] != self.identities[j]]
 
     @cached_property
     def _normals(self) -> Vector:

@@ -6,21 +6,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.benchmark.prior import Drawn, Prior, Urn
+from mcsim.benchmark.prior import CaseSampler, Drawn, Prior
 from mcsim.benchmark.record import Geometry, Record, most_probable
 from mcsim.benchmark.reduced import without
-from mcsim.diagnosis.attribute import Attribution, attribute
+from mcsim.diagnosis.analysis import Proposal
 from mcsim.diagnosis.batch import Batch
 from mcsim.diagnosis.candidate import Candidate, columns_of
-from mcsim.diagnosis.case import Court
-from mcsim.diagnosis.evidence import Proposal
-from mcsim.diagnosis.refine import effects_at, quiet_templates
-from mcsim.diagnosis.shrink import Prediction, Shrink, achieved, predicted
+from mcsim.diagnosis.inference import DiagnosisContext
+from mcsim.diagnosis.refine import effects_at, significant_templates
+from mcsim.diagnosis.selection import Attribution, attribute
+from mcsim.diagnosis.validation import Prediction, Shrink, achieved, predicted
 from mcsim.errors import InputError
 from mcsim.sphere import rng
 from mcsim.stats.detection import power
-from mcsim.stats.gaussian import Null, bases, fit
-from mcsim.stats.look_elsewhere import Calibration, calibrate, gap
+from mcsim.stats.gaussian import SimulatedGaussian, fit, whitened_templates
+from mcsim.stats.look_elsewhere import Calibration, calibrate, global_test
 
 Vector = NDArray[np.float64]
 
@@ -52,9 +52,9 @@ class Bench:
         Evidence of simulations that the null has not seen, shape (n, p).
     """
 
-    null: Null
-    used: Null | None
-    fresh: Null | None
+    null: SimulatedGaussian
+    used: SimulatedGaussian | None
+    fresh: SimulatedGaussian | None
     first: NDArray[np.int64]
     second: NDArray[np.int64]
     templates: NDArray[np.float64]
@@ -64,22 +64,22 @@ class Bench:
     data: NDArray[np.float64]
 
 
-def bench(court: Court, names: tuple[str, ...] = ()) -> Bench:
+def bench(context: DiagnosisContext, names: tuple[str, ...] = ()) -> Bench:
     """Of a court, without some effects; a quarter of its simulations become data."""
-    fewer = without(court.asked, court.known, names)
-    known, asked = fewer.known, fewer.asked
+    fewer = without(context.analysis, context.known, names)
+    known, analysis = fewer.known, fewer.analysis
     kept = len(known.simulations) - int(HELD_OUT * len(known.simulations))
     seen = replace(known, simulations=known.simulations[:kept])
-    folds = np.array([-1 if entry.fold is None else entry.fold for entry in asked.entries])
+    folds = np.array([-1 if element.fold is None else element.fold for element in analysis.elements])
     first, second = np.flatnonzero(folds == 0), np.flatnonzero(folds == 1)
-    of = {proposal.label: one for proposal, one in zip(court.asked.proposals, court.candidates, strict=True)}
+    of = {proposal.label: one for proposal, one in zip(context.analysis.proposals, context.candidates, strict=True)}
     # Templates are exact here, also those of what draws: its scatter, which a diagnosis would measure, is none.
     candidates = tuple(
         replace(of[proposal.label], columns=columns, shape_error=None)
-        for proposal, columns in zip(asked.proposals, asked.columns, strict=True)
+        for proposal, columns in zip(analysis.proposals, analysis.columns, strict=True)
     )
-    whole, t = seen.null(), quiet_templates(known)
-    groups = bases(whole, t, [candidate.columns for candidate in candidates])
+    whole, t = seen.null(), significant_templates(known)
+    groups = whitened_templates(whole, t, [candidate.columns for candidate in candidates])
     return Bench(
         whole,
         seen.null(first) if len(first) and len(second) else None,
@@ -88,14 +88,14 @@ def bench(court: Court, names: tuple[str, ...] = ()) -> Bench:
         second,
         t,
         candidates,
-        asked.proposals,
+        analysis.proposals,
         calibrate(whole, groups),
         known.simulations[kept:] + known.offset,
     )
 
 
 def draws(
-    court: Court, number: int, seed: int, *, prior: Prior | None = None, call: Batch | None = None
+    context: DiagnosisContext, number: int, seed: int, *, prior: Prior | None = None, call: Batch | None = None
 ) -> list[Record]:
     """Draw evidence and judge it.
 
@@ -115,7 +115,7 @@ def draws(
     Returns
     -------
     list
-        One record for every draw, judged by :func:`mcsim.diagnosis.attribute.attribute`.
+        One record for every draw, judged by :func:`mcsim.diagnosis.selection.attribute`.
 
     Notes
     -----
@@ -124,17 +124,17 @@ def draws(
     and everything else that a map goes through, is tested by full skies.
     """
     prior = prior or Prior()
-    full = bench(court)
-    urn = urn_of(full, prior)
-    kinds = urn.kinds(seed, number, False)
+    full = bench(context)
+    sampler = sampler_of(full, prior)
+    kinds = sampler.kinds(seed, number, False)
     by_library: dict[tuple[str, ...], list[tuple[int, Drawn]]] = {}
     for case in range(number):
-        one = urn.draw(kinds, seed, case)
+        one = sampler.draw(kinds, seed, case)
         by_library.setdefault(one.without, []).append((case, one))
     tasks = []
     for names, cases in by_library.items():
-        here = bench(court, names) if names else full
-        rows = without(court.asked, court.known, names).rows
+        here = bench(context, names) if names else full
+        rows = without(context.analysis, context.known, names).rows
         posed = [Draw(case, one, response_of(full, one)[rows]) for case, one in cases]
         tasks += [(here, prior, seed, posed[start : start + TASK]) for start in range(0, len(posed), TASK)]
     records: list[Record] = []
@@ -143,10 +143,10 @@ def draws(
     return sorted(records, key=lambda record: record.case)
 
 
-def urn_of(bench: Bench, prior: Prior) -> Urn:
+def sampler_of(bench: Bench, prior: Prior) -> CaseSampler:
     """What draws from the library of a bench."""
     columns = [candidate.columns for candidate in bench.candidates]
-    return Urn(prior, bench.proposals, columns, bench.templates, bench.null.length, {})
+    return CaseSampler(prior, bench.proposals, columns, bench.templates, bench.null.expected_snr, {})
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +171,7 @@ def response_of(bench: Bench, drawn: Drawn) -> Vector:
 def judged(bench: Bench, prior: Prior, seed: int, cases: Sequence[Draw]) -> list[Record]:
     """Task: judge draws."""
     geometry = Geometry.of(bench.null, bench.templates, bench.candidates, bench.calibration)
-    bayes = geometry.bayes(urn_of(bench, prior))
+    bayes = geometry.bayes(sampler_of(bench, prior))
     found = []
     for draw in cases:
         x = bench.data[draw.case % len(bench.data)] + draw.response
@@ -186,11 +186,11 @@ def judged(bench: Bench, prior: Prior, seed: int, cases: Sequence[Draw]) -> list
                 f"draw-{draw.case:05d}",
                 draw.drawn.kind,
                 truth,
-                bench.null.length(draw.response),
+                bench.null.expected_snr(draw.response),
                 len(members[0].coordinates) if len(members) == 1 else 0,
                 geometry.rival(draw.response, truth) if truth else 0.0,
                 geometry.distances(draw.response) if draw.drawn.kind in ("left_out", "invented") else (),
-                said.gap.probability,
+                said.gap.pvalue,
                 said.gap.maximum,
                 said.verdict,
                 answers_of(said, bench.candidates),
@@ -249,10 +249,10 @@ def _absent(
     """Gap before and after one effect that is neither there nor like what is there."""
     if len(truth) != 1 or draw.drawn.kind != "one":
         return None
-    if bench.null.length(draw.response) < STRONG:
+    if bench.null.expected_snr(draw.response) < STRONG:
         return None
-    white = bench.null.templates(draw.response[:, None])[:, 0]
-    cosines = np.sqrt(geometry.groups.drops(white)) / np.linalg.norm(white)
+    white = bench.null.whiten_templates(draw.response[:, None])[:, 0]
+    cosines = np.sqrt(geometry.groups.delta_chi2(white)) / np.linalg.norm(white)
     unlike = [
         index
         for index, candidate in enumerate(bench.candidates)
@@ -291,21 +291,23 @@ class Power:
     null_gap: Vector
 
 
-def powers(court: Court, number: int, seed: int, *, alpha: float = 0.05) -> Power:
+def powers(context: DiagnosisContext, number: int, seed: int, *, alpha: float = 0.05) -> Power:
     """Detection of single effects against strength, from 1 to 9, without attribution."""
-    here = bench(court)
-    urn = urn_of(here, Prior(none=0.0, one=1.0, two=0.0, left_out=0.0, invented=0.0, weakest=1.0, strongest=9.0))
+    here = bench(context)
+    sampler = sampler_of(
+        here, Prior(none=0.0, one=1.0, two=0.0, left_out=0.0, invented=0.0, weakest=1.0, strongest=9.0)
+    )
     geometry = Geometry.of(here.null, here.templates, here.candidates, here.calibration)
-    kinds = urn.kinds(seed, number, False)
+    kinds = sampler.kinds(seed, number, False)
     strengths, columns, found = np.empty(number), np.zeros(number, dtype=int), np.empty((number, 2))
     for case in range(number):
-        drawn = urn.draw(kinds, seed, case)
+        drawn = sampler.draw(kinds, seed, case)
         strengths[case], columns[case] = drawn.members[0].strength, len(drawn.members[0].coordinates)
-        said = gap(
+        said = global_test(
             here.null, here.data[case % len(here.data)] + response_of(here, drawn), geometry.groups, here.calibration
         )
-        found[case] = said.maximum, said.probability
-    quiet = [gap(here.null, x, geometry.groups, here.calibration) for x in here.data]
+        found[case] = said.maximum, said.pvalue
+    quiet = [global_test(here.null, x, geometry.groups, here.calibration) for x in here.data]
     grid = np.linspace(0.5, 9.0, 35)
     tests, p = here.calibration.tests, here.null.dimension
     kinds_of_columns, counts = np.unique(columns, return_counts=True)
@@ -326,5 +328,5 @@ def powers(court: Court, number: int, seed: int, *, alpha: float = 0.05) -> Powe
         limit,
         finite,
         np.array([one.maximum for one in quiet]),
-        np.array([one.probability for one in quiet]),
+        np.array([one.pvalue for one in quiet]),
     )

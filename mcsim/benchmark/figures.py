@@ -105,7 +105,7 @@ def _detection(records: Sequence[Record], power: Power | None) -> list[Figure]:
 
 def _naming(records: Sequence[Record], known: Sequence[Record]) -> list[Figure]:
     ones = [r for r in records if r.kind == "one" and r.strength >= NAMED]
-    apart, twins = [r for r in ones if r.rival <= APART], [r for r in ones if r.rival > TWINS]
+    apart, nearest_candidates = [r for r in ones if r.rival <= APART], [r for r in ones if r.rival > TWINS]
     rest = [r for r in ones if APART < r.rival <= TWINS]
     found = [
         share(
@@ -114,7 +114,7 @@ def _naming(records: Sequence[Record], known: Sequence[Record]) -> list[Figure]:
         share(f"right effect, s >= {NAMED:g}, {APART:g} < |rho| <= {TWINS:g}", [r.right for r in rest]),
         share(
             f"truth in the set, s >= {NAMED:g}, |rho| > {TWINS:g}",
-            [r.truth in r.answers for r in twins],
+            [r.truth in r.answers for r in nearest_candidates],
             "at least 95 %",
             least=0.95,
         ),
@@ -151,13 +151,13 @@ def _unknowns(records: Sequence[Record]) -> list[Figure]:
             f"wrong single name, of all at distance >= {FAR:g}",
             [r.wrong_name for r in [*far, *near]],
             "at most 5 %",
-            most=0.05,
+            max_amplitude=0.05,
         ),
         share(
             "wrong single name, truth in the library",
             [r.wrong_name for r in records if r.known],
             "at most 5 %",
-            most=0.05,
+            max_amplitude=0.05,
         ),
         share("wrong single name, of all cases with a gap", [r.wrong_name for r in named]),
     ]
@@ -173,11 +173,11 @@ def _amplitudes(records: Sequence[Record]) -> list[Figure]:
     return [*_pulls("of the effect that is there", fitted, True), *_pulls("where named", named, False)]
 
 
-def _pulls(which: str, pulls: Sequence[float], asked: bool) -> list[Figure]:
+def _pulls(which: str, pulls: Sequence[float], analysis: bool) -> list[Figure]:
     title = f"pulls {which}, s >= {NAMED:g}"
     return [
-        mean(f"{title}: mean", pulls, "within 0.1" if asked else "", 0.1 if asked else None),
-        width(f"{title}: width", pulls, "0.9 to 1.1" if asked else "", (0.9, 1.1) if asked else None),
+        mean(f"{title}: mean", pulls, "within 0.1" if analysis else "", 0.1 if analysis else None),
+        width(f"{title}: width", pulls, "0.9 to 1.1" if analysis else "", (0.9, 1.1) if analysis else None),
     ]
 
 

@@ -47,15 +47,15 @@ class Figure:
 
 
 def share(
-    name: str, hits: Sequence[bool], target: str = "", least: float | None = None, most: float | None = None
+    name: str, hits: Sequence[bool], target: str = "", least: float | None = None, max_amplitude: float | None = None
 ) -> Figure:
     """Share of cases, with the interval of Clopper & Pearson (Biometrika 26, 404, 1934)."""
     k, n = int(sum(hits)), len(hits)
     low, high = binomial(k, n)
     value = k / n if n else np.nan
     met = None
-    if n and (least is not None or most is not None):
-        met = bool((least is None or value >= least) and (most is None or value <= most))
+    if n and (least is not None or max_amplitude is not None):
+        met = bool((least is None or value >= least) and (max_amplitude is None or value <= max_amplitude))
     return Figure(name, value, low, high, n, target, met)
 
 
@@ -74,14 +74,22 @@ def binomial(k: int, n: int, level: float = 0.95) -> tuple[float, float]:
     return low, high
 
 
-def mean(name: str, values: Sequence[float], target: str = "", most: float | None = None) -> Figure:
+def mean(name: str, values: Sequence[float], target: str = "", max_amplitude: float | None = None) -> Figure:
     """Mean, with its Student interval; met where its size is at most ``most``."""
     n = len(values)
     if n < 2:
         return Figure(name, np.nan, np.nan, np.nan, n, target)
     value = float(np.mean(values))
     half = float(stats.t.ppf(0.975, n - 1) * np.std(values, ddof=1) / np.sqrt(n))
-    return Figure(name, value, value - half, value + half, n, target, None if most is None else abs(value) <= most)
+    return Figure(
+        name,
+        value,
+        value - half,
+        value + half,
+        n,
+        target,
+        None if max_amplitude is None else abs(value) <= max_amplitude,
+    )
 
 
 def width(name: str, values: Sequence[float], target: str = "", within: tuple[float, float] | None = None) -> Figure:
@@ -96,7 +104,7 @@ def width(name: str, values: Sequence[float], target: str = "", within: tuple[fl
     return Figure(name, value, float(low), float(high), n, target, met)
 
 
-def slope(name: str, x: Vector, y: Vector, target: str, least: float, most: float) -> Figure:
+def slope(name: str, x: Vector, y: Vector, target: str, least: float, max_amplitude: float) -> Figure:
     """Slope of y = k x where both are noisy about their means: sum y/sum x, with its interval from resampled cases.
 
     Least squares would not do: the noise of x flattens its slope.
@@ -107,7 +115,7 @@ def slope(name: str, x: Vector, y: Vector, target: str, least: float, most: floa
     value = float(y.sum() / x.sum())
     rows = np.random.default_rng(0).integers(0, n, (1000, n))
     low, high = np.quantile(y[rows].sum(axis=1) / x[rows].sum(axis=1), (0.025, 0.975))
-    return Figure(name, value, float(low), float(high), n, target, bool(least <= value <= most))
+    return Figure(name, value, float(low), float(high), n, target, bool(least <= value <= max_amplitude))
 
 
 def removed(name: str, gaps: Sequence[tuple[float, float]], target: str) -> Figure:

@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.benchmark import toml
-from mcsim.benchmark.inventions import introduced, load
-from mcsim.benchmark.prior import Drawn, Invention, Prior, Urn
-from mcsim.benchmark.sitting import Sitting, evidence_with, sitting
+from mcsim.benchmark.learned_model import LearnedModel, evidence_with, learned_model
+from mcsim.benchmark.out_of_library import introduced, load
+from mcsim.benchmark.prior import CaseSampler, Drawn, OutOfLibrary, Prior
 from mcsim.benchmark.truth import KEYS, MAPS, SEAL, Member, Truth, key_path, new_nonce, sealed, write_whole
+from mcsim.diagnosis.analysis import Job, analysis_of
+from mcsim.diagnosis.api import prepared
 from mcsim.diagnosis.batch import Batch, asking, batch
-from mcsim.diagnosis.case import Court
-from mcsim.diagnosis.evidence import Job, questions
+from mcsim.diagnosis.inference import DiagnosisContext
 from mcsim.diagnosis.knowledge import after_jobs, seeded, with_effects
-from mcsim.diagnosis.refine import quiet_templates
-from mcsim.diagnosis.session import prepared
+from mcsim.diagnosis.refine import significant_templates
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
@@ -55,7 +55,7 @@ def make(
     *,
     sampled_share: float = 0.5,
     prior: Prior | None = None,
-    inventions: str | Path | None = None,
+    out_of_library: str | Path | None = None,
     simulations: int | None = None,
     workers: int | None = None,
     quiet: bool = True,
@@ -100,7 +100,7 @@ def make(
     target, prior, lent = (
         Path(folder),
         prior or Prior(),
-        None if inventions is None else str(Path(inventions).resolve()),
+        None if out_of_library is None else str(Path(out_of_library).resolve()),
     )
     for channel in survey(run).channels if sampled_share > 0.0 or lent else ():
         sampled.check(channel)
@@ -120,15 +120,15 @@ def make(
     if not missing:
         return target
     with batch(run.compute.workers if workers is None else workers) as call:
-        court = prepared(run, questions(run), asking(call, quiet), simulations)
-        urn = urn_of(court, prior)
-        kinds = urn.kinds(seed, cases, lent is not None)
+        context = prepared(run, analysis_of(run), asking(call, quiet), simulations)
+        sampler = sampler_of(context, prior)
+        kinds = sampler.kinds(seed, cases, lent is not None)
         if any(kinds[number] == "invented" for number in missing):
-            urn = replace(urn, inventions=_responses(court, lent, call))
+            sampler = replace(sampler, out_of_library=_responses(context, lent, call))
         text = config.to_json(run)
         with reporting("cases", float(len(missing)), "cases", quiet) as report:
             tasks = (
-                (text, simulations, str(target), names[number], urn.draw(kinds, seed, number),
+                (text, simulations, str(target), names[number], sampler.draw(kinds, seed, number),
                  *_drawn_seed(seed, number, sampled_share), lent)
                 for number in missing
             )  # fmt: skip
@@ -137,10 +137,12 @@ def make(
     return target
 
 
-def urn_of(court: Court, prior: Prior) -> Urn:
+def sampler_of(context: DiagnosisContext, prior: Prior) -> CaseSampler:
     """What draws the cases of a model."""
-    asked = court.asked
-    return Urn(prior, asked.proposals, asked.columns, quiet_templates(court.known), court.null.length, {})
+    analysis = context.analysis
+    return CaseSampler(
+        prior, analysis.proposals, analysis.columns, significant_templates(context.known), context.null.expected_snr, {}
+    )
 
 
 def _settle(path: Path, settings: Mapping[str, Any]) -> None:
@@ -157,34 +159,36 @@ def _drawn_seed(seed: int, number: int, share: float) -> tuple[int, bool]:
     return int(draw.integers(2**40, 2**62)), bool(draw.random() < share)
 
 
-def _responses(court: Court, inventions: str | None, call: Batch) -> dict[str, list[Invention]]:
+def _responses(context: DiagnosisContext, out_of_library: str | None, call: Batch) -> dict[str, list[OutOfLibrary]]:
     """Responses of the evidence to a unit of every invention, seen sample by sample, without noise."""
-    assert inventions is not None  # nothing is invented without
-    run, found = court.run, []
+    assert out_of_library is not None  # nothing is invented without
+    run, found = context.run, []
     quiet = replace(run, channels=tuple(replace(c, noise=config.Noise()) for c in run.channels))
-    for kind in load(inventions).values():
+    for kind in load(out_of_library).values():
         for channel in [None] if kind.scope == "common" else [spec.name for spec in run.channels]:
             found.append((kind, channel, kind(amplitude=kind.step)))
     # An effect of no strength: the dipole is seen and taken off only where there is some effect.
     idle = tuple(config.Effect(name="beam_width", channel=c.name, parameters={"amplitude": 0.0}) for c in run.channels)
-    jobs = [_samples(run, with_effects(quiet, idle), inventions)]
+    jobs = [_samples(run, with_effects(quiet, idle), out_of_library)]
     for kind, channel, effect in found:
         table = config.Effect(
             name=kind.name, channel=channel, parameters={"amplitude": effect.amplitude, **effect.parameters()}
         )
-        jobs.append(_samples(run, with_effects(quiet, (*idle, table)), inventions))
+        jobs.append(_samples(run, with_effects(quiet, (*idle, table)), out_of_library))
     answers: list[Vector] = [np.empty(0)] * len(jobs)
-    for index, answer in call(evidence_with, ((job, inventions) for job in jobs)):
+    for index, answer in call(evidence_with, ((job, out_of_library) for job in jobs)):
         answers[index] = answer.mean(axis=0)
-    result: dict[str, list[Invention]] = {}
+    result: dict[str, list[OutOfLibrary]] = {}
     for (kind, channel, effect), answer in zip(found, answers[1:], strict=True):
-        result.setdefault(kind.name, []).append(Invention(kind, channel, (answer - answers[0]) / effect.amplitude))
+        result.setdefault(kind.name, []).append(OutOfLibrary(kind, channel, (answer - answers[0]) / effect.amplitude))
     return result
 
 
-def _samples(believed: config.RunConfig, simulated: config.RunConfig, inventions: str) -> Job:
+def _samples(fiducial: config.RunConfig, simulated: config.RunConfig, out_of_library: str) -> Job:
     # While they are lent inventions are in the catalogue; they must not be proposed.
-    return Job(config.to_json(believed), config.to_json(simulated), 0, INVENTED_SKIES, True, tuple(load(inventions)))
+    return Job(
+        config.to_json(fiducial), config.to_json(simulated), 0, INVENTED_SKIES, True, tuple(load(out_of_library))
+    )
 
 
 def make_case(
@@ -195,7 +199,7 @@ def make_case(
     drawn: Drawn,
     seed: int,
     sample_by_sample: bool,
-    inventions: str | None,
+    out_of_library: str | None,
 ) -> str:
     """Task: maps, seal and key of one case; the key first, the folder of the maps, complete, last."""
     target, run = Path(folder), config.from_json(model)
@@ -210,20 +214,20 @@ def make_case(
         truth = Truth(case, drawn.kind, members, drawn.without, seed, sample_by_sample, new_nonce())
         write_whole(key, truth.text())
     with appearing(target / MAPS / case) as scratch:
-        for name, map_uk in maps_of(run, truth, inventions):
+        for name, map_uk in maps_of(run, truth, out_of_library):
             channel, _, split = name.partition(":")
             _write_map(scratch / f"{channel}{'_' if split else ''}{split}.fits", map_uk, run.map.frame)
-        believed = {**config.to_dict(run), "name": case}
-        (scratch / "model.toml").write_text(toml.text(believed))
+        fiducial = {**config.to_dict(run), "name": case}
+        (scratch / "model.toml").write_text(toml.text(fiducial))
         (scratch / "question.json").write_text(json.dumps({"without": list(truth.without)}) + "\n")
         (scratch / SEAL).write_text(f"{sealed(key)}  {KEYS}/{case}.json\n")
     return case
 
 
-def maps_of(run: config.RunConfig, truth: Truth, inventions: str | None) -> list[tuple[str, Vector]]:
+def maps_of(run: config.RunConfig, truth: Truth, out_of_library: str | None) -> list[tuple[str, Vector]]:
     """Maps of a truth, by name."""
     data = with_effects(seeded(run, truth.seed), [member.table() for member in truth.members])
-    with introduced(inventions):
+    with introduced(out_of_library):
         shared = survey(data)
         if truth.sampled:
             return sampled.maps(shared, 0, epsilon=EPSILON)
@@ -236,31 +240,31 @@ def _measured(model: str, simulations: int | None, members: Sequence[Member], se
     So too where the effect, far beyond a straight line, is much stronger than was drawn. What draws has the strength of
     its mean response, any other effect that of its response in the sky and noise of the case.
     """
-    seat = sitting(model, simulations)
-    null = seat.court.null
+    learned = learned_model(model, simulations)
+    null = learned.context.null
     found = []
     for member in members:
         for attempt in range(ATTEMPTS):
             factor = SMALLER**attempt
             assert member.candidate is not None  # it is of the library
-            proposal = seat.court.asked.proposals[member.candidate]
+            proposal = learned.context.analysis.proposals[member.candidate]
             scaled = {**member.parameters, "amplitude": factor * member.parameters["amplitude"]}
             effect = proposal.kind(**scaled)
             try:
-                jobs = after_jobs(seat.court.run, seat.court.asked, [proposal.table(effect)], SKIES)
-                one, two = (answer for answer in seat.ask(jobs))
+                jobs = after_jobs(learned.context.run, learned.context.analysis, [proposal.table(effect)], SKIES)
+                one, two = (answer for answer in learned.ask(jobs))
             except InputError:
                 continue
-            reference = seat.court.known.reference
+            reference = learned.context.known.reference
             # Two halves of the skies, so that their noise does not count as strength.
             halves = (one - reference[: len(one)], two - reference[len(one) : len(one) + len(two)])
-            first, second = (null.templates(half.mean(axis=0)[:, None])[:, 0] for half in halves)
+            first, second = (null.whiten_templates(half.mean(axis=0)[:, None])[:, 0] for half in halves)
             strength = float(np.sqrt(max(null.unbiased * float(first @ second), 0.0)))
             if strength > LARGER * member.strength and attempt + 1 < ATTEMPTS:
                 continue  # its response is no straight line
             coordinates = tuple(float(value) for value in effect.coordinates())
             if not proposal.kind.draws:
-                strength = _strength_here(seat, proposal.table(effect), seed)
+                strength = _strength_here(learned, proposal.table(effect), seed)
             found.append(replace(member, parameters=scaled, coordinates=coordinates, strength=strength))
             break
         else:
@@ -268,13 +272,13 @@ def _measured(model: str, simulations: int | None, members: Sequence[Member], se
     return tuple(found)
 
 
-def _strength_here(seat: Sitting, effect: config.Effect, seed: int) -> float:
+def _strength_here(learned: LearnedModel, effect: config.Effect, seed: int) -> float:
     """White length of what an effect changes in one sky; a modulation, say, makes a dipole of its quadrupole."""
-    run = seeded(seat.court.run, seed)
-    believed = config.to_json(seat.court.run)
-    jobs = [Job(believed, config.to_json(with_effects(run, effects)), 0, 1) for effects in ((), (effect,))]
-    before, after = seat.ask(jobs)
-    return seat.court.null.length(after[0] - before[0])
+    run = seeded(learned.context.run, seed)
+    fiducial = config.to_json(learned.context.run)
+    jobs = [Job(fiducial, config.to_json(with_effects(run, effects)), 0, 1) for effects in ((), (effect,))]
+    before, after = learned.ask(jobs)
+    return learned.context.null.expected_snr(after[0] - before[0])
 
 
 def _write_map(path: Path, map_uk: Vector, frame: str) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.benchmark.truth import Identity, Kind, Member
-from mcsim.diagnosis.evidence import Proposal
+from mcsim.diagnosis.analysis import Proposal
 from mcsim.errors import InputError
 from mcsim.sphere import rng
 from mcsim.systematics import Effect
@@ -43,10 +43,10 @@ class Prior:
         if min(self.shares(True)) < 0.0 or sum(self.shares(False)) <= 0.0:
             raise InputError("shares of a challenge must not be negative, nor all zero; correct them.")
 
-    def shares(self, inventions: bool) -> Vector:
+    def shares(self, out_of_library: bool) -> Vector:
         """Probabilities of the kinds; nothing is invented where there are no inventions."""
         values = np.array([getattr(self, kind) for kind in KINDS])
-        if not inventions:
+        if not out_of_library:
             values[KINDS.index("invented")] = 0.0
         return values / max(float(values.sum()), 1e-300)
 
@@ -69,7 +69,7 @@ class Drawn:
 
 
 @dataclass(frozen=True)
-class Invention:
+class OutOfLibrary:
     """An effect that no library has, in one channel, and the response of the evidence to one unit of its amplitude."""
 
     kind: type[Effect]
@@ -78,7 +78,7 @@ class Invention:
 
 
 @dataclass(frozen=True)
-class Urn:
+class CaseSampler:
     """Draws cases.
 
     Attributes
@@ -100,7 +100,7 @@ class Urn:
     columns: Sequence[tuple[int, ...]]
     templates: NDArray[np.float64]
     white_length: WhiteLength
-    inventions: Mapping[str, Sequence[Invention]]
+    out_of_library: Mapping[str, Sequence[OutOfLibrary]]
 
     def draw(self, kinds: Sequence[Kind], seed: int, case: int) -> Drawn:
         """Case number ``case`` of a challenge with these :meth:`kinds`."""
@@ -110,7 +110,7 @@ class Urn:
         if kind == "none":
             return Drawn(kind, (), ())
         if kind == "invented":
-            names = sorted(self.inventions)
+            names = sorted(self.out_of_library)
             return Drawn(kind, (self._invented(draw, names[turn % len(names)]),), ())
         if kind == "left_out":
             names = self.names()
@@ -125,9 +125,9 @@ class Urn:
                 members.append(found)
         return Drawn(kind, tuple(members), ())
 
-    def kinds(self, seed: int, count: int, inventions: bool) -> list[Kind]:
+    def kinds(self, seed: int, count: int, out_of_library: bool) -> list[Kind]:
         """Kinds of the first cases of a challenge; a case's does not depend on how many there are."""
-        edges = np.cumsum(self.prior.shares(inventions))
+        edges = np.cumsum(self.prior.shares(out_of_library))
         drawn = rng.generator(seed, 0, "challenge/kinds").random(count)
         return [KINDS[min(int(np.searchsorted(edges, value, side="right")), len(KINDS) - 1)] for value in drawn]
 
@@ -147,8 +147,8 @@ class Urn:
 
     def _heard(self, index: int) -> bool:
         best = max(self.white_length(self.templates[:, column]) for column in self.columns[index])
-        most = self.proposals[index].kind.most
-        return best > 0.0 if np.isinf(most) else most * best >= self.prior.weakest
+        max_amplitude = self.proposals[index].kind.max_amplitude
+        return best > 0.0 if np.isinf(max_amplitude) else max_amplitude * best >= self.prior.weakest
 
     def _channels(self, name: str) -> list[list[int]]:
         """Proposals of an effect, channel by channel."""
@@ -166,10 +166,10 @@ class Urn:
         strength = self.prior.strength(draw)
         gram = np.array([[self._product(t[:, i], t[:, j]) for j in range(t.shape[1])] for i in range(t.shape[1])])
         values, vectors = np.linalg.eigh(gram)
-        heard = values > 1e-9 * values[-1]
+        filtered = values > 1e-9 * values[-1]
         direction = draw.standard_normal(len(values))
-        theta = vectors[:, heard] @ (direction[heard] / np.sqrt(values[heard]))
-        if proposal.kind.side:
+        theta = vectors[:, filtered] @ (direction[filtered] / np.sqrt(values[filtered]))
+        if proposal.kind.sign:
             theta = np.abs(theta)
         effect = proposal.with_parameters(theta, gram)
         # The parameters reach only some directions, and coordinates need not be linear in the amplitude.
@@ -192,7 +192,7 @@ class Urn:
         return 0.25 * (self.white_length(a + b) ** 2 - self.white_length(a - b) ** 2)
 
     def _invented(self, draw: np.random.Generator, name: str) -> Member:
-        group = self.inventions[name]
+        group = self.out_of_library[name]
         invention = group[int(draw.integers(len(group)))]
         strength = self.prior.strength(draw)
         amplitude = strength / self.white_length(invention.response)

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.benchmark.bayes import Bayes
-from mcsim.benchmark.prior import Urn
+from mcsim.benchmark.prior import CaseSampler
 from mcsim.benchmark.truth import Identity, Kind
 from mcsim.diagnosis.candidate import Candidate
 from mcsim.diagnosis.subsets import Subsets
-from mcsim.stats.gaussian import Bases, Null, bases
+from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates, whitened_templates
 from mcsim.stats.look_elsewhere import Calibration
 
 Vector = NDArray[np.float64]
@@ -119,41 +119,43 @@ def _sorted(answer: Answer) -> list[list[str | None]]:
 class Geometry:
     """Responses of a library in white coordinates."""
 
-    null: Null
+    null: SimulatedGaussian
     candidates: Sequence[Candidate]
-    groups: Bases
+    groups: WhitenedTemplates
     calibration: Calibration
 
     @classmethod
     def of(
-        cls, null: Null, t: NDArray[np.float64], candidates: Sequence[Candidate], calibration: Calibration
+        cls, null: SimulatedGaussian, t: NDArray[np.float64], candidates: Sequence[Candidate], calibration: Calibration
     ) -> "Geometry":
         """From templates."""
-        return cls(null, candidates, bases(null, t, [candidate.columns for candidate in candidates]), calibration)
+        return cls(
+            null, candidates, whitened_templates(null, t, [candidate.columns for candidate in candidates]), calibration
+        )
 
-    def bayes(self, urn: Urn) -> Bayes:
+    def bayes(self, sampler: CaseSampler) -> Bayes:
         """The classifier that knows what the urn draws."""
         identities = [candidate.identity for candidate in self.candidates]
-        return Bayes(self.null, self.groups, identities, urn.weights(), urn.prior)
+        return Bayes(self.null, self.groups, identities, sampler.weights(), sampler.prior)
 
     def rival(self, response: Vector, truth: Iterable[Identity]) -> float:
         """Largest cosine of a response with the candidates that are not of the truth."""
-        white = self.null.templates(response[:, None])[:, 0]
+        white = self.null.whiten_templates(response[:, None])[:, 0]
         size = float(np.linalg.norm(white))
         there = set(truth)
         others = [index for index, candidate in enumerate(self.candidates) if candidate.identity not in there]
         if size == 0.0 or not others:
             return 0.0
-        return float(np.sqrt(np.max(self.groups.drops(white)[others])) / size)
+        return float(np.sqrt(np.max(self.groups.delta_chi2(white)[others])) / size)
 
-    def distances(self, response: Vector, most: int = 3) -> tuple[float, ...]:
+    def distances(self, response: Vector, max_amplitude: int = 3) -> tuple[float, ...]:
         """White length that is left of a response by the best 1, 2, ... candidates of this library."""
-        white = self.null.templates(response[:, None])[:, 0]
+        white = self.null.whiten_templates(response[:, None])[:, 0]
         names = [candidate.identity for candidate in self.candidates]
         ones = np.ones(len(names))
         search = Subsets(self.null, white, self.groups, names, ones, np.zeros(len(names)), self.calibration)
         found, best = [], search.total
-        for size in range(1, most + 1):
+        for size in range(1, max_amplitude + 1):
             left = [search.solve(rows).chi2.min() for rows in search.rows(size, ()) if len(rows)]
             best = min([best, *left])
             found.append(float(np.sqrt(self.null.unbiased * max(best, 0.0))))

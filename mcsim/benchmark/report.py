@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from mcsim.benchmark.figure import challenge_figure
 from mcsim.benchmark.figures import Confusion, Score
 from mcsim.benchmark.intervals import Figure
+from mcsim.benchmark.picture import challenge_figure
 
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; color: #222; }

@@ -4,14 +4,14 @@ import json
 from pathlib import Path
 
 from mcsim import config
+from mcsim.benchmark.learned_model import without_effects
 from mcsim.benchmark.make import SETTINGS
-from mcsim.benchmark.sitting import lesser
 from mcsim.benchmark.truth import MAPS, finished_cases
+from mcsim.diagnosis.analysis import analysis_of
+from mcsim.diagnosis.api import prepared
 from mcsim.diagnosis.batch import asking, batch
-from mcsim.diagnosis.case import judge
-from mcsim.diagnosis.data import read_maps
-from mcsim.diagnosis.evidence import questions
-from mcsim.diagnosis.session import prepared
+from mcsim.diagnosis.inference import diagnose_maps
+from mcsim.diagnosis.observed_maps import read_maps
 from mcsim.errors import InputError
 from mcsim.support.folders import appearing
 from mcsim.support.progress import reporting
@@ -36,17 +36,17 @@ def run(folder: str | Path, *, workers: int | None = None, quiet: bool = True) -
         Number of cases that were diagnosed.
     """
     target = Path(folder)
-    believed, simulations = settings_of(target)
+    fiducial, simulations = settings_of(target)
     missing = [case for case in finished_cases(target) if not (target / VERDICTS / case).is_dir()]
     if not missing:
         return 0
-    with batch(believed.compute.workers if workers is None else workers) as call:
-        prepared(believed, questions(believed), asking(call, quiet), simulations)
-        text = config.to_json(believed)
+    with batch(fiducial.compute.workers if workers is None else workers) as call:
+        prepared(fiducial, analysis_of(fiducial), asking(call, quiet), simulations)
+        text = config.to_json(fiducial)
         # Cases of one library follow each other, so that a worker seldom changes its court.
-        asked = sorted((_without(target, case), case) for case in missing)
+        analysis = sorted((_without(target, case), case) for case in missing)
         with reporting("cases", float(len(missing)), "cases", quiet) as report:
-            tasks = ((text, simulations, str(target), case, names) for names, case in asked)
+            tasks = ((text, simulations, str(target), case, names) for names, case in analysis)
             for done, _ in enumerate(call(judge_case, tasks)):
                 report(float(done + 1))
     return len(missing)
@@ -65,15 +65,17 @@ def settings_of(folder: Path) -> tuple[config.RunConfig, int | None]:
 def judge_case(model: str, simulations: int | None, folder: str, case: str, names: tuple[str, ...]) -> str:
     """Task: verdict of one case; its folder appears complete or not at all."""
     target = Path(folder)
-    seat = lesser(model, simulations, names)
-    found = judge(seat.court, case, read_maps(seat.court.asked.model, target / MAPS / case), seat.ask)
+    learned = without_effects(model, simulations, names)
+    found = diagnose_maps(
+        learned.context, case, read_maps(learned.context.analysis.model, target / MAPS / case), learned.ask
+    )
     said = found.attribution
     answer = {
         "evidence": [float(value) for value in found.evidence["data"].values],
         "maximum": said.gap.maximum,
         "explanations": [
             {
-                "proposals": [seat.court.asked.proposals[member].label for member in explanation.members],
+                "proposals": [learned.context.analysis.proposals[member].label for member in explanation.members],
                 "amplitudes": explanation.fit.amplitudes.tolist(),
                 "errors": explanation.fit.errors.tolist(),
             }

@@ -13,16 +13,16 @@ from mcsim.benchmark import report
 from mcsim.benchmark.bayes import Bayes
 from mcsim.benchmark.draws import draws, powers
 from mcsim.benchmark.figures import Score, scored
-from mcsim.benchmark.make import SETTINGS, urn_of
+from mcsim.benchmark.learned_model import LearnedModel, without_effects
+from mcsim.benchmark.make import SETTINGS, sampler_of
 from mcsim.benchmark.prior import Prior
 from mcsim.benchmark.record import Answer, Geometry, Record, most_probable
 from mcsim.benchmark.run import VERDICTS, settings_of
-from mcsim.benchmark.sitting import Sitting, lesser
 from mcsim.benchmark.truth import Truth, finished_cases, open_key
+from mcsim.diagnosis.analysis import analysis_of
+from mcsim.diagnosis.api import prepared
 from mcsim.diagnosis.batch import asking, batch
-from mcsim.diagnosis.evidence import questions
-from mcsim.diagnosis.refine import quiet_templates
-from mcsim.diagnosis.session import prepared
+from mcsim.diagnosis.refine import significant_templates
 from mcsim.errors import InputError
 from mcsim.support.folders import writable
 
@@ -45,20 +45,20 @@ def score(folder: str | Path, *, workers: int | None = None, quiet: bool = True)
         A key that is not the sealed one, or no verdict.
     """
     target = Path(folder)
-    believed, simulations = settings_of(target)
+    fiducial, simulations = settings_of(target)
     cases = [case for case in finished_cases(target) if (target / VERDICTS / case).is_dir()]
     if not cases:
         raise InputError(f"{folder} has no verdicts; run mcsim challenge run {folder} first.")
     truths = [open_key(target, case) for case in cases]
-    with batch(believed.compute.workers if workers is None else workers) as call:
-        prepared(believed, questions(believed), asking(call, quiet), simulations)
-    text = config.to_json(believed)
-    full = lesser(text, simulations, ())
+    with batch(fiducial.compute.workers if workers is None else workers) as call:
+        prepared(fiducial, analysis_of(fiducial), asking(call, quiet), simulations)
+    text = config.to_json(fiducial)
+    full = without_effects(text, simulations, ())
     prior = Prior(**json.loads((target / SETTINGS).read_text())["prior"])
-    judge = _Judge(text, simulations, full, prior)
+    diagnose_maps = _Judge(text, simulations, full, prior)
     # Cases of one library after each other: a lesser court takes a second.
     order = sorted(range(len(cases)), key=lambda index: truths[index].without)
-    records = {index: judge.record(truths[index], target / VERDICTS / cases[index]) for index in order}
+    records = {index: diagnose_maps.record(truths[index], target / VERDICTS / cases[index]) for index in order}
     result = scored(f"{len(cases)} full skies", [records[index] for index in range(len(cases))])
     report.write([result], target / "score")
     return result
@@ -94,9 +94,9 @@ def score_draws(
     run = model if isinstance(model, config.RunConfig) else config.load(model)
     writable(Path(folder))
     with batch(run.compute.workers if workers is None else workers) as call:
-        court = prepared(run, questions(run), asking(call, quiet), simulations)
-        records = draws(court, number, seed, prior=prior, call=call)
-    power = powers(court, detections, seed)
+        context = prepared(run, analysis_of(run), asking(call, quiet), simulations)
+        records = draws(context, number, seed, prior=prior, call=call)
+    power = powers(context, detections, seed)
     result = scored(f"{number} draws of the evidence", records, power)
     report.write([result], Path(folder))
     return result
@@ -105,18 +105,18 @@ def score_draws(
 class _Judge:
     """From a key and a verdict to a record."""
 
-    def __init__(self, model: str, simulations: int | None, full: Sitting, prior: Prior) -> None:
+    def __init__(self, model: str, simulations: int | None, full: LearnedModel, prior: Prior) -> None:
         self.model, self.simulations, self.full = model, simulations, full
-        self.templates = quiet_templates(full.court.known)
+        self.templates = significant_templates(full.context.known)
         self.geometry = _geometry(full)
-        self.bayes: Bayes = self.geometry.bayes(urn_of(full.court, prior))
+        self.bayes: Bayes = self.geometry.bayes(sampler_of(full.context, prior))
 
     def record(self, truth: Truth, folder: Path) -> Record:
         """Of one case."""
         verdict = json.loads((folder / "verdict.json").read_text())
         answer = json.loads((folder / "answer.json").read_text())
-        seat = lesser(self.model, self.simulations, truth.without)
-        geometry = self.geometry if not truth.without else _geometry(seat)
+        learned = without_effects(self.model, self.simulations, truth.without)
+        geometry = self.geometry if not truth.without else _geometry(learned)
         response = self._response(truth)
         best, right = None, np.nan
         if truth.kind in ("none", "one", "two"):
@@ -127,10 +127,10 @@ class _Judge:
             truth.case,
             truth.kind,
             truth.identities,
-            members[0].strength if len(members) == 1 else self.full.court.null.length(response),
+            members[0].strength if len(members) == 1 else self.full.context.null.expected_snr(response),
             len(members[0].coordinates) if len(members) == 1 else 0,
-            geometry.rival(response[seat.rows], truth.identities) if members else 0.0,
-            geometry.distances(response[seat.rows]) if truth.kind in ("left_out", "invented") else (),
+            geometry.rival(response[learned.rows], truth.identities) if members else 0.0,
+            geometry.distances(response[learned.rows]) if truth.kind in ("left_out", "invented") else (),
             verdict["gap"]["p_value"],
             answer["maximum"],
             verdict["verdict"],
@@ -154,7 +154,7 @@ class _Judge:
             if member.candidate is None:
                 total += np.array(member.response)
             else:
-                columns = list(self.full.court.candidates[member.candidate].columns)
+                columns = list(self.full.context.candidates[member.candidate].columns)
                 total += self.templates[:, columns] @ np.array(member.coordinates)
         return total
 
@@ -163,15 +163,15 @@ class _Judge:
             return ()
         (member,), best = truth.members, answer["explanations"][0]
         assert member.candidate is not None  # it is of the library
-        if best["proposals"] != [self.full.court.asked.proposals[member.candidate].label]:
+        if best["proposals"] != [self.full.context.analysis.proposals[member.candidate].label]:
             return ()
         fitted = zip(best["amplitudes"], member.coordinates, best["errors"], strict=True)
         return tuple(float((value - true) / error) for value, true, error in fitted)
 
 
-def _geometry(seat: Sitting) -> Geometry:
-    court = seat.court
-    return Geometry.of(court.null, quiet_templates(court.known), court.candidates, court.calibration)
+def _geometry(learned: LearnedModel) -> Geometry:
+    context = learned.context
+    return Geometry.of(context.null, significant_templates(context.known), context.candidates, context.calibration)
 
 
 def _answers(verdict: Mapping[str, Any]) -> tuple[Answer, ...]:

@@ -295,7 +295,7 @@ class Biposh:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Ensemble:
-    """Realizations 0 .. realizations - 1 of the seed; ``paired`` adds the circular twin of every one."""
+    """Realizations 0 .. realizations - 1 of the seed; ``paired`` adds the circular-beam control of every one."""
 
     realizations: Annotated[int, Field(ge=1, le=10_000_000)] = 100
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.evidence import Job, evidence_of
+from mcsim.diagnosis.analysis import Job, data_vectors
 from mcsim.ensemble import runner
 from mcsim.support.progress import reporting
 
@@ -37,7 +37,7 @@ def batch(workers: int) -> Iterator[Batch]:
 
 
 def asking(
-    call: Batch, quiet: bool, task: Callable[[Job], NDArray[np.float64]] = evidence_of
+    call: Batch, quiet: bool, task: Callable[[Job], NDArray[np.float64]] = data_vectors
 ) -> Callable[[Sequence[Job]], list[NDArray[np.float64]]]:
     """Answers of jobs in their order."""
 

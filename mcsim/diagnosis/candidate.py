@@ -40,7 +40,7 @@ class Candidate:
     prior: float = 1.0
     shape_error: float | None = None
     positive: bool = False
-    most: float = np.inf
+    max_amplitude: float = np.inf
     scatter: NDArray[np.float64] | None = field(default=None, compare=False)
 
     @property
@@ -69,6 +69,6 @@ def allowed(candidates: Sequence[Candidate], members: Sequence[int], found: Fit)
     """Whether a fit of members asks for no amplitude that one of them cannot have."""
     for member, amplitudes, _ in parts_of(candidates, members, found):
         candidate = candidates[member]
-        if (candidate.positive and np.any(amplitudes < 0.0)) or np.linalg.norm(amplitudes) > candidate.most:
+        if (candidate.positive and np.any(amplitudes < 0.0)) or np.linalg.norm(amplitudes) > candidate.max_amplitude:
             return False
     return True

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
 
-from mcsim.diagnosis.case import Diagnosis
-from mcsim.diagnosis.reading import APART, Gap, Reading
+from mcsim.diagnosis.inference import Diagnosis
+from mcsim.diagnosis.view import APART, ExcessSummary, ReportView
 
 # Okabe and Ito's palette: told apart with any colour vision.
 BLUE, RED, GREEN, AMBER = "#0072b2", "#d55e00", "#00785a", "#e69f00"
@@ -36,7 +36,7 @@ def first_screen(diagnosis: Diagnosis) -> Figure:
     diagnosis
         Of one case.
     """
-    reading = Reading(diagnosis.verdict, diagnosis.evidence)
+    view = ReportView(diagnosis.verdict, diagnosis.evidence)
     kind = diagnosis.verdict["verdict"]
     lines = textwrap.wrap(_plain(sentence_for_people(diagnosis)), 110)
     top = 0.8 + 0.24 * len(lines)
@@ -56,8 +56,8 @@ def first_screen(diagnosis: Diagnosis) -> Figure:
     words = figure.text(0.02, 1.0 - 0.6 / height, "\n".join(lines), fontsize=10.5, va="top", linespacing=1.35)
     words.set_in_layout(False)
     left, right = figure.subplots(1, 2)
-    draw_gap(left, reading.gap)
-    draw_impacts(right, reading, 6)
+    draw_gap(left, view.excess)
+    draw_impacts(right, view, 6)
     return figure
 
 
@@ -66,14 +66,14 @@ def sentence_for_people(diagnosis: Diagnosis) -> str:
     return diagnosis.sentence.replace(" +- ", " ± ")
 
 
-def gap_figure(reading: Reading) -> Figure:
+def gap_figure(view: ReportView) -> Figure:
     """Gap before and after."""
     figure = Figure(figsize=(6.4, 2.2), layout="constrained")
-    draw_gap(figure.subplots(), reading.gap)
+    draw_gap(figure.subplots(), view.excess)
     return figure
 
 
-def draw_gap(axes: Axes, gap: Gap) -> None:
+def draw_gap(axes: Axes, gap: ExcessSummary) -> None:
     """Bars of the gap, with what was predicted to remain."""
     values = [(gap.before, gap.before_sigma, "gap now" if gap.after is None else "before", RED)]
     if gap.after is not None:
@@ -103,17 +103,17 @@ def draw_gap(axes: Axes, gap: Gap) -> None:
     _bare(axes)
 
 
-def impacts_figure(reading: Reading) -> Figure:
+def impacts_figure(view: ReportView) -> Figure:
     """Candidates fitted alone, ranked."""
-    count = min(TOP, len(reading.ranked))
+    count = min(TOP, len(view.ranked))
     figure = Figure(figsize=(7.2, 1.0 + 0.27 * count), layout="constrained")
-    draw_impacts(figure.subplots(), reading, TOP)
+    draw_impacts(figure.subplots(), view, TOP)
     return figure
 
 
-def draw_impacts(axes: Axes, reading: Reading, count: int) -> None:
+def draw_impacts(axes: Axes, view: ReportView, count: int) -> None:
     """Bars of the root of the fall of chi^2 of each candidate alone; those of the accepted set in colour."""
-    rows = reading.ranked[:count]
+    rows = view.ranked[:count]
     colours = [BLUE if row.accepted else AMBER if row.alternative else "#b5b5b5" for row in rows]
     axes.barh(range(len(rows)), [row.impact for row in rows], height=0.7, color=colours)
     axes.set_yticks(range(len(rows)), [_plain(_short(row.label, 34)) for row in rows], fontsize=8)
@@ -124,9 +124,9 @@ def draw_impacts(axes: Axes, reading: Reading, count: int) -> None:
     _bare(axes)
 
 
-def blocks_figure(reading: Reading) -> Figure:
+def blocks_figure(view: ReportView) -> Figure:
     """Largest deviate of every block, before and after the fit."""
-    kinds, columns, tables = reading.blocks
+    kinds, columns, tables = view.blocks
     width = 2.4 + len(tables) * (0.62 * len(columns) + 0.3)
     figure = Figure(figsize=(width, 2.6 + 0.27 * len(kinds)), layout="constrained")
     grid = figure.subplots(1, len(tables), sharey=True, squeeze=False)[0]
@@ -149,17 +149,17 @@ def blocks_figure(reading: Reading) -> Figure:
     return figure
 
 
-def entries_figure(reading: Reading) -> Figure:
+def entries_figure(view: ReportView) -> Figure:
     """Every deviate before and after the fit, kind by kind."""
-    order = sorted(range(len(reading.entries)), key=lambda k: _family(reading.entries[k]["name"]))
-    families = [_family(reading.entries[k]["name"]) for k in order]
+    order = sorted(range(len(view.elements)), key=lambda k: _family(view.elements[k]["name"]))
+    families = [_family(view.elements[k]["name"]) for k in order]
     figure = Figure(figsize=(10.5, 3.6), layout="constrained")
     axes = figure.subplots()
     axes.axhspan(-2.0, 2.0, color="#e9e9e9", zorder=0)
     place = list(range(len(order)))
-    axes.plot(place, reading.z[order], "o", markersize=3.2, color=RED, label="data against model")
-    if reading.left is not None:
-        axes.plot(place, reading.left[order], "o", markersize=3.2, color=BLUE, label="left by the best explanation")
+    axes.plot(place, view.z[order], "o", markersize=3.2, color=RED, label="data against model")
+    if view.left is not None:
+        axes.plot(place, view.left[order], "o", markersize=3.2, color=BLUE, label="left by the best explanation")
     starts = [k for k in place if k == 0 or families[k] != families[k - 1]]
     for start, stop in zip(starts, [*starts[1:], len(order)], strict=True):
         axes.axvline(start - 0.5, color="0.6", linewidth=0.6)
@@ -173,7 +173,7 @@ def entries_figure(reading: Reading) -> Figure:
             va="bottom",
         )
     axes.set_yscale("symlog", linthresh=5.0)
-    largest = max(float(np.max(np.abs(reading.z))), 5.0)
+    largest = max(float(np.max(np.abs(view.z))), 5.0)
     axes.set_yticks(*_ticks(largest))
     axes.set_ylim(-1.2 * largest, 1.2 * largest)
     axes.set_xlim(-1.0, len(order))
@@ -183,11 +183,11 @@ def entries_figure(reading: Reading) -> Figure:
     return figure
 
 
-def residual_figure(reading: Reading) -> Figure | None:
+def residual_figure(view: ReportView) -> Figure | None:
     """Residual of every map, or of the most unusual ones, over its noise; None where the data were no maps."""
-    if "residual_map" not in reading.evidence:
+    if "residual_map" not in view.evidence:
         return None
-    maps = reading.evidence["residual_map"]
+    maps = view.evidence["residual_map"]
     rms = np.sqrt(np.nanmean(maps.values**2, axis=1))
     if len(rms) > MAPS:
         maps = maps.isel(map=np.sort(np.argsort(-np.abs(rms - 1.0))[:MAPS]))
@@ -214,28 +214,28 @@ def residual_figure(reading: Reading) -> Figure | None:
     return figure
 
 
-def correlation_figure(reading: Reading) -> Figure:
+def correlation_figure(view: ReportView) -> Figure:
     """Largest canonical correlation of every pair of candidates."""
     return _matrix(
-        reading,
-        reading.evidence["correlation"].values,
+        view,
+        view.evidence["correlation"].values,
         "correlation of responses",
         {"cmap": "Blues", "vmin": 0.0, "vmax": 1.0},
     )
 
 
-def isolation_figure(reading: Reading) -> Figure:
+def isolation_figure(view: ReportView) -> Figure:
     """Strength at which each pair is told apart in 95 cases of 100."""
-    needed = np.clip(reading.isolating, None, 1e4)
+    needed = np.clip(view.isolating, None, 1e4)
     scale = {"cmap": "viridis_r", "norm": LogNorm(2.0, 100.0)}
-    return _matrix(reading, needed, "strength needed to tell apart, 95 % [sigmas]", scale)
+    return _matrix(view, needed, "strength needed to tell apart, 95 % [sigmas]", scale)
 
 
-def calibration_figure(reading: Reading) -> Figure:
+def calibration_figure(view: ReportView) -> Figure:
     """Simulations judged by the others, and the data's probability among draws without a gap."""
     figure = Figure(figsize=(9.0, 3.1), layout="constrained")
     left, right = figure.subplots(1, 2)
-    held = reading.evidence["held_out"].values
+    held = view.evidence["held_out"].values
     bins = 20
     left.hist(held, bins=bins, range=(0.0, 1.0), histtype="step", color=BLUE, linewidth=1.6)
     low, high = stats.binom.interval(0.95, len(held), 1.0 / bins)
@@ -246,10 +246,10 @@ def calibration_figure(reading: Reading) -> Figure:
     left.set_xlabel("omnibus probability of a simulation held out")
     left.set_ylabel(f"simulations of {len(held)}")
     left.set_title("grey: where 95 % of the bins of a flat one are", fontsize=9)
-    draws = np.maximum(reading.evidence["calibration"].values, 1e-12)
+    draws = np.maximum(view.evidence["calibration"].values, 1e-12)
     rank = (1.0 + np.arange(len(draws))) / (1.0 + len(draws))
     right.plot(draws, rank, color=BLUE, label="draws without a gap")
-    p = max(float(reading.verdict["gap"]["p_value"]), 1e-300)
+    p = max(float(view.verdict["gap"]["p_value"]), 1e-300)
     floor = rank[0] / 3.0
     inside = p >= rank[0]
     at = float(np.interp(p, rank, draws)) if inside else draws[0]
@@ -298,14 +298,14 @@ def telling_figure(contrast: dict[str, Any]) -> Figure:
     return figure
 
 
-def _matrix(reading: Reading, values: NDArray[np.float64], label: str, scale: dict[str, Any]) -> Figure:
-    labels = reading.labels
-    side = 2.6 + max(3.0, 0.15 * len(labels))
-    figure = Figure(figsize=(side, side + 0.8), layout="constrained")
+def _matrix(view: ReportView, values: NDArray[np.float64], label: str, scale: dict[str, Any]) -> Figure:
+    labels = view.labels
+    sign = 2.6 + max(3.0, 0.15 * len(labels))
+    figure = Figure(figsize=(sign, sign + 0.8), layout="constrained")
     axes = figure.subplots()
     shown = axes.imshow(values, interpolation="nearest", **scale)
     size = 6.5 if len(labels) > 12 else 9
-    accepted = {row.label for row in reading.ranked if row.accepted}
+    accepted = {row.label for row in view.ranked if row.accepted}
     words = [_plain(_short(name, 36)) for name in labels]
     axes.set_xticks(range(len(labels)), words, rotation=90, fontsize=size)
     axes.set_yticks(range(len(labels)), words, fontsize=size)
@@ -356,5 +356,5 @@ def _plain(text: str) -> str:
 
 
 def _bare(axes: Axes) -> None:
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    for sign in ("top", "right"):
+        axes.spines[sign].set_visible(False)

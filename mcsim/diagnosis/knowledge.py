@@ -11,9 +11,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.diagnosis.blocks import Entry
-from mcsim.diagnosis.evidence import Job, Proposal, Questions
-from mcsim.stats.gaussian import Null, null
+from mcsim.diagnosis.analysis import Analysis, Job, Proposal
+from mcsim.diagnosis.summaries import Element
+from mcsim.stats.gaussian import SimulatedGaussian, null
 
 Vector = NDArray[np.float64]
 Ask = Callable[[Sequence[Job]], list[NDArray[np.float64]]]
@@ -49,7 +49,7 @@ SCATTER_SKIES = 24
 PIECE = 4
 """Of those, in a task."""
 
-REFEREE_SKIES = 6
+TIME_ORDERED_SKIES = 6
 """Skies seen sample by sample, that the default route is compared with."""
 
 ATLAS = 300
@@ -94,10 +94,10 @@ class Knowledge:
     curvature: NDArray[np.float64]
     template_error: NDArray[np.float64]
     reference: NDArray[np.float64]
-    atlas: NDArray[np.float64]
-    entries: tuple[Entry, ...]
+    bipolar_scan: NDArray[np.float64]
+    elements: tuple[Element, ...]
 
-    def null(self, where: Sequence[int] | NDArray[np.int64] | None = None) -> Null:
+    def null(self, where: Sequence[int] | NDArray[np.int64] | None = None) -> SimulatedGaussian:
         """Null of all entries, or of some."""
         rows = slice(None) if where is None else np.asarray(where)
         return null(self.simulations[:, rows], self.offset[rows], COLLINEAR)
@@ -112,9 +112,9 @@ class Knowledge:
                 "curvature": (("entry", "column"), self.curvature, {"long_name": "half the second derivative"}),
                 "template_error": (("entry", "column"), self.template_error, {"long_name": "standard error"}),
                 "reference": (("sky", "entry"), self.reference, {"long_name": "evidence of the responses' skies"}),
-                "atlas": (("drawn", "number"), self.atlas, {"long_name": "atlas of the model"}),
+                "bipolar_scan": (("drawn", "number"), self.bipolar_scan, {"long_name": "atlas of the model"}),
             },
-            attrs={"entries": json.dumps([asdict(entry) for entry in self.entries])},
+            attrs={"entries": json.dumps([asdict(element) for element in self.elements])},
         )
         dataset.to_zarr(path, mode="w", consolidated=False)
 
@@ -123,13 +123,13 @@ class Knowledge:
         """Read what :meth:`save` wrote."""
         with xr.open_zarr(path, consolidated=False) as dataset:
             arrays = {str(name): np.asarray(values) for name, values in dataset.data_vars.items()}
-            entries = tuple(_entry(row) for row in json.loads(dataset.attrs["entries"]))
-        return cls(**arrays, entries=entries)
+            elements = tuple(_entry(row) for row in json.loads(dataset.attrs["entries"]))
+        return cls(**arrays, elements=elements)
 
 
-def _entry(row: Mapping[str, Any]) -> Entry:
+def _entry(row: Mapping[str, Any]) -> Element:
     ell = row["ell"]
-    return Entry(**{**row, "channels": tuple(row["channels"]), "ell": None if ell is None else tuple(ell)})
+    return Element(**{**row, "channels": tuple(row["channels"]), "ell": None if ell is None else tuple(ell)})
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ class Plan:
     purposes: tuple[tuple[Any, ...], ...]
 
 
-def plan(run: config.RunConfig, asked: Questions, simulations: int | None = None, referee: bool = True) -> Plan:
+def plan(run: config.RunConfig, analysis: Analysis, simulations: int | None = None, time_ordered: bool = True) -> Plan:
     """All simulations that :func:`learned` is made of.
 
     Parameters
@@ -154,30 +154,30 @@ def plan(run: config.RunConfig, asked: Questions, simulations: int | None = None
     referee
         Compare with the sample-by-sample route where every channel's pointing is known.
     """
-    believed = config.to_json(run)
-    wanted = PER_ENTRY * len(asked.entries) if simulations is None else simulations
+    fiducial = config.to_json(run)
+    wanted = PER_ENTRY * len(analysis.elements) if simulations is None else simulations
     jobs, purposes = [], []
 
     def add(
         purpose: tuple[Any, ...], simulated: config.RunConfig, first: int, count: int, samples: bool = False
     ) -> None:
-        atlas = purpose[0] == "null" and first < ATLAS
-        jobs.append(Job(believed, config.to_json(simulated), first, count, samples, asked.without, atlas))
+        bipolar_scan = purpose[0] == "null" and first < ATLAS
+        jobs.append(Job(fiducial, config.to_json(simulated), first, count, samples, analysis.without, bipolar_scan))
         purposes.append(purpose)
 
     base = seeded(run, _RESPONSE)
-    if referee and all(c.site.pointing is not None for c in asked.model.survey.channels):
+    if time_ordered and all(c.site.pointing is not None for c in analysis.model.survey.channels):
         quiet = replace(base, channels=tuple(replace(c, noise=config.Noise()) for c in base.channels))
-        for sky in range(REFEREE_SKIES):
+        for sky in range(TIME_ORDERED_SKIES):
             add(("referee", sky), quiet, sky, 1, True)
             add(("default", sky), quiet, sky, 1)
     for first in range(0, wanted, CHUNK):
         add(("null", first), seeded(run, _COVARIANCE), first, min(CHUNK, wanted - first))
     for first in range(0, NOISY_SKIES, CHUNK):
         add(("reference", first), base, first, min(CHUNK, NOISY_SKIES - first))
-    for number, column, sign, effect in _basis(asked):
-        count = skies(asked.proposals[number], asked.model.lmax)
-        add(("response", column, sign), with_effects(base, [asked.proposals[number].table(effect)]), 0, count)
+    for number, column, sign, effect in _basis(analysis):
+        count = skies(analysis.proposals[number], analysis.model.lmax)
+        add(("response", column, sign), with_effects(base, [analysis.proposals[number].table(effect)]), 0, count)
     return Plan(tuple(jobs), tuple(purposes))
 
 
@@ -202,26 +202,26 @@ def answered(plan: Plan, size: int, ask: Ask) -> tuple[Plan, list[NDArray[np.flo
     return needed, [answers[k] for k in kept]
 
 
-def learned(asked: Questions, plan: Plan, answers: Sequence[NDArray[np.float64]]) -> Knowledge:
+def learned(analysis: Analysis, plan: Plan, answers: Sequence[NDArray[np.float64]]) -> Knowledge:
     """Put the answers to the jobs of a plan together."""
     by_purpose = dict(zip(plan.purposes, answers, strict=True))
 
-    size = len(asked.entries)
+    size = len(analysis.elements)
 
     def stacked(kind: str) -> NDArray[np.float64]:
         rows = [by_purpose[purpose][:, :size] for purpose in plan.purposes if purpose[0] == kind]
         return np.concatenate(rows) if rows else np.zeros((0, size))
 
     reference = stacked("reference")
-    columns = sum(len(proposal.basis) for proposal in asked.proposals)
+    columns = sum(len(proposal.basis) for proposal in analysis.proposals)
     shape = (size, columns)
     templates, curvature, error = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-    for number, column, sign, effect in _basis(asked):
+    for number, column, sign, effect in _basis(analysis):
         other = by_purpose.get(("response", column, -sign))
         if sign < 0 and other is not None:
             continue  # done with the other sign
         here = by_purpose["response", column, sign]
-        step = effect.coordinates()[asked.columns[number].index(column)]
+        step = effect.coordinates()[analysis.columns[number].index(column)]
         same = reference[: len(here)]
         if other is None:
             each = (here - same) / step
@@ -230,47 +230,47 @@ def learned(asked: Questions, plan: Plan, answers: Sequence[NDArray[np.float64]]
             curvature[:, column] = np.mean(here + other - 2.0 * same, axis=0) / (2.0 * step**2)
         templates[:, column] = each.mean(axis=0)
         error[:, column] = each.std(axis=0, ddof=1) / np.sqrt(len(each))
-    referee, default = stacked("referee"), stacked("default")
-    offset = np.mean(referee - default, axis=0) if len(referee) else np.zeros(size)
-    atlas = [answer[:, size:] for job, answer in zip(plan.jobs, answers, strict=True) if job.atlas]
+    time_ordered, default = stacked("referee"), stacked("default")
+    offset = np.mean(time_ordered - default, axis=0) if len(time_ordered) else np.zeros(size)
+    bipolar_scan = [answer[:, size:] for job, answer in zip(plan.jobs, answers, strict=True) if job.bipolar_scan]
     return Knowledge(
-        stacked("null"), offset, templates, curvature, error, reference, np.concatenate(atlas), asked.entries
+        stacked("null"), offset, templates, curvature, error, reference, np.concatenate(bipolar_scan), analysis.elements
     )
 
 
 def after_jobs(
-    run: config.RunConfig, asked: Questions, found: Sequence[config.Effect], skies: int = NOISY_SKIES
+    run: config.RunConfig, analysis: Analysis, found: Sequence[config.Effect], skies: int = NOISY_SKIES
 ) -> list[Job]:
     """Simulations of the model with effects at frozen amplitudes, over the skies of the responses."""
-    believed = config.to_json(run)
+    fiducial = config.to_json(run)
     simulated = config.to_json(with_effects(seeded(run, _RESPONSE), found))
     half = -(-skies // 2)
-    return [Job(believed, simulated, first, min(half, skies - first), False, asked.without) for first in (0, half)]
+    return [Job(fiducial, simulated, first, min(half, skies - first), False, analysis.without) for first in (0, half)]
 
 
 def constrained_jobs(
     run: config.RunConfig,
-    asked: Questions,
+    analysis: Analysis,
     found: Sequence[config.Effect],
     observed: NDArray[np.complex128],
     first: int = 0,
     last: int = CONSTRAINED_SKIES,
 ) -> list[Job]:
     """Simulations of the model with effects at frozen amplitudes, over skies that agree with an observed one."""
-    believed = config.to_json(run)
+    fiducial = config.to_json(run)
     simulated = config.to_json(with_effects(seeded(run, _RESPONSE), found))
     return [
-        Job(believed, simulated, start, min(PIECE, last - start), False, asked.without, False, observed)
+        Job(fiducial, simulated, start, min(PIECE, last - start), False, analysis.without, False, observed)
         for start in range(first, last, PIECE)
     ]
 
 
-def _basis(asked: Questions) -> Iterator[tuple[int, int, int, Any]]:
+def _basis(analysis: Analysis) -> Iterator[tuple[int, int, int, Any]]:
     """Proposal, column, sign and effect of every response that is simulated."""
-    for number, (proposal, columns) in enumerate(zip(asked.proposals, asked.columns, strict=True)):
+    for number, (proposal, columns) in enumerate(zip(analysis.proposals, analysis.columns, strict=True)):
         for column, effect in zip(columns, proposal.basis, strict=True):
             for sign in (1, -1):
-                if proposal.kind.side in (0, sign):
+                if proposal.kind.sign in (0, sign):
                     yield number, column, sign, effect.scaled(sign)
 
 

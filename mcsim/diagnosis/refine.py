@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.diagnosis.attribute import LARGEST, Attribution, attribute
+from mcsim.diagnosis.analysis import Analysis, Proposal
 from mcsim.diagnosis.candidate import Candidate, columns_of, parts_of
-from mcsim.diagnosis.closest import Closest, closest
-from mcsim.diagnosis.evidence import Proposal, Questions
 from mcsim.diagnosis.knowledge import CONSTRAINED_SKIES, SCATTER_SKIES, Knowledge
 from mcsim.diagnosis.knowledge import skies as skies_of
+from mcsim.diagnosis.partial_explanation import PartialExplanation, partial_explanation
+from mcsim.diagnosis.selection import LARGEST, Attribution, attribute
 from mcsim.errors import InputError
-from mcsim.stats.gaussian import Fit, Null, fit
+from mcsim.stats.gaussian import Fit, SimulatedGaussian, fit
 from mcsim.stats.look_elsewhere import Calibration
 from mcsim.systematics import Effect
 
@@ -76,19 +76,19 @@ class Refined:
     templates: NDArray[np.float64]
     candidates: tuple[Candidate, ...]
     simulated: tuple[int, ...]
-    heard: Closest | None = None
+    filtered: PartialExplanation | None = None
 
 
-def quiet_templates(known: Knowledge) -> NDArray[np.float64]:
+def significant_templates(known: Knowledge) -> NDArray[np.float64]:
     """Templates, shape (p, K), those that are noisy without the entries that are only noise."""
     scatter = known.simulations.std(axis=0)[:, None]
     noise = np.sum((known.template_error / scatter) ** 2, axis=0)
     noisy = noise > NOISY * np.sum((known.templates / scatter) ** 2, axis=0)
-    heard = np.abs(known.templates) > CLEAN * known.template_error
-    return np.where(noisy & ~heard, 0.0, known.templates)
+    filtered = np.abs(known.templates) > CLEAN * known.template_error
+    return np.where(noisy & ~filtered, 0.0, known.templates)
 
 
-def scatter_of(known: Knowledge, asked: Questions) -> NDArray[np.float64]:
+def scatter_of(known: Knowledge, analysis: Analysis) -> NDArray[np.float64]:
     """How far the response in one sky is from the mean response: rms of the ratio of their lengths, shape (proposals,).
 
     Lengths of entries over their scatter, all columns of a proposal together.
@@ -97,19 +97,23 @@ def scatter_of(known: Knowledge, asked: Questions) -> NDArray[np.float64]:
     noise = np.sum((known.template_error / spread) ** 2, axis=0)
     size = np.sum((known.templates / spread) ** 2, axis=0)
     found = []
-    for proposal, columns in zip(asked.proposals, asked.columns, strict=True):
+    for proposal, columns in zip(analysis.proposals, analysis.columns, strict=True):
         rows = list(columns)
         # A column of nothing but noise says nothing of the others.
-        heard = size[rows] > 2.0 * noise[rows]
-        ratio = skies_of(proposal, asked.model.lmax) * noise[rows] / np.maximum(size[rows] - noise[rows], 1e-300)
-        found.append(float(np.sqrt(np.mean(ratio[heard]))) if heard.any() else np.inf)
+        filtered = size[rows] > 2.0 * noise[rows]
+        ratio = skies_of(proposal, analysis.model.lmax) * noise[rows] / np.maximum(size[rows] - noise[rows], 1e-300)
+        found.append(float(np.sqrt(np.mean(ratio[filtered]))) if filtered.any() else np.inf)
     return np.array(found)
 
 
-def on_this_sky(known: Knowledge, asked: Questions, t: NDArray[np.float64], respond: Respond) -> NDArray[np.float64]:
+def templates_on_sky(
+    known: Knowledge, analysis: Analysis, t: NDArray[np.float64], respond: Respond
+) -> NDArray[np.float64]:
     """Templates, those of effects whose response depends on the very sky measured on the one that was observed."""
     result = t.copy()
-    for proposal, columns, scatter in zip(asked.proposals, asked.columns, scatter_of(known, asked), strict=True):
+    for proposal, columns, scatter in zip(
+        analysis.proposals, analysis.columns, scatter_of(known, analysis), strict=True
+    ):
         if scatter < SCATTERED or proposal.drawn or proposal.kind.mean_response:
             continue
         for column, basis in zip(columns, proposal.basis, strict=True):
@@ -125,7 +129,7 @@ def on_this_sky(known: Knowledge, asked: Questions, t: NDArray[np.float64], resp
 def effect_at(proposal: Proposal, coordinates: Vector, covariance: NDArray[np.float64]) -> Effect:
     """The effect that is nearest to fitted coordinates, as far as data tell them."""
     precision: NDArray[np.float64] = np.asarray(np.linalg.pinv(covariance), dtype=np.float64)
-    return proposal.with_parameters(proposal.kind.told(coordinates, precision), precision)
+    return proposal.with_parameters(proposal.kind.constrained(coordinates, precision), precision)
 
 
 def _acting_at(proposal: Proposal, coordinates: Vector, covariance: NDArray[np.float64]) -> Effect:
@@ -156,7 +160,7 @@ def tables_at(
 
 def refine(
     known: Knowledge,
-    null: Null,
+    null: SimulatedGaussian,
     x: Vector,
     t: NDArray[np.float64],
     candidates: Sequence[Candidate],
@@ -181,7 +185,7 @@ def refine(
         for index, coordinates, covariance in _to_try(found, tried, proposals, calibration):
             columns, proposal = list(candidates[index].columns), proposals[index]
             bent = _bent(known, null, columns, coordinates)
-            draws = proposal.kind.draws and (proposal.kind.side == 0 or coordinates[0] > 0.0)
+            draws = proposal.kind.draws and (proposal.kind.sign == 0 or coordinates[0] > 0.0)
             if not (bent or draws) or _close(done.get(index), coordinates, covariance):
                 continue
             done[index] = coordinates
@@ -204,31 +208,33 @@ def refine(
         if not changed:
             break
         found = attribute(null, x, t, tried, calibration)
-    heard = None
+    filtered = None
     if found.verdict == "unknown":
-        heard = heard_in(null, x, t, tried, proposals, calibration, respond)
-        if heard is not None and len(heard.members) <= LARGEST:
-            together = attribute(null, x, heard.templates, tried, calibration)
+        filtered = detected_in(null, x, t, tried, proposals, calibration, respond)
+        if filtered is not None and len(filtered.members) <= LARGEST:
+            together = attribute(null, x, filtered.templates, tried, calibration)
             if together.explanations:
-                t, found, heard = heard.templates, together, None
-    return Refined(found, t, tuple(tried), tuple(done), heard)
+                t, found, filtered = filtered.templates, together, None
+    return Refined(found, t, tuple(tried), tuple(done), filtered)
 
 
-def heard_in(
-    null: Null,
+def detected_in(
+    null: SimulatedGaussian,
     x: Vector,
     t: NDArray[np.float64],
     candidates: Sequence[Candidate],
     proposals: Sequence[Proposal],
     calibration: Calibration,
     respond: Respond,
-) -> Closest | None:
+) -> PartialExplanation | None:
     """What of the library is heard in evidence, each set simulated together at its amplitudes."""
-    return closest(null, x, t, candidates, calibration, partial(_together, null, x, candidates, proposals, respond))
+    return partial_explanation(
+        null, x, t, candidates, calibration, partial(_together, null, x, candidates, proposals, respond)
+    )
 
 
 def _together(
-    null: Null,
+    null: SimulatedGaussian,
     x: Vector,
     candidates: Sequence[Candidate],
     proposals: Sequence[Proposal],
@@ -260,14 +266,14 @@ def _together(
     return None
 
 
-def _beyond(null: Null, t: NDArray[np.float64], at: Vector, response: Vector) -> NDArray[np.float64]:
+def _beyond(null: SimulatedGaussian, t: NDArray[np.float64], at: Vector, response: Vector) -> NDArray[np.float64]:
     """What makes templates, shape (p, k), exact at coordinates: what their simulated response has beyond the sum.
 
     It is shared out by the squares of the white lengths of the parts, so that one that is hardly heard, whatever its
     fitted coordinate, stays what it is.
     """
     parts = t * at
-    weights = np.sum(null.templates(parts) ** 2, axis=0)
+    weights = np.sum(null.whiten_templates(parts) ** 2, axis=0)
     shares = np.divide(weights, at * weights.sum(), out=np.zeros_like(at), where=weights > 0.0)
     return np.outer(response - parts.sum(axis=1), shares)
 
@@ -302,23 +308,23 @@ def _to_try(
     if found.explanations and len(found.explanations[0].members) == 1:
         return list(work.values())
     # Singles too: a strong effect bends its response, and one that draws scatters it, until only a mixture seems to do.
-    ranked = [int(index) for index in np.argsort([-single.drop for single in found.singles])]
+    ranked = [int(index) for index in np.argsort([-single.delta_chi2 for single in found.singles])]
     drawing: set[tuple[str, str | None]] = {candidates[index].identity for index in work if proposals[index].kind.draws}
     for place, index in enumerate(ranked):
         single, candidate = found.singles[index], candidates[index]
-        heard = proposals[index].kind.draws and float(calibration.trials(single.score)) <= TELLING
-        if place < TRIED or (heard and candidate.identity not in drawing):
+        filtered = proposals[index].kind.draws and float(calibration.global_pvalue(single.nested_pvalue)) <= TELLING
+        if place < TRIED or (filtered and candidate.identity not in drawing):
             work.setdefault(index, (index, single.amplitudes, single.covariance))
             if proposals[index].kind.draws:
                 drawing.add(candidate.identity)
     return list(work.values())
 
 
-def _bent(known: Knowledge, null: Null, columns: list[int], coordinates: Vector) -> bool:
+def _bent(known: Knowledge, null: SimulatedGaussian, columns: list[int], coordinates: Vector) -> bool:
     """Whether the second derivative matters at these coordinates."""
     shift = known.curvature[:, columns] @ coordinates**2
     crossed = float(np.sum(np.abs(coordinates)) ** 2) / max(float(coordinates @ coordinates), 1e-300)
-    return crossed * float(np.linalg.norm(null.templates(shift[:, None]))) > STRAIGHT
+    return crossed * float(np.linalg.norm(null.whiten_templates(shift[:, None]))) > STRAIGHT
 
 
 def _settled(before: Vector, now: Fit) -> bool:

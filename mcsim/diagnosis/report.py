@@ -14,8 +14,8 @@ import jinja2
 from matplotlib.figure import Figure
 
 from mcsim.diagnosis import figures as plots
-from mcsim.diagnosis.case import Diagnosis
-from mcsim.diagnosis.reading import APART, Reading
+from mcsim.diagnosis.inference import Diagnosis
+from mcsim.diagnosis.view import APART, ReportView
 
 DOTS_PER_INCH = 120
 
@@ -49,7 +49,7 @@ def write(diagnosis: Diagnosis, path: str | Path) -> None:
 
 def page(diagnosis: Diagnosis) -> str:
     """The page as text; whatever comes from configurations or data is escaped."""
-    reading = Reading(diagnosis.verdict, diagnosis.evidence)
+    view = ReportView(diagnosis.verdict, diagnosis.evidence)
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -66,11 +66,11 @@ def page(diagnosis: Diagnosis) -> str:
     return environment.get_template("report.html.j2").render(
         verdict=diagnosis.verdict,
         sentence=plots.sentence_for_people(diagnosis),
-        sets=_sets(reading),
-        reading=reading,
-        pictures=_pictures(reading),
-        contrasts=[(one, _picture(plots.telling_figure(one), _telling_words(one))) for one in reading.contrasts],
-        settings=_settings(reading),
+        sets=_sets(view),
+        view=view,
+        pictures=_pictures(view),
+        contrasts=[(one, _picture(plots.telling_figure(one), _telling_words(one))) for one in view.contrasts],
+        settings=_settings(view),
         configuration=json.dumps(json.loads(diagnosis.evidence.attrs["configuration"]), indent=2, ensure_ascii=False),
         apart=APART,
         version=version("mcsim"),
@@ -129,42 +129,42 @@ def _power(exponent: int) -> str:
     return "10" + str(exponent).translate(_SUPERSCRIPTS)
 
 
-def _sets(reading: Reading) -> list[dict[str, Any]]:
+def _sets(view: ReportView) -> list[dict[str, Any]]:
     """Accepted sets, the most probable first, with odds and probability of what each leaves."""
-    verdict = reading.verdict
+    verdict = view.verdict
     effects = [verdict["effects"], *verdict["alternatives"]] if verdict["effects"] else []
     return [
         {"effects": one, "odds": stated["odds"], "p": stated["probability"], "further": stated["further"]}
-        for one, stated in zip(effects, reading.explanations, strict=True)
+        for one, stated in zip(effects, view.explanations, strict=True)
     ]
 
 
-def _settings(reading: Reading) -> list[tuple[str, str]]:
-    rows = [(key.replace("_", " "), str(value)) for key, value in reading.evidence.attrs.items() if key not in _DATA]
-    run = json.loads(reading.evidence.attrs["configuration"])
+def _settings(view: ReportView) -> list[tuple[str, str]]:
+    rows = [(key.replace("_", " "), str(value)) for key, value in view.evidence.attrs.items() if key not in _DATA]
+    run = json.loads(view.evidence.attrs["configuration"])
     return [*rows, ("seed of the run", str(run.get("ensemble", {}).get("seed", "–")))]
 
 
-def _pictures(reading: Reading) -> dict[str, Picture]:
-    gap, best = reading.gap, reading.ranked[0]
+def _pictures(view: ReportView) -> dict[str, Picture]:
+    gap, best = view.excess, view.ranked[0]
     change = f", {gap.after:.0f} after" if gap.after is not None else ""
-    largest = max(zip(abs(reading.z), reading.entries, strict=True), key=lambda pair: pair[0])
+    largest = max(zip(abs(view.z), view.elements, strict=True), key=lambda pair: pair[0])
     figures: dict[str, tuple[Figure | None, str]] = {
-        "gap": (plots.gap_figure(reading), f"Bars: gap of {gap.before:.0f} before{change}; {gap.words}."),
+        "gap": (plots.gap_figure(view), f"Bars: gap of {gap.before:.0f} before{change}; {gap.words}."),
         "impacts": (
-            plots.impacts_figure(reading),
+            plots.impacts_figure(view),
             f"Bars: candidates fitted alone, ranked; first {best.label} with {best.impact:.1f} sigmas.",
         ),
         "blocks": (
-            plots.blocks_figure(reading),
+            plots.blocks_figure(view),
             f"Table of deviates by kind and map; the largest is {largest[0]:.1f} sigmas, {largest[1]['kind']}.",
         ),
-        "entries": (plots.entries_figure(reading), "Points: deviate of every entry, before and after the fit."),
-        "residual": (plots.residual_figure(reading), "Sky maps of what is left of each map, over its noise."),
-        "correlation": (plots.correlation_figure(reading), "Matrix: correlation of the responses of the candidates."),
-        "isolation": (plots.isolation_figure(reading), "Matrix: strength at which two candidates are told apart."),
+        "entries": (plots.entries_figure(view), "Points: deviate of every entry, before and after the fit."),
+        "residual": (plots.residual_figure(view), "Sky maps of what is left of each map, over its noise."),
+        "correlation": (plots.correlation_figure(view), "Matrix: correlation of the responses of the candidates."),
+        "isolation": (plots.isolation_figure(view), "Matrix: strength at which two candidates are told apart."),
         "calibration": (
-            plots.calibration_figure(reading),
+            plots.calibration_figure(view),
             "Histogram of probabilities of simulations held out, and the data's among draws without a gap.",
         ),
     }

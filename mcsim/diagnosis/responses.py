@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config, systematics
-from mcsim.diagnosis.evidence import Questions
+from mcsim.diagnosis.analysis import Analysis
 from mcsim.diagnosis.knowledge import CONSTRAINED_SKIES, Ask, Knowledge, after_jobs, constrained_jobs
 
 Rows = NDArray[np.float64]
@@ -26,10 +26,10 @@ class Responses:
     """
 
     def __init__(
-        self, run: config.RunConfig, asked: Questions, known: Knowledge, observed: NDArray[np.complex128], ask: Ask
+        self, run: config.RunConfig, analysis: Analysis, known: Knowledge, observed: NDArray[np.complex128], ask: Ask
     ) -> None:
-        self._run, self._asked, self._known, self._observed, self._ask = run, asked, known, observed, ask
-        self._without: Rows = np.zeros((0, len(asked.entries)))
+        self._run, self._asked, self._known, self._observed, self._ask = run, analysis, known, observed, ask
+        self._without: Rows = np.zeros((0, len(analysis.elements)))
 
     def __call__(self, found: Sequence[config.Effect], skies: int) -> Rows:
         """Changes of the evidence, a row for every sky, shape (rows, entries).

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mcsim.stats.detection import log_evidence
-from mcsim.stats.gaussian import COLLINEAR, Bases, Null, residual_probability, score_probability
+from mcsim.stats.gaussian import COLLINEAR, SimulatedGaussian, WhitenedTemplates, nested_pvalue, residual_pvalue
 from mcsim.stats.look_elsewhere import Calibration
 
 # Widths of the amplitudes' prior in standard deviations: flat in the logarithm, from what can hardly be seen to what
@@ -24,7 +24,7 @@ class Solved:
     """Fits of many subsets, shape (M,) each."""
 
     chi2: NDArray[np.float64]
-    probability: NDArray[np.float64]
+    pvalue: NDArray[np.float64]
     evidence: NDArray[np.float64]
     allowance: NDArray[np.float64]
 
@@ -49,9 +49,9 @@ class Subsets:
 
     def __init__(
         self,
-        null: Null,
+        null: SimulatedGaussian,
         y: NDArray[np.float64],
-        groups: Bases,
+        groups: WhitenedTemplates,
         names: Sequence[Hashable],
         prior: NDArray[np.float64],
         errors: NDArray[np.float64],
@@ -73,9 +73,9 @@ class Subsets:
 
     def rows(self, size: int, accepted: Sequence[tuple[int, ...]]) -> Iterator[NDArray[np.int64]]:
         """Subsets without rivals or an accepted part, shape (M, size), all of the same ranks."""
-        heard = np.flatnonzero(self.sizes > 0)
-        heard = heard[np.argsort(self.sizes[heard], kind="stable")]
-        rows = np.array(list(combinations(heard, size)), dtype=np.int64).reshape(-1, size)
+        filtered = np.flatnonzero(self.sizes > 0)
+        filtered = filtered[np.argsort(self.sizes[filtered], kind="stable")]
+        rows = np.array(list(combinations(filtered, size)), dtype=np.int64).reshape(-1, size)
         kept = np.ones(len(rows), dtype=bool)
         for i, j in combinations(range(size), 2):
             kept &= self.identity[rows[:, i]] != self.identity[rows[:, j]]
@@ -105,15 +105,15 @@ class Subsets:
         K, null = columns.shape[1], self.null
         score = self.score[columns]
         fitted = np.linalg.solve(self._matrix(columns), score[:, :, None])[:, :, 0]
-        drop = np.minimum(np.sum(score * fitted, axis=1), self.total)
+        delta_chi2 = np.minimum(np.sum(score * fitted, axis=1), self.total)
         part = np.zeros((count, size))
         np.add.at(part.T, place, fitted.T**2)
-        allowance = np.sum(self.errors[subsets] ** 2 * np.minimum(part, drop[:, None]), axis=1)
+        allowance = np.sum(self.errors[subsets] ** 2 * np.minimum(part, delta_chi2[:, None]), axis=1)
         prior = special.gammaln(size + 1) + self.log_prior[subsets].sum(axis=1)
         return Solved(
-            chi2=self.total - drop,
-            probability=residual_probability(self.total - drop, null.dimension - K, null.dof, allowance),
-            evidence=log_evidence(null, self.total, drop, K, WIDTHS) + prior,
+            chi2=self.total - delta_chi2,
+            pvalue=residual_pvalue(self.total - delta_chi2, null.dimension - K, null.dof, allowance),
+            evidence=log_evidence(null, self.total, delta_chi2, K, WIDTHS) + prior,
             allowance=allowance,
         )
 
@@ -131,8 +131,8 @@ class Subsets:
                 chi2, allowance = without.chi2, without.allowance
             rank = self.sizes[subsets[:, place]]
             dimension = self.null.dimension - (self.sizes[subsets].sum(axis=1) - rank)
-            scores = score_probability(chi2 - whole.chi2, chi2, rank, dimension, self.null.dof, allowance)
-            largest = np.maximum(largest, self.calibration.trials(scores))
+            scores = nested_pvalue(chi2 - whole.chi2, chi2, rank, dimension, self.null.dof, allowance)
+            largest = np.maximum(largest, self.calibration.global_pvalue(scores))
         return largest
 
     def further(
@@ -155,11 +155,16 @@ class Subsets:
             )
             values, vectors = np.linalg.eigh(block)
             along = np.einsum("mcij,mci->mcj", vectors, left[:, index])
-            heard = values > COLLINEAR
-            drop = np.sum(np.where(heard, along**2 / np.where(heard, values, 1.0), 0.0), axis=-1)
-            scores = score_probability(
-                drop, chi2[:, None], heard.sum(axis=-1), self.null.dimension - K, self.null.dof, allowance[:, None]
+            filtered = values > COLLINEAR
+            delta_chi2 = np.sum(np.where(filtered, along**2 / np.where(filtered, values, 1.0), 0.0), axis=-1)
+            scores = nested_pvalue(
+                delta_chi2,
+                chi2[:, None],
+                filtered.sum(axis=-1),
+                self.null.dimension - K,
+                self.null.dof,
+                allowance[:, None],
             )
             rivals = np.any(self.identity[subsets][:, :, None] == self.identity[others], axis=1)
             smallest = np.minimum(smallest, np.where(rivals, 1.0, scores).min(axis=1))
-        return self.calibration.trials(smallest)
+        return self.calibration.global_pvalue(smallest)

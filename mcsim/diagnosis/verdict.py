@@ -6,15 +6,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.attribute import Attribution, Explanation
+from mcsim.diagnosis.analysis import Proposal
 from mcsim.diagnosis.candidate import Candidate, parts_of
-from mcsim.diagnosis.closest import Closest
-from mcsim.diagnosis.evidence import Proposal
+from mcsim.diagnosis.partial_explanation import PartialExplanation
 from mcsim.diagnosis.refine import effect_at
-from mcsim.diagnosis.shrink import Prediction, Shrink
+from mcsim.diagnosis.selection import Attribution, Explanation
+from mcsim.diagnosis.validation import Prediction, Shrink
 from mcsim.diagnosis.where import Place
 from mcsim.stats.detection import detectable
-from mcsim.stats.gaussian import Null
+from mcsim.stats.gaussian import SimulatedGaussian
 
 SCHEMA = 1
 PLACES = 12
@@ -23,7 +23,7 @@ SETS = 2
 
 
 def effects_of(
-    explanation: Explanation | Closest, candidates: Sequence[Candidate], proposals: Sequence[Proposal]
+    explanation: Explanation | PartialExplanation, candidates: Sequence[Candidate], proposals: Sequence[Proposal]
 ) -> list[dict[str, Any]]:
     """The effects of a set with amplitude, standard error, unit and parameters."""
     found = []
@@ -49,11 +49,11 @@ def _sigma(proposal: Proposal, theta: NDArray[np.float64], covariance: NDArray[n
     """
     scale = np.sqrt(np.diag(covariance))
     precision = np.asarray(np.linalg.pinv(covariance), dtype=np.float64)
-    told = proposal.kind.told(theta, precision)
+    constrained = proposal.kind.constrained(theta, precision)
     slopes: NDArray[np.float64] = np.zeros(len(theta))
-    for k in np.flatnonzero((scale > 0.0) & ((told != 0.0) | (theta == 0.0))):
+    for k in np.flatnonzero((scale > 0.0) & ((constrained != 0.0) | (theta == 0.0))):
         step = scale[k] * np.eye(len(theta))[k]
-        up, down = (proposal.with_parameters(told + side, precision).amplitude for side in (step, -step))
+        up, down = (proposal.with_parameters(constrained + sign, precision).amplitude for sign in (step, -step))
         slopes[k] = (up - down) / (2.0 * scale[k])
     return float(np.sqrt(max(float(slopes @ covariance @ slopes), 0.0)))
 
@@ -64,7 +64,7 @@ def _plain(value: Any) -> Any:
 
 def where_of(place: Place) -> dict[str, Any]:
     """A place, as JSON has it."""
-    e = place.entry
+    e = place.element
     return {
         "statistic": {"score": "map", "noise": "cl"}.get(e.statistic, e.statistic),
         "channels": list(e.channels),
@@ -80,7 +80,7 @@ def where_of(place: Place) -> dict[str, Any]:
 
 
 def detectable_of(
-    null: Null, t: NDArray[np.float64], candidates: Sequence[Candidate], proposals: Sequence[Proposal]
+    null: SimulatedGaussian, t: NDArray[np.float64], candidates: Sequence[Candidate], proposals: Sequence[Proposal]
 ) -> list[dict[str, Any]]:
     """Smallest amplitude of every candidate that is found in nine cases of ten, root mean square over directions."""
     found = []
@@ -104,7 +104,7 @@ def verdict_of(
     shrink: tuple[Prediction, Shrink, str] | None,
     able: Sequence[Mapping[str, Any]],
     notes: Sequence[str],
-    heard: Closest | None = None,
+    filtered: PartialExplanation | None = None,
 ) -> dict[str, Any]:
     """``verdict.json``, schema 1; ``heard`` goes with "unknown"."""
     sets = [effects_of(explanation, candidates, proposals) for explanation in found.explanations]
@@ -112,7 +112,7 @@ def verdict_of(
     result: dict[str, Any] = {
         "schema": SCHEMA,
         "case": case,
-        "gap": {"p_value": found.gap.probability, "statistic": found.gap.chi2, "dof": found.gap.dimension},
+        "gap": {"p_value": found.gap.pvalue, "statistic": found.gap.chi2, "dof": found.gap.dimension},
         "verdict": found.verdict,
         "effects": sets[0] if sets else [],
         "alternatives": sets[1:],
@@ -120,8 +120,8 @@ def verdict_of(
         "where": [where_of(place) for place in where[:PLACES]],
         "shrink": None,
         "nearest": {"name": nearest.kind.name, "channel": nearest.channel, "cosine": found.cosine},
-        "heard": [] if heard is None else effects_of(heard, candidates, proposals),
-        "left": None if heard is None else heard.left,
+        "heard": [] if filtered is None else effects_of(filtered, candidates, proposals),
+        "left": None if filtered is None else filtered.left,
         "detectable": list(able),
         "notes": list(notes),
     }

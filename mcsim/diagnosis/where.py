@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.blocks import Entry
-from mcsim.stats.look_elsewhere import atlas
+from mcsim.diagnosis.summaries import Element
+from mcsim.stats.look_elsewhere import scan_pvalues
 
 SIGNIFICANT = 0.01
 """Probability, trials included, up to which a group is brought before others of a kind that is listed already."""
@@ -29,13 +29,13 @@ class Place:
         Deviate of that number alone.
     """
 
-    entry: Entry
+    element: Element
     z: float
     p: float
     peak: float
 
 
-def places(x: NDArray[np.float64], simulations: NDArray[np.float64], entries: Sequence[Entry]) -> list[Place]:
+def places(x: NDArray[np.float64], simulations: NDArray[np.float64], elements: Sequence[Element]) -> list[Place]:
     """Groups of entries, the one that departs most first, and of each kind one before the others of it.
 
     Parameters
@@ -58,12 +58,12 @@ def places(x: NDArray[np.float64], simulations: NDArray[np.float64], entries: Se
     deviates = (x - mean) / spread / np.sqrt(1.0 + 1.0 / count)
     others = (simulations - mean) / spread
     groups: dict[tuple[object, ...], list[int]] = {}
-    for number, e in enumerate(entries):
+    for number, e in enumerate(elements):
         groups.setdefault((e.statistic, e.channels, e.split, e.frame, e.L, e.M, e.parity), []).append(number)
     rows = list(groups.values())
     found = np.array([np.mean(deviates[row] ** 2) for row in rows])
     drawn = np.stack([np.mean(others[:, row] ** 2, axis=1) for row in rows], axis=1)
-    z, p = atlas(np.cbrt(found), np.cbrt(drawn))
+    z, p = scan_pvalues(np.cbrt(found), np.cbrt(drawn))
     # Too quiet a group is no place of a gap.
     p = np.where(z > 0, p, 1.0)
     firsts: list[Place] = []
@@ -72,8 +72,8 @@ def places(x: NDArray[np.float64], simulations: NDArray[np.float64], entries: Se
     for group in np.argsort(-z):
         row = rows[group]
         peak = row[int(np.argmax(np.abs(deviates[row])))]
-        place = Place(entries[peak], float(z[group]), float(p[group]), float(deviates[peak]))
-        kind = (place.entry.frame, place.entry.L, place.entry.parity)
+        place = Place(elements[peak], float(z[group]), float(p[group]), float(deviates[peak]))
+        kind = (place.element.frame, place.element.L, place.element.parity)
         new = kind not in seen and (place.p <= SIGNIFICANT or not seen)
         (firsts if new else others_of_kind).append(place)
         seen.add(kind)

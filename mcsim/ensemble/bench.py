@@ -29,6 +29,7 @@ def bench(nside: int = 512, lmax: int = 1024, repeats: int = 5) -> Iterator[str]
     repeats
         Pairs of timings, of the bare transforms and of the realization in turn; medians of their ratios are given.
     """
+    _run(nside, lmax, 0.0, 1)  # refuses sizes that do not fit
     yield f"nside {nside}, lmax {lmax}, m_max 2, L_max 2, paired; one thread; medians of {repeats} interleaved pairs"
     yield from _realization(nside, lmax, repeats)
     yield from _workers(nside, lmax, 16 * repeats)

@@ -85,6 +85,7 @@ def layout(survey: Survey) -> Layout:
         survey.lmax,
         run.ensemble.paired,
         12 * run.map.resolution**2 if run.ensemble.keep_maps else None,
+        frame=run.map.frame,
     )
     return _chunked(bare, run.compute.chunk)
 
@@ -152,7 +153,7 @@ def check_mergeable(path: Path, first: Mapping[str, Any], other: Path, second: M
 
 def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """What keeps two stores' attributes from describing rows of one ensemble: science, kept maps, mcsim itself."""
-    changes = config.differences(old["science"], new["science"])
+    changes = [change for change in config.differences(old["science"], new["science"]) if not _of_summary(change)]
     for key, before, after in (
         ("ensemble.keep_maps", *(a["configuration"]["ensemble"]["keep_maps"] for a in (old, new))),
         ("version of mcsim", *(a["packages"]["mcsim"] for a in (old, new))),
@@ -160,6 +161,11 @@ def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
         if before != after:
             changes.append(f"{key}: {before} -> {after}")
     return changes
+
+
+def _of_summary(change: str) -> bool:
+    """Whether a difference is of the summary alone; earlier versions took its bins for a part of the science."""
+    return change.startswith("biposh.summary_bin: ")
 
 
 def stored(path: Path, realizations: int) -> tuple[Layout, summary.Recipe]:
@@ -173,7 +179,9 @@ def stored(path: Path, realizations: int) -> tuple[Layout, summary.Recipe]:
         stored_modes = tuple(
             Mode(int(L), int(M), int(d)) for L, M, d in zip(found["L"], found["M"], found["d"], strict=True)
         )
-    layout = Layout(realizations, store.chunk(path), maps, pairs, stored_modes, lmax, paired, kept)
+    layout = Layout(
+        realizations, store.chunk(path), maps, pairs, stored_modes, lmax, paired, kept, frame=attrs["map"]["frame"]
+    )
     return layout, summary.Recipe(pairs, stored_modes, lmax, attrs["biposh"]["summary_bin"], paired)
 
 

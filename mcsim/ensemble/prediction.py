@@ -1,6 +1,5 @@
 """From a configuration to what its ensemble should give: means, errors and detectability, without Monte Carlo."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,7 +27,6 @@ from mcsim.bipolar.theory import (
 )
 from mcsim.bipolar.theory.harmonics import spin_functions
 from mcsim.ensemble import plan, summary
-from mcsim.ensemble.describe import table
 from mcsim.errors import InputError
 from mcsim.simulation import survey as survey_
 from mcsim.simulation.rings import Rings
@@ -76,8 +74,9 @@ def predict(
     xarray.Dataset
         Laid out like :func:`mcsim.open_summary`, so that the two subtract: ``{biposh, cl}{, _circular,
         _difference}_mean`` in uK^2, raw and binned. ``_standard_deviation`` and ``_standard_error`` are those of an
-        isotropic sky, the error for ``ensemble.realizations`` of the configuration; of the difference to the circular
-        twin, whose scatter is not that of an isotropic sky, they are NaN. Attributes say what is left out.
+        isotropic sky, the error for ``ensemble.realizations`` of the configuration; of the difference to the
+        circular-beam control, whose scatter is not that of an isotropic sky, they are NaN. Attributes say what is left
+        out.
 
     Raises
     ------
@@ -148,54 +147,6 @@ def without_windows(
         l2 = np.flatnonzero(existing(L, d, survey.lmax))
         row[l2] /= windows[pair[0]][l2 - d] * windows[pair[1]][l2]
     return result
-
-
-def describe(prediction: xr.Dataset, count: int = 8) -> str:
-    """Text about a prediction: its order, and the spectra that stand out most of the scatter of one sky."""
-    attrs = prediction.attrs
-    lines = [f"{attrs['name']}: {attrs['prediction']}, f_sky = {attrs['f_sky']:.3g}, {attrs['frame']} frame"]
-    if "signal_to_noise" not in prediction:
-        return lines[0]
-    total = float(prediction["signal_to_noise_total"])
-    lines.append(f"  signal to noise of one sky, all maps and modes jointly: {total:.4g}")
-    if np.isinf(total):
-        lines.append("  (maps without noise see the same sky through different beams: nothing hides the beams)")
-    each = prediction["signal_to_noise"].stack(spectrum=("pair", "mode")).fillna(0.0)
-    strongest = float(each.max())
-    for index in np.argsort(-each.values)[:count]:
-        if each[index] <= 1e-6 * strongest:
-            break
-        pair, mode = each["spectrum"].values[index]
-        bins = prediction["signal_to_noise_binned"].sel(pair=pair, mode=mode)
-        place = int(bins.fillna(0.0).argmax("bin"))
-        at = f"l = {int(bins['bin_first'][place])}-{int(bins['bin_last'][place])}"
-        lines.append(f"    {pair}  {mode:8s} {float(each[index]):8.3g}, most of it at {at} ({float(bins[place]):.3g})")
-    return "\n".join(lines)
-
-
-def write(prediction: xr.Dataset, output: str | Path) -> None:
-    """Write a prediction as a Zarr group (``.zarr``), or its binned spectra as an ECSV table (``.ecsv``).
-
-    Raises
-    ------
-    InputError
-        For another ending, a Zarr group that exists, or an output that cannot be written.
-    """
-    target = Path(output)
-    try:
-        if target.suffix == ".zarr":
-            if target.exists():
-                raise InputError(f"{target} exists already; choose another output, or delete it.")
-            with warnings.catch_warnings():
-                # Zarr says that its consolidated metadata and its strings are young.
-                warnings.simplefilter("ignore", category=UserWarning)
-                prediction.to_zarr(target, zarr_format=3, consolidated=True)
-        elif target.suffix == ".ecsv":
-            table(prediction).write(target, format="ascii.ecsv", overwrite=True)
-        else:
-            raise InputError(f"{target} ends in {target.suffix or 'nothing'}; choose .zarr or .ecsv (table).")
-    except OSError as error:
-        raise InputError(f"{target} cannot be written ({error.strerror or error}); choose another file.") from error
 
 
 def _orientations(

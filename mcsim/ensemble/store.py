@@ -5,7 +5,6 @@ chunks, ``done`` last. Nothing but ``done`` says that a realization exists.
 """
 
 import os
-import re
 import shutil
 import tempfile
 import warnings
@@ -27,6 +26,9 @@ from mcsim.errors import InputError, RunError
 _CODECS: dict[str, Any] = {"compressors": (ZstdCodec(level=1, checksum=True),)}
 # Written even where all is the fill value, so that an array without its file is known as damaged.
 _WHOLE: dict[str, Any] = {"config": {"write_empty_chunks": True}, **_CODECS}
+MAP, FORMER_MAP = "observed_map", "map"
+"""Name of kept maps, and that in stores made before it, which keep it; xarray has a method of the former name."""
+
 _FAULTS = (OSError, KeyError, ValueError, RuntimeError, TypeError)
 
 
@@ -79,6 +81,8 @@ def create(path: Path, layout: Layout, attributes: Mapping[str, Any]) -> None:
             for name, (dims, dtype, unit, text) in layout.variables().items():
                 shape = tuple(sizes[dim] for dim in ("realization", *dims))
                 _array(group, name, shape, (layout.chunk, *shape[1:]), dtype, ("realization", *dims), unit, text)
+            if layout.kept_npix is not None:
+                group[layout.kept_name].attrs.update(layout.kept_attributes())
             _array(group, "done", (layout.realizations,), (layout.chunk,), "bool", ("realization",), "1", "finished")
             _consolidate(scratch / "new")
             os.replace(scratch / "new", path)
@@ -100,7 +104,7 @@ def write(path: Path, first: int, values: Mapping[str, NDArray], done: NDArray[n
         group = _open(path, "r+")
         stop = first + len(done)
         for name, rows in values.items():
-            _member(group, name)[first:stop] = rows
+            _member(group, FORMER_MAP if name == MAP and name not in group else name)[first:stop] = rows
         _member(group, "done")[first:stop] = done
 
 
@@ -114,9 +118,9 @@ def read(path: Path, start: int, stop: int, maps: bool = False) -> dict[str, NDA
     """
     with _faults_named(path):
         group = _open(path)
-        left_out = {"realization"} if maps else {"realization", "map"}
+        left_out = {"realization"} if maps else {"realization", MAP, FORMER_MAP}
         found = {name: array for name, array in group.arrays() if name not in left_out and _over_realizations(array)}
-        rows = {name: np.asarray(array[start:stop]) for name, array in found.items()}
+        rows = {MAP if name == FORMER_MAP else name: np.asarray(array[start:stop]) for name, array in found.items()}
     absent = _absent(rows)
     if absent.any():
         raise RunError(
@@ -181,7 +185,8 @@ def restore(path: Path, layout: Layout, update: Mapping[str, Any]) -> None:
     with _faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
         shutil.rmtree(path / "summary", ignore_errors=True)
         made = _remembered(path)["done"]
-        layout = replace(layout, realizations=made.shape[0], chunk=made.chunk_grid.chunk_shape[0])
+        kept = FORMER_MAP if FORMER_MAP in _remembered(path) else MAP
+        layout = replace(layout, realizations=made.shape[0], chunk=made.chunk_grid.chunk_shape[0], kept_name=kept)
         fresh = Path(scratch) / "fresh"
         create(fresh, layout, {**attributes(path), **update})
         for file in sorted(fresh.rglob("*")):
@@ -189,18 +194,6 @@ def restore(path: Path, layout: Layout, update: Mapping[str, Any]) -> None:
             if file.is_file():
                 target.parent.mkdir(parents=True, exist_ok=True)
                 os.replace(file, target)
-
-
-def sweep(path: Path) -> None:
-    """Remove what writers that were killed left: halves of files, and folders that never got their name."""
-    for left in path.rglob("*.partial"):
-        left.unlink(missing_ok=True)
-    scratch = re.compile(rf"\.{re.escape(path.name)}\.[a-z0-9_]{{8}}")  # as tempfile names them
-    for left in [entry for entry in path.absolute().parent.iterdir() if scratch.fullmatch(entry.name)]:
-        if left.is_dir():
-            shutil.rmtree(left, ignore_errors=True)
-        else:
-            left.unlink(missing_ok=True)
 
 
 def variables(path: Path) -> list[str]:
@@ -278,12 +271,21 @@ def write_summary(path: Path, summary: xr.Dataset) -> None:
         _consolidate(path)
 
 
-def summarised(path: Path) -> int:
-    """Number of realizations that the summary speaks of; 0 without one."""
-    if not (path / "summary").is_dir():
-        return 0
+def amend(path: Path, update: Mapping[str, Any]) -> None:
+    """Change attributes of a store."""
     with _faults_named(path):
-        return int(np.asarray(_member(_open(path / "summary"), "count")[()]))
+        _open(path, "r+").attrs.update(update)
+        _consolidate(path)
+
+
+def summarised(path: Path) -> tuple[int, list[int]]:
+    """Number of realizations that the summary speaks of, 0 without one, and the first ell of each of its bins."""
+    if not (path / "summary").is_dir():
+        return 0, []
+    with _faults_named(path):
+        group = _open(path / "summary")
+        count, first = (np.asarray(_member(group, name)[...]) for name in ("count", "bin_first"))
+        return int(count), first.tolist()
 
 
 def open_ensemble(path: str | Path) -> xr.Dataset:
@@ -292,9 +294,9 @@ def open_ensemble(path: str | Path) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        ``biposh``, ``cl``, their circular twins, ``done``; coordinates realization, pair, mode (with L, M, d, parity),
-        ell.
-        ``.sel(mode="L2M0d0")`` picks a spectrum.
+        ``biposh``, ``cl``, their circular-beam controls, with kept maps ``observed_map`` (in stores of earlier versions
+        ``map``), lazily; in memory ``done`` and the coordinates realization, pair, mode (with L, M, d, parity), ell.
+        ``.sel(mode="L2M0d0")`` picks a spectrum, ``.where(ds.L == 2, drop=True)`` all of one L.
 
     Raises
     ------
@@ -302,8 +304,7 @@ def open_ensemble(path: str | Path) -> xr.Dataset:
         If there is no store at ``path``.
     """
     attributes(Path(path))
-    with _faults_named(Path(path)):
-        return xr.open_zarr(path)
+    return _opened(Path(path), None)
 
 
 def open_summary(path: str | Path) -> xr.Dataset:
@@ -319,8 +320,16 @@ def open_summary(path: str | Path) -> xr.Dataset:
         raise InputError(
             f"{path} has no summary, because no run on it has ended yet; continue it with mcsim run --resume."
         )
-    with _faults_named(Path(path)):
-        return xr.open_zarr(path, group="summary")
+    return _opened(Path(path), "summary")
+
+
+def _opened(path: Path, group: str | None) -> xr.Dataset:
+    """A group, lazily but for its coordinates and ``done``: xarray chooses rows by values that it has in memory."""
+    with _faults_named(path):
+        found = xr.open_zarr(path, group=group)
+        for name in {*found.coords, "done"} & {*found.variables}:
+            found.variables[name].load()
+        return found
 
 
 def _write_coordinates(group: zarr.Group, layout: Layout) -> None:

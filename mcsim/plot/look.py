@@ -42,8 +42,13 @@ def look_at_beams(
         Side of a pixel of a beam map, degrees; by default its header's.
     """
     path = Path(source)
+    if path.is_dir() or (not path.exists() and path.suffix not in ("", ".toml")):
+        what = "is a folder" if path.is_dir() else "does not exist"
+        raise InputError(f"{path} {what}; give a beam map or b_lm (FITS), or a configuration.")
     if path.suffix == ".toml" or not path.exists():
         run = config.load(source)
+        if pixel_deg is not None:
+            raise InputError(f"{source} is a configuration, which says pixel_deg itself; leave out --pixel-deg.")
         for channel in run.channels:
             spec = channel.beam
             image = channels.load_beam_map(channel.name, spec) if isinstance(spec, config.BeamMap) else None

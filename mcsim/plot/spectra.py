@@ -68,7 +68,8 @@ def _matching(prediction: xr.Dataset, pair: str, modes: xr.Dataset) -> xr.Datase
         return prediction.sel(pair=pair, mode=modes["mode"].values)
     except KeyError as error:
         raise InputError(
-            f"The prediction has no {error.args[0]}, which the ensemble has; predict from the ensemble's configuration."
+            f"The prediction lacks the pair {pair} or one of its modes ({error.args[0]}); predict from the "
+            "configuration of the ensemble."
         ) from None
 
 
@@ -92,7 +93,7 @@ def _draw(modes: xr.Dataset, panels: list[tuple[int, int]], title: str, expected
         axes.legend(fontsize=8, frameon=False)
     notes = [r"$\hat{A}$: Bennett normalisation (odd parity: see bin_factor)"]
     if paired:
-        notes += ["points: non-circular minus circular twin", "band (M = 0): plain mean and its standard error"]
+        notes += ["points: non-circular minus circular-beam control", "band (M = 0): plain mean and its standard error"]
     if expected is not None:
         notes.append(f"dashed: prediction, {expected.attrs['prediction']}")
     figure.supxlabel(";  ".join(notes), fontsize=9)

@@ -11,6 +11,7 @@ from mcsim import config, systematics
 from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
 from mcsim.instrument.beams.turn import mirrored, rotated
+from mcsim.sphere import alm as alm_
 from mcsim.sphere import rotation
 from mcsim.support import resources
 
@@ -84,6 +85,27 @@ def effects_on(run: config.RunConfig, channel: str) -> tuple[systematics.Effect,
         if entry.channel in (None, channel):
             acting.append(effect)
     return tuple(acting)
+
+
+def check_effects(run: config.RunConfig) -> None:
+    """Refuse a run with an effect that is not known, or cannot act where it is put; no map is made.
+
+    Raises
+    ------
+    InputError
+        As a run of it would.
+    """
+    for spec in run.channels:
+        acting = effects_on(run, spec.name)
+        if not acting:
+            continue
+        if run.map.grid == "gl":
+            refuse_pixel_effects(spec.name, acting)
+        site = site_of(run, spec)
+        systematics.seen_through(acting, site)
+        systematics.looked_at(acting, np.zeros(alm_.size(site.lmax), complex), site, run.ensemble.seed, 0)
+        for effect in acting:
+            effect.gain(np.zeros(1), site)
 
 
 def refuse_pixel_effects(channel: str, acting: tuple[systematics.Effect, ...]) -> None:

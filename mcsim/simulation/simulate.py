@@ -48,7 +48,7 @@ def realize(survey: Survey, realization: int, nthreads: int = 1) -> dict[str, ND
     -------
     dict
         ``biposh`` (pair, mode, lmax + 1) complex and ``cl`` (pair, lmax + 1), uK^2; with pairing the same of the
-        circular twin, ``biposh_circular`` and ``cl_circular``; with kept maps ``map`` (map, npix), uK.
+        circular twin, ``biposh_circular`` and ``cl_circular``; with kept maps ``observed_map`` (map, npix), uK.
     """
     ensemble = survey.config.ensemble
     sky = draw_sky(survey, realization)
@@ -58,7 +58,7 @@ def realize(survey: Survey, realization: int, nthreads: int = 1) -> dict[str, ND
     if ensemble.paired:
         result |= _spectra(survey, [o.circular for o in observed if o.circular is not None], "_circular")
     if ensemble.keep_maps:
-        result["map"] = np.stack([o.map_uk for o in observed if o.map_uk is not None])
+        result["observed_map"] = np.stack([o.map_uk for o in observed if o.map_uk is not None])
     return result
 
 

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special, stats
 from scipy.optimize import brentq
 
-from mcsim.stats.gaussian import Bases, Null
+from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates
 
 # Nodes of the average over the part of the data that no template hears.
 NODES = 40
@@ -46,7 +46,7 @@ def power(strength: float, columns: int, threshold: float, dimension: int, simul
     return float(np.mean(1.0 - special.ncfdtr(columns, d2, strength**2 * shrunk, level)))
 
 
-def strength_needed(
+def snr_needed(
     columns: int,
     tests: int,
     dimension: int,
@@ -86,17 +86,19 @@ class Detectable:
     strength: float
 
 
-def detectable(null: Null, t: NDArray[np.float64], tests: int, alpha: float = 0.05, target: float = 0.9) -> Detectable:
+def detectable(
+    null: SimulatedGaussian, t: NDArray[np.float64], tests: int, alpha: float = 0.05, target: float = 0.9
+) -> Detectable:
     """Smallest amplitude of a candidate with columns ``t``, shape (p_raw, K), in one unit.
 
     The strength per amplitude is taken from the estimated metric, less its bias: F = (n - p - 1)/n t_w't_w.
     """
-    white = null.templates(t)
+    white = null.whiten_templates(t)
     response = null.unbiased * np.linalg.eigvalsh(white.T @ white)
     # The evidence may have fewer numbers than the effect has components.
     columns = max(int(np.sum(response > 1e-12 * response[-1])), 1)
-    finite = strength_needed(columns, tests, null.dimension, null.count, alpha, target)
-    limit = strength_needed(columns, tests, null.dimension, None, alpha, target)
+    finite = snr_needed(columns, tests, null.dimension, null.count, alpha, target)
+    limit = snr_needed(columns, tests, null.dimension, None, alpha, target)
     deaf = response[0] <= 1e-12 * response[-1] or response[-1] == 0.0
     least = 0.0 if deaf else float(np.sqrt(response[0]))
     mean = float(np.sqrt(np.mean(np.maximum(response, 0.0))))
@@ -122,7 +124,7 @@ def confusion(strength: ArrayLike, cosine: ArrayLike) -> NDArray[np.float64]:
     return special.ndtr(-a) * special.ndtr(b) + special.ndtr(a) * special.ndtr(-b)
 
 
-def strength_to_isolate(cosine: ArrayLike, target: float = 0.95) -> NDArray[np.float64]:
+def snr_to_separate(cosine: ArrayLike, target: float = 0.95) -> NDArray[np.float64]:
     """Strength at which :func:`confusion` falls to 1 - target; infinite for a cosine of 1."""
     rho = np.abs(np.asarray(cosine, dtype=float))
     far = 1.0 - rho < 1e-12
@@ -134,7 +136,7 @@ def strength_to_isolate(cosine: ArrayLike, target: float = 0.95) -> NDArray[np.f
     return np.where(far, np.inf, high)
 
 
-def cosines(candidates: Bases) -> NDArray[np.float64]:
+def cosines(candidates: WhitenedTemplates) -> NDArray[np.float64]:
     """Largest canonical correlation of each pair of candidates, shape (C, C); 0 for one that is not heard."""
     parts = [candidates.basis[:, a:b] for a, b in pairwise(candidates.start)]
     found = np.eye(len(parts))
@@ -148,7 +150,7 @@ def cosines(candidates: Bases) -> NDArray[np.float64]:
     return found
 
 
-def log_likelihood(null: Null, chi2: ArrayLike) -> NDArray[np.float64]:
+def log_likelihood(null: SimulatedGaussian, chi2: ArrayLike) -> NDArray[np.float64]:
     """Logarithm of the likelihood of a white residual, up to a constant.
 
     Notes
@@ -156,16 +158,16 @@ def log_likelihood(null: Null, chi2: ArrayLike) -> NDArray[np.float64]:
     -(n - p + 2)/2 log(1 + chi2/n): the Student t that the exact tests imply, with the covariance marginalised under the
     prior whose intervals match them (Percival et al., MNRAS 510, 3207, 2022); Gaussian for infinitely many simulations.
     """
-    return null.log_volume - 0.5 * (null.dof - null.dimension + 2.0) * np.log1p(np.asarray(chi2) / null.dof)
+    return null.log_jacobian - 0.5 * (null.dof - null.dimension + 2.0) * np.log1p(np.asarray(chi2) / null.dof)
 
 
-def _precision(null: Null, chi2: ArrayLike) -> NDArray[np.float64]:
+def _precision(null: SimulatedGaussian, chi2: ArrayLike) -> NDArray[np.float64]:
     """Curvature of the likelihood at a best fit, per white square: 1 for infinitely many simulations."""
     return (null.dof - null.dimension + 2.0) / (null.dof + np.asarray(chi2))
 
 
 def log_evidence(
-    null: Null, total: ArrayLike, drop: ArrayLike, columns: ArrayLike, widths: Sequence[float]
+    null: SimulatedGaussian, total: ArrayLike, delta_chi2: ArrayLike, columns: ArrayLike, widths: Sequence[float]
 ) -> NDArray[np.float64]:
     """Logarithm of the marginal likelihood under a broad prior of the amplitudes.
 
@@ -187,7 +189,7 @@ def log_evidence(
     precision w those of :func:`log_likelihood`: Occam's factor of K columns, without the limit that a single width sets
     to strong effects.
     """
-    T, K = np.asarray(drop), np.asarray(columns)
+    T, K = np.asarray(delta_chi2), np.asarray(columns)
     chi2 = np.asarray(total) - T
     g = np.asarray(widths).reshape((-1,) + (1,) * T.ndim) ** 2
     wide = 1.0 + _precision(null, chi2 + T / (1.0 + g)) * g
@@ -196,9 +198,9 @@ def log_evidence(
 
 
 def posterior(
-    null: Null,
+    null: SimulatedGaussian,
     x: NDArray[np.float64],
-    candidates: Bases,
+    candidates: WhitenedTemplates,
     strengths: NDArray[np.float64],
     prior: NDArray[np.float64],
     weights: NDArray[np.float64] | None = None,
@@ -230,9 +232,9 @@ def posterior(
     The direction of an effect of K columns is isotropic in white coordinates, so that the marginal over it is closed:
     exp(-w s^2/2) 0F1(K/2, w^2 s^2 T/4). Against brute force: tests/unit/test_diagnose_attribute.py.
     """
-    y = null.data(x)
+    y = null.whiten(x)
     total = np.sum(y**2, axis=-1, keepdims=True)
-    T, K = candidates.drops(y), candidates.sizes
+    T, K = candidates.delta_chi2(y), candidates.sizes
     w = _precision(null, total - T)[..., None]
     share = np.ones(len(strengths)) if weights is None else np.asarray(weights)
     root = np.sqrt(T)[..., None]

@@ -14,7 +14,7 @@ COLLINEAR = 1e-6
 
 
 @dataclass(frozen=True)
-class Null:
+class SimulatedGaussian:
     """What simulations without the effect say: a mean, and the coordinates in which their scatter is n times one.
 
     Attributes
@@ -32,7 +32,7 @@ class Null:
     mean: NDArray[np.float64]
     whitening: NDArray[np.float64]
     count: int
-    log_volume: float = 0.0
+    log_jacobian: float = 0.0
 
     @property
     def dimension(self) -> int:
@@ -49,28 +49,28 @@ class Null:
         """(n - p - 1)/n: squares in white coordinates times this have the expectation of those in the true metric."""
         return (self.dof - self.dimension - 1) / self.dof
 
-    def data(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def whiten(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """White coordinates of evidence, shape (..., p_raw) to (..., p), less the mean and its own error."""
         return (x - self.mean) @ self.whitening.T / np.sqrt(1.0 + 1.0 / self.count)
 
-    def templates(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """White coordinates of templates, shape (p_raw, K) to (p, K), on the scale of :meth:`data`."""
+    def whiten_templates(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """White coordinates of templates, shape (p_raw, K) to (p, K), on the scale of :meth:`whiten`."""
         return self.whitening @ t / np.sqrt(1.0 + 1.0 / self.count)
 
-    def square(self, x: NDArray[np.float64]) -> float:
+    def chi2(self, x: NDArray[np.float64]) -> float:
         """Square of evidence, shape (p_raw,), in white coordinates."""
-        y = self.data(x)
+        y = self.whiten(x)
         return float(y @ y)
 
-    def probability(self, x: NDArray[np.float64]) -> float:
+    def pvalue(self, x: NDArray[np.float64]) -> float:
         """Probability of a square as large as that of evidence, shape (p_raw,): a test of everything at once."""
-        return float(residual_probability(self.square(x), self.dimension, self.dof))
+        return float(residual_pvalue(self.chi2(x), self.dimension, self.dof))
 
-    def length(self, change: NDArray[np.float64]) -> float:
+    def expected_snr(self, change: NDArray[np.float64]) -> float:
         """White length of a change of the evidence, shape (p_raw,), in standard deviations."""
-        return float(np.sqrt(self.unbiased) * np.linalg.norm(self.templates(change[:, None])))
+        return float(np.sqrt(self.unbiased) * np.linalg.norm(self.whiten_templates(change[:, None])))
 
-    def widened(self, *scatters: NDArray[np.float64]) -> "Null":
+    def with_extra_covariance(self, *scatters: NDArray[np.float64]) -> "SimulatedGaussian":
         """With further Gaussian scatters, each known by draws.
 
         Parameters
@@ -86,15 +86,17 @@ class Null:
         """
         wide = self
         for deviations in scatters:
-            white = np.sqrt(self.unbiased) * wide.templates(deviations)
+            white = np.sqrt(self.unbiased) * wide.whiten_templates(deviations)
             values, vectors = np.linalg.eigh(np.eye(self.dimension) + _shrunk(white))
             turn = (vectors / np.sqrt(values)) @ vectors.T
-            volume = wide.log_volume - 0.5 * float(np.sum(np.log(values)))
-            wide = replace(wide, whitening=turn @ wide.whitening, log_volume=volume)
+            volume = wide.log_jacobian - 0.5 * float(np.sum(np.log(values)))
+            wide = replace(wide, whitening=turn @ wide.whitening, log_jacobian=volume)
         return wide
 
 
-def null(simulations: NDArray[np.float64], offset: NDArray[np.float64] | None = None, floor: float = 1e-8) -> Null:
+def null(
+    simulations: NDArray[np.float64], offset: NDArray[np.float64] | None = None, floor: float = 1e-8
+) -> SimulatedGaussian:
     """Null of an ensemble.
 
     Parameters
@@ -126,7 +128,7 @@ def null(simulations: NDArray[np.float64], offset: NDArray[np.float64] | None = 
             f"{10 * dimension}."
         )
     whitening = np.sqrt(count - 1.0) * right[kept] / singular[kept, None] / scale
-    return Null(mean if offset is None else mean + offset, whitening, count)
+    return SimulatedGaussian(mean if offset is None else mean + offset, whitening, count)
 
 
 def _shrunk(white: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -142,9 +144,7 @@ def _shrunk(white: NDArray[np.float64]) -> NDArray[np.float64]:
     return (1.0 - weight) * found + weight * mean * np.eye(p)
 
 
-def residual_probability(
-    chi2: ArrayLike, dimension: ArrayLike, n: int, allowance: ArrayLike = 0.0
-) -> NDArray[np.float64]:
+def residual_pvalue(chi2: ArrayLike, dimension: ArrayLike, n: int, allowance: ArrayLike = 0.0) -> NDArray[np.float64]:
     """Probability of a white square as large as this in ``dimension`` dimensions.
 
     Parameters
@@ -168,8 +168,8 @@ def residual_probability(
     return np.where(q > 0.0, _tail(f, np.maximum(q, 1.0), n - q + 1.0, allowance), 1.0)
 
 
-def score_probability(
-    drop: ArrayLike, chi2: ArrayLike, columns: ArrayLike, dimension: ArrayLike, n: int, allowance: ArrayLike = 0.0
+def nested_pvalue(
+    delta_chi2: ArrayLike, chi2: ArrayLike, columns: ArrayLike, dimension: ArrayLike, n: int, allowance: ArrayLike = 0.0
 ) -> NDArray[np.float64]:
     """Probability that templates without a part in the data lower chi2 by as much as this.
 
@@ -184,14 +184,14 @@ def score_probability(
     dimension
         Dimensions before: p, less the templates that were fitted already.
     n, allowance
-        As for :func:`residual_probability`.
+        As for :func:`residual_pvalue`.
 
     Notes
     -----
     (n - p + 1)/K drop/(n + chi2 - drop) ~ F(K, n - p + 1): the residual acts as covariates (Rao, Biometrika 46, 49,
     1959). Uniform: tests/statistical/test_diagnose_statistics.py.
     """
-    K, T = np.asarray(columns, dtype=float), np.asarray(drop)
+    K, T = np.asarray(columns, dtype=float), np.asarray(delta_chi2)
     d2 = n - np.asarray(dimension, dtype=float) + 1.0
     f = d2 / np.maximum(K, 1.0) * T / (n + np.maximum(np.asarray(chi2) - T, 0.0))
     return np.where(K > 0.0, _tail(f, np.maximum(K, 1.0), d2, allowance), 1.0)
@@ -222,11 +222,11 @@ class Fit:
     amplitudes: NDArray[np.float64]
     covariance: NDArray[np.float64]
     dof: int
-    drop: float
-    score: float
+    delta_chi2: float
+    nested_pvalue: float
     chi2: float
     dimension: int
-    probability: float
+    pvalue: float
 
     @property
     def errors(self) -> NDArray[np.float64]:
@@ -234,7 +234,7 @@ class Fit:
         return np.sqrt(np.diag(self.covariance))
 
 
-def fit(null: Null, x: NDArray[np.float64], t: NDArray[np.float64]) -> Fit:
+def fit(null: SimulatedGaussian, x: NDArray[np.float64], t: NDArray[np.float64]) -> Fit:
     """Fit templates with the weight S^-1.
 
     Parameters
@@ -252,22 +252,22 @@ def fit(null: Null, x: NDArray[np.float64], t: NDArray[np.float64]) -> Fit:
     t with n - q degrees of freedom; the covariance has its variance, (n + chi2)/(n - q - 2) H^-1. Pulls of unit width:
     tests/statistical/test_diagnose_statistics.py.
     """
-    y = null.data(x)
-    basis, back = orthonormal(null.templates(t))
+    y = null.whiten(x)
+    basis, back = orthonormal(null.whiten_templates(t))
     along = basis.T @ y
     total, n = float(y @ y), null.dof
-    drop = float(along @ along)
-    chi2 = max(total - drop, 0.0)
+    delta_chi2 = float(along @ along)
+    chi2 = max(total - delta_chi2, 0.0)
     q = null.dimension - basis.shape[1]
     return Fit(
         amplitudes=back @ along,
         covariance=(n + chi2) / (n - q - 2) * back @ back.T,
         dof=n - q,
-        drop=drop,
-        score=float(score_probability(drop, total, basis.shape[1], null.dimension, n)),
+        delta_chi2=delta_chi2,
+        nested_pvalue=float(nested_pvalue(delta_chi2, total, basis.shape[1], null.dimension, n)),
         chi2=chi2,
         dimension=q,
-        probability=float(residual_probability(chi2, q, n)),
+        pvalue=float(residual_pvalue(chi2, q, n)),
     )
 
 
@@ -281,7 +281,7 @@ def orthonormal(white: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
 
 
 @dataclass(frozen=True)
-class Bases:
+class WhitenedTemplates:
     """White orthonormal bases of groups of templates, side by side.
 
     Attributes
@@ -303,16 +303,20 @@ class Bases:
         """Rank r_c of each group; 0 where the evidence does not hear it."""
         return np.diff(self.start)
 
-    def drops(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
+    def delta_chi2(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Fall of the white square when each group is fitted alone, shape (..., p) to (..., groups)."""
         cumulative = np.cumsum((y @ self.basis) ** 2, axis=-1)
         padded = np.concatenate([np.zeros((*cumulative.shape[:-1], 1)), cumulative], axis=-1)
         return np.diff(padded[..., self.start], axis=-1)
 
 
-def bases(null: Null, t: NDArray[np.float64], groups: Sequence[Sequence[int]]) -> Bases:
+def whitened_templates(
+    null: SimulatedGaussian, t: NDArray[np.float64], groups: Sequence[Sequence[int]]
+) -> WhitenedTemplates:
     """Bases of groups of columns of the templates ``t``, shape (p_raw, K)."""
-    white = null.templates(t)
+    white = null.whiten_templates(t)
     pairs = [orthonormal(white[:, list(group)]) for group in groups]
     start = np.cumsum([0] + [basis.shape[1] for basis, _ in pairs])
-    return Bases(np.concatenate([basis for basis, _ in pairs], axis=1), start, tuple(back for _, back in pairs))
+    return WhitenedTemplates(
+        np.concatenate([basis for basis, _ in pairs], axis=1), start, tuple(back for _, back in pairs)
+    )

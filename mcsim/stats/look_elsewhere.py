@@ -9,7 +9,7 @@ from scipy.linalg import solve_triangular
 
 from mcsim.errors import InputError
 from mcsim.sphere.rng import generator
-from mcsim.stats.gaussian import COLLINEAR, Bases, Null, residual_probability, score_probability
+from mcsim.stats.gaussian import COLLINEAR, SimulatedGaussian, WhitenedTemplates, nested_pvalue, residual_pvalue
 
 # Scatters drawn for a calibration; each serves many vectors, because a scatter costs a thousand times a vector.
 SCATTERS = 200
@@ -32,7 +32,7 @@ class Calibration:
     smallest: NDArray[np.float64]
     combined: NDArray[np.float64]
 
-    def trials(self, smallest: ArrayLike) -> NDArray[np.float64]:
+    def global_pvalue(self, smallest: ArrayLike) -> NDArray[np.float64]:
         """Probability that the smallest probability of all candidates is this one or less.
 
         Its rank among the draws, or Bonferroni's bound where that is lower, beyond the reach of the draws.
@@ -41,7 +41,7 @@ class Calibration:
 
     def combine(self, omnibus: ArrayLike, smallest: ArrayLike) -> NDArray[np.float64]:
         """Probability of the gap, from that of the omnibus test and the smallest one of the candidates."""
-        least = np.minimum(omnibus, self.trials(smallest))
+        least = np.minimum(omnibus, self.global_pvalue(smallest))
         return np.minimum(_rank(self.combined, least), 2.0 * least)
 
 
@@ -50,7 +50,9 @@ def _rank(draws: NDArray[np.float64], value: ArrayLike) -> NDArray[np.float64]:
     return np.asarray((1.0 + rank) / (1.0 + len(draws)), dtype=np.float64)
 
 
-def calibrate(null: Null, candidates: Bases, draws: int = 20_000, seed: int = 0) -> Calibration:
+def calibrate(
+    null: SimulatedGaussian, candidates: WhitenedTemplates, draws: int = 20_000, seed: int = 0
+) -> Calibration:
     """Draw pairs of data and scatter without any effect, for the geometry of the candidates.
 
     Notes
@@ -75,24 +77,24 @@ def calibrate(null: Null, candidates: Bases, draws: int = 20_000, seed: int = 0)
         y = solve_triangular(root, rng.normal(size=(r, each)), lower=True) * np.sqrt(1.0 + rest)
         white = solve_triangular(root, coordinates, lower=True)
         total = n * (rest + np.sum(y**2, axis=0))
-        omnibus[row] = residual_probability(total, p, n)
+        omnibus[row] = residual_pvalue(total, p, n)
         for k, index in columns.items():
             basis = np.linalg.qr(np.moveaxis(white[:, index], 0, 1))[0]
-            drop = n * np.max(np.sum((np.swapaxes(basis, 1, 2) @ y) ** 2, axis=1), axis=0)
-            smallest[row] = np.minimum(smallest[row], score_probability(drop, total, k, p, n))
+            delta_chi2 = n * np.max(np.sum((np.swapaxes(basis, 1, 2) @ y) ** 2, axis=1), axis=0)
+            smallest[row] = np.minimum(smallest[row], nested_pvalue(delta_chi2, total, k, p, n))
     first = Calibration(int((sizes > 0).sum()), np.sort(smallest.ravel()), np.empty(0))
-    least = np.minimum(omnibus.ravel(), first.trials(smallest.ravel()))
+    least = np.minimum(omnibus.ravel(), first.global_pvalue(smallest.ravel()))
     return Calibration(first.tests, first.smallest, np.sort(least))
 
 
 @dataclass(frozen=True)
-class Gap:
+class GlobalTest:
     """Whether there is a gap: calibrated probability, its two parts, and the candidate that stands out most.
 
     ``maximum`` is the probability of the most significant candidate, ``best``, corrected for trials.
     """
 
-    probability: float
+    pvalue: float
     chi2: float
     dimension: int
     omnibus: float
@@ -100,24 +102,28 @@ class Gap:
     best: int
 
 
-def gap(null: Null, x: NDArray[np.float64], candidates: Bases, calibration: Calibration) -> Gap:
+def global_test(
+    null: SimulatedGaussian, x: NDArray[np.float64], candidates: WhitenedTemplates, calibration: Calibration
+) -> GlobalTest:
     """Test evidence, shape (p_raw,), against everything and against every candidate, as one probability."""
-    y = null.data(x)
+    y = null.whiten(x)
     chi2 = float(y @ y)
-    omnibus = null.probability(x)
-    scores = score_probability(candidates.drops(y), chi2, candidates.sizes, null.dimension, null.dof)
+    omnibus = null.pvalue(x)
+    scores = nested_pvalue(candidates.delta_chi2(y), chi2, candidates.sizes, null.dimension, null.dof)
     best = int(np.argmin(scores))
-    return Gap(
-        probability=float(calibration.combine(omnibus, scores[best])),
+    return GlobalTest(
+        pvalue=float(calibration.combine(omnibus, scores[best])),
         chi2=chi2,
         dimension=null.dimension,
         omnibus=omnibus,
-        maximum=float(calibration.trials(scores[best])),
+        maximum=float(calibration.global_pvalue(scores[best])),
         best=best,
     )
 
 
-def atlas(x: NDArray[np.float64], simulations: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def scan_pvalues(
+    x: NDArray[np.float64], simulations: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Deviations of many correlated numbers, and their probabilities corrected for looking at all of them.
 
     Parameters
@@ -151,8 +157,8 @@ def atlas(x: NDArray[np.float64], simulations: NDArray[np.float64]) -> tuple[NDA
     exceeding = count - np.searchsorted(np.sort(maxima), np.abs(z), side="left")
     waits = np.sort(-np.log1p(-2.0 * special.ndtr(-maxima)))
     upper = max(10, count // 10)
-    trials = max(upper / (np.sum(waits[:upper]) + (count - upper) * waits[upper - 1]), 1.0)
-    beyond = -np.expm1(trials * np.log1p(-np.minimum(2.0 * special.ndtr(-np.abs(z)), 1.0 - 1e-12)))
+    global_pvalue = max(upper / (np.sum(waits[:upper]) + (count - upper) * waits[upper - 1]), 1.0)
+    beyond = -np.expm1(global_pvalue * np.log1p(-np.minimum(2.0 * special.ndtr(-np.abs(z)), 1.0 - 1e-12)))
     ranked = (1.0 + exceeding) / (1.0 + count)
     return z, np.where(exceeding > 0, ranked, np.minimum(ranked, beyond))
 

@@ -143,11 +143,11 @@ class Effect:
     signature: ClassVar[str]
     source: ClassVar[str] = ""
     step: ClassVar[float]
-    own_score: ClassVar[bool] = True
-    side: ClassVar[Literal[-1, 0, 1]] = 0
+    matched_filter: ClassVar[bool] = True
+    sign: ClassVar[Literal[-1, 0, 1]] = 0
     draws: ClassVar[bool] = False
     mean_response: ClassVar[bool] = False
-    most: ClassVar[float] = np.inf
+    max_amplitude: ClassVar[float] = np.inf
     variants: ClassVar[tuple[Mapping[str, Any], ...]] = ({},)
 
     amplitude: float = 0.0
@@ -208,7 +208,7 @@ class Effect:
         return np.array([self.amplitude])
 
     @classmethod
-    def told(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Vector:
+    def constrained(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Vector:
         """Of fitted coordinates what data tell: all of them, where an effect does not say which are beyond them.
 
         Parameters

@@ -41,9 +41,9 @@ class Boost(DirectedEffect):
     signature = "L = 1, d = 1, growing as l: to be seen from l of about 1000 on."
     source = "Challinor & van Leeuwen 2002, Phys. Rev. D 65, 103001; Planck 2013 results XXVII"
     step = 1e-4
-    own_score = False
+    matched_filter = False
     mean_response = True
-    most = 0.01
+    max_amplitude = 0.01
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
         """Boosted."""

@@ -26,7 +26,7 @@ class DipoleModulation(DirectedEffect):
     signature = "L = 1, d = 1, the same in every channel and split, at all l."
     source = "Gordon et al. 2005, Phys. Rev. D 72, 103002"
     step = 0.01
-    own_score = False
+    matched_filter = False
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
         """Modulated."""

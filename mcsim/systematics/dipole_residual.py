@@ -26,7 +26,7 @@ class DipoleResidual(DirectedEffect):
     signature = "l = 1, the same in both halves."
     source = "Hinshaw et al. 2009, ApJS 180, 225 (the dipole and its error)"
     step = 0.5
-    own_score = False
+    matched_filter = False
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
         """With the dipole added."""

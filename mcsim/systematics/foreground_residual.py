@@ -51,7 +51,7 @@ class ForegroundResidual(Effect):
     )
     source = "Bennett et al. 2013, ApJS 208, 20, Sec. 5 (residuals of cleaned bands); the morphology is a model"
     step = 5.0
-    own_score = False
+    matched_filter = False
     draws = True
 
     spectral_index: float = 2.0

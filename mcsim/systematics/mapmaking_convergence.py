@@ -16,7 +16,7 @@ class MapmakingConvergence(Effect):
     signature = "Stripes in the frame of the scan, at the largest scales; acts on differencing scans only."
     source = "Hinshaw et al. 2003, ApJS 148, 63, Sec. 3 (iterations of the map-making)"
     step = 1.0
-    side = 1
+    sign = 1
 
     def differencing(self, imbalance: float, iterations_short: int) -> tuple[float, int]:
         """Fewer iterations."""

@@ -19,7 +19,7 @@ class NoiseLevel(Effect):
     signature = "Autos only, flat in l, as the hits."
     source = "Jarosik et al. 2011, ApJS 192, 14 (sigma0 per channel, and its error)"
     step = 0.01
-    own_score = False
+    matched_filter = False
 
     def noise(self, site: Site) -> Map | None:
         """The same factor everywhere."""

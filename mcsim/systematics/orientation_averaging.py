@@ -31,7 +31,7 @@ class OrientationAveraging(Effect):
     signature = "L = 2, M = 0 falls to 0.66 of what parallel transport gives, and other M appear."
     source = "Joshi et al. arXiv:1210.7318, Sec. V"
     step = 0.05
-    side = 1
+    sign = 1
     variants = ({"model": "wmap"},)
 
     model: str = ""

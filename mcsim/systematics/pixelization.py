@@ -23,7 +23,7 @@ class Pixelization(Effect):
     signature = "Small scales, depending on nside, and the gradient of the sky at pixels that are hit unevenly."
     source = "Gorski et al. 2005, ApJ 622, 759, Sec. 6 (window functions)"
     step = 0.1
-    most = 2.0
+    max_amplitude = 2.0
 
     def spread(self) -> float:
         """1 - amplitude."""

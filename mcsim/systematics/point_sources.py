@@ -29,10 +29,10 @@ class PointSources(Effect):
     signature = "Flat C_l, in autos and crosses of all channels alike."
     source = "Tegmark & Efstathiou 1996, MNRAS 281, 1297; Wright et al. 2009, ApJS 180, 283"
     step = 1e-4
-    own_score = False
+    matched_filter = False
     draws = True
     mean_response = True
-    side = -1
+    sign = -1
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
         """With the sources added."""

@@ -31,7 +31,7 @@ class QuadrupoleModulation(Effect):
     signature = "L = 2, the same in every channel and split: a near twin of m = 2 in one channel."
     source = "Ackerman, Carroll & Wise 2007, Phys. Rev. D 75, 083502, with a modulation of the sky in place of P(k)"
     step = 0.01
-    own_score = False
+    matched_filter = False
 
     components: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 0.0)
 

@@ -45,7 +45,7 @@ class Spectrum(Effect):
     signature = "L = 0, every channel alike."
     source = "Follows from the definition"
     step = 0.02
-    own_score = False
+    matched_filter = False
     mean_response = True
 
     bands: tuple[float, ...] = (1.0,) * BANDS
@@ -75,7 +75,7 @@ class Spectrum(Effect):
         return along(self.name, "bands", self.bands, self.amplitude)
 
     @classmethod
-    def told(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Vector:
+    def constrained(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Vector:
         """Bands that are neither known nor heard, those beyond the degrees that are analysed, stay as believed."""
         errors = np.sqrt(np.diag(np.linalg.pinv(precision)))
         silent = (errors > KNOWN) & (np.abs(coordinates) < HEARD * errors)

@@ -9,11 +9,11 @@ import pytest
 
 from mcsim import config, systematics
 from mcsim.benchmark import make, run, score
-from mcsim.benchmark.inventions import introduced, load
+from mcsim.benchmark.out_of_library import introduced, load
 from mcsim.benchmark.prior import Prior
 from mcsim.benchmark.truth import Truth, finished_cases, key_path
-from mcsim.diagnosis.data import read_maps
-from mcsim.diagnosis.evidence import questions
+from mcsim.diagnosis.analysis import analysis_of
+from mcsim.diagnosis.observed_maps import read_maps
 from mcsim.errors import InputError
 
 INVENTIONS = Path(__file__).parents[1] / "inventions.py"
@@ -50,7 +50,7 @@ def small_library():
 
 
 def made(folder, cases=CASES, **changes):
-    values = {"prior": PRIOR, "inventions": INVENTIONS, "simulations": 150, "workers": 0}
+    values = {"prior": PRIOR, "out_of_library": INVENTIONS, "simulations": 150, "workers": 0}
     return make.make(MODEL, folder, cases, SEED, **(values | changes))
 
 
@@ -85,10 +85,10 @@ def test_a_lost_case_is_made_again_with_the_same_key(challenge, tmp_path):
 
 def test_cases_are_what_a_diagnosis_reads(challenge):
     folder, _ = challenge
-    believed = config.load(folder / "cases" / "case-000" / "model.toml")
-    assert believed.name == "case-000"
-    assert believed.effects == ()
-    assert len(read_maps(questions(believed).model, folder / "cases" / "case-000")) == 2
+    fiducial = config.load(folder / "cases" / "case-000" / "model.toml")
+    assert fiducial.name == "case-000"
+    assert fiducial.effects == ()
+    assert len(read_maps(analysis_of(fiducial).model, folder / "cases" / "case-000")) == 2
     public = [path.read_text() for path in folder.glob("c*/**/*") if path.suffix in (".json", ".toml")]
     truths = [Truth.read(key_path(folder, case)) for case in finished_cases(folder)]
     assert all(str(truth.seed) not in text for truth in truths for text in public)

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ from astropy.io import fits
 from astropy.table import Table
 
 from mcsim import cli, config
+from mcsim.ensemble import tables
+from mcsim.ensemble.prediction import predict
 
 from .conftest import table
 
@@ -129,6 +132,28 @@ seed = 7
         (("scan", "no-such-scan"), "no-such-scan"),
         (("scan", "wmap", "--nside", "100"), "100"),
         (("config",), "Nothing was asked for"),
+        (("beam", "nothing.fits"), "does not exist"),
+        (("beam", "."), "folder"),
+        (("beam", "quickstart", "--pixel-deg", "-1"), "pixel"),
+        (("info", "."), "not an ensemble store"),
+        (("info", ".", "--verify"), "not an ensemble store"),
+        (("plot", "."), "not an ensemble store"),
+        (("plot", ".", "--predict", "nothing.zarr"), "not an ensemble store"),
+        (("merge", ".", ".", "-o", "x.zarr"), "not an ensemble store"),
+        (("fit", "nothing.zarr", "quickstart"), "nothing.zarr"),
+        (("predict", "quickstart", "-o", "x.txt"), "x.txt"),
+        (("predict", "nothing.toml"), "nothing.toml"),
+        (("scan", "wmap", "--smax", "2", "--nside", "-4"), "-4"),
+        (("scan", "wmap", "--sample-period-s", "nan"), "nan"),
+        (("scan", "wmap", "--sample-period-s", "-1"), "-1"),
+        (("scan", "wmap", "--frame", "lunar"), "lunar"),
+        (("scan", "wmap", "--line-of-sight", "Z"), "Z"),
+        (("bench", "--nside", "3"), "3"),
+        (("bench", "--nside", "4", "--lmax", "40"), "40"),
+        (("effects", "gain_drit"), "gain_drift"),
+        (("run", "quickstart", "--realizations", "-1:3"), "-1:3"),
+        (("run", "quickstart", "--realizations", "0:1000"), "0:1000"),
+        (("run", "quickstart", "--scheduler", "nonsense"), "nonsense"),
     ],
 )
 def test_bad_input_is_one_sentence(words: tuple[str, ...], message: str, mcsim: Command, tmp_path: Path) -> None:
@@ -181,6 +206,8 @@ def test_predict_plot_and_fit(mcsim: Command, small_store: Path, tmp_path: Path)
     assert code == 0
     assert "signal to noise" in out
     assert "value" in Table.read(tmp_path / "expected.ecsv", format="ascii.ecsv").colnames
+    for row in ("L2M0d0", "10-19"):
+        assert row in out
     assert mcsim("plot", small_store, "--predict", "small.toml", "-o", "both.png")[0] == 0
     code, _, err = mcsim("fit", small_store, "small.toml")
     assert code == 2
@@ -199,3 +226,68 @@ def test_predict_plot_and_fit(mcsim: Command, small_store: Path, tmp_path: Path)
     code, _, err = mcsim("fit", small_store, "small.toml", "--model", "cubic")
     assert code == 2
     assert "cubic" in err
+
+
+def test_version(mcsim: Command) -> None:
+    code, out, _ = mcsim("--version")
+    assert code == 0
+    assert out.split() == ["mcsim", version("mcsim")]
+
+
+@pytest.mark.parametrize("ending", ["zarr", "ecsv"])
+def test_plot_reads_what_predict_wrote(ending: str, mcsim: Command, small_store: Path, tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(SMALL)
+    assert mcsim("predict", "small.toml", "-o", f"expected.{ending}")[0] == 0
+    expected = predict(tmp_path / "small.toml")
+    found = tables.read_prediction(tmp_path / f"expected.{ending}")
+    assert found.attrs["prediction"] == expected.attrs["prediction"]
+    expected = expected.sel(mode=found["mode"].values)
+    for kind in ("", "_difference"):
+        for name in ("mean", "standard_error"):
+            name = f"biposh{kind}_binned_{name}"
+            np.testing.assert_allclose(found[name].values, expected[name].values, rtol=1e-12, atol=1e-12)
+    for name in ("L", "M", "d", "parity", "bin", "bin_first", "bin_last"):
+        assert found[name].values.tolist() == expected[name].values.tolist()
+    code, _, err = mcsim("plot", small_store, "--predict", f"expected.{ending}", "-o", "both.png")
+    assert (code, err) == (0, "")
+    assert (tmp_path / "both.png").stat().st_size > 10_000
+    code, _, err = mcsim("plot", small_store, "--predict", f"expected.{ending}", "--exact")
+    assert code == 2
+    assert "--exact" in err
+
+
+@pytest.mark.parametrize("name", ["nothing.zarr", "nothing.ecsv", "store.zarr", "text.ecsv", "columns.ecsv"])
+def test_a_file_that_is_no_prediction_is_refused(name: str, mcsim: Command, small_store: Path, tmp_path: Path) -> None:
+    (tmp_path / "store.zarr").symlink_to(small_store)
+    (tmp_path / "text.ecsv").write_text("no table")
+    Table({"L": [2], "value": [1.0]}).write(tmp_path / "columns.ecsv", format="ascii.ecsv")
+    code, _, err = mcsim("plot", small_store, "--predict", name, "-o", "x.png")
+    assert code == 2
+    assert name in err
+    assert err.count("\n") == 1
+    assert not (tmp_path / "x.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("effect", "key"),
+    [
+        ('[[effects]]\nname = "gain_drift"', "[[effect]]"),
+        ('[[effect]]\nname = "gain_drit"', "gain_drift"),
+        ('[[effect]]\nname = "gain_drift"', "channel"),
+        ('[[effect]]\nname = "gain_drift"\nchannel = "W1"\nphase = 3.0', "phase"),
+        ('[[effect]]\nname = "gain_drift"\nchannel = "W1"\namplitude = "large"', "amplitude"),
+        ('[[effect]]\nname = "gain_drift"\nchannel = "W1"\namplitude = 0.1', "pointed"),
+        ('[[effect]]\nname = "gain_drift"\nchannel = "V9"', "V9"),
+        ('[[effect]]\nname = "dipole_modulation"\nchannel = "W1"', "common"),
+        ('[[effect]]\nname = "beam_noncircularity"\nchannel = "W1"\namplitude = 1.0', "m_max"),
+    ],
+)
+def test_config_refuses_effects_that_run_refuses(effect: str, key: str, mcsim: Command, tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(f"{SMALL}{effect}\n")
+    answers = [mcsim("config", "small.toml"), mcsim("run", "small.toml")]
+    for code, _, err in answers:
+        assert code == 2
+        assert key in err
+        assert "Traceback" not in err
+    assert answers[0][2] == answers[1][2]
+    assert [file.name for file in tmp_path.iterdir()] == ["small.toml"]

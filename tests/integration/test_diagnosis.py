@@ -11,17 +11,17 @@ from scipy.stats import kstest
 import mcsim
 from mcsim import config, systematics
 from mcsim.diagnosis import knowledge
-from mcsim.diagnosis.case import court, judge
-from mcsim.diagnosis.data import read_maps
-from mcsim.diagnosis.evidence import evidence_of, questions
+from mcsim.diagnosis.analysis import analysis_of, data_vectors
+from mcsim.diagnosis.inference import context, diagnose_maps
 from mcsim.diagnosis.knowledge import with_effects
-from mcsim.diagnosis.listen import show
-from mcsim.diagnosis.refine import quiet_templates
+from mcsim.diagnosis.observed_maps import read_maps
+from mcsim.diagnosis.refine import significant_templates
+from mcsim.diagnosis.wiener_filter import show
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
-from mcsim.stats.gaussian import bases
-from mcsim.stats.look_elsewhere import gap
+from mcsim.stats.gaussian import whitened_templates
+from mcsim.stats.look_elsewhere import global_test
 
 PROPOSED = ("beam_ellipticity", "pointing_offset", "noise_level", "dipole_modulation")
 MODEL = {
@@ -44,15 +44,15 @@ MODEL = {
 
 
 def ask(jobs):
-    return [evidence_of(job) for job in jobs]
+    return [data_vectors(job) for job in jobs]
 
 
 @pytest.fixture(scope="module")
 def small():
     run = config.load(MODEL)
-    asked = questions(run, without=[name for name in systematics.catalogue() if name not in PROPOSED])
-    plan = knowledge.plan(run, asked, simulations=260, referee=False)
-    return court(run, asked, knowledge.learned(asked, plan, ask(plan.jobs)))
+    analysis = analysis_of(run, without=[name for name in systematics.catalogue() if name not in PROPOSED])
+    plan = knowledge.plan(run, analysis, simulations=260, time_ordered=False)
+    return context(run, analysis, knowledge.learned(analysis, plan, ask(plan.jobs)))
 
 
 def data_of(run, name=None, channel=None, seed=77, **parameters):
@@ -62,25 +62,25 @@ def data_of(run, name=None, channel=None, seed=77, **parameters):
 
 
 def test_both_folds_hear_every_range_of_the_sky(small):
-    sky = [entry for entry in small.asked.entries if entry.name.startswith("sky/")]
-    even, odd = ([entry.ell for entry in sky if entry.fold == fold] for fold in (0, 1))
+    sky = [element for element in small.analysis.elements if element.name.startswith("sky/")]
+    even, odd = ([element.ell for element in sky if element.fold == fold] for fold in (0, 1))
     assert even == odd
     # The numbers are of different degrees, so that their noise, the sky itself, is independent.
-    rows = {entry.name: row for row, entry in enumerate(small.asked.entries)}
-    for entry in sky[: len(even)]:
-        pair = small.known.simulations[:, [rows[entry.name], rows[entry.name.replace("even", "odd")]]]
+    rows = {element.name: row for row, element in enumerate(small.analysis.elements)}
+    for element in sky[: len(even)]:
+        pair = small.known.simulations[:, [rows[element.name], rows[element.name.replace("even", "odd")]]]
         assert abs(np.corrcoef(pair.T)[0, 1]) < 4.0 / np.sqrt(len(pair))
 
 
 def test_no_gap_where_there_is_none(small):
     shared = data_of(small.run)
-    groups = bases(small.null, quiet_templates(small.known), [c.columns for c in small.candidates])
+    groups = whitened_templates(small.null, significant_templates(small.known), [c.columns for c in small.candidates])
     skies = [list(simulate.maps(shared, r)) for r in range(40)]
-    p = [gap(small.null, small.asked.answer(maps), groups, small.calibration).probability for maps in skies]
+    p = [global_test(small.null, small.analysis.answer(maps), groups, small.calibration).pvalue for maps in skies]
     # 40 draws of a uniform number: 7 or more below 0.05 once in 300 cases; and Kolmogorov-Smirnov.
     assert np.sum(np.array(p) <= 0.05) < 7
     assert kstest(p, "uniform").pvalue > 1e-3
-    found = judge(small, "null", skies[int(np.argsort(p)[20])], ask)
+    found = diagnose_maps(small, "null", skies[int(np.argsort(p)[20])], ask)
     assert found.verdict["verdict"] == "none"
     assert found.verdict["effects"] == []
 
@@ -89,7 +89,7 @@ def test_ellipticity_seen_sample_by_sample_is_named_and_shrinks(small):
     truth = 0.25
     shared = data_of(small.run, "beam_ellipticity", "W1", amplitude=truth, angle_deg=20.0)
     maps = [map_uk for _, map_uk in sampled.maps(shared, 0)]
-    found = judge(small, "ellipse", maps, ask)
+    found = diagnose_maps(small, "ellipse", maps, ask)
     verdict = found.verdict
     assert verdict["gap"]["p_value"] < 1e-3
     best = verdict["effects"][0]
@@ -102,15 +102,15 @@ def test_ellipticity_seen_sample_by_sample_is_named_and_shrinks(small):
 
 def test_a_broken_simulator_shrinks_nothing(small):
     maps = list(simulate.maps(data_of(small.run, "beam_ellipticity", "W1", amplitude=0.25), 0))
-    asked = []
+    analysis = []
 
     def working(jobs):
-        asked.append(jobs)
+        analysis.append(jobs)
         return ask(jobs)
 
-    works = judge(small, "works", maps, working).verdict
+    works = diagnose_maps(small, "works", maps, working).verdict
     # The last simulations are those of the shrink: the effect at its frozen amplitude.
-    last = asked[-1]
+    last = analysis[-1]
     assert config.from_json(last[0].simulated).effects
 
     def broken(jobs):
@@ -119,7 +119,7 @@ def test_a_broken_simulator_shrinks_nothing(small):
         quiet = replace(config.from_json(jobs[0].simulated), effects=())
         return ask([replace(job, simulated=config.to_json(quiet)) for job in jobs])
 
-    breaks = judge(small, "breaks", maps, broken).verdict
+    breaks = diagnose_maps(small, "breaks", maps, broken).verdict
     assert works["effects"] == breaks["effects"]
     assert works["shrink"]["achieved"] > 0.5
     assert abs(breaks["shrink"]["achieved"]) < 1e-6
@@ -134,7 +134,7 @@ def test_an_amplitude_that_cannot_be_simulated_is_no_explanation(small):
             raise InputError("no such amplitude")
         return ask(jobs)
 
-    found = judge(small, "refused", maps, refusing).verdict
+    found = diagnose_maps(small, "refused", maps, refusing).verdict
     assert ("beam_ellipticity", "W1") not in [(effect["name"], effect["channel"]) for effect in found["effects"]]
 
 
@@ -146,7 +146,7 @@ def test_no_shrink_is_said_of_what_cannot_be_simulated_again(small):
         simulated.append(jobs[0].simulated)
         return ask(jobs)
 
-    works = judge(small, "works", maps, remembering).verdict
+    works = diagnose_maps(small, "works", maps, remembering).verdict
     last = simulated[-1]
 
     def refusing(jobs):
@@ -154,7 +154,7 @@ def test_no_shrink_is_said_of_what_cannot_be_simulated_again(small):
             raise InputError("no such amplitude")
         return ask(jobs)
 
-    found = judge(small, "refused", maps, refusing).verdict
+    found = diagnose_maps(small, "refused", maps, refusing).verdict
     assert found["effects"] == works["effects"]
     assert works["shrink"] is not None
     assert found["shrink"] is None
@@ -165,7 +165,7 @@ def test_pixels_that_the_data_lack_are_no_gap(small):
     holed = [map_uk.copy() for map_uk in maps]
     for number, map_uk in enumerate(holed):
         map_uk[100 + 31 * number :: 150] = healpy.UNSEEN  # 20 of 3072
-    whole, lacking = (float(y @ y) for y in (small.null.data(small.asked.answer(m)) for m in (maps, holed)))
+    whole, lacking = (float(y @ y) for y in (small.null.whiten(small.analysis.answer(m)) for m in (maps, holed)))
     # Zeros there would make chi^2 fall out of its distribution by tens of its width, sqrt(2 p).
     assert abs(lacking - whole) < np.sqrt(2 * small.null.dimension)
 
@@ -185,9 +185,15 @@ def test_nothing_is_asked_that_has_no_answer(kind, tmp_path):
             map=replace(run.map, splits=()),
             channels=tuple(replace(channel, scan=still) for channel in run.channels),
         )
-    asked = questions(run)
-    answers = evidence_of(knowledge.plan(run, asked, simulations=4, referee=False).jobs[0])[:, : len(asked.entries)]
-    dead = [entry.name for entry, spread in zip(asked.entries, np.ptp(answers, axis=0), strict=True) if spread == 0.0]
+    analysis = analysis_of(run)
+    answers = data_vectors(knowledge.plan(run, analysis, simulations=4, time_ordered=False).jobs[0])[
+        :, : len(analysis.elements)
+    ]
+    dead = [
+        element.name
+        for element, spread in zip(analysis.elements, np.ptp(answers, axis=0), strict=True)
+        if spread == 0.0
+    ]
     assert dead == []
 
 
@@ -197,8 +203,8 @@ def test_orders_are_proposed_where_a_run_leaves_some_out(small):
     cut, whole = (config.BeamEllipticalGaussian(**ellipse, m_max=m_max) for m_max in (0, None))
     for beam, expected in ((cut, ["beam_noncircularity (V1)"]), (whole, [])):
         run = replace(small.run, channels=(replace(small.run.channels[0], beam=beam), small.run.channels[1]))
-        asked = questions(run, without=[name for name in systematics.catalogue() if name != "beam_noncircularity"])
-        assert [proposal.label for proposal in asked.proposals] == expected
+        analysis = analysis_of(run, without=[name for name in systematics.catalogue() if name != "beam_noncircularity"])
+        assert [proposal.label for proposal in analysis.proposals] == expected
 
 
 def test_what_cannot_be_done_is_said_before_anything_is_learned(small, folder):
@@ -220,14 +226,14 @@ def test_exchanged_channels_are_noticed(small):
         channels=(small.run.channels[0], replace(small.run.channels[1], beam=config.BeamGaussian(fwhm_arcmin=500.0))),
     )
     maps = list(simulate.maps(data_of(run), 0))
-    found = judge(small, "wide", maps, ask).verdict
+    found = diagnose_maps(small, "wide", maps, ask).verdict
     # No effect of this library widens a beam: whatever is said, it is no single confident name.
     assert found["verdict"] in ("unknown", "mixture", "degenerate")
 
 
 @pytest.fixture
 def folder(small, tmp_path):
-    for part, map_uk in zip(small.asked.model.parts, simulate.maps(data_of(small.run), 0), strict=True):
+    for part, map_uk in zip(small.analysis.model.parts, simulate.maps(data_of(small.run), 0), strict=True):
         write(tmp_path, part.name, map_uk)
     return tmp_path
 
@@ -238,7 +244,7 @@ def write(folder, name, map_uk, **options):
 
 
 def test_maps_are_read_as_they_were_written(small, folder):
-    maps = read_maps(small.asked.model, folder)
+    maps = read_maps(small.analysis.model, folder)
     expected = simulate.maps(data_of(small.run), 0)
     assert all(np.array_equal(a, b) for a, b in zip(maps, expected, strict=True))
 
@@ -246,7 +252,7 @@ def test_maps_are_read_as_they_were_written(small, folder):
 def test_a_nested_map_with_an_honest_header_is_read(small, folder):
     expected = simulate.maps(data_of(small.run), 0)[0]
     write(folder, "V1:half1", healpy.reorder(expected, r2n=True), nest=True)
-    assert np.array_equal(read_maps(small.asked.model, folder)[0], expected)
+    assert np.array_equal(read_maps(small.analysis.model, folder)[0], expected)
 
 
 @pytest.mark.parametrize(
@@ -264,39 +270,39 @@ def test_hostile_data_end_in_a_sentence(small, folder, change, options, said):
     map_uk = simulate.maps(data_of(small.run), 0)[0]
     write(folder, "V1:half1", change(map_uk), **options)
     with pytest.raises(InputError, match=said):
-        read_maps(small.asked.model, folder)
+        read_maps(small.analysis.model, folder)
 
 
 def test_data_in_mk_with_a_header_are_read(small, folder):
     expected = simulate.maps(data_of(small.run), 0)[0]
     write(folder, "V1:half1", np.where(expected == healpy.UNSEEN, expected, expected / 1000.0), unit="mK")
-    assert np.allclose(read_maps(small.asked.model, folder)[0], expected, rtol=1e-12)
+    assert np.allclose(read_maps(small.analysis.model, folder)[0], expected, rtol=1e-12)
 
 
 def test_a_missing_file_is_named(small, folder):
     (folder / "W1_half2.fits").unlink()
     with pytest.raises(InputError, match=r"W1_half2\.fits does not exist"):
-        read_maps(small.asked.model, folder)
+        read_maps(small.analysis.model, folder)
 
 
 def test_the_verdict_is_json_and_the_evidence_opens(small, tmp_path):
-    found = judge(small, "saved", list(simulate.maps(data_of(small.run), 0)), ask)
+    found = diagnose_maps(small, "saved", list(simulate.maps(data_of(small.run), 0)), ask)
     found.save(tmp_path / "out")
     assert json.loads((tmp_path / "out" / "verdict.json").read_text())["schema"] == 1
 
 
 def test_responses_on_the_observed_sky_have_the_mean_of_those_on_any(small):
     """One sky's response scatters about the mean of many, by the strength of its own multipoles, but is not biased."""
-    asked, run = small.asked, small.run
+    analysis, run = small.analysis, small.run
     effect = config.Effect(name="beam_ellipticity", channel="W1", parameters={"amplitude": 0.1})
     members = next(c.columns for c in small.candidates if c.identity == ("beam_ellipticity", "W1"))
-    expected = small.null.templates(small.known.templates[:, members[:1]] * 0.1)[:, 0]
+    expected = small.null.whiten_templates(small.known.templates[:, members[:1]] * 0.1)[:, 0]
     ratios = []
     for realization in range(12):
-        observed = show(asked.model, list(simulate.maps(data_of(run, seed=5), realization)))
-        after = np.concatenate(ask(knowledge.constrained_jobs(run, asked, [effect], observed)))
-        before = np.concatenate(ask(knowledge.constrained_jobs(run, asked, [], observed)))
-        response = small.null.templates(np.mean(after - before, axis=0)[:, None])[:, 0]
+        observed = show(analysis.model, list(simulate.maps(data_of(run, seed=5), realization)))
+        after = np.concatenate(ask(knowledge.constrained_jobs(run, analysis, [effect], observed)))
+        before = np.concatenate(ask(knowledge.constrained_jobs(run, analysis, [], observed)))
+        response = small.null.whiten_templates(np.mean(after - before, axis=0)[:, None])[:, 0]
         ratios.append(response @ expected / (expected @ expected))
     scatter = np.std(ratios, ddof=1) / np.sqrt(len(ratios))
     assert abs(np.mean(ratios) - 1.0) < 4.0 * scatter

@@ -8,7 +8,7 @@ from distributed import Client
 from scipy import stats
 
 from mcsim import beamfit, config, open_ensemble, open_summary
-from mcsim.ensemble import prediction, runner
+from mcsim.ensemble import prediction, runner, tables
 from mcsim.errors import InputError
 from mcsim.instrument import scan
 from mcsim.support import resources
@@ -82,7 +82,7 @@ def test_hit_average_fitted_with_parallel_transport_gives_the_factor_of_a20(tmp_
             {"name": "W1", "beam": BEAM, "scan": {"kind": "moments", "path": limit_moments(tmp_path / "m.fits", 64)}}
         ],
     )
-    prediction.write(prediction.predict(hit), tmp_path / "hit.ecsv")
+    tables.write_prediction(prediction.predict(hit), tmp_path / "hit.ecsv")
     transported = table(channel=[{"name": "W1", "beam": BEAM, "scan": {"kind": "parallel_transport"}}])
     found = beamfit.fit(tmp_path / "hit.ecsv", transported, "constant", kind="plain")
     assert found.solution.parameters[0] == pytest.approx(0.6576, abs=1e-3)

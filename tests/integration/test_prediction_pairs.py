@@ -12,7 +12,7 @@ from scipy import stats
 
 from mcsim import config
 from mcsim.beamfit.data import SUMMARY, Row, parts, project
-from mcsim.ensemble import prediction
+from mcsim.ensemble import prediction, tables
 from mcsim.instrument import scan
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import Survey, survey
@@ -131,7 +131,7 @@ def test_joint_signal_to_noise_is_at_least_that_of_every_mode_and_less_than_infi
     assert float(each.max()) < float(autos) < total < np.inf
     bins = np.sqrt((expected["signal_to_noise_binned"] ** 2).sum("bin"))
     xr.testing.assert_allclose(bins.where(np.isfinite(each)), each, rtol=1e-10)
-    assert "jointly" in prediction.describe(expected)
+    assert "jointly" in tables.describe_prediction(expected)
     # What all maps say together does not depend on which pairs the ensemble keeps.
     run = shared.config
     autos = prediction.predict(survey(replace(run, biposh=replace(run.biposh, pairs="auto"))), snr=True)

@@ -184,11 +184,11 @@ def test_kept_maps(client: Client, tmp_path: Path) -> None:
     path = tmp_path / "x.zarr"
     runner.run(table(**ensemble(2, keep_maps=True)), path, client=client)
     with open_ensemble(path) as stored:
-        assert stored["map"].sizes == {"realization": 2, "map_name": 1, "pixel": 3072}
-        assert stored["map"].attrs["units"] == "uK"
+        assert stored["observed_map"].sizes == {"realization": 2, "map_name": 1, "pixel": 3072}
+        assert stored["observed_map"].attrs["units"] == "uK"
         shared = survey(config.load(table(**ensemble(2, keep_maps=True))))
-        expected = simulate.realize(shared, 1)["map"]
-        np.testing.assert_array_equal(stored["map"][1], expected.astype(np.float32))
+        expected = simulate.realize(shared, 1)["observed_map"]
+        np.testing.assert_array_equal(stored["observed_map"][1], expected.astype(np.float32))
 
 
 def test_merge_refuses_what_does_not_belong_together(small_store: Path, client: Client, tmp_path: Path) -> None:

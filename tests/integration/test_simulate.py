@@ -87,7 +87,7 @@ def test_pixel_window_is_in_the_map_and_taken_out_of_the_coefficients() -> None:
     on = realize(map={"nside": 16, "pixel_window": "computed"}, **ensemble(keep_maps=True))
     window = healpix.pixel_window(16, 32)
     np.testing.assert_allclose(on["cl_circular"], off["cl_circular"], rtol=1e-12)
-    maps = [healpix.analysis(values["map"][0], 32, iterations=8) for values in (on, off)]
+    maps = [healpix.analysis(values["observed_map"][0], 32, iterations=8) for values in (on, off)]
     power = [bipolar.power_spectrum(a, a, 32) for a in maps]
     np.testing.assert_allclose(power[0][2:] / power[1][2:], window[2:] ** 2, rtol=1e-3)
 

@@ -7,22 +7,22 @@ import pytest
 from scipy import stats
 from scipy.linalg import solve_triangular
 
-from mcsim.diagnosis.shrink import achieved, carried, excess, predicted
-from mcsim.stats.detection import confusion, detectable, posterior, power, strength_needed, strength_to_isolate
-from mcsim.stats.gaussian import Null, bases, fit, null, residual_probability, score_probability
-from mcsim.stats.look_elsewhere import atlas, calibrate, gap
+from mcsim.diagnosis.validation import achieved, carried, excess, predicted
+from mcsim.stats.detection import confusion, detectable, posterior, power, snr_needed, snr_to_separate
+from mcsim.stats.gaussian import SimulatedGaussian, fit, nested_pvalue, null, residual_pvalue, whitened_templates
+from mcsim.stats.look_elsewhere import calibrate, global_test, scan_pvalues
 
 SEED = 20121024
 # Of a uniform sample a Kolmogorov-Smirnov probability is below this once in a thousand seeds.
 KS = 1e-3
 
 
-def drawn_null(rng: np.random.Generator, p: int, count: int) -> Null:
+def drawn_null(rng: np.random.Generator, p: int, count: int) -> SimulatedGaussian:
     """Null of ``count`` simulations of p independent unit normals: Bartlett's scatter instead of the simulations."""
     n = count - 1
     root = np.tril(rng.normal(size=(p, p)), -1) + np.diag(np.sqrt(rng.chisquare(n - np.arange(p))))
     whitening = np.sqrt(n) * solve_triangular(root, np.eye(p), lower=True)
-    return Null(rng.normal(size=p) / np.sqrt(count), whitening, count)
+    return SimulatedGaussian(rng.normal(size=p) / np.sqrt(count), whitening, count)
 
 
 @pytest.fixture(scope="module")
@@ -37,16 +37,16 @@ def few_simulations() -> dict[str, np.ndarray]:
         name: [] for name in ("omnibus", "one", "three", "residual", "further", "student", "pull")
     }
     for _ in range(draws):
-        believed = null(rng.normal(size=(count, p)) @ root.T)
+        fiducial = null(rng.normal(size=(count, p)) @ root.T)
         noise = root @ rng.normal(size=p)
-        y = believed.data(noise)
-        found["omnibus"].append(residual_probability(y @ y, p, count - 1))
-        found["one"].append(fit(believed, noise, t[:, :1]).score)
-        found["three"].append(fit(believed, noise, t[:, 2:]).score)
+        y = fiducial.whiten(noise)
+        found["omnibus"].append(residual_pvalue(y @ y, p, count - 1))
+        found["one"].append(fit(fiducial, noise, t[:, :1]).nested_pvalue)
+        found["three"].append(fit(fiducial, noise, t[:, 2:]).nested_pvalue)
         x = noise + t @ truth
-        two, all_of_them = fit(believed, x, t[:, :2]), fit(believed, x, t)
-        found["residual"].append(two.probability)
-        found["further"].append(score_probability(two.chi2 - all_of_them.chi2, two.chi2, 3, p - 2, count - 1))
+        two, all_of_them = fit(fiducial, x, t[:, :2]), fit(fiducial, x, t)
+        found["residual"].append(two.pvalue)
+        found["further"].append(nested_pvalue(two.chi2 - all_of_them.chi2, two.chi2, 3, p - 2, count - 1))
         scale = two.errors / stats.t.std(two.dof)
         found["student"].append(stats.t.cdf((two.amplitudes - truth[:2]) / scale, two.dof))
         found["pull"].append((two.amplitudes - truth[:2]) / two.errors)
@@ -75,12 +75,14 @@ def test_gap_is_uniform(p, count, draws):
     t = rng.normal(size=(p, 40))
     t[:, 20:] += 2.0 * t[:, :1]
     groups = [(i,) for i in range(12)] + [(i, i + 1) for i in range(12, 30, 2)] + [(31, 32, 33), (35, 36, 37)]
-    believed = drawn_null(rng, p, count)
-    calibration = calibrate(believed, bases(believed, t, groups), seed=SEED)
+    fiducial = drawn_null(rng, p, count)
+    calibration = calibrate(fiducial, whitened_templates(fiducial, t, groups), seed=SEED)
     found = []
     for _ in range(draws):
-        believed = drawn_null(rng, p, count)
-        found.append(gap(believed, rng.normal(size=p), bases(believed, t, groups), calibration).probability)
+        fiducial = drawn_null(rng, p, count)
+        found.append(
+            global_test(fiducial, rng.normal(size=p), whitened_templates(fiducial, t, groups), calibration).pvalue
+        )
     assert stats.kstest(found, "uniform").pvalue > KS
     low, high = stats.binom.interval(0.999, draws, 0.05)
     assert low <= np.sum(np.array(found) < 0.05) <= high
@@ -97,13 +99,13 @@ def test_scatter_known_by_few_draws_is_allowed_for(spectrum):
     root = np.linalg.qr(rng.normal(size=(p, p)))[0] * np.sqrt(spectrum)
     probabilities, squares = [], []
     for _ in range(200):
-        believed = drawn_null(rng, p, 1000)
+        fiducial = drawn_null(rng, p, 1000)
         deviations = root @ rng.normal(size=(p, draws))
         deviations -= deviations.mean(axis=1, keepdims=True)
-        wide = believed.widened(deviations * np.sqrt((1.0 + 1.0 / draws) / (draws - 1.0)))
+        wide = fiducial.with_extra_covariance(deviations * np.sqrt((1.0 + 1.0 / draws) / (draws - 1.0)))
         x = rng.normal(size=p) + root @ rng.normal(size=p)
-        probabilities.append(wide.probability(x))
-        squares.append(wide.unbiased * wide.square(x) / p)
+        probabilities.append(wide.pvalue(x))
+        squares.append(wide.unbiased * wide.chi2(x) / p)
     assert np.mean(np.array(probabilities) < 0.02) <= 0.10 + 3.0 * np.sqrt(0.1 * 0.9 / 200)
     assert 0.7 < np.mean(squares) < 1.1
 
@@ -115,7 +117,7 @@ def test_atlas_is_calibrated_within_and_beyond_the_ranks():
     found = []
     for _ in range(200):
         simulations = rng.normal(size=(200, 60)) @ mixing
-        found.append(atlas(rng.normal(size=(100, 60)) @ mixing, simulations)[1].min(axis=1))
+        found.append(scan_pvalues(rng.normal(size=(100, 60)) @ mixing, simulations)[1].min(axis=1))
     smallest = np.concatenate(found)
     # Data of one ensemble share its ranks: a level a errs by sqrt(1/(200 a))/sqrt(200), beside Poisson's error. The
     # smallest rank is 1/201; 0.001 lies beyond it, where the fitted trials err by 1/sqrt(20).
@@ -128,11 +130,13 @@ def test_power_is_that_of_drawn_ensembles():
     rng = np.random.default_rng(SEED)
     p, count, threshold, draws = 15, 60, 0.01, 1500
     for columns in (1, 3):
-        strength = strength_needed(columns, 5, p, count, alpha=0.05)
+        strength = snr_needed(columns, 5, p, count, alpha=0.05)
         assert power(strength, columns, threshold, p, count) == pytest.approx(0.9, abs=1e-4)
         t = np.eye(p)[:, :columns]
         x = strength * np.sqrt(1 + 1 / count) * t[:, 0]
-        hits = sum(fit(drawn_null(rng, p, count), x + rng.normal(size=p), t).score < threshold for _ in range(draws))
+        hits = sum(
+            fit(drawn_null(rng, p, count), x + rng.normal(size=p), t).nested_pvalue < threshold for _ in range(draws)
+        )
         assert abs(hits - 0.9 * draws) < 4.0 * np.sqrt(0.09 * draws)
 
 
@@ -150,7 +154,7 @@ def test_detectable_amplitude_is_unbiased():
 @pytest.mark.parametrize("cosine", [0.0, 0.7, -0.95])
 def test_confusion_is_that_of_drawn_scores(cosine):
     rng = np.random.default_rng(SEED)
-    strength, draws = strength_to_isolate(cosine), 20_000
+    strength, draws = snr_to_separate(cosine), 20_000
     assert confusion(strength, cosine) == pytest.approx(0.05, abs=1e-6)
     noise = rng.normal(size=(draws, 2)) @ np.linalg.cholesky([[1.0, cosine], [cosine, 1.0]]).T
     scores = np.abs(strength * np.array([1.0, cosine]) + noise)
@@ -166,11 +170,11 @@ def test_posterior_is_calibrated():
     t[:, 4] = t[:, 0] + 0.5 * rng.normal(size=p)
     groups = [(0,), (1, 2), (3,), (4,), (5, 6, 7), (8,)]
     strengths, prior = np.linspace(1.0, 7.0, 25), np.array([0.4, *[0.1] * 6])
-    exact = bases(Null(np.zeros(p), np.eye(p), 10**9), t, groups)
-    believed, right = [], []
+    exact = whitened_templates(SimulatedGaussian(np.zeros(p), np.eye(p), 10**9), t, groups)
+    fiducial, right = [], []
     for _ in range(draws // 20):
         found = drawn_null(rng, p, count)
-        candidates = bases(found, t, groups)
+        candidates = whitened_templates(found, t, groups)
         truth = rng.choice(7, size=20, p=prior)
         x = rng.normal(size=(20, p))
         for row, index in zip(x, truth, strict=True):
@@ -179,9 +183,9 @@ def test_posterior_is_calibrated():
                 direction = rng.normal(size=basis.shape[1])
                 row += rng.choice(strengths) * basis @ direction / np.linalg.norm(direction)
         probability = posterior(found, x, candidates, strengths, prior)
-        believed.append(probability.max(axis=1))
+        fiducial.append(probability.max(axis=1))
         right.append(probability.argmax(axis=1) == truth)
-    confidence, hit = np.concatenate(believed), np.concatenate(right)
+    confidence, hit = np.concatenate(fiducial), np.concatenate(right)
     sigma = np.sqrt(np.sum(confidence * (1 - confidence)))
     assert abs(np.sum(hit) - np.sum(confidence)) < 4.0 * sigma
     for part in (confidence < 0.6, confidence > 0.9):
@@ -207,14 +211,14 @@ def frozen_fits(request) -> dict[str, np.ndarray]:
     for _ in range(600):
         best = fit(drawn_null(rng, 40, count), t_fit @ truth + rng.normal(size=40), t_fit)
         before, after = drawn_null(rng, p, count), drawn_null(rng, p, count)
-        after = Null(after.mean + t_test @ best.amplitudes, after.whitening, count)
+        after = SimulatedGaussian(after.mean + t_test @ best.amplitudes, after.whitening, count)
         x = signal + other + rng.normal(size=p)
         forecast = predicted(before, x, t_test, best.amplitudes, best.covariance)
         shrink = achieved(before, after, x)
         left = signal - t_test @ best.amplitudes
         expected = 1.0 - (left @ left + other @ other) / (signal @ signal + other @ other)
-        found["forecast"].append(forecast.drop.value)
-        found["forecast_sigma"].append(forecast.drop.sigma)
+        found["forecast"].append(forecast.delta_chi2.value)
+        found["forecast_sigma"].append(forecast.delta_chi2.sigma)
         found["drop"].append(shrink.before.value - shrink.after.value)
         found["sigma"].append(shrink.fraction.sigma)
         found["fraction"].append(shrink.fraction.value)
@@ -243,9 +247,11 @@ def test_forecast_drop_of_what_draws_is_the_drop():
         scatter = root @ rng.normal(size=(3, draws))
         scatter = (scatter - scatter.mean(axis=1, keepdims=True)) / np.sqrt(draws - 1.0)
         x = t + root @ rng.normal(size=3) + rng.normal(size=fitted + p)
-        frozen = fit(learning.widened(scatter[:fitted]), x[:fitted], t[:fitted, None])
+        frozen = fit(learning.with_extra_covariance(scatter[:fitted]), x[:fitted], t[:fitted, None])
         noise = fit(learning, x[:fitted], t[:fitted, None]).covariance
-        after = replace(before, mean=before.mean + t[fitted:] * frozen.amplitudes[0]).widened(scatter[fitted:])
+        after = replace(before, mean=before.mean + t[fitted:] * frozen.amplitudes[0]).with_extra_covariance(
+            scatter[fitted:]
+        )
         drawn = (t + np.sqrt(draws) * scatter.T) ** 2
         seen = excess(learning, x[:fitted])
         forecast = carried(
@@ -259,8 +265,8 @@ def test_forecast_drop_of_what_draws_is_the_drop():
             drawn[:, :fitted].sum(axis=1),
         )
         shrink = achieved(before, after, x[fitted:])
-        differences.append(shrink.before.value - shrink.after.value - forecast.drop.value)
-        errors.append(forecast.drop.sigma)
+        differences.append(shrink.before.value - shrink.after.value - forecast.delta_chi2.value)
+        errors.append(forecast.delta_chi2.sigma)
     assert abs(np.mean(differences)) < 4.0 * np.std(differences) / np.sqrt(len(differences))
     # Forecasts of the mean drop: the noise of the data that measure it is not in their error.
     assert 0.7 < np.mean(errors) / np.std(differences) < 1.2

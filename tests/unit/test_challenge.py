@@ -10,7 +10,7 @@ from scipy import integrate, stats
 
 from mcsim import config, systematics
 from mcsim.benchmark import intervals, toml
-from mcsim.benchmark.draws import Draw, bench, draws, judged, powers, urn_of
+from mcsim.benchmark.draws import Draw, bench, draws, judged, powers, sampler_of
 from mcsim.benchmark.expected import SIGNATURES, places_right
 from mcsim.benchmark.figures import confusion, scored
 from mcsim.benchmark.prior import Drawn, Prior
@@ -18,10 +18,10 @@ from mcsim.benchmark.record import Geometry, Record
 from mcsim.benchmark.reduced import without
 from mcsim.benchmark.report import lines, write
 from mcsim.benchmark.truth import MAPS, SEAL, Member, Truth, finished_cases, key_path, open_key, sealed, write_whole
-from mcsim.diagnosis.blocks import Block, Entry
-from mcsim.diagnosis.case import court
-from mcsim.diagnosis.evidence import Proposal, Questions
+from mcsim.diagnosis.analysis import Analysis, Proposal
+from mcsim.diagnosis.inference import context
 from mcsim.diagnosis.knowledge import Knowledge
+from mcsim.diagnosis.summaries import Block, Element
 from mcsim.errors import InputError
 
 ENTRIES = 24
@@ -38,12 +38,12 @@ def toy(names, simulations=800, seed=1, common=0.0):
     directions = np.linalg.qr(rng.standard_normal((ENTRIES // 2, columns)))[0]
     directions = np.sqrt(1.0 - common) * directions + np.sqrt(common) * directions[:, :1]
     templates = np.repeat(directions, 2, axis=0)
-    entries = [Entry(f"entry{i}", "map", ("A",), None, i % 2) for i in range(ENTRIES)]
-    blocks = [Block(tuple(entries), lambda model, heard: np.zeros(ENTRIES))]
+    elements = [Element(f"entry{i}", "map", ("A",), None, i % 2) for i in range(ENTRIES)]
+    blocks = [Block(tuple(elements), lambda model, filtered: np.zeros(ENTRIES))]
     rows = [templates]
     for number, proposal in enumerate(proposals):
-        score = Entry(f"score/{proposal.label}/0", "score", ("A",))
-        blocks.append(Block((score,), lambda model, heard: np.zeros(1)))
+        score = Element(f"score/{proposal.label}/0", "score", ("A",))
+        blocks.append(Block((score,), lambda model, filtered: np.zeros(1)))
         row = np.zeros((1, columns))
         row[0, number] = 0.5
         rows.append(row)
@@ -57,16 +57,16 @@ def toy(names, simulations=800, seed=1, common=0.0):
         np.zeros_like(t),
         np.zeros((24, p)),
         np.zeros((0, 0)),
-        tuple(entry for block in blocks for entry in block.entries),
+        tuple(element for block in blocks for element in block.elements),
     )
-    return court(None, Questions(SimpleNamespace(lmax=128), tuple(proposals), tuple(blocks)), known)
+    return context(None, Analysis(SimpleNamespace(lmax=128), tuple(proposals), tuple(blocks)), known)
 
 
 NAMES = (("beam_width", "A"), ("noise_level", "A"), ("beam_ellipticity", "A"), ("beam_width", "B"), ("spectrum", None))
 
 
 @pytest.fixture(scope="module")
-def sitting():
+def learned_model():
     return toy(NAMES[:4])
 
 
@@ -115,11 +115,11 @@ def test_toml_loads_as_the_same_run():
 # Draws
 
 
-def test_cases_do_not_depend_on_how_many_there_are(sitting):
-    urn = urn_of(bench(sitting), Prior())
-    few, many = urn.kinds(3, 20, False), urn.kinds(3, 400, False)
+def test_cases_do_not_depend_on_how_many_there_are(learned_model):
+    sampler = sampler_of(bench(learned_model), Prior())
+    few, many = sampler.kinds(3, 20, False), sampler.kinds(3, 400, False)
     assert many[:20] == few
-    assert [urn.draw(few, 3, case) for case in range(20)] == [urn.draw(many, 3, case) for case in range(20)]
+    assert [sampler.draw(few, 3, case) for case in range(20)] == [sampler.draw(many, 3, case) for case in range(20)]
     assert "invented" not in many
     # 20, 45, 15 and 12 of 92; 4 sigma.
     for kind, part in (("none", 20), ("one", 45), ("two", 15), ("left_out", 12)):
@@ -127,38 +127,38 @@ def test_cases_do_not_depend_on_how_many_there_are(sitting):
         assert abs(many.count(kind) - 400 * share) < 4 * np.sqrt(400 * share * (1 - share))
 
 
-def test_what_is_left_out_rotates(sitting):
-    urn = urn_of(bench(sitting), Prior(none=0, one=0, two=0, left_out=1))
-    kinds = urn.kinds(1, 6, False)
-    names = [urn.draw(kinds, 1, case).without[0] for case in range(6)]
-    assert sorted(names[:3]) == sorted(names[3:]) == sorted(set(urn.names()))
+def test_what_is_left_out_rotates(learned_model):
+    sampler = sampler_of(bench(learned_model), Prior(none=0, one=0, two=0, left_out=1))
+    kinds = sampler.kinds(1, 6, False)
+    names = [sampler.draw(kinds, 1, case).without[0] for case in range(6)]
+    assert sorted(names[:3]) == sorted(names[3:]) == sorted(set(sampler.names()))
 
 
-def test_what_nature_has_too_little_of_is_not_drawn(sitting, monkeypatch):
-    urn = urn_of(bench(sitting), Prior())
-    name = urn.names()[0]
-    kind = next(one.kind for one in urn.proposals if one.kind.name == name)
+def test_what_nature_has_too_little_of_is_not_drawn(learned_model, monkeypatch):
+    sampler = sampler_of(bench(learned_model), Prior())
+    name = sampler.names()[0]
+    kind = next(one.kind for one in sampler.proposals if one.kind.name == name)
     strongest = max(
-        urn.white_length(urn.templates[:, column])
-        for proposal, columns in zip(urn.proposals, urn.columns, strict=True)
+        sampler.white_length(sampler.templates[:, column])
+        for proposal, columns in zip(sampler.proposals, sampler.columns, strict=True)
         for column in columns
         if proposal.kind is kind
     )
-    monkeypatch.setattr(kind, "most", 1.01 * urn.prior.weakest / strongest)
-    assert name in urn.names()
-    monkeypatch.setattr(kind, "most", 0.99 * urn.prior.weakest / strongest)
-    assert name not in urn.names()
+    monkeypatch.setattr(kind, "max_amplitude", 1.01 * sampler.prior.weakest / strongest)
+    assert name in sampler.names()
+    monkeypatch.setattr(kind, "max_amplitude", 0.99 * sampler.prior.weakest / strongest)
+    assert name not in sampler.names()
 
 
-def test_strengths_are_the_drawn_ones(sitting):
+def test_strengths_are_the_drawn_ones(learned_model):
     """White length of the response, by the covariance that the toy was made with; known to 5 % from 600 simulations."""
-    urn = urn_of(bench(sitting), Prior(none=0, one=1, two=0, left_out=0))
-    kinds = urn.kinds(1, 200, False)
+    sampler = sampler_of(bench(learned_model), Prior(none=0, one=1, two=0, left_out=0))
+    kinds = sampler.kinds(1, 200, False)
     for case in range(200):
-        (found,) = urn.draw(kinds, 1, case).members
+        (found,) = sampler.draw(kinds, 1, case).members
         assert 3.0 * (1 - 1e-6) < found.strength < 20.0 * (1 + 1e-6)
-        columns = list(sitting.candidates[found.candidate].columns)
-        length = np.linalg.norm(sitting.known.templates[:, columns] @ found.coordinates)
+        columns = list(learned_model.candidates[found.candidate].columns)
+        length = np.linalg.norm(learned_model.known.templates[:, columns] @ found.coordinates)
         assert length == pytest.approx(found.strength, rel=0.15)
 
 
@@ -182,10 +182,10 @@ def test_power_of_one_template_is_the_known_one():
     assert low <= false <= high
 
 
-def test_draws_are_judged(sitting, tmp_path):
-    records = draws(sitting, 120, 2)
+def test_draws_are_judged(learned_model, tmp_path):
+    records = draws(learned_model, 120, 2)
     assert [record.case for record in records] == [f"draw-{number:05d}" for number in range(120)]
-    score = scored("toy", records, powers(sitting, 300, 2))
+    score = scored("toy", records, powers(learned_model, 300, 2))
     strong = [record for record in records if record.kind == "one" and record.strength > 6]
     # Nearly orthogonal templates, far above the threshold: only the 5 % of true sets that are refused go wrong.
     wrong = sum(not record.right for record in strong)
@@ -209,18 +209,18 @@ def test_draws_are_judged(sitting, tmp_path):
     assert any("false alarms" in line for line in lines(score))
 
 
-def test_an_invention_is_called_unknown(sitting):
+def test_an_invention_is_called_unknown(learned_model):
     """A response at right angles to every template, at ten sigmas, in 40 skies: no name, but where noise adds one."""
-    here = bench(sitting)
+    here = bench(learned_model)
     rng = np.random.default_rng(8)
-    left = here.null.templates(here.templates)
+    left = here.null.whiten_templates(here.templates)
     basis = np.linalg.qr(left)[0]
     found = []
     for case in range(40):
         direction = rng.standard_normal(here.null.dimension)
         direction -= basis @ (basis.T @ direction)
-        response = np.linalg.lstsq(here.null.templates(np.eye(len(here.templates))), direction, rcond=None)[0]
-        length = np.sqrt(here.null.unbiased) * np.linalg.norm(here.null.templates(response[:, None]))
+        response = np.linalg.lstsq(here.null.whiten_templates(np.eye(len(here.templates))), direction, rcond=None)[0]
+        length = np.sqrt(here.null.unbiased) * np.linalg.norm(here.null.whiten_templates(response[:, None]))
         invented = member("invented", candidate=None, response=tuple(10.0 / length * response))
         found.append(Draw(case, Drawn("invented", (invented,), ()), 10.0 / length * response))
     records = judged(here, Prior(), 0, found)
@@ -237,10 +237,10 @@ def test_pairs_have_the_evidence_of_brute_force():
     """Likelihood times prior of two amplitudes on a grid, against importance sampling; many simulations: Gaussian."""
     prior = Prior(none=0.2, one=0.5, two=0.3, left_out=0, invented=0, weakest=2.0, strongest=10.0)
     here = bench(toy(NAMES[:2], simulations=20_000, common=0.3))
-    urn = urn_of(here, prior)
+    sampler = sampler_of(here, prior)
     geometry = Geometry.of(here.null, here.templates, here.candidates, here.calibration)
-    bayes = geometry.bayes(urn)
-    white = here.null.templates(here.templates)
+    bayes = geometry.bayes(sampler)
+    white = here.null.whiten_templates(here.templates)
     unit = white / np.linalg.norm(white, axis=0)
     noise = np.random.default_rng(3).standard_normal(here.null.dimension)
     s = np.concatenate([-np.linspace(10, 2, 1201), np.linspace(2, 10, 1201)])
@@ -269,22 +269,22 @@ def test_pairs_have_the_evidence_of_brute_force():
 # Without an effect
 
 
-def test_an_effect_leaves_its_columns_and_entries_only(sitting):
-    fewer = without(sitting.asked, sitting.known, ["beam_width"])
-    assert [proposal.kind.name for proposal in fewer.asked.proposals] == ["noise_level", "beam_ellipticity"]
-    assert fewer.asked.without == ("beam_width",)
-    names = [entry.name for entry in fewer.known.entries]
-    assert names == [entry.name for entry in fewer.asked.entries]
-    assert sorted({e.name for e in sitting.known.entries} - set(names)) == [
+def test_an_effect_leaves_its_columns_and_entries_only(learned_model):
+    fewer = without(learned_model.analysis, learned_model.known, ["beam_width"])
+    assert [proposal.kind.name for proposal in fewer.analysis.proposals] == ["noise_level", "beam_ellipticity"]
+    assert fewer.analysis.without == ("beam_width",)
+    names = [element.name for element in fewer.known.elements]
+    assert names == [element.name for element in fewer.analysis.elements]
+    assert sorted({e.name for e in learned_model.known.elements} - set(names)) == [
         "score/beam_width (A)/0",
         "score/beam_width (B)/0",
     ]
-    for proposal, columns in zip(fewer.asked.proposals, fewer.asked.columns, strict=True):
-        index = sitting.asked.proposals.index(proposal)
-        full = sitting.known.templates[np.ix_(fewer.rows, sitting.asked.columns[index])]
+    for proposal, columns in zip(fewer.analysis.proposals, fewer.analysis.columns, strict=True):
+        index = learned_model.analysis.proposals.index(proposal)
+        full = learned_model.known.templates[np.ix_(fewer.rows, learned_model.analysis.columns[index])]
         np.testing.assert_array_equal(fewer.known.templates[:, columns], full)
-    same = without(sitting.asked, sitting.known, [])
-    assert same.known.templates.shape == sitting.known.templates.shape
+    same = without(learned_model.analysis, learned_model.known, [])
+    assert same.known.templates.shape == learned_model.known.templates.shape
 
 
 # Figures
@@ -301,9 +301,9 @@ def test_intervals_cover_what_they_say():
     assert gone.value == pytest.approx(0.8)
     rng = np.random.default_rng(0)
     x = rng.uniform(20, 100, 400)
-    drops = [0.9 * x, x] + 15 * rng.standard_normal((2, 400))
+    delta_chi2 = [0.9 * x, x] + 15 * rng.standard_normal((2, 400))
     # The sums' errors, 15 sqrt(400) of some 24,000 each, are 1.8 % together.
-    found = intervals.slope("x", drops[1], drops[0], "", 0.8, 1.0)
+    found = intervals.slope("x", delta_chi2[1], delta_chi2[0], "", 0.8, 1.0)
     assert found.value == pytest.approx(0.9, abs=4 * 0.018 * 0.9)
     assert found.low < found.value < found.high
     assert found.met is True

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from mcsim.diagnosis.attribute import Attribution, attribute
 from mcsim.diagnosis.candidate import Candidate
-from mcsim.diagnosis.case import confirmed
-from mcsim.diagnosis.closest import Closest, Exact, closest
-from mcsim.diagnosis.shrink import Measured, Prediction, Shrink
-from mcsim.stats.detection import cosines, detectable, log_evidence, posterior, strength_needed, strength_to_isolate
-from mcsim.stats.gaussian import Null, bases, null
+from mcsim.diagnosis.inference import confirmed
+from mcsim.diagnosis.partial_explanation import Exact, PartialExplanation, partial_explanation
+from mcsim.diagnosis.selection import Attribution, attribute
+from mcsim.diagnosis.validation import Measured, Prediction, Shrink
+from mcsim.stats.detection import cosines, detectable, log_evidence, posterior, snr_needed, snr_to_separate
+from mcsim.stats.gaussian import SimulatedGaussian, null, whitened_templates
 from mcsim.stats.look_elsewhere import calibrate
 
 P, N = 60, 800
@@ -28,10 +28,10 @@ class Bench:
     def __init__(self, t: np.ndarray, candidates: list[Candidate]) -> None:
         self.null = null(np.random.default_rng(7).normal(size=(N, P)))
         self.t, self.candidates = t, candidates
-        self.bases = bases(self.null, t, [candidate.columns for candidate in candidates])
-        self.calibration = calibrate(self.null, self.bases)
+        self.whitened_templates = whitened_templates(self.null, t, [candidate.columns for candidate in candidates])
+        self.calibration = calibrate(self.null, self.whitened_templates)
 
-    def judge(self, signal: np.ndarray, seed: int, **options) -> Attribution:
+    def diagnose_maps(self, signal: np.ndarray, seed: int, **options) -> Attribution:
         x = signal + np.random.default_rng(seed).normal(size=P)
         return attribute(self.null, x, self.t, self.candidates, self.calibration, **options)
 
@@ -53,7 +53,7 @@ def bench() -> Bench:
 
 
 def verdicts(bench: Bench, signal: np.ndarray, draws: int, **options) -> list[Attribution]:
-    return [bench.judge(signal, seed, **options) for seed in range(draws)]
+    return [bench.diagnose_maps(signal, seed, **options) for seed in range(draws)]
 
 
 def test_without_an_effect_one_in_twenty_is_named(bench):
@@ -100,38 +100,38 @@ def test_twins_are_told_as_twins_with_what_parts_them():
     t = directions(3, 10)
     t[:, 1] = t[:, 0]
     t[7, 1] += 0.1
-    twins = Bench(t, singles(3))
-    found = twins.judge(10.0 * t[:, 0], 1)
+    nearest_candidates = Bench(t, singles(3))
+    found = nearest_candidates.diagnose_maps(10.0 * t[:, 0], 1)
     assert found.verdict == "degenerate"
     assert {e.members for e in found.explanations} == {(0,), (1,)}
     contrast = found.contrasts[0]
-    assert contrast.entries[0] == 7
+    assert contrast.elements[0] == 7
     assert contrast.shares.sum() == pytest.approx(1.0)
     assert contrast.separation < 2.0
     assert found.correlation[0, 1] > 0.99
-    assert twins.judge(300.0 * t[:, 0], 1, shape_error=0.0).verdict == "effect"
+    assert nearest_candidates.diagnose_maps(300.0 * t[:, 0], 1, shape_error=0.0).verdict == "effect"
 
 
 def test_an_effect_of_one_sign_is_not_named_with_the_other():
     t = directions(2, 13)
     bench = Bench(t, [Candidate("positive", None, (0,), positive=True), singles(2)[1]])
-    assert bench.judge(8.0 * t[:, 0], 3).verdict == "effect"
-    assert bench.judge(-8.0 * t[:, 0], 3).verdict == "unknown"
-    assert bench.judge(-8.0 * t[:, 1], 3).verdict == "effect"
+    assert bench.diagnose_maps(8.0 * t[:, 0], 3).verdict == "effect"
+    assert bench.diagnose_maps(-8.0 * t[:, 0], 3).verdict == "unknown"
+    assert bench.diagnose_maps(-8.0 * t[:, 1], 3).verdict == "effect"
 
 
 def test_an_effect_larger_than_nature_has_it_is_not_named():
     t = directions(3, 14)
-    bench = Bench(t, [Candidate("small", None, (0, 1), most=10.0), Candidate("other", None, (2,))])
-    assert bench.judge(t[:, :2] @ [5.0, 6.0], 3).verdict == "effect"
-    assert bench.judge(t[:, :2] @ [10.0, 12.0], 3).verdict == "unknown"
-    assert bench.judge(t @ [0.0, 0.0, 15.0], 3).verdict == "effect"
+    bench = Bench(t, [Candidate("small", None, (0, 1), max_amplitude=10.0), Candidate("other", None, (2,))])
+    assert bench.diagnose_maps(t[:, :2] @ [5.0, 6.0], 3).verdict == "effect"
+    assert bench.diagnose_maps(t[:, :2] @ [10.0, 12.0], 3).verdict == "unknown"
+    assert bench.diagnose_maps(t @ [0.0, 0.0, 15.0], 3).verdict == "effect"
 
 
 def test_simpler_of_two_nested_effects_is_first():
     """One column, and three that contain it."""
     nested = Bench(directions(3, 11), [Candidate("large", None, (0, 1, 2)), Candidate("small", None, (0,))])
-    found = [nested.judge(10.0 * nested.t[:, 0], seed) for seed in range(40)]
+    found = [nested.diagnose_maps(10.0 * nested.t[:, 0], seed) for seed in range(40)]
     first = [one.explanations[0].members for one in found if one.explanations]
     assert first.count((1,)) >= 35
     assert all(one.explanations[1].odds < 1.0 for one in found if len(one.explanations) > 1)
@@ -148,7 +148,7 @@ def test_settings_of_one_effect_compete():
         Candidate("lobe", "W2", (3,), {"r0": 5.0}),
     ]
     bench = Bench(t, candidates)
-    found = [bench.judge(14.0 * t[:, 1], seed) for seed in range(40)]
+    found = [bench.diagnose_maps(14.0 * t[:, 1], seed) for seed in range(40)]
     assert sum(one.verdict == "effect" and one.explanations[0].members == (1,) for one in found) >= 36
     assert all({0, 1} - set(e.members) for one in found for e in one.explanations)
 
@@ -176,8 +176,8 @@ def test_own_shape_error_replaces_that_of_the_search():
     t = directions(2, 15)
     signal = 100.0 * (t[:, 0] + 0.2 * directions(1, 16)[:, 0])
     exact, vague = Bench(t, singles(2)), Bench(t, [Candidate("vague", None, (0,), shape_error=0.2), *singles(2)[1:]])
-    assert exact.judge(signal, 0).verdict == "unknown"
-    assert vague.judge(signal, 0).explanations[0].members == (0,)
+    assert exact.diagnose_maps(signal, 0).verdict == "unknown"
+    assert vague.diagnose_maps(signal, 0).explanations[0].members == (0,)
 
 
 def drawing(bench: Bench, spread: np.ndarray) -> Bench:
@@ -196,7 +196,7 @@ def test_effect_that_draws_is_named_once_its_scatter_is_known(bench):
     for seed in range(40):
         signal = 12.0 * bench.t[:, 0] + spread @ np.random.default_rng(1000 + seed).normal(size=5)
         for kind, one in (("plain", bench), ("wide", wide)):
-            found = one.judge(signal, seed)
+            found = one.diagnose_maps(signal, seed)
             named[kind] += bool(found.explanations) and found.explanations[0].members == (0,)
     # Levels of 2 and 0.5 %, and a scatter that is known by 24 draws.
     assert named["wide"] >= 34
@@ -207,7 +207,7 @@ def test_a_wide_scatter_explains_nothing_by_itself(bench):
     """Something unknown in just the directions in which a drawing effect scatters, without its mean."""
     spread = 6.0 * directions(5, 21)
     wide = drawing(bench, spread)
-    found = [wide.judge(spread @ np.random.default_rng(1000 + seed).normal(size=5), seed) for seed in range(20)]
+    found = [wide.diagnose_maps(spread @ np.random.default_rng(1000 + seed).normal(size=5), seed) for seed in range(20)]
     assert not any((0,) in [one.members for one in each.explanations] for each in found)
 
 
@@ -217,7 +217,7 @@ def test_amplitude_beside_a_scatter_is_honest(bench):
     pulls = []
     for seed in range(60):
         signal = 60.0 * bench.t[:, 0] + spread @ np.random.default_rng(1000 + seed).normal(size=5)
-        found = wide.judge(signal, seed).explanations
+        found = wide.diagnose_maps(signal, seed).explanations
         if found and found[0].members == (0,):
             pulls.append((found[0].fit.amplitudes[0] - 60.0) / found[0].fit.errors[0])
     # A width of one, known to 1 / sqrt(2 * 50) = 0.1 from the pulls, and no better from 24 draws in five directions.
@@ -231,7 +231,7 @@ def test_prior_moves_the_odds():
     plain, favoured = Bench(t, singles(2)), Bench(t, [singles(2)[0], Candidate("effect1", None, (1,), prior=9.0)])
     ratios = []
     for bench in (plain, favoured):
-        odds = {e.members: e.odds for e in bench.judge(9.0 * t[:, 0], 3).explanations}
+        odds = {e.members: e.odds for e in bench.diagnose_maps(9.0 * t[:, 0], 3).explanations}
         ratios.append(odds[(1,)] / odds[(0,)])
     assert ratios[1] / ratios[0] == pytest.approx(9.0)
 
@@ -242,14 +242,14 @@ def test_sixty_candidates_take_less_than_two_seconds():
     bench = Bench(t, candidates)
     start = time.process_time()
     # Unknown and weak: nothing small suffices, and the residual of most triples passes.
-    bench.judge(7.0 * directions(1, 19)[:, 0], 4)
+    bench.diagnose_maps(7.0 * directions(1, 19)[:, 0], 4)
     assert time.process_time() - start < 2.0
 
 
 def test_evidence_is_the_integral_over_its_prior():
     """Against draws of the amplitudes, the covariance known."""
     rng = np.random.default_rng(20)
-    known = Null(np.zeros(6), np.eye(6), 10**9)
+    known = SimulatedGaussian(np.zeros(6), np.eye(6), 10**9)
     y = rng.normal(size=6) + np.array([2.0, -1.0, 0.0, 0.0, 0.0, 0.0])
     for K in (1, 2):
         values = []
@@ -265,10 +265,10 @@ def test_evidence_is_the_integral_over_its_prior():
 def test_posterior_is_bayes_theorem():
     rng = np.random.default_rng(21)
     t = rng.normal(size=(6, 5))
-    known = Null(np.zeros(6), np.eye(6), 10**9)
+    known = SimulatedGaussian(np.zeros(6), np.eye(6), 10**9)
     groups, prior, strengths = [(0,), (1, 2), (3, 4)], np.array([0.4, 0.3, 0.2, 0.1]), np.array([1.0, 3.0])
     x = rng.normal(size=6) + t[:, 0]
-    candidates = bases(known, t, groups)
+    candidates = whitened_templates(known, t, groups)
     likelihood = [np.exp(-0.5 * x @ x)]
     for i, group in enumerate(groups):
         basis = candidates.basis[:, candidates.start[i] : candidates.start[i + 1]]
@@ -288,13 +288,13 @@ def test_posterior_is_bayes_theorem():
 @pytest.mark.parametrize(("columns", "tests", "strength"), [(1, 1, 3.24), (1, 20, 4.30), (110, 1, 7.2)])
 def test_strengths_of_known_covariance(columns, tests, strength):
     """The normal, Bonferroni's and the chi2's figures; few simulations need more."""
-    assert strength_needed(columns, tests, 110, None) == pytest.approx(strength, abs=0.05)
-    assert strength_needed(columns, tests, 110, 10**6) == pytest.approx(strength, abs=0.05)
-    assert strength_needed(columns, tests, 110, 600) > 1.05 * strength_needed(columns, tests, 110, None)
+    assert snr_needed(columns, tests, 110, None) == pytest.approx(strength, abs=0.05)
+    assert snr_needed(columns, tests, 110, 10**6) == pytest.approx(strength, abs=0.05)
+    assert snr_needed(columns, tests, 110, 600) > 1.05 * snr_needed(columns, tests, 110, None)
 
 
 def test_detectable_takes_the_least_favourable_direction():
-    known = Null(np.zeros(4), np.eye(4), 10**6)
+    known = SimulatedGaussian(np.zeros(4), np.eye(4), 10**6)
     t = np.zeros((4, 2))
     t[0, 0], t[1, 1] = 2.0, 0.5
     found = detectable(known, t, 1)
@@ -309,8 +309,8 @@ def test_cosines_are_canonical_correlations():
     rng = np.random.default_rng(22)
     t = rng.normal(size=(9, 6))
     t[:, 5] = 0.0
-    known = Null(np.zeros(9), np.eye(9), 10**6)
-    found = cosines(bases(known, t, [(0,), (1, 2), (3, 4), (5,)]))
+    known = SimulatedGaussian(np.zeros(9), np.eye(9), 10**6)
+    found = cosines(whitened_templates(known, t, [(0,), (1, 2), (3, 4), (5,)]))
     one, two = np.linalg.qr(t[:, 1:3])[0], np.linalg.qr(t[:, 3:5])[0]
     assert found[1, 2] == pytest.approx(np.linalg.svd(one.T @ two, compute_uv=False)[0])
     assert found[0, 1] == pytest.approx(np.linalg.norm(one.T @ t[:, 0]) / np.linalg.norm(t[:, 0]))
@@ -320,11 +320,11 @@ def test_cosines_are_canonical_correlations():
 
 def test_isolation_needs_more_of_closer_effects():
     cosine = np.array([[1.0, 0.5], [-0.9, 0.0]])
-    found = strength_to_isolate(cosine)
+    found = snr_to_separate(cosine)
     assert found[0, 0] == np.inf
     assert found[1, 0] > found[0, 1] > found[1, 1]
     # Close twins: only the difference counts, Q(a) = 0.05.
-    close = strength_to_isolate(0.99)
+    close = snr_to_separate(0.99)
     assert close * np.sqrt(0.005) == pytest.approx(-special.ndtri(0.05), rel=1e-3)
 
 
@@ -332,23 +332,23 @@ def test_four_effects_are_heard_where_no_set_of_three_suffices(bench):
     """The four, the strongest first, and what is left is noise; without a gap there is nothing."""
     weights = np.array([30.0, 20.0, 14.0, 10.0])
 
-    def heard(x: np.ndarray, exact: Exact = lambda t, members, fitted: t) -> Closest | None:
-        return closest(bench.null, x, bench.t, bench.candidates, bench.calibration, exact)
+    def filtered(x: np.ndarray, exact: Exact = lambda t, members, fitted: t) -> PartialExplanation | None:
+        return partial_explanation(bench.null, x, bench.t, bench.candidates, bench.calibration, exact)
 
     signal = bench.t[:, :4] @ weights
-    found = [heard(signal + np.random.default_rng(seed).normal(size=P)) for seed in range(10)]
+    found = [filtered(signal + np.random.default_rng(seed).normal(size=P)) for seed in range(10)]
     # A fifth joins them by chance once in 200.
     assert sum(one.members == (0, 1, 2, 3) for one in found) >= 9
     pulls = np.concatenate([(one.fit.amplitudes[:4] - weights) / one.fit.errors[:4] for one in found])
     assert np.mean(pulls**2) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 40))
     # The square of 56 numbers scatters by sqrt(2 56) about them, beside a gap of 1,596.
     assert max(one.left for one in found) < 4.0 * np.sqrt(2.0 * 56) / 1596
-    assert heard(bench.null.mean) is None
+    assert filtered(bench.null.mean) is None
     # What cannot have its amplitude, or says something else there, is passed over.
-    assert 0 not in heard(signal, lambda t, members, fitted: None if 0 in members else t).members
+    assert 0 not in filtered(signal, lambda t, members, fitted: None if 0 in members else t).members
     other = bench.t.copy()
     other[:, 0] -= signal * (signal @ other[:, 0]) / (signal @ signal)
-    assert 0 not in heard(signal, lambda t, members, fitted: other if 0 in members else t).members
+    assert 0 not in filtered(signal, lambda t, members, fitted: other if 0 in members else t).members
 
 
 UNSURE = Prediction(Measured(0.0, 1e4), Measured(0.0, 100.0))
@@ -357,13 +357,15 @@ UNSURE = Prediction(Measured(0.0, 1e4), Measured(0.0, 100.0))
 @pytest.mark.parametrize(("achieved", "named"), [(0.9, True), (-0.5, True), (-2.0, False)])
 def test_set_that_opens_the_gap_is_not_named(bench, achieved, named):
     """Three standard deviations below zero: what fits best, simulated, made it worse."""
-    found = bench.judge(12.0 * bench.t[:, 3], 0)
+    found = bench.diagnose_maps(12.0 * bench.t[:, 3], 0)
     assert found.verdict == "effect"
-    court = SimpleNamespace(asked=SimpleNamespace(proposals=[SimpleNamespace(label=c.name) for c in bench.candidates]))
+    context = SimpleNamespace(
+        analysis=SimpleNamespace(proposals=[SimpleNamespace(label=c.name) for c in bench.candidates])
+    )
     after = Measured(100.0 * (1.0 - achieved), 10.0)
     shrink = UNSURE, Shrink(Measured(100.0, 10.0), after, Measured(achieved, 0.5), 0.5), "half2"
     notes: list[str] = []
-    judged, kept = confirmed(court, found, shrink, notes)
+    judged, kept = confirmed(context, found, shrink, notes)
     assert (judged.verdict, kept is shrink, bool(notes)) == (
         ("effect", True, False) if named else ("unknown", False, True)
     )
@@ -382,12 +384,14 @@ def test_set_that_opens_the_gap_is_not_named(bench, achieved, named):
     ],
 )
 def test_set_that_closes_less_than_half_of_what_was_forecast_is_not_named(bench, achieved, forecast, error, named):
-    found = bench.judge(12.0 * bench.t[:, 3], 0)
-    court = SimpleNamespace(asked=SimpleNamespace(proposals=[SimpleNamespace(label=c.name) for c in bench.candidates]))
+    found = bench.diagnose_maps(12.0 * bench.t[:, 3], 0)
+    context = SimpleNamespace(
+        analysis=SimpleNamespace(proposals=[SimpleNamespace(label=c.name) for c in bench.candidates])
+    )
     expected = Prediction(Measured(100.0 * forecast, 15.0), Measured(forecast, 0.15))
     measured = Shrink(Measured(100.0, 10.0), Measured(100.0 * (1.0 - achieved), 10.0), Measured(achieved, error), 0.5)
     notes: list[str] = []
-    judged, _ = confirmed(court, found, (expected, measured, "half2"), notes)
+    judged, _ = confirmed(context, found, (expected, measured, "half2"), notes)
     assert judged.verdict == ("effect" if named else "unknown")
     assert named or ("opens the gap" if achieved < 0.0 else "takes 35% of the other's gap, where 97%") in notes[0]
 
@@ -396,11 +400,13 @@ def test_set_that_closes_less_than_half_of_what_was_forecast_is_not_named(bench,
 @pytest.mark.parametrize(("after", "named"), [(15.0, True), (80.0, False)])
 def test_half_without_a_gap_measures_no_shrink(bench, before, after, named):
     """Shares of nothing are large, of either sign, and say nothing; a gap that is opened is one from nothing too."""
-    found = bench.judge(12.0 * bench.t[:, 3], 0)
-    court = SimpleNamespace(asked=SimpleNamespace(proposals=[SimpleNamespace(label=c.name) for c in bench.candidates]))
+    found = bench.diagnose_maps(12.0 * bench.t[:, 3], 0)
+    context = SimpleNamespace(
+        analysis=SimpleNamespace(proposals=[SimpleNamespace(label=c.name) for c in bench.candidates])
+    )
     share = Measured(1.0 - after / before, 12.0)
     notes: list[str] = []
     shrink = UNSURE, Shrink(Measured(before, 12.0), Measured(after, 12.0), share, 0.5), "half2"
-    judged, kept = confirmed(court, found, shrink, notes)
+    judged, kept = confirmed(context, found, shrink, notes)
     assert (judged.verdict, kept) == ("effect" if named else "unknown", None)
     assert ("shows no gap by itself" if named else "opens the gap") in notes[0]

@@ -5,8 +5,8 @@ import pytest
 from scipy import stats
 
 from mcsim.errors import InputError
-from mcsim.stats.gaussian import bases, fit, null, residual_probability, score_probability
-from mcsim.stats.look_elsewhere import Calibration, atlas, calibrate, gap
+from mcsim.stats.gaussian import fit, nested_pvalue, null, residual_pvalue, whitened_templates
+from mcsim.stats.look_elsewhere import Calibration, calibrate, global_test, scan_pvalues
 
 P, N = 12, 60
 
@@ -30,50 +30,52 @@ def templates(ensemble) -> np.ndarray:
 
 
 def test_scatter_is_n_times_one(ensemble):
-    believed = null(ensemble)
-    white = believed.data(ensemble) * np.sqrt(1 + 1 / N)
+    fiducial = null(ensemble)
+    white = fiducial.whiten(ensemble) * np.sqrt(1 + 1 / N)
     np.testing.assert_allclose(white.T @ white, (N - 1) * np.eye(P), atol=1e-9)
 
 
 def test_offset_moves_the_mean(ensemble, evidence):
     shift = np.arange(P, dtype=float)
-    np.testing.assert_allclose(null(ensemble, shift).data(evidence + shift), null(ensemble).data(evidence), rtol=1e-9)
+    np.testing.assert_allclose(
+        null(ensemble, shift).whiten(evidence + shift), null(ensemble).whiten(evidence), rtol=1e-9
+    )
 
 
 def test_wider_null_is_that_of_both_scatters(ensemble):
     """Against the covariance itself, where draws are so many that nothing is drawn towards anything."""
     rng = np.random.default_rng(3)
-    believed = null(ensemble)
-    p = believed.dimension
+    fiducial = null(ensemble)
+    p = fiducial.dimension
     root = rng.normal(size=(p, p)) * np.sqrt(np.var(ensemble, axis=0))[:, None]
     draws = root @ rng.normal(size=(p, 400_000))
-    wide = believed.widened((draws - draws.mean(axis=1, keepdims=True)) / np.sqrt(399_999.0))
+    wide = fiducial.with_extra_covariance((draws - draws.mean(axis=1, keepdims=True)) / np.sqrt(399_999.0))
     S = np.cov(ensemble.T)
-    scale = 1.0 + 1.0 / believed.count
-    x = rng.normal(size=p) * ensemble.std(axis=0) + believed.mean
+    scale = 1.0 + 1.0 / fiducial.count
+    x = rng.normal(size=p) * ensemble.std(axis=0) + fiducial.mean
     # S is too small by the factor that makes squares unbiased.
-    expected = (x - believed.mean) @ np.linalg.solve(S + believed.unbiased / scale * root @ root.T, x - believed.mean)
-    assert wide.square(x) == pytest.approx(expected / scale, rel=0.01)
-    volume = np.linalg.slogdet(np.eye(p) + believed.unbiased / scale * np.linalg.solve(S, root @ root.T))[1]
-    assert wide.log_volume == pytest.approx(-0.5 * volume, rel=0.01)
+    expected = (x - fiducial.mean) @ np.linalg.solve(S + fiducial.unbiased / scale * root @ root.T, x - fiducial.mean)
+    assert wide.chi2(x) == pytest.approx(expected / scale, rel=0.01)
+    volume = np.linalg.slogdet(np.eye(p) + fiducial.unbiased / scale * np.linalg.solve(S, root @ root.T))[1]
+    assert wide.log_jacobian == pytest.approx(-0.5 * volume, rel=0.01)
 
 
 def test_statistics_equal_those_of_the_scatter(ensemble, evidence, templates):
     """The formulas of Hotelling and Rao written with S itself."""
-    believed, n = null(ensemble), N - 1
+    fiducial, n = null(ensemble), N - 1
     inverse = np.linalg.inv(np.cov(ensemble.T) * n)
     x = (evidence - ensemble.mean(axis=0)) / np.sqrt(1 + 1 / N)
     t = templates[:, :3]
     square = x @ inverse @ x
-    y = believed.data(evidence)
+    y = fiducial.whiten(evidence)
     np.testing.assert_allclose(y @ y / n, square, rtol=1e-8)
     score, normal = t.T @ inverse @ x, t.T @ inverse @ t
     T = score @ np.linalg.solve(normal, score)
-    found = fit(believed, evidence, t)
+    found = fit(fiducial, evidence, t)
     expected = stats.f.sf((n - P + 1) / 3 * T / (1 + square - T), 3, n - P + 1)
-    assert found.score == pytest.approx(expected, rel=1e-7)
+    assert found.nested_pvalue == pytest.approx(expected, rel=1e-7)
     q = P - 3
-    assert found.probability == pytest.approx(stats.f.sf((n - q + 1) / q * (square - T), q, n - q + 1), rel=1e-7)
+    assert found.pvalue == pytest.approx(stats.f.sf((n - q + 1) / q * (square - T), q, n - q + 1), rel=1e-7)
     theta = np.linalg.solve(normal, score) * np.sqrt(1 + 1 / N)
     np.testing.assert_allclose(found.amplitudes, theta, rtol=1e-7)
     student = (1 + square - T) * np.linalg.inv(normal) * (1 + 1 / N) / (n - q) * stats.t.var(n - q)
@@ -88,7 +90,7 @@ def test_repeated_entries_change_nothing(ensemble, evidence, templates):
     assert long.dimension == P
     one, two = fit(short, evidence, templates[:, :2]), fit(long, mixing @ evidence, mixing @ templates[:, :2])
     np.testing.assert_allclose(one.amplitudes, two.amplitudes, rtol=1e-6)
-    assert one.probability == pytest.approx(two.probability, rel=1e-6)
+    assert one.pvalue == pytest.approx(two.pvalue, rel=1e-6)
 
 
 def test_a_repeated_column_has_no_amplitude_of_its_own(ensemble, evidence, templates):
@@ -99,8 +101,8 @@ def test_a_repeated_column_has_no_amplitude_of_its_own(ensemble, evidence, templ
 
 
 def test_probabilities_without_columns_or_dimensions_are_one():
-    assert score_probability(0.0, 5.0, 0, P, N) == 1.0
-    assert residual_probability(0.0, 0, N) == 1.0
+    assert nested_pvalue(0.0, 5.0, 0, P, N) == 1.0
+    assert residual_pvalue(0.0, 0, N) == 1.0
 
 
 @pytest.mark.parametrize(("q", "allowance"), [(1, 4.0), (30, 9.0), (100, 100.0)])
@@ -108,7 +110,7 @@ def test_forgiven_errors_make_the_tail_noncentral(q, allowance):
     """Patnaik's approximation, within 10 % of the noncentral F at the 5 % level where it decides."""
     n = 1200
     chi2 = stats.ncf.isf(0.05, q, n - q + 1, allowance) * n * q / (n - q + 1)
-    assert residual_probability(chi2, q, n, allowance) == pytest.approx(0.05, rel=0.1)
+    assert residual_pvalue(chi2, q, n, allowance) == pytest.approx(0.05, rel=0.1)
 
 
 def test_bad_ensembles_say_what_to_do(ensemble):
@@ -128,20 +130,23 @@ def test_gap_is_invariant_and_names_the_candidate(ensemble, evidence, templates)
     x = evidence + 20.0 * templates[:, 1]
     results = []
     for scale in (1.0, 1e-6):
-        believed = null(ensemble * scale)
-        candidates = bases(believed, templates * scale, groups)
-        results.append(gap(believed, x * scale, candidates, calibrate(believed, candidates, draws=2000)))
+        fiducial = null(ensemble * scale)
+        candidates = whitened_templates(fiducial, templates * scale, groups)
+        results.append(global_test(fiducial, x * scale, candidates, calibrate(fiducial, candidates, draws=2000)))
     assert results[0].best == 1
-    assert results[0].probability == pytest.approx(results[1].probability, rel=1e-6)
+    assert results[0].pvalue == pytest.approx(results[1].pvalue, rel=1e-6)
     assert results[0].chi2 == pytest.approx(results[1].chi2, rel=1e-8)
 
 
 def test_silent_candidates_count_for_nothing(ensemble, evidence, templates):
-    believed = null(ensemble)
+    fiducial = null(ensemble)
     silent = np.column_stack([templates, np.zeros(P)])
-    heard, all_of_them = bases(believed, templates, [(0,), (1, 2)]), bases(believed, silent, [(0,), (1, 2), (6,)])
-    one = gap(believed, evidence, heard, calibrate(believed, heard, draws=2000))
-    two = gap(believed, evidence, all_of_them, calibrate(believed, all_of_them, draws=2000))
+    filtered, all_of_them = (
+        whitened_templates(fiducial, templates, [(0,), (1, 2)]),
+        whitened_templates(fiducial, silent, [(0,), (1, 2), (6,)]),
+    )
+    one = global_test(fiducial, evidence, filtered, calibrate(fiducial, filtered, draws=2000))
+    two = global_test(fiducial, evidence, all_of_them, calibrate(fiducial, all_of_them, draws=2000))
     assert one == two
 
 
@@ -150,19 +155,19 @@ def test_calibration_goes_on_beyond_its_draws():
     draws = np.sort(np.random.default_rng(4).uniform(size=1000))
     calibration = Calibration(5, draws / 5, draws)
     p = np.logspace(-30, 0, 400)
-    for values in (calibration.trials(p), calibration.combine(1.0, p), calibration.combine(p, 1.0)):
+    for values in (calibration.global_pvalue(p), calibration.combine(1.0, p), calibration.combine(p, 1.0)):
         assert np.all(np.diff(values) >= 0.0)
         assert values[0] > 0.0
         assert values[-1] <= 1.0
-    assert np.all(calibration.trials(p) <= 5 * p)
-    assert calibration.trials(1e-20) == pytest.approx(5e-20)
+    assert np.all(calibration.global_pvalue(p) <= 5 * p)
+    assert calibration.global_pvalue(1e-20) == pytest.approx(5e-20)
 
 
 def test_atlas_deviations_are_those_of_left_out_simulations():
     """The data put among the simulations and left out again have the same deviation."""
     rng = np.random.default_rng(5)
     simulations, x = rng.normal(size=(40, 7)) * np.arange(1, 8), rng.normal(size=7)
-    z, p = atlas(x, simulations)
+    z, p = scan_pvalues(x, simulations)
     t = (x - simulations.mean(axis=0)) / simulations.std(axis=0, ddof=1) / np.sqrt(1 + 1 / 40)
     np.testing.assert_allclose(stats.norm.sf(z), stats.t.sf(t, 39), rtol=1e-9)
     assert np.all(p >= 2.0 * stats.norm.sf(np.abs(z)) * 0.999)
@@ -173,9 +178,9 @@ def test_atlas_deviations_are_those_of_left_out_simulations():
 def test_atlas_reaches_beyond_the_ranks():
     rng = np.random.default_rng(6)
     simulations = rng.normal(size=(500, 20))
-    _, p = atlas(np.array([8.0] + [0.0] * 19), simulations)
+    _, p = scan_pvalues(np.array([8.0] + [0.0] * 19), simulations)
     # Student's tail with 499 degrees of freedom, times about 20 trials.
     assert 5 < p[0] / (2.0 * stats.t.sf(8.0 / simulations[:, 0].std(ddof=1), 499)) < 80
     assert p[1] == 1.0
     with pytest.raises(InputError, match="at least 20"):
-        atlas(np.zeros(20), simulations[:10])
+        scan_pvalues(np.zeros(20), simulations[:10])

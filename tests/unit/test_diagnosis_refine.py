@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mcsim.diagnosis.attribute import attribute
+from mcsim.diagnosis.analysis import Proposal
 from mcsim.diagnosis.candidate import Candidate
-from mcsim.diagnosis.evidence import Proposal
 from mcsim.diagnosis.refine import refine
-from mcsim.stats.gaussian import bases, null
+from mcsim.diagnosis.selection import attribute
+from mcsim.stats.gaussian import null, whitened_templates
 from mcsim.stats.look_elsewhere import calibrate
 from mcsim.systematics import Effect
 
@@ -39,16 +39,16 @@ class Instrument:
         self.null = null(rng.normal(size=(900, P)))
         self.candidates = [Candidate("push", name, (k,)) for k, name in enumerate("ABC")]
         self.proposals = [Proposal(Push, name, {}, (Push(amplitude=1.0),)) for name in "ABC"]
-        self.calibration = calibrate(self.null, bases(self.null, self.t, [(0,), (1,), (2,)]))
+        self.calibration = calibrate(self.null, whitened_templates(self.null, self.t, [(0,), (1,), (2,)]))
         self.known = SimpleNamespace(curvature=np.outer(bend * self.sideways[0], [1.0, 0.0, 0.0]))
-        self.asked: list[dict[str | None, float]] = []
+        self.analysis: list[dict[str | None, float]] = []
 
     def response(self, a: float, b: float) -> np.ndarray:
         return self.t[:, :2] @ [a, b] + self.bend * a**2 * self.sideways[0] + self.cross * a * b * self.sideways[1]
 
     def respond(self, tables, skies: int) -> np.ndarray:
         amplitudes = {table.channel: float(table.parameters["amplitude"]) for table in tables}
-        self.asked.append(amplitudes)
+        self.analysis.append(amplitudes)
         return np.tile(self.response(amplitudes.get("A", 0.0), amplitudes.get("B", 0.0)), (skies, 1))
 
     def refined(self, x: np.ndarray):
@@ -73,7 +73,7 @@ def test_effects_that_change_each_other_are_simulated_together():
     plain = attribute(instrument.null, x, instrument.t, instrument.candidates, instrument.calibration)
     assert plain.verdict == "unknown"
     found = instrument.refined(x).attribution
-    assert instrument.asked[-1].keys() == {"A", "B"}
+    assert instrument.analysis[-1].keys() == {"A", "B"}
     assert (found.verdict, found.explanations[0].members) == ("mixture", (0, 1))
     assert found.explanations[0].fit.amplitudes == pytest.approx([12.0, 14.0], abs=0.5)
 
@@ -82,7 +82,7 @@ def test_what_is_none_of_the_library_stays_unknown_beside_two_that_are():
     instrument = Instrument(bend=0.0, cross=0.0)
     x = instrument.response(12.0, 14.0) + 10.0 * instrument.sideways[1]
     found = instrument.refined(x).attribution
-    assert instrument.asked[-1].keys() == {"A", "B"}
+    assert instrument.analysis[-1].keys() == {"A", "B"}
     assert found.verdict == "unknown"
 
 
@@ -94,15 +94,15 @@ def test_amplitudes_that_run_away_are_not_heard():
     x = instrument.t[:, :2] @ [14.0, 12.0] + 10.0 * instrument.sideways[1]
     found = instrument.refined(x)
     assert found.attribution.verdict == "unknown"
-    assert [instrument.candidates[member].channel for member in found.heard.members] == ["B"]
+    assert [instrument.candidates[member].channel for member in found.filtered.members] == ["B"]
 
 
 def test_what_data_tell_nothing_of_is_neither_heard_nor_simulated(monkeypatch):
     """However significant: an effect without an amplitude is none."""
     instrument = Instrument(bend=0.0, cross=0.0)
     x = instrument.response(12.0, 14.0) + 10.0 * instrument.sideways[1]
-    monkeypatch.setattr(Push, "told", classmethod(lambda cls, coordinates, precision: 0.0 * coordinates))
+    monkeypatch.setattr(Push, "constrained", classmethod(lambda cls, coordinates, precision: 0.0 * coordinates))
     found = instrument.refined(x)
     assert found.attribution.verdict == "unknown"
-    assert found.heard is None
-    assert instrument.asked == []
+    assert found.filtered is None
+    assert instrument.analysis == []

@@ -13,20 +13,20 @@ import xarray as xr
 from scipy import stats
 
 from mcsim import config, systematics
-from mcsim.diagnosis import case, exhibits, report
 from mcsim.diagnosis import figures as plots
-from mcsim.diagnosis.attribute import attribute
-from mcsim.diagnosis.blocks import Entry
+from mcsim.diagnosis import inference, report, report_arrays
+from mcsim.diagnosis.analysis import Proposal
 from mcsim.diagnosis.candidate import Candidate
-from mcsim.diagnosis.case import Diagnosis
-from mcsim.diagnosis.evidence import Proposal
-from mcsim.diagnosis.reading import Reading, entry_words
+from mcsim.diagnosis.inference import Diagnosis
 from mcsim.diagnosis.refine import Refined
-from mcsim.diagnosis.shrink import Measured, Prediction, Shrink
+from mcsim.diagnosis.selection import attribute
+from mcsim.diagnosis.summaries import Element
+from mcsim.diagnosis.validation import Measured, Prediction, Shrink
 from mcsim.diagnosis.verdict import detectable_of, effects_of, verdict_of
+from mcsim.diagnosis.view import ReportView, entry_words
 from mcsim.diagnosis.where import Place
-from mcsim.stats.detection import confusion, strength_needed
-from mcsim.stats.gaussian import bases, null, residual_probability
+from mcsim.stats.detection import confusion, snr_needed
+from mcsim.stats.gaussian import null, residual_pvalue, whitened_templates
 from mcsim.stats.look_elsewhere import calibrate
 from mcsim.support import resources
 
@@ -35,17 +35,21 @@ P, N = 30, 500
 VERDICTS = ("none", "effect", "mixture", "degenerate", "unknown")
 
 
-def entries() -> list[Entry]:
+def elements() -> list[Element]:
     found = [
-        Entry(f"beam/{EVIL}:half{half + 1}/m{s}{part}/{low}-{low + 9}", "map", (EVIL,), f"half{half + 1}", half,
+        Element(f"beam/{EVIL}:half{half + 1}/m{s}{part}/{low}-{low + 9}", "map", (EVIL,), f"half{half + 1}", half,
               (low, low + 9), s, 0, "even", "ecliptic")
         for half in (0, 1) for s, part in ((0, "re"), (2, "re"), (2, "im")) for low in (2, 12)
     ]  # fmt: skip
-    found += [Entry(f"dipole/V:half1/{axis}", "map", ("V",), "half1", 0, (1, 1), 1, frame="ecliptic") for axis in "xyz"]
-    found += [Entry(f"sky/{low}-{low + 9}", "cl", (EVIL, "V"), None, 0, (low, low + 9), 0) for low in range(2, 92, 10)]
-    found += [Entry(f"score/pointing_offset (V)/{k}", "score", ("V",)) for k in (0, 1)]
-    found += [Entry(f"noise/V/0-0.25/pixels{k}", "noise", ("V",), None, k, L=0, frame="ecliptic") for k in (0, 1)]
-    return [*found, Entry("mine/&<b>", "other", ("V",)), Entry("square/V", "map", ("V",))]
+    found += [
+        Element(f"dipole/V:half1/{axis}", "map", ("V",), "half1", 0, (1, 1), 1, frame="ecliptic") for axis in "xyz"
+    ]
+    found += [
+        Element(f"sky/{low}-{low + 9}", "cl", (EVIL, "V"), None, 0, (low, low + 9), 0) for low in range(2, 92, 10)
+    ]
+    found += [Element(f"score/pointing_offset (V)/{k}", "score", ("V",)) for k in (0, 1)]
+    found += [Element(f"noise/V/0-0.25/pixels{k}", "noise", ("V",), None, k, L=0, frame="ecliptic") for k in (0, 1)]
+    return [*found, Element("mine/&<b>", "other", ("V",)), Element("square/V", "map", ("V",))]
 
 
 def proposals() -> list[Proposal]:
@@ -53,10 +57,10 @@ def proposals() -> list[Proposal]:
     return [Proposal(systematics.get(name), channel, {}, systematics.get(name).basis()) for name, channel in chosen]
 
 
-def templates(twins: bool) -> np.ndarray:
+def templates(nearest_candidates: bool) -> np.ndarray:
     """Directions of about unit length; those of the first two candidates all but agree where they are twins."""
     t = np.random.default_rng(3).normal(size=(P, sum(len(one.basis) for one in proposals())))
-    if twins:
+    if nearest_candidates:
         t[:, 2:4] = t[:, :2] + 0.02 * t[:, 2:4]
     return t / np.linalg.norm(t[:, 0])
 
@@ -79,14 +83,14 @@ def diagnoses() -> dict[str, Diagnosis]:
     with pytest.MonkeyPatch.context() as patch:
         sky = np.random.default_rng(5).normal(size=(2, 12 * 8**2))
         sky[:, :60] = np.nan
-        patch.setattr(exhibits, "residual_maps", lambda model, maps: sky)
+        patch.setattr(report_arrays, "residual_maps", lambda model, maps: sky)
         return {kind: diagnosis(kind) for kind in VERDICTS}
 
 
 @lru_cache
-def bench(twins: bool) -> SimpleNamespace:
+def bench(nearest_candidates: bool) -> SimpleNamespace:
     """What the five cases have in common."""
-    proposed, t = proposals(), RESPONSE * templates(twins)
+    proposed, t = proposals(), RESPONSE * templates(nearest_candidates)
     simulations = np.random.default_rng(10).normal(size=(N, P))
     model = null(simulations)
     columns = np.split(np.arange(t.shape[1]), np.cumsum([len(one.basis) for one in proposed])[:-1])
@@ -96,11 +100,13 @@ def bench(twins: bool) -> SimpleNamespace:
     )
     return SimpleNamespace(
         run=replace(config.load(resources.workflow("quickstart")), name=EVIL),
-        asked=SimpleNamespace(entries=entries(), proposals=proposed),
+        analysis=SimpleNamespace(elements=elements(), proposals=proposed),
         known=SimpleNamespace(simulations=simulations),
         null=model,
         candidates=candidates,
-        calibration=calibrate(model, bases(model, t, [candidate.columns for candidate in candidates]), draws=2000),
+        calibration=calibrate(
+            model, whitened_templates(model, t, [candidate.columns for candidate in candidates]), draws=2000
+        ),
         templates=t,
         detectable=detectable_of(model, t, candidates, proposed),
     )
@@ -108,14 +114,14 @@ def bench(twins: bool) -> SimpleNamespace:
 
 def diagnosis(kind: str) -> Diagnosis:
     """Through the code that makes the evidence, on constructed simulations and data."""
-    court = bench(kind == "degenerate")
-    t, proposed, rng = court.templates, court.asked.proposals, np.random.default_rng(11)
+    context = bench(kind == "degenerate")
+    t, proposed, rng = context.templates, context.analysis.proposals, np.random.default_rng(11)
     x = sum((value * t[:, k] for k, value in SIGNALS[kind].items()), rng.normal(size=P))
     if kind == "unknown":
         strange = rng.normal(size=P)
         x += 15.0 * (strange - t @ np.linalg.lstsq(t, strange, rcond=None)[0]) / np.sqrt(P)
-    found = attribute(court.null, x, t, court.candidates, court.calibration)
-    where = [Place(court.asked.entries[0], 9.1, 1e-8, 8.0), Place(court.asked.entries[-2], 1.0, 0.7, 1.2)]
+    found = attribute(context.null, x, t, context.candidates, context.calibration)
+    where = [Place(context.analysis.elements[0], 9.1, 1e-8, 8.0), Place(context.analysis.elements[-2], 1.0, 0.7, 1.2)]
     shrink = None
     if found.explanations:
         shrink = (
@@ -125,11 +131,13 @@ def diagnosis(kind: str) -> Diagnosis:
         )
     notes = ["a <b>note</b> & so"]
     name = f"case <i>{kind}</i>"
-    verdict = verdict_of(name, found, court.candidates, proposed, where, shrink, court.detectable, notes)
+    verdict = verdict_of(name, found, context.candidates, proposed, where, shrink, context.detectable, notes)
     survey = SimpleNamespace(config=SimpleNamespace(map=SimpleNamespace(frame="ecliptic")))
-    believed = SimpleNamespace(survey=survey, parts=[SimpleNamespace(name=name) for name in (EVIL, "V")])
-    shown = exhibits.exhibits(believed, [], court.known.simulations, court.null, found, court.candidates, proposed)
-    evidence = case.dataset(court, x, Refined(found, t, (), ()), where, verdict)
+    fiducial = SimpleNamespace(survey=survey, parts=[SimpleNamespace(name=name) for name in (EVIL, "V")])
+    shown = report_arrays.report_arrays(
+        fiducial, [], context.known.simulations, context.null, found, context.candidates, proposed
+    )
+    evidence = inference.dataset(context, x, Refined(found, t, (), ()), where, verdict)
     return Diagnosis(verdict, evidence.merge(shown, combine_attrs="no_conflicts"), found)
 
 
@@ -211,38 +219,38 @@ def test_explanations_stand_side_by_side_with_what_tells_them_apart(diagnoses, p
     sets = [diagnoses["degenerate"].verdict["effects"], *diagnoses["degenerate"].verdict["alternatives"]]
     assert len(sets) == 2
     assert all(report.measured(one[0]["amplitude"], one[0]["sigma"]) in text for one in sets)
-    (contrast,) = Reading(diagnoses["degenerate"].verdict, diagnoses["degenerate"].evidence).contrasts
+    (contrast,) = ReportView(diagnoses["degenerate"].verdict, diagnoses["degenerate"].evidence).contrasts
     assert f"differ by {contrast['separation']:.1f} sigmas" in text
     assert contrast["entries"][0]["words"] in text
 
 
 def test_best_explanation_is_taken_from_what_is_left(diagnoses):
     for kind in ("effect", "mixture"):
-        reading = Reading(diagnoses[kind].verdict, diagnoses[kind].evidence)
-        np.testing.assert_allclose(reading.prediction(0), reading.evidence["explained"].values, atol=1e-12)
+        view = ReportView(diagnoses[kind].verdict, diagnoses[kind].evidence)
+        np.testing.assert_allclose(view.prediction(0), view.evidence["explained"].values, atol=1e-12)
         # 30 unit normals: their square exceeds 80 once in a million.
-        assert np.sum(reading.left**2) < 80.0 < np.sum(reading.z**2)
-        _, _, (before, after) = reading.blocks
-        assert np.nanmax(np.abs(before)) == np.abs(reading.z).max()
-        assert np.nanmax(np.abs(after)) == np.abs(reading.left).max()
+        assert np.sum(view.left**2) < 80.0 < np.sum(view.z**2)
+        _, _, (before, after) = view.blocks
+        assert np.nanmax(np.abs(before)) == np.abs(view.z).max()
+        assert np.nanmax(np.abs(after)) == np.abs(view.left).max()
 
 
 def test_ranked_candidates_have_their_amplitudes(diagnoses):
-    reading = Reading(diagnoses["effect"].verdict, diagnoses["effect"].evidence)
-    first = reading.ranked[0]
+    view = ReportView(diagnoses["effect"].verdict, diagnoses["effect"].evidence)
+    first = view.ranked[0]
     (effect,) = diagnoses["effect"].verdict["effects"]
     assert (first.accepted, first.unit) == (True, effect["unit"])
     assert (first.amplitude, first.sigma) == (effect["amplitude"], effect["sigma"])
     assert first.p < 1e-6
-    assert not any(row.accepted for row in reading.ranked[1:])
+    assert not any(row.accepted for row in view.ranked[1:])
 
 
 def test_detectable_amplitude_and_isolating_amplitude_agree_in_strength(diagnoses):
-    reading = Reading(diagnoses["none"].verdict, diagnoses["none"].evidence)
-    assert [row["label"] for row in reading.twins] == reading.labels
-    for row, proposal in zip(reading.twins, proposals(), strict=True):
+    view = ReportView(diagnoses["none"].verdict, diagnoses["none"].evidence)
+    assert [row["label"] for row in view.nearest_candidates] == view.labels
+    for row, proposal in zip(view.nearest_candidates, proposals(), strict=True):
         assert confusion(row["strength"], row["cosine"]) == pytest.approx(0.05)
-        found = strength_needed(len(proposal.basis), 3, P, N)
+        found = snr_needed(len(proposal.basis), 3, P, N)
         assert row["isolated"] / row["detectable"] == pytest.approx(row["strength"] / found)
 
 
@@ -264,11 +272,11 @@ def test_evidence_without_maps_has_no_map_pictures(diagnoses):
 
 def test_largest_picture_leaves_the_page_small(diagnoses):
     one = diagnoses["effect"]
-    sky = np.random.default_rng(1).normal(size=(20, 12 * exhibits.NSIDE**2))
+    sky = np.random.default_rng(1).normal(size=(20, 12 * report_arrays.NSIDE**2))
     sky[3] *= 2.0
     maps = xr.Dataset({"residual_map": (("map", "pixel"), sky)}, coords={"map": [f"W:{k}" for k in range(20)]})
-    reading = Reading(one.verdict, one.evidence.drop_dims("map").merge(maps))
-    figure = plots.residual_figure(reading)
+    view = ReportView(one.verdict, one.evidence.drop_dims("map").merge(maps))
+    figure = plots.residual_figure(view)
     titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
     assert len(titles) == plots.MAPS
     assert f"W:3: rms {np.sqrt(np.mean(sky[3] ** 2)):.2f}" in titles
@@ -289,16 +297,16 @@ def test_first_screen_fits_its_picture(diagnoses, kind, tmp_path):
 
 def test_simulations_held_out_against_refits():
     simulations = np.random.default_rng(2).normal(size=(60, 8)) @ np.random.default_rng(3).normal(size=(8, 8))
-    found = exhibits.held_out(simulations, null(simulations))
+    found = report_arrays.held_out(simulations, null(simulations))
     for i in range(5):
         others = null(np.delete(simulations, i, axis=0))
-        y = others.data(simulations[i])
-        assert found[i] == pytest.approx(residual_probability(y @ y, 8, others.dof), rel=1e-9)
+        y = others.whiten(simulations[i])
+        assert found[i] == pytest.approx(residual_pvalue(y @ y, 8, others.dof), rel=1e-9)
 
 
 def test_simulations_held_out_are_uniform():
     simulations = np.random.default_rng(4).normal(size=(2000, 20))
-    assert stats.kstest(exhibits.held_out(simulations, null(simulations)), "uniform").pvalue > 1e-3
+    assert stats.kstest(report_arrays.held_out(simulations, null(simulations)), "uniform").pvalue > 1e-3
 
 
 def test_residual_maps_are_in_units_of_noise(monkeypatch):
@@ -308,13 +316,13 @@ def test_residual_maps_are_in_units_of_noise(monkeypatch):
     blind = healpy.query_disc(nside, (0.0, 0.0, 1.0), 0.3)
     residual[blind] = 0.0
     part = SimpleNamespace(precision=precision)
-    monkeypatch.setattr(exhibits, "listen", lambda model, maps: SimpleNamespace(residual=residual[None]))
-    (coarse,) = exhibits.residual_maps(SimpleNamespace(nside=nside, parts=[part]), [])
-    assert healpy.npix2nside(coarse.size) == exhibits.NSIDE
+    monkeypatch.setattr(report_arrays, "wiener_filter", lambda model, maps: SimpleNamespace(residual=residual[None]))
+    (coarse,) = report_arrays.residual_maps(SimpleNamespace(nside=nside, parts=[part]), [])
+    assert healpy.npix2nside(coarse.size) == report_arrays.NSIDE
     assert np.isnan(coarse[0])
     # Variance of 3,000 unit normals, five sigmas.
     assert np.nanvar(coarse) == pytest.approx(1.0, abs=5 * np.sqrt(2 / np.isfinite(coarse).sum()))
-    ring = healpy.ang2pix(exhibits.NSIDE, *healpy.pix2ang(nside, np.arange(precision.size)))
+    ring = healpy.ang2pix(report_arrays.NSIDE, *healpy.pix2ang(nside, np.arange(precision.size)))
     seen = (ring == 2000) & (residual != 0.0)
     assert coarse[2000] == pytest.approx(residual[seen].sum() / np.sqrt(precision[seen].sum()))
 
@@ -345,7 +353,7 @@ def test_tiny_probabilities_are_powers_of_ten():
 
 
 def test_entries_in_words():
-    words = [entry_words({**vars(entry), "ell": entry.ell}) for entry in entries()]
+    words = [entry_words({**vars(element), "ell": element.ell}) for element in elements()]
     assert "beam, order 2, imaginary, " in words[4]
     assert "half1, ℓ 2–11" in words[4]
     assert words[-3] == "noise variance, V, 0-0.25, pixels1"

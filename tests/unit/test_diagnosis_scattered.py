@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mcsim.diagnosis.scattered import scattered
+from mcsim.diagnosis.with_scatter import with_scatter
 from mcsim.stats.gaussian import fit, null
 
 P, SKIES = 12, 4000
@@ -18,7 +18,7 @@ def test_errors_grow_with_the_scatter_and_never_shrink(growth: float) -> None:
     found = fit(model, 30.0 * t[:, 0], t)
     before = rng.normal(size=(SKIES, P)) @ mixing
     # The response itself, the same in every sky, is no scatter.
-    wide = scattered(model, t, found, before, 30.0 * t[:, 0] + growth * before)
+    wide = with_scatter(model, t, found, before, 30.0 * t[:, 0] + growth * before)
     np.testing.assert_allclose(wide.errors / found.errors, np.sqrt(1.0 + max(growth**2 - 1.0, 0.0)), rtol=0.05)
     np.testing.assert_array_equal(wide.amplitudes, found.amplitudes)
     np.testing.assert_allclose(_correlation(wide.covariance), _correlation(found.covariance), rtol=1e-12)
@@ -33,4 +33,4 @@ def test_without_a_change_of_the_scatter_errors_stay() -> None:
     rng = np.random.default_rng(4)
     model, t = null(rng.normal(size=(500, P))), rng.normal(size=(P, 1))
     found, skies = fit(model, 5.0 * t[:, 0], t), rng.normal(size=(8, P))
-    np.testing.assert_allclose(scattered(model, t, found, skies, skies + t[:, 0]).covariance, found.covariance)
+    np.testing.assert_allclose(with_scatter(model, t, found, skies, skies + t[:, 0]).covariance, found.covariance)

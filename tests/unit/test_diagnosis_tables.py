@@ -7,8 +7,9 @@ import pytest
 from astropy.table import Table
 
 from mcsim import bipolar, config, systematics
-from mcsim.diagnosis import knowledge, report, tables
-from mcsim.diagnosis.case import court
+from mcsim.diagnosis import knowledge, report
+from mcsim.diagnosis import spectra as tables
+from mcsim.diagnosis.inference import context
 from mcsim.diagnosis.knowledge import with_effects
 from mcsim.errors import InputError
 from mcsim.simulation import simulate
@@ -66,16 +67,18 @@ def read(folder, table, run=RUN):
 def small(tmp_path_factory):
     """What tables of these rows are judged with."""
     spectra = read(tmp_path_factory.mktemp("small"), measured(RUN))
-    run = tables.listening(RUN, spectra)
-    asked = tables.questions_of(run, spectra, [name for name in systematics.catalogue() if name not in PROPOSED])
-    plan = tables.plan(run, asked, 300)
-    known = knowledge.learned(asked, plan, [spectra(job) for job in plan.jobs])
-    return court(run, asked, tables.of_mean(known, SKIES))
+    run = tables.estimator_for(RUN, spectra)
+    analysis = tables.analysis_of_spectra(
+        run, spectra, [name for name in systematics.catalogue() if name not in PROPOSED]
+    )
+    plan = tables.plan(run, analysis, 300)
+    known = knowledge.learned(analysis, plan, [spectra(job) for job in plan.jobs])
+    return context(run, analysis, tables.of_mean(known, SKIES))
 
 
 def judged(small, folder, table):
     spectra = read(folder, table)
-    return tables.judge(small, "table", spectra, lambda jobs: [spectra(job) for job in jobs])
+    return tables.diagnose_maps(small, "table", spectra, lambda jobs: [spectra(job) for job in jobs])
 
 
 def test_an_ellipticity_is_named_and_its_gap_shrinks(small, tmp_path):
@@ -113,13 +116,13 @@ def test_the_mean_of_skies_scatters_as_the_tests_take_it_to(small):
 
 def test_power_spectra_are_those_of_the_pair(tmp_path):
     spectra = read(tmp_path, measured(RUN))
-    run = tables.listening(RUN, spectra)
+    run = tables.estimator_for(RUN, spectra)
     cl = simulate.realize(survey(run), 3)["cl"][0]
     ell = np.arange(41)
     expected = [np.mean((ell * (ell + 1) / (2 * np.pi) * cl)[a : b + 1]) for a, b in BINS]
     np.testing.assert_allclose(spectra.of(run, 3, 1)[0, : len(BINS)], expected, rtol=1e-12)
-    assert [entry.statistic for entry in spectra.entries[: len(BINS)]] == ["cl"] * len(BINS)
-    assert [entry.fold for entry in spectra.entries[: len(BINS)]] == [0, 1, 0, 1, 0, 1]
+    assert [element.statistic for element in spectra.elements[: len(BINS)]] == ["cl"] * len(BINS)
+    assert [element.fold for element in spectra.elements[: len(BINS)]] == [0, 1, 0, 1, 0, 1]
 
 
 def test_other_frames_are_those_of_rotated_coefficients(tmp_path):
@@ -129,10 +132,10 @@ def test_other_frames_are_those_of_rotated_coefficients(tmp_path):
     assert len(views) == 2 * len(BINS)
     at = {(row.mode, row.ell_min, row.imaginary): value for row, value in zip(spectra.rows, spectra.value, strict=True)}
     family = [bipolar.Mode(2, M, 0) for M in range(3)]
-    for entry, matrix in views:
-        low = entry.ell[0]
+    for element, matrix in views:
+        low = element.ell[0]
         own = np.array([at[mode, low, False] + 1j * at.get((mode, low, True), 0.0) for mode in family])
-        turned = rotate_biposh(own[:, None], [(2, M, 0) for M in range(3)], "ecliptic", entry.frame)
+        turned = rotate_biposh(own[:, None], [(2, M, 0) for M in range(3)], "ecliptic", element.frame)
         assert matrix @ spectra.value == pytest.approx(turned[0, 0].real, rel=1e-12)
 
 
@@ -189,7 +192,7 @@ def test_a_mean_of_more_skies_than_it_says_is_refused(small, tmp_path):
     spectra = read(tmp_path, table)
     quiet = small.null.mean + 0.01 * (spectra.value - small.null.mean)
     with pytest.raises(InputError, match="far less than a mean of 10 skies can"):
-        tables.judge(small, "quiet", replace(spectra, value=quiet), lambda jobs: [])
+        tables.diagnose_maps(small, "quiet", replace(spectra, value=quiet), lambda jobs: [])
 
 
 def test_errors_that_the_model_does_not_have_are_noted(small, tmp_path):
@@ -200,7 +203,7 @@ def test_errors_that_the_model_does_not_have_are_noted(small, tmp_path):
 
 
 def test_correlated_bins_are_freed_of_what_others_predict(small):
-    folds = np.array([entry.fold for entry in small.asked.entries])
+    folds = np.array([element.fold for element in small.analysis.elements])
     rng = np.random.default_rng(5)
     drawn = rng.normal(size=(300, len(folds)))
     used, fresh = np.flatnonzero(folds == 0)[0], np.flatnonzero(folds == 1)[0]
@@ -217,14 +220,16 @@ def test_a_few_power_spectra_alone_are_judged(tmp_path):
     few = table[(table["L"] == 0) & (table["ell_max"] < BINS[-1][1])]
     few["value"] *= 1.0 + 0.3 * np.arange(len(few))
     spectra = read(tmp_path, few)
-    run = tables.listening(RUN, spectra)
+    run = tables.estimator_for(RUN, spectra)
     # Coma is not heard at all, and the spectrum has more components than there are numbers.
     proposed = ("beam_coma", "beam_width", "spectrum")
-    asked = tables.questions_of(run, spectra, [name for name in systematics.catalogue() if name not in proposed])
-    plan = tables.plan(run, asked, 60)
-    known = knowledge.learned(asked, plan, [spectra(job) for job in plan.jobs])
-    seat = court(run, asked, tables.of_mean(known, SKIES))
-    found = tables.judge(seat, "few", spectra, lambda jobs: [spectra(job) for job in jobs])
+    analysis = tables.analysis_of_spectra(
+        run, spectra, [name for name in systematics.catalogue() if name not in proposed]
+    )
+    plan = tables.plan(run, analysis, 60)
+    known = knowledge.learned(analysis, plan, [spectra(job) for job in plan.jobs])
+    learned = context(run, analysis, tables.of_mean(known, SKIES))
+    found = tables.diagnose_maps(learned, "few", spectra, lambda jobs: [spectra(job) for job in jobs])
     assert found.verdict["verdict"] != "none"
     assert "beam_coma" not in [effect["name"] for effect in found.verdict["effects"]]
     report.write(found, tmp_path / "report.html")

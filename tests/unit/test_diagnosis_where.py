@@ -2,22 +2,22 @@
 
 import numpy as np
 
-from mcsim.diagnosis.blocks import Entry
+from mcsim.diagnosis.summaries import Element
 from mcsim.diagnosis.where import places
 
 KINDS = [("V1", "ecliptic", 2), ("W1", "ecliptic", 2), ("W2", "ecliptic", 2), ("V1", "galactic", 1), ("W1", None, 0)]
 
 
-def entries() -> list[Entry]:
+def elements() -> list[Element]:
     return [
-        Entry(f"{channel}/{frame}/{L}", "biposh", (channel,), frame=frame, L=L, M=0, parity="even")
+        Element(f"{channel}/{frame}/{L}", "biposh", (channel,), frame=frame, L=L, M=0, parity="even")
         for channel, frame, L in KINDS
     ]
 
 
 def ranked(x: list[float]) -> list[tuple[str, int | None]]:
     simulations = np.random.default_rng(1).normal(size=(400, len(KINDS)))
-    return [(place.entry.channels[0], place.entry.L) for place in places(np.array(x), simulations, entries())]
+    return [(place.element.channels[0], place.element.L) for place in places(np.array(x), simulations, elements())]
 
 
 def test_each_kind_comes_before_more_of_the_same():

@@ -188,3 +188,48 @@ def test_broken_packages_are_named(registered):
     registered(EntryPoint("beam", "mcsim.instrument.beams:Beam", registry.ENTRY_POINTS))
     with pytest.raises(InputError, match="no class derived from"):
         systematics.catalogue()
+
+
+def whole(**changes):
+    """An effect of another package, with attributes that differ from a whole one's; None: left out."""
+    own = {"name": "foreign", "scope": "channel", "unit": "-", "cause": "a test", "signature": "none", "step": 1.0}
+    body = {key: value for key, value in (own | changes).items() if value is not None}
+    return dataclass(frozen=True, kw_only=True)(type("Thing", (systematics.Effect,), body))
+
+
+def no_dataclass():
+    return type("Thing", (whole(),), {"__annotations__": {"angle_deg": float}, "angle_deg": 0.0})
+
+
+def no_default():
+    return dataclass(frozen=True, kw_only=True)(type("Thing", (whole(),), {"__annotations__": {"angle_deg": float}}))
+
+
+@pytest.mark.parametrize(
+    ("kind", "key"),
+    [
+        (whole(step=None), "step"),
+        (whole(step=0.0), "step"),
+        (whole(step="large"), "step"),
+        (whole(step=np.inf), "step"),
+        (whole(name=None), "name"),
+        (whole(scope="everywhere"), "scope"),
+        (whole(unit=None), "unit"),
+        (whole(cause=None), "cause"),
+        (whole(signature=3), "signature"),
+        (whole(side=2), "side"),
+        (whole(most=-1.0), "most"),
+        (whole(variants=({"no_such": 1.0},)), "no_such"),
+        (whole(coordinates=lambda self: np.zeros(2)), "coordinates"),
+        (no_dataclass(), "angle_deg"),
+        (no_default(), "angle_deg"),
+    ],
+)
+def test_an_effect_that_is_not_whole_is_refused_when_it_is_loaded(kind, key, registered):
+    class Entry(EntryPoint):
+        def load(self):
+            return kind
+
+    registered(Entry("foreign", "package:Thing", registry.ENTRY_POINTS))
+    with pytest.raises(InputError, match=key):
+        systematics.catalogue()

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
+from mcsim.diagnosis.analysis import Job, analysis_of, data_vectors
+from mcsim.diagnosis.api import prepared
 from mcsim.diagnosis.batch import asking, batch
-from mcsim.diagnosis.evidence import Job, evidence_of, questions
 from mcsim.diagnosis.knowledge import seeded, with_effects
-from mcsim.diagnosis.session import prepared
 from mcsim.systematics import Effect
 
 SEED = 20121026
@@ -36,39 +36,39 @@ def main() -> None:
     parser.add_argument("--simulations", type=int, help="as given to mcsim diagnose")
     arguments = parser.parse_args()
     run = config.load(arguments.model)
-    asked = questions(run, nthreads=os.cpu_count() or 1)
+    analysis = analysis_of(run, nthreads=os.cpu_count() or 1)
     with batch(run.compute.workers) as call:
-        null = prepared(run, asked, asking(call, quiet=False), arguments.simulations).null
+        null = prepared(run, analysis, asking(call, quiet=False), arguments.simulations).null
     plain = seeded(run, SEED)
     quiet = replace(plain, channels=tuple(replace(channel, noise=config.Noise()) for channel in plain.channels))
-    believed = config.to_json(run)
+    fiducial = config.to_json(run)
 
     def seen(found: Sequence[config.Effect], samples: bool) -> NDArray[np.float64]:
-        answer: NDArray[np.float64] = evidence_of(
-            Job(believed, config.to_json(with_effects(quiet, found)), 0, 1, samples)
+        answer: NDArray[np.float64] = data_vectors(
+            Job(fiducial, config.to_json(with_effects(quiet, found)), 0, 1, samples)
         )[0]
         return answer
 
     without = {samples: seen([], samples) for samples in (False, True)}
     channel = arguments.channel or run.channels[-1].name
-    for proposal in asked.proposals:
+    for proposal in analysis.proposals:
         kind = proposal.kind
         wanted = kind.name in arguments.effects if arguments.effects else not kind.draws
         if not wanted or kind.noise is not Effect.noise or proposal.channel not in (None, channel):
             continue
         for number, basis in enumerate(proposal.basis):
             # An effect of one sign is the whole of it, as pixelization is.
-            effect = basis.scaled(STEPS) if proposal.kind.side == 0 and STEPS * basis.amplitude < 1.0 else basis
+            effect = basis.scaled(STEPS) if proposal.kind.sign == 0 and STEPS * basis.amplitude < 1.0 else basis
             changes = []
             for samples in (False, True):
                 up = seen([proposal.table(effect)], samples)
-                down = seen([proposal.table(effect.scaled(-1.0))], samples) if proposal.kind.side == 0 else None
+                down = seen([proposal.table(effect.scaled(-1.0))], samples) if proposal.kind.sign == 0 else None
                 change = up - without[samples] if down is None else 0.5 * (up - down)
-                changes.append(null.templates(change[:, None])[:, 0])
-            default, referee = changes
+                changes.append(null.whiten_templates(change[:, None])[:, 0])
+            default, time_ordered = changes
             size = float(np.linalg.norm(default))
-            cosine = float(default @ referee) / size / float(np.linalg.norm(referee))
-            ratio = float(default @ referee) / size**2
+            cosine = float(default @ time_ordered) / size / float(np.linalg.norm(time_ordered))
+            ratio = float(default @ time_ordered) / size**2
             print(f"{proposal.label}/{number}: cosine {cosine:.4f}, sampled over default {ratio:.4f}, {size:.1f} sigma")
 
 

@@ -67,9 +67,9 @@ def factors() -> dict[float, str]:
     model = scan.load_model(resources.scan_model("wmap_focal_plane"))
     sides = [scan.limit_factors(model, line_of_sight=line) for line in ("W1A", "W1B")]
     return {
-        float(np.mean([side.quadrupole_ratio for side in sides])): "mean of $w_2$ that A$^{20}$ sees",
-        float(np.mean([side.sky_mean for side in sides])): "sky mean of $w_2$",
-        float(np.mean([side.f_ell[-1] for side in sides])): "$f_\\ell$ of the paper",
+        float(np.mean([sign.quadrupole_ratio for sign in sides])): "mean of $w_2$ that A$^{20}$ sees",
+        float(np.mean([sign.sky_mean for sign in sides])): "sky mean of $w_2$",
+        float(np.mean([sign.f_ell[-1] for sign in sides])): "$f_\\ell$ of the paper",
     }
 
 

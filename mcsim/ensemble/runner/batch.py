@@ -106,8 +106,9 @@ def run(
 def _finished(target: Path, run: config.RunConfig, wanted: range) -> bool:
     """Whether a store of this configuration has all that is wanted, its summary included."""
     plan.check_same(target, run)
-    done = store.done(target)
-    return wanted.stop <= len(done) and bool(done[wanted].all()) and store.summarised(target) == done.sum()
+    done, (count, bins) = store.done(target), store.summarised(target)
+    binned = bins == list(range(0, config.analysis_lmax(run) + 1, run.biposh.summary_bin))
+    return wanted.stop <= len(done) and bool(done[wanted].all()) and count == done.sum() and binned
 
 
 @contextmanager
@@ -141,6 +142,10 @@ def _run(client: Client, shared: Survey, target: Path, wanted: range, journal: J
     plan.check_same(target, run)
     if run.ensemble.realizations > store.size(target):
         store.extend(target, run.ensemble.realizations, plan.attributes(run))
+    found = store.attributes(target)["configuration"]
+    if found["biposh"]["summary_bin"] != run.biposh.summary_bin:
+        biposh = found["biposh"] | {"summary_bin": run.biposh.summary_bin}
+        store.amend(target, {"configuration": found | {"biposh": biposh}})
     before = int(store.done(target).sum())
     try:
         roll = Roll(client, journal)

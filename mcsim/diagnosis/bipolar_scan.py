@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import bipolar
-from mcsim.diagnosis.blocks import Entry, bins, scales
-from mcsim.diagnosis.listen import Heard, Model, by_degree
+from mcsim.diagnosis.summaries import Element, bins, scales
+from mcsim.diagnosis.wiener_filter import FilteredMaps, Model, by_degree
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.rotation import FRAMES, rotate_biposh
 
@@ -27,7 +27,7 @@ RANGES = 3
 
 
 @dataclass(frozen=True)
-class Atlas:
+class BipolarScan:
     """Maker of the atlas of one model."""
 
     model: Model
@@ -43,24 +43,24 @@ class Atlas:
         return min(max(self.model.survey.config.biposh.L_max, 1), L_MAX, self.model.lmax)
 
     @cached_property
-    def entries(self) -> tuple[Entry, ...]:
+    def elements(self) -> tuple[Element, ...]:
         """Where each number was heard, in the order of :meth:`values`."""
-        return tuple(entry for entry, _ in self._layout)
+        return tuple(element for element, _ in self._layout)
 
-    def values(self, heard: Heard) -> Vector:
+    def values(self, filtered: FilteredMaps) -> Vector:
         """All numbers of a set of maps, shape (entries,)."""
-        arrays = self._coefficients(heard)
-        own = self._powers(heard)
+        arrays = self._coefficients(filtered)
+        own = self._powers(filtered)
         return np.array(
             [own[pick[1]] if pick[0] == "power" else _binned(arrays[pick[0]], pick) for _, pick in self._layout]
         )
 
     @cached_property
-    def _layout(self) -> tuple[tuple[Entry, Pick], ...]:
+    def _layout(self) -> tuple[tuple[Element, Pick], ...]:
         """Entries, each with the array, row, range and part that it is taken from."""
         frame = self.model.survey.config.map.frame
-        found: list[tuple[Entry, Pick]] = []
-        for key, entry in self._sources:
+        found: list[tuple[Element, Pick]] = []
+        for key, element in self._sources:
             for view in FRAMES:
                 for row, mode in enumerate(self.tables.modes):
                     if mode.L == 0 or (view != frame and mode.M > 0) or (key == "sky" and not mode.in_auto):
@@ -69,8 +69,8 @@ class Atlas:
                     for low, high in bins(2, self.model.lmax, RANGES):
                         for part in parts:
                             where = replace(
-                                entry,
-                                name=f"biposh/{entry.name}/{view}/{mode.name}{part}/{low}-{high}",
+                                element,
+                                name=f"biposh/{element.name}/{view}/{mode.name}{part}/{low}-{high}",
                                 ell=(low, high),
                                 L=mode.L,
                                 M=mode.M,
@@ -78,49 +78,49 @@ class Atlas:
                                 frame=view,
                             )
                             found.append((where, ((key, view), row, (low, high), part)))
-        found += [(entry, ("power", number)) for number, entry in enumerate(self._power_entries)]
+        found += [(element, ("power", number)) for number, element in enumerate(self._power_entries)]
         return tuple(found)
 
     @cached_property
-    def _sources(self) -> tuple[tuple[str, Entry], ...]:
+    def _sources(self) -> tuple[tuple[str, Element], ...]:
         names = [channel.name for channel in self.model.survey.channels]
-        found = [("sky", Entry("sky", "biposh", tuple(names)))]
+        found = [("sky", Element("sky", "biposh", tuple(names)))]
         for number, name in enumerate(names):
-            found.append((f"{number}+", Entry(name, "biposh", (name,))))
+            found.append((f"{number}+", Element(name, "biposh", (name,))))
             if len(self.model.of(number)) > 1:
-                found.append((f"{number}-", Entry(f"{name} difference", "biposh", (name,), "difference")))
+                found.append((f"{number}-", Element(f"{name} difference", "biposh", (name,), "difference")))
         return tuple(found)
 
-    def _coefficients(self, heard: Heard) -> dict[tuple[str, str], NDArray[np.complex128]]:
+    def _coefficients(self, filtered: FilteredMaps) -> dict[tuple[str, str], NDArray[np.complex128]]:
         lmax, frame = self.model.lmax, self.model.survey.config.map.frame
         inverse = np.divide(1.0, self.model.cl, out=np.zeros(lmax + 1), where=self.model.cl > 0)
         modes = [(mode.L, mode.M, mode.d) for mode in self.tables.modes]
         found = {}
         for key, _ in self._sources:
             if key == "sky":
-                left = alm_.multiply(heard.sky, inverse, lmax)
+                left = alm_.multiply(filtered.sky, inverse, lmax)
             else:
                 members = self.model.of(int(key[:-1]))
                 signs = [1.0 if key[-1] == "+" else (-1.0) ** place for place in range(len(members))]
-                total = sum(sign * heard.adjoint[i] for sign, i in zip(signs, members, strict=True))
+                total = sum(sign * filtered.adjoint[i] for sign, i in zip(signs, members, strict=True))
                 # A dipole beside the sky's quadrupole would look like L = 3; it has a place of its own.
                 response = np.where(np.arange(lmax + 1) >= 2, self.model.response[int(key[:-1])][: lmax + 1], 0.0)
                 left = alm_.multiply(total, response, lmax)
-            coefficients = np.nan_to_num(bipolar.estimate(self.tables, left, heard.sky))
+            coefficients = np.nan_to_num(bipolar.estimate(self.tables, left, filtered.sky))
             for view in FRAMES:
                 found[key, view] = coefficients if view == frame else rotate_biposh(coefficients, modes, frame, view)
         return found
 
     @cached_property
-    def _power_entries(self) -> tuple[Entry, ...]:
+    def _power_entries(self) -> tuple[Element, ...]:
         frame = self.model.survey.config.map.frame
-        entries = []
+        elements = []
         for a, b in combinations_with_replacement(range(len(self.model.parts)), 2):
             names = [self.model.parts[i].name.partition(":") for i in (a, b)]
             splits = {name[2] for name in names if name[2]}
             for low, high in scales(self.model.lmax):
-                entries.append(
-                    Entry(
+                elements.append(
+                    Element(
                         f"cl/{self.model.parts[a].name},{self.model.parts[b].name}/{low}-{high}",
                         "cl",
                         tuple(dict.fromkeys(name[0] for name in names)),
@@ -133,13 +133,13 @@ class Atlas:
                         frame=frame,
                     )
                 )
-        return tuple(entries)
+        return tuple(elements)
 
-    def _powers(self, heard: Heard) -> Vector:
+    def _powers(self, filtered: FilteredMaps) -> Vector:
         """Power that residuals have in common."""
         found = []
         for a, b in combinations_with_replacement(range(len(self.model.parts)), 2):
-            power = by_degree(heard.adjoint[a], heard.adjoint[b], self.model.lmax)
+            power = by_degree(filtered.adjoint[a], filtered.adjoint[b], self.model.lmax)
             found += [float(power[low : high + 1].sum()) for low, high in scales(self.model.lmax)]
         return np.array(found)
 

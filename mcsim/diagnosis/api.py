@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config, systematics
-from mcsim.diagnosis import knowledge, report, tables
+from mcsim.diagnosis import knowledge, report, spectra
+from mcsim.diagnosis.analysis import Analysis, analysis_of
 from mcsim.diagnosis.batch import asking, batch
-from mcsim.diagnosis.case import Court, Diagnosis, court, judge
-from mcsim.diagnosis.data import checked, read_maps
-from mcsim.diagnosis.evidence import Questions, questions
+from mcsim.diagnosis.inference import Diagnosis, DiagnosisContext, context, diagnose_maps
+from mcsim.diagnosis.observed_maps import checked, read_maps
 from mcsim.errors import InputError
 from mcsim.support import folders
 
@@ -44,7 +44,7 @@ def diagnose(
     data
         Folder with ``{channel}.fits`` or ``{channel}_{split}.fits``, uK; or the maps themselves, shape (npix,) each, in
         the order channel by channel, split by split; or a table of measured spectra
-        (:func:`mcsim.diagnosis.tables.read_spectra`).
+        (:func:`mcsim.diagnosis.spectra.read_spectra`).
     output
         Folder for ``verdict.json``, ``evidence.zarr`` and ``report.html``; None: nothing is written.
     case
@@ -77,11 +77,11 @@ def diagnose(
     if isinstance(data, str | Path) and Path(data).is_file():
         found = _of_table(run, data, name, without, simulations, workers, quiet)
     else:
-        asked = questions(run, without, nthreads=os.cpu_count() or 1)
-        maps = read_maps(asked.model, data) if isinstance(data, str | Path) else checked(asked.model, data)
+        analysis = analysis_of(run, without, nthreads=os.cpu_count() or 1)
+        maps = read_maps(analysis.model, data) if isinstance(data, str | Path) else checked(analysis.model, data)
         with batch(workers) as call:
             ask = asking(call, quiet)
-            found = judge(prepared(run, asked, ask, simulations), name, maps, ask)
+            found = diagnose_maps(prepared(run, analysis, ask, simulations), name, maps, ask)
     if output is not None:
         found.save(output)
         report.write(found, Path(output) / "report.html")
@@ -97,60 +97,62 @@ def _of_table(
     workers: int,
     quiet: bool,
 ) -> Diagnosis:
-    measured = tables.read_spectra(path, run)
-    run = tables.listening(run, measured)
-    asked = tables.questions_of(run, measured, without, nthreads=os.cpu_count() or 1)
+    measured = spectra.read_spectra(path, run)
+    run = spectra.estimator_for(run, measured)
+    analysis = spectra.analysis_of_spectra(run, measured, without, nthreads=os.cpu_count() or 1)
     with batch(workers) as call:
         ask = asking(call, quiet, measured)
-        known = _learned(run, asked, simulations, ask, tables.plan)
-        return tables.judge(court(run, asked, tables.of_mean(known, measured.realizations)), case, measured, ask)
+        known = _learned(run, analysis, simulations, ask, spectra.plan)
+        return spectra.diagnose_maps(
+            context(run, analysis, spectra.of_mean(known, measured.realizations)), case, measured, ask
+        )
 
 
 def prepared(
     run: config.RunConfig,
-    asked: Questions,
+    analysis: Analysis,
     ask: knowledge.Ask,
     simulations: int | None = None,
-) -> Court:
+) -> DiagnosisContext:
     """What every case of a run is judged with, learned or from the cache."""
-    return court(run, asked, _learned(run, asked, simulations, ask))
+    return context(run, analysis, _learned(run, analysis, simulations, ask))
 
 
 def _learned(
     run: config.RunConfig,
-    asked: Questions,
+    analysis: Analysis,
     simulations: int | None,
     ask: knowledge.Ask,
-    planned: Callable[[config.RunConfig, Questions, int | None], knowledge.Plan] = knowledge.plan,
+    planned: Callable[[config.RunConfig, Analysis, int | None], knowledge.Plan] = knowledge.plan,
 ) -> knowledge.Knowledge:
-    if simulations is not None and simulations <= len(asked.entries):
+    if simulations is not None and simulations <= len(analysis.elements):
         raise InputError(
-            f"{simulations} simulations are too few for the {len(asked.entries)} numbers of the evidence; give at "
-            f"least {2 * len(asked.entries)}, better {knowledge.PER_ENTRY * len(asked.entries)}."
+            f"{simulations} simulations are too few for the {len(analysis.elements)} numbers of the evidence; give at "
+            f"least {2 * len(analysis.elements)}, better {knowledge.PER_ENTRY * len(analysis.elements)}."
         )
 
     def fill(scratch: Path) -> None:
-        plan = planned(run, asked, simulations)
+        plan = planned(run, analysis, simulations)
         if simulations is None:
-            plan, answers = knowledge.answered(plan, len(asked.entries), ask)
+            plan, answers = knowledge.answered(plan, len(analysis.elements), ask)
         else:
             answers = ask(plan.jobs)
-        knowledge.learned(asked, plan, answers).save(scratch)
+        knowledge.learned(analysis, plan, answers).save(scratch)
 
-    name = f"diagnose/{_key(run, asked, simulations)}.zarr"
+    name = f"diagnose/{_key(run, analysis, simulations)}.zarr"
     return knowledge.Knowledge.load(folders.cached(name, fill))
 
 
-def _key(run: config.RunConfig, asked: Questions, simulations: int | None) -> str:
+def _key(run: config.RunConfig, analysis: Analysis, simulations: int | None) -> str:
     """Hash of what the simulations of a model depend on; its name, seed and number of realizations are not among it."""
     science = config.science(run)
     science["ensemble"] = {}
-    library = [[proposal.label, [repr(basis) for basis in proposal.basis]] for proposal in asked.proposals]
+    library = [[proposal.label, [repr(basis) for basis in proposal.basis]] for proposal in analysis.proposals]
     rest = [
         METHOD,
         simulations,
         library,
-        [entry.name for entry in asked.entries],
+        [element.name for element in analysis.elements],
         version("ducc0"),
     ]
     return hashlib.sha256(json.dumps([science, rest], sort_keys=True).encode()).hexdigest()[:32]

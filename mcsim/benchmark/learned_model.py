@@ -8,50 +8,50 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.benchmark.inventions import introduced
+from mcsim.benchmark.out_of_library import introduced
 from mcsim.benchmark.reduced import without
-from mcsim.diagnosis.case import Court, court
-from mcsim.diagnosis.evidence import Job, evidence_of, questions
-from mcsim.diagnosis.session import prepared
+from mcsim.diagnosis.analysis import Job, analysis_of, data_vectors
+from mcsim.diagnosis.api import prepared
+from mcsim.diagnosis.inference import DiagnosisContext, context
 from mcsim.errors import RunError
 
 Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Sitting:
+class LearnedModel:
     """A court, and which entries of the full evidence it looks at."""
 
-    court: Court
+    context: DiagnosisContext
     rows: NDArray[np.int64]
 
     def ask(self, jobs: Sequence[Job]) -> list[Vector]:
         """Answers of jobs in this process."""
-        return [evidence_of(replace(job, without=()))[:, self.rows] for job in jobs]
+        return [data_vectors(replace(job, without=()))[:, self.rows] for job in jobs]
 
 
 @lru_cache(maxsize=1)
-def sitting(model: str, simulations: int | None) -> Sitting:
+def learned_model(model: str, simulations: int | None) -> LearnedModel:
     """Of a model, given as JSON, that has been learned before."""
     run = config.from_json(model)
-    found = prepared(run, questions(run), _refuse, simulations)
-    return Sitting(found, np.arange(len(found.asked.entries)))
+    found = prepared(run, analysis_of(run), _refuse, simulations)
+    return LearnedModel(found, np.arange(len(found.analysis.elements)))
 
 
 @lru_cache(maxsize=2)
-def lesser(model: str, simulations: int | None, names: tuple[str, ...]) -> Sitting:
+def without_effects(model: str, simulations: int | None, names: tuple[str, ...]) -> LearnedModel:
     """The same without some effects."""
-    full = sitting(model, simulations)
+    full = learned_model(model, simulations)
     if not names:
         return full
-    fewer = without(full.court.asked, full.court.known, names)
-    return Sitting(court(full.court.run, fewer.asked, fewer.known), fewer.rows)
+    fewer = without(full.context.analysis, full.context.known, names)
+    return LearnedModel(context(full.context.run, fewer.analysis, fewer.known), fewer.rows)
 
 
-def evidence_with(job: Job, inventions: str | None) -> Vector:
+def evidence_with(job: Job, out_of_library: str | None) -> Vector:
     """Task: evidence of simulations that may contain inventions."""
-    with introduced(inventions):
-        return evidence_of(job)
+    with introduced(out_of_library):
+        return data_vectors(job)
 
 
 def _refuse(jobs: Sequence[Job]) -> list[Vector]:

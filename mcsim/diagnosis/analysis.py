@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config, systematics
-from mcsim.diagnosis.atlas import Atlas
-from mcsim.diagnosis.blocks import Block, Entry, blocks_of
-from mcsim.diagnosis.listen import ORDERS, Model, listen, model_of, show
-from mcsim.diagnosis.scores import Score, score_of
+from mcsim.diagnosis.bipolar_scan import BipolarScan
+from mcsim.diagnosis.matched_filters import MatchedFilter, matched_filter
+from mcsim.diagnosis.summaries import Block, Element, blocks_of
+from mcsim.diagnosis.wiener_filter import BEAM_ORDERS, Model, model_of, show, wiener_filter
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import Survey, survey
@@ -50,7 +50,7 @@ class Proposal:
     @property
     def drawn(self) -> bool:
         """Whether the responses that are measured of it are draws: not those of an effect that is only taken away."""
-        return self.kind.draws and self.kind.side >= 0
+        return self.kind.draws and self.kind.sign >= 0
 
     def with_parameters(self, coordinates: NDArray[np.float64], precision: NDArray[np.float64]) -> Effect:
         """The effect nearest to fitted coordinates."""
@@ -66,7 +66,7 @@ class Proposal:
 
 
 @dataclass(frozen=True)
-class Questions:
+class Analysis:
     """A believed survey, what might be wrong with it, and what to listen for.
 
     Attributes
@@ -87,9 +87,9 @@ class Questions:
     without: tuple[str, ...] = ()
 
     @property
-    def entries(self) -> tuple[Entry, ...]:
+    def elements(self) -> tuple[Element, ...]:
         """Where every number of the evidence was heard."""
-        return tuple(entry for block in self.blocks for entry in block.entries)
+        return tuple(element for block in self.blocks for element in block.elements)
 
     @property
     def columns(self) -> tuple[tuple[int, ...], ...]:
@@ -97,19 +97,19 @@ class Questions:
         edges = np.cumsum([0, *(len(proposal.basis) for proposal in self.proposals)])
         return tuple(tuple(range(int(a), int(b))) for a, b in pairwise(edges))
 
-    def answer(self, maps: Sequence[Map], nthreads: int = 1, atlas: bool = False) -> NDArray[np.float64]:
+    def answer(self, maps: Sequence[Map], nthreads: int = 1, bipolar_scan: bool = False) -> NDArray[np.float64]:
         """Evidence of a set of maps, shape (entries,), and behind it the atlas, where it is asked for."""
-        heard = listen(self.model, maps, nthreads)
-        found = [block.values(self.model, heard) for block in self.blocks]
-        return np.concatenate([*found, self.atlas.values(heard)] if atlas else found)
+        filtered = wiener_filter(self.model, maps, nthreads)
+        found = [block.values(self.model, filtered) for block in self.blocks]
+        return np.concatenate([*found, self.bipolar_scan.values(filtered)] if bipolar_scan else found)
 
     @cached_property
-    def atlas(self) -> Atlas:
+    def bipolar_scan(self) -> BipolarScan:
         """What else is measured, to say where."""
-        return Atlas(self.model)
+        return BipolarScan(self.model)
 
 
-def questions(run: config.RunConfig, without: Sequence[str] = (), nthreads: int = 1) -> Questions:
+def analysis_of(run: config.RunConfig, without: Sequence[str] = (), nthreads: int = 1) -> Analysis:
     """What to ask of data that ``run`` claims to describe.
 
     Parameters
@@ -121,7 +121,7 @@ def questions(run: config.RunConfig, without: Sequence[str] = (), nthreads: int 
     nthreads
         Threads for what is computed once.
     """
-    model = model_of(survey(run, nthreads=nthreads, orders=ORDERS))
+    model = model_of(survey(run, nthreads=nthreads, orders=BEAM_ORDERS))
     proposals = tuple(
         Proposal(kind, channel, dict(settings), tuple(replace(basis, **settings) for basis in kind.basis()))
         for name, kind in systematics.catalogue().items()
@@ -130,7 +130,7 @@ def questions(run: config.RunConfig, without: Sequence[str] = (), nthreads: int 
         for settings in kind.variants
         if _applies(model, kind, channel, settings)
     )
-    return Questions(model, proposals, (*blocks_of(model), *_score_blocks(model, proposals)), tuple(without))
+    return Analysis(model, proposals, (*blocks_of(model), *_matched_blocks(model, proposals)), tuple(without))
 
 
 def _applies(model: Model, kind: type[Effect], channel: str | None, settings: Mapping[str, Any]) -> bool:
@@ -162,22 +162,22 @@ def _applies(model: Model, kind: type[Effect], channel: str | None, settings: Ma
     return not (quiet and kind.noise is not Effect.noise)
 
 
-def _score_blocks(model: Model, proposals: Sequence[Proposal]) -> list[Block]:
+def _matched_blocks(model: Model, proposals: Sequence[Proposal]) -> list[Block]:
     names = [channel.name for channel in model.survey.channels]
     blocks = []
     for proposal in proposals:
         where = None if proposal.channel is None else names.index(proposal.channel)
         for number, basis in enumerate(proposal.basis):
-            score = score_of(model, basis, where)
+            score = matched_filter(model, basis, where)
             if score is not None:
-                blocks.append(_score_block(proposal, number, score, names))
+                blocks.append(_matched_block(proposal, number, score, names))
     return blocks
 
 
-def _score_block(proposal: Proposal, number: int, score: Score, names: Sequence[str]) -> Block:
+def _matched_block(proposal: Proposal, number: int, score: MatchedFilter, names: Sequence[str]) -> Block:
     channels = tuple(names) if proposal.channel is None else (proposal.channel,)
-    entry = Entry(f"score/{proposal.label}/{number}", "score", channels)
-    return Block((entry,), lambda model, heard: np.array([score(model, heard)]))
+    element = Element(f"score/{proposal.label}/{number}", "score", channels)
+    return Block((element,), lambda model, filtered: np.array([score(model, filtered)]))
 
 
 @dataclass(frozen=True)
@@ -200,19 +200,19 @@ class Job:
         Coefficients of the sky that data show, shape (size,) of the model's lmax: the skies are then constrained by it.
     """
 
-    believed: str
+    fiducial: str
     simulated: str
     first: int
     count: int
     sample_by_sample: bool = False
     without: tuple[str, ...] = ()
-    atlas: bool = False
+    bipolar_scan: bool = False
     observed: NDArray[np.complex128] | None = None
 
 
-def evidence_of(job: Job) -> NDArray[np.float64]:
+def data_vectors(job: Job) -> NDArray[np.float64]:
     """Task: evidence of simulations, shape (count, entries), with the atlas behind it where it is asked for."""
-    asked = _questions(job.believed, job.without)
+    analysis = _questions(job.fiducial, job.without)
     shared = _survey(job.simulated)
     rows = []
     for realization in range(job.first, job.first + job.count):
@@ -221,9 +221,9 @@ def evidence_of(job: Job) -> NDArray[np.float64]:
         else:
             sky = None
             if job.observed is not None:
-                sky = _constrained(asked.model, job.observed, shared.config.ensemble.seed, realization)
+                sky = _constrained(analysis.model, job.observed, shared.config.ensemble.seed, realization)
             maps = list(simulate.maps(shared, realization, sky=sky))
-        rows.append(asked.answer(maps, atlas=job.atlas))
+        rows.append(analysis.answer(maps, bipolar_scan=job.bipolar_scan))
     return np.stack(rows)
 
 
@@ -258,5 +258,5 @@ def _survey(simulated: str) -> Survey:
 
 
 @lru_cache(maxsize=1)
-def _questions(believed: str, without: tuple[str, ...]) -> Questions:
-    return questions(config.from_json(believed), without)
+def _questions(fiducial: str, without: tuple[str, ...]) -> Analysis:
+    return analysis_of(config.from_json(fiducial), without)

@@ -13,13 +13,13 @@ from mcsim.beamfit.data import Row, Scaling, parts, project
 from mcsim.beamfit.table import COLUMNS, in_uk2, read_ecsv, scaling_of
 from mcsim.bipolar import Mode
 from mcsim.diagnosis import knowledge
-from mcsim.diagnosis.blocks import Block, Entry
-from mcsim.diagnosis.case import Court, Diagnosis, confirmed, dataset, heard_of, shrink_of
-from mcsim.diagnosis.evidence import Job, Questions, questions
-from mcsim.diagnosis.exhibits import exhibits
+from mcsim.diagnosis.analysis import Analysis, Job, analysis_of
+from mcsim.diagnosis.inference import Diagnosis, DiagnosisContext, confirmed, dataset, partial_explanation_of, shrink_of
 from mcsim.diagnosis.knowledge import Ask, Knowledge, Plan
-from mcsim.diagnosis.refine import Refined, Respond, quiet_templates, refine
-from mcsim.diagnosis.shrink import Prediction, Shrink
+from mcsim.diagnosis.refine import Refined, Respond, refine, significant_templates
+from mcsim.diagnosis.report_arrays import report_arrays
+from mcsim.diagnosis.summaries import Block, Element
+from mcsim.diagnosis.validation import Prediction, Shrink
 from mcsim.diagnosis.verdict import detectable_of, verdict_of
 from mcsim.diagnosis.where import Place, places
 from mcsim.errors import InputError
@@ -43,7 +43,7 @@ LARGEST = 1000.0
 CORRELATED = 5.0
 """Correlation of two entries, times the root of the number of simulations, that is no chance."""
 
-_HEARD = ("sky", "beam", "pointing", "spread", "orientations", "noise")
+_SPECTRAL_HOOKS = ("sky", "beam", "pointing", "spread", "orientations", "noise")
 """Hooks that change spectra of a map. A drift of the gain does so in the lowest degrees only and is not proposed."""
 
 
@@ -77,17 +77,17 @@ class Spectra:
     realizations: int
 
     @property
-    def entries(self) -> tuple[Entry, ...]:
+    def elements(self) -> tuple[Element, ...]:
         """Where every number was heard; bins are in fold 0 and 1 alternately."""
         bins = sorted({(row.ell_min, row.ell_max) for row in self.rows})
         return tuple(self._entry(row, pair, bins) for row, pair in zip(self.rows, self.pairs, strict=True))
 
-    def _entry(self, row: Row, pair: str, bins: Sequence[tuple[int, int]]) -> Entry:
+    def _entry(self, row: Row, pair: str, bins: Sequence[tuple[int, int]]) -> Element:
         maps = [name.partition(":") for name in pair.split(",")]
         splits = {name[2] for name in maps if name[2]}
         ell, mode = (row.ell_min, row.ell_max), row.mode
         kind = f"BipoSH {mode.name}, {'imaginary' if row.imaginary else 'real'}" if mode.L else "spectrum"
-        return Entry(
+        return Element(
             f"{kind}/{pair}/{ell[0]}-{ell[1]}, {_words(self.scaling)}",
             "biposh" if mode.L else "cl",
             tuple(dict.fromkeys(name[0] for name in maps)),
@@ -226,27 +226,29 @@ def _realizations(path: str | Path, meta: Any) -> int:
     return count
 
 
-def listening(run: config.RunConfig, measured: Spectra) -> config.RunConfig:
+def estimator_for(run: config.RunConfig, measured: Spectra) -> config.RunConfig:
     """The run with the estimator that a table needs: its L, its pairs, no twins; what is believed stays."""
     both = any(name.partition(",")[0] != name.partition(",")[2] for name in measured.pairs)
     biposh = replace(run.biposh, L_max=max(row.mode.L for row in measured.rows), pairs="all" if both else "auto")
     return replace(run, biposh=biposh, ensemble=replace(run.ensemble, paired=False, keep_maps=False))
 
 
-def questions_of(run: config.RunConfig, measured: Spectra, without: Sequence[str] = (), nthreads: int = 1) -> Questions:
+def analysis_of_spectra(
+    run: config.RunConfig, measured: Spectra, without: Sequence[str] = (), nthreads: int = 1
+) -> Analysis:
     """What to ask of a table: effects of the library that change spectra; the numbers of the table are the evidence."""
     deaf = [name for name, kind in systematics.catalogue().items() if not _changes_spectra(kind)]
-    asked = questions(run, (*without, *deaf), nthreads)
-    return replace(asked, blocks=(Block(measured.entries, lambda model, heard: measured.value),))
+    analysis = analysis_of(run, (*without, *deaf), nthreads)
+    return replace(analysis, blocks=(Block(measured.elements, lambda model, filtered: measured.value),))
 
 
 def _changes_spectra(kind: type[Effect]) -> bool:
-    return any(getattr(kind, hook) is not getattr(Effect, hook) for hook in _HEARD)
+    return any(getattr(kind, hook) is not getattr(Effect, hook) for hook in _SPECTRAL_HOOKS)
 
 
-def plan(run: config.RunConfig, asked: Questions, simulations: int | None = None) -> Plan:
+def plan(run: config.RunConfig, analysis: Analysis, simulations: int | None = None) -> Plan:
     """All simulations that a table is judged with: of the model, and with every effect and without it, same skies."""
-    whole = knowledge.plan(run, asked, simulations, referee=False)
+    whole = knowledge.plan(run, analysis, simulations, time_ordered=False)
     kept = [
         (replace(job, count=SKIES) if purpose[0] == "response" else job, purpose)
         for job, purpose in zip(whole.jobs, whole.purposes, strict=True)
@@ -254,9 +256,9 @@ def plan(run: config.RunConfig, asked: Questions, simulations: int | None = None
     return Plan(tuple(job for job, _ in kept), tuple(purpose for _, purpose in kept))
 
 
-def _after(run: config.RunConfig, asked: Questions, found: Sequence[config.Effect]) -> list[Job]:
+def _after(run: config.RunConfig, analysis: Analysis, found: Sequence[config.Effect]) -> list[Job]:
     """Simulations with effects at frozen amplitudes, of the skies of the responses."""
-    planned = plan(run, asked, 0)
+    planned = plan(run, analysis, 0)
     return [
         replace(job, simulated=config.to_json(knowledge.with_effects(config.from_json(job.simulated), found)))
         for job, purpose in zip(planned.jobs, planned.purposes, strict=True)
@@ -278,7 +280,7 @@ def of_mean(known: Knowledge, realizations: int) -> Knowledge:
     return replace(known, simulations=mean + scale * (known.simulations - mean))
 
 
-def judge(court: Court, case: str, measured: Spectra, ask: Ask) -> Diagnosis:
+def diagnose_maps(context: DiagnosisContext, case: str, measured: Spectra, ask: Ask) -> Diagnosis:
     """Judge a table of spectra.
 
     Parameters
@@ -305,40 +307,50 @@ def judge(court: Court, case: str, measured: Spectra, ask: Ask) -> Diagnosis:
     correlated, what the former predict of the latter is taken out; the correlation that remains is stated.
     Rotated to other frames are only spectra with every M, real and imaginary.
     """
-    asked, known, x = court.asked, court.known, measured.value
-    _check(measured, court)
+    analysis, known, x = context.analysis, context.known, measured.value
+    _check(measured, context)
 
     def respond(found: Sequence[config.Effect], skies: int) -> NDArray[np.float64]:
         # Whatever number is asked for: each of these skies has its spectra already.
-        after = np.concatenate(ask(_after(court.run, asked, found)))
+        after = np.concatenate(ask(_after(context.run, analysis, found)))
         changes: NDArray[np.float64] = after - known.reference[: len(after)]
         return changes
 
-    t = quiet_templates(known)
+    t = significant_templates(known)
     refined = refine(
-        known, court.null, x, t, court.candidates, asked.proposals, court.calibration, respond, measured.realizations
+        known,
+        context.null,
+        x,
+        t,
+        context.candidates,
+        analysis.proposals,
+        context.calibration,
+        respond,
+        measured.realizations,
     )
     found = refined.attribution
     notes = list(_notes(measured, known.simulations))
     shrink = None
     if found.explanations:
-        found, shrink = confirmed(court, found, _shrink(court, x, refined, respond), notes)
+        found, shrink = confirmed(context, found, _shrink(context, x, refined, respond), notes)
     where = _where(measured, known.simulations)
-    able = detectable_of(court.null, refined.templates, court.candidates, asked.proposals)
-    heard = heard_of(court, x, refined, found, respond)
-    verdict = verdict_of(case, found, court.candidates, asked.proposals, where, shrink, able, notes, heard)
+    able = detectable_of(context.null, refined.templates, context.candidates, analysis.proposals)
+    filtered = partial_explanation_of(context, x, refined, found, respond)
+    verdict = verdict_of(case, found, context.candidates, analysis.proposals, where, shrink, able, notes, filtered)
     # Of no sky: a table has no maps to show.
-    dark = [np.zeros(12 * asked.model.nside**2) for _ in asked.model.parts]
-    shown = exhibits(asked.model, dark, known.simulations, court.null, found, court.candidates, asked.proposals)
-    evidence = dataset(court, x, replace(refined, attribution=found), where, verdict)
+    dark = [np.zeros(12 * analysis.model.nside**2) for _ in analysis.model.parts]
+    shown = report_arrays(
+        analysis.model, dark, known.simulations, context.null, found, context.candidates, analysis.proposals
+    )
+    evidence = dataset(context, x, replace(refined, attribution=found), where, verdict)
     evidence = evidence.merge(shown.drop_vars(["residual_map", "map"]), combine_attrs="no_conflicts")
     evidence.attrs |= {"table": measured.path, "skies_behind_the_mean": measured.realizations}
     return Diagnosis(verdict, evidence, found)
 
 
-def _check(measured: Spectra, court: Court) -> None:
+def _check(measured: Spectra, context: DiagnosisContext) -> None:
     power = np.array([row.mode.L == 0 for row in measured.rows])
-    size = np.abs(measured.value) / np.sqrt(np.mean(court.known.simulations**2, axis=0))
+    size = np.abs(measured.value) / np.sqrt(np.mean(context.known.simulations**2, axis=0))
     unit = "is the unit in its header the right one, and the scaling?"
     if power.any() and not 1.0 / POWER_RATIO < np.median(size[power]) < POWER_RATIO:
         raise InputError(
@@ -349,10 +361,10 @@ def _check(measured: Spectra, court: Court) -> None:
             f"{measured.path}: BipoSH are {np.median(size[~power]):.2g} times as large as the simulations', beyond "
             f"{LARGEST:g}; {unit}"
         )
-    if 1.0 - court.null.probability(measured.value) < TOO_QUIET:
+    if 1.0 - context.null.pvalue(measured.value) < TOO_QUIET:
         raise InputError(
-            f"{measured.path} departs from the model by chi^2 = {court.null.square(measured.value):.2g} in "
-            f"{court.null.dimension} numbers, far less than a mean of {measured.realizations} skies can; say of how "
+            f"{measured.path} departs from the model by chi^2 = {context.null.chi2(measured.value):.2g} in "
+            f"{context.null.dimension} numbers, far less than a mean of {measured.realizations} skies can; say of how "
             "many in its meta (realizations), or correct its unit."
         )
 
@@ -366,36 +378,38 @@ def _notes(measured: Spectra, simulations: NDArray[np.float64]) -> Iterator[str]
         )
 
 
-def _shrink(court: Court, x: Vector, refined: Refined, respond: Respond) -> tuple[Prediction, Shrink, str] | None:
+def _shrink(
+    context: DiagnosisContext, x: Vector, refined: Refined, respond: Respond
+) -> tuple[Prediction, Shrink, str] | None:
     """As :func:`shrink_of`, with fresh entries from which the others predict nothing."""
-    turn, words = _independent(court)
-    known = replace(court.known, simulations=court.known.simulations @ turn.T, offset=turn @ court.known.offset)
+    turn, words = _independent(context)
+    known = replace(context.known, simulations=context.known.simulations @ turn.T, offset=turn @ context.known.offset)
     turned = replace(
         refined,
         templates=turn @ refined.templates,
         candidates=tuple(c if c.scatter is None else replace(c, scatter=turn @ c.scatter) for c in refined.candidates),
     )
     found = shrink_of(
-        replace(court, known=known), turn @ x, turned, lambda effects, skies: respond(effects, skies) @ turn.T
+        replace(context, known=known), turn @ x, turned, lambda effects, skies: respond(effects, skies) @ turn.T
     )
     return None if found is None else (found[0], found[1], words)
 
 
-def _independent(court: Court) -> tuple[NDArray[np.float64], str]:
+def _independent(context: DiagnosisContext) -> tuple[NDArray[np.float64], str]:
     """Matrix that takes from the entries of fold 1 what those of fold 0 predict, and the correlation in words."""
-    folds = np.array([entry.fold for entry in court.asked.entries])
+    folds = np.array([element.fold for element in context.analysis.elements])
     used, fresh = np.flatnonzero(folds == 0), np.flatnonzero(folds == 1)
-    count, size = len(court.known.simulations), len(folds)
+    count, size = len(context.known.simulations), len(folds)
     if not len(used) or not len(fresh):
         return np.eye(size), ""
-    r = np.corrcoef(court.known.simulations.T).reshape(size, size)[np.ix_(fresh, used)]
+    r = np.corrcoef(context.known.simulations.T).reshape(size, size)[np.ix_(fresh, used)]
     rms, chance = float(np.sqrt(np.mean(r**2))), 1.0 / np.sqrt(count)
     words = f"alternate bins (frozen on the others; rms correlation {rms:.3f}, by chance {chance:.3f}"
     hanging = np.any(np.abs(r) > CORRELATED * chance, axis=0)
     turn = np.eye(size)
     if hanging.any():
         known = used[hanging]
-        centred = court.known.simulations - court.known.simulations.mean(axis=0)
+        centred = context.known.simulations - context.known.simulations.mean(axis=0)
         slopes = np.linalg.lstsq(centred[:, known], centred[:, fresh], rcond=None)[0]
         turn[np.ix_(fresh, known)] = -slopes.T
         words += f"; what {len(known)} of them predict is taken out"
@@ -406,11 +420,11 @@ def _where(measured: Spectra, simulations: NDArray[np.float64]) -> list[Place]:
     views = list(_views(measured))
     matrix = np.stack([np.zeros(len(measured.rows)), *(row for _, row in views)])[1:]
     drawn = np.concatenate([simulations, simulations @ matrix.T], axis=1)
-    entries = (*measured.entries, *(entry for entry, _ in views))
-    return places(np.concatenate([measured.value, matrix @ measured.value]), drawn, entries)
+    elements = (*measured.elements, *(element for element, _ in views))
+    return places(np.concatenate([measured.value, matrix @ measured.value]), drawn, elements)
 
 
-def _views(measured: Spectra) -> Iterator[tuple[Entry, Vector]]:
+def _views(measured: Spectra) -> Iterator[tuple[Element, Vector]]:
     """M = 0 in other frames, where the table has every M: entry, and what it is the product of with the values."""
     at = {(pair, row): i for i, (pair, row) in enumerate(zip(measured.pairs, measured.rows, strict=True))}
     for (pair, row), number in at.items():
@@ -427,7 +441,7 @@ def _views(measured: Spectra) -> Iterator[tuple[Entry, Vector]]:
         for frame in FRAMES:
             if frame != measured.frame:
                 turned = rotate_biposh(unit, [(m.L, m.M, m.d) for m in family], measured.frame, frame)[:, 0, 0]
-                own = measured.entries[number]
+                own = measured.elements[number]
                 yield (
                     replace(own, name=f"{own.name} {frame}", frame=frame),
                     turned.imag if row.imaginary else turned.real,

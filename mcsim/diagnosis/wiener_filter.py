@@ -30,10 +30,10 @@ from mcsim.sphere.sky import dipole_alm
 Map = NDArray[np.float64]
 Alm = NDArray[np.complex128]
 
-ORDERS = 4
+BEAM_ORDERS = 4
 """Highest order of a beam that is listened for."""
 
-SPLIT_ORDERS = 2
+SPLIT_BEAM_ORDERS = 2
 """Highest order for which every map of a channel is heard by itself; above it the first stands for their sum."""
 
 NOISE_FLOOR = 1e-3
@@ -106,7 +106,7 @@ class Model:
 
 
 @dataclass(frozen=True)
-class Heard:
+class FilteredMaps:
     """What one set of maps says.
 
     Attributes
@@ -174,7 +174,7 @@ def _response(channel: Channel, lmax: int) -> NDArray[np.float64]:
     return response
 
 
-def listen(model: Model, maps: Sequence[Map], nthreads: int = 1) -> Heard:
+def wiener_filter(model: Model, maps: Sequence[Map], nthreads: int = 1) -> FilteredMaps:
     """Sky, residuals and scores of a set of maps.
 
     Parameters
@@ -193,7 +193,7 @@ def listen(model: Model, maps: Sequence[Map], nthreads: int = 1) -> Heard:
     geometry = healpix.geometry(nside)
     expected = np.empty((len(model.parts), seen[0].size))
     residual, adjoint = np.empty_like(expected), np.empty((len(model.parts), sky.size), dtype=np.complex128)
-    orders = np.zeros((len(model.parts), ORDERS + 1, lmax + 1), dtype=np.complex128)
+    orders = np.zeros((len(model.parts), BEAM_ORDERS + 1, lmax + 1), dtype=np.complex128)
     k = np.sqrt(4 * np.pi / (2 * np.arange(lmax + 1) + 1))
     made = convolve.CircularMaps(nside, lmax, nthreads)
     for channel in range(len(model.response)):
@@ -221,7 +221,7 @@ def listen(model: Model, maps: Sequence[Map], nthreads: int = 1) -> Heard:
             orders[i, s] = (
                 -2.0 * window * k * (by_degree(looked_at, electric, lmax) + 1j * by_degree(looked_at, magnetic, lmax))
             )
-    return Heard(sky, expected, residual, adjoint, orders)
+    return FilteredMaps(sky, expected, residual, adjoint, orders)
 
 
 def show(model: Model, maps: Sequence[Map], nthreads: int = 1) -> Alm:
@@ -268,12 +268,12 @@ def _sky(model: Model, clean: Sequence[Map], nthreads: int) -> Alm:
 
 def _transforms(model: Model, members: tuple[int, ...]) -> Iterator[tuple[int, int, tuple[int, ...]]]:
     """Map in whose place a transform is kept, its order, and the maps that it adds up."""
-    for s in range(1, ORDERS + 1):
-        heard = tuple(i for i in members if model.parts[i].moments.smax >= s)
-        if s <= SPLIT_ORDERS:
-            yield from ((i, s, (i,)) for i in heard)
-        elif heard:
-            yield heard[0], s, heard
+    for s in range(1, BEAM_ORDERS + 1):
+        filtered = tuple(i for i in members if model.parts[i].moments.smax >= s)
+        if s <= SPLIT_BEAM_ORDERS:
+            yield from ((i, s, (i,)) for i in filtered)
+        elif filtered:
+            yield filtered[0], s, filtered
 
 
 def by_degree(a: Alm, b: Alm, lmax: int) -> NDArray[np.float64]:

@@ -9,13 +9,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.attribute import Attribution, Explanation
+from mcsim.diagnosis.analysis import Proposal
 from mcsim.diagnosis.candidate import Candidate
-from mcsim.diagnosis.evidence import Proposal
-from mcsim.diagnosis.listen import Model, listen
+from mcsim.diagnosis.selection import Attribution, Explanation
 from mcsim.diagnosis.verdict import effects_of
+from mcsim.diagnosis.wiener_filter import Model, wiener_filter
 from mcsim.errors import InputError
-from mcsim.stats.gaussian import Fit, Null, residual_probability
+from mcsim.stats.gaussian import Fit, SimulatedGaussian, residual_pvalue
 
 Map = NDArray[np.float64]
 
@@ -26,11 +26,11 @@ TELLING = 12
 """Entries that are named where two explanations differ."""
 
 
-def exhibits(
+def report_arrays(
     model: Model,
     maps: Sequence[Map],
     simulations: NDArray[np.float64],
-    null: Null,
+    null: SimulatedGaussian,
     found: Attribution,
     candidates: Sequence[Candidate],
     proposals: Sequence[Proposal],
@@ -76,7 +76,7 @@ def exhibits(
                         "first": one.first,
                         "second": one.second,
                         "separation": one.separation,
-                        "entries": one.entries[:TELLING].tolist(),
+                        "entries": one.elements[:TELLING].tolist(),
                         "shares": one.shares[:TELLING].tolist(),
                     }
                     for one in found.contrasts
@@ -98,9 +98,9 @@ def residual_maps(model: Model, maps: Sequence[Map]) -> Map:
     fine = np.arange(12 * model.nside**2)
     coarse = healpy.ring2nest(model.nside, fine) // (model.nside // nside) ** 2
     coarse = healpy.nest2ring(nside, coarse)
-    heard = listen(model, maps)
+    filtered = wiener_filter(model, maps)
     rows = []
-    for residual, part in zip(heard.residual, model.parts, strict=True):
+    for residual, part in zip(filtered.residual, model.parts, strict=True):
         total = np.bincount(coarse, weights=residual, minlength=12 * nside**2)
         weight = np.bincount(coarse, weights=np.where(residual != 0.0, part.precision, 0.0), minlength=12 * nside**2)
         seen = weight > 0.0
@@ -108,7 +108,7 @@ def residual_maps(model: Model, maps: Sequence[Map]) -> Map:
     return np.stack(rows)
 
 
-def held_out(simulations: NDArray[np.float64], null: Null) -> NDArray[np.float64]:
+def held_out(simulations: NDArray[np.float64], null: SimulatedGaussian) -> NDArray[np.float64]:
     """Omnibus probability of every simulation against all others, shape (N,): uniform where the evidence is Gaussian.
 
     Notes
@@ -122,7 +122,7 @@ def held_out(simulations: NDArray[np.float64], null: Null) -> NDArray[np.float64
     white = (simulations - simulations.mean(axis=0)) @ null.whitening.T
     a = np.sum(white**2, axis=1) / null.dof * count / (count - 1)
     square = (null.dof - 1) * a / np.maximum(1.0 - a, 1e-12)
-    return residual_probability(square, null.dimension, null.dof - 1)
+    return residual_pvalue(square, null.dimension, null.dof - 1)
 
 
 def _texts(words: Iterable[str]) -> NDArray[np.object_]:
@@ -135,9 +135,7 @@ def _alone(
 ) -> tuple[float, float]:
     """Amplitude and standard error of a candidate; NaN where no effect has such an amplitude."""
     try:
-        (effect,) = effects_of(
-            Explanation((index,), single, 1.0, single.probability, single.probability), candidates, proposals
-        )
+        (effect,) = effects_of(Explanation((index,), single, 1.0, single.pvalue, single.pvalue), candidates, proposals)
     except InputError:
         return float("nan"), float("nan")
     return effect["amplitude"], effect["sigma"]
@@ -148,7 +146,7 @@ def _explanation(one: Explanation) -> dict[str, Any]:
         "members": list(one.members),
         "amplitudes": one.fit.amplitudes.tolist(),
         "odds": one.odds,
-        "probability": one.probability,
+        "probability": one.pvalue,
         "further": one.further,
         "chi2": one.fit.chi2,
         "dimension": one.fit.dimension,

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.diagnosis.candidate import Candidate, allowed, columns_of
-from mcsim.stats.gaussian import Fit, Null, fit, score_probability
+from mcsim.stats.gaussian import Fit, SimulatedGaussian, fit, nested_pvalue
 from mcsim.stats.look_elsewhere import Calibration
 
 Exact = Callable[[NDArray[np.float64], tuple[int, ...], Fit], NDArray[np.float64] | None]
@@ -22,7 +22,7 @@ REFUSED = 6
 
 
 @dataclass(frozen=True)
-class Closest:
+class PartialExplanation:
     """Effects that are heard in a gap without being all of it.
 
     Attributes
@@ -43,14 +43,14 @@ class Closest:
     templates: NDArray[np.float64]
 
 
-def closest(
-    null: Null,
+def partial_explanation(
+    null: SimulatedGaussian,
     x: NDArray[np.float64],
     t: NDArray[np.float64],
     candidates: Sequence[Candidate],
     calibration: Calibration,
     exact: Exact,
-) -> Closest | None:
+) -> PartialExplanation | None:
     """Add the most significant candidate beside those that are heard already, as long as one is significant.
 
     Parameters
@@ -75,9 +75,9 @@ def closest(
     before = fit(null, x, t[:, :0])
     total = before.chi2
 
-    def score_of(after: Fit) -> float:
+    def matched_filter(after: Fit) -> float:
         rank = before.dimension - after.dimension
-        return float(score_probability(before.chi2 - after.chi2, before.chi2, rank, before.dimension, null.dof))
+        return float(nested_pvalue(before.chi2 - after.chi2, before.chi2, rank, before.dimension, null.dof))
 
     while len(members) < MOST and len(refused) < REFUSED:
         smallest, chosen = 1.0, -1
@@ -85,16 +85,19 @@ def closest(
         for index, candidate in enumerate(candidates):
             if candidate.identity not in taken and index not in refused:
                 after = fit(null, x, t[:, columns_of(candidates, (*members, index))])
-                score = score_of(after)
+                score = matched_filter(after)
                 if allowed(candidates, (*members, index), after) and (score < smallest or chosen < 0):
                     smallest, best, chosen = score, after, index
-        if chosen < 0 or float(calibration.trials(smallest)) > LEVEL:
+        if chosen < 0 or float(calibration.global_pvalue(smallest)) > LEVEL:
             break
         together = (*members, chosen)
         straight = exact(t, together, best)
         if straight is not None:
             after = fit(null, x, straight[:, columns_of(candidates, together)])
-            if allowed(candidates, together, after) and float(calibration.trials(score_of(after))) <= LEVEL:
+            if (
+                allowed(candidates, together, after)
+                and float(calibration.global_pvalue(matched_filter(after))) <= LEVEL
+            ):
                 members, t, before = together, straight, after
                 continue
         refused.add(chosen)
@@ -102,4 +105,4 @@ def closest(
         return None
     gap = null.unbiased * total - null.dimension
     left = null.unbiased * before.chi2 - before.dimension
-    return Closest(members, before, min(max(left / gap, 0.0), 1.0) if gap > 0.0 else 1.0, t)
+    return PartialExplanation(members, before, min(max(left / gap, 0.0), 1.0) if gap > 0.0 else 1.0, t)

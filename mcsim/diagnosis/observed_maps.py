@@ -7,7 +7,7 @@ import healpy
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.listen import Model
+from mcsim.diagnosis.wiener_filter import Model
 from mcsim.errors import InputError
 from mcsim.sphere import healpix
 
@@ -80,14 +80,14 @@ def _checked(model: Model, part: int, map_: Map, name: str) -> Map:
     if broken:
         raise InputError(f"{name} has {broken} pixels that are not finite; mark what was not observed as UNSEEN.")
     unseen = map_ == healpy.UNSEEN
-    believed = model.parts[part].precision > 0
-    lost = float(np.mean(unseen[believed]))
+    fiducial = model.parts[part].precision > 0
+    lost = float(np.mean(unseen[fiducial]))
     if lost > MISSING:
         raise InputError(
             f"{name} leaves out {100 * lost:.0f} % of the pixels that the believed scan hits, at most "
             f"{100 * MISSING:.0f} % may be; give the model a mask (map.mask) that leaves them out too."
         )
-    seen = map_[believed & ~unseen]
+    seen = map_[fiducial & ~unseen]
     rms = float(np.std(seen))
     if rms == 0.0:
         raise InputError(f"{name} is constant; give an observed map.")

@@ -10,9 +10,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.shrink import excess_of
-from mcsim.stats.detection import strength_needed, strength_to_isolate
-from mcsim.stats.gaussian import score_probability
+from mcsim.diagnosis.validation import excess_of
+from mcsim.stats.detection import snr_needed, snr_to_separate
+from mcsim.stats.gaussian import nested_pvalue
 
 Vector = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ class Ranked:
 
 
 @dataclass(frozen=True)
-class Gap:
+class ExcessSummary:
     """Excess of chi^2 before and after (None: nothing was added), each with a standard deviation.
 
     ``words`` says on which data; ``expected`` is what was predicted to remain.
@@ -80,7 +80,7 @@ class Gap:
 
 
 @dataclass(frozen=True)
-class Reading:
+class ReportView:
     """What a verdict and its evidence say.
 
     Attributes
@@ -95,7 +95,7 @@ class Reading:
     evidence: xr.Dataset
 
     @cached_property
-    def entries(self) -> list[dict[str, Any]]:
+    def elements(self) -> list[dict[str, Any]]:
         """Where each number was heard, with its kind and column of the block picture."""
         found = []
         for row in json.loads(self.evidence.attrs["entries"]):
@@ -140,10 +140,10 @@ class Reading:
     def ranked(self) -> list[Ranked]:
         """Candidates fitted alone, the one that matters most first."""
         evidence, gap = self.evidence, self.verdict["gap"]
-        heard = np.any(evidence["templates"].values != 0.0, axis=0)
-        rank = np.array([int(heard[self.columns([k])].sum()) for k in range(len(self.labels))])
-        drop = evidence["drop"].values
-        p = score_probability(drop, gap["statistic"], rank, gap["dof"], int(evidence.attrs["simulations"]) - 1)
+        filtered = np.any(evidence["templates"].values != 0.0, axis=0)
+        rank = np.array([int(filtered[self.columns([k])].sum()) for k in range(len(self.labels))])
+        delta_chi2 = evidence["drop"].values
+        p = nested_pvalue(delta_chi2, gap["statistic"], rank, gap["dof"], int(evidence.attrs["simulations"]) - 1)
         sets = [one["members"] for one in self.explanations]
         return [
             Ranked(
@@ -152,30 +152,32 @@ class Reading:
                 unit=str(evidence["unit"].values[k]),
                 amplitude=float(evidence["alone"].values[k]),
                 sigma=float(evidence["alone_sigma"].values[k]),
-                impact=float(np.sqrt(max(drop[k], 0.0))),
+                impact=float(np.sqrt(max(delta_chi2[k], 0.0))),
                 p=min(1.0, float(p[k]) * int((rank > 0).sum())),
                 accepted=any(k in one for one in sets[:1]),
                 alternative=any(k in one for one in sets[1:]),
             )
-            for k in np.argsort(-drop, kind="stable")
+            for k in np.argsort(-delta_chi2, kind="stable")
         ]
 
     @cached_property
-    def gap(self) -> Gap:
+    def excess(self) -> ExcessSummary:
         """Before and after, on fresh data where the shrink was measured, else of the whole evidence."""
         shrink = self.verdict["shrink"]
         if shrink is not None:
             before, after = shrink["gap_before"], shrink["gap_after"]
             expected = before * (1.0 - shrink["predicted"])
             errors = shrink["sigma_before"], shrink["sigma_after"]
-            return Gap(before, errors[0], after, errors[1], expected, f"judged on {shrink['data']}")
+            return ExcessSummary(before, errors[0], after, errors[1], expected, f"judged on {shrink['data']}")
         n, p = int(self.evidence.attrs["simulations"]) - 1, self.verdict["gap"]["dof"]
         found = excess_of(self.verdict["gap"]["statistic"], p, n)
         if not self.explanations:
-            return Gap(found.value, found.sigma, None, 0.0, None, "all of the evidence")
+            return ExcessSummary(found.value, found.sigma, None, 0.0, None, "all of the evidence")
         one = self.explanations[0]
         left = excess_of(one["chi2"], one["dimension"], n)
-        return Gap(found.value, found.sigma, left.value, left.sigma, None, "fitted and judged on the same data")
+        return ExcessSummary(
+            found.value, found.sigma, left.value, left.sigma, None, "fitted and judged on the same data"
+        )
 
     @property
     def shrink_is_measured(self) -> bool:
@@ -186,18 +188,18 @@ class Reading:
     @cached_property
     def isolating(self) -> NDArray[np.float64]:
         """Strength at which each candidate is told from each other one in 95 cases of 100, shape (C, C)."""
-        needed = strength_to_isolate(self.evidence["correlation"].values)
+        needed = snr_to_separate(self.evidence["correlation"].values)
         np.fill_diagonal(needed, np.nan)
         return needed
 
     @cached_property
-    def twins(self) -> list[dict[str, Any]]:
+    def nearest_candidates(self) -> list[dict[str, Any]]:
         """Of every candidate the one most like it, and the amplitude from which they are told apart."""
         evidence = self.evidence
         labels = {_label(row): row for row in self.verdict["detectable"]}
         p, N = self.verdict["gap"]["dof"], int(evidence.attrs["simulations"])
-        heard = {label: min(len(self.columns([k])), p) for k, label in enumerate(self.labels)}
-        strengths = {k: strength_needed(k, len(self.labels), p, N) for k in set(heard.values())}
+        filtered = {label: min(len(self.columns([k])), p) for k, label in enumerate(self.labels)}
+        strengths = {k: snr_needed(k, len(self.labels), p, N) for k in set(filtered.values())}
         found = []
         for k, label in enumerate(self.labels):
             if label not in labels:
@@ -210,7 +212,7 @@ class Reading:
             twin = int(np.argmax(cosine))
             lone = cosine[twin] < 0.0
             isolate = 0.0 if lone else self.isolating[k, twin]
-            scale = float(row["amplitude_90"]) / strengths[heard[label]]
+            scale = float(row["amplitude_90"]) / strengths[filtered[label]]
             found.append(
                 {
                     "label": label,
@@ -241,7 +243,7 @@ class Reading:
                     "factor": (APART / separation) ** 2 if separation > 0 else np.inf,
                     "entries": [
                         {
-                            "words": entry_words(self.entries[k]),
+                            "words": entry_words(self.elements[k]),
                             "share": share,
                             "first": float(a[k]),
                             "second": float(b[k]),
@@ -261,15 +263,15 @@ class Reading:
     @cached_property
     def blocks(self) -> tuple[list[str], list[str], list[NDArray[np.float64]]]:
         """Kinds, columns, and the largest deviate of every block before and (where explained) after; NaN where none."""
-        kinds = list(dict.fromkeys(entry["kind"] for entry in self.entries))
-        columns = sorted({entry["column"] for entry in self.entries}, key=lambda name: (name == "several", name))
+        kinds = list(dict.fromkeys(element["kind"] for element in self.elements))
+        columns = sorted({element["column"] for element in self.elements}, key=lambda name: (name == "several", name))
         tables = []
         for z in (self.z, self.left):
             if z is None:
                 continue
             table = np.full((len(kinds), len(columns)), np.nan)
-            for entry, value in zip(self.entries, z, strict=True):
-                at = kinds.index(entry["kind"]), columns.index(entry["column"])
+            for element, value in zip(self.elements, z, strict=True):
+                at = kinds.index(element["kind"]), columns.index(element["column"])
                 if not abs(table[at]) >= abs(value):
                     table[at] = value
             tables.append(table)

@@ -8,8 +8,8 @@ import healpy
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.listen import ORDERS, SPLIT_ORDERS, Heard, Model, by_degree
-from mcsim.diagnosis.scores import normalised_difference, sky_of
+from mcsim.diagnosis.matched_filters import normalised_difference, sky_of
+from mcsim.diagnosis.wiener_filter import BEAM_ORDERS, SPLIT_BEAM_ORDERS, FilteredMaps, Model, by_degree
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotation_matrix
@@ -34,7 +34,7 @@ LARGE_SCALES = 64
 
 
 @dataclass(frozen=True)
-class Entry:
+class Element:
     """Where one number of the evidence was heard.
 
     Attributes
@@ -70,8 +70,8 @@ class Entry:
 class Block:
     """Entries that are computed together."""
 
-    entries: tuple[Entry, ...]
-    values: Callable[[Model, Heard], Vector] = field(repr=False)
+    elements: tuple[Element, ...]
+    values: Callable[[Model, FilteredMaps], Vector] = field(repr=False)
 
 
 def blocks_of(model: Model) -> tuple[Block, ...]:
@@ -114,21 +114,21 @@ def _beam_block(model: Model, part: int) -> Block:
     frame, lmax = _frame(model), model.lmax
     ell = np.arange(lmax + 1)
     beam = model.survey.channels[model.parts[part].channel].site.beam
-    kernels, entries = [], []
+    kernels, elements = [], []
     first = part == model.of(model.parts[part].channel)[0]
-    for s in range(min(ORDERS if first else SPLIT_ORDERS, model.parts[part].moments.smax) + 1):
+    for s in range(min(BEAM_ORDERS if first else SPLIT_BEAM_ORDERS, model.parts[part].moments.smax) + 1):
         shape = beam.blm[0, : lmax + 1].real * (ell / lmax) ** max(s, 1)
         for low, high in bins(2, lmax, BEAM_BINS[s]):
             kernel = np.where((ell >= low) & (ell <= high), shape, 0.0)
             for quadrature in ("re", "im") if s else ("re",):
                 kernels.append((s, quadrature, kernel))
-                entries.append(
-                    Entry(
+                elements.append(
+                    Element(
                         f"beam/{model.parts[part].name}/m{s}{quadrature}/{low}-{high}",
                         "map",
                         (channel,),
-                        split if s <= SPLIT_ORDERS else None,
-                        _fold(model, part) if s <= SPLIT_ORDERS else None,
+                        split if s <= SPLIT_BEAM_ORDERS else None,
+                        _fold(model, part) if s <= SPLIT_BEAM_ORDERS else None,
                         (low, high),
                         L=s,
                         M=0,
@@ -137,13 +137,13 @@ def _beam_block(model: Model, part: int) -> Block:
                     )
                 )
 
-    def values(model: Model, heard: Heard) -> Vector:
+    def values(model: Model, filtered: FilteredMaps) -> Vector:
         found = [
-            np.dot(kernel, getattr(heard.orders[part, s], _PARTS[quadrature])) for s, quadrature, kernel in kernels
+            np.dot(kernel, getattr(filtered.orders[part, s], _PARTS[quadrature])) for s, quadrature, kernel in kernels
         ]
         return np.array(found)
 
-    return Block(tuple(entries), values)
+    return Block(tuple(elements), values)
 
 
 _PARTS = {"re": "real", "im": "imag"}
@@ -152,8 +152,8 @@ _PARTS = {"re": "real", "im": "imag"}
 def _additive_block(model: Model, part: int) -> Block:
     """The dipole of the residual: x, y, z."""
     channel, split = _label(model, part)
-    entries = tuple(
-        Entry(
+    elements = tuple(
+        Element(
             f"dipole/{model.parts[part].name}/{axis}",
             "map",
             (channel,),
@@ -167,11 +167,11 @@ def _additive_block(model: Model, part: int) -> Block:
     )
     one, two = alm_.start(model.lmax, 0) + 1, alm_.start(model.lmax, 1) + 1
 
-    def values(model: Model, heard: Heard) -> Vector:
-        alm = heard.adjoint[part]
+    def values(model: Model, filtered: FilteredMaps) -> Vector:
+        alm = filtered.adjoint[part]
         return np.array([-alm[two].real, alm[two].imag, alm[one].real])
 
-    return Block(entries, values)
+    return Block(elements, values)
 
 
 def _plane_block(model: Model, part: int) -> Block:
@@ -181,7 +181,7 @@ def _plane_block(model: Model, part: int) -> Block:
     height = matrix[2] @ np.stack(healpy.pix2vec(model.nside, np.arange(12 * model.nside**2)))
     profile = 1.0 / (1.0 + (height / PLANE) ** 2)
     profile -= profile.mean()
-    entry = Entry(
+    element = Element(
         f"plane/{model.parts[part].name}",
         "map",
         (channel,),
@@ -194,10 +194,10 @@ def _plane_block(model: Model, part: int) -> Block:
         frame="galactic",
     )
 
-    def values(model: Model, heard: Heard) -> Vector:
-        return np.array([float(heard.residual[part] @ profile)])
+    def values(model: Model, filtered: FilteredMaps) -> Vector:
+        return np.array([float(filtered.residual[part] @ profile)])
 
-    return Block((entry,), values)
+    return Block((element,), values)
 
 
 def _noise_block(model: Model, channel: int) -> Block:
@@ -209,15 +209,15 @@ def _noise_block(model: Model, channel: int) -> Block:
     height = np.abs(matrix[2] @ np.stack([x, y, z]))
     alternate = np.arange(height.size) % 2
     seen = np.all([model.parts[i].precision > 0 for i in parts[:2]], axis=0)
-    rows, entries = [], []
+    rows, elements = [], []
     for half in (0, 1):
         for low, high in pairwise(LATITUDES):
             band = seen & (height >= low) & (height <= high) & (alternate == half)
             if not band.any():
                 continue  # behind a mask, or never scanned
             rows.append(band.astype(float))
-            entries.append(
-                Entry(
+            elements.append(
+                Element(
                     f"noise/{name}/{low:g}-{high:g}/pixels{half}",
                     "noise",
                     (name,),
@@ -229,21 +229,21 @@ def _noise_block(model: Model, channel: int) -> Block:
             )
     bands = np.stack(rows)
 
-    def values(model: Model, heard: Heard) -> Vector:
-        found: Vector = bands @ normalised_difference(model, heard, parts)
+    def values(model: Model, filtered: FilteredMaps) -> Vector:
+        found: Vector = bands @ normalised_difference(model, filtered, parts)
         return found
 
-    return Block(tuple(entries), values)
+    return Block(tuple(elements), values)
 
 
 def _linearity_block(model: Model, channel: int) -> Block:
     """What is left against the square of the sky: a gain that depends on the signal."""
     parts, name = model.of(channel), model.survey.channels[channel].name
 
-    def values(model: Model, heard: Heard) -> Vector:
-        return np.array([sum(np.dot(heard.residual[i], heard.expected[i] ** 2) for i in parts)])
+    def values(model: Model, filtered: FilteredMaps) -> Vector:
+        return np.array([sum(np.dot(filtered.residual[i], filtered.expected[i] ** 2) for i in parts)])
 
-    return Block((Entry(f"square/{name}", "map", (name,)),), values)
+    return Block((Element(f"square/{name}", "map", (name,)),), values)
 
 
 def _repeated_block(model: Model, channel: int) -> Block:
@@ -251,18 +251,18 @@ def _repeated_block(model: Model, channel: int) -> Block:
     first, second = model.of(channel)[:2]
     name = model.survey.channels[channel].name
     ranges = scales(model.lmax)
-    entries = tuple(
-        Entry(f"{kind}/{name}/{low}-{high}", "cl", (name,), None, None, (low, high), L=0)
+    elements = tuple(
+        Element(f"{kind}/{name}/{low}-{high}", "cl", (name,), None, None, (low, high), L=0)
         for kind in ("common", "difference")
         for low, high in ranges
     )
 
-    def values(model: Model, heard: Heard) -> Vector:
-        a, b = heard.adjoint[first], heard.adjoint[second]
+    def values(model: Model, filtered: FilteredMaps) -> Vector:
+        a, b = filtered.adjoint[first], filtered.adjoint[second]
         common, apart = by_degree(a, b, model.lmax), by_degree(a - b, a - b, model.lmax)
         return np.array([power[low : high + 1].sum() for power in (common, apart) for low, high in ranges])
 
-    return Block(entries, values)
+    return Block(elements, values)
 
 
 def _contrast_block(model: Model) -> Block | None:
@@ -279,29 +279,29 @@ def _contrast_block(model: Model) -> Block | None:
     height = np.abs(matrix[2] @ np.stack(healpy.pix2vec(nside, np.arange(12 * nside * nside))))
     bands = np.stack([(height >= low) & (height <= high) for low, high in pairwise(LATITUDES)]).astype(float)
     names = tuple(channels[c].name for group in groups for c in group)
-    entries = tuple(
-        Entry(f"contrast/{low:g}-{high:g}", "map", names, None, None, (2, top), L=0, frame="galactic")
+    elements = tuple(
+        Element(f"contrast/{low:g}-{high:g}", "map", names, None, None, (2, top), L=0, frame="galactic")
         for low, high in pairwise(LATITUDES)
     )
 
-    def smoothed(model: Model, heard: Heard, split: int) -> Map:
+    def smoothed(model: Model, filtered: FilteredMaps, split: int) -> Map:
         total = np.zeros(alm_.size(model.lmax), dtype=np.complex128)
         for group, sign in zip(groups, (1.0, -1.0), strict=True):
             for c in group:
                 part = model.of(c)[split]
                 weight = np.mean(model.parts[part].precision) * healpy.nside2npix(model.nside)
-                total += sign / len(group) / weight * heard.adjoint[part]
+                total += sign / len(group) / weight * filtered.adjoint[part]
         low = alm_.resize(total, model.lmax, top)
         low[: min(2, top + 1)] = 0.0
         low[top + 1] = 0.0
         found: Map = healpix.synthesis(low[None], nside, top)[0]
         return found
 
-    def values(model: Model, heard: Heard) -> Vector:
-        found: Vector = bands @ (smoothed(model, heard, 0) * smoothed(model, heard, 1))
+    def values(model: Model, filtered: FilteredMaps) -> Vector:
+        found: Vector = bands @ (smoothed(model, filtered, 0) * smoothed(model, filtered, 1))
         return found
 
-    return Block(entries, values)
+    return Block(elements, values)
 
 
 def _sky_block(model: Model) -> Block:
@@ -310,20 +310,20 @@ def _sky_block(model: Model) -> Block:
     large = [(2, 11), (12, 40)] if model.lmax > LARGE_SCALES else []
     ranges = [*large, *bins(41 if large else 2, model.lmax, SKY_BINS - len(large))]
     ell = np.arange(model.lmax + 1)
-    rows, entries = [], []
+    rows, elements = [], []
     for fold, parity in enumerate(("even", "odd")):
         for low, high in ranges:
             weight = np.where((ell >= low) & (ell <= high) & (ell % 2 == fold), 2.0 * ell + 1.0, 0.0)
             if weight.any():
                 rows.append(weight / weight.sum())
-                entries.append(Entry(f"sky/{low}-{high}/{parity}", "cl", names, None, fold, (low, high), L=0))
+                elements.append(Element(f"sky/{low}-{high}/{parity}", "cl", names, None, fold, (low, high), L=0))
     means = np.stack(rows)
 
-    def values(model: Model, heard: Heard) -> Vector:
-        found: Vector = means @ sky_of(model, heard)
+    def values(model: Model, filtered: FilteredMaps) -> Vector:
+        found: Vector = means @ sky_of(model, filtered)
         return found
 
-    return Block(tuple(entries), values)
+    return Block(tuple(elements), values)
 
 
 def _isotropy_block(model: Model) -> Block:
@@ -346,8 +346,8 @@ def _isotropy_block(model: Model) -> Block:
         ("xy", 2, 2),
     )
     ranges = bins(2, lmax, 2)
-    entries = tuple(
-        Entry(f"isotropy/{form}/{low}-{high}", "biposh", names, None, fold, (low, high), L, M, "even", _frame(model))
+    elements = tuple(
+        Element(f"isotropy/{form}/{low}-{high}", "biposh", names, None, fold, (low, high), L, M, "even", _frame(model))
         for fold, (low, high) in enumerate(ranges)
         for form, L, M in named
     )
@@ -355,12 +355,12 @@ def _isotropy_block(model: Model) -> Block:
     inverse = np.divide(1.0, model.cl, out=np.zeros(lmax + 1), where=model.cl > 0)
     filters = [np.where((ell >= low) & (ell <= high), inverse, 0.0) for low, high in ranges]
 
-    def values(model: Model, heard: Heard) -> Vector:
-        sky = healpix.synthesis(heard.sky[None], nside, lmax)[0]
-        weighted = [healpix.synthesis(alm_.multiply(heard.sky, f, lmax)[None], nside, lmax)[0] for f in filters]
+    def values(model: Model, filtered: FilteredMaps) -> Vector:
+        sky = healpix.synthesis(filtered.sky[None], nside, lmax)[0]
+        weighted = [healpix.synthesis(alm_.multiply(filtered.sky, f, lmax)[None], nside, lmax)[0] for f in filters]
         return np.concatenate([forms @ (sky * field) for field in weighted])
 
-    return Block(entries, values)
+    return Block(elements, values)
 
 
 def _fold(model: Model, part: int) -> int | None:

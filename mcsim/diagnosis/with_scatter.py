@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.stats.gaussian import Fit, Null, orthonormal
+from mcsim.stats.gaussian import Fit, SimulatedGaussian, orthonormal
 
 
-def scattered(
-    null: Null, t: NDArray[np.float64], found: Fit, before: NDArray[np.float64], after: NDArray[np.float64]
+def with_scatter(
+    null: SimulatedGaussian, t: NDArray[np.float64], found: Fit, before: NDArray[np.float64], after: NDArray[np.float64]
 ) -> Fit:
     """A fit with the errors that its amplitudes have where the effects act.
 
@@ -26,8 +26,10 @@ def scattered(
     it has among the skies with the effects beyond what it has without them: the same skies, whose common scatter
     cancels. Correlations stay; errors are not made smaller.
     """
-    basis, back = orthonormal(null.templates(t))
-    without, acting = (np.var(back @ basis.T @ null.templates(rows.T), axis=1, ddof=1) for rows in (before, after))
+    basis, back = orthonormal(null.whiten_templates(t))
+    without, acting = (
+        np.var(back @ basis.T @ null.whiten_templates(rows.T), axis=1, ddof=1) for rows in (before, after)
+    )
     own = np.diag(found.covariance)
     factor = np.sqrt(1.0 + np.divide(np.maximum(acting - without, 0.0), own, out=np.zeros_like(own), where=own > 0.0))
     return replace(found, covariance=factor[:, None] * found.covariance * factor)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from mcsim.diagnosis.candidate import Candidate, allowed, columns_of
 from mcsim.diagnosis.subsets import Subsets
 from mcsim.stats.detection import cosines
-from mcsim.stats.gaussian import Fit, Null, bases, fit
-from mcsim.stats.look_elsewhere import Calibration, Gap, gap
+from mcsim.stats.gaussian import Fit, SimulatedGaussian, fit, whitened_templates
+from mcsim.stats.look_elsewhere import Calibration, GlobalTest, global_test
 
 Verdict = Literal["none", "effect", "mixture", "degenerate", "unknown"]
 
@@ -43,7 +43,7 @@ class Explanation:
     members: tuple[int, ...]
     fit: Fit
     odds: float
-    probability: float
+    pvalue: float
     further: float
 
 
@@ -65,7 +65,7 @@ class Contrast:
     first: int
     second: int
     separation: float
-    entries: NDArray[np.int64]
+    elements: NDArray[np.int64]
     shares: NDArray[np.float64]
 
 
@@ -89,7 +89,7 @@ class Attribution:
     """
 
     verdict: Verdict
-    gap: Gap
+    gap: GlobalTest
     explanations: tuple[Explanation, ...]
     nearest: int
     cosine: float
@@ -103,7 +103,7 @@ class Attribution:
 
 
 def attribute(
-    null: Null,
+    null: SimulatedGaussian,
     x: NDArray[np.float64],
     t: NDArray[np.float64],
     candidates: Sequence[Candidate],
@@ -149,21 +149,21 @@ def attribute(
     fit); the sum over members makes both tests noncentral, in the direction that hurts most.
     The prior of a subset is k! times the product of its candidates' shares of the weight.
     """
-    groups = bases(null, t, [candidate.columns for candidate in candidates])
+    groups = whitened_templates(null, t, [candidate.columns for candidate in candidates])
     searches = list(_searches(null, x, t, candidates, calibration, shape_error, largest))
-    y = null.data(x)
-    found = gap(null, x, groups, calibration)
-    drops = groups.drops(y)
-    nearest = int(np.argmax(drops))
-    signal = null.unbiased * drops[nearest] - groups.sizes[nearest]
+    y = null.whiten(x)
+    found = global_test(null, x, groups, calibration)
+    delta_chi2 = groups.delta_chi2(y)
+    nearest = int(np.argmax(delta_chi2))
+    signal = null.unbiased * delta_chi2[nearest] - groups.sizes[nearest]
     excess = max(null.unbiased * float(y @ y) - null.dimension, signal, 1e-300)
     explanations: tuple[Explanation, ...] = ()
-    if found.probability <= alpha:
+    if found.pvalue <= alpha:
         possible = partial(_possible, x, t, candidates)
         accepted = _accepted(searches, levels, largest, np.log(odds_cut), possible)
         explanations = tuple(_explanations(x, t, candidates, accepted, np.log(odds_cut)))
     return Attribution(
-        verdict=_verdict(found.probability > alpha, explanations),
+        verdict=_verdict(found.pvalue > alpha, explanations),
         gap=found,
         explanations=explanations,
         nearest=nearest,
@@ -185,7 +185,7 @@ def _verdict(agrees: bool, explanations: Sequence[Explanation]) -> Verdict:
 
 
 def _searches(
-    null: Null,
+    null: SimulatedGaussian,
     x: NDArray[np.float64],
     t: NDArray[np.float64],
     candidates: Sequence[Candidate],
@@ -202,9 +202,9 @@ def _searches(
         for drawn in combinations(scatters, size):
             if len({names[index] for index in drawn}) < size:
                 continue
-            wide = null.widened(*(scatters[index] for index in drawn))
-            groups = bases(wide, t, columns)
-            yield Subsets(wide, wide.data(x), groups, names, prior, errors, calibration, scatters, drawn)
+            wide = null.with_extra_covariance(*(scatters[index] for index in drawn))
+            groups = whitened_templates(wide, t, columns)
+            yield Subsets(wide, wide.whiten(x), groups, names, prior, errors, calibration, scatters, drawn)
 
 
 @dataclass(frozen=True, order=True)
@@ -213,20 +213,20 @@ class _Accepted:
 
     evidence: float
     members: tuple[int, ...]
-    probability: float
+    pvalue: float
     further: float
-    null: Null = field(compare=False)
+    null: SimulatedGaussian = field(compare=False)
 
 
 def _possible(
     x: NDArray[np.float64],
     t: NDArray[np.float64],
     candidates: Sequence[Candidate],
-    null: Null,
+    null: SimulatedGaussian,
     members: tuple[int, ...],
 ) -> bool:
     """Whether no member would need an amplitude that it cannot have."""
-    if not any(candidates[member].positive or np.isfinite(candidates[member].most) for member in members):
+    if not any(candidates[member].positive or np.isfinite(candidates[member].max_amplitude) for member in members):
         return True
     return allowed(candidates, members, fit(null, x, t[:, columns_of(candidates, members)]))
 
@@ -236,7 +236,7 @@ def _accepted(
     levels: tuple[float, float],
     largest: int,
     cut: float,
-    possible: Callable[[Null, tuple[int, ...]], bool],
+    possible: Callable[[SimulatedGaussian, tuple[int, ...]], bool],
 ) -> list[_Accepted]:
     """Minimal sufficient subsets that are possible, unless their evidence is below the best one's by over ``cut``."""
     accepted: list[_Accepted] = []
@@ -260,11 +260,11 @@ def _sufficient(
     levels: tuple[float, float],
     least: float,
     doubted: bool,
-    possible: Callable[[Null, tuple[int, ...]], bool],
+    possible: Callable[[SimulatedGaussian, tuple[int, ...]], bool],
 ) -> Iterator[_Accepted]:
     """Of subsets of the same ranks those that suffice; of doubted ones every member has to be significant."""
     solved = search.solve(subsets)
-    passing = np.flatnonzero((solved.probability > levels[0]) & (solved.evidence >= least))
+    passing = np.flatnonzero((solved.pvalue > levels[0]) & (solved.evidence >= least))
     for first in range(0, len(passing), CHUNK):
         rows = passing[first : first + CHUNK]
         further = search.further(subsets[rows], solved.chi2[rows], solved.allowance[rows])
@@ -274,7 +274,7 @@ def _sufficient(
         for row, beside in zip(rows[alone], further[alone], strict=True):
             members = tuple(int(member) for member in subsets[row])
             if possible(search.null, members):
-                numbers = float(solved.evidence[row]), members, float(solved.probability[row]), float(beside)
+                numbers = float(solved.evidence[row]), members, float(solved.pvalue[row]), float(beside)
                 yield _Accepted(*numbers, search.null)
 
 
@@ -294,11 +294,14 @@ def _explanations(
         if lost <= cut and identity not in seen:
             seen.add(identity)
             best = fit(found.null, x, t[:, columns_of(candidates, found.members)])
-            yield Explanation(found.members, best, float(np.exp(-lost)), found.probability, found.further)
+            yield Explanation(found.members, best, float(np.exp(-lost)), found.pvalue, found.further)
 
 
 def _contrasts(
-    null: Null, t: NDArray[np.float64], candidates: Sequence[Candidate], explanations: Sequence[Explanation]
+    null: SimulatedGaussian,
+    t: NDArray[np.float64],
+    candidates: Sequence[Candidate],
+    explanations: Sequence[Explanation],
 ) -> Iterator[Contrast]:
     """Each pair of explanations, and the entries in which their predictions differ by most of their distance."""
     predictions = [
@@ -306,7 +309,7 @@ def _contrasts(
     ]
     for first, second in combinations(range(len(predictions)), 2):
         difference = predictions[first] - predictions[second]
-        white = null.templates(difference[:, None])[:, 0]
+        white = null.whiten_templates(difference[:, None])[:, 0]
         squared = float(white @ white)
         shares = difference * (null.whitening.T @ white) / np.sqrt(1.0 + 1.0 / null.count) / max(squared, 1e-300)
         order = np.argsort(-shares)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import systematics
-from mcsim.diagnosis.listen import ORDERS, Heard, Model, by_degree
+from mcsim.diagnosis.wiener_filter import BEAM_ORDERS, FilteredMaps, Model, by_degree
 from mcsim.instrument.scan.cache import moments_key
 from mcsim.simulation import tod
 from mcsim.simulation.survey import mean_gain
@@ -25,38 +25,38 @@ Map = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class BeamScore:
+class BeamFilter:
     """Change of a beam: sum of Re[conj(db_ls) D_s(l)] over the channel's maps."""
 
     parts: tuple[int, ...]
     change: NDArray[np.complex128]
 
-    def __call__(self, model: Model, heard: Heard) -> float:
+    def __call__(self, model: Model, filtered: FilteredMaps) -> float:
         """The score."""
-        total = sum(heard.orders[i] for i in self.parts)
+        total = sum(filtered.orders[i] for i in self.parts)
         return float(np.sum(self.change.real * np.real(total) + self.change.imag * np.imag(total)))
 
 
 @dataclass(frozen=True)
-class GainScore:
+class GainFilter:
     """Change of the gain: every map times the mean error of its pixels, the dipole in it."""
 
     parts: tuple[int, ...]
     errors: tuple[Map, ...]
     dipole: Map
 
-    def __call__(self, model: Model, heard: Heard) -> float:
+    def __call__(self, model: Model, filtered: FilteredMaps) -> float:
         """The score."""
         return float(
             sum(
-                np.dot(heard.residual[i], error * (heard.expected[i] + self.dipole))
+                np.dot(filtered.residual[i], error * (filtered.expected[i] + self.dipole))
                 for i, error in zip(self.parts, self.errors, strict=True)
             )
         )
 
 
 @dataclass(frozen=True)
-class SkyScore:
+class SkyFilter:
     """Change of the sky that one channel looks at, or (all parts) that all do."""
 
     effect: Effect
@@ -64,54 +64,54 @@ class SkyScore:
     parts: tuple[int, ...]
     common: bool
 
-    def __call__(self, model: Model, heard: Heard) -> float:
+    def __call__(self, model: Model, filtered: FilteredMaps) -> float:
         """The score."""
         lmax = model.lmax
         site = replace(self.site, lmax=lmax)
-        change = self.effect.sky(heard.sky, site, _no_draws) - heard.sky
+        change = self.effect.sky(filtered.sky, site, _no_draws) - filtered.sky
         if self.common:
             # What all maps together say, sum_i P_i^t r_i, is S^-1 s^.
             inverse = np.divide(1.0, model.cl, out=np.zeros(lmax + 1), where=model.cl > 0)
-            return float(np.dot(inverse, by_degree(heard.sky, change, lmax)))
+            return float(np.dot(inverse, by_degree(filtered.sky, change, lmax)))
         return float(
             sum(
-                np.dot(model.response[model.parts[i].channel], by_degree(change, heard.adjoint[i], lmax))
+                np.dot(model.response[model.parts[i].channel], by_degree(change, filtered.adjoint[i], lmax))
                 for i in self.parts
             )
         )
 
 
 @dataclass(frozen=True)
-class NoiseScore:
+class NoiseFilter:
     """Change of the noise's variance, heard in the difference of a channel's maps (or in the one that there is)."""
 
     parts: tuple[int, ...]
     change: Map
 
-    def __call__(self, model: Model, heard: Heard) -> float:
+    def __call__(self, model: Model, filtered: FilteredMaps) -> float:
         """The score."""
-        return float(np.dot(normalised_difference(model, heard, self.parts), self.change))
+        return float(np.dot(normalised_difference(model, filtered, self.parts), self.change))
 
 
-Score = BeamScore | GainScore | SkyScore | NoiseScore
+MatchedFilter = BeamFilter | GainFilter | SkyFilter | NoiseFilter
 
 
-def normalised_difference(model: Model, heard: Heard, parts: tuple[int, ...]) -> Map:
+def normalised_difference(model: Model, filtered: FilteredMaps, parts: tuple[int, ...]) -> Map:
     """u^2 - 1 of every pixel seen by the first two maps of a channel: u their difference over its noise; else 0."""
     # Residuals are zero where nothing was seen, and come times their precision: (r/a - s/b)^2 / (1/a + 1/b).
-    first, a = heard.residual[parts[0]], model.parts[parts[0]].precision
+    first, a = filtered.residual[parts[0]], model.parts[parts[0]].precision
     seen = first != 0.0
     if len(parts) == 1:
         square, scale = first**2, a
     else:
-        second, b = heard.residual[parts[1]], model.parts[parts[1]].precision
+        second, b = filtered.residual[parts[1]], model.parts[parts[1]].precision
         seen &= second != 0.0
         square, scale = (first * b - second * a) ** 2, a * b * (a + b)
     found = np.divide(square, scale, out=np.zeros_like(square), where=seen)
     return found - seen
 
 
-def score_of(model: Model, effect: Effect, channel: int | None) -> Score | None:
+def matched_filter(model: Model, effect: Effect, channel: int | None) -> MatchedFilter | None:
     """The score of a small effect in a channel (None: in all); None where it has none of these kinds.
 
     Parameters
@@ -127,23 +127,23 @@ def score_of(model: Model, effect: Effect, channel: int | None) -> Score | None:
     where = 0 if channel is None else channel
     owner = model.survey.channels[where]
     parts = tuple(range(len(model.parts))) if channel is None else model.of(channel)
-    if not kind.own_score:
+    if not kind.matched_filter:
         return None
     if kind.sky is not Effect.sky:
-        return SkyScore(effect, owner.site, parts, channel is None)
+        return SkyFilter(effect, owner.site, parts, channel is None)
     if channel is None:
         return None
     if kind.beam is not Effect.beam or kind.pointing is not Effect.pointing or kind.spread is not Effect.spread:
-        return _beam_score(model, effect, channel, parts)
+        return _beam_filter(model, effect, channel, parts)
     factor = effect.noise(owner.site)
     if factor is not None:
-        return NoiseScore(parts, np.asarray(factor) - 1.0)
+        return NoiseFilter(parts, np.asarray(factor) - 1.0)
     if effect.gain(np.zeros(1), owner.site) is not None:
         splits = len(parts)
         errors = tuple(gain_of(effect, owner.site, (n / splits, (n + 1) / splits)) for n in range(splits))
         lmax = max(model.lmax, 1)
         dipole = healpix.synthesis(dipole_alm(owner.site.dipole_uk, lmax)[None], model.nside, lmax)[0]
-        return GainScore(parts, errors, dipole)
+        return GainFilter(parts, errors, dipole)
     return None
 
 
@@ -170,30 +170,30 @@ _TIMES = 4096
 """At which a gain is looked at to know it again."""
 
 
-def _beam_score(model: Model, effect: Effect, channel: int, parts: tuple[int, ...]) -> BeamScore | None:
+def _beam_filter(model: Model, effect: Effect, channel: int, parts: tuple[int, ...]) -> BeamFilter | None:
     owner = model.survey.channels[channel]
     lmax = model.lmax
     changed, before = systematics.seen_through((effect,), owner.site), owner.site.beam
-    change = np.zeros((ORDERS + 1, lmax + 1), dtype=np.complex128)
+    change = np.zeros((BEAM_ORDERS + 1, lmax + 1), dtype=np.complex128)
     for beam, sign in ((changed, 1.0), (before, -1.0)):
-        rows = min(beam.mmax, ORDERS) + 1
+        rows = min(beam.mmax, BEAM_ORDERS) + 1
         change[:rows] += sign * beam.blm[:rows, : lmax + 1]
     spread = effect.spread()
     if spread != 1.0:
         window = np.maximum(owner.window[: lmax + 1], np.finfo(float).tiny)
-        rows = min(before.mmax, ORDERS) + 1
+        rows = min(before.mmax, BEAM_ORDERS) + 1
         change[:rows] += before.blm[:rows, : lmax + 1] * (window ** (spread * spread - 1.0) - 1.0)
     # Samples at the centres of their pixels, with no pixel window, cannot come closer.
-    return BeamScore(parts, change) if change.any() else None
+    return BeamFilter(parts, change) if change.any() else None
 
 
 def _no_draws(stage: str) -> np.random.Generator:
     raise TypeError(f"an effect that draws ({stage}) has no score of its own: set own_score = False")
 
 
-def sky_of(model: Model, heard: Heard) -> NDArray[np.float64]:
+def sky_of(model: Model, filtered: FilteredMaps) -> NDArray[np.float64]:
     """Spectrum of s^ over what is expected of it, minus one, shape (lmax + 1,); 0 where no power is expected."""
     lmax = model.lmax
-    found = by_degree(heard.sky, heard.sky, lmax) / (2 * np.arange(lmax + 1) + 1)
+    found = by_degree(filtered.sky, filtered.sky, lmax) / (2 * np.arange(lmax + 1) + 1)
     expected = model.cl * model.sky_power
     return np.divide(found, expected, out=np.ones(lmax + 1), where=expected > 0) - 1.0

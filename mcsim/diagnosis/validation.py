@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.stats.gaussian import Null
+from mcsim.stats.gaussian import SimulatedGaussian
 
 
 @dataclass(frozen=True)
@@ -30,13 +30,13 @@ class Shrink:
 class Prediction:
     """Expected fall of the gap, and the fraction of the gap that this is."""
 
-    drop: Measured
+    delta_chi2: Measured
     fraction: Measured
 
 
-def excess(null: Null, x: NDArray[np.float64]) -> Measured:
+def excess(null: SimulatedGaussian, x: NDArray[np.float64]) -> Measured:
     """Gap G of evidence, shape (p_raw,): its white square above expectation; see :func:`excess_of`."""
-    return excess_of(null.square(x), null.dimension, null.dof)
+    return excess_of(null.chi2(x), null.dimension, null.dof)
 
 
 def excess_of(chi2: float, p: int, n: int) -> Measured:
@@ -53,7 +53,7 @@ def excess_of(chi2: float, p: int, n: int) -> Measured:
 
 
 def predicted(
-    test: Null,
+    test: SimulatedGaussian,
     x: NDArray[np.float64],
     t: NDArray[np.float64],
     amplitudes: NDArray[np.float64],
@@ -76,17 +76,17 @@ def predicted(
     unbiased estimate from the fit is theta^'F theta^ - 2 tr(F V); tr(F V) = K where both data are equally good. sigma
     of the drop is its error as a forecast of the mean drop on fresh data: 2 sqrt(theta^'F V F theta^ + tr(F V F V)).
     """
-    white = test.templates(t)
+    white = test.whiten_templates(t)
     fisher = test.unbiased * white.T @ white
     product = fisher @ covariance
-    drop = float(amplitudes @ fisher @ amplitudes) - 2.0 * float(np.trace(product))
+    delta_chi2 = float(amplitudes @ fisher @ amplitudes) - 2.0 * float(np.trace(product))
     variance = 4.0 * float(amplitudes @ product @ fisher @ amplitudes) + 4.0 * float(np.trace(product @ product))
-    return _of_gap(Measured(drop, float(np.sqrt(variance))), excess(test, x))
+    return _of_gap(Measured(delta_chi2, float(np.sqrt(variance))), excess(test, x))
 
 
 def carried(
-    test: Null,
-    wide: Null,
+    test: SimulatedGaussian,
+    wide: SimulatedGaussian,
     x: NDArray[np.float64],
     t: NDArray[np.float64],
     covariance: NDArray[np.float64],
@@ -117,19 +117,19 @@ def carried(
     part of its error.
     """
     share = float(np.mean(here) / np.mean(there))
-    white = wide.templates(t)
+    white = wide.whiten_templates(t)
     lost = wide.unbiased * float(np.trace(white.T @ white @ covariance))
     sigma = float(np.hypot(share * seen.sigma, np.std(here - share * there, ddof=1)))
     return _of_gap(Measured(share * seen.value - lost, sigma), excess(test, x))
 
 
-def _of_gap(drop: Measured, before: Measured) -> Prediction:
-    fraction = drop.value / before.value
-    sigma = float(np.hypot(drop.sigma, fraction * before.sigma)) / abs(before.value)
-    return Prediction(drop, Measured(fraction, sigma))
+def _of_gap(delta_chi2: Measured, before: Measured) -> Prediction:
+    fraction = delta_chi2.value / before.value
+    sigma = float(np.hypot(delta_chi2.sigma, fraction * before.sigma)) / abs(before.value)
+    return Prediction(delta_chi2, Measured(fraction, sigma))
 
 
-def achieved(before: Null, after: Null, x: NDArray[np.float64]) -> Shrink:
+def achieved(before: SimulatedGaussian, after: SimulatedGaussian, x: NDArray[np.float64]) -> Shrink:
     """Shrink of the gap of evidence, shape (p_raw,), between two ensembles of independent simulations.
 
     Notes
@@ -141,13 +141,13 @@ def achieved(before: Null, after: Null, x: NDArray[np.float64]) -> Shrink:
     first, last = excess(before, x), excess(after, x)
     fraction = 1.0 - last.value / first.value
     p, d2 = before.dimension, before.dof - before.dimension + 1
-    shift = before.templates((after.mean - before.mean)[:, None])[:, 0]
+    shift = before.whiten_templates((after.mean - before.mean)[:, None])[:, 0]
     distance, length = max(first.value, 0.0), max(last.value, 0.0)
     # The error of the two means adds to the square of their difference.
     moved = max(before.unbiased * float(shift @ shift) - p * (1.0 / before.count + 1.0 / after.count), 0.0)
-    along = before.unbiased * float(shift @ before.data(x))
+    along = before.unbiased * float(shift @ before.whiten(x))
     mismatch = max(moved - 2.0 * fraction * along + fraction**2 * distance, 0.0)
     data = (4.0 * mismatch + 2.0 * p * fraction**2) * (d2 - 2) / (d2 - 4)
     scatter = 2.0 * ((p + length) ** 2 + (1.0 - fraction) ** 2 * (p + distance) ** 2) / (d2 - 4)
     sigma = float(np.sqrt(data + scatter)) / abs(first.value)
-    return Shrink(first, last, Measured(fraction, sigma), after.probability(x))
+    return Shrink(first, last, Measured(fraction, sigma), after.pvalue(x))
