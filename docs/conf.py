@@ -143,7 +143,17 @@ def _plain(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[s
             literal = indentation
 
 
+def _forget(app: Any) -> None:
+    """Remove the pages of modules that are gone."""
+    for page in (HERE / "reference" / "generated").glob("mcsim.*.rst"):
+        parts = page.stem.split(".")[1:]
+        place = HERE.parent.joinpath("mcsim", *parts)
+        if not (place.is_dir() or place.with_suffix(".py").is_file()):
+            page.unlink()
+
+
 def setup(app: Any) -> None:
-    """Connect the two hooks."""
+    """Connect the hooks."""
+    app.connect("builder-inited", _forget, priority=1)
     app.connect("source-read", _public)
     app.connect("autodoc-process-docstring", _plain)
