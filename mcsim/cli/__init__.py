@@ -52,7 +52,7 @@ def _options(
     """Is the isotropy violation that I measure made by my instrument?"""
 
 
-for _command in (ensembles.run, ensembles.merge, ensembles.info, ensembles.plot, ensembles.predict):
+for _command in (ensembles.run, ensembles.merge, ensembles.info, ensembles.plot, ensembles.predict, ensembles.maps):
     app.command()(_command)
 
 

@@ -142,6 +142,37 @@ def predict(
         out.print(f"wrote {output}", markup=False)
 
 
+def maps(
+    config: Config,
+    folder: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to fill; nothing is replaced.")],
+    realization: Annotated[
+        int | None, typer.Option(metavar="N", help="Only this one, its files directly in DIR.")
+    ] = None,
+    realizations: Annotated[
+        str | None, typer.Option(metavar="A:B", help="Realizations A to B - 1; default: all of the ensemble.")
+    ] = None,
+    sample_by_sample: Annotated[
+        bool, typer.Option("--sample-by-sample", help="By the time-ordered reference, where the pointing is known.")
+    ] = False,
+) -> None:
+    """Write the maps of a run as FITS files, such as mcsim diagnose reads.
+
+    A folder for each realization holds CHANNEL.fits or CHANNEL_SPLIT.fits: HEALPix in RING order, uK.
+    """
+    from mcsim.ensemble.maps import write_maps
+
+    if realization is not None and realizations is not None:
+        raise InputError("--realization and --realizations exclude each other; give one of them.")
+    chosen = _slice(realizations) if realization is None else realization
+    interrupt_once()
+    try:
+        found = write_maps(config, folder, chosen, sample_by_sample=sample_by_sample, quiet=False)
+    except KeyboardInterrupt:
+        print("mcsim: interrupted; folders that exist are complete.", file=sys.stderr)
+        raise typer.Exit(130) from None
+    out.print(f"wrote maps of {len(found)} realization{'' if len(found) == 1 else 's'} to {folder}", markup=False)
+
+
 def _slice(text: str | None) -> slice | None:
     if text is None:
         return None

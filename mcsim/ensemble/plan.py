@@ -11,6 +11,7 @@ import numpy as np
 
 from mcsim import config
 from mcsim.bipolar import Mode, estimate, estimator, modes
+from mcsim.bipolar.dataset import CONVENTION, NORMALISATION
 from mcsim.ensemble import store, summary
 from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError
@@ -29,8 +30,8 @@ CONVENTIONS = {
     "alm": "healpy m-major order, analysis divided by the pixel window",
     "psi": "rotation of the beam about its axis, from e_theta (south) towards e_phi (east)",
     "beam": "b_lm of the beam at the pole, b_l0 = sqrt((2l+1)/4pi) B_l, B_0 = 1; x axis = spin axis x boresight",
-    "biposh": "A^{LM}_{l1 l2} = sum a_{l1 m1} conj(a_{l2 m2}) (-1)^{m2} C^{LM}_{l1 m1 l2 -m2}, ell = l2, d = l2 - l1",
-    "normalisation": "Hajian-Souradeep",
+    "biposh": CONVENTION,
+    "normalisation": NORMALISATION,
     "weights": "maps times weights of unit mean square, spectra over the mean product of the two weights",
 }
 _PACKAGES = ("mcsim", "numpy", "healpy", "ducc0", "numba", "scipy", "dask", "distributed", "zarr", "xarray")

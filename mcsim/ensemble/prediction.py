@@ -92,6 +92,13 @@ def predict(
     far above their own scales; what they make of an isotropic sky is left out, as in the paired difference. Variances
     are C_l1 C_l2 (1 + delta_l1l2) / f_sky, f_sky = <W_x W_y>^2 / <W_x^2 W_y^2>. Ensembles agree within their errors:
     tests/integration/test_prediction.py, and test_prediction_pairs.py for pairs, noise and masks.
+
+    Examples
+    --------
+    >>> import mcsim
+    >>> expected = mcsim.predict("tiny")
+    >>> float(expected.biposh_mean.sel(mode="L2M0d0", pair="demo,demo", ell=20).real) > 0.0
+    True
     """
     survey = survey_of(source, nthreads)
     if survey.cl is None:

@@ -13,7 +13,6 @@ from mcsim.instrument import beams, scan
 from mcsim.plot.beam import beam_figure
 from mcsim.plot.scan import scan_figure
 from mcsim.simulation import channels
-from mcsim.support import resources
 from mcsim.support.progress import reporting
 
 
@@ -55,9 +54,9 @@ def look_at_beams(
             yield _look_at(channel.name, channels.load_beam(channel, lmax), image)
     elif beams.holds_image(path):
         image = beams.read_map(path, pixel_deg=pixel_deg)
-        yield _look_at(path.name, image.beam(lmax, m_max), image)
+        yield _look_at(path.name, beams.Beam.from_map(image, lmax, m_max), image)
     else:
-        yield _look_at(path.name, beams.from_blm_file(path, lmax, m_max), None)
+        yield _look_at(path.name, beams.Beam.from_blm(path, lmax, m_max), None)
 
 
 def _look_at(name: str, shown: beams.Beam, image: beams.BeamMap | None) -> Look:
@@ -96,7 +95,7 @@ def look_at_scan(
     """
     if smax < 2:
         raise InputError(f"smax = {smax} is too small for a look at a scan, which is about w_2; take 2 or more.")
-    loaded = scan.load_model(resources.scan_model(model))
+    loaded = scan.ScanModel.load(model)
     if sample_period_s is not None:
         loaded = loaded.with_sampling(sample_period_s)
     lines = None if line_of_sight is None else [line_of_sight]

@@ -16,6 +16,7 @@ from mcsim.simulation.survey import Channel, Survey, SurveyMap
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rng
 from mcsim.sphere.sky import dipole_alm, gaussian_alm
+from mcsim.support.npy import read_npy
 
 Alm = NDArray[np.complex128]
 
@@ -246,12 +247,11 @@ def _spectra(survey: Survey, alms: list[Alm], suffix: str) -> dict[str, NDArray]
 
 
 def _read_alm(path: Path, lmax: int) -> Alm:
-    try:
-        alm, mmax = healpy.read_alm(path, return_mmax=True)
-    except Exception as error:  # libraries raise whatever a broken file makes of them
-        raise InputError(
-            f"{path} cannot be read as a_lm ({error}); give a FITS file as healpy.write_alm makes it."
-        ) from error
+    if path.suffix == ".npy":
+        alm = read_npy(path)
+        mmax = healpy.Alm.getlmax(alm.size)
+    else:
+        alm, mmax = _read_fits_alm(path)
     found = healpy.Alm.getlmax(alm.size, mmax)
     if mmax != found or found < lmax:
         raise InputError(f"{path} holds a_lm up to l = {found}, m = {mmax}; the sky needs both up to {lmax}.")
@@ -259,6 +259,16 @@ def _read_alm(path: Path, lmax: int) -> Alm:
         raise InputError(f"{path} holds a_lm that are not finite; repair the file.")
     _check_size(path, alm)
     return alm_.resize(alm.astype(np.complex128), found, lmax)
+
+
+def _read_fits_alm(path: Path) -> tuple[Alm, int]:
+    try:
+        alm, mmax = healpy.read_alm(path, return_mmax=True)
+        return alm, int(mmax)
+    except Exception as error:  # libraries raise whatever a broken file makes of them
+        raise InputError(
+            f"{path} cannot be read as a_lm ({error}); give a FITS file as healpy.write_alm makes it."
+        ) from error
 
 
 def _read_sky_map(path: Path, lmax: int, frame: str) -> Alm:

@@ -1,14 +1,23 @@
 """Harmonic coefficients in healpy's m-major order: a_00, a_10, ..., a_lmax0, a_11, a_21, ..."""
 
+import math
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from mcsim.errors import InputError
 
 
 def size(lmax: int) -> int:
     """Number of coefficients with 0 <= m <= l <= lmax."""
     return (lmax + 1) * (lmax + 2) // 2
+
+
+def lmax_of(count: int) -> int | None:
+    """Degree whose coefficients with 0 <= m <= l <= lmax are ``count``; None where there is none."""
+    lmax = (math.isqrt(8 * count + 1) - 3) // 2
+    return lmax if lmax >= 0 and size(lmax) == count else None
 
 
 def start(lmax: int, m: int) -> int:
@@ -45,3 +54,23 @@ def resize(alm: NDArray[np.complex128], lmax: int, new_lmax: int) -> NDArray[np.
         source, target = start(lmax, m), start(new_lmax, m)
         resized[target + m : target + top + 1] = alm[source + m : source + top + 1]
     return resized
+
+
+def whole(given: ArrayLike, name: str) -> tuple[NDArray[np.complex128], int]:
+    """Return given coefficients and their lmax; ``name`` names them in messages.
+
+    Raises
+    ------
+    InputError
+        If they are not those of a map with every m up to lmax, or not finite.
+    """
+    alm = np.asarray(given, dtype=np.complex128)
+    lmax = lmax_of(alm.size) if alm.ndim == 1 else None
+    if lmax is None:
+        raise InputError(
+            f"{name} has the shape {alm.shape}, which is no map with every m up to lmax; give (lmax + 1)(lmax + 2)/2 "
+            "coefficients in healpy's order."
+        )
+    if not np.all(np.isfinite(alm)):
+        raise InputError(f"{name} has values that are not finite; give the coefficients of a whole map.")
+    return alm, lmax

@@ -13,6 +13,7 @@ from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
+from mcsim.support.npy import read_npy
 
 Map = NDArray[np.float64]
 Alm = NDArray[np.complex128]
@@ -135,11 +136,18 @@ _TO_UK = {"uk": 1.0, "mk": 1e3, "k": 1e6}
 def read_map(path: Path) -> tuple[Map, str | None, str | None]:
     """First map of a HEALPix FITS file in RING order, its frame and its unit as far as the header tells them.
 
+    Of a .npy file, an array of shape (npix,) in RING order, neither is known.
+
     Raises
     ------
     InputError
         If the file cannot be read as a HEALPix map.
     """
+    if path.suffix == ".npy":
+        array = read_npy(path, "biuf").astype(np.float64)
+        if not healpy.isnpixok(array.size):
+            raise InputError(f"{path} has {array.size} pixels, which is no HEALPix map; give all 12 nside^2 pixels.")
+        return array, None, None
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", category=AstropyUserWarning)
@@ -163,21 +171,25 @@ def to_uk(unit: str | None, path: Path) -> float:
 
 
 def read_pixel_window(path: Path, lmax: int) -> NDArray[np.float64]:
-    """Temperature pixel window of a FITS file in the HEALPix format, shape (lmax + 1,).
+    """Temperature pixel window of a FITS file in the HEALPix format, or of a .npy file, shape (lmax + 1,).
 
     Raises
     ------
     InputError
         If the file cannot be read or ends below lmax.
     """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", category=AstropyUserWarning)
-            window = np.asarray(fits.getdata(path, 1).field(0), dtype=float).ravel()
-    except Exception as error:  # libraries raise whatever a broken file makes of them
-        raise InputError(f"{path} is not a FITS pixel window ({error}); give a HEALPix pixel_window file.") from error
+    window = read_npy(path, "iuf").astype(np.float64) if path.suffix == ".npy" else _fits_pixel_window(path)
     if window.size <= lmax:
         raise InputError(f"{path} holds a pixel window up to l = {window.size - 1}, below the lmax {lmax} of the sky.")
     if not np.all(window[: lmax + 1] > 0.0):
         raise InputError(f"{path} holds a pixel window that is not positive up to l = {lmax}; give a HEALPix table.")
     return window[: lmax + 1]
+
+
+def _fits_pixel_window(path: Path) -> NDArray[np.float64]:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", category=AstropyUserWarning)
+            return np.asarray(fits.getdata(path, 1).field(0), dtype=float).ravel()
+    except Exception as error:  # libraries raise whatever a broken file makes of them
+        raise InputError(f"{path} is not a FITS pixel window ({error}); give a HEALPix pixel_window file.") from error

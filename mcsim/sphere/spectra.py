@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.support import resources
+from mcsim.support.npy import read_npy
 
 # Names of D_l = l(l+1) C_l / 2 pi as they stand in headers: D_l, Dl, D_ell, D_{\ell}, l(l+1)Cl.
 _NAMES_OF_D_L = re.compile(r"(?i)\bD_?\{?\\?(l|ell)\b|(l|ell)\s*\*?\s*\((l|ell)\s*\+\s*1\)")
@@ -30,7 +31,7 @@ def load(spec: str | Path, lmax: int) -> NDArray[np.float64]:
         A packaged name (``"wmap7"``, ``"planck2018"``); or a text table of the two columns ell, C_ell [uK^2] (``#``
         starts a header line; rows in any order, complete from ell = 2; ell = 0 and 1 may be absent and are zero
         then); or a FITS file as ``healpy.read_cl`` reads: a table in the first extension whose first column is TT
-        from ell = 0.
+        from ell = 0; or a .npy file of C_l in uK^2 from ell = 0.
     lmax
         Highest degree wanted, >= 0.
 
@@ -52,7 +53,10 @@ def load(spec: str | Path, lmax: int) -> NDArray[np.float64]:
     and accuracy stand in ``workflows/spectra/make_spectra.py``.
     """
     path = resources.spectrum(spec)
-    cl = _read_fits(path) if path.name.removesuffix(".gz").endswith((".fits", ".fit")) else _read_text(path)
+    if path.suffix == ".npy":
+        cl = read_npy(path, "iuf").astype(np.float64)
+    else:
+        cl = _read_fits(path) if path.name.removesuffix(".gz").endswith((".fits", ".fit")) else _read_text(path)
     if len(cl) <= lmax:
         raise InputError(
             f"power spectrum {str(spec)!r} ends at l = {len(cl) - 1}, but lmax = {lmax} is wanted; "

@@ -65,14 +65,14 @@ def _flaw(kind: type[Effect]) -> str | None:
             return f"has no {key}: it needs a text"
     if getattr(kind, "scope", None) not in ("channel", "common"):
         return 'has no scope: it needs "channel" or "common"'
-    for key in ("step", "most"):
+    for key in ("step", "max_amplitude"):
         value = getattr(kind, key, None)
         if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0.0:
             return f"has {key} = {value!r}: it needs a number above 0"
     if not isfinite(kind.step):
         return f"has step = {kind.step!r}: it needs a finite number"
-    if kind.side not in (-1, 0, 1):
-        return f"has side = {kind.side!r}: it needs -1, 0 or 1"
+    if kind.sign not in (-1, 0, 1):
+        return f"has sign = {kind.sign!r}: it needs -1, 0 or 1"
     try:
         basis = kind.basis()
         sizes = {effect.coordinates().shape for effect in basis}

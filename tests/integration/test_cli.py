@@ -49,7 +49,7 @@ def test_help_loads_no_heavy_library() -> None:
         "except SystemExit:\n    print(sorted({'numpy', 'numba', 'dask', 'xarray', 'healpy'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    for command in ("run", "merge", "info", "plot", "predict", "fit", "beam", "scan", "bench", "config"):
+    for command in ("run", "merge", "info", "plot", "predict", "fit", "beam", "scan", "bench", "config", "maps"):
         assert command in done.stdout
     assert done.stdout.rstrip().endswith("[]")
 

@@ -11,7 +11,6 @@ from mcsim import beamfit, config, open_ensemble, open_summary
 from mcsim.ensemble import prediction, runner, tables
 from mcsim.errors import InputError
 from mcsim.instrument import scan
-from mcsim.support import resources
 
 from .conftest import ensemble, table
 
@@ -20,8 +19,8 @@ BEAM = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 300.0, "fwhm_minor_a
 
 def limit_moments(path: Path, nside: int) -> str:
     """The WMAP-like scan in the limit of endless time, as a file."""
-    model = scan.load_model(resources.scan_model("wmap"))
-    scan.write_moments_fits(path, scan.limit_on_pixels(model, nside, 4))
+    model = scan.ScanModel.load("wmap")
+    scan.write_moments_fits(path, scan.Moments.limit(model, nside, 4))
     return str(path)
 
 

@@ -8,11 +8,10 @@ import pytest
 
 from mcsim import systematics
 from mcsim.errors import InputError
-from mcsim.instrument.beams import elliptical_gaussian
-from mcsim.instrument.scan import load_model, parallel_transport
+from mcsim.instrument.beams import Beam
+from mcsim.instrument.scan import Moments, ScanModel
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.sphere.spectra import load
-from mcsim.support import resources
 from mcsim.systematics import registry
 
 LMAX, NSIDE = 48, 8
@@ -47,14 +46,14 @@ def draw(_: str) -> np.random.Generator:
 
 @pytest.fixture(scope="module")
 def site() -> systematics.Site:
-    model = load_model(resources.scan_model("wmap"))
+    model = ScanModel.load("wmap")
     return systematics.Site(
         channel="W1",
         frequency_ghz=94.0,
         frame="galactic",
         nside=NSIDE,
         lmax=LMAX,
-        beam=elliptical_gaussian(330.0, 300.0, 20.0, LMAX),
+        beam=Beam.elliptical(330.0, 300.0, 20.0, LMAX),
         pointing=systematics.Pointing(model, model.line_of_sight("A")),
         dipole_uk=np.array([1.0, 2.0, 3.0]),
     )
@@ -80,7 +79,7 @@ def test_zero_amplitude_changes_nothing(name, site):
     assert effect.noise(site) is None
     assert effect.spread() == 1.0
     assert effect.differencing(0.01, 2) == (0.01, 2)
-    moments = parallel_transport(0.3, NSIDE, 2, "galactic")
+    moments = Moments.parallel_transport(NSIDE, np.rad2deg(0.3), 2, "galactic")
     assert effect.orientations(moments, site) is moments
     here = tuple(np.array([value]) for value in (0.4, 1.0, 2.0))
     moved = effect.moved(*here)
@@ -217,8 +216,8 @@ def no_default():
         (whole(unit=None), "unit"),
         (whole(cause=None), "cause"),
         (whole(signature=3), "signature"),
-        (whole(side=2), "side"),
-        (whole(most=-1.0), "most"),
+        (whole(sign=2), "sign"),
+        (whole(max_amplitude=-1.0), "max_amplitude"),
         (whole(variants=({"no_such": 1.0},)), "no_such"),
         (whole(coordinates=lambda self: np.zeros(2)), "coordinates"),
         (no_dataclass(), "angle_deg"),

@@ -93,7 +93,7 @@ def raw_blm() -> Figure:
     """Coefficients of the raw beams, with |b_l2| / b_l0 printed."""
     maps = raw_maps()
     for name, beam_map in maps.items():
-        blm = beam_map.beam(beam_figures.LMAX, 2).blm
+        blm = beams.Beam.from_map(beam_map, beam_figures.LMAX, 2).blm
         ratio = np.abs(blm[2]) / np.abs(blm[0])
         zero = np.flatnonzero(np.diff(np.sign(blm[2].real[20:]))) + 20
         at = ", ".join(f"{ratio[ell]:.4f} at l = {ell}" for ell in (100, 200, 500, 800))

@@ -72,6 +72,25 @@ def run(
     ------
     InputError
         For bad input, an unwritable or foreign store, a scheduler that does not answer. The store is then as it was.
+
+    Returns
+    -------
+    Result
+        ``store``, and how many realizations are ``finished``, were ``computed`` now, or failed (``failures``).
+
+    Notes
+    -----
+    Workers are processes, which import the main module again: in a script, keep the call under
+    ``if __name__ == "__main__":``.
+
+    Examples
+    --------
+    >>> import mcsim
+    >>> result = mcsim.run("tiny", "tiny.zarr")
+    >>> result.finished
+    32
+    >>> mcsim.run("tiny", "tiny.zarr").computed  # all is there already
+    0
     """
     loaded = source if isinstance(source, config.RunConfig) else config.load(source)
     wanted = plan.wanted(loaded, realizations)

@@ -1,7 +1,7 @@
 """From a two-dimensional beam map to b_lm, exact on the curved sky."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil, pi, sin
 from pathlib import Path
 from typing import Literal, get_args
@@ -14,7 +14,8 @@ from scipy.ndimage import map_coordinates
 
 from mcsim.errors import InputError
 from mcsim.instrument.beams._fits import opened
-from mcsim.instrument.beams.beam import Beam, check_lmax, check_mmax, normalize
+from mcsim.instrument.beams.coefficients import check_lmax, check_mmax
+from mcsim.support.npy import read_npy
 
 Projection = Literal["equidistant", "orthographic", "equal_area"]
 PEAK_BOX = 8
@@ -47,14 +48,14 @@ class BeamMap:
     cut_rad: float
     projection: Projection = "equidistant"
 
-    def beam(self, lmax: int, mmax: int | None = None, nthreads: int = 1) -> Beam:
-        """Return the beam normalised to B_0 = 1; ``mmax=None`` chooses the largest order."""
+    def blm(self, lmax: int, mmax: int | None = None, nthreads: int = 1) -> NDArray[np.complex128]:
+        """Return the coefficients up to the largest order that the cut can hold, in the map's unit times sr."""
         check_lmax(lmax)
         if mmax is not None:
             check_mmax(mmax, lmax)
         # No order above lmax sin(cut) fits inside the cut, so that this holds the beam's whole power up to lmax.
         holds_all = min(lmax, ceil(lmax * sin(min(self.cut_rad, pi / 2))) + 32)
-        blm = blm_of_map(
+        return blm_of_map(
             self.image,
             self.pixel_rad,
             self.centre,
@@ -64,7 +65,6 @@ class BeamMap:
             projection=self.projection,
             nthreads=nthreads,
         )
-        return normalize(blm, mmax, "the beam map")
 
     def values(self, theta: NDArray[np.float64], phi: NDArray[np.float64]) -> NDArray[np.float64]:
         """Interpolate the response (cubic) at angles from the centre and azimuths from x towards y; 0 outside."""
@@ -72,44 +72,6 @@ class BeamMap:
         position = [self.centre[0] + radius * np.sin(phi), self.centre[1] + radius * np.cos(phi)]
         values: NDArray[np.float64] = map_coordinates(self.image, position, order=3, mode="constant")
         return values
-
-
-def from_map(
-    path: str | Path,
-    lmax: int,
-    mmax: int | None = None,
-    *,
-    pixel_deg: float | None = None,
-    cut_deg: float = DEFAULT_CUT_DEG,
-    centre: tuple[float, float] | None = None,
-    plane: int = 0,
-    projection: Projection = "equidistant",
-    pixel_average: bool = False,
-    nthreads: int = 1,
-) -> Beam:
-    """Read a beam map and return its harmonic coefficients.
-
-    Parameters
-    ----------
-    path, pixel_deg, cut_deg, centre, plane, projection, pixel_average
-        As in :func:`read_map`.
-    lmax
-        Largest degree.
-    mmax
-        Largest order; ``None`` chooses it (:func:`mcsim.instrument.beams.choose_mmax`).
-    nthreads
-        Number of threads.
-    """
-    beam_map = read_map(
-        path,
-        pixel_deg=pixel_deg,
-        cut_deg=cut_deg,
-        centre=centre,
-        plane=plane,
-        projection=projection,
-        pixel_average=pixel_average,
-    )
-    return beam_map.beam(lmax, mmax, nthreads)
 
 
 def read_map(
@@ -154,10 +116,30 @@ def read_map(
     |b_l2| in V and W, 8e-5 and 4e-4 in K. The plane of projection is taken to touch the sphere at the beam's centre;
     that the WMAP maps have the optic axis there, up to 3 deg away, is of the same order.
     """
+    image, header = _read_image(Path(path), plane)
+    pixel_deg = _pixel_deg(header, path) if pixel_deg is None else pixel_deg
+    beam_map = placed(image, pixel_deg, cut_deg=cut_deg, centre=centre, projection=projection, origin=str(path))
+    return replace(beam_map, image=_divide_pixel_window(beam_map.image)) if pixel_average else beam_map
+
+
+def placed(
+    image: NDArray[np.float64],
+    pixel_deg: float,
+    *,
+    cut_deg: float = DEFAULT_CUT_DEG,
+    centre: tuple[float, float] | None = None,
+    projection: Projection = "equidistant",
+    origin: str = "the beam map",
+) -> BeamMap:
+    """Return a beam map that is given as an array, shape (rows, columns); ``origin`` names it in messages.
+
+    The other parameters, and what is refused, are those of :func:`read_map`.
+    """
     if projection not in get_args(Projection):
         raise InputError(f"projection = {projection!r} is not one of {', '.join(get_args(Projection))}")
-    image, header = _read_image(Path(path), plane)
-    pixel = np.radians(_pixel_deg(header, path) if pixel_deg is None else pixel_deg)
+    if image.ndim != 2:
+        raise InputError(f"{origin} has {image.ndim} dimensions where a beam map has 2: rows along y, columns along x")
+    pixel = np.radians(pixel_deg)
     if not 0 < pixel < np.radians(10):
         raise InputError(f"the pixel of a beam map, {np.degrees(pixel):g} deg, must lie between 0 and 10 deg")
     if not 0 < cut_deg <= 90:
@@ -168,17 +150,15 @@ def read_map(
         )
     if not np.all(np.isfinite(image)):
         raise InputError(
-            f"{path} has {np.count_nonzero(~np.isfinite(image))} values that are not finite: "
+            f"{origin} has {np.count_nonzero(~np.isfinite(image))} values that are not finite: "
             "set pixels without data to 0"
         )
     if centre is None:
-        centre = find_centre(image, str(path))
+        centre = find_centre(image, origin)
     elif not all(0 <= position <= size - 1 for position, size in zip(centre, image.shape, strict=True)):
         raise InputError(
-            f"centre = {tuple(centre)} lies outside the {image.shape} pixels of {path}: give (row, column)"
+            f"centre = {tuple(centre)} lies outside the {image.shape} pixels of {origin}: give (row, column)"
         )
-    if pixel_average:
-        image = _divide_pixel_window(image)
     return BeamMap(image, float(pixel), centre, float(np.radians(cut_deg)), projection)
 
 
@@ -327,6 +307,8 @@ def holds_image(path: str | Path) -> bool:
 def _read_image(path: Path, plane: int) -> tuple[NDArray[np.float64], fits.Header]:
     if not path.is_file():
         raise InputError(f"beam map {path} does not exist: give the path of a FITS image")
+    if path.suffix == ".npy":
+        return read_npy(path, "iuf", (2,)).astype(np.float64), fits.Header()
     try:
         with opened(path) as hdus:
             images = [hdu for hdu in hdus if hdu.is_image and hdu.data is not None]

@@ -2,14 +2,12 @@
 
 import math
 
-import healpy
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ellipj, ellipkm1
 
 from mcsim.errors import InputError
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
-from mcsim.instrument.scan.moments import Moments
 
 _NODES = 128
 _FAST_PRECESSION = 50.0
@@ -84,17 +82,6 @@ def limit_moments(
             value[-1] *= 0.5
             w[s - 1, seen] = value.sum(axis=0) / (_NODES - 1)
     return density, w
-
-
-def limit_on_pixels(model: ScanModel, nside: int, smax: int, line_of_sight: str | None = None) -> Moments:
-    """The limit at the centres of HEALPix pixels, as moments of a survey in ecliptic coordinates.
-
-    Hits are 1 on the mean. Parameters and errors as of :func:`limit_moments`.
-    """
-    theta, _ = healpy.pix2ang(nside, np.arange(12 * nside * nside))
-    rings, ring = np.unique(theta, return_inverse=True)
-    density, w = limit_moments(model, rings, smax, line_of_sight)
-    return Moments(nside, "ecliptic", density[ring] / density[ring].mean(), w[:, ring])
 
 
 def caustics(model: ScanModel, line_of_sight: str | None = None) -> NDArray[np.float64]:

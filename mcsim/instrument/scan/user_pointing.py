@@ -1,8 +1,8 @@
-"""Orientation moments of a user's own pointing: files of theta, phi, psi and, if they like, time."""
+"""A user's own pointing, theta, phi and psi from files and arrays, and its sums per pixel."""
 
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,46 +11,42 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
-from mcsim.instrument.scan.accumulate import add_sample, moments_from_sums, pixel_sums
-from mcsim.instrument.scan.geometry import check_frame, check_nside
-from mcsim.instrument.scan.moments import Moments
+from mcsim.instrument.scan.accumulate import add_sample, pixel_sums
+from mcsim.instrument.scan.geometry import check_nside
 from mcsim.instrument.scan.pointing import quarter_turns, ring_pixel
 
 _ROWS = 1 << 20
 _NAMES = ("theta", "phi", "psi")
 
 
-def pointing_moments(
-    paths: str | Path | Sequence[str | Path], nside: int, smax: int, frame: str = "ecliptic"
-) -> Moments:
-    """Orientation moments of samples that are given one by one in files.
+def sums_of_samples(blocks: Iterable[Sequence[NDArray]], nside: int, smax: int) -> NDArray[np.float64]:
+    """Return the sums per pixel, as of :func:`mcsim.instrument.scan.accumulate.pixel_sums`, of blocks of samples.
 
     Parameters
     ----------
-    paths
-        One file or several, added up. Columns theta, phi, psi in radians, in the frame of the maps, and
-        optionally time, which the moments do not need: a FITS binary table or a .npz file with these names, a .npy
-        file (structured with these names, or of shape (n, 3) or (n, 4)), or text of 3 or 4 columns.
+    blocks
+        theta, phi, psi in radians, shape (n,) each, as :func:`blocks_of_files` and :func:`checked_samples` give them.
     nside, smax
         HEALPix resolution, and largest s (>= 1).
-    frame
-        Frame of the pointing and of the maps.
 
     Raises
     ------
     InputError
-        If a file cannot be read, lacks a column, is empty, or has a value that is not finite or a theta outside
-        0 to pi.
+        If nside or smax is out of range.
     """
     check_nside(nside)
-    check_frame(frame)
     if smax < 1:
         raise InputError(f"smax is {smax}, but moments need smax >= 1.")
     sums = pixel_sums(nside, smax)
+    for theta, phi, psi in blocks:
+        _add_angles(theta, phi, psi, nside, smax, sums)
+    return sums
+
+
+def blocks_of_files(paths: str | Path | Sequence[str | Path]) -> Iterator[tuple[NDArray[np.float64], ...]]:
+    """Read theta, phi, psi from one file or several, block by block; InputError where they cannot be used."""
     for path in [paths] if isinstance(paths, str | Path) else paths:
-        for theta, phi, psi in _blocks(Path(path)):
-            _add_angles(theta, phi, psi, nside, smax, sums)
-    return moments_from_sums(sums, nside, smax, frame)
+        yield from _blocks(Path(path))
 
 
 def _blocks(path: Path) -> Iterator[tuple[NDArray[np.float64], ...]]:
@@ -61,7 +57,9 @@ def _blocks(path: Path) -> Iterator[tuple[NDArray[np.float64], ...]]:
             columns = _columns(path)
         size = min(len(column) for column in columns)
         for first in range(0, size, _ROWS):
-            yield _checked([np.array(column[first : first + _ROWS], dtype=np.float64) for column in columns], where)
+            yield checked_samples(
+                [np.array(column[first : first + _ROWS], dtype=np.float64) for column in columns], where
+            )
     except InputError:
         raise
     except Exception as error:  # libraries raise whatever a broken file makes of them
@@ -96,7 +94,8 @@ def _columns(path: Path) -> list[Any]:
     return [array[:, column] for column in range(3)]
 
 
-def _checked(columns: list[NDArray[np.float64]], where: str) -> tuple[NDArray[np.float64], ...]:
+def checked_samples(columns: Sequence[NDArray[np.float64]], where: str) -> tuple[NDArray[np.float64], ...]:
+    """Return theta, phi, psi if they are finite and theta is a colatitude in radians; ``where`` names them."""
     for name, column in zip(_NAMES, columns, strict=True):
         if not np.isfinite(column).all():
             raise InputError(f"{where}: {name} has values that are not finite; leave such samples out.")
