@@ -12,8 +12,9 @@ from typing import Any
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
-# The kernels of the tutorials import the same package as this file.
+# The kernels of the tutorials import the same package as this file, and find the command that is installed beside it.
 os.environ["PYTHONPATH"] = os.pathsep.join([str(HERE.parent), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
 
 import mcsim  # noqa: E402
 from mcsim import systematics  # noqa: E402
@@ -71,7 +72,7 @@ def _public(app: Any, docname: str, source: list[str]) -> None:
     """Write names and effects into the pages that have a place for them, so that none is forgotten."""
     if "PUBLIC-NAMES" in source[0]:
         entries = []
-        for name in sorted(mcsim.__all__, key=str.lower):
+        for name in sorted((name for name in mcsim.__all__ if not name.startswith("_")), key=str.lower):
             kind = "autoclass" if isinstance(getattr(mcsim, name), type) else "autofunction"
             entries.append(f".. {kind}:: mcsim.{name}\n")
         source[0] = source[0].replace("PUBLIC-NAMES", "\n".join(entries))
