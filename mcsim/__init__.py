@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from mcsim.config import RunConfig
     from mcsim.config import load as load_config
     from mcsim.diagnosis.api import diagnose
+    from mcsim.ensemble.opening import open_ensemble, open_summary
     from mcsim.ensemble.prediction import predict
     from mcsim.ensemble.runner import merge, run
-    from mcsim.ensemble.store import open_ensemble, open_summary
     from mcsim.errors import InputError
     from mcsim.instrument.beams import Beam
     from mcsim.instrument.scan import Moments, ScanModel
@@ -69,8 +69,8 @@ _HOME = {
     "load_config": "mcsim.config:load",
     "merge": "mcsim.ensemble.runner",
     "observe": "mcsim.simulation.observe",
-    "open_ensemble": "mcsim.ensemble.store",
-    "open_summary": "mcsim.ensemble.store",
+    "open_ensemble": "mcsim.ensemble.opening",
+    "open_summary": "mcsim.ensemble.opening",
     "predict": "mcsim.ensemble.prediction",
     "run": "mcsim.ensemble.runner",
 }

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.bipolar import Mode, bennett_factor
-from mcsim.ensemble import store
+from mcsim.ensemble import opening, store
 from mcsim.ensemble.summary import bin_factor
 from mcsim.errors import InputError
 
@@ -158,7 +158,7 @@ def from_store(
     InputError
         If the store does not hold what is asked for.
     """
-    with store.open_ensemble(path) as ensemble:
+    with opening.open_ensemble(path) as ensemble:
         width = int(ensemble.attrs["configuration"]["biposh"]["summary_bin"])
         lmax = ensemble.sizes["ell"] - 1
         paired = "biposh_circular" in ensemble
@@ -205,7 +205,7 @@ def with_covariance_of(measured: Measurement, path: str | Path, pair: str | None
     InputError
         If the store does not hold what the measurement does.
     """
-    with store.open_ensemble(path) as ensemble:
+    with opening.open_ensemble(path) as ensemble:
         labels = [str(name) for name in ensemble["pair"].values]
     label = pair or (measured.pair if measured.pair in labels else labels[0])
     drawn = realizations(path, measured.rows, measured.scaling, measured.kind, label)
@@ -222,7 +222,7 @@ def realizations(path: str | Path, rows: Sequence[Row], scaling: Scaling, kind: 
         If the store has another lmax or lacks the pair, a mode or the circular twins.
     """
     target = Path(path)
-    with store.open_ensemble(target) as ensemble:
+    with opening.open_ensemble(target) as ensemble:
         labels = {str(name): number for number, name in enumerate(ensemble["mode"].values)}
         pairs = [str(name) for name in ensemble["pair"].values]
         lmax, paired = ensemble.sizes["ell"] - 1, "biposh_circular" in ensemble

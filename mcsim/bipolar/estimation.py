@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
+from mcsim.sphere.checks import check_alm, check_finite, check_whole
 from mcsim.sphere.clebsch import Band, band, evaluate
 
 
@@ -65,6 +66,8 @@ def estimator(L_max: int, lmax: int, both_orders: bool = False) -> Estimator:
     InputError
         If L_max is negative or exceeds lmax.
     """
+    check_whole(lmax, "lmax")
+    check_whole(L_max, "L_max")
     if not 0 <= L_max <= lmax:
         raise InputError(f"L_max = {L_max} is outside 0 ... {lmax} (the analysis lmax); choose a smaller L_max.")
     wanted = modes(L_max, both_orders)
@@ -91,11 +94,20 @@ def estimate(
         A^{LM}_{l2 - d, l2}, shape (modes, lmax + 1), in the square of the input's unit. NaN where the coefficient does
         not exist (l1 < 0, l1 > lmax, the triangle of l1, l2, L), and for one map in the modes that repeat others.
 
+    Raises
+    ------
+    InputError
+        If the coefficients are not complex, not finite, or not of the tables' lmax.
+
     Notes
     -----
     Only m2 >= 0 is summed for M = 0; the other half follows from the reality of the maps. Agrees with an explicit sum
     over exact Clebsch-Gordan coefficients to 1e-13 (``tests/unit/test_biposh.py``).
     """
+    for name, alm in (("alm_x", alm_x), ("alm_y", alm_y)):
+        if alm is not None:
+            check_alm(alm, tables.lmax, name)
+            check_finite(alm, name)
     auto = alm_y is None
     ar, ai = _parts(alm_x)
     br, bi = (ar, ai) if alm_y is None else _parts(alm_y)
@@ -148,7 +160,9 @@ def bennett_factor(mode: Mode, lmax: int) -> NDArray[np.float64]:
 
 
 def power_spectrum(alm_x: NDArray[np.complex128], alm_y: NDArray[np.complex128], lmax: int) -> NDArray[np.float64]:
-    """C_l = sum_m a_lm conj(b_lm) / (2 l + 1) of two real maps, shape (lmax + 1,)."""
+    """C_l = sum_m a_lm conj(b_lm) / (2 l + 1) of two real maps, shape (lmax + 1,); InputError for other sizes."""
+    check_alm(alm_x, lmax, "alm_x")
+    check_alm(alm_y, lmax, "alm_y")
     product = alm_x.real * alm_y.real + alm_x.imag * alm_y.imag
     product[lmax + 1 :] *= 2.0
     total = np.bincount(alm_.degrees(lmax), weights=product, minlength=lmax + 1)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from mcsim.ensemble import store
+from mcsim.ensemble import opening, store
 from mcsim.ensemble.tables import lines, strongest, table
 from mcsim.errors import InputError
 
@@ -18,7 +18,7 @@ def describe(path: str | Path) -> str:
     attributes = store.attributes(target)
     done = store.done(target)
     files = [file for file in target.rglob("*") if file.is_file()]
-    with store.open_ensemble(target) as ensemble:
+    with opening.open_ensemble(target) as ensemble:
         sizes = dict(ensemble.sizes)
         pairs = [str(pair) for pair in ensemble["pair"].values]
         paired = "biposh_circular" in ensemble
@@ -34,7 +34,7 @@ def describe(path: str | Path) -> str:
         f"  made with {', '.join(f'{name} {number}' for name, number in attributes['packages'].items())}",
     ]
     if (target / "summary").is_dir():
-        with store.open_summary(target) as summary:
+        with opening.open_summary(target) as summary:
             rows = strongest(summary, "_difference" if paired else "", count=5)
             found += ["  strongest binned spectra (mean over error):", *lines(rows)] if rows else []
     return "\n".join(found)
@@ -53,7 +53,7 @@ def export(path: str | Path, output: str | Path) -> None:
         For another ending, or an output that cannot be written.
     """
     target = Path(output)
-    with store.open_summary(path) as stored:
+    with opening.open_summary(path) as stored:
         summary = stored.load()
         try:
             if target.suffix == ".nc":

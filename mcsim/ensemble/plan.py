@@ -12,7 +12,7 @@ import numpy as np
 from mcsim import config
 from mcsim.bipolar import Mode, estimate, estimator, modes
 from mcsim.bipolar.dataset import CONVENTION, NORMALISATION
-from mcsim.ensemble import store, summary
+from mcsim.ensemble import opening, store, summary
 from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError
 from mcsim.simulation import differencing
@@ -171,7 +171,7 @@ def _of_summary(change: str) -> bool:
 
 def stored(path: Path, realizations: int) -> tuple[Layout, summary.Recipe]:
     """Layout and recipe of an existing store, for a store of as many realizations with the same contents."""
-    with store.open_ensemble(path) as found:
+    with opening.open_ensemble(path) as found:
         attrs = found.attrs["configuration"]
         pairs = tuple(str(pair) for pair in found["pair"].values)
         kept = found.sizes.get("pixel")

@@ -100,7 +100,7 @@ def write(path: Path, first: int, values: Mapping[str, NDArray], done: NDArray[n
     RunError
         If the store cannot be written.
     """
-    with _faults_named(path):
+    with faults_named(path):
         group = _open(path, "r+")
         stop = first + len(done)
         for name, rows in values.items():
@@ -116,7 +116,7 @@ def read(path: Path, start: int, stop: int, maps: bool = False) -> dict[str, NDA
     RunError
         If an array is missing or damaged.
     """
-    with _faults_named(path):
+    with faults_named(path):
         group = _open(path)
         left_out = {"realization"} if maps else {"realization", MAP, FORMER_MAP}
         found = {name: array for name, array in group.arrays() if name not in left_out and _over_realizations(array)}
@@ -132,7 +132,7 @@ def read(path: Path, start: int, stop: int, maps: bool = False) -> dict[str, NDA
 
 def examine(path: Path, start: int, leave_out: Collection[str] = ()) -> Damage | None:
     """Read every file of one chunk of realizations, against its checksum; None if it is whole."""
-    with _faults_named(path):
+    with faults_named(path):
         group = _open(path)
         last = _member(group, "done")
         stop = min(start + last.chunks[0], last.shape[0])
@@ -152,7 +152,7 @@ def examine(path: Path, start: int, leave_out: Collection[str] = ()) -> Damage |
 
 def discard(path: Path, damage: Damage) -> None:
     """Forget a damaged chunk: its ``done`` first, so that a call that was cut short leaves nothing that looks whole."""
-    with _faults_named(path):
+    with faults_named(path):
         group = _open(path)
         for name in ("done", *(name for name in variables(path) if name not in ("realization", "done"))):
             array = _member(group, name)
@@ -162,7 +162,7 @@ def discard(path: Path, damage: Damage) -> None:
 
 def broken_parts(path: Path) -> dict[str, str]:
     """What is wrong beside the realizations, by name: metadata, coordinates, summary. Empty if nothing is."""
-    with _faults_named(path):
+    with faults_named(path):
         group, remembered = _open(path), _remembered(path)
     broken = {}
     for name, metadata in remembered.items():
@@ -182,7 +182,7 @@ def broken_parts(path: Path) -> dict[str, str]:
 
 def restore(path: Path, layout: Layout, update: Mapping[str, Any]) -> None:
     """Write metadata and coordinates anew, as those of a new store of this layout; drop the summary."""
-    with _faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
+    with faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
         shutil.rmtree(path / "summary", ignore_errors=True)
         made = _remembered(path)["done"]
         kept = FORMER_MAP if FORMER_MAP in _remembered(path) else MAP
@@ -198,19 +198,19 @@ def restore(path: Path, layout: Layout, update: Mapping[str, Any]) -> None:
 
 def variables(path: Path) -> list[str]:
     """Names of the arrays over realizations that the store was made with, whether their files exist or not."""
-    with _faults_named(path):
+    with faults_named(path):
         return [name for name, metadata in _remembered(path).items() if _over_realizations(metadata)]
 
 
 def done(path: Path, start: int = 0, stop: int | None = None) -> NDArray[np.bool_]:
     """Which realizations from ``start`` to ``stop`` are finished; by default all."""
-    with _faults_named(path):
+    with faults_named(path):
         return np.asarray(_member(_open(path), "done")[start:stop])
 
 
 def size(path: Path) -> int:
     """Number of realizations that a store has room for."""
-    with _faults_named(path):
+    with faults_named(path):
         return int(_member(_open(path), "done").shape[0])
 
 
@@ -233,7 +233,7 @@ def attributes(path: Path) -> dict[str, Any]:
 
 def chunk(path: Path) -> int:
     """Realizations that one task owns."""
-    with _faults_named(path):
+    with faults_named(path):
         return int(_member(_open(path), "done").chunks[0])
 
 
@@ -256,7 +256,7 @@ def extend(path: Path, realizations: int, update: Mapping[str, Any]) -> None:
 
 def write_summary(path: Path, summary: xr.Dataset) -> None:
     """Put the summary group in place of the former one."""
-    with _faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
+    with faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", category=UserWarning)
             summary.to_zarr(
@@ -273,7 +273,7 @@ def write_summary(path: Path, summary: xr.Dataset) -> None:
 
 def amend(path: Path, update: Mapping[str, Any]) -> None:
     """Change attributes of a store."""
-    with _faults_named(path):
+    with faults_named(path):
         _open(path, "r+").attrs.update(update)
         _consolidate(path)
 
@@ -282,54 +282,10 @@ def summarised(path: Path) -> tuple[int, list[int]]:
     """Number of realizations that the summary speaks of, 0 without one, and the first ell of each of its bins."""
     if not (path / "summary").is_dir():
         return 0, []
-    with _faults_named(path):
+    with faults_named(path):
         group = _open(path / "summary")
         count, first = (np.asarray(_member(group, name)[...]) for name in ("count", "bin_first"))
         return int(count), first.tolist()
-
-
-def open_ensemble(path: str | Path) -> xr.Dataset:
-    """Open the realizations of a store lazily.
-
-    Returns
-    -------
-    xarray.Dataset
-        ``biposh``, ``cl``, their circular-beam controls, with kept maps ``observed_map`` (in stores of earlier versions
-        ``map``), lazily; in memory ``done`` and the coordinates realization, pair, mode (with L, M, d, parity), ell.
-        ``.sel(mode="L2M0d0")`` picks a spectrum, ``.where(ds.L == 2, drop=True)`` all of one L.
-
-    Raises
-    ------
-    InputError
-        If there is no store at ``path``.
-    """
-    attributes(Path(path))
-    return _opened(Path(path), None)
-
-
-def open_summary(path: str | Path) -> xr.Dataset:
-    """Open the summary of a store: means, standard errors, standard deviations, binned spectra and covariances.
-
-    Raises
-    ------
-    InputError
-        If there is no store at ``path``, or it has no summary yet.
-    """
-    attributes(Path(path))
-    if not (Path(path) / "summary").is_dir():
-        raise InputError(
-            f"{path} has no summary, because no run on it has ended yet; continue it with mcsim run --resume."
-        )
-    return _opened(Path(path), "summary")
-
-
-def _opened(path: Path, group: str | None) -> xr.Dataset:
-    """A group, lazily but for its coordinates and ``done``: xarray chooses rows by values that it has in memory."""
-    with _faults_named(path):
-        found = xr.open_zarr(path, group=group)
-        for name in {*found.coords, "done"} & {*found.variables}:
-            found.variables[name].load()
-        return found
 
 
 def _write_coordinates(group: zarr.Group, layout: Layout) -> None:
@@ -425,7 +381,7 @@ def _consolidate(path: Path) -> None:
 
 
 @contextmanager
-def _faults_named(path: Path) -> Iterator[None]:
+def faults_named(path: Path) -> Iterator[None]:
     """Turn what a damaged or vanished store, or a full disk, makes of zarr's calls into one sentence."""
     try:
         yield

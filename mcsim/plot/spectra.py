@@ -7,7 +7,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mcsim.ensemble import store
+from mcsim.ensemble import opening
 from mcsim.errors import InputError
 
 _COLOURS = ("#1f5fa8", "#c44e22", "#3c8c3c", "#7b4fa3", "#8c6d1f", "#1f8f94")
@@ -39,7 +39,7 @@ def ensemble_figure(
     InputError
         If nothing of the store fits the choice, or the prediction lacks the pair or a mode.
     """
-    with store.open_summary(path) as summary:
+    with opening.open_summary(path) as summary:
         pairs = [str(label) for label in summary["pair"].values]
         label = pairs[0] if pair is None else pair
         if label not in pairs:

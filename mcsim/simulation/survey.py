@@ -280,7 +280,7 @@ def _window(run: config.RunConfig, spec: config.Channel) -> NDArray[np.float64]:
         return np.ones(run.sky.lmax + 1)
     if choice == "computed":
         return healpix.pixel_window(run.map.resolution, run.sky.lmax)
-    return healpix.read_pixel_window(Path(choice), run.sky.lmax)
+    return healpix.read_pixel_window(Path(choice), run.sky.lmax, run.map.resolution)
 
 
 def _moments(

@@ -9,7 +9,7 @@ import xarray as xr
 from distributed import Client
 
 from mcsim import config, open_ensemble
-from mcsim.ensemble import runner, store
+from mcsim.ensemble import opening, runner, store
 from mcsim.errors import InputError
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
@@ -20,7 +20,7 @@ from .conftest import ensemble, table
 def assert_same(a: Path, b: Path, attributes: bool = True) -> None:
     """Same arrays, summary and scientific attributes, bit for bit."""
     xr.testing.assert_identical(open_ensemble(a).drop_attrs(), open_ensemble(b).drop_attrs())
-    xr.testing.assert_identical(store.open_summary(a), store.open_summary(b))
+    xr.testing.assert_identical(opening.open_summary(a), opening.open_summary(b))
     for path in (a, b):
         assert open_ensemble(path).done.all()
     if attributes:
@@ -45,7 +45,7 @@ def test_store_holds_what_a_realization_gives(small_store: Path) -> None:
 
 
 def test_summary_is_that_of_the_realizations(small_store: Path) -> None:
-    with open_ensemble(small_store) as stored, store.open_summary(small_store) as summary:
+    with open_ensemble(small_store) as stored, opening.open_summary(small_store) as summary:
         difference = (stored.biposh - stored.biposh_circular).values
         for name, sample in {
             "biposh": stored.biposh.values,

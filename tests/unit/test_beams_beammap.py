@@ -5,8 +5,10 @@ import pytest
 from astropy.io import fits
 from scipy.special import gammaln
 
+from mcsim import config
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam, blm_of_map, find_centre, read_map
+from mcsim.simulation.channels import load_beam_map
 
 PIXEL_DEG = 0.04
 PIXEL = np.radians(PIXEL_DEG)
@@ -27,9 +29,9 @@ def spherical_harmonics(lmax: int, m: int, theta: float, phi: float) -> np.ndarr
 
 
 def directions(size: int, centre: tuple[float, float], projection: str = "equidistant"):
-    """Theta and phi of the pixels of a square map."""
-    y = (np.arange(size) - centre[0])[:, None] * PIXEL
-    x = (np.arange(size) - centre[1])[None, :] * PIXEL
+    """Theta and phi of the pixels of a square map about a centre (column, row)."""
+    x = (np.arange(size) - centre[0])[None, :] * PIXEL
+    y = (np.arange(size) - centre[1])[:, None] * PIXEL
     radius = np.hypot(x, y)
     theta = {"equidistant": radius, "orthographic": np.arcsin(radius), "equal_area": 2 * np.arcsin(radius / 2)}
     return theta[projection], np.arctan2(y, x)
@@ -87,6 +89,24 @@ def test_elliptical_gaussian_map_gives_the_closed_form(tmp_path, projection) -> 
         assert relative(beam.blm[m], expected.blm[m]) < 1e-9
 
 
+def test_centre_is_column_and_row(tmp_path) -> None:
+    # A circular beam at column 50, row 25 of a map that is wider than it is high.
+    x, y = (np.arange(81) - 50)[None, :] * PIXEL, (np.arange(61) - 25)[:, None] * PIXEL
+    theta, phi = np.hypot(x, y), np.arctan2(y, x)
+    path = write(tmp_path / "beam.fits", ellipse(theta, phi, 10, 10))
+    found = read_map(path)
+    assert found.centre == pytest.approx((50, 25), abs=1e-4)
+    given = Beam.from_map(path, 200, 2, centre=(50, 25))
+    assert np.abs(given.blm[1, 20]) < 1e-10 * given.blm[0, 20].real
+    # So in a run's configuration, whose key is centre_pixel.
+    channel = {"kind": "map", "path": str(path), "centre_pixel": (50.0, 25.0)}
+    np.testing.assert_array_equal(load_beam_map("W1", config.BeamMap(**channel)).centre, (50, 25))
+    with pytest.raises(InputError, match=r"column, row"):
+        read_map(path, centre=(25, 50))
+    with pytest.raises(InputError, match=r"column, row"):
+        read_map(path, centre=(25, 70))
+
+
 def test_wrong_projection_is_seen_in_a_wide_beam(tmp_path) -> None:
     theta, phi = directions(240, (120, 120))
     path = write(tmp_path / "beam.fits", ellipse(theta, phi, 120, 90))
@@ -118,7 +138,7 @@ def test_sum_over_pixels_is_the_sum_of_harmonics() -> None:
     expected = np.zeros((mmax + 1, lmax + 1), dtype=complex)
     for row in range(12):
         for column in range(15):
-            y, x = (row - centre[0]) * pixel, (column - centre[1]) * pixel
+            x, y = (column - centre[0]) * pixel, (row - centre[1]) * pixel
             radius = np.hypot(x, y)
             if radius <= np.radians(5.0):
                 area = pixel**2 * np.sin(radius) / radius
@@ -173,7 +193,7 @@ def test_centroid_is_over_fifteen_pixels() -> None:
     image[20, 20] = 1.0
     image[20, 27] = 0.5
     image[28, 20] = 0.5
-    assert find_centre(image) == pytest.approx((20, 20 + 7 / 3))
+    assert find_centre(image) == pytest.approx((20 + 7 / 3, 20))
 
 
 def test_negative_sidelobes_are_kept_and_the_cut_is_applied(tmp_path) -> None:
@@ -194,7 +214,7 @@ def test_pixel_means_are_restored(tmp_path) -> None:
     mean = 0.0
     for y, weight_y in zip(node / 2, weight / 2, strict=True):
         for x, weight_x in zip(node / 2, weight / 2, strict=True):
-            theta, phi = directions(160, (79.3 - y, 80.1 - x))
+            theta, phi = directions(160, (79.3 - x, 80.1 - y))
             mean = mean + weight_y * weight_x * ellipse(theta, phi)
     path = write(tmp_path / "beam.fits", mean)
     expected = Beam.elliptical(13.9, 12.7, 25.0, 1024, 4).blm
@@ -219,6 +239,14 @@ def test_plane_of_a_cube_and_given_pixel(tmp_path) -> None:
     path = write(tmp_path / "cube.fits", cube, pixel_deg=None)
     beam = Beam.from_map(read_map(path, pixel_deg=PIXEL_DEG, plane=2), 500, 2)
     assert relative(beam.blm, Beam.elliptical(20, 12, 25, 500, 2).blm) < 1e-6
+
+
+def test_logarithmic_map_is_refused(tmp_path) -> None:
+    theta, phi = directions(100, (50, 50))
+    path = write(tmp_path / "beam.fits", 60.0 + 10.0 * np.log10(ellipse(theta, phi) + 1e-6))
+    fits.setval(path, "BUNIT", value="dBi")
+    with pytest.raises(InputError, match="dBi"):
+        read_map(path)
 
 
 def small_image() -> np.ndarray:

@@ -1,5 +1,7 @@
 """Beams from files of coefficients."""
 
+from types import SimpleNamespace
+
 import healpy
 import numpy as np
 import pytest
@@ -71,8 +73,16 @@ def test_more_than_the_file_holds_is_refused(tmp_path, beam, lmax, mmax, named) 
 def test_coefficients_that_are_no_beam_are_refused(tmp_path, beam, index, value, named) -> None:
     blm = beam.blm.copy()
     blm[index] = value
+    path = write(tmp_path / "beam.alm.fits", SimpleNamespace(blm=blm, lmax=120, mmax=6))
     with pytest.raises(InputError, match=named):
-        Beam.from_blm(write(tmp_path / "beam.alm.fits", Beam(blm)), 120)
+        Beam.from_blm(path, 120)
+
+
+@pytest.mark.parametrize("power", [-0.5, 0.5])
+def test_other_normalisation_in_l_is_refused(tmp_path, beam, power) -> None:
+    path = write(tmp_path / "beam.alm.fits", Beam(beam.blm * (2.0 * np.arange(121) + 1.0) ** power))
+    with pytest.raises(InputError, match="B_1"):
+        Beam.from_blm(path, 120)
 
 
 def test_all_zero_file_is_refused(tmp_path, beam) -> None:

@@ -13,7 +13,7 @@ PIXEL = np.radians(0.04)
 
 def drawn(major, minor, angle_deg, size=151, centre=(74.6, 75.3), offset=(0.0, 0.0)) -> BeamMap:
     sigma = np.radians(np.array([major, minor]) / 60) * SIGMA_PER_FWHM
-    y, x = (np.arange(size) - centre[0])[:, None] * PIXEL, (np.arange(size) - centre[1])[None, :] * PIXEL
+    x, y = (np.arange(size) - centre[0])[None, :] * PIXEL, (np.arange(size) - centre[1])[:, None] * PIXEL
     x, y = x - offset[0], y - offset[1]
     cos, sin = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
     image = np.exp(-(((x * cos + y * sin) / sigma[0]) ** 2 + ((y * cos - x * sin) / sigma[1]) ** 2) / 2)

@@ -89,7 +89,7 @@ def test_what_other_orders_of_the_beam_do_is_no_part_of_the_factor(shared):
     """An m = 1 part feeds L = 2 too: it stays as configured and is not rescaled."""
     blm = rescaled(shared, 0.5)
     own = shared.channels[0].beam.blm.copy()
-    blm[1] = own[1] = 0.05 * np.abs(own[0])
+    blm[1, 1:] = own[1, 1:] = 0.05 * np.abs(own[0, 1:])
     beam = replace(shared.channels[0].beam, blm=own)
     changed = replace(shared, channels=(replace(shared.channels[0], beam=beam),))
     found = fit(expected(changed, blm), changed)

@@ -204,7 +204,7 @@ def test_fast_route_is_the_referee_at_pixel_centres(scan, sky, beams, monkeypatc
     np.testing.assert_allclose(fast, slow, atol=1e-9 * np.abs(slow).max())
 
 
-@pytest.mark.parametrize("sign", [0, 1])
+@pytest.mark.parametrize("side", [0, 1])
 def test_stages_belong_to_their_side(side, scan, sky, beams):
     """A gain of 1.5 on one side is a beam 1.5 times as strong there."""
 

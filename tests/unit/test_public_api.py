@@ -49,7 +49,7 @@ NAMES = [
 ]
 OBJECTS = [name for name in NAMES if name != "__version__"]
 
-WITHOUT_EXAMPLE = {"diagnose", "open_ensemble", "open_summary"}
+WITHOUT_EXAMPLE = {"diagnose"}
 """Its example is a tutorial: nothing that it can be shown on takes a second."""
 
 CONSTRUCTORS = [

@@ -76,6 +76,8 @@ def test_last_sample_survives_rounding():
         ("spin_period_s = 100.0", "spin_period_s = nan", "must be a finite number"),
         ("precession_period_s = -5000.0", "precession_period_s = 0.0", "precession_period_s is 0"),
         ("precession_angle_deg = 30.0", "precession_angle_deg = 91.0", "between 0 and 90"),
+        ("orbit_period_s = 31557600.0", "orbit_period_s = 365.25", "orbit_period_s is 365.25, less than a day"),
+        ("duration_days = 10.0", "duration_days = 864000.0", "more than a century"),
         ("sample_period_s = 0.5", "sample_period_s = -0.5", "sample_period_s is -0.5"),
         ("duration_days = 10.0", "duration_days = 1e-6", "has no sample"),
         ("boresight_angle_deg = 60.0", "boresight_angle_deg = 180.0", "must lie between 0 and 180"),

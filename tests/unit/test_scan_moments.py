@@ -330,12 +330,87 @@ def test_bad_arrays_of_pointing(samples):
 
 
 @pytest.mark.parametrize(
-    ("theta", "message"), [([91.0], "theta runs from 91"), ([np.nan], "theta has values"), ([], "no samples")]
+    ("angles", "message"),
+    [
+        ({"theta": [91.0]}, "theta runs from 91"),
+        ({"theta": [np.nan]}, "theta has values"),
+        ({"theta": []}, "no samples"),
+        ({"theta": [1.0, 2.0], "phi": [10.0, 200.0]}, "phi runs from 10 to 200"),
+        ({"theta": [1.0, 2.0], "psi": [-170.0, 1.0]}, "psi runs from -170"),
+        ({"theta": [1.0, 2.0], "psi": [1e5, np.inf]}, "psi has values"),
+        ({"theta": [0.5, 6.0], "phi": [1.0, 3.0]}, "exchanged"),
+        ({"theta": [1.0, -1.5]}, "colatitudes"),
+        ({"theta": [1.0, 2.0], "phi": [1.0]}, "one length"),
+        ({"theta": [1.0], "psi": [1j]}, "not real"),
+    ],
 )
-def test_bad_user_pointing(tmp_path, theta, message):
-    path = write_pointing(tmp_path, "npz", np.array(theta), np.zeros(len(theta)), np.zeros(len(theta)))
+def test_bad_user_pointing(tmp_path, angles, message):
+    zeros = np.zeros(len(angles["theta"]))
+    columns = {"theta": zeros, "phi": zeros, "psi": zeros} | {k: np.array(v) for k, v in angles.items()}
+    np.savez(tmp_path / "p.npz", **columns)
     with pytest.raises(InputError, match=message):
-        Moments.from_pointing_files(path, NSIDE, 2)
+        Moments.from_pointing_files(tmp_path / "p.npz", NSIDE, 2)
+
+
+def test_user_pointing_in_degrees_by_its_header(tmp_path):
+    samples = pointing(MODEL, LINES[0], 100, 500)
+    expected = brute_force([samples], NSIDE, SMAX)
+    path = write_pointing(tmp_path, "fits", *samples)
+
+    def in_degrees(table):
+        for name in table.columns.names:
+            table.data[name] = np.degrees(table.data[name])
+
+    damaged(path, in_degrees)
+    for number in (1, 2, 3):
+        fits.setval(path, f"TUNIT{number}", value="deg", ext=1)
+    assert_same(Moments.from_pointing_files(path, NSIDE, SMAX), expected, 1e-12)
+    fits.setval(path, "TUNIT2", value="m", ext=1)
+    with pytest.raises(InputError, match="'m'"):
+        Moments.from_pointing_files(path, NSIDE, SMAX)
+
+
+def test_user_pointing_of_another_frame(tmp_path):
+    path = write_pointing(tmp_path, "fits", *pointing(MODEL, LINES[0], 100, 500))
+    damaged(path, header("COORDSYS", "GALACTIC"))
+    assert Moments.from_pointing_files(path, NSIDE, 2, "galactic").frame == "galactic"
+    with pytest.raises(InputError, match="galactic"):
+        Moments.from_pointing_files(path, NSIDE, 2, "ecliptic")
+
+
+@pytest.mark.parametrize("name", ["phi theta psi", "time theta phi psi", "theta[deg] phi[deg] psi[deg]", "DEGREES"])
+def test_user_pointing_whose_header_names_other_columns(tmp_path, name):
+    np.savetxt(tmp_path / "p.txt", np.full((3, 3), 0.1), header=name)
+    with pytest.raises(InputError, match="cannot be read"):
+        Moments.from_pointing_files(tmp_path / "p.txt", NSIDE, 2)
+
+
+def test_user_pointing_with_time_first(tmp_path):
+    samples = np.stack([np.linspace(0.0, 3.0, 50), *pointing(MODEL, LINES[0], 100, 50)], axis=1)
+    samples[:, 1:] %= 3.0
+    np.save(tmp_path / "p.npy", samples)
+    with pytest.raises(InputError, match="in this order"):
+        Moments.from_pointing_files(tmp_path / "p.npy", NSIDE, 2)
+
+
+def test_centroids_in_other_units(tmp_path):
+    moments = Moments.from_model(MODEL, NSIDE, 2)
+    path = tmp_path / "moments.fits"
+    write_moments_fits(path, moments)
+
+    def in_degrees(table):
+        for name in ("DTHETA", "DPHI"):
+            table.data[name] = np.degrees(table.data[name])
+
+    damaged(path, in_degrees)  # while the header says rad
+    with pytest.raises(InputError, match="DTHETA and DPHI in radians"):
+        read_moments_fits(path)
+
+    for number in (6, 7):
+        fits.setval(path, f"TUNIT{number}", value="deg", ext=1)
+    np.testing.assert_allclose(read_moments_fits(path).dtheta, moments.dtheta, rtol=1e-12, atol=1e-15)
+    damaged(path, header("COORDSYS", "EQUATORIAL"))
+    assert read_moments_fits(path).frame == "equatorial"
 
 
 def test_unreadable_user_pointing(tmp_path):

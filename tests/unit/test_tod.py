@@ -171,7 +171,7 @@ def test_stages_act_where_they_are_put(sky, beam, monkeypatch):
         ({"line_of_sight": "Z"}, "no line of sight 'Z'"),
         ({"time_range": (0.5, 0.5)}, r"time_range is \(0.5, 0.5\)"),
         ({"time_range": (0.0, 1e-9)}, "contains no sample"),
-        ({"lmax": 30}, "lmax 30 needs"),
+        ({"lmax": 30}, "lmax = 30"),
         ({"beam": Beam.gaussian(900.0, 20)}, "ends at l = 20"),
         ({"noise_sigma0_uk": 3.0}, "noise_sigma0_uk is 3 but no rng"),
         ({"nside": 12}, "nside is 12"),
@@ -185,5 +185,5 @@ def test_bad_input_is_named(changes, message, sky, beam):
 
 
 def test_dipole_needs_its_degree():
-    with pytest.raises(InputError, match="lmax is 0"):
+    with pytest.raises(InputError, match="lmax of a dipole is 0"):
         dipole_alm([0.0, 0.0, 1.0], 0)

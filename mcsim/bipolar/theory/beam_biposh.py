@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 from mcsim.bipolar.theory.harmonics import negative_spin
 from mcsim.bipolar.theory.modes import Mode, check_modes, existing, spin_coupling
+from mcsim.errors import InputError
+from mcsim.sphere.checks import check_finite, check_whole
 
 
 class ScannedBeam(NamedTuple):
@@ -22,6 +24,19 @@ class ScannedBeam(NamedTuple):
 
     blm: NDArray[np.complex128]
     w: NDArray[np.complex128]
+
+    def check(self, lmax: int) -> None:
+        """Raise InputError unless beam and moments have their shapes, and the beam reaches ``lmax``."""
+        check_whole(lmax, "lmax")
+        blm, w = np.asarray(self.blm), np.asarray(self.w)
+        if blm.ndim != 2 or blm.shape[0] > blm.shape[1]:
+            raise InputError(f"blm has shape {blm.shape}, but (mmax + 1, lmax + 1) is needed.")
+        if blm.shape[1] <= lmax:
+            raise InputError(f"the beam ends at l = {blm.shape[1] - 1}, below lmax {lmax}; compute it further.")
+        if w.ndim != 3 or w.shape[2] != 2 * w.shape[1] - 1:
+            raise InputError(f"w has shape {w.shape}, but (smax + 1, L_max + 1, 2 L_max + 1) is needed.")
+        check_finite(blm, "blm")
+        check_finite(w, "w")
 
     @property
     def smax(self) -> int:
@@ -79,6 +94,7 @@ def beam_biposh(beam: ScannedBeam, mode: Mode, lmax: int) -> NDArray[np.complex1
     circular beam gives (-1)^l B_l sqrt(2l+1) for L = 0 and nothing else.
     """
     check_modes([mode])
+    beam.check(lmax)
     L, M, d = mode
     l2 = np.arange(lmax + 1)
     exists = existing(L, d, lmax)

@@ -7,15 +7,7 @@ from numpy.typing import NDArray
 
 from mcsim.bipolar.theory.beam_biposh import ScannedBeam, beam_biposh
 from mcsim.bipolar.theory.modes import Mode, bennett_factor, check_modes, existing
-from mcsim.errors import InputError
-
-
-def check_spectrum(cl: NDArray[np.float64], lmax: int) -> None:
-    """Raise InputError when C_l ends below lmax."""
-    if len(cl) <= lmax:
-        raise InputError(
-            f"the spectrum ends at ell = {len(cl) - 1}, below lmax {lmax}; lower lmax or extend the spectrum."
-        )
+from mcsim.sphere.checks import check_cl, check_shape, check_whole
 
 
 def cmb_biposh_leading(
@@ -52,8 +44,10 @@ def cmb_biposh_leading(
     (tests/unit/test_predict_brute_force.py); :func:`mcsim.predict.exact.cmb_biposh_exact` has it.
     """
     check_modes(modes)
-    check_spectrum(cl, lmax)
+    check_cl(cl, lmax)
     y = x if y is None else y
+    for beam in (x, y):
+        beam.check(lmax)
     l2 = np.arange(lmax + 1)
     sign = (-1.0) ** l2
     root = np.sqrt(2.0 * l2 + 1)
@@ -97,7 +91,9 @@ def noise_biposh(modes: Sequence[Mode], variance: NDArray[np.complex128], lmax: 
     (tests/unit/test_predict_cmb_biposh.py holds it to an explicit sum).
     """
     check_modes(modes)
+    check_whole(lmax, "lmax")
     L_max = len(variance) - 1
+    check_shape(variance, (L_max + 1, 2 * L_max + 1), "the variance")
     result = np.full((len(modes), lmax + 1), np.nan, dtype=np.complex128)
     for row, (L, M, d) in zip(result, modes, strict=True):
         v = variance[L, L_max + M] if L_max >= L else 0.0

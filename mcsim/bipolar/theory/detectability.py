@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from mcsim.bipolar.theory.modes import Mode, check_modes, existing
 from mcsim.errors import InputError
+from mcsim.sphere.checks import check_cl, check_shape
 
 
 def isotropic_variance(
@@ -45,6 +46,9 @@ def isotropic_variance(
     cross = x if cl_total_y is None else cl_cross
     if cross is None:
         raise InputError("the cross spectrum of the two maps is missing; give cl_cross with cl_total_y.")
+    for name, cl in (("cl_total_x", x), ("cl_total_y", y), ("cl_cross", cross)):
+        check_cl(cl, lmax, name)
+        check_shape(cl, (lmax + 1,), name)
     variance = np.full((len(modes), lmax + 1), np.nan)
     for row, (L, _, d) in zip(variance, modes, strict=True):
         l2 = np.flatnonzero(existing(L, d, lmax))
@@ -92,6 +96,7 @@ def signal_to_noise(
     """
     if not 0.0 < f_sky <= 1.0:
         raise InputError(f"f_sky = {f_sky} is not a fraction of the sky; give 0 < f_sky <= 1.")
+    check_shape(biposh, (len(modes), len(cl_total_x)), "biposh")
     first, last = (0, biposh.shape[1] - 1) if ell_range is None else ell_range
     variance = isotropic_variance(modes, cl_total_x, cl_total_y, cl_cross)[:, first : last + 1]
     signal = abs(biposh[:, first : last + 1]) ** 2
@@ -142,6 +147,9 @@ def fisher_information(
     for L, M, d in modes:
         if M < 0 or d < 0:
             raise InputError(f"mode L={L}, M={M}, d={d} repeats information of M >= 0, d >= 0; leave it out.")
+    n_map = len(cl_total)
+    check_shape(cl_total, (n_map, n_map, cl_total.shape[-1]), "cl_total")
+    check_shape(biposh, (n_map, n_map, len(modes), cl_total.shape[-1]), "biposh")
     spectra = np.moveaxis(cl_total, -1, 0)
     inverse = np.zeros_like(spectra)
     diagonal = np.einsum("lxx->lx", spectra)

@@ -10,8 +10,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.bipolar.theory.beam_biposh import ScannedBeam
-from mcsim.bipolar.theory.cmb_biposh import check_spectrum
 from mcsim.bipolar.theory.modes import Mode, check_modes, existing
+from mcsim.sphere.checks import check_cl
 from mcsim.sphere.wigner import sixj_family, threej_family
 
 _BLOCK = 32
@@ -69,8 +69,10 @@ def cmb_biposh_exact(
     A^{20}, it is within 8e-4, 2.5e-4 and 7e-5 of A^{20} with L_max 32, 64 and 128 (within a sixth of this at l = 400).
     """
     check_modes(modes)
-    check_spectrum(cl, lmax)
+    check_cl(cl, lmax)
     y = x if y is None else y
+    for beam in (x, y):
+        beam.check(lmax)
     result = np.full((len(modes), lmax + 1), np.nan, dtype=np.complex128)
     groups: dict[tuple[int, int], list[int]] = {}
     for i, (L, _, d) in enumerate(modes):

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
+from mcsim.sphere.checks import check_angle, check_finite, check_shape, check_whole, nside_of
 from mcsim.sphere.healpix import geometry
 
 
@@ -39,10 +40,14 @@ def orientation_harmonics(
     The integrals are sums over pixels of equal weight, wrong by about nside^-2 of the largest coefficient where the
     moments are smooth (tests/unit/test_predict_harmonics.py), 4e-6 at nside 512.
     """
+    if np.ndim(w) != 2:
+        raise InputError(f"w has shape {np.shape(w)}, but moment maps are (smax, npix).")
     smax, npix = w.shape
-    nside = round(np.sqrt(npix / 12))
-    if 12 * nside**2 != npix:
-        raise InputError(f"a moment map has {npix} pixels, which no HEALPix map has; give maps of 12 nside^2 pixels.")
+    nside = nside_of(npix, "a moment map")
+    check_whole(L_max, "L_max")
+    check_finite(w, "w")
+    if observed is not None:
+        check_shape(observed, (npix,), "observed")
     grid = geometry(nside)
     area = 4 * np.pi / npix
     result = np.zeros((smax + 1, L_max + 1, 2 * L_max + 1), dtype=np.complex128)
@@ -104,6 +109,9 @@ def ring_orientation_harmonics(w: NDArray[np.complex128], L_max: int) -> NDArray
     w_{s,L0} = 2 pi int w_s (-s)Y_L0 sin(theta) d theta. Odd s are not polynomials in cos(theta): their error falls as
     ntheta^-3 (for w_s = 1, 5e-6 with 200 rings, tests/unit/test_predict_harmonics.py).
     """
+    if np.ndim(w) != 2:
+        raise InputError(f"w has shape {np.shape(w)}, but moments on rings are (smax, ntheta).")
+    check_finite(w, "w")
     smax, ntheta = w.shape
     result = _isotropic_zero(smax, L_max)
     weights = ducc0.misc.GL_weights(ntheta, 1)  # of the sphere: 2 pi is in them
@@ -134,6 +142,9 @@ def parallel_transport_harmonics(smax: int, L_max: int, psi0: float = 0.0) -> ND
     and equal steps in theta for odd s, where d^L_{0s} sin(theta) is a cosine series. The power of w_2 at L = 2, 4, 6,
     8 is 83.3, 10, 3.1, 1.35 %.
     """
+    check_whole(smax, "smax")
+    check_whole(L_max, "L_max")
+    check_angle(psi0, "psi0")
     result = _isotropic_zero(smax, L_max)
     gauss = spin_functions(smax, L_max, ducc0.misc.GL_thetas(L_max + 2))
     gauss_weights = ducc0.misc.GL_weights(L_max + 2, 1)  # of the sphere: 2 pi is in them

@@ -69,5 +69,7 @@ def bennett_factor(L: int, d: int, lmax: int) -> NDArray[np.float64]:
 
 def to_bennett(biposh: NDArray, modes: Sequence[Mode]) -> NDArray:
     """BipoSH of shape (..., n_mode, lmax + 1) in the Bennett normalisation; NaN for odd parity."""
+    if biposh.ndim < 2 or biposh.shape[-2] != len(modes):
+        raise InputError(f"biposh has shape {biposh.shape}, but {len(modes)} modes need (..., {len(modes)}, lmax + 1).")
     lmax = biposh.shape[-1] - 1
     return biposh * np.stack([bennett_factor(L, d, lmax) for L, _, d in modes])

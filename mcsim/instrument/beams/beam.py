@@ -14,6 +14,7 @@ from mcsim.instrument.beams.beammap import DEFAULT_CUT_DEG, BeamMap, placed, rea
 from mcsim.instrument.beams.coefficients import check_mmax, choose_mmax, power_by_order
 from mcsim.instrument.beams.files import checked_blm
 from mcsim.instrument.beams.gaussian import elliptical_blm
+from mcsim.sphere.checks import check_finite
 from mcsim.support.npy import read_npz
 
 DEFAULT_LMAX = 2048
@@ -53,6 +54,16 @@ class Beam:
     blm: NDArray[np.complex128]
     neglected_power: float = 0.0
     integral: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless the coefficients are finite and stand at ``blm[m, l]``, zero for l < m."""
+        blm = self.blm
+        if not isinstance(blm, np.ndarray) or not np.iscomplexobj(blm) or blm.ndim != 2 or not blm.size:
+            raise InputError(f"blm has shape {np.shape(blm)}, but it must be complex, (mmax + 1, lmax + 1).")
+        check_mmax(self.mmax, self.lmax)
+        check_finite(blm, "blm")
+        if any(blm[m, :m].any() for m in range(1, len(blm))):
+            raise InputError("blm has coefficients with l < m, which do not exist: give blm[m, l].")
 
     @classmethod
     def gaussian(cls, fwhm_arcmin: float, lmax: int = DEFAULT_LMAX) -> Self:
@@ -148,7 +159,7 @@ class Beam:
         cut_deg
             Angle from the centre beyond which the map is not used, degrees.
         centre
-            Row and column of the beam's centre; ``None`` takes the intensity centroid about the peak.
+            Column and row of the beam's centre, from 0; ``None`` takes the intensity centroid about the peak.
 
         Raises
         ------
@@ -330,6 +341,8 @@ class Beam:
         ndarray
             B in sr^-1, in the shape of ``theta``.
         """
+        if np.any((theta < 0.0) | (theta > np.pi)):
+            raise InputError("theta must lie between 0 and pi radians: give the angle from the centre of the beam.")
         direction = np.stack([np.ravel(theta), np.ravel(phi) % (2 * np.pi)], axis=1)
         values: NDArray[np.float64] = ducc0.sht.synthesis_general(
             alm=self.packed()[None],

@@ -34,7 +34,7 @@ class BeamMap:
     pixel_rad
         Side of a pixel in radians.
     centre
-        Row and column of the beam's centre (fractions allowed; pixel centres are at integers).
+        Column and row of the beam's centre, from 0 (fractions allowed; pixel centres are at integers).
     cut_rad
         Angle from the centre beyond which the map is not used, radians.
     projection
@@ -69,7 +69,8 @@ class BeamMap:
     def values(self, theta: NDArray[np.float64], phi: NDArray[np.float64]) -> NDArray[np.float64]:
         """Interpolate the response (cubic) at angles from the centre and azimuths from x towards y; 0 outside."""
         radius = _PROJECTIONS[self.projection][0](theta) / self.pixel_rad
-        position = [self.centre[0] + radius * np.sin(phi), self.centre[1] + radius * np.cos(phi)]
+        column, row = self.centre
+        position = [row + radius * np.sin(phi), column + radius * np.cos(phi)]
         values: NDArray[np.float64] = map_coordinates(self.image, position, order=3, mode="constant")
         return values
 
@@ -95,7 +96,7 @@ def read_map(
     cut_deg
         Angle from the centre beyond which the map is not used, degrees.
     centre
-        Row and column of the beam's centre; ``None`` takes the centroid (:func:`find_centre`).
+        Column and row of the beam's centre, from 0; ``None`` takes the centroid (:func:`find_centre`).
     plane
         Plane of a three-dimensional image (a WMAP beam file has side A, its noise, side B, its noise).
     projection
@@ -155,15 +156,31 @@ def placed(
         )
     if centre is None:
         centre = find_centre(image, origin)
-    elif not all(0 <= position <= size - 1 for position, size in zip(centre, image.shape, strict=True)):
-        raise InputError(
-            f"centre = {tuple(centre)} lies outside the {image.shape} pixels of {origin}: give (row, column)"
-        )
+    else:
+        _check_centre(image, centre, origin)
     return BeamMap(image, float(pixel), centre, float(np.radians(cut_deg)), projection)
 
 
+def _check_centre(image: NDArray[np.float64], centre: tuple[float, float], path: str | Path) -> None:
+    """Raise InputError for a centre outside the map, or one that is far from the peak until row and column change."""
+    rows, columns = image.shape
+    column, row = centre
+    if not (0 <= column <= columns - 1 and 0 <= row <= rows - 1):
+        raise InputError(
+            f"centre = {tuple(centre)} lies outside the {columns} columns and {rows} rows of {path}: give "
+            "(column, row), counted from 0"
+        )
+    peak = float(image.max())
+    here = image[round(row), round(column)]
+    if column < rows and row < columns and here < 0.01 * peak and image[round(column), round(row)] > 0.5 * peak:
+        raise InputError(
+            f"centre = {tuple(centre)} of {path} has less than 1 % of the peak, and {(row, column)} more than half of "
+            "it: give (column, row), in this order"
+        )
+
+
 def find_centre(image: NDArray[np.float64], origin: str = "the beam map") -> tuple[float, float]:
-    """Return the intensity centroid around the peak as (row, column).
+    """Return the intensity centroid around the peak as (column, row).
 
     The centroid is over the 15 x 15 pixels less than 8 pixels from the peak in row and column: the choice that the
     reference spectra of the WMAP-7 beam maps were made with (one more pixel on each side moves the binned A^{20}_ll of
@@ -183,14 +200,14 @@ def find_centre(image: NDArray[np.float64], origin: str = "the beam map") -> tup
     if min(row, column, image.shape[0] - 1 - row, image.shape[1] - 1 - column) < reach:
         raise InputError(
             f"the peak of {origin} at row {row}, column {column} is less than {PEAK_BOX} pixels from an edge of its "
-            f"{image.shape} pixels: give centre = (row, column), or a larger map"
+            f"{image.shape} pixels: give centre = (column, row), or a larger map"
         )
     box = image[row - reach : row + reach + 1, column - reach : column + reach + 1]
     total = box.sum()
     if not total > 0:
         raise InputError(f"{origin} sums to {total:.3g} around its peak, where it must be positive: give its centre")
     offset = np.arange(-reach, reach + 1)
-    return float(row + box.sum(axis=1) @ offset / total), float(column + box.sum(axis=0) @ offset / total)
+    return float(column + box.sum(axis=0) @ offset / total), float(row + box.sum(axis=1) @ offset / total)
 
 
 def blm_of_map(
@@ -266,8 +283,8 @@ def solid_angle_values(
     projection: Projection = "equidistant",
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return response times solid angle, theta and phi of the pixels within the cut that are not zero."""
-    y = (np.arange(image.shape[0]) - centre[0])[:, None] * pixel_rad
-    x = (np.arange(image.shape[1]) - centre[1])[None, :] * pixel_rad
+    x = (np.arange(image.shape[1]) - centre[0])[None, :] * pixel_rad
+    y = (np.arange(image.shape[0]) - centre[1])[:, None] * pixel_rad
     radius = np.hypot(x, y)
     radius_of_cut, theta_of, stretch = _PROJECTIONS[projection]
     inside = (radius <= radius_of_cut(np.asarray(cut_rad))) & (image != 0)
@@ -318,6 +335,8 @@ def _read_image(path: Path, plane: int) -> tuple[NDArray[np.float64], fits.Heade
         raise InputError(f"{path} cannot be read as a FITS image ({error}): it may be truncated") from error
     if not image.size:
         raise InputError(f"{path} holds no image: a beam map is a two-dimensional FITS image")
+    if str(header.get("BUNIT", "")).strip().lower().startswith("db"):
+        raise InputError(f"{path} is in {header['BUNIT']!r}: give the response itself, 10^(dB/10), not its logarithm")
     if image.ndim == 3 and 0 <= plane < len(image):
         image = image[plane]
     elif image.ndim == 3:

@@ -14,14 +14,16 @@ CIRCULAR_POWER = 1e-20
 
 def check_lmax(lmax: int) -> None:
     """Refuse a degree that is no degree."""
-    if lmax < 1:
-        raise InputError(f"lmax = {lmax} must be 1 or more for a beam")
+    if not isinstance(lmax, int | np.integer) or lmax < 1:
+        raise InputError(f"lmax = {lmax} must be a whole number of 1 or more for a beam")
 
 
 def check_mmax(mmax: int, lmax: int) -> None:
     """Refuse an order that no coefficient up to ``lmax`` has."""
-    if not 0 <= mmax <= lmax:
-        raise InputError(f"mmax = {mmax} of a beam must lie between 0 and its lmax = {lmax}: lower mmax or raise lmax")
+    if not isinstance(mmax, int | np.integer) or not 0 <= mmax <= lmax:
+        raise InputError(
+            f"mmax = {mmax} of a beam must be whole and lie between 0 and its lmax = {lmax}: lower mmax or raise lmax"
+        )
 
 
 def power_by_order(blm: NDArray[np.complex128]) -> NDArray[np.float64]:

@@ -14,6 +14,8 @@ from mcsim.support.npy import read_npy
 
 LEAST_CIRCULAR_POWER = 0.5
 REALITY_TOLERANCE = 1e-6
+LEAST_FIRST_WINDOW = 0.8
+"""B_1 = <cos theta> over the beam: 0.98 for a FWHM of 20 deg; 0.58 where b_l0 is B_l itself, 1.7 where 2l + 1 is."""
 
 
 def checked_blm(
@@ -32,7 +34,7 @@ def checked_blm(
     ------
     InputError
         If the file cannot be read, the array has another shape, the source stops before lmax or mmax, has a complex
-        b_l0, or is not pointed at the pole.
+        b_l0, another normalisation in l, or is not pointed at the pole.
     """
     if isinstance(source, str | Path):
         path, origin = Path(source), str(source)
@@ -62,6 +64,12 @@ def checked_blm(
             f"{origin} has {power[0]:.2g} of its power {power.sum():.2g} at m = 0, where a beam pointed at the pole "
             f"has more than a fraction {LEAST_CIRCULAR_POWER}: rotate the beam to the pole before taking its "
             "coefficients"
+        )
+    first = float(blm[0, 1].real / blm[0, 0].real / np.sqrt(3.0))
+    if blm[0, 0].real > 0.0 and not LEAST_FIRST_WINDOW < first < 2.0 - LEAST_FIRST_WINDOW:
+        raise InputError(
+            f"{origin} has B_1 = {first:.3g} where any beam has nearly B_0 = 1: its coefficients are not b_lm with "
+            "b_l0 = sqrt((2l+1)/4pi) B_l, so multiply or divide them by a power of sqrt(2l+1)"
         )
     blm[0] = blm[0].real
     return blm, origin

@@ -11,9 +11,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
-from mcsim.instrument.scan.geometry import check_nside
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
 from mcsim.instrument.scan.pointing import BLOCK, PointingStream, fill_block, ring_pixel
+from mcsim.sphere.checks import check_nside, check_whole
 
 _RANGES = 16
 _CHUNK = 1 << 21
@@ -64,8 +64,7 @@ def stream_sums(
     pixel's centre is the centroid offset. So at smax 2 a pixel is one cache line.
     """
     check_nside(nside)
-    if smax < 1:
-        raise InputError(f"smax is {smax}, but moments need smax >= 1.")
+    check_whole(smax, "smax", 1)
     start, stop = time_range
     if not 0.0 <= start < stop <= 1.0:
         raise InputError(f"time_range is ({start:g}, {stop:g}), but it must be an increasing pair within 0 and 1.")

@@ -8,6 +8,7 @@ from typing import Any
 
 from mcsim.errors import InputError
 from mcsim.instrument.scan.model import SECONDS_PER_DAY, ScanModel, model_from_table
+from mcsim.sphere.checks import check_angle
 
 _COPIED = (
     "spin_period_s",
@@ -57,7 +58,7 @@ def read_described(path: str | Path) -> Described:
         {
             "name": name,
             "boresight_angle_deg": wanted["boresight_angle_deg"],
-            "azimuth_deg": math.degrees(_number(azimuths, name, path)),
+            "azimuth_deg": math.degrees(_azimuth(azimuths, name, path)),
         }
         for name in azimuths
     ]
@@ -73,6 +74,12 @@ def read_described(path: str | Path) -> Described:
     )
     dipole = _number(table, "dipole_uk", path) if "dipole_uk" in table else None
     return Described(model, dipole)
+
+
+def _azimuth(table: dict[str, Any], name: str, path: Path) -> float:
+    azimuth = _number(table, name, path)
+    check_angle(azimuth, f"{path}: spin_azimuth_rad of {name}")
+    return azimuth
 
 
 def _number(table: dict[str, Any], key: str, path: Path) -> float:

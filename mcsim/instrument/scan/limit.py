@@ -8,6 +8,7 @@ from scipy.special import ellipj, ellipkm1
 
 from mcsim.errors import InputError
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
+from mcsim.sphere.checks import check_whole
 
 _NODES = 128
 _FAST_PRECESSION = 50.0
@@ -56,7 +57,10 @@ def limit_moments(
     Measured against adaptive quadrature: 4e-11 at 0.01 degrees from a caustic, 1e-13 elsewhere
     (tests/unit/test_scan_limit.py).
     """
+    check_whole(smax, "smax", 1)
     line = _line(model, line_of_sight)
+    if not np.all((np.asarray(theta) >= 0.0) & (np.asarray(theta) <= math.pi)):
+        raise InputError("theta must lie between 0 and pi; give ecliptic colatitudes in radians.")
     theta = np.atleast_1d(np.asarray(theta, dtype=np.float64))
     # At the poles the orientations are all equally frequent: take them as limits.
     theta = np.clip(theta, 1e-6, math.pi - 1e-6)

@@ -12,6 +12,9 @@ from mcsim.support import resources
 
 SECONDS_PER_DAY = 86400.0
 
+LONGEST_DAYS = 36525.0
+"""Of a survey: a century."""
+
 
 @dataclass(frozen=True)
 class LineOfSight:
@@ -102,6 +105,10 @@ class ScanModel:
     description: str = ""
     source: dict[str, str] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        """Raise InputError if the numbers describe no possible survey."""
+        _check(self)
+
     @classmethod
     def load(cls, name_or_path: str | Path) -> "ScanModel":
         """Read a scan model.
@@ -164,8 +171,9 @@ class ScanModel:
         side_a, side_b = self.pairs[name]
         return self.line_of_sight(side_a), self.line_of_sight(side_b)
 
-    def select(self, names: list[str] | tuple[str, ...] | None) -> tuple[LineOfSight, ...]:
+    def select(self, names: str | list[str] | tuple[str, ...] | None) -> tuple[LineOfSight, ...]:
         """The lines of sight called ``names``; the model's default ones if None."""
+        names = [names] if isinstance(names, str) else names
         return tuple(self.line_of_sight(name) for name in (self.default_lines if names is None else names))
 
     def period_of_samples(self, line: LineOfSight) -> float:
@@ -180,7 +188,7 @@ class ScanModel:
     def with_sampling(self, sample_period_s: float) -> "ScanModel":
         """Return the same survey with every line of sight sampled every ``sample_period_s`` seconds."""
         lines = tuple(replace(line, sample_period_s=None) for line in self.lines_of_sight)
-        return _checked(replace(self, sample_period_s=float(sample_period_s), lines_of_sight=lines), self.name)
+        return replace(self, sample_period_s=float(sample_period_s), lines_of_sight=lines)
 
     def with_lines_of_sight(self, *names: str) -> "ScanModel":
         """Return the same survey with these lines of sight as the default ones; InputError if one is unknown."""
@@ -219,16 +227,18 @@ def model_from_table(table: dict[str, Any], where: str) -> ScanModel:
         pairs[key] = (pair[0], pair[1])
     source = _subtable(table, "source", where)
     _refuse_unknown(source, _NUMBERS, f"{where}, [source]")
-    model = ScanModel(
-        name=table["name"],
-        description=str(table.get("description", "")),
-        lines_of_sight=lines,
-        default_lines=default_lines,
-        pairs=pairs,
-        source={key: str(value) for key, value in source.items()},
-        **numbers,
-    )
-    return _checked(model, where)
+    try:
+        return ScanModel(
+            name=table["name"],
+            description=str(table.get("description", "")),
+            lines_of_sight=lines,
+            default_lines=default_lines,
+            pairs=pairs,
+            source={key: str(value) for key, value in source.items()},
+            **numbers,
+        )
+    except InputError as error:
+        raise InputError(f"{where}, {error}") from None
 
 
 def _refuse_unknown(table: dict[str, Any], known: set[str], where: str) -> None:
@@ -283,11 +293,21 @@ def _lines(tables: Any, where: str) -> tuple[LineOfSight, ...]:
     return tuple(lines)
 
 
-def _checked(model: ScanModel, where: str) -> ScanModel:
-    """Return the model if its numbers describe a possible survey."""
+def _check(model: ScanModel) -> None:
+    """Raise InputError if the numbers of a model describe no possible survey."""
+    where = f"scan model {model.name!r}"
+    for key in _NUMBERS:
+        if not math.isfinite(getattr(model, key)):
+            raise InputError(f"{where}: {key} is {getattr(model, key)}, but it must be a finite number.")
     for key in ("spin_period_s", "orbit_period_s", "sample_period_s", "duration_days"):
         if not getattr(model, key) > 0.0:
             raise InputError(f"{where}: {key} is {getattr(model, key):g}, but it must be > 0.")
+    if model.orbit_period_s < SECONDS_PER_DAY:
+        raise InputError(
+            f"{where}: orbit_period_s is {model.orbit_period_s:g}, less than a day; give seconds (a year has 31557600)."
+        )
+    if model.duration_days > LONGEST_DAYS:
+        raise InputError(f"{where}: duration_days is {model.duration_days:g}, more than a century; give days.")
     if model.precession_period_s == 0.0:
         raise InputError(f"{where}: precession_period_s is 0; for no precession set precession_angle_deg = 0 instead.")
     if not 0.0 <= model.precession_angle_deg <= 90.0:
@@ -307,4 +327,3 @@ def _checked(model: ScanModel, where: str) -> ScanModel:
                 f"{inside}: a survey of {model.duration_days:g} days has no sample every "
                 f"{model.period_of_samples(line):g} s; lengthen duration_days."
             )
-    return model

@@ -13,10 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from mcsim.errors import InputError
 from mcsim.instrument.scan.accumulate import means, stream_sums
-from mcsim.instrument.scan.geometry import FRAMES, check_frame, check_nside, nside_of
+from mcsim.instrument.scan.geometry import FRAMES, check_frame
 from mcsim.instrument.scan.limit import limit_moments
 from mcsim.instrument.scan.model import ScanModel
 from mcsim.instrument.scan.user_pointing import blocks_of_files, checked_samples, sums_of_samples
+from mcsim.sphere.checks import check_nside, check_shape, check_whole, nside_of
+from mcsim.sphere.header import frame_named, radians
 
 _META = "moments.json"
 _ARRAYS = ("hits", "w", "dtheta", "dphi")
@@ -53,6 +55,21 @@ class Moments:
     dtheta: NDArray[np.float64] | None = None
     dphi: NDArray[np.float64] | None = None
 
+    def __post_init__(self) -> None:
+        """Raise InputError unless frame, nside and the sizes of the arrays agree."""
+        check_nside(self.nside)
+        check_frame(self.frame)
+        npix = 12 * self.nside**2
+        check_shape(self.hits, (npix,), f"hits of moments of nside {self.nside}")
+        check_shape(self.w, (max(np.shape(self.w)[:1], default=0), npix), f"w of moments of nside {self.nside}")
+        if not np.iscomplexobj(self.w):
+            raise InputError("w is real, but moments are complex, the means of e^(-i s psi).")
+        if (self.dtheta is None) != (self.dphi is None):
+            raise InputError("dtheta and dphi belong together; give both or neither.")
+        for name, offset in (("dtheta", self.dtheta), ("dphi", self.dphi)):
+            if offset is not None:
+                check_shape(offset, (npix,), f"{name} of moments of nside {self.nside}")
+
     @classmethod
     def from_model(
         cls,
@@ -84,10 +101,6 @@ class Moments:
         ------
         InputError
             If nside is not a power of two, smax < 1, the frame is unknown, or the time range is empty.
-
-        Notes
-        -----
-        A year of WMAP has 6e8 samples and takes a minute or so. Runs keep such moments in the cache.
 
         Examples
         --------
@@ -123,7 +136,8 @@ class Moments:
         Raises
         ------
         InputError
-            If the arrays are of different shape or empty, a value is not finite, or theta lies outside 0 to pi.
+            If the arrays are of different shape or empty, a value is not finite, theta lies outside 0 to pi, or phi or
+            psi beyond two turns.
 
         Examples
         --------
@@ -151,20 +165,22 @@ class Moments:
         Parameters
         ----------
         paths
-            One file or several, added up. Columns theta, phi, psi in radians, in the frame of the maps, and
-            optionally time, which the moments do not need: a FITS binary table or a .npz file with these names, a .npy
-            file (structured with these names, or of shape (n, 3) or (n, 4)), or text of 3 or 4 columns.
+            One file or several, added up. Columns theta, phi, psi in radians (FITS: in the unit that TUNIT states, if
+            it does), in the frame of the maps, and optionally time, which the moments do not need: a FITS binary table
+            or a .npz file with these names, a .npy file (structured with these names, or of shape (n, 3) or (n, 4)), or
+            text of 3 or 4 columns.
         nside, smax, frame
             As in :meth:`from_pointing`.
 
         Raises
         ------
         InputError
-            If a file cannot be read, lacks a column, is empty, or has a value that is not finite or a theta outside
-            0 to pi.
+            If a file cannot be read, lacks a column, has columns of several lengths or in another order, is in
+            another frame, is empty, or has a value that is not real and finite, a theta outside 0 to pi, or a phi or
+            psi beyond two turns.
         """
         check_frame(frame)
-        return cls(nside, frame, **means(sums_of_samples(blocks_of_files(paths), nside, smax), nside, smax))
+        return cls(nside, frame, **means(sums_of_samples(blocks_of_files(paths, frame), nside, smax), nside, smax))
 
     @classmethod
     def parallel_transport(cls, nside: int, psi0_deg: float = 0.0, smax: int = 4, frame: str = "ecliptic") -> Self:
@@ -199,8 +215,9 @@ class Moments:
         """
         check_nside(nside)
         check_frame(frame)
-        if smax < 1:
-            raise InputError(f"smax is {smax}, but moments need smax >= 1.")
+        check_whole(smax, "smax", 1)
+        if not np.isfinite(psi0_deg):
+            raise InputError(f"psi0_deg is {psi0_deg}, but it must be a finite angle in degrees.")
         npix = 12 * nside * nside
         w = np.exp(-1j * np.deg2rad(psi0_deg) * np.arange(1, smax + 1))[:, np.newaxis]
         return cls(nside, frame, np.broadcast_to(np.float64(1.0), npix), np.broadcast_to(w, (smax, npix)))
@@ -291,11 +308,11 @@ class Moments:
             meta = json.loads((folder / _META).read_text())
             names = _ARRAYS if meta["offsets"] else _ARRAYS[:2]
             arrays = {name: np.load(folder / f"{name}.npy", mmap_mode=mode) for name in names}
+            return cls(nside=meta["nside"], frame=meta["frame"], **arrays)
         except (OSError, ValueError, KeyError) as error:
             raise InputError(
                 f"folder {str(folder)!r} does not hold complete moments ({error}); delete it and compute them again."
             ) from None
-        return cls(nside=meta["nside"], frame=meta["frame"], **arrays)
 
 
 def read_moments_fits(
@@ -360,6 +377,12 @@ def read_moments_fits(
     if largest > 1.0 + 1e-6:
         raise InputError(f"{where}: a moment has modulus {largest:g}, but means of e^(-i s psi) are <= 1.")
     centroid = [np.where(seen, columns[name], 0.0) for name in offsets]
+    farthest = max((float(np.abs(offset).max()) for offset in centroid), default=0.0)
+    if farthest > 2.0 * healpy.max_pixrad(found):
+        raise InputError(
+            f"{where}: samples lie {farthest:g} rad from their pixel's centre, but a pixel of nside {found} "
+            f"reaches {healpy.max_pixrad(found):.3g}; give DTHETA and DPHI in radians, or their unit in TUNIT."
+        )
     return Moments(found, frame, hits, w, *centroid)
 
 
@@ -389,14 +412,11 @@ def write_moments_fits(path: str | Path, moments: Moments) -> None:
 def _frame_of(coordsys: Any, frame: str | None, where: str) -> str:
     if frame is not None:
         check_frame(frame)
-    if coordsys is None:
+    named = frame_named(coordsys, where)
+    if named is None:
         if frame is None:
             raise InputError(f"{where} has no COORDSYS; write E, G or C there.")
         return frame
-    letter = str(coordsys).strip().upper()[:1]
-    named = {value: key for key, value in FRAMES.items()}.get(letter)
-    if named is None:
-        raise InputError(f"{where} has COORDSYS = {coordsys!r}, but it must be E, G or C.")
     if frame is not None and named != frame:
         raise InputError(f"{where} is in {named} coordinates, but the maps are {frame}; use moments of that frame.")
     return named
@@ -417,6 +437,9 @@ def _read_table(path: str | Path) -> tuple[dict[str, NDArray[np.float64]], dict[
                 columns = {
                     name.upper(): np.array(table.data[name], dtype=np.float64).ravel() for name in table.columns.names
                 }
+                for column in table.columns:
+                    if column.unit and column.name.upper() in ("DTHETA", "DPHI"):
+                        columns[column.name.upper()] *= radians(column.unit)
                 header = {key: table.header.get(key) for key in ("NSIDE", "ORDERING", "COORDSYS")}
     except Exception as error:  # libraries raise whatever a broken file makes of them
         raise InputError(f"moments file {str(path)!r} cannot be read: {error}; give a complete FITS table.") from None
