@@ -129,12 +129,12 @@ def _described(kind: Any) -> str:
     return f"## {kind.name}\n\n{summary}\n\n{lines}"
 
 
-_UNPAIRED = re.compile(r"\*(?=\S)(?=[^*]*$)(?<!\S\*)")
+_UNPAIRED = re.compile(r"(?<!\w)\*(?=\S)(?=[^*]*$)")
 """A star that would begin an emphasis, but for which none ends it on the line."""
 
 
 def _plain(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Keep bars of absolute values, and lone stars, from being read as markup, but for what is quoted and for literal blocks."""
+    """Keep bars of absolute values and lone stars from being read as markup, outside of quotes and literal blocks."""
     literal = -1  # indentation of the line that began a literal block
     for number, line in enumerate(lines):
         indentation = len(line) - len(line.lstrip())
