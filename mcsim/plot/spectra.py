@@ -91,12 +91,13 @@ def _draw(modes: xr.Dataset, panels: list[tuple[int, int]], title: str, expected
         axes.set_xlabel(r"multipole $\ell = l_2$")
         axes.set_ylabel(rf"$\ell(\ell+1)\hat{{A}}^{{{L}{M}}}/2\pi$  [$\mu$K$^2$]")
         axes.legend(fontsize=8, frameon=False)
-    notes = [r"$\hat{A}$: Bennett normalisation (odd parity: see bin_factor)"]
+    notes = [r"$\hat{A}$: Bennett normalisation (odd parity: Hajian-Souradeep, rescaled alike)"]
     if paired:
         notes += ["points: non-circular minus circular-beam control", "band (M = 0): plain mean and its standard error"]
     if expected is not None:
         notes.append(f"dashed: prediction, {expected.attrs['prediction']}")
-    figure.supxlabel(";  ".join(notes), fontsize=9)
+    # On a narrow figure a line for each; one line would be cut at both sides.
+    figure.supxlabel((";  " if figure.get_figwidth() > 10.0 else "\n").join(notes), fontsize=9)
     return figure
 
 
