@@ -90,6 +90,7 @@ def test_exact_data_give_back_their_beam_and_leading_order_does_not(shared, name
     assert "all orders in the beam" in report([found])
 
 
+@pytest.mark.slow
 def test_the_minimum_is_that_of_a_brute_force_search_over_predictions(shared):
     """Noisy data, each chi^2 of the search from a prediction of its own: equal to a thousandth of an error."""
     rng = np.random.default_rng(3)
@@ -125,6 +126,7 @@ def test_leading_order_is_enough_where_the_data_cannot_tell(shared):
     assert len(set(orders)) == 1
 
 
+@pytest.mark.slow
 def test_ensembles_of_the_same_configuration_are_accepted(shared):
     """Paired differences of 12 ensembles of 48 skies: their p-values are uniform; leading order rejects the whole."""
     modes = {mode.name: number for number, mode in enumerate(shared.estimator.modes)}
