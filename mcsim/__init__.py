@@ -1,31 +1,89 @@
 """mcsim: is the isotropy violation that I measure made by my instrument?
 
-Monte Carlo ensembles of isotropic skies seen through non-circular beams under a scan, their BipoSH coefficients and
-power spectra, stored as xarray/Zarr. Names are loaded when they are first used, so that ``import mcsim`` costs nothing.
+Monte Carlo ensembles of isotropic skies seen through non-circular beams under a scan, their bipolar spherical harmonic
+(BipoSH) coefficients and power spectra, stored as xarray/Zarr; their prediction without Monte Carlo; and a diagnosis of
+the difference between simulations and maps. Temperatures are in uK_CMB, a_lm in healpy's m-major order, pixels in RING
+order.
+
+Ensembles: `run`, `merge`, `open_ensemble`, `open_summary`; configurations: `load_config`, `RunConfig`.
+Instrument: `Beam`, `ScanModel`, `Moments`, and what they make of one sky: `observe`.
+Statistics: `biposh` of maps at hand, `predict` of a run, `fit` of an effective beam, `diagnose` of maps.
+Systematic effects: `effects`, and `Effect` to write one. Bad input raises `InputError`.
+
+Names are loaded when they are first used, so that ``import mcsim`` costs little.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mcsim.beamfit.api import fit
+    from mcsim.bipolar.dataset import biposh
+    from mcsim.config import RunConfig
+    from mcsim.config import load as load_config
     from mcsim.diagnosis.api import diagnose
+    from mcsim.ensemble.opening import open_ensemble, open_summary
+    from mcsim.ensemble.prediction import predict
     from mcsim.ensemble.runner import merge, run
-    from mcsim.ensemble.store import open_ensemble, open_summary
     from mcsim.errors import InputError
+    from mcsim.instrument.beams import Beam
+    from mcsim.instrument.scan import Moments, ScanModel
+    from mcsim.simulation.observe import observe
+    from mcsim.systematics import Effect
+    from mcsim.systematics.library import effects
 
-__all__ = ["InputError", "diagnose", "merge", "open_ensemble", "open_summary", "run"]
+    __version__: str
+
+__all__ = [
+    "Beam",
+    "Effect",
+    "InputError",
+    "Moments",
+    "RunConfig",
+    "ScanModel",
+    "__version__",
+    "biposh",
+    "diagnose",
+    "effects",
+    "fit",
+    "load_config",
+    "merge",
+    "observe",
+    "open_ensemble",
+    "open_summary",
+    "predict",
+    "run",
+]
 
 _HOME = {
+    "Beam": "mcsim.instrument.beams",
+    "Effect": "mcsim.systematics",
     "InputError": "mcsim.errors",
+    "Moments": "mcsim.instrument.scan",
+    "RunConfig": "mcsim.config",
+    "ScanModel": "mcsim.instrument.scan",
+    "biposh": "mcsim.bipolar.dataset",
     "diagnose": "mcsim.diagnosis.api",
+    "effects": "mcsim.systematics.library",
+    "fit": "mcsim.beamfit.api",
+    "load_config": "mcsim.config:load",
     "merge": "mcsim.ensemble.runner",
-    "open_ensemble": "mcsim.ensemble.store",
-    "open_summary": "mcsim.ensemble.store",
+    "observe": "mcsim.simulation.observe",
+    "open_ensemble": "mcsim.ensemble.opening",
+    "open_summary": "mcsim.ensemble.opening",
+    "predict": "mcsim.ensemble.prediction",
     "run": "mcsim.ensemble.runner",
 }
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return import_module("importlib.metadata").version("mcsim")
     if name in _HOME:
-        return getattr(import_module(_HOME[name]), name)
+        module, _, own = _HOME[name].partition(":")
+        return getattr(import_module(module), own or name)
     raise AttributeError(f"module 'mcsim' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*__all__, *(name for name in globals() if name.startswith("__"))})

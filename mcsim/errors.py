@@ -6,10 +6,19 @@ class InputError(ValueError):
 
     The message is one sentence that names the value, the limit and the remedy; the command line prints it
     without a traceback and exits with code 2.
+
+    Examples
+    --------
+    >>> import mcsim
+    >>> try:
+    ...     mcsim.Beam.gaussian(-5.0)
+    ... except mcsim.InputError as error:
+    ...     print("refused:", "-5.0" in str(error))
+    refused: True
     """
 
     def __init__(self, message: str) -> None:
-        """What a library said of a broken file may have several lines; here it becomes one."""
+        """Make one line of what a library said of a broken file."""
         super().__init__(" ".join(message.split()) if "\n" in message else message)
 
 

@@ -3,13 +3,13 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.bipolar import Mode, bennett_factor
-from mcsim.ensemble import store
+from mcsim.bipolar import Mode, bennett_factor, parse_mode
+from mcsim.ensemble import opening, store
 from mcsim.ensemble.summary import bin_factor
 from mcsim.errors import InputError
 
@@ -17,6 +17,50 @@ Kind = Literal["plain", "difference"]
 
 QUADRUPOLE = ("L2M0d0", "L2M0d2")
 """A^{20}_{l l} and A^{20}_{l-2,l}: the modes fitted by default."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which spectra of a store or table are fitted.
+
+    Attributes
+    ----------
+    modes
+        Labels of the modes that are fitted jointly.
+    ell_range
+        Only bins that lie within these multipoles.
+    kind
+        "difference" to the circular-beam controls (default where there are any) or "plain".
+    pair
+        Label of the pair of maps; by default the first.
+
+    Raises
+    ------
+    InputError
+        For modes that cannot exist or repeat, a range that ends before it begins, or another kind.
+    """
+
+    modes: Sequence[str] = QUADRUPOLE
+    ell_range: tuple[int, int] | None = None
+    kind: Kind | None = None
+    pair: str | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.modes, str) or not self.modes or len(set(self.parsed)) < len(self.modes):
+            raise InputError(f"modes = {self.modes!r} are no different labels; give some such as ['L2M0d0'].")
+        if self.kind is not None and self.kind not in get_args(Kind):
+            raise InputError(f"the kind of spectra {self.kind!r} is not known; give plain or difference.")
+        if self.ell_range is not None and not 0 <= self.ell_range[0] <= self.ell_range[1]:
+            raise InputError(f"ell = {self.ell_range[0]} ... {self.ell_range[1]} is no range; give 0 <= first <= last.")
+
+    @property
+    def parsed(self) -> tuple[Mode, ...]:
+        """The modes."""
+        return tuple(parse_mode(name) for name in self.modes)
+
+
+EVERYTHING = Selection()
+"""The quadrupole modes at every ell."""
 
 
 class Row(NamedTuple):
@@ -39,7 +83,7 @@ class Scaling(NamedTuple):
     summary: bool
 
     def factor(self, mode: Mode, lmax: int) -> NDArray[np.float64]:
-        """Factor from raw coefficients, shape (lmax + 1,)."""
+        """Return the factor from raw coefficients, shape (lmax + 1,)."""
         if self.summary:
             return bin_factor(mode, lmax)
         ell = np.arange(lmax + 1.0)
@@ -59,7 +103,7 @@ class Measurement:
     origin, pair
         Where the data are from, and the pair of maps that they belong to; ``None``: the only map.
     kind
-        "plain", or "difference" to the circular twins.
+        "plain", or "difference" to the circular-beam controls.
     rows, scaling
         What each datum is.
     value, covariance
@@ -92,33 +136,14 @@ class Measurement:
 
 
 def parts(mode: Mode) -> tuple[bool, ...]:
-    """Which parts of a mode carry data: False for the real, True for the imaginary one."""
+    """Return which parts of a mode carry data: False for the real, True for the imaginary one."""
     return (False, True) if mode.M > 0 else (mode.parity == "odd",)
-
-
-def parse_mode(name: str) -> Mode:
-    """A mode from its label, for example ``L2M0d-2``.
-
-    Raises
-    ------
-    InputError
-        For another form, or a mode that cannot exist.
-    """
-    try:
-        L, rest = name.removeprefix("L").split("M")
-        M, d = rest.split("d")
-        mode = Mode(int(L), int(M), int(d))
-    except ValueError:
-        raise InputError(f"{name!r} is no BipoSH mode; write it like L2M0d0.") from None
-    if not (0 <= mode.M <= mode.L and abs(mode.d) <= mode.L and mode.L > 0):
-        raise InputError(f"the mode {name} does not exist; it needs L > 0, 0 <= M <= L and |d| <= L.")
-    return mode
 
 
 def project(
     rows: Sequence[Row], scaling: Scaling, spectra: Mapping[Mode, NDArray[np.complex128]]
 ) -> NDArray[np.float64]:
-    """Data vectors, shape (..., rows), of spectra of shape (..., lmax + 1); NaN where a bin is empty."""
+    """Return data vectors, shape (..., rows), of spectra of shape (..., lmax + 1); NaN where a bin is empty."""
     scaled = {mode: scaling.factor(mode, array.shape[-1] - 1) * array for mode, array in spectra.items()}
     columns = []
     for row in rows:
@@ -131,44 +156,32 @@ def project(
     return np.stack(columns, axis=-1)
 
 
-def from_store(
-    path: str | Path,
-    modes: Sequence[str] = QUADRUPOLE,
-    ell_range: tuple[int, int] | None = None,
-    kind: Kind | None = None,
-    pair: str | None = None,
-) -> Measurement:
-    """Mean of an ensemble, with the covariance of its data vector over all modes and bins.
+def from_store(path: str | Path, selection: Selection = EVERYTHING) -> Measurement:
+    """Read the mean of an ensemble, with the covariance of its data vector over all modes and bins.
 
     Parameters
     ----------
     path
         Store.
-    modes
-        Labels of the modes.
-    ell_range
-        Only bins of the summary that lie within these multipoles.
-    kind
-        "difference" to the circular twins (default of a paired ensemble) or "plain".
-    pair
-        Label of the pair; by default the first.
+    selection
+        Modes, bins of the summary, kind and pair.
 
     Raises
     ------
     InputError
         If the store does not hold what is asked for.
     """
-    with store.open_ensemble(path) as ensemble:
+    with opening.open_ensemble(path) as ensemble:
         width = int(ensemble.attrs["configuration"]["biposh"]["summary_bin"])
         lmax = ensemble.sizes["ell"] - 1
         paired = "biposh_circular" in ensemble
-        label = str(ensemble["pair"].values[0]) if pair is None else pair
-    chosen = ("difference" if paired else "plain") if kind is None else kind
-    first, last = ell_range or (0, lmax)
+        label = str(ensemble["pair"].values[0]) if selection.pair is None else selection.pair
+    chosen = ("difference" if paired else "plain") if selection.kind is None else selection.kind
+    first, last = selection.ell_range or (0, lmax)
     bins = [(a, min(a + width - 1, lmax)) for a in range(0, lmax + 1, width)]
     rows = tuple(
         Row(mode, a, b, imaginary)
-        for mode in map(parse_mode, modes)
+        for mode in selection.parsed
         for imaginary in parts(mode)
         for a, b in bins
         if a >= first and b <= last
@@ -177,8 +190,9 @@ def from_store(
         raise InputError(f"no bin of {path} lies within ell = {first} ... {last}; its bins are {width} wide, widen it.")
     drawn = realizations(path, rows, SUMMARY, chosen, label)
     measured = np.atleast_1d(np.isfinite(drawn).all(axis=0))
-    if not measured.any():
-        raise InputError(f"{path} has none of the modes {', '.join(modes)} for the pair {label}; choose others.")
+    absent = set(selection.parsed) - {row.mode for row, keep in zip(rows, measured, strict=True) if keep}
+    if absent:
+        raise InputError(f"{path} has no {min(absent).name} for the pair {label} at these ell; leave the mode out.")
     drawn = drawn[:, measured]
     covariance = np.cov(drawn.T, ddof=1).reshape(drawn.shape[1], -1)
     kept = tuple(row for row, keep in zip(rows, measured, strict=True) if keep)
@@ -189,7 +203,7 @@ def from_store(
 
 
 def with_covariance_of(measured: Measurement, path: str | Path, pair: str | None = None) -> Measurement:
-    """The data of a measurement with the covariance of one realization of an ensemble that models it.
+    """Return the data of a measurement with the covariance of one realization of an ensemble that models it.
 
     Parameters
     ----------
@@ -205,7 +219,7 @@ def with_covariance_of(measured: Measurement, path: str | Path, pair: str | None
     InputError
         If the store does not hold what the measurement does.
     """
-    with store.open_ensemble(path) as ensemble:
+    with opening.open_ensemble(path) as ensemble:
         labels = [str(name) for name in ensemble["pair"].values]
     label = pair or (measured.pair if measured.pair in labels else labels[0])
     drawn = realizations(path, measured.rows, measured.scaling, measured.kind, label)
@@ -214,22 +228,24 @@ def with_covariance_of(measured: Measurement, path: str | Path, pair: str | None
 
 
 def realizations(path: str | Path, rows: Sequence[Row], scaling: Scaling, kind: str, pair: str) -> NDArray[np.float64]:
-    """Data vectors of all finished realizations of a store, shape (N, rows), read chunk by chunk.
+    """Return data vectors of all finished realizations of a store, shape (N, rows), read chunk by chunk.
 
     Raises
     ------
     InputError
-        If the store has another lmax or lacks the pair, a mode or the circular twins.
+        If the store has another lmax or lacks the pair, a mode or the circular-beam controls.
     """
     target = Path(path)
-    with store.open_ensemble(target) as ensemble:
+    with opening.open_ensemble(target) as ensemble:
         labels = {str(name): number for number, name in enumerate(ensemble["mode"].values)}
         pairs = [str(name) for name in ensemble["pair"].values]
         lmax, paired = ensemble.sizes["ell"] - 1, "biposh_circular" in ensemble
     if pair not in pairs:
         raise InputError(f"There is no pair {pair} in {path}; choose among {'; '.join(pairs)}.")
     if kind == "difference" and not paired:
-        raise InputError(f"{path} has no circular twins; fit its plain spectra, or run it with ensemble.paired = true.")
+        raise InputError(
+            f"{path} has no circular-beam controls; fit its plain spectra, or run it with ensemble.paired = true."
+        )
     missing = [row.mode.name for row in rows if row.mode.name not in labels]
     if missing:
         raise InputError(f"{path} has no mode {missing[0]}; it holds {', '.join(labels)}.")

@@ -1,22 +1,25 @@
 """Effective beams: the f_l by which the b_l2 of a configuration must be rescaled to give the measured BipoSH."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import optimize, stats
 
-from mcsim.beamfit.data import QUADRUPOLE, Kind, Measurement, from_store, project, with_covariance_of
-from mcsim.beamfit.likelihood import Comparison, Solution, compare, solve, solve_each
+from mcsim.beamfit.data import EVERYTHING, Measurement, Selection, from_store, with_covariance_of
+from mcsim.beamfit.likelihood import Comparison, Solution, compare, size, solve, solve_each, whitening
 from mcsim.beamfit.models import Model, model
 from mcsim.beamfit.table import read_table
-from mcsim.bipolar.theory import ScannedBeam, cmb_biposh_leading
-from mcsim.ensemble import prediction, store
+from mcsim.beamfit.templates import ORDERS, Order, Polynomial, Templates, templates
+from mcsim.ensemble import store
+from mcsim.ensemble.expectation import Source, survey_of
 from mcsim.errors import InputError
-from mcsim.simulation.survey import Survey
+
+NEGLIGIBLE = 0.1
+"""Leading order suffices where the orders beyond it are below this size in sigma: no parameter shifts by more."""
 
 
 @dataclass(frozen=True)
@@ -30,47 +33,55 @@ class Fit:
     model
         The model of f_l; where the data do not see one of its parameters (the imaginary part of ``orientation``),
         without.
+    order
+        "leading", or "exact" to all orders in the beam.
     offset, design
-        The data expected of the orders of the beam other than 2, and per unit of each parameter, uK^2: shapes (p,),
-        (p, K).
+        The expected data are offset + design @ parameters, uK^2: shapes (p,), (p, K); where ``order`` is "exact",
+        that is their tangent at the best fit.
     solution
         Parameters, their covariance, chi2, its degrees of freedom and probability.
+    beyond_leading
+        Size in sigma of the orders beyond the leading one at the best fit; ``None`` where leading order was asked for.
     each
-        The same for every realization, where asked for.
+        Fits of every realization, where :func:`fit_each` has made them.
     """
 
     measured: Measurement
     model: Model
+    order: str
     offset: NDArray[np.float64]
     design: NDArray[np.float64]
     solution: Solution
+    beyond_leading: float | None = None
     each: tuple[Solution, ...] = ()
 
     @property
     def best(self) -> NDArray[np.float64]:
-        """Data expected of the best fit, uK^2, shape (p,)."""
+        """Return the data expected of the best fit, uK^2, shape (p,)."""
         return self.offset + self.design @ self.solution.parameters
 
     @property
     def ell(self) -> NDArray[np.float64]:
-        """Multipoles from the first to the last of the data."""
+        """Return the multipoles from the first to the last of the data."""
         return np.arange(min(row.ell_min for row in self.measured.rows), self.measured.lmax + 1.0)
 
     def factor(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """f_l at :attr:`ell` and its standard deviation; of ``orientation`` the real part."""
+        """Return f_l at :attr:`ell` and its standard deviation; of ``orientation`` the real part."""
         functions = self.model.functions(self.ell).real
         width = np.sqrt(np.einsum("kl,km,ml->l", functions, self.solution.covariance, functions))
         return self.solution.parameters @ functions, width
 
     def pulls(self, truth: Sequence[float]) -> NDArray[np.float64]:
-        """(estimate - truth)/error of every realization and parameter, shape (N, K)."""
+        """Return (estimate - truth)/error of every realization and parameter, shape (N, K)."""
         return np.array([(one.parameters - truth) / one.errors for one in self.each])
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, for JSON."""
+        """Return plain numbers, for JSON."""
         solution = self.solution
         result: dict[str, Any] = {
             "model": self.model.name,
+            "order": self.order,
+            "beyond_leading": self.beyond_leading,
             "data": self.measured.origin,
             "pair": self.measured.pair,
             "kind": self.measured.kind,
@@ -99,16 +110,11 @@ class Fit:
 
 def fit(
     data: str | Path | Measurement,
-    source: prediction.Source,
+    source: Source,
     name: str = "constant",
     *,
-    modes: Sequence[str] = QUADRUPOLE,
-    ell_range: tuple[int, int] | None = None,
-    kind: Kind | None = None,
-    pair: str | None = None,
-    covariance: str | Path | None = None,
     knots: int = 4,
-    each: bool = False,
+    order: Order = "auto",
     nthreads: int = 1,
 ) -> Fit:
     """Fit effective beams b_l2^eff = f_l b_l2 to measured or simulated BipoSH.
@@ -116,17 +122,15 @@ def fit(
     Parameters
     ----------
     data
-        A store, whose mean is fitted with the covariance of its realizations over their number; or an ECSV table; or
-        what :func:`measurement` made of one.
+        What :func:`measurement` made of a store or table; or the path of one, of which the quadrupole is fitted.
     source
         Configuration of the spectrum, the beams and the scan whose b_l2 are rescaled: often the beam of the data under
         parallel transport.
     name, knots
         Model of f_l: "constant", "linear", "spline" or "orientation"; see :func:`mcsim.beamfit.models.model`.
-    modes, ell_range, kind, pair, covariance
-        See :func:`measurement`.
-    each
-        Fit every realization of the store on its own, too, for pulls.
+    order
+        "leading": to leading order in the beam's non-circular part. "exact": to all orders. "auto": to all orders
+        where they matter, that is where they exceed :data:`NEGLIGIBLE` sigma of the data.
     nthreads
         Threads.
 
@@ -137,37 +141,122 @@ def fit(
 
     Notes
     -----
-    To leading order A^{LM} is linear in b_l2 (:func:`mcsim.predict.cmb_biposh_leading`), so f_l = sum_k theta_k g_k(l)
-    makes a linear model: its templates are the A^{LM} of g_k(l) b_l2, both at l1 and at l2; other orders of the beam
-    stay as they are. On simulated ensembles the pulls have unit width (tests/statistical/test_fit.py), and the data of
-    a hit-averaged WMAP-like scan fitted with parallel transport give 0.6575 (tests/integration/test_prediction.py). The
-    paired difference of many realizations has smaller errors than the second order of the beam that the templates lack.
+    f_l = sum_k theta_k g_k(l) rescales b_l2 both at l1 and at l2; other orders of the beam stay as they are. To leading
+    order the data are linear in theta, to all orders they are a polynomial of second degree, known from (K + 1)(K +
+    2)/2 predictions. Its least squares are found by scipy's Levenberg-Marquardt from the leading-order fit; errors and
+    tests are those of the tangent there, exact as far as the curvature within the errors of theta is negligible
+    (tests/unit/test_fit_exact.py compares with a minimisation over independent predictions). On simulated ensembles
+    the pulls have unit width (tests/statistical/test_fit.py), and the data of a hit-averaged WMAP-like scan fitted with
+    parallel transport give 0.6575 (tests/integration/test_prediction.py).
     """
-    survey = prediction.survey_of(source, nthreads)
-    measured = measurement(data, survey, modes=modes, ell_range=ell_range, kind=kind, pair=pair, covariance=covariance)
+    survey = survey_of(source, nthreads)
+    measured = data if isinstance(data, Measurement) else measurement(data, survey)
+    return _fit(templates(survey, measured, nthreads), name, knots, order)
+
+
+def _fit(made: Templates, name: str, knots: int, order: Order) -> Fit:
+    """Fit one model; see :func:`fit`."""
+    if order not in ORDERS:
+        raise InputError(f"there is no order {order!r} of the prediction; choose among {', '.join(ORDERS)}.")
+    measured = made.measured
     first = min(row.ell_min for row in measured.rows)
     chosen = model(name, (first, measured.lmax), knots)
-    offset, design = templates(survey, measured, chosen, nthreads)
-    if name == "orientation" and _unseen(design, measured):
+    expected = made.leading(chosen)
+    if name == "orientation" and _unseen(expected.linear, measured):
         chosen = Model(name, chosen.parameters[:1], lambda ell: np.ones((1, len(ell))))
-        design = design[:, :1]
-    solution = solve(measured.value - offset, design, measured.covariance, measured.simulations)
-    singly: tuple[Solution, ...] = ()
-    if each:
-        if measured.realizations is None:
-            raise InputError(f"{measured.origin} is no ensemble; fits of single realizations need a store.")
-        singly = tuple(solve_each(measured.realizations - offset, design))
-    return Fit(measured, chosen, offset, design, solution, singly)
+        expected = expected.keeping(1)
+    offset, design = expected.constant, expected.linear
+    solution = _solve(measured, offset, design)
+    beyond = None
+    if order != "leading":
+        change = made.beyond_leading(chosen, solution.parameters)
+        beyond = size(change, measured.covariance, measured.simulations)
+    if order == "leading" or (order == "auto" and beyond is not None and beyond < NEGLIGIBLE):
+        return Fit(measured, chosen, "leading", offset, design, solution, beyond)
+    expected = made.exact(chosen)
+    best = _minimise(measured, expected, solution.parameters)
+    design = expected.derivative(best)
+    offset = expected.at(best) - design @ best
+    return Fit(measured, chosen, "exact", offset, design, _solve(measured, offset, design), beyond)
+
+
+def fit_models(
+    measured: Measurement,
+    source: Source,
+    names: Sequence[str],
+    *,
+    knots: int = 4,
+    order: Order = "auto",
+    nthreads: int = 1,
+) -> list[Fit]:
+    """Fit several models to the same data and to the same order: to all orders where one of them asks for it.
+
+    Parameters
+    ----------
+    measured
+        What :func:`measurement` made of a store or table.
+    source, knots, order, nthreads
+        As for :func:`fit`.
+    names
+        Of the models.
+
+    Raises
+    ------
+    InputError
+        As :func:`fit`, and for no model or one that is named twice.
+    """
+    if not names or len(set(names)) < len(names):
+        raise InputError(f"the models {', '.join(names) or '(none)'} are not different ones; name each model once.")
+    made = templates(survey_of(source, nthreads), measured, nthreads)
+    fits = [_fit(made, name, knots, order) for name in names]
+    if len({one.order for one in fits}) == 1:
+        return fits
+    return [
+        one if one.order == "exact" else _fit(made, name, knots, "exact") for one, name in zip(fits, names, strict=True)
+    ]
+
+
+def _solve(measured: Measurement, offset: NDArray[np.float64], design: NDArray[np.float64]) -> Solution:
+    return solve(measured.value - offset, design, measured.covariance, measured.simulations)
+
+
+def _minimise(measured: Measurement, expected: Polynomial, start: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the parameters of least chi^2."""
+    white = whitening(measured.value, expected.linear, measured.covariance, measured.simulations)
+    found = optimize.least_squares(
+        lambda theta: white @ (measured.value - expected.at(theta)),
+        start,
+        jac=lambda theta: -white @ expected.derivative(theta),
+        method="lm",
+        x_scale="jac",
+        xtol=1e-13,
+        ftol=1e-13,
+        gtol=1e-13,
+    )
+    if not found.success:
+        raise InputError(
+            f"the fit of {measured.origin} to all orders does not converge ({found.message}); choose a simpler model."
+        )
+    return np.asarray(found.x)
+
+
+def fit_each(found: Fit) -> Fit:
+    """Return a fit with those of every single realization, about the tangent at the best fit of their mean.
+
+    Raises
+    ------
+    InputError
+        For data that are not those of an ensemble.
+    """
+    if found.measured.realizations is None:
+        raise InputError(f"{found.measured.origin} is no ensemble; fits of single realizations need a store.")
+    return replace(found, each=tuple(solve_each(found.measured.realizations - found.offset, found.design)))
 
 
 def measurement(
     data: str | Path | Measurement,
-    source: prediction.Source,
-    *,
-    modes: Sequence[str] = QUADRUPOLE,
-    ell_range: tuple[int, int] | None = None,
-    kind: Kind | None = None,
-    pair: str | None = None,
+    source: Source,
+    selection: Selection = EVERYTHING,
     covariance: str | Path | None = None,
 ) -> Measurement:
     """Read what is to be fitted.
@@ -175,30 +264,29 @@ def measurement(
     Parameters
     ----------
     data
-        Store (a folder) or ECSV table.
+        A store (a folder), whose mean is fitted with the covariance of its realizations over their number; or an ECSV
+        table.
     source
         Configuration, for the frame.
-    modes
-        Labels of the modes that are fitted jointly.
-    ell_range
-        Only bins within these multipoles.
-    kind
-        "difference" to the circular twins (default where there are any) or "plain".
-    pair
-        Label of the pair of maps; by default the first.
+    selection
+        Modes, multipoles, kind and pair.
     covariance
         Store that models the data: the covariance of one of its realizations replaces that of the data.
+
+    Raises
+    ------
+    InputError
+        For data that cannot be read, lack what is selected, or are in another frame than the configuration.
     """
     if isinstance(data, Measurement):
         return data
-    survey = prediction.survey_of(source)
-    path, frame = Path(data), survey.config.map.frame
+    path, frame = Path(data), survey_of(source).config.map.frame
     if path.is_dir():
-        measured = from_store(path, modes, ell_range, kind, pair)
+        measured = from_store(path, selection)
         _check_frame(path, frame)
     else:
-        measured = read_table(path, frame, modes, ell_range, kind, pair)
-    return measured if covariance is None else with_covariance_of(measured, covariance, pair)
+        measured = read_table(path, frame, selection)
+    return measured if covariance is None else with_covariance_of(measured, covariance, selection.pair)
 
 
 def _check_frame(path: Path, frame: str) -> None:
@@ -207,73 +295,18 @@ def _check_frame(path: Path, frame: str) -> None:
         raise InputError(f"{path} is in the {found} frame, the configuration in the {frame} one; rotate one of them.")
 
 
-def templates(
-    survey: Survey, measured: Measurement, chosen: Model, nthreads: int = 1
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Data expected of the orders of the beam but 2, shape (p,), and per unit of each parameter, shape (p, K)."""
-    if survey.cl is None:
-        raise InputError(f"{survey.config.name} names no spectrum; add sky.spectrum for the templates of a fit.")
-    if measured.lmax > survey.lmax:
-        raise InputError(
-            f"the data reach ell = {measured.lmax}, the configuration ends at {survey.lmax}; raise its lmax."
-        )
-    L_max = max(mode.L for mode in measured.modes)
-    beams = prediction.scanned_beams(survey, L_max, nthreads)
-    pair = _maps_of(survey, measured.pair)
-    x, y = (beams[number] for number in pair)
-    if x.smax < 2 or y.smax < 2:
-        raise InputError(f"a beam of {survey.config.name} is circular, so it has no b_l2 to rescale; give its shape.")
-    cl, modes = survey.cl, [(mode.L, mode.M, mode.d) for mode in measured.modes]
-
-    def expected(change: Any) -> NDArray[np.float64]:
-        left, right = (ScannedBeam(change(beam.blm.copy()), beam.w) for beam in (x, y))
-        seen = cmb_biposh_leading(modes, cl, survey.lmax, left, right)
-        spectra = prediction.without_windows(survey, seen, modes, pair)
-        return project(measured.rows, measured.scaling, dict(zip(measured.modes, spectra, strict=True)))
-
-    def without(blm: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        blm[2] = 0.0
-        return blm
-
-    def scaled(function: NDArray) -> Any:
-        def change(blm: NDArray[np.complex128]) -> NDArray[np.complex128]:
-            blm[1:2] = 0.0
-            blm[2] *= function
-            blm[3:] = 0.0
-            return blm
-
-        return change
-
-    functions = chosen.functions(np.arange(x.blm.shape[1], dtype=float))
-    return expected(without), np.stack([expected(scaled(function)) for function in functions], axis=-1)
-
-
-def _maps_of(survey: Survey, pair: str | None) -> tuple[int, int]:
-    """Numbers of the maps of a pair; the only map stands for any name."""
-    names = survey.map_names
-    if len(names) == 1:
-        return 0, 0
-    wanted = [] if pair is None else pair.split(",")
-    if len(wanted) != 2 or any(name not in names for name in wanted):
-        raise InputError(
-            f"the configuration has the maps {', '.join(names)}, the data are of {pair or 'a pair without name'}; "
-            "name their pair, or give a configuration with one map."
-        )
-    return names.index(wanted[0]), names.index(wanted[1])
-
-
 def _unseen(design: NDArray[np.float64], measured: Measurement) -> bool:
-    """Whether the data say nothing about the imaginary part: in sigmas its template is under 1e-6 of the real one."""
-    size = np.linalg.norm(design / np.sqrt(np.diag(measured.covariance))[:, None], axis=0)
-    return bool(size[1] < 1e-6 * size[0])
+    """Return True if the data say nothing about the imaginary part: its template is under 1e-6 of the real one."""
+    real, imaginary = np.linalg.norm(design / np.sqrt(np.diag(measured.covariance))[:, None], axis=0)
+    return bool(imaginary < 1e-6 * real)
 
 
 def comparisons(fits: Sequence[Fit]) -> list[tuple[str, str, Comparison]]:
-    """Every pair of nested models among fits to the same data: the smaller, the larger and their test."""
+    """Return every pair of nested models among fits to the same data: the smaller, the larger and their test."""
     nested = {("constant", "linear"), ("constant", "spline"), ("linear", "spline"), ("constant", "orientation")}
     return [
         (a.model.name, b.model.name, compare(a.solution, b.solution))
         for a in fits
         for b in fits
-        if (a.model.name, b.model.name) in nested and a.solution.dof > b.solution.dof
+        if (a.model.name, b.model.name) in nested and a.solution.dof > b.solution.dof and a.order == b.order
     ]

@@ -1,4 +1,4 @@
-"""Generalised least squares and its tests, exact also where the covariance comes from few simulations."""
+"""Least squares for beam fits: the covariance is known, or estimated from simulations (:mod:`mcsim.stats.gaussian`)."""
 
 from dataclasses import dataclass
 
@@ -8,6 +8,7 @@ from scipy import stats
 from scipy.linalg import LinAlgError, cholesky, solve_triangular
 
 from mcsim.errors import InputError
+from mcsim.stats import gaussian
 
 
 @dataclass(frozen=True)
@@ -18,19 +19,19 @@ class Solution:
     ----------
     parameters, covariance
         Shape (K,) and (K, K): estimates, and the covariance of their distribution about the truth.
-    chi2, dof
-        r'C^-1 r of the residual r, and the number of data less K.
+    square, dof
+        r'C^-1 r of the residual r with the covariance C as given, and the number of data less K.
     probability
-        Of a chi2 as large as this or larger where the model holds.
+        Of a square as large as this or larger where the model holds.
     residual
         Shape (p,).
     simulations
-        Behind the covariance of the data; ``None``: that is known.
+        Number of simulations that C was estimated from; ``None``: it is known.
     """
 
     parameters: NDArray[np.float64]
     covariance: NDArray[np.float64]
-    chi2: float
+    square: float
     dof: int
     probability: float
     residual: NDArray[np.float64]
@@ -47,12 +48,17 @@ class Solution:
         return self.covariance / np.outer(self.errors, self.errors)
 
     @property
-    def reduced_chi2(self) -> float:
-        """chi2 over its expectation: dof where the covariance is known, n dof/(n - dof - 1) for n = simulations - 1."""
+    def chi2(self) -> float:
+        """Chi^2, with expectation ``dof``; that of ``square`` is n/(n - dof - 1) larger for n + 1 simulations."""
         if self.simulations is None:
-            return self.chi2 / self.dof
+            return self.square
         n = self.simulations - 1
-        return self.chi2 * (n - self.dof - 1) / (n * self.dof)
+        return self.square * (n - self.dof - 1) / n
+
+    @property
+    def reduced_chi2(self) -> float:
+        """chi2/dof."""
+        return self.chi2 / self.dof
 
 
 def solve(
@@ -78,17 +84,55 @@ def solve(
     Raises
     ------
     InputError
-        For fewer than p + 3 simulations, data without scatter, or a design whose columns are not independent.
+        For arrays of other shapes, values that are not finite, fewer than p + 3 simulations, data without scatter, or
+        a design whose columns are not independent.
 
     Notes
     -----
-    With n = N - 1, q = p - K, R = chi2/n and H = T'C^-1 T/n: (n - q + 1)/q R ~ F(q, n - q + 1), Hotelling's T^2 of the
-    residual (Ann. Math. Stat. 2, 360, 1931). The residual acts as q covariates of the parameters, so that each of them
-    over sqrt((1 + R) (H^-1)_kk/(n - q)) is a Student t with n - q degrees of freedom (Rao, Biometrika 46, 49, 1959),
-    whose standard deviation is quoted. A plain chi2 and its errors are wrong by factors of order 1 + p/N (Hartlap et
-    al., A&A 464, 399, 2007). Probabilities are uniform and pulls of unit width: tests/statistical/test_fit.py.
+    The estimates, their Student t errors and the F test of the residual are those of
+    :meth:`mcsim.stats.gaussian.SimulatedGaussian.fit`; a plain chi^2 and its errors are wrong by factors of order
+    1 + p/N (Hartlap et al., A&A 464, 399, 2007). Probabilities are uniform and pulls of unit width:
+    tests/statistical/test_fit.py.
+    """
+    white = whitening(data, design, covariance, simulations)
+    K = design.shape[1]
+    if simulations is None:
+        basis, back = gaussian.orthonormal(white @ design)
+        along = basis.T @ (white @ data)
+        rank, parameters, spread = basis.shape[1], back @ along, back @ back.T
+        q = len(data) - rank
+        square = float(np.sum((white @ data - basis @ along) ** 2))
+        probability = float(stats.chi2.sf(square, q))
+    else:
+        # The fit allows for the error of the simulations' mean; here the mean is a model's, and has none.
+        null = gaussian.SimulatedGaussian(np.zeros(len(data)), np.sqrt(1.0 + 1.0 / simulations) * white, simulations)
+        found = null.fit(data, design)
+        parameters, spread, square = found.amplitudes, found.covariance, found.chi2
+        q, probability = found.dimension, found.pvalue
+        rank = len(data) - q
+    if rank < K:
+        raise InputError("the data cannot tell the parameters of the model apart; choose a simpler model or more data.")
+    return Solution(parameters, spread, square, q, probability, data - design @ parameters, simulations)
+
+
+def whitening(
+    data: NDArray[np.float64], design: NDArray[np.float64], covariance: NDArray[np.float64], simulations: int | None
+) -> NDArray[np.float64]:
+    """Return the inverse Cholesky factor of a covariance, shape (p, p), and check what :func:`solve` is given.
+
+    Raises
+    ------
+    InputError
+        As :func:`solve`.
     """
     p, K = design.shape
+    if data.shape != (p,) or covariance.shape != (p, p):
+        raise InputError(
+            f"data of shape {data.shape}, a design of {design.shape} and a covariance of {covariance.shape} do not "
+            f"belong together; give shapes ({p},), ({p}, {K}) and ({p}, {p})."
+        )
+    if not (np.isfinite(data).all() and np.isfinite(design).all() and np.isfinite(covariance).all()):
+        raise InputError("data, design or covariance hold values that are not finite; leave those bins out.")
     if p <= K:
         raise InputError(f"{p} data cannot be fitted with {K} parameters; give more bins or a simpler model.")
     if simulations is not None and simulations < p + 3:
@@ -96,37 +140,39 @@ def solve(
             f"{simulations} realizations are too few for the covariance of {p} binned data; give wider bins, fewer "
             f"modes, a narrower range of ell or at least {p + 3} realizations."
         )
-    scale = np.sqrt(np.diag(covariance))
-    if not np.all(scale > 0.0):
-        raise InputError(f"datum {int(np.argmin(scale))} has no scatter, so it cannot be weighted; leave its bin out.")
+    variance = np.diag(covariance)
+    if not np.all(variance > 0.0):
+        raise InputError(
+            f"datum {int(np.argmin(variance))} has no scatter, so it cannot be weighted; leave its bin out."
+        )
+    scale = np.sqrt(variance)
     try:
         root = cholesky(covariance / np.outer(scale, scale), lower=True)
     except LinAlgError:
         raise InputError("the covariance of the data is not positive definite; leave out bins that repeat.") from None
-    white = solve_triangular(root, design / scale[:, None], lower=True)
-    size = np.linalg.norm(white, axis=0)
-    unit = white / np.where(size > 0.0, size, 1.0)
-    if np.any(size == 0.0) or np.linalg.svd(unit, compute_uv=False)[-1] < 1e-7:
-        raise InputError("the data cannot tell the parameters of the model apart; choose a simpler model or more data.")
-    orthogonal, triangle = np.linalg.qr(unit)
-    target = solve_triangular(root, data / scale, lower=True)
-    parameters = solve_triangular(triangle, orthogonal.T @ target) / size
-    inverse = solve_triangular(triangle, np.eye(K)) / size[:, None]
-    residual = data - design @ parameters
-    chi2 = float(np.sum((target - orthogonal @ (orthogonal.T @ target)) ** 2))
-    q = p - K
-    if simulations is None:
-        return Solution(parameters, inverse @ inverse.T, chi2, q, float(stats.chi2.sf(chi2, q)), residual, None)
-    n = simulations - 1
-    student = n - q
-    widening = n * (1.0 + chi2 / n) / student * (student / (student - 2.0))
-    probability = float(stats.f.sf((n - q + 1) / q * chi2 / n, q, n - q + 1))
-    return Solution(parameters, widening * inverse @ inverse.T, chi2, q, probability, residual, simulations)
+    return solve_triangular(root, np.diag(1.0 / scale), lower=True)
+
+
+def size(change: NDArray[np.float64], covariance: NDArray[np.float64], simulations: int | None) -> float:
+    """Return the length of a change of the data, shape (p,), in sigma: no parameter shifts by more of its errors."""
+    white = whitening(change, np.zeros((len(change), 0)), covariance, simulations) @ change
+    n = np.inf if simulations is None else simulations - 1.0
+    return float(np.linalg.norm(white) * np.sqrt(1.0 - (len(change) + 1.0) / n))
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Test of a model against one that contains it: drop of chi2, parameters added, and its probability by chance."""
+    """Test of a model against one that contains it.
+
+    Attributes
+    ----------
+    drop
+        Fall of chi^2; for a covariance of few simulations ``added`` times the F statistic, which falls alike.
+    added
+        Number of parameters that the larger model adds.
+    probability
+        Of such a fall by chance.
+    """
 
     drop: float
     added: int
@@ -134,28 +180,29 @@ class Comparison:
 
 
 def compare(small: Solution, large: Solution) -> Comparison:
-    """Whether a model is worth the parameters that it adds to one that it contains, fitted to the same data.
+    """Test whether a model is worth the parameters that it adds to one that it contains, fitted to the same data.
 
     Raises
     ------
     InputError
-        If the models are not of different size, in this order.
+        If the models are not of different size, in this order, or of data with different covariances.
 
     Notes
     -----
-    The drop of chi2 is a chi^2 of as many degrees of freedom as there are added parameters. With n = N - 1 of a sample
-    covariance, nu = n - q + 1 and q of the smaller model, nu/added (R_small - R_large)/(1 + R_large) ~ F(added, nu),
-    R = chi2/n (Rao 1959).
+    With a known covariance the fall of chi^2 has a chi^2 distribution with as many degrees of freedom as there are
+    added parameters; else the test is :func:`mcsim.stats.gaussian.nested_pvalue` (Rao, Biometrika 46, 49, 1959).
     """
     added = small.dof - large.dof
     if added <= 0:
         raise InputError("a comparison needs a model and another one that adds parameters to it; exchange them.")
-    drop = small.chi2 - large.chi2
+    if small.simulations != large.simulations:
+        raise InputError("the models were fitted with different covariances; fit both to the same data.")
+    drop = small.square - large.square
     if small.simulations is None:
         return Comparison(drop, added, float(stats.chi2.sf(drop, added)))
     n = small.simulations - 1
-    nu = n - small.dof + 1
-    return Comparison(drop, added, float(stats.f.sf(nu / added * drop / (n + large.chi2), added, nu)))
+    probability = float(gaussian.nested_pvalue(drop, small.square, added, small.dof, n))
+    return Comparison((n - small.dof + 1) * drop / (n + large.square), added, probability)
 
 
 def solve_each(realizations: NDArray[np.float64], design: NDArray[np.float64]) -> list[Solution]:

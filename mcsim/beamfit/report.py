@@ -7,23 +7,40 @@ from mcsim.beamfit.orientation import orientation
 
 
 def report(fits: Sequence[Fit]) -> str:
-    """Text about fits of several models to the same data."""
+    """Describe fits of several models to the same data in words."""
     measured = fits[0].measured
-    known = f"covariance of {measured.simulations} realizations" if measured.simulations else "independent errors"
     modes = ", ".join(mode.name for mode in measured.modes)
     first = min(row.ell_min for row in measured.rows)
     lines = [
-        f"{measured.origin}: {measured.kind} spectra {modes}, ell = {first}-{measured.lmax}, "
-        f"{len(measured.rows)} bins, {known}"
+        f"{measured.origin}: {measured.kind} spectra {modes}, ell = {first}-{measured.lmax}, {len(measured.rows)} bins",
+        f"  {_order(fits)}",
+        f"  {_tests(measured.simulations)}",
     ]
     for one in fits:
         lines += _model(one)
     for small, large, test in comparisons(fits):
         lines.append(
-            f"  {large} over {small}: chi2 falls by {test.drop:.4g} for {test.added} more, by chance with probability "
-            f"{test.probability:.3g}"
+            f"  {large} over {small}: chi2 falls by {test.drop:.3g} for {test.added} more parameter"
+            f"{'s' if test.added > 1 else ''}, p = {test.probability:.3g}"
         )
     return "\n".join(lines)
+
+
+def _order(fits: Sequence[Fit]) -> str:
+    """Say to which order of the beam the data are predicted, and why."""
+    beyond = [one.beyond_leading for one in fits if one.beyond_leading is not None]
+    text = "leading order in the beam" if fits[0].order == "leading" else "all orders in the beam"
+    return f"{text} (those beyond the leading one: {max(beyond):.2g} sigma)" if beyond else text
+
+
+def _tests(simulations: int | None) -> str:
+    """Say what the p-values are."""
+    if simulations is None:
+        return "the covariance is taken as known, p-values are chi^2 tests"
+    return (
+        f"the covariance comes from {simulations} realizations, so p-values are small-sample F tests and chi2 is "
+        "scaled to expect its dof"
+    )
 
 
 def _model(one: Fit) -> list[str]:
@@ -33,8 +50,8 @@ def _model(one: Fit) -> list[str]:
         for name, value, error in zip(one.model.parameters, solution.parameters, solution.errors, strict=True)
     )
     lines = [
-        f"  {one.model.name}: {values}; chi2 = {solution.chi2:.4g} for {solution.dof} degrees of freedom "
-        f"(reduced {solution.reduced_chi2:.3g}), probability {solution.probability:.3g}"
+        f"  {one.model.name}: {values}; chi2/dof = {solution.chi2:.1f}/{solution.dof} = "
+        f"{solution.reduced_chi2:.2f}, p = {solution.probability:.3g}"
     ]
     if len(solution.parameters) == 2:
         lines.append(f"    correlation {solution.correlation[0, 1]:.3f}")
@@ -50,7 +67,7 @@ def _model(one: Fit) -> list[str]:
         each = one.to_dict()["realizations"]
         pulls = ", ".join(f"{name} {width:.3f}" for name, width in each["pull_width"].items())
         lines.append(
-            f"    {each['count']} single realizations: width of the pulls {pulls}; probabilities uniform with p = "
+            f"    {each['count']} single realizations: width of the pulls {pulls}; p-values uniform with p = "
             f"{each['probability_uniform']:.3g}"
         )
     return lines

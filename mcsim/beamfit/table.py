@@ -10,21 +10,14 @@ from astropy import units
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from mcsim.beamfit.data import QUADRUPOLE, SUMMARY, Measurement, Row, Scaling, parse_mode, parts
+from mcsim.beamfit.data import EVERYTHING, SUMMARY, Measurement, Row, Scaling, Selection, parts
 from mcsim.errors import InputError
 
 COLUMNS = ("L", "M", "d", "ell_min", "ell_max")
-"""That say what is in a row."""
+"""The columns that say what is in a row."""
 
 
-def read_table(
-    path: str | Path,
-    frame: str,
-    modes: Sequence[str] = QUADRUPOLE,
-    ell_range: tuple[int, int] | None = None,
-    kind: str | None = None,
-    pair: str | None = None,
-) -> Measurement:
+def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING) -> Measurement:
     """Read binned spectra with independent errors.
 
     Parameters
@@ -37,8 +30,8 @@ def read_table(
         ensembles, ``value_difference`` and so on.
     frame
         Frame of the model, which that of the table must equal.
-    modes, ell_range, kind, pair
-        As for :func:`mcsim.beamfit.data.from_store`.
+    selection
+        Modes, bins, kind and pair.
 
     Raises
     ------
@@ -49,40 +42,41 @@ def read_table(
     missing = [name for name in COLUMNS if name not in table.colnames]
     if missing:
         raise InputError(f"{path} has no column {missing[0]}; give {', '.join(COLUMNS)}, value and error.")
-    suffix, chosen = _kind(path, table, kind)
+    suffix, chosen = _kind(path, table, selection.kind)
     scaling = scaling_of(path, table.meta)
     found = str(table.meta.get("frame", frame)).lower()
     if found != frame:
         raise InputError(f"{path} is in the {found} frame, the configuration in the {frame} one; rotate one of them.")
-    label = _pair(path, table, pair)
+    label = _pair(path, table, selection.pair)
     if label is not None:
         table = table[[str(name) == label for name in table["pair"]]]
-    wanted = [parse_mode(name) for name in modes]
-    first, last = ell_range or (0, int(np.max(table["ell_max"])))
+    L, M, d, low, high = (_integers(path, table, name) for name in COLUMNS)
+    wrong = np.flatnonzero((low < 0) | (low > high))
+    if len(wrong):
+        a, b = low[wrong[0]], high[wrong[0]]
+        raise InputError(f"{path}: ell_min = {a}, ell_max = {b} is no range; correct the row.")
+    first, last = selection.ell_range or (0, int(high.max()))
     real, error = (in_uk2(path, table, f"{name}{suffix}") for name in ("value", "error"))
     rows: list[Row] = []
     values: list[float] = []
     errors: list[float] = []
-    for mode in wanted:
+    for mode in selection.parsed:
         for imaginary in parts(mode):
             part = in_uk2(path, table, f"value_imag{suffix}") if imaginary else real
             if mode.parity == "odd" and not scaling.summary and scaling.bennett:
                 raise InputError(
                     f"{path}: {mode.name} has odd parity, which the Bennett normalisation does not have; leave it out."
                 )
-            for number, line in enumerate(table):
-                low, high = int(line["ell_min"]), int(line["ell_max"])
-                same = (int(line["L"]), int(line["M"]), int(line["d"])) == (mode.L, mode.M, mode.d)
-                if not same or low < first or high > last:
-                    continue
-                if not 0 <= low <= high:
-                    raise InputError(f"{path}: ell_min = {low}, ell_max = {high} is no range; correct the row.")
-                rows.append(Row(mode, low, high, imaginary))
+            same = (L == mode.L) & (M == mode.M) & (d == mode.d) & (low >= first) & (high <= last)
+            for number in np.flatnonzero(same).tolist():
+                rows.append(Row(mode, int(low[number]), int(high[number]), imaginary))
                 values.append(float(part[number]))
                 # The error of a mode with M > 0 is that of its modulus; its two parts share the variance.
                 errors.append(float(error[number]) * (1.0 if mode.M == 0 else np.sqrt(0.5)))
     if not rows:
-        raise InputError(f"{path} has no row of {', '.join(modes)} within ell = {first} ... {last}; choose others.")
+        raise InputError(
+            f"{path} has no row of {', '.join(selection.modes)} within ell = {first} ... {last}; choose others."
+        )
     if len(set(rows)) < len(rows):
         raise InputError(f"{path} gives a bin of one mode twice; keep one row of each.")
     _check(path, rows, values, errors)
@@ -99,8 +93,19 @@ def _check(path: str | Path, rows: Sequence[Row], values: Sequence[float], error
             )
 
 
+def _integers(path: str | Path, table: Table, name: str) -> NDArray[np.int64]:
+    """Return a column of integers; InputError where it holds anything else."""
+    try:
+        values: NDArray[np.float64] = np.ma.filled(np.ma.asarray(table[name], dtype=float), np.nan)
+    except (ValueError, TypeError):
+        values = np.array([np.nan])
+    if not np.all(np.abs(values - np.round(values)) == 0.0):
+        raise InputError(f"{path}: the column {name} holds values that are no integers; correct them.")
+    return values.astype(np.int64)
+
+
 def read_ecsv(path: str | Path) -> Table:
-    """An ECSV table that has rows; InputError where it is none."""
+    """Read an ECSV table that has rows; InputError where it is none."""
     try:
         table = Table.read(path, format="ascii.ecsv")
     except Exception as error:  # libraries raise whatever a broken file makes of them
@@ -111,7 +116,7 @@ def read_ecsv(path: str | Path) -> Table:
 
 
 def _kind(path: str | Path, table: Table, kind: str | None) -> tuple[str, str]:
-    """Suffix of the columns, and what they are."""
+    """Return the suffix of the columns, and what they are."""
     has_difference = "value_difference" in table.colnames
     chosen = ("difference" if has_difference else "plain") if kind is None else kind
     if chosen == "difference" and not has_difference:
@@ -120,7 +125,7 @@ def _kind(path: str | Path, table: Table, kind: str | None) -> tuple[str, str]:
 
 
 def scaling_of(path: str | Path, meta: Any) -> Scaling:
-    """What the header of a table says of its normalisation; InputError where it says nothing that is known."""
+    """Read what the header of a table says of its normalisation; InputError where that is not known."""
     normalisation, scaling = (str(meta.get(name, "")).lower() for name in ("normalisation", "scaling"))
     if not normalisation:
         raise InputError(
@@ -150,7 +155,7 @@ def _pair(path: str | Path, table: Table, pair: str | None) -> str | None:
 
 
 def in_uk2(path: str | Path, table: Table, name: str) -> NDArray[np.float64]:
-    """A column in uK^2, NaN where it is masked; InputError where it is missing or has no such unit."""
+    """Return a column in uK^2, NaN where it is masked; InputError where it is missing or has no such unit."""
     if name not in table.colnames:
         raise InputError(f"{path} has no column {name}; add it.")
     column = table[name]

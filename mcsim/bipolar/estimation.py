@@ -12,39 +12,11 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from mcsim.bipolar.modes import Mode, modes
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
-from mcsim.sphere.clebsch import Band, band, evaluate
-
-
-@dataclass(frozen=True, order=True)
-class Mode:
-    """One BipoSH spectrum: L, M >= 0 and d = l2 - l1."""
-
-    L: int
-    M: int
-    d: int
-
-    @property
-    def name(self) -> str:
-        """Index label, for example ``L2M0d0``."""
-        return f"L{self.L}M{self.M}d{self.d}"
-
-    @property
-    def parity(self) -> str:
-        """``even`` or ``odd``: that of l1 + l2 + L."""
-        return "odd" if (self.d + self.L) % 2 else "even"
-
-    @property
-    def in_auto(self) -> bool:
-        """Whether one map alone has this mode: d >= 0, and not the identically vanishing d = 0 of odd parity."""
-        return self.d > 0 or (self.d == 0 and self.parity == "even")
-
-
-def modes(L_max: int, both_orders: bool) -> tuple[Mode, ...]:
-    """All modes up to L_max: of one map (0 <= d <= L), or of ordered pairs of maps (-L <= d <= L)."""
-    every = (Mode(L, M, d) for L in range(L_max + 1) for M in range(L + 1) for d in range(-L, L + 1))
-    return tuple(mode for mode in every if both_orders or mode.in_auto)
+from mcsim.sphere.checks import check_alm, check_finite, check_whole
+from mcsim.sphere.clebsch import Band, band
 
 
 @dataclass(frozen=True)
@@ -65,6 +37,8 @@ def estimator(L_max: int, lmax: int, both_orders: bool = False) -> Estimator:
     InputError
         If L_max is negative or exceeds lmax.
     """
+    check_whole(lmax, "lmax")
+    check_whole(L_max, "L_max")
     if not 0 <= L_max <= lmax:
         raise InputError(f"L_max = {L_max} is outside 0 ... {lmax} (the analysis lmax); choose a smaller L_max.")
     wanted = modes(L_max, both_orders)
@@ -91,24 +65,30 @@ def estimate(
         A^{LM}_{l2 - d, l2}, shape (modes, lmax + 1), in the square of the input's unit. NaN where the coefficient does
         not exist (l1 < 0, l1 > lmax, the triangle of l1, l2, L), and for one map in the modes that repeat others.
 
+    Raises
+    ------
+    InputError
+        If the coefficients are not complex, not finite, or not of the tables' lmax.
+
     Notes
     -----
     Only m2 >= 0 is summed for M = 0; the other half follows from the reality of the maps. Agrees with an explicit sum
     over exact Clebsch-Gordan coefficients to 1e-13 (``tests/unit/test_biposh.py``).
     """
+    for name, alm in (("alm_x", alm_x), ("alm_y", alm_y)):
+        if alm is not None:
+            check_alm(alm, tables.lmax, name)
+            check_finite(alm, name)
     auto = alm_y is None
-    ar, ai = _parts(alm_x)
-    br, bi = (ar, ai) if alm_y is None else _parts(alm_y)
+    x = _parts(alm_x)
+    y = x if alm_y is None else _parts(alm_y)
     result = np.full((len(tables.modes), tables.lmax + 1), complex(np.nan, np.nan))
     l2 = np.arange(tables.lmax + 1)
     for b in tables.bands:
         if auto and b.d < 0:
             continue
         total = np.zeros((b.L_max - b.L_min + 1, 2, tables.lmax + 1))
-        _accumulate(
-            ar, ai, br, bi, tables.lmax, b.M, b.d, b.norm, b.rising_a, b.rising_b, b.shift_a, b.shift_b,
-            b.constant, b.slope, b.previous, total,
-        )  # fmt: skip
+        _accumulate(x, y, tables.lmax, b, total)
         l1 = l2 - b.d
         for row, mode in enumerate(tables.modes):
             if (mode.M, mode.d) != (b.M, b.d) or (auto and not mode.in_auto):
@@ -122,33 +102,10 @@ def estimate(
     return result
 
 
-def bennett_factor(mode: Mode, lmax: int) -> NDArray[np.float64]:
-    """Factor from the Hajian-Souradeep to the Bennett (WMAP) normalisation at ell = l2, shape (lmax + 1,).
-
-    sqrt(2L+1) / (sqrt((2 l1 + 1)(2 l2 + 1)) C^{L0}_{l1 0 l2 0}); NaN where the coefficient does not exist.
-
-    Raises
-    ------
-    InputError
-        For odd parity, where C^{L0}_{l1 0 l2 0} vanishes.
-    """
-    if mode.parity == "odd":
-        raise InputError(
-            f"Mode {mode.name} has odd parity, for which the Bennett normalisation does not exist; "
-            "use the Hajian-Souradeep normalisation."
-        )
-    tables = band(mode.L, 0, mode.d, lmax)
-    factor = np.full(lmax + 1, np.nan)
-    for l2 in range(lmax + 1):
-        l1 = l2 - mode.d
-        if l1 >= 0 and l1 + l2 >= mode.L:
-            clebsch = evaluate(tables, mode.L, l2, 0)
-            factor[l2] = np.sqrt(2 * mode.L + 1) / (np.sqrt((2 * l1 + 1.0) * (2 * l2 + 1.0)) * clebsch)
-    return factor
-
-
 def power_spectrum(alm_x: NDArray[np.complex128], alm_y: NDArray[np.complex128], lmax: int) -> NDArray[np.float64]:
-    """C_l = sum_m a_lm conj(b_lm) / (2 l + 1) of two real maps, shape (lmax + 1,)."""
+    """C_l = sum_m a_lm conj(b_lm) / (2 l + 1) of two real maps, shape (lmax + 1,); InputError for other sizes."""
+    check_alm(alm_x, lmax, "alm_x")
+    check_alm(alm_y, lmax, "alm_y")
     product = alm_x.real * alm_y.real + alm_x.imag * alm_y.imag
     product[lmax + 1 :] *= 2.0
     total = np.bincount(alm_.degrees(lmax), weights=product, minlength=lmax + 1)
@@ -160,10 +117,10 @@ def _parts(alm: NDArray[np.complex128]) -> tuple[NDArray[np.float64], NDArray[np
 
 
 @numba.njit(cache=True, nogil=True)
-def _accumulate(  # type: ignore[no-untyped-def]
-    ar, ai, br, bi, lmax, M, d, norm, rising_a, rising_b, shift_a, shift_b, constant, slope, previous, total
-):  # fmt: skip
-    """Add sum_m2 G_L P to total[L - L_min, (real, imaginary), l2]."""
+def _accumulate(x, y, lmax, tables, total):  # type: ignore[no-untyped-def]
+    """Add sum_m2 G_L P to total[L - L_min, (real, imaginary), l2]; ``x`` and ``y`` are (real, imaginary) of a_lm."""
+    M, d, _, _, norm, rising_a, rising_b, shift_a, shift_b, constant, slope, previous = tables
+    (ar, ai), (br, bi) = x, y
     rows = total.shape[0]
     work = np.empty((4, lmax + 1))
     for m2 in range(0 if M == 0 else -lmax, lmax + 1):
@@ -186,10 +143,9 @@ def _accumulate(  # type: ignore[no-untyped-def]
         elif M == 0 and m2 > 0:
             sign = 2.0
         real, imag, g, before = work[:, : stop - first]
-        _products(
-            ar[ia + first : ia + stop], ai[ia + first : ia + stop], br[ib + first : ib + stop],
-            bi[ib + first : ib + stop], sign, sign * sign_a, sign_b, real, imag,
-        )  # fmt: skip
+        here_a, here_b = slice(ia + first, ia + stop), slice(ib + first, ib + stop)
+        signs = (sign, sign * sign_a, sign_b)
+        _products((ar[here_a], ai[here_a]), (br[here_b], bi[here_b]), signs, real, imag)
         a, b = first - m1 + shift_a, first + m1 + shift_b
         _bottom(norm[first:stop], rising_a[a : a + stop - first], rising_b[b : b + stop - first], g, before)
         for row in range(rows):
@@ -202,8 +158,10 @@ def _accumulate(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _products(x, y, u, v, sign_x, sign_y, sign_v, real, imag):  # type: ignore[no-untyped-def]
-    """(sign_x x + i sign_y y)(u + i sign_v v)."""
+def _products(first, second, signs, real, imag):  # type: ignore[no-untyped-def]
+    """(sign_x x + i sign_y y)(u + i sign_v v) of (x, y) and (u, v)."""
+    (x, y), (u, v) = first, second
+    sign_x, sign_y, sign_v = signs
     for i in range(real.size):
         a, b, c = sign_x * x[i], sign_y * y[i], sign_v * v[i]
         real[i] = a * u[i] - b * c

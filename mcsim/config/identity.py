@@ -13,7 +13,8 @@ from mcsim.config.schema import RunConfig, analysis_lmax, pixel_window
 def science(config: RunConfig) -> dict[str, Any]:
     """The part of a run that defines its numbers, with the contents of files in place of their names.
 
-    Sky, map, channels, effects, biposh, seed and pairing; not name, compute, the number of realizations or keep_maps. A
+    Sky, map, channels, effects, biposh, seed and pairing; not name, compute, the number of realizations, keep_maps or
+    the bins of the summary. A
     file is stood for by the SHA-256 of its contents, a template by those of its files. Skies given one file per
     realization are stood for by the part of their template that has the placeholder and by the contents of
     realization 0: the others are not read.
@@ -32,6 +33,7 @@ def science(config: RunConfig) -> dict[str, Any]:
         entry.holder[entry.field] = contents
     _leave_out_what_says_nothing(plain)
     plain["biposh"]["lmax"] = analysis_lmax(config)
+    del plain["biposh"]["summary_bin"]
     window = plain["map"].pop("pixel_window")
     for table, channel in zip(plain["channel"], config.channels, strict=True):
         table["pixel_window"] = pixel_window(config, channel) if window is None else window

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from mcsim.config import paths
+from mcsim.config import arrays, paths
 from mcsim.config.messages import sentence, shown
 from mcsim.config.schema import RunConfig, analysis_lmax, pixel_window
 from mcsim.errors import InputError
@@ -25,7 +25,10 @@ def load(source: str | Path | Mapping[str, Any], base: str | Path | None = None)
     ----------
     source
         Path of a TOML file of schema 1; or the name of a packaged workflow (``"quickstart"``), used where no such
-        file exists; or a dict of the same structure.
+        file exists; or a dict of the same structure. In a dict an array may stand in place of a file (``sky.spectrum``,
+        ``sky.alm``, ``sky.map``, ``map.mask``, ``map.pixel_window``, the ``path`` of a beam), a
+        :class:`mcsim.Beam` in place of a beam, and :class:`mcsim.Moments` or a :class:`mcsim.ScanModel` in place of a
+        scan.
     base
         Folder that the relative paths of a dict start from; default: the working folder. Those of a file start from
         its folder.
@@ -40,10 +43,32 @@ def load(source: str | Path | Mapping[str, Any], base: str | Path | None = None)
     ------
     InputError
         Whatever is wrong: one sentence with file, key, value, limit and remedy.
+
+    Notes
+    -----
+    Arrays and objects are written once into the cache ($MCSIM_CACHE, or ~/.cache/mcsim), and the run names these files;
+    its hash is over their contents.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import mcsim
+    >>> run = mcsim.load_config("quickstart")
+    >>> run.name, run.map.nside
+    ('quickstart', 128)
+    >>> channel = {
+    ...     "name": "W1",
+    ...     "beam": mcsim.Beam.elliptical(300.0, 250.0, lmax=32),
+    ...     "scan": mcsim.Moments.parallel_transport(nside=16),
+    ... }
+    >>> sky = {"spectrum": 1.0 / (1.0 + np.arange(33)) ** 2, "lmax": 32}
+    >>> run = mcsim.load_config({"name": "mine", "sky": sky, "map": {"nside": 16}, "channel": [channel]})
+    >>> run.channels[0].scan.kind
+    'moments'
     """
     if isinstance(source, Mapping):
         where, folder = "configuration", Path(base or ".")
-        plain = _plain(source, where)
+        plain = _plain(arrays.in_files(source), where)
     else:
         path = Path(source)
         where = str(source)

@@ -37,7 +37,8 @@ _TABLES: dict[tuple[str, ...], type] = {
     ("channel", "scan", "pointing"): schema.ScanPointing,
     ("channel", "scan", "differencing"): schema.ScanDifferencing,
 }
-_TOML_NAMES = {"schema_version": "schema", "channels": "channel"}
+_TOML_NAMES = {"schema_version": "schema", "channels": "channel", "effects": "effect"}
+_REPEATED = {"channel": "[[channel]]", "effect": "[[effect]]"}
 
 _EXPECTED = {
     "int_type": "a whole number",
@@ -126,7 +127,7 @@ def _quoted(text: str) -> list[str]:
 
 def _closest(word: str, known: Iterable[str]) -> str:
     match = difflib.get_close_matches(word, list(known), n=1)
-    return f" (did you mean {match[0]}?)" if match else ""
+    return f" (did you mean {_REPEATED.get(match[0], match[0])}?)" if match else ""
 
 
 def _locate(loc: tuple[int | str, ...], plain: Any) -> tuple[str, tuple[str, ...]]:

@@ -4,66 +4,42 @@ The unit of every number stands in its key. A check that fails raises ValueError
 :mod:`mcsim.config.messages` makes the sentence of it.
 """
 
-from collections.abc import Sequence
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    model_validator,
+)
 from pydantic.dataclasses import dataclass
+from pydantic_core import core_schema
+
+from mcsim.config import arrays
+from mcsim.config.values import (
+    NSIDE_MAX,
+    BeamOrder,
+    Degree,
+    Frame,
+    Fwhm,
+    Label,
+    PathText,
+    different,
+    power_of_two,
+    unique,
+)
 
 _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, validate_by_name=True, validate_by_alias=True)
-
-NSIDE_MAX = 8192
-LMAX_MAX = 32768
-
-
-def _power_of_two(value: int) -> int:
-    if value < 1 or value & (value - 1):
-        above = 1 << max(value, 1).bit_length()
-        raise ValueError(f"is not a power of two; use {max(above // 2, 1)} or {above}")
-    return value
-
-
-def _label(value: str) -> str:
-    """Names of channels and splits become parts of file names and of the labels ``channel:split,channel:split``."""
-    if not value.strip() or value != value.strip() or any(c in "/\\:,{}" or not c.isprintable() for c in value):
-        raise ValueError(
-            "is not a usable name: it needs printable characters, no blanks at its ends and none of / \\ : , { }; "
-            "rename it"
-        )
-    return value
-
-
-def _different(values: Sequence[str]) -> None:
-    twice = [value for value in values if values.count(value) > 1]
-    if twice:
-        raise ValueError(f"names {twice[0]!r} twice; give every one its own name")
-
-
-def _unique(values: tuple[str, ...]) -> tuple[str, ...]:
-    _different(values)
-    return values
-
-
-def _not_empty(value: str) -> str:
-    if not value.strip():
-        raise ValueError("is empty; give a name or a path")
-    return value
-
-
-Label = Annotated[str, AfterValidator(_label)]
-PathText = Annotated[str, AfterValidator(_not_empty)]
-Degree = Annotated[int, Field(ge=2, le=LMAX_MAX)]
-BeamOrder = Annotated[int, Field(ge=0, le=LMAX_MAX)] | None
-Fwhm = Annotated[float, Field(gt=0.0, le=10800.0)]
-Frame = Literal["ecliptic", "galactic", "equatorial"]
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Sky:
     """Isotropic Gaussian skies from ``spectrum``, or skies given as a_lm or map files (a template: {realization}).
 
-    ``dipole_uk`` (towards galactic ``dipole_lon_deg``, ``dipole_lat_deg``) is seen by the survey and taken off as
-    believed, so that it shows only through effects; left out, it is what the description of the scan says, or none.
+    ``dipole_uk`` (towards galactic ``dipole_lon_deg``, ``dipole_lat_deg``) is seen by the survey and taken off with
+    the fiducial beam and gain, so that it shows only through effects; left out, it is what the description of the scan
+    says, or none.
     """
 
     lmax: Degree
@@ -96,13 +72,13 @@ class Map:
     of its soft edge.
     """
 
-    nside: Annotated[int, Field(ge=1, le=NSIDE_MAX), AfterValidator(_power_of_two)] | None = None
+    nside: Annotated[int, Field(ge=1, le=NSIDE_MAX), AfterValidator(power_of_two)] | None = None
     grid: Literal["healpix", "gl"] = "healpix"
     frame: Frame = "ecliptic"
     mask: PathText | None = None
     mask_frame: Frame | None = None
     mask_apodisation_deg: Annotated[float, Field(ge=0.0, le=90.0)] = 0.0
-    splits: Annotated[tuple[Label, ...], AfterValidator(_unique)] = ()
+    splits: Annotated[tuple[Label, ...], AfterValidator(unique)] = ()
     pixel_window: PathText | None = None
 
     @property
@@ -243,10 +219,33 @@ class ScanDifferencing:
     max_iterations: Annotated[int, Field(ge=1, le=1_000_000)] = 500
 
 
-Beam = Annotated[BeamGaussian | BeamEllipticalGaussian | BeamMap | BeamBlm, Field(discriminator="kind")]
+class _OrObject:
+    """Lets an object stand for a table in Python; JSON has none, and its errors stay those of the table."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        table = handler(source)
+        return core_schema.json_or_python_schema(
+            table, core_schema.no_info_before_validator_function(self._table, table)
+        )
+
+    @staticmethod
+    def _table(value: Any) -> Any:
+        if not isinstance(value, arrays.Tabled):
+            return value
+        table = arrays.table_of(value)
+        kinds = {"blm": BeamBlm, "moments": ScanMoments, "hit_averaged": ScanHitAveraged}
+        return kinds[table.pop("kind")](**table)
+
+
+Beam = Annotated[
+    BeamGaussian | BeamEllipticalGaussian | BeamMap | BeamBlm,
+    Field(discriminator="kind"),
+    _OrObject(),
+]
 Scan = Annotated[
     ScanParallelTransport | ScanHitAveraged | ScanMoments | ScanPointing | ScanDifferencing,
     Field(discriminator="kind"),
+    _OrObject(),
 ]
 
 
@@ -295,7 +294,7 @@ class Biposh:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Ensemble:
-    """Realizations 0 .. realizations - 1 of the seed; ``paired`` adds the circular twin of every one."""
+    """Realizations 0 .. realizations - 1 of the seed; ``paired`` adds the circular-beam control of every one."""
 
     realizations: Annotated[int, Field(ge=1, le=10_000_000)] = 100
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0
@@ -308,7 +307,7 @@ class Compute:
     """How it is computed: no result depends on it. ``chunk``: realizations of a task, by default chosen by mcsim."""
 
     workers: Annotated[int, Field(ge=1, le=100_000)] = 2
-    chunk: Annotated[int, Field(ge=1, le=2**20), AfterValidator(_power_of_two)] | None = None
+    chunk: Annotated[int, Field(ge=1, le=2**20), AfterValidator(power_of_two)] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -322,7 +321,33 @@ class Effect:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class RunConfig:
-    """A whole run. In TOML ``schema_version`` is ``schema`` and ``channels`` are the tables ``[[channel]]``."""
+    """A whole run, as :func:`mcsim.load_config` reads it; frozen, ``dataclasses.replace`` makes another one.
+
+    Parameters
+    ----------
+    schema_version
+        1; in TOML ``schema``.
+    name
+        Of the run, and of its store.
+    sky, map
+        The skies, and the pixels and frame of the maps.
+    channels
+        Beams under scans; in TOML the tables ``[[channel]]``.
+    effects
+        Changes of the simulation, such as :func:`mcsim.effects` lists; in TOML the tables ``[[effect]]``.
+    biposh, ensemble, compute
+        What is estimated, how many realizations of which seed, and how they are computed.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> import mcsim
+    >>> run = mcsim.load_config("tiny")
+    >>> isinstance(run, mcsim.RunConfig), run.sky.lmax
+    (True, 48)
+    >>> replace(run, ensemble=replace(run.ensemble, realizations=200)).ensemble.realizations
+    200
+    """
 
     schema_version: Annotated[int, Field(alias="schema", ge=1, le=1)] = 1
     name: Label
@@ -351,7 +376,7 @@ class RunConfig:
         if self.biposh.L_max > lmax:
             raise ValueError(f"biposh.L_max = {self.biposh.L_max} is above the lmax of the analysis, {lmax}; lower it")
         try:
-            _different([channel.name for channel in self.channels])
+            different([channel.name for channel in self.channels])
         except ValueError as error:
             raise ValueError(f"channel {error}") from None
         names = [channel.name for channel in self.channels]

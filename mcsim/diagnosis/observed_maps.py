@@ -17,7 +17,7 @@ from mcsim.diagnosis.responses import Responses
 from mcsim.diagnosis.selection import Attribution
 from mcsim.diagnosis.wiener_filter import Model, shared_sky
 from mcsim.errors import InputError
-from mcsim.sphere import healpix
+from mcsim.sphere import header, healpix
 from mcsim.stats.look_elsewhere import global_test
 
 Map = NDArray[np.float64]
@@ -173,7 +173,9 @@ def _read(model: Model, part: int, path: Path) -> Map:
     expected = model.survey.config.map.frame
     if frame not in (None, expected):
         raise InputError(f"{path} is in {frame} coordinates, the model in {expected}; rotate the map.")
-    return _checked(model, part, np.where(map_ == healpy.UNSEEN, map_, healpix.to_uk(unit, path) * map_), str(path))
+    frequency = model.survey.channels[model.parts[part].channel].site.frequency_ghz
+    factor = header.to_uk(unit, path, frequency)
+    return _checked(model, part, np.where(map_ == healpy.UNSEEN, map_, factor * map_), str(path))
 
 
 def _checked(model: Model, part: int, map_: Map, name: str) -> Map:

@@ -16,7 +16,6 @@ from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere import healpix, rng
 from mcsim.sphere.sky import gaussian_alm
-from mcsim.support import resources
 
 
 def bench(nside: int = 512, lmax: int = 1024, repeats: int = 5) -> Iterator[str]:
@@ -29,6 +28,7 @@ def bench(nside: int = 512, lmax: int = 1024, repeats: int = 5) -> Iterator[str]
     repeats
         Pairs of timings, of the bare transforms and of the realization in turn; medians of their ratios are given.
     """
+    _run(nside, lmax, 0.0, 1)  # refuses sizes that do not fit
     yield f"nside {nside}, lmax {lmax}, m_max 2, L_max 2, paired; one thread; medians of {repeats} interleaved pairs"
     yield from _realization(nside, lmax, repeats)
     yield from _workers(nside, lmax, 16 * repeats)
@@ -84,11 +84,11 @@ def _workers(nside: int, lmax: int, realizations: int) -> Iterator[str]:
 
 
 def _moments(nside: int) -> str:
-    model = scan.load_model(resources.scan_model("wmap"))
+    model = scan.ScanModel.load("wmap")
     threads = min(2, os.cpu_count() or 1)
     part = (0.0, 0.05)
-    scan.stream_moments(model, nside, 2, time_range=(0.0, 1e-5), nthreads=threads)
-    seconds = _seconds(scan.stream_moments, model, nside, 2, time_range=part, nthreads=threads)
+    scan.Moments.from_model(model, nside, 2, time_range=(0.0, 1e-5), nthreads=threads)
+    seconds = _seconds(scan.Moments.from_model, model, nside, 2, time_range=part, nthreads=threads)
     samples = part[1] * sum(model.samples(line) for line in model.select(None))
     return f"  orientation moments, s <= 2: {samples / seconds / 1e6:.1f} million samples/s on {threads} threads"
 

@@ -1,5 +1,6 @@
 """The shape of an ensemble store: dimensions, variables, how many realizations a chunk holds, and what that takes."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -22,6 +23,8 @@ class Layout:
     lmax: int
     paired: bool
     kept_npix: int | None
+    kept_name: str = "observed_map"
+    frame: str = ""
 
     def variables(self) -> dict[str, tuple[tuple[str, ...], str, str, str]]:
         """Dimensions, type, unit and long name of every array over realizations."""
@@ -37,10 +40,15 @@ class Layout:
         found = dict(spectra)
         if self.paired:
             for name, (dims, dtype, unit, text) in spectra.items():
-                found[f"{name}_circular"] = (dims, dtype, unit, f"{text} of the circular twin")
+                found[f"{name}_circular"] = (dims, dtype, unit, f"{text} of the circular-beam control")
         if self.kept_npix is not None:
-            found["map"] = (("map_name", "pixel"), "float32", "uK", "simulated map, HEALPix RING")
+            found[self.kept_name] = (("map_name", "pixel"), "float32", "uK", "simulated map, HEALPix RING")
         return found
+
+    def kept_attributes(self) -> dict[str, str | int | float]:
+        """What a kept map says of itself beside unit and long name."""
+        nside = math.isqrt((self.kept_npix or 0) // 12)
+        return {"nside": nside, "frame": self.frame, "ordering": "RING", "unseen": -1.6375e30}
 
     def sizes(self) -> dict[str, int]:
         """Length of every dimension."""

@@ -11,11 +11,12 @@ import numpy as np
 
 from mcsim import config
 from mcsim.bipolar import Mode, estimate, estimator, modes
-from mcsim.ensemble import store, summary
+from mcsim.bipolar.dataset import CONVENTION, NORMALISATION
+from mcsim.ensemble import opening, store, summary
 from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError
 from mcsim.simulation import differencing
-from mcsim.simulation.channels import load_beam
+from mcsim.simulation.channels import check_effects, load_beam
 from mcsim.simulation.survey import Survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rng, spectra
@@ -29,8 +30,8 @@ CONVENTIONS = {
     "alm": "healpy m-major order, analysis divided by the pixel window",
     "psi": "rotation of the beam about its axis, from e_theta (south) towards e_phi (east)",
     "beam": "b_lm of the beam at the pole, b_l0 = sqrt((2l+1)/4pi) B_l, B_0 = 1; x axis = spin axis x boresight",
-    "biposh": "A^{LM}_{l1 l2} = sum a_{l1 m1} conj(a_{l2 m2}) (-1)^{m2} C^{LM}_{l1 m1 l2 -m2}, ell = l2, d = l2 - l1",
-    "normalisation": "Hajian-Souradeep",
+    "biposh": CONVENTION,
+    "normalisation": NORMALISATION,
     "weights": "maps times weights of unit mean square, spectra over the mean product of the two weights",
 }
 _PACKAGES = ("mcsim", "numpy", "healpy", "ducc0", "numba", "scipy", "dask", "distributed", "zarr", "xarray")
@@ -85,6 +86,7 @@ def layout(survey: Survey) -> Layout:
         survey.lmax,
         run.ensemble.paired,
         12 * run.map.resolution**2 if run.ensemble.keep_maps else None,
+        frame=run.map.frame,
     )
     return _chunked(bare, run.compute.chunk)
 
@@ -152,7 +154,7 @@ def check_mergeable(path: Path, first: Mapping[str, Any], other: Path, second: M
 
 def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """What keeps two stores' attributes from describing rows of one ensemble: science, kept maps, mcsim itself."""
-    changes = config.differences(old["science"], new["science"])
+    changes = [change for change in config.differences(old["science"], new["science"]) if not _of_summary(change)]
     for key, before, after in (
         ("ensemble.keep_maps", *(a["configuration"]["ensemble"]["keep_maps"] for a in (old, new))),
         ("version of mcsim", *(a["packages"]["mcsim"] for a in (old, new))),
@@ -162,9 +164,14 @@ def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     return changes
 
 
+def _of_summary(change: str) -> bool:
+    """Whether a difference is of the summary alone; earlier versions took its bins for a part of the science."""
+    return change.startswith("biposh.summary_bin: ")
+
+
 def stored(path: Path, realizations: int) -> tuple[Layout, summary.Recipe]:
     """Layout and recipe of an existing store, for a store of as many realizations with the same contents."""
-    with store.open_ensemble(path) as found:
+    with opening.open_ensemble(path) as found:
         attrs = found.attrs["configuration"]
         pairs = tuple(str(pair) for pair in found["pair"].values)
         kept = found.sizes.get("pixel")
@@ -173,13 +180,16 @@ def stored(path: Path, realizations: int) -> tuple[Layout, summary.Recipe]:
         stored_modes = tuple(
             Mode(int(L), int(M), int(d)) for L, M, d in zip(found["L"], found["M"], found["d"], strict=True)
         )
-    layout = Layout(realizations, store.chunk(path), maps, pairs, stored_modes, lmax, paired, kept)
+    layout = Layout(
+        realizations, store.chunk(path), maps, pairs, stored_modes, lmax, paired, kept, frame=attrs["map"]["frame"]
+    )
     return layout, summary.Recipe(pairs, stored_modes, lmax, attrs["biposh"]["summary_bin"], paired)
 
 
 def describe(source: str | Path, part: slice | None = None, workers: int | None = None) -> str:
     """What a run will take, in words: realizations, tasks, memory, disk, files and time."""
     run = config.load(source)
+    check_effects(run)
     planned = cost(run, wanted(run, part))
     count = workers or run.compute.workers
     hours = planned.realizations * planned.seconds_per_realization / 3600.0

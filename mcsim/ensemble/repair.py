@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import re
+import shutil
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -105,7 +107,7 @@ def mend(path: Path, layout: Layout, attributes: Mapping[str, Any], quiet: bool 
     ``layout`` and ``attributes`` are what the store's configuration gives: what is broken beside the realizations is
     made from them.
     """
-    store.sweep(path)
+    _sweep(path)
     broken = broken_parts(path)
     if broken:
         store.restore(path, layout, {name: attributes[name] for name in ("science", "digest")})
@@ -113,6 +115,18 @@ def mend(path: Path, layout: Layout, attributes: Mapping[str, Any], quiet: bool 
     for damage in verdict.damages:
         store.discard(path, damage)
     return Verdict(path, verdict.finished, verdict.size, verdict.damages, broken | verdict.broken)
+
+
+def _sweep(path: Path) -> None:
+    """Remove what writers that were killed left: halves of files, and folders that never got their name."""
+    for left in path.rglob("*.partial"):
+        left.unlink(missing_ok=True)
+    scratch = re.compile(rf"\.{re.escape(path.name)}\.[a-z0-9_]{{8}}")  # as tempfile names them
+    for left in [entry for entry in path.absolute().parent.iterdir() if scratch.fullmatch(entry.name)]:
+        if left.is_dir():
+            shutil.rmtree(left, ignore_errors=True)
+        else:
+            left.unlink(missing_ok=True)
 
 
 def broken_parts(path: Path) -> dict[str, str]:

@@ -5,7 +5,6 @@ chunks, ``done`` last. Nothing but ``done`` says that a realization exists.
 """
 
 import os
-import re
 import shutil
 import tempfile
 import warnings
@@ -27,6 +26,9 @@ from mcsim.errors import InputError, RunError
 _CODECS: dict[str, Any] = {"compressors": (ZstdCodec(level=1, checksum=True),)}
 # Written even where all is the fill value, so that an array without its file is known as damaged.
 _WHOLE: dict[str, Any] = {"config": {"write_empty_chunks": True}, **_CODECS}
+MAP, FORMER_MAP = "observed_map", "map"
+"""Name of kept maps, and that in stores made before it, which keep it; xarray has a method of the former name."""
+
 _FAULTS = (OSError, KeyError, ValueError, RuntimeError, TypeError)
 
 
@@ -76,10 +78,22 @@ def create(path: Path, layout: Layout, attributes: Mapping[str, Any]) -> None:
             group.attrs.update({**attributes, "coordinates": "L M d parity"})
             _write_coordinates(group, layout)
             sizes = layout.sizes()
-            for name, (dims, dtype, unit, text) in layout.variables().items():
+            whole = {**layout.variables(), "done": ((), "bool", "1", "finished")}
+            for name, (dims, dtype, unit, text) in whole.items():
                 shape = tuple(sizes[dim] for dim in ("realization", *dims))
-                _array(group, name, shape, (layout.chunk, *shape[1:]), dtype, ("realization", *dims), unit, text)
-            _array(group, "done", (layout.realizations,), (layout.chunk,), "bool", ("realization",), "1", "finished")
+                fill: Any = {"bool": False, "complex128": complex(np.nan, np.nan)}.get(dtype, np.nan)
+                array = group.create_array(
+                    name,
+                    shape=shape,
+                    chunks=(layout.chunk, *shape[1:]),
+                    dtype=dtype,
+                    fill_value=fill,
+                    dimension_names=("realization", *dims),
+                    **_CODECS,
+                )
+                array.attrs.update({"units": unit, "long_name": text})
+            if layout.kept_npix is not None:
+                group[layout.kept_name].attrs.update(layout.kept_attributes())
             _consolidate(scratch / "new")
             os.replace(scratch / "new", path)
     finally:
@@ -96,11 +110,11 @@ def write(path: Path, first: int, values: Mapping[str, NDArray], done: NDArray[n
     RunError
         If the store cannot be written.
     """
-    with _faults_named(path):
+    with faults_named(path):
         group = _open(path, "r+")
         stop = first + len(done)
         for name, rows in values.items():
-            _member(group, name)[first:stop] = rows
+            _member(group, FORMER_MAP if name == MAP and name not in group else name)[first:stop] = rows
         _member(group, "done")[first:stop] = done
 
 
@@ -112,11 +126,11 @@ def read(path: Path, start: int, stop: int, maps: bool = False) -> dict[str, NDA
     RunError
         If an array is missing or damaged.
     """
-    with _faults_named(path):
+    with faults_named(path):
         group = _open(path)
-        left_out = {"realization"} if maps else {"realization", "map"}
+        left_out = {"realization"} if maps else {"realization", MAP, FORMER_MAP}
         found = {name: array for name, array in group.arrays() if name not in left_out and _over_realizations(array)}
-        rows = {name: np.asarray(array[start:stop]) for name, array in found.items()}
+        rows = {MAP if name == FORMER_MAP else name: np.asarray(array[start:stop]) for name, array in found.items()}
     absent = _absent(rows)
     if absent.any():
         raise RunError(
@@ -128,7 +142,7 @@ def read(path: Path, start: int, stop: int, maps: bool = False) -> dict[str, NDA
 
 def examine(path: Path, start: int, leave_out: Collection[str] = ()) -> Damage | None:
     """Read every file of one chunk of realizations, against its checksum; None if it is whole."""
-    with _faults_named(path):
+    with faults_named(path):
         group = _open(path)
         last = _member(group, "done")
         stop = min(start + last.chunks[0], last.shape[0])
@@ -148,7 +162,7 @@ def examine(path: Path, start: int, leave_out: Collection[str] = ()) -> Damage |
 
 def discard(path: Path, damage: Damage) -> None:
     """Forget a damaged chunk: its ``done`` first, so that a call that was cut short leaves nothing that looks whole."""
-    with _faults_named(path):
+    with faults_named(path):
         group = _open(path)
         for name in ("done", *(name for name in variables(path) if name not in ("realization", "done"))):
             array = _member(group, name)
@@ -158,7 +172,7 @@ def discard(path: Path, damage: Damage) -> None:
 
 def broken_parts(path: Path) -> dict[str, str]:
     """What is wrong beside the realizations, by name: metadata, coordinates, summary. Empty if nothing is."""
-    with _faults_named(path):
+    with faults_named(path):
         group, remembered = _open(path), _remembered(path)
     broken = {}
     for name, metadata in remembered.items():
@@ -178,10 +192,11 @@ def broken_parts(path: Path) -> dict[str, str]:
 
 def restore(path: Path, layout: Layout, update: Mapping[str, Any]) -> None:
     """Write metadata and coordinates anew, as those of a new store of this layout; drop the summary."""
-    with _faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
+    with faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
         shutil.rmtree(path / "summary", ignore_errors=True)
         made = _remembered(path)["done"]
-        layout = replace(layout, realizations=made.shape[0], chunk=made.chunk_grid.chunk_shape[0])
+        kept = FORMER_MAP if FORMER_MAP in _remembered(path) else MAP
+        layout = replace(layout, realizations=made.shape[0], chunk=made.chunk_grid.chunk_shape[0], kept_name=kept)
         fresh = Path(scratch) / "fresh"
         create(fresh, layout, {**attributes(path), **update})
         for file in sorted(fresh.rglob("*")):
@@ -191,33 +206,21 @@ def restore(path: Path, layout: Layout, update: Mapping[str, Any]) -> None:
                 os.replace(file, target)
 
 
-def sweep(path: Path) -> None:
-    """Remove what writers that were killed left: halves of files, and folders that never got their name."""
-    for left in path.rglob("*.partial"):
-        left.unlink(missing_ok=True)
-    scratch = re.compile(rf"\.{re.escape(path.name)}\.[a-z0-9_]{{8}}")  # as tempfile names them
-    for left in [entry for entry in path.absolute().parent.iterdir() if scratch.fullmatch(entry.name)]:
-        if left.is_dir():
-            shutil.rmtree(left, ignore_errors=True)
-        else:
-            left.unlink(missing_ok=True)
-
-
 def variables(path: Path) -> list[str]:
     """Names of the arrays over realizations that the store was made with, whether their files exist or not."""
-    with _faults_named(path):
+    with faults_named(path):
         return [name for name, metadata in _remembered(path).items() if _over_realizations(metadata)]
 
 
 def done(path: Path, start: int = 0, stop: int | None = None) -> NDArray[np.bool_]:
     """Which realizations from ``start`` to ``stop`` are finished; by default all."""
-    with _faults_named(path):
+    with faults_named(path):
         return np.asarray(_member(_open(path), "done")[start:stop])
 
 
 def size(path: Path) -> int:
     """Number of realizations that a store has room for."""
-    with _faults_named(path):
+    with faults_named(path):
         return int(_member(_open(path), "done").shape[0])
 
 
@@ -240,7 +243,7 @@ def attributes(path: Path) -> dict[str, Any]:
 
 def chunk(path: Path) -> int:
     """Realizations that one task owns."""
-    with _faults_named(path):
+    with faults_named(path):
         return int(_member(_open(path), "done").chunks[0])
 
 
@@ -263,7 +266,7 @@ def extend(path: Path, realizations: int, update: Mapping[str, Any]) -> None:
 
 def write_summary(path: Path, summary: xr.Dataset) -> None:
     """Put the summary group in place of the former one."""
-    with _faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
+    with faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", category=UserWarning)
             summary.to_zarr(
@@ -278,49 +281,21 @@ def write_summary(path: Path, summary: xr.Dataset) -> None:
         _consolidate(path)
 
 
-def summarised(path: Path) -> int:
-    """Number of realizations that the summary speaks of; 0 without one."""
+def amend(path: Path, update: Mapping[str, Any]) -> None:
+    """Change attributes of a store."""
+    with faults_named(path):
+        _open(path, "r+").attrs.update(update)
+        _consolidate(path)
+
+
+def summarised(path: Path) -> tuple[int, list[int]]:
+    """Number of realizations that the summary speaks of, 0 without one, and the first ell of each of its bins."""
     if not (path / "summary").is_dir():
-        return 0
-    with _faults_named(path):
-        return int(np.asarray(_member(_open(path / "summary"), "count")[()]))
-
-
-def open_ensemble(path: str | Path) -> xr.Dataset:
-    """Open the realizations of a store lazily.
-
-    Returns
-    -------
-    xarray.Dataset
-        ``biposh``, ``cl``, their circular twins, ``done``; coordinates realization, pair, mode (with L, M, d, parity),
-        ell.
-        ``.sel(mode="L2M0d0")`` picks a spectrum.
-
-    Raises
-    ------
-    InputError
-        If there is no store at ``path``.
-    """
-    attributes(Path(path))
-    with _faults_named(Path(path)):
-        return xr.open_zarr(path)
-
-
-def open_summary(path: str | Path) -> xr.Dataset:
-    """Open the summary of a store: means, standard errors, standard deviations, binned spectra and covariances.
-
-    Raises
-    ------
-    InputError
-        If there is no store at ``path``, or it has no summary yet.
-    """
-    attributes(Path(path))
-    if not (Path(path) / "summary").is_dir():
-        raise InputError(
-            f"{path} has no summary, because no run on it has ended yet; continue it with mcsim run --resume."
-        )
-    with _faults_named(Path(path)):
-        return xr.open_zarr(path, group="summary")
+        return 0, []
+    with faults_named(path):
+        group = _open(path / "summary")
+        count, first = (np.asarray(_member(group, name)[...]) for name in ("count", "bin_first"))
+        return int(count), first.tolist()
 
 
 def _write_coordinates(group: zarr.Group, layout: Layout) -> None:
@@ -333,22 +308,6 @@ def _write_coordinates(group: zarr.Group, layout: Layout) -> None:
     _labels(group, "parity", [mode.parity for mode in layout.modes], "parity of l1 + l2 + L", "mode")
     if layout.kept_npix is not None:
         _labels(group, "map_name", layout.maps, "map")
-
-
-def _array(  # type: ignore[no-untyped-def]
-    group: zarr.Group, name: str, shape, chunks, dtype: str, dims: tuple[str, ...], unit: str, text: str
-) -> None:
-    fill: Any = {"bool": False, "complex128": complex(np.nan, np.nan)}.get(dtype, np.nan)
-    array = group.create_array(
-        name,
-        shape=shape,
-        chunks=chunks,
-        dtype=dtype,
-        fill_value=fill,
-        dimension_names=dims,
-        **_CODECS,
-    )
-    array.attrs.update({"units": unit, "long_name": text})
 
 
 def _open(path: Path, mode: Literal["r", "r+"] = "r") -> zarr.Group:
@@ -416,7 +375,7 @@ def _consolidate(path: Path) -> None:
 
 
 @contextmanager
-def _faults_named(path: Path) -> Iterator[None]:
+def faults_named(path: Path) -> Iterator[None]:
     """Turn what a damaged or vanished store, or a full disk, makes of zarr's calls into one sentence."""
     try:
         yield

@@ -85,11 +85,11 @@ def reduce_rows(recipe: Recipe, rows: Mapping[str, NDArray], first: int) -> Sums
 
 _MEANING = {
     "biposh": "BipoSH coefficients",
-    "biposh_circular": "BipoSH coefficients of the circular twin",
-    "biposh_difference": "BipoSH coefficients, non-circular minus circular twin",
+    "biposh_circular": "BipoSH coefficients of the circular-beam control",
+    "biposh_difference": "BipoSH coefficients, non-circular minus circular-beam control",
     "cl": "power spectrum",
-    "cl_circular": "power spectrum of the circular twin",
-    "cl_difference": "power spectrum, non-circular minus circular twin",
+    "cl_circular": "power spectrum of the circular-beam control",
+    "cl_difference": "power spectrum, non-circular minus circular-beam control",
 }
 
 

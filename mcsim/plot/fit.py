@@ -88,6 +88,6 @@ def _words(axes: Axes, fits: Sequence[Fit]) -> None:
         if len(solution.parameters) > 2:
             shown = [f"{len(solution.parameters)} parameters"]
         lines.append(f"{one.model.name}: {', '.join(shown)}")
-        lines.append(rf"   $\chi^2$ = {solution.chi2:.1f}, reduced {solution.reduced_chi2:.2f}")
-        lines.append(f"   probability {solution.probability:.2g}")
+        lines.append(rf"   $\chi^2$/dof = {solution.chi2:.1f}/{solution.dof} = {solution.reduced_chi2:.2f}")
+        lines.append(f"   p = {solution.probability:.2g}")
     axes.text(0.0, 0.95, "\n".join(lines), transform=axes.transAxes, fontsize=8, va="top")

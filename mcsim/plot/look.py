@@ -13,7 +13,6 @@ from mcsim.instrument import beams, scan
 from mcsim.plot.beam import beam_figure
 from mcsim.plot.scan import scan_figure
 from mcsim.simulation import channels
-from mcsim.support import resources
 from mcsim.support.progress import reporting
 
 
@@ -42,17 +41,22 @@ def look_at_beams(
         Side of a pixel of a beam map, degrees; by default its header's.
     """
     path = Path(source)
+    if path.is_dir() or (not path.exists() and path.suffix not in ("", ".toml")):
+        what = "is a folder" if path.is_dir() else "does not exist"
+        raise InputError(f"{path} {what}; give a beam map or b_lm (FITS), or a configuration.")
     if path.suffix == ".toml" or not path.exists():
         run = config.load(source)
+        if pixel_deg is not None:
+            raise InputError(f"{source} is a configuration, which says pixel_deg itself; leave out --pixel-deg.")
         for channel in run.channels:
             spec = channel.beam
             image = channels.load_beam_map(channel.name, spec) if isinstance(spec, config.BeamMap) else None
             yield _look_at(channel.name, channels.load_beam(channel, lmax), image)
     elif beams.holds_image(path):
         image = beams.read_map(path, pixel_deg=pixel_deg)
-        yield _look_at(path.name, image.beam(lmax, m_max), image)
+        yield _look_at(path.name, beams.Beam.from_map(image, lmax, m_max), image)
     else:
-        yield _look_at(path.name, beams.from_blm_file(path, lmax, m_max), None)
+        yield _look_at(path.name, beams.Beam.from_blm(path, lmax, m_max), None)
 
 
 def _look_at(name: str, shown: beams.Beam, image: beams.BeamMap | None) -> Look:
@@ -67,9 +71,10 @@ def look_at_scan(
     frame: str = "ecliptic",
     sample_period_s: float | None = None,
     line_of_sight: str | None = None,
-    quiet: bool = True,
 ) -> Look:
     """Look at a scan model: hits, orientation moments, and the factors by which it weakens a beam's ellipticity.
+
+    Progress is reported on standard error.
 
     Parameters
     ----------
@@ -81,8 +86,6 @@ def look_at_scan(
         Time between samples; by default the model's.
     line_of_sight
         One of the model's; by default its default ones.
-    quiet
-        Report no progress.
 
     Raises
     ------
@@ -91,11 +94,11 @@ def look_at_scan(
     """
     if smax < 2:
         raise InputError(f"smax = {smax} is too small for a look at a scan, which is about w_2; take 2 or more.")
-    loaded = scan.load_model(resources.scan_model(model))
+    loaded = scan.ScanModel.load(model)
     if sample_period_s is not None:
         loaded = loaded.with_sampling(sample_period_s)
     lines = None if line_of_sight is None else [line_of_sight]
-    with reporting("orientation moments", 1.0, "", quiet) as report:
+    with reporting("orientation moments", 1.0, "", quiet=False) as report:
         folder = scan.cached_moments(loaded, nside, smax, frame, lines, nthreads=os.cpu_count() or 1, progress=report)
     moments = scan.Moments.load(folder)
     alone = loaded if frame == "ecliptic" and lines is None and len(loaded.default_lines) == 1 else None

@@ -1,4 +1,4 @@
-"""The paper's scan figure: orientation of the beam and <cos 2 rho> over the sky, with hits and w_2 by latitude."""
+"""The paper's scan figure: orientation of the beam and <cos 2 psi> over the sky, with hits and w_2 by latitude."""
 
 from typing import Any
 
@@ -31,14 +31,14 @@ def scan_figure(moments: Moments, title: str = "", model: ScanModel | None = Non
     Returns
     -------
     Figure
-        Four panels: rho-bar = -arg(w_2) / 2, the mean orientation of the beam's x axis from e_theta towards e_phi,
-        an axis and so known up to 180 degrees; <cos 2 rho> = Re w_2; hits and Re w_2 against latitude.
+        Four panels: psi-bar = -arg(w_2) / 2, the mean orientation of the beam's x axis from e_theta towards e_phi,
+        an axis and so known up to 180 degrees; <cos 2 psi> = Re w_2; hits and Re w_2 against latitude.
 
     Notes
     -----
-    The paper (arXiv:1210.7318, fig. cos2rho) averages the angles rho themselves, which depends on where the circle
-    is cut. The circular mean of e^{i rho}, -arg(w_1), would be +-90 degrees nearly everywhere: the two passes over
-    a pixel see it at rho and 180 deg - rho.
+    The paper (arXiv:1210.7318, fig. cos2rho) averages the angles themselves (rho there), which depends on where the
+    circle is cut. The circular mean of e^{i psi}, -arg(w_1), would be +-90 degrees nearly everywhere: the two passes
+    over a pixel see it at psi and 180 deg - psi.
     """
     if moments.smax < 2:
         raise InputError(f"the moments end at s = {moments.smax}, but the figure needs s = 2; use smax >= 2.")
@@ -47,25 +47,18 @@ def scan_figure(moments: Moments, title: str = "", model: ScanModel | None = Non
     figure = Figure(figsize=(11.0, 7.0), layout="constrained")
     figure.suptitle(title)
     axes = figure.subplots(2, 2, height_ratios=(1.0, 0.8))
-    mean_rho = np.degrees(-0.5 * np.angle(w2))
-    _mollweide(figure, axes[0, 0], mean_rho, moments.nside, "twilight_shifted", (-90.0, 90.0), "degrees, modulo 180")
-    axes[0, 0].set_title(r"mean orientation $\bar\rho = -\frac{1}{2}\,\arg w_2$")
-    _mollweide(figure, axes[0, 1], w2.real, moments.nside, "RdBu", (-1.0, 1.0), "")
-    axes[0, 1].set_title(r"$\langle\cos 2\rho\rangle = \mathrm{Re}\,w_2$")
+    mean_psi = np.degrees(-0.5 * np.angle(w2))
+    _mollweide(axes[0, 0], mean_psi, "twilight_shifted", (-90.0, 90.0), "degrees, modulo 180")
+    axes[0, 0].set_title(r"mean orientation $\bar\psi = -\frac{1}{2}\,\arg w_2$")
+    _mollweide(axes[0, 1], w2.real, "RdBu", (-1.0, 1.0), "")
+    axes[0, 1].set_title(r"$\langle\cos 2\psi\rangle = \mathrm{Re}\,w_2$")
     _against_latitude(axes[1, 0], axes[1, 1], moments, model)
     return figure
 
 
-def _mollweide(
-    figure: Figure,
-    axes: Axes,
-    values: NDArray[np.float64],
-    nside: int,
-    colours: str,
-    limits: tuple[float, float],
-    unit: str,
-) -> None:
+def _mollweide(axes: Axes, values: NDArray[np.float64], colours: str, limits: tuple[float, float], unit: str) -> None:
     """Draw a RING map in Mollweide projection, longitude 0 in the middle and growing to the left."""
+    nside = healpy.npix2nside(values.size)
     projector: Any = healpy.projector.MollweideProj(xsize=1200)
     image = projector.projmap(values, lambda x, y, z: healpy.vec2pix(nside, x, y, z))
     image = np.ma.masked_invalid(np.where(np.isneginf(image), np.nan, image))
@@ -73,7 +66,7 @@ def _mollweide(
         image, origin="lower", extent=projector.get_extent(), cmap=colours, vmin=limits[0], vmax=limits[1]
     )
     axes.set_axis_off()
-    figure.colorbar(shown, ax=axes, orientation="horizontal", shrink=0.6, pad=0.02, label=unit)
+    axes.figure.colorbar(shown, ax=axes, orientation="horizontal", shrink=0.6, pad=0.02, label=unit)
 
 
 def _against_latitude(hits_axes: Axes, w_axes: Axes, moments: Moments, model: ScanModel | None) -> None:

@@ -7,7 +7,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mcsim.ensemble import store
+from mcsim.ensemble import opening
 from mcsim.errors import InputError
 
 _COLOURS = ("#1f5fa8", "#c44e22", "#3c8c3c", "#7b4fa3", "#8c6d1f", "#1f8f94")
@@ -39,7 +39,7 @@ def ensemble_figure(
     InputError
         If nothing of the store fits the choice, or the prediction lacks the pair or a mode.
     """
-    with store.open_summary(path) as summary:
+    with opening.open_summary(path) as summary:
         pairs = [str(label) for label in summary["pair"].values]
         label = pairs[0] if pair is None else pair
         if label not in pairs:
@@ -68,7 +68,8 @@ def _matching(prediction: xr.Dataset, pair: str, modes: xr.Dataset) -> xr.Datase
         return prediction.sel(pair=pair, mode=modes["mode"].values)
     except KeyError as error:
         raise InputError(
-            f"The prediction has no {error.args[0]}, which the ensemble has; predict from the ensemble's configuration."
+            f"The prediction lacks the pair {pair} or one of its modes ({error.args[0]}); predict from the "
+            "configuration of the ensemble."
         ) from None
 
 
@@ -90,12 +91,13 @@ def _draw(modes: xr.Dataset, panels: list[tuple[int, int]], title: str, expected
         axes.set_xlabel(r"multipole $\ell = l_2$")
         axes.set_ylabel(rf"$\ell(\ell+1)\hat{{A}}^{{{L}{M}}}/2\pi$  [$\mu$K$^2$]")
         axes.legend(fontsize=8, frameon=False)
-    notes = [r"$\hat{A}$: Bennett normalisation (odd parity: see bin_factor)"]
+    notes = [r"$\hat{A}$: Bennett normalisation (odd parity: Hajian-Souradeep, rescaled alike)"]
     if paired:
-        notes += ["points: non-circular minus circular twin", "band (M = 0): plain mean and its standard error"]
+        notes += ["points: non-circular minus circular-beam control", "band (M = 0): plain mean and its standard error"]
     if expected is not None:
         notes.append(f"dashed: prediction, {expected.attrs['prediction']}")
-    figure.supxlabel(";  ".join(notes), fontsize=9)
+    # On a narrow figure a line for each; one line would be cut at both sides.
+    figure.supxlabel((";  " if figure.get_figwidth() > 10.0 else "\n").join(notes), fontsize=9)
     return figure
 
 

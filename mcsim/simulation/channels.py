@@ -11,6 +11,7 @@ from mcsim import config, systematics
 from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
 from mcsim.instrument.beams.turn import mirrored, rotated
+from mcsim.sphere import alm as alm_
 from mcsim.sphere import rotation
 from mcsim.support import resources
 
@@ -33,15 +34,17 @@ def load_beam_b(channel: config.Channel, lmax: int) -> beams.Beam:
 def _beam(channel: str, spec: config.Beam, lmax: int) -> beams.Beam:
     match spec:
         case config.BeamGaussian():
-            return beams.gaussian(spec.fwhm_arcmin, lmax)
+            return beams.Beam.gaussian(spec.fwhm_arcmin, lmax)
         case config.BeamEllipticalGaussian():
             major, minor = spec.fwhm_major_arcmin, spec.fwhm_minor_arcmin
-            return beams.elliptical_gaussian(major, minor, spec.angle_deg, lmax, mmax=spec.m_max)
+            return beams.Beam.elliptical(major, minor, spec.angle_deg, lmax, mmax=spec.m_max)
         case config.BeamMap():
-            return rotated(load_beam_map(channel, spec).beam(lmax, spec.m_max), np.deg2rad(spec.angle_deg))
+            return rotated(
+                beams.Beam.from_map(load_beam_map(channel, spec), lmax, spec.m_max), np.deg2rad(spec.angle_deg)
+            )
         case config.BeamBlm():
             file = config.channel_path(spec.path, channel)
-            return rotated(beams.from_blm_file(file, lmax, mmax=spec.m_max), np.deg2rad(spec.angle_deg))
+            return rotated(beams.Beam.from_blm(file, lmax, mmax=spec.m_max), np.deg2rad(spec.angle_deg))
 
 
 def load_beam_map(channel: str, spec: config.BeamMap) -> beams.BeamMap:
@@ -61,7 +64,7 @@ def scan_model(
 ) -> scan.ScanModel:
     """The scan model of a channel, at the sampling that the channel asks for."""
     template = config.channel_path(chosen.model, spec.name, split)
-    model = scan.load_model(resources.scan_model(str(template)))
+    model = scan.ScanModel.load(str(template))
     return model if chosen.sample_period_s is None else model.with_sampling(chosen.sample_period_s)
 
 
@@ -86,6 +89,27 @@ def effects_on(
         if entry.channel in (None, channel):
             acting.append(effect)
     return tuple(acting)
+
+
+def check_effects(run: config.RunConfig) -> None:
+    """Refuse a run with an effect that is not known, or cannot act where it is put; no map is made.
+
+    Raises
+    ------
+    InputError
+        As a run of it would.
+    """
+    for spec in run.channels:
+        acting = effects_on(run, spec.name)
+        if not acting:
+            continue
+        if run.map.grid == "gl":
+            refuse_pixel_effects(spec.name, acting)
+        site = site_of(run, spec)
+        systematics.seen_through(acting, site)
+        systematics.looked_at(acting, np.zeros(alm_.size(site.lmax), complex), site, run.ensemble.seed, 0)
+        for effect in acting:
+            effect.gain(np.zeros(1), site)
 
 
 def refuse_pixel_effects(channel: str, acting: tuple[systematics.Effect, ...]) -> None:

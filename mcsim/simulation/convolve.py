@@ -18,6 +18,7 @@ from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
+from mcsim.sphere.checks import check_alm, check_cl, check_nside, check_shape
 
 
 @dataclass(frozen=True)
@@ -38,9 +39,18 @@ class Response:
 
 
 def response(beam: Beam, lmax: int, window: NDArray[np.float64] | None = None) -> Response:
-    """Response of a beam known up to at least ``lmax``, times a pixel window of shape (>= lmax + 1,)."""
+    """Response of a beam known up to at least ``lmax``, times a pixel window of shape (>= lmax + 1,).
+
+    Raises
+    ------
+    InputError
+        If beam or window end below ``lmax``.
+    """
+    if beam.lmax < lmax:
+        raise InputError(f"the beam ends at l = {beam.lmax}, below the lmax {lmax} of the sky; compute it further.")
     k = np.sqrt(4.0 * np.pi / (2.0 * np.arange(lmax + 1) + 1.0))
     if window is not None:
+        check_cl(window, lmax, "the pixel window")
         k = k * window[: lmax + 1]
     return Response(k * beam.blm[:, : lmax + 1])
 
@@ -99,6 +109,8 @@ def spin_maps(
     ducc0 returns -S_s from E = Re(k b_s) a, B = Im(k b_s) a. The test against ``ducc0.totalconvolve`` holds the sign
     (``tests/unit/test_convolve.py``).
     """
+    check_nside(nside)
+    check_alm(alm, response.lmax, "the sky")
     maps = {}
     for s in range(1, response.mmax + 1):
         factor = -response.factors[s]
@@ -112,13 +124,21 @@ def spin_maps(
 
 
 def noncircular_map(maps: dict[int, NDArray[np.float64]], moments: Moments) -> healpix.Map:
-    """2 Re sum_{s > 0} w_s S_s: what the non-circular part of the beam adds under a scan, uK, shape (npix,)."""
+    """2 Re sum_{s > 0} w_s S_s: what the non-circular part of the beam adds under a scan, uK, shape (npix,).
+
+    Raises
+    ------
+    InputError
+        If the moments have fewer orders than the maps, or another nside.
+    """
     highest = max(maps, default=0)
     if moments.smax < highest:
         raise InputError(
             f"The moments end at s = {moments.smax}, the beam has orders up to {highest}; lower its m_max."
         )
     total = np.zeros(12 * moments.nside**2)
+    for s, pair in maps.items():
+        check_shape(pair, (2, total.size), f"the map S_{s} beside moments of nside {moments.nside}")
     for s, (real, imag) in maps.items():
         _add_twice_real_part(moments.w[s - 1], real, imag, total)
     return total
@@ -133,6 +153,8 @@ def _add_twice_real_part(w, real, imag, total):  # type: ignore[no-untyped-def]
 
 def turned(map_: healpix.Map, moments: Moments, s: int, total: NDArray[np.float64]) -> None:
     """Add conj(w_s) times a map to ``total``, real and imaginary part, shape (2, npix): adjoint to w_s S_s."""
+    check_shape(map_, (moments.npix,), f"the map beside moments of nside {moments.nside}")
+    check_shape(total, (2, moments.npix), f"the sum beside moments of nside {moments.nside}")
     _add_turned(map_, moments.w[s - 1], total)
 
 
@@ -154,6 +176,9 @@ def centroid_map(gradient: NDArray[np.float64], moments: Moments) -> healpix.Map
     moments
         With ``dtheta`` and ``dphi``.
     """
+    if moments.dtheta is None or moments.dphi is None:
+        raise InputError("the moments have no centroids (dtheta, dphi); leave the centroid map out.")
+    check_shape(gradient, (2, moments.npix), f"the gradient beside moments of nside {moments.nside}")
     result = np.empty(gradient.shape[1])
     _along(moments.dtheta, gradient[0], moments.dphi, gradient[1], result)
     return result

@@ -25,6 +25,7 @@ from mcsim.instrument.scan.limit import caustics, limit_moments
 from mcsim.instrument.scan.model import ScanModel
 from mcsim.simulation.convolve import Response
 from mcsim.sphere import alm as alm_
+from mcsim.sphere.checks import check_alm, check_angle
 
 Alm = NDArray[np.complex128]
 Vector = NDArray[np.float64]
@@ -59,6 +60,7 @@ class Rings:
 
 def parallel_transport_rings(psi0: float, orders: Iterable[int], degree: int) -> tuple[Rings, ...]:
     """Rings for w_s = e^{-i s psi0} everywhere; see :func:`limit_rings`."""
+    check_angle(psi0, "psi0")
     moments = {s: np.exp(-1j * s * psi0) for s in orders}
     return _rings(lambda theta: {s: np.full(theta.size, w) for s, w in moments.items()}, np.empty(0), degree)
 
@@ -124,7 +126,17 @@ def noncircular_alm(alm: Alm, response: Response, rings: Iterable[Rings], lmax: 
         Of the beam.
     rings
         For the sum of the two lmax.
+    lmax
+        Of the result, no more than the response's.
+
+    Raises
+    ------
+    InputError
+        If the sky is not of the response's lmax, or ``lmax`` exceeds it.
     """
+    check_alm(alm, response.lmax, "the sky")
+    if lmax > response.lmax:
+        raise InputError(f"lmax = {lmax} is above that of the response, {response.lmax}; lower it.")
     total = np.zeros(alm_.size(lmax), dtype=np.complex128)
     for each in rings:
         if each.s > response.mmax or not response.factors[each.s].any():

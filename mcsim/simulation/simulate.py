@@ -3,24 +3,19 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import reduce
-from pathlib import Path
 
 import healpy
 import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import bipolar, config, systematics
-from mcsim.errors import InputError
-from mcsim.simulation import convolve, differencing, rings
+from mcsim.simulation import convolve, differencing, rings, skies
 from mcsim.simulation.survey import Channel, Survey, SurveyMap
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rng
 from mcsim.sphere.sky import dipole_alm, gaussian_alm
 
 Alm = NDArray[np.complex128]
-
-LARGEST_UK = 1e12
-"""Of a user's sky."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +43,7 @@ def realize(survey: Survey, realization: int, nthreads: int = 1) -> dict[str, ND
     -------
     dict
         ``biposh`` (pair, mode, lmax + 1) complex and ``cl`` (pair, lmax + 1), uK^2; with pairing the same of the
-        circular twin, ``biposh_circular`` and ``cl_circular``; with kept maps ``map`` (map, npix), uK.
+        circular twin, ``biposh_circular`` and ``cl_circular``; with kept maps ``observed_map`` (map, npix), uK.
     """
     ensemble = survey.config.ensemble
     sky = draw_sky(survey, realization)
@@ -58,7 +53,7 @@ def realize(survey: Survey, realization: int, nthreads: int = 1) -> dict[str, ND
     if ensemble.paired:
         result |= _spectra(survey, [o.circular for o in observed if o.circular is not None], "_circular")
     if ensemble.keep_maps:
-        result["map"] = np.stack([o.map_uk for o in observed if o.map_uk is not None])
+        result["observed_map"] = np.stack([o.map_uk for o in observed if o.map_uk is not None])
     return result
 
 
@@ -66,9 +61,13 @@ def draw_sky(survey: Survey, realization: int) -> Alm:
     """Coefficients of the sky of one realization up to the sky's lmax, uK: drawn, or read from the user's files."""
     sky = survey.config.sky
     if sky.alm is not None:
-        return _read_alm(config.sky_path(sky.alm, realization), sky.lmax)
+        return skies.read_alm(config.sky_path(sky.alm, realization), sky.lmax, survey.config.map.frame)
     if sky.map is not None:
-        return _read_sky_map(config.sky_path(sky.map, realization), sky.lmax, survey.config.map.frame)
+        channels = {channel.frequency_ghz for channel in survey.config.channels}
+        frequency = channels.pop() if len(channels) == 1 else None
+        return skies.read_map(
+            config.sky_path(sky.map, realization), sky.lmax, survey.config.map.frame, frequency_ghz=frequency
+        )
     assert survey.cl is not None  # the configuration holds at least one of the three sources
     return gaussian_alm(survey.cl, rng.generator(survey.config.ensemble.seed, realization, "sky"))
 
@@ -243,42 +242,3 @@ def _spectra(survey: Survey, alms: list[Alm], suffix: str) -> dict[str, NDArray]
         coefficients[row] = norm * bipolar.estimate(survey.estimator, alms[x], None if x == y else alms[y])
         cl[row] = norm * bipolar.power_spectrum(alms[x], alms[y], lmax)
     return {f"biposh{suffix}": coefficients, f"cl{suffix}": cl}
-
-
-def _read_alm(path: Path, lmax: int) -> Alm:
-    try:
-        alm, mmax = healpy.read_alm(path, return_mmax=True)
-    except Exception as error:  # libraries raise whatever a broken file makes of them
-        raise InputError(
-            f"{path} cannot be read as a_lm ({error}); give a FITS file as healpy.write_alm makes it."
-        ) from error
-    found = healpy.Alm.getlmax(alm.size, mmax)
-    if mmax != found or found < lmax:
-        raise InputError(f"{path} holds a_lm up to l = {found}, m = {mmax}; the sky needs both up to {lmax}.")
-    if not np.all(np.isfinite(alm)):
-        raise InputError(f"{path} holds a_lm that are not finite; repair the file.")
-    _check_size(path, alm)
-    return alm_.resize(alm.astype(np.complex128), found, lmax)
-
-
-def _read_sky_map(path: Path, lmax: int, frame: str) -> Alm:
-    map_, found, unit = healpix.read_map(path)
-    nside = healpy.npix2nside(map_.size)
-    if nside & (nside - 1):
-        raise InputError(f"{path} has nside {nside}, which is not a power of two; bring the sky to one that is.")
-    if found not in (None, frame):
-        raise InputError(f"{path} is in {found} coordinates, the run's maps in {frame}; rotate the sky first.")
-    if not np.all(np.isfinite(map_)) or np.any(map_ == healpy.UNSEEN):
-        raise InputError(f"{path} has pixels that are not finite or unseen; a sky must be complete.")
-    if lmax > 3 * nside - 1:
-        raise InputError(f"{path} has nside {nside}, good to l = {3 * nside - 1}; the sky's lmax {lmax} is above it.")
-    map_uk = healpix.to_uk(unit, path) * map_
-    _check_size(path, map_uk)
-    return healpix.analysis(map_uk, lmax, iterations=3)
-
-
-def _check_size(path: Path, sky: NDArray[np.generic]) -> None:
-    """Refuse what a flipped bit makes of a number: its power would overflow."""
-    largest = float(np.max(np.abs(sky)))
-    if largest > LARGEST_UK:
-        raise InputError(f"{path} holds {largest:.3g} uK, more than any sky ({LARGEST_UK:g} uK); repair the file.")

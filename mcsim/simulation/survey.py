@@ -291,7 +291,7 @@ def _window(run: config.RunConfig, spec: config.Channel) -> NDArray[np.float64]:
         return np.ones(run.sky.lmax + 1)
     if choice == "computed":
         return healpix.pixel_window(run.map.resolution, run.sky.lmax)
-    return healpix.read_pixel_window(Path(choice), run.sky.lmax)
+    return healpix.read_pixel_window(Path(choice), run.sky.lmax, run.map.resolution)
 
 
 def _moments(
@@ -307,13 +307,13 @@ def _moments(
     nside, frame, smax = run.map.resolution, run.map.frame, max(mmax, 1)
     match spec.scan:
         case config.ScanParallelTransport():
-            return scan.parallel_transport(np.deg2rad(spec.scan.psi0_deg), nside, smax, frame)
+            return scan.Moments.parallel_transport(nside, spec.scan.psi0_deg, smax, frame)
         case config.ScanMoments():
             path = config.channel_path(spec.scan.path, spec.name, split)
             return _moments_of_file(path, nside, needed if mmax == needed else None, frame)
         case config.ScanPointing():
             path = config.channel_path(spec.scan.path, spec.name, split)
-            return scan.pointing_moments([path], nside, smax, frame)
+            return scan.Moments.from_pointing_files([path], nside, smax, frame)
         case config.ScanHitAveraged():
             model = scan_model(spec, spec.scan, split)
             lines = None if spec.scan.line_of_sight is None else [spec.scan.line_of_sight]
@@ -328,7 +328,7 @@ def _moments(
 @lru_cache(maxsize=16)
 def _moments_of_file(path: Path, nside: int, smax: int | None, frame: str) -> scan.Moments:
     """Moments are shared by the surveys of a process that differ in effects alone."""
-    return scan.read_moments_fits(path, nside, smax, frame)
+    return scan.read_moments(path, nside, smax, frame)
 
 
 def _pairs(

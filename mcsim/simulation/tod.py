@@ -23,10 +23,9 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
-from mcsim.instrument.scan.geometry import check_nside
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
 from mcsim.instrument.scan.pointing import BLOCK, PointingStream, fill_block, ring_pixel
-from mcsim.sphere import alm as alm_
+from mcsim.sphere.checks import check_alm, check_nside, check_shape
 from mcsim.sphere.healpix import Map
 from mcsim.sphere.sky import dipole_alm
 
@@ -152,8 +151,7 @@ def sky_signal(
     interpolation. Memory 8 (2 mmax + 1) bytes for about 3 lmax^2 grid points and each thread. 0.2 to 0.6 microseconds
     per sample (lmax 384 to 1024, mmax 2, epsilon 1e-7 to 1e-10).
     """
-    if alm.shape != (alm_.size(lmax),):
-        raise InputError(f"the sky has shape {alm.shape}, but lmax {lmax} needs ({alm_.size(lmax)},) coefficients.")
+    check_alm(alm, lmax, "the sky")
     if beam.lmax < lmax:
         raise InputError(f"the beam ends at l = {beam.lmax}, below the lmax {lmax} of the sky; compute it further.")
     mmax = min(beam.mmax, lmax)
@@ -182,6 +180,8 @@ def sky_signal(
 
 def white_noise(sigma0_uk: float, rng: np.random.Generator) -> Stage:
     """Stage that adds white noise of ``sigma0_uk`` per sample, drawn in the order of time: chunks do not matter."""
+    if not 0.0 <= sigma0_uk < math.inf:
+        raise InputError(f"the noise per sample is {sigma0_uk:g} uK, but it must be finite and >= 0.")
 
     def stage(stream: Iterable[Samples]) -> Iterator[Samples]:
         for chunk in stream:
@@ -200,8 +200,14 @@ def through(stream: Iterable[Samples], stages: Iterable[Stage]) -> Iterable[Samp
 
 def bin_samples(stream: Iterable[Samples], nside: int) -> tuple[Map, Map]:
     """Mean signal of every pixel in uK, ``healpy.UNSEEN`` where there is none, and hits; both of shape (npix,)."""
+    check_nside(nside)
     total, hits = np.zeros(12 * nside * nside), np.zeros(12 * nside * nside)
     for chunk in stream:
+        check_shape(chunk.signal_uk, chunk.pixel.shape, "the signal of a chunk of samples")
+        if chunk.pixel.size and not 0 <= chunk.pixel.min() <= chunk.pixel.max() < hits.size:
+            raise InputError(
+                f"a sample is in pixel {chunk.pixel.max()}, but nside {nside} has {hits.size}; give its own nside."
+            )
         _add(chunk.pixel, chunk.signal_uk, total, hits)
     seen = hits > 0.0
     return np.divide(total, hits, out=np.full(hits.size, healpy.UNSEEN), where=seen), hits
@@ -268,7 +274,7 @@ def observe(
         alm = alm + dipole_alm(dipole_uk, lmax)
     line = model.line_of_sight(line_of_sight)
     stages = [*pointing_stages, sky_signal(alm, lmax, beam, epsilon, nthreads), *signal_stages]
-    if noise_sigma0_uk > 0.0:
+    if noise_sigma0_uk != 0.0:
         stages.append(white_noise(noise_sigma0_uk, given(rng, noise_sigma0_uk)))
     return bin_samples(through(samples(model, line, nside, frame, time_range, at_pixel_centres), stages), nside)
 

@@ -1,14 +1,23 @@
 """Harmonic coefficients in healpy's m-major order: a_00, a_10, ..., a_lmax0, a_11, a_21, ..."""
 
+import math
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from mcsim.errors import InputError
 
 
 def size(lmax: int) -> int:
     """Number of coefficients with 0 <= m <= l <= lmax."""
     return (lmax + 1) * (lmax + 2) // 2
+
+
+def lmax_of(count: int) -> int | None:
+    """Degree whose coefficients with 0 <= m <= l <= lmax are ``count``; None where there is none."""
+    lmax = (math.isqrt(8 * count + 1) - 3) // 2
+    return lmax if lmax >= 0 and size(lmax) == count else None
 
 
 def start(lmax: int, m: int) -> int:
@@ -33,15 +42,50 @@ def orders(lmax: int) -> NDArray[np.int64]:
 
 
 def multiply(alm: NDArray[np.complex128], factor: NDArray, lmax: int) -> NDArray[np.complex128]:
-    """Coefficients f_l a_lm for a factor f_l of shape (>= lmax + 1,), real or complex."""
+    """Coefficients f_l a_lm for a factor f_l of shape (>= lmax + 1,), real or complex.
+
+    Raises
+    ------
+    InputError
+        If the sizes do not fit ``lmax``.
+    """
+    _check_size(alm, lmax)
+    if np.ndim(factor) != 1 or len(factor) <= lmax:
+        raise InputError(f"the factor f_l has shape {np.shape(factor)}, but lmax = {lmax} needs (>= {lmax + 1},).")
     return alm * factor[degrees(lmax)]
 
 
 def resize(alm: NDArray[np.complex128], lmax: int, new_lmax: int) -> NDArray[np.complex128]:
-    """Coefficients up to ``new_lmax``: cut, or padded with zeros."""
+    """Coefficients up to ``new_lmax``: cut, or padded with zeros; InputError if they are not of ``lmax``."""
+    _check_size(alm, lmax)
     resized = np.zeros(size(new_lmax), dtype=np.complex128)
     top = min(lmax, new_lmax)
     for m in range(top + 1):
         source, target = start(lmax, m), start(new_lmax, m)
         resized[target + m : target + top + 1] = alm[source + m : source + top + 1]
     return resized
+
+
+def whole(given: ArrayLike, name: str) -> tuple[NDArray[np.complex128], int]:
+    """Return given coefficients and their lmax; ``name`` names them in messages.
+
+    Raises
+    ------
+    InputError
+        If they are not complex, not those of a map with every m up to lmax, or not finite.
+    """
+    alm = np.asarray(given)
+    lmax = lmax_of(alm.size) if alm.ndim == 1 and np.iscomplexobj(alm) else None
+    if lmax is None:
+        raise InputError(
+            f"{name} is {alm.dtype} of shape {alm.shape}, which is no map with every m up to lmax; give "
+            "(lmax + 1)(lmax + 2)/2 complex coefficients in healpy's order."
+        )
+    if not np.all(np.isfinite(alm)):
+        raise InputError(f"{name} has values that are not finite; give the coefficients of a whole map.")
+    return alm.astype(np.complex128), lmax
+
+
+def _check_size(alm: NDArray[np.complex128], lmax: int) -> None:
+    if np.shape(alm) != (size(lmax),):
+        raise InputError(f"the coefficients have shape {np.shape(alm)}, but lmax = {lmax} needs ({size(lmax)},).")

@@ -5,7 +5,7 @@ closed product at the smallest L of a band and a three-term recursion in L whose
 kept as short tables in l, so that a band of lmax 2000 costs kilobytes and a handful of operations per coefficient.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 Table = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Band:
+class Band(NamedTuple):
     r"""Tables for G_L = (-1)^{m2} C^{LM}_{l1 m1 l2 -m2} with l1 = l2 - d, m2 = m1 - M and L = L_min ... L_max.
 
     ``G_{L_min} = norm[l2] * rising_a[x] * rising_b[y]`` and

@@ -13,6 +13,9 @@ from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
+from mcsim.sphere.checks import check_alm, check_complete, check_map, check_nside, check_whole
+from mcsim.sphere.header import frame_named
+from mcsim.support.npy import read_npy
 
 Map = NDArray[np.float64]
 Alm = NDArray[np.complex128]
@@ -25,13 +28,23 @@ def geometry(nside: int) -> dict[str, Any]:
 
 
 def synthesis(alm: Alm, nside: int, lmax: int, spin: int = 0, nthreads: int = 1) -> NDArray[np.float64]:
-    """Map of a_lm: shape (1, npix) from (1, size) at spin 0, (2, npix) from E and B (2, size) otherwise."""
+    """Map of a_lm: shape (1, npix) from (1, size) at spin 0, (2, npix) from E and B (2, size) otherwise.
+
+    Raises
+    ------
+    InputError
+        If the coefficients do not fit ``lmax`` and ``spin``, or nside is no whole number (any will do).
+    """
+    check_whole(nside, "nside", 1)
+    check_alm(alm, lmax, shape=(2 if spin else 1,))
     maps = ducc0.sht.synthesis(alm=alm, spin=spin, lmax=lmax, nthreads=nthreads, **geometry(nside))
     return np.asarray(maps)
 
 
 def gradient(alm: Alm, nside: int, lmax: int, nthreads: int = 1) -> NDArray[np.float64]:
-    """(d/dtheta, 1/sin(theta) d/dphi) of a spin-0 map, shape (2, npix)."""
+    """(d/dtheta, 1/sin(theta) d/dphi) of a spin-0 map of a_lm of shape (size,): shape (2, npix)."""
+    check_whole(nside, "nside", 1)
+    check_alm(alm, lmax)
     maps = ducc0.sht.synthesis_deriv1(alm=alm[None], lmax=lmax, nthreads=nthreads, **geometry(nside))
     return np.asarray(maps)
 
@@ -48,12 +61,21 @@ def analysis(map_: Map, lmax: int, iterations: int = 0, nthreads: int = 1) -> Al
     iterations
         Each adds a synthesis and an adjoint synthesis to the one adjoint synthesis of the quadrature.
 
+    Raises
+    ------
+    InputError
+        If the map is no complete HEALPix map, or lmax is beyond 3 nside - 1.
+
     Notes
     -----
     Relative error at nside 512, lmax 1024 for a sky seen by a 13.6' beam: 3e-5, 3e-6 and 4e-7 with 0, 1 and 2
     iterations (``tests/unit/test_healpix.py`` holds a smaller case).
     """
-    nside = healpy.npix2nside(map_.size)
+    nside = check_map(map_)
+    check_complete(map_)
+    check_whole(lmax, "lmax")
+    if lmax > 3 * nside - 1:
+        raise InputError(f"lmax = {lmax} is beyond {3 * nside - 1}, the largest that nside {nside} holds; lower lmax.")
     weight = _pixel_weights(nside)
 
     def quadrature(residual: Map) -> Alm:
@@ -91,6 +113,8 @@ def pixel_window(nside: int, lmax: int) -> NDArray[np.float64]:
     published HEALPix tables, l <= 3 nside: within 2e-4 for nside 32 to 1024; where that matters, name a table in
     ``[map] pixel_window``.
     """
+    check_nside(nside)
+    check_whole(lmax, "lmax")
     lattice = min(nside, 32)
     step = (nside // lattice) ** 2
     cell = np.arange(lattice * lattice)
@@ -128,18 +152,22 @@ def _mean_legendre(pixels: NDArray[np.int64], nside: int, split: int, lmax: int)
     return mean
 
 
-_FRAMES = {"E": "ecliptic", "G": "galactic", "C": "equatorial"}
-_TO_UK = {"uk": 1.0, "mk": 1e3, "k": 1e6}
-
-
 def read_map(path: Path) -> tuple[Map, str | None, str | None]:
     """First map of a HEALPix FITS file in RING order, its frame and its unit as far as the header tells them.
+
+    Of a .npy file, an array of shape (npix,) in RING order, neither is known.
 
     Raises
     ------
     InputError
-        If the file cannot be read as a HEALPix map.
+        If the file cannot be read as a HEALPix map, does not say whether it is RING or NESTED, or names a frame that
+        is not known.
     """
+    if path.suffix == ".npy":
+        array = read_npy(path, "biuf").astype(np.float64)
+        if not healpy.isnpixok(array.size):
+            raise InputError(f"{path} has {array.size} pixels, which is no HEALPix map; give all 12 nside^2 pixels.")
+        return array, None, None
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", category=AstropyUserWarning)
@@ -147,37 +175,45 @@ def read_map(path: Path) -> tuple[Map, str | None, str | None]:
     except Exception as error:  # libraries raise whatever a broken file makes of them
         raise InputError(f"{path} cannot be read as a HEALPix map ({error}); give a complete FITS map.") from error
     keywords = dict(header)
-    frame = _FRAMES.get(str(keywords.get("COORDSYS", "")).strip().upper()[:1])
-    unit = str(keywords.get("TUNIT1", "")).strip() or None
-    return np.asarray(map_), frame, unit
+    if str(keywords.get("ORDERING", "")).strip().upper() not in ("RING", "NESTED"):
+        raise InputError(f"{path} does not say how its pixels are ordered; write ORDERING = RING or NESTED there.")
+    # An explicit list of pixels has them in its first column, and healpy's map is the second.
+    column = 2 if str(keywords.get("INDXSCHM", "")).strip().upper() == "EXPLICIT" else 1
+    unit = str(keywords.get(f"TUNIT{column}", "")).strip() or None
+    if str(keywords.get("TEMPTYPE", "")).strip().upper().startswith("ANT"):
+        unit = f"{unit or 'K'} antenna"
+    return np.asarray(map_), frame_named(keywords.get("COORDSYS"), str(path)), unit
 
 
-def to_uk(unit: str | None, path: Path) -> float:
-    """Factor from a unit of temperature to uK; 1 where the header gives none."""
-    if unit is None:
-        return 1.0
-    factor = _TO_UK.get(unit.lower().replace("_", ",").split(",")[0].strip().replace("µ", "u"))
-    if factor is None:
-        raise InputError(f"{path} is in {unit!r}; give a map in uK, mK or K (CMB).")
-    return factor
-
-
-def read_pixel_window(path: Path, lmax: int) -> NDArray[np.float64]:
-    """Temperature pixel window of a FITS file in the HEALPix format, shape (lmax + 1,).
+def read_pixel_window(path: Path, lmax: int, nside: int | None = None) -> NDArray[np.float64]:
+    """Temperature pixel window of a FITS file in the HEALPix format, or of a .npy file, shape (lmax + 1,).
 
     Raises
     ------
     InputError
-        If the file cannot be read or ends below lmax.
+        If the file cannot be read, ends below lmax, says that it is of another ``nside``, or is no window.
     """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", category=AstropyUserWarning)
-            window = np.asarray(fits.getdata(path, 1).field(0), dtype=float).ravel()
-    except Exception as error:  # libraries raise whatever a broken file makes of them
-        raise InputError(f"{path} is not a FITS pixel window ({error}); give a HEALPix pixel_window file.") from error
+    window, found = (read_npy(path, "iuf"), None) if path.suffix == ".npy" else _fits_pixel_window(path)
+    window = window.astype(np.float64)
+    if nside is not None and found not in (None, nside):
+        raise InputError(f"{path} holds the pixel window of nside {found}; give that of {nside}.")
     if window.size <= lmax:
         raise InputError(f"{path} holds a pixel window up to l = {window.size - 1}, below the lmax {lmax} of the sky.")
     if not np.all(window[: lmax + 1] > 0.0):
         raise InputError(f"{path} holds a pixel window that is not positive up to l = {lmax}; give a HEALPix table.")
+    if abs(window[0] - 1.0) > 0.01 or window[: lmax + 1].max() > 1.01:
+        raise InputError(
+            f"{path} starts at {window[0]:g} and reaches {window[: lmax + 1].max():g}, where a pixel window starts at "
+            "1 and stays below; give w_l from l = 0."
+        )
     return window[: lmax + 1]
+
+
+def _fits_pixel_window(path: Path) -> tuple[NDArray, int | None]:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", category=AstropyUserWarning)
+            table, header = fits.getdata(path, 1, header=True)
+            return np.asarray(table.field(0), dtype=float).ravel(), header.get("NSIDE")
+    except Exception as error:  # libraries raise whatever a broken file makes of them
+        raise InputError(f"{path} is not a FITS pixel window ({error}); give a HEALPix pixel_window file.") from error

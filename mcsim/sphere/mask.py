@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from mcsim.errors import InputError
 from mcsim.sphere import healpix, rotation
+from mcsim.sphere.checks import check_map, check_nside
 
 Mask = NDArray[np.float64]
 
@@ -46,6 +47,7 @@ def read_mask(
     frame is changed pixel by pixel (:func:`mcsim.sphere.rotation.rotate_pixels`) at the finer of the two resolutions.
     The edge is softened last, so that its width is the same whatever the mask came from.
     """
+    check_nside(nside)
     mask, stated, _ = healpix.read_map(path)
     found = healpy.get_nside(mask)
     if found & (found - 1):
@@ -82,10 +84,12 @@ def apodise(mask: Mask, width: float) -> Mask:
     0. Its slope is continuous: the mask's power at l > 3 pi / width is at most 1/64 of a sharp edge's. It takes sky
     away and gives none back.
     """
+    nside = check_map(mask, name="the mask")
+    if not 0.0 <= width <= np.pi:
+        raise InputError(f"the width of the soft edge is {width:g} rad, but it must lie between 0 and pi.")
     zeros = mask == 0.0
     if width == 0.0 or not zeros.any() or zeros.all():
         return mask
-    nside = healpy.get_nside(mask)
     used = np.flatnonzero(~zeros)
     nearest = cKDTree(_vectors(nside, _edge(zeros, nside)))
     chord, _ = nearest.query(_vectors(nside, used), distance_upper_bound=2.0 * np.sin(min(width, np.pi) / 2.0))

@@ -11,6 +11,7 @@ from scipy.linalg import expm
 
 from mcsim.errors import InputError
 from mcsim.sphere import healpix
+from mcsim.sphere.checks import check_alm, check_map, check_shape
 
 FRAMES = {"ecliptic": "E", "galactic": "G", "equatorial": "C"}
 
@@ -79,7 +80,13 @@ def rotate_alm(
     -------
     ndarray
         Shape (size(lmax),).
+
+    Raises
+    ------
+    InputError
+        For an unknown frame, or coefficients that are not of ``lmax``.
     """
+    check_alm(alm, lmax)
     alpha, beta, gamma = euler_angles(rotation_matrix(frame_from, frame_to))
     return np.asarray(ducc0.sht.rotate_alm(alm, lmax, gamma, beta, alpha, nthreads=nthreads))
 
@@ -96,9 +103,9 @@ def rotate_map(sky: NDArray[np.float64], frame_from: str, frame_to: str, nthread
     -----
     Multipoles above 2 nside are lost: a map that has power there, or sharp edges, rings.
     """
+    nside = check_map(sky)
     if np.any(~np.isfinite(sky)) or np.any(sky == hp.UNSEEN):
         raise InputError("the map has unobserved pixels, which a_lm cannot rotate; use rotate_pixels for it.")
-    nside = hp.get_nside(sky)
     lmax = 2 * nside
     alm = healpix.analysis(sky, lmax, iterations=3, nthreads=nthreads)
     rotated = rotate_alm(alm, lmax, frame_from, frame_to, nthreads)
@@ -107,7 +114,7 @@ def rotate_map(sky: NDArray[np.float64], frame_from: str, frame_to: str, nthread
 
 def rotate_pixels(values: NDArray, frame_from: str, frame_to: str) -> NDArray:
     """A HEALPix map (RING) in another frame, each pixel taking the value found at its centre: for masks and hits."""
-    nside = hp.get_nside(values)
+    nside = check_map(values)
     centres = np.array(hp.pix2vec(nside, np.arange(len(values))))
     return values[hp.vec2pix(nside, *(rotation_matrix(frame_to, frame_from) @ centres))]
 
@@ -141,6 +148,8 @@ def rotate_biposh(
     A^{LM} turns like a_{LM}: sum_M' D^L_{MM'} A^{LM'}, with A^{L,-M} = (-1)^{l1+l2-L+M} conj(A^{LM}), which holds for
     pairs of maps too. Equal to rotating the sky first to round-off (tests/unit/test_rotation.py).
     """
+    if biposh.ndim < 2 or biposh.shape[-2] != len(modes):
+        raise InputError(f"biposh has shape {biposh.shape}, but {len(modes)} modes need (..., {len(modes)}, lmax + 1).")
     rows = {mode: i for i, mode in enumerate(modes)}
     rotated = np.empty_like(biposh)
     for L, d in sorted({(L, d) for L, _, d in modes}):
@@ -172,7 +181,10 @@ def rotate_orientation_harmonics(w: NDArray[np.complex128], frame_from: str, fra
     ndarray
         The same shape.
     """
+    if w.ndim != 3:
+        raise InputError(f"w has shape {w.shape}, but (smax + 1, L_max + 1, 2 L_max + 1) is needed.")
     L_max = w.shape[1] - 1
+    check_shape(w, (len(w), L_max + 1, 2 * L_max + 1), "w")
     rotated = np.zeros_like(w)
     for L in range(L_max + 1):
         span = slice(L_max - L, L_max + L + 1)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
+from mcsim.sphere.checks import check_cl, check_whole
 
 
 def gaussian_alm(cl: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.complex128]:
@@ -24,8 +25,16 @@ def gaussian_alm(cl: NDArray[np.float64], rng: np.random.Generator) -> NDArray[n
     -------
     ndarray
         a_lm in uK, shape (size(lmax),), with E|a_lm|^2 = C_l; a_l0 is real.
+
+    Raises
+    ------
+    InputError
+        If the spectrum is not one-dimensional, finite and non-negative.
     """
-    lmax = len(cl) - 1
+    lmax = np.size(cl) - 1
+    check_cl(cl, lmax)
+    if cl.min() < 0.0:
+        raise InputError(f"the spectrum is {cl.min():g} at l = {cl.argmin()}, but C_l must be >= 0; correct it.")
     alm = rng.standard_normal(2 * alm_.size(lmax)).view(np.complex128)
     alm[: lmax + 1] = alm[: lmax + 1].real * np.sqrt(2.0)
     alm *= np.sqrt(cl / 2.0)[alm_.degrees(lmax)]
@@ -34,8 +43,9 @@ def gaussian_alm(cl: NDArray[np.float64], rng: np.random.Generator) -> NDArray[n
 
 def dipole_alm(dipole_uk: Sequence[float] | NDArray[np.float64], lmax: int) -> NDArray[np.complex128]:
     """Coefficients of the sky d . n of a vector d in the frame of the maps, in uK: l = 1 only, up to ``lmax`` >= 1."""
-    if lmax < 1:
-        raise InputError(f"lmax is {lmax}, but a dipole needs lmax >= 1.")
+    check_whole(lmax, "lmax of a dipole", 1)
+    if np.shape(dipole_uk) != (3,) or not np.all(np.isfinite(dipole_uk)):
+        raise InputError(f"dipole_uk is {dipole_uk}, but it must be a vector of three finite components in uK.")
     x, y, z = (float(component) for component in dipole_uk)
     alm = np.zeros(alm_.size(lmax), dtype=np.complex128)
     alm[alm_.start(lmax, 0) + 1] = math.sqrt(4.0 * math.pi / 3.0) * z

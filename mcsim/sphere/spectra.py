@@ -13,12 +13,29 @@ from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
+from mcsim.sphere.checks import check_whole
 from mcsim.support import resources
+from mcsim.support.npy import read_npy
 
-# Names of D_l = l(l+1) C_l / 2 pi as they stand in headers: D_l, Dl, D_ell, D_{\ell}, l(l+1)Cl.
-_NAMES_OF_D_L = re.compile(r"(?i)\bD_?\{?\\?(l|ell)\b|(l|ell)\s*\*?\s*\((l|ell)\s*\+\s*1\)")
+# Names of D_l = l(l+1) C_l / 2 pi as they stand in headers: D_l, Dl, D_ell, D_{\ell}, DlTT, l(l+1)Cl.
+_NAMES_OF_D_L = re.compile(
+    r"(?i)(?<![a-z])D_?\{?\\?(l|ell)(?=TT|[^a-z]|$)|(l|ell)\s*\*?\s*\((l|ell)\s*\+\s*1\)|dimensionless"
+)
+_NAMES_OF_C_L = re.compile(r"(?i)(?<![a-z])C_?[\{(]?\\?(l|ell)(?=TT|[^a-z]|$)")
 
 _TO_UK2 = {"uk2": 1.0, "muk2": 1.0, "microk2": 1.0, "mk2": 1e6, "k2": 1e12}
+_UNIT = re.compile(
+    r"(?i)(?<![a-z])(micro|mu|[muµμ])?K([_\s{]*(CMB|thermo\w*|RJ|ant\w*)\}?)?(\s*(\^|\*\*)\s*\{?2\}?|2|²)(?![\w.])"
+)
+
+SMALLEST_D_UK2, LARGEST_D_UK2 = 1e-6, 1e9
+"""Of the largest l(l+1) C_l / 2 pi (up to l = 100) of any sky: tables in K^2 lie below, in nK^2 above."""
+
+SMALLEST_UNSTATED_UK2 = 0.03
+"""The same where the table does not state its unit: the CMB has 6000 uK^2, which is 0.006 mK^2."""
+
+D_L_RANGE_UK2, D_L_SLOPE, D_L_ROWS = (50.0, 5e4), -0.8, 6
+"""A table of D_l of the CMB, l <= 300: its median, the least slope d ln / d ln l (C_l has -1.6), rows to judge by."""
 
 
 def load(spec: str | Path, lmax: int) -> NDArray[np.float64]:
@@ -28,9 +45,9 @@ def load(spec: str | Path, lmax: int) -> NDArray[np.float64]:
     ----------
     spec
         A packaged name (``"wmap7"``, ``"planck2018"``); or a text table of the two columns ell, C_ell [uK^2] (``#``
-        starts a header line; rows in any order, complete from ell = 2; ell = 0 and 1 may be absent and are zero
-        then); or a FITS file as ``healpy.read_cl`` reads: a table in the first extension whose first column is TT
-        from ell = 0.
+        starts a header line, which may state the unit; rows in any order, complete from ell = 2; ell = 0 and 1 may be
+        absent and are zero then); or a FITS file as ``healpy.read_cl`` reads: a table in the first extension whose
+        first column is TT from ell = 0, or ell and the second TT; or a .npy file of C_l in uK^2 from ell = 0.
     lmax
         Highest degree wanted, >= 0.
 
@@ -43,21 +60,34 @@ def load(spec: str | Path, lmax: int) -> NDArray[np.float64]:
     ------
     InputError
         No such file, an unreadable one, a header that names D_l, an unknown unit, a table that ends below lmax or has
-        gaps, a value that is not finite or is negative.
+        gaps, a value that is not finite or is negative; numbers that can only be D_l or in another unit.
+
+    Warns
+    -----
+    UserWarning
+        If a spectrum that its header calls C_l, or a white one, has the size of D_l of the CMB.
 
     Notes
     -----
-    The unit of a FITS column is its TUNIT1: uK^2, mK^2 and K^2 are converted (a CMB marker such as uK_CMB^2 is
-    understood); a column without unit is taken to be in uK^2. The packaged tables reach l = 4096; their parameters
-    and accuracy stand in ``workflows/spectra/make_spectra.py``.
+    The unit of a FITS column is its TUNIT, that of a text table stands in a header line: uK^2, mK^2 and K^2 are
+    converted (a CMB marker such as uK_CMB^2 is understood); a table without unit is taken to be in uK^2 if it is of the
+    size that any temperature spectrum in uK^2 has. C_l of the CMB falls as l^-2, D_l does not. The packaged tables
+    reach l = 4096; their parameters and accuracy stand in ``workflows/spectra/make_spectra.py``.
     """
+    check_whole(lmax, "lmax")
     path = resources.spectrum(spec)
-    cl = _read_fits(path) if path.name.removesuffix(".gz").endswith((".fits", ".fit")) else _read_text(path)
+    if path.suffix == ".npy":
+        cl, names, stated = read_npy(path, "iuf").astype(np.float64), "", False
+    elif path.name.removesuffix(".gz").endswith((".fits", ".fit")):
+        cl, names, stated = _read_fits(path)
+    else:
+        cl, names, stated = _read_text(path)
     if len(cl) <= lmax:
         raise InputError(
             f"power spectrum {str(spec)!r} ends at l = {len(cl) - 1}, but lmax = {lmax} is wanted; "
             "lower lmax or give a longer table."
         )
+    table = np.where(np.isfinite(cl), cl, 0.0)
     cl = cl[: lmax + 1]
     for bad, what in ((~np.isfinite(cl), "not finite"), (cl < 0.0, "negative")):
         if bad.any():
@@ -65,14 +95,56 @@ def load(spec: str | Path, lmax: int) -> NDArray[np.float64]:
             raise InputError(
                 f"power spectrum {str(spec)!r} has C_l = {cl[ell]:g} at l = {ell}, which is {what}; correct the table."
             )
+    where = f"power spectrum {str(spec)!r}"
+    _check_size(where, table, stated)
+    _check_shape(where, table, _NAMES_OF_C_L.search(names) is not None)
     return cl
+
+
+def _check_size(where: str, cl: NDArray[np.float64], stated: bool) -> None:
+    """Raise InputError for numbers that are no spectrum in uK^2."""
+    ell = np.arange(2, min(len(cl), 101))
+    largest = float(np.max(ell * (ell + 1) * cl[ell] / (2 * np.pi), initial=0.0))
+    least = SMALLEST_D_UK2 if stated else SMALLEST_UNSTATED_UK2
+    if largest > 0.0 and not least < largest < LARGEST_D_UK2:
+        raise InputError(
+            f"{where} has l(l+1) C_l / 2 pi of at most {largest:.3g} up to l = 100, where the CMB has 1000 to 6000 "
+            "uK^2; convert it to uK^2, or say its unit (TUNIT1, or a line such as '# ell, C_ell [K^2]')."
+        )
+
+
+def _check_shape(where: str, cl: NDArray[np.float64], named: bool) -> None:
+    """Raise InputError for a table of D_l, or of C_l that starts at ell = 2; warn where it may be right."""
+    first = np.arange(min(len(cl), 8))
+    if len(first) == 8 and cl[:8].min() > 0.0:
+        shifted, own = (first + 2) * (first + 3) * cl[:8], (first * (first + 1) * cl[:8])[2:]
+        if shifted.max() < 1.6 * shifted.min() and own.max() > 1.6 * own.min():
+            raise InputError(f"{where} seems to start at ell = 2; put zeros for ell = 0 and 1 before it.")
+    ell = np.arange(2, min(len(cl), 301))
+    ell = ell[cl[ell] > 0.0]
+    low, high = D_L_RANGE_UK2
+    if len(ell) < D_L_ROWS or not low < np.median(cl[ell]) < high:
+        return
+    slope = np.polyfit(np.log(ell), np.log(cl[ell]), 1)[0]
+    white = np.ptp(cl[ell]) < 1e-3 * cl[ell[0]]
+    if slope < D_L_SLOPE or (white and named):
+        return
+    message = (
+        f"{where} has {np.median(cl[ell]):.3g} uK^2 as its median up to l = {ell[-1]} and does not fall as C_l of the "
+        "CMB does, so it seems to hold D_l = l(l+1) C_l / 2 pi; divide by l(l+1) / 2 pi, or name the column C_ell if "
+        "it is C_l."
+    )
+    if not (white or named):
+        raise InputError(message)
+    warnings.warn(message, stacklevel=3)
 
 
 def _refuse_d_l(path: Path, header: str) -> None:
     if _NAMES_OF_D_L.search(header):
         raise InputError(
-            f"power spectrum {str(path)!r} says {header.strip()[:60]!r}, so it seems to hold D_l = l(l+1) C_l / 2 pi, "
-            "but C_l in uK^2 is wanted; divide by l(l+1) / 2 pi and name the columns 'ell, C_ell [uK^2]'."
+            f"power spectrum {str(path)!r} says {header.strip()[:60]!r}, so it seems to hold D_l = l(l+1) C_l / 2 pi "
+            "or to be dimensionless, but C_l in uK^2 is wanted; divide by l(l+1) / 2 pi and name the columns "
+            "'ell, C_ell [uK^2]'."
         )
 
 
@@ -81,7 +153,8 @@ def _contents(path: Path) -> bytes:
     return gzip.decompress(contents) if path.suffix == ".gz" else contents
 
 
-def _read_text(path: Path) -> NDArray[np.float64]:
+def _read_text(path: Path) -> tuple[NDArray[np.float64], str, bool]:
+    """C_l in uK^2, the header lines, and whether they state a unit."""
     try:
         lines = _contents(path).decode().splitlines()
     except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
@@ -89,10 +162,12 @@ def _read_text(path: Path) -> NDArray[np.float64]:
             f"power spectrum {str(path)!r} cannot be read as text ({error}); give a text table or a FITS file."
         ) from None
     found: dict[int, float] = {}
+    header = ""
     for number, line in enumerate(lines, start=1):
         row = line.strip()
         if row.startswith("#"):
             _refuse_d_l(path, row)
+            header += f"{row}\n"
             continue
         if not row:
             continue
@@ -116,28 +191,52 @@ def _read_text(path: Path) -> NDArray[np.float64]:
         )
     cl = np.zeros(max(found) + 1)
     cl[list(found)] = list(found.values())
-    return cl
+    factors = {_factor(path, match[0]) for match in _UNIT.finditer(header)}
+    if len(factors) > 1:
+        raise InputError(f"power spectrum {str(path)!r} names several units in its header lines; leave one of them.")
+    return cl * factors.pop() if factors else cl, header, bool(factors)
 
 
-def _read_fits(path: Path) -> NDArray[np.float64]:
+def _read_fits(path: Path) -> tuple[NDArray[np.float64], str, bool]:
+    """C_l in uK^2, the column's name, and whether it states a unit."""
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("error", ".*truncated.*", AstropyUserWarning)
             with fits.open(io.BytesIO(_contents(path))) as hdus:
                 header = hdus[1].header
-                cl = np.ravel(np.ma.filled(hdus[1].data.field(0), np.nan)).astype(np.float64)
+                columns = [
+                    np.ravel(np.ma.filled(hdus[1].data.field(i), np.nan)).astype(np.float64)
+                    for i in range(min(2, len(hdus[1].columns)))
+                ]
     except Exception as error:  # libraries raise whatever a broken file makes of them
         raise InputError(
             f"power spectrum {str(path)!r} cannot be read as a FITS table ({error}); "
             "give a file as healpy.write_cl writes it."
         ) from None
-    _refuse_d_l(path, str(header.get("TTYPE1", "")))
-    unit = str(header.get("TUNIT1", "")).strip()
-    if not unit:
-        return cl
-    key = re.sub(r"[\s^_*()]|cmb", "", unit.lower().replace("µ", "u").replace("μ", "u"))
+    # A first column that counts is ell, and the second is C_l.
+    ell = columns[0]
+    counts = len(columns) == 2 and len(ell) > 3 and np.array_equal(ell, ell[0] + np.arange(len(ell))) and ell[0] >= 0
+    column = 2 if counts else 1
+    cl = columns[1] if counts else columns[0]
+    if counts:
+        cl = np.concatenate([np.zeros(int(ell[0])), cl])
+        if ell[0] > 2 or ell[0] % 1:
+            raise InputError(f"power spectrum {str(path)!r} starts at ell = {ell[0]:g}; give every ell from 2 on.")
+    name = str(header.get(f"TTYPE{column}", ""))
+    _refuse_d_l(path, name)
+    unit = str(header.get(f"TUNIT{column}", "")).strip()
+    if unit.lower() in ("", "unknown"):
+        return cl, name, False
+    return cl * _factor(path, unit), name, True
+
+
+def _factor(path: Path, unit: str) -> float:
+    """From the square of a temperature to uK^2."""
+    key = re.sub(
+        r"[\s^_*(){}]|cmb|thermo(dynamic)?", "", unit.lower().replace("µ", "u").replace("μ", "u").replace("²", "2")
+    )
     if key not in _TO_UK2:
         raise InputError(
             f"power spectrum {str(path)!r} has the unit {unit!r}; convert it to uK^2 (mK^2 and K^2 are read too)."
         )
-    return cl * _TO_UK2[key]
+    return _TO_UK2[key]

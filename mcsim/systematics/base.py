@@ -157,6 +157,28 @@ class Effect:
         Largest physical amplitude, in absolute value; a diagnosis names no larger one.
     variants
         Fixed parameters with which the effect is a candidate, one candidate for each.
+
+    Examples
+    --------
+    An effect of one's own, which a package offers under the entry points ``mcsim.effects``:
+
+    >>> from dataclasses import dataclass, replace
+    >>> import mcsim
+    >>> @dataclass(frozen=True, kw_only=True)
+    ... class Squint(mcsim.Effect):
+    ...     name = "squint"
+    ...     scope = "channel"
+    ...     unit = "relative change of b_l2"
+    ...     cause = "A beam more elongated than measured."
+    ...     signature = "L = 2, as the beam's own."
+    ...     step = 0.01
+    ...
+    ...     def beam(self, beam, site):
+    ...         blm = beam.blm.copy()
+    ...         blm[2] *= 1.0 + self.amplitude
+    ...         return replace(beam, blm=blm)
+    >>> Squint(amplitude=0.1).scaled(0.5)
+    Squint(amplitude=0.05)
     """
 
     name: ClassVar[str]

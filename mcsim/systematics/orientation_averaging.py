@@ -4,8 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mcsim.instrument.scan import Moments, cached_moments, load_model
-from mcsim.support.resources import scan_model
+from mcsim.instrument.scan import Moments, ScanModel, cached_moments
 from mcsim.systematics.base import Effect, Site, Wording
 
 
@@ -43,7 +42,7 @@ class OrientationAveraging(Effect):
         if self.amplitude == 0.0:
             return moments
         if self.model:
-            real, lines, part = load_model(scan_model(self.model)), None, (0.0, 1.0)
+            real, lines, part = ScanModel.load(self.model), None, (0.0, 1.0)
         else:
             pointed = site.pointed(self.name)
             real, lines, part = pointed.model, (pointed.line.name,), pointed.time_range

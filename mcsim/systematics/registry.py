@@ -8,6 +8,7 @@ from dataclasses import fields
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from math import isfinite
 from types import MappingProxyType
 from typing import Any
 
@@ -47,10 +48,44 @@ def catalogue() -> Library:
             ) from error
         if not (isinstance(kind, type) and issubclass(kind, Effect)):
             raise InputError(f"effect {entry.name} of {entry.value} is no class derived from mcsim.systematics.Effect.")
+        flaw = _flaw(kind)
+        if flaw is not None:
+            raise InputError(f"effect {entry.name} of {entry.value} {flaw}; mend or uninstall it.")
         if kind.name in found:
             raise InputError(f"effect {kind.name} of {entry.value} has a name that is taken; rename it.")
         found[kind.name] = kind
     return MappingProxyType(found)
+
+
+def _flaw(kind: type[Effect]) -> str | None:
+    """What keeps a class from being a whole effect; None: nothing."""
+    own = {key for key, text in vars(kind).get("__annotations__", {}).items() if "ClassVar" not in str(text)}
+    missing = own - {f.name for f in fields(kind)}
+    if missing:
+        return f"is no dataclass, so {', '.join(sorted(missing))} is no parameter of it: decorate it with @dataclass"
+    for key in ("name", "unit", "cause", "signature"):
+        if not isinstance(getattr(kind, key, None), str) or not getattr(kind, key):
+            return f"has no {key}: it needs a text"
+    if getattr(kind, "scope", None) not in ("channel", "common"):
+        return 'has no scope: it needs "channel" or "common"'
+    for key in ("step", "max_amplitude"):
+        value = getattr(kind, key, None)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0.0:
+            return f"has {key} = {value!r}: it needs a number above 0"
+    if not isfinite(kind.step):
+        return f"has step = {kind.step!r}: it needs a finite number"
+    if kind.sign not in (-1, 0, 1):
+        return f"has sign = {kind.sign!r}: it needs -1, 0 or 1"
+    try:
+        basis = kind.basis()
+        sizes = {effect.coordinates().shape for effect in basis}
+        for variant in kind.variants:
+            base.build(kind, variant)
+    except Exception as error:  # whatever a foreign class does
+        return f"cannot be made ({type(error).__name__}: {error})"
+    if not basis or sizes != {(len(basis),)}:
+        return f"has a basis of {len(basis)} effects whose coordinates have other shapes: each needs ({len(basis)},)"
+    return None
 
 
 def get(name: str, library: Library | None = None) -> type[Effect]:

@@ -1,9 +1,11 @@
 """The command line as a user meets it: outputs, exit codes, one sentence for bad input, nothing left behind."""
 
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,9 @@ import xarray as xr
 from astropy.io import fits
 from astropy.table import Table
 
-from mcsim import cli, config
+from mcsim import cli, config, open_summary
+from mcsim.ensemble import tables
+from mcsim.ensemble.prediction import predict
 
 from .conftest import table
 
@@ -46,7 +50,7 @@ def test_help_loads_no_heavy_library() -> None:
         "except SystemExit:\n    print(sorted({'numpy', 'numba', 'dask', 'xarray', 'healpy'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    for command in ("run", "merge", "info", "plot", "predict", "fit", "beam", "scan", "bench", "config"):
+    for command in ("run", "merge", "info", "plot", "predict", "fit", "beam", "scan", "bench", "config", "maps"):
         assert command in done.stdout
     assert done.stdout.rstrip().endswith("[]")
 
@@ -92,6 +96,17 @@ def test_finished_store_says_so(mcsim: Command, small_store: Path, tmp_path: Pat
     assert "is finished: 10 realizations, nothing to do" in out
 
 
+def test_other_bins_of_a_finished_store_need_no_realization(mcsim: Command, small_store: Path, tmp_path: Path) -> None:
+    shutil.copytree(small_store, tmp_path / "small.zarr")
+    (tmp_path / "small.toml").write_text(SMALL.replace("summary_bin = 10", "summary_bin = 16"))
+    code, out, _ = mcsim("run", "small.toml", "--workers", 1)
+    assert code == 0
+    assert "nothing to do" not in out
+    assert "summary" in out
+    assert open_summary(tmp_path / "small.zarr")["bin_first"].values.tolist() == [0, 16, 32]
+    assert "nothing to do" in mcsim("run", "small.toml")[1]
+
+
 SMALL = """\
 schema = 1
 name = "small"
@@ -129,6 +144,28 @@ seed = 7
         (("scan", "no-such-scan"), "no-such-scan"),
         (("scan", "wmap", "--nside", "100"), "100"),
         (("config",), "Nothing was asked for"),
+        (("beam", "nothing.fits"), "does not exist"),
+        (("beam", "."), "folder"),
+        (("beam", "quickstart", "--pixel-deg", "-1"), "pixel"),
+        (("info", "."), "not an ensemble store"),
+        (("info", ".", "--verify"), "not an ensemble store"),
+        (("plot", "."), "not an ensemble store"),
+        (("plot", ".", "--predict", "nothing.zarr"), "not an ensemble store"),
+        (("merge", ".", ".", "-o", "x.zarr"), "not an ensemble store"),
+        (("fit", "nothing.zarr", "quickstart"), "nothing.zarr"),
+        (("predict", "quickstart", "-o", "x.txt"), "x.txt"),
+        (("predict", "nothing.toml"), "nothing.toml"),
+        (("scan", "wmap", "--smax", "2", "--nside", "-4"), "-4"),
+        (("scan", "wmap", "--sample-period-s", "nan"), "nan"),
+        (("scan", "wmap", "--sample-period-s", "-1"), "-1"),
+        (("scan", "wmap", "--frame", "lunar"), "lunar"),
+        (("scan", "wmap", "--line-of-sight", "Z"), "Z"),
+        (("bench", "--nside", "3"), "3"),
+        (("bench", "--nside", "4", "--lmax", "40"), "40"),
+        (("effects", "gain_drit"), "gain_drift"),
+        (("run", "quickstart", "--realizations", "-1:3"), "-1:3"),
+        (("run", "quickstart", "--realizations", "0:1000"), "0:1000"),
+        (("run", "quickstart", "--scheduler", "nonsense"), "nonsense"),
     ],
 )
 def test_bad_input_is_one_sentence(words: tuple[str, ...], message: str, mcsim: Command, tmp_path: Path) -> None:
@@ -181,6 +218,8 @@ def test_predict_plot_and_fit(mcsim: Command, small_store: Path, tmp_path: Path)
     assert code == 0
     assert "signal to noise" in out
     assert "value" in Table.read(tmp_path / "expected.ecsv", format="ascii.ecsv").colnames
+    for row in ("L2M0d0", "10-19"):
+        assert row in out
     assert mcsim("plot", small_store, "--predict", "small.toml", "-o", "both.png")[0] == 0
     code, _, err = mcsim("fit", small_store, "small.toml")
     assert code == 2
@@ -193,12 +232,112 @@ def test_predict_plot_and_fit(mcsim: Command, small_store: Path, tmp_path: Path)
     code, out, _ = mcsim("fit", small_store, "small.toml", *options)
     assert code == 0
     assert json.loads(out[: out.rindex("]") + 1])[0]["kind"] == "plain"
-    code, _, err = mcsim("fit", small_store, "small.toml", "--kind", "paired")
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--kind", "paired"), "paired"),
+        (("--model", "cubic"), "cubic"),
+        (("--model", "linear", "--model", "linear"), "linear, linear"),
+        (("--model", "spline", "--knots", 2), "2 knots"),
+        (("--order", "second"), "second"),
+        (("--mode", "L2M0"), "L2M0"),
+        (("--mode", "L2M3d0"), "L2M3d0"),
+        (("--mode", "L2M0d-2"), "L2M0d-2"),
+        (("--mode", "L3M0d1"), "L3M0d1"),
+        (("--mode", "L2M0d0", "--mode", "L2M0d0"), "L2M0d0"),
+        (("--pair", "V1,V1"), "V1,V1"),
+        (("--ell-min", 20, "--ell-max", 15), "20"),
+        (("--ell-min", 900), "900"),
+        (("--covariance", "nothing.zarr"), "nothing.zarr"),
+    ],
+)
+def test_options_of_fit_that_mean_nothing(
+    options: tuple[object, ...], named: str, mcsim: Command, small_store: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "small.toml").write_text(SMALL)
+    code, _, err = mcsim("fit", small_store, "small.toml", *options)
     assert code == 2
-    assert "plain or difference" in err
-    code, _, err = mcsim("fit", small_store, "small.toml", "--model", "cubic")
+    assert named in err
+    assert err.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["small.toml"]
+
+
+@pytest.mark.parametrize("words", [("small.toml", "STORE"), ("nothing.zarr", "small.toml"), ("STORE", "nothing.toml")])
+def test_files_of_fit_that_are_none(words: tuple[str, str], mcsim: Command, small_store: Path, tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(SMALL)
+    code, _, err = mcsim("fit", *(small_store if word == "STORE" else word for word in words))
     assert code == 2
-    assert "cubic" in err
+    assert err.count("\n") == 1
+    assert "Traceback" not in err
+
+
+def test_version(mcsim: Command) -> None:
+    code, out, _ = mcsim("--version")
+    assert code == 0
+    assert out.split() == ["mcsim", version("mcsim")]
+
+
+@pytest.mark.parametrize("ending", ["zarr", "ecsv"])
+def test_plot_reads_what_predict_wrote(ending: str, mcsim: Command, small_store: Path, tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(SMALL)
+    assert mcsim("predict", "small.toml", "-o", f"expected.{ending}")[0] == 0
+    expected = predict(tmp_path / "small.toml")
+    found = tables.read_prediction(tmp_path / f"expected.{ending}")
+    assert found.attrs["prediction"] == expected.attrs["prediction"]
+    expected = expected.sel(mode=found["mode"].values)
+    for kind in ("", "_difference"):
+        for name in ("mean", "standard_error"):
+            name = f"biposh{kind}_binned_{name}"
+            np.testing.assert_allclose(found[name].values, expected[name].values, rtol=1e-12, atol=1e-12)
+    for name in ("L", "M", "d", "parity", "bin", "bin_first", "bin_last"):
+        assert found[name].values.tolist() == expected[name].values.tolist()
+    code, _, err = mcsim("plot", small_store, "--predict", f"expected.{ending}", "-o", "both.png")
+    assert (code, err) == (0, "")
+    assert (tmp_path / "both.png").stat().st_size > 10_000
+    code, _, err = mcsim("plot", small_store, "--predict", f"expected.{ending}", "--exact")
+    assert code == 2
+    assert "--exact" in err
+
+
+@pytest.mark.parametrize("name", ["nothing.zarr", "nothing.ecsv", "store.zarr", "text.ecsv", "columns.ecsv"])
+def test_a_file_that_is_no_prediction_is_refused(name: str, mcsim: Command, small_store: Path, tmp_path: Path) -> None:
+    (tmp_path / "store.zarr").symlink_to(small_store)
+    (tmp_path / "text.ecsv").write_text("no table")
+    Table({"L": [2], "value": [1.0]}).write(tmp_path / "columns.ecsv", format="ascii.ecsv")
+    code, _, err = mcsim("plot", small_store, "--predict", name, "-o", "x.png")
+    assert code == 2
+    assert name in err
+    assert err.count("\n") == 1
+    assert not (tmp_path / "x.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("effect", "key"),
+    [
+        ('[[effects]]\nname = "gain_drift"', "[[effect]]"),
+        ('[[effect]]\nname = "gain_drit"', "gain_drift"),
+        ('[[effect]]\nname = "gain_drift"', "channel"),
+        ('[[effect]]\nname = "gain_drift"\nchannel = "W1"\nphase = 3.0', "phase"),
+        ('[[effect]]\nname = "gain_drift"\nchannel = "W1"\namplitude = "large"', "amplitude"),
+        ('[[effect]]\nname = "gain_drift"\nchannel = "W1"\namplitude = 0.1', "pointed"),
+        ('[[effect]]\nname = "gain_drift"\nchannel = "V9"', "V9"),
+        ('[[effect]]\nname = "dipole_modulation"\nchannel = "W1"', "common"),
+        ('[[effect]]\nname = "beam_noncircularity"\nchannel = "W1"\namplitude = 1.0', "m_max"),
+    ],
+)
+def test_config_refuses_effects_that_run_refuses(effect: str, key: str, mcsim: Command, tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(f"{SMALL}{effect}\n")
+    answers = [
+        mcsim(*words) for words in (("config", "small.toml"), ("run", "small.toml"), ("run", "small.toml", "--dry-run"))
+    ]
+    for code, _, err in answers:
+        assert code == 2
+        assert key in err
+        assert "Traceback" not in err
+    assert len({err for _, _, err in answers}) == 1
+    assert [file.name for file in tmp_path.iterdir()] == ["small.toml"]
 
 
 @pytest.mark.parametrize(

@@ -330,6 +330,19 @@ def test_data_in_mk_with_a_header_are_read(small, folder):
     assert np.allclose(read_maps(small.analysis.model, folder)[0], expected, rtol=1e-12)
 
 
+def test_data_in_antenna_temperature_are_read(small, folder):
+    expected = simulate.maps(data_of(small.run), 0)[0]
+    frequency = small.run.channels[0].frequency_ghz
+    assert frequency is not None
+    x = 6.62607015e-34 * frequency * 1e9 / (1.380649e-23 * 2.7255)
+    factor = np.expm1(x) ** 2 / (x**2 * np.exp(x))
+    write(folder, "V1:half1", np.where(expected == healpy.UNSEEN, expected, expected / factor), unit="uK_RJ")
+    assert np.allclose(read_maps(small.analysis.model, folder)[0], expected, rtol=1e-6)
+    write(folder, "V1:half1", expected, unit="V")
+    with pytest.raises(InputError, match="'V'"):
+        read_maps(small.analysis.model, folder)
+
+
 def test_a_missing_file_is_named(small, folder):
     (folder / "W1_half2.fits").unlink()
     with pytest.raises(InputError, match=r"W1_half2\.fits does not exist"):

@@ -87,7 +87,9 @@ def test_equal_round_beams_recover_the_sky(year, x):
     values, sky = simulate.realize(shared, 0), simulate.draw_sky(shared, 0)
     smooth = healpix.synthesis(convolve.circular_alm(sky, shared.channels[0].response)[None], NSIDE, LMAX)[0]
     # The monopole is not seen at x = 0, and to tol / 2 x^2 at others; this sky has none in its a_lm.
-    np.testing.assert_allclose(values["map"][0], smooth - np.mean(smooth) * (x == 0.0), atol=1e-7 * smooth.std())
+    np.testing.assert_allclose(
+        values["observed_map"][0], smooth - np.mean(smooth) * (x == 0.0), atol=1e-7 * smooth.std()
+    )
     seen = alm_.multiply(sky, shared.channels[0].beam.window, LMAX)
     np.testing.assert_allclose(values["cl"][0, 2:], bipolar.power_spectrum(seen, seen, LMAX)[2:], rtol=1e-5)
     np.testing.assert_array_equal(values["biposh"], values["biposh_circular"])
@@ -104,7 +106,7 @@ def test_map_is_that_of_the_whole_beams_solved_at_once(year):
     (pairs,) = [m.pairs for m in channel.maps]
     expected, report = mapmaking.solve(pairs, mapmaking.rhs_from_maps(pairs, [tuple(sides)])[0], tol=1e-10)
     assert report.converged
-    found = simulate.realize(shared, 3)["map"][0]
+    found = simulate.realize(shared, 3)["observed_map"][0]
     np.testing.assert_allclose(found, expected, atol=1e-6 * expected.std())
 
 
@@ -204,7 +206,7 @@ def test_maps_that_do_not_converge_are_failures_and_can_be_made_later(year, clie
 
 def test_threads_do_not_change_a_map(year):
     shared = survey(year(channel={"noise": {"sigma0_uk": 10.0}}, **ensemble(keep_maps=True)))
-    one, two = (simulate.realize(shared, 0, nthreads)["map"] for nthreads in (1, 2))
+    one, two = (simulate.realize(shared, 0, nthreads)["observed_map"] for nthreads in (1, 2))
     # ducc0's transforms may differ in the last bits.
     np.testing.assert_allclose(one, two, rtol=1e-9)
 
@@ -220,7 +222,7 @@ def test_part_of_the_sky(year, model: Path, tmp_path: Path):
     assert 0.05 < unseen.mean() < 0.9
     assert m.weight is not None
     values = simulate.realize(shared, 0)
-    np.testing.assert_array_equal(values["map"][0] == healpy.UNSEEN, unseen)
+    np.testing.assert_array_equal(values["observed_map"][0] == healpy.UNSEEN, unseen)
     assert np.all(np.isfinite(values["cl"]))
 
 

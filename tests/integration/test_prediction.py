@@ -8,10 +8,9 @@ from distributed import Client
 from scipy import stats
 
 from mcsim import beamfit, config, open_ensemble, open_summary
-from mcsim.ensemble import prediction, runner
+from mcsim.ensemble import prediction, runner, tables
 from mcsim.errors import InputError
 from mcsim.instrument import scan
-from mcsim.support import resources
 
 from .conftest import ensemble, table
 
@@ -20,8 +19,8 @@ BEAM = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 300.0, "fwhm_minor_a
 
 def limit_moments(path: Path, nside: int) -> str:
     """The WMAP-like scan in the limit of endless time, as a file."""
-    model = scan.load_model(resources.scan_model("wmap"))
-    scan.write_moments_fits(path, scan.limit_on_pixels(model, nside, 4))
+    model = scan.ScanModel.load("wmap")
+    scan.write_moments_fits(path, scan.Moments.limit(model, nside, 4))
     return str(path)
 
 
@@ -82,9 +81,10 @@ def test_hit_average_fitted_with_parallel_transport_gives_the_factor_of_a20(tmp_
             {"name": "W1", "beam": BEAM, "scan": {"kind": "moments", "path": limit_moments(tmp_path / "m.fits", 64)}}
         ],
     )
-    prediction.write(prediction.predict(hit), tmp_path / "hit.ecsv")
+    tables.write_prediction(prediction.predict(hit), tmp_path / "hit.ecsv")
     transported = table(channel=[{"name": "W1", "beam": BEAM, "scan": {"kind": "parallel_transport"}}])
-    found = beamfit.fit(tmp_path / "hit.ecsv", transported, "constant", kind="plain")
+    measured = beamfit.measurement(tmp_path / "hit.ecsv", transported, beamfit.Selection(kind="plain"))
+    found = beamfit.fit(measured, transported, "constant")
     assert found.solution.parameters[0] == pytest.approx(0.6576, abs=1e-3)
 
 

@@ -4,18 +4,16 @@ import healpy
 import numpy as np
 import pytest
 
-from mcsim.instrument.beams import Beam, elliptical_gaussian
-from mcsim.instrument.scan import Moments, load_model
-from mcsim.instrument.scan.accumulate import stream_moments
+from mcsim.instrument.beams import Beam
+from mcsim.instrument.scan import Moments, ScanModel
 from mcsim.simulation import convolve, mapmaking, tod
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.sphere.spectra import load
-from mcsim.support import resources
 
 NSIDE, LMAX = 64, 192
 # Half a year, a sample every 8 seconds: 35 in the median pixel.
-MODEL = load_model(resources.scan_model("wmap")).with_sampling(8.0)
+MODEL = ScanModel.load("wmap").with_sampling(8.0)
 HALF = (0.0, 0.5)
 
 
@@ -26,12 +24,12 @@ def sky() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def beam() -> Beam:
-    return elliptical_gaussian(88.0 * 1.15**0.5, 88.0 / 1.15**0.5, 20.0, LMAX)
+    return Beam.elliptical(88.0 * 1.15**0.5, 88.0 / 1.15**0.5, 20.0, LMAX)
 
 
 @pytest.fixture(scope="module")
 def moments(beam: Beam) -> Moments:
-    return stream_moments(MODEL, NSIDE, beam.mmax, time_range=HALF)
+    return Moments.from_model(MODEL, NSIDE, beam.mmax, time_range=HALF)
 
 
 def default_route(sky: np.ndarray, beam: Beam, moments: Moments, window: np.ndarray | None) -> tuple[np.ndarray, ...]:

@@ -9,7 +9,7 @@ import xarray as xr
 from distributed import Client
 
 from mcsim import config, open_ensemble
-from mcsim.ensemble import runner, store
+from mcsim.ensemble import opening, runner, store
 from mcsim.errors import InputError
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
@@ -20,7 +20,7 @@ from .conftest import ensemble, table
 def assert_same(a: Path, b: Path, attributes: bool = True) -> None:
     """Same arrays, summary and scientific attributes, bit for bit."""
     xr.testing.assert_identical(open_ensemble(a).drop_attrs(), open_ensemble(b).drop_attrs())
-    xr.testing.assert_identical(store.open_summary(a), store.open_summary(b))
+    xr.testing.assert_identical(opening.open_summary(a), opening.open_summary(b))
     for path in (a, b):
         assert open_ensemble(path).done.all()
     if attributes:
@@ -45,7 +45,7 @@ def test_store_holds_what_a_realization_gives(small_store: Path) -> None:
 
 
 def test_summary_is_that_of_the_realizations(small_store: Path) -> None:
-    with open_ensemble(small_store) as stored, store.open_summary(small_store) as summary:
+    with open_ensemble(small_store) as stored, opening.open_summary(small_store) as summary:
         difference = (stored.biposh - stored.biposh_circular).values
         for name, sample in {
             "biposh": stored.biposh.values,
@@ -184,11 +184,11 @@ def test_kept_maps(client: Client, tmp_path: Path) -> None:
     path = tmp_path / "x.zarr"
     runner.run(table(**ensemble(2, keep_maps=True)), path, client=client)
     with open_ensemble(path) as stored:
-        assert stored["map"].sizes == {"realization": 2, "map_name": 1, "pixel": 3072}
-        assert stored["map"].attrs["units"] == "uK"
+        assert stored["observed_map"].sizes == {"realization": 2, "map_name": 1, "pixel": 3072}
+        assert stored["observed_map"].attrs["units"] == "uK"
         shared = survey(config.load(table(**ensemble(2, keep_maps=True))))
-        expected = simulate.realize(shared, 1)["map"]
-        np.testing.assert_array_equal(stored["map"][1], expected.astype(np.float32))
+        expected = simulate.realize(shared, 1)["observed_map"]
+        np.testing.assert_array_equal(stored["observed_map"][1], expected.astype(np.float32))
 
 
 def test_merge_refuses_what_does_not_belong_together(small_store: Path, client: Client, tmp_path: Path) -> None:

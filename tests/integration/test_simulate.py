@@ -87,7 +87,7 @@ def test_pixel_window_is_in_the_map_and_taken_out_of_the_coefficients() -> None:
     on = realize(map={"nside": 16, "pixel_window": "computed"}, **ensemble(keep_maps=True))
     window = healpix.pixel_window(16, 32)
     np.testing.assert_allclose(on["cl_circular"], off["cl_circular"], rtol=1e-12)
-    maps = [healpix.analysis(values["map"][0], 32, iterations=8) for values in (on, off)]
+    maps = [healpix.analysis(values["observed_map"][0], 32, iterations=8) for values in (on, off)]
     power = [bipolar.power_spectrum(a, a, 32) for a in maps]
     np.testing.assert_allclose(power[0][2:] / power[1][2:], window[2:] ** 2, rtol=1e-3)
 
@@ -132,12 +132,12 @@ def test_mask_of_another_frame_and_resolution_with_a_soft_edge(tmp_path: Path) -
 
 
 def test_files_of_b_lm_may_be_turned(tmp_path: Path) -> None:
-    ellipse = beams.elliptical_gaussian(300.0, 250.0, 10.0, 32, mmax=4)
+    ellipse = beams.Beam.elliptical(300.0, 250.0, 10.0, 32, mmax=4)
     packed = np.concatenate([ellipse.blm[m, m:] for m in range(5)])
     healpy.write_alm(tmp_path / "b.fits", packed, lmax=32, mmax=4, mmax_in=4, out_dtype=np.float64)
     turned = {"kind": "blm", "path": str(tmp_path / "b.fits"), "m_max": 4, "angle_deg": 25.0}
     (loaded,) = survey(config.load(table(channel=[channel(beam=turned)]))).channels
-    expected = beams.elliptical_gaussian(300.0, 250.0, 35.0, 32, mmax=4).blm
+    expected = beams.Beam.elliptical(300.0, 250.0, 35.0, 32, mmax=4).blm
     np.testing.assert_allclose(loaded.beam.blm, expected, atol=1e-12)
 
 

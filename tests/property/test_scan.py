@@ -4,7 +4,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numba import njit
 
-from mcsim.instrument.scan.accumulate import stream_moments
+from mcsim.instrument.scan import Moments
 from mcsim.instrument.scan.limit import caustics, limit_moments
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
 from mcsim.instrument.scan.pointing import pointing, quarter_turns, ring_pixel
@@ -92,7 +92,7 @@ def test_limit_is_a_symmetric_mean_of_unit_numbers(model):
 @SETTINGS
 @given(models(), st.integers(1, 3))
 def test_moments_are_bounded_and_count_every_sample(model, smax):
-    moments = stream_moments(model, 4, smax)
+    moments = Moments.from_model(model, 4, smax)
     assert moments.hits.sum() == model.samples(model.lines_of_sight[0])
     assert (np.abs(moments.w) <= 1.0 + 1e-12).all()
     # No point of a pixel of nside 4 is farther than 15 degrees from its centre.

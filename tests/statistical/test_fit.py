@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from mcsim import config
-from mcsim.beamfit import Measurement, compare, fit, solve
+from mcsim.beamfit import Measurement, compare, fit, fit_each, solve
 from mcsim.beamfit.data import QUADRUPOLE, SUMMARY, Row, project
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
@@ -21,16 +21,17 @@ def few_simulations() -> dict[str, np.ndarray]:
     root = np.tril(rng.normal(size=(p, p))) + 2.0 * np.eye(p)
     design = np.stack([np.ones(p), np.linspace(0.0, 1.0, p)], axis=1)
     truth = np.array([1.0, 0.0])
-    found: dict[str, list] = {name: [] for name in ("probability", "pulls", "comparison", "plain")}
+    found: dict[str, list] = {name: [] for name in ("probability", "chi2", "pulls", "comparison", "plain")}
     for _ in range(draws):
         data = design @ truth + root @ rng.normal(size=p)
         simulated = rng.normal(size=(N, p)) @ root.T
         covariance = np.cov(simulated.T)
         large = solve(data, design, covariance, N)
         found["probability"].append(large.probability)
+        found["chi2"].append(large.chi2)
         found["pulls"].append((large.parameters - truth) / large.errors)
         found["comparison"].append(compare(solve(data, design[:, :1], covariance, N), large).probability)
-        found["plain"].append(stats.chi2.sf(large.chi2, large.dof))
+        found["plain"].append(stats.chi2.sf(large.square, large.dof))
     return {name: np.array(values) for name, values in found.items()}
 
 
@@ -42,6 +43,14 @@ def test_probabilities_are_uniform(name, few_simulations):
 def test_an_uncorrected_chi2_would_not_be(few_simulations):
     """The test above can fail: a plain chi^2 of the same fits calls most of them bad."""
     assert np.mean(few_simulations["plain"] < 0.05) > 0.4
+
+
+def test_chi2_has_the_expectation_of_its_degrees_of_freedom(few_simulations):
+    """With n = 23 and q = 10 the square is n q/(n - q + 1) F(q, n - q + 1), of expectation n q/(n - q - 1) = 19."""
+    chi2 = few_simulations["chi2"]
+    n, q = 23, 10
+    width = q * (n - q - 1) / (n - q + 1) * stats.f(q, n - q + 1).std()
+    assert abs(chi2.mean() - q) < 4.0 * width / np.sqrt(len(chi2))
 
 
 def test_pulls_have_unit_width(few_simulations):
@@ -87,7 +96,7 @@ def skies():
 def test_pulls_over_simulated_skies(name, truth, skies):
     """Each sky fitted on its own, all with the true beam: width within 0.9 ... 1.1, as within 3 of its errors."""
     shared, measured = skies
-    found = fit(measured, shared, name, each=True)
+    found = fit_each(fit(measured, shared, name))
     pulls = found.pulls(truth)
     width = pulls.std(axis=0, ddof=1)
     assert np.all(np.abs(width - 1.0) < 0.1)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from mcsim.errors import InputError
-from mcsim.instrument.beams import MMAX_TOLERANCE, Beam, choose_mmax, elliptical_gaussian, gaussian
-from mcsim.instrument.beams.beam import normalize, power_by_order
+from mcsim.instrument.beams import MMAX_TOLERANCE, Beam, choose_mmax
+from mcsim.instrument.beams.coefficients import power_by_order
 
 
 def random_blm(lmax: int, mmax: int) -> np.ndarray:
@@ -16,7 +16,7 @@ def random_blm(lmax: int, mmax: int) -> np.ndarray:
 
 
 def test_truncation_keeps_account_of_the_power() -> None:
-    whole = normalize(random_blm(20, 9), 9, "a test beam")
+    whole = Beam.normalized(random_blm(20, 9), 9, "a test beam")
     power = power_by_order(whole.blm)
     once = whole.truncated(3)
     twice = whole.truncated(6).truncated(3)
@@ -33,7 +33,7 @@ def test_power_counts_both_signs_of_m() -> None:
 
 
 def test_circular_part() -> None:
-    beam = elliptical_gaussian(30, 20, 40, 300, 4)
+    beam = Beam.elliptical(30, 20, 40, 300, 4)
     circular = beam.circular()
     assert circular.mmax == 0
     np.testing.assert_array_equal(circular.window, beam.window)
@@ -41,7 +41,7 @@ def test_circular_part() -> None:
 
 
 def test_normalize_divides_by_the_integral() -> None:
-    beam = normalize(random_blm(8, 3) * 7, 3, "a test beam")
+    beam = Beam.normalized(random_blm(8, 3) * 7, 3, "a test beam")
     assert beam.window[0] == pytest.approx(1, abs=1e-15)
     np.testing.assert_allclose(beam.blm * beam.integral, random_blm(8, 3) * 7, rtol=1e-14)
 
@@ -68,15 +68,15 @@ def test_mmax_of_a_beam_known_only_up_to_a_lower_order() -> None:
 
 
 def test_chosen_mmax_of_mild_and_strong_ellipses() -> None:
-    assert elliptical_gaussian(13.9, 12.7, 0, 1024).mmax == 2
-    assert elliptical_gaussian(20, 12, 0, 1024).mmax == 4
-    assert elliptical_gaussian(20, 12, 0, 1024).neglected_power < MMAX_TOLERANCE
+    assert Beam.elliptical(13.9, 12.7, 0, 1024).mmax == 2
+    assert Beam.elliptical(20, 12, 0, 1024).mmax == 4
+    assert Beam.elliptical(20, 12, 0, 1024).neglected_power < MMAX_TOLERANCE
 
 
 def test_values_are_the_elliptical_gaussian() -> None:
     sigma_major, sigma_minor = np.radians([1.0, 0.75]) / np.sqrt(8 * np.log(2))
     # At lmax 1500 and mmax 24 nothing of this beam is cut: what is left is the closed form's own error.
-    beam = elliptical_gaussian(60, 45, 0, 1500, 24)
+    beam = Beam.elliptical(60, 45, 0, 1500, 24)
     theta, phi = np.meshgrid(np.linspace(1e-3, 0.03, 12), np.arange(0, 6, 0.5))
     expected = np.exp(-((theta * np.cos(phi) / sigma_major) ** 2 + (theta * np.sin(phi) / sigma_minor) ** 2) / 2)
     expected /= 2 * np.pi * sigma_major * sigma_minor
@@ -87,7 +87,7 @@ def test_values_are_the_elliptical_gaussian() -> None:
 @pytest.mark.parametrize("mmax", [-1, 11])
 def test_truncation_to_no_order_is_refused(mmax) -> None:
     with pytest.raises(InputError, match=f"mmax = {mmax}"):
-        gaussian(60, 10).truncated(mmax)
+        Beam.gaussian(60, 10).truncated(mmax)
 
 
 @pytest.mark.parametrize(
@@ -99,15 +99,15 @@ def test_normalize_refuses(change, named) -> None:
     blm = random_blm(8, 3)
     blm[m, ell] = value
     with pytest.raises(InputError, match=named):
-        normalize(blm, None, "a test beam")
+        Beam.normalized(blm, None, "a test beam")
 
 
 def test_normalize_refuses_orders_that_are_not_there() -> None:
     with pytest.raises(InputError, match="mmax = 5 exceeds the largest order 3"):
-        normalize(random_blm(8, 3), 5, "a test beam")
+        Beam.normalized(random_blm(8, 3), 5, "a test beam")
 
 
 def test_beams_compare_by_identity() -> None:
-    beam = gaussian(60, 10)
+    beam = Beam.gaussian(60, 10)
     assert beam == beam
     assert beam != Beam(beam.blm)

@@ -5,8 +5,10 @@ import pytest
 from astropy.io import fits
 from scipy.special import gammaln
 
+from mcsim import config
 from mcsim.errors import InputError
-from mcsim.instrument.beams import blm_of_map, elliptical_gaussian, find_centre, from_map, read_map
+from mcsim.instrument.beams import Beam, blm_of_map, find_centre, read_map
+from mcsim.simulation.channels import load_beam_map
 
 PIXEL_DEG = 0.04
 PIXEL = np.radians(PIXEL_DEG)
@@ -27,9 +29,9 @@ def spherical_harmonics(lmax: int, m: int, theta: float, phi: float) -> np.ndarr
 
 
 def directions(size: int, centre: tuple[float, float], projection: str = "equidistant"):
-    """Theta and phi of the pixels of a square map."""
-    y = (np.arange(size) - centre[0])[:, None] * PIXEL
-    x = (np.arange(size) - centre[1])[None, :] * PIXEL
+    """Theta and phi of the pixels of a square map about a centre (column, row)."""
+    x = (np.arange(size) - centre[0])[None, :] * PIXEL
+    y = (np.arange(size) - centre[1])[:, None] * PIXEL
     radius = np.hypot(x, y)
     theta = {"equidistant": radius, "orthographic": np.arcsin(radius), "equal_area": 2 * np.arcsin(radius / 2)}
     return theta[projection], np.arctan2(y, x)
@@ -79,20 +81,38 @@ def relative(blm, expected):
 def test_elliptical_gaussian_map_gives_the_closed_form(tmp_path, projection) -> None:
     theta, phi = directions(200, (98.3, 101.6), projection)
     path = write(tmp_path / "beam.fits", ellipse(theta, phi))
-    beam = from_map(path, 1024, 6, projection=projection, centre=(98.3, 101.6))
-    expected = elliptical_gaussian(13.9, 12.7, 25.0, 1024, 6)
+    beam = Beam.from_map(read_map(path, projection=projection, centre=(98.3, 101.6)), 1024, 6)
+    expected = Beam.elliptical(13.9, 12.7, 25.0, 1024, 6)
     # What is left is the closed form's error, 2e-11 of the order; no pixel effect at 5 pixels per FWHM.
     assert relative(beam.blm, expected.blm) < 1e-10
     for m in (2, 4):
         assert relative(beam.blm[m], expected.blm[m]) < 1e-9
 
 
+def test_centre_is_column_and_row(tmp_path) -> None:
+    # A circular beam at column 50, row 25 of a map that is wider than it is high.
+    x, y = (np.arange(81) - 50)[None, :] * PIXEL, (np.arange(61) - 25)[:, None] * PIXEL
+    theta, phi = np.hypot(x, y), np.arctan2(y, x)
+    path = write(tmp_path / "beam.fits", ellipse(theta, phi, 10, 10))
+    found = read_map(path)
+    assert found.centre == pytest.approx((50, 25), abs=1e-4)
+    given = Beam.from_map(path, 200, 2, centre=(50, 25))
+    assert np.abs(given.blm[1, 20]) < 1e-10 * given.blm[0, 20].real
+    # So in a run's configuration, whose key is centre_pixel.
+    channel = {"kind": "map", "path": str(path), "centre_pixel": (50.0, 25.0)}
+    np.testing.assert_array_equal(load_beam_map("W1", config.BeamMap(**channel)).centre, (50, 25))
+    with pytest.raises(InputError, match=r"column, row"):
+        read_map(path, centre=(25, 50))
+    with pytest.raises(InputError, match=r"column, row"):
+        read_map(path, centre=(25, 70))
+
+
 def test_wrong_projection_is_seen_in_a_wide_beam(tmp_path) -> None:
     theta, phi = directions(240, (120, 120))
     path = write(tmp_path / "beam.fits", ellipse(theta, phi, 120, 90))
-    expected = elliptical_gaussian(120, 90, 25.0, 200, 2).blm
-    assert relative(from_map(path, 200, 2, cut_deg=4.5).blm, expected) < 1e-6
-    assert relative(from_map(path, 200, 2, cut_deg=4.5, projection="orthographic").blm, expected) > 1e-4
+    expected = Beam.elliptical(120, 90, 25.0, 200, 2).blm
+    assert relative(Beam.from_map(path, 200, 2, cut_deg=4.5).blm, expected) < 1e-6
+    assert relative(Beam.from_map(read_map(path, cut_deg=4.5, projection="orthographic"), 200, 2).blm, expected) > 1e-4
 
 
 def test_comatic_beam_has_its_odd_orders_and_imaginary_parts(tmp_path) -> None:
@@ -102,7 +122,7 @@ def test_comatic_beam_has_its_odd_orders_and_imaginary_parts(tmp_path) -> None:
     image = lobe(theta, phi, 14) + 0.2 * lobe(theta, phi, 20, *first) - 0.05 * lobe(theta, phi, 16, *second)
     blm = lobe_blm(1024, 8, 14) + 0.2 * lobe_blm(1024, 8, 20, *first) - 0.05 * lobe_blm(1024, 8, 16, *second)
     path = write(tmp_path / "beam.fits", 3.0 * image)
-    beam = from_map(path, 1024, 8, centre=(109.25, 110.5))
+    beam = Beam.from_map(path, 1024, 8, centre=(109.25, 110.5))
     assert beam.integral == pytest.approx(3.0 * 1.15, rel=1e-9)
     for m in range(9):
         assert np.abs(beam.blm[m].imag).max() > (1e-3 if m else -1)
@@ -118,7 +138,7 @@ def test_sum_over_pixels_is_the_sum_of_harmonics() -> None:
     expected = np.zeros((mmax + 1, lmax + 1), dtype=complex)
     for row in range(12):
         for column in range(15):
-            y, x = (row - centre[0]) * pixel, (column - centre[1]) * pixel
+            x, y = (column - centre[0]) * pixel, (row - centre[1]) * pixel
             radius = np.hypot(x, y)
             if radius <= np.radians(5.0):
                 area = pixel**2 * np.sin(radius) / radius
@@ -148,7 +168,7 @@ def test_rotated_map_turns_the_phases(tmp_path, width, centre) -> None:
         image = ellipse(theta, phi, width, 0.7 * width, 20)
         for strength, at_theta, at_phi in ((6e-7, 0.02, 2.0), (-8e-7, 0.025, -1.0)):
             image += strength * lobe(theta, phi, 15, at_theta, at_phi)
-        beams.append(from_map(write(tmp_path / f"beam{turn:.2f}.fits", image), 1024, 8, centre=centre))
+        beams.append(Beam.from_map(write(tmp_path / f"beam{turn:.2f}.fits", image), 1024, 8, centre=centre))
     upright, turned = beams
     for m in range(9):
         largest = np.abs(upright.blm[m]).max()
@@ -165,7 +185,7 @@ def test_beam_does_not_depend_on_where_it_lies_in_the_map(tmp_path, shift) -> No
     path = write(tmp_path / "beam.fits", ellipse(theta, phi, 6, 5.5))
     beam_map = read_map(path, cut_deg=2.0)
     assert beam_map.centre == pytest.approx((99 + shift[0], 98 + shift[1]), abs=1e-6)
-    assert relative(beam_map.beam(1024, 4).blm, elliptical_gaussian(6, 5.5, 25, 1024, 4).blm) < 3e-7
+    assert relative(Beam.from_map(beam_map, 1024, 4).blm, Beam.elliptical(6, 5.5, 25, 1024, 4).blm) < 3e-7
 
 
 def test_centroid_is_over_fifteen_pixels() -> None:
@@ -173,7 +193,7 @@ def test_centroid_is_over_fifteen_pixels() -> None:
     image[20, 20] = 1.0
     image[20, 27] = 0.5
     image[28, 20] = 0.5
-    assert find_centre(image) == pytest.approx((20, 20 + 7 / 3))
+    assert find_centre(image) == pytest.approx((20 + 7 / 3, 20))
 
 
 def test_negative_sidelobes_are_kept_and_the_cut_is_applied(tmp_path) -> None:
@@ -181,8 +201,8 @@ def test_negative_sidelobes_are_kept_and_the_cut_is_applied(tmp_path) -> None:
     image[50, 50], image[50, 75], image[90, 50] = 1.0, -0.25, 9.0e-3
     path = write(tmp_path / "beam.fits", image)
     wide, narrow = (
-        from_map(path, 50, 2, cut_deg=1.2, centre=(50, 50)),
-        from_map(path, 50, 2, cut_deg=0.9, centre=(50, 50)),
+        Beam.from_map(path, 50, 2, cut_deg=1.2, centre=(50, 50)),
+        Beam.from_map(path, 50, 2, cut_deg=0.9, centre=(50, 50)),
     )
     assert wide.integral == pytest.approx(0.75 * PIXEL**2, rel=1e-4)
     assert narrow.integral == pytest.approx(PIXEL**2, rel=1e-12)
@@ -194,19 +214,21 @@ def test_pixel_means_are_restored(tmp_path) -> None:
     mean = 0.0
     for y, weight_y in zip(node / 2, weight / 2, strict=True):
         for x, weight_x in zip(node / 2, weight / 2, strict=True):
-            theta, phi = directions(160, (79.3 - y, 80.1 - x))
+            theta, phi = directions(160, (79.3 - x, 80.1 - y))
             mean = mean + weight_y * weight_x * ellipse(theta, phi)
     path = write(tmp_path / "beam.fits", mean)
-    expected = elliptical_gaussian(13.9, 12.7, 25.0, 1024, 4).blm
-    assert relative(from_map(path, 1024, 4, centre=(79.3, 80.1), pixel_average=True).blm, expected) < 1e-6
-    assert relative(from_map(path, 1024, 4, centre=(79.3, 80.1)).blm, expected) > 1e-3
+    expected = Beam.elliptical(13.9, 12.7, 25.0, 1024, 4).blm
+    assert (
+        relative(Beam.from_map(read_map(path, centre=(79.3, 80.1), pixel_average=True), 1024, 4).blm, expected) < 1e-6
+    )
+    assert relative(Beam.from_map(path, 1024, 4, centre=(79.3, 80.1)).blm, expected) > 1e-3
 
 
 def test_mmax_is_chosen_and_the_rest_reported(tmp_path) -> None:
     theta, phi = directions(160, (80, 80))
     path = write(tmp_path / "beam.fits", ellipse(theta, phi, 20, 12))
-    closed = elliptical_gaussian(20, 12, 25, 1024)
-    beam = from_map(path, 1024)
+    closed = Beam.elliptical(20, 12, 25, 1024)
+    beam = Beam.from_map(path, 1024)
     assert beam.mmax == closed.mmax == 4
     assert beam.neglected_power == pytest.approx(closed.neglected_power, rel=1e-6)
 
@@ -215,8 +237,16 @@ def test_plane_of_a_cube_and_given_pixel(tmp_path) -> None:
     theta, phi = directions(100, (50, 50))
     cube = np.stack([ellipse(theta, phi), np.ones_like(theta), ellipse(theta, phi, 20, 12)])
     path = write(tmp_path / "cube.fits", cube, pixel_deg=None)
-    beam = from_map(path, 500, 2, pixel_deg=PIXEL_DEG, plane=2)
-    assert relative(beam.blm, elliptical_gaussian(20, 12, 25, 500, 2).blm) < 1e-6
+    beam = Beam.from_map(read_map(path, pixel_deg=PIXEL_DEG, plane=2), 500, 2)
+    assert relative(beam.blm, Beam.elliptical(20, 12, 25, 500, 2).blm) < 1e-6
+
+
+def test_logarithmic_map_is_refused(tmp_path) -> None:
+    theta, phi = directions(100, (50, 50))
+    path = write(tmp_path / "beam.fits", 60.0 + 10.0 * np.log10(ellipse(theta, phi) + 1e-6))
+    fits.setval(path, "BUNIT", value="dBi")
+    with pytest.raises(InputError, match="dBi"):
+        read_map(path)
 
 
 def small_image() -> np.ndarray:
@@ -244,7 +274,7 @@ def small_image() -> np.ndarray:
     ],
 )
 def test_unusable_map_is_refused(tmp_path, change, options, named) -> None:
-    image = small_image()
+    image, options = small_image(), dict(options)
     if change == "nan":
         image[3, 3] = np.nan
     elif change == "zero":
@@ -258,8 +288,9 @@ def test_unusable_map_is_refused(tmp_path, change, options, named) -> None:
     elif change == "empty inside":
         image[:10, :10] = 0
     path = write(tmp_path / "beam.fits", image)
+    degrees = {key: options.pop(key) for key in ("lmax", "mmax") if key in options}
     with pytest.raises(InputError, match=named):
-        from_map(path, **{"lmax": 100, **options})
+        Beam.from_map(read_map(path, **options), **{"lmax": 100, **degrees})
 
 
 def test_unusable_headers_are_refused(tmp_path) -> None:
@@ -279,9 +310,9 @@ def test_unusable_headers_are_refused(tmp_path) -> None:
         (tmp_path / "absent.fits", "does not exist"),
     ]:
         with pytest.raises(InputError, match=named):
-            from_map(path, 100)
+            Beam.from_map(path, 100)
     with pytest.raises(InputError, match=r"plane = 2 .* planes 0 to 1"):
-        from_map(cube, 100, plane=2)
+        read_map(cube, plane=2)
 
 
 def test_truncated_empty_and_foreign_files_are_refused(tmp_path) -> None:
@@ -295,4 +326,4 @@ def test_truncated_empty_and_foreign_files_are_refused(tmp_path) -> None:
         ("empty", "holds no image"),
     ]:
         with pytest.raises(InputError, match=named):
-            from_map(tmp_path / f"{name}.fits", 100)
+            Beam.from_map(tmp_path / f"{name}.fits", 100)

@@ -1,12 +1,14 @@
 """Beams from files of coefficients."""
 
+from types import SimpleNamespace
+
 import healpy
 import numpy as np
 import pytest
 from astropy.io import fits
 
 from mcsim.errors import InputError
-from mcsim.instrument.beams import Beam, elliptical_gaussian, from_blm_file
+from mcsim.instrument.beams import Beam
 from mcsim.sphere import alm as alm_
 
 
@@ -28,19 +30,19 @@ def write(path, beam: Beam, scale: float = 1.0):
 
 @pytest.fixture
 def beam() -> Beam:
-    return elliptical_gaussian(60, 40, 30, 120, 6)
+    return Beam.elliptical(60, 40, 30, 120, 6)
 
 
 def test_file_comes_back_normalised(tmp_path, beam) -> None:
     path = write(tmp_path / "beam.alm.fits", beam, scale=0.4945)
-    read = from_blm_file(path, 120, 6)
+    read = Beam.from_blm(path, 120, 6)
     np.testing.assert_allclose(read.blm, beam.blm, rtol=0, atol=1e-15)
     assert read.integral == pytest.approx(0.4945, rel=1e-14)
 
 
 def test_lower_lmax_and_chosen_mmax(tmp_path, beam) -> None:
-    read = from_blm_file(write(tmp_path / "beam.alm.fits", beam), 80)
-    expected = elliptical_gaussian(60, 40, 30, 80)
+    read = Beam.from_blm(write(tmp_path / "beam.alm.fits", beam), 80)
+    expected = Beam.elliptical(60, 40, 30, 80)
     assert (read.lmax, read.mmax) == (80, expected.mmax)
     np.testing.assert_allclose(read.blm, expected.blm, rtol=0, atol=1e-15)
 
@@ -56,7 +58,7 @@ def test_lower_lmax_and_chosen_mmax(tmp_path, beam) -> None:
 )
 def test_more_than_the_file_holds_is_refused(tmp_path, beam, lmax, mmax, named) -> None:
     with pytest.raises(InputError, match=named):
-        from_blm_file(write(tmp_path / "beam.alm.fits", beam), lmax, mmax)
+        Beam.from_blm(write(tmp_path / "beam.alm.fits", beam), lmax, mmax)
 
 
 @pytest.mark.parametrize(
@@ -71,13 +73,21 @@ def test_more_than_the_file_holds_is_refused(tmp_path, beam, lmax, mmax, named) 
 def test_coefficients_that_are_no_beam_are_refused(tmp_path, beam, index, value, named) -> None:
     blm = beam.blm.copy()
     blm[index] = value
+    path = write(tmp_path / "beam.alm.fits", SimpleNamespace(blm=blm, lmax=120, mmax=6))
     with pytest.raises(InputError, match=named):
-        from_blm_file(write(tmp_path / "beam.alm.fits", Beam(blm)), 120)
+        Beam.from_blm(path, 120)
+
+
+@pytest.mark.parametrize("power", [-0.5, 0.5])
+def test_other_normalisation_in_l_is_refused(tmp_path, beam, power) -> None:
+    path = write(tmp_path / "beam.alm.fits", Beam(beam.blm * (2.0 * np.arange(121) + 1.0) ** power))
+    with pytest.raises(InputError, match="B_1"):
+        Beam.from_blm(path, 120)
 
 
 def test_all_zero_file_is_refused(tmp_path, beam) -> None:
     with pytest.raises(InputError, match="at m = 0"):
-        from_blm_file(write(tmp_path / "beam.alm.fits", Beam(0 * beam.blm)), 120)
+        Beam.from_blm(write(tmp_path / "beam.alm.fits", Beam(0 * beam.blm)), 120)
 
 
 def test_unreadable_files_are_refused(tmp_path, beam) -> None:
@@ -87,6 +97,6 @@ def test_unreadable_files_are_refused(tmp_path, beam) -> None:
     fits.PrimaryHDU(np.ones((3, 3))).writeto(tmp_path / "image.fits")
     for name in ("truncated", "text", "image"):
         with pytest.raises(InputError, match="cannot be read as FITS coefficients"):
-            from_blm_file(tmp_path / f"{name}.fits", 100)
+            Beam.from_blm(tmp_path / f"{name}.fits", 100)
     with pytest.raises(InputError, match="do not exist"):
-        from_blm_file(tmp_path / "absent.fits", 100)
+        Beam.from_blm(tmp_path / "absent.fits", 100)

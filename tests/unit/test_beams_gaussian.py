@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from mcsim.errors import InputError
-from mcsim.instrument.beams import elliptical_gaussian, gaussian
+from mcsim.instrument.beams import Beam
 
 SIGMA_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
 
@@ -55,22 +55,22 @@ def quadrature(major: float, minor: float, angle_deg: float, lmax: int, orders: 
     ],
 )
 def test_elliptical_gaussian_against_quadrature(major, minor, lmax, root, tolerances) -> None:
-    beam = elliptical_gaussian(major, minor, 25.0, lmax, 6)
+    beam = Beam.elliptical(major, minor, 25.0, lmax, 6)
     expected = quadrature(major, minor, 25.0, lmax, tuple(tolerances), root)
     for (m, tolerance), reference in zip(tolerances.items(), expected, strict=True):
         np.testing.assert_allclose(beam.blm[m], reference, rtol=0, atol=tolerance * np.abs(reference).max())
 
 
 def test_odd_orders_and_degrees_below_m_vanish() -> None:
-    blm = elliptical_gaussian(20, 12, 10, 64, 6).blm
+    blm = Beam.elliptical(20, 12, 10, 64, 6).blm
     assert not blm[1::2].any()
     assert not np.tril(blm, -1).any()
     assert blm[2, 2:].all()
 
 
 def test_major_axis_along_x_makes_b_l2_positive_and_along_y_negative() -> None:
-    along_x = elliptical_gaussian(20, 12, 0, 500, 2).blm[2, 2:]
-    along_y = elliptical_gaussian(20, 12, 90, 500, 2).blm[2, 2:]
+    along_x = Beam.elliptical(20, 12, 0, 500, 2).blm[2, 2:]
+    along_y = Beam.elliptical(20, 12, 90, 500, 2).blm[2, 2:]
     assert np.all(along_x.real > 0)
     np.testing.assert_allclose(along_y, -along_x, rtol=1e-13)
 
@@ -78,17 +78,17 @@ def test_major_axis_along_x_makes_b_l2_positive_and_along_y_negative() -> None:
 def test_gaussian_is_the_usual_window() -> None:
     ell = np.arange(801)
     sigma = np.radians(1.0) * SIGMA_PER_FWHM
-    beam = gaussian(60.0, 800)
+    beam = Beam.gaussian(60.0, 800)
     np.testing.assert_allclose(beam.window, np.exp(-ell * (ell + 1) * sigma**2 / 2), rtol=1e-12)
     assert (beam.mmax, beam.neglected_power, beam.integral) == (0, 0.0, 1.0)
 
 
 def test_normalisation_is_exact() -> None:
-    assert elliptical_gaussian(500, 100, 33, 50).window[0] == pytest.approx(1, abs=1e-15)
+    assert Beam.elliptical(500, 100, 33, 50).window[0] == pytest.approx(1, abs=1e-15)
 
 
 def test_large_degrees_neither_overflow_nor_warn() -> None:
-    blm = elliptical_gaussian(60, 30, 0, 6000, 8).blm
+    blm = Beam.elliptical(60, 30, 0, 6000, 8).blm
     assert np.all(np.isfinite(blm))
     assert abs(blm[2, 6000]) < 1e-100
 
@@ -109,4 +109,4 @@ def test_large_degrees_neither_overflow_nor_warn() -> None:
 )
 def test_bad_input_is_named(arguments, named) -> None:
     with pytest.raises(InputError, match=named):
-        elliptical_gaussian(*arguments)
+        Beam.elliptical(*arguments)

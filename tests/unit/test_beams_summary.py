@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from mcsim.instrument.beams import BeamMap, elliptical_gaussian, format_summary, gaussian, summarize
+from mcsim.instrument.beams import Beam, BeamMap, format_summary, summarize
 from mcsim.plot.beam import beam_figure
 
 SIGMA_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
@@ -13,7 +13,7 @@ PIXEL = np.radians(0.04)
 
 def drawn(major, minor, angle_deg, size=151, centre=(74.6, 75.3), offset=(0.0, 0.0)) -> BeamMap:
     sigma = np.radians(np.array([major, minor]) / 60) * SIGMA_PER_FWHM
-    y, x = (np.arange(size) - centre[0])[:, None] * PIXEL, (np.arange(size) - centre[1])[None, :] * PIXEL
+    x, y = (np.arange(size) - centre[0])[None, :] * PIXEL, (np.arange(size) - centre[1])[:, None] * PIXEL
     x, y = x - offset[0], y - offset[1]
     cos, sin = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
     image = np.exp(-(((x * cos + y * sin) / sigma[0]) ** 2 + ((y * cos - x * sin) / sigma[1]) ** 2) / 2)
@@ -24,7 +24,7 @@ def drawn(major, minor, angle_deg, size=151, centre=(74.6, 75.3), offset=(0.0, 0
 @pytest.mark.parametrize(("major", "minor", "angle_deg"), [(30.0, 24.0, 20.0), (40.0, 20.0, -65.0)])
 def test_ellipse_is_measured(known_as, major, minor, angle_deg) -> None:
     # At lmax 3000 and mmax 60 nothing of these beams is cut, so that no rings are measured as negative response.
-    beam = elliptical_gaussian(major, minor, angle_deg, 3000, 60)
+    beam = Beam.elliptical(major, minor, angle_deg, 3000, 60)
     beam_map = drawn(major, minor, angle_deg) if known_as == "map" else None
     summary = summarize(beam, beam_map)
     sigma = np.radians(np.array([major, minor]) / 60) * SIGMA_PER_FWHM
@@ -39,14 +39,14 @@ def test_ellipse_is_measured(known_as, major, minor, angle_deg) -> None:
 
 
 def test_circular_beam() -> None:
-    summary = summarize(gaussian(30, 1500))
+    summary = summarize(Beam.gaussian(30, 1500))
     assert summary.fwhm_circular_arcmin == pytest.approx(30, rel=1e-3)
     assert summary.axis_ratio == pytest.approx(1, abs=1e-6)
     assert "circular" in format_summary(summary)
 
 
 def test_coefficients_at_the_listed_degrees() -> None:
-    beam = elliptical_gaussian(30, 24, 20, 600, 4)
+    beam = Beam.elliptical(30, 24, 20, 600, 4)
     summary = summarize(beam, ells=(100, 400, 601))
     assert summary.ells == (100, 400)
     np.testing.assert_allclose(summary.window, beam.window[[100, 400]], rtol=1e-15)
@@ -58,7 +58,7 @@ def test_negative_response_and_mean_offset_of_a_map() -> None:
     beam_map = drawn(20.0, 20.0, 0.0)
     lower = drawn(20.0, 20.0, 0.0, offset=(0.0, np.radians(1.2)))
     both = BeamMap(beam_map.image - 0.1 * lower.image, PIXEL, beam_map.centre, beam_map.cut_rad)
-    summary = summarize(both.beam(500), both)
+    summary = summarize(Beam.from_map(both, 500), both)
     # A pixel at 1.2 deg has theta^2/6 = 7e-5 less solid angle than one at the centre, and the lobe's own width adds.
     assert summary.negative_over_positive == pytest.approx(0.1, rel=2e-4)
     # sin(theta) for theta, and the lobes' own curvature: 1e-4 of 8'.
@@ -67,7 +67,7 @@ def test_negative_response_and_mean_offset_of_a_map() -> None:
 
 def test_text_names_what_matters() -> None:
     beam_map = drawn(30.0, 24.0, 20.0)
-    text = format_summary(summarize(beam_map.beam(1000), beam_map))
+    text = format_summary(summarize(Beam.from_map(beam_map, 1000), beam_map))
     for fragment in (
         "arcmin^2",
         "30.0",
@@ -82,13 +82,13 @@ def test_text_names_what_matters() -> None:
 
 
 def test_text_warns_of_a_beam_cut_at_lmax() -> None:
-    assert "B_l is still" in format_summary(summarize(gaussian(10, 500)))
+    assert "B_l is still" in format_summary(summarize(Beam.gaussian(10, 500)))
 
 
 @pytest.mark.parametrize("known_as", ["map", "blm", "circular"])
 def test_figure_has_its_panels(tmp_path, known_as) -> None:
     beam_map = drawn(30.0, 24.0, 20.0)
-    beam = gaussian(30, 800) if known_as == "circular" else elliptical_gaussian(30, 24, 20, 800)
+    beam = Beam.gaussian(30, 800) if known_as == "circular" else Beam.elliptical(30, 24, 20, 800)
     figure = beam_figure(beam, beam_map if known_as == "map" else None, "a beam")
     assert isinstance(figure, Figure)
     panels = [axes for axes in figure.axes if axes.get_title()]

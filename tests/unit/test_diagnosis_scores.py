@@ -7,16 +7,15 @@ import pytest
 
 from mcsim import systematics
 from mcsim.diagnosis import matched_filters
-from mcsim.instrument.beams import elliptical_gaussian
-from mcsim.instrument.scan import load_model
+from mcsim.instrument.beams import Beam
+from mcsim.instrument.scan import ScanModel
 from mcsim.simulation.survey import mean_gain
-from mcsim.support import resources
 
 HALVES = ((0.0, 0.5), (0.5, 1.0))
 
 
 def test_gain_of_every_half_is_kept_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    model = replace(load_model(resources.scan_model("wmap")), sample_period_s=7.0, duration_days=365.0)
+    model = replace(ScanModel.load("wmap"), sample_period_s=7.0, duration_days=365.0)
     line = model.line_of_sight("A")
     site = systematics.Site(
         channel="W1",
@@ -24,7 +23,7 @@ def test_gain_of_every_half_is_kept_apart(monkeypatch: pytest.MonkeyPatch) -> No
         frame="ecliptic",
         nside=8,
         lmax=8,
-        beam=elliptical_gaussian(330.0, 300.0, 20.0, 8),
+        beam=Beam.elliptical(330.0, 300.0, 20.0, 8),
         pointing=systematics.Pointing(model, replace(line, sample_period_s=None)),
         dipole_uk=np.zeros(3),
     )

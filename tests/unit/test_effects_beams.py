@@ -9,21 +9,20 @@ from scipy.special import sph_harm_y
 
 from mcsim import systematics
 from mcsim.errors import InputError
-from mcsim.instrument.beams import Beam, elliptical_gaussian, gaussian
+from mcsim.instrument.beams import Beam
 from mcsim.instrument.beams.gaussian import SIGMA_PER_FWHM
-from mcsim.instrument.scan import load_model
+from mcsim.instrument.scan import ScanModel
 from mcsim.simulation import tod
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.sphere.spectra import load
-from mcsim.support import resources
 from mcsim.systematics.shape import displaced, extended, shape, smeared, stretched
 
 FWHM = 88.0
 
 
 def site_of(beam: Beam) -> systematics.Site:
-    model = load_model(resources.scan_model("wmap"))
+    model = ScanModel.load("wmap")
     pointing = systematics.Pointing(model, model.line_of_sight("A"))
     return systematics.Site(
         channel="W1", frequency_ghz=94.0, frame="ecliptic", nside=8, lmax=beam.lmax, beam=beam, pointing=pointing
@@ -40,29 +39,29 @@ def same(found: Beam, expected: Beam, tolerance: float) -> None:
 # At lmax 192 the window is still 0.1: what lies beyond must not matter. At 512 it is all there.
 @pytest.mark.parametrize("lmax", [48, 192, 512])
 def test_a_round_gaussian_stretches_to_closed_forms(lmax):
-    beam = gaussian(FWHM, lmax)
+    beam = Beam.gaussian(FWHM, lmax)
     ellipse = systematics.get("beam_ellipticity")(amplitude=0.1, angle_deg=20.0).beam(beam, site_of(beam))
-    same(ellipse, elliptical_gaussian(FWHM * 1.1**0.5, FWHM / 1.1**0.5, 20.0, lmax, ellipse.mmax), 1e-9)
+    same(ellipse, Beam.elliptical(FWHM * 1.1**0.5, FWHM / 1.1**0.5, 20.0, lmax, ellipse.mmax), 1e-9)
     turned = systematics.get("beam_ellipticity")(amplitude=-0.1, angle_deg=20.0).beam(beam, site_of(beam))
-    same(turned, elliptical_gaussian(FWHM * 1.1**0.5, FWHM / 1.1**0.5, 110.0, lmax, turned.mmax), 1e-9)
+    same(turned, Beam.elliptical(FWHM * 1.1**0.5, FWHM / 1.1**0.5, 110.0, lmax, turned.mmax), 1e-9)
     wide = systematics.get("beam_width")(amplitude=0.02).beam(beam, site_of(beam))
-    same(wide, gaussian(FWHM * 1.02, lmax), 1e-9)
+    same(wide, Beam.gaussian(FWHM * 1.02, lmax), 1e-9)
 
 
 @pytest.mark.parametrize("lmax", [192, 512])
 def test_an_elliptical_beam_stretches_further(lmax):
     """What continues an ellipse beyond lmax is no closed form: 3e-7 there, 1e-8 where there is little to continue."""
-    beam = elliptical_gaussian(FWHM * 1.1**0.5, FWHM / 1.1**0.5, 20.0, lmax, 8)
+    beam = Beam.elliptical(FWHM * 1.1**0.5, FWHM / 1.1**0.5, 20.0, lmax, 8)
     found = systematics.get("beam_ellipticity")(amplitude=0.05, angle_deg=20.0).beam(beam, site_of(beam))
     ratio = 1.1 * 1.05
-    expected = elliptical_gaussian(FWHM * ratio**0.5, FWHM / ratio**0.5, 20.0, lmax, found.mmax)
+    expected = Beam.elliptical(FWHM * ratio**0.5, FWHM / ratio**0.5, 20.0, lmax, found.mmax)
     same(found, expected, 1e-6 if lmax == 192 else 3e-8)
 
 
 def test_a_beam_map_stretches_as_its_values():
     """A lopsided beam, by its values at the points that the stretch sends to each other."""
     lmax = 400
-    beam = displaced(elliptical_gaussian(150.0, 120.0, 0.0, lmax, 8), 0.4, np.deg2rad(0.5))
+    beam = displaced(Beam.elliptical(150.0, 120.0, 0.0, lmax, 8), 0.4, np.deg2rad(0.5))
     found = stretched(beam, 1.1, 0.95, 0.3, 24, 12)
     rng = np.random.default_rng(1)
     x, y = np.deg2rad(rng.uniform(-2.0, 2.0, (2, 40)))
@@ -87,7 +86,7 @@ def quadrature(values, lmax: int, order: int, reach: float) -> np.ndarray:
 
 def test_coma_by_quadrature():
     lmax, angle = 128, np.deg2rad(35.0)
-    beam, sigma = gaussian(FWHM, lmax), np.deg2rad(FWHM / 60.0) * SIGMA_PER_FWHM
+    beam, sigma = Beam.gaussian(FWHM, lmax), np.deg2rad(FWHM / 60.0) * SIGMA_PER_FWHM
     found = systematics.get("beam_coma")(amplitude=0.02, angle_deg=35.0).beam(beam, site_of(beam))
     assert found.mmax == 3
 
@@ -105,7 +104,7 @@ def test_coma_by_quadrature():
 
 def test_sidelobe_by_quadrature():
     lmax = 128
-    beam, sigma = gaussian(FWHM, lmax), np.deg2rad(FWHM / 60.0) * SIGMA_PER_FWHM
+    beam, sigma = Beam.gaussian(FWHM, lmax), np.deg2rad(FWHM / 60.0) * SIGMA_PER_FWHM
     kind = systematics.get("beam_sidelobe")
     found = kind(amplitude=0.01, quadrupole=0.5, radius_sigmas=4.0, width_sigmas=0.8).beam(beam, site_of(beam))
     assert shape(beam, 0).sigma == pytest.approx(sigma, rel=1e-4)
@@ -143,12 +142,12 @@ def orders(full: np.ndarray, lmax: int, mmax: int) -> np.ndarray:
 def test_displaced_beam_is_a_rotated_one():
     lmax = 192
     distance, angle = np.deg2rad(0.5), np.deg2rad(-130.0)
-    round_beam = gaussian(FWHM, lmax)
+    round_beam = Beam.gaussian(FWHM, lmax)
     found = displaced(round_beam, angle, distance)
     ell = np.arange(1, lmax + 1)
     expected = np.sqrt(4 * np.pi / (2 * ell + 1)) * round_beam.blm[0, 1:] * sph_harm_y(ell, 1, distance, angle).conj()
     np.testing.assert_allclose(found.blm[1, 1:], expected, rtol=0.0, atol=1e-13)
-    ellipse = elliptical_gaussian(100.0, 80.0, 20.0, lmax, 4)
+    ellipse = Beam.elliptical(100.0, 80.0, 20.0, lmax, 4)
     found = displaced(ellipse, angle, distance)
     rotated = ducc0.sht.rotate_alm(every_order(ellipse), lmax, -angle, distance, angle)
     np.testing.assert_allclose(found.blm, orders(rotated, lmax, found.mmax), rtol=0.0, atol=1e-12)
@@ -158,7 +157,7 @@ def test_displaced_beam_is_a_rotated_one():
 def test_smeared_beam_is_filtered_in_the_spin_frame():
     """e_phi is the direction of motion, beam x: from the pole to the circle by R_y(boresight) R_z(90 deg)."""
     lmax, boresight, lag = 192, np.deg2rad(70.5), 0.004
-    beam = elliptical_gaussian(100.0, 80.0, 20.0, lmax, 4)
+    beam = Beam.elliptical(100.0, 80.0, 20.0, lmax, 4)
     for signed in (lag, -lag):
         found = smeared(beam, boresight, signed)
         spin = ducc0.sht.rotate_alm(every_order(beam), lmax, np.pi / 2, boresight, 0.0)
@@ -173,7 +172,7 @@ def test_smeared_beam_is_filtered_in_the_spin_frame():
 def test_time_constant_is_the_mean_of_the_past():
     """Quadrature over earlier positions of the beam on its circle, node by node, against the filter."""
     lmax = 96
-    beam = elliptical_gaussian(200.0, 150.0, 20.0, lmax, 4)
+    beam = Beam.elliptical(200.0, 150.0, 20.0, lmax, 4)
     effect = systematics.get("time_constant")(amplitude=0.1)
     site = site_of(beam)
     found = effect.pointing(beam, site)
@@ -192,7 +191,7 @@ def test_time_constant_is_the_mean_of_the_past():
 def test_moved_samples_see_what_a_displaced_beam_sees():
     """Both hooks of the offset, by interpolated convolution at 200 directions and orientations."""
     lmax, rng = 96, np.random.default_rng(3)
-    beam = elliptical_gaussian(200.0, 150.0, 20.0, lmax, 6)
+    beam = Beam.elliptical(200.0, 150.0, 20.0, lmax, 6)
     sky = gaussian_alm(load("wmap7", lmax), rng)
     theta, phi, psi = np.arccos(rng.uniform(-1, 1, 200)), rng.uniform(0, 2 * np.pi, 200), rng.uniform(-3, 3, 200)
     effect = systematics.get("pointing_offset")(amplitude=40.0, angle_deg=65.0)
@@ -219,7 +218,7 @@ def test_moved_samples_see_what_a_displaced_beam_sees():
 
 def test_orders_that_were_left_out_come_back():
     """Beside what other effects have made of the orders that were kept, and of orders that were not there."""
-    whole = elliptical_gaussian(FWHM * 1.1**0.5, FWHM / 1.1**0.5, 20.0, 64, 6)
+    whole = Beam.elliptical(FWHM * 1.1**0.5, FWHM / 1.1**0.5, 20.0, 64, 6)
     believed = whole.truncated(2)
     site = replace(site_of(believed), whole=lambda: whole)
     kind = systematics.get("beam_noncircularity")
@@ -241,7 +240,7 @@ def test_orders_that_were_left_out_come_back():
 )
 def test_responses_are_linear_at_the_step(name):
     """Half the step changes the beam half as much, to 2 %, in every component."""
-    beam = gaussian(44.0, 384)
+    beam = Beam.gaussian(44.0, 384)
     site = site_of(beam)
 
     def change(effect):
@@ -255,7 +254,7 @@ def test_responses_are_linear_at_the_step(name):
 
 
 def test_beams_without_a_falling_window_are_left_alone():
-    beam = gaussian(FWHM, 192)
+    beam = Beam.gaussian(FWHM, 192)
     blm = beam.blm.copy()
     blm[0, 150:] *= -1.0
     lopsided = replace(beam, blm=blm)
@@ -266,7 +265,7 @@ def test_beams_without_a_falling_window_are_left_alone():
 
 
 def test_what_is_no_beam_is_refused():
-    beam = gaussian(FWHM, 48)
+    beam = Beam.gaussian(FWHM, 48)
     site = site_of(beam)
     for name, amplitude in (("beam_ellipticity", 2.5), ("beam_width", -0.95)):
         with pytest.raises(InputError, match=rf"effect {name}: amplitude = {amplitude:g}"):

@@ -8,11 +8,10 @@ import pytest
 
 from mcsim import systematics
 from mcsim.errors import InputError
-from mcsim.instrument.beams import elliptical_gaussian
-from mcsim.instrument.scan import load_model, parallel_transport
+from mcsim.instrument.beams import Beam
+from mcsim.instrument.scan import Moments, ScanModel
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.sphere.spectra import load
-from mcsim.support import resources
 from mcsim.systematics import registry
 
 LMAX, NSIDE = 48, 8
@@ -47,14 +46,14 @@ def draw(_: str) -> np.random.Generator:
 
 @pytest.fixture(scope="module")
 def site() -> systematics.Site:
-    model = load_model(resources.scan_model("wmap"))
+    model = ScanModel.load("wmap")
     return systematics.Site(
         channel="W1",
         frequency_ghz=94.0,
         frame="galactic",
         nside=NSIDE,
         lmax=LMAX,
-        beam=elliptical_gaussian(330.0, 300.0, 20.0, LMAX),
+        beam=Beam.elliptical(330.0, 300.0, 20.0, LMAX),
         pointing=systematics.Pointing(model, model.line_of_sight("A")),
         dipole_uk=np.array([1.0, 2.0, 3.0]),
     )
@@ -80,7 +79,7 @@ def test_zero_amplitude_changes_nothing(name, site):
     assert effect.noise(site) is None
     assert effect.spread() == 1.0
     assert effect.differencing(0.01, 2) == (0.01, 2)
-    moments = parallel_transport(0.3, NSIDE, 2, "galactic")
+    moments = Moments.parallel_transport(NSIDE, np.rad2deg(0.3), 2, "galactic")
     assert effect.orientations(moments, site) is moments
     here = tuple(np.array([value]) for value in (0.4, 1.0, 2.0))
     moved = effect.moved(*here)
@@ -187,4 +186,49 @@ def test_broken_packages_are_named(registered):
     registry.catalogue.cache_clear()
     registered(EntryPoint("beam", "mcsim.instrument.beams:Beam", registry.ENTRY_POINTS))
     with pytest.raises(InputError, match="no class derived from"):
+        systematics.catalogue()
+
+
+def whole(**changes):
+    """An effect of another package, with attributes that differ from a whole one's; None: left out."""
+    own = {"name": "foreign", "scope": "channel", "unit": "-", "cause": "a test", "signature": "none", "step": 1.0}
+    body = {key: value for key, value in (own | changes).items() if value is not None}
+    return dataclass(frozen=True, kw_only=True)(type("Thing", (systematics.Effect,), body))
+
+
+def no_dataclass():
+    return type("Thing", (whole(),), {"__annotations__": {"angle_deg": float}, "angle_deg": 0.0})
+
+
+def no_default():
+    return dataclass(frozen=True, kw_only=True)(type("Thing", (whole(),), {"__annotations__": {"angle_deg": float}}))
+
+
+@pytest.mark.parametrize(
+    ("kind", "key"),
+    [
+        (whole(step=None), "step"),
+        (whole(step=0.0), "step"),
+        (whole(step="large"), "step"),
+        (whole(step=np.inf), "step"),
+        (whole(name=None), "name"),
+        (whole(scope="everywhere"), "scope"),
+        (whole(unit=None), "unit"),
+        (whole(cause=None), "cause"),
+        (whole(signature=3), "signature"),
+        (whole(sign=2), "sign"),
+        (whole(max_amplitude=-1.0), "max_amplitude"),
+        (whole(variants=({"no_such": 1.0},)), "no_such"),
+        (whole(coordinates=lambda self: np.zeros(2)), "coordinates"),
+        (no_dataclass(), "angle_deg"),
+        (no_default(), "angle_deg"),
+    ],
+)
+def test_an_effect_that_is_not_whole_is_refused_when_it_is_loaded(kind, key, registered):
+    class Entry(EntryPoint):
+        def load(self):
+            return kind
+
+    registered(Entry("foreign", "package:Thing", registry.ENTRY_POINTS))
+    with pytest.raises(InputError, match=key):
         systematics.catalogue()

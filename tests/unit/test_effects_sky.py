@@ -9,14 +9,13 @@ import pytest
 
 from mcsim import systematics
 from mcsim.errors import InputError
-from mcsim.instrument.beams import gaussian
-from mcsim.instrument.scan import load_model, parallel_transport, stream_moments
+from mcsim.instrument.beams import Beam
+from mcsim.instrument.scan import Moments, ScanModel
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotate_alm, rotate_pixels
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.sphere.spectra import load
-from mcsim.support import resources
 
 LMAX, NSIDE = 64, 16
 TOWARDS = {"lon_deg": 200.0, "lat_deg": 30.0}
@@ -25,14 +24,14 @@ AXIS = healpy.ang2vec(200.0, 30.0, lonlat=True)
 
 @pytest.fixture(scope="module")
 def site() -> systematics.Site:
-    model = load_model(resources.scan_model("wmap")).with_sampling(600.0)
+    model = ScanModel.load("wmap").with_sampling(600.0)
     return systematics.Site(
         channel="W1",
         frequency_ghz=94.0,
         frame="ecliptic",
         nside=NSIDE,
         lmax=LMAX,
-        beam=gaussian(300.0, LMAX),
+        beam=Beam.gaussian(300.0, LMAX),
         pointing=systematics.Pointing(model, model.line_of_sight("A")),
     )
 
@@ -232,9 +231,9 @@ def test_gain_follows_the_year(site):
 
 
 def test_orientations_are_mixed_with_those_of_the_scan(site):
-    believed = parallel_transport(0.3, NSIDE, 2)
+    believed = Moments.parallel_transport(NSIDE, np.rad2deg(0.3), 2)
     effect = systematics.get("orientation_averaging")(amplitude=0.25)
-    real = stream_moments(site.pointing.model, NSIDE, 2, lines_of_sight=["A"])
+    real = Moments.from_model(site.pointing.model.with_lines_of_sight("A"), NSIDE, 2)
     seen = real.hits > 0
     assert seen.mean() > 0.5
     found = effect.orientations(believed, site)

@@ -8,12 +8,14 @@ import pytest
 from astropy.table import Table
 
 from mcsim import config
-from mcsim.beamfit import Measurement, comparisons, fit, orientation, report
-from mcsim.beamfit.data import SUMMARY, Row, parse_mode, parts, project
+from mcsim.beamfit import Measurement, comparisons, fit_each, orientation, report
+from mcsim.beamfit import fit as fit_to_any_order
+from mcsim.beamfit.data import SUMMARY, Row, parts, project
+from mcsim.bipolar import parse_mode
 from mcsim.bipolar.theory import ScannedBeam, cmb_biposh_leading
-from mcsim.ensemble import prediction
+from mcsim.ensemble import expectation, prediction
 from mcsim.errors import InputError
-from mcsim.instrument.beams import Beam, elliptical_gaussian
+from mcsim.instrument.beams import Beam
 from mcsim.plot.fit import fit_figure
 from mcsim.simulation.survey import Survey, survey
 
@@ -41,7 +43,7 @@ def expected(shared: Survey, blm: np.ndarray, names=("L2M0d0", "L2M0d2"), error=
     """Leading-order data of a beam under the survey's scan."""
     modes = [parse_mode(name) for name in names]
     rows = tuple(Row(mode, a, b, part) for mode in modes for part in parts(mode) for a, b in BINS)
-    w = prediction.scanned_beams(shared, 2)[0].w
+    w = expectation.scanned_beams(shared, 2)[0].w
     spectra = cmb_biposh_leading([(m.L, m.M, m.d) for m in modes], shared.cl, LMAX, ScannedBeam(blm, w))
     value = project(rows, SUMMARY, dict(zip(modes, spectra, strict=True)))
     return Measurement("synthetic", None, "plain", rows, SUMMARY, value, error**2 * np.eye(len(rows)), None)
@@ -54,6 +56,11 @@ def rescaled(shared: Survey, factor) -> np.ndarray:
 
 
 ELL = np.arange(LMAX + 1.0)
+
+
+def fit(data, source, name="constant"):
+    """Data made to leading order are fitted to leading order; tests/unit/test_fit_exact.py has the others."""
+    return fit_to_any_order(data, source, name, order="leading")
 
 
 @pytest.mark.parametrize(
@@ -89,7 +96,7 @@ def test_what_other_orders_of_the_beam_do_is_no_part_of_the_factor(shared):
     """An m = 1 part feeds L = 2 too: it stays as configured and is not rescaled."""
     blm = rescaled(shared, 0.5)
     own = shared.channels[0].beam.blm.copy()
-    blm[1] = own[1] = 0.05 * np.abs(own[0])
+    blm[1, 1:] = own[1, 1:] = 0.05 * np.abs(own[0, 1:])
     beam = replace(shared.channels[0].beam, blm=own)
     changed = replace(shared, channels=(replace(shared.channels[0], beam=beam),))
     found = fit(expected(changed, blm), changed)
@@ -99,16 +106,16 @@ def test_what_other_orders_of_the_beam_do_is_no_part_of_the_factor(shared):
 
 def test_angle_between_two_sides_and_their_common_turn(shared):
     """Sides at 7 - 15 and 7 + 15 degrees, made by turning the Gaussian itself."""
-    sides = [elliptical_gaussian(70.0, 60.0, angle, LMAX).blm for angle in (-8.0, 22.0)]
+    sides = [Beam.elliptical(70.0, 60.0, angle, LMAX).blm for angle in (-8.0, 22.0)]
     names = ("L2M0d0", "L2M0d1", "L2M0d2")
-    angles = orientation(fit(expected(shared, 0.5 * (sides[0] + sides[1]), names), shared, "orientation", modes=names))
+    angles = orientation(fit(expected(shared, 0.5 * (sides[0] + sides[1]), names), shared, "orientation"))
     assert angles.symmetric_deg == pytest.approx(30.0, abs=1e-4)
     assert angles.common_deg == pytest.approx(7.0, abs=1e-4)
     assert 0.0 < angles.symmetric_error_deg < 1.0
 
 
 def test_even_parity_alone_leaves_the_common_turn_open(shared):
-    sides = [elliptical_gaussian(70.0, 60.0, angle, LMAX).blm for angle in (0.0, 30.0)]
+    sides = [Beam.elliptical(70.0, 60.0, angle, LMAX).blm for angle in (0.0, 30.0)]
     found = fit(expected(shared, 0.5 * (sides[0] + sides[1])), shared, "orientation")
     angles = orientation(found)
     assert found.model.parameters == ("real",)
@@ -162,7 +169,7 @@ def test_refusals(shared):
     with pytest.raises(InputError, match="ends at 100"):
         fit(data, configuration() | {"biposh": {"lmax": 100}})
     with pytest.raises(InputError, match="no ensemble"):
-        fit(data, shared, each=True)
+        fit_each(fit(data, shared))
     with pytest.raises(InputError, match="no model"):
         fit(data, shared, "quadratic")
     two = configuration()

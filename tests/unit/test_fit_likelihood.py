@@ -5,6 +5,7 @@ import pytest
 from scipy import stats
 
 from mcsim.beamfit import compare, solve, solve_each
+from mcsim.beamfit.likelihood import size
 from mcsim.errors import InputError
 
 RNG = np.random.default_rng(11)
@@ -86,3 +87,41 @@ def test_each_realization_is_weighted_by_the_others():
 def test_refusals(design, covariance, simulations, message):
     with pytest.raises(InputError, match=message):
         solve(DATA, design, covariance, simulations)
+
+
+@pytest.mark.parametrize(
+    ("data", "design", "covariance"),
+    [
+        (DATA[:-1], DESIGN, COVARIANCE),
+        (DATA, DESIGN, COVARIANCE[:-1, :-1]),
+        (DATA[:, None], DESIGN, COVARIANCE),
+        (np.where(np.arange(P) == 2, np.nan, DATA), DESIGN, COVARIANCE),
+        (DATA, DESIGN, np.where(np.eye(P) > 0, np.inf, COVARIANCE)),
+        (DATA, DESIGN, -COVARIANCE),
+    ],
+)
+def test_arrays_that_do_not_belong_together_are_refused(data, design, covariance):
+    with pytest.raises(InputError):
+        solve(data, design, covariance)
+
+
+def test_chi2_of_few_simulations_is_scaled_to_expect_its_degrees_of_freedom():
+    found = solve(DATA, DESIGN, COVARIANCE, 40)
+    weight = np.linalg.inv(COVARIANCE)
+    assert found.square == pytest.approx(found.residual @ weight @ found.residual, rel=1e-9)
+    assert found.chi2 == pytest.approx(found.square * (39 - (P - K) - 1) / 39)
+    assert found.reduced_chi2 == found.chi2 / found.dof
+
+
+def test_size_bounds_the_shift_of_every_parameter():
+    change = ROOT @ RNG.normal(size=P)
+    shift = solve(DATA + change, DESIGN, COVARIANCE).parameters - solve(DATA, DESIGN, COVARIANCE).parameters
+    errors = solve(DATA, DESIGN, COVARIANCE).errors
+    assert np.all(np.abs(shift) <= size(change, COVARIANCE, None) * errors)
+    assert size(change, COVARIANCE, None) == pytest.approx(np.sqrt(change @ np.linalg.inv(COVARIANCE) @ change))
+    assert size(change, COVARIANCE, 10**8) == pytest.approx(size(change, COVARIANCE, None), rel=1e-6)
+
+
+def test_models_of_different_data_are_not_compared():
+    with pytest.raises(InputError):
+        compare(solve(DATA, DESIGN[:, :1], COVARIANCE), solve(DATA, DESIGN, COVARIANCE, 40))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from mcsim.beamfit import read_table
+from mcsim.beamfit import Selection, read_table
 from mcsim.bipolar import Mode, bennett_factor
 from mcsim.errors import InputError
 
@@ -31,7 +31,7 @@ def table(meta=META, unit="uK2", **columns):
 def read(tmp_path, made, **arguments):
     path = tmp_path / "table.ecsv"
     made.write(path, format="ascii.ecsv", overwrite=True)
-    return read_table(path, "ecliptic", **arguments)
+    return read_table(path, "ecliptic", Selection(**arguments))
 
 
 def test_rows_values_and_independent_errors(tmp_path):
@@ -99,6 +99,17 @@ def test_parts_of_complex_modes_share_the_variance(tmp_path):
         (table(pair=["a,a", "a,a", "b,b"]), {"pair": "c,c"}, "no pair c,c"),
         (table(value_imag=[0.0, 0.0, 0.0], d=[1, 0, 0]), {"modes": ["L2M0d1"]}, "odd parity"),
         (table(M=[1, 0, 0]), {"modes": ["L2M1d0"]}, "no column value_imag"),
+        (table(ell_min=[10.5, 20.0, 10.0]), {}, "column ell_min"),
+        (table(ell_max=[np.nan, 29.0, 19.0]), {}, "column ell_max"),
+        (table(L=["two", "2", "2"]), {}, "column L"),
+        (table(L=np.ma.array([2, 2, 2], mask=[True, False, False])), {}, "column L"),
+        (table(ell_min=[-5, 20, 10]), {}, "is no range"),
+        (table(value=[0.1, 0.2, 0.3], error=[-1.0, -2.0, -3.0]), {}, "error -1"),
+        (table(error=[np.inf, 0.2, 0.3]), {}, "error inf"),
+        (table(value=np.ma.array([1.0, 2.0, 3.0], mask=[True, False, False])), {}, "value nan"),
+        (table(value=["a", "b", "c"]), {}, "column value"),
+        (table(unit="uK"), {}, "unit uK; convert"),
+        (table(unit="uK_RJ2"), {}, "unit uK_RJ2; convert"),
     ],
 )
 def test_refusals(tmp_path, made, arguments, message):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mcsim.errors import InputError
-from mcsim.instrument.beams import Beam, elliptical_gaussian, gaussian
+from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import ScanModel
 from mcsim.instrument.scan.model import LineOfSight
 from mcsim.instrument.scan.pointing import pointing
@@ -44,7 +44,7 @@ def sky() -> np.ndarray:
 @pytest.fixture(scope="module")
 def beams() -> tuple[Beam, Beam]:
     """Different widths, axes and numbers of orders on the two sides."""
-    return elliptical_gaussian(700.0, 500.0, 20.0, LMAX, mmax=4), elliptical_gaussian(600.0, 500.0, -50.0, LMAX, mmax=2)
+    return Beam.elliptical(700.0, 500.0, 20.0, LMAX, mmax=4), Beam.elliptical(600.0, 500.0, -50.0, LMAX, mmax=2)
 
 
 def pointing_matrix(scan: mapmaking.DifferencingScan, x: float) -> np.ndarray:
@@ -135,7 +135,7 @@ def test_known_sky_is_recovered(x, fine_scan):
     lmax = 64
     sky = gaussian_alm(1000.0 / (1.0 + np.arange(lmax + 1)) ** 2, np.random.default_rng(2))
     sky = sky + dipole_alm([1200.0, -2500.0, 1900.0], lmax)
-    side = mapmaking.side_maps(sky, convolve.response(gaussian(180.0, lmax), lmax), 32)
+    side = mapmaking.side_maps(sky, convolve.response(Beam.gaussian(180.0, lmax), lmax), 32)
     assert side.shape == (fine_scan.npix, 1)
     rhs = mapmaking.rhs_from_maps(fine_scan, [(side, side)], x=x)
     found, report = mapmaking.solve(fine_scan, rhs[0], x, tol=1e-12)
@@ -149,7 +149,7 @@ def test_known_sky_is_recovered(x, fine_scan):
 def test_imbalance_taken_for_zero_leaves_the_dipole(fine_scan):
     """A wrong x is a signal of x (T_A + T_B): the dipole's part of it is not small."""
     sky = dipole_alm([0.0, 0.0, 3300.0], 8)
-    side = mapmaking.side_maps(sky, convolve.response(gaussian(180.0, 8), 8), 32)
+    side = mapmaking.side_maps(sky, convolve.response(Beam.gaussian(180.0, 8), 8), 32)
     errors = []
     for believed in (0.01, 0.0):
         rhs = mapmaking.rhs_from_maps(fine_scan, [(side, side)], x=0.01, x_assumed=believed)
@@ -204,7 +204,7 @@ def test_fast_route_is_the_referee_at_pixel_centres(scan, sky, beams, monkeypatc
     np.testing.assert_allclose(fast, slow, atol=1e-9 * np.abs(slow).max())
 
 
-@pytest.mark.parametrize("sign", [0, 1])
+@pytest.mark.parametrize("side", [0, 1])
 def test_stages_belong_to_their_side(side, scan, sky, beams):
     """A gain of 1.5 on one side is a beam 1.5 times as strong there."""
 

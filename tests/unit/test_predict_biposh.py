@@ -7,11 +7,11 @@ import pytest
 from scipy.special import ive, sph_harm_y
 from wignernj import wigner3j
 
+from mcsim.bipolar.modes import bennett_factor, to_bennett
 from mcsim.bipolar.theory.beam_biposh import ScannedBeam, beam_biposh
 from mcsim.bipolar.theory.cmb_biposh import cmb_biposh_leading, noise_biposh
-from mcsim.bipolar.theory.exact import cmb_biposh_exact, power_spectrum_exact
+from mcsim.bipolar.theory.exact import cmb_biposh_exact
 from mcsim.bipolar.theory.harmonics import parallel_transport_harmonics
-from mcsim.bipolar.theory.modes import bennett_factor, to_bennett
 from mcsim.errors import InputError
 
 
@@ -120,7 +120,8 @@ def test_circular_beam():
     for mode in [(1, 0, 0), (2, 0, 0), (2, 1, -2), (3, 2, 1)]:
         assert np.nanmax(abs(beam_biposh(beam, mode, lmax))) == 0.0
     cl = 1.0 / (ell + 1.0) ** 2
-    np.testing.assert_allclose(power_spectrum_exact(cl, lmax, beam), cl * window**2, rtol=1e-12)
+    monopole = cmb_biposh_exact([(0, 0, 0)], cl, lmax, beam)[0]
+    np.testing.assert_allclose(monopole, (-1.0) ** ell * np.sqrt(2 * ell + 1) * cl * window**2, rtol=1e-12)
 
 
 @pytest.mark.parametrize("kind", [cmb_biposh_leading, cmb_biposh_exact])
@@ -175,12 +176,11 @@ def test_exchange_of_a_pair_and_of_m(kind):
 
 def test_bennett_factor():
     for L, d in [(1, 1), (2, 0), (2, 2), (2, -2), (3, 1)]:
-        factor = bennett_factor(L, d, 12)
+        factor = bennett_factor((L, 0, d), 12)
         for l2 in range(4, 9):
             l1 = l2 - d
             norm = sqrt((2 * l1 + 1) * (2 * l2 + 1)) * clebsch(L, 0, l1, 0, l2, 0)
             assert factor[l2] == pytest.approx(sqrt(2 * L + 1) / norm, rel=1e-12)
-    assert np.all(np.isnan(bennett_factor(2, 1, 12)))
 
 
 def test_noise_is_an_explicit_sum():
@@ -221,3 +221,18 @@ def test_user_errors():
         cmb_biposh_leading([(2, 0, 0)], np.ones(4), 4, beam)
     with pytest.raises(InputError, match="ends at ell = 3"):
         cmb_biposh_exact([(2, 0, 0)], np.ones(4), 4, beam)
+    for kind in (cmb_biposh_leading, cmb_biposh_exact):
+        for wrong in (np.array([1.0, 1.0, np.nan, 1.0, 1.0]), np.array([1.0, -1.0, 1.0, 1.0, 1.0])):
+            with pytest.raises(InputError, match="spectrum"):
+                kind([(2, 0, 0)], wrong, 4, beam)
+    for blm, w in [(beam.blm[0], beam.w), (beam.blm, beam.w[0]), (beam.w, beam.blm), (beam.blm, beam.w[:, :, 1:])]:
+        with pytest.raises(InputError, match="scanned beam"):
+            ScannedBeam(blm, w)
+    with pytest.raises(InputError, match="finite"):
+        ScannedBeam(np.nan * beam.blm, beam.w)
+    with pytest.raises(InputError, match=r"\(3, 3\)"):
+        noise_biposh([(2, 0, 0)], np.zeros((3, 3), dtype=complex), 4)
+    with pytest.raises(InputError, match="odd parity"):
+        to_bennett(np.zeros((1, 5)), [(2, 0, 1)])
+    with pytest.raises(InputError, match="d=3"):
+        bennett_factor((2, 0, 3), 4)

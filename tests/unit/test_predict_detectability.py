@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from wignernj import wigner3j
 
-from mcsim.bipolar.theory.detectability import fisher_information, isotropic_variance, signal_to_noise
-from mcsim.bipolar.theory.modes import existing
+from mcsim.bipolar.modes import existing
+from mcsim.bipolar.theory.detectability import Spectra, fisher_information, isotropic_variance, signal_to_noise
 from mcsim.errors import InputError
 
 LMAX = 4
@@ -77,10 +77,10 @@ def test_single_map_information_is_the_quadratic_sum_of_its_modes():
     modes = [(L, M, d) for L in (1, 2, 3) for M in range(L + 1) for d in range(L + 1) if d > 0 or L % 2 == 0]
     signal = random_signal(rng, modes, 1)
     cl = rng.uniform(1.0, 2.0, LMAX + 1)
-    each = signal_to_noise(signal[0, 0], modes, cl, f_sky=0.5)
+    each = signal_to_noise(signal[0, 0], modes, Spectra(cl), f_sky=0.5)
     assert np.sum(each**2) == pytest.approx(fisher_information(signal, modes, cl[None, None], f_sky=0.5), rel=1e-12)
-    low = signal_to_noise(signal[0, 0], modes, cl, f_sky=0.5, ell_range=(0, 2))
-    high = signal_to_noise(signal[0, 0], modes, cl, f_sky=0.5, ell_range=(3, LMAX))
+    low = signal_to_noise(signal[0, 0], modes, Spectra(cl), f_sky=0.5, ell_range=(0, 2))
+    high = signal_to_noise(signal[0, 0], modes, Spectra(cl), f_sky=0.5, ell_range=(3, LMAX))
     np.testing.assert_allclose(np.hypot(low, high), each, rtol=1e-12)
 
 
@@ -99,8 +99,8 @@ def test_variances_of_isotropic_maps():
             alm[:, :, ell, lmax - m] = (-1) ** m * alm[:, :, ell, lmax + m].conj()
     modes = [(1, 0, 0), (1, 1, 1), (2, 0, 0), (2, 1, 0), (2, 2, -1), (3, 0, 1)]
     for channels, expected in (
-        ((0, 1), isotropic_variance(modes, x_cl, y_cl, cross)),
-        ((0, 0), isotropic_variance(modes, x_cl)),
+        ((0, 1), isotropic_variance(modes, Spectra(x_cl, y_cl, cross))),
+        ((0, 0), isotropic_variance(modes, Spectra(x_cl))),
     ):
         first, second = (alm[i] for i in channels)
         for row, (L, M, d) in zip(expected, modes, strict=True):
@@ -122,12 +122,18 @@ def test_user_errors():
     cl = np.ones(5)
     signal = np.zeros((1, 5), dtype=complex)
     with pytest.raises(InputError, match=r"f_sky = 1\.2"):
-        signal_to_noise(signal, [(2, 0, 0)], cl, f_sky=1.2)
+        signal_to_noise(signal, [(2, 0, 0)], Spectra(cl), f_sky=1.2)
     with pytest.raises(InputError, match=r"f_sky = 0\.0"):
         fisher_information(signal[None, None], [(2, 0, 0)], cl[None, None], f_sky=0.0)
     with pytest.raises(InputError, match="d=-1"):
         fisher_information(signal[None, None], [(2, 0, -1)], cl[None, None])
     with pytest.raises(InputError, match="L=0"):
-        isotropic_variance([(0, 0, 0)], cl)
-    with pytest.raises(InputError, match="cl_cross"):
-        isotropic_variance([(2, 0, 0)], cl, cl)
+        isotropic_variance([(0, 0, 0)], Spectra(cl))
+    with pytest.raises(InputError, match=r"\(1, 4\)"):
+        signal_to_noise(signal[:, :4], [(2, 0, 0)], Spectra(cl))
+    with pytest.raises(InputError, match="y ends"):
+        isotropic_variance([(2, 0, 0)], Spectra(cl, cl[:3], cl))
+    with pytest.raises(InputError, match="x has"):
+        isotropic_variance([(2, 0, 0)], Spectra(np.nan * cl))
+    with pytest.raises(InputError, match="cross spectrum"):
+        isotropic_variance([(2, 0, 0)], Spectra(cl, cl))

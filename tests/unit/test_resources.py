@@ -1,9 +1,11 @@
 """Packaged files are found in an installed package, in a checkout, and from any folder."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from mcsim import config
 from mcsim.errors import InputError
 from mcsim.support import resources
 
@@ -68,3 +70,9 @@ def test_this_installation_has_its_files_from_any_folder(tmp_path, monkeypatch):
     assert resources.workflow("quickstart").is_file()
     assert resources.scan_model("wmap").is_file()
     assert resources.spectrum("wmap7").is_file()
+
+
+def test_demonstration_differs_from_its_model_by_one_effect():
+    model, truth = (config.load(name) for name in ("demo-model", "demo-truth"))
+    assert [(effect.name, effect.channel) for effect in truth.effects] == [("beam_ellipticity", "W1")]
+    assert replace(truth, name=model.name, effects=(), ensemble=model.ensemble) == model

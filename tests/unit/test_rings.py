@@ -14,12 +14,11 @@ from mcsim.simulation import channels, convolve, rings, simulate
 from mcsim.simulation import survey as survey_
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.sky import gaussian_alm
-from mcsim.support import resources
 from mcsim.systematics import Effect
 
 LMAX = 24
-WMAP = scan.load_model(resources.scan_model("wmap"))
-LITEBIRD = scan.load_model(resources.scan_model("litebird"))
+WMAP = scan.ScanModel.load("wmap")
+LITEBIRD = scan.ScanModel.load("litebird")
 PSI0 = 0.3
 
 
@@ -211,8 +210,8 @@ def test_refusals(changes, message):
 
 def test_refused_scans():
     with pytest.raises(InputError, match="long-time limit needs more than"):
-        rings.limit_rings(scan.load_model(resources.scan_model("planck")), [2], 8)
-    lines = scan.load_model(resources.scan_model("wmap_focal_plane"))
+        rings.limit_rings(scan.ScanModel.load("planck"), [2], 8)
+    lines = scan.ScanModel.load("wmap_focal_plane")
     with pytest.raises(InputError, match="at different angles"):
         rings.limit_rings(lines, [2], 8)
 

@@ -5,14 +5,12 @@ import numpy as np
 import pytest
 
 from mcsim.errors import InputError
-from mcsim.instrument.scan.accumulate import stream_moments
+from mcsim.instrument.scan import Moments, ScanModel
 from mcsim.instrument.scan.factors import latitude_means, limit_factors, ring_means, scan_factors, sky_means, summary
 from mcsim.instrument.scan.limit import limit_moments
-from mcsim.instrument.scan.model import load_model
-from mcsim.instrument.scan.moments import Moments, parallel_transport
 from mcsim.plot.scan import scan_figure
 
-WMAP = load_model(Path(__file__).parents[2] / "scan_models" / "wmap.toml")
+WMAP = ScanModel.load(Path(__file__).parents[2] / "scan_models" / "wmap.toml")
 NSIDE = 64
 THETA = healpy.pix2ang(NSIDE, np.arange(12 * NSIDE**2))[0]
 
@@ -20,7 +18,7 @@ THETA = healpy.pix2ang(NSIDE, np.arange(12 * NSIDE**2))[0]
 @pytest.fixture(scope="module")
 def year():
     """One year sampled every 2 s: 321 samples per pixel of nside 64."""
-    return stream_moments(WMAP.with_sampling(2.0), NSIDE, 2, nthreads=2)
+    return Moments.from_model(WMAP.with_sampling(2.0), NSIDE, 2, nthreads=2)
 
 
 def made_up(w2):
@@ -28,7 +26,7 @@ def made_up(w2):
 
 
 def test_parallel_transport_has_factors_of_one():
-    factors = scan_factors(parallel_transport(0.0, NSIDE, 2), (2, 50, 300))
+    factors = scan_factors(Moments.parallel_transport(NSIDE, 0.0, 2), (2, 50, 300))
     assert factors.quadrupole_ratio == pytest.approx(1.0, abs=1e-14)
     assert factors.sky_mean == pytest.approx(1.0, abs=1e-14)
     # (2l+1)/2 int (d^l_22)^2 dcos(theta) = 1.

@@ -8,7 +8,7 @@ from scipy.integrate import quad
 from scipy.special import lpmv
 
 from mcsim.errors import InputError
-from mcsim.instrument.scan.accumulate import stream_moments
+from mcsim.instrument.scan import Moments
 from mcsim.instrument.scan.factors import ring_means
 from mcsim.instrument.scan.limit import caustics, limit_harmonics, limit_moments, limit_quadrature
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
@@ -171,7 +171,7 @@ def test_streamed_ring_means_approach_the_limit():
     # Rings of nside 32 within 37 degrees of the equator, where the limit is smooth across a pixel.
     rms = []
     for sample_period in (256.0, 16.0):
-        moments = stream_moments(WMAP.with_sampling(sample_period), 32, 2, nthreads=2)
+        moments = Moments.from_model(WMAP.with_sampling(sample_period), 32, 2, nthreads=2)
         theta, hits, w = ring_means(moments)
         density, limit = limit_moments(WMAP, theta, 2)
         band = np.abs(np.cos(theta)) < 0.6

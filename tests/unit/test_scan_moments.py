@@ -6,12 +6,11 @@ import pytest
 from astropy.io import fits
 
 from mcsim.errors import InputError
-from mcsim.instrument.scan.accumulate import stream_moments
+from mcsim.instrument.scan.accumulate import stream_sums
 from mcsim.instrument.scan.cache import cached_moments, moments_key
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
-from mcsim.instrument.scan.moments import Moments, parallel_transport, read_moments_fits, write_moments_fits
+from mcsim.instrument.scan.moments import Moments, read_moments_fits, write_moments_fits
 from mcsim.instrument.scan.pointing import pointing
-from mcsim.instrument.scan.user_pointing import pointing_moments
 from mcsim.support.folders import default_cache_dir
 
 LINES = (LineOfSight("A", 70.5), LineOfSight("B", 69.0, 170.0, 3.0))
@@ -53,7 +52,8 @@ def assert_same(moments, expected, tolerance):
     [(None, (0.0, 1.0), "ecliptic"), (["A", "B"], (0.25, 0.5), "galactic"), (["B"], (0.5, 1.0), "equatorial")],
 )
 def test_streamed_moments_against_brute_force(names, time_range, frame):
-    moments = stream_moments(MODEL, NSIDE, SMAX, frame, names, time_range)
+    chosen = MODEL if names is None else MODEL.with_lines_of_sight(*names)
+    moments = Moments.from_model(chosen, NSIDE, SMAX, frame, time_range)
     samples = []
     for line in MODEL.select(names):
         first, last = (round(edge * MODEL.samples(line)) for edge in time_range)
@@ -63,17 +63,22 @@ def test_streamed_moments_against_brute_force(names, time_range, frame):
     assert_same(moments, brute_force(samples, NSIDE, SMAX), 6e-12)
 
 
-def test_threads_change_no_bit_and_progress_ends_at_one():
-    seen = []
-    runs = [stream_moments(MODEL, NSIDE, SMAX, nthreads=n, progress=seen.append) for n in (1, 2, 3)]
+def test_threads_change_no_bit():
+    runs = [Moments.from_model(MODEL, NSIDE, SMAX, nthreads=n) for n in (1, 2, 3)]
     for run in runs[1:]:
         for name in ("hits", "w", "dtheta", "dphi"):
             assert getattr(run, name).tobytes() == getattr(runs[0], name).tobytes()
-    assert seen.count(1.0) == 3
+
+
+def test_progress_ends_at_one():
+    seen = []
+    stream_sums(MODEL, NSIDE, SMAX, nthreads=2, progress=seen.append)
+    assert seen.count(1.0) == 1
+    assert max(seen) == 1.0
 
 
 def test_halves_add_up_to_the_whole():
-    whole, one, two = (stream_moments(MODEL, NSIDE, 2, time_range=part) for part in ((0, 1), (0, 0.5), (0.5, 1)))
+    whole, one, two = (Moments.from_model(MODEL, NSIDE, 2, time_range=part) for part in ((0, 1), (0, 0.5), (0.5, 1)))
     np.testing.assert_array_equal(one.hits + two.hits, whole.hits)
     assert np.abs(one.hits * one.w + two.hits * two.w - whole.hits * whole.w).max() < 1e-11
 
@@ -84,7 +89,6 @@ def test_halves_add_up_to_the_whole():
         ({"nside": 17}, "nside is 17"),
         ({"smax": 0}, "smax is 0"),
         ({"frame": "lunar"}, "frame is 'lunar'"),
-        ({"lines_of_sight": ["C"]}, "no line of sight 'C'"),
         ({"time_range": (0.5, 0.5)}, "time_range"),
         ({"time_range": (0.0, 1.5)}, "time_range"),
         ({"time_range": (0.0, 1e-9)}, "contains no sample"),
@@ -92,11 +96,16 @@ def test_halves_add_up_to_the_whole():
 )
 def test_streaming_checks_its_input(change, message):
     with pytest.raises(InputError, match=message):
-        stream_moments(MODEL, **({"nside": NSIDE, "smax": 2} | change))
+        Moments.from_model(MODEL, **({"nside": NSIDE, "smax": 2} | change))
+
+
+def test_unknown_line_of_sight_is_refused():
+    with pytest.raises(InputError, match="no line of sight 'C'"):
+        MODEL.with_lines_of_sight("C")
 
 
 def test_parallel_transport_is_constant_and_takes_no_memory():
-    moments = parallel_transport(0.3, 512, 4)
+    moments = Moments.parallel_transport(512, np.rad2deg(0.3), 4)
     assert moments.hits.strides == (0,)
     assert moments.w.strides[1] == 0
     np.testing.assert_allclose(moments.w[:, 7], np.exp(-1j * 0.3 * np.arange(1, 5)), rtol=1e-15)
@@ -104,12 +113,12 @@ def test_parallel_transport_is_constant_and_takes_no_memory():
     assert moments.dphi is None
     assert moments.hits[0] == 1.0
     with pytest.raises(InputError, match="smax is 0"):
-        parallel_transport(0.0, 8, 0)
+        Moments.parallel_transport(8, 0.0, 0)
 
 
 @pytest.mark.parametrize("mmap", [True, False])
 def test_save_and_load(tmp_path, mmap):
-    moments = stream_moments(MODEL, NSIDE, 2)
+    moments = Moments.from_model(MODEL, NSIDE, 2)
     moments.save(tmp_path / "m")
     loaded = Moments.load(tmp_path / "m", mmap=mmap)
     assert isinstance(loaded.w, np.memmap) is mmap
@@ -128,7 +137,7 @@ def test_cache_computes_once_and_leaves_nothing_behind(tmp_path, monkeypatch):
     assert cached_moments(MODEL, NSIDE, 2, nthreads=2) == folder
     assert (folder / "w.npy").stat().st_mtime_ns == stamp
     assert [entry.name for entry in (tmp_path / "cache").iterdir()] == [folder.name]
-    np.testing.assert_array_equal(Moments.load(folder).hits, stream_moments(MODEL, NSIDE, 2).hits)
+    np.testing.assert_array_equal(Moments.load(folder).hits, Moments.from_model(MODEL, NSIDE, 2).hits)
 
 
 def test_interrupted_computation_leaves_the_cache_empty(tmp_path):
@@ -173,7 +182,7 @@ def test_key_depends_on_every_number_and_on_nothing_else():
 
 
 def test_fits_round_trip(tmp_path):
-    moments = stream_moments(MODEL, NSIDE, SMAX, "galactic")
+    moments = Moments.from_model(MODEL, NSIDE, SMAX, "galactic")
     path = tmp_path / "moments.fits"
     write_moments_fits(path, moments)
     back = read_moments_fits(path, NSIDE, SMAX, "galactic")
@@ -266,7 +275,7 @@ def test_missing_and_truncated_fits_files(tmp_path):
     path = tmp_path / "moments.fits"
     with pytest.raises(InputError, match="cannot be read"):
         read_moments_fits(path)
-    write_moments_fits(path, parallel_transport(0.0, NSIDE, 2))
+    write_moments_fits(path, Moments.parallel_transport(NSIDE, 0.0, 2))
     path.write_bytes(path.read_bytes()[:30000])
     with pytest.raises(InputError, match="cannot be read"):
         read_moments_fits(path)
@@ -300,25 +309,116 @@ def test_user_pointing_in_every_format(tmp_path, form):
     samples = pointing(MODEL, LINES[0], 100, 3000)
     path = write_pointing(tmp_path, form, *samples)
     # The same numbers on both sides: rounding of a hundred additions.
-    assert_same(pointing_moments(path, NSIDE, SMAX), brute_force([samples], NSIDE, SMAX), 1e-13)
-    assert_same(pointing_moments([path, path], NSIDE, SMAX), brute_force([samples, samples], NSIDE, SMAX), 1e-13)
+    assert_same(Moments.from_pointing_files(path, NSIDE, SMAX), brute_force([samples], NSIDE, SMAX), 1e-13)
+    assert_same(
+        Moments.from_pointing_files([path, path], NSIDE, SMAX), brute_force([samples, samples], NSIDE, SMAX), 1e-13
+    )
+
+
+def test_user_pointing_from_arrays_is_that_from_files(tmp_path):
+    samples = pointing(MODEL, LINES[0], 100, 3000)
+    arrays = Moments.from_pointing(*samples, NSIDE, SMAX, "galactic")
+    files = Moments.from_pointing_files(write_pointing(tmp_path, "npz", *samples), NSIDE, SMAX, "galactic")
+    for name in ("hits", "w", "dtheta", "dphi"):
+        np.testing.assert_array_equal(getattr(arrays, name), getattr(files, name))
+
+
+@pytest.mark.parametrize("samples", [([], [], []), ([1.0], [1.0, 2.0], [0.0]), ([4.0], [0.0], [0.0])])
+def test_bad_arrays_of_pointing(samples):
+    with pytest.raises(InputError):
+        Moments.from_pointing(*samples, NSIDE)
 
 
 @pytest.mark.parametrize(
-    ("theta", "message"), [([91.0], "theta runs from 91"), ([np.nan], "theta has values"), ([], "no samples")]
+    ("angles", "message"),
+    [
+        ({"theta": [91.0]}, "theta runs from 91"),
+        ({"theta": [np.nan]}, "theta has values"),
+        ({"theta": []}, "no samples"),
+        ({"theta": [1.0, 2.0], "phi": [10.0, 200.0]}, "phi runs from 10 to 200"),
+        ({"theta": [1.0, 2.0], "psi": [-170.0, 1.0]}, "psi runs from -170"),
+        ({"theta": [1.0, 2.0], "psi": [1e5, np.inf]}, "psi has values"),
+        ({"theta": [0.5, 6.0], "phi": [1.0, 3.0]}, "exchanged"),
+        ({"theta": [1.0, -1.5]}, "colatitudes"),
+        ({"theta": [1.0, 2.0], "phi": [1.0]}, "one length"),
+        ({"theta": [1.0], "psi": [1j]}, "not real"),
+    ],
 )
-def test_bad_user_pointing(tmp_path, theta, message):
-    path = write_pointing(tmp_path, "npz", np.array(theta), np.zeros(len(theta)), np.zeros(len(theta)))
+def test_bad_user_pointing(tmp_path, angles, message):
+    zeros = np.zeros(len(angles["theta"]))
+    columns = {"theta": zeros, "phi": zeros, "psi": zeros} | {k: np.array(v) for k, v in angles.items()}
+    np.savez(tmp_path / "p.npz", **columns)
     with pytest.raises(InputError, match=message):
-        pointing_moments(path, NSIDE, 2)
+        Moments.from_pointing_files(tmp_path / "p.npz", NSIDE, 2)
+
+
+def test_user_pointing_in_degrees_by_its_header(tmp_path):
+    samples = pointing(MODEL, LINES[0], 100, 500)
+    expected = brute_force([samples], NSIDE, SMAX)
+    path = write_pointing(tmp_path, "fits", *samples)
+
+    def in_degrees(table):
+        for name in table.columns.names:
+            table.data[name] = np.degrees(table.data[name])
+
+    damaged(path, in_degrees)
+    for number in (1, 2, 3):
+        fits.setval(path, f"TUNIT{number}", value="deg", ext=1)
+    assert_same(Moments.from_pointing_files(path, NSIDE, SMAX), expected, 1e-12)
+    fits.setval(path, "TUNIT2", value="m", ext=1)
+    with pytest.raises(InputError, match="'m'"):
+        Moments.from_pointing_files(path, NSIDE, SMAX)
+
+
+def test_user_pointing_of_another_frame(tmp_path):
+    path = write_pointing(tmp_path, "fits", *pointing(MODEL, LINES[0], 100, 500))
+    damaged(path, header("COORDSYS", "GALACTIC"))
+    assert Moments.from_pointing_files(path, NSIDE, 2, "galactic").frame == "galactic"
+    with pytest.raises(InputError, match="galactic"):
+        Moments.from_pointing_files(path, NSIDE, 2, "ecliptic")
+
+
+@pytest.mark.parametrize("name", ["phi theta psi", "time theta phi psi", "theta[deg] phi[deg] psi[deg]", "DEGREES"])
+def test_user_pointing_whose_header_names_other_columns(tmp_path, name):
+    np.savetxt(tmp_path / "p.txt", np.full((3, 3), 0.1), header=name)
+    with pytest.raises(InputError, match="cannot be read"):
+        Moments.from_pointing_files(tmp_path / "p.txt", NSIDE, 2)
+
+
+def test_user_pointing_with_time_first(tmp_path):
+    samples = np.stack([np.linspace(0.0, 3.0, 50), *pointing(MODEL, LINES[0], 100, 50)], axis=1)
+    samples[:, 1:] %= 3.0
+    np.save(tmp_path / "p.npy", samples)
+    with pytest.raises(InputError, match="in this order"):
+        Moments.from_pointing_files(tmp_path / "p.npy", NSIDE, 2)
+
+
+def test_centroids_in_other_units(tmp_path):
+    moments = Moments.from_model(MODEL, NSIDE, 2)
+    path = tmp_path / "moments.fits"
+    write_moments_fits(path, moments)
+
+    def in_degrees(table):
+        for name in ("DTHETA", "DPHI"):
+            table.data[name] = np.degrees(table.data[name])
+
+    damaged(path, in_degrees)  # while the header says rad
+    with pytest.raises(InputError, match="DTHETA and DPHI in radians"):
+        read_moments_fits(path)
+
+    for number in (6, 7):
+        fits.setval(path, f"TUNIT{number}", value="deg", ext=1)
+    np.testing.assert_allclose(read_moments_fits(path).dtheta, moments.dtheta, rtol=1e-12, atol=1e-15)
+    damaged(path, header("COORDSYS", "EQUATORIAL"))
+    assert read_moments_fits(path).frame == "equatorial"
 
 
 def test_unreadable_user_pointing(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
-        pointing_moments(tmp_path / "none.fits", NSIDE, 2)
+        Moments.from_pointing_files(tmp_path / "none.fits", NSIDE, 2)
     np.savez(tmp_path / "p.npz", theta=np.zeros(3), phi=np.zeros(3))
     with pytest.raises(InputError, match=r"cannot be read.*psi"):
-        pointing_moments(tmp_path / "p.npz", NSIDE, 2)
+        Moments.from_pointing_files(tmp_path / "p.npz", NSIDE, 2)
     np.save(tmp_path / "p.npy", np.zeros((3, 2)))
     with pytest.raises(InputError, match=r"shape is \(3, 2\)"):
-        pointing_moments(tmp_path / "p.npy", NSIDE, 2)
+        Moments.from_pointing_files(tmp_path / "p.npy", NSIDE, 2)

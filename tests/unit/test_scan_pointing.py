@@ -7,9 +7,10 @@ from numba import njit
 from scipy.spatial.transform import Rotation
 
 from mcsim.errors import InputError
-from mcsim.instrument.scan.geometry import check_nside, frame_matrix, nside_of
+from mcsim.instrument.scan.geometry import frame_matrix
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
 from mcsim.instrument.scan.pointing import pointing, quarter_turns, ring_pixel
+from mcsim.sphere.checks import check_nside, nside_of
 
 LINE = LineOfSight("A", 70.5, 12.0)
 MODEL = ScanModel("toy", 129.3, -3600.0, 22.5, 31557600.0, 0.0512, 365.25, (LINE,), ("A",), {}, 33.0, 44.0, 55.0)

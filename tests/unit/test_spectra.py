@@ -69,7 +69,7 @@ def test_fits_as_healpy_reads_it(tmp_path):
 )
 @pytest.mark.filterwarnings("ignore::astropy.units.UnitsWarning")  # FITS knows neither muK nor K_CMB
 def test_fits_units(tmp_path, unit, factor):
-    np.testing.assert_allclose(spectra.load(write_fits(tmp_path / "cl.fits", unit), 4), CL * factor, rtol=1e-15)
+    np.testing.assert_allclose(spectra.load(write_fits(tmp_path / "cl.fits", unit, cl=CL / factor), 4), CL, rtol=1e-15)
 
 
 def test_ascii_table_of_fits(tmp_path):
@@ -141,6 +141,112 @@ def test_truncated_fits(tmp_path, kept):
 def test_wrong_fits_columns(tmp_path, unit, name, message):
     with pytest.raises(InputError, match=message):
         spectra.load(write_fits(tmp_path / "cl.fits", unit, name), 4)
+
+
+ELL = np.arange(601)
+LCDM = spectra.load("wmap7", 600)
+D_L = ELL * (ELL + 1) * LCDM / (2 * np.pi)
+
+
+def write_text(path, cl, header="", first=2):
+    np.savetxt(path, np.column_stack([ELL[first : len(cl)], cl[first:]]), fmt=["%d", "%.9e"], header=header)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("header", "factor"),
+    [
+        ("", 1.0),
+        ("ell C_ell", 1.0),
+        ("ell C_ell [uK^2]", 1.0),
+        ("l, C_l (uK_CMB^2)", 1.0),
+        ("l, C_l (uK_{CMB}^2)", 1.0),
+        ("l, C_l in uK thermodynamic**2", 1.0),
+        ("l C_l / µK²", 1.0),
+        ("ell C_ell [mK^2]", 1e6),
+        ("ell, C_ell in K**2", 1e12),
+    ],
+)
+def test_units_of_text_tables(tmp_path, header, factor):
+    found = spectra.load(write_text(tmp_path / "cl.txt", LCDM / factor, header), 600)
+    np.testing.assert_allclose(found, LCDM, rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("table", "header", "message"),
+    [
+        (1e-12 * LCDM, "", "convert it to uK"),
+        (1e-12 * LCDM, "ell C_ell [uK^2]", "convert it to uK"),
+        (1e-6 * LCDM, "", "convert it to uK"),
+        (1e6 * LCDM, "", "convert it to uK"),
+        (LCDM, "ell C_ell [K^2]", "convert it to uK"),
+        (D_L, "", "seems to hold D_l"),
+        (D_L[:31], "", "seems to hold D_l"),
+        (1e-12 * D_L, "", "convert it to uK"),
+        (LCDM, "l DlTT", "seems to hold D_l"),
+        (LCDM, "l D_l_TT", "seems to hold D_l"),
+        (LCDM, "l TT, dimensionless", "dimensionless"),
+        (LCDM, "C_l in uK^2, was K^2", "several units"),
+        (LCDM, "C_l in uK_RJ^2", "unit"),
+        (LCDM, "C_l in mK antenna ^2", "unit"),
+    ],
+)
+def test_tables_in_other_units_or_of_d_l(tmp_path, table, header, message):
+    path = write_text(tmp_path / "cl.txt", table, header)
+    with pytest.raises(InputError, match=message):
+        spectra.load(path, 20)
+    with pytest.raises(InputError):
+        spectra.load(write_fits(tmp_path / "cl.fits", cl=table) if not header else path, 20)
+
+
+@pytest.mark.parametrize(
+    ("table", "header"),
+    [
+        (np.zeros(601), ""),
+        (np.ones(601), ""),
+        (100.0 + 0.0 * ELL, "ell C_ell [uK^2]"),
+        (1e-4 + 0.0 * ELL, ""),
+        (1e-3 * LCDM, "ell C_ell [uK^2]"),
+        (10.0 * LCDM, ""),
+        (LCDM * np.maximum(ELL, 1.0) ** 0.4, ""),
+        (LCDM * np.maximum(ELL, 1.0) ** -1.0, ""),
+        (1e5 * np.maximum(ELL, 1.0) ** -2.5, ""),
+        (LCDM[:6], ""),
+    ],
+)
+def test_other_skies_are_accepted(tmp_path, table, header):
+    found = spectra.load(write_text(tmp_path / "cl.txt", table, header), 5)
+    np.testing.assert_allclose(found[2:], table[2:6], rtol=1e-8)
+
+
+@pytest.mark.parametrize(("table", "header"), [(100.0 + 0.0 * ELL, ""), (D_L, "ell C_ell [uK^2]")])
+def test_a_table_that_may_be_d_l_is_taken_with_a_warning(tmp_path, table, header):
+    path = write_text(tmp_path / "cl.txt", table, header)
+    with pytest.warns(UserWarning, match="seems to hold D_l"):
+        found = spectra.load(path, 5)
+    np.testing.assert_allclose(found[2:], table[2:6], rtol=1e-8)
+
+
+def test_fits_with_a_column_of_ell(tmp_path):
+    for first in (0, 2):
+        path = tmp_path / f"cl{first}.fits"
+        columns = [
+            fits.Column(name="ELL", format="J", array=ELL[first:]),
+            fits.Column(name="TT", format="D", array=LCDM[first:] / 1e6, unit="mK^2"),
+        ]
+        fits.BinTableHDU.from_columns(columns).writeto(path)
+        np.testing.assert_allclose(spectra.load(path, 600), LCDM, rtol=1e-12)
+
+
+def test_fits_that_starts_at_the_quadrupole(tmp_path):
+    with pytest.raises(InputError, match="start at ell = 2"):
+        spectra.load(write_fits(tmp_path / "cl.fits", "uK^2", cl=LCDM[2:]), 20)
+
+
+def test_lmax_is_whole():
+    for lmax in (-3, 2.5):
+        with pytest.raises(InputError, match="lmax"):
+            spectra.load("wmap7", lmax)
 
 
 def test_missing_file_lists_the_packaged_names(tmp_path):

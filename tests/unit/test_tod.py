@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mcsim.errors import InputError
-from mcsim.instrument.beams import Beam, gaussian
+from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import ScanModel
 from mcsim.instrument.scan.model import LineOfSight
 from mcsim.instrument.scan.pointing import pointing
@@ -97,7 +97,7 @@ def test_signal_is_the_integral_of_sky_times_turned_beam(sky, beam):
 
 def test_dipole_is_seen_through_the_beam():
     vector = np.array([1200.0, -2500.0, 1900.0])
-    beam = gaussian(900.0, 8)
+    beam = Beam.gaussian(900.0, 8)
     stream = next(iter(tod.samples(MODEL, LINE, NSIDE)))
     found = next(tod.sky_signal(dipole_alm(vector, 8), 8, beam)([stream])).signal_uk
     expected = beam.window[1] * healpy.ang2vec(stream.theta, stream.phi) @ vector
@@ -171,8 +171,8 @@ def test_stages_act_where_they_are_put(sky, beam, monkeypatch):
         ({"line_of_sight": "Z"}, "no line of sight 'Z'"),
         ({"time_range": (0.5, 0.5)}, r"time_range is \(0.5, 0.5\)"),
         ({"time_range": (0.0, 1e-9)}, "contains no sample"),
-        ({"lmax": 30}, "lmax 30 needs"),
-        ({"beam": gaussian(900.0, 20)}, "ends at l = 20"),
+        ({"lmax": 30}, "lmax = 30"),
+        ({"beam": Beam.gaussian(900.0, 20)}, "ends at l = 20"),
         ({"noise_sigma0_uk": 3.0}, "noise_sigma0_uk is 3 but no rng"),
         ({"nside": 12}, "nside is 12"),
         ({"frame": "solar"}, "frame is 'solar'"),
@@ -185,5 +185,5 @@ def test_bad_input_is_named(changes, message, sky, beam):
 
 
 def test_dipole_needs_its_degree():
-    with pytest.raises(InputError, match="lmax is 0"):
+    with pytest.raises(InputError, match="lmax of a dipole is 0"):
         dipole_alm([0.0, 0.0, 1.0], 0)

@@ -19,7 +19,6 @@ from mcsim.instrument.scan.limit import caustics
 from mcsim.simulation import convolve, tod
 from mcsim.sphere import healpix, rng, spectra
 from mcsim.sphere.sky import gaussian_alm
-from mcsim.support import resources
 
 LIMIT_NSIDE = 128
 AWAY_DEG = (2.0, 3.0)
@@ -30,10 +29,10 @@ PARTS = 16
 def against_samples(nside: int, period_s: float) -> None:
     """Residual of the default route against the referee, uK."""
     lmax = 2 * nside + nside // 2
-    model = scan.load_model(resources.scan_model("wmap")).with_sampling(period_s)
-    beam = beams.elliptical_gaussian(13.9, 12.7, 0.0, lmax, 2)
+    model = scan.ScanModel.load("wmap").with_sampling(period_s)
+    beam = beams.Beam.elliptical(13.9, 12.7, 0.0, lmax, 2)
     sky = gaussian_alm(spectra.load("wmap7", lmax), rng.generator(1, 0, "sky"))
-    moments = scan.stream_moments(model, nside, 2, lines_of_sight=["A"], nthreads=2)
+    moments = scan.Moments.from_model(model.with_lines_of_sight("A"), nside, 2, nthreads=2)
     truth, hits = tod.observe(sky, lmax, beam, model, nside, line_of_sight="A", nthreads=2)
     centred, _ = tod.observe(
         sky, lmax, beam, model, nside, line_of_sight="A", at_pixel_centres=True, nthreads=2, epsilon=1e-11
@@ -59,7 +58,7 @@ def against_samples(nside: int, period_s: float) -> None:
 
 def against_the_limit() -> None:
     """Ring means and pixel scatter of streamed w_2 against the exact limit, by sampling and by duration."""
-    model = scan.load_model(resources.scan_model("wmap"))
+    model = scan.ScanModel.load("wmap")
     start = time.perf_counter()
     theta = healpy.pix2ang(LIMIT_NSIDE, np.arange(12 * LIMIT_NSIDE**2))[0]
     colatitude, rings = np.unique(np.round(theta, 10), return_inverse=True)
@@ -70,7 +69,7 @@ def against_the_limit() -> None:
     for period, years in ((3.2, 1), (0.4, 1), (0.1, 0.25), (0.1, 1), (0.1, 4), (0.0512, 1)):
         start = time.perf_counter()
         scanned = replace(model.with_sampling(period), duration_days=365.25 * years)
-        moments = scan.stream_moments(scanned, LIMIT_NSIDE, 2, lines_of_sight=["A"], nthreads=2)
+        moments = scan.Moments.from_model(scanned.with_lines_of_sight("A"), LIMIT_NSIDE, 2, nthreads=2)
         took = time.perf_counter() - start
         w = moments.w[1].real
         mean = np.bincount(rings, moments.hits * w) / np.maximum(np.bincount(rings, moments.hits), 1)

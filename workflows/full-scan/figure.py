@@ -21,7 +21,6 @@ from mcsim.simulation.channels import load_beam
 from mcsim.simulation.survey import survey
 from mcsim.sphere import spectra
 from mcsim.stats.streaming import jackknife
-from mcsim.support import resources
 
 HERE = Path(__file__).parent
 RUNS = (
@@ -45,7 +44,9 @@ FIRST = 1  # the first bin, l < 25, is left out of overall ratios
 
 def binned_differences(folder: Path, run: str, mode: str) -> np.ndarray:
     """Paired difference of every realization, binned, shape (realization, bin), uK^2."""
-    found = beamfit.from_store(folder / f"{run}.zarr", [mode], kind="difference", pair="W1,W1").realizations
+    found = beamfit.from_store(
+        folder / f"{run}.zarr", beamfit.Selection((mode,), kind="difference", pair="W1,W1")
+    ).realizations
     assert found is not None  # as of every store
     return found
 
@@ -64,7 +65,7 @@ def straight_line(part: np.ndarray, whole: np.ndarray, ell: np.ndarray) -> tuple
 
 def factors() -> dict[float, str]:
     """What the paper calls ~0.45, three numbers, in the limit of a long survey with the lines of sight of W1."""
-    model = scan.load_model(resources.scan_model("wmap_focal_plane"))
+    model = scan.ScanModel.load("wmap_focal_plane")
     sides = [scan.limit_factors(model, line_of_sight=line) for line in ("W1A", "W1B")]
     return {
         float(np.mean([sign.quadrupole_ratio for sign in sides])): "mean of $w_2$ that A$^{20}$ sees",

@@ -17,7 +17,6 @@ import numpy as np
 from mcsim import config
 from mcsim.instrument import scan
 from mcsim.simulation import simulate, survey
-from mcsim.support import resources
 
 SEED = 5
 
@@ -47,8 +46,8 @@ def believed(lmax: int, grid: dict[str, object], orientation: dict[str, object],
 
 def limit_file(nside: int, path: Path) -> Path:
     """Moments of the WMAP scan's long-time limit at the centres of pixels."""
-    model = scan.load_model(resources.scan_model("wmap"))
-    scan.write_moments_fits(path, scan.limit_on_pixels(model, nside, 2))
+    model = scan.ScanModel.load("wmap")
+    scan.write_moments_fits(path, scan.Moments.limit(model, nside, 2))
     return path
 
 

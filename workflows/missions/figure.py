@@ -34,7 +34,9 @@ FIRST = 1  # the first bin, l < 32, is left out of overall ratios
 
 def binned_differences(store: Path, channel: str, mode: str) -> np.ndarray:
     """Paired difference of every realization, binned, shape (realization, bin), uK^2."""
-    found = beamfit.from_store(store, [mode], kind="difference", pair=f"{channel},{channel}").realizations
+    found = beamfit.from_store(
+        store, beamfit.Selection((mode,), kind="difference", pair=f"{channel},{channel}")
+    ).realizations
     assert found is not None  # as of every store
     return found
 

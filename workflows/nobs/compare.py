@@ -23,7 +23,6 @@ from mcsim.instrument import scan
 from mcsim.instrument.scan import ScanModel
 from mcsim.simulation import mapmaking
 from mcsim.sphere import healpix
-from mcsim.support import resources
 
 FRAGMENT = "wmap_maps/wmap_band_iqumap_r9_7yr_W_v4_first26264pix.fits"
 COARSE = "wmap_maps/wmap_band_iqumap_r9_7yr_W_v4_udgraded32.fits"
@@ -97,7 +96,7 @@ def main() -> None:
     nside, pixel, observations = read()
     theta = sub_pixels(nside, pixel)
     latitude = np.abs(90.0 - np.degrees(theta.mean(axis=1)))
-    focal_plane, nominal = (scan.load_model(resources.scan_model(name)) for name in ("wmap_focal_plane", "wmap"))
+    focal_plane, nominal = (scan.ScanModel.load(name) for name in ("wmap_focal_plane", "wmap"))
     pairs = mapmaking.prepare(focal_plane.with_sampling(0.6), "W1", 64, "galactic", nthreads=2)
     limit = density(focal_plane, LINES, theta)
     models = {"one line of sight at 70.5°": density(nominal, ("A",), theta)}

@@ -23,6 +23,7 @@ from PIL import Image
 import mcsim
 from mcsim import beamfit, config
 from mcsim.ensemble import prediction
+from mcsim.ensemble.expectation import survey_of
 from mcsim.instrument import beams, scan
 
 WORKFLOWS = Path(__file__).resolve().parent.parent
@@ -72,12 +73,15 @@ def against(toml: str, folder: Path | None, channels: dict[str, str]) -> Figure:
 def effective(folder: Path | None) -> Figure:
     """Effective beams of the hit average in terms of the beams under parallel transport."""
     store = store_of(SCANNED, folder)
-    survey = prediction.survey_of(WORKFLOWS / TRANSPORTED)
+    survey = survey_of(WORKFLOWS / TRANSPORTED)
+    measured = {
+        channel: beamfit.measurement(
+            store, survey, beamfit.Selection(ell_range=ELL_RANGE, kind="plain", pair=f"{channel},{channel}")
+        )
+        for channel in ("V2", "W1")
+    }
     fits = {
-        channel: [
-            beamfit.fit(store, survey, name, ell_range=ELL_RANGE, kind="plain", pair=f"{channel},{channel}")
-            for name in ("constant", "linear")
-        ]
+        channel: [beamfit.fit(measured[channel], survey, name) for name in ("constant", "linear")]
         for channel in ("V2", "W1")
     }
     for channel, models in fits.items():
@@ -93,7 +97,7 @@ def raw_blm() -> Figure:
     """Coefficients of the raw beams, with |b_l2| / b_l0 printed."""
     maps = raw_maps()
     for name, beam_map in maps.items():
-        blm = beam_map.beam(beam_figures.LMAX, 2).blm
+        blm = beams.Beam.from_map(beam_map, beam_figures.LMAX, 2).blm
         ratio = np.abs(blm[2]) / np.abs(blm[0])
         zero = np.flatnonzero(np.diff(np.sign(blm[2].real[20:]))) + 20
         at = ", ".join(f"{ratio[ell]:.4f} at l = {ell}" for ell in (100, 200, 500, 800))

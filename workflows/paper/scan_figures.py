@@ -6,7 +6,6 @@ from matplotlib.figure import Figure
 from mcsim.instrument import scan
 from mcsim.instrument.scan.limit import limit_quadrature
 from mcsim.plot.scan import scan_figure
-from mcsim.support import resources
 
 NSIDE = 128
 SAMPLE_PERIOD_S = 0.2048
@@ -15,7 +14,7 @@ SAMPLE_PERIOD_S = 0.2048
 
 def moments() -> tuple[scan.ScanModel, scan.Moments]:
     """Scan model and one year of its orientation moments, from the cache where they are there already."""
-    model = scan.load_model(resources.scan_model("wmap")).with_sampling(SAMPLE_PERIOD_S)
+    model = scan.ScanModel.load("wmap").with_sampling(SAMPLE_PERIOD_S)
     folder = scan.cached_moments(model, NSIDE, 2, nthreads=2)
     return model, scan.Moments.load(folder)
 

@@ -28,10 +28,9 @@ import litebird_sim as lbs
 import numpy as np
 
 from mcsim.instrument import scan
-from mcsim.instrument.beams import Beam, elliptical_gaussian
+from mcsim.instrument.beams import Beam
 from mcsim.simulation import convolve
 from mcsim.sphere import healpix, sky, spectra
-from mcsim.support import resources
 
 NSIDE, LMAX, M_MAX = 256, 512, 2
 FWHM_ARCMIN = (32.3, 29.4)
@@ -46,7 +45,7 @@ Clock = Callable[[], float]
 
 # litebird_sim's angles at t = 0 in terms of mcsim's: its precession starts half a turn later, and so does its spin.
 MODEL = replace(
-    scan.load_model(resources.scan_model("wmap")),
+    scan.ScanModel.load("wmap"),
     spin_phase_deg=180.0,
     precession_phase_deg=180.0,
     duration_days=365.25,
@@ -57,7 +56,7 @@ BORESIGHT_DEG = MODEL.line_of_sight("A").boresight_angle_deg
 def horn_sky() -> tuple[np.ndarray, Beam]:
     """The sky's a_lm in uK, and the beam."""
     alm = sky.gaussian_alm(spectra.load("planck2018", LMAX), np.random.default_rng(1))
-    return alm, elliptical_gaussian(*FWHM_ARCMIN, 0.0, LMAX, M_MAX)
+    return alm, Beam.elliptical(*FWHM_ARCMIN, 0.0, LMAX, M_MAX)
 
 
 def observation(days: float, quaternion_step_s: float, dtype: type) -> lbs.Simulation:
@@ -155,7 +154,9 @@ def cost(repeats: int, threads: int) -> dict[str, list[float]]:
     alm, beam = horn_sky()
     inputs = harmonics(alm, beam, np.pi)
     samples = MODEL.samples(MODEL.line_of_sight("A"))
-    part = scan.stream_moments(MODEL, NSIDE, M_MAX, time_range=(0.0, 0.02), lines_of_sight=["A"], nthreads=threads)
+    part = scan.Moments.from_model(
+        MODEL.with_lines_of_sight("A"), NSIDE, M_MAX, time_range=(0.0, 0.02), nthreads=threads
+    )
     response = convolve.response(beam, LMAX, healpix.pixel_window(NSIDE, LMAX))
     bare = replace(part, dtheta=None, dphi=None)
     map_uk = our_map(alm, response, part, threads)
@@ -179,8 +180,8 @@ def cost(repeats: int, threads: int) -> dict[str, list[float]]:
         row["mcsim: analysis"] = seconds_of(lambda: healpix.analysis(map_uk, LMAX, nthreads=threads))
         row["mcsim: moments, once"] = (
             seconds_of(
-                lambda: scan.stream_moments(
-                    MODEL, NSIDE, M_MAX, time_range=(0.0, MOMENTS_PART), lines_of_sight=["A"], nthreads=threads
+                lambda: scan.Moments.from_model(
+                    MODEL.with_lines_of_sight("A"), NSIDE, M_MAX, time_range=(0.0, MOMENTS_PART), nthreads=threads
                 )
             )
             / MOMENTS_PART
@@ -219,7 +220,7 @@ def agreement() -> None:
         f"psi of mcsim minus psi of litebird_sim: {np.degrees(np.abs(turn)).min():.5f} to "
         f"{np.degrees(np.abs(turn)).max():.5f} degrees"
     )
-    moments = scan.stream_moments(model, NSIDE, M_MAX, lines_of_sight=["A"], nthreads=2)
+    moments = scan.Moments.from_model(model.with_lines_of_sight("A"), NSIDE, M_MAX, nthreads=2)
     hit = moments.hits > 0
     points = replace(moments, dtheta=None, dphi=None)
     bare = convolve.response(beam, LMAX)

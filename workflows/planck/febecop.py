@@ -25,8 +25,8 @@ from astropy.io import fits
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from mcsim.bipolar import to_bennett
 from mcsim.bipolar.theory import ScannedBeam, cmb_biposh_leading, orientation_harmonics
-from mcsim.bipolar.theory.modes import to_bennett
 from mcsim.instrument import beams, scan
 from mcsim.sphere import rotation, spectra
 from mcsim.sphere.healpix import pixel_window
@@ -66,7 +66,7 @@ def focal_plane(path: Path, frequency: str, reading: str) -> list[Shape]:
 
 def mean_beam(radiometers: list[Shape]) -> NDArray[np.complex128]:
     """b_lm of the mean of elliptical Gaussians, m <= 2, shape (3, LMAX + 1)."""
-    return np.mean([beams.elliptical_gaussian(*shape, LMAX, 2).blm for shape in radiometers], axis=0)
+    return np.mean([beams.Beam.elliptical(*shape, LMAX, 2).blm for shape in radiometers], axis=0)
 
 
 def predicted(blm: NDArray[np.complex128], w: NDArray[np.complex128]) -> tuple[NDArray, NDArray]:
@@ -90,7 +90,7 @@ def reference(path: Path) -> NDArray[np.float64]:
 
 def orientations() -> NDArray[np.complex128]:
     """w_{s,LM} of one year of the Planck-like scan, ecliptic."""
-    model = scan.load_model(resources.scan_model("planck")).with_sampling(SAMPLE_PERIOD_S)
+    model = scan.ScanModel.load("planck").with_sampling(SAMPLE_PERIOD_S)
     moments = scan.Moments.load(scan.cached_moments(model, NSIDE, 2, nthreads=2))
     print(f"scan: BipoSH factor over parallel transport {scan.scan_factors(moments).quadrupole_ratio:.3f}")
     return orientation_harmonics(np.asarray(moments.w), 2)

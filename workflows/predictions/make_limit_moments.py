@@ -6,9 +6,8 @@ A year leaves structure of its own at the scale of the scan's lines; the limit d
 """
 
 from mcsim.instrument import scan
-from mcsim.support import resources
 
 NSIDE, SMAX = 256, 3
 
-model = scan.load_model(resources.scan_model("wmap"))
-scan.write_moments_fits("wmap-limit-moments.fits", scan.limit_on_pixels(model, NSIDE, SMAX))
+model = scan.ScanModel.load("wmap")
+scan.write_moments_fits("wmap-limit-moments.fits", scan.Moments.limit(model, NSIDE, SMAX))

@@ -1,28 +1,25 @@
 """BipoSH without Monte Carlo: from a beam's b_lm, the moments of a scan and C_l to the mean of an ensemble.
 
-Nothing here is shared with the convolution and the estimator of the ensembles, so that each checks the other.
+Nothing but the modes' names and normalisation is shared with the convolution and the estimator of the ensembles, so
+that each checks the other.
 """
 
 from mcsim.bipolar.theory.beam_biposh import ScannedBeam, beam_biposh
 from mcsim.bipolar.theory.cmb_biposh import cmb_biposh_leading, noise_biposh
-from mcsim.bipolar.theory.detectability import fisher_information, isotropic_variance, signal_to_noise
-from mcsim.bipolar.theory.exact import cmb_biposh_exact, power_spectrum_exact
+from mcsim.bipolar.theory.detectability import Spectra, fisher_information, isotropic_variance, signal_to_noise
+from mcsim.bipolar.theory.exact import cmb_biposh_exact
 from mcsim.bipolar.theory.harmonics import orientation_harmonics, parallel_transport_harmonics
-from mcsim.bipolar.theory.modes import Mode, bennett_factor, existing
 
 __all__ = [
-    "Mode",
     "ScannedBeam",
+    "Spectra",
     "beam_biposh",
-    "bennett_factor",
     "cmb_biposh_exact",
     "cmb_biposh_leading",
-    "existing",
     "fisher_information",
     "isotropic_variance",
     "noise_biposh",
     "orientation_harmonics",
     "parallel_transport_harmonics",
-    "power_spectrum_exact",
     "signal_to_noise",
 ]

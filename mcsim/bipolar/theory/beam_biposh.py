@@ -1,15 +1,20 @@
 """Beam-BipoSH B^{LM}_{l1 l2}: a non-circular beam under any scan in the bipolar spherical-harmonic basis."""
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
+from mcsim.bipolar.modes import Indices, check_modes, existing
 from mcsim.bipolar.theory.harmonics import negative_spin
-from mcsim.bipolar.theory.modes import Mode, check_modes, existing, spin_coupling
+from mcsim.errors import InputError
+from mcsim.sphere.checks import check_finite, check_whole
+from mcsim.sphere.wigner import threej_family
 
 
-class ScannedBeam(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class ScannedBeam:
     """A beam and the orientations under which it saw the sky.
 
     Attributes
@@ -17,24 +22,44 @@ class ScannedBeam(NamedTuple):
     blm
         b_lm of the beam at the pole, complex, shape (mmax + 1, lmax + 1), ``blm[m, l]``.
     w
-        w_{s,LM}, shape (smax + 1, L_max + 1, 2 L_max + 1), as :mod:`mcsim.predict.harmonics` makes them.
+        w_{s,LM}, shape (smax + 1, L_max + 1, 2 L_max + 1), as :mod:`mcsim.bipolar.theory.harmonics` makes them.
+
+    Raises
+    ------
+    InputError
+        For arrays of other shapes, or that are not finite.
     """
 
     blm: NDArray[np.complex128]
     w: NDArray[np.complex128]
 
+    def __post_init__(self) -> None:
+        if self.blm.ndim != 2 or self.w.ndim != 3 or self.w.shape[2] != 2 * self.w.shape[1] - 1:
+            raise InputError(
+                f"b_lm of shape {self.blm.shape} and w of {self.w.shape} are no scanned beam; give (mmax + 1, "
+                "lmax + 1) and (smax + 1, L_max + 1, 2 L_max + 1)."
+            )
+        check_finite(self.blm, "blm")
+        check_finite(self.w, "w")
+
+    def check(self, lmax: int) -> None:
+        """Raise InputError unless the beam reaches ``lmax``."""
+        check_whole(lmax, "lmax")
+        if self.blm.shape[1] <= lmax:
+            raise InputError(f"the beam ends at l = {self.blm.shape[1] - 1}, below lmax {lmax}; compute it further.")
+
     @property
     def smax(self) -> int:
-        """Highest spin that both the beam and the moments have."""
+        """Return the highest spin that both the beam and the moments have."""
         return min(len(self.blm), len(self.w)) - 1
 
     @property
     def L_max(self) -> int:
-        """Highest degree of the moments."""
+        """Return the highest degree of the moments."""
         return self.w.shape[1] - 1
 
     def response(self, lmax: int) -> NDArray[np.complex128]:
-        """k_l b_ls for s = -smax..smax, shape (2 smax + 1, lmax + 1), zero beyond the beam's lmax."""
+        """Return k_l b_ls for s = -smax..smax, shape (2 smax + 1, lmax + 1), zero beyond the beam's lmax."""
         top = min(lmax, self.blm.shape[1] - 1)
         positive = np.zeros((self.smax + 1, lmax + 1), dtype=np.complex128)
         positive[:, : top + 1] = self.blm[: self.smax + 1, : top + 1] * np.sqrt(
@@ -44,13 +69,13 @@ class ScannedBeam(NamedTuple):
         return np.concatenate([sign[:, None] * positive[:0:-1].conj(), positive])
 
     def orientations(self) -> NDArray[np.complex128]:
-        """w_{s,LM} for s = -smax..smax, shape (2 smax + 1, L_max + 1, 2 L_max + 1)."""
+        """Return w_{s,LM} for s = -smax..smax, shape (2 smax + 1, L_max + 1, 2 L_max + 1)."""
         w = self.w[: self.smax + 1]
         return np.concatenate([negative_spin(w)[:0:-1], w])
 
 
-def beam_biposh(beam: ScannedBeam, mode: Mode, lmax: int) -> NDArray[np.complex128]:
-    """B^{LM}_{l1 l2} of a beam under any scan.
+def beam_biposh(beam: ScannedBeam, mode: Indices, lmax: int) -> NDArray[np.complex128]:
+    """Return B^{LM}_{l1 l2} of a beam under any scan.
 
     Parameters
     ----------
@@ -79,6 +104,7 @@ def beam_biposh(beam: ScannedBeam, mode: Mode, lmax: int) -> NDArray[np.complex1
     circular beam gives (-1)^l B_l sqrt(2l+1) for L = 0 and nothing else.
     """
     check_modes([mode])
+    beam.check(lmax)
     L, M, d = mode
     l2 = np.arange(lmax + 1)
     exists = existing(L, d, lmax)
@@ -88,6 +114,17 @@ def beam_biposh(beam: ScannedBeam, mode: Mode, lmax: int) -> NDArray[np.complex1
         top = min(beam.smax, L)
         for s in range(-top, top + 1):
             w = orientations[beam.smax + s, L, beam.L_max + M]
-            total += w * response[beam.smax + s] * spin_coupling(L, d, s, lmax)
+            total += w * response[beam.smax + s] * _spin_coupling(L, d, s, lmax)
     norm = np.sqrt(np.where(exists, (2.0 * l2 + 1) * (2.0 * (l2 - d) + 1), 0.0) / (4 * np.pi))
     return np.where(exists, (-1) ** d * norm * total, np.nan)
+
+
+@njit(cache=True, nogil=True)
+def _spin_coupling(L: int, d: int, s: int, lmax: int) -> NDArray[np.float64]:
+    """3j symbols (l1 L l2; 0 s -s) with l1 = l2 - d at l2 = 0..lmax, zero where they vanish; |s| <= L."""
+    symbols, family = np.zeros(lmax + 1), np.zeros(2 * L + 1)
+    for l2 in range(abs(s), lmax + 1):
+        lowest, n = threej_family(L, l2, s, -s, family)
+        if 0 <= l2 - d - lowest < n:
+            symbols[l2] = family[l2 - d - lowest]
+    return symbols

@@ -5,23 +5,19 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from mcsim.bipolar.modes import Indices, bennett_factor, check_modes, existing
 from mcsim.bipolar.theory.beam_biposh import ScannedBeam, beam_biposh
-from mcsim.bipolar.theory.modes import Mode, bennett_factor, check_modes, existing
-from mcsim.errors import InputError
-
-
-def check_spectrum(cl: NDArray[np.float64], lmax: int) -> None:
-    """Raise InputError when C_l ends below lmax."""
-    if len(cl) <= lmax:
-        raise InputError(
-            f"the spectrum ends at ell = {len(cl) - 1}, below lmax {lmax}; lower lmax or extend the spectrum."
-        )
+from mcsim.sphere.checks import check_cl, check_shape, check_whole
 
 
 def cmb_biposh_leading(
-    modes: Sequence[Mode], cl: NDArray[np.float64], lmax: int, x: ScannedBeam, y: ScannedBeam | None = None
+    modes: Sequence[Indices],
+    cl: NDArray[np.float64],
+    lmax: int,
+    x: ScannedBeam,
+    y: ScannedBeam | None = None,
 ) -> NDArray[np.complex128]:
-    """Mean A^{LM}_{l1 l2} of one map, or of the ordered pair X, Y, to leading order.
+    """Return the mean A^{LM}_{l1 l2} of one map, or of the ordered pair X, Y, to leading order.
 
     Parameters
     ----------
@@ -49,11 +45,13 @@ def cmb_biposh_leading(
     For L > 0, A = (-1)^{l2} [C_{l2} B^{00,Y}_{l2 l2} B^{LM,X}_{l1 l2}/sqrt(2 l2+1) + (-1)^L C_{l1} B^{00,X}_{l1 l1}
     B^{LM,Y}_{l2 l1}/sqrt(2 l1+1)] (arXiv:1210.7318, eqs. WMAP1 and WMAP2 generalised); for L = 0 the circular spectrum
     (-1)^l sqrt(2l+1) C_l B^X_l B^Y_l. What is left out is second order in b_ls: halving b_l2 quarters it
-    (tests/unit/test_predict_brute_force.py); :func:`mcsim.predict.exact.cmb_biposh_exact` has it.
+    (tests/unit/test_predict_brute_force.py); :func:`mcsim.bipolar.theory.cmb_biposh_exact` has it.
     """
     check_modes(modes)
-    check_spectrum(cl, lmax)
+    check_cl(cl, lmax)
     y = x if y is None else y
+    for beam in (x, y):
+        beam.check(lmax)
     l2 = np.arange(lmax + 1)
     sign = (-1.0) ** l2
     root = np.sqrt(2.0 * l2 + 1)
@@ -72,8 +70,8 @@ def cmb_biposh_leading(
     return result
 
 
-def noise_biposh(modes: Sequence[Mode], variance: NDArray[np.complex128], lmax: int) -> NDArray[np.complex128]:
-    """Mean A^{LM}_{l1 l2} of white noise of uneven variance.
+def noise_biposh(modes: Sequence[Indices], variance: NDArray[np.complex128], lmax: int) -> NDArray[np.complex128]:
+    """Return the mean A^{LM}_{l1 l2} of white noise of uneven variance.
 
     Parameters
     ----------
@@ -97,12 +95,12 @@ def noise_biposh(modes: Sequence[Mode], variance: NDArray[np.complex128], lmax: 
     (tests/unit/test_predict_cmb_biposh.py holds it to an explicit sum).
     """
     check_modes(modes)
+    check_whole(lmax, "lmax")
     L_max = len(variance) - 1
+    check_shape(variance, (L_max + 1, 2 * L_max + 1), "the variance")
     result = np.full((len(modes), lmax + 1), np.nan, dtype=np.complex128)
     for row, (L, M, d) in zip(result, modes, strict=True):
         v = variance[L, L_max + M] if L_max >= L else 0.0
-        bennett = bennett_factor(L, d, lmax)
-        row[existing(L, d, lmax)] = 0.0
-        even = np.isfinite(bennett)
-        row[even] = v / np.sqrt(4 * np.pi) / bennett[even]
+        exists = existing(L, d, lmax)
+        row[exists] = v / np.sqrt(4 * np.pi) / bennett_factor((L, M, d), lmax)[exists] if (L + d) % 2 == 0 else 0.0
     return result

@@ -1,30 +1,41 @@
 """How well a BipoSH signal can be seen: variances under isotropy, signal to noise and Fisher information."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.bipolar.theory.modes import Mode, check_modes, existing
+from mcsim.bipolar.modes import Indices, check_modes, existing
 from mcsim.errors import InputError
+from mcsim.sphere.checks import check_cl, check_shape
 
 
-def isotropic_variance(
-    modes: Sequence[Mode],
-    cl_total_x: NDArray[np.float64],
-    cl_total_y: NDArray[np.float64] | None = None,
-    cl_cross: NDArray[np.float64] | None = None,
-) -> NDArray[np.float64]:
-    """E|A^{LM}_{l1 l2}|^2 of an isotropic sky.
+class Spectra(NamedTuple):
+    """Total power spectra of a map X, or of a pair X, Y, uK^2.
+
+    Attributes
+    ----------
+    x, y
+        Beam^2 signal + noise of the maps, shape (lmax + 1,); for one map leave out ``y`` and ``cross``.
+    cross
+        C_l^{XY}, shape (lmax + 1,).
+    """
+
+    x: NDArray[np.float64]
+    y: NDArray[np.float64] | None = None
+    cross: NDArray[np.float64] | None = None
+
+
+def isotropic_variance(modes: Sequence[Indices], spectra: Spectra) -> NDArray[np.float64]:
+    """Return E|A^{LM}_{l1 l2}|^2 of an isotropic sky.
 
     Parameters
     ----------
     modes
         (L, M, d) each, L > 0.
-    cl_total_x, cl_total_y
-        Total spectra (beam^2 signal + noise) of the maps X and Y, uK^2, shape (lmax + 1,).
-    cl_cross
-        C_l^{XY}, shape (lmax + 1,). For one map give ``cl_total_x`` alone.
+    spectra
+        Of the map or of the pair.
 
     Returns
     -------
@@ -39,12 +50,14 @@ def isotropic_variance(
     check_modes(modes)
     if any(L == 0 for L, _, _ in modes):
         raise InputError("the variance of L=0 is that of C_l, not of an anisotropy; give modes with L >= 1.")
-    lmax = len(cl_total_x) - 1
-    x = cl_total_x
-    y = x if cl_total_y is None else cl_total_y
-    cross = x if cl_total_y is None else cl_cross
+    x = spectra.x
+    lmax = len(x) - 1
+    y, cross = (x, x) if spectra.y is None else (spectra.y, spectra.cross)
     if cross is None:
-        raise InputError("the cross spectrum of the two maps is missing; give cl_cross with cl_total_y.")
+        raise InputError("the cross spectrum of the two maps is missing; give cross with y.")
+    for name, cl in (("x", x), ("y", y), ("cross", cross)):
+        check_cl(cl, lmax, name, cross=name == "cross")
+        check_shape(cl, (lmax + 1,), name)
     variance = np.full((len(modes), lmax + 1), np.nan)
     for row, (L, _, d) in zip(variance, modes, strict=True):
         l2 = np.flatnonzero(existing(L, d, lmax))
@@ -57,14 +70,12 @@ def isotropic_variance(
 
 def signal_to_noise(
     biposh: NDArray[np.complex128],
-    modes: Sequence[Mode],
-    cl_total_x: NDArray[np.float64],
-    cl_total_y: NDArray[np.float64] | None = None,
-    cl_cross: NDArray[np.float64] | None = None,
+    modes: Sequence[Indices],
+    spectra: Spectra,
     f_sky: float = 1.0,
     ell_range: tuple[int, int] | None = None,
 ) -> NDArray[np.float64]:
-    """Signal to noise of each mode, all ell of a range together.
+    """Return the signal to noise of each mode, all ell of a range together.
 
     Parameters
     ----------
@@ -72,8 +83,8 @@ def signal_to_noise(
         Expected A^{LM}_{l1 l2} in uK^2 (Hajian-Souradeep), shape (n_mode, lmax + 1).
     modes
         (L, M, d) of each row, L > 0, M >= 0.
-    cl_total_x, cl_total_y, cl_cross
-        As for :func:`isotropic_variance`.
+    spectra
+        Of the map or of the pair.
     f_sky
         Observed fraction of the sky, 0 < f_sky <= 1.
     ell_range
@@ -90,10 +101,10 @@ def signal_to_noise(
     one pair share noise (E A_{l1 l2} A*_{l2 l1} is not zero): their sum in quadrature is an approximation;
     :func:`fisher_information` is exact.
     """
-    if not 0.0 < f_sky <= 1.0:
-        raise InputError(f"f_sky = {f_sky} is not a fraction of the sky; give 0 < f_sky <= 1.")
+    _check_f_sky(f_sky)
+    _check_biposh(biposh, (len(modes), len(spectra.x)))
     first, last = (0, biposh.shape[1] - 1) if ell_range is None else ell_range
-    variance = isotropic_variance(modes, cl_total_x, cl_total_y, cl_cross)[:, first : last + 1]
+    variance = isotropic_variance(modes, spectra)[:, first : last + 1]
     signal = abs(biposh[:, first : last + 1]) ** 2
     ratio = np.divide(signal, variance, out=np.zeros_like(variance), where=variance > 0.0)
     weight = np.array([1.0 if M == 0 else 2.0 for _, M, _ in modes])
@@ -102,11 +113,11 @@ def signal_to_noise(
 
 def fisher_information(
     biposh: NDArray[np.complex128],
-    modes: Sequence[Mode],
+    modes: Sequence[Indices],
     cl_total: NDArray[np.float64],
     f_sky: float = 1.0,
 ) -> float:
-    """Information 1/2 Tr[C^-1 dC C^-1 dC] of a BipoSH signal in all maps jointly.
+    """Return the information 1/2 Tr[C^-1 dC C^-1 dC] of a BipoSH signal in all maps jointly.
 
     Parameters
     ----------
@@ -137,11 +148,14 @@ def fisher_information(
     maps. Equal to the trace over an explicit covariance to 1e-12 (tests/unit/test_predict_detectability.py).
     """
     check_modes(modes)
-    if not 0.0 < f_sky <= 1.0:
-        raise InputError(f"f_sky = {f_sky} is not a fraction of the sky; give 0 < f_sky <= 1.")
+    _check_f_sky(f_sky)
+    _check_biposh(biposh, (*cl_total.shape[:2], len(modes), cl_total.shape[-1]))
     for L, M, d in modes:
         if M < 0 or d < 0:
             raise InputError(f"mode L={L}, M={M}, d={d} repeats information of M >= 0, d >= 0; leave it out.")
+    n_map = len(cl_total)
+    check_shape(cl_total, (n_map, n_map, cl_total.shape[-1]), "cl_total")
+    check_shape(biposh, (n_map, n_map, len(modes), cl_total.shape[-1]), "biposh")
     spectra = np.moveaxis(cl_total, -1, 0)
     inverse = np.zeros_like(spectra)
     diagonal = np.einsum("lxx->lx", spectra)
@@ -159,3 +173,13 @@ def fisher_information(
         trace = np.einsum("lab,lbc,lcd,lad->", inverse[l2 - d], signal, inverse[l2], signal.conj(), optimize=True)
         total += (1.0 if M == 0 else 2.0) / (2.0 if d == 0 else 1.0) * float(trace.real)
     return f_sky * total
+
+
+def _check_f_sky(f_sky: float) -> None:
+    if not 0.0 < f_sky <= 1.0:
+        raise InputError(f"f_sky = {f_sky} is not a fraction of the sky; give 0 < f_sky <= 1.")
+
+
+def _check_biposh(biposh: NDArray[np.complex128], shape: tuple[int, ...]) -> None:
+    if biposh.shape != shape:
+        raise InputError(f"the BipoSH have shape {biposh.shape}, modes and spectra ask for {shape}; give those.")

@@ -1,37 +1,38 @@
-"""Mean CMB BipoSH and C_l to all orders in the beam."""
+"""Mean CMB BipoSH to all orders in the beam."""
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
-import ducc0
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from mcsim.bipolar.modes import Indices, check_modes, existing
 from mcsim.bipolar.theory.beam_biposh import ScannedBeam
-from mcsim.bipolar.theory.cmb_biposh import check_spectrum
-from mcsim.bipolar.theory.modes import Mode, check_modes, existing
+from mcsim.sphere.checks import check_cl
 from mcsim.sphere.wigner import sixj_family, threej_family
 
 _BLOCK = 32
 
+# A product of moments and beams below this fraction of the circular term is left out.
+_TOLERANCE = 1e-12
+
 
 def cmb_biposh_exact(
-    modes: Sequence[Mode],
+    modes: Sequence[Indices],
     cl: NDArray[np.float64],
     lmax: int,
     x: ScannedBeam,
     y: ScannedBeam | None = None,
-    tolerance: float = 1e-12,
     nthreads: int = 1,
 ) -> NDArray[np.complex128]:
-    """Mean A^{LM}_{l1 l2} of one map, or of the ordered pair X, Y, to all orders in b_ls.
+    """Return the mean A^{LM}_{l1 l2} of one map, or of the ordered pair X, Y, to all orders in b_ls.
 
     Parameters
     ----------
     modes
-        (L, M, d) each, with |M|, |d| <= L; L = 0 gives C_l with the second-order beam correction.
+        (L, M, d) each, with |M|, |d| <= L; L = 0 gives (-1)^l sqrt(2l+1) C_l with the second order of the beam.
     cl
         C_l of the sky without beam, uK^2, shape (> lmax,). Skies often end above ``lmax``; power there leaks down, so
         give it.
@@ -40,8 +41,6 @@ def cmb_biposh_exact(
     x, y
         Beams and scans of a_{l1 m1} and of a_{l2 m2}; ``y`` is ``x`` by default. Sums over L1, L2 end with
         their moments: see Notes.
-    tolerance
-        A product of moments and beams below this fraction of the circular term is left out. 0 keeps all.
     nthreads
         Blocks of ell are shared among so many threads.
 
@@ -69,16 +68,15 @@ def cmb_biposh_exact(
     A^{20}, it is within 8e-4, 2.5e-4 and 7e-5 of A^{20} with L_max 32, 64 and 128 (within a sixth of this at l = 400).
     """
     check_modes(modes)
-    check_spectrum(cl, lmax)
+    check_cl(cl, lmax)
     y = x if y is None else y
+    for beam in (x, y):
+        beam.check(lmax)
     result = np.full((len(modes), lmax + 1), np.nan, dtype=np.complex128)
     groups: dict[tuple[int, int], list[int]] = {}
     for i, (L, _, d) in enumerate(modes):
         groups.setdefault((L, d), []).append(i)
-    plans = {
-        (L, d): _plan(L, tuple(modes[i][1] for i in rows), x, y, len(cl) - 1, tolerance)
-        for (L, d), rows in groups.items()
-    }
+    plans = {(L, d): _plan(L, tuple(modes[i][1] for i in rows), x, y, len(cl) - 1) for (L, d), rows in groups.items()}
     reach = max(abs(d) for _, d in groups) if groups else 0
     response_x, response_y = x.response(len(cl) - 1), y.response(len(cl) - 1)
     power = cl * (2.0 * np.arange(len(cl)) + 1) / (4 * np.pi)
@@ -89,10 +87,11 @@ def cmb_biposh_exact(
         low, high = max(first - reach, 0), min(last + reach, lmax + 1)
         table_x = _spin_table(low, high, x.smax, x.L_max, response_x)
         table_y = table_x if same else _spin_table(low, high, y.smax, y.L_max, response_y)
+        seen = _Seen(low, power, table_x, table_y)
         for (L, d), rows in groups.items():
             l2 = np.arange(first, last)[existing(L, d, lmax)[first:last]]
             block = np.zeros((len(rows), len(l2)), dtype=np.complex128)
-            _contract(L, d, l2, low, power, table_x, table_y, *plans[L, d], block)
+            _contract(L, d, l2, seen, plans[L, d], block)
             for row, values in zip(rows, block, strict=True):
                 result[row, l2] = values
 
@@ -101,16 +100,13 @@ def cmb_biposh_exact(
     return result
 
 
-def power_spectrum_exact(
-    cl: NDArray[np.float64], lmax: int, x: ScannedBeam, y: ScannedBeam | None = None, nthreads: int = 1
-) -> NDArray[np.float64]:
-    """Mean pseudo-C_l of one map or a pair: (-1)^l A^{00}_ll / sqrt(2l+1), uK^2, shape (lmax + 1,).
+class _Seen(NamedTuple):
+    """The sky's (2l+1) C_l/4pi, and the tables of two beams, whose first l1 or l2 is ``low``."""
 
-    Arguments as in :func:`cmb_biposh_exact`; circular part C_l B^X_l B^Y_l plus the terms of second order in b_ls.
-    """
-    monopole = cmb_biposh_exact([(0, 0, 0)], cl, lmax, x, y, nthreads=nthreads)[0]
-    ell = np.arange(lmax + 1)
-    return (-1.0) ** ell * monopole.real / np.sqrt(2.0 * ell + 1)
+    low: int
+    power: NDArray[np.float64]
+    x: NDArray[np.complex128]
+    y: NDArray[np.complex128]
 
 
 class _Plan(NamedTuple):
@@ -122,9 +118,9 @@ class _Plan(NamedTuple):
     coupling: NDArray[np.complex128]
 
 
-def _plan(L: int, orders: tuple[int, ...], x: ScannedBeam, y: ScannedBeam, lsky: int, tolerance: float) -> _Plan:
+def _plan(L: int, orders: tuple[int, ...], x: ScannedBeam, y: ScannedBeam, lsky: int) -> _Plan:
     size_x, size_y = (abs(beam.response(lsky)).max(axis=1) for beam in (x, y))
-    limit = tolerance * 4 * np.pi
+    limit = _TOLERANCE * 4 * np.pi
     pairs, counts, spins, couplings = [], [0], [], []
     for L1, L2, coupling in _moment_couplings(L, orders, x, y):
         scale = size_x[:, None] * size_y
@@ -147,18 +143,35 @@ def _moment_couplings(
 ) -> Iterator[tuple[int, int, NDArray[np.complex128]]]:
     """(L1, L2, X) with X[M, s, s'] = sum_{M1 M2} C^{LM}_{L1 M1 L2 M2} w^X_{s,L1 M1} w^Y_{s',L2 M2}."""
     w_x, w_y = x.orientations(), y.orientations()
-    present_x, present_y = (abs(w).sum(axis=0) > 0.0 for w in (w_x, w_y))
     for L1 in range(x.L_max + 1):
         for L2 in range(abs(L - L1), min(L + L1, y.L_max) + 1):
             coupling = np.zeros((len(orders), len(w_x), len(w_y)), dtype=np.complex128)
             for row, M in zip(coupling, orders, strict=True):
-                for M1 in range(max(-L1, M - L2), min(L1, M + L2) + 1):
-                    i, j = x.L_max + M1, y.L_max + M - M1
-                    if present_x[L1, i] and present_y[L2, j]:
-                        lowest, family = ducc0.misc.wigner3j_int(L1, L2, M1, M - M1)
-                        clebsch = (-1) ** (L1 - L2 + M) * np.sqrt(2 * L + 1) * family[L - lowest]
-                        row += clebsch * w_x[:, L1, i, None] * w_y[:, L2, j]
+                _couple((L, M), w_x[:, L1], w_y[:, L2], (L1, L2), row)
             yield L1, L2, coupling
+
+
+@njit(cache=True, nogil=True)
+def _couple(
+    mode: tuple[int, int],
+    w_x: NDArray[np.complex128],
+    w_y: NDArray[np.complex128],
+    degrees: tuple[int, int],
+    row: NDArray[np.complex128],
+) -> None:
+    """Add sum_{M1 M2} C^{LM}_{L1 M1 L2 M2} w^X_{s,L1 M1} w^Y_{s',L2 M2} to ``row[s, s']``."""
+    (L, M), (L1, L2) = mode, degrees
+    family = np.zeros(2 * min(L1, L2) + 1)
+    sign = 1.0 if (L1 - L2 + M) % 2 == 0 else -1.0
+    for M1 in range(max(-L1, M - L2), min(L1, M + L2) + 1):
+        left, right = w_x[:, w_x.shape[1] // 2 + M1], w_y[:, w_y.shape[1] // 2 + M - M1]
+        if not (np.any(left != 0.0) and np.any(right != 0.0)):
+            continue
+        lowest, _ = threej_family(L1, L2, M1, M - M1, family)
+        clebsch = sign * np.sqrt(2.0 * L + 1.0) * family[L - lowest]
+        for s in range(len(left)):
+            for t in range(len(right)):
+                row[s, t] += clebsch * left[s] * right[t]
 
 
 @njit(cache=True, nogil=True)
@@ -182,20 +195,11 @@ def _spin_table(low: int, high: int, smax: int, L_max: int, response: NDArray[np
 
 @njit(cache=True, nogil=True)
 def _contract(
-    L: int,
-    d: int,
-    degrees: NDArray[np.int64],
-    low: int,
-    power: NDArray[np.float64],
-    table_x: NDArray[np.complex128],
-    table_y: NDArray[np.complex128],
-    pairs: NDArray[np.int64],
-    first_term: NDArray[np.int64],
-    spins: NDArray[np.int64],
-    coupling: NDArray[np.complex128],
-    block: NDArray[np.complex128],
+    L: int, d: int, degrees: NDArray[np.int64], seen: _Seen, plan: _Plan, block: NDArray[np.complex128]
 ) -> None:
     """Add to ``block[M, l2]`` the sums over l, (L1, L2) and (s, s')."""
+    low, power, table_x, table_y = seen
+    pairs, first_term, spins, coupling = plan
     L_max_x, L_max_y = table_x.shape[1] - 1, table_y.shape[1] - 1
     symbols = np.zeros(2 * max(L_max_x, L_max_y) + 2)
     sums = np.zeros(table_x.shape[3] * table_y.shape[3], dtype=np.complex128)

@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
+from mcsim.sphere.checks import check_angle, check_finite, check_whole, nside_of
 from mcsim.sphere.healpix import geometry
 
 
-def orientation_harmonics(
-    w: NDArray[np.complex128], L_max: int, observed: NDArray[np.bool_] | None = None, nthreads: int = 1
-) -> NDArray[np.complex128]:
-    """w_{s,LM} of moment maps, for every M.
+def orientation_harmonics(w: NDArray[np.complex128], L_max: int, nthreads: int = 1) -> NDArray[np.complex128]:
+    """Return w_{s,LM} of moment maps, for every M.
 
     Parameters
     ----------
@@ -24,47 +23,38 @@ def orientation_harmonics(
         w_s(n) = <e^{-i s psi}> for s = 1..smax, HEALPix RING, shape (smax, npix).
     L_max
         Highest degree.
-    observed
-        Where w_0 = 1 (elsewhere 0), shape (npix,); all pixels by default.
     nthreads
         Threads of the transforms.
 
     Returns
     -------
     ndarray
-        Shape (smax + 1, L_max + 1, 2 L_max + 1), as the module describes.
+        Shape (smax + 1, L_max + 1, 2 L_max + 1), as the module describes; w_0 = 1 everywhere.
+
+    Raises
+    ------
+    InputError
+        For maps that are not finite or not of 12 nside^2 pixels.
 
     Notes
     -----
     The integrals are sums over pixels of equal weight, wrong by about nside^-2 of the largest coefficient where the
     moments are smooth (tests/unit/test_predict_harmonics.py), 4e-6 at nside 512.
     """
+    if np.ndim(w) != 2:
+        raise InputError(f"w has shape {np.shape(w)}, but moment maps are (smax, npix).")
     smax, npix = w.shape
-    nside = round(np.sqrt(npix / 12))
-    if 12 * nside**2 != npix:
-        raise InputError(f"a moment map has {npix} pixels, which no HEALPix map has; give maps of 12 nside^2 pixels.")
+    nside = nside_of(npix, "a moment map")
+    check_whole(L_max, "L_max")
+    check_finite(w, "w")
     grid = geometry(nside)
     area = 4 * np.pi / npix
-    result = np.zeros((smax + 1, L_max + 1, 2 * L_max + 1), dtype=np.complex128)
-    if observed is None or observed.all():
-        result[0, 0, L_max] = np.sqrt(4 * np.pi)
-    else:
-        scalar = ducc0.sht.adjoint_synthesis(
-            map=observed.astype(np.float64)[None] * area, spin=0, lmax=L_max, nthreads=nthreads, **grid
-        )
-        _fill_scalar(result[0], scalar[0], L_max)
+    result = _isotropic_zero(smax, L_max)
     for s in range(1, min(smax, L_max) + 1):
         conjugate = np.stack([w[s - 1].real, -w[s - 1].imag]) * area
         gradient, curl = ducc0.sht.adjoint_synthesis(map=conjugate, spin=s, lmax=L_max, nthreads=nthreads, **grid)
         _fill_spin(result[s], s, gradient, curl, L_max)
     return result
-
-
-def _fill_scalar(target: NDArray[np.complex128], alm: NDArray[np.complex128], L_max: int) -> None:
-    for M in range(L_max + 1):
-        column = alm[alm_.start(L_max, M) + M : alm_.start(L_max, M) + L_max + 1]
-        target[M:, L_max - M] = (-1) ** M * column.conj()
-        target[M:, L_max + M] = column
 
 
 def _fill_spin(
@@ -83,37 +73,8 @@ def _fill_spin(
         target[low:, L_max + M] = -((-1) ** s) * (gradient[span] - 1j * curl[span])
 
 
-def ring_orientation_harmonics(w: NDArray[np.complex128], L_max: int) -> NDArray[np.complex128]:
-    """w_{s,L0} of moments that depend on colatitude alone.
-
-    Parameters
-    ----------
-    w
-        w_s(theta) for s = 1..smax at the Gauss-Legendre colatitudes (north to south) of
-        ``ducc0.misc.GL_thetas(ntheta)``, shape (smax, ntheta).
-    L_max
-        Highest degree; only M = 0 is filled.
-
-    Returns
-    -------
-    ndarray
-        Shape (smax + 1, L_max + 1, 2 L_max + 1), as the module describes.
-
-    Notes
-    -----
-    w_{s,L0} = 2 pi int w_s (-s)Y_L0 sin(theta) d theta. Odd s are not polynomials in cos(theta): their error falls as
-    ntheta^-3 (for w_s = 1, 5e-6 with 200 rings, tests/unit/test_predict_harmonics.py).
-    """
-    smax, ntheta = w.shape
-    result = _isotropic_zero(smax, L_max)
-    weights = ducc0.misc.GL_weights(ntheta, 1)  # of the sphere: 2 pi is in them
-    functions = spin_functions(smax, L_max, ducc0.misc.GL_thetas(ntheta))
-    result[1:, :, L_max] = np.einsum("slt,st->sl", functions[1:], w * weights)
-    return result
-
-
 def parallel_transport_harmonics(smax: int, L_max: int, psi0: float = 0.0) -> NDArray[np.complex128]:
-    """w_{s,L0} of w_s = e^{-i s psi0} everywhere, exactly.
+    """Return w_{s,L0} of w_s = e^{-i s psi0} everywhere, exactly.
 
     Parameters
     ----------
@@ -134,6 +95,9 @@ def parallel_transport_harmonics(smax: int, L_max: int, psi0: float = 0.0) -> ND
     and equal steps in theta for odd s, where d^L_{0s} sin(theta) is a cosine series. The power of w_2 at L = 2, 4, 6,
     8 is 83.3, 10, 3.1, 1.35 %.
     """
+    check_whole(smax, "smax")
+    check_whole(L_max, "L_max")
+    check_angle(psi0, "psi0")
     result = _isotropic_zero(smax, L_max)
     gauss = spin_functions(smax, L_max, ducc0.misc.GL_thetas(L_max + 2))
     gauss_weights = ducc0.misc.GL_weights(L_max + 2, 1)  # of the sphere: 2 pi is in them
@@ -154,7 +118,7 @@ def _isotropic_zero(smax: int, L_max: int) -> NDArray[np.complex128]:
 
 
 def spin_functions(smax: int, L_max: int, theta: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(-s)Y_L0(theta) = sqrt((2L+1)/4pi) d^L_{0s}(theta) for s = 0..smax, shape (smax + 1, L_max + 1, ntheta).
+    """Return (-s)Y_L0(theta) = sqrt((2L+1)/4pi) d^L_{0s}(theta) for s = 0..smax, shape (smax + 1, L_max + 1, ntheta).
 
     Notes
     -----
@@ -175,7 +139,7 @@ def spin_functions(smax: int, L_max: int, theta: NDArray[np.float64]) -> NDArray
 
 
 def negative_spin(w: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """w_{-s,LM} = (-1)^{s+M} conj(w_{s,L,-M}), in the same layout."""
+    """Return w_{-s,LM} = (-1)^{s+M} conj(w_{s,L,-M}), in the same layout."""
     smax, width = w.shape[0] - 1, w.shape[2]
     sign_s = (-1.0) ** np.arange(smax + 1)
     sign_m = (-1.0) ** np.arange(-(width // 2), width // 2 + 1)

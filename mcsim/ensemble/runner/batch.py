@@ -27,12 +27,16 @@ from mcsim.support.progress import Journal, reporting
 
 @dataclass(frozen=True)
 class Result:
-    """What a run left behind: the store, how many realizations it now holds, how many were computed, what failed."""
+    """What a run left behind: the store, how many realizations it now holds, how many were computed, what failed.
+
+    ``summarised``: whether the summary was made anew, for more realizations or for other bins.
+    """
 
     store: Path
     finished: int
     computed: int
     failures: tuple[Failure, ...]
+    summarised: bool = False
 
 
 def run(
@@ -72,6 +76,25 @@ def run(
     ------
     InputError
         For bad input, an unwritable or foreign store, a scheduler that does not answer. The store is then as it was.
+
+    Returns
+    -------
+    Result
+        ``store``, and how many realizations are ``finished``, were ``computed`` now, or failed (``failures``).
+
+    Notes
+    -----
+    Workers are processes, which import the main module again: in a script, keep the call under
+    ``if __name__ == "__main__":``.
+
+    Examples
+    --------
+    >>> import mcsim
+    >>> result = mcsim.run("tiny", "tiny.zarr")
+    >>> result.finished
+    32
+    >>> mcsim.run("tiny", "tiny.zarr").computed  # all is there already
+    0
     """
     loaded = source if isinstance(source, config.RunConfig) else config.load(source)
     wanted = plan.wanted(loaded, realizations)
@@ -106,8 +129,9 @@ def run(
 def _finished(target: Path, run: config.RunConfig, wanted: range) -> bool:
     """Whether a store of this configuration has all that is wanted, its summary included."""
     plan.check_same(target, run)
-    done = store.done(target)
-    return wanted.stop <= len(done) and bool(done[wanted].all()) and store.summarised(target) == done.sum()
+    done, (count, bins) = store.done(target), store.summarised(target)
+    binned = bins == list(range(0, config.analysis_lmax(run) + 1, run.biposh.summary_bin))
+    return wanted.stop <= len(done) and bool(done[wanted].all()) and count == done.sum() and binned
 
 
 @contextmanager
@@ -141,6 +165,10 @@ def _run(client: Client, shared: Survey, target: Path, wanted: range, journal: J
     plan.check_same(target, run)
     if run.ensemble.realizations > store.size(target):
         store.extend(target, run.ensemble.realizations, plan.attributes(run))
+    found = store.attributes(target)["configuration"]
+    if found["biposh"]["summary_bin"] != run.biposh.summary_bin:
+        biposh = found["biposh"] | {"summary_bin": run.biposh.summary_bin}
+        store.amend(target, {"configuration": found | {"biposh": biposh}})
     before = int(store.done(target).sum())
     try:
         roll = Roll(client, journal)
@@ -161,7 +189,7 @@ def _run(client: Client, shared: Survey, target: Path, wanted: range, journal: J
     journal.write(
         f"done: {finished} realizations stored, {finished - before} of them new, {len(failures)} failed{named}"
     )
-    return Result(target, finished, finished - before, tuple(failures))
+    return Result(target, finished, finished - before, tuple(failures), summarised=True)
 
 
 def _simulate(roll: Roll, target: Path, run: config.RunConfig, wanted: range, journal: Journal) -> list[Failure]:

@@ -1,8 +1,11 @@
 """Workers: clusters of this machine or of others, calls sent to them, and who is there to answer."""
 
 import logging
+import multiprocessing
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
+from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 from itertools import islice
 from typing import Any
@@ -33,14 +36,38 @@ the system each time, and fetching its pages anew costs nearly as much as the tr
 
 
 @contextmanager
+def _script_left_alone() -> Iterator[None]:
+    """Keep processes that start meanwhile from running the script that this process runs.
+
+    multiprocessing runs it again in each of them, for functions that the script defines; those travel to workers by
+    value. A script without ``if __name__ == "__main__"`` would start workers of its own there. What is called
+    "__main__" by its specification is not run again (CPython, Lib/multiprocessing/spawn.py, ``_fixup_main_from_name``).
+    """
+    script = sys.modules["__main__"]
+    before = script.__spec__
+    script.__spec__ = ModuleSpec("__main__", None)
+    try:
+        yield
+    finally:
+        script.__spec__ = before
+
+
+@contextmanager
 def local_client(workers: int) -> Iterator[Client]:
     """Client of a local cluster of single-threaded processes, whose ports are open to this machine alone.
 
     Raises
     ------
+    InputError
+        In a process that may have no others below it.
     RunError
         If its processes do not start.
     """
+    if multiprocessing.current_process().daemon:
+        raise InputError(
+            "A worker of multiprocessing.Pool can start no workers of its own; call mcsim from the main process, or "
+            "from a concurrent.futures.ProcessPoolExecutor."
+        )
     single = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "DUCC0", "NUMBA")}
     settings = {
         "distributed.nanny.pre-spawn-environ": (
@@ -49,7 +76,7 @@ def local_client(workers: int) -> Iterator[Client]:
         "distributed.scheduler.allowed-failures": ATTEMPTS - 1,
         "distributed.worker.preload": [_WORKER_SETUP],
     }
-    with dask.config.set(settings), ExitStack() as stack:
+    with dask.config.set(settings), _script_left_alone(), ExitStack() as stack:
         try:
             cluster = stack.enter_context(
                 LocalCluster(

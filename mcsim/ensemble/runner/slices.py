@@ -17,10 +17,31 @@ from mcsim.support.progress import reporting
 def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> Result:
     """Join stores of slices of one ensemble into a new store.
 
+    Parameters
+    ----------
+    paths
+        Stores that :func:`run` made with ``realizations``.
+    path
+        The new store.
+    quiet
+        Report no progress on standard error.
+
+    Returns
+    -------
+    Result
+        ``store``, and how many realizations are ``finished``.
+
     Raises
     ------
     InputError
         If the stores are not of one configuration, or ``path`` exists.
+
+    Examples
+    --------
+    >>> import mcsim
+    >>> parts = [mcsim.run("tiny", realizations=part).store for part in (slice(0, 16), slice(16, 32))]
+    >>> mcsim.merge(parts, "merged.zarr").finished
+    32
     """
     sources = [Path(p) for p in paths]
     target = Path(path)
@@ -47,7 +68,7 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
             store.write_summary(scratch, summary.dataset(recipe, total, first))
         target.parent.mkdir(parents=True, exist_ok=True)
         os.replace(scratch, target)
-    return Result(target, int(store.done(target).sum()), 0, ())
+    return Result(target, int(store.done(target).sum()), 0, (), summarised=total is not None)
 
 
 def _merge_chunk(sources: list[Path], target: Path, start: int, stop: int) -> None:

@@ -1,6 +1,8 @@
 """What a beam is to the rest of the package: its harmonic coefficients, normalised and cut in m."""
 
 from dataclasses import dataclass
+from math import pi
+from pathlib import Path
 from typing import Self
 
 import ducc0
@@ -8,12 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
+from mcsim.instrument.beams.beammap import DEFAULT_CUT_DEG, BeamMap, placed, read_map
+from mcsim.instrument.beams.coefficients import check_mmax, choose_mmax, power_by_order
+from mcsim.instrument.beams.files import checked_blm
+from mcsim.instrument.beams.gaussian import elliptical_blm
+from mcsim.sphere.checks import check_finite
+from mcsim.support.npy import read_npz
 
-MMAX_TOLERANCE = 4e-4
-"""Largest fraction of a beam's power that :func:`choose_mmax` leaves beyond m_max."""
-
-CIRCULAR_POWER = 1e-20
-"""Fraction of a beam's power below which what is not m = 0 is round-off, and the beam circular."""
+DEFAULT_LMAX = 2048
+"""Largest degree of a beam where none is asked for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,11 +40,258 @@ class Beam:
     -----
     The beam is B(n) = sum_lm b_lm Y_lm(n) in sr^-1, with b_{l,-m} = (-1)^m conj(b_lm) and the azimuth counted from the
     beam's x axis, the direction of the scan (spin axis) x (boresight), towards y; (x, y, outward) is right-handed.
+
+    Examples
+    --------
+    >>> from mcsim import Beam
+    >>> beam = Beam.elliptical(60.0, 50.0, lmax=300)
+    >>> beam.lmax, beam.mmax
+    (300, 2)
+    >>> print(f"{beam.window[100]:.4f}")
+    0.7909
     """
 
     blm: NDArray[np.complex128]
     neglected_power: float = 0.0
     integral: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless the coefficients are finite and stand at ``blm[m, l]``, zero for l < m."""
+        blm = self.blm
+        if not isinstance(blm, np.ndarray) or not np.iscomplexobj(blm) or blm.ndim != 2 or not blm.size:
+            raise InputError(f"blm has shape {np.shape(blm)}, but it must be complex, (mmax + 1, lmax + 1).")
+        check_mmax(self.mmax, self.lmax)
+        check_finite(blm, "blm")
+        if any(blm[m, :m].any() for m in range(1, len(blm))):
+            raise InputError("blm has coefficients with l < m, which do not exist: give blm[m, l].")
+
+    @classmethod
+    def gaussian(cls, fwhm_arcmin: float, lmax: int = DEFAULT_LMAX) -> Self:
+        """Return the circular Gaussian beam B_l = exp(-l(l+1) sigma^2 / 2).
+
+        Parameters
+        ----------
+        fwhm_arcmin
+            Full width at half maximum in arcmin, positive, at most 1200.
+        lmax
+            Largest degree, >= 1.
+
+        Raises
+        ------
+        InputError
+            If the width or lmax is out of range.
+
+        Examples
+        --------
+        >>> from mcsim import Beam
+        >>> print(f"{Beam.gaussian(30.0, lmax=200).window[200]:.4f}")
+        0.7588
+        """
+        return cls.elliptical(fwhm_arcmin, fwhm_arcmin, 0.0, lmax, 0)
+
+    @classmethod
+    def elliptical(
+        cls,
+        fwhm_major_arcmin: float,
+        fwhm_minor_arcmin: float,
+        angle_deg: float = 0.0,
+        lmax: int = DEFAULT_LMAX,
+        mmax: int | None = None,
+    ) -> Self:
+        """Return an elliptical Gaussian beam.
+
+        Parameters
+        ----------
+        fwhm_major_arcmin, fwhm_minor_arcmin
+            Full widths at half maximum along the axes in arcmin, major >= minor > 0, at most 1200.
+        angle_deg
+            Direction of the major axis, in degrees from the beam's x axis towards y; b_l2 is positive at 0.
+        lmax
+            Largest degree, >= 1.
+        mmax
+            Largest order; ``None`` chooses it (:func:`mcsim.instrument.beams.choose_mmax`). Odd orders vanish.
+
+        Raises
+        ------
+        InputError
+            If a width, the angle, lmax or mmax is out of range.
+
+        Notes
+        -----
+        Formula and accuracy: :func:`mcsim.instrument.beams.gaussian.elliptical_blm`.
+
+        Examples
+        --------
+        >>> from mcsim import Beam
+        >>> beam = Beam.elliptical(13.9, 12.7, angle_deg=30.0, lmax=1024)
+        >>> print(f"{abs(beam.blm[2, 600] / beam.blm[0, 600]):.3f}")
+        0.022
+        """
+        blm = elliptical_blm(fwhm_major_arcmin, fwhm_minor_arcmin, angle_deg, lmax, mmax)
+        whole = cls.normalized(blm, mmax, f"an elliptical Gaussian of {fwhm_major_arcmin} x {fwhm_minor_arcmin} arcmin")
+        return cls(whole.blm, whole.neglected_power)
+
+    @classmethod
+    def from_map(
+        cls,
+        source: NDArray | BeamMap | str | Path,
+        lmax: int | None = None,
+        mmax: int | None = None,
+        *,
+        pixel_deg: float | None = None,
+        cut_deg: float = DEFAULT_CUT_DEG,
+        centre: tuple[float, float] | None = None,
+    ) -> Self:
+        """Return the beam of a two-dimensional map, exact on the curved sky.
+
+        Parameters
+        ----------
+        source
+            Response at the pixel centres in any unit, shape (rows, columns), column = beam x (in-scan), row = beam y;
+            or the FITS file of one; or what :func:`mcsim.instrument.beams.read_map` made of a file with several planes
+            or another projection (pixel_deg, cut_deg and centre are then in it).
+        lmax
+            Largest degree; ``None``: 2048, or what the pixels resolve if that is less.
+        mmax
+            Largest order; ``None`` chooses it (:func:`mcsim.instrument.beams.choose_mmax`).
+        pixel_deg
+            Side of a pixel in degrees; needed for an array, ``None`` takes a file's from its header.
+        cut_deg
+            Angle from the centre beyond which the map is not used, degrees.
+        centre
+            Column and row of the beam's centre, from 0; ``None`` takes the intensity centroid about the peak.
+
+        Raises
+        ------
+        InputError
+            If the file, the pixel size, the cut, the centre or the image cannot be used.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from mcsim import Beam
+        >>> y, x = np.mgrid[-30:31, -30:31] * 0.1
+        >>> image = np.exp(-(x**2) / 2 / 0.5**2 - y**2 / 2 / 0.4**2)
+        >>> beam = Beam.from_map(image, 200, pixel_deg=0.1)
+        >>> print(f"{abs(beam.blm[2, 100] / beam.blm[0, 100]):.4f}")
+        0.0346
+        """
+        if isinstance(source, BeamMap):
+            beam_map = source
+        elif isinstance(source, str | Path):
+            beam_map = read_map(source, pixel_deg=pixel_deg, cut_deg=cut_deg, centre=centre)
+        elif pixel_deg is None:
+            raise InputError("pixel_deg is not given, but an array does not say it; give the side of a pixel in deg")
+        else:
+            image = np.asarray(source, dtype=np.float64)
+            beam_map = placed(image, pixel_deg, cut_deg=cut_deg, centre=centre)
+        lmax = min(DEFAULT_LMAX, int(pi / beam_map.pixel_rad)) if lmax is None else lmax
+        return cls.normalized(beam_map.blm(lmax, mmax), mmax, "the beam map")
+
+    @classmethod
+    def from_blm(cls, source: NDArray | str | Path, lmax: int | None = None, mmax: int | None = None) -> Self:
+        """Return the beam of given coefficients.
+
+        Parameters
+        ----------
+        source
+            b_lm in healpy's m-major order with every m up to lmax, or [m, l] of shape (mmax + 1, lmax + 1); or a FITS
+            file as healpy reads it, whose first table is the temperature beam. The beam points at the pole. Or what
+            :meth:`save` wrote, which is taken as it is.
+        lmax
+            Largest degree, no more than the source's; ``None``: the source's.
+        mmax
+            Largest order, no more than the source's; ``None`` chooses it
+            (:func:`mcsim.instrument.beams.choose_mmax`).
+
+        Returns
+        -------
+        Beam
+            Normalised to B_0 = 1; its ``integral`` says by how much: sqrt(4pi) b_00 of the source.
+
+        Raises
+        ------
+        InputError
+            If the source cannot be read, stops before lmax or mmax, has a complex b_l0, an integral that is not
+            positive, or is not pointed at the pole.
+
+        Notes
+        -----
+        Coefficients are those of B = sum b_lm Y_lm, b_lm = int B conj(Y_lm), with the Condon-Shortley phase, as optics
+        codes in the Planck pipelines write them. In that convention b_00 of a beam that is normalised to 1 is
+        1/sqrt(4pi), or half of it for one polarisation; either is divided out. Coefficients cannot show whether their
+        azimuth starts at the scan direction: multiply by exp(-i m angle) before use if it does not.
+
+        Examples
+        --------
+        >>> import healpy
+        >>> from mcsim import Beam
+        >>> blm = healpy.blm_gauss(0.02, lmax=100)
+        >>> Beam.from_blm(blm).mmax
+        0
+        """
+        if isinstance(source, str | Path) and Path(source).suffix == ".npz":
+            return cls._saved(source, lmax, mmax)
+        blm, origin = checked_blm(source, lmax, mmax)
+        return cls.normalized(blm, mmax, origin)
+
+    @classmethod
+    def _saved(cls, path: str | Path, lmax: int | None, mmax: int | None) -> Self:
+        arrays = read_npz(path)
+        try:
+            beam = cls(arrays["blm"], float(arrays["neglected_power"]), float(arrays["integral"]))
+        except (KeyError, TypeError) as error:
+            raise InputError(f"{path} holds no beam ({error}): write it with Beam.save") from None
+        if beam.lmax < (lmax or 0):
+            raise InputError(f"{path} stops at lmax = {beam.lmax}, below the lmax = {lmax} asked for: lower lmax")
+        if beam.mmax < (mmax or 0):
+            raise InputError(f"{path} stops at mmax = {beam.mmax}, below the mmax = {mmax} asked for: lower mmax")
+        if lmax is not None and lmax < beam.lmax:
+            beam = cls(beam.blm[: lmax + 1, : lmax + 1].copy(), beam.neglected_power, beam.integral)
+        return beam if mmax is None else beam.truncated(mmax)
+
+    def save(self, path: str | Path) -> None:
+        """Write the beam as a .npz file, from which :meth:`from_blm` reads the same beam, bit for bit."""
+        np.savez(path, blm=self.blm, neglected_power=self.neglected_power, integral=self.integral)
+
+    def as_table(self, folder: Path) -> dict[str, str]:
+        """Write the beam into a folder; return the table that stands for it in a run."""
+        self.save(folder / "beam.npz")
+        return {"kind": "blm", "path": "beam.npz"}
+
+    @classmethod
+    def normalized(
+        cls, blm: NDArray[np.complex128], mmax: int | None, origin: str, neglected_power: float = 0.0
+    ) -> Self:
+        """Return a beam with B_0 = 1 from coefficients in any unit.
+
+        Parameters
+        ----------
+        blm
+            Coefficients, shape (>= mmax + 1, lmax + 1), to the largest order that is known.
+        mmax
+            Order to cut at; ``None`` takes that of :func:`choose_mmax`.
+        origin
+            What the coefficients are of, for messages.
+        neglected_power
+            Fraction of the power that ``blm`` lacks already.
+
+        Raises
+        ------
+        InputError
+            If a coefficient is not finite, the integral of the beam is not positive, or it has no order ``mmax``.
+        """
+        if not np.all(np.isfinite(blm)):
+            raise InputError(f"{origin} has coefficients that are not finite: repair it before use")
+        integral = float(blm[0, 0].real * np.sqrt(4 * np.pi))
+        if integral <= 0:
+            raise InputError(f"{origin} integrates to {integral:.3g} over the sphere where a beam must be positive")
+        if mmax is not None:
+            check_mmax(mmax, blm.shape[1] - 1)
+            if mmax >= len(blm):
+                raise InputError(f"mmax = {mmax} exceeds the largest order {len(blm) - 1} of {origin}: lower mmax")
+        whole = cls(blm / integral, neglected_power, integral)
+        return whole.truncated(choose_mmax(blm) if mmax is None else mmax)
 
     @property
     def lmax(self) -> int:
@@ -89,6 +341,8 @@ class Beam:
         ndarray
             B in sr^-1, in the shape of ``theta``.
         """
+        if np.any((theta < 0.0) | (theta > np.pi)):
+            raise InputError("theta must lie between 0 and pi radians: give the angle from the centre of the beam.")
         direction = np.stack([np.ravel(theta), np.ravel(phi) % (2 * np.pi)], axis=1)
         values: NDArray[np.float64] = ducc0.sht.synthesis_general(
             alm=self.packed()[None],
@@ -100,86 +354,3 @@ class Beam:
             nthreads=nthreads,
         )[0].reshape(np.shape(theta))
         return values
-
-
-def check_lmax(lmax: int) -> None:
-    """Refuse a degree that is no degree."""
-    if lmax < 1:
-        raise InputError(f"lmax = {lmax} must be 1 or more for a beam")
-
-
-def check_mmax(mmax: int, lmax: int) -> None:
-    """Refuse an order that no coefficient up to ``lmax`` has."""
-    if not 0 <= mmax <= lmax:
-        raise InputError(f"mmax = {mmax} of a beam must lie between 0 and its lmax = {lmax}: lower mmax or raise lmax")
-
-
-def power_by_order(blm: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Sum over l of |b_lm|^2, both signs of m together, shape (mmax + 1,)."""
-    power: NDArray[np.float64] = np.sum(np.abs(blm) ** 2, axis=1)
-    power[1:] *= 2
-    return power
-
-
-def choose_mmax(blm: NDArray[np.complex128], tolerance: float = MMAX_TOLERANCE) -> int:
-    """Choose the order above which a beam may be cut.
-
-    Parameters
-    ----------
-    blm
-        Coefficients to a larger order than can matter, shape (mmax + 1, lmax + 1).
-    tolerance
-        Largest fraction of the power, over the degrees given, that may be neglected.
-
-    Returns
-    -------
-    int
-        0 for a beam that is circular to round-off, else the smallest m >= 2 that neglects no more than ``tolerance``.
-
-    Notes
-    -----
-    Never 1, nor 0 for a beam that is not circular: m = 2 may hold less than the tolerance and still be all of
-    A^{20}. Orders that differ by 2 feed A^{20} in pairs, so that the leading neglected effect is b_l4 b_l2 over
-    b_l2 b_l0. At the default, and lmax = 1024, the WMAP-7 beam maps V2, W1 and W4 get mmax = 4. On the same skies under
-    parallel transport (mmax = 4 against 10, bins of 50 in l) that left out at most 0.5 uK^2 of a binned A^{20}_ll that
-    reaches 269 uK^2 for V2, and 0.9 of 476 uK^2 for W1 (0.2 % of the largest), where mmax = 2 leaves out 2.7 and
-    5.2 uK^2 (1 %). What is studied at L > 2 may need more: pass mmax then.
-    """
-    power = power_by_order(blm)
-    if power[1:].sum() <= CIRCULAR_POWER * power.sum():
-        return 0
-    beyond = np.append(np.cumsum(power[::-1])[::-1][1:], 0.0) / power.sum()
-    smallest = int(np.argmax(beyond <= tolerance))
-    return min(max(2, smallest), len(power) - 1)
-
-
-def normalize(blm: NDArray[np.complex128], mmax: int | None, origin: str, neglected_power: float = 0.0) -> Beam:
-    """Build a beam with B_0 = 1 from coefficients in any unit.
-
-    Parameters
-    ----------
-    blm
-        Coefficients, shape (>= mmax + 1, lmax + 1), to the largest order that is known.
-    mmax
-        Order to cut at; ``None`` takes that of :func:`choose_mmax`.
-    origin
-        What the coefficients are of, for messages.
-    neglected_power
-        Fraction of the power that ``blm`` lacks already.
-
-    Raises
-    ------
-    InputError
-        If a coefficient is not finite, the integral of the beam is not positive, or it has no order ``mmax``.
-    """
-    if not np.all(np.isfinite(blm)):
-        raise InputError(f"{origin} has coefficients that are not finite: repair it before use")
-    integral = float(blm[0, 0].real * np.sqrt(4 * np.pi))
-    if integral <= 0:
-        raise InputError(f"{origin} integrates to {integral:.3g} over the sphere where a beam must be positive")
-    if mmax is not None:
-        check_mmax(mmax, blm.shape[1] - 1)
-        if mmax >= len(blm):
-            raise InputError(f"mmax = {mmax} exceeds the largest order {len(blm) - 1} of {origin}: lower mmax")
-    whole = Beam(blm / integral, neglected_power, integral)
-    return whole.truncated(choose_mmax(blm) if mmax is None else mmax)

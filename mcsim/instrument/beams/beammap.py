@@ -1,7 +1,7 @@
 """From a two-dimensional beam map to b_lm, exact on the curved sky."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil, pi, sin
 from pathlib import Path
 from typing import Literal, get_args
@@ -14,7 +14,9 @@ from scipy.ndimage import map_coordinates
 
 from mcsim.errors import InputError
 from mcsim.instrument.beams._fits import opened
-from mcsim.instrument.beams.beam import Beam, check_lmax, check_mmax, normalize
+from mcsim.instrument.beams.coefficients import check_lmax, check_mmax
+from mcsim.sphere.checks import check_finite
+from mcsim.support.npy import read_npy
 
 Projection = Literal["equidistant", "orthographic", "equal_area"]
 PEAK_BOX = 8
@@ -33,7 +35,7 @@ class BeamMap:
     pixel_rad
         Side of a pixel in radians.
     centre
-        Row and column of the beam's centre (fractions allowed; pixel centres are at integers).
+        Column and row of the beam's centre, from 0 (fractions allowed; pixel centres are at integers).
     cut_rad
         Angle from the centre beyond which the map is not used, radians.
     projection
@@ -47,14 +49,24 @@ class BeamMap:
     cut_rad: float
     projection: Projection = "equidistant"
 
-    def beam(self, lmax: int, mmax: int | None = None, nthreads: int = 1) -> Beam:
-        """Return the beam normalised to B_0 = 1; ``mmax=None`` chooses the largest order."""
+    def __post_init__(self) -> None:
+        """Raise InputError unless the image is finite and its centre and cut can be used."""
+        image = self.image
+        if not isinstance(image, np.ndarray) or image.ndim != 2 or image.dtype.kind not in "fiu":
+            raise InputError(f"a beam map has shape {np.shape(image)}, but it must be a real two-dimensional array")
+        check_finite(image, "the beam map")
+        if not 0.0 < self.cut_rad <= pi / 2:
+            raise InputError(f"cut_rad = {self.cut_rad:g} of a beam map must be above 0 and at most pi/2: give radians")
+        _check_centre(image, self.centre)
+
+    def blm(self, lmax: int, mmax: int | None = None, nthreads: int = 1) -> NDArray[np.complex128]:
+        """Return the coefficients up to the largest order that the cut can hold, in the map's unit times sr."""
         check_lmax(lmax)
         if mmax is not None:
             check_mmax(mmax, lmax)
         # No order above lmax sin(cut) fits inside the cut, so that this holds the beam's whole power up to lmax.
         holds_all = min(lmax, ceil(lmax * sin(min(self.cut_rad, pi / 2))) + 32)
-        blm = blm_of_map(
+        return blm_of_map(
             self.image,
             self.pixel_rad,
             self.centre,
@@ -64,52 +76,14 @@ class BeamMap:
             projection=self.projection,
             nthreads=nthreads,
         )
-        return normalize(blm, mmax, "the beam map")
 
     def values(self, theta: NDArray[np.float64], phi: NDArray[np.float64]) -> NDArray[np.float64]:
         """Interpolate the response (cubic) at angles from the centre and azimuths from x towards y; 0 outside."""
         radius = _PROJECTIONS[self.projection][0](theta) / self.pixel_rad
-        position = [self.centre[0] + radius * np.sin(phi), self.centre[1] + radius * np.cos(phi)]
+        column, row = self.centre
+        position = [row + radius * np.sin(phi), column + radius * np.cos(phi)]
         values: NDArray[np.float64] = map_coordinates(self.image, position, order=3, mode="constant")
         return values
-
-
-def from_map(
-    path: str | Path,
-    lmax: int,
-    mmax: int | None = None,
-    *,
-    pixel_deg: float | None = None,
-    cut_deg: float = DEFAULT_CUT_DEG,
-    centre: tuple[float, float] | None = None,
-    plane: int = 0,
-    projection: Projection = "equidistant",
-    pixel_average: bool = False,
-    nthreads: int = 1,
-) -> Beam:
-    """Read a beam map and return its harmonic coefficients.
-
-    Parameters
-    ----------
-    path, pixel_deg, cut_deg, centre, plane, projection, pixel_average
-        As in :func:`read_map`.
-    lmax
-        Largest degree.
-    mmax
-        Largest order; ``None`` chooses it (:func:`mcsim.instrument.beams.choose_mmax`).
-    nthreads
-        Number of threads.
-    """
-    beam_map = read_map(
-        path,
-        pixel_deg=pixel_deg,
-        cut_deg=cut_deg,
-        centre=centre,
-        plane=plane,
-        projection=projection,
-        pixel_average=pixel_average,
-    )
-    return beam_map.beam(lmax, mmax, nthreads)
 
 
 def read_map(
@@ -133,7 +107,7 @@ def read_map(
     cut_deg
         Angle from the centre beyond which the map is not used, degrees.
     centre
-        Row and column of the beam's centre; ``None`` takes the centroid (:func:`find_centre`).
+        Column and row of the beam's centre, from 0; ``None`` takes the centroid (:func:`find_centre`).
     plane
         Plane of a three-dimensional image (a WMAP beam file has side A, its noise, side B, its noise).
     projection
@@ -154,10 +128,30 @@ def read_map(
     |b_l2| in V and W, 8e-5 and 4e-4 in K. The plane of projection is taken to touch the sphere at the beam's centre;
     that the WMAP maps have the optic axis there, up to 3 deg away, is of the same order.
     """
+    image, header = _read_image(Path(path), plane)
+    pixel_deg = _pixel_deg(header, path) if pixel_deg is None else pixel_deg
+    beam_map = placed(image, pixel_deg, cut_deg=cut_deg, centre=centre, projection=projection, origin=str(path))
+    return replace(beam_map, image=_divide_pixel_window(beam_map.image)) if pixel_average else beam_map
+
+
+def placed(
+    image: NDArray[np.float64],
+    pixel_deg: float,
+    *,
+    cut_deg: float = DEFAULT_CUT_DEG,
+    centre: tuple[float, float] | None = None,
+    projection: Projection = "equidistant",
+    origin: str = "the beam map",
+) -> BeamMap:
+    """Return a beam map that is given as an array, shape (rows, columns); ``origin`` names it in messages.
+
+    The other parameters, and what is refused, are those of :func:`read_map`.
+    """
     if projection not in get_args(Projection):
         raise InputError(f"projection = {projection!r} is not one of {', '.join(get_args(Projection))}")
-    image, header = _read_image(Path(path), plane)
-    pixel = np.radians(_pixel_deg(header, path) if pixel_deg is None else pixel_deg)
+    if image.ndim != 2:
+        raise InputError(f"{origin} has {image.ndim} dimensions where a beam map has 2: rows along y, columns along x")
+    pixel = np.radians(pixel_deg)
     if not 0 < pixel < np.radians(10):
         raise InputError(f"the pixel of a beam map, {np.degrees(pixel):g} deg, must lie between 0 and 10 deg")
     if not 0 < cut_deg <= 90:
@@ -168,22 +162,34 @@ def read_map(
         )
     if not np.all(np.isfinite(image)):
         raise InputError(
-            f"{path} has {np.count_nonzero(~np.isfinite(image))} values that are not finite: "
+            f"{origin} has {np.count_nonzero(~np.isfinite(image))} values that are not finite: "
             "set pixels without data to 0"
         )
     if centre is None:
-        centre = find_centre(image, str(path))
-    elif not all(0 <= position <= size - 1 for position, size in zip(centre, image.shape, strict=True)):
-        raise InputError(
-            f"centre = {tuple(centre)} lies outside the {image.shape} pixels of {path}: give (row, column)"
-        )
-    if pixel_average:
-        image = _divide_pixel_window(image)
+        centre = find_centre(image, origin)
     return BeamMap(image, float(pixel), centre, float(np.radians(cut_deg)), projection)
 
 
+def _check_centre(image: NDArray[np.float64], centre: tuple[float, float]) -> None:
+    """Raise InputError for a centre outside the map, or one that is far from the peak until row and column change."""
+    rows, columns = image.shape
+    column, row = centre
+    if not (0 <= column <= columns - 1 and 0 <= row <= rows - 1):
+        raise InputError(
+            f"centre = {tuple(centre)} lies outside the {columns} columns and {rows} rows of the map: give "
+            "(column, row), counted from 0"
+        )
+    peak = float(image.max())
+    here = image[round(row), round(column)]
+    if column < rows and row < columns and here < 0.01 * peak and image[round(column), round(row)] > 0.5 * peak:
+        raise InputError(
+            f"centre = {tuple(centre)} of a beam map has less than 1 % of the peak, and {(row, column)} more than "
+            "half of it: give (column, row), in this order"
+        )
+
+
 def find_centre(image: NDArray[np.float64], origin: str = "the beam map") -> tuple[float, float]:
-    """Return the intensity centroid around the peak as (row, column).
+    """Return the intensity centroid around the peak as (column, row).
 
     The centroid is over the 15 x 15 pixels less than 8 pixels from the peak in row and column: the choice that the
     reference spectra of the WMAP-7 beam maps were made with (one more pixel on each side moves the binned A^{20}_ll of
@@ -203,14 +209,14 @@ def find_centre(image: NDArray[np.float64], origin: str = "the beam map") -> tup
     if min(row, column, image.shape[0] - 1 - row, image.shape[1] - 1 - column) < reach:
         raise InputError(
             f"the peak of {origin} at row {row}, column {column} is less than {PEAK_BOX} pixels from an edge of its "
-            f"{image.shape} pixels: give centre = (row, column), or a larger map"
+            f"{image.shape} pixels: give centre = (column, row), or a larger map"
         )
     box = image[row - reach : row + reach + 1, column - reach : column + reach + 1]
     total = box.sum()
     if not total > 0:
         raise InputError(f"{origin} sums to {total:.3g} around its peak, where it must be positive: give its centre")
     offset = np.arange(-reach, reach + 1)
-    return float(row + box.sum(axis=1) @ offset / total), float(column + box.sum(axis=0) @ offset / total)
+    return float(column + box.sum(axis=0) @ offset / total), float(row + box.sum(axis=1) @ offset / total)
 
 
 def blm_of_map(
@@ -286,8 +292,8 @@ def solid_angle_values(
     projection: Projection = "equidistant",
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return response times solid angle, theta and phi of the pixels within the cut that are not zero."""
-    y = (np.arange(image.shape[0]) - centre[0])[:, None] * pixel_rad
-    x = (np.arange(image.shape[1]) - centre[1])[None, :] * pixel_rad
+    x = (np.arange(image.shape[1]) - centre[0])[None, :] * pixel_rad
+    y = (np.arange(image.shape[0]) - centre[1])[:, None] * pixel_rad
     radius = np.hypot(x, y)
     radius_of_cut, theta_of, stretch = _PROJECTIONS[projection]
     inside = (radius <= radius_of_cut(np.asarray(cut_rad))) & (image != 0)
@@ -327,6 +333,8 @@ def holds_image(path: str | Path) -> bool:
 def _read_image(path: Path, plane: int) -> tuple[NDArray[np.float64], fits.Header]:
     if not path.is_file():
         raise InputError(f"beam map {path} does not exist: give the path of a FITS image")
+    if path.suffix == ".npy":
+        return read_npy(path, "iuf", (2,)).astype(np.float64), fits.Header()
     try:
         with opened(path) as hdus:
             images = [hdu for hdu in hdus if hdu.is_image and hdu.data is not None]
@@ -336,6 +344,8 @@ def _read_image(path: Path, plane: int) -> tuple[NDArray[np.float64], fits.Heade
         raise InputError(f"{path} cannot be read as a FITS image ({error}): it may be truncated") from error
     if not image.size:
         raise InputError(f"{path} holds no image: a beam map is a two-dimensional FITS image")
+    if str(header.get("BUNIT", "")).strip().lower().startswith("db"):
+        raise InputError(f"{path} is in {header['BUNIT']!r}: give the response itself, 10^(dB/10), not its logarithm")
     if image.ndim == 3 and 0 <= plane < len(image):
         image = image[plane]
     elif image.ndim == 3:

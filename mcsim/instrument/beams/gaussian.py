@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln, ive
 
 from mcsim.errors import InputError
-from mcsim.instrument.beams.beam import Beam, check_lmax, check_mmax, normalize
+from mcsim.instrument.beams.coefficients import check_lmax, check_mmax
 
 SIGMA_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
 MAX_FWHM_ARCMIN = 1200.0
@@ -13,23 +13,10 @@ MAX_FWHM_ARCMIN = 1200.0
 _LARGEST_ORDER = 64
 
 
-def gaussian(fwhm_arcmin: float, lmax: int) -> Beam:
-    """Return the circular Gaussian beam B_l = exp(-l(l+1) sigma^2 / 2).
-
-    Parameters
-    ----------
-    fwhm_arcmin
-        Full width at half maximum in arcmin, positive, at most 1200.
-    lmax
-        Largest degree.
-    """
-    return elliptical_gaussian(fwhm_arcmin, fwhm_arcmin, 0.0, lmax, 0)
-
-
-def elliptical_gaussian(
+def elliptical_blm(
     fwhm_major_arcmin: float, fwhm_minor_arcmin: float, angle_deg: float, lmax: int, mmax: int | None = None
-) -> Beam:
-    """Return an elliptical Gaussian beam.
+) -> NDArray[np.complex128]:
+    """Return the coefficients of an elliptical Gaussian beam, to a larger order than can matter.
 
     Parameters
     ----------
@@ -40,7 +27,12 @@ def elliptical_gaussian(
     lmax
         Largest degree.
     mmax
-        Largest order; ``None`` chooses it (:func:`mcsim.instrument.beams.choose_mmax`). Odd orders vanish.
+        Order that must be among them. Odd orders vanish.
+
+    Returns
+    -------
+    ndarray
+        b_lm, shape (>= mmax + 1, lmax + 1), with b_00 = 1/sqrt(4pi) up to the accuracy below.
 
     Raises
     ------
@@ -93,8 +85,7 @@ def elliptical_gaussian(
     for m in range(0, highest + 1, 2):
         phase = np.exp(-1j * m * np.radians(angle_deg))
         blm[m, m:] = phase * _order(m, lmax, sigma_major, sigma_minor)
-    whole = normalize(blm, mmax, f"an elliptical Gaussian of {fwhm_major_arcmin} x {fwhm_minor_arcmin} arcmin")
-    return Beam(whole.blm, whole.neglected_power)
+    return blm
 
 
 def _order(m: int, lmax: int, sigma_major: float, sigma_minor: float) -> NDArray[np.float64]:

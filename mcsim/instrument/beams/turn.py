@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from mcsim.instrument.beams.beam import Beam
+from mcsim.sphere.checks import check_angle
 
 
 def rotated(beam: Beam, angle: float) -> Beam:
@@ -14,6 +15,7 @@ def rotated(beam: Beam, angle: float) -> Beam:
     -----
     B'(theta, phi) = B(theta, phi - angle), so that b_lm becomes e^{-i m angle} b_lm.
     """
+    check_angle(angle, "the angle of a beam")
     if angle == 0.0:
         return beam
     phases = np.exp(-1j * angle * np.arange(beam.mmax + 1))

@@ -11,27 +11,25 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
-from mcsim.instrument.scan.geometry import check_nside
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
-from mcsim.instrument.scan.moments import Moments
 from mcsim.instrument.scan.pointing import BLOCK, PointingStream, fill_block, ring_pixel
+from mcsim.sphere.checks import check_nside, check_whole
 
 _RANGES = 16
 _CHUNK = 1 << 21
 _CACHE_LINE = 64
 
 
-def stream_moments(
+def stream_sums(
     model: ScanModel,
     nside: int,
     smax: int,
     frame: str = "ecliptic",
-    lines_of_sight: list[str] | tuple[str, ...] | None = None,
     time_range: tuple[float, float] = (0.0, 1.0),
     nthreads: int = 1,
     progress: Callable[[float], None] | None = None,
-) -> Moments:
-    """Orientation moments of a survey, by streaming every sample.
+) -> NDArray[np.float64]:
+    """Return the sums per pixel of a survey's default lines of sight, by streaming every sample.
 
     Parameters
     ----------
@@ -41,8 +39,6 @@ def stream_moments(
         HEALPix resolution, and largest s of the moments (>= 1).
     frame
         Frame of the pixels: "ecliptic", "galactic" or "equatorial".
-    lines_of_sight
-        Names of the lines of sight to add up; None: the model's default ones.
     time_range
         Part of the survey, as fractions of its samples: (0, 0.5) is the first half.
     nthreads
@@ -53,13 +49,13 @@ def stream_moments(
 
     Returns
     -------
-    Moments
+    ndarray
+        As of :func:`pixel_sums`.
 
     Raises
     ------
     InputError
-        If nside is not a power of two, smax < 1, the frame or a line of sight is unknown, or the time range is
-        empty.
+        If nside is not a power of two, smax < 1, the frame is unknown, or the time range is empty.
 
     Notes
     -----
@@ -68,16 +64,14 @@ def stream_moments(
     pixel's centre is the centroid offset. So at smax 2 a pixel is one cache line.
     """
     check_nside(nside)
-    if smax < 1:
-        raise InputError(f"smax is {smax}, but moments need smax >= 1.")
+    check_whole(smax, "smax", 1)
     start, stop = time_range
     if not 0.0 <= start < stop <= 1.0:
         raise InputError(f"time_range is ({start:g}, {stop:g}), but it must be an increasing pair within 0 and 1.")
-    tasks = [task for line in model.select(lines_of_sight) for task in _tasks(model, line, frame, start, stop)]
+    tasks = [task for line in model.select(None) for task in _tasks(model, line, frame, start, stop)]
     if not tasks:
         raise InputError(f"time_range ({start:g}, {stop:g}) of {model.name!r} contains no sample; widen it.")
-    sums = _sum_of_tasks(tasks, nside, smax, max(1, nthreads), progress)
-    return moments_from_sums(sums, nside, smax, frame)
+    return _sum_of_tasks(tasks, nside, smax, max(1, nthreads), progress)
 
 
 def pixel_sums(nside: int, smax: int) -> NDArray[np.float64]:
@@ -89,8 +83,8 @@ def pixel_sums(nside: int, smax: int) -> NDArray[np.float64]:
     return memory[offset : offset + 12 * nside * nside * columns].reshape(-1, columns)
 
 
-def moments_from_sums(sums: NDArray[np.float64], nside: int, smax: int, frame: str) -> Moments:
-    """Means of an accumulator of :func:`pixel_sums`."""
+def means(sums: NDArray[np.float64], nside: int, smax: int) -> dict[str, NDArray]:
+    """Return ``hits, w, dtheta, dphi`` of an accumulator of :func:`pixel_sums`."""
     hits = sums[:, 0].copy()
     inverse = np.divide(1.0, hits, out=np.zeros_like(hits), where=hits > 0.0)
     w = np.empty((smax, hits.size), dtype=np.complex128)
@@ -105,7 +99,7 @@ def moments_from_sums(sums: NDArray[np.float64], nside: int, smax: int, frame: s
         x, y, z = (sums[part, axis] * inverse[part] for axis in (1, 2, 3))
         dtheta[part] = np.cos(theta) * (x * np.cos(phi) + y * np.sin(phi)) - np.sin(theta) * z
         dphi[part] = y * np.cos(phi) - x * np.sin(phi)
-    return Moments(nside=nside, frame=frame, hits=hits, w=w, dtheta=dtheta, dphi=dphi)
+    return {"hits": hits, "w": w, "dtheta": dtheta, "dphi": dphi}
 
 
 class _Task:

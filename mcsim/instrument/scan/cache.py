@@ -5,7 +5,9 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+from mcsim.instrument.scan.accumulate import means, stream_sums
 from mcsim.instrument.scan.model import ScanModel
+from mcsim.instrument.scan.moments import Moments
 from mcsim.support import folders
 from mcsim.support.code import package_digest
 
@@ -53,8 +55,10 @@ def cached_moments(
 
     Parameters
     ----------
-    model, nside, smax, frame, lines_of_sight, time_range, nthreads, progress
-        As in :func:`mcsim.instrument.scan.accumulate.stream_moments`.
+    model, nside, smax, frame, time_range, nthreads, progress
+        As in :func:`mcsim.instrument.scan.accumulate.stream_sums`.
+    lines_of_sight
+        Names of the lines of sight to add up; None: the model's default ones.
     cache_dir
         Where to keep it; None: :func:`mcsim.support.folders.default_cache_dir`.
 
@@ -67,13 +71,13 @@ def cached_moments(
     Raises
     ------
     InputError
-        If the cache folder cannot be written, or as in ``stream_moments``.
+        If the cache folder cannot be written, or as in ``stream_sums``.
     """
 
     def fill(folder: Path) -> None:
-        from mcsim.instrument.scan.accumulate import stream_moments
-
-        stream_moments(model, nside, smax, frame, lines_of_sight, time_range, nthreads, progress).save(folder)
+        chosen = model if lines_of_sight is None else model.with_lines_of_sight(*lines_of_sight)
+        sums = stream_sums(chosen, nside, smax, frame, time_range, nthreads, progress)
+        Moments(nside, frame, **means(sums, nside, smax)).save(folder)
 
     name = f"moments-{moments_key(model, nside, smax, frame, lines_of_sight, time_range)}"
     return folders.cached(name, fill, cache_dir)

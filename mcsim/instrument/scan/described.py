@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from mcsim.errors import InputError
-from mcsim.instrument.scan.model import SECONDS_PER_DAY, ScanModel, load_model, model_from_table
+from mcsim.instrument.scan.model import SECONDS_PER_DAY, ScanModel, model_from_table
+from mcsim.sphere.checks import check_angle
 
 _COPIED = (
     "spin_period_s",
@@ -32,7 +33,7 @@ def read_described(path: str | Path) -> Described:
     Parameters
     ----------
     path
-        A scan model (see :func:`mcsim.instrument.scan.load_model`), or a survey's short description: a TOML file with
+        A scan model (:meth:`mcsim.instrument.scan.ScanModel.load`), or a survey's short description: a TOML file with
         the periods and angles of a scan model, one ``boresight_angle_deg``, the number of ``samples``, the azimuth of
         every channel about the spin axis in a table ``spin_azimuth_rad``, and optionally ``dipole_uk``. Its lines of
         sight bear the names of the channels.
@@ -48,7 +49,7 @@ def read_described(path: str | Path) -> Described:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
         raise InputError(f"{path} is not a readable TOML file ({error}); give a scan model.") from None
     if "spin_azimuth_rad" not in table:
-        return Described(load_model(path))
+        return Described(ScanModel.load(path))
     azimuths = table["spin_azimuth_rad"]
     wanted = {key: _number(table, key, path) for key in (*_COPIED, "boresight_angle_deg", "samples")}
     if not isinstance(azimuths, dict) or not azimuths:
@@ -57,7 +58,7 @@ def read_described(path: str | Path) -> Described:
         {
             "name": name,
             "boresight_angle_deg": wanted["boresight_angle_deg"],
-            "azimuth_deg": math.degrees(_number(azimuths, name, path)),
+            "azimuth_deg": math.degrees(_azimuth(azimuths, name, path)),
         }
         for name in azimuths
     ]
@@ -73,6 +74,12 @@ def read_described(path: str | Path) -> Described:
     )
     dipole = _number(table, "dipole_uk", path) if "dipole_uk" in table else None
     return Described(model, dipole)
+
+
+def _azimuth(table: dict[str, Any], name: str, path: Path) -> float:
+    azimuth = _number(table, name, path)
+    check_angle(azimuth, f"{path}: spin_azimuth_rad of {name}")
+    return azimuth
 
 
 def _number(table: dict[str, Any], key: str, path: Path) -> float:

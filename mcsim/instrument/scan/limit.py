@@ -2,14 +2,13 @@
 
 import math
 
-import healpy
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ellipj, ellipkm1
 
 from mcsim.errors import InputError
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
-from mcsim.instrument.scan.moments import Moments
+from mcsim.sphere.checks import check_whole
 
 _NODES = 128
 _FAST_PRECESSION = 50.0
@@ -58,7 +57,10 @@ def limit_moments(
     Measured against adaptive quadrature: 4e-11 at 0.01 degrees from a caustic, 1e-13 elsewhere
     (tests/unit/test_scan_limit.py).
     """
+    check_whole(smax, "smax", 1)
     line = _line(model, line_of_sight)
+    if not np.all((np.asarray(theta) >= 0.0) & (np.asarray(theta) <= math.pi)):
+        raise InputError("theta must lie between 0 and pi; give ecliptic colatitudes in radians.")
     theta = np.atleast_1d(np.asarray(theta, dtype=np.float64))
     # At the poles the orientations are all equally frequent: take them as limits.
     theta = np.clip(theta, 1e-6, math.pi - 1e-6)
@@ -84,17 +86,6 @@ def limit_moments(
             value[-1] *= 0.5
             w[s - 1, seen] = value.sum(axis=0) / (_NODES - 1)
     return density, w
-
-
-def limit_on_pixels(model: ScanModel, nside: int, smax: int, line_of_sight: str | None = None) -> Moments:
-    """The limit at the centres of HEALPix pixels, as moments of a survey in ecliptic coordinates.
-
-    Hits are 1 on the mean. Parameters and errors as of :func:`limit_moments`.
-    """
-    theta, _ = healpy.pix2ang(nside, np.arange(12 * nside * nside))
-    rings, ring = np.unique(theta, return_inverse=True)
-    density, w = limit_moments(model, rings, smax, line_of_sight)
-    return Moments(nside, "ecliptic", density[ring] / density[ring].mean(), w[:, ring])
 
 
 def caustics(model: ScanModel, line_of_sight: str | None = None) -> NDArray[np.float64]:

@@ -1,5 +1,6 @@
 """Spin-precession-orbit scan models, read from TOML."""
 
+import json
 import math
 import tomllib
 from dataclasses import dataclass, field, fields, replace
@@ -7,8 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from mcsim.errors import InputError
+from mcsim.support import resources
 
 SECONDS_PER_DAY = 86400.0
+
+LONGEST_DAYS = 36525.0
+"""Of a survey: a century."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +69,8 @@ class ScanModel:
         Differencing pairs: name of the assembly and the names of its two lines of sight.
     spin_phase_deg, precession_phase_deg, orbit_phase_deg
         Angles at t = 0.
+    description
+        In words.
     source
         Citation of each number, by key.
 
@@ -73,6 +80,13 @@ class ScanModel:
     angle ``boresight_angle_deg`` and azimuth 2 pi t / spin_period + spin_phase + azimuth; to ecliptic coordinates
     it is turned by R_z(2 pi t / orbit) R_y(90 deg) R_z(2 pi t / precession) R_y(precession_angle), so that the
     anti-Sun direction is at longitude ``orbit_phase_deg`` at t = 0.
+
+    Examples
+    --------
+    >>> from mcsim import ScanModel
+    >>> model = ScanModel.load("planck").with_sampling(10.0)
+    >>> model.samples(model.lines_of_sight[0]) > 1_000_000
+    True
     """
 
     name: str
@@ -91,6 +105,56 @@ class ScanModel:
     description: str = ""
     source: dict[str, str] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        """Raise InputError if the numbers describe no possible survey."""
+        _check(self)
+
+    @classmethod
+    def load(cls, name_or_path: str | Path) -> "ScanModel":
+        """Read a scan model.
+
+        Parameters
+        ----------
+        name_or_path
+            Name of a packaged model, for example ``"wmap"``, ``"planck"`` or ``"litebird"``; or a TOML file. Its keys
+            are the fields of :class:`ScanModel`, with tables ``[[line_of_sight]]`` (fields of :class:`LineOfSight`),
+            ``[pairs]`` (assembly = [line, line]) and ``[source]`` (key = citation).
+
+        Raises
+        ------
+        InputError
+            If there is no such model, the file cannot be read, a key is unknown or missing, or a value is not
+            physical.
+
+        Examples
+        --------
+        >>> from mcsim import ScanModel
+        >>> model = ScanModel.load("wmap")
+        >>> model.spin_period_s, model.precession_angle_deg
+        (129.3, 22.5)
+        """
+        path = resources.scan_model(name_or_path)
+        try:
+            table = tomllib.loads(path.read_bytes().decode("utf-8"))
+        except OSError as error:
+            raise InputError(f"scan model {str(path)!r} cannot be read: {error.strerror}; give a TOML file.") from None
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+            raise InputError(f"scan model {str(path)!r} is not valid TOML: {error}.") from None
+        return model_from_table(table, str(path))
+
+    def as_table(self, folder: Path) -> dict[str, str]:
+        """Write the model as TOML into a folder; return the table that stands for it in a run."""
+        own = ("lines_of_sight", "pairs", "source")
+        lines = ["schema = 1"]
+        lines += [f"{f.name} = {_toml(getattr(self, f.name))}" for f in fields(self) if f.name not in own]
+        for key in ("pairs", "source"):
+            lines += [f"[{key}]", *(f"{_toml(name)} = {_toml(value)}" for name, value in getattr(self, key).items())]
+        for line in self.lines_of_sight:
+            given = {f.name: getattr(line, f.name) for f in fields(line)}
+            lines += ["[[line_of_sight]]", *(f"{key} = {_toml(v)}" for key, v in given.items() if v is not None)]
+        (folder / "scan-model.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        return {"kind": "hit_averaged", "model": "scan-model.toml"}
+
     def line_of_sight(self, name: str) -> LineOfSight:
         """The line of sight called ``name``; InputError if there is none."""
         for line in self.lines_of_sight:
@@ -107,8 +171,9 @@ class ScanModel:
         side_a, side_b = self.pairs[name]
         return self.line_of_sight(side_a), self.line_of_sight(side_b)
 
-    def select(self, names: list[str] | tuple[str, ...] | None) -> tuple[LineOfSight, ...]:
+    def select(self, names: str | list[str] | tuple[str, ...] | None) -> tuple[LineOfSight, ...]:
         """The lines of sight called ``names``; the model's default ones if None."""
+        names = [names] if isinstance(names, str) else names
         return tuple(self.line_of_sight(name) for name in (self.default_lines if names is None else names))
 
     def period_of_samples(self, line: LineOfSight) -> float:
@@ -121,9 +186,18 @@ class ScanModel:
         return math.floor(self.duration_days * SECONDS_PER_DAY / self.period_of_samples(line) + 1e-6)
 
     def with_sampling(self, sample_period_s: float) -> "ScanModel":
-        """The same survey with every line of sight sampled every ``sample_period_s`` seconds."""
+        """Return the same survey with every line of sight sampled every ``sample_period_s`` seconds."""
         lines = tuple(replace(line, sample_period_s=None) for line in self.lines_of_sight)
-        return _checked(replace(self, sample_period_s=float(sample_period_s), lines_of_sight=lines), self.name)
+        return replace(self, sample_period_s=float(sample_period_s), lines_of_sight=lines)
+
+    def with_lines_of_sight(self, *names: str) -> "ScanModel":
+        """Return the same survey with these lines of sight as the default ones; InputError if one is unknown."""
+        return replace(self, default_lines=tuple(line.name for line in self.select(names)))
+
+
+def _toml(value: str | float | tuple[str, ...]) -> str:
+    """Text, number or list of texts as TOML, from which the same value is read, bit for bit."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 _TABLES = {"schema", "line_of_sight", "lines_of_sight", "default_lines", "pairs", "source"}
@@ -131,31 +205,6 @@ _TEXT = {"name", "description"}
 _NUMBERS = {f.name for f in fields(ScanModel)} - _TEXT - _TABLES
 _OPTIONAL = {"spin_phase_deg", "precession_phase_deg", "orbit_phase_deg"}
 _LINE_NUMBERS = {"boresight_angle_deg", "azimuth_deg", "sample_period_s"}
-
-
-def load_model(path: str | Path) -> ScanModel:
-    """Read a scan model from a TOML file.
-
-    Parameters
-    ----------
-    path
-        The file. Its keys are the fields of :class:`ScanModel`, with tables ``[[line_of_sight]]`` (fields of
-        :class:`LineOfSight`), ``[pairs]`` (assembly = [line, line]) and ``[source]`` (key = citation).
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, a key is unknown or missing, or a value is not physical.
-    """
-    path = Path(path)
-    try:
-        with path.open("rb") as stream:
-            table = tomllib.load(stream)
-    except OSError as error:
-        raise InputError(f"scan model {str(path)!r} cannot be read: {error.strerror}; give a TOML file.") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"scan model {str(path)!r} is not valid TOML: {error}.") from None
-    return model_from_table(table, str(path))
 
 
 def model_from_table(table: dict[str, Any], where: str) -> ScanModel:
@@ -178,16 +227,18 @@ def model_from_table(table: dict[str, Any], where: str) -> ScanModel:
         pairs[key] = (pair[0], pair[1])
     source = _subtable(table, "source", where)
     _refuse_unknown(source, _NUMBERS, f"{where}, [source]")
-    model = ScanModel(
-        name=table["name"],
-        description=str(table.get("description", "")),
-        lines_of_sight=lines,
-        default_lines=default_lines,
-        pairs=pairs,
-        source={key: str(value) for key, value in source.items()},
-        **numbers,
-    )
-    return _checked(model, where)
+    try:
+        return ScanModel(
+            name=table["name"],
+            description=str(table.get("description", "")),
+            lines_of_sight=lines,
+            default_lines=default_lines,
+            pairs=pairs,
+            source={key: str(value) for key, value in source.items()},
+            **numbers,
+        )
+    except InputError as error:
+        raise InputError(f"{where}, {error}") from None
 
 
 def _refuse_unknown(table: dict[str, Any], known: set[str], where: str) -> None:
@@ -242,11 +293,21 @@ def _lines(tables: Any, where: str) -> tuple[LineOfSight, ...]:
     return tuple(lines)
 
 
-def _checked(model: ScanModel, where: str) -> ScanModel:
-    """Return the model if its numbers describe a possible survey."""
+def _check(model: ScanModel) -> None:
+    """Raise InputError if the numbers of a model describe no possible survey."""
+    where = f"scan model {model.name!r}"
+    for key in _NUMBERS:
+        if not math.isfinite(getattr(model, key)):
+            raise InputError(f"{where}: {key} is {getattr(model, key)}, but it must be a finite number.")
     for key in ("spin_period_s", "orbit_period_s", "sample_period_s", "duration_days"):
         if not getattr(model, key) > 0.0:
             raise InputError(f"{where}: {key} is {getattr(model, key):g}, but it must be > 0.")
+    if model.orbit_period_s < SECONDS_PER_DAY:
+        raise InputError(
+            f"{where}: orbit_period_s is {model.orbit_period_s:g}, less than a day; give seconds (a year has 31557600)."
+        )
+    if model.duration_days > LONGEST_DAYS:
+        raise InputError(f"{where}: duration_days is {model.duration_days:g}, more than a century; give days.")
     if model.precession_period_s == 0.0:
         raise InputError(f"{where}: precession_period_s is 0; for no precession set precession_angle_deg = 0 instead.")
     if not 0.0 <= model.precession_angle_deg <= 90.0:
@@ -266,4 +327,3 @@ def _checked(model: ScanModel, where: str) -> ScanModel:
                 f"{inside}: a survey of {model.duration_days:g} days has no sample every "
                 f"{model.period_of_samples(line):g} s; lengthen duration_days."
             )
-    return model

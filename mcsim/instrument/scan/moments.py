@@ -2,17 +2,26 @@
 
 import json
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
+import healpy
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mcsim.errors import InputError
-from mcsim.instrument.scan.geometry import FRAMES, check_frame, check_nside, nside_of
+from mcsim.instrument.scan.accumulate import means, stream_sums
+from mcsim.instrument.scan.geometry import FRAMES, check_frame
+from mcsim.instrument.scan.limit import limit_moments
+from mcsim.instrument.scan.model import ScanModel
+from mcsim.instrument.scan.user_pointing import blocks_of_files, checked_samples, sums_of_samples
+from mcsim.sphere.checks import check_nside, check_shape, check_whole, nside_of
+from mcsim.sphere.header import frame_named, radians
 
 _META = "moments.json"
+_ARRAYS = ("hits", "w", "dtheta", "dphi")
 
 
 @dataclass(frozen=True)
@@ -30,6 +39,13 @@ class Moments:
     dtheta, dphi
         Mean offset of the samples from the pixel's centre along e_theta and e_phi, in radians (components of the
         mean direction in the tangent plane at the centre), shape (npix,); None if zero or unknown.
+
+    Examples
+    --------
+    >>> from mcsim import Moments
+    >>> moments = Moments.parallel_transport(nside=16, psi0_deg=30.0)
+    >>> moments.nside, moments.smax, moments.npix
+    (16, 4, 3072)
     """
 
     nside: int
@@ -38,6 +54,210 @@ class Moments:
     w: NDArray[np.complex128]
     dtheta: NDArray[np.float64] | None = None
     dphi: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless frame, nside and the sizes of the arrays agree."""
+        check_nside(self.nside)
+        check_frame(self.frame)
+        npix = 12 * self.nside**2
+        check_shape(self.hits, (npix,), f"hits of moments of nside {self.nside}")
+        check_shape(self.w, (max(np.shape(self.w)[:1], default=0), npix), f"w of moments of nside {self.nside}")
+        if not np.iscomplexobj(self.w):
+            raise InputError("w is real, but moments are complex, the means of e^(-i s psi).")
+        if (self.dtheta is None) != (self.dphi is None):
+            raise InputError("dtheta and dphi belong together; give both or neither.")
+        for name, offset in (("dtheta", self.dtheta), ("dphi", self.dphi)):
+            if offset is not None:
+                check_shape(offset, (npix,), f"{name} of moments of nside {self.nside}")
+
+    @classmethod
+    def from_model(
+        cls,
+        model: ScanModel | str | Path,
+        nside: int,
+        smax: int = 4,
+        frame: str = "ecliptic",
+        time_range: tuple[float, float] = (0.0, 1.0),
+        nthreads: int = 1,
+    ) -> Self:
+        """Return the moments of a survey, by streaming every sample of its default lines of sight.
+
+        Parameters
+        ----------
+        model
+            The survey, or what :meth:`ScanModel.load` reads one from. ``model.with_sampling`` and
+            ``model.with_lines_of_sight`` choose its samples.
+        nside, smax
+            HEALPix resolution, and largest s of the moments (>= 1): at least the mmax of the beam.
+        frame
+            Frame of the pixels: "ecliptic", "galactic" or "equatorial".
+        time_range
+            Part of the survey, as fractions of its samples: (0, 0.5) is the first half.
+        nthreads
+            Number of threads. The result does not depend on it, bit for bit; the memory does: one accumulator of
+            8 (4 + 2 smax) bytes per pixel for each thread and one for the sum.
+
+        Raises
+        ------
+        InputError
+            If nside is not a power of two, smax < 1, the frame is unknown, or the time range is empty.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from mcsim import Moments, ScanModel
+        >>> moments = Moments.from_model(ScanModel.load("wmap").with_sampling(60.0), nside=8)
+        >>> moments.w.shape
+        (4, 768)
+        >>> print(f"{np.mean(moments.w[1].real):.2f}")
+        0.55
+        """
+        survey = model if isinstance(model, ScanModel) else ScanModel.load(model)
+        sums = stream_sums(survey, nside, smax, frame, time_range, nthreads)
+        return cls(nside, frame, **means(sums, nside, smax))
+
+    @classmethod
+    def from_pointing(
+        cls, theta: ArrayLike, phi: ArrayLike, psi: ArrayLike, nside: int, smax: int = 4, frame: str = "ecliptic"
+    ) -> Self:
+        """Return the moments of samples that are given one by one.
+
+        Parameters
+        ----------
+        theta, phi
+            Colatitude (0 to pi) and longitude of the samples in ``frame``, in radians, shape (n,).
+        psi
+            Angle of the beam's x axis from e_theta (south) towards e_phi (east), in radians, shape (n,).
+        nside, smax
+            HEALPix resolution, and largest s (>= 1).
+        frame
+            Frame of the pointing and of the maps.
+
+        Raises
+        ------
+        InputError
+            If the arrays are of different shape or empty, a value is not finite, theta lies outside 0 to pi, or phi or
+            psi beyond two turns.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from mcsim import Moments
+        >>> moments = Moments.from_pointing([1.0, 1.0], [2.0, 2.0], [0.0, np.pi / 2], nside=4)
+        >>> seen = moments.hits > 0
+        >>> moments.hits[seen], np.abs(moments.w[1, seen]).round(12)
+        (array([2.]), array([0.]))
+        """
+        check_frame(frame)
+        arrays = [np.atleast_1d(np.asarray(angle, dtype=np.float64)) for angle in (theta, phi, psi)]
+        shapes = [array.shape for array in arrays]
+        if len(set(shapes)) > 1 or arrays[0].ndim != 1 or not arrays[0].size:
+            raise InputError(f"theta, phi and psi have the shapes {shapes}; give three arrays of one length, (n,).")
+        sums = sums_of_samples([checked_samples(arrays, "the pointing")], nside, smax)
+        return cls(nside, frame, **means(sums, nside, smax))
+
+    @classmethod
+    def from_pointing_files(
+        cls, paths: str | Path | Sequence[str | Path], nside: int, smax: int = 4, frame: str = "ecliptic"
+    ) -> Self:
+        """Return the moments of samples that are given one by one in files.
+
+        Parameters
+        ----------
+        paths
+            One file or several, added up. Columns theta, phi, psi in radians (FITS: in the unit that TUNIT states, if
+            it does), in the frame of the maps, and optionally time, which the moments do not need: a FITS binary table
+            or a .npz file with these names, a .npy file (structured with these names, or of shape (n, 3) or (n, 4)), or
+            text of 3 or 4 columns.
+        nside, smax, frame
+            As in :meth:`from_pointing`.
+
+        Raises
+        ------
+        InputError
+            If a file cannot be read, lacks a column, has columns of several lengths or in another order, is in
+            another frame, is empty, or has a value that is not real and finite, a theta outside 0 to pi, or a phi or
+            psi beyond two turns.
+        """
+        check_frame(frame)
+        return cls(nside, frame, **means(sums_of_samples(blocks_of_files(paths, frame), nside, smax), nside, smax))
+
+    @classmethod
+    def parallel_transport(cls, nside: int, psi0_deg: float = 0.0, smax: int = 4, frame: str = "ecliptic") -> Self:
+        """Return the moments of a survey that sees every pixel's centre once, at a fixed angle to the meridian.
+
+        Parameters
+        ----------
+        nside
+            HEALPix resolution.
+        psi0_deg
+            Angle of the beam's x axis from e_theta (south) towards e_phi (east), in degrees.
+        smax
+            Largest s (>= 1).
+        frame
+            "ecliptic", "galactic" or "equatorial".
+
+        Returns
+        -------
+        Moments
+            Read-only arrays that take no memory: hits 1, w_s = e^{-i s psi0}, no offsets.
+
+        Raises
+        ------
+        InputError
+            If nside is not a power of two, smax < 1, or the frame is unknown.
+
+        Examples
+        --------
+        >>> from mcsim import Moments
+        >>> Moments.parallel_transport(nside=4, psi0_deg=90.0, smax=2).w[:, 0].round(12)
+        array([ 0.-1.j, -1.-0.j])
+        """
+        check_nside(nside)
+        check_frame(frame)
+        check_whole(smax, "smax", 1)
+        if not np.isfinite(psi0_deg):
+            raise InputError(f"psi0_deg is {psi0_deg}, but it must be a finite angle in degrees.")
+        npix = 12 * nside * nside
+        w = np.exp(-1j * np.deg2rad(psi0_deg) * np.arange(1, smax + 1))[:, np.newaxis]
+        return cls(nside, frame, np.broadcast_to(np.float64(1.0), npix), np.broadcast_to(w, (smax, npix)))
+
+    @classmethod
+    def limit(cls, model: ScanModel | str | Path, nside: int, smax: int = 4, line_of_sight: str | None = None) -> Self:
+        """Return the exact long-time limit of a scan at the pixels' centres, in ecliptic coordinates.
+
+        Parameters
+        ----------
+        model
+            The survey, or what :meth:`ScanModel.load` reads one from.
+        nside, smax
+            HEALPix resolution, and largest s (>= 1).
+        line_of_sight
+            Name of the line of sight; None: the first of the model's default ones.
+
+        Returns
+        -------
+        Moments
+            Hits are 1 on the mean. Formula and accuracy: :func:`mcsim.instrument.scan.limit_moments`.
+
+        Raises
+        ------
+        InputError
+            If the precession is not much faster than the orbit, or the line of sight is unknown.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from mcsim import Moments
+        >>> print(f"{np.mean(Moments.limit('wmap', nside=32).w[1].real):.2f}")
+        0.55
+        """
+        check_nside(nside)
+        survey = model if isinstance(model, ScanModel) else ScanModel.load(model)
+        theta, _ = healpy.pix2ang(nside, np.arange(12 * nside * nside))
+        rings, ring = np.unique(theta, return_inverse=True)
+        density, w = limit_moments(survey, rings, smax, line_of_sight)
+        return cls(nside, "ecliptic", density[ring] / density[ring].mean(), w[:, ring])
 
     @property
     def smax(self) -> int:
@@ -49,11 +269,17 @@ class Moments:
         """Number of pixels."""
         return int(self.hits.shape[0])
 
+    def as_table(self, folder: Path) -> dict[str, str]:
+        """Write the moments into a folder; return the table that stands for them in a run."""
+        arrays = {name: value for name in _ARRAYS if (value := getattr(self, name)) is not None}
+        np.savez(folder / "moments.npz", nside=self.nside, frame=self.frame, **arrays)
+        return {"kind": "moments", "path": "moments.npz"}
+
     def save(self, folder: str | Path) -> None:
         """Write the arrays as .npy files into ``folder``, which is created."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        for name in ("hits", "w", "dtheta", "dphi"):
+        for name in _ARRAYS:
             array = getattr(self, name)
             if array is not None:
                 np.save(folder / f"{name}.npy", array)
@@ -61,7 +287,7 @@ class Moments:
         (folder / _META).write_text(json.dumps(meta))
 
     @classmethod
-    def load(cls, folder: str | Path, mmap: bool = True) -> "Moments":
+    def load(cls, folder: str | Path, mmap: bool = True) -> Self:
         """Read what :meth:`save` wrote.
 
         Parameters
@@ -80,44 +306,13 @@ class Moments:
         mode: Any = "r" if mmap else None
         try:
             meta = json.loads((folder / _META).read_text())
-            names = ("hits", "w", "dtheta", "dphi") if meta["offsets"] else ("hits", "w")
+            names = _ARRAYS if meta["offsets"] else _ARRAYS[:2]
             arrays = {name: np.load(folder / f"{name}.npy", mmap_mode=mode) for name in names}
+            return cls(nside=meta["nside"], frame=meta["frame"], **arrays)
         except (OSError, ValueError, KeyError) as error:
             raise InputError(
                 f"folder {str(folder)!r} does not hold complete moments ({error}); delete it and compute them again."
             ) from None
-        return cls(nside=meta["nside"], frame=meta["frame"], **arrays)
-
-
-def parallel_transport(psi0: float, nside: int, smax: int, frame: str = "ecliptic") -> Moments:
-    """Moments of a survey that sees every pixel's centre once, with the beam's x axis at angle psi0.
-
-    Parameters
-    ----------
-    psi0
-        Angle of the beam's x axis from e_theta towards e_phi, in radians.
-    nside, smax
-        HEALPix resolution, and largest s (>= 1).
-    frame
-        "ecliptic", "galactic" or "equatorial".
-
-    Returns
-    -------
-    Moments
-        Read-only arrays that take no memory: hits 1, w_s = e^{-i s psi0}, no offsets.
-    """
-    check_nside(nside)
-    check_frame(frame)
-    if smax < 1:
-        raise InputError(f"smax is {smax}, but moments need smax >= 1.")
-    npix = 12 * nside * nside
-    w = np.exp(-1j * psi0 * np.arange(1, smax + 1))[:, np.newaxis]
-    return Moments(
-        nside=nside,
-        frame=frame,
-        hits=np.broadcast_to(np.float64(1.0), npix),
-        w=np.broadcast_to(w, (smax, npix)),
-    )
 
 
 def read_moments_fits(
@@ -182,6 +377,12 @@ def read_moments_fits(
     if largest > 1.0 + 1e-6:
         raise InputError(f"{where}: a moment has modulus {largest:g}, but means of e^(-i s psi) are <= 1.")
     centroid = [np.where(seen, columns[name], 0.0) for name in offsets]
+    farthest = max((float(np.abs(offset).max()) for offset in centroid), default=0.0)
+    if farthest > 2.0 * healpy.max_pixrad(found):
+        raise InputError(
+            f"{where}: samples lie {farthest:g} rad from their pixel's centre, but a pixel of nside {found} "
+            f"reaches {healpy.max_pixrad(found):.3g}; give DTHETA and DPHI in radians, or their unit in TUNIT."
+        )
     return Moments(found, frame, hits, w, *centroid)
 
 
@@ -211,14 +412,11 @@ def write_moments_fits(path: str | Path, moments: Moments) -> None:
 def _frame_of(coordsys: Any, frame: str | None, where: str) -> str:
     if frame is not None:
         check_frame(frame)
-    if coordsys is None:
+    named = frame_named(coordsys, where)
+    if named is None:
         if frame is None:
             raise InputError(f"{where} has no COORDSYS; write E, G or C there.")
         return frame
-    letter = str(coordsys).strip().upper()[:1]
-    named = {value: key for key, value in FRAMES.items()}.get(letter)
-    if named is None:
-        raise InputError(f"{where} has COORDSYS = {coordsys!r}, but it must be E, G or C.")
     if frame is not None and named != frame:
         raise InputError(f"{where} is in {named} coordinates, but the maps are {frame}; use moments of that frame.")
     return named
@@ -239,6 +437,9 @@ def _read_table(path: str | Path) -> tuple[dict[str, NDArray[np.float64]], dict[
                 columns = {
                     name.upper(): np.array(table.data[name], dtype=np.float64).ravel() for name in table.columns.names
                 }
+                for column in table.columns:
+                    if column.unit and column.name.upper() in ("DTHETA", "DPHI"):
+                        columns[column.name.upper()] *= radians(column.unit)
                 header = {key: table.header.get(key) for key in ("NSIDE", "ORDERING", "COORDSYS")}
     except Exception as error:  # libraries raise whatever a broken file makes of them
         raise InputError(f"moments file {str(path)!r} cannot be read: {error}; give a complete FITS table.") from None

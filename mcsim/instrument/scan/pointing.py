@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from mcsim.instrument.scan.geometry import frame_matrix
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
+from mcsim.sphere.checks import check_whole
 
 BLOCK = 512
 """Samples whose trigonometry is done together: the work arrays of a block stay in the processor's first caches."""
@@ -80,6 +81,8 @@ def pointing(
         Colatitude, longitude in [0, 2 pi) and orientation of the beam's x axis from e_theta towards e_phi in
         (-pi, pi], in radians, each of shape (count,).
     """
+    check_whole(first, "first")
+    check_whole(count, "count")
     stream = PointingStream(model, line, frame)
     theta, phi, psi = np.empty(count), np.empty(count), np.empty(count)
     _angles(

@@ -15,10 +15,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
-from mcsim.instrument.scan.geometry import check_frame, check_nside
+from mcsim.instrument.scan.geometry import check_frame
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
 from mcsim.instrument.scan.pointing import BLOCK, PointingStream, fill_block, ring_pixel
 from mcsim.simulation.tod import chunks, sample_range
+from mcsim.sphere.checks import check_nside
 from mcsim.support import folders
 from mcsim.support.code import package_digest
 

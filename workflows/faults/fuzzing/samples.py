@@ -98,13 +98,13 @@ def write_files(folder: Path) -> None:
     healpy.write_map(
         folder / "sky.fits", rng.normal(size=npix), coord="E", column_units="uK", overwrite=True, dtype=np.float64
     )
-    scan.write_moments_fits(folder / "moments.fits", scan.parallel_transport(0.3, NSIDE, 4))
+    scan.write_moments_fits(folder / "moments.fits", scan.Moments.parallel_transport(NSIDE, np.rad2deg(0.3), 4))
     y, x = np.mgrid[:41, :41] - 20.0
     image = fits.PrimaryHDU(np.exp(-(x**2 / 40 + y**2 / 30)))
     image.header["CDELT1"] = image.header["CDELT2"] = 0.5
     image.writeto(folder / "beam.fits", overwrite=True)
     packed = np.zeros(healpy.Alm.getsize(LMAX, LMAX), dtype=complex)
-    beam = beams.elliptical_gaussian(600, 500, 0, LMAX, 4)
+    beam = beams.Beam.elliptical(600, 500, 0, LMAX, 4)
     for m in range(beam.mmax + 1):
         packed[healpy.Alm.getidx(LMAX, np.arange(m, LMAX + 1), m)] = beam.blm[m, m:]
     healpy.write_alm(folder / "blm.fits", packed, overwrite=True, out_dtype=np.float64)
@@ -156,7 +156,7 @@ def readers(folder: Path) -> dict[str, Callable[[], object]]:
         "blm.fits": using(with_("beam", kind="blm", path="blm.fits")),
         "spectrum.txt": using(with_("sky", spectrum="spectrum.txt")),
         "spectrum.fits": using(with_("sky", spectrum="spectrum.fits")),
-        "model.toml": lambda: scan.load_model(folder / "model.toml"),
+        "model.toml": lambda: scan.ScanModel.load(folder / "model.toml"),
         "data.ecsv": lambda: beamfit.measurement(folder / "data.ecsv", base()),
     }
     for suffix in ("txt", "npy", "npz", "fits"):

@@ -5,34 +5,24 @@ Exit codes: 0 done, 1 failed realizations, 2 bad input, 130 interrupted.
 
 import json
 import os
-import signal
 import sys
 from pathlib import Path
-from types import FrameType
 from typing import Annotated
 
 import typer
 from rich.console import Console
 
+from mcsim.cli import ensembles
+from mcsim.cli.common import Config, Png, Simulations, Workers, interrupt_once, out, save
 from mcsim.errors import InputError, RunError
 
 app = typer.Typer(
     name="mcsim",
-    help="Is the isotropy violation that I measure made by my instrument?",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-out = Console(highlight=False, soft_wrap=True)
-
-Config = Annotated[str, typer.Argument(metavar="CONFIG", help="TOML file, or a packaged workflow such as quickstart.")]
-Store = Annotated[Path, typer.Argument(metavar="STORE", help="Folder that mcsim run wrote.")]
-Workers = Annotated[int | None, typer.Option(min=0, help="Processes; 0: this one; default: the model's.")]
-Simulations = Annotated[
-    int | None, typer.Option(min=50, help="For the covariance of the data vector; default: ten per element.")
-]
-Png = Annotated[Path | None, typer.Option("-o", "--output", metavar="PNG", help="Picture to write.")]
 
 
 def main() -> None:
@@ -44,127 +34,25 @@ def main() -> None:
         sys.exit(2 if isinstance(error, InputError) else 1)
 
 
-@app.command()
-def run(
-    config: Config,
-    store: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="STORE", help="Default: NAME.zarr here.")
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Check a store, repair it, and continue it.")] = False,
-    realizations: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Only realizations A to B - 1, for slices that merge joins.")
-    ] = None,
-    workers: Annotated[int | None, typer.Option(min=1, help="Local processes; default: the configuration's.")] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Running Dask scheduler, tcp://host:port or tls://host:port.")
-    ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say memory, disk, files and time; compute nothing.")
+def _version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        out.print(f"mcsim {version('mcsim')}", markup=False)
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say the version and exit.")
     ] = False,
 ) -> None:
-    """Run an ensemble; continue it if it was interrupted; extend it if more realizations are asked for.
-
-    With --resume the store is read and checked first, and what is damaged is computed again. STORE.log beside the store
-    says what happened.
-
-    Exit codes: 0 done; 1 realizations failed, or the run could not go on: what is finished is stored, run again; 2 bad
-    input, nothing was computed; 130 interrupted by Ctrl-C or SIGTERM: run again to go on.
-    """
-    if workers is not None and scheduler is not None:
-        raise InputError("--workers and --scheduler exclude each other: workers of a running scheduler are its own.")
-    part = _slice(realizations)
-    if dry_run:
-        from mcsim.ensemble import plan
-
-        out.print(plan.describe(config, part, workers), markup=False)
-        return
-    _interrupt_once()
-    try:
-        from mcsim.ensemble import runner
-
-        result = runner.run(
-            config, store, resume=resume, realizations=part, workers=workers, scheduler=scheduler, quiet=False
-        )
-    except KeyboardInterrupt:
-        print("mcsim: interrupted; run the same command again to continue.", file=sys.stderr)
-        raise typer.Exit(130) from None
-    _report(result)
+    """Is the isotropy violation that I measure made by my instrument?"""
 
 
-@app.command()
-def merge(
-    slices: Annotated[list[Path], typer.Argument(metavar="STORE...", help="Stores of slices of one ensemble.")],
-    store: Annotated[Path, typer.Option("-o", "--output", metavar="STORE", help="Store to make.")],
-) -> None:
-    """Join slices that were run with --realizations A:B."""
-    from mcsim.ensemble import runner
-
-    _report(runner.merge(slices, store, quiet=False))
-
-
-@app.command()
-def info(
-    store: Store,
-    export: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Write the summary: .nc (NetCDF) or .ecsv (table of binned spectra)."),
-    ] = None,
-    verify: Annotated[
-        bool, typer.Option("--verify", help="Read every file, name damaged realizations; exit code 1 if there are any.")
-    ] = False,
-) -> None:
-    """Say what a store holds; export its summary; verify it."""
-    if verify:
-        from mcsim.ensemble import repair
-
-        verdict = repair.verify(store, quiet=False)
-        out.print(verdict.text(), markup=False)
-        raise typer.Exit(0 if verdict.intact else 1)
-    from mcsim.ensemble import describe
-
-    out.print(describe.describe(store), markup=False)
-    if export is not None:
-        describe.export(store, export)
-        out.print(f"wrote {export}", markup=False)
-
-
-@app.command()
-def plot(
-    store: Store,
-    output: Png = None,
-    L: Annotated[int | None, typer.Option("--L", help="Only this L.")] = None,
-    M: Annotated[int | None, typer.Option("--M", help="Only this M.")] = None,
-    d: Annotated[int | None, typer.Option("--d", help="Only this d = l2 - l1.")] = None,
-    pair: Annotated[str | None, typer.Option(help='Pair of maps, for example "W1,W1"; default: the first.')] = None,
-    predict: Annotated[str | None, typer.Option(metavar="CONFIG", help="Draw what this run should give, too.")] = None,
-    exact: Annotated[bool, typer.Option("--exact", help="The prediction to all orders in the beam.")] = False,
-) -> None:
-    """Draw the binned spectra of a store with their error bars, and a prediction over them."""
-    from mcsim.ensemble import prediction
-    from mcsim.plot.spectra import ensemble_figure
-
-    expected = None if predict is None else prediction.predict(predict, exact=exact, nthreads=os.cpu_count() or 1)
-    figure = ensemble_figure(store, L=L, M=M, d=d, pair=pair, prediction=expected)
-    _save(figure, output or store.with_suffix(".png"))
-
-
-@app.command()
-def predict(
-    config: Config,
-    exact: Annotated[bool, typer.Option("--exact", help="To all orders in the beam; default: leading order.")] = False,
-    snr: Annotated[bool, typer.Option("--snr", help="Add the signal to noise of every mode.")] = False,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write it: .zarr, or .ecsv (binned).")
-    ] = None,
-) -> None:
-    """Predict the summary of a run without Monte Carlo."""
-    from mcsim.ensemble import prediction
-
-    expected = prediction.predict(config, exact=exact, snr=snr, nthreads=os.cpu_count() or 1)
-    out.print(prediction.describe(expected), markup=False)
-    if output is not None:
-        prediction.write(expected, output)
-        out.print(f"wrote {output}", markup=False)
+for _command in (ensembles.run, ensembles.merge, ensembles.info, ensembles.plot, ensembles.predict, ensembles.maps):
+    app.command()(_command)
 
 
 @app.command()
@@ -181,8 +69,12 @@ def fit(
         list[str] | None, typer.Option("--mode", help="Such as L2M0d0; may be repeated; default: A20 at d = 0 and 2.")
     ] = None,
     kind: Annotated[
-        str | None, typer.Option(help="plain, or difference to the circular twins; default: difference where known.")
+        str | None,
+        typer.Option(help="plain, or difference to the circular-beam controls; default: difference where known."),
     ] = None,
+    order: Annotated[
+        str, typer.Option(help="leading or exact (all orders in the beam); auto: exact where the data tell them apart.")
+    ] = "auto",
     covariance: Annotated[
         Path | None, typer.Option(metavar="STORE", help="Take the covariance of one of its realizations.")
     ] = None,
@@ -193,28 +85,23 @@ def fit(
 ) -> None:
     """Fit an effective beam, b_l2 f_l with f_l = alpha or alpha + beta l, to measured or simulated spectra."""
     from mcsim import beamfit
+    from mcsim.ensemble.expectation import survey_of
     from mcsim.plot.fit import fit_figure
 
-    if kind not in (None, "plain", "difference"):
-        raise InputError(f"--kind {kind} is not known; give plain or difference.")
     nthreads = os.cpu_count() or 1
     span = None if ell_max is None and ell_min == 2 else (ell_min, ell_max if ell_max is not None else 1 << 30)
-    measured = beamfit.measurement(
-        data,
-        config,
-        modes=mode or beamfit.QUADRUPOLE,
-        ell_range=span,
-        kind=kind,  # type: ignore[arg-type]
-        pair=pair,
-        covariance=covariance,
-    )
+    selection = beamfit.Selection(tuple(mode or beamfit.QUADRUPOLE), span, kind, pair)  # type: ignore[arg-type]
+    survey = survey_of(config, nthreads)
+    measured = beamfit.measurement(data, survey, selection, covariance)
     names = model or ["constant", "linear"]
-    fits = [beamfit.fit(measured, config, name, knots=knots, each=each, nthreads=nthreads) for name in names]
+    fits = beamfit.fit_models(measured, survey, names, knots=knots, order=order, nthreads=nthreads)  # type: ignore[arg-type]
+    if each:
+        fits = [beamfit.fit_each(one) for one in fits]
     if as_json:
         print(json.dumps([one.to_dict() for one in fits], indent=2))
     else:
         out.print(beamfit.report(fits), markup=False)
-    _save(fit_figure(fits), output or Path("fit.png"))
+    save(fit_figure(fits), output or Path("fit.png"))
 
 
 @app.command()
@@ -233,7 +120,7 @@ def beam(
     for number, look in enumerate(look_at_beams(source, lmax, m_max, pixel_deg)):
         out.print(look.text, markup=False)
         target = output or Path("beam.png")
-        _save(look.figure, target if number == 0 else target.with_stem(f"{target.stem}-{look.name}"))
+        save(look.figure, target if number == 0 else target.with_stem(f"{target.stem}-{look.name}"))
 
 
 @app.command()
@@ -249,9 +136,9 @@ def scan(
     """Say what a scan does to a beam: hits, orientation moments, the three factors; draw it."""
     from mcsim.plot.look import look_at_scan
 
-    look = look_at_scan(model, nside, smax, frame, sample_period_s, line_of_sight, quiet=False)
+    look = look_at_scan(model, nside, smax, frame, sample_period_s, line_of_sight)
     out.print(look.text, markup=False)
-    _save(look.figure, output or Path(f"scan-{look.name}.png"))
+    save(look.figure, output or Path(f"scan-{look.name}.png"))
 
 
 @app.command()
@@ -273,7 +160,7 @@ def diagnose(
     from mcsim.diagnosis.api import diagnose as judge
     from mcsim.diagnosis.words import summary
 
-    _interrupt_once()
+    interrupt_once()
     found = judge(
         model,
         data,
@@ -312,7 +199,7 @@ def challenge_make(
     from mcsim.benchmark.folder import Settings
     from mcsim.benchmark.make import make
 
-    _interrupt_once()
+    interrupt_once()
     file = None if inventions is None else str(inventions)
     shared = Settings(config.load(model), sampled_share=sampled_share, out_of_library=file, simulations=simulations)
     make(shared, output, cases, seed, workers=workers, quiet=False)
@@ -323,7 +210,7 @@ def challenge_run(folder: Folder, workers: Workers = None) -> None:
     """Diagnose all cases that have no verdict."""
     from mcsim.benchmark.run import run as diagnose_all
 
-    _interrupt_once()
+    interrupt_once()
     out.print(f"{diagnose_all(folder, workers=workers, quiet=False)} cases diagnosed", markup=False)
 
 
@@ -396,54 +283,10 @@ def config(
     if schema:
         print(json.dumps(config_.json_schema(), indent=2))
     elif name is not None:
+        from mcsim.simulation.channels import check_effects
+
         loaded = config_.load(name)
+        check_effects(loaded)
         print(json.dumps({"digest": config_.digest(loaded), **config_.resolved(loaded)}, indent=2))
     else:
         raise InputError("Nothing was asked for; give a configuration to check, or --schema.")
-
-
-def _interrupt_once() -> None:
-    """Ctrl-C, or the SIGTERM of a batch system, ends a run in order; a second one does not disturb that."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        for name in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(name, signal.SIG_IGN)
-        raise KeyboardInterrupt
-
-    for name in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(name, interrupt)
-
-
-def _slice(text: str | None) -> slice | None:
-    if text is None:
-        return None
-    start, colon, stop = text.partition(":")
-    if not colon or not (start or "0").isdecimal() or (stop and not stop.isdecimal()):
-        raise InputError(f"--realizations {text} is not of the form A:B with whole numbers; for example 0:50.")
-    return slice(int(start or 0), int(stop) if stop else None)
-
-
-def _save(figure, path: Path) -> None:  # type: ignore[no-untyped-def]
-    try:
-        figure.savefig(path)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be written ({error}); choose another file with -o.") from error
-    out.print(f"wrote {path}", markup=False)
-
-
-def _report(result) -> None:  # type: ignore[no-untyped-def]
-    if result.computed == 0 and not result.failures:
-        out.print(f"{result.store} is finished: {result.finished} realizations, nothing to do.", markup=False)
-    else:
-        out.print(f"{result.store}: {result.finished} realizations, {result.computed} of them new.", markup=False)
-    for failure in result.failures[:10]:
-        out.print(f"realization {failure.realization} failed: {failure.reason}", markup=False)
-    if result.failures:
-        out.print(
-            f"{len(result.failures)} realizations failed; run the same command again to retry them.", markup=False
-        )
-        raise typer.Exit(1)
-
-
-if __name__ == "__main__":
-    main()

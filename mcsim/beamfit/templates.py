@@ -1,0 +1,186 @@
+"""Data expected of effective beams b_l2 f_l: polynomials in the parameters of f_l."""
+
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.beamfit.data import Measurement, project
+from mcsim.beamfit.models import Model
+from mcsim.bipolar.theory import ScannedBeam, cmb_biposh_exact, cmb_biposh_leading
+from mcsim.ensemble import expectation
+from mcsim.errors import InputError
+from mcsim.simulation.survey import Survey
+
+Order = Literal["auto", "leading", "exact"]
+
+ORDERS: tuple[str, ...] = get_args(Order)
+
+TRIAL_MOMENTS = 16
+"""Degree of the orientation moments that tells how large the orders beyond the leading one are: to about 5 %."""
+
+
+@dataclass(frozen=True)
+class Polynomial:
+    """Data as a polynomial of second degree in the parameters theta.
+
+    Attributes
+    ----------
+    constant, linear, quadratic
+        uK^2, shapes (p,), (p, K) and, symmetric in its last two, (p, K, K).
+    """
+
+    constant: NDArray[np.float64]
+    linear: NDArray[np.float64]
+    quadratic: NDArray[np.float64]
+
+    def at(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the data, shape (p,)."""
+        return self.constant + self.linear @ theta + self.quadratic @ theta @ theta
+
+    def derivative(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the derivative with respect to theta, shape (p, K)."""
+        return self.linear + 2.0 * self.quadratic @ theta
+
+    def keeping(self, count: int) -> "Polynomial":
+        """Return the polynomial of the first ``count`` parameters, the others being 0."""
+        return Polynomial(self.constant, self.linear[:, :count], self.quadratic[:, :count, :count])
+
+
+@dataclass(frozen=True)
+class Templates:
+    """What a survey's beams, with b_l2 times f_l, make of the spectrum in the bins of a measurement.
+
+    Attributes
+    ----------
+    measured
+        The data.
+    survey
+        Beams, scans and spectrum.
+    pair
+        Numbers of the maps.
+    beams
+        Of these maps, with moments of high degree.
+    nthreads
+        Threads.
+    known
+        Exact data that were asked for already, by f_l: models contain one another.
+    """
+
+    measured: Measurement
+    survey: Survey
+    pair: tuple[int, int]
+    beams: tuple[ScannedBeam, ScannedBeam]
+    nthreads: int = 1
+    known: dict[bytes, NDArray[np.float64]] = field(default_factory=dict, repr=False)
+
+    def data(self, factor: NDArray, L_moments: int | None) -> NDArray[np.float64]:
+        """Return data, shape (p,), for f_l at l = 0, 1, ...: to all orders with ``L_moments``, else to the leading."""
+        x, y = (_rescaled(beam, factor, L_moments) for beam in self.beams)
+        modes, cl, lmax = self.measured.modes, expectation.spectrum(self.survey), self.survey.lmax
+        if L_moments is None:
+            seen = cmb_biposh_leading(modes, cl, lmax, x, y)
+        else:
+            seen = cmb_biposh_exact(modes, cl, lmax, x, x if self.pair[0] == self.pair[1] else y, self.nthreads)
+        seen = expectation.without_windows(self.survey, seen, modes, self.pair)
+        if self.measured.kind == "plain" and self.pair[0] == self.pair[1]:
+            seen = seen + expectation.noise_mean(self.survey, self.pair[0], modes)
+        return project(self.measured.rows, self.measured.scaling, dict(zip(modes, seen, strict=True)))
+
+    def functions(self, model: Model) -> NDArray:
+        """Return g_k(l) at every l of the beams, shape (K, l)."""
+        return model.functions(np.arange(self.beams[0].blm.shape[1], dtype=float))
+
+    def leading(self, model: Model) -> Polynomial:
+        """Return the data to leading order in the beam, which are linear in the parameters."""
+        functions = self.functions(model)
+        constant = self.data(0.0 * functions[0], None)
+        linear = np.stack([self.data(function, None) - constant for function in functions], axis=-1)
+        return Polynomial(constant, linear, np.zeros((*linear.shape, len(functions))))
+
+    def exact(self, model: Model) -> Polynomial:
+        """Return the data to all orders in the beam.
+
+        Notes
+        -----
+        The exact A^{LM} is bilinear in the beams of the two maps, so that it is a polynomial of second degree in theta:
+        its values at 0, +-h_k and h_k + h_l, (K + 1)(K + 2)/2 of them, tell it everywhere.
+        """
+        functions = self.functions(model)
+        K, step = len(functions), 1.0 / np.abs(functions).max(axis=1)
+        scaled = step[:, None] * functions
+
+        def at(factor: NDArray) -> NDArray[np.float64]:
+            key = factor.astype(complex).tobytes()
+            if key not in self.known:
+                self.known[key] = self.data(factor, expectation.L_MOMENTS)
+            return self.known[key]
+
+        constant = at(0.0 * functions[0])
+        above, below = (np.stack([at(sign * one) for one in scaled], axis=-1) for sign in (1.0, -1.0))
+        linear, even = 0.5 * (above - below), 0.5 * (above + below) - constant[:, None]
+        quadratic = np.zeros((len(constant), K, K))
+        for k in range(K):
+            quadratic[:, k, k] = even[:, k]
+            for m in range(k):
+                both = at(scaled[k] + scaled[m]) - constant - linear[:, k] - linear[:, m] - even[:, k] - even[:, m]
+                quadratic[:, k, m] = quadratic[:, m, k] = 0.5 * both
+        return Polynomial(constant, linear / step, quadratic / np.outer(step, step))
+
+    def beyond_leading(self, model: Model, theta: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return about how much all orders differ from the leading one at theta, shape (p,)."""
+        factor = theta @ self.functions(model)
+        return self.data(factor, TRIAL_MOMENTS) - self.data(factor, None)
+
+
+def templates(survey: Survey, measured: Measurement, nthreads: int = 1) -> Templates:
+    """Make the templates of a survey for a measurement.
+
+    Raises
+    ------
+    InputError
+        For a survey without a spectrum, of another lmax or with other maps, or with circular beams.
+    """
+    expectation.spectrum(survey)
+    if measured.lmax > survey.lmax:
+        raise InputError(
+            f"the data reach ell = {measured.lmax}, the configuration ends at {survey.lmax}; raise its lmax."
+        )
+    pair = _maps_of(survey, measured.pair)
+    beams = expectation.scanned_beams(survey, expectation.L_MOMENTS, nthreads)
+    x, y = (beams[number] for number in pair)
+    if x.smax < 2 or y.smax < 2:
+        raise InputError(f"a beam of {survey.config.name} is circular, so it has no b_l2 to rescale; give its shape.")
+    made = Templates(measured, survey, pair, (x, y), nthreads)
+    expected = made.data(np.ones(x.blm.shape[1]), None)
+    if not np.isfinite(expected).all():
+        row = measured.rows[int(np.argmin(np.isfinite(expected)))]
+        raise InputError(
+            f"no coefficient of {row.mode.name} exists at ell = {row.ell_min}-{row.ell_max}; leave the bin out."
+        )
+    return made
+
+
+def _rescaled(beam: ScannedBeam, factor: NDArray, L_moments: int | None) -> ScannedBeam:
+    """Return a beam with b_l2 f_l, and its moments up to a degree."""
+    blm = beam.blm.copy()
+    blm[2] *= factor
+    if L_moments is None:
+        return ScannedBeam(blm, beam.w)
+    low, high = beam.L_max - L_moments, beam.L_max + L_moments + 1
+    return ScannedBeam(blm, beam.w[:, : L_moments + 1, low:high])
+
+
+def _maps_of(survey: Survey, pair: str | None) -> tuple[int, int]:
+    """Return the numbers of the maps of a pair; the only map stands for any name."""
+    names = survey.map_names
+    if len(names) == 1:
+        return 0, 0
+    wanted = [] if pair is None else pair.split(",")
+    if len(wanted) != 2 or any(name not in names for name in wanted):
+        raise InputError(
+            f"the configuration has the maps {', '.join(names)}, the data are of {pair or 'a pair without name'}; "
+            "name their pair, or give a configuration with one map."
+        )
+    return names.index(wanted[0]), names.index(wanted[1])

@@ -1,0 +1,5 @@
+"""``python -m mcsim.cli``."""
+
+from mcsim.cli import main
+
+main()

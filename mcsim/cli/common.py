@@ -1,0 +1,40 @@
+"""What all commands share: arguments, output, interruption, pictures."""
+
+import signal
+from pathlib import Path
+from types import FrameType
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from mcsim.errors import InputError
+
+out = Console(highlight=False, soft_wrap=True)
+
+Config = Annotated[str, typer.Argument(metavar="CONFIG", help="TOML file, or a packaged workflow such as quickstart.")]
+Workers = Annotated[int | None, typer.Option(min=0, help="Processes; 0: this one; default: the model's.")]
+Simulations = Annotated[
+    int | None, typer.Option(min=50, help="For the covariance of the data vector; default: ten per element.")
+]
+Png = Annotated[Path | None, typer.Option("-o", "--output", metavar="PNG", help="Picture to write.")]
+
+
+def interrupt_once() -> None:
+    """Ctrl-C, or the SIGTERM of a batch system, ends a run in order; a second one does not disturb that."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        for name in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(name, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    for name in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(name, interrupt)
+
+
+def save(figure, path: Path) -> None:  # type: ignore[no-untyped-def]
+    try:
+        figure.savefig(path)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be written ({error}); choose another file with -o.") from error
+    out.print(f"wrote {path}", markup=False)

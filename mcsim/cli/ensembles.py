@@ -1,0 +1,198 @@
+"""Commands about ensembles: run them, join them, look at them, predict them."""
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mcsim.cli.common import Config, Png, interrupt_once, out, save
+from mcsim.errors import InputError
+
+Store = Annotated[Path, typer.Argument(metavar="STORE", help="Folder that mcsim run wrote.")]
+
+
+def run(
+    config: Config,
+    store: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="STORE", help="Default: NAME.zarr here.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Check a store, repair it, and continue it.")] = False,
+    realizations: Annotated[
+        str | None, typer.Option(metavar="A:B", help="Only realizations A to B - 1, for slices that merge joins.")
+    ] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Local processes; default: the configuration's.")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Running Dask scheduler, tcp://host:port or tls://host:port.")
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say memory, disk, files and time; compute nothing.")
+    ] = False,
+) -> None:
+    """Run an ensemble; continue it if it was interrupted; extend it if more realizations are asked for.
+
+    With --resume the store is read and checked first, and what is damaged is computed again. STORE.log beside the store
+    says what happened.
+
+    Exit codes: 0 done; 1 realizations failed, or the run could not go on: what is finished is stored, run again; 2 bad
+    input, nothing was computed; 130 interrupted by Ctrl-C or SIGTERM: run again to go on.
+    """
+    if workers is not None and scheduler is not None:
+        raise InputError("--workers and --scheduler exclude each other: workers of a running scheduler are its own.")
+    part = _slice(realizations)
+    if dry_run:
+        from mcsim.ensemble import plan
+
+        out.print(plan.describe(config, part, workers), markup=False)
+        return
+    interrupt_once()
+    try:
+        from mcsim.ensemble import runner
+
+        result = runner.run(
+            config, store, resume=resume, realizations=part, workers=workers, scheduler=scheduler, quiet=False
+        )
+    except KeyboardInterrupt:
+        print("mcsim: interrupted; run the same command again to continue.", file=sys.stderr)
+        raise typer.Exit(130) from None
+    _report(result)
+
+
+def merge(
+    slices: Annotated[list[Path], typer.Argument(metavar="STORE...", help="Stores of slices of one ensemble.")],
+    store: Annotated[Path, typer.Option("-o", "--output", metavar="STORE", help="Store to make.")],
+) -> None:
+    """Join slices that were run with --realizations A:B."""
+    from mcsim.ensemble import runner
+
+    _report(runner.merge(slices, store, quiet=False))
+
+
+def info(
+    store: Store,
+    export: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write the summary: .nc (NetCDF) or .ecsv (table of binned spectra)."),
+    ] = None,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Read every file, name damaged realizations; exit code 1 if there are any.")
+    ] = False,
+) -> None:
+    """Say what a store holds; export its summary; verify it."""
+    if verify:
+        from mcsim.ensemble import repair
+
+        verdict = repair.verify(store, quiet=False)
+        out.print(verdict.text(), markup=False)
+        raise typer.Exit(0 if verdict.intact else 1)
+    from mcsim.ensemble import describe
+
+    out.print(describe.describe(store), markup=False)
+    if export is not None:
+        describe.export(store, export)
+        out.print(f"wrote {export}", markup=False)
+
+
+def plot(
+    store: Store,
+    output: Png = None,
+    L: Annotated[int | None, typer.Option("--L", help="Only this L.")] = None,
+    M: Annotated[int | None, typer.Option("--M", help="Only this M.")] = None,
+    d: Annotated[int | None, typer.Option("--d", help="Only this d = l2 - l1.")] = None,
+    pair: Annotated[str | None, typer.Option(help='Pair of maps, for example "W1,W1"; default: the first.')] = None,
+    predict: Annotated[
+        str | None,
+        typer.Option(metavar="CONFIG", help="Draw what this run should give, too; or a file of mcsim predict -o."),
+    ] = None,
+    exact: Annotated[bool, typer.Option("--exact", help="The prediction to all orders in the beam.")] = False,
+) -> None:
+    """Draw the binned spectra of a store with their error bars, and a prediction over them."""
+    from mcsim.ensemble import prediction, tables
+    from mcsim.ensemble import store as stores
+    from mcsim.plot.spectra import ensemble_figure
+
+    stores.attributes(store)
+    expected = None
+    if predict is not None and predict.endswith((".zarr", ".ecsv")):
+        if exact:
+            raise InputError(f"--exact says how to predict, but {predict} is predicted already; leave it out.")
+        expected = tables.read_prediction(predict)
+    elif predict is not None:
+        expected = prediction.predict(predict, exact=exact, nthreads=os.cpu_count() or 1)
+    figure = ensemble_figure(store, L=L, M=M, d=d, pair=pair, prediction=expected)
+    save(figure, output or store.with_suffix(".png"))
+
+
+def predict(
+    config: Config,
+    exact: Annotated[bool, typer.Option("--exact", help="To all orders in the beam; default: leading order.")] = False,
+    snr: Annotated[bool, typer.Option("--snr", help="Add the signal to noise of every mode.")] = False,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write it: .zarr, or .ecsv (binned).")
+    ] = None,
+) -> None:
+    """Predict the summary of a run without Monte Carlo."""
+    from mcsim.ensemble import prediction, tables
+
+    expected = prediction.predict(config, exact=exact, snr=snr, nthreads=os.cpu_count() or 1)
+    out.print(tables.describe_prediction(expected), markup=False)
+    if output is not None:
+        tables.write_prediction(expected, output)
+        out.print(f"wrote {output}", markup=False)
+
+
+def maps(
+    config: Config,
+    folder: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to fill; nothing is replaced.")],
+    realization: Annotated[
+        int | None, typer.Option(metavar="N", help="Only this one, its files directly in DIR.")
+    ] = None,
+    realizations: Annotated[
+        str | None, typer.Option(metavar="A:B", help="Realizations A to B - 1; default: all of the ensemble.")
+    ] = None,
+    sample_by_sample: Annotated[
+        bool, typer.Option("--sample-by-sample", help="By the time-ordered reference, where the pointing is known.")
+    ] = False,
+) -> None:
+    """Write the maps of a run as FITS files, such as mcsim diagnose reads.
+
+    A folder for each realization holds CHANNEL.fits or CHANNEL_SPLIT.fits: HEALPix in RING order, uK.
+    """
+    from mcsim.ensemble.maps import write_maps
+
+    if realization is not None and realizations is not None:
+        raise InputError("--realization and --realizations exclude each other; give one of them.")
+    chosen = _slice(realizations) if realization is None else realization
+    interrupt_once()
+    try:
+        found = write_maps(config, folder, chosen, sample_by_sample=sample_by_sample, quiet=False)
+    except KeyboardInterrupt:
+        print("mcsim: interrupted; folders that exist are complete.", file=sys.stderr)
+        raise typer.Exit(130) from None
+    out.print(f"wrote maps of {len(found)} realization{'' if len(found) == 1 else 's'} to {folder}", markup=False)
+
+
+def _slice(text: str | None) -> slice | None:
+    if text is None:
+        return None
+    start, colon, stop = text.partition(":")
+    if not colon or not (start or "0").isdecimal() or (stop and not stop.isdecimal()):
+        raise InputError(f"--realizations {text} is not of the form A:B with whole numbers; for example 0:50.")
+    return slice(int(start or 0), int(stop) if stop else None)
+
+
+def _report(result) -> None:  # type: ignore[no-untyped-def]
+    if result.computed == 0 and not result.failures and result.summarised:
+        out.print(f"{result.store} is finished: {result.finished} realizations; its summary is new.", markup=False)
+    elif result.computed == 0 and not result.failures:
+        out.print(f"{result.store} is finished: {result.finished} realizations, nothing to do.", markup=False)
+    else:
+        out.print(f"{result.store}: {result.finished} realizations, {result.computed} of them new.", markup=False)
+    for failure in result.failures[:10]:
+        out.print(f"realization {failure.realization} failed: {failure.reason}", markup=False)
+    if result.failures:
+        out.print(
+            f"{len(result.failures)} realizations failed; run the same command again to retry them.", markup=False
+        )
+        raise typer.Exit(1)

@@ -1,0 +1,65 @@
+"""Types of single values in a run, and what their checks say.
+
+A check that fails raises ValueError whose text follows ``key = value``; :mod:`mcsim.config.messages` makes the
+sentence of it.
+"""
+
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo
+
+from mcsim.config import arrays
+
+NSIDE_MAX = 8192
+LMAX_MAX = 32768
+
+
+def power_of_two(value: int) -> int:
+    """Return the value if it is a power of two."""
+    if value < 1 or value & (value - 1):
+        above = 1 << max(value, 1).bit_length()
+        raise ValueError(f"is not a power of two; use {max(above // 2, 1)} or {above}")
+    return value
+
+
+def _label(value: str) -> str:
+    """Names of channels and splits become parts of file names and of the labels ``channel:split,channel:split``."""
+    if not value.strip() or value != value.strip() or any(c in "/\\:,{}" or not c.isprintable() for c in value):
+        raise ValueError(
+            "is not a usable name: it needs printable characters, no blanks at its ends and none of / \\ : , { }; "
+            "rename it"
+        )
+    return value
+
+
+def different(values: Sequence[str]) -> None:
+    """Refuse names that are given twice."""
+    twice = [value for value in values if values.count(value) > 1]
+    if twice:
+        raise ValueError(f"names {twice[0]!r} twice; give every one its own name")
+
+
+def unique(values: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names if none is given twice."""
+    different(values)
+    return values
+
+
+def _not_empty(value: str) -> str:
+    if not value.strip():
+        raise ValueError("is empty; give a name or a path")
+    return value
+
+
+def _in_file(value: Any, info: ValidationInfo) -> Any:
+    """Put the path of a file in place of an array or an object."""
+    return arrays.in_files(value, info.field_name or "")
+
+
+Label = Annotated[str, AfterValidator(_label)]
+PathText = Annotated[str, BeforeValidator(_in_file), AfterValidator(_not_empty)]
+Degree = Annotated[int, Field(ge=2, le=LMAX_MAX)]
+BeamOrder = Annotated[int, Field(ge=0, le=LMAX_MAX)] | None
+Fwhm = Annotated[float, Field(gt=0.0, le=10800.0)]
+Frame = Literal["ecliptic", "galactic", "equatorial"]

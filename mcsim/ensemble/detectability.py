@@ -1,0 +1,102 @@
+"""Errors of a survey's BipoSH under isotropy, and the signal to noise of what the beams make."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.bipolar.modes import Mode, existing
+from mcsim.bipolar.theory import Spectra, fisher_information, isotropic_variance, signal_to_noise
+from mcsim.ensemble.expectation import Means
+from mcsim.simulation.survey import Survey
+
+MONOPOLE = Mode(0, 0, 0)
+
+
+def cl_of(survey: Survey, monopole: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Return C_l of A^{00}_ll."""
+    ell = np.arange(survey.lmax + 1)
+    return (-1.0) ** ell * monopole.real / np.sqrt(2.0 * ell + 1.0)
+
+
+def _total_cl(survey: Survey, found: dict[tuple[int, int], Means], pair: tuple[int, int]) -> NDArray[np.float64]:
+    monopole = survey.estimator.modes.index(MONOPOLE)
+    return cl_of(survey, (found[pair].beam + found[pair].noise)[monopole])
+
+
+def sky_fraction(survey: Survey, pair: tuple[int, int]) -> float:
+    """Return <W_x W_y>^2 / <W_x^2 W_y^2>."""
+    maps = [m for channel in survey.channels for m in channel.maps]
+    weights = [maps[i].weight for i in pair]
+    if all(weight is None for weight in weights):
+        return 1.0
+    product = np.prod([np.ones(maps[pair[0]].moments.npix) if w is None else w for w in weights], axis=0)
+    return float(product.mean() ** 2 / np.mean(product**2))
+
+
+def variance_of(survey: Survey, found: dict[tuple[int, int], Means], pair: tuple[int, int]) -> NDArray[np.float64]:
+    """Return E|A - mean|^2 of an isotropic sky with these spectra, shape (mode, lmax + 1)."""
+    x, y = pair
+    xx, yy, xy = (_total_cl(survey, found, p) for p in ((x, x), (y, y), pair))
+    modes = survey.estimator.modes
+    variance = np.empty((len(modes), survey.lmax + 1))
+    anisotropic = [row for row, (L, _, _) in enumerate(modes) if L > 0]
+    variance[anisotropic] = isotropic_variance([modes[row] for row in anisotropic], Spectra(xx, yy, xy))
+    variance[modes.index(MONOPOLE)] = xx * yy + xy**2
+    return np.where(np.isnan(found[pair].beam), np.nan, variance / sky_fraction(survey, pair))
+
+
+def variables(survey: Survey, found: dict[tuple[int, int], Means], joint: float) -> dict[str, tuple[Any, ...]]:
+    """Return the variables of a summary's signal to noise in one sky, L > 0; ``joint`` is that of all maps together."""
+    modes, lmax = survey.estimator.modes, survey.lmax
+    rows = [row for row, (L, _, _) in enumerate(modes) if L > 0]
+    anisotropic = [modes[row] for row in rows]
+    first = np.arange(0, lmax + 1, survey.config.biposh.summary_bin)
+    last = np.append(first[1:] - 1, lmax)
+    each = np.full((len(survey.pairs), len(modes)), np.nan)
+    binned = np.full((*each.shape, len(first)), np.nan)
+    for number, (x, y) in enumerate(survey.pairs):
+        signal = (found[x, y].beam - found[x, y].circular)[rows]
+        spectra = Spectra(*(_total_cl(survey, found, pair) for pair in ((x, x), (y, y), (x, y))))
+        f_sky = sky_fraction(survey, (x, y))
+        each[number, rows] = signal_to_noise(signal, anisotropic, spectra, f_sky)
+        for b, ells in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
+            binned[number, rows, b] = signal_to_noise(signal, anisotropic, spectra, f_sky, ells)
+    text = "signal to noise in one sky of what the beam adds to its circular part"
+    return {
+        "signal_to_noise": (("pair", "mode"), each, {"units": "1", "long_name": text}),
+        "signal_to_noise_binned": (("pair", "mode", "bin"), binned, {"units": "1", "long_name": f"{text}, per bin"}),
+        "signal_to_noise_total": (
+            (),
+            joint,
+            {"units": "1", "long_name": f"{text}, all maps and modes jointly (exact Fisher information)"},
+        ),
+    }
+
+
+def joint_signal_to_noise(survey: Survey, found: dict[tuple[int, int], Means]) -> float:
+    """Return the root of the Fisher information of all maps; infinite where maps without noise show the beams alone."""
+    size, lmax = len(survey.map_names), survey.lmax
+    stored = survey.estimator.modes
+    modes = [
+        mode for mode in stored if mode[0] > 0 and mode[2] >= 0 and not (mode[2] == 0 and mode[0] % 2 and size == 1)
+    ]
+    cl = np.empty((size, size, lmax + 1))
+    signal = np.zeros((size, size, len(modes), lmax + 1), dtype=np.complex128)
+    for x, y in found:
+        cl[x, y] = cl[y, x] = _total_cl(survey, found, (x, y))
+        beam = np.nan_to_num(found[x, y].beam - found[x, y].circular)
+        for row, (L, M, d) in enumerate(modes):
+            signal[x, y, row] = beam[stored.index(Mode(L, M, d))]
+            if x != y:
+                # A^{LM}_{l1 l2} of the exchanged pair is (-1)^{l1+l2+L} A^{LM}_{l2 l1}.
+                l2 = np.flatnonzero(existing(L, d, lmax))
+                signal[y, x, row, l2] = (-1) ** (L + d) * beam[stored.index(Mode(L, M, -d)), l2 - d]
+    if size > 1:
+        diagonal = np.sqrt(np.einsum("xxl->xl", cl))
+        seen = (diagonal > 0.0).all(axis=0)
+        correlation = (cl / np.where(seen, diagonal[:, None] * diagonal, 1.0))[:, :, seen]
+        if np.any(np.linalg.eigvalsh(np.moveaxis(correlation, -1, 0))[:, 0] < 1e-12):
+            return float("inf")
+    f_sky = min(sky_fraction(survey, pair) for pair in found)
+    return float(np.sqrt(fisher_information(signal, modes, cl, f_sky)))

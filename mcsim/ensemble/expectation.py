@@ -1,0 +1,177 @@
+"""Mean BipoSH of a survey's maps: of their signal, of its part that circular beams see, and of their noise."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from healpy import nside2pixarea
+from numpy.typing import NDArray
+
+from mcsim import config
+from mcsim.bipolar.modes import Indices, existing
+from mcsim.bipolar.theory import (
+    ScannedBeam,
+    cmb_biposh_exact,
+    cmb_biposh_leading,
+    noise_biposh,
+    orientation_harmonics,
+    parallel_transport_harmonics,
+)
+from mcsim.bipolar.theory.harmonics import spin_functions
+from mcsim.errors import InputError
+from mcsim.simulation import survey as survey_
+from mcsim.simulation.rings import Rings
+from mcsim.simulation.survey import Channel, Survey, SurveyMap
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix
+
+Source = str | Path | Mapping[str, Any] | config.RunConfig | Survey
+
+L_MOMENTS = 64
+"""Highest degree of the orientation moments in predictions to all orders in the beam."""
+
+
+@dataclass(frozen=True)
+class Means:
+    """Means of an ordered pair of maps, uK^2, shape (mode, lmax + 1), NaN where one map repeats another mode.
+
+    Attributes
+    ----------
+    beam, circular
+        Of the signal, through the beams and through their circular parts.
+    noise
+        Of the noise.
+    """
+
+    beam: NDArray[np.complex128]
+    circular: NDArray[np.complex128]
+    noise: NDArray[np.complex128]
+
+
+def survey_of(source: Source, nthreads: int = 1) -> Survey:
+    """Return the survey of a configuration in any form."""
+    if isinstance(source, Survey):
+        return source
+    run = source if isinstance(source, config.RunConfig) else config.load(source)
+    return survey_.survey(run, nthreads)
+
+
+def scanned_beams(survey: Survey, L_max: int, nthreads: int = 1) -> tuple[ScannedBeam, ...]:
+    """Return the beam, times the pixel window, and the moments up to degree ``L_max`` of every map."""
+    specs = {channel.name: channel.scan for channel in survey.config.channels}
+    for name, scan in specs.items():
+        if isinstance(scan, config.ScanDifferencing):
+            raise InputError(
+                f"Channel {name} reads two beams as a difference, which predictions do not cover; "
+                "predict the same model with hit_averaged instead."
+            )
+    return tuple(
+        ScannedBeam(channel.beam.blm * channel.window, _orientations(specs[channel.name], channel, m, L_max, nthreads))
+        for channel in survey.channels
+        for m in channel.maps
+    )
+
+
+def without_windows(
+    survey: Survey, spectra: NDArray[np.complex128], modes: Sequence[Indices], pair: tuple[int, int]
+) -> NDArray[np.complex128]:
+    """Return the coefficients of maps as the analysis leaves them: over the pixel windows at l1 and l2."""
+    windows = [channel.window for channel in survey.channels for _ in channel.maps]
+    result = spectra.copy()
+    for row, (L, _, d) in zip(result, modes, strict=True):
+        l2 = np.flatnonzero(existing(L, d, survey.lmax))
+        row[l2] /= windows[pair[0]][l2 - d] * windows[pair[1]][l2]
+    return result
+
+
+def _orientations(
+    scan: config.Scan, channel: Channel, m: SurveyMap, L_max: int, nthreads: int
+) -> NDArray[np.complex128]:
+    smax = channel.beam.mmax
+    if channel.rings is not None:
+        return _orientations_on_rings(channel.rings, smax, L_max)
+    if isinstance(scan, config.ScanParallelTransport) and m.weight is None:
+        return parallel_transport_harmonics(smax, L_max, float(np.deg2rad(scan.psi0_deg)))
+    w = np.asarray(m.moments.w[:smax])
+    return orientation_harmonics(w if m.weight is None else w * m.weight**2, L_max, nthreads=nthreads)
+
+
+def _orientations_on_rings(grid: tuple[Rings, ...], smax: int, L_max: int) -> NDArray[np.complex128]:
+    """Return w_{s,LM} of moments that depend on colatitude alone, so M = 0; the rings integrate them without error."""
+    result = np.zeros((smax + 1, L_max + 1, 2 * L_max + 1), dtype=np.complex128)
+    result[0, 0, L_max] = np.sqrt(4.0 * np.pi)
+    for rings in grid:
+        harmonics = spin_functions(rings.s, L_max, rings.theta)[rings.s]
+        result[rings.s, :, L_max] = rings.phase * (harmonics @ rings.weight)
+    return result
+
+
+def means(
+    survey: Survey, beams: tuple[ScannedBeam, ...], pair: tuple[int, int], exact: bool, nthreads: int = 1
+) -> Means:
+    """Return the means of a pair of maps in all modes of the survey.
+
+    Parameters
+    ----------
+    survey, beams
+        The survey and what :func:`scanned_beams` makes of it.
+    pair
+        Numbers of the maps.
+    exact
+        To all orders in the beam, instead of leading order in its non-circular part.
+    nthreads
+        Threads.
+
+    Raises
+    ------
+    InputError
+        For a survey without a spectrum.
+    """
+    cl = spectrum(survey)
+    x, y = beams[pair[0]], beams[pair[1]]
+    modes, lmax = survey.estimator.modes, survey.lmax
+    signal = cmb_biposh_leading(modes, cl, lmax, x, y)
+    circular = np.where(np.array([L for L, _, _ in modes])[:, None] == 0, signal, 0.0 * signal)
+    if exact:
+        signal = cmb_biposh_exact(modes, cl, lmax, x, x if pair[0] == pair[1] else y, nthreads=nthreads)
+    signal, circular = (without_windows(survey, array, modes, pair) for array in (signal, circular))
+    noise = np.zeros_like(signal)
+    if pair[0] == pair[1]:
+        noise = noise_mean(survey, pair[0], modes)
+        repeated = [row for row, mode in enumerate(survey.estimator.modes) if not mode.in_auto]
+        for array in (signal, circular, noise):
+            array[repeated] = np.nan
+    return Means(signal, circular, noise)
+
+
+def spectrum(survey: Survey) -> NDArray[np.float64]:
+    """Return C_l of the sky.
+
+    Raises
+    ------
+    InputError
+        For a survey without a spectrum.
+    """
+    if survey.cl is None:
+        raise InputError(
+            f"{survey.config.name} takes its skies from files and names no spectrum; add sky.spectrum for a prediction."
+        )
+    return survey.cl
+
+
+def noise_mean(survey: Survey, number: int, modes: Sequence[Indices]) -> NDArray[np.complex128]:
+    """Return the mean BipoSH of the noise of a map, uK^2, shape (mode, lmax + 1)."""
+    m = [m for channel in survey.channels for m in channel.maps][number]
+    L_max, lmax = max(L for L, _, _ in modes), survey.lmax
+    if m.noise_uk is None:
+        return np.zeros((len(modes), lmax + 1), dtype=np.complex128)
+    power = m.noise_uk**2 * nside2pixarea(m.moments.nside)
+    alm = healpix.analysis(power if m.weight is None else power * m.weight**2, L_max, iterations=3)
+    variance = np.zeros((L_max + 1, 2 * L_max + 1), dtype=np.complex128)
+    for M in range(L_max + 1):
+        column = alm[alm_.start(L_max, M) + M : alm_.start(L_max, M) + L_max + 1]
+        variance[M:, L_max - M] = (-1) ** M * column.conj()
+        variance[M:, L_max + M] = column
+    return without_windows(survey, noise_biposh(modes, variance, lmax), modes, (number, number))

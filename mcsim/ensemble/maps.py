@@ -1,0 +1,151 @@
+"""The maps of a run as FITS files, such as :func:`mcsim.diagnose` reads."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import healpy
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim import config
+from mcsim.ensemble import plan
+from mcsim.errors import InputError
+from mcsim.simulation import sampled, simulate
+from mcsim.simulation.survey import Survey, survey
+from mcsim.support.folders import appearing, writable
+from mcsim.support.progress import reporting
+
+_COORDINATES = {"ecliptic": "E", "galactic": "G", "equatorial": "C"}
+
+
+def write_maps(
+    source: str | Path | dict[str, Any] | config.RunConfig,
+    folder: str | Path,
+    realizations: int | slice | None = None,
+    *,
+    sample_by_sample: bool = False,
+    nthreads: int | None = None,
+    quiet: bool = True,
+) -> list[Path]:
+    """Write the maps of a run, effects and noise included, as HEALPix FITS files.
+
+    Parameters
+    ----------
+    source
+        Configuration: a TOML file, the name of a packaged workflow, a dict, or one that is loaded.
+    folder
+        To fill; it is made if it does not exist.
+    realizations
+        A number: this one, its files directly in ``folder``, which must be new or empty. A slice, or None for all of
+        the ensemble: a folder of its own for each, ``00000`` and so on.
+    sample_by_sample
+        Make them by the time-ordered reference: each map is the plain mean of its samples, whose pointing must be
+        known. Sky and effects are those of the default route, the noise is a draw of its own.
+    nthreads
+        Threads; default: all processors.
+    quiet
+        Report no progress on standard error.
+
+    Returns
+    -------
+    list of Path
+        Folders with ``{channel}.fits``, or ``{channel}_{split}.fits`` where the run has splits: uK_CMB in RING order,
+        float64, ``healpy.UNSEEN`` where nothing was observed. The header has frame (COORDSYS), unit (TUNIT1), the
+        run's name and digest (RUN, DIGEST) and the realization (REALIZ).
+
+    Raises
+    ------
+    InputError
+        For bad input, a grid without pixels, a folder that cannot be written or holds what would be written over.
+
+    Notes
+    -----
+    A folder appears whole or not at all. Memory is that of one realization.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp()) / "observed"
+    >>> [path.name for path in write_maps("quickstart", folder, 3)[0].iterdir()]
+    ['demo.fits']
+    """
+    run = source if isinstance(source, config.RunConfig) else config.load(source)
+    if run.map.grid != "healpix":
+        raise InputError(f'{run.name} has map.grid = "{run.map.grid}" and so no pixels; set map.grid = "healpix".')
+    alone = realizations is not None and not isinstance(realizations, slice)
+    wanted = plan.wanted(run, _slice(realizations))
+    names = file_names(run)
+    targets = {r: Path(folder) if alone else Path(folder) / f"{r:05d}" for r in wanted}
+    _refuse_what_is_there(Path(folder), list(targets.values()))
+    config.check_skies(run, wanted)
+    threads = nthreads or os.cpu_count() or 1
+    with reporting("orientation moments", 1.0, "", quiet) as report:
+        shared = survey(run, nthreads=threads, progress=report)
+    if sample_by_sample:
+        for channel in shared.channels:
+            sampled.check(channel)
+    simulate.draw_sky(shared, wanted.start)  # bad files of skies are to be found before a folder is made
+    writable(Path(folder) if not alone else Path(folder).absolute().parent)
+    header = [("RUN", _ascii(run.name)), ("DIGEST", config.digest(run))]
+    with reporting("maps", float(len(wanted)), "realizations", quiet) as report:
+        for number, (r, target) in enumerate(targets.items()):
+            made = _maps(shared, r, sample_by_sample, threads)
+            try:
+                with appearing(target) as scratch:
+                    for name, map_uk in made:
+                        write_map(scratch / names[name], map_uk, run.map.frame, [*header, ("REALIZ", r)])
+            except OSError as error:
+                reason = error.strerror or str(error)
+                raise InputError(f"{target} cannot be written ({reason}); choose another folder with -o.") from error
+            report(number + 1.0)
+    return list(targets.values())
+
+
+def write_map(path: Path, map_uk: NDArray[np.float64], frame: str, header: list[tuple[str, Any]] | None = None) -> None:
+    """Write one HEALPix map in RING order, uK, with its frame in the header."""
+    healpy.write_map(
+        path, map_uk, dtype=np.float64, coord=_COORDINATES[frame], column_units="uK", column_names=["TEMPERATURE"],
+        fits_IDL=False, extra_header=header or (),
+    )  # fmt: skip
+
+
+def file_names(run: config.RunConfig) -> dict[str, str]:
+    """File of every map of a run: ``{channel}.fits`` or ``{channel}_{split}.fits``.
+
+    Raises
+    ------
+    InputError
+        If two maps would have one file.
+    """
+    names = {name: f"{name.replace(':', '_')}.fits" for name in config.map_names(run)}
+    for name, file in names.items():
+        twice = [other for other, own in names.items() if own == file and other != name]
+        if twice:
+            raise InputError(f"The maps {name} and {twice[0]} would both be {file}; rename a channel or a split.")
+    return names
+
+
+def _maps(shared: Survey, realization: int, sample_by_sample: bool, nthreads: int) -> list[tuple[str, NDArray]]:
+    if sample_by_sample:
+        return sampled.maps(shared, realization, nthreads)
+    return list(zip(shared.map_names, simulate.maps(shared, realization, nthreads), strict=True))
+
+
+def _refuse_what_is_there(folder: Path, targets: list[Path]) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder} is a file; choose a folder with -o.")
+    for target in targets:
+        if target.exists() and (not target.is_dir() or any(target.iterdir())):
+            raise InputError(f"{target} is not empty, and nothing is written over; choose another folder with -o.")
+
+
+def _slice(realizations: int | slice | None) -> slice | None:
+    if realizations is None or isinstance(realizations, slice):
+        return realizations
+    return slice(int(realizations), int(realizations) + 1)
+
+
+def _ascii(name: str) -> str:
+    """A name as FITS headers can hold it."""
+    return name.encode("ascii", "backslashreplace").decode()

@@ -1,0 +1,84 @@
+"""Opening of stored ensembles with xarray, lazily."""
+
+from pathlib import Path
+
+import xarray as xr
+
+from mcsim.ensemble import store
+from mcsim.errors import InputError
+
+
+def open_ensemble(path: str | Path) -> xr.Dataset:
+    """Open the realizations of a store lazily.
+
+    Parameters
+    ----------
+    path
+        The store.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``biposh``, ``cl``, their circular-beam controls, with kept maps ``observed_map`` (in stores of earlier versions
+        ``map``), lazily; in memory ``done`` and the coordinates realization, pair, mode (with L, M, d, parity), ell.
+        ``.sel(mode="L2M0d0")`` picks a spectrum, ``.where(ds.L == 2, drop=True)`` all of one L.
+
+    Raises
+    ------
+    InputError
+        If there is no store at ``path``.
+
+    Examples
+    --------
+    >>> import mcsim
+    >>> ensemble = mcsim.open_ensemble(mcsim.run("tiny", "tiny.zarr").store)
+    >>> dict(ensemble.biposh.sel(mode="L2M0d0").sizes)
+    {'realization': 32, 'pair': 1, 'ell': 33}
+    """
+    store.attributes(Path(path))
+    return _opened(Path(path), None)
+
+
+def open_summary(path: str | Path) -> xr.Dataset:
+    """Open the summary of a store: means, standard errors, standard deviations, binned spectra and covariances.
+
+    Parameters
+    ----------
+    path
+        The store.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``biposh_mean``, ``biposh_standard_error``, ``biposh_standard_deviation``, the same ``_binned``, of ``cl`` and,
+        where the run is paired, of ``_circular`` and ``_difference``; uK^2.
+
+    Raises
+    ------
+    InputError
+        If there is no store at ``path``, or it has no summary yet.
+
+    Examples
+    --------
+    >>> import mcsim
+    >>> summary = mcsim.open_summary(mcsim.run("tiny", "tiny.zarr").store)
+    >>> spectra = summary.sel(mode="L2M0d0", pair="demo,demo", ell=slice(10, 30))
+    >>> significance = abs(spectra.biposh_difference_mean) / spectra.biposh_difference_standard_error
+    >>> bool((significance > 5.0).all())  # the beam makes a quadrupole
+    True
+    """
+    store.attributes(Path(path))
+    if not (Path(path) / "summary").is_dir():
+        raise InputError(
+            f"{path} has no summary, because no run on it has ended yet; continue it with mcsim run --resume."
+        )
+    return _opened(Path(path), "summary")
+
+
+def _opened(path: Path, group: str | None) -> xr.Dataset:
+    """A group, lazily but for its coordinates and ``done``: xarray chooses rows by values that it has in memory."""
+    with store.faults_named(path):
+        found = xr.open_zarr(path, group=group)
+        for name in {*found.coords, "done"} & {*found.variables}:
+            found.variables[name].load()
+        return found

@@ -1,0 +1,65 @@
+"""Harmonic coefficients of beams, shape (mmax + 1, lmax + 1): their limits, their power, and where to cut them in m."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.errors import InputError
+
+MMAX_TOLERANCE = 4e-4
+"""Largest fraction of a beam's power that :func:`choose_mmax` leaves beyond m_max."""
+
+CIRCULAR_POWER = 1e-20
+"""Fraction of a beam's power below which what is not m = 0 is round-off, and the beam circular."""
+
+
+def check_lmax(lmax: int) -> None:
+    """Refuse a degree that is no degree."""
+    if not isinstance(lmax, int | np.integer) or lmax < 1:
+        raise InputError(f"lmax = {lmax} must be a whole number of 1 or more for a beam")
+
+
+def check_mmax(mmax: int, lmax: int) -> None:
+    """Refuse an order that no coefficient up to ``lmax`` has."""
+    if not isinstance(mmax, int | np.integer) or not 0 <= mmax <= lmax:
+        raise InputError(
+            f"mmax = {mmax} of a beam must be whole and lie between 0 and its lmax = {lmax}: lower mmax or raise lmax"
+        )
+
+
+def power_by_order(blm: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Sum over l of |b_lm|^2, both signs of m together, shape (mmax + 1,)."""
+    power: NDArray[np.float64] = np.sum(np.abs(blm) ** 2, axis=1)
+    power[1:] *= 2
+    return power
+
+
+def choose_mmax(blm: NDArray[np.complex128], tolerance: float = MMAX_TOLERANCE) -> int:
+    """Choose the order above which a beam may be cut.
+
+    Parameters
+    ----------
+    blm
+        Coefficients to a larger order than can matter, shape (mmax + 1, lmax + 1).
+    tolerance
+        Largest fraction of the power, over the degrees given, that may be neglected.
+
+    Returns
+    -------
+    int
+        0 for a beam that is circular to round-off, else the smallest m >= 2 that neglects no more than ``tolerance``.
+
+    Notes
+    -----
+    Never 1, nor 0 for a beam that is not circular: m = 2 may hold less than the tolerance and still be all of
+    A^{20}. Orders that differ by 2 feed A^{20} in pairs, so that the leading neglected effect is b_l4 b_l2 over
+    b_l2 b_l0. At the default, and lmax = 1024, the WMAP-7 beam maps V2, W1 and W4 get mmax = 4. On the same skies under
+    parallel transport (mmax = 4 against 10, bins of 50 in l) that left out at most 0.5 uK^2 of a binned A^{20}_ll that
+    reaches 269 uK^2 for V2, and 0.9 of 476 uK^2 for W1 (0.2 % of the largest), where mmax = 2 leaves out 2.7 and
+    5.2 uK^2 (1 %). What is studied at L > 2 may need more: pass mmax then.
+    """
+    power = power_by_order(blm)
+    if power[1:].sum() <= CIRCULAR_POWER * power.sum():
+        return 0
+    beyond = np.append(np.cumsum(power[::-1])[::-1][1:], 0.0) / power.sum()
+    smallest = int(np.argmax(beyond <= tolerance))
+    return min(max(2, smallest), len(power) - 1)

@@ -1,0 +1,108 @@
+"""Skies that users give, as files of a_lm or of maps, refused in one sentence where they cannot be used."""
+
+from pathlib import Path
+
+import healpy
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from mcsim.errors import InputError
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import header, healpix
+from mcsim.support.npy import read_npy
+
+Alm = NDArray[np.complex128]
+
+LARGEST_UK = 1e12
+"""Of a user's sky."""
+
+SMALLEST_UK = 0.01
+"""Of the largest value of a user's sky that is not zero: a CMB sky in K has 5e-4, and any in uK has more than 1."""
+
+
+def read_alm(path: Path, lmax: int, frame: str) -> Alm:
+    """Read the coefficients of a sky up to ``lmax``, uK, from a file of ``healpy.write_alm`` or ``numpy.save``.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, ends below ``lmax``, states another frame or a unit that is no CMB temperature, or
+        has values that are not finite or of no sky in uK.
+    """
+    if path.suffix == ".npy":
+        given = read_npy(path)
+        mmax, keywords = healpy.Alm.getlmax(given.size), fits.Header()
+    else:
+        given, mmax, keywords = _read_fits_alm(path)
+    alm = given.astype(np.complex128)
+    found = healpy.Alm.getlmax(alm.size, mmax)
+    if mmax != found or found < lmax:
+        raise InputError(f"{path} holds a_lm up to l = {found}, m = {mmax}; the sky needs both up to {lmax}.")
+    if not np.all(np.isfinite(alm)):
+        raise InputError(f"{path} holds a_lm that are not finite; repair the file.")
+    if np.abs(alm[: found + 1].imag).max() > 1e-6 * np.abs(alm).max():
+        raise InputError(f"{path} has complex a_l0, where a real sky has real ones; check the order of its a_lm.")
+    _check_frame(path, header.frame_named(keywords.get("COORDSYS"), str(path)), frame)
+    factor = header.to_uk(str(keywords.get("TUNIT2", "")), path)
+    alm = alm if factor == 1.0 else factor * alm
+    _check_size(path, alm)
+    return alm_.resize(alm, found, lmax)
+
+
+def _read_fits_alm(path: Path) -> tuple[Alm, int, fits.Header]:
+    try:
+        alm, mmax = healpy.read_alm(path, return_mmax=True)
+        return alm, int(mmax), fits.getheader(path, 1)
+    except Exception as error:  # libraries raise whatever a broken file makes of them
+        raise InputError(
+            f"{path} cannot be read as a_lm ({error}); give a FITS file as healpy.write_alm makes it."
+        ) from error
+
+
+def read_map(path: Path, lmax: int, frame: str, frequency_ghz: float | None = None) -> Alm:
+    """Read a HEALPix map of the whole sky and return its coefficients up to ``lmax``, uK.
+
+    Parameters
+    ----------
+    path, lmax
+        The file, and the largest degree, up to 3 nside - 1 of it.
+    frame
+        Of the run: the file's, where it states one.
+    frequency_ghz
+        Of the run's channels, where they have one in common: antenna temperature and brightness need it.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be used so.
+    """
+    map_, found, unit = healpix.read_map(path)
+    nside = healpy.npix2nside(map_.size)
+    if nside & (nside - 1):
+        raise InputError(f"{path} has nside {nside}, which is not a power of two; bring the sky to one that is.")
+    _check_frame(path, found, frame)
+    if not np.all(np.isfinite(map_)) or np.any(map_ == healpy.UNSEEN):
+        raise InputError(f"{path} has pixels that are not finite or unseen; a sky must be complete.")
+    if lmax > 3 * nside - 1:
+        raise InputError(f"{path} has nside {nside}, good to l = {3 * nside - 1}; the sky's lmax {lmax} is above it.")
+    map_uk = header.to_uk(unit, path, frequency_ghz) * map_
+    _check_size(path, map_uk)
+    return healpix.analysis(map_uk, lmax, iterations=3)
+
+
+def _check_frame(path: Path, found: str | None, frame: str) -> None:
+    if found not in (None, frame):
+        raise InputError(f"{path} is in {found} coordinates, the run's maps in {frame}; rotate the sky first.")
+
+
+def _check_size(path: Path, sky: NDArray[np.generic]) -> None:
+    """Refuse what a flipped bit or another unit makes of a sky."""
+    largest = float(np.max(np.abs(sky)))
+    if largest > LARGEST_UK:
+        raise InputError(f"{path} holds {largest:.3g} uK, more than any sky ({LARGEST_UK:g} uK); repair the file.")
+    if 0.0 < largest < SMALLEST_UK:
+        raise InputError(
+            f"{path} holds at most {largest:.3g} uK, less than any sky ({SMALLEST_UK:g} uK); is it in K? Say the unit "
+            "in its header (TUNIT), or give it in uK."
+        )

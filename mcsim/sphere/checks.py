@@ -1,0 +1,103 @@
+"""Sizes, kinds and values of what functions are given: wrong ones end in an InputError instead of a wrong number.
+
+The arrays behind come from users and other packages, and compiled loops do not check where they read.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.errors import InputError
+from mcsim.sphere import alm as alm_
+
+NSIDE_MAX = 8192
+
+UNSEEN_BELOW = -1e30
+"""Values below this are ``healpy.UNSEEN`` (-1.6375e30), exactly or in single precision."""
+
+LARGEST_ANGLE = 4.0 * math.pi
+"""Two turns: an angle in radians beyond them is one in degrees, or was never reduced."""
+
+
+def check_whole(value: Any, name: str, least: int = 0) -> None:
+    """Raise InputError unless ``value`` is a whole number of type int, ``least`` or more."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise InputError(f"{name} is {value!r}, but it must be a whole number (int) >= {least}.")
+
+
+def check_nside(nside: Any) -> None:
+    """Raise InputError unless ``nside`` is a power of two between 1 and NSIDE_MAX."""
+    whole = isinstance(nside, int | np.integer) and not isinstance(nside, bool)
+    if not whole or nside < 1 or nside > NSIDE_MAX or nside & (nside - 1):
+        raise InputError(f"nside is {nside}, but it must be a power of two between 1 and {NSIDE_MAX}.")
+
+
+def check_angle(angle: float, name: str) -> None:
+    """Raise InputError unless an angle in radians is finite and at most two turns."""
+    if not abs(angle) <= LARGEST_ANGLE:
+        raise InputError(f"{name} is {angle:g} rad, but angles go up to 4 pi; convert degrees to radians.")
+
+
+def check_alm(alm: Any, lmax: int, name: str = "alm", shape: tuple[int, ...] = ()) -> None:
+    """Raise InputError unless ``alm`` are complex coefficients for ``lmax``, of shape (*shape, size(lmax))."""
+    check_whole(lmax, "lmax")
+    if not isinstance(alm, np.ndarray) or not np.iscomplexobj(alm):
+        kind = f"an array of {alm.dtype}" if isinstance(alm, np.ndarray) else f"a {type(alm).__name__}"
+        raise InputError(f"{name} is {kind}, but coefficients are a complex numpy array in healpy's order.")
+    wanted = (*shape, alm_.size(lmax))
+    if alm.shape != wanted:
+        found = (math.isqrt(8 * alm.shape[-1] + 1) - 3) // 2 if alm.ndim else -1
+        of = f" (as of lmax = {found})" if alm.ndim and found >= 0 and alm_.size(found) == alm.shape[-1] else ""
+        raise InputError(f"{name} has shape {alm.shape}{of}, but lmax = {lmax} needs {wanted}; use alm.resize.")
+
+
+def check_finite(values: NDArray, name: str) -> None:
+    """Raise InputError if a value is NaN or infinite."""
+    # One pass without a temporary array; NaN and infinity survive the sum.
+    if not np.isfinite(values.sum()) and not np.isfinite(values).all():
+        raise InputError(f"{name} has values that are not finite; repair it.")
+
+
+def check_shape(values: Any, shape: tuple[int, ...], name: str) -> None:
+    """Raise InputError unless an array has this shape."""
+    if np.shape(values) != shape:
+        raise InputError(f"{name} has shape {np.shape(values)}, but {shape} is needed.")
+
+
+def check_cl(cl: Any, lmax: int, name: str = "the spectrum", cross: bool = False) -> None:
+    """Raise InputError unless ``cl`` is real, finite and, but for a cross spectrum, >= 0, of shape (> lmax,)."""
+    check_whole(lmax, "lmax")
+    if not isinstance(cl, np.ndarray) or cl.ndim != 1 or cl.dtype.kind not in "fiu":
+        raise InputError(f"{name} has shape {np.shape(cl)}, but it must be a real numpy array, one value for each ell.")
+    if len(cl) <= lmax:
+        raise InputError(f"{name} ends at ell = {len(cl) - 1}, below lmax {lmax}; lower lmax or extend the spectrum.")
+    check_finite(cl, name)
+    if not cross and cl.min() < 0.0:
+        raise InputError(f"{name} is {cl.min():g} at ell = {int(cl.argmin())}, but power is not negative; repair it.")
+
+
+def check_map(map_: Any, nside: int | None = None, name: str = "the map") -> int:
+    """Return nside of a real HEALPix map of shape (npix,); raise InputError for anything else, or another nside."""
+    if not isinstance(map_, np.ndarray) or map_.ndim != 1 or map_.dtype.kind not in "fiub":
+        raise InputError(f"{name} has shape {np.shape(map_)}, but it must be a real numpy array of shape (npix,).")
+    found = nside_of(map_.size, name)
+    if nside is not None and found != nside:
+        raise InputError(f"{name} has nside {found}, but {nside} is needed; bring both to the same.")
+    return found
+
+
+def check_complete(map_: NDArray, name: str = "the map") -> None:
+    """Raise InputError if a pixel of a map is NaN, infinite or unseen."""
+    # One pass in the good case: a pixel that is NaN, infinite or unseen shows in the sum.
+    if not abs(map_.sum()) < -0.1 * UNSEEN_BELOW and not (map_.min() > UNSEEN_BELOW and map_.max() < math.inf):
+        raise InputError(f"{name} has pixels that are not finite or unseen (UNSEEN); set them to 0 by a mask first.")
+
+
+def nside_of(npix: int, where: str) -> int:
+    """Resolution of a full sky of ``npix`` pixels; ``where`` names it in the InputError raised if there is none."""
+    nside = math.isqrt(max(npix, 0) // 12)
+    if nside == 0 or 12 * nside * nside != npix or nside & (nside - 1):
+        raise InputError(f"{where} has {npix} pixels, which is no full HEALPix sky; write all 12 nside^2 pixels.")
+    return nside

@@ -1,0 +1,104 @@
+"""What the headers of FITS files say of a map: its unit of temperature and its coordinate frame."""
+
+import re
+from pathlib import Path
+
+from mcsim.errors import InputError
+
+T_CMB_K = 2.7255
+"""Temperature of the CMB (Fixsen 2009, ApJ 707, 916)."""
+
+_PREFIXES = {"": 1e6, "m": 1e3, "milli": 1e3, "u": 1.0, "mu": 1.0, "micro": 1.0, "n": 1e-3, "nano": 1e-3}
+_CMB = r"cmb|thermo(?:dynamic)?"
+_RJ = r"rj|a|ant(?:enna)?|rayleigh[\s_-]*jeans|b|brightness"
+_KELVIN = re.compile(
+    rf"(milli|micro|nano|mu|m|u|n|)[\s_-]*(?:kelvin|k)[\W_]*(?:({_CMB})|({_RJ}))?(?:[\W_]*temp\w*)?\W*"
+)
+_SILENT = {"", "unknown", "none", "n/a", "undefined"}
+
+_FRAMES = {
+    "ecliptic": ("e", "ecl", "ecliptic"),
+    "galactic": ("g", "gal", "galactic"),
+    "equatorial": ("c", "q", "cel", "celestial", "equ", "equatorial", "icrs", "fk5", "j2000"),
+}
+
+
+def frame_named(coordsys: object, where: str) -> str | None:
+    """Return the frame that a COORDSYS keyword names, None where it is missing or empty.
+
+    Raises
+    ------
+    InputError
+        For a word that names none of the three frames; ``where`` names the file.
+    """
+    word = str(coordsys or "").strip().lower()
+    if word in _SILENT:
+        return None
+    for frame, words in _FRAMES.items():
+        if word in words:
+            return frame
+    raise InputError(f"{where} has COORDSYS = {coordsys!r}, but it must be E, G or C (ecliptic, galactic, equatorial).")
+
+
+def radians(unit: str) -> float:
+    """Return the factor from a unit of angle to radians; InputError for one that is none."""
+    from astropy import units as u
+
+    try:
+        return float(u.Unit(unit.strip().lower()).to(u.rad))
+    except (ValueError, TypeError):
+        raise InputError(f"the unit {unit!r} is none of angle; give rad, deg, arcmin or arcsec.") from None
+
+
+def to_uk(unit: str | None, path: Path, frequency_ghz: float | None = None) -> float:
+    """Return the factor from a unit to uK of CMB (thermodynamic) temperature; 1 where the header gives none.
+
+    Parameters
+    ----------
+    unit
+        As headers have it: uK, mK, K (CMB temperature unless they say antenna or RJ), or a brightness such as MJy/sr.
+    path
+        Of the file, for messages.
+    frequency_ghz
+        Of the channel: antenna temperature and brightness need it.
+
+    Raises
+    ------
+    InputError
+        For another unit, and without a frequency where one is needed.
+
+    Notes
+    -----
+    The conversions are those of ``astropy.units`` at one frequency: d B_nu / d T at 2.7255 K for the CMB,
+    2 nu^2 k / c^2 for antenna (Rayleigh-Jeans) temperature. A wide band needs its own factor.
+    """
+    text = (unit or "").strip().replace("µ", "u").replace("μ", "u")
+    if text.lower() in _SILENT:
+        return 1.0
+    kelvin = _KELVIN.fullmatch(text.lower())
+    if kelvin and not kelvin[3]:
+        return _PREFIXES[kelvin[1]]
+    if kelvin:
+        return _PREFIXES[kelvin[1]] * _brightness_to_k(unit, path, frequency_ghz, None)
+    return 1e6 * _brightness_to_k(unit, path, frequency_ghz, text)
+
+
+def _brightness_to_k(unit: str | None, path: Path, frequency_ghz: float | None, text: str | None) -> float:
+    """K of CMB temperature per unit ``text`` of brightness, or per K of antenna temperature (None)."""
+    from astropy import units as u
+
+    sky = u.Jy / u.sr
+    try:
+        brightness = u.K if text is None else u.Unit(text.replace("Jysr", "Jy sr"))
+    except (ValueError, TypeError):
+        brightness = u.dimensionless_unscaled
+    if text is not None and not brightness.is_equivalent(sky):
+        raise InputError(f"{path} is in {unit!r}; give a map in uK, mK or K (CMB or antenna temperature), or MJy/sr.")
+    if frequency_ghz is None:
+        raise InputError(
+            f"{path} is in {unit!r}, which is no CMB temperature; give the channel's frequency_ghz to convert it, or a "
+            "map in uK (CMB)."
+        )
+    frequency = frequency_ghz * u.GHz
+    value = (1.0 * brightness).to(sky, u.brightness_temperature(frequency))
+    return float(value.to_value(u.K, u.thermodynamic_temperature(frequency, T_cmb=T_CMB_K * u.K)))

@@ -1,0 +1,44 @@
+"""Arrays in numpy's own files: what is given as an array in place of a file is kept so."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.errors import InputError
+
+
+def read_npy(path: str | Path, kind: str = "biufc", ndims: tuple[int, ...] = (1,)) -> NDArray:
+    """Read a .npy file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    kind
+        numpy's letters of the types that it may hold; by default any numbers.
+    ndims
+        Numbers of dimensions that it may have.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or holds another type or shape.
+    """
+    try:
+        array = np.load(path, allow_pickle=False)
+    except Exception as error:  # libraries raise whatever a broken file makes of them
+        raise InputError(f"{path} cannot be read as an array of numpy ({error}); write it with numpy.save.") from error
+    if array.ndim not in ndims or array.dtype.kind not in kind:
+        wanted = f"{'numbers' if 'c' in kind else 'real numbers'} in {' or '.join(map(str, ndims))} dimensions"
+        raise InputError(f"{path} holds {array.dtype} of shape {array.shape}; give {wanted}.")
+    return array
+
+
+def read_npz(path: str | Path) -> dict[str, NDArray]:
+    """Read all arrays of a .npz file; InputError if it cannot be read."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return dict(archive)
+    except Exception as error:  # libraries raise whatever a broken file makes of them
+        raise InputError(f"{path} cannot be read as arrays of numpy ({error}); write it again.") from error

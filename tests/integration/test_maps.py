@@ -1,0 +1,146 @@
+"""The maps of a run as FITS files: what they hold, what reads them back, and what is refused."""
+
+from pathlib import Path
+from typing import Any
+
+import healpy
+import numpy as np
+import pytest
+from astropy.io import fits
+from distributed import Client
+
+from mcsim import config, open_ensemble
+from mcsim.diagnosis.observed_maps import read_maps
+from mcsim.diagnosis.wiener_filter import model_of
+from mcsim.ensemble import maps as maps_
+from mcsim.ensemble import runner
+from mcsim.ensemble.maps import write_maps
+from mcsim.errors import InputError
+from mcsim.simulation import sampled, simulate
+from mcsim.simulation.survey import survey
+
+from .conftest import ensemble, table
+from .test_cli import SMALL, Command, mcsim
+
+__all__ = ["mcsim"]
+
+SCAN = {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 61.0, "line_of_sight": "A"}
+
+
+def halves(**changes: Any) -> dict[str, Any]:
+    """Two channels, two halves of a year, with noise."""
+    beam = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 400.0, "fwhm_minor_arcmin": 350.0}
+    channels = [{"name": name, "beam": beam, "noise": {"sigma0_uk": 30.0}, "scan": SCAN} for name in ("V1", "W1")]
+    return table(map={"nside": 16, "frame": "galactic", "splits": ["a", "b"]}, channel=channels) | changes
+
+
+def test_a_diagnosis_reads_what_is_written(tmp_path: Path) -> None:
+    run = config.load(halves())
+    folder = tmp_path / "observed"
+    assert write_maps(run, folder, 3, nthreads=1) == [folder]
+    assert sorted(file.name for file in folder.iterdir()) == ["V1_a.fits", "V1_b.fits", "W1_a.fits", "W1_b.fits"]
+    shared = survey(run)
+    expected = simulate.maps(shared, 3)
+    for found, map_uk in zip(read_maps(model_of(shared), folder), expected, strict=True):
+        np.testing.assert_array_equal(found, map_uk)
+    header = fits.getheader(folder / "V1_b.fits", 1)
+    told = {"ORDERING": "RING", "COORDSYS": "G", "NSIDE": 16, "TUNIT1": "uK", "RUN": "small", "REALIZ": 3}
+    assert {key: header[key] for key in told} == told
+    assert header["DIGEST"] == config.digest(run)
+
+
+def test_they_are_the_maps_that_a_store_keeps(client: Client, tmp_path: Path) -> None:
+    run = table(**ensemble(3, keep_maps=True))
+    runner.run(run, tmp_path / "x.zarr", client=client)
+    folders = write_maps(run, tmp_path / "maps", slice(1, 3))
+    assert [folder.name for folder in folders] == ["00001", "00002"]
+    kept = open_ensemble(tmp_path / "x.zarr").observed_map
+    for r, folder in zip((1, 2), folders, strict=True):
+        np.testing.assert_array_equal(healpy.read_map(folder / "W1.fits").astype(np.float32), kept[r, 0].values)
+
+
+def test_unobserved_pixels_are_unseen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def bare(*_: object) -> np.ndarray:
+        map_uk = simulate_maps(*_)
+        map_uk[:, :5] = healpy.UNSEEN
+        return map_uk
+
+    simulate_maps = simulate.maps
+    monkeypatch.setattr(maps_.simulate, "maps", bare)
+    folder = write_maps(table(), tmp_path / "x", 0)[0]
+    assert (healpy.read_map(folder / "W1.fits")[:6] == healpy.UNSEEN).tolist() == [True] * 5 + [False]
+
+
+def test_sample_by_sample(tmp_path: Path) -> None:
+    run = config.load(halves())
+    folder = write_maps(run, tmp_path / "x", 0, sample_by_sample=True, nthreads=1)[0]
+    for name, map_uk in sampled.maps(survey(run), 0):
+        np.testing.assert_array_equal(healpy.read_map(folder / f"{name.replace(':', '_')}.fits", dtype=float), map_uk)
+
+
+@pytest.mark.parametrize(
+    ("run", "options", "key"),
+    [
+        (table(), {"realizations": 10}, "10"),
+        (table(), {"realizations": -1}, "-1"),
+        (table(), {"realizations": slice(5, 3)}, "5:3"),
+        (table(), {"sample_by_sample": True}, "W1"),
+        (table(map={"grid": "gl"}), {}, "grid"),
+        (
+            halves(map={"nside": 16, "splits": ["a", "b_a"]}, channel=[halves()["channel"][0] | {"name": n} for n in
+                   ("V", "V_b")]),
+            {},
+            "V_b_a.fits",
+        ),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_written_is_refused_before(
+    run: dict[str, Any], options: dict[str, Any], key: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=key):
+        write_maps(run, tmp_path / "x", **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nothing_is_written_over_and_nothing_is_left_half(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, folder = table(**ensemble(3)), tmp_path / "x"
+    write_maps(run, folder, slice(1, 2))
+    before = (folder / "00001" / "W1.fits").read_bytes()
+    for chosen in (None, slice(1, 3), 0):
+        with pytest.raises(InputError, match="not empty"):
+            write_maps(run, folder, chosen)
+    assert (folder / "00001" / "W1.fits").read_bytes() == before
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(healpy, "write_map", full)
+    with pytest.raises(InputError, match="No space left"):
+        write_maps(run, folder, slice(2, 3))
+    assert [file.name for file in folder.iterdir()] == ["00001"]
+    with pytest.raises(InputError, match="No space left"):
+        write_maps(run, tmp_path / "y", 0)
+    assert not (tmp_path / "y").exists()
+
+
+def test_the_command(mcsim: Command, tmp_path: Path) -> None:
+    toml = tmp_path / "small.toml"
+    toml.write_text(SMALL)
+    assert mcsim("maps", "small.toml", "-o", "one", "--realization", 4)[0] == 0
+    assert mcsim("maps", "small.toml", "-o", "some", "--realizations", "4:6")[0] == 0
+    assert (tmp_path / "one" / "W1.fits").read_bytes() == (tmp_path / "some" / "00004" / "W1.fits").read_bytes()
+    for words in (
+        ("small.toml", "-o", "one", "--realization", 4),
+        ("small.toml", "-o", "x", "--realization", 4, "--realizations", "4:6"),
+        ("small.toml", "-o", "x", "--realization", 10),
+        ("small.toml", "-o", "x", "--realizations", "6:4"),
+        ("small.toml", "-o", "x", "--sample-by-sample"),
+        ("small.toml", "-o", "small.toml"),
+        ("small.toml", "-o", "/proc/x"),
+        ("nothing.toml", "-o", "x"),
+        ("small.toml",),
+    ):
+        code, _, err = mcsim("maps", *words)
+        assert code == 2, words
+        assert "Traceback" not in err
+    assert not (tmp_path / "x").exists()
