@@ -188,7 +188,7 @@ def fit_models(
     order: Order = "auto",
     nthreads: int = 1,
 ) -> list[Fit]:
-    """Fit several models to the same data and to the same order: to all orders if one of them needs it.
+    """Fit several models to the same data and to the same order: to all orders if one model needs it.
 
     Parameters
     ----------

@@ -108,7 +108,7 @@ def power_spectrum(alm_x: NDArray[np.complex128], alm_y: NDArray[np.complex128],
     Raises
     ------
     InputError
-        If the coefficients are not complex, not finite, or not of ``lmax``.
+        If the coefficients are not complex or not of ``lmax``.
     """
     check_alm(alm_x, lmax, "alm_x")
     check_alm(alm_y, lmax, "alm_y")
