@@ -55,9 +55,7 @@ def beam_figure(beam: Beam, beam_map: BeamMap | None = None, title: str = "") ->
 
 def _data_reach_arcmin(beam_map: BeamMap) -> float:
     """Return the largest distance from the centre of a pixel with data inside the cut."""
-    _, theta, _ = solid_angle_values(
-        beam_map.image, beam_map.pixel_rad, beam_map.centre, beam_map.cut_rad, beam_map.projection
-    )
+    _, theta, _ = solid_angle_values(beam_map)
     return float(theta.max() * _ARCMIN)
 
 
