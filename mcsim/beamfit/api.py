@@ -17,6 +17,7 @@ class Fits(tuple[Fit, ...]):
     __slots__ = ()
 
     def __repr__(self) -> str:
+        """Return the text that ``mcsim fit`` prints."""
         return report(self)
 
 
@@ -33,17 +34,17 @@ def fit(
     Parameters
     ----------
     data
-        Store of an ensemble, whose mean is fitted; or ECSV table of binned spectra; or what
-        :func:`mcsim.beamfit.measurement` made of one with further options.
+        Store of an ensemble, whose mean is fitted; or ECSV table of binned spectra; or a result of
+        :func:`mcsim.beamfit.measurement`, which has further options.
     config
-        Run whose spectrum, beams and scan are rescaled: often the beam of the data under parallel transport. A TOML
-        file, the name of a packaged workflow, a dict, or one that is loaded.
+        Run whose spectrum and scan are used and whose beams are rescaled: often the beam of the data under parallel
+        transport. A TOML file, the name of a packaged workflow, a dict, or a loaded configuration.
     models
         Models of f_l: "constant", "linear" (alpha + beta l), "spline", "orientation".
     selection
         Modes, multipoles, kind of spectra and pair of maps; by default A^20 at d = 0 and 2 of the first pair.
     order
-        "leading" or "exact" (to all orders in the beam); "auto": exact where the data tell them apart.
+        "leading" or "exact" (to all orders in the beam); "auto": exact if the data distinguish the two.
 
     Returns
     -------
@@ -54,7 +55,7 @@ def fit(
     Raises
     ------
     InputError
-        For data that do not fit the configuration or the models, too few realizations, and circular beams.
+        For data that do not match the configuration or the models, too few realizations, or circular beams.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Binned BipoSH spectra as one vector of real data with its covariance, from the realizations of a store."""
+"""Binned BipoSH spectra as a real data vector with its covariance, from the realizations of a store."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,23 +21,23 @@ QUADRUPOLE = ("L2M0d0", "L2M0d2")
 
 @dataclass(frozen=True)
 class Selection:
-    """Which spectra of a store or table are fitted.
+    """Selection of the fitted spectra of a store or table.
 
     Attributes
     ----------
     modes
-        Labels of the modes that are fitted jointly.
+        Labels of the modes, which are fitted jointly.
     ell_range
-        Only bins that lie within these multipoles.
+        First and last multipole; bins within them are used.
     kind
-        "difference" to the circular-beam controls (default where there are any) or "plain".
+        "difference" to the circular-beam controls (default if they exist) or "plain".
     pair
         Label of the pair of maps; by default the first.
 
     Raises
     ------
     InputError
-        For modes that cannot exist or repeat, a range that ends before it begins, or another kind.
+        For modes that cannot exist or repeat, an empty range, or another kind.
     """
 
     modes: Sequence[str] = QUADRUPOLE
@@ -46,6 +46,7 @@ class Selection:
     pair: str | None = None
 
     def __post_init__(self) -> None:
+        """Check the values."""
         if isinstance(self.modes, str) or not self.modes or len(set(self.parsed)) < len(self.modes):
             raise InputError(f"modes = {self.modes!r} are no different labels; give some such as ['L2M0d0'].")
         if self.kind is not None and self.kind not in get_args(Kind):
@@ -55,7 +56,7 @@ class Selection:
 
     @property
     def parsed(self) -> tuple[Mode, ...]:
-        """The modes."""
+        """Modes, parsed from their labels."""
         return tuple(parse_mode(name) for name in self.modes)
 
 
@@ -64,7 +65,7 @@ EVERYTHING = Selection()
 
 
 class Row(NamedTuple):
-    """One datum: real or imaginary part of the mean of a mode over ell_min <= l2 <= ell_max."""
+    """One element of the data vector: real or imaginary part of the mean of a mode over ell_min <= l2 <= ell_max."""
 
     mode: Mode
     ell_min: int
@@ -73,9 +74,9 @@ class Row(NamedTuple):
 
 
 class Scaling(NamedTuple):
-    """What is binned: coefficients in the Bennett or the Hajian-Souradeep normalisation, times l(l+1)/2pi or not.
+    """Scaling of the binned coefficients: Bennett or Hajian-Souradeep normalisation, times l(l+1)/2pi or not.
 
-    ``summary`` marks the scaling of an ensemble's summary, the only one that has odd parity beside Bennett's.
+    ``summary`` marks the scaling of an ensemble's summary, which alone combines odd parity with Bennett's.
     """
 
     bennett: bool
@@ -96,22 +97,22 @@ SUMMARY = Scaling(bennett=True, spectrum=True, summary=True)
 
 @dataclass(frozen=True)
 class Measurement:
-    """What is fitted.
+    """Data vector of a fit.
 
     Attributes
     ----------
     origin, pair
-        Where the data are from, and the pair of maps that they belong to; ``None``: the only map.
+        Source of the data, and their pair of maps; ``None``: the only map.
     kind
         "plain", or "difference" to the circular-beam controls.
     rows, scaling
-        What each datum is.
+        Mode, part and bin of each element, and the scaling of all.
     value, covariance
-        uK^2 and uK^4, shape (p,) and (p, p).
+        Data vector and its covariance, uK^2 and uK^4, shape (p,) and (p, p).
     simulations
-        Number of realizations behind the covariance; ``None``: it is known.
+        Number of realizations that the covariance is estimated from; ``None``: the covariance is known.
     realizations
-        Data of every realization, shape (N, p), where they are known.
+        Data vectors of the realizations, shape (N, p), if known.
     """
 
     origin: str
@@ -126,7 +127,7 @@ class Measurement:
 
     @property
     def modes(self) -> tuple[Mode, ...]:
-        """The modes, each once, in order."""
+        """Modes, each once, in order."""
         return tuple(dict.fromkeys(row.mode for row in self.rows))
 
     @property
@@ -136,7 +137,7 @@ class Measurement:
 
 
 def parts(mode: Mode) -> tuple[bool, ...]:
-    """Return which parts of a mode carry data: False for the real, True for the imaginary one."""
+    """Return the nonzero parts of a mode: False for the real, True for the imaginary one."""
     return (False, True) if mode.M > 0 else (mode.parity == "odd",)
 
 
@@ -169,7 +170,7 @@ def from_store(path: str | Path, selection: Selection = EVERYTHING) -> Measureme
     Raises
     ------
     InputError
-        If the store does not hold what is asked for.
+        If the store lacks what is selected.
     """
     with opening.open_ensemble(path) as ensemble:
         width = int(ensemble.attrs["configuration"]["biposh"]["summary_bin"])
@@ -208,16 +209,16 @@ def with_covariance_of(measured: Measurement, path: str | Path, pair: str | None
     Parameters
     ----------
     measured
-        Usually a table, whose errors are then not used.
+        Usually from a table; its own errors are not used.
     path
-        Store with the modes and degrees of the measurement; its realizations are binned like the data.
+        Store with the modes and degrees of the measurement.
     pair
         Label of the pair in the store; by default that of the measurement, or the store's first.
 
     Raises
     ------
     InputError
-        If the store does not hold what the measurement does.
+        If the store lacks a mode or degree of the measurement.
     """
     with opening.open_ensemble(path) as ensemble:
         labels = [str(name) for name in ensemble["pair"].values]

@@ -1,4 +1,4 @@
-"""Effective beams: the f_l by which the b_l2 of a configuration must be rescaled to give the measured BipoSH."""
+"""Effective beams: the factor f_l of the b_l2 of a configuration that fits the measured BipoSH."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ from mcsim.ensemble.expectation import Source, survey_of
 from mcsim.errors import InputError
 
 NEGLIGIBLE = 0.1
-"""Leading order suffices where the orders beyond it are below this size in sigma: no parameter shifts by more."""
+"""Leading order suffices if the higher orders are below this size in sigma: no parameter shifts by more."""
 
 
 @dataclass(frozen=True)
@@ -29,21 +29,20 @@ class Fit:
     Attributes
     ----------
     measured
-        The data.
+        Data vector and its covariance.
     model
-        The model of f_l; where the data do not see one of its parameters (the imaginary part of ``orientation``),
-        without.
+        Model of f_l, without a parameter that the data do not constrain (the imaginary part of ``orientation``).
     order
         "leading", or "exact" to all orders in the beam.
     offset, design
-        The expected data are offset + design @ parameters, uK^2: shapes (p,), (p, K); where ``order`` is "exact",
-        that is their tangent at the best fit.
+        The expected data are offset + design @ parameters, uK^2: shapes (p,), (p, K); if ``order`` is "exact",
+        this is their tangent at the best fit.
     solution
         Parameters, their covariance, chi2, its degrees of freedom and probability.
     beyond_leading
-        Size in sigma of the orders beyond the leading one at the best fit; ``None`` where leading order was asked for.
+        Size in sigma of the higher orders at the best fit; ``None`` if leading order was requested.
     each
-        Fits of every realization, where :func:`fit_each` has made them.
+        Fits of every realization, if made by :func:`fit_each`.
     """
 
     measured: Measurement
@@ -57,12 +56,12 @@ class Fit:
 
     @property
     def best(self) -> NDArray[np.float64]:
-        """Return the data expected of the best fit, uK^2, shape (p,)."""
+        """Return the data expected at the best fit, uK^2, shape (p,)."""
         return self.offset + self.design @ self.solution.parameters
 
     @property
     def ell(self) -> NDArray[np.float64]:
-        """Return the multipoles from the first to the last of the data."""
+        """Return all multipoles between the first and the last of the data."""
         return np.arange(min(row.ell_min for row in self.measured.rows), self.measured.lmax + 1.0)
 
     def factor(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -122,29 +121,29 @@ def fit(
     Parameters
     ----------
     data
-        What :func:`measurement` made of a store or table; or the path of one, of which the quadrupole is fitted.
+        Result of :func:`measurement`; or the path of a store or table, of which the quadrupole is fitted.
     source
         Configuration of the spectrum, the beams and the scan whose b_l2 are rescaled: often the beam of the data under
         parallel transport.
     name, knots
         Model of f_l: "constant", "linear", "spline" or "orientation"; see :func:`mcsim.beamfit.models.model`.
     order
-        "leading": to leading order in the beam's non-circular part. "exact": to all orders. "auto": to all orders
-        where they matter, that is where they exceed :data:`NEGLIGIBLE` sigma of the data.
+        "leading": leading order in the beam's non-circular part. "exact": all orders. "auto": all orders if the higher
+        ones exceed :data:`NEGLIGIBLE` sigma of the data.
     nthreads
-        Threads.
+        Number of threads.
 
     Raises
     ------
     InputError
-        For data that do not fit the configuration or the model, and circular beams.
+        For data that do not match the configuration or the model, or circular beams.
 
     Notes
     -----
-    f_l = sum_k theta_k g_k(l) rescales b_l2 both at l1 and at l2; other orders of the beam stay as they are. To leading
-    order the data are linear in theta, to all orders they are a polynomial of second degree, known from (K + 1)(K +
-    2)/2 predictions. Its least squares are found by scipy's Levenberg-Marquardt from the leading-order fit; errors and
-    tests are those of the tangent there, exact as far as the curvature within the errors of theta is negligible
+    f_l = sum_k theta_k g_k(l) rescales b_l2 both at l1 and at l2; other orders of the beam are unchanged. To leading
+    order the data are linear in theta; to all orders they are a polynomial of second degree, known from (K + 1)(K +
+    2)/2 predictions. scipy's Levenberg-Marquardt minimises chi^2 from the leading-order fit. Errors and tests are
+    those of the tangent there, exact if the curvature within the errors of theta is negligible
     (tests/unit/test_fit_exact.py compares with a minimisation over independent predictions). On simulated ensembles
     the pulls have unit width (tests/statistical/test_fit.py), and the data of a hit-averaged WMAP-like scan fitted with
     parallel transport give 0.6575 (tests/integration/test_prediction.py).
@@ -189,21 +188,21 @@ def fit_models(
     order: Order = "auto",
     nthreads: int = 1,
 ) -> list[Fit]:
-    """Fit several models to the same data and to the same order: to all orders where one of them asks for it.
+    """Fit several models to the same data and to the same order: to all orders if one model needs it.
 
     Parameters
     ----------
     measured
-        What :func:`measurement` made of a store or table.
+        Result of :func:`measurement`.
     source, knots, order, nthreads
         As for :func:`fit`.
     names
-        Of the models.
+        Names of the models.
 
     Raises
     ------
     InputError
-        As :func:`fit`, and for no model or one that is named twice.
+        As :func:`fit`, and for no model or a repeated one.
     """
     if not names or len(set(names)) < len(names):
         raise InputError(f"the models {', '.join(names) or '(none)'} are not different ones; name each model once.")
@@ -221,7 +220,7 @@ def _solve(measured: Measurement, offset: NDArray[np.float64], design: NDArray[n
 
 
 def _minimise(measured: Measurement, expected: Polynomial, start: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the parameters of least chi^2."""
+    """Return the parameters that minimise chi^2."""
     white = whitening(measured.value, expected.linear, measured.covariance, measured.simulations)
     found = optimize.least_squares(
         lambda theta: white @ (measured.value - expected.at(theta)),
@@ -241,12 +240,12 @@ def _minimise(measured: Measurement, expected: Polynomial, start: NDArray[np.flo
 
 
 def fit_each(found: Fit) -> Fit:
-    """Return a fit with those of every single realization, about the tangent at the best fit of their mean.
+    """Return a fit with the fits of every realization, on the tangent at the best fit of their mean.
 
     Raises
     ------
     InputError
-        For data that are not those of an ensemble.
+        If the data are not from an ensemble.
     """
     if found.measured.realizations is None:
         raise InputError(f"{found.measured.origin} is no ensemble; fits of single realizations need a store.")
@@ -259,15 +258,14 @@ def measurement(
     selection: Selection = EVERYTHING,
     covariance: str | Path | None = None,
 ) -> Measurement:
-    """Read what is to be fitted.
+    """Read the data vector of a fit.
 
     Parameters
     ----------
     data
-        A store (a folder), whose mean is fitted with the covariance of its realizations over their number; or an ECSV
-        table.
+        A store (a folder): its mean, with the covariance of its realizations over their number; or an ECSV table.
     source
-        Configuration, for the frame.
+        Configuration, whose frame the data must have.
     selection
         Modes, multipoles, kind and pair.
     covariance
@@ -296,7 +294,7 @@ def _check_frame(path: Path, frame: str) -> None:
 
 
 def _unseen(design: NDArray[np.float64], measured: Measurement) -> bool:
-    """Return True if the data say nothing about the imaginary part: its template is under 1e-6 of the real one."""
+    """Return True if the data do not constrain the imaginary part: its template is under 1e-6 of the real one."""
     real, imaginary = np.linalg.norm(design / np.sqrt(np.diag(measured.covariance))[:, None], axis=0)
     return bool(imaginary < 1e-6 * real)
 

@@ -1,4 +1,4 @@
-"""Least squares for beam fits: the covariance is known, or estimated from simulations (:mod:`mcsim.stats.gaussian`)."""
+"""Least squares for beam fits, with a known covariance or one of simulations (:mod:`mcsim.stats.gaussian`)."""
 
 from dataclasses import dataclass
 
@@ -18,15 +18,15 @@ class Solution:
     Attributes
     ----------
     parameters, covariance
-        Shape (K,) and (K, K): estimates, and the covariance of their distribution about the truth.
+        Estimates and the covariance of their distribution about the truth, shape (K,) and (K, K).
     square, dof
-        r'C^-1 r of the residual r with the covariance C as given, and the number of data less K.
+        r'C^-1 r of the residual r with the given covariance C, and the number of data minus K.
     probability
-        Of a square as large as this or larger where the model holds.
+        P-value: probability of a square at least as large if the model is true.
     residual
-        Shape (p,).
+        Data minus best fit, shape (p,).
     simulations
-        Number of simulations that C was estimated from; ``None``: it is known.
+        Number of simulations that C was estimated from; ``None``: C is known.
     """
 
     parameters: NDArray[np.float64]
@@ -57,7 +57,7 @@ class Solution:
 
     @property
     def reduced_chi2(self) -> float:
-        """chi2/dof."""
+        """Chi^2 per degree of freedom."""
         return self.chi2 / self.dof
 
 
@@ -72,14 +72,14 @@ def solve(
     Parameters
     ----------
     data
-        Shape (p,).
+        Data vector, shape (p,).
     design
-        Shape (p, K), of rank K < p.
+        Templates as columns, shape (p, K), of rank K < p.
     covariance
-        Of the data, shape (p, p); with ``simulations`` proportional to a sample covariance.
+        Covariance of the data, shape (p, p); with ``simulations`` proportional to a sample covariance.
     simulations
-        Number N of independent draws behind it, their mean subtracted, and the data independent of it; ``None``: it is
-        known.
+        Number N of independent draws behind the sample covariance, which subtracts their mean and is independent of
+        the data; ``None``: the covariance is known.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def solve(
         square = float(np.sum((white @ data - basis @ along) ** 2))
         probability = float(stats.chi2.sf(square, q))
     else:
-        # The fit allows for the error of the simulations' mean; here the mean is a model's, and has none.
+        # The fit allows for the error of the simulations' mean; here the mean is a model's, without error.
         null = gaussian.SimulatedGaussian(np.zeros(len(data)), np.sqrt(1.0 + 1.0 / simulations) * white, simulations)
         found = null.fit(data, design)
         parameters, spread, square = found.amplitudes, found.covariance, found.chi2
@@ -118,7 +118,7 @@ def solve(
 def whitening(
     data: NDArray[np.float64], design: NDArray[np.float64], covariance: NDArray[np.float64], simulations: int | None
 ) -> NDArray[np.float64]:
-    """Return the inverse Cholesky factor of a covariance, shape (p, p), and check what :func:`solve` is given.
+    """Check the arguments of :func:`solve`; return the inverse Cholesky factor of the covariance, shape (p, p).
 
     Raises
     ------
@@ -167,11 +167,11 @@ class Comparison:
     Attributes
     ----------
     drop
-        Fall of chi^2; for a covariance of few simulations ``added`` times the F statistic, which falls alike.
+        Decrease of chi^2; for an estimated covariance ``added`` times the F statistic.
     added
         Number of parameters that the larger model adds.
     probability
-        Of such a fall by chance.
+        P-value: probability of at least this decrease if the smaller model is true.
     """
 
     drop: float
@@ -180,17 +180,17 @@ class Comparison:
 
 
 def compare(small: Solution, large: Solution) -> Comparison:
-    """Test whether a model is worth the parameters that it adds to one that it contains, fitted to the same data.
+    """Test a model against a smaller one that it contains, fitted to the same data.
 
     Raises
     ------
     InputError
-        If the models are not of different size, in this order, or of data with different covariances.
+        If ``large`` does not have more parameters than ``small``, or their covariances differ.
 
     Notes
     -----
-    With a known covariance the fall of chi^2 has a chi^2 distribution with as many degrees of freedom as there are
-    added parameters; else the test is :func:`mcsim.stats.gaussian.nested_pvalue` (Rao, Biometrika 46, 49, 1959).
+    With a known covariance the decrease of chi^2 has a chi^2 distribution with as many degrees of freedom as there are
+    added parameters; otherwise the test is :func:`mcsim.stats.gaussian.nested_pvalue` (Rao, Biometrika 46, 49, 1959).
     """
     added = small.dof - large.dof
     if added <= 0:
@@ -211,9 +211,9 @@ def solve_each(realizations: NDArray[np.float64], design: NDArray[np.float64]) -
     Parameters
     ----------
     realizations
-        Shape (N, p).
+        Data vectors, shape (N, p).
     design
-        Shape (p, K).
+        Templates as columns, shape (p, K).
     """
     count = len(realizations)
     deviation = realizations - realizations.mean(axis=0)

@@ -26,7 +26,7 @@ class Model:
     parameters
         Names of the theta_k.
     functions
-        From ell, shape (n,), to g_k(ell), shape (K, n); complex for ``orientation`` alone.
+        Function of ell, shape (n,), that returns g_k(ell), shape (K, n); complex for ``orientation`` alone.
     """
 
     name: str
@@ -40,13 +40,13 @@ def model(name: str, ell_range: tuple[int, int], knots: int = 4) -> Model:
     Parameters
     ----------
     name
-        "constant": alpha. "linear": alpha + beta l. "spline": a natural cubic spline, straight outside, whose
+        "constant": alpha. "linear": alpha + beta l. "spline": a natural cubic spline, linear outside, whose
         parameters are its values at ``knots`` equidistant multipoles. "orientation": a complex constant, as
         :func:`mcsim.beamfit.orientation.orientation` reads it.
     ell_range
         First and last l of the spline.
     knots
-        Of the spline, >= 3.
+        Number of knots of the spline, >= 3.
 
     Raises
     ------

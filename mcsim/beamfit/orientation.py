@@ -1,4 +1,4 @@
-"""Relative orientation of two sides whose mean makes one map, from a fit with the model ``orientation``."""
+"""Relative orientation of two sides whose mean is one map, from a fit with the model ``orientation``."""
 
 from dataclasses import dataclass
 
@@ -10,16 +10,16 @@ from mcsim.errors import InputError
 
 @dataclass(frozen=True)
 class Orientation:
-    """Two copies of the beam of the configuration, turned about their axes, that together give the fitted map.
+    """Rotation angles of two copies of the configured beam whose mean gives the fitted map.
 
     Attributes
     ----------
     symmetric_deg, symmetric_error_deg
-        Angle between the sides when they are turned by half of it either way: arccos of the modulus of c.
+        Angle between the sides if each is rotated by half of it, in opposite senses: arccos of the modulus of c.
     one_sided_deg, one_sided_error_deg
-        Angle when one side stands as configured and the other is turned: arccos sqrt(Re c).
+        Angle if only one side is rotated: arccos sqrt(Re c).
     common_deg, common_error_deg
-        Rotation of both sides together, -arg(c)/2, modulo 180 degrees; None where the data do not see it.
+        Rotation of both sides together, -arg(c)/2, modulo 180 degrees; None if the data do not constrain it.
     """
 
     symmetric_deg: float
@@ -40,12 +40,12 @@ def orientation(fit: Fit) -> Orientation:
 
     Notes
     -----
-    A beam turned by an angle a, from x towards y, has b_ls e^{-i s a}. Two sides at phi - delta/2 and phi + delta/2
+    A beam rotated by an angle a, from x towards y, has b_ls e^{-i s a}. Two sides at phi - delta/2 and phi + delta/2
     have the mean b_l2 e^{-2 i phi} (e^{i delta} + e^{-i delta})/2 = c b_l2 with c = e^{-2 i phi} cos(delta): |c| gives
-    the angle between them, arg c the turn of both. One side at 0 and the other at delta is phi = delta/2: c = (1 +
+    the angle between them, arg c the rotation of both. One side at 0 and the other at delta is phi = delta/2: c = (1 +
     e^{-2 i delta})/2, Re c = cos^2(delta). Under a scan that treats both senses of rotation alike (w_2 real) Im c acts
-    on odd parity alone; from even parity the two cases cannot be told apart. A factor above 1 gives the angle 0, with
-    the error of the factor turned into an angle: arccos(1 - error). Angles are ambiguous in sign.
+    on odd parity alone; even parity cannot distinguish the two cases. A factor above 1 gives the angle 0, with the
+    error arccos(1 - error of the factor). Angles are ambiguous in sign.
     """
     if fit.model.name != "orientation":
         raise InputError(f"angles are read from a fit with the model orientation, not {fit.model.name}; fit that one.")
@@ -67,7 +67,7 @@ def orientation(fit: Fit) -> Orientation:
 
 
 def _arccos(cosine: float, error: float) -> tuple[float, float]:
-    """Angle and its error in degrees; at and above 1 the angle at which the cosine is one error below."""
+    """Return the angle and its error in degrees; for a cosine >= 1 the error is arccos(1 - error)."""
     if cosine >= 1.0:
         return 0.0, float(np.degrees(np.arccos(max(1.0 - error, -1.0))))
     return float(np.degrees(np.arccos(cosine))), float(np.degrees(error / np.sqrt(1.0 - cosine**2)))

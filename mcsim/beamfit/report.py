@@ -1,4 +1,4 @@
-"""Fits in words."""
+"""Text reports of fits."""
 
 from collections.abc import Sequence
 
@@ -7,7 +7,7 @@ from mcsim.beamfit.orientation import orientation
 
 
 def report(fits: Sequence[Fit]) -> str:
-    """Describe fits of several models to the same data in words."""
+    """Return a text that describes fits of several models to the same data."""
     measured = fits[0].measured
     modes = ", ".join(mode.name for mode in measured.modes)
     first = min(row.ell_min for row in measured.rows)
@@ -27,14 +27,14 @@ def report(fits: Sequence[Fit]) -> str:
 
 
 def _order(fits: Sequence[Fit]) -> str:
-    """Say to which order of the beam the data are predicted, and why."""
+    """Return a sentence on the order of the prediction in the beam, and its reason."""
     beyond = [one.beyond_leading for one in fits if one.beyond_leading is not None]
     text = "leading order in the beam" if fits[0].order == "leading" else "all orders in the beam"
     return f"{text} (those beyond the leading one: {max(beyond):.2g} sigma)" if beyond else text
 
 
 def _tests(simulations: int | None) -> str:
-    """Say what the p-values are."""
+    """Return a sentence on the definition of the p-values."""
     if simulations is None:
         return "the covariance is taken as known, p-values are chi^2 tests"
     return (

@@ -14,7 +14,7 @@ from mcsim.beamfit.data import EVERYTHING, SUMMARY, Measurement, Row, Scaling, S
 from mcsim.errors import InputError
 
 COLUMNS = ("L", "M", "d", "ell_min", "ell_max")
-"""The columns that say what is in a row."""
+"""Columns that identify the content of a row."""
 
 
 def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING) -> Measurement:
@@ -23,20 +23,20 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING) 
     Parameters
     ----------
     path
-        ECSV table. Columns L, M, d, ell_min, ell_max, value, error, and value_imag where parts are imaginary;
+        ECSV table. Columns L, M, d, ell_min, ell_max, value, error, and value_imag if parts are imaginary;
         ``value`` is the mean over ell_min <= l2 <= ell_max, d = l2 - l1, with its unit. The header's ``meta`` holds
         ``normalisation`` ("Bennett", "WMAP" or "Hajian-Souradeep"), ``scaling`` ("l(l+1)/2pi" or "none") and
         optionally ``frame``. ``mcsim info --export`` writes such tables, with a column ``pair`` and, for paired
         ensembles, ``value_difference`` and so on.
     frame
-        Frame of the model, which that of the table must equal.
+        Frame of the model, which the table must have.
     selection
         Modes, bins, kind and pair.
 
     Raises
     ------
     InputError
-        For a table that cannot be read, or leaves open what its numbers are.
+        For a table that cannot be read, or does not define its numbers.
     """
     table = read_ecsv(path)
     missing = [name for name in COLUMNS if name not in table.colnames]
@@ -71,7 +71,7 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING) 
             for number in np.flatnonzero(same).tolist():
                 rows.append(Row(mode, int(low[number]), int(high[number]), imaginary))
                 values.append(float(part[number]))
-                # The error of a mode with M > 0 is that of its modulus; its two parts share the variance.
+                # The error of a mode with M > 0 is that of its modulus; its two parts share the variance equally.
                 errors.append(float(error[number]) * (1.0 if mode.M == 0 else np.sqrt(0.5)))
     if not rows:
         raise InputError(
@@ -94,7 +94,7 @@ def _check(path: str | Path, rows: Sequence[Row], values: Sequence[float], error
 
 
 def _integers(path: str | Path, table: Table, name: str) -> NDArray[np.int64]:
-    """Return a column of integers; InputError where it holds anything else."""
+    """Return a column of integers; raise InputError for anything else."""
     try:
         values: NDArray[np.float64] = np.ma.filled(np.ma.asarray(table[name], dtype=float), np.nan)
     except (ValueError, TypeError):
@@ -105,10 +105,10 @@ def _integers(path: str | Path, table: Table, name: str) -> NDArray[np.int64]:
 
 
 def read_ecsv(path: str | Path) -> Table:
-    """Read an ECSV table that has rows; InputError where it is none."""
+    """Read an ECSV table with rows; raise InputError for anything else."""
     try:
         table = Table.read(path, format="ascii.ecsv")
-    except Exception as error:  # libraries raise whatever a broken file makes of them
+    except Exception as error:  # libraries raise errors of any type for a broken file
         raise InputError(f"{path} cannot be read as an ECSV table ({error}); give a store or such a table.") from None
     if len(table) == 0:
         raise InputError(f"{path} has no rows; give the measured bins.")
@@ -116,7 +116,7 @@ def read_ecsv(path: str | Path) -> Table:
 
 
 def _kind(path: str | Path, table: Table, kind: str | None) -> tuple[str, str]:
-    """Return the suffix of the columns, and what they are."""
+    """Return the suffix of the columns, and the kind of their spectra."""
     has_difference = "value_difference" in table.colnames
     chosen = ("difference" if has_difference else "plain") if kind is None else kind
     if chosen == "difference" and not has_difference:
@@ -125,7 +125,7 @@ def _kind(path: str | Path, table: Table, kind: str | None) -> tuple[str, str]:
 
 
 def scaling_of(path: str | Path, meta: Any) -> Scaling:
-    """Read what the header of a table says of its normalisation; InputError where that is not known."""
+    """Read the normalisation from the header of a table; raise InputError if it is unknown."""
     normalisation, scaling = (str(meta.get(name, "")).lower() for name in ("normalisation", "scaling"))
     if not normalisation:
         raise InputError(
@@ -140,7 +140,7 @@ def scaling_of(path: str | Path, meta: Any) -> Scaling:
     spectrum = bare.startswith("ll+1/2pi")
     if not spectrum and bare not in ("none", "raw", "1"):
         raise InputError(f'{path} has scaling {scaling!r}, which is not known; write "l(l+1)/2pi" or "none".')
-    # The header of an exported summary says by itself what its odd parity is.
+    # The header of an exported summary defines the scaling of odd parity.
     return SUMMARY if bennett and spectrum and "hajian" in normalisation else Scaling(bennett, spectrum, summary=False)
 
 
@@ -155,7 +155,7 @@ def _pair(path: str | Path, table: Table, pair: str | None) -> str | None:
 
 
 def in_uk2(path: str | Path, table: Table, name: str) -> NDArray[np.float64]:
-    """Return a column in uK^2, NaN where it is masked; InputError where it is missing or has no such unit."""
+    """Return a column in uK^2, NaN where masked; raise InputError if it is missing or has another unit."""
     if name not in table.colnames:
         raise InputError(f"{path} has no column {name}; add it.")
     column = table[name]

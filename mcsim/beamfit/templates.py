@@ -18,7 +18,7 @@ Order = Literal["auto", "leading", "exact"]
 ORDERS: tuple[str, ...] = get_args(Order)
 
 TRIAL_MOMENTS = 16
-"""Degree of the orientation moments that tells how large the orders beyond the leading one are: to about 5 %."""
+"""Degree of the orientation moments that gives the size of the higher orders to about 5 %."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Polynomial:
     Attributes
     ----------
     constant, linear, quadratic
-        uK^2, shapes (p,), (p, K) and, symmetric in its last two, (p, K, K).
+        Coefficients in uK^2, shapes (p,), (p, K) and, symmetric in the last two axes, (p, K, K).
     """
 
     constant: NDArray[np.float64]
@@ -50,22 +50,22 @@ class Polynomial:
 
 @dataclass(frozen=True)
 class Templates:
-    """What a survey's beams, with b_l2 times f_l, make of the spectrum in the bins of a measurement.
+    """Prediction of binned data for a survey's beams with b_l2 times f_l.
 
     Attributes
     ----------
     measured
-        The data.
+        Data vector, which defines the bins.
     survey
-        Beams, scans and spectrum.
+        Survey with beams, scans and spectrum.
     pair
-        Numbers of the maps.
+        Indices of the maps.
     beams
-        Of these maps, with moments of high degree.
+        Beams of these maps, with moments of high degree.
     nthreads
-        Threads.
+        Number of threads.
     known
-        Exact data that were asked for already, by f_l: models contain one another.
+        Exact data computed so far, by f_l: nested models share them.
     """
 
     measured: Measurement
@@ -104,8 +104,8 @@ class Templates:
 
         Notes
         -----
-        The exact A^{LM} is bilinear in the beams of the two maps, so that it is a polynomial of second degree in theta:
-        its values at 0, +-h_k and h_k + h_l, (K + 1)(K + 2)/2 of them, tell it everywhere.
+        The exact A^{LM} is bilinear in the beams of the two maps, hence a polynomial of second degree in theta. Its
+        (K + 1)(K + 2)/2 values at 0, +-h_k and h_k + h_l determine it.
         """
         functions = self.functions(model)
         K, step = len(functions), 1.0 / np.abs(functions).max(axis=1)
@@ -129,18 +129,18 @@ class Templates:
         return Polynomial(constant, linear / step, quadratic / np.outer(step, step))
 
     def beyond_leading(self, model: Model, theta: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return about how much all orders differ from the leading one at theta, shape (p,)."""
+        """Return the approximate difference between all orders and the leading one at theta, shape (p,)."""
         factor = theta @ self.functions(model)
         return self.data(factor, TRIAL_MOMENTS) - self.data(factor, None)
 
 
 def templates(survey: Survey, measured: Measurement, nthreads: int = 1) -> Templates:
-    """Make the templates of a survey for a measurement.
+    """Build the templates of a survey for a measurement.
 
     Raises
     ------
     InputError
-        For a survey without a spectrum, of another lmax or with other maps, or with circular beams.
+        For a survey without a spectrum, with another lmax or other maps, or with circular beams.
     """
     expectation.spectrum(survey)
     if measured.lmax > survey.lmax:
@@ -173,7 +173,7 @@ def _rescaled(beam: ScannedBeam, factor: NDArray, L_moments: int | None) -> Scan
 
 
 def _maps_of(survey: Survey, pair: str | None) -> tuple[int, int]:
-    """Return the numbers of the maps of a pair; the only map stands for any name."""
+    """Return the indices of the maps of a pair; a single map matches any name."""
     names = survey.map_names
     if len(names) == 1:
         return 0, 0

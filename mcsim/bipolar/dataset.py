@@ -1,4 +1,4 @@
-"""BipoSH and power spectra of maps at hand, as a labelled dataset."""
+"""BipoSH and power spectra of given maps as a labelled dataset."""
 
 import numpy as np
 import xarray as xr
@@ -20,8 +20,8 @@ def biposh(alm: ArrayLike, alm2: ArrayLike | None = None, L_max: int = 2) -> xr.
     alm
         Coefficients in healpy's m-major order, uK, shape ((lmax + 1)(lmax + 2)/2,).
     alm2
-        Those of a second map, up to the same lmax: ``alm`` then carries l1 and ``alm2`` carries l2. ``None``: the same
-        map twice.
+        Coefficients of a second map up to the same lmax: ``alm`` then carries l1 and ``alm2`` carries l2. ``None``: the
+        same map twice.
     L_max
         Largest bipolar degree L, 0 to lmax.
 
@@ -30,12 +30,12 @@ def biposh(alm: ArrayLike, alm2: ArrayLike | None = None, L_max: int = 2) -> xr.
     xarray.Dataset
         ``biposh`` (mode, ell), complex, uK^2, at ell = l2, NaN where a coefficient does not exist; ``cl`` (ell), uK^2.
         Coordinates ``mode`` ("L2M0d0"), ``L``, ``M``, ``d`` = l2 - l1 and ``parity``, as in the store of an ensemble:
-        M >= 0, and 0 <= d <= L for one map, -L <= d <= L for a pair. Attributes say the conventions.
+        M >= 0, and 0 <= d <= L for one map, -L <= d <= L for a pair. Attributes state the conventions.
 
     Raises
     ------
     InputError
-        If the coefficients are not those of whole maps of one lmax, or not finite, or L_max is out of range.
+        If the coefficients are incomplete, not finite or of different lmax, or L_max is out of range.
 
     Notes
     -----

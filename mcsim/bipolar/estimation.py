@@ -21,7 +21,7 @@ from mcsim.sphere.clebsch import Band, band
 
 @dataclass(frozen=True)
 class Estimator:
-    """What the estimator needs besides the a_lm; made once per run by :func:`estimator`."""
+    """Tables that the estimator needs besides the a_lm; :func:`estimator` makes them once per run."""
 
     lmax: int
     modes: tuple[Mode, ...]
@@ -30,7 +30,7 @@ class Estimator:
 
 @lru_cache(maxsize=4)
 def estimator(L_max: int, lmax: int, both_orders: bool = False) -> Estimator:
-    """Clebsch-Gordan tables for all modes up to L_max at l1, l2 <= lmax.
+    """Return the Clebsch-Gordan tables for all modes up to L_max at l1, l2 <= lmax.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def estimator(L_max: int, lmax: int, both_orders: bool = False) -> Estimator:
 def estimate(
     tables: Estimator, alm_x: NDArray[np.complex128], alm_y: NDArray[np.complex128] | None = None
 ) -> NDArray[np.complex128]:
-    """BipoSH coefficients of one map, or of an ordered pair of maps.
+    """Return the BipoSH coefficients of one map, or of an ordered pair of maps.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def estimate(
                 continue
             real, imag = total[mode.L - b.L_min]
             if mode.M == 0:
-                # The sum holds m > 0 twice; of m and -m together only this part survives.
+                # The sum counts m > 0 twice; of m and -m together only this part remains.
                 real, imag = (real, 0.0 * imag) if mode.parity == "even" else (0.0 * real, imag)
             exists = (l1 >= 0) & (l1 <= tables.lmax) & (l1 + l2 >= mode.L)
             result[row, exists] = (real + 1j * imag)[exists]
@@ -103,7 +103,13 @@ def estimate(
 
 
 def power_spectrum(alm_x: NDArray[np.complex128], alm_y: NDArray[np.complex128], lmax: int) -> NDArray[np.float64]:
-    """C_l = sum_m a_lm conj(b_lm) / (2 l + 1) of two real maps, shape (lmax + 1,); InputError for other sizes."""
+    """Return C_l = sum_m a_lm conj(b_lm) / (2 l + 1) of two real maps, shape (lmax + 1,).
+
+    Raises
+    ------
+    InputError
+        If the coefficients are not complex or not of ``lmax``.
+    """
     check_alm(alm_x, lmax, "alm_x")
     check_alm(alm_y, lmax, "alm_y")
     product = alm_x.real * alm_y.real + alm_x.imag * alm_y.imag
@@ -159,7 +165,7 @@ def _accumulate(x, y, lmax, tables, total):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _products(first, second, signs, real, imag):  # type: ignore[no-untyped-def]
-    """(sign_x x + i sign_y y)(u + i sign_v v) of (x, y) and (u, v)."""
+    """Compute (sign_x x + i sign_y y)(u + i sign_v v) of (x, y) and (u, v)."""
     (x, y), (u, v) = first, second
     sign_x, sign_y, sign_v = signs
     for i in range(real.size):
@@ -170,7 +176,7 @@ def _products(first, second, signs, real, imag):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _bottom(norm, rising_a, rising_b, g, before):  # type: ignore[no-untyped-def]
-    """G at the smallest L, and zero below it."""
+    """Set G at the smallest L, and zero below it."""
     for i in range(g.size):
         g[i] = norm[i] * rising_a[i] * rising_b[i]
         before[i] = 0.0
@@ -185,7 +191,7 @@ def _add(g, real, imag, total_real, total_imag):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _step(constant, slope, previous, m1, g, before):  # type: ignore[no-untyped-def]
-    """From L to L + 1."""
+    """Step G from L to L + 1."""
     for i in range(g.size):
         after = (constant[i] + slope[i] * m1) * g[i] + previous[i] * before[i]
         before[i] = g[i]

@@ -1,4 +1,4 @@
-"""Modes (L, M, d) of BipoSH spectra stored at ell = l2 with d = l2 - l1: which exist, and their two normalisations."""
+"""Modes (L, M, d) of BipoSH spectra, stored at ell = l2 with d = l2 - l1, and their two normalisations."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -27,12 +27,12 @@ class Mode(NamedTuple):
 
     @property
     def parity(self) -> str:
-        """``even`` or ``odd``: that of l1 + l2 + L."""
+        """Parity of l1 + l2 + L, ``even`` or ``odd``."""
         return "odd" if (self.d + self.L) % 2 else "even"
 
     @property
     def in_auto(self) -> bool:
-        """True if one map alone has this mode: d >= 0, and not the identically vanishing d = 0 of odd parity."""
+        """Return True if one map alone has this mode: d >= 0, and not the identically vanishing d = 0 of odd parity."""
         return self.d > 0 or (self.d == 0 and self.parity == "even")
 
 
@@ -48,7 +48,7 @@ def parse_mode(name: str) -> Mode:
     Raises
     ------
     InputError
-        For another form, or a mode that cannot exist.
+        For another form of label, or a mode that cannot exist.
     """
     try:
         L, rest = name.removeprefix("L").split("M")
@@ -62,14 +62,14 @@ def parse_mode(name: str) -> Mode:
 
 
 def check_modes(modes: Iterable[Indices]) -> None:
-    """Raise InputError for a mode that no BipoSH has: L >= 0, |M| <= L and |d| <= L are needed."""
+    """Raise InputError for a mode that cannot exist: L >= 0, |M| <= L and |d| <= L are needed."""
     for L, M, d in modes:
         if L < 0 or abs(M) > L or abs(d) > L:
             raise InputError(f"mode L={L}, M={M}, d={d} does not exist; |M| and |d| must not exceed L.")
 
 
 def existing(L: int, d: int, lmax: int) -> NDArray[np.bool_]:
-    """Return where A^{LM}_{l2-d, l2} exists for l2 = 0..lmax: 0 <= l1 <= lmax and |l1 - l2| <= L <= l1 + l2."""
+    """Return True where A^{LM}_{l2-d, l2} exists, l2 = 0..lmax: 0 <= l1 <= lmax and |l1 - l2| <= L <= l1 + l2."""
     l2 = np.arange(lmax + 1)
     l1 = l2 - d
     return (l1 >= 0) & (l1 <= lmax) & (abs(d) <= L) & (l1 + l2 >= L)
@@ -83,7 +83,7 @@ def bennett_factor(mode: Indices, lmax: int) -> NDArray[np.float64]:
     Raises
     ------
     InputError
-        For odd parity, where C^{L0}_{l1 0 l2 0} vanishes, and a mode that no BipoSH has.
+        For odd parity, where C^{L0}_{l1 0 l2 0} vanishes, or a mode that cannot exist.
 
     Notes
     -----

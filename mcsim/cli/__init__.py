@@ -1,4 +1,4 @@
-"""The command line: thin calls of public functions.
+"""Command line: thin calls of public functions.
 
 Exit codes: 0 done, 1 failed realizations, 2 bad input, 130 interrupted.
 """
@@ -48,7 +48,7 @@ def _options(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Say the version and exit.")
     ] = False,
 ) -> None:
-    """Is the isotropy violation that I measure made by my instrument?"""
+    """Tell whether a measured isotropy violation is made by the instrument."""
 
 
 for _command in (ensembles.run, ensembles.merge, ensembles.info, ensembles.plot, ensembles.predict, ensembles.maps):
@@ -114,7 +114,7 @@ def beam(
     ] = None,
     output: Png = None,
 ) -> None:
-    """Say what a beam is like: solid angle, widths, B_l and b_lm; draw it."""
+    """Print a beam's solid angle, widths, B_l and b_lm; draw it."""
     from mcsim.plot.look import look_at_beams
 
     for number, look in enumerate(look_at_beams(source, lmax, m_max, pixel_deg)):
@@ -133,7 +133,7 @@ def scan(
     line_of_sight: Annotated[str | None, typer.Option(help="One of the model's lines of sight.")] = None,
     output: Png = None,
 ) -> None:
-    """Say what a scan does to a beam: hits, orientation moments, the three factors; draw it."""
+    """Print the hits, the orientation moments and the three factors of a scan; draw them."""
     from mcsim.plot.look import look_at_scan
 
     look = look_at_scan(model, nside, smax, frame, sample_period_s, line_of_sight)
@@ -194,7 +194,7 @@ def challenge_make(
     simulations: Simulations = None,
     workers: Workers = None,
 ) -> None:
-    """Draw effects, make maps, seal the keys."""
+    """Draw effects, make the maps of the cases, seal the keys."""
     from mcsim import config
     from mcsim.benchmark.folder import Settings
     from mcsim.benchmark.make import make
@@ -231,7 +231,7 @@ def challenge_draws(
     simulations: Simulations = None,
     workers: Workers = None,
 ) -> None:
-    """Score draws of the data vector, without maps."""
+    """Draw and score compressed data vectors, without maps."""
     from mcsim import config
     from mcsim.benchmark import report, score
     from mcsim.benchmark.folder import Settings

@@ -1,4 +1,4 @@
-"""What all commands share: arguments, output, interruption, pictures."""
+"""Shared parts of the commands: arguments, output, interruption, figures."""
 
 import signal
 from pathlib import Path
@@ -21,7 +21,7 @@ Png = Annotated[Path | None, typer.Option("-o", "--output", metavar="PNG", help=
 
 
 def interrupt_once() -> None:
-    """Ctrl-C, or the SIGTERM of a batch system, ends a run in order; a second one does not disturb that."""
+    """End a run in order at Ctrl-C or a batch system's SIGTERM; ignore a second one."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         for name in (signal.SIGINT, signal.SIGTERM):
@@ -33,6 +33,7 @@ def interrupt_once() -> None:
 
 
 def save(figure, path: Path) -> None:  # type: ignore[no-untyped-def]
+    """Save a figure and print its path; raise InputError if the file cannot be written."""
     try:
         figure.savefig(path)
     except (OSError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""Commands about ensembles: run them, join them, look at them, predict them."""
+"""Commands for ensembles: run, join, inspect, draw, predict."""
 
 import os
 import sys
@@ -32,11 +32,11 @@ def run(
 ) -> None:
     """Run an ensemble; continue it if it was interrupted; extend it if more realizations are asked for.
 
-    With --resume the store is read and checked first, and what is damaged is computed again. STORE.log beside the store
-    says what happened.
+    With --resume the store is checked first, and damaged realizations are computed again. STORE.log beside the store
+    records the events.
 
-    Exit codes: 0 done; 1 realizations failed, or the run could not go on: what is finished is stored, run again; 2 bad
-    input, nothing was computed; 130 interrupted by Ctrl-C or SIGTERM: run again to go on.
+    Exit codes: 0 done; 1 realizations failed or the run could not continue (finished ones are stored: run again); 2 bad
+    input, nothing was computed; 130 interrupted by Ctrl-C or SIGTERM (run again to continue).
     """
     if workers is not None and scheduler is not None:
         raise InputError("--workers and --scheduler exclude each other: workers of a running scheduler are its own.")
@@ -79,7 +79,7 @@ def info(
         bool, typer.Option("--verify", help="Read every file, name damaged realizations; exit code 1 if there are any.")
     ] = False,
 ) -> None:
-    """Say what a store holds; export its summary; verify it."""
+    """Describe a store; export its summary; verify it."""
     if verify:
         from mcsim.ensemble import repair
 
@@ -107,7 +107,7 @@ def plot(
     ] = None,
     exact: Annotated[bool, typer.Option("--exact", help="The prediction to all orders in the beam.")] = False,
 ) -> None:
-    """Draw the binned spectra of a store with their error bars, and a prediction over them."""
+    """Draw the binned spectra of a store with error bars, and optionally a prediction."""
     from mcsim.ensemble import prediction, tables
     from mcsim.ensemble import store as stores
     from mcsim.plot.spectra import ensemble_figure
@@ -155,7 +155,7 @@ def maps(
         bool, typer.Option("--sample-by-sample", help="By the time-ordered reference, where the pointing is known.")
     ] = False,
 ) -> None:
-    """Write the maps of a run as FITS files, such as mcsim diagnose reads.
+    """Write the maps of a run as FITS files, which mcsim diagnose can read.
 
     A folder for each realization holds CHANNEL.fits or CHANNEL_SPLIT.fits: HEALPix in RING order, uK.
     """

@@ -1,7 +1,7 @@
-"""Arrays and objects given in place of files: kept in the cache under the hash of their content, and named by path.
+"""Arrays and objects given in place of files: written to the cache under the hash of their content.
 
-A run names files, so that its text is all that workers, stores and resumption need. What is given in Python becomes
-such a file here, and nowhere else; the run's hash is over the contents of files, so equal arrays make equal runs.
+A run refers to files only, so that its text is all that workers, stores and resumption need. Here arrays and objects
+become such files. The run's hash is over the contents of files, so equal arrays make equal runs.
 """
 
 import hashlib
@@ -17,7 +17,7 @@ from mcsim.errors import InputError
 from mcsim.support import folders
 
 TEMPLATES = {"alm", "map", "mask", "path", "model"}
-"""Keys that name files in which {channel} and the like are filled."""
+"""Keys that name files and may contain placeholders such as {channel}."""
 
 FILES = TEMPLATES | {"spectrum", "pixel_window", "template"}
 """Keys that name files."""
@@ -25,26 +25,26 @@ FILES = TEMPLATES | {"spectrum", "pixel_window", "template"}
 
 @runtime_checkable
 class Tabled(Protocol):
-    """An object that a table of a run can stand for: a beam, the moments of a scan, a scan model."""
+    """Object that a table of a run can represent: a beam, the moments of a scan, a scan model."""
 
     def as_table(self, folder: Path) -> dict[str, str]:
-        """Write the object into an empty folder; return the kind of table, and under its key the name of the file."""
+        """Write the object into an empty folder; return its table: the kind, and the name of the file."""
 
 
 def in_files(value: Any, key: str = "") -> Any:
-    """Return a table of a run with the paths of files in place of the arrays and objects in it.
+    """Return a table of a run with its arrays and objects replaced by paths of files.
 
     Parameters
     ----------
     value
         Table, list or value. An array under a key that names a file is written; another becomes a list.
     key
-        Under which the value stands.
+        Key of the value.
 
     Raises
     ------
     InputError
-        For an array with a unit or a mask of its own, or of objects; where the cache cannot be written.
+        For an array of objects or with a unit or mask, or if the cache cannot be written.
     """
     if isinstance(value, Mapping):
         return {name: in_files(item, name) for name, item in value.items()}
@@ -59,7 +59,7 @@ def in_files(value: Any, key: str = "") -> Any:
 
 
 def table_of(given: Tabled) -> dict[str, str]:
-    """Keep an object; return the table that stands for it in a run, the path last."""
+    """Write an object to the cache; return the table that represents it in a run, the path last."""
     table: dict[str, str] = {}
     folder = _kept(lambda scratch: table.update(given.as_table(scratch)), type(given).__name__)
     key, name = table.popitem()
@@ -67,7 +67,7 @@ def table_of(given: Tabled) -> dict[str, str]:
 
 
 def file_of(given: Any, key: str) -> str:
-    """Keep an array; return the path of its .npy file, which bears the name of the key."""
+    """Write an array to the cache; return the path of its .npy file, named after the key."""
     if getattr(given, "unit", None) is not None or isinstance(given, np.ma.MaskedArray):
         own = "a mask of its own" if isinstance(given, np.ma.MaskedArray) else f"the unit {given.unit}"
         raise InputError(f"the array {key} has {own}; give plain numbers, temperatures in uK and spectra in uK^2.")
@@ -79,7 +79,7 @@ def file_of(given: Any, key: str) -> str:
 
 
 def _kept(write: Callable[[Path], Any], what: str) -> Path:
-    """Folder of the cache that holds what ``write`` writes, under the hash of that."""
+    """Return the cache folder with the output of ``write``, named by the hash of that output."""
     root = folders.default_cache_dir()
     try:
         root.mkdir(parents=True, exist_ok=True)
@@ -104,5 +104,5 @@ def _kept(write: Callable[[Path], Any], what: str) -> Path:
 
 
 def _literal(path: Path, key: str) -> str:
-    """Braces of a folder's name are no placeholders."""
+    """Escape the braces of a folder's name: they are not placeholders."""
     return str(path).replace("{", "{{").replace("}", "}}") if key in TEMPLATES else str(path)

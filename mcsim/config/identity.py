@@ -1,4 +1,4 @@
-"""What defines the result of a run: its hash, and how two runs differ."""
+"""Identity of a run: the hash of what defines its result, and the differences of two runs."""
 
 import hashlib
 import json
@@ -11,18 +11,17 @@ from mcsim.config.schema import RunConfig, analysis_lmax, pixel_window
 
 
 def science(config: RunConfig) -> dict[str, Any]:
-    """The part of a run that defines its numbers, with the contents of files in place of their names.
+    """Return the part of a run that defines its numbers, with file names replaced by hashes of contents.
 
-    Sky, map, channels, effects, biposh, seed and pairing; not name, compute, the number of realizations, keep_maps or
-    the bins of the summary. A
-    file is stood for by the SHA-256 of its contents, a template by those of its files. Skies given one file per
-    realization are stood for by the part of their template that has the placeholder and by the contents of
-    realization 0: the others are not read.
+    It has sky, map, channels, effects, biposh, seed and pairing; not name, compute, the number of realizations,
+    keep_maps or the bins of the summary. A file is represented by the SHA-256 of its contents, a template by those of
+    its files. Skies given one file per realization are represented by the part of their template with the placeholder
+    and by the contents of realization 0; the others are not read.
 
     Raises
     ------
     InputError
-        A file does not exist.
+        If a file does not exist.
     """
     plain = to_dict(config)
     for entry in paths.entries(plain):
@@ -45,9 +44,9 @@ def science(config: RunConfig) -> dict[str, Any]:
 
 
 def _leave_out_what_says_nothing(plain: dict[str, Any]) -> None:
-    """Drop keys that stand for what a run without them is, and the limit of iterations: no finished map depends on it.
+    """Drop keys at their defaults, and the limit of iterations, on which no finished map depends.
 
-    A run that does not use a key so keeps the hash that it had before there was such a key.
+    A run that does not use a key thus keeps its hash from before the key existed.
     """
     section = plain["map"]
     if section["grid"] == "healpix":
@@ -78,14 +77,14 @@ def _leave_out_what_says_nothing(plain: dict[str, Any]) -> None:
 
 
 def digest(config: RunConfig) -> str:
-    """SHA-256 of the canonical JSON of :func:`science`, in hexadecimal."""
+    """Return the SHA-256 of the canonical JSON of :func:`science`, in hexadecimal."""
     return hashlib.sha256(
         json.dumps(science(config), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
     ).hexdigest()
 
 
 def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    """Keys whose values differ between two results of :func:`science`, as ``key: old -> new``, sorted by key."""
+    """Return the differences between two results of :func:`science`, as ``key: old -> new``, sorted by key."""
     before, after = dict(_leaves(old, "")), dict(_leaves(new, ""))
     return [
         f"{key}: {before.get(key, 'absent')} -> {after.get(key, 'absent')}"

@@ -30,19 +30,19 @@ def load(source: str | Path | Mapping[str, Any], base: str | Path | None = None)
         :class:`mcsim.Beam` in place of a beam, and :class:`mcsim.Moments` or a :class:`mcsim.ScanModel` in place of a
         scan.
     base
-        Folder that the relative paths of a dict start from; default: the working folder. Those of a file start from
-        its folder.
+        Folder that the relative paths of a dict start from; default: the working folder. Relative paths in a file start
+        from its folder.
 
     Returns
     -------
     RunConfig
-        With absolute paths, in which {channel}, {split} and {realization} are still to be filled by
-        :func:`channel_path` and :func:`sky_path`. All files that it names exist.
+        Its paths are absolute; :func:`channel_path` and :func:`sky_path` fill {channel}, {split} and {realization}.
+        All its files exist.
 
     Raises
     ------
     InputError
-        Whatever is wrong: one sentence with file, key, value, limit and remedy.
+        For any error, with file, key, value, limit and remedy.
 
     Notes
     -----
@@ -81,12 +81,12 @@ def load(source: str | Path | Mapping[str, Any], base: str | Path | None = None)
 
 
 def check_skies(config: RunConfig, realizations: range) -> None:
-    """Refuse a run whose sky files of these realizations do not all exist."""
+    """Raise InputError unless the sky files of all these realizations exist."""
     paths.check_files(config, to_dict(config), config.name, realizations)
 
 
 def to_dict(config: RunConfig) -> dict[str, Any]:
-    """Plain dict as in TOML: ``load(to_dict(config)) == config``; None marks what is left out."""
+    """Return a plain dict as in TOML: ``load(to_dict(config)) == config``; omitted keys are None."""
     plain: dict[str, Any] = _ADAPTER.dump_python(config, mode="json", by_alias=True)
     for effect in plain["effect"]:
         effect |= effect.pop("parameters")
@@ -94,9 +94,9 @@ def to_dict(config: RunConfig) -> dict[str, Any]:
 
 
 def resolved(config: RunConfig) -> dict[str, Any]:
-    """Plain dict with the defaults written out, for the attributes of a store and for people; it loads as the same run.
+    """Return a plain dict with the defaults filled in, for stores and people; it loads as the same run.
 
-    ``map.pixel_window`` stays None where channels differ in it.
+    ``map.pixel_window`` stays None if channels differ in it.
     """
     plain = to_dict(config)
     plain["biposh"]["lmax"] = analysis_lmax(config)
@@ -106,24 +106,24 @@ def resolved(config: RunConfig) -> dict[str, Any]:
 
 
 def to_json(config: RunConfig) -> str:
-    """JSON from which :func:`from_json` rebuilds the same configuration."""
+    """Return JSON from which :func:`from_json` rebuilds the configuration."""
     return json.dumps(to_dict(config))
 
 
 def from_json(text: str) -> RunConfig:
-    """Rebuild a configuration, for instance on a worker; files are not looked for."""
+    """Rebuild a configuration, for instance on a worker, without checking that files exist."""
     return _validate(json.loads(text), "configuration")
 
 
 def json_schema() -> dict[str, Any]:
-    """JSON schema of the TOML file, for editors."""
+    """Return the JSON schema of the TOML file, for editors."""
     return _ADAPTER.json_schema(by_alias=True)
 
 
 def _is_file(path: Path) -> bool:
     try:
         return path.is_file()
-    except (OSError, ValueError):  # a name that no file system takes
+    except (OSError, ValueError):  # an invalid name
         return False
 
 
@@ -140,7 +140,7 @@ def _read(path: Path) -> tuple[dict[str, Any], Path]:
 
 
 def _plain(source: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Copy that consists of what JSON knows, with numpy's scalars and pathlib's paths converted."""
+    """Return a copy in JSON's types, with numpy's scalars and pathlib's paths converted."""
 
     def convert(value: Any) -> Any:
         if isinstance(value, np.generic):
@@ -164,8 +164,7 @@ def _plain(source: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 def _validate(plain: dict[str, Any], where: str) -> RunConfig:
     plain = _with_parameters(plain)
-    # JSON mode is strict about numbers and text but takes lists for tuples, which TOML has and Python's strict mode
-    # refuses.
+    # JSON mode is strict about numbers and text, yet takes TOML's lists for tuples; Python's strict mode refuses them.
     try:
         return _ADAPTER.validate_json(json.dumps(plain), by_alias=True, by_name=False)
     except ValidationError as error:
@@ -173,7 +172,7 @@ def _validate(plain: dict[str, Any], where: str) -> RunConfig:
 
 
 def _with_parameters(plain: dict[str, Any]) -> dict[str, Any]:
-    """The same run with the parameters of effects in tables of their own, as the schema has them."""
+    """Return the run with the parameters of effects in separate tables, as in the schema."""
     tables = plain.get("effect")
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
         return plain

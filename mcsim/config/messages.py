@@ -1,4 +1,4 @@
-"""From a failed check of the schema to one sentence: file, key, value, limit, remedy."""
+"""Messages of failed checks of the schema: one sentence with file, key, value, limit, remedy."""
 
 import difflib
 import json
@@ -11,7 +11,7 @@ from pydantic_core import ErrorDetails
 
 from mcsim.config import schema
 
-# Table -> what may stand in it. A beam or scan is told apart by its kind, which pydantic puts into the location.
+# Table -> its possible classes. The kind of a beam or scan, which pydantic puts into the location, selects one.
 _TABLES: dict[tuple[str, ...], type] = {
     (): schema.RunConfig,
     ("sky",): schema.Sky,
@@ -63,7 +63,7 @@ _BOUNDS = {
 
 
 def sentence(error: ValidationError, plain: Any, where: str) -> str:
-    """One sentence about the first thing that is wrong; unknown keys first, for they explain the missing ones."""
+    """Return one sentence on the first error; unknown keys come first because they explain missing ones."""
     details = error.errors(include_url=False)
     first = next((item for item in details if item["type"] == "unexpected_keyword_argument"), details[0])
     key, tables = _locate(first["loc"], plain)
@@ -106,13 +106,13 @@ def _text(item: ErrorDetails, key: str, tables: tuple[str, ...]) -> str:
 
 
 def label(table: Any, number: int) -> str:
-    """Name of a channel in a key, or its number where it has no readable one."""
+    """Return the name of a channel in a key, or its number if the name is unreadable."""
     name = table.get("name") if isinstance(table, dict) else None
     return name if isinstance(name, str) and name.isprintable() else str(number)
 
 
 def shown(value: Any) -> str:
-    """A value as TOML writes it, cut to a readable length."""
+    """Return a value as TOML writes it, cut to a readable length."""
     try:
         text = json.dumps(value, default=str)
     except (ValueError, TypeError):
@@ -121,7 +121,7 @@ def shown(value: Any) -> str:
 
 
 def _quoted(text: str) -> list[str]:
-    """Words within quotes: pydantic lists what it expects as 'a', 'b' or 'c'."""
+    """Return the quoted words: pydantic lists expected values as 'a', 'b' or 'c'."""
     return text.split("'")[1::2]
 
 
@@ -131,7 +131,7 @@ def _closest(word: str, known: Iterable[str]) -> str:
 
 
 def _locate(loc: tuple[int | str, ...], plain: Any) -> tuple[str, tuple[str, ...]]:
-    """Dotted key for people, with the names of channels, and the table that it stands in."""
+    """Return the dotted key, with the names of channels, and the table that contains it."""
     key, here = "", plain
     tag_passed = False
     for part in loc:

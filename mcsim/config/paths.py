@@ -1,4 +1,4 @@
-"""Files that a run names: environment variables, the folder they start from, and {channel}, {split}, {realization}."""
+"""Files of a run: environment variables, relative paths, and {channel}, {split}, {realization}."""
 
 import os
 import re
@@ -13,14 +13,14 @@ from mcsim.errors import InputError
 from mcsim.support import resources
 
 DESCRIPTION = "scan.toml"
-"""Name of the file beside moments that says how the survey was pointed."""
+"""Name of the file beside moments that describes the survey's pointing."""
 
 _VARIABLE = re.compile(r"\$\{([A-Za-z_][A-Za-z0-9_]*)\}")
 _NUMBER_FORMAT = re.compile(r"(0?[1-9]?d)?")
 
 
 class _Rule(NamedTuple):
-    """May the key hold a packaged name of this kind or one of these words, and which placeholders may it contain?"""
+    """Rules of a key: the kind of packaged name, the words and the placeholders that it may contain."""
 
     packaged: str | None = None
     words: tuple[str, ...] = ()
@@ -44,20 +44,20 @@ _RULES = {
 class Entry(NamedTuple):
     """One key that names a file (or a family of files) in the plain dict of a run."""
 
-    key: str  # as messages name it: channel[W1].beam.path
-    holder: dict[str, Any]  # the table that has it
-    field: str  # its name there
+    key: str  # as in messages: channel[W1].beam.path
+    holder: dict[str, Any]  # the table that contains it
+    field: str  # its name in that table
     rule: _Rule
-    channels: tuple[str, ...]  # channels that it speaks of
+    channels: tuple[str, ...]  # channels that it applies to
 
     @property
     def template(self) -> str:
-        """Its value."""
+        """Value of the key."""
         return str(self.holder[self.field])
 
 
 def channel_path(template: str, channel: str, split: str | None = None) -> Path:
-    """Fill {channel} and {split} in a path of a run; a packaged name comes back as it is."""
+    """Fill {channel} and {split} in a path of a run; a packaged name is returned unchanged."""
     return Path(template.format(channel=channel, split=split))
 
 
@@ -67,7 +67,7 @@ def sky_path(template: str, realization: int) -> Path:
 
 
 def entries(plain: dict[str, Any]) -> Iterator[Entry]:
-    """Every key of the plain dict (as in TOML) that names files; values of a wrong type are left to the schema."""
+    """Yield every key of the plain dict (as in TOML) that names files; the schema checks the types."""
     channels = plain.get("channel")
     tables = [channel for channel in channels if isinstance(channel, dict)] if isinstance(channels, list) else []
     every = tuple(str(table.get("name")) for table in tables)
@@ -90,7 +90,7 @@ def entries(plain: dict[str, Any]) -> Iterator[Entry]:
 
 
 def make_absolute(plain: dict[str, Any], base: Path, where: str) -> None:
-    """Expand ${VAR} and let relative paths start from ``base``, in place; packaged names stay names."""
+    """Expand ${VAR} and make relative paths start from ``base``, in place; keep packaged names."""
     for entry in entries(plain):
         if _is_packaged(entry):
             continue
@@ -109,7 +109,7 @@ def make_absolute(plain: dict[str, Any], base: Path, where: str) -> None:
 
 
 def find_descriptions(plain: dict[str, Any]) -> None:
-    """Let channels whose moments have a ``scan.toml`` beside them, and name no model, name that, in place."""
+    """Set, in place, the model of channels without one to the ``scan.toml`` beside their moments."""
     channels = plain.get("channel")
     for channel in channels if isinstance(channels, list) else []:
         scan = channel.get("scan") if isinstance(channel, dict) else None
@@ -124,12 +124,12 @@ def find_descriptions(plain: dict[str, Any]) -> None:
 
 
 def files(entry: Entry, splits: Sequence[str], where: str, realization: int = 0) -> dict[str, Path]:
-    """Files that an entry stands for: the values of its placeholders ("W1,half1"; "" without any) -> file.
+    """Return the files of an entry, by the values of its placeholders ("W1,half1"; "" without any).
 
     Raises
     ------
     InputError
-        Unknown or malformed placeholders; {split} without splits; a file that does not exist.
+        For an unknown or malformed placeholder, {split} without splits, or a missing file.
     """
     used = _placeholders(entry, where)
     if "split" in used and not splits:
@@ -147,7 +147,7 @@ def files(entry: Entry, splits: Sequence[str], where: str, realization: int = 0)
 
 
 def check_files(config: RunConfig, plain: dict[str, Any], where: str, realizations: range | None = None) -> None:
-    """Refuse a run that names a file that does not exist; skies are looked for at every one of the realizations."""
+    """Raise InputError unless all files of a run exist, with the skies of all these realizations."""
     for entry in entries(plain):
         files(entry, config.map.splits, where)
         if "realization" in _placeholders(entry, where):
@@ -156,14 +156,14 @@ def check_files(config: RunConfig, plain: dict[str, Any], where: str, realizatio
 
 
 def template_tail(template: str) -> str:
-    """Part of a template from the first folder or file name that has a placeholder."""
+    """Return the part of a template from the first folder or file name that has a placeholder."""
     parts = Path(template).parts
     first = next((number for number, part in enumerate(parts) if "{" in part.replace("{{", "")), len(parts))
     return "/".join(parts[first:])
 
 
 def _literal(text: str, rule: _Rule) -> str:
-    """Braces of a folder's name are no placeholders."""
+    """Escape the braces of a folder's name: they are not placeholders."""
     return text.replace("{", "{{").replace("}", "}}") if rule.placeholders else text
 
 

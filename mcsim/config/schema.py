@@ -1,7 +1,7 @@
 """Schema 1 of a run: frozen dataclasses that check themselves, one definition for TOML and for Python.
 
-The unit of every number stands in its key. A check that fails raises ValueError whose text follows ``key = value``;
-:mod:`mcsim.config.messages` makes the sentence of it.
+Every key states the unit of its number. A failed check raises ValueError whose text follows ``key = value``;
+:mod:`mcsim.config.messages` completes the sentence.
 """
 
 from typing import Annotated, Any, Literal, Self
@@ -37,9 +37,9 @@ _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, validate_
 class Sky:
     """Isotropic Gaussian skies from ``spectrum``, or skies given as a_lm or map files (a template: {realization}).
 
-    ``dipole_uk`` (towards galactic ``dipole_lon_deg``, ``dipole_lat_deg``) is seen by the survey and taken off with
-    the fiducial beam and gain, so that it shows only through effects; left out, it is what the description of the scan
-    says, or none.
+    ``dipole_uk`` (towards galactic ``dipole_lon_deg``, ``dipole_lat_deg``) is observed by the survey and subtracted
+    with the fiducial beam and gain, so that only effects leave a trace of it. Default: that of the scan's description,
+    or none.
     """
 
     lmax: Degree
@@ -63,12 +63,13 @@ class Sky:
 class Map:
     """Pixels, frame, mask, splits and pixel window.
 
-    ``grid``: "healpix", or "gl", Gauss quadrature on rings, several times faster and exact, for surveys whose
-    orientation moments depend on colatitude alone: parallel transport, and the exact long-time limit of a scan model
-    (``hit_averaged`` then stands for it) in the ecliptic frame. It has no pixels, so no ``nside``, mask, splits, noise.
-    ``pixel_window``: "computed", "none" or a FITS file; left out, it is "computed" for scans whose samples spread over
-    the pixels and "none" for parallel transport, whose samples stand at the centres.
-    ``mask_frame``: frame of the mask, left out what its file says, or that of the maps; ``mask_apodisation_deg``: width
+    ``grid``: "healpix", or "gl": Gauss quadrature on rings, several times faster and exact, for surveys whose
+    orientation moments depend on colatitude alone. These are parallel transport, and the exact long-time limit of a
+    scan model (``hit_averaged`` then means it) in the ecliptic frame. It has no pixels, so no ``nside``, mask, splits
+    or noise.
+    ``pixel_window``: "computed", "none" or a FITS file; default: "computed" for scans whose samples spread over the
+    pixels, "none" for parallel transport, whose samples are at the centres.
+    ``mask_frame``: frame of the mask; default: that of its file, or that of the maps. ``mask_apodisation_deg``: width
     of its soft edge.
     """
 
@@ -83,7 +84,7 @@ class Map:
 
     @property
     def resolution(self) -> int:
-        """nside, 0 on a grid without pixels."""
+        """Value of nside, 0 on a grid without pixels."""
         return self.nside or 0
 
     @model_validator(mode="after")
@@ -138,8 +139,8 @@ class BeamEllipticalGaussian:
 class BeamMap:
     """Two-dimensional beam map in FITS.
 
-    ``pixel_deg`` left out is read from the file, ``centre_pixel`` (column, row) left out is the intensity centroid;
-    ``plane`` picks one image of a cube; ``angle_deg`` turns the beam about its axis, from x towards y.
+    ``pixel_deg``: by default from the file. ``centre_pixel`` (column, row): by default the intensity centroid.
+    ``plane``: one image of a cube. ``angle_deg``: rotation of the beam about its axis, from x towards y.
     """
 
     kind: Literal["map"] = "map"
@@ -155,7 +156,7 @@ class BeamMap:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class BeamBlm:
-    """File of b_lm; ``angle_deg`` turns the beam about its axis, from x towards y."""
+    """File of b_lm; ``angle_deg`` rotates the beam about its axis, from x towards y."""
 
     kind: Literal["blm"] = "blm"
     path: PathText
@@ -165,7 +166,7 @@ class BeamBlm:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class ScanParallelTransport:
-    """One sample at every pixel centre, at the angle ``psi0_deg`` from e_theta."""
+    """Parallel transport: one sample at every pixel centre, at the angle ``psi0_deg`` from e_theta."""
 
     kind: Literal["parallel_transport"] = "parallel_transport"
     psi0_deg: float = 0.0
@@ -185,8 +186,8 @@ class ScanHitAveraged:
 class ScanMoments:
     """Orientation moments from a FITS file.
 
-    ``model``: how the survey was pointed, for effects that depend on time: a scan model, or a survey's description;
-    left out, it is ``scan.toml`` beside the file, if there is one. ``line_of_sight``: left out, the channel's name.
+    ``model``: a scan model or a survey's description, for effects that depend on time; default: ``scan.toml`` beside
+    the file, if it exists. ``line_of_sight``: by default the channel's name.
     """
 
     kind: Literal["moments"] = "moments"
@@ -197,7 +198,7 @@ class ScanMoments:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class ScanPointing:
-    """Orientation moments of a file of pointings: theta, phi, psi[, time]."""
+    """Orientation moments from a file of pointings: theta, phi, psi[, time]."""
 
     kind: Literal["pointing"] = "pointing"
     path: PathText
@@ -207,7 +208,7 @@ class ScanPointing:
 class ScanDifferencing:
     """A differencing pair of a scan model; maps are made from (1+x) T_A - (1-x) T_B, x the transmission imbalance.
 
-    ``tolerance`` is the relative residual that the map-making must reach within ``max_iterations``.
+    ``tolerance``: the relative residual that the map-making must reach within ``max_iterations``.
     """
 
     kind: Literal["differencing"] = "differencing"
@@ -220,7 +221,7 @@ class ScanDifferencing:
 
 
 class _OrObject:
-    """Lets an object stand for a table in Python; JSON has none, and its errors stay those of the table."""
+    """Accept an object in place of a table in Python; JSON accepts the table only."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
         table = handler(source)
@@ -260,7 +261,7 @@ class Noise:
 class Channel:
     """One detector or band: a beam under a scan, with noise.
 
-    ``beam_b``: beam of side B of a differencing scan; left out, it is ``beam`` mirrored.
+    ``beam_b``: beam of side B of a differencing scan; default: ``beam`` mirrored.
     """
 
     name: Label
@@ -282,7 +283,7 @@ class Channel:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Biposh:
-    """What is estimated; ``lmax`` left out is the sky's, ``iterations`` are Jacobi iterations of the analysis."""
+    """Settings of the estimator; ``lmax``: by default the sky's; ``iterations``: Jacobi iterations of the analysis."""
 
     L_max: Annotated[int, Field(ge=0)] = 2
     lmax: Degree | None = None
@@ -294,7 +295,7 @@ class Biposh:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Ensemble:
-    """Realizations 0 .. realizations - 1 of the seed; ``paired`` adds the circular-beam control of every one."""
+    """Realizations 0 .. realizations - 1 of the seed; ``paired`` adds the circular-beam control of each."""
 
     realizations: Annotated[int, Field(ge=1, le=10_000_000)] = 100
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0
@@ -304,7 +305,7 @@ class Ensemble:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Compute:
-    """How it is computed: no result depends on it. ``chunk``: realizations of a task, by default chosen by mcsim."""
+    """Settings of the computation; no result depends on them. ``chunk``: realizations per task (default: chosen)."""
 
     workers: Annotated[int, Field(ge=1, le=100_000)] = 2
     chunk: Annotated[int, Field(ge=1, le=2**20), AfterValidator(power_of_two)] | None = None
@@ -312,7 +313,7 @@ class Compute:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Effect:
-    """A named change of the simulation; in TOML ``parameters`` are further keys of the table ``[[effect]]``."""
+    """Named change of the simulation; in TOML its ``parameters`` are keys of the table ``[[effect]]``."""
 
     name: PathText
     channel: Label | None = None
@@ -321,14 +322,14 @@ class Effect:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class RunConfig:
-    """A whole run, as :func:`mcsim.load_config` reads it; frozen, ``dataclasses.replace`` makes another one.
+    """Configuration of a run, from :func:`mcsim.load_config`; frozen: ``dataclasses.replace`` makes another one.
 
     Parameters
     ----------
     schema_version
-        1; in TOML ``schema``.
+        Always 1; in TOML ``schema``.
     name
-        Of the run, and of its store.
+        Name of the run and of its store.
     sky, map
         The skies, and the pixels and frame of the maps.
     channels
@@ -336,7 +337,7 @@ class RunConfig:
     effects
         Changes of the simulation, such as :func:`mcsim.effects` lists; in TOML the tables ``[[effect]]``.
     biposh, ensemble, compute
-        What is estimated, how many realizations of which seed, and how they are computed.
+        Settings of the estimator, of the realizations and seed, and of the computation.
 
     Examples
     --------
@@ -398,7 +399,7 @@ class RunConfig:
 
 
 def _check_rings(run: RunConfig) -> None:
-    """Refuse what needs pixels, or moments that depend on more than colatitude."""
+    """Refuse settings that need pixels, or moments that depend on more than colatitude."""
     remedy = 'or set map.grid = "healpix"'
     for channel in run.channels:
         kind = channel.scan.kind
@@ -427,12 +428,12 @@ def _check_rings(run: RunConfig) -> None:
 
 
 def analysis_lmax(config: RunConfig) -> int:
-    """Highest degree that the maps are analysed to."""
+    """Return the highest degree of the analysis of the maps."""
     return config.sky.lmax if config.biposh.lmax is None else config.biposh.lmax
 
 
 def pixel_window(config: RunConfig, channel: Channel) -> str:
-    """Pixel window of a channel: "computed", "none" or the path of a FITS file."""
+    """Return the pixel window of a channel: "computed", "none" or the path of a FITS file."""
     if config.map.grid == "gl":
         return "none"
     if config.map.pixel_window is not None:
@@ -441,7 +442,7 @@ def pixel_window(config: RunConfig, channel: Channel) -> str:
 
 
 def map_names(config: RunConfig) -> tuple[str, ...]:
-    """Names of the maps of one realization: "channel", or "channel:split" for each of the splits."""
+    """Return the names of the maps of one realization: "channel", or "channel:split" for each split."""
     splits: tuple[Any, ...] = config.map.splits or (None,)
     return tuple(
         channel.name if split is None else f"{channel.name}:{split}" for channel in config.channels for split in splits

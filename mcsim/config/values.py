@@ -1,7 +1,7 @@
-"""Types of single values in a run, and what their checks say.
+"""Types of single values in a run, and their checks.
 
-A check that fails raises ValueError whose text follows ``key = value``; :mod:`mcsim.config.messages` makes the
-sentence of it.
+A failed check raises ValueError whose text follows ``key = value``; :mod:`mcsim.config.messages` completes the
+sentence.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ def power_of_two(value: int) -> int:
 
 
 def _label(value: str) -> str:
-    """Names of channels and splits become parts of file names and of the labels ``channel:split,channel:split``."""
+    """Return a name of a channel or split if it can be part of a file name and of a pair's label."""
     if not value.strip() or value != value.strip() or any(c in "/\\:,{}" or not c.isprintable() for c in value):
         raise ValueError(
             "is not a usable name: it needs printable characters, no blanks at its ends and none of / \\ : , { }; "
@@ -34,7 +34,7 @@ def _label(value: str) -> str:
 
 
 def different(values: Sequence[str]) -> None:
-    """Refuse names that are given twice."""
+    """Raise ValueError if a name is given twice."""
     twice = [value for value in values if values.count(value) > 1]
     if twice:
         raise ValueError(f"names {twice[0]!r} twice; give every one its own name")
@@ -53,7 +53,7 @@ def _not_empty(value: str) -> str:
 
 
 def _in_file(value: Any, info: ValidationInfo) -> Any:
-    """Put the path of a file in place of an array or an object."""
+    """Replace an array or an object by the path of a file."""
     return arrays.in_files(value, info.field_name or "")
 
 

@@ -1,4 +1,4 @@
-"""How fast this machine runs mcsim, in ratios to the bare transforms that a realization needs."""
+"""Speed of mcsim on this machine, relative to the transforms that a realization needs."""
 
 import os
 import statistics
@@ -19,16 +19,16 @@ from mcsim.sphere.sky import gaussian_alm
 
 
 def bench(nside: int = 512, lmax: int = 1024, repeats: int = 5) -> Iterator[str]:
-    """Measure, line by line: transforms, a realization over what it needs, workers and their memory, moments.
+    """Measure transforms, a realization relative to them, workers and their memory, moments; yield lines of text.
 
     Parameters
     ----------
     nside, lmax
         Size of the maps and of the analysis.
     repeats
-        Pairs of timings, of the bare transforms and of the realization in turn; medians of their ratios are given.
+        Number of paired timings, of the transforms and of the realization; medians of the ratios are given.
     """
-    _run(nside, lmax, 0.0, 1)  # refuses sizes that do not fit
+    _run(nside, lmax, 0.0, 1)  # refuses invalid sizes
     yield f"nside {nside}, lmax {lmax}, m_max 2, L_max 2, paired; one thread; medians of {repeats} interleaved pairs"
     yield from _realization(nside, lmax, repeats)
     yield from _workers(nside, lmax, 16 * repeats)

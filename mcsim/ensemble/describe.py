@@ -1,4 +1,4 @@
-"""What a store holds, in words, and its summary in other formats."""
+"""Text about a store, and export of its summary to other formats."""
 
 import json
 from pathlib import Path
@@ -13,7 +13,7 @@ from mcsim.errors import InputError
 
 
 def describe(path: str | Path) -> str:
-    """Text about a store: configuration, progress, size, and the most significant spectra."""
+    """Return a text about a store: configuration, progress, size, and the most significant spectra."""
     target = Path(path)
     attributes = store.attributes(target)
     done = store.done(target)
@@ -50,7 +50,7 @@ def export(path: str | Path, output: str | Path) -> None:
     Raises
     ------
     InputError
-        For another ending, or an output that cannot be written.
+        For another file extension, or an output that cannot be written.
     """
     target = Path(output)
     with opening.open_summary(path) as stored:
@@ -69,7 +69,7 @@ def export(path: str | Path, output: str | Path) -> None:
 
 
 def _real(summary: xr.Dataset) -> xr.Dataset:
-    """Complex variables as pairs ``_re``, ``_im``, which NetCDF can hold."""
+    """Split complex variables into pairs ``_re``, ``_im``, which NetCDF can hold."""
     parts = {}
     for name, variable in summary.data_vars.items():
         if np.iscomplexobj(variable):
@@ -77,7 +77,7 @@ def _real(summary: xr.Dataset) -> xr.Dataset:
             parts[f"{name}_re"].attrs, parts[f"{name}_im"].attrs = variable.attrs, variable.attrs
         else:
             parts[str(name)] = variable.astype("int32") if variable.dtype == np.int64 else variable
-    # NetCDF has no nested attributes: they go in as text.
+    # NetCDF has no nested attributes: they are stored as text.
     attributes = {name: value if isinstance(value, str) else json.dumps(value) for name, value in summary.attrs.items()}
     real = xr.Dataset(parts, attrs=attributes)
     for name, coordinate in real.coords.items():

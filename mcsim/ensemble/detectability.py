@@ -1,4 +1,4 @@
-"""Errors of a survey's BipoSH under isotropy, and the signal to noise of what the beams make."""
+"""Errors of a survey's BipoSH under isotropy, and the signal to noise of the beams' BipoSH."""
 
 from typing import Any
 
@@ -47,7 +47,7 @@ def variance_of(survey: Survey, found: dict[tuple[int, int], Means], pair: tuple
 
 
 def variables(survey: Survey, found: dict[tuple[int, int], Means], joint: float) -> dict[str, tuple[Any, ...]]:
-    """Return the variables of a summary's signal to noise in one sky, L > 0; ``joint`` is that of all maps together."""
+    """Return the signal-to-noise variables of a summary for one sky, L > 0; ``joint`` is that of all maps."""
     modes, lmax = survey.estimator.modes, survey.lmax
     rows = [row for row, (L, _, _) in enumerate(modes) if L > 0]
     anisotropic = [modes[row] for row in rows]
@@ -75,7 +75,7 @@ def variables(survey: Survey, found: dict[tuple[int, int], Means], joint: float)
 
 
 def joint_signal_to_noise(survey: Survey, found: dict[tuple[int, int], Means]) -> float:
-    """Return the root of the Fisher information of all maps; infinite where maps without noise show the beams alone."""
+    """Return the root of the Fisher information of all maps; infinite for several without noise."""
     size, lmax = len(survey.map_names), survey.lmax
     stored = survey.estimator.modes
     modes = [

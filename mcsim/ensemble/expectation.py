@@ -1,4 +1,4 @@
-"""Mean BipoSH of a survey's maps: of their signal, of its part that circular beams see, and of their noise."""
+"""Mean BipoSH of a survey's maps: of their signal, of their circular-beam control, and of their noise."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -40,9 +40,9 @@ class Means:
     Attributes
     ----------
     beam, circular
-        Of the signal, through the beams and through their circular parts.
+        Means of the signal, through the beams and through their circular parts.
     noise
-        Of the noise.
+        Means of the noise.
     """
 
     beam: NDArray[np.complex128]
@@ -77,7 +77,7 @@ def scanned_beams(survey: Survey, L_max: int, nthreads: int = 1) -> tuple[Scanne
 def without_windows(
     survey: Survey, spectra: NDArray[np.complex128], modes: Sequence[Indices], pair: tuple[int, int]
 ) -> NDArray[np.complex128]:
-    """Return the coefficients of maps as the analysis leaves them: over the pixel windows at l1 and l2."""
+    """Return the coefficients of maps divided by the pixel windows at l1 and l2, as the analysis does."""
     windows = [channel.window for channel in survey.channels for _ in channel.maps]
     result = spectra.copy()
     for row, (L, _, d) in zip(result, modes, strict=True):
@@ -99,7 +99,7 @@ def _orientations(
 
 
 def _orientations_on_rings(grid: tuple[Rings, ...], smax: int, L_max: int) -> NDArray[np.complex128]:
-    """Return w_{s,LM} of moments that depend on colatitude alone, so M = 0; the rings integrate them without error."""
+    """Return w_{s,L0} of moments that depend on colatitude alone; the quadrature on rings is exact."""
     result = np.zeros((smax + 1, L_max + 1, 2 * L_max + 1), dtype=np.complex128)
     result[0, 0, L_max] = np.sqrt(4.0 * np.pi)
     for rings in grid:
@@ -116,13 +116,13 @@ def means(
     Parameters
     ----------
     survey, beams
-        The survey and what :func:`scanned_beams` makes of it.
+        The survey and its :func:`scanned_beams`.
     pair
-        Numbers of the maps.
+        Indices of the maps.
     exact
         To all orders in the beam, instead of leading order in its non-circular part.
     nthreads
-        Threads.
+        Number of threads.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The shape of an ensemble store: dimensions, variables, how many realizations a chunk holds, and what that takes."""
+"""Layout of an ensemble store: dimensions, variables, chunks and sizes."""
 
 import math
 from collections.abc import Iterable
@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:  # stored ensembles are opened without the numerics, which take long to load
+if TYPE_CHECKING:  # stored ensembles open without the numerics, which load slowly
     from mcsim.bipolar import Mode
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Shape of a store: realizations and how many of them one task owns, maps, pairs, modes, degrees."""
+    """Layout of a store: realizations, realizations per task, maps, pairs, modes, degrees."""
 
     realizations: int
     chunk: int
@@ -27,7 +27,7 @@ class Layout:
     frame: str = ""
 
     def variables(self) -> dict[str, tuple[tuple[str, ...], str, str, str]]:
-        """Dimensions, type, unit and long name of every array over realizations."""
+        """Return dimensions, type, unit and long name of every array over realizations."""
         spectra = {
             "biposh": (
                 ("pair", "mode", "ell"),
@@ -46,12 +46,12 @@ class Layout:
         return found
 
     def kept_attributes(self) -> dict[str, str | int | float]:
-        """What a kept map says of itself beside unit and long name."""
+        """Return the attributes of kept maps besides unit and long name."""
         nside = math.isqrt((self.kept_npix or 0) // 12)
         return {"nside": nside, "frame": self.frame, "ordering": "RING", "unseen": -1.6375e30}
 
     def sizes(self) -> dict[str, int]:
-        """Length of every dimension."""
+        """Return the length of every dimension."""
         return {
             "realization": self.realizations,
             "pair": len(self.pairs),
@@ -62,7 +62,7 @@ class Layout:
         }
 
     def realization_bytes(self) -> int:
-        """Uncompressed size of one realization."""
+        """Return the uncompressed size of one realization in bytes."""
         sizes = self.sizes()
         return sum(
             int(np.prod([sizes[dim] for dim in dims])) * np.dtype(dtype).itemsize
@@ -70,14 +70,14 @@ class Layout:
         )
 
     def files(self) -> int:
-        """Number of data files of the finished store, coordinates and metadata included."""
+        """Return the number of files of the finished store, coordinates and metadata included."""
         chunks = -(-self.realizations // self.chunk)
-        # Coordinates and the summary's 32 variables or so come with metadata and one chunk each.
+        # Coordinates and about 32 variables of the summary have metadata and one chunk each.
         return (len(self.variables()) + 1) * (chunks + 1) + 100
 
 
 def listed(numbers: Iterable[int]) -> str:
-    """Whole numbers in words: ``realizations 3, 7-9``."""
+    """Return realization numbers as text: ``realizations 3, 7-9``."""
     ranges: list[list[int]] = []
     for number in sorted(int(n) for n in numbers):
         if ranges and number == ranges[-1][1] + 1:

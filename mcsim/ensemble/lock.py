@@ -1,4 +1,4 @@
-"""One run at a time writes to a store."""
+"""Lock of a store: one run at a time writes to it."""
 
 import fcntl
 import os
@@ -12,7 +12,7 @@ from typing import NoReturn
 from mcsim.errors import InputError
 
 _held: set[Path] = set()
-"""Locks that this process holds, as whole paths."""
+"""Absolute paths of the locks that this process holds."""
 
 
 @contextmanager
@@ -22,7 +22,7 @@ def locked(path: Path) -> Iterator[None]:
     Raises
     ------
     InputError
-        If another run holds it. The lock of a process of this host that is gone is taken over.
+        If another run holds it. The lock of a dead process of this host is taken over.
     """
     lock = path.absolute().with_name(f"{path.name}.lock")
     while True:
@@ -40,12 +40,12 @@ def locked(path: Path) -> Iterator[None]:
         yield
     finally:
         _held.discard(lock)
-        with suppress(OSError):  # on a disk that has become read-only; then the next run takes it over
+        with suppress(OSError):  # if the disk has become read-only, the next run takes the lock over
             lock.unlink()
 
 
 def _make(lock: Path, path: Path) -> None:
-    """Make the lock with its contents in one step, so that a process that is killed leaves a lock that can be read."""
+    """Make the lock and its contents in one step, so that a killed process leaves a readable lock."""
     with tempfile.NamedTemporaryFile("w", prefix=f".{path.name}.", dir=path.parent) as stream:
         stream.write(f"{socket.gethostname()} {os.getpid()}")
         stream.flush()
@@ -53,7 +53,7 @@ def _make(lock: Path, path: Path) -> None:
 
 
 def _take_over(lock: Path, path: Path) -> None:
-    """Remove the lock of a dead process, or refuse."""
+    """Remove the lock of a dead process; raise InputError for that of a live one."""
     with suppress(FileNotFoundError), lock.open() as stream:
         try:
             host, number = stream.read().split()
@@ -62,7 +62,7 @@ def _take_over(lock: Path, path: Path) -> None:
             host, process = "an unknown host", 0
         dead = lock not in _held if process == os.getpid() else not _alive(process)
         if host == socket.gethostname() and dead:
-            # Of several that find it so one removes it, and none the lock that another has made since.
+            # If several processes find a dead lock, one removes it, and none removes a newer lock.
             fcntl.flock(stream, fcntl.LOCK_EX)
             if os.fstat(stream.fileno()).st_ino == lock.stat().st_ino:
                 lock.unlink()
@@ -83,6 +83,6 @@ def _alive(process: int) -> bool:
         return False
     except PermissionError:
         return True
-    with suppress(OSError):  # a process that has ended but that its parent has not asked after
+    with suppress(OSError):  # a zombie: ended, but not yet waited for by its parent
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     return True

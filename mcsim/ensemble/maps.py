@@ -1,4 +1,4 @@
-"""The maps of a run as FITS files, such as :func:`mcsim.diagnose` reads."""
+"""Maps of a run as FITS files, which :func:`mcsim.diagnose` can read."""
 
 import os
 from pathlib import Path
@@ -33,35 +33,35 @@ def write_maps(
     Parameters
     ----------
     source
-        Configuration: a TOML file, the name of a packaged workflow, a dict, or one that is loaded.
+        Configuration: a TOML file, the name of a packaged workflow, a dict, or a loaded one.
     folder
-        To fill; it is made if it does not exist.
+        Output folder; it is made if it does not exist.
     realizations
-        A number: this one, its files directly in ``folder``, which must be new or empty. A slice, or None for all of
-        the ensemble: a folder of its own for each, ``00000`` and so on.
+        A number: this one, its files directly in ``folder``, which must be new or empty. A slice, or None for the
+        whole ensemble: a subfolder for each, ``00000`` and so on.
     sample_by_sample
-        Make them by the time-ordered reference: each map is the plain mean of its samples, whose pointing must be
-        known. Sky and effects are those of the default route, the noise is a draw of its own.
+        Use the time-ordered reference: each map is the plain mean of its samples, whose pointing must be known. Sky
+        and effects are those of the default route; the noise is another draw.
     nthreads
-        Threads; default: all processors.
+        Number of threads; default: all processors.
     quiet
         Report no progress on standard error.
 
     Returns
     -------
     list of Path
-        Folders with ``{channel}.fits``, or ``{channel}_{split}.fits`` where the run has splits: uK_CMB in RING order,
+        Folders with ``{channel}.fits``, or ``{channel}_{split}.fits`` if the run has splits: uK_CMB in RING order,
         float64, ``healpy.UNSEEN`` where nothing was observed. The header has frame (COORDSYS), unit (TUNIT1), the
         run's name and digest (RUN, DIGEST) and the realization (REALIZ).
 
     Raises
     ------
     InputError
-        For bad input, a grid without pixels, a folder that cannot be written or holds what would be written over.
+        For bad input, a grid without pixels, a folder that cannot be written, or files that would be overwritten.
 
     Notes
     -----
-    A folder appears whole or not at all. Memory is that of one realization.
+    A folder appears complete or not at all. Memory is that of one realization.
 
     Examples
     --------
@@ -85,7 +85,7 @@ def write_maps(
     if sample_by_sample:
         for channel in shared.channels:
             sampled.check(channel)
-    simulate.draw_sky(shared, wanted.start)  # bad files of skies are to be found before a folder is made
+    simulate.draw_sky(shared, wanted.start)  # finds bad sky files before a folder is made
     writable(Path(folder) if not alone else Path(folder).absolute().parent)
     header = [("RUN", _ascii(run.name)), ("DIGEST", config.digest(run))]
     with reporting("maps", float(len(wanted)), "realizations", quiet) as report:
@@ -111,12 +111,12 @@ def write_map(path: Path, map_uk: NDArray[np.float64], frame: str, header: list[
 
 
 def file_names(run: config.RunConfig) -> dict[str, str]:
-    """File of every map of a run: ``{channel}.fits`` or ``{channel}_{split}.fits``.
+    """Return the file name of every map of a run: ``{channel}.fits`` or ``{channel}_{split}.fits``.
 
     Raises
     ------
     InputError
-        If two maps would have one file.
+        If two maps would have the same file.
     """
     names = {name: f"{name.replace(':', '_')}.fits" for name in config.map_names(run)}
     for name, file in names.items():
@@ -147,5 +147,5 @@ def _slice(realizations: int | slice | None) -> slice | None:
 
 
 def _ascii(name: str) -> str:
-    """A name as FITS headers can hold it."""
+    """Return a name in ASCII, as FITS headers require."""
     return name.encode("ascii", "backslashreplace").decode()

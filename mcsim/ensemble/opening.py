@@ -1,4 +1,4 @@
-"""Opening of stored ensembles with xarray, lazily."""
+"""Lazy opening of stored ensembles with xarray."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ def open_ensemble(path: str | Path) -> xr.Dataset:
     xarray.Dataset
         ``biposh``, ``cl``, their circular-beam controls, with kept maps ``observed_map`` (in stores of earlier versions
         ``map``), lazily; in memory ``done`` and the coordinates realization, pair, mode (with L, M, d, parity), ell.
-        ``.sel(mode="L2M0d0")`` picks a spectrum, ``.where(ds.L == 2, drop=True)`` all of one L.
+        ``.sel(mode="L2M0d0")`` selects a spectrum, ``.where(ds.L == 2, drop=True)`` all of one L.
 
     Raises
     ------
@@ -51,7 +51,7 @@ def open_summary(path: str | Path) -> xr.Dataset:
     -------
     xarray.Dataset
         ``biposh_mean``, ``biposh_standard_error``, ``biposh_standard_deviation``, the same ``_binned``, of ``cl`` and,
-        where the run is paired, of ``_circular`` and ``_difference``; uK^2.
+        if the run is paired, of ``_circular`` and ``_difference``; uK^2.
 
     Raises
     ------
@@ -76,7 +76,7 @@ def open_summary(path: str | Path) -> xr.Dataset:
 
 
 def _opened(path: Path, group: str | None) -> xr.Dataset:
-    """A group, lazily but for its coordinates and ``done``: xarray chooses rows by values that it has in memory."""
+    """Open a group lazily; load its coordinates and ``done``, by which xarray selects rows."""
     with store.faults_named(path):
         found = xr.open_zarr(path, group=group)
         for name in {*found.coords, "done"} & {*found.variables}:

@@ -1,4 +1,4 @@
-"""What a run will be before it is one: its realizations, chunks, attributes, and cost."""
+"""Plan of a run: its realizations, chunks, attributes and cost."""
 
 import time
 from collections.abc import Mapping
@@ -38,7 +38,7 @@ _PACKAGES = ("mcsim", "numpy", "healpy", "ducc0", "numba", "scipy", "dask", "dis
 
 
 def wanted(run: config.RunConfig, part: slice | None) -> range:
-    """Realizations to compute: all, or a slice ``A:B`` of them.
+    """Return the realizations to compute: all, or a slice ``A:B`` of them.
 
     Raises
     ------
@@ -57,7 +57,7 @@ def wanted(run: config.RunConfig, part: slice | None) -> range:
 
 
 def default_store(run: config.RunConfig, part: slice | None) -> Path:
-    """``{name}.zarr`` in the working folder; slices of an ensemble get stores of their own, ``{name}.{A}-{B}.zarr``."""
+    """Return ``{name}.zarr`` in the working folder, or ``{name}.{A}-{B}.zarr`` for a slice of an ensemble."""
     if part is None:
         return Path(f"{run.name}.zarr")
     realizations = wanted(run, part)
@@ -65,7 +65,7 @@ def default_store(run: config.RunConfig, part: slice | None) -> Path:
 
 
 def exists(path: Path) -> bool:
-    """Whether there is something at ``path``; refuses names that no file system takes."""
+    """Return True if ``path`` exists; raise InputError for an invalid name."""
     try:
         return path.exists()
     except OSError as error:
@@ -75,7 +75,7 @@ def exists(path: Path) -> bool:
 
 
 def layout(survey: Survey) -> Layout:
-    """Layout of a new store."""
+    """Return the layout of a new store."""
     run = survey.config
     bare = Layout(
         run.ensemble.realizations,
@@ -92,9 +92,9 @@ def layout(survey: Survey) -> Layout:
 
 
 def _chunked(bare: Layout, chunk: int | None) -> Layout:
-    """About 128 chunks, which keeps files few and tasks many, unless a chunk would pass 64 MiB.
+    """Return the layout with a chunk size: about 128 chunks, unless a chunk would exceed 64 MiB.
 
-    Powers of two, as the tree of sums needs.
+    The tree of sums needs a power of two.
     """
     if chunk is not None:
         while chunk // 2 >= bare.realizations:
@@ -107,7 +107,7 @@ def _chunked(bare: Layout, chunk: int | None) -> Layout:
 
 
 def recipe(survey: Survey) -> summary.Recipe:
-    """Recipe of the summary."""
+    """Return the recipe of the summary."""
     run = survey.config
     return summary.Recipe(
         survey.pair_names, survey.estimator.modes, survey.lmax, run.biposh.summary_bin, run.ensemble.paired
@@ -115,7 +115,7 @@ def recipe(survey: Survey) -> summary.Recipe:
 
 
 def attributes(run: config.RunConfig) -> dict[str, Any]:
-    """Attributes of a store: configuration (without what leaves the result alone), hash, conventions, versions."""
+    """Return the attributes of a store: configuration (what defines the result), hash, conventions, versions."""
     resolved = config.resolved(run)
     del resolved["compute"]
     return {
@@ -129,12 +129,12 @@ def attributes(run: config.RunConfig) -> dict[str, Any]:
 
 
 def check_same(path: Path, run: config.RunConfig) -> None:
-    """Refuse a store of another configuration, or one that has other variables.
+    """Raise InputError unless a store has this configuration and its variables.
 
     Raises
     ------
     InputError
-        Naming the keys that differ.
+        With the keys that differ.
     """
     found = store.attributes(path)
     changes = _changes(found, attributes(run))
@@ -146,14 +146,14 @@ def check_same(path: Path, run: config.RunConfig) -> None:
 
 
 def check_mergeable(path: Path, first: Mapping[str, Any], other: Path, second: Mapping[str, Any]) -> None:
-    """Refuse to merge stores of different configurations."""
+    """Raise InputError if stores have different configurations."""
     changes = _changes(first, second)
     if changes:
         raise InputError(f"{other} and {path} differ ({'; '.join(changes)}); merge slices of one configuration.")
 
 
 def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """What keeps two stores' attributes from describing rows of one ensemble: science, kept maps, mcsim itself."""
+    """Return the differences that keep two stores from being one ensemble: science, kept maps, mcsim's version."""
     changes = [change for change in config.differences(old["science"], new["science"]) if not _of_summary(change)]
     for key, before, after in (
         ("ensemble.keep_maps", *(a["configuration"]["ensemble"]["keep_maps"] for a in (old, new))),
@@ -165,12 +165,12 @@ def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
 
 
 def _of_summary(change: str) -> bool:
-    """Whether a difference is of the summary alone; earlier versions took its bins for a part of the science."""
+    """Return True for a difference of the summary alone, whose bins earlier versions counted as science."""
     return change.startswith("biposh.summary_bin: ")
 
 
 def stored(path: Path, realizations: int) -> tuple[Layout, summary.Recipe]:
-    """Layout and recipe of an existing store, for a store of as many realizations with the same contents."""
+    """Return the layout and recipe of an existing store, with another number of realizations."""
     with opening.open_ensemble(path) as found:
         attrs = found.attrs["configuration"]
         pairs = tuple(str(pair) for pair in found["pair"].values)
@@ -187,7 +187,7 @@ def stored(path: Path, realizations: int) -> tuple[Layout, summary.Recipe]:
 
 
 def describe(source: str | Path, part: slice | None = None, workers: int | None = None) -> str:
-    """What a run will take, in words: realizations, tasks, memory, disk, files and time."""
+    """Return a text on the cost of a run: realizations, tasks, memory, disk, files and time."""
     run = config.load(source)
     check_effects(run)
     planned = cost(run, wanted(run, part))
@@ -206,7 +206,7 @@ def describe(source: str | Path, part: slice | None = None, workers: int | None 
 
 @dataclass(frozen=True)
 class Cost:
-    """What a run will take: realizations, tasks, worker memory, disk, files, and processor time of the transforms."""
+    """Cost of a run: realizations, tasks, worker memory, disk, files, and processor time of the transforms."""
 
     realizations: int
     tasks: int
@@ -222,7 +222,7 @@ def cost(run: config.RunConfig, realizations: range) -> Cost:
         spectra.load(run.sky.spectrum, run.sky.lmax)
     mmax = [load_beam(channel, run.sky.lmax).mmax for channel in run.channels]
     lmax = config.analysis_lmax(run)
-    # A grid of rings costs about what HEALPix with as many rings does.
+    # A grid of rings costs about as much as HEALPix with as many rings.
     nside = run.map.resolution or 1 + 3 * run.sky.lmax // 10
     names = config.map_names(run)
     both = run.biposh.pairs == "all"
@@ -254,7 +254,7 @@ def cost(run: config.RunConfig, realizations: range) -> Cost:
 
 
 def _timed(nside: int, lmax_sky: int, lmax: int, L_max: int) -> tuple[float, float]:
-    """Seconds of one spin-0 synthesis and of one estimate of all coefficients, on one thread."""
+    """Return the seconds of one spin-0 synthesis and of one estimate of all coefficients, on one thread."""
     alm = gaussian_alm(np.ones(lmax_sky + 1), rng.generator(0, 0, "timing"))
     tables, cut = estimator(L_max, lmax), alm_.resize(alm, lmax_sky, lmax)
     estimate(estimator(L_max, min(lmax, L_max + 2)), alm_.resize(alm, lmax_sky, min(lmax, L_max + 2)))  # compiles it

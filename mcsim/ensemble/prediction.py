@@ -1,4 +1,4 @@
-"""From a configuration to what its ensemble should give: means, errors and detectability, without Monte Carlo."""
+"""Prediction of an ensemble's means, errors and detectability from its configuration, without Monte Carlo."""
 
 from dataclasses import replace
 from typing import Any
@@ -23,24 +23,24 @@ def predict(
     Parameters
     ----------
     source
-        Configuration: a TOML file, the name of a packaged workflow, a dict, or one that is loaded; or its survey.
+        Configuration: a TOML file, the name of a packaged workflow, a dict, or a loaded one; or its survey.
     exact
         To all orders in the beam, instead of leading order in its non-circular part.
     snr
-        Add the signal to noise of what the beam makes: ``signal_to_noise`` of each pair and mode, ``_binned`` the same
+        Add the signal to noise of the beam's BipoSH: ``signal_to_noise`` of each pair and mode, ``_binned`` the same
         per bin, and ``_total`` of all maps jointly.
     L_moments
-        Highest degree of the orientation moments where ``exact``; see :func:`mcsim.bipolar.theory.cmb_biposh_exact`.
+        Highest degree of the orientation moments if ``exact``; see :func:`mcsim.bipolar.theory.cmb_biposh_exact`.
     nthreads
-        Threads.
+        Number of threads.
 
     Returns
     -------
     xarray.Dataset
-        Laid out like :func:`mcsim.open_summary`, so that the two subtract: ``{biposh, cl}{, _circular,
+        With the layout of :func:`mcsim.open_summary`, so that the two subtract: ``{biposh, cl}{, _circular,
         _difference}_mean`` in uK^2, raw and binned. ``_standard_deviation`` and ``_standard_error`` are those of an
         isotropic sky, the error for ``ensemble.realizations`` of the configuration; of the difference to the circular-
-        beam control, whose scatter is not that of an isotropic sky, they are NaN. Attributes say what is left out.
+        beam control, whose scatter is not that of an isotropic sky, they are NaN. Attributes state what is neglected.
 
     Raises
     ------
@@ -50,10 +50,10 @@ def predict(
     Notes
     -----
     Signal: :mod:`mcsim.bipolar.theory`, from b_lm, the spin harmonics of the moments w_s (exact ones for parallel
-    transport) and C_l. The pixel window multiplies what enters a map and divides what its analysis gives: the scan
-    couples degrees in between, so it cancels in part only. Noise of variance v(n) per pixel adds v_LM times the pixel
-    area to the autos. Weights W(n) (masks, unobserved pixels) replace w_s by W^2 w_s: so they act on the beam's part
-    where l is far above their own scales; what they make of an isotropic sky is left out, as in the paired difference.
+    transport) and C_l. The pixel window multiplies the beam and divides the result of the analysis. The scan couples
+    degrees in between, so it cancels only in part. Noise of variance v(n) per pixel adds v_LM times the pixel area to
+    the autos. Weights W(n) (masks, unobserved pixels) replace w_s by W^2 w_s, which holds for l far above their own
+    scales; their own BipoSH of an isotropic sky is neglected, as in the paired difference.
     Variances are C_l1 C_l2 (1 + delta_l1l2) / f_sky, f_sky = <W_x W_y>^2 / <W_x^2 W_y^2>. Ensembles agree within their
     errors: tests/integration/test_prediction.py, and test_prediction_pairs.py for pairs, noise and masks.
 
@@ -71,7 +71,7 @@ def predict(
     result.attrs |= _attributes(survey, L_moments if exact else None)
     if not snr:
         return result
-    # The information of all maps jointly needs every pair and both its orders, whatever pairs the ensemble keeps.
+    # The joint information of all maps needs every pair in both orders, whatever pairs the ensemble keeps.
     every, whole = found, survey
     if len(beams) > 1 and survey.config.biposh.pairs != "all":
         whole = replace(survey, estimator=estimator(survey.config.biposh.L_max, survey.lmax, both_orders=True))
@@ -101,7 +101,7 @@ def _dataset(survey: Survey, found: dict[tuple[int, int], Means]) -> xr.Dataset:
         scatter[f"{name}_binned"] = _binned_variance(recipe, scatter[name])
         if not name.endswith("difference"):
             comoment[f"{name}_binned"] = scatter[f"{name}_binned"][..., None] * np.eye(len(recipe.edges) - 1)
-    # The sums of two realizations with these variances, so that the summary's own code lays them out.
+    # Build the sums of two realizations with these variances, so that the summary's own code makes the dataset.
     result = summary.dataset(recipe, Sums(2, mean, scatter, comoment), plan.attributes(run))
     for name in mean:
         result[f"{name}_standard_error"].values[:] = np.sqrt(scatter[name] / run.ensemble.realizations)
@@ -110,7 +110,7 @@ def _dataset(survey: Survey, found: dict[tuple[int, int], Means]) -> xr.Dataset:
 
 
 def _binned_variance(recipe: summary.Recipe, variance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Variance of the mean over a bin of coefficients that are independent from ell to ell."""
+    """Return the variance of the mean over a bin, for coefficients independent from ell to ell."""
     scaled = recipe.factor**2 * variance
     exists = np.isfinite(scaled)
     total = np.add.reduceat(np.where(exists, scaled, 0.0), recipe.edges[:-1], axis=-1)

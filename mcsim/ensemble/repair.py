@@ -1,4 +1,4 @@
-"""What is damaged in a store, and making room for it to be computed again."""
+"""Check of a store, and removal of damaged parts so that a run computes them again."""
 
 import hashlib
 import json
@@ -21,16 +21,16 @@ THREADS = 4
 
 @dataclass(frozen=True)
 class Verdict:
-    """What reading every file of a store has found.
+    """Result of reading every file of a store.
 
     Attributes
     ----------
     finished, size
-        Realizations that are whole, and those that the store has room for.
+        Number of intact realizations, and of those that the store has room for.
     damages
-        Chunks of realizations that cannot be trusted.
+        Damaged chunks of realizations.
     broken
-        Other parts and what is wrong with them: metadata, coordinates, summary.
+        Faults of other parts, by name: metadata, coordinates, summary.
     """
 
     path: Path
@@ -41,16 +41,16 @@ class Verdict:
 
     @property
     def lost(self) -> tuple[int, ...]:
-        """Realizations that counted as finished and are not whole."""
+        """Realizations marked as finished that are damaged."""
         return tuple(r for damage in self.damages for r in damage.lost)
 
     @property
     def intact(self) -> bool:
-        """Whether everything that counts as finished is whole."""
+        """Return True if everything marked as finished is undamaged."""
         return not self.lost and not self.broken
 
     def text(self) -> str:
-        """In words."""
+        """Return the result as text."""
         if self.intact:
             return f"{self.path} is intact: {self.finished} of {self.size} realizations, each file read and checked."
         lines = [f"{self.path} is damaged."]
@@ -63,7 +63,7 @@ class Verdict:
 
 
 def verify(path: str | Path, quiet: bool = True) -> Verdict:
-    """Read every chunk of every array, against its checksum.
+    """Read every chunk of every array and check its checksum.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def verify(path: str | Path, quiet: bool = True) -> Verdict:
 
 
 def _examined(path: Path, size: int, chunk: int, broken: set[str]) -> Iterator[tuple[int, int, Damage | None]]:
-    """Start, number of whole realizations, and damage of every chunk; a few at a time, for memory's sake."""
+    """Yield start, number of intact realizations and damage of every chunk; a few at a time to save memory."""
 
     def one(start: int) -> tuple[int, int, Damage | None]:
         damage = store.examine(path, start, broken)
@@ -102,10 +102,9 @@ def _examined(path: Path, size: int, chunk: int, broken: set[str]) -> Iterator[t
 
 
 def mend(path: Path, layout: Layout, attributes: Mapping[str, Any], quiet: bool = True) -> Verdict:
-    """Verify a store that no run writes to, and drop what is damaged, so that a run computes it again.
+    """Verify a store that no run writes to, and drop damaged parts, so that a run computes them again.
 
-    ``layout`` and ``attributes`` are what the store's configuration gives: what is broken beside the realizations is
-    made from them.
+    Broken metadata and coordinates are rebuilt from the ``layout`` and ``attributes`` of the store's configuration.
     """
     _sweep(path)
     broken = broken_parts(path)
@@ -118,10 +117,10 @@ def mend(path: Path, layout: Layout, attributes: Mapping[str, Any], quiet: bool 
 
 
 def _sweep(path: Path) -> None:
-    """Remove what writers that were killed left: halves of files, and folders that never got their name."""
+    """Remove the remains of killed writers: partial files and temporary folders."""
     for left in path.rglob("*.partial"):
         left.unlink(missing_ok=True)
-    scratch = re.compile(rf"\.{re.escape(path.name)}\.[a-z0-9_]{{8}}")  # as tempfile names them
+    scratch = re.compile(rf"\.{re.escape(path.name)}\.[a-z0-9_]{{8}}")  # tempfile's names
     for left in [entry for entry in path.absolute().parent.iterdir() if scratch.fullmatch(entry.name)]:
         if left.is_dir():
             shutil.rmtree(left, ignore_errors=True)
@@ -130,7 +129,7 @@ def _sweep(path: Path) -> None:
 
 
 def broken_parts(path: Path) -> dict[str, str]:
-    """What is wrong beside the realizations, by name."""
+    """Return the faults of parts other than realizations, by name."""
     attributes = store.attributes(path)
     broken = store.broken_parts(path)
     canonical = json.dumps(attributes["science"], sort_keys=True, separators=(",", ":")).encode()

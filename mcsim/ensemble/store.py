@@ -1,7 +1,7 @@
-"""The ensemble store: one Zarr 3 group per run, and the only module that touches zarr.
+"""The ensemble store: one Zarr 3 group per run. This is the only module that uses zarr.
 
-Arrays have the dimensions (realization, pair, mode, ell) and are chunked along realization alone; one task writes whole
-chunks, ``done`` last. Nothing but ``done`` says that a realization exists.
+Arrays have the dimensions (realization, pair, mode, ell) and are chunked along realization alone. One task writes whole
+chunks, ``done`` last. A realization exists only if ``done`` is True.
 """
 
 import os
@@ -24,19 +24,19 @@ from mcsim.ensemble.layout import Layout, listed
 from mcsim.errors import InputError, RunError
 
 _CODECS: dict[str, Any] = {"compressors": (ZstdCodec(level=1, checksum=True),)}
-# Written even where all is the fill value, so that an array without its file is known as damaged.
+# Write chunks of fill values too, so that a missing file means damage.
 _WHOLE: dict[str, Any] = {"config": {"write_empty_chunks": True}, **_CODECS}
 MAP, FORMER_MAP = "observed_map", "map"
-"""Name of kept maps, and that in stores made before it, which keep it; xarray has a method of the former name."""
+"""Name of kept maps, and their name in older stores, which hides an xarray method."""
 
 _FAULTS = (OSError, KeyError, ValueError, RuntimeError, TypeError)
 
 
 @dataclass(frozen=True)
 class Damage:
-    """A chunk that cannot be trusted: the realizations whose numbers it took with it, and why.
+    """A damaged chunk: the lost realizations, and the reason.
 
-    ``lost`` is empty for leftovers, files of realizations that do not count as finished.
+    ``lost`` is empty for leftovers: files of realizations not marked as finished.
     """
 
     start: int
@@ -45,7 +45,7 @@ class Damage:
 
 
 def check_writable(path: Path) -> Path:
-    """Refuse a place where no store can be made, leave it as it was, and return the innermost folder that exists.
+    """Check that a store can be made, without making anything; return the innermost existing folder.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def check_writable(path: Path) -> Path:
 
 
 def create(path: Path, layout: Layout, attributes: Mapping[str, Any]) -> None:
-    """Make an empty store at ``path``, whole or not at all.
+    """Make an empty store at ``path``, complete or not at all.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def create(path: Path, layout: Layout, attributes: Mapping[str, Any]) -> None:
 
 
 def write(path: Path, first: int, values: Mapping[str, NDArray], done: NDArray[np.bool_]) -> None:
-    """Write whole chunks of realizations from ``first`` on; ``done`` goes last.
+    """Write whole chunks of realizations from ``first`` on; ``done`` is written last.
 
     ``values`` holds arrays of shape (n, ...); rows that are not done are stored as NaN.
 
@@ -119,7 +119,7 @@ def write(path: Path, first: int, values: Mapping[str, NDArray], done: NDArray[n
 
 
 def read(path: Path, start: int, stop: int, maps: bool = False) -> dict[str, NDArray]:
-    """Arrays over realizations ``start`` to ``stop``, ``done`` among them; kept maps only if asked for.
+    """Read the arrays over realizations ``start`` to ``stop``, with ``done``; kept maps only if ``maps``.
 
     Raises
     ------
@@ -141,7 +141,7 @@ def read(path: Path, start: int, stop: int, maps: bool = False) -> dict[str, NDA
 
 
 def examine(path: Path, start: int, leave_out: Collection[str] = ()) -> Damage | None:
-    """Read every file of one chunk of realizations, against its checksum; None if it is whole."""
+    """Read every file of one chunk of realizations and check its checksum; return None if it is intact."""
     with faults_named(path):
         group = _open(path)
         last = _member(group, "done")
@@ -161,7 +161,7 @@ def examine(path: Path, start: int, leave_out: Collection[str] = ()) -> Damage |
 
 
 def discard(path: Path, damage: Damage) -> None:
-    """Forget a damaged chunk: its ``done`` first, so that a call that was cut short leaves nothing that looks whole."""
+    """Delete a damaged chunk, ``done`` first, so that an interrupted call leaves nothing that looks intact."""
     with faults_named(path):
         group = _open(path)
         for name in ("done", *(name for name in variables(path) if name not in ("realization", "done"))):
@@ -171,7 +171,7 @@ def discard(path: Path, damage: Damage) -> None:
 
 
 def broken_parts(path: Path) -> dict[str, str]:
-    """What is wrong beside the realizations, by name: metadata, coordinates, summary. Empty if nothing is."""
+    """Return the faults of metadata, coordinates and summary, by name; empty without faults."""
     with faults_named(path):
         group, remembered = _open(path), _remembered(path)
     broken = {}
@@ -207,25 +207,25 @@ def restore(path: Path, layout: Layout, update: Mapping[str, Any]) -> None:
 
 
 def variables(path: Path) -> list[str]:
-    """Names of the arrays over realizations that the store was made with, whether their files exist or not."""
+    """Return the names of the arrays over realizations, even if their files are missing."""
     with faults_named(path):
         return [name for name, metadata in _remembered(path).items() if _over_realizations(metadata)]
 
 
 def done(path: Path, start: int = 0, stop: int | None = None) -> NDArray[np.bool_]:
-    """Which realizations from ``start`` to ``stop`` are finished; by default all."""
+    """Return True for each finished realization from ``start`` to ``stop``; by default of all."""
     with faults_named(path):
         return np.asarray(_member(_open(path), "done")[start:stop])
 
 
 def size(path: Path) -> int:
-    """Number of realizations that a store has room for."""
+    """Return the number of realizations that a store has room for."""
     with faults_named(path):
         return int(_member(_open(path), "done").shape[0])
 
 
 def attributes(path: Path) -> dict[str, Any]:
-    """Attributes of a store.
+    """Return the attributes of a store.
 
     Raises
     ------
@@ -242,15 +242,15 @@ def attributes(path: Path) -> dict[str, Any]:
 
 
 def chunk(path: Path) -> int:
-    """Realizations that one task owns."""
+    """Return the number of realizations per task."""
     with faults_named(path):
         return int(_member(_open(path), "done").chunks[0])
 
 
 def extend(path: Path, realizations: int, update: Mapping[str, Any]) -> None:
-    """Grow a store to more realizations; those that are finished stay.
+    """Grow a store to more realizations; keep the finished ones.
 
-    ``done``, whose length is that of the store, grows last: a call that was cut short is made good by another.
+    ``done``, whose length is that of the store, grows last: another call completes an interrupted one.
     """
     with _refuse_unwritable(path):
         group = _open(path, "r+")
@@ -265,7 +265,7 @@ def extend(path: Path, realizations: int, update: Mapping[str, Any]) -> None:
 
 
 def write_summary(path: Path, summary: xr.Dataset) -> None:
-    """Put the summary group in place of the former one."""
+    """Replace the summary group."""
     with faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", category=UserWarning)
@@ -289,7 +289,7 @@ def amend(path: Path, update: Mapping[str, Any]) -> None:
 
 
 def summarised(path: Path) -> tuple[int, list[int]]:
-    """Number of realizations that the summary speaks of, 0 without one, and the first ell of each of its bins."""
+    """Return the number of realizations in the summary, 0 without one, and the first ell of each of its bins."""
     if not (path / "summary").is_dir():
         return 0, []
     with faults_named(path):
@@ -311,7 +311,7 @@ def _write_coordinates(group: zarr.Group, layout: Layout) -> None:
 
 
 def _open(path: Path, mode: Literal["r", "r+"] = "r") -> zarr.Group:
-    """The group as it is, not as its consolidated metadata remember it."""
+    """Open the group without its consolidated metadata, which may be out of date."""
     return zarr.open_group(path, mode=mode, use_consolidated=False)
 
 
@@ -338,19 +338,19 @@ def _over_realizations(array: Any) -> bool:
 
 
 def _remembered(path: Path) -> dict[str, Any]:
-    """Metadata of everything in the store as they were when it was made or last summarised."""
+    """Return the consolidated metadata, from when the store was made or last summarised."""
     consolidated = zarr.open_group(path, mode="r").metadata.consolidated_metadata
     return {} if consolidated is None else dict(consolidated.flattened_metadata)
 
 
 def _form(metadata: dict[str, Any]) -> str:
-    """Metadata without the length, which an extension that was cut short may have changed."""
+    """Return metadata as text without the length, which an interrupted extension may have changed."""
     shape = metadata.pop("shape", ())
     return repr((sorted(metadata.items(), key=lambda item: item[0]), len(shape), tuple(shape)[1:]))
 
 
 def _absent(rows: Mapping[str, NDArray]) -> NDArray[np.bool_]:
-    """Which rows count as finished though an array has nothing of them: its file is gone, or two runs wrote at once."""
+    """Return True for finished rows that an array lacks: its file is gone, or two runs wrote at once."""
     absent = np.zeros(rows["done"].shape, dtype=bool)
     for name, values in rows.items():
         if name != "done" and values.size:
@@ -368,7 +368,7 @@ def _reason(error: BaseException) -> str:
 
 
 def _consolidate(path: Path) -> None:
-    """Metadata in one file, so that xarray opens the store in one read; zarr warns that the format is young."""
+    """Write all metadata into one file, which xarray reads at once; silence zarr's warning about the format."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", category=UserWarning)
         zarr.consolidate_metadata(path)
@@ -376,7 +376,7 @@ def _consolidate(path: Path) -> None:
 
 @contextmanager
 def faults_named(path: Path) -> Iterator[None]:
-    """Turn what a damaged or vanished store, or a full disk, makes of zarr's calls into one sentence."""
+    """Turn zarr's errors for a damaged or vanished store, or a full disk, into one sentence."""
     try:
         yield
     except _FAULTS as error:

@@ -1,4 +1,4 @@
-"""The summary of an ensemble: means, errors and binned spectra with their covariance, from rows of realizations."""
+"""Summary of an ensemble: means, errors and binned spectra with their covariance."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from mcsim.stats.streaming import Sums
 
 @dataclass(frozen=True)
 class Recipe:
-    """What is summarised: the labels of the spectra and the width of their bins in ell."""
+    """Definition of a summary: the labels of the spectra and the width of their bins in ell."""
 
     pairs: tuple[str, ...]
     modes: tuple[Mode, ...]
@@ -31,11 +31,11 @@ class Recipe:
 
     @cached_property
     def factor(self) -> NDArray[np.float64]:
-        """Factor from the raw coefficients to what is binned, shape (mode, lmax + 1); see :func:`bin_factor`."""
+        """Factor from the raw to the binned coefficients, shape (mode, lmax + 1); see :func:`bin_factor`."""
         return np.stack([bin_factor(mode, self.lmax) for mode in self.modes])
 
     def binned(self, biposh: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Mean over each bin of factor * A, shape (..., mode, bin); coefficients that do not exist are left out."""
+        """Return the mean of factor * A over the existing coefficients of each bin, shape (..., mode, bin)."""
         scaled = self.factor * biposh
         exists = np.isfinite(scaled)
         total = np.add.reduceat(np.where(exists, scaled, 0.0), self.edges[:-1], axis=-1)
@@ -44,10 +44,10 @@ class Recipe:
 
 
 def bin_factor(mode: Mode, lmax: int) -> NDArray[np.float64]:
-    """Factor that turns A^{LM}_{l1 l2} into a spectrum that is smooth in ell = l2, shape (lmax + 1,).
+    """Return the factor that makes A^{LM}_{l1 l2} smooth in ell = l2, shape (lmax + 1,).
 
-    l(l+1)/2pi times the Bennett factor for even parity. For odd parity, where that does not exist, l(l+1)/2pi times
-    (-1)^l ((2 l1 + 1)(2 l2 + 1))^{-1/4}, which takes out the same alternation of sign and growth with l.
+    It is l(l+1)/2pi times the Bennett factor for even parity. For odd parity, which has no such factor, it is
+    l(l+1)/2pi times (-1)^l ((2 l1 + 1)(2 l2 + 1))^{-1/4}, which removes the same alternation of sign and growth with l.
     """
     ell = np.arange(lmax + 1, dtype=float)
     spectrum = ell * (ell + 1.0) / (2.0 * np.pi)
@@ -58,14 +58,14 @@ def bin_factor(mode: Mode, lmax: int) -> NDArray[np.float64]:
 
 
 def reduce_rows(recipe: Recipe, rows: Mapping[str, NDArray], first: int) -> Sums | None:
-    """Statistics of consecutive realizations by the tree of their indices.
+    """Reduce consecutive realizations to statistics, by the tree of their indices.
 
     Parameters
     ----------
     recipe
-        What is summarised.
+        Definition of the summary.
     rows
-        Arrays over realizations as the store holds them, with ``done``.
+        Arrays over realizations as stored, with ``done``.
     first
         Index of the first row; a multiple of the smallest power of two that is not below the number of rows.
     """
@@ -94,9 +94,9 @@ _MEANING = {
 
 
 def dataset(recipe: Recipe, sums: Sums, attributes: Mapping[str, Any]) -> xr.Dataset:
-    """The summary as a dataset: ``{variable}_{mean, standard_error, standard_deviation}``, raw and binned.
+    """Return the summary as a dataset: ``{variable}_{mean, standard_error, standard_deviation}``, raw and binned.
 
-    ``attributes`` are the store's: what of them says where the numbers come from stays with the summary.
+    The provenance among the store's ``attributes`` is copied into the summary.
 
     Binned spectra are means over bins of ``bin_factor * A``; their covariance is that of single realizations, over the
     bins of one mode.

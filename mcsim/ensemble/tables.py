@@ -1,4 +1,4 @@
-"""Binned spectra as tables: for people, as ECSV, and back."""
+"""Binned spectra as tables: for the terminal, to ECSV and from ECSV."""
 
 import warnings
 from pathlib import Path
@@ -11,10 +11,10 @@ from astropy.table import Table
 from mcsim.errors import InputError
 
 NEGLIGIBLE = 1e-6
-"""Of its error: what a prediction calls zero."""
+"""Fraction of its error below which a predicted value counts as zero."""
 
 ROWS = 40
-"""Of a prediction that are shown."""
+"""Number of bins of a prediction that are shown."""
 
 
 class Bin(NamedTuple):
@@ -29,7 +29,7 @@ class Bin(NamedTuple):
 
 
 def strongest(summary: xr.Dataset, kind: str, count: int) -> list[Bin]:
-    """Bin that stands out most of its error, for the ``count`` spectra with L > 0 where one does most.
+    """Return the most significant bin of each of the ``count`` most significant spectra with L > 0.
 
     ``kind``: "" for the plain mean, "_difference" for that to the circular-beam control.
     """
@@ -53,7 +53,7 @@ def _bins(summary: xr.Dataset, kind: str, pair: str, mode: str) -> list[Bin]:
 
 
 def lines(rows: list[Bin]) -> list[str]:
-    """Rows for a terminal."""
+    """Return the rows as lines for a terminal."""
     return [
         f"    {row.pair}  {row.mode:8s} {f'l = {row.first}-{row.last}':14s} {row.value:.4g} uK^2, "
         f"{abs(row.value) / row.error:.1f} sigma"
@@ -62,11 +62,11 @@ def lines(rows: list[Bin]) -> list[str]:
 
 
 def table(summary: xr.Dataset) -> Table:
-    """Binned spectra as a table: pair, L, M, d, ell_min, ell_max, value, value_imag, error, in uK^2.
+    """Return binned spectra as a table: pair, L, M, d, ell_min, ell_max, value, value_imag, error, in uK^2.
 
-    ``value`` and ``value_imag`` are real and imaginary part of the plain mean, ``error`` its standard error; for paired
-    ensembles those of the difference to the circular-beam control follow. Units, scaling and normalisation are in the
-    header.
+    ``value`` and ``value_imag`` are the real and imaginary part of the plain mean, ``error`` its standard error. For
+    paired ensembles those of the difference to the circular-beam control follow. The header has units, scaling and
+    normalisation.
     """
     kinds = [kind for kind in ("", "_difference") if f"biposh{kind}_binned_mean" in summary]
     rows = []
@@ -96,9 +96,9 @@ def table(summary: xr.Dataset) -> Table:
 
 
 def describe_prediction(prediction: xr.Dataset, count: int = 8) -> str:
-    """Text about a prediction: its order, its strongest binned spectra, and the signal to noise where it was asked for.
+    """Return a text on a prediction: its order, its strongest binned spectra, and its signal to noise if present.
 
-    ``count``: of the modes whose signal to noise is named.
+    ``count`` is the number of modes whose signal to noise is given.
     """
     attrs = prediction.attrs
     text = [f"{attrs['name']}: {attrs['prediction']}, f_sky = {attrs['f_sky']:.3g}, {attrs['frame']} frame"]
@@ -123,7 +123,7 @@ def describe_prediction(prediction: xr.Dataset, count: int = 8) -> str:
 
 
 def _predicted(prediction: xr.Dataset) -> list[str]:
-    """Bins of the spectra that stand out most, whole spectra as long as there is room."""
+    """Return lines for the bins of the strongest spectra, whole spectra if there is room."""
     text = ["  binned means in uK^2, errors of the mean of an isotropic ensemble:"]
     text.append(f"    {'pair':<16} {'mode':<9} {'l':<11} {'value':>22} {'error':>10}")
     best = strongest(prediction, "", count=prediction.sizes["mode"] * prediction.sizes["pair"])
@@ -148,7 +148,7 @@ def write_prediction(prediction: xr.Dataset, output: str | Path) -> None:
     Raises
     ------
     InputError
-        For another ending, a Zarr group that exists, or an output that cannot be written.
+        For another file extension, an existing Zarr group, or an output that cannot be written.
     """
     target = Path(output)
     try:
@@ -156,7 +156,7 @@ def write_prediction(prediction: xr.Dataset, output: str | Path) -> None:
             if target.exists():
                 raise InputError(f"{target} exists already; choose another output, or delete it.")
             with warnings.catch_warnings():
-                # Zarr says that its consolidated metadata and its strings are young.
+                # Zarr warns that its consolidated metadata and strings are not yet standard.
                 warnings.simplefilter("ignore", category=UserWarning)
                 prediction.to_zarr(target, zarr_format=3, consolidated=True)
         elif target.suffix == ".ecsv":
@@ -173,13 +173,13 @@ def read_prediction(path: str | Path) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        ``biposh{, _difference}_binned_{mean, standard_error}`` with the coordinates of a summary, and how they were
-        predicted as the attribute ``prediction``; from a Zarr group all else that was predicted, too.
+        ``biposh{, _difference}_binned_{mean, standard_error}`` with the coordinates of a summary; the attribute
+        ``prediction`` states the method. A Zarr group gives all predicted variables.
 
     Raises
     ------
     InputError
-        For a file that is no prediction.
+        For a file that is not a prediction.
     """
     source = Path(path)
     if not source.exists():
@@ -189,7 +189,7 @@ def read_prediction(path: str | Path) -> xr.Dataset:
         if "biposh_binned_mean" not in found:
             raise KeyError("biposh_binned_mean")
         found = found.load()
-    except Exception as error:  # libraries raise whatever a foreign file makes of them
+    except Exception as error:  # libraries raise errors of any type for a foreign file
         raise InputError(
             f"{source} cannot be read as a prediction ({type(error).__name__}: {' '.join(str(error).split())}); give "
             "what mcsim predict -o wrote."
@@ -198,7 +198,7 @@ def read_prediction(path: str | Path) -> xr.Dataset:
 
 
 def _from_table(path: Path) -> xr.Dataset:
-    from mcsim.bipolar import Mode  # the numerics, which take long to load
+    from mcsim.bipolar import Mode  # the numerics, which load slowly
 
     rows = Table.read(path, format="ascii.ecsv")
     attributes = {key: str(value) for key, value in rows.meta.items()}

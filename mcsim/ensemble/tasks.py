@@ -1,4 +1,4 @@
-"""What workers do: the realizations of a chunk, the sums of a node of the tree. Nothing here knows of Dask."""
+"""Tasks of workers, without Dask: the realizations of a chunk, the sums of a node of the tree."""
 
 import platform
 import time
@@ -33,18 +33,18 @@ class Failure:
 
 @dataclass(frozen=True)
 class Job:
-    """What all tasks of a run share; it travels with each of them, so it is small.
+    """Parameters shared by all tasks of a run; each task carries them, so they are small.
 
     Attributes
     ----------
     text, digest
-        Configuration as JSON, and the hash of it and of the files that it names.
+        Configuration as JSON, and the hash of it and of its files.
     path
         Store.
     chunk
-        Realizations that one task owns.
+        Number of realizations per task.
     first, stop
-        Realizations that are asked for: first ... stop - 1.
+        Wanted realizations: first ... stop - 1.
     packages
         Versions of the driver, see :func:`packages`.
     """
@@ -59,18 +59,18 @@ class Job:
 
 
 def packages() -> tuple[tuple[str, str], ...]:
-    """Versions of all that a realization's bits, or the store's files, may depend on."""
+    """Return the versions of the packages that a realization's bits, or the store's files, depend on."""
     names = ("mcsim", "numpy", "scipy", "ducc0", "healpy", "zarr", "numcodecs")
     return ("python", ".".join(platform.python_version_tuple()[:2])), *((name, version(name)) for name in names)
 
 
 def check_same_packages(where: str, theirs: Iterable[tuple[str, str]], own: Iterable[tuple[str, str]]) -> None:
-    """Refuse a worker whose versions, ``theirs``, are not the driver's, ``own``.
+    """Raise InputError unless a worker's versions, ``theirs``, are the driver's, ``own``.
 
     Raises
     ------
     InputError
-        Naming the package and both versions.
+        With the package and both versions.
     """
     found = dict(theirs)
     wrong = [f"{name} {found.get(name)} for {number}" for name, number in own if found.get(name) != number]
@@ -82,7 +82,7 @@ def check_same_packages(where: str, theirs: Iterable[tuple[str, str]], own: Iter
 
 @lru_cache(maxsize=1)
 def _survey_of(text: str, digest: str, own: tuple[tuple[str, str], ...]) -> Survey:
-    """The survey of a configuration, made once per worker process and contents of its files."""
+    """Return the survey of a configuration, made once per worker process and content of its files."""
     check_same_packages(f"A worker on {platform.node()}", packages(), own)
     run = config.from_json(text)
     found = config.digest(run)
@@ -92,7 +92,7 @@ def _survey_of(text: str, digest: str, own: tuple[tuple[str, str], ...]) -> Surv
 
 
 def realize_chunk(job: Job, start: int, only: int | None = None) -> tuple[int, list[Failure]]:
-    """Task: compute what is missing of one chunk and write the chunk whole; returns the count and what failed.
+    """Compute what is missing of one chunk and write the whole chunk; return the count and the failures.
 
     ``only`` limits it to one realization.
     """
@@ -115,14 +115,14 @@ def realize_chunk(job: Job, start: int, only: int | None = None) -> tuple[int, l
 
 
 def _attempt(shared: Survey, r: int) -> dict[str, NDArray] | Failure:
-    """A realization, or why it failed every time: the next attempt helps where a file system or memory was short."""
+    """Return a realization, or its failure after several attempts, which help if disk or memory was short."""
     for attempt in range(ATTEMPTS):
         try:
             values = simulate.realize(shared, r)
             if not np.all(np.isfinite(values["cl"])):
                 raise FloatingPointError("its power spectrum is not finite")
             return values
-        except Exception as error:  # whatever one realization meets, the others are to finish
+        except Exception as error:  # an error of one realization must not stop the others
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             if isinstance(error, InputError):
                 break
@@ -131,9 +131,9 @@ def _attempt(shared: Survey, r: int) -> dict[str, NDArray] | Failure:
 
 
 def _write(target: Path, start: int, count: int, computed: dict[int, dict[str, NDArray]]) -> None:
-    """Write a chunk whole: what it holds by now, and the new rows.
+    """Write a whole chunk: its present content and the new rows.
 
-    It is read again at the end, for a task that was given up for lost may have been done by another meanwhile.
+    The chunk is read again here, because another worker may have done a task given up for lost.
     """
     done = store.done(target, start, start + count)
     rows = store.read(target, start, start + count, maps=True) if done.any() else {}
@@ -148,12 +148,12 @@ def _write(target: Path, start: int, count: int, computed: dict[int, dict[str, N
 
 
 def empty(count: int, like: NDArray) -> NDArray:
-    """Rows of realizations that do not exist: not done, or NaN."""
+    """Return rows of realizations that do not exist: not done, or NaN."""
     return np.full((count, *like.shape[1:]), False if like.dtype == bool else np.nan, like.dtype)
 
 
 def summarise_node(path: str, recipe: summary.Recipe, start: int, stop: int, chunk: int) -> Sums | None:
-    """Task: statistics of the realizations of a node of the tree, read chunk by chunk."""
+    """Return the statistics of the realizations of a node of the tree, read chunk by chunk."""
     target = Path(path)
     starts = range(start, stop, chunk)
 

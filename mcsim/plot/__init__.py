@@ -1,1 +1,1 @@
-"""Figures, drawn on matplotlib's Figure without any global state."""
+"""Figures, drawn on matplotlib's Figure without global state."""

@@ -1,4 +1,4 @@
-"""A beam at a glance: its peak, its faint surroundings and its coefficients."""
+"""Figure of a beam: its peak, its faint surroundings and its coefficients."""
 
 import numpy as np
 from matplotlib import colormaps
@@ -17,7 +17,7 @@ _PIXELS = 361
 _CONTOURS = (0.1, 0.25, 0.5, 0.75, 0.9)
 _LARGEST_ORDER = 8
 _ARCMIN = np.degrees(1.0) * 60
-# Negative blue, positive ochre, white at and below the floor: told apart by any eye and in grey at the ends.
+# Negative blue, positive ochre, white at and below the floor: safe for colour-blind readers.
 _SIGNED = LinearSegmentedColormap.from_list(
     "signed_db", ["#08204a", "#1f5fa8", "#a9cbe8", "#ffffff", "#f5cfa0", "#c8641e", "#4f1605"]
 )
@@ -31,14 +31,14 @@ def beam_figure(beam: Beam, beam_map: BeamMap | None = None, title: str = "") ->
     beam
         The beam.
     beam_map
-        The map that it comes from; without it the pattern is synthesised from the coefficients.
+        Map of the beam; without it the pattern is synthesised from the coefficients.
     title
         Heading of the figure.
 
     Returns
     -------
     Figure
-        A figure that no pyplot state knows of; save it with ``figure.savefig``.
+        Independent of pyplot; save it with ``figure.savefig``.
     """
     summary = summarize(beam, beam_map)
     figure = Figure(figsize=(15.0, 4.9), layout=ConstrainedLayoutEngine(wspace=0.06))
@@ -54,15 +54,13 @@ def beam_figure(beam: Beam, beam_map: BeamMap | None = None, title: str = "") ->
 
 
 def _data_reach_arcmin(beam_map: BeamMap) -> float:
-    """Largest distance from the centre of a pixel with data inside the cut."""
-    _, theta, _ = solid_angle_values(
-        beam_map.image, beam_map.pixel_rad, beam_map.centre, beam_map.cut_rad, beam_map.projection
-    )
+    """Return the largest distance from the centre of a pixel with data inside the cut."""
+    _, theta, _ = solid_angle_values(beam_map)
     return float(theta.max() * _ARCMIN)
 
 
 def _pattern(beam: Beam, beam_map: BeamMap | None, reach_arcmin: float) -> NDArray[np.float64]:
-    """Response over its peak on a square of +-reach in theta (cos phi, sin phi); row = y."""
+    """Return the response over its peak on a square of +-reach in theta (cos phi, sin phi); row = y."""
     axis = np.linspace(-reach_arcmin, reach_arcmin, _PIXELS) / _ARCMIN
     x, y = np.meshgrid(axis, axis)
     theta, phi = np.hypot(x, y), np.arctan2(y, x)

@@ -1,4 +1,4 @@
-"""Effective beams: measured BipoSH with the best fits, their residuals, and f_l."""
+"""Figure of effective beams: measured BipoSH with the best fits, their residuals, and f_l."""
 
 from collections.abc import Sequence
 
@@ -18,13 +18,13 @@ def fit_figure(fits: Sequence[Fit]) -> Figure:
     Parameters
     ----------
     fits
-        At least one.
+        One or more fits.
 
     Returns
     -------
     Figure
-        A column for every mode (and part), with the data and the best fits above their residuals in sigmas, and a last
-        one with f_l and its 68 % band.
+        A column for every mode (and part), with the data and the best fits above their residuals in sigmas; the last
+        column has f_l and its 68 % band.
     """
     measured = fits[0].measured
     columns = list(dict.fromkeys((row.mode, row.imaginary) for row in measured.rows))
@@ -68,7 +68,7 @@ def _factors(axes: Axes, fits: Sequence[Fit]) -> None:
         colour = _COLOURS[one.model.name]
         axes.plot(one.ell, factor, color=colour, label=one.model.name)
         axes.fill_between(one.ell, factor - width, factor + width, color=colour, alpha=0.2, linewidth=0)
-    # Where the templates vanish, at low l, a flexible model is not held at all: the band may leave the picture there.
+    # At low l, where the templates vanish, a flexible model is unconstrained: its band may exceed the axes.
     centre = np.concatenate([one.factor()[0][len(one.ell) // 4 :] for one in fits])
     margin = max(0.1, float(np.ptp(centre)))
     axes.set_ylim(float(centre.min()) - margin, float(centre.max()) + margin)
@@ -78,7 +78,7 @@ def _factors(axes: Axes, fits: Sequence[Fit]) -> None:
 
 
 def _words(axes: Axes, fits: Sequence[Fit]) -> None:
-    """Parameters and tests, as text under f_l."""
+    """Write the parameters and tests as text under f_l."""
     axes.set_axis_off()
     lines = []
     for one in fits:

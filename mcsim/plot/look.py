@@ -1,4 +1,4 @@
-"""What the commands that look at one thing show of it: a text and a figure of a beam or of a scan."""
+"""Text and figure of a beam or of a scan, for the commands that show one."""
 
 import os
 from collections.abc import Iterator
@@ -28,7 +28,7 @@ class Look:
 def look_at_beams(
     source: str | Path, lmax: int = 2048, m_max: int | None = None, pixel_deg: float | None = None
 ) -> Iterator[Look]:
-    """Look at the beams of a run configuration, at a beam map, or at a file of b_lm.
+    """Yield the text and figure of the beams of a run configuration, of a beam map, or of a file of b_lm.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def look_at_beams(
     lmax, m_max
         Degree and order of the coefficients; m_max by default from the beam.
     pixel_deg
-        Side of a pixel of a beam map, degrees; by default its header's.
+        Side of a pixel of a beam map in degrees; by default from its header.
     """
     path = Path(source)
     if path.is_dir() or (not path.exists() and path.suffix not in ("", ".toml")):
@@ -72,7 +72,7 @@ def look_at_scan(
     sample_period_s: float | None = None,
     line_of_sight: str | None = None,
 ) -> Look:
-    """Look at a scan model: hits, orientation moments, and the factors by which it weakens a beam's ellipticity.
+    """Return a scan model's hits, orientation moments and reduction of a beam's ellipticity, in text and figure.
 
     Progress is reported on standard error.
 
@@ -81,16 +81,16 @@ def look_at_scan(
     model
         Packaged name or TOML file.
     nside, smax, frame
-        Of the moments, which are computed once and cached.
+        Resolution, highest spin and frame of the moments, which are cached.
     sample_period_s
-        Time between samples; by default the model's.
+        Time between samples in seconds; by default the model's.
     line_of_sight
-        One of the model's; by default its default ones.
+        One of the model's lines of sight; by default its default ones.
 
     Raises
     ------
     InputError
-        For a model, a line of sight or a size that cannot be used.
+        For an invalid model, line of sight or size.
     """
     if smax < 2:
         raise InputError(f"smax = {smax} is too small for a look at a scan, which is about w_2; take 2 or more.")

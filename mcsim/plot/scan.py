@@ -1,4 +1,4 @@
-"""The paper's scan figure: orientation of the beam and <cos 2 psi> over the sky, with hits and w_2 by latitude."""
+"""Figure of a scan: orientation of the beam and <cos 2 psi> over the sky, hits and w_2 by latitude."""
 
 from typing import Any
 
@@ -16,29 +16,29 @@ from mcsim.instrument.scan.moments import Moments
 
 
 def scan_figure(moments: Moments, title: str = "", model: ScanModel | None = None) -> Figure:
-    """Draw what a survey does to the orientation of the beam.
+    """Draw the orientation of the beam in a survey.
 
     Parameters
     ----------
     moments
-        With smax >= 2.
+        Orientation moments with smax >= 2.
     title
-        Heading.
+        Heading of the figure.
     model
-        If given, its exact long-time limit is drawn beside the moments; leave it out for other frames than
-        ecliptic and for models whose limit does not exist.
+        If given, its exact long-time limit is drawn beside the moments; omit it outside the ecliptic frame and for
+        models without such a limit.
 
     Returns
     -------
     Figure
         Four panels: psi-bar = -arg(w_2) / 2, the mean orientation of the beam's x axis from e_theta towards e_phi,
-        an axis and so known up to 180 degrees; <cos 2 psi> = Re w_2; hits and Re w_2 against latitude.
+        an axis and so defined up to 180 degrees; <cos 2 psi> = Re w_2; hits and Re w_2 against latitude.
 
     Notes
     -----
     The paper (arXiv:1210.7318, fig. cos2rho) averages the angles themselves (rho there), which depends on where the
     circle is cut. The circular mean of e^{i psi}, -arg(w_1), would be +-90 degrees nearly everywhere: the two passes
-    over a pixel see it at psi and 180 deg - psi.
+    over a pixel have psi and 180 deg - psi.
     """
     if moments.smax < 2:
         raise InputError(f"the moments end at s = {moments.smax}, but the figure needs s = 2; use smax >= 2.")
@@ -57,7 +57,7 @@ def scan_figure(moments: Moments, title: str = "", model: ScanModel | None = Non
 
 
 def _mollweide(axes: Axes, values: NDArray[np.float64], colours: str, limits: tuple[float, float], unit: str) -> None:
-    """Draw a RING map in Mollweide projection, longitude 0 in the middle and growing to the left."""
+    """Draw a RING map in Mollweide projection, longitude 0 in the middle, increasing to the left."""
     nside = healpy.npix2nside(values.size)
     projector: Any = healpy.projector.MollweideProj(xsize=1200)
     image = projector.projmap(values, lambda x, y, z: healpy.vec2pix(nside, x, y, z))

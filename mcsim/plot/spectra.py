@@ -1,4 +1,4 @@
-"""Binned BipoSH spectra of an ensemble with their error bars."""
+"""Figure of the binned BipoSH spectra of an ensemble with error bars."""
 
 from pathlib import Path
 
@@ -32,12 +32,12 @@ def ensemble_figure(
     pair
         Label of the pair; by default the first.
     prediction
-        What :func:`mcsim.prediction.predict` expects of the ensemble, drawn as dashed lines through its binned spectra.
+        Prediction by :func:`mcsim.predict`, drawn as dashed lines.
 
     Raises
     ------
     InputError
-        If nothing of the store fits the choice, or the prediction lacks the pair or a mode.
+        If the selection is empty, or the prediction lacks the pair or a mode.
     """
     with opening.open_summary(path) as summary:
         pairs = [str(label) for label in summary["pair"].values]
@@ -52,7 +52,7 @@ def ensemble_figure(
     if L is None and np.any(chosen["L"].values > 0):
         keep &= chosen["L"].values > 0
     modes = chosen.isel(mode=np.flatnonzero(keep))
-    # A pair of orders -d, d beside an auto spectrum is all NaN there: nothing to draw.
+    # Modes that only pairs have (d < 0) are all NaN for an auto spectrum: nothing to draw.
     modes = modes.isel(mode=np.flatnonzero(np.isfinite(modes["biposh_binned_mean"].values).any(axis=-1)))
     if modes.sizes["mode"] == 0:
         wanted = ", ".join(f"{name} = {value}" for name, value in (("L", L), ("M", M), ("d", d)) if value is not None)
@@ -63,7 +63,7 @@ def ensemble_figure(
 
 
 def _matching(prediction: xr.Dataset, pair: str, modes: xr.Dataset) -> xr.Dataset:
-    """The same pair and modes of a prediction."""
+    """Return the same pair and modes of a prediction."""
     try:
         return prediction.sel(pair=pair, mode=modes["mode"].values)
     except KeyError as error:
@@ -96,24 +96,24 @@ def _draw(modes: xr.Dataset, panels: list[tuple[int, int]], title: str, expected
         notes += ["points: non-circular minus circular-beam control", "band (M = 0): plain mean and its standard error"]
     if expected is not None:
         notes.append(f"dashed: prediction, {expected.attrs['prediction']}")
-    # On a narrow figure a line for each; one line would be cut at both sides.
+    # A narrow figure takes one line for each; a single line would be cut off.
     figure.supxlabel((";  " if figure.get_figwidth() > 10.0 else "\n").join(notes), fontsize=9)
     return figure
 
 
 def _abscissa(one: xr.Dataset) -> np.ndarray:
-    """Middles of the bins; modes of one panel stand a tenth of a bin apart."""
+    """Return the centres of the bins, with modes of one panel a tenth of a bin apart."""
     width = one["bin_last"].values - one["bin_first"].values + 1.0
     return np.asarray(one["bin"].values + 0.1 * width * int(one["d"]))
 
 
 def _parts(one: xr.Dataset) -> list[bool]:
-    """Parts of a mode that an ensemble can have: False for the real one, True for the imaginary one."""
+    """Return the nonzero parts of a mode: False for the real one, True for the imaginary one."""
     return [str(one["parity"].values) == "odd"] if int(one["M"]) == 0 else [False, True]
 
 
 def _expected(axes: Axes, one: xr.Dataset, colour: str, paired: bool) -> None:
-    """The prediction of one mode, a line for each of its parts."""
+    """Draw the prediction of one mode, a line for each part."""
     values = one[f"biposh{'_difference' if paired else ''}_binned_mean"].values
     for imaginary in _parts(one):
         axes.plot(
@@ -126,7 +126,7 @@ def _expected(axes: Axes, one: xr.Dataset, colour: str, paired: bool) -> None:
 
 
 def _spectrum(axes: Axes, one: xr.Dataset, colour: str, paired: bool) -> None:
-    """One mode: points with errors, and behind paired ones the band of the plain mean."""
+    """Draw one mode: points with errors and, if paired, the band of the plain mean behind them."""
     d, M, odd = int(one["d"]), int(one["M"]), str(one["parity"].values) == "odd"
 
     def component(name: str, imaginary: bool) -> np.ndarray:
@@ -136,7 +136,7 @@ def _spectrum(axes: Axes, one: xr.Dataset, colour: str, paired: bool) -> None:
     name = "biposh_difference_binned" if paired else "biposh_binned"
     for imaginary in _parts(one):
         label = f"d = {d}" + (f", {'imaginary' if imaginary else 'real'}" if M > 0 or odd else "")
-        # The modulus' variance of a mode with M > 0 is shared by its two parts.
+        # The two parts of a mode with M > 0 share the variance of its modulus.
         share = 1.0 if M == 0 else np.sqrt(0.5)
         x = _abscissa(one)
         axes.errorbar(

@@ -20,12 +20,12 @@ WHOLE = 4
 
 
 def load_beam(channel: config.Channel, lmax: int) -> beams.Beam:
-    """The beam of a channel, up to lmax; of a differencing scan that of side A."""
+    """Return the beam of a channel, up to lmax; of a differencing scan that of side A."""
     return _beam(channel.name, channel.beam, lmax)
 
 
 def load_beam_b(channel: config.Channel, lmax: int) -> beams.Beam:
-    """The beam of side B of a differencing channel, up to lmax: its own, or side A's mirrored."""
+    """Return the beam of side B of a differencing channel, up to lmax: its own, or side A's mirrored."""
     if channel.beam_b is None:
         return mirrored(load_beam(channel, lmax))
     return _beam(channel.name, channel.beam_b, lmax)
@@ -48,7 +48,7 @@ def _beam(channel: str, spec: config.Beam, lmax: int) -> beams.Beam:
 
 
 def load_beam_map(channel: str, spec: config.BeamMap) -> beams.BeamMap:
-    """The beam map of a channel."""
+    """Return the beam map of a channel."""
     return beams.read_map(
         config.channel_path(spec.path, channel),
         pixel_deg=spec.pixel_deg,
@@ -62,7 +62,7 @@ def load_beam_map(channel: str, spec: config.BeamMap) -> beams.BeamMap:
 def scan_model(
     spec: config.Channel, chosen: config.ScanHitAveraged | config.ScanDifferencing, split: str | None
 ) -> scan.ScanModel:
-    """The scan model of a channel, at the sampling that the channel asks for."""
+    """Return the scan model of a channel, at the sampling that the channel asks for."""
     template = config.channel_path(chosen.model, spec.name, split)
     model = scan.ScanModel.load(str(template))
     return model if chosen.sample_period_s is None else model.with_sampling(chosen.sample_period_s)
@@ -124,7 +124,7 @@ def refuse_pixel_effects(channel: str, acting: tuple[systematics.Effect, ...]) -
 
 
 def site_of(run: config.RunConfig, spec: config.Channel) -> systematics.Site:
-    """What effects may know of a channel."""
+    """Return what effects may know of a channel."""
     pointing, dipole = _described(spec)
     amplitude = run.sky.dipole_uk if run.sky.dipole_uk is not None else dipole or 0.0
     towards = healpy.ang2vec(run.sky.dipole_lon_deg, run.sky.dipole_lat_deg, lonlat=True)
@@ -142,7 +142,7 @@ def site_of(run: config.RunConfig, spec: config.Channel) -> systematics.Site:
 
 
 def site_b_of(site: systematics.Site, spec: config.Channel) -> systematics.Site:
-    """The same for side B of a differencing channel, from that of side A."""
+    """Return what effects may know of side B of a differencing channel, from that of side A."""
     whole = partial(_whole, load_beam_b, spec, site.lmax) if _is_cut(spec.beam_b or spec.beam) else None
     return replace(site, beam=load_beam_b(spec, site.lmax), whole=whole)
 
@@ -152,7 +152,7 @@ def _is_cut(spec: config.Beam) -> bool:
 
 
 def _whole(load: Callable[[config.Channel, int], beams.Beam], spec: config.Channel, lmax: int) -> beams.Beam:
-    """A beam of a channel without its m_max."""
+    """Return a beam of a channel without its m_max."""
     chosen = load(_with_m_max(spec, None), lmax)
     if chosen.mmax >= WHOLE:
         return chosen
@@ -172,7 +172,7 @@ def _cut_at(spec: config.Beam, m_max: int | None) -> config.Beam:
 
 
 def _described(spec: config.Channel) -> tuple[systematics.Pointing | None, float | None]:
-    """How a channel was pointed, where one line of sight says it all, and the dipole that its description names."""
+    """Return how a channel was pointed, if one line of sight says it all, and the dipole that its description names."""
     match spec.scan:
         case config.ScanMoments() if spec.scan.model is not None:
             file = resources.scan_model(str(config.channel_path(spec.scan.model, spec.name)))

@@ -39,7 +39,7 @@ class Response:
 
 
 def response(beam: Beam, lmax: int, window: NDArray[np.float64] | None = None) -> Response:
-    """Response of a beam known up to at least ``lmax``, times a pixel window of shape (>= lmax + 1,).
+    """Return the response of a beam known up to at least ``lmax``, times a pixel window of shape (>= lmax + 1,).
 
     Raises
     ------
@@ -56,12 +56,12 @@ def response(beam: Beam, lmax: int, window: NDArray[np.float64] | None = None) -
 
 
 def circular_alm(alm: NDArray[np.complex128], response: Response) -> NDArray[np.complex128]:
-    """Coefficients of the sky seen through the circular part of the beam, shape as ``alm``."""
+    """Return the coefficients of the sky seen through the circular part of the beam, shape as ``alm``."""
     return alm_.multiply(alm, response.factors[0].real, response.lmax)
 
 
 def circular_map(alm: NDArray[np.complex128], response: Response, nside: int, nthreads: int = 1) -> healpix.Map:
-    """S_0: the sky through the circular part of the beam at pixel centres, uK, shape (npix,)."""
+    """Return S_0, the sky through the circular part of the beam at pixel centres, uK, shape (npix,)."""
     return healpix.synthesis(circular_alm(alm, response)[None], nside, response.lmax, nthreads=nthreads)[0]
 
 
@@ -81,11 +81,11 @@ class CircularMaps:
         self._made: dict[str, NDArray[np.float64]] = {}
 
     def map(self, alm: NDArray[np.complex128]) -> healpix.Map:
-        """The sky at pixel centres, uK, shape (npix,); read-only."""
+        """Return the sky at pixel centres, uK, shape (npix,); read-only."""
         return self._once(alm, "map", lambda: healpix.synthesis(alm[None], *self._grid, nthreads=self.nthreads)[0])
 
     def gradient(self, alm: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Its gradient as of :func:`mcsim.sphere.healpix.gradient`, uK per radian, shape (2, npix); read-only."""
+        """Return its gradient as :func:`mcsim.sphere.healpix.gradient` does, uK/rad, shape (2, npix); read-only."""
         return self._once(alm, "gradient", lambda: healpix.gradient(alm, *self._grid, self.nthreads))
 
     def _once(
@@ -102,7 +102,7 @@ class CircularMaps:
 def spin_maps(
     alm: NDArray[np.complex128], response: Response, nside: int, nthreads: int = 1
 ) -> dict[int, NDArray[np.float64]]:
-    """S_s at pixel centres for every s > 0 that the beam has: real and imaginary parts, shape (2, npix), in uK.
+    """Return S_s at pixel centres for every s > 0 that the beam has: real and imaginary parts, shape (2, npix), in uK.
 
     Notes
     -----
@@ -124,7 +124,7 @@ def spin_maps(
 
 
 def noncircular_map(maps: dict[int, NDArray[np.float64]], moments: Moments) -> healpix.Map:
-    """2 Re sum_{s > 0} w_s S_s: what the non-circular part of the beam adds under a scan, uK, shape (npix,).
+    """Return 2 Re sum_{s > 0} w_s S_s, what the non-circular part of the beam adds under a scan, uK, shape (npix,).
 
     Raises
     ------
@@ -146,7 +146,7 @@ def noncircular_map(maps: dict[int, NDArray[np.float64]], moments: Moments) -> h
 
 @numba.njit(cache=True, nogil=True)
 def _add_twice_real_part(w, real, imag, total):  # type: ignore[no-untyped-def]
-    """total += 2 Re(w (real + i imag)) in one pass over memory, which is what this costs."""
+    """Add 2 Re(w (real + i imag)) to ``total`` in one pass over memory, which is what this costs."""
     for pixel in range(total.size):
         total[pixel] += 2.0 * (w[pixel].real * real[pixel] - w[pixel].imag * imag[pixel])
 
@@ -160,14 +160,14 @@ def turned(map_: healpix.Map, moments: Moments, s: int, total: NDArray[np.float6
 
 @numba.njit(cache=True, nogil=True)
 def _add_turned(map_, w, total):  # type: ignore[no-untyped-def]
-    """In one pass over memory."""
+    """Add conj(w) times a map to ``total`` in one pass over memory."""
     for pixel in range(map_.size):
         total[0, pixel] += map_[pixel] * w[pixel].real
         total[1, pixel] -= map_[pixel] * w[pixel].imag
 
 
 def centroid_map(gradient: NDArray[np.float64], moments: Moments) -> healpix.Map:
-    """d . grad S_0 for samples whose mean position is off the pixel centre by d, uK, shape (npix,).
+    """Return d . grad S_0 for samples whose mean position is off the pixel centre by d, uK, shape (npix,).
 
     Parameters
     ----------
@@ -186,6 +186,6 @@ def centroid_map(gradient: NDArray[np.float64], moments: Moments) -> healpix.Map
 
 @numba.njit(cache=True, nogil=True)
 def _along(dtheta, down, dphi, east, result):  # type: ignore[no-untyped-def]
-    """In one pass over memory."""
+    """Fill ``result`` with d . grad in one pass over memory."""
     for pixel in range(result.size):
         result[pixel] = dtheta[pixel] * down[pixel] + dphi[pixel] * east[pixel]

@@ -1,7 +1,7 @@
 """Maps of one sky from the differences of two beams: side maps, right-hand sides, conjugate gradients."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,7 @@ class Solved:
 
 
 def sides(run: config.RunConfig) -> dict[str, str]:
-    """What stands for the beam of side B of every differencing channel, in words."""
+    """Say in words what stands for the beam of side B of every differencing channel."""
     return {
         channel.name: "side A's beam mirrored, x -> -x, b_lm -> (-1)^m conj(b_lm)"
         if channel.beam_b is None
@@ -46,7 +46,7 @@ def sides(run: config.RunConfig) -> dict[str, str]:
 
 
 def seconds(run: config.RunConfig) -> float:
-    """Estimate of the time that one realization of all differencing channels takes a core."""
+    """Estimate the time that one realization of all differencing channels takes one core."""
     splits = run.map.splits or (None,)
     models = [
         (scan_model(channel, channel.scan, splits[0]), channel.scan.pair)
@@ -60,12 +60,11 @@ def maps(
     channel: Channel,
     sky: NDArray[np.complex128],
     dipole: NDArray[np.complex128] | None,
-    nside: int,
     seed: int,
     realization: int,
     nthreads: int = 1,
 ) -> Iterator[tuple[SurveyMap, Solved]]:
-    """Maps of a differencing channel, one for each split of its survey.
+    """Yield the maps of a differencing channel, one for each split of its survey.
 
     Parameters
     ----------
@@ -74,11 +73,9 @@ def maps(
     sky
         Coefficients up to the sky's lmax, uK.
     dipole
-        What of the sky is taken off the differences again as believed, of the same shape; None: nothing.
-    nside
-        Of the maps.
+        What of the sky is taken off the differences again with the fiducial beams, of the same shape; None: nothing.
     seed, realization
-        They fix the noise, which the map and its circular twin share.
+        They fix the noise, which the map and its circular-beam control share.
     nthreads
         Threads; they do not change the result.
 
@@ -89,43 +86,37 @@ def maps(
 
     Notes
     -----
-    Map-making is linear, so the twin and what the rest of the beams adds are solved for apart, each to the tolerance
-    asked for relative to itself: the paired difference does not inherit the residual of the much larger twin. The twin
-    starts from the mean of the two circular maps, which is the solution itself where these are equal and there is no
-    noise.
+    Map-making is linear, so the circular-beam control and what the rest of the beams adds are solved for apart, each to
+    the tolerance asked for relative to itself: the paired difference does not inherit the residual of the much larger
+    control. The control starts from the mean of the two circular maps, which is the solution itself where these are
+    equal and there is no noise.
     """
-    side_b = channel.side_b
+    side_b, nside = channel.side_b, channel.site.nside
     assert side_b is not None  # the caller has told the channels apart
-    whole = [mapmaking.side_maps(sky, response, nside, nthreads) for response in (channel.response, side_b.response)]
-    round_parts = [side[:, :1] for side in whole]
-    start = 0.5 * (round_parts[0][:, 0] + round_parts[1][:, 0])
-    taken_off: list[mapmaking.SideMaps] = []
+    whole_a, whole_b = (mapmaking.side_maps(sky, r, nside, nthreads) for r in (channel.response, side_b.response))
+    circular_a, circular_b = whole_a[:, :1], whole_b[:, :1]
+    start = 0.5 * (circular_a[:, 0] + circular_b[:, 0])
+    skies, x = [(circular_a, circular_b), (whole_a, whole_b)], side_b.scan.transmission_imbalance
+    removed = None
     if dipole is not None:
-        believed = (channel.site.beam, side_b.believed)
-        responses = [convolve.response(beam, channel.site.lmax, channel.window) for beam in believed]
-        taken_off = [mapmaking.side_maps(dipole, response, nside, nthreads) for response in responses]
+        fiducial = [
+            convolve.response(b, channel.site.lmax, channel.window) for b in (channel.site.beam, side_b.fiducial)
+        ]
+        dipole_a, dipole_b = (mapmaking.side_maps(dipole, response, nside, nthreads) for response in fiducial)
+        removed = [(dipole_a, dipole_b)]
     for m in channel.maps:
         assert m.pairs is not None  # as of every map of such a channel
-        circular, complete = mapmaking.rhs_from_maps(
-            m.pairs,
-            [(round_parts[0], round_parts[1]), (whole[0], whole[1])],
-            x=side_b.imbalance,
-            x_assumed=side_b.scan.transmission_imbalance,
-            noise_sigma0_uk=side_b.sigma0_uk,
-            rng=rng.generator(seed, realization, f"noise/{m.name}"),
-            nthreads=nthreads,
-        )
-        if taken_off:
-            sides = (taken_off[0], taken_off[1])
-            known = mapmaking.rhs_from_maps(m.pairs, [sides], x=side_b.scan.transmission_imbalance, nthreads=nthreads)[
-                0
-            ]
-            circular, complete = circular - known, complete - known
+        noise = mapmaking.DifferenceNoise(side_b.sigma0_uk, rng.generator(seed, realization, f"noise/{m.name}"))
+        imbalance = mapmaking.Imbalance(side_b.imbalance, x)
+        control, complete = mapmaking.rhs_from_maps(m.pairs, skies, imbalance, noise, nthreads)
+        if removed is not None:
+            known = mapmaking.rhs_from_maps(m.pairs, removed, mapmaking.Imbalance(x), nthreads=nthreads)[0]
+            control, complete = control - known, complete - known
         yield (
             m,
             Solved(
-                _solve(m, side_b, circular, start, "the circular twin", nthreads),
-                _solve(m, side_b, complete - circular, None, "the non-circular part", nthreads),
+                _solve(m, side_b, control, start, "the circular-beam control", nthreads),
+                _solve(m, side_b, complete - control, None, "the non-circular part", nthreads),
             ),
         )
 
@@ -133,11 +124,11 @@ def maps(
 def _solve(m: SurveyMap, side_b: SideB, rhs: Map, start: Map | None, what: str, nthreads: int) -> Map:
     assert m.pairs is not None  # as of every map of such a channel
     chosen = side_b.scan
-    x, limit = chosen.transmission_imbalance, chosen.max_iterations
-    map_uk, report = mapmaking.solve(m.pairs, rhs, x, chosen.tolerance, limit, start, nthreads=nthreads)
+    x, rule = chosen.transmission_imbalance, mapmaking.StoppingRule(chosen.tolerance, chosen.max_iterations)
+    map_uk, report = mapmaking.solve(m.pairs, rhs, x, rule, start, nthreads)
     if side_b.iterations_short > 0 and report.converged:
-        limit = max(report.iterations - side_b.iterations_short, 0)
-        map_uk, _ = mapmaking.solve(m.pairs, rhs, x, chosen.tolerance, limit, start, nthreads=nthreads)
+        short = replace(rule, max_iterations=max(report.iterations - side_b.iterations_short, 0))
+        map_uk, _ = mapmaking.solve(m.pairs, rhs, x, short, start, nthreads)
     if not report.converged:
         raise RuntimeError(
             f"map {m.name}, {what}: the map-making reached a relative residual of {report.relative_residual:.2g} in "

@@ -59,7 +59,7 @@ class Rings:
 
 
 def parallel_transport_rings(psi0: float, orders: Iterable[int], degree: int) -> tuple[Rings, ...]:
-    """Rings for w_s = e^{-i s psi0} everywhere; see :func:`limit_rings`."""
+    """Return the rings for w_s = e^{-i s psi0} everywhere; see :func:`limit_rings`."""
     check_angle(psi0, "psi0")
     moments = {s: np.exp(-1j * s * psi0) for s in orders}
     return _rings(lambda theta: {s: np.full(theta.size, w) for s, w in moments.items()}, np.empty(0), degree)
@@ -68,7 +68,7 @@ def parallel_transport_rings(psi0: float, orders: Iterable[int], degree: int) ->
 def limit_rings(
     model: ScanModel, orders: Iterable[int], degree: int, line_of_sight: str | None = None
 ) -> tuple[Rings, ...]:
-    """Rings for the exact long-time limit of a scan model, in ecliptic coordinates.
+    """Return the rings for the exact long-time limit of a scan model, in ecliptic coordinates.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def limit_rings(
 
 
 def noncircular_alm(alm: Alm, response: Response, rings: Iterable[Rings], lmax: int, nthreads: int = 1) -> Alm:
-    """a_lm up to ``lmax`` of 2 Re sum_{s > 0} w_s S_s: what the non-circular part of the beam adds under a scan.
+    """Return a_lm up to ``lmax`` of 2 Re sum_{s > 0} w_s S_s: what the non-circular part of the beam adds under a scan.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def noncircular_alm(alm: Alm, response: Response, rings: Iterable[Rings], lmax: 
 
 
 def _real_part(alm: Alm, factor: Alm, s: int, theta: Vector, nthreads: int) -> NDArray[np.complex128]:
-    """Fourier coefficients in azimuth of Re S_s on rings, shape (ring, lmax + 1)."""
+    """Return the fourier coefficients in azimuth of Re S_s on rings, shape (ring, lmax + 1)."""
     lmax = factor.size - 1
     if theta.min() ** (1 - s) > _ROUND_OFF:
         fields = np.stack([alm_.multiply(alm, -factor.real, lmax), alm_.multiply(alm, -factor.imag, lmax)])
@@ -178,7 +178,7 @@ def _real_part(alm: Alm, factor: Alm, s: int, theta: Vector, nthreads: int) -> N
 
 @numba.njit(cache=True, nogil=True)
 def _times_sine_power(alm, real, imag, s, start, result):  # type: ignore[no-untyped-def]
-    """Coefficients of Re(sin^s(theta) S_s) by m: rows m..lmax + s, at start[m].
+    """Return the coefficients of Re(sin^s(theta) S_s) by m: rows m..lmax + s, at start[m].
 
     With h_k = sin^k (spin-raised k times), h_{k+1} = -(sin d/dtheta - 2 k cos - m) h_k, which takes the degree l to
     l - 1, l and l + 1. The sky is real, so the real part keeps what is even in m of the factor's real part and what
@@ -211,7 +211,7 @@ def _times_sine_power(alm, real, imag, s, start, result):  # type: ignore[no-unt
 
 
 def _rings(moments: Callable[[Vector], dict[int, Alm]], breaks: Vector, degree: int) -> tuple[Rings, ...]:
-    """Rules up to a degree for moments that are smooth between the breaks."""
+    """Return rules up to a degree for moments that are smooth between the breaks."""
     theta, weight = _fine_rule(breaks, degree)
     found = []
     for s, w in moments(theta).items():
@@ -228,7 +228,7 @@ def _rings(moments: Callable[[Vector], dict[int, Alm]], breaks: Vector, degree: 
 
 
 def _signed_rule(theta: Vector, measure: Vector, degree: int) -> tuple[Vector, Vector]:
-    """Few nodes, and weights, that integrate polynomials in cos(theta) like the many of ``measure``."""
+    """Return few nodes, and weights, that integrate polynomials in cos(theta) like the many of ``measure``."""
     counts = np.abs(measure) > 1e-17 * np.abs(measure).sum()
     x, theta, measure = np.cos(theta[counts]), theta[counts], measure[counts]
     if np.abs(x + x[::-1]).max() < 1e-12 and np.abs(measure - measure[::-1]).max() < 1e-10 * np.abs(measure).max():
@@ -252,7 +252,7 @@ def _signed_rule(theta: Vector, measure: Vector, degree: int) -> tuple[Vector, V
 
 
 def _nodes(length: float, degree: int) -> int:
-    """Gauss nodes that integrate polynomials of a degree in cos(theta) to round-off over an interval of theta.
+    """Return Gauss nodes that integrate polynomials of a degree in cos(theta) to round-off over an interval of theta.
 
     A node is needed for every two thirds of a wavelength at its middle, and some for the last digits.
     """
@@ -260,7 +260,7 @@ def _nodes(length: float, degree: int) -> int:
 
 
 def _fine_rule(breaks: Vector, degree: int) -> tuple[Vector, Vector]:
-    """Double-exponential rule over the sphere between the breaks (Takahasi & Mori 1974), fine enough for a degree."""
+    """Return a double-exponential rule (Takahasi & Mori 1974) between the breaks, fine enough for a degree."""
     edges = np.concatenate([[0.0], breaks, [np.pi]])
     thetas, weights = [], []
     for low, high in pairwise(edges):
@@ -274,7 +274,7 @@ def _fine_rule(breaks: Vector, degree: int) -> tuple[Vector, Vector]:
 
 
 def _gauss(x: Vector, weight: Vector, count: int) -> tuple[Vector, Vector]:
-    """Gauss rule with ``count`` nodes, as colatitudes, for a sum of points with positive weights in x = cos(theta)."""
+    """Return ``count`` Gauss nodes, as colatitudes, for a sum of points with positive weights in x = cos(theta)."""
     if x[0] + x[-1] < 0.0:
         # The same steps as for its mirror image, so that round-off is the same as well.
         nodes, weights = _gauss(-x[::-1], weight[::-1], count)
@@ -288,7 +288,7 @@ def _gauss(x: Vector, weight: Vector, count: int) -> tuple[Vector, Vector]:
 
 
 def _lanczos(x: Vector, weight: Vector, count: int) -> tuple[Vector, Vector]:
-    """As :func:`_recurrence`, free of its round-off, at a cost of count^2 points."""
+    """Return what :func:`_recurrence` does, free of its round-off, at a cost of count^2 points."""
     basis = np.zeros((count, x.size))
     diagonal, squared = np.empty(count), np.empty(count)
     vector = np.sqrt(weight)
@@ -304,7 +304,7 @@ def _lanczos(x: Vector, weight: Vector, count: int) -> tuple[Vector, Vector]:
 
 @numba.njit(cache=True, nogil=True)
 def _recurrence(x, weight, count):  # type: ignore[no-untyped-def]
-    """Coefficients a_k, b_k of the monic orthogonal polynomials of a sum of points, added one by one."""
+    """Return the coefficients a_k, b_k of the monic orthogonal polynomials of a sum of points, added one by one."""
     diagonal, squared = np.zeros(count), np.zeros(count)
     for point in range(x.size):
         mass, cosine, sine, shift = weight[point], 1.0, 0.0, 0.0

@@ -1,4 +1,4 @@
-"""The whole survey sample by sample, effects and all: the referee of the default route, realization by realization."""
+"""The whole survey sample by sample, effects and all: the time-ordered reference of each realization."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -11,6 +11,7 @@ from mcsim import systematics
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import ScanModel
+from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.simulation import simulate, tod
 from mcsim.simulation.survey import Channel, Survey
 from mcsim.sphere import rng
@@ -25,15 +26,15 @@ EPSILON = 1e-9
 def maps(
     survey: Survey, realization: int, nthreads: int = 1, epsilon: float = EPSILON
 ) -> list[tuple[str, NDArray[np.float64]]]:
-    """Maps of one realization, each the plain mean of its samples.
+    """Return the maps of one realization, each the plain mean of its samples.
 
     Parameters
     ----------
     survey
         With channels whose pointing is known and whose scans do not difference.
     realization
-        Index: sky and what effects draw are those of :func:`mcsim.simulation.simulate.maps`, the noise is a draw of its
-        own.
+        Index: the sky and what effects draw are those of :func:`mcsim.simulation.simulate.maps`, the noise is a draw
+        of its own.
     nthreads
         Threads of the interpolation; they do not change the result.
     epsilon
@@ -54,7 +55,7 @@ def maps(
     Notes
     -----
     For every sample: its true pointing (moved, or earlier), the sky and the dipole through the true beam there, times
-    one plus the error of the gain, less the dipole through the believed beam at the believed pointing, plus noise.
+    one plus the error of the gain, less the dipole through the fiducial beam at the fiducial pointing, plus noise.
     An effect acts by its ``moved`` and ``lags`` where it has them, else by the beam that its ``pointing`` gives.
     """
     sky = simulate.draw_sky(survey, realization)
@@ -87,7 +88,7 @@ def _channel(
 
 
 def check(channel: Channel) -> None:
-    """InputError for a channel that cannot be simulated sample by sample."""
+    """Raise InputError for a channel that cannot be simulated sample by sample."""
     if channel.side_b is not None or channel.site.pointing is None:
         raise InputError(
             f"channel {channel.name} cannot be simulated sample by sample: its scan differences two beams, or when it "
@@ -106,7 +107,7 @@ def _cut(beam: Beam, lmax: int) -> Beam:
 
 
 def _beam(acting: tuple[systematics.Effect, ...], site: systematics.Site) -> Beam:
-    """The beam about the true line of sight."""
+    """Return the beam about the true line of sight."""
     beam = site.beam
     for effect in acting:
         beam = effect.beam(beam, site)
@@ -121,16 +122,16 @@ def _moves(effect: systematics.Effect) -> bool:
     return effect.lags() is not None or effect.moved(nowhere, nowhere, nowhere) is not None
 
 
-def _believed(channel: Channel, share: tuple[float, float], delay_s: float = 0.0) -> Iterator[tod.Samples]:
-    """The channel's samples as they are believed to point, or as they pointed ``delay_s`` before."""
+def _fiducial_samples(channel: Channel, share: tuple[float, float], delay_s: float = 0.0) -> Iterator[tod.Samples]:
+    """Yield the channel's samples at their fiducial pointing, or at that of ``delay_s`` before."""
     site = channel.site
     pointing = site.pointed("of sampled maps")
     model = pointing.model if delay_s == 0.0 else _earlier(pointing.model, delay_s)
-    return tod.samples(model, pointing.line, site.nside, site.frame, share)
+    return tod.samples(model, pointing.line, MapGrid(site.nside, site.frame, share))
 
 
 def _earlier(model: ScanModel, delay_s: float) -> ScanModel:
-    """The same survey with all its angles as they were ``delay_s`` before."""
+    """Return the same survey with all its angles as they were ``delay_s`` before."""
     return replace(
         model,
         spin_phase_deg=model.spin_phase_deg - 360.0 * delay_s / model.spin_period_s,
@@ -140,25 +141,25 @@ def _earlier(model: ScanModel, delay_s: float) -> ScanModel:
 
 
 def _seen(channel: Channel, share: tuple[float, float], observe: tod.Stage) -> Iterator[tod.Samples]:
-    """The signal at the true pointings, on samples that keep the believed ones."""
+    """Yield the signal at the true pointings, on samples that keep the fiducial ones."""
     lags = [(1.0, 0.0)]
     for effect in channel.effects:
         more = effect.lags()
         if more is not None:
             lags = [(weight * w, delay + d) for weight, delay in lags for w, d in more]
-    streams = [observe(_moved(channel, _believed(channel, share, delay), share, delay)) for _, delay in lags]
-    for believed, *true in zip(_drawn_in(channel, _believed(channel, share)), *streams, strict=True):
+    streams = [observe(_moved(channel, _fiducial_samples(channel, share, delay), share, delay)) for _, delay in lags]
+    for fiducial, *true in zip(_drawn_in(channel, _fiducial_samples(channel, share)), *streams, strict=True):
         signal = sum((w * chunk.signal_uk for (w, _), chunk in zip(lags, true, strict=True)), start=0.0)
-        yield replace(believed, signal_uk=np.asarray(signal))
+        yield replace(fiducial, signal_uk=np.asarray(signal))
 
 
 def _moved(
     channel: Channel, stream: Iterable[tod.Samples], share: tuple[float, float], delay_s: float
 ) -> Iterator[tod.Samples]:
-    """True directions and orientations."""
+    """Yield true directions and orientations."""
     spread = _spread(channel)
-    believed = stream if delay_s == 0.0 or spread == 1.0 else _believed(channel, share)
-    pairs = ((chunk, chunk) for chunk in stream) if believed is stream else zip(stream, believed, strict=True)
+    fiducial = stream if delay_s == 0.0 or spread == 1.0 else _fiducial_samples(channel, share)
+    pairs = ((chunk, chunk) for chunk in stream) if fiducial is stream else zip(stream, fiducial, strict=True)
     for chunk, reference in pairs:
         theta, phi, psi = chunk.theta, chunk.phi, chunk.psi
         for effect in channel.effects:
@@ -176,7 +177,7 @@ def _spread(channel: Channel) -> float:
 
 
 def _drawn_in(channel: Channel, stream: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
-    """Believed samples, as near to the centres of their pixels as an effect on their spread puts them."""
+    """Yield fiducial samples, as near to the centres of their pixels as an effect on their spread puts them."""
     spread = _spread(channel)
     for chunk in stream:
         if spread == 1.0:
@@ -196,7 +197,7 @@ def _angles(vector: Map) -> tuple[Map, Map]:
 
 
 def _offset(channel: Channel, chunk: tod.Samples) -> Map:
-    """From the centre of each sample's pixel to the sample, shape (3, n)."""
+    """Return the vector from the centre of each sample's pixel to the sample, shape (3, n)."""
     centres = np.stack(healpy.pix2vec(channel.site.nside, chunk.pixel))
     return np.asarray(_vector(chunk.theta, chunk.phi) - centres)
 

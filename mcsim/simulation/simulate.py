@@ -20,7 +20,7 @@ Alm = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class Observed:
-    """What one map of a realization gives: its a_lm, those of its circular twin, and the map itself where asked for."""
+    """A map's a_lm, those of its circular-beam control, and the map itself where asked for."""
 
     alm: Alm
     circular: Alm | None
@@ -28,7 +28,7 @@ class Observed:
 
 
 def realize(survey: Survey, realization: int, nthreads: int = 1) -> dict[str, NDArray]:
-    """Spectra of one realization.
+    """Return the spectra of one realization.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def realize(survey: Survey, realization: int, nthreads: int = 1) -> dict[str, ND
     -------
     dict
         ``biposh`` (pair, mode, lmax + 1) complex and ``cl`` (pair, lmax + 1), uK^2; with pairing the same of the
-        circular twin, ``biposh_circular`` and ``cl_circular``; with kept maps ``observed_map`` (map, npix), uK.
+        circular-beam control, ``biposh_circular`` and ``cl_circular``; with kept maps ``observed_map`` (map, npix), uK.
     """
     ensemble = survey.config.ensemble
     sky = draw_sky(survey, realization)
@@ -58,7 +58,7 @@ def realize(survey: Survey, realization: int, nthreads: int = 1) -> dict[str, ND
 
 
 def draw_sky(survey: Survey, realization: int) -> Alm:
-    """Coefficients of the sky of one realization up to the sky's lmax, uK: drawn, or read from the user's files."""
+    """Draw the sky of one realization, or read it from the user's files: a_lm up to the sky's lmax, uK."""
     sky = survey.config.sky
     if sky.alm is not None:
         return skies.read_alm(config.sky_path(sky.alm, realization), sky.lmax, survey.config.map.frame)
@@ -73,7 +73,7 @@ def draw_sky(survey: Survey, realization: int) -> Alm:
 
 
 def maps(survey: Survey, realization: int, nthreads: int = 1, sky: Alm | None = None) -> NDArray[np.float64]:
-    """Maps of one realization, effects and noise included, uK, shape (map, npix); ``healpy.UNSEEN`` without a hit.
+    """Return the maps of one realization with effects and noise, uK, shape (map, npix), ``healpy.UNSEEN`` without hits.
 
     ``sky``: coefficients up to the sky's lmax, in place of those that the realization would draw.
     """
@@ -82,23 +82,23 @@ def maps(survey: Survey, realization: int, nthreads: int = 1, sky: Alm | None = 
     found = []
     made = _circular_maps(survey, nthreads)
     for channel in survey.channels:
-        for m, layers in _layers(survey, channel, sky, realization, made, smooth=True):
-            found.append(np.where(m.moments.hits > 0, layers.total, healpy.UNSEEN))
+        for m, parts in _map_parts(survey, channel, sky, realization, made, smooth=True):
+            found.append(np.where(m.moments.hits > 0, parts.total, healpy.UNSEEN))
     return np.stack(found)
 
 
 @dataclass(frozen=True)
-class Layers:
-    """What a map is the sum of, uK, shape (npix,) each.
+class MapParts:
+    """The parts that add up to a map, uK, shape (npix,) each.
 
-    They are analysed apart, so that the quadrature error of the circular twin cancels in the paired difference.
+    They are analysed apart, so that the quadrature error of the circular-beam control cancels in the paired difference.
 
     Attributes
     ----------
     smooth
         The sky through the circular part of the beam at the pixels' centres; None where its a_lm stand for it.
     extra
-        What the circular twin sees beyond that: centroids, noise, gain. None: nothing.
+        The rest of the circular-beam control: centroids, noise, gain. None: nothing.
     difference
         What the rest of the beam adds. None: nothing.
     """
@@ -109,7 +109,7 @@ class Layers:
 
     @property
     def total(self) -> NDArray[np.float64]:
-        """The map."""
+        """Sum of the parts."""
         return reduce(np.add, [part for part in (self.smooth, self.extra, self.difference) if part is not None])
 
 
@@ -120,7 +120,7 @@ def _circular_maps(survey: Survey, nthreads: int) -> convolve.CircularMaps:
 def _observe(
     survey: Survey, channel: Channel, sky: Alm, realization: int, made: convolve.CircularMaps
 ) -> list[Observed]:
-    """The channel's maps of one sky, analysed."""
+    """Return the analysed maps of a channel for one sky."""
     ensemble = survey.config.ensemble
     if channel.rings is not None:
         return [_observe_on_rings(survey, channel, channel.rings, sky, realization, made.nthreads)]
@@ -130,39 +130,38 @@ def _observe(
         seen, dipole = _seen(survey, channel, sky, realization)
         known = _circular(survey, channel, seen, dipole)
     results = []
-    for m, layers in _layers(survey, channel, sky, realization, made, smooth):
+    for m, parts in _map_parts(survey, channel, sky, realization, made, smooth):
         if known is not None and _is_exact(survey, m):
-            exact = alm_.multiply(known, 1.0 / channel.window, survey.config.sky.lmax)
-            twin = (
-                exact if layers.extra is None else exact + _analyse(survey, channel, layers.extra, None, made.nthreads)
-            )
+            control = alm_.multiply(known, 1.0 / channel.window, survey.config.sky.lmax)
+            if parts.extra is not None:
+                control = control + _analyse(survey, channel, parts.extra, None, made.nthreads)
         else:
-            assert layers.smooth is not None  # asked for above
-            circular = layers.smooth if layers.extra is None else layers.smooth + layers.extra
-            twin = _analyse(survey, channel, circular, m.weight, made.nthreads)
-        alm = twin
-        if layers.difference is not None:
-            alm = twin + _analyse(survey, channel, layers.difference, m.weight, made.nthreads)
-        kept = np.where(m.moments.hits > 0, layers.total, healpy.UNSEEN) if ensemble.keep_maps else None
-        results.append(Observed(alm, twin if ensemble.paired else None, kept))
+            assert parts.smooth is not None  # asked for above
+            circular = parts.smooth if parts.extra is None else parts.smooth + parts.extra
+            control = _analyse(survey, channel, circular, m.weight, made.nthreads)
+        alm = control
+        if parts.difference is not None:
+            alm = control + _analyse(survey, channel, parts.difference, m.weight, made.nthreads)
+        kept = np.where(m.moments.hits > 0, parts.total, healpy.UNSEEN) if ensemble.keep_maps else None
+        results.append(Observed(alm, control if ensemble.paired else None, kept))
     return results
 
 
-def _layers(
+def _map_parts(
     survey: Survey, channel: Channel, sky: Alm, realization: int, made: convolve.CircularMaps, smooth: bool
-) -> Iterator[tuple[SurveyMap, Layers]]:
-    """The channel's maps of one sky; transforms that splits share are made once."""
+) -> Iterator[tuple[SurveyMap, MapParts]]:
+    """Yield the maps of a channel for one sky, in parts; transforms that splits share are made once."""
     run = survey.config
     nside, seed, nthreads = run.map.resolution, run.ensemble.seed, made.nthreads
     seen, dipole = _seen(survey, channel, sky, realization)
     if channel.side_b is not None:
-        for m, solved in differencing.maps(channel, seen, dipole, nside, seed, realization, nthreads):
-            yield m, Layers(solved.circular, None, solved.difference)
+        for m, solved in differencing.maps(channel, seen, dipole, seed, realization, nthreads):
+            yield m, MapParts(solved.circular, None, solved.difference)
         return
     circular = _circular(survey, channel, seen, dipole)
     spins = convolve.spin_maps(seen, channel.response, nside, nthreads)
     if dipole is not None:
-        for s, map_uk in convolve.spin_maps(dipole, _believed(channel), nside, nthreads).items():
+        for s, map_uk in convolve.spin_maps(dipole, _fiducial_response(channel), nside, nthreads).items():
             spins[s] = spins[s] - map_uk if s in spins else -map_uk
     flat = made.map(circular) if smooth else None
     whole = None
@@ -181,17 +180,17 @@ def _layers(
         if m.gain is not None and whole is not None:
             extra.append(m.gain * whole)
         difference = convolve.noncircular_map(spins, m.moments) if spins else None
-        yield m, Layers(flat, sum(extra[1:], start=extra[0]) if extra else None, difference)
+        yield m, MapParts(flat, sum(extra[1:], start=extra[0]) if extra else None, difference)
 
 
 def _circular(survey: Survey, channel: Channel, seen: Alm, dipole: Alm | None) -> Alm:
-    """What the circular part of the beam sees, less the dipole as believed: what an effect makes of it stays."""
+    """Return what the circular part of the beam sees, less the dipole through the fiducial beam."""
     circular = convolve.circular_alm(seen, channel.response)
-    return circular if dipole is None else circular - convolve.circular_alm(dipole, _believed(channel))
+    return circular if dipole is None else circular - convolve.circular_alm(dipole, _fiducial_response(channel))
 
 
-def _believed(channel: Channel) -> convolve.Response:
-    """Response to the dipole that is taken off: the believed beam, at the samples' own places."""
+def _fiducial_response(channel: Channel) -> convolve.Response:
+    """Return the response to the dipole that is taken off: the fiducial beam, at the samples' own places."""
     spread = systematics.spread_of(channel.effects)
     return convolve.response(channel.site.beam, channel.site.lmax, channel.window ** (spread * spread))
 
@@ -199,20 +198,20 @@ def _believed(channel: Channel) -> convolve.Response:
 def _observe_on_rings(
     survey: Survey, channel: Channel, grid: tuple[rings.Rings, ...], sky: Alm, realization: int, nthreads: int
 ) -> Observed:
-    """The channel's a_lm of one sky where no map is needed for them."""
+    """Return the a_lm of a channel for one sky, where no map is needed for them."""
     lmax_sky, lmax = survey.config.sky.lmax, survey.lmax
     seen, dipole = _seen(survey, channel, sky, realization)
     circular = convolve.circular_alm(seen, channel.response)
     difference = rings.noncircular_alm(seen, channel.response, grid, lmax, nthreads)
     if dipole is not None:
-        circular = circular - convolve.circular_alm(dipole, _believed(channel))
-        difference = difference - rings.noncircular_alm(dipole, _believed(channel), grid, lmax, nthreads)
-    twin = alm_.resize(circular, lmax_sky, lmax)
-    return Observed(twin + difference, twin if survey.config.ensemble.paired else None, None)
+        circular = circular - convolve.circular_alm(dipole, _fiducial_response(channel))
+        difference = difference - rings.noncircular_alm(dipole, _fiducial_response(channel), grid, lmax, nthreads)
+    control = alm_.resize(circular, lmax_sky, lmax)
+    return Observed(control + difference, control if survey.config.ensemble.paired else None, None)
 
 
 def _seen(survey: Survey, channel: Channel, sky: Alm, realization: int) -> tuple[Alm, Alm | None]:
-    """The sky that the channel looks at, and the dipole in it that is taken off again; None where none shows."""
+    """Return the sky that the channel looks at, and the dipole in it that is taken off again, None if there is none."""
     sky = systematics.looked_at(channel.effects, sky, channel.site, survey.config.ensemble.seed, realization)
     if not channel.effects or not channel.site.dipole_uk.any():
         return sky, None
@@ -223,14 +222,14 @@ def _seen(survey: Survey, channel: Channel, sky: Alm, realization: int) -> tuple
 def _analyse(
     survey: Survey, channel: Channel, map_uk: NDArray[np.float64], weight: NDArray[np.float64] | None, nthreads: int
 ) -> Alm:
-    """Coefficients of a weighted map, with the pixel window divided out."""
+    """Return the coefficients of a weighted map, with the pixel window divided out."""
     weighted = map_uk if weight is None else weight * map_uk
     alm = healpix.analysis(weighted, survey.lmax, survey.config.biposh.iterations, nthreads)
     return alm_.multiply(alm, 1.0 / channel.window[: survey.lmax + 1], survey.lmax)
 
 
 def _is_exact(survey: Survey, m: SurveyMap) -> bool:
-    """Whether the twin's a_lm are known without making its map: all sky, no noise, no power beyond the analysis."""
+    """Return True if the control's a_lm follow without a map: all sky, no noise, no power beyond the analysis."""
     return m.weight is None and m.noise_uk is None and survey.config.sky.lmax == survey.lmax
 
 

@@ -12,6 +12,7 @@ from mcsim import config
 from mcsim.bipolar import Estimator, estimator
 from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
+from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.simulation import convolve, mapmaking, tod
 from mcsim.simulation.channels import effects_on, refuse_pixel_effects, scan_model, site_b_of, site_of
 from mcsim.simulation.rings import Rings, limit_rings, parallel_transport_rings
@@ -63,21 +64,21 @@ class SideB:
     ----------
     beam, response
         Beam of side B, effects included.
-    believed
-        The same without effects.
+    fiducial
+        Beam of side B without effects.
     scan
         Transmission imbalance, noise per difference, and convergence of the map-making.
     sigma0_uk
         White noise per difference.
     imbalance
-        True transmission imbalance; map-making believes that of ``scan``.
+        True transmission imbalance; that of ``scan`` is the fiducial one, which map-making uses.
     iterations_short
         How many iterations before convergence the map-making stops.
     """
 
     beam: beams.Beam
     response: convolve.Response
-    believed: beams.Beam
+    fiducial: beams.Beam
     scan: config.ScanDifferencing
     sigma0_uk: float
     imbalance: float
@@ -93,11 +94,11 @@ class Channel:
     beam, response
         What the sky is seen through, effects included.
     window
-        Pixel window as believed, shape (lmax + 1,), ones where there is none.
+        Fiducial pixel window, shape (lmax + 1,), ones where there is none.
     maps
         One for every split.
     site
-        What effects may know of the channel, its beam as believed among it.
+        What effects may know of the channel, its fiducial beam among it.
     effects
         Those that act in this channel, in the order of the configuration.
     side_b
@@ -196,19 +197,25 @@ def _channel(
     splits = run.map.splits or (None,)
     maps = []
     for index, split in enumerate(splits):
-        share = (index / len(splits), (index + 1) / len(splits))
+        grid = MapGrid(run.map.resolution, run.map.frame, (index / len(splits), (index + 1) / len(splits)))
         name = spec.name if split is None else f"{spec.name}:{split}"
         pairs = None
         if isinstance(spec.scan, config.ScanDifferencing):
-            pairs = _pairs(run, spec, spec.scan, split, share, nthreads, progress)
+            model = scan_model(spec, spec.scan, split)
+            pairs = mapmaking.prepare(model, spec.scan.pair, grid, nthreads=nthreads, progress=progress)
             moments = _hits_alone(pairs, max(beam.mmax, 1))
         else:
             smax = max(beam.mmax, orders)
-            moments = _moments(run, spec, split, share, smax, nthreads, progress, site.beam.mmax)
+            if isinstance(spec.scan, config.ScanMoments):
+                path = config.channel_path(spec.scan.path, spec.name, split)
+                wanted = smax if smax == site.beam.mmax else None
+                moments = _moments_of_file(path, grid.nside, wanted, grid.frame)
+            else:
+                moments = _moments(spec, split, grid, max(smax, 1), nthreads, progress)
             # An effect may give the beam higher orders than a file of moments has: they are left out.
             beam = beam.truncated(moments.smax) if acting and moments.smax < beam.mmax else beam
         m = _survey_map(run, spec, split, name, moments, pairs)
-        maps.append(_with_effects(m, acting, site, share, spread))
+        maps.append(_with_effects(m, acting, site, grid.time_range, spread))
     # A pixel whose samples keep closer to its centre blurs less; the window is a Gaussian in all but name.
     response = convolve.response(beam, run.sky.lmax, window ** (spread * spread))
     side_b = _side_b(spec, window ** (spread * spread), site, acting)
@@ -257,7 +264,7 @@ def _with_effects(
     share: tuple[float, float],
     spread: float,
 ) -> SurveyMap:
-    """The map with what effects make of its moments, noise and gain."""
+    """Return the map with what effects make of its moments, noise and gain."""
     moments, noise = m.moments, m.noise_uk
     for effect in acting:
         moments = effect.orientations(moments, site)
@@ -270,14 +277,14 @@ def _with_effects(
 
 
 def mean_gain(acting: tuple[Effect, ...], site: Site, share: tuple[float, float]) -> NDArray[np.float64] | None:
-    """Mean relative error of the gain in every pixel of a part of the survey, by a pass over its pointing."""
+    """Return the mean relative error of the gain in every pixel, by a pass over the pointing of part of the survey."""
     drifting = [effect for effect in acting if effect.gain(np.zeros(1), site) is not None]
     if not drifting:
         return None
     pointing = site.pointed(drifting[0].name)
 
     def errors() -> Iterator[tod.Samples]:
-        for chunk in tod.samples(pointing.model, pointing.line, site.nside, site.frame, share):
+        for chunk in tod.samples(pointing.model, pointing.line, MapGrid(site.nside, site.frame, share)):
             gains = [effect.gain(chunk.time_s, site) for effect in drifting]
             yield replace(chunk, signal_uk=sum((g for g in gains if g is not None), start=chunk.signal_uk))
 
@@ -295,22 +302,12 @@ def _window(run: config.RunConfig, spec: config.Channel) -> NDArray[np.float64]:
 
 
 def _moments(
-    run: config.RunConfig,
-    spec: config.Channel,
-    split: str | None,
-    share: tuple[float, float],
-    mmax: int,
-    nthreads: int,
-    progress: Progress | None,
-    needed: int,
+    spec: config.Channel, split: str | None, grid: MapGrid, smax: int, nthreads: int, progress: Progress | None
 ) -> scan.Moments:
-    nside, frame, smax = run.map.resolution, run.map.frame, max(mmax, 1)
+    nside, frame = grid.nside, grid.frame
     match spec.scan:
         case config.ScanParallelTransport():
             return scan.Moments.parallel_transport(nside, spec.scan.psi0_deg, smax, frame)
-        case config.ScanMoments():
-            path = config.channel_path(spec.scan.path, spec.name, split)
-            return _moments_of_file(path, nside, needed if mmax == needed else None, frame)
         case config.ScanPointing():
             path = config.channel_path(spec.scan.path, spec.name, split)
             return scan.Moments.from_pointing_files([path], nside, smax, frame)
@@ -318,38 +315,23 @@ def _moments(
             model = scan_model(spec, spec.scan, split)
             lines = None if spec.scan.line_of_sight is None else [spec.scan.line_of_sight]
             folder = scan.cached_moments(
-                model, nside, smax, frame, lines, time_range=share, nthreads=nthreads, progress=progress
+                model, nside, smax, frame, lines, grid.time_range, nthreads=nthreads, progress=progress
             )
             return scan.Moments.load(folder, mmap=True)
-        case config.ScanDifferencing():
-            raise TypeError("a differencing scan has pairs of pixels, no moments")
+        case config.ScanMoments() | config.ScanDifferencing():
+            raise TypeError("the caller reads files of moments, and a differencing scan has no moments")
 
 
 @lru_cache(maxsize=16)
 def _moments_of_file(path: Path, nside: int, smax: int | None, frame: str) -> scan.Moments:
-    """Moments are shared by the surveys of a process that differ in effects alone."""
+    """Read moments once for all surveys of a process that differ in effects alone."""
     return scan.read_moments(path, nside, smax, frame)
 
 
-def _pairs(
-    run: config.RunConfig,
-    spec: config.Channel,
-    chosen: config.ScanDifferencing,
-    split: str | None,
-    share: tuple[float, float],
-    nthreads: int,
-    progress: Progress | None,
-) -> mapmaking.DifferencingScan:
-    model = scan_model(spec, chosen, split)
-    return mapmaking.prepare(
-        model, chosen.pair, run.map.resolution, run.map.frame, share, nthreads=nthreads, progress=progress
-    )
-
-
 def _hits_alone(pairs: mapmaking.DifferencingScan, smax: int) -> scan.Moments:
-    """What weights and masks ask of a scan, its hits; whatever asks for moments, which mean nothing here, gets NaN."""
+    """Return the hits of a differencing scan, for weights and masks; its moments mean nothing and are NaN."""
     unknown = np.broadcast_to(np.complex128(np.nan), (smax, pairs.npix))
-    return scan.Moments(pairs.nside, pairs.frame, pairs.hits_a + pairs.hits_b, unknown)
+    return scan.Moments(pairs.grid.nside, pairs.grid.frame, pairs.hits_a + pairs.hits_b, unknown)
 
 
 def _survey_map(
@@ -381,7 +363,7 @@ def _survey_map(
 
 
 def _overlap(x: SurveyMap, y: SurveyMap) -> float:
-    """<w_x w_y>: by what the weights scale the spectra of the pair."""
+    """Return <w_x w_y>, by which the weights scale the spectra of the pair."""
     if x.weight is None and y.weight is None:
         return 1.0
     product = (1.0 if x.weight is None else x.weight) * (1.0 if y.weight is None else y.weight)

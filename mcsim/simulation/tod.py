@@ -1,16 +1,16 @@
-"""The referee: a survey sample by sample, with the beam convolved at each sample's own direction and orientation.
+"""The time-ordered reference: the beam convolved at each sample's own direction and orientation.
 
 A stream of chunks passes through stages, each a function from a stream to a stream:
 
     samples -> pointing stages -> sky_signal -> signal stages -> white_noise -> bin_samples
 
-What changes the true pointing but not the believed one (the pixel) is a pointing stage; gains, time constants and
+What changes the true pointing but not the fiducial one (the pixel) is a pointing stage; gains, time constants and
 anything else that acts on the time line are signal stages. A stage that remembers (a filter) keeps its state in local
 variables of its generator, since chunks come in the order of time.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
+from mcsim.instrument.scan.geometry import MapGrid, check_time_range
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
 from mcsim.instrument.scan.pointing import BLOCK, PointingStream, fill_block, ring_pixel
 from mcsim.sphere.checks import check_alm, check_nside, check_shape
 from mcsim.sphere.healpix import Map
-from mcsim.sphere.sky import dipole_alm
 
 CHUNK = 1 << 18
 """Samples of a chunk: 12 MB of arrays, and enough of them that the interpolation does not wait for its set-up."""
@@ -64,16 +64,15 @@ Stage = Callable[[Iterable[Samples]], Iterator[Samples]]
 
 
 def sample_range(model: ScanModel, line: LineOfSight, time_range: tuple[float, float]) -> tuple[int, int]:
-    """First sample of a part of the survey (fractions of its samples) and the first one after it.
+    """Return the first sample of a part of the survey (fractions of its samples) and the first one after it.
 
     Raises
     ------
     InputError
         If the range is no increasing pair within 0 and 1, or contains no sample.
     """
+    check_time_range(time_range)
     start, stop = time_range
-    if not 0.0 <= start < stop <= 1.0:
-        raise InputError(f"time_range is ({start:g}, {stop:g}), but it must be an increasing pair within 0 and 1.")
     number = model.samples(line)
     first, last = round(start * number), round(stop * number)
     if first == last:
@@ -86,32 +85,23 @@ def chunks(first: int, last: int) -> list[tuple[int, int]]:
     return [(low, min(low + CHUNK, last)) for low in range(first, last, CHUNK)]
 
 
-def samples(
-    model: ScanModel,
-    line: LineOfSight,
-    nside: int,
-    frame: str = "ecliptic",
-    time_range: tuple[float, float] = (0.0, 1.0),
-    at_pixel_centres: bool = False,
-) -> Iterator[Samples]:
-    """Pointing of a survey in chunks of at most CHUNK samples, signal zero.
+def samples(model: ScanModel, line: LineOfSight, grid: MapGrid, at_pixel_centres: bool = False) -> Iterator[Samples]:
+    """Yield the pointing of a survey in chunks of at most CHUNK samples, signal zero.
 
     Parameters
     ----------
     model, line
         The survey and one of its lines of sight.
-    nside, frame
-        Of the pixels: HEALPix resolution, and "ecliptic", "galactic" or "equatorial".
-    time_range
-        Part of the survey, as fractions of its samples.
+    grid
+        Pixels, and the part of the survey.
     at_pixel_centres
         Move every sample to the centre of its pixel and keep its psi as it is: what orientation moments assume.
     """
-    check_nside(nside)
-    first, last = sample_range(model, line, time_range)
-    stream = PointingStream(model, line, frame)
+    nside = grid.nside
+    first, last = sample_range(model, line, grid.time_range)
+    stream = PointingStream(model, line, grid.frame)
     period = model.period_of_samples(line)
-    centres = healpy.pix2ang(nside, np.arange(12 * nside * nside)) if at_pixel_centres else None
+    centres = healpy.pix2ang(nside, np.arange(grid.npix)) if at_pixel_centres else None
     for low, high in chunks(first, last):
         count = high - low
         angles = np.empty((3, count))
@@ -127,7 +117,7 @@ def samples(
 def sky_signal(
     alm: NDArray[np.complex128], lmax: int, beam: Beam, epsilon: float = EPSILON, nthreads: int = 1
 ) -> Stage:
-    """Stage that adds the sky seen by a beam at the samples' own directions and orientations.
+    """Return a stage that adds the sky seen by a beam at the samples' own directions and orientations.
 
     Parameters
     ----------
@@ -179,7 +169,10 @@ def sky_signal(
 
 
 def white_noise(sigma0_uk: float, rng: np.random.Generator) -> Stage:
-    """Stage that adds white noise of ``sigma0_uk`` per sample, drawn in the order of time: chunks do not matter."""
+    """Return a stage that adds white noise of ``sigma0_uk`` per sample, drawn in the order of time.
+
+    The result does not depend on how the samples are cut into chunks.
+    """
     if not 0.0 <= sigma0_uk < math.inf:
         raise InputError(f"the noise per sample is {sigma0_uk:g} uK, but it must be finite and >= 0.")
 
@@ -192,14 +185,14 @@ def white_noise(sigma0_uk: float, rng: np.random.Generator) -> Stage:
 
 
 def through(stream: Iterable[Samples], stages: Iterable[Stage]) -> Iterable[Samples]:
-    """The stream after all ``stages``, in their order."""
+    """Return the stream after all ``stages``, in their order."""
     for stage in stages:
         stream = stage(stream)
     return stream
 
 
 def bin_samples(stream: Iterable[Samples], nside: int) -> tuple[Map, Map]:
-    """Mean signal of every pixel in uK, ``healpy.UNSEEN`` where there is none, and hits; both of shape (npix,)."""
+    """Return the mean signal of every pixel in uK, ``healpy.UNSEEN`` where there is none, and hits, shape (npix,)."""
     check_nside(nside)
     total, hits = np.zeros(12 * nside * nside), np.zeros(12 * nside * nside)
     for chunk in stream:
@@ -214,52 +207,16 @@ def bin_samples(stream: Iterable[Samples], nside: int) -> tuple[Map, Map]:
 
 
 def observe(
-    alm: NDArray[np.complex128],
-    lmax: int,
-    beam: Beam,
-    model: ScanModel,
-    nside: int,
-    *,
-    line_of_sight: str,
-    frame: str = "ecliptic",
-    time_range: tuple[float, float] = (0.0, 1.0),
-    at_pixel_centres: bool = False,
-    dipole_uk: Sequence[float] | NDArray[np.float64] | None = None,
-    noise_sigma0_uk: float = 0.0,
-    rng: np.random.Generator | None = None,
-    pointing_stages: Sequence[Stage] = (),
-    signal_stages: Sequence[Stage] = (),
-    epsilon: float = EPSILON,
-    nthreads: int = 1,
+    model: ScanModel, line: LineOfSight, grid: MapGrid, stages: Iterable[Stage], at_pixel_centres: bool = False
 ) -> tuple[Map, Map]:
-    """Map of a survey, sample by sample.
+    """Return the map of a survey, sample by sample, and its hits, as :func:`bin_samples` does.
 
     Parameters
     ----------
-    alm, lmax, beam, epsilon
-        As in :func:`sky_signal`.
-    model, nside, frame, time_range, at_pixel_centres
+    model, line, grid, at_pixel_centres
         As in :func:`samples`.
-    line_of_sight
-        Name of one of the model's lines of sight.
-    dipole_uk
-        Vector in the frame of the maps, in uK, whose d . n the beam sees besides ``alm``.
-    noise_sigma0_uk, rng
-        White noise per sample, in uK, and the generator it is drawn from (needed if there is noise).
-    pointing_stages, signal_stages
-        Further stages before and after the sky's signal.
-    nthreads
-        Threads of the interpolation; they do not change the result, bit for bit.
-
-    Returns
-    -------
-    map, hits
-        Mean of the samples of every pixel in uK (``healpy.UNSEEN`` where there is none) and their number, (npix,).
-
-    Raises
-    ------
-    InputError
-        For a sky, beam, nside, frame, line of sight or time range that cannot be used, or noise without ``rng``.
+    stages
+        What the samples pass through: pointing stages, :func:`sky_signal`, signal stages, :func:`white_noise`.
 
     Notes
     -----
@@ -268,22 +225,9 @@ def observe(
     epsilon.
     Where samples stay in their places, the default route misses 7.1, 4.7 and 1.8 % of the sky's rms without
     corrections, with the pixel window, and with the centroid term too (44' beam, nside 128, half a year, 2 s sampling;
-    tests/integration/test_referee.py has a case of nside 64).
+    tests/integration/test_time_ordered.py has a case of nside 64).
     """
-    if dipole_uk is not None:
-        alm = alm + dipole_alm(dipole_uk, lmax)
-    line = model.line_of_sight(line_of_sight)
-    stages = [*pointing_stages, sky_signal(alm, lmax, beam, epsilon, nthreads), *signal_stages]
-    if noise_sigma0_uk != 0.0:
-        stages.append(white_noise(noise_sigma0_uk, given(rng, noise_sigma0_uk)))
-    return bin_samples(through(samples(model, line, nside, frame, time_range, at_pixel_centres), stages), nside)
-
-
-def given(rng: np.random.Generator | None, noise_sigma0_uk: float) -> np.random.Generator:
-    """``rng``; InputError if noise is asked for without one."""
-    if rng is None:
-        raise InputError(f"noise_sigma0_uk is {noise_sigma0_uk:g} but no rng is given; pass a numpy Generator.")
-    return rng
+    return bin_samples(through(samples(model, line, grid, at_pixel_centres), stages), grid.nside)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

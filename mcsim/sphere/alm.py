@@ -10,24 +10,24 @@ from mcsim.errors import InputError
 
 
 def size(lmax: int) -> int:
-    """Number of coefficients with 0 <= m <= l <= lmax."""
+    """Return the number of coefficients with 0 <= m <= l <= lmax."""
     return (lmax + 1) * (lmax + 2) // 2
 
 
 def lmax_of(count: int) -> int | None:
-    """Degree whose coefficients with 0 <= m <= l <= lmax are ``count``; None where there is none."""
+    """Return the lmax of ``count`` coefficients with 0 <= m <= l <= lmax; None if there is none."""
     lmax = (math.isqrt(8 * count + 1) - 3) // 2
     return lmax if lmax >= 0 and size(lmax) == count else None
 
 
 def start(lmax: int, m: int) -> int:
-    """Offset such that a_lm stands at ``start(lmax, m) + l``."""
+    """Return the offset such that a_lm is at ``start(lmax, m) + l``."""
     return m * (2 * lmax + 1 - m) // 2
 
 
 @lru_cache(maxsize=8)
 def degrees(lmax: int) -> NDArray[np.int64]:
-    """Degree l of every coefficient, shape (size(lmax),), read-only."""
+    """Return the degree l of every coefficient, shape (size(lmax),), read-only."""
     ell = np.concatenate([np.arange(m, lmax + 1) for m in range(lmax + 1)])
     ell.setflags(write=False)
     return ell
@@ -35,14 +35,14 @@ def degrees(lmax: int) -> NDArray[np.int64]:
 
 @lru_cache(maxsize=8)
 def orders(lmax: int) -> NDArray[np.int64]:
-    """Order m of every coefficient, shape (size(lmax),), read-only."""
+    """Return the order m of every coefficient, shape (size(lmax),), read-only."""
     m = np.repeat(np.arange(lmax + 1), np.arange(lmax + 1, 0, -1))
     m.setflags(write=False)
     return m
 
 
 def multiply(alm: NDArray[np.complex128], factor: NDArray, lmax: int) -> NDArray[np.complex128]:
-    """Coefficients f_l a_lm for a factor f_l of shape (>= lmax + 1,), real or complex.
+    """Return f_l a_lm for a factor f_l of shape (>= lmax + 1,), real or complex.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def multiply(alm: NDArray[np.complex128], factor: NDArray, lmax: int) -> NDArray
 
 
 def resize(alm: NDArray[np.complex128], lmax: int, new_lmax: int) -> NDArray[np.complex128]:
-    """Coefficients up to ``new_lmax``: cut, or padded with zeros; InputError if they are not of ``lmax``."""
+    """Return the coefficients cut or zero-padded to ``new_lmax``; raise InputError if they are not of ``lmax``."""
     _check_size(alm, lmax)
     resized = np.zeros(size(new_lmax), dtype=np.complex128)
     top = min(lmax, new_lmax)

@@ -1,6 +1,6 @@
-"""Sizes, kinds and values of what functions are given: wrong ones end in an InputError instead of a wrong number.
+"""Checks of arguments: a wrong size, type or value raises InputError instead of giving a wrong number.
 
-The arrays behind come from users and other packages, and compiled loops do not check where they read.
+The arrays come from users and other packages, and compiled loops do not check their bounds.
 """
 
 import math
@@ -18,7 +18,7 @@ UNSEEN_BELOW = -1e30
 """Values below this are ``healpy.UNSEEN`` (-1.6375e30), exactly or in single precision."""
 
 LARGEST_ANGLE = 4.0 * math.pi
-"""Two turns: an angle in radians beyond them is one in degrees, or was never reduced."""
+"""Two turns: a larger angle in radians is probably one in degrees."""
 
 
 def check_whole(value: Any, name: str, least: int = 0) -> None:
@@ -67,7 +67,7 @@ def check_shape(values: Any, shape: tuple[int, ...], name: str) -> None:
 
 
 def check_cl(cl: Any, lmax: int, name: str = "the spectrum", cross: bool = False) -> None:
-    """Raise InputError unless ``cl`` is real, finite and, but for a cross spectrum, >= 0, of shape (> lmax,)."""
+    """Raise InputError unless ``cl`` is real, finite, of shape (> lmax,) and, unless ``cross``, >= 0."""
     check_whole(lmax, "lmax")
     if not isinstance(cl, np.ndarray) or cl.ndim != 1 or cl.dtype.kind not in "fiu":
         raise InputError(f"{name} has shape {np.shape(cl)}, but it must be a real numpy array, one value for each ell.")
@@ -79,7 +79,7 @@ def check_cl(cl: Any, lmax: int, name: str = "the spectrum", cross: bool = False
 
 
 def check_map(map_: Any, nside: int | None = None, name: str = "the map") -> int:
-    """Return nside of a real HEALPix map of shape (npix,); raise InputError for anything else, or another nside."""
+    """Return nside of a real HEALPix map, shape (npix,); raise InputError for anything else or another nside."""
     if not isinstance(map_, np.ndarray) or map_.ndim != 1 or map_.dtype.kind not in "fiub":
         raise InputError(f"{name} has shape {np.shape(map_)}, but it must be a real numpy array of shape (npix,).")
     found = nside_of(map_.size, name)
@@ -90,13 +90,13 @@ def check_map(map_: Any, nside: int | None = None, name: str = "the map") -> int
 
 def check_complete(map_: NDArray, name: str = "the map") -> None:
     """Raise InputError if a pixel of a map is NaN, infinite or unseen."""
-    # One pass in the good case: a pixel that is NaN, infinite or unseen shows in the sum.
+    # One pass for a valid map: a pixel that is NaN, infinite or unseen shows in the sum.
     if not abs(map_.sum()) < -0.1 * UNSEEN_BELOW and not (map_.min() > UNSEEN_BELOW and map_.max() < math.inf):
         raise InputError(f"{name} has pixels that are not finite or unseen (UNSEEN); set them to 0 by a mask first.")
 
 
 def nside_of(npix: int, where: str) -> int:
-    """Resolution of a full sky of ``npix`` pixels; ``where`` names it in the InputError raised if there is none."""
+    """Return nside of a full sky of ``npix`` pixels; raise an InputError that names ``where`` if there is none."""
     nside = math.isqrt(max(npix, 0) // 12)
     if nside == 0 or 12 * nside * nside != npix or nside & (nside - 1):
         raise InputError(f"{where} has {npix} pixels, which is no full HEALPix sky; write all 12 nside^2 pixels.")

@@ -50,7 +50,7 @@ class Band(NamedTuple):
 
 
 def _rising(x: Table, k: int) -> Table:
-    """sqrt((x + k)! / x!), as the product of k factors: no large factorials."""
+    """Return sqrt((x + k)! / x!) as a product of k factors, which avoids large factorials."""
     product = np.ones_like(x)
     for i in range(1, k + 1):
         product *= np.sqrt(x + i)
@@ -58,7 +58,7 @@ def _rising(x: Table, k: int) -> Table:
 
 
 def band(L_max: int, M: int, d: int, lmax: int) -> Band:
-    r"""Tables of the Clebsch-Gordan band of order M and offset d = l2 - l1 for l2 <= lmax.
+    r"""Return the tables of the Clebsch-Gordan band of order M and offset d = l2 - l1 for l2 <= lmax.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def band(L_max: int, M: int, d: int, lmax: int) -> Band:
 
 
 def evaluate(tables: Band, L: int, l2: int, m1: int) -> float:
-    """One coefficient (-1)^{m2} C^{LM}_{l1 m1 l2 -m2}, l1 = l2 - d, m2 = m1 - M: the recursion spelled out."""
+    """Return one (-1)^{m2} C^{LM}_{l1 m1 l2 -m2}, with l1 = l2 - d and m2 = m1 - M, by the recursion."""
     l1, m2 = l2 - tables.d, m1 - tables.M
     if l1 < 0 or abs(m1) > l1 or abs(m2) > l2 or l1 + l2 < L:
         return 0.0

@@ -1,4 +1,4 @@
-"""What the headers of FITS files say of a map: its unit of temperature and its coordinate frame."""
+"""Units of temperature and coordinate frames of maps, from FITS headers."""
 
 import re
 from pathlib import Path
@@ -24,7 +24,7 @@ _FRAMES = {
 
 
 def frame_named(coordsys: object, where: str) -> str | None:
-    """Return the frame that a COORDSYS keyword names, None where it is missing or empty.
+    """Return the frame that a COORDSYS keyword names; None if it is missing or empty.
 
     Raises
     ------
@@ -41,7 +41,7 @@ def frame_named(coordsys: object, where: str) -> str | None:
 
 
 def radians(unit: str) -> float:
-    """Return the factor from a unit of angle to radians; InputError for one that is none."""
+    """Return the factor from a unit of angle to radians; raise InputError for any other unit."""
     from astropy import units as u
 
     try:
@@ -51,21 +51,21 @@ def radians(unit: str) -> float:
 
 
 def to_uk(unit: str | None, path: Path, frequency_ghz: float | None = None) -> float:
-    """Return the factor from a unit to uK of CMB (thermodynamic) temperature; 1 where the header gives none.
+    """Return the factor from a unit to uK of CMB (thermodynamic) temperature; 1 if the header gives none.
 
     Parameters
     ----------
     unit
-        As headers have it: uK, mK, K (CMB temperature unless they say antenna or RJ), or a brightness such as MJy/sr.
+        As in a header: uK, mK, K (CMB temperature unless they say antenna or RJ), or a brightness such as MJy/sr.
     path
-        Of the file, for messages.
+        Path of the file, for messages.
     frequency_ghz
-        Of the channel: antenna temperature and brightness need it.
+        Frequency of the channel; antenna temperature and brightness need it.
 
     Raises
     ------
     InputError
-        For another unit, and without a frequency where one is needed.
+        For another unit, or if a needed frequency is missing.
 
     Notes
     -----
@@ -84,7 +84,7 @@ def to_uk(unit: str | None, path: Path, frequency_ghz: float | None = None) -> f
 
 
 def _brightness_to_k(unit: str | None, path: Path, frequency_ghz: float | None, text: str | None) -> float:
-    """K of CMB temperature per unit ``text`` of brightness, or per K of antenna temperature (None)."""
+    """Return K of CMB temperature per unit ``text`` of brightness, or per K of antenna temperature (None)."""
     from astropy import units as u
 
     sky = u.Jy / u.sr

@@ -23,17 +23,17 @@ Alm = NDArray[np.complex128]
 
 @lru_cache(maxsize=4)
 def geometry(nside: int) -> dict[str, Any]:
-    """Rings of the RING-ordered map, as ducc0's transforms take them."""
+    """Return the rings of a RING-ordered map, as ducc0's transforms take them."""
     return dict(ducc0.healpix.Healpix_Base(nside, "RING").sht_info())
 
 
 def synthesis(alm: Alm, nside: int, lmax: int, spin: int = 0, nthreads: int = 1) -> NDArray[np.float64]:
-    """Map of a_lm: shape (1, npix) from (1, size) at spin 0, (2, npix) from E and B (2, size) otherwise.
+    """Return the map of a_lm: (1, npix) from (1, size) at spin 0, else (2, npix) from E and B (2, size).
 
     Raises
     ------
     InputError
-        If the coefficients do not fit ``lmax`` and ``spin``, or nside is no whole number (any will do).
+        If the coefficients do not fit ``lmax`` and ``spin``, or nside is not a whole number (any will do).
     """
     check_whole(nside, "nside", 1)
     check_alm(alm, lmax, shape=(2 if spin else 1,))
@@ -42,7 +42,7 @@ def synthesis(alm: Alm, nside: int, lmax: int, spin: int = 0, nthreads: int = 1)
 
 
 def gradient(alm: Alm, nside: int, lmax: int, nthreads: int = 1) -> NDArray[np.float64]:
-    """(d/dtheta, 1/sin(theta) d/dphi) of a spin-0 map of a_lm of shape (size,): shape (2, npix)."""
+    """Return (d/dtheta, 1/sin(theta) d/dphi), shape (2, npix), of the spin-0 map of a_lm of shape (size,)."""
     check_whole(nside, "nside", 1)
     check_alm(alm, lmax)
     maps = ducc0.sht.synthesis_deriv1(alm=alm[None], lmax=lmax, nthreads=nthreads, **geometry(nside))
@@ -50,7 +50,7 @@ def gradient(alm: Alm, nside: int, lmax: int, nthreads: int = 1) -> NDArray[np.f
 
 
 def analysis(map_: Map, lmax: int, iterations: int = 0, nthreads: int = 1) -> Alm:
-    """Coefficients of a map by ring-weighted quadrature and Jacobi iterations.
+    """Return the coefficients of a map by ring-weighted quadrature and Jacobi iterations.
 
     Parameters
     ----------
@@ -59,17 +59,17 @@ def analysis(map_: Map, lmax: int, iterations: int = 0, nthreads: int = 1) -> Al
     lmax
         Largest degree, <= 3 nside - 1.
     iterations
-        Each adds a synthesis and an adjoint synthesis to the one adjoint synthesis of the quadrature.
+        Number of Jacobi iterations; each costs a synthesis and an adjoint synthesis.
 
     Raises
     ------
     InputError
-        If the map is no complete HEALPix map, or lmax is beyond 3 nside - 1.
+        If the map is not a complete HEALPix map, or lmax exceeds 3 nside - 1.
 
     Notes
     -----
-    Relative error at nside 512, lmax 1024 for a sky seen by a 13.6' beam: 3e-5, 3e-6 and 4e-7 with 0, 1 and 2
-    iterations (``tests/unit/test_healpix.py`` holds a smaller case).
+    Relative error at nside 512, lmax 1024 for a sky smoothed by a 13.6' beam: 3e-5, 3e-6 and 4e-7 with 0, 1 and 2
+    iterations (``tests/unit/test_healpix.py`` tests a smaller case).
     """
     nside = check_map(map_)
     check_complete(map_)
@@ -91,7 +91,7 @@ def analysis(map_: Map, lmax: int, iterations: int = 0, nthreads: int = 1) -> Al
 
 @lru_cache(maxsize=2)
 def _pixel_weights(nside: int) -> Map:
-    """Quadrature weight of every pixel: its area times the ring weights that healpy ships (none for nside 1)."""
+    """Return each pixel's quadrature weight: its area times healpy's ring weight (none for nside 1)."""
     rings = np.ones(4 * nside - 1)
     path = Path(healpy.__file__).parent / "data" / f"weight_ring_n{nside:05d}.fits"
     if nside > 1:
@@ -104,13 +104,13 @@ def _pixel_weights(nside: int) -> Map:
 
 @lru_cache(maxsize=4)
 def pixel_window(nside: int, lmax: int) -> NDArray[np.float64]:
-    r"""Pixel window w_l, averaged over all pixels and computed from their shapes; shape (lmax + 1,).
+    r"""Return the pixel window w_l, computed from the shapes of the pixels and averaged; shape (lmax + 1,).
 
     Notes
     -----
     w_l^2 is the mean over pixels of <P_l(x . y)>, x and y uniform in the pixel. A lattice of at most 32 x 32 pixels on
-    one polar and one equatorial face stands for all; a pixel is sampled at the centres of its sub-pixels. Against the
-    published HEALPix tables, l <= 3 nside: within 2e-4 for nside 32 to 1024; where that matters, name a table in
+    one polar and one equatorial face represents all. A pixel is sampled at the centres of its sub-pixels. Against the
+    published HEALPix tables, l <= 3 nside: within 2e-4 for nside 32 to 1024; if that matters, name a table in
     ``[map] pixel_window``.
     """
     check_nside(nside)
@@ -118,13 +118,13 @@ def pixel_window(nside: int, lmax: int) -> NDArray[np.float64]:
     lattice = min(nside, 32)
     step = (nside // lattice) ** 2
     cell = np.arange(lattice * lattice)
-    # Alternately the pixels just above and just below the middle of a cell: their mean is at the middle.
+    # Pixels alternate just above and just below the middle of a cell: their mean is at the middle.
     above = (cell ^ (cell >> 1)) & 1 == 0
     pixels = cell * step + np.where(above, 3 * step // 4, max(step // 4 - 1, 0))
     window = np.zeros(lmax + 1)
     for face, share in ((0, 2.0 / 3.0), (4, 1.0 / 3.0)):
         shifted = pixels + face * nside * nside
-        # The centres of n x n sub-pixels miss 1/n^2 of a pixel's extent: extrapolated from n = 4 and 8.
+        # The centres of n x n sub-pixels miss 1/n^2 of a pixel's extent: extrapolate from n = 4 and 8.
         window += (
             share * (4.0 * _mean_legendre(shifted, nside, 8, lmax) - _mean_legendre(shifted, nside, 4, lmax)) / 3.0
         )
@@ -134,7 +134,7 @@ def pixel_window(nside: int, lmax: int) -> NDArray[np.float64]:
 
 
 def _mean_legendre(pixels: NDArray[np.int64], nside: int, split: int, lmax: int) -> NDArray[np.float64]:
-    """<P_l(x . y)> over pairs of split x split sub-pixel centres of NESTED pixels, by a histogram of separations."""
+    """Return <P_l(x . y)> over pairs of the split x split sub-pixel centres of NESTED pixels, by a histogram."""
     inside = pixels[:, None] * split**2 + np.arange(split**2)
     centres = np.stack(healpy.pix2vec(split * nside, inside, nest=True), axis=-1)
     difference = centres[:, :, None, :] - centres[:, None, :, :]
@@ -153,15 +153,15 @@ def _mean_legendre(pixels: NDArray[np.int64], nside: int, split: int, lmax: int)
 
 
 def read_map(path: Path) -> tuple[Map, str | None, str | None]:
-    """First map of a HEALPix FITS file in RING order, its frame and its unit as far as the header tells them.
+    """Read the first map of a HEALPix FITS file in RING order, and its frame and unit if the header has them.
 
-    Of a .npy file, an array of shape (npix,) in RING order, neither is known.
+    A .npy file holds an array of shape (npix,) in RING order; its frame and unit are None.
 
     Raises
     ------
     InputError
-        If the file cannot be read as a HEALPix map, does not say whether it is RING or NESTED, or names a frame that
-        is not known.
+        If the file cannot be read as a HEALPix map, does not say whether it is RING or NESTED, or names an
+        unknown frame.
     """
     if path.suffix == ".npy":
         array = read_npy(path, "biuf").astype(np.float64)
@@ -172,12 +172,12 @@ def read_map(path: Path) -> tuple[Map, str | None, str | None]:
         with warnings.catch_warnings():
             warnings.simplefilter("error", category=AstropyUserWarning)
             map_, header = healpy.read_map(path, dtype=float, h=True)
-    except Exception as error:  # libraries raise whatever a broken file makes of them
+    except Exception as error:  # libraries raise errors of any type for a broken file
         raise InputError(f"{path} cannot be read as a HEALPix map ({error}); give a complete FITS map.") from error
     keywords = dict(header)
     if str(keywords.get("ORDERING", "")).strip().upper() not in ("RING", "NESTED"):
         raise InputError(f"{path} does not say how its pixels are ordered; write ORDERING = RING or NESTED there.")
-    # An explicit list of pixels has them in its first column, and healpy's map is the second.
+    # A map with explicit pixel indices has them in its first column and the values in its second.
     column = 2 if str(keywords.get("INDXSCHM", "")).strip().upper() == "EXPLICIT" else 1
     unit = str(keywords.get(f"TUNIT{column}", "")).strip() or None
     if str(keywords.get("TEMPTYPE", "")).strip().upper().startswith("ANT"):
@@ -186,12 +186,12 @@ def read_map(path: Path) -> tuple[Map, str | None, str | None]:
 
 
 def read_pixel_window(path: Path, lmax: int, nside: int | None = None) -> NDArray[np.float64]:
-    """Temperature pixel window of a FITS file in the HEALPix format, or of a .npy file, shape (lmax + 1,).
+    """Read a temperature pixel window, shape (lmax + 1,), from a HEALPix FITS file or a .npy file.
 
     Raises
     ------
     InputError
-        If the file cannot be read, ends below lmax, says that it is of another ``nside``, or is no window.
+        If the file cannot be read, ends below lmax, states another ``nside``, or is not a window.
     """
     window, found = (read_npy(path, "iuf"), None) if path.suffix == ".npy" else _fits_pixel_window(path)
     window = window.astype(np.float64)
@@ -215,5 +215,5 @@ def _fits_pixel_window(path: Path) -> tuple[NDArray, int | None]:
             warnings.simplefilter("error", category=AstropyUserWarning)
             table, header = fits.getdata(path, 1, header=True)
             return np.asarray(table.field(0), dtype=float).ravel(), header.get("NSIDE")
-    except Exception as error:  # libraries raise whatever a broken file makes of them
+    except Exception as error:  # libraries raise errors of any type for a broken file
         raise InputError(f"{path} is not a FITS pixel window ({error}); give a HEALPix pixel_window file.") from error

@@ -1,4 +1,4 @@
-"""Masks: from a file to weights of the maps' pixels, in their frame, with a soft edge."""
+"""Masks: read from a file, brought to the frame and nside of the maps, apodised."""
 
 from pathlib import Path
 
@@ -17,16 +17,16 @@ Mask = NDArray[np.float64]
 def read_mask(
     path: Path, nside: int, frame: str = "ecliptic", mask_frame: str | None = None, apodisation_deg: float = 0.0
 ) -> Mask:
-    """Weights of the pixels of a map from a HEALPix FITS file.
+    """Read the weights of the pixels of a map from a HEALPix FITS file.
 
     Parameters
     ----------
     path
-        HEALPix map of weights between 0 and 1 (1 where the sky is used), of any nside; RING or NESTED as it says.
+        HEALPix map of weights between 0 and 1 (1 where the sky is used), of any nside; the header states the ordering.
     nside, frame
-        Of the maps.
+        Those of the maps.
     mask_frame
-        Frame of the mask; None: what the file's COORDSYS says, or that of the maps where it says nothing.
+        Frame of the mask; None: that of the file's COORDSYS, else that of the maps.
     apodisation_deg
         Width of the soft edge (:func:`apodise`), >= 0.
 
@@ -38,14 +38,14 @@ def read_mask(
     Raises
     ------
     InputError
-        If the file is no HEALPix map, has an nside that is no power of two, values outside 0 ... 1, or another frame
-        than the one given.
+        If the file is not a HEALPix map, its nside is not a power of two, a value is outside 0 ... 1, or its frame
+        is not the given one.
 
     Notes
     -----
-    Another nside is reached by ``healpy.ud_grade``: coarser pixels hand their value down, finer ones are averaged. The
+    The nside is changed by ``healpy.ud_grade``: coarser pixels are copied, finer ones are averaged. The
     frame is changed pixel by pixel (:func:`mcsim.sphere.rotation.rotate_pixels`) at the finer of the two resolutions.
-    The edge is softened last, so that its width is the same whatever the mask came from.
+    The edge is apodised last, so that its width does not depend on the resolution of the file.
     """
     check_nside(nside)
     mask, stated, _ = healpix.read_map(path)
@@ -69,20 +69,19 @@ def read_mask(
 
 
 def apodise(mask: Mask, width: float) -> Mask:
-    r"""Mask times a soft edge that rises from 0 at its zeros to 1 at the distance ``width`` from them.
+    r"""Return the mask times a soft edge, which rises from 0 at its zeros to 1 at a distance ``width``.
 
     Parameters
     ----------
     mask
         Weights in RING order, shape (npix,).
     width
-        In radians, >= 0.
+        Width of the edge in radians, >= 0.
 
     Notes
     -----
     The edge is (1 - cos(pi d / width)) / 2 of the angle d from a pixel's centre to that of the nearest pixel of weight
-    0. Its slope is continuous: the mask's power at l > 3 pi / width is at most 1/64 of a sharp edge's. It takes sky
-    away and gives none back.
+    0. Its slope is continuous: the mask's power at l > 3 pi / width is at most 1/64 of a sharp edge's.
     """
     nside = check_map(mask, name="the mask")
     if not 0.0 <= width <= np.pi:
@@ -93,7 +92,7 @@ def apodise(mask: Mask, width: float) -> Mask:
     used = np.flatnonzero(~zeros)
     nearest = cKDTree(_vectors(nside, _edge(zeros, nside)))
     chord, _ = nearest.query(_vectors(nside, used), distance_upper_bound=2.0 * np.sin(min(width, np.pi) / 2.0))
-    # Beyond the bound the tree answers infinity.
+    # Beyond the bound the tree returns infinity.
     distance = 2.0 * np.arcsin(np.minimum(chord, 2.0) / 2.0)
     soft = mask.copy()
     soft[used] *= np.where(distance < width, 0.5 - 0.5 * np.cos(np.pi * np.minimum(distance / width, 1.0)), 1.0)
@@ -101,11 +100,11 @@ def apodise(mask: Mask, width: float) -> Mask:
 
 
 def _edge(zeros: NDArray[np.bool_], nside: int) -> NDArray[np.int64]:
-    """Pixels of weight 0 with a neighbour of another weight: one of them is the nearest zero of any used pixel."""
+    """Return the pixels of weight 0 that have a neighbour of another weight: the nearest zero is one of them."""
     pixels = np.flatnonzero(zeros)
     neighbours = healpy.get_all_neighbours(nside, pixels)
-    # Where a pixel has only seven neighbours the eighth is -1, and the last pixel stands in for it: at worst the edge
-    # has a pixel too many.
+    # If a pixel has only seven neighbours, the eighth is -1 and indexes the last pixel: at worst the edge has one
+    # pixel too many.
     edge: NDArray[np.int64] = pixels[np.any(~zeros[neighbours], axis=0)]
     return edge
 

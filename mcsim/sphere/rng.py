@@ -1,4 +1,4 @@
-"""From (seed, realization, stage) to a random generator, independent of workers, order and resumption."""
+"""Random generators from (seed, realization, stage), independent of workers, order and resumption."""
 
 import zlib
 
@@ -8,7 +8,7 @@ from mcsim.sphere.checks import check_whole
 
 
 def generator(seed: int, realization: int, stage: str) -> np.random.Generator:
-    """Generator of one stage of one realization.
+    """Return the generator of one stage of one realization.
 
     Parameters
     ----------
@@ -18,7 +18,7 @@ def generator(seed: int, realization: int, stage: str) -> np.random.Generator:
         Index of the realization, >= 0.
     stage
         What is drawn, for example ``"sky"`` or ``"noise/W1/half1"``. Stages are named, not counted, so that a
-        further channel changes no other channel's draw; the CRC-32 of the name is the second spawn key.
+        new channel does not change another channel's draw; the CRC-32 of the name is the second spawn key.
     """
     check_whole(seed, "seed")
     check_whole(realization, "realization")

@@ -1,4 +1,4 @@
-"""Between the ecliptic, galactic and equatorial frames (J2000): a_lm, maps, BipoSH and orientation moments."""
+"""Rotations of a_lm, maps, BipoSH and moments between ecliptic, galactic and equatorial frames (J2000)."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -17,12 +17,12 @@ FRAMES = {"ecliptic": "E", "galactic": "G", "equatorial": "C"}
 
 
 def rotation_matrix(frame_from: str, frame_to: str) -> NDArray[np.float64]:
-    """Matrix R with (components in ``frame_to``) = R (components in ``frame_from``), shape (3, 3).
+    """Return R, shape (3, 3), with (components in ``frame_to``) = R (components in ``frame_from``).
 
     Raises
     ------
     InputError
-        A frame other than ecliptic, galactic or equatorial.
+        For a frame other than ecliptic, galactic or equatorial.
     """
     for frame in (frame_from, frame_to):
         if frame not in FRAMES:
@@ -33,20 +33,21 @@ def rotation_matrix(frame_from: str, frame_to: str) -> NDArray[np.float64]:
 
 
 def euler_angles(matrix: NDArray[np.float64]) -> tuple[float, float, float]:
-    """(alpha, beta, gamma) in radians with matrix = R_z(alpha) R_y(beta) R_z(gamma)."""
+    """Return (alpha, beta, gamma) in radians with matrix = R_z(alpha) R_y(beta) R_z(gamma)."""
     beta = float(np.arctan2(np.hypot(matrix[0, 2], matrix[1, 2]), matrix[2, 2]))
     if np.hypot(matrix[0, 2], matrix[1, 2]) < 1e-12:
-        # Along the pole alpha and gamma only occur together.
+        # At the pole only the sum or difference of alpha and gamma is defined.
         return float(np.arctan2(-matrix[0, 1], matrix[1, 1])), beta, 0.0
     return float(np.arctan2(matrix[1, 2], matrix[0, 2])), beta, float(np.arctan2(matrix[2, 1], -matrix[2, 0]))
 
 
 def wigner_D(L: int, matrix: NDArray[np.float64]) -> NDArray[np.complex128]:
-    """D^L_{MM'} of a rotation, shape (2L + 1, 2L + 1), M and M' from -L to L: a'_{LM} = sum_M' D^L_{MM'} a_{LM'}.
+    """Return D^L_{MM'} of a rotation, with a'_{LM} = sum_M' D^L_{MM'} a_{LM'}; shape (2L + 1, 2L + 1).
 
     Notes
     -----
-    e^{-i M alpha} (e^{-i beta J_y})_{MM'} e^{-i M' gamma}, by the matrix exponential: meant for the L of BipoSH.
+    M and M' run from -L to L. e^{-i M alpha} (e^{-i beta J_y})_{MM'} e^{-i M' gamma} by the matrix exponential, which
+    suits the small L of BipoSH.
     """
     alpha, beta, gamma = euler_angles(matrix)
     orders = np.arange(-L, L + 1)
@@ -63,7 +64,7 @@ def _frame_D(L: int, frame_from: str, frame_to: str) -> NDArray[np.complex128]:
 def rotate_alm(
     alm: NDArray[np.complex128], lmax: int, frame_from: str, frame_to: str, nthreads: int = 1
 ) -> NDArray[np.complex128]:
-    """a_lm of a real field in another frame.
+    """Return the a_lm of a real field in another frame.
 
     Parameters
     ----------
@@ -92,12 +93,12 @@ def rotate_alm(
 
 
 def rotate_map(sky: NDArray[np.float64], frame_from: str, frame_to: str, nthreads: int = 1) -> NDArray[np.float64]:
-    """A full-sky HEALPix map (RING) in another frame, through its a_lm up to 2 nside.
+    """Return a full-sky HEALPix map (RING) in another frame, through its a_lm up to 2 nside.
 
     Raises
     ------
     InputError
-        A map with unobserved pixels; for those, and for masks and hit counts, use :func:`rotate_pixels`.
+        For a map with unobserved pixels; use :func:`rotate_pixels` for those, masks and hit counts.
 
     Notes
     -----
@@ -113,7 +114,7 @@ def rotate_map(sky: NDArray[np.float64], frame_from: str, frame_to: str, nthread
 
 
 def rotate_pixels(values: NDArray, frame_from: str, frame_to: str) -> NDArray:
-    """A HEALPix map (RING) in another frame, each pixel taking the value found at its centre: for masks and hits."""
+    """Return a HEALPix map (RING) in another frame, by the value at each pixel's centre: for masks and hits."""
     nside = check_map(values)
     centres = np.array(hp.pix2vec(nside, np.arange(len(values))))
     return values[hp.vec2pix(nside, *(rotation_matrix(frame_to, frame_from) @ centres))]
@@ -122,14 +123,14 @@ def rotate_pixels(values: NDArray, frame_from: str, frame_to: str) -> NDArray:
 def rotate_biposh(
     biposh: NDArray[np.complex128], modes: Sequence[tuple[int, int, int]], frame_from: str, frame_to: str
 ) -> NDArray[np.complex128]:
-    """A^{LM}_{l1 l2} in another frame.
+    """Return A^{LM}_{l1 l2} in another frame.
 
     Parameters
     ----------
     biposh
         Shape (..., n_mode, lmax + 1), of one map or of an ordered pair, at ell = l2 with d = l2 - l1.
     modes
-        (L, M, d) along the next-to-last axis: every M = 0..L of each (L, d), and no M < 0.
+        (L, M, d) along the next-to-last axis: every M = 0..L of each (L, d), no M < 0.
     frame_from, frame_to
         "ecliptic", "galactic" or "equatorial".
 
@@ -141,11 +142,11 @@ def rotate_biposh(
     Raises
     ------
     InputError
-        An M of some (L, d) is missing.
+        If an M of some (L, d) is missing.
 
     Notes
     -----
-    A^{LM} turns like a_{LM}: sum_M' D^L_{MM'} A^{LM'}, with A^{L,-M} = (-1)^{l1+l2-L+M} conj(A^{LM}), which holds for
+    A^{LM} rotates like a_{LM}: sum_M' D^L_{MM'} A^{LM'}, with A^{L,-M} = (-1)^{l1+l2-L+M} conj(A^{LM}), which holds for
     pairs of maps too. Equal to rotating the sky first to round-off (tests/unit/test_rotation.py).
     """
     if biposh.ndim < 2 or biposh.shape[-2] != len(modes):
@@ -167,7 +168,7 @@ def rotate_biposh(
 
 
 def rotate_orientation_harmonics(w: NDArray[np.complex128], frame_from: str, frame_to: str) -> NDArray[np.complex128]:
-    """w_{s,LM} of the orientation moments in another frame, psi counted from the new frame's e_theta.
+    """Return w_{s,LM} of the orientation moments in another frame, with psi from its e_theta.
 
     Parameters
     ----------

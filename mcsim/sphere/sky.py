@@ -1,4 +1,4 @@
-"""Skies as coefficients: isotropic Gaussian ones, and the dipole."""
+"""Coefficients of isotropic Gaussian skies and of the dipole."""
 
 import math
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ def gaussian_alm(cl: NDArray[np.float64], rng: np.random.Generator) -> NDArray[n
     cl
         Power spectrum C_l in uK^2, shape (lmax + 1,), non-negative.
     rng
-        Source of randomness: 2 * size(lmax) standard normal numbers are drawn.
+        Random generator; 2 * size(lmax) standard normal numbers are drawn.
 
     Returns
     -------
@@ -42,7 +42,7 @@ def gaussian_alm(cl: NDArray[np.float64], rng: np.random.Generator) -> NDArray[n
 
 
 def dipole_alm(dipole_uk: Sequence[float] | NDArray[np.float64], lmax: int) -> NDArray[np.complex128]:
-    """Coefficients of the sky d . n of a vector d in the frame of the maps, in uK: l = 1 only, up to ``lmax`` >= 1."""
+    """Return the a_lm up to ``lmax`` >= 1 of the sky d . n, for a vector d in uK in the frame of the maps."""
     check_whole(lmax, "lmax of a dipole", 1)
     if np.shape(dipole_uk) != (3,) or not np.all(np.isfinite(dipole_uk)):
         raise InputError(f"dipole_uk is {dipole_uk}, but it must be a vector of three finite components in uK.")

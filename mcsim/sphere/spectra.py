@@ -17,7 +17,7 @@ from mcsim.sphere.checks import check_whole
 from mcsim.support import resources
 from mcsim.support.npy import read_npy
 
-# Names of D_l = l(l+1) C_l / 2 pi as they stand in headers: D_l, Dl, D_ell, D_{\ell}, DlTT, l(l+1)Cl.
+# Names of D_l = l(l+1) C_l / 2 pi in headers: D_l, Dl, D_ell, D_{\ell}, DlTT, l(l+1)Cl.
 _NAMES_OF_D_L = re.compile(
     r"(?i)(?<![a-z])D_?\{?\\?(l|ell)(?=TT|[^a-z]|$)|(l|ell)\s*\*?\s*\((l|ell)\s*\+\s*1\)|dimensionless"
 )
@@ -29,13 +29,13 @@ _UNIT = re.compile(
 )
 
 SMALLEST_D_UK2, LARGEST_D_UK2 = 1e-6, 1e9
-"""Of the largest l(l+1) C_l / 2 pi (up to l = 100) of any sky: tables in K^2 lie below, in nK^2 above."""
+"""Limits of the largest l(l+1) C_l / 2 pi (up to l = 100) of a sky: tables in K^2 lie below, in nK^2 above."""
 
 SMALLEST_UNSTATED_UK2 = 0.03
-"""The same where the table does not state its unit: the CMB has 6000 uK^2, which is 0.006 mK^2."""
+"""The same for a table that does not state its unit: the CMB has 6000 uK^2, which is 0.006 mK^2."""
 
 D_L_RANGE_UK2, D_L_SLOPE, D_L_ROWS = (50.0, 5e4), -0.8, 6
-"""A table of D_l of the CMB, l <= 300: its median, the least slope d ln / d ln l (C_l has -1.6), rows to judge by."""
+"""A table of D_l of the CMB, l <= 300: its median, least d ln / d ln l (C_l has -1.6) and least number of rows."""
 
 
 def load(spec: str | Path, lmax: int) -> NDArray[np.float64]:
@@ -59,20 +59,20 @@ def load(spec: str | Path, lmax: int) -> NDArray[np.float64]:
     Raises
     ------
     InputError
-        No such file, an unreadable one, a header that names D_l, an unknown unit, a table that ends below lmax or has
-        gaps, a value that is not finite or is negative; numbers that can only be D_l or in another unit.
+        If the file is missing or unreadable, its header names D_l or an unknown unit, the table ends below lmax or has
+        gaps, a value is negative or not finite, or the numbers can only be D_l or in another unit.
 
     Warns
     -----
     UserWarning
-        If a spectrum that its header calls C_l, or a white one, has the size of D_l of the CMB.
+        If a white spectrum, or one whose header names C_l, has the size of D_l of the CMB.
 
     Notes
     -----
-    The unit of a FITS column is its TUNIT, that of a text table stands in a header line: uK^2, mK^2 and K^2 are
-    converted (a CMB marker such as uK_CMB^2 is understood); a table without unit is taken to be in uK^2 if it is of the
-    size that any temperature spectrum in uK^2 has. C_l of the CMB falls as l^-2, D_l does not. The packaged tables
-    reach l = 4096; their parameters and accuracy stand in ``workflows/spectra/make_spectra.py``.
+    The unit is that of a FITS column's TUNIT or a text table's header line: uK^2, mK^2 and K^2 are converted (a CMB
+    marker such as uK_CMB^2 is understood). A table without unit is taken to be in uK^2 if its size allows it. C_l of
+    the CMB falls as l^-2, D_l does not. The packaged tables reach l = 4096; ``workflows/spectra/make_spectra.py``
+    states their parameters and accuracy.
     """
     check_whole(lmax, "lmax")
     path = resources.spectrum(spec)
@@ -102,7 +102,7 @@ def load(spec: str | Path, lmax: int) -> NDArray[np.float64]:
 
 
 def _check_size(where: str, cl: NDArray[np.float64], stated: bool) -> None:
-    """Raise InputError for numbers that are no spectrum in uK^2."""
+    """Raise InputError for numbers that are not a spectrum in uK^2."""
     ell = np.arange(2, min(len(cl), 101))
     largest = float(np.max(ell * (ell + 1) * cl[ell] / (2 * np.pi), initial=0.0))
     least = SMALLEST_D_UK2 if stated else SMALLEST_UNSTATED_UK2
@@ -114,7 +114,7 @@ def _check_size(where: str, cl: NDArray[np.float64], stated: bool) -> None:
 
 
 def _check_shape(where: str, cl: NDArray[np.float64], named: bool) -> None:
-    """Raise InputError for a table of D_l, or of C_l that starts at ell = 2; warn where it may be right."""
+    """Raise InputError for a table of D_l, or of C_l that starts at ell = 2; warn if it may be right."""
     first = np.arange(min(len(cl), 8))
     if len(first) == 8 and cl[:8].min() > 0.0:
         shifted, own = (first + 2) * (first + 3) * cl[:8], (first * (first + 1) * cl[:8])[2:]
@@ -154,7 +154,7 @@ def _contents(path: Path) -> bytes:
 
 
 def _read_text(path: Path) -> tuple[NDArray[np.float64], str, bool]:
-    """C_l in uK^2, the header lines, and whether they state a unit."""
+    """Read C_l in uK^2, the header lines, and True if they state a unit."""
     try:
         lines = _contents(path).decode().splitlines()
     except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
@@ -198,7 +198,7 @@ def _read_text(path: Path) -> tuple[NDArray[np.float64], str, bool]:
 
 
 def _read_fits(path: Path) -> tuple[NDArray[np.float64], str, bool]:
-    """C_l in uK^2, the column's name, and whether it states a unit."""
+    """Read C_l in uK^2, the column's name, and True if it states a unit."""
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("error", ".*truncated.*", AstropyUserWarning)
@@ -208,12 +208,12 @@ def _read_fits(path: Path) -> tuple[NDArray[np.float64], str, bool]:
                     np.ravel(np.ma.filled(hdus[1].data.field(i), np.nan)).astype(np.float64)
                     for i in range(min(2, len(hdus[1].columns)))
                 ]
-    except Exception as error:  # libraries raise whatever a broken file makes of them
+    except Exception as error:  # libraries raise errors of any type for a broken file
         raise InputError(
             f"power spectrum {str(path)!r} cannot be read as a FITS table ({error}); "
             "give a file as healpy.write_cl writes it."
         ) from None
-    # A first column that counts is ell, and the second is C_l.
+    # If the first column counts up, it is ell and the second is C_l.
     ell = columns[0]
     counts = len(columns) == 2 and len(ell) > 3 and np.array_equal(ell, ell[0] + np.arange(len(ell))) and ell[0] >= 0
     column = 2 if counts else 1
@@ -231,7 +231,7 @@ def _read_fits(path: Path) -> tuple[NDArray[np.float64], str, bool]:
 
 
 def _factor(path: Path, unit: str) -> float:
-    """From the square of a temperature to uK^2."""
+    """Return the factor from the square of a temperature unit to uK^2."""
     key = re.sub(
         r"[\s^_*(){}]|cmb|thermo(dynamic)?", "", unit.lower().replace("µ", "u").replace("μ", "u").replace("²", "2")
     )

@@ -21,10 +21,10 @@ def _minimal_at_both_ends(
     n: int,
     out: NDArray[np.float64],
 ) -> None:
-    """Solution of upper_i f_{i+1} + diagonal_i f_i + lower_i f_{i-1} = 0 that falls off at both ends, up to a factor.
+    """Solve upper_i f_{i+1} + diagonal_i f_i + lower_i f_{i-1} = 0, falling off at both ends, up to a factor.
 
-    Forward to the first decrease, backward from the top, joined by least squares over three points, so that neither
-    recursion runs into a region where its solution should fall.
+    The recursion runs forward to the first decrease and backward from the top, where each is stable. Least squares
+    over three points joins them.
     """
     out[0] = 1.0
     join = n - 1
@@ -72,7 +72,7 @@ def _normalise(jmin: int, n: int, factor: float, top_sign: float, out: NDArray[n
 
 @njit(cache=True, nogil=True)
 def threej_family(j2: int, j3: int, m2: int, m3: int, out: NDArray[np.float64]) -> tuple[int, int]:
-    """3j symbols (j j2 j3; -m2-m3 m2 m3) for every j, written to the start of ``out``.
+    """Write the 3j symbols (j j2 j3; -m2-m3 m2 m3) for every j to the start of ``out``.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def threej_family(j2: int, j3: int, m2: int, m3: int, out: NDArray[np.float64]) 
 
 @njit(cache=True, nogil=True)
 def sixj_family(j2: int, j3: int, j4: int, j5: int, j6: int, out: NDArray[np.float64]) -> tuple[int, int]:
-    """6j symbols {j j2 j3; j4 j5 j6} for every j, written to the start of ``out``.
+    """Write the 6j symbols {j j2 j3; j4 j5 j6} for every j to the start of ``out``.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def sixj_family(j2: int, j3: int, j4: int, j5: int, j6: int, out: NDArray[np.flo
     x2, x3, x4 = j2 * (j2 + 1.0), j3 * (j3 + 1.0), j4 * (j4 + 1.0)
     x5, x6 = j5 * (j5 + 1.0), j6 * (j6 + 1.0)
     upper, diagonal, lower = np.zeros(n), np.zeros(n), np.zeros(n)
-    here = 0.0  # vanishes at jmin, like the coefficient that it stands in
+    here = 0.0  # vanishes at jmin
     for i in range(n):
         j = float(jmin + i)
         beyond = _root(j + 1.0, j2 + j3 + 1.0, j2 - j3) * _root(j + 1.0, j5 + j6 + 1.0, j5 - j6)

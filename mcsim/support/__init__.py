@@ -1,1 +1,1 @@
-"""What every package leans on: folders and caches on disk, progress, and the files that the package ships."""
+"""Helpers for all packages: folders and caches on disk, progress, and the files shipped with mcsim."""

@@ -12,15 +12,15 @@ from mcsim.errors import InputError
 
 @contextmanager
 def appearing(path: Path) -> Iterator[Path]:
-    """A scratch folder beside ``path`` that takes its name when the block ends, and vanishes where the block fails.
+    """Yield a scratch folder beside ``path``; rename it to ``path`` at the end, delete it if the block fails.
 
-    Another process may be quicker: then its folder stays.
+    If another process was faster, its folder stays.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     try:
         yield scratch
-        scratch.chmod(0o755)  # the scratch folder was for its owner alone
+        scratch.chmod(0o755)  # a temporary folder is readable by its owner alone
         try:
             scratch.rename(path)
         except OSError:
@@ -31,7 +31,7 @@ def appearing(path: Path) -> Iterator[Path]:
 
 
 def writable(folder: Path) -> None:
-    """Make a folder; InputError where nothing can be written into it."""
+    """Make a folder; raise InputError if nothing can be written into it."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -41,7 +41,7 @@ def writable(folder: Path) -> None:
 
 
 def default_cache_dir() -> Path:
-    """$MCSIM_CACHE, or $XDG_CACHE_HOME/mcsim, or ~/.cache/mcsim."""
+    """Return $MCSIM_CACHE, or $XDG_CACHE_HOME/mcsim, or ~/.cache/mcsim."""
     if own := os.environ.get("MCSIM_CACHE"):
         return Path(own)
     if xdg := os.environ.get("XDG_CACHE_HOME"):
@@ -50,16 +50,16 @@ def default_cache_dir() -> Path:
 
 
 def cached(name: str, fill: Callable[[Path], None], cache_dir: str | Path | None = None) -> Path:
-    """Folder of the cache, filled where it is not there yet.
+    """Return a folder of the cache; fill it first if it does not exist.
 
     Parameters
     ----------
     name
-        That says all that the content depends on.
+        Name of the folder; it identifies everything that the content depends on.
     fill
-        Writes the content into an empty folder.
+        Function that writes the content into an empty folder.
     cache_dir
-        None: :func:`default_cache_dir`.
+        Root of the cache; None: :func:`default_cache_dir`.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def cached(name: str, fill: Callable[[Path], None], cache_dir: str | Path | None
             with appearing(folder) as scratch:
                 fill(scratch)
         except OSError as error:
-            if error.errno is None:  # of a connection or a limit of time, not of a file
+            if error.errno is None:  # from a connection or a timeout, not from a file
                 raise
             raise InputError(
                 f"cache folder {str(root)!r} cannot be written ({error.strerror}); make room there, or set MCSIM_CACHE "

@@ -1,4 +1,4 @@
-"""Arrays in numpy's own files: what is given as an array in place of a file is kept so."""
+"""Readers of numpy's .npy and .npz files."""
 
 from pathlib import Path
 
@@ -16,18 +16,18 @@ def read_npy(path: str | Path, kind: str = "biufc", ndims: tuple[int, ...] = (1,
     path
         The file.
     kind
-        numpy's letters of the types that it may hold; by default any numbers.
+        Allowed ``dtype.kind`` letters; by default any numbers.
     ndims
-        Numbers of dimensions that it may have.
+        Allowed numbers of dimensions.
 
     Raises
     ------
     InputError
-        If it cannot be read, or holds another type or shape.
+        If the file cannot be read, or has another type or shape.
     """
     try:
         array = np.load(path, allow_pickle=False)
-    except Exception as error:  # libraries raise whatever a broken file makes of them
+    except Exception as error:  # libraries raise errors of any type for a broken file
         raise InputError(f"{path} cannot be read as an array of numpy ({error}); write it with numpy.save.") from error
     if array.ndim not in ndims or array.dtype.kind not in kind:
         wanted = f"{'numbers' if 'c' in kind else 'real numbers'} in {' or '.join(map(str, ndims))} dimensions"
@@ -36,9 +36,9 @@ def read_npy(path: str | Path, kind: str = "biufc", ndims: tuple[int, ...] = (1,
 
 
 def read_npz(path: str | Path) -> dict[str, NDArray]:
-    """Read all arrays of a .npz file; InputError if it cannot be read."""
+    """Read all arrays of a .npz file; raise InputError if it cannot be read."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             return dict(archive)
-    except Exception as error:  # libraries raise whatever a broken file makes of them
+    except Exception as error:  # libraries raise errors of any type for a broken file
         raise InputError(f"{path} cannot be read as arrays of numpy ({error}); write it again.") from error

@@ -1,4 +1,4 @@
-"""Progress of long work: a bar on a terminal, a plain line a minute elsewhere; and a log beside the store."""
+"""Progress of long work: a bar on a terminal, otherwise a line per minute; and a log beside the store."""
 
 import os
 import socket
@@ -15,10 +15,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 
 class Reporter(Protocol):
-    """Told how far the work is."""
+    """Function that shows the progress."""
 
     def __call__(self, finished: float, failed: int = 0) -> None:
-        """``finished`` units are done, ``failed`` of them in vain."""
+        """Show that ``finished`` units are done, ``failed`` of them unsuccessfully."""
 
     def expect(self, more: float) -> None:
         """Add ``more`` units to the total."""
@@ -26,18 +26,18 @@ class Reporter(Protocol):
 
 @contextmanager
 def reporting(label: str, total: float, unit: str, quiet: bool = False, every_s: float = 60.0) -> Iterator[Reporter]:
-    """Report work of ``total`` units on standard error.
+    """Yield a function that reports progress on standard error.
 
     Parameters
     ----------
     label, unit
-        What is done, and what is counted.
+        Name of the work, and of what is counted.
     total
         Number of units; 0 if :meth:`Reporter.expect` says later how many there are.
     quiet
         Report nothing.
     every_s
-        Seconds between lines where standard error is no terminal.
+        Seconds between lines if standard error is not a terminal.
     """
     console = Console(stderr=True)
     if quiet:
@@ -66,7 +66,7 @@ class Journal:
     quiet: bool = True
 
     def write(self, text: str, aloud: bool = False) -> None:
-        """Append a line; ``aloud`` says it on standard error, too, unless quiet. A full disk must not stop a run."""
+        """Append a line; print it on standard error too if ``aloud``, unless quiet. Ignore a full disk."""
         line = " ".join(text.split())
         with suppress(OSError), self.store.with_name(f"{self.store.name}.log").open("a") as stream:
             now = datetime.now(UTC).isoformat(timespec="seconds")
@@ -84,7 +84,7 @@ class _Silent:
 
 
 class _Rate:
-    """Units per second since the start, and what follows for the rest."""
+    """Units per second since the start, and the time left."""
 
     def __init__(self, total: float, unit: str) -> None:
         self.total, self.unit, self.start = total, unit, time.monotonic()

@@ -25,7 +25,7 @@ def scan_model(name_or_path: str | Path, relative_to: str | Path | None = None) 
     Raises
     ------
     InputError
-        Neither a packaged name nor an existing file.
+        If it is neither a packaged name nor an existing file.
     """
     return _find("scan model", "scan_models", ".toml", name_or_path, relative_to)
 
@@ -41,7 +41,7 @@ def spectrum(name_or_path: str | Path, relative_to: str | Path | None = None) ->
 
 
 def names(kind: str) -> tuple[str, ...]:
-    """Sorted names that are packaged; ``kind`` is ``"scan_models"``, ``"workflows"`` or ``"data"`` (power spectra)."""
+    """Return the packaged names, sorted; ``kind``: ``"scan_models"``, ``"workflows"``, ``"data"`` (spectra)."""
     suffix = ".txt" if kind == "data" else ".toml"
     return tuple(sorted(path.stem for path in _folder(kind).glob(f"*{suffix}")))
 
@@ -58,7 +58,7 @@ def _find(noun: str, kind: str, suffix: str, name_or_path: str | Path, relative_
     try:
         if path.is_file():
             return path.resolve()
-    except (OSError, ValueError):  # names that no file system takes: too long, or with a NUL
+    except (OSError, ValueError):  # invalid names: too long, or with a NUL
         pass
     raise InputError(
         f"{noun} {str(name_or_path)!r} is neither a file (looked for {str(path)!r}) nor packaged with mcsim; "

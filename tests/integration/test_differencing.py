@@ -1,4 +1,4 @@
-"""Maps from the differences of two beams as a batch: skies recovered, twins, splits, noise, masks, refusals."""
+"""Maps from the differences of two beams as a batch: skies, controls, splits, noise, masks, refusals."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -104,7 +104,9 @@ def test_map_is_that_of_the_whole_beams_solved_at_once(year):
     sky = simulate.draw_sky(shared, 3)
     sides = [mapmaking.side_maps(sky, response, NSIDE) for response in (channel.response, channel.side_b.response)]
     (pairs,) = [m.pairs for m in channel.maps]
-    expected, report = mapmaking.solve(pairs, mapmaking.rhs_from_maps(pairs, [tuple(sides)])[0], tol=1e-10)
+    expected, report = mapmaking.solve(
+        pairs, mapmaking.rhs_from_maps(pairs, [tuple(sides)])[0], rule=mapmaking.StoppingRule(1e-10)
+    )
     assert report.converged
     found = simulate.realize(shared, 3)["observed_map"][0]
     np.testing.assert_allclose(found, expected, atol=1e-6 * expected.std())

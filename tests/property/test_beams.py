@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mcsim.instrument.beams import Beam, blm_of_map
+from mcsim.instrument.beams import Beam, BeamMap, blm_of_map
 from mcsim.instrument.beams.coefficients import power_by_order
 
 widths = st.floats(5.0, 300.0)
@@ -41,9 +41,9 @@ def test_quarter_turns_of_any_map_are_exact(seed: int, quarters: int) -> None:
     image = np.random.default_rng(seed).standard_normal((17, 17))
     image[8, 8] += 100.0
     pixel, cut = np.radians(0.5), np.radians(3.9)
-    upright = Beam.normalized(blm_of_map(image, pixel, (8, 8), cut, 60, 5), 5, "a map")
+    upright = Beam.normalized(blm_of_map(BeamMap(image, pixel, (8, 8), cut), 60, 5), 5, "a map")
     # Columns are x and rows y, so that numpy's rot90 from axis 1 (x) to axis 0 (y) turns the beam from x towards y.
     turned_image = np.rot90(image, quarters, axes=(1, 0))
-    turned = Beam.normalized(blm_of_map(turned_image, pixel, (8, 8), cut, 60, 5), 5, "a map")
+    turned = Beam.normalized(blm_of_map(BeamMap(turned_image, pixel, (8, 8), cut), 60, 5), 5, "a map")
     phases = np.exp(-1j * np.arange(6) * quarters * np.pi / 2)[:, None]
     np.testing.assert_allclose(turned.blm, upright.blm * phases, rtol=0, atol=1e-11 * np.abs(upright.blm).max())

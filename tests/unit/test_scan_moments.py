@@ -8,6 +8,7 @@ from astropy.io import fits
 from mcsim.errors import InputError
 from mcsim.instrument.scan.accumulate import stream_sums
 from mcsim.instrument.scan.cache import cached_moments, moments_key
+from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
 from mcsim.instrument.scan.moments import Moments, read_moments_fits, write_moments_fits
 from mcsim.instrument.scan.pointing import pointing
@@ -72,7 +73,7 @@ def test_threads_change_no_bit():
 
 def test_progress_ends_at_one():
     seen = []
-    stream_sums(MODEL, NSIDE, SMAX, nthreads=2, progress=seen.append)
+    stream_sums(MODEL, MapGrid(NSIDE), SMAX, nthreads=2, progress=seen.append)
     assert seen.count(1.0) == 1
     assert max(seen) == 1.0
 

@@ -11,6 +11,7 @@ import pytest
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import ScanModel
+from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.model import LineOfSight
 from mcsim.instrument.scan.pointing import pointing
 from mcsim.simulation import tod
@@ -20,6 +21,7 @@ from mcsim.sphere.sky import dipole_alm, gaussian_alm
 LINE = LineOfSight("A", 70.5, 12.0)
 MODEL = ScanModel("toy", 129.3, -3600.0, 22.5, 31557600.0, 11.0, 10.0, (LINE,), ("A",))
 NSIDE, LMAX = 16, 40
+GRID = MapGrid(NSIDE)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +53,7 @@ def whole(stream: Iterable[tod.Samples]) -> tod.Samples:
 def test_samples_are_the_pointing_of_the_model(monkeypatch):
     monkeypatch.setattr(tod, "CHUNK", 7001)
     count = MODEL.samples(LINE)
-    stream = whole(tod.samples(MODEL, LINE, NSIDE, "galactic"))
+    stream = whole(tod.samples(MODEL, LINE, MapGrid(NSIDE, "galactic")))
     theta, phi, psi = pointing(MODEL, LINE, 0, count, "galactic")
     np.testing.assert_allclose(stream.theta, theta, atol=1e-11)
     np.testing.assert_allclose(np.exp(1j * stream.phi), np.exp(1j * phi), atol=1e-9)
@@ -62,16 +64,16 @@ def test_samples_are_the_pointing_of_the_model(monkeypatch):
 
 
 def test_parts_of_the_survey_follow_each_other():
-    everything = whole(tod.samples(MODEL, LINE, NSIDE))
-    halves = [whole(tod.samples(MODEL, LINE, NSIDE, time_range=part)) for part in ((0.0, 0.37), (0.37, 1.0))]
+    everything = whole(tod.samples(MODEL, LINE, GRID))
+    halves = [whole(tod.samples(MODEL, LINE, replace(GRID, time_range=part))) for part in ((0.0, 0.37), (0.37, 1.0))]
     for name in ("time_s", "theta", "pixel"):
         joined = np.concatenate([getattr(half, name) for half in halves])
         np.testing.assert_allclose(joined, getattr(everything, name), rtol=1e-10)
 
 
 def test_at_pixel_centres_only_the_direction_changes():
-    free = whole(tod.samples(MODEL, LINE, NSIDE))
-    moved = whole(tod.samples(MODEL, LINE, NSIDE, at_pixel_centres=True))
+    free = whole(tod.samples(MODEL, LINE, GRID))
+    moved = whole(tod.samples(MODEL, LINE, GRID, at_pixel_centres=True))
     np.testing.assert_array_equal(moved.psi, free.psi)
     np.testing.assert_array_equal(moved.pixel, free.pixel)
     theta, phi = healpy.pix2ang(NSIDE, free.pixel)
@@ -81,7 +83,7 @@ def test_at_pixel_centres_only_the_direction_changes():
 
 def test_signal_is_the_integral_of_sky_times_turned_beam(sky, beam):
     """The beam turned to (phi, theta, psi) by its Euler angles, then integrated against the sky."""
-    stream = next(iter(tod.samples(MODEL, LINE, NSIDE)))
+    stream = next(iter(tod.samples(MODEL, LINE, GRID)))
     few = replace(stream, **{name: getattr(stream, name)[:2000:157] for name in vars(stream)})
     found = next(tod.sky_signal(sky, LMAX, beam)([few])).signal_uk
     full = np.zeros(alm_.size(LMAX), complex)
@@ -98,22 +100,17 @@ def test_signal_is_the_integral_of_sky_times_turned_beam(sky, beam):
 def test_dipole_is_seen_through_the_beam():
     vector = np.array([1200.0, -2500.0, 1900.0])
     beam = Beam.gaussian(900.0, 8)
-    stream = next(iter(tod.samples(MODEL, LINE, NSIDE)))
+    stream = next(iter(tod.samples(MODEL, LINE, GRID)))
     found = next(tod.sky_signal(dipole_alm(vector, 8), 8, beam)([stream])).signal_uk
     expected = beam.window[1] * healpy.ang2vec(stream.theta, stream.phi) @ vector
     assert beam.window[1] < 0.99
     np.testing.assert_allclose(found, expected, atol=1e-6)
-    sky = gaussian_alm(np.ones(9), np.random.default_rng(3))
-    kwargs = {"line_of_sight": "A", "time_range": (0.0, 0.1)}
-    with_dipole, hits = tod.observe(sky, 8, beam, MODEL, 4, dipole_uk=vector, **kwargs)
-    summed, _ = tod.observe(sky + dipole_alm(vector, 8), 8, beam, MODEL, 4, **kwargs)
-    np.testing.assert_array_equal(with_dipole[hits > 0], summed[hits > 0])
 
 
 def test_map_is_the_mean_of_the_samples(sky, beam):
     stages = [tod.sky_signal(sky, LMAX, beam)]
-    stream = whole(tod.through(tod.samples(MODEL, LINE, 32), stages))
-    found, hits = tod.observe(sky, LMAX, beam, MODEL, 32, line_of_sight="A")
+    stream = whole(tod.through(tod.samples(MODEL, LINE, MapGrid(32)), stages))
+    found, hits = tod.observe(MODEL, LINE, MapGrid(32), stages)
     expected = np.full(12 * 32**2, healpy.UNSEEN)
     for pixel in np.unique(stream.pixel):
         expected[pixel] = stream.signal_uk[stream.pixel == pixel].mean()
@@ -123,21 +120,25 @@ def test_map_is_the_mean_of_the_samples(sky, beam):
 
 
 def test_noise_is_white_and_does_not_depend_on_chunks(sky, beam, monkeypatch):
-    kwargs = {"line_of_sight": "A", "noise_sigma0_uk": 50.0}
-    clean, hits = tod.observe(sky, LMAX, beam, MODEL, NSIDE, line_of_sight="A")
-    noisy, _ = tod.observe(sky, LMAX, beam, MODEL, NSIDE, rng=np.random.default_rng(4), **kwargs)
+    signal = tod.sky_signal(sky, LMAX, beam)
+
+    def with_noise() -> np.ndarray:
+        return tod.observe(MODEL, LINE, GRID, [signal, tod.white_noise(50.0, np.random.default_rng(4))])[0]
+
+    clean, hits = tod.observe(MODEL, LINE, GRID, [signal])
+    noisy = with_noise()
     seen = hits > 0
     scaled = (noisy - clean)[seen] * np.sqrt(hits[seen]) / 50.0
     # The mean square of n standard normal numbers has the standard deviation sqrt(2/n).
     assert abs(np.mean(scaled**2) - 1.0) < 4.0 * np.sqrt(2.0 / seen.sum())
     monkeypatch.setattr(tod, "CHUNK", 1000)
-    again, _ = tod.observe(sky, LMAX, beam, MODEL, NSIDE, rng=np.random.default_rng(4), **kwargs)
+    again = with_noise()
     # Chunks begin the phases of the pointing anew, to 1e-11 rad.
     np.testing.assert_allclose(again[seen], noisy[seen], atol=1e-6)
 
 
 def test_threads_do_not_change_a_bit(sky, beam):
-    one, two = (tod.observe(sky, LMAX, beam, MODEL, NSIDE, line_of_sight="A", nthreads=n)[0] for n in (1, 2))
+    one, two = (tod.observe(MODEL, LINE, GRID, [tod.sky_signal(sky, LMAX, beam, nthreads=n)])[0] for n in (1, 2))
     np.testing.assert_array_equal(one, two)
 
 
@@ -156,10 +157,8 @@ def test_stages_act_where_they_are_put(sky, beam, monkeypatch):
             before = chunk.signal_uk[-1]
 
     turned = Beam(beam.blm * np.exp(-0.3j * np.arange(4))[:, None])
-    expected = whole(tod.through(tod.samples(MODEL, LINE, NSIDE), [tod.sky_signal(sky, LMAX, turned)]))
-    found, hits = tod.observe(
-        sky, LMAX, beam, MODEL, NSIDE, line_of_sight="A", pointing_stages=[turn], signal_stages=[lag]
-    )
+    expected = whole(tod.through(tod.samples(MODEL, LINE, GRID), [tod.sky_signal(sky, LMAX, turned)]))
+    found, hits = tod.observe(MODEL, LINE, GRID, [turn, tod.sky_signal(sky, LMAX, beam), lag])
     shifted = np.concatenate([[0.0], expected.signal_uk[:-1]])
     total = np.bincount(expected.pixel, weights=shifted, minlength=hits.size)
     np.testing.assert_allclose(found[hits > 0] * hits[hits > 0], total[hits > 0], atol=1e-6)
@@ -168,20 +167,24 @@ def test_stages_act_where_they_are_put(sky, beam, monkeypatch):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"line_of_sight": "Z"}, "no line of sight 'Z'"),
         ({"time_range": (0.5, 0.5)}, r"time_range is \(0.5, 0.5\)"),
         ({"time_range": (0.0, 1e-9)}, "contains no sample"),
-        ({"lmax": 30}, "lmax = 30"),
-        ({"beam": Beam.gaussian(900.0, 20)}, "ends at l = 20"),
-        ({"noise_sigma0_uk": 3.0}, "noise_sigma0_uk is 3 but no rng"),
         ({"nside": 12}, "nside is 12"),
         ({"frame": "solar"}, "frame is 'solar'"),
     ],
 )
-def test_bad_input_is_named(changes, message, sky, beam):
-    good = {"alm": sky, "lmax": LMAX, "beam": beam, "model": MODEL, "nside": NSIDE, "line_of_sight": "A"}
+def test_bad_grids_are_named(changes, message):
     with pytest.raises(InputError, match=message):
-        tod.observe(**(good | changes))
+        tod.observe(MODEL, LINE, MapGrid(**({"nside": NSIDE} | changes)), [])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [({"lmax": 30}, "lmax = 30"), ({"beam": Beam.gaussian(900.0, 20)}, "ends at l = 20")],
+)
+def test_skies_and_beams_that_do_not_fit_are_named(changes, message, sky, beam):
+    with pytest.raises(InputError, match=message):
+        tod.sky_signal(**({"alm": sky, "lmax": LMAX, "beam": beam} | changes))
 
 
 def test_dipole_needs_its_degree():

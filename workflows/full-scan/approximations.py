@@ -15,6 +15,7 @@ import healpy
 import numpy as np
 
 from mcsim.instrument import beams, scan
+from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.limit import caustics
 from mcsim.simulation import convolve, tod
 from mcsim.sphere import healpix, rng, spectra
@@ -27,16 +28,16 @@ PARTS = 16
 
 
 def against_samples(nside: int, period_s: float) -> None:
-    """Residual of the default route against the referee, uK."""
+    """Print the residual of the default route against the time-ordered reference, uK."""
     lmax = 2 * nside + nside // 2
     model = scan.ScanModel.load("wmap").with_sampling(period_s)
     beam = beams.Beam.elliptical(13.9, 12.7, 0.0, lmax, 2)
     sky = gaussian_alm(spectra.load("wmap7", lmax), rng.generator(1, 0, "sky"))
     moments = scan.Moments.from_model(model.with_lines_of_sight("A"), nside, 2, nthreads=2)
-    truth, hits = tod.observe(sky, lmax, beam, model, nside, line_of_sight="A", nthreads=2)
-    centred, _ = tod.observe(
-        sky, lmax, beam, model, nside, line_of_sight="A", at_pixel_centres=True, nthreads=2, epsilon=1e-11
-    )
+    line, grid = model.line_of_sight("A"), MapGrid(nside)
+    truth, hits = tod.observe(model, line, grid, [tod.sky_signal(sky, lmax, beam, nthreads=2)])
+    exact = tod.sky_signal(sky, lmax, beam, epsilon=1e-11, nthreads=2)
+    centred, _ = tod.observe(model, line, grid, [exact], at_pixel_centres=True)
     seen = hits > 0
 
     def route(window: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 
 from mcsim.instrument import scan
 from mcsim.instrument.scan import ScanModel
+from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.simulation import mapmaking
 from mcsim.sphere import healpix
 
@@ -73,7 +74,7 @@ def kept(pairs: mapmaking.DifferencingScan, share: float, nside: int, pixel: np.
     coarse, _, _ = healpix.read_map(data_file(COARSE))
     latitude = 90.0 - np.degrees(healpy.pix2ang(32, np.arange(coarse.size))[0])
     coarse = np.where(np.abs(latitude) < PLANE_DEG, coarse, -np.inf)
-    bright = healpy.ud_grade((coarse > np.quantile(coarse, 1.0 - share)).astype(float), pairs.nside)
+    bright = healpy.ud_grade((coarse > np.quantile(coarse, 1.0 - share)).astype(float), pairs.grid.nside)
     lost = np.add.reduceat(pairs.count * bright[pairs.partner], pairs.row_start[:-1])
     return np.asarray(
         healpy.get_interp_val(1.0 - lost / (pairs.hits_a + pairs.hits_b), *healpy.pix2ang(nside, pixel, nest=True))
@@ -97,7 +98,7 @@ def main() -> None:
     theta = sub_pixels(nside, pixel)
     latitude = np.abs(90.0 - np.degrees(theta.mean(axis=1)))
     focal_plane, nominal = (scan.ScanModel.load(name) for name in ("wmap_focal_plane", "wmap"))
-    pairs = mapmaking.prepare(focal_plane.with_sampling(0.6), "W1", 64, "galactic", nthreads=2)
+    pairs = mapmaking.prepare(focal_plane.with_sampling(0.6), "W1", MapGrid(64, "galactic"), nthreads=2)
     limit = density(focal_plane, LINES, theta)
     models = {"one line of sight at 70.5°": density(nominal, ("A",), theta)}
     for share in BRIGHT:

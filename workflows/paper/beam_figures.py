@@ -99,7 +99,5 @@ def beam_maps(maps: dict[str, beams.BeamMap]) -> Figure:
 
 def negative_share(beam_map: beams.BeamMap) -> float:
     """Sum of the negative pixels over that of the positive ones, inside the cut."""
-    values, _, _ = solid_angle_values(
-        beam_map.image, beam_map.pixel_rad, beam_map.centre, beam_map.cut_rad, beam_map.projection
-    )
+    values, _, _ = solid_angle_values(beam_map)
     return float(-values[values < 0].sum() / values[values > 0].sum())

@@ -1,7 +1,7 @@
-"""BipoSH without Monte Carlo: from a beam's b_lm, the moments of a scan and C_l to the mean of an ensemble.
+"""Prediction of mean BipoSH without Monte Carlo, from b_lm of a beam, the moments of a scan and C_l.
 
-Nothing but the modes' names and normalisation is shared with the convolution and the estimator of the ensembles, so
-that each checks the other.
+Only the modes' names and normalisation are shared with the convolution and the estimator of the ensembles, so that
+each checks the other.
 """
 
 from mcsim.bipolar.theory.beam_biposh import ScannedBeam, beam_biposh

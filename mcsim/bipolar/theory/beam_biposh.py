@@ -15,7 +15,7 @@ from mcsim.sphere.wigner import threej_family
 
 @dataclass(frozen=True, eq=False)
 class ScannedBeam:
-    """A beam and the orientations under which it saw the sky.
+    """A beam and the moments of the orientations in which it observed the sky.
 
     Attributes
     ----------
@@ -27,13 +27,14 @@ class ScannedBeam:
     Raises
     ------
     InputError
-        For arrays of other shapes, or that are not finite.
+        If an array has another shape or is not finite.
     """
 
     blm: NDArray[np.complex128]
     w: NDArray[np.complex128]
 
     def __post_init__(self) -> None:
+        """Check the shapes and values."""
         if self.blm.ndim != 2 or self.w.ndim != 3 or self.w.shape[2] != 2 * self.w.shape[1] - 1:
             raise InputError(
                 f"b_lm of shape {self.blm.shape} and w of {self.w.shape} are no scanned beam; give (mmax + 1, "
@@ -94,7 +95,7 @@ def beam_biposh(beam: ScannedBeam, mode: Indices, lmax: int) -> NDArray[np.compl
     Raises
     ------
     InputError
-        |M| or |d| above L.
+        If |M| or |d| exceeds L.
 
     Notes
     -----
@@ -121,7 +122,7 @@ def beam_biposh(beam: ScannedBeam, mode: Indices, lmax: int) -> NDArray[np.compl
 
 @njit(cache=True, nogil=True)
 def _spin_coupling(L: int, d: int, s: int, lmax: int) -> NDArray[np.float64]:
-    """3j symbols (l1 L l2; 0 s -s) with l1 = l2 - d at l2 = 0..lmax, zero where they vanish; |s| <= L."""
+    """Return the 3j symbols (l1 L l2; 0 s -s), l1 = l2 - d, at l2 = 0..lmax; |s| <= L."""
     symbols, family = np.zeros(lmax + 1), np.zeros(2 * L + 1)
     for l2 in range(abs(s), lmax + 1):
         lowest, n = threej_family(L, l2, s, -s, family)

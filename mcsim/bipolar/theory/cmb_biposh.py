@@ -38,14 +38,14 @@ def cmb_biposh_leading(
     Raises
     ------
     InputError
-        A mode that cannot exist, or a spectrum that ends below lmax.
+        If a mode cannot exist, or the spectrum ends below lmax.
 
     Notes
     -----
     For L > 0, A = (-1)^{l2} [C_{l2} B^{00,Y}_{l2 l2} B^{LM,X}_{l1 l2}/sqrt(2 l2+1) + (-1)^L C_{l1} B^{00,X}_{l1 l1}
     B^{LM,Y}_{l2 l1}/sqrt(2 l1+1)] (arXiv:1210.7318, eqs. WMAP1 and WMAP2 generalised); for L = 0 the circular spectrum
-    (-1)^l sqrt(2l+1) C_l B^X_l B^Y_l. What is left out is second order in b_ls: halving b_l2 quarters it
-    (tests/unit/test_predict_brute_force.py); :func:`mcsim.bipolar.theory.cmb_biposh_exact` has it.
+    (-1)^l sqrt(2l+1) C_l B^X_l B^Y_l. The error is of second order in b_ls: halving b_l2 quarters it
+    (tests/unit/test_predict_brute_force.py); :func:`mcsim.bipolar.theory.cmb_biposh_exact` includes it.
     """
     check_modes(modes)
     check_cl(cl, lmax)
@@ -91,8 +91,8 @@ def noise_biposh(modes: Sequence[Indices], variance: NDArray[np.complex128], lma
     Notes
     -----
     A^{LM}_{l1 l2} = v_LM sqrt((2 l1+1)(2 l2+1)/(4pi (2L+1))) C^{L0}_{l1 0 l2 0}: in the Bennett normalisation
-    v_LM/sqrt(4pi), for every l. From the addition of int Y* Y V; the convolution does not enter
-    (tests/unit/test_predict_cmb_biposh.py holds it to an explicit sum).
+    v_LM/sqrt(4pi), for every l. It follows from int Y* Y V, without the convolution
+    (tests/unit/test_predict_cmb_biposh.py compares with an explicit sum).
     """
     check_modes(modes)
     check_whole(lmax, "lmax")

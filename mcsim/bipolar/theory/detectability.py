@@ -1,4 +1,4 @@
-"""How well a BipoSH signal can be seen: variances under isotropy, signal to noise and Fisher information."""
+"""Detectability of a BipoSH signal: variances under isotropy, signal to noise and Fisher information."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -63,7 +63,7 @@ def isotropic_variance(modes: Sequence[Indices], spectra: Spectra) -> NDArray[np
         l2 = np.flatnonzero(existing(L, d, lmax))
         product = x[l2 - d] * y[l2]
         row[l2] = product + ((-1) ** L * cross[l2] ** 2 if d == 0 else 0.0)
-        # Of maps without noise nothing is left for odd L but round-off of either sign.
+        # For maps without noise and odd L only round-off of either sign remains.
         row[l2[row[l2] < 1e-12 * product]] = 0.0
     return variance
 
@@ -75,7 +75,7 @@ def signal_to_noise(
     f_sky: float = 1.0,
     ell_range: tuple[int, int] | None = None,
 ) -> NDArray[np.float64]:
-    """Return the signal to noise of each mode, all ell of a range together.
+    """Return the signal to noise of each mode, summed over a range of ell.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def fisher_information(
         dA^{LM}_{l1 l2} of every ordered pair of maps per unit of the parameter, uK^2, shape (n_map, n_map, n_mode,
         lmax + 1).
     modes
-        (L, M, d) with M >= 0 and d >= 0: d < 0 is the exchanged pair's. L = 0 is C_l's own part.
+        (L, M, d) with M >= 0 and d >= 0: d < 0 belongs to the exchanged pair. L = 0 is the part of C_l.
     cl_total
         Total spectra and cross-spectra of the maps, uK^2, shape (n_map, n_map, lmax + 1); degrees where this is
         singular (such as l = 0, 1 without power) are left out.
@@ -140,7 +140,7 @@ def fisher_information(
     Raises
     ------
     InputError
-        f_sky outside (0, 1], or a mode with M < 0 or d < 0.
+        If f_sky is outside (0, 1], or a mode has M < 0 or d < 0.
 
     Notes
     -----

@@ -15,7 +15,7 @@ from mcsim.sphere.wigner import sixj_family, threej_family
 
 _BLOCK = 32
 
-# A product of moments and beams below this fraction of the circular term is left out.
+# Products of moments and beams below this fraction of the circular term are left out.
 _TOLERANCE = 1e-12
 
 
@@ -34,15 +34,14 @@ def cmb_biposh_exact(
     modes
         (L, M, d) each, with |M|, |d| <= L; L = 0 gives (-1)^l sqrt(2l+1) C_l with the second order of the beam.
     cl
-        C_l of the sky without beam, uK^2, shape (> lmax,). Skies often end above ``lmax``; power there leaks down, so
-        give it.
+        C_l of the sky without beam, uK^2, shape (> lmax,). Include any power above ``lmax``: it leaks down.
     lmax
         Highest l1 and l2.
     x, y
-        Beams and scans of a_{l1 m1} and of a_{l2 m2}; ``y`` is ``x`` by default. Sums over L1, L2 end with
-        their moments: see Notes.
+        Beams and scans of a_{l1 m1} and of a_{l2 m2}; ``y`` is ``x`` by default. The sums over L1, L2 end at
+        the L_max of their moments: see Notes.
     nthreads
-        Blocks of ell are shared among so many threads.
+        Number of threads that share the blocks of ell.
 
     Returns
     -------
@@ -52,13 +51,13 @@ def cmb_biposh_exact(
     Raises
     ------
     InputError
-        A mode that cannot exist, or a spectrum that ends below lmax.
+        If a mode cannot exist, or the spectrum ends below lmax.
 
     Notes
     -----
     A^{LM}_{l1 l2} = sum_{l L1 L2} C_l (-1)^{l1+L2-L} sqrt((2 L1+1)(2 L2+1)) {l l1 L1; L L2 l2}
     sum_{M1 M2} C^{LM}_{L1 M1 L2 M2} B^{L1 M1,X}_{l1 l} B^{L2 M2,Y}_{l2 l}
-    (arXiv:1210.7318, appendix; the phase (-1)^l of its main text fails for odd parity). With the beam-BipoSH put in,
+    (arXiv:1210.7318, appendix; the phase (-1)^l of its main text fails for odd parity). With the beam-BipoSH inserted,
     the moments couple once, X^{ss'}_{L1 L2} = sum C^{LM}_{L1 M1 L2 M2} w_{s,L1 M1} w_{s',L2 M2}, whatever l1, l2 and
     l, so that M costs next to nothing.
 
@@ -101,7 +100,7 @@ def cmb_biposh_exact(
 
 
 class _Seen(NamedTuple):
-    """The sky's (2l+1) C_l/4pi, and the tables of two beams, whose first l1 or l2 is ``low``."""
+    """(2l+1) C_l/4pi of the sky, and the tables of two beams, whose first l1 or l2 is ``low``."""
 
     low: int
     power: NDArray[np.float64]
@@ -110,7 +109,7 @@ class _Seen(NamedTuple):
 
 
 class _Plan(NamedTuple):
-    """Which (L1, L2) and, within each, which (s, s') are summed, and the moments' coupling for every M."""
+    """Terms (L1, L2) and (s, s') of the sum, and the coupling of the moments for every M."""
 
     pairs: NDArray[np.int64]
     first_term: NDArray[np.int64]
@@ -141,7 +140,7 @@ def _plan(L: int, orders: tuple[int, ...], x: ScannedBeam, y: ScannedBeam, lsky:
 def _moment_couplings(
     L: int, orders: tuple[int, ...], x: ScannedBeam, y: ScannedBeam
 ) -> Iterator[tuple[int, int, NDArray[np.complex128]]]:
-    """(L1, L2, X) with X[M, s, s'] = sum_{M1 M2} C^{LM}_{L1 M1 L2 M2} w^X_{s,L1 M1} w^Y_{s',L2 M2}."""
+    """Yield (L1, L2, X), X[M, s, s'] = sum_{M1 M2} C^{LM}_{L1 M1 L2 M2} w^X_{s,L1 M1} w^Y_{s',L2 M2}."""
     w_x, w_y = x.orientations(), y.orientations()
     for L1 in range(x.L_max + 1):
         for L2 in range(abs(L - L1), min(L + L1, y.L_max) + 1):
@@ -176,7 +175,7 @@ def _couple(
 
 @njit(cache=True, nogil=True)
 def _spin_table(low: int, high: int, smax: int, L_max: int, response: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """k_l b_ls (l1 L1 l; 0 s -s) at [l1 - low, L1, l - l1 + L_max, smax + s], zero where it does not exist."""
+    """Return k_l b_ls (l1 L1 l; 0 s -s) at [l1 - low, L1, l - l1 + L_max, smax + s], zero if undefined."""
     lsky = response.shape[1] - 1
     table = np.zeros((high - low, L_max + 1, 2 * L_max + 1, 2 * smax + 1), dtype=np.complex128)
     family = np.zeros(2 * L_max + 1)

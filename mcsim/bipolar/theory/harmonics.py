@@ -34,7 +34,7 @@ def orientation_harmonics(w: NDArray[np.complex128], L_max: int, nthreads: int =
     Raises
     ------
     InputError
-        For maps that are not finite or not of 12 nside^2 pixels.
+        If a map is not finite or does not have 12 nside^2 pixels.
 
     Notes
     -----
@@ -64,7 +64,7 @@ def _fill_spin(
     curl: NDArray[np.complex128],
     L_max: int,
 ) -> None:
-    """From E and B of the spin-(+s) field conj(w_s) to w_{s,LM} = (-1)^{s+M} conj((conj w_s)_{L,-M})."""
+    """Fill w_{s,LM} = (-1)^{s+M} conj((conj w_s)_{L,-M}) from E and B of the spin-(+s) field conj(w_s)."""
     for M in range(L_max + 1):
         low = max(M, s)
         span = slice(alm_.start(L_max, M) + low, alm_.start(L_max, M) + L_max + 1)
@@ -90,8 +90,8 @@ def parallel_transport_harmonics(smax: int, L_max: int, psi0: float = 0.0) -> ND
 
     Notes
     -----
-    A constant w_s is singular at the poles as a spin field, so the coefficients fall only as L^{-3/2}; yet each is an
-    integral that a finite rule does exactly: Gauss-Legendre for even s, where d^L_{0s} is a polynomial in cos(theta),
+    A constant w_s is singular at the poles as a spin field, so the coefficients fall only as L^{-3/2}. Each is an
+    integral that a finite rule gives exactly: Gauss-Legendre for even s, where d^L_{0s} is a polynomial in cos(theta),
     and equal steps in theta for odd s, where d^L_{0s} sin(theta) is a cosine series. The power of w_2 at L = 2, 4, 6,
     8 is 83.3, 10, 3.1, 1.35 %.
     """
@@ -100,7 +100,7 @@ def parallel_transport_harmonics(smax: int, L_max: int, psi0: float = 0.0) -> ND
     check_angle(psi0, "psi0")
     result = _isotropic_zero(smax, L_max)
     gauss = spin_functions(smax, L_max, ducc0.misc.GL_thetas(L_max + 2))
-    gauss_weights = ducc0.misc.GL_weights(L_max + 2, 1)  # of the sphere: 2 pi is in them
+    gauss_weights = ducc0.misc.GL_weights(L_max + 2, 1)  # of the sphere: they include 2 pi
     steps = 2 * L_max + 4
     theta = np.pi * np.arange(steps + 1) / steps
     equal = spin_functions(smax, L_max, theta)

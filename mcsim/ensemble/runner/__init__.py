@@ -1,7 +1,7 @@
-"""The batch: one Dask task per chunk of realizations, results from worker to store, a tree of sums to the summary.
+"""Runs on Dask: one task per chunk of realizations, which writes to the store, and a tree of sums.
 
-The only package that touches dask. Nothing large is in the graph: tasks carry the configuration as text and load beams
-and moments on the worker, once.
+This is the only package that uses dask. The graph stays small: tasks carry the configuration as text, and each worker
+loads beams and moments once.
 """
 
 from mcsim.ensemble.runner.batch import Result, run

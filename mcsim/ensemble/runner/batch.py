@@ -1,4 +1,4 @@
-"""A run: make, continue or extend a store, compute what is missing, summarise."""
+"""Run of an ensemble: make, continue or extend a store, compute what is missing, summarise."""
 
 import os
 from asyncio import CancelledError
@@ -27,9 +27,9 @@ from mcsim.support.progress import Journal, reporting
 
 @dataclass(frozen=True)
 class Result:
-    """What a run left behind: the store, how many realizations it now holds, how many were computed, what failed.
+    """Result of a run: the store, its number of finished realizations, the number computed, the failures.
 
-    ``summarised``: whether the summary was made anew, for more realizations or for other bins.
+    ``summarised`` is True if the summary was made anew, for more realizations or other bins.
     """
 
     store: Path
@@ -50,23 +50,23 @@ def run(
     client: Client | None = None,
     quiet: bool = True,
 ) -> Result:
-    """Run an ensemble, or continue or extend the one that is stored.
+    """Run an ensemble, or continue or extend a stored one.
 
     Parameters
     ----------
     source
-        Configuration: a TOML file, the name of a packaged workflow, a dict, or one that is loaded.
+        Configuration: a TOML file, the name of a packaged workflow, a dict, or a loaded one.
     path
         Store; default ``{name}.zarr`` in the working folder.
     resume
-        Demand that the store exists, read all of it first, and compute again what is damaged.
+        Require an existing store, check all of it first, and compute damaged realizations again.
     realizations
-        Only these of the ensemble, for slices that :func:`merge` joins.
+        Compute only these; :func:`merge` joins such slices.
     workers
         Processes of the local cluster; default: the configuration's.
     scheduler
         Address of a running scheduler, ``tcp://host:port`` (or ``tls://``, with the keys that Dask's configuration
-        names), whose workers see the same files.
+        names), whose workers share the file system.
     client
         An existing client, left open.
     quiet
@@ -75,12 +75,12 @@ def run(
     Raises
     ------
     InputError
-        For bad input, an unwritable or foreign store, a scheduler that does not answer. The store is then as it was.
+        For bad input, an unwritable or foreign store, or a scheduler that does not answer. The store is unchanged.
 
     Returns
     -------
     Result
-        ``store``, and how many realizations are ``finished``, were ``computed`` now, or failed (``failures``).
+        ``store``, the numbers of realizations ``finished`` in all and ``computed`` now, and the ``failures``.
 
     Notes
     -----
@@ -114,7 +114,7 @@ def run(
             client = stack.enter_context(remote_client(scheduler))
         with reporting("orientation moments", 1.0, "", quiet) as report:
             shared = survey(loaded, nthreads=os.cpu_count() or 1, progress=report)
-        simulate.draw_sky(shared, wanted.start)  # bad files of skies are to be found before a store is made
+        simulate.draw_sky(shared, wanted.start)  # finds bad sky files before a store is made
         stack.enter_context(locked(target))
         stack.enter_context(_written_down(journal, loaded, wanted))
         if resume:
@@ -127,7 +127,7 @@ def run(
 
 
 def _finished(target: Path, run: config.RunConfig, wanted: range) -> bool:
-    """Whether a store of this configuration has all that is wanted, its summary included."""
+    """Return True if a store of this configuration has all wanted realizations and their summary."""
     plan.check_same(target, run)
     done, (count, bins) = store.done(target), store.summarised(target)
     binned = bins == list(range(0, config.analysis_lmax(run) + 1, run.biposh.summary_bin))
@@ -136,7 +136,7 @@ def _finished(target: Path, run: config.RunConfig, wanted: range) -> bool:
 
 @contextmanager
 def _written_down(journal: Journal, run: config.RunConfig, wanted: range) -> Iterator[None]:
-    """Log how a run starts and what ends it."""
+    """Log the start and the end of a run."""
     journal.write(
         f"start: {run.name}, realizations {wanted.start} to {wanted.stop - 1}, mcsim {dict(packages())['mcsim']}"
     )
@@ -220,10 +220,10 @@ def _simulate(roll: Roll, target: Path, run: config.RunConfig, wanted: range, jo
 def _outcomes(
     roll: Roll, job: Job, missing: dict[int, list[int]], journal: Journal
 ) -> Iterator[tuple[int, list[Failure]]]:
-    """Results of the tasks of all chunks.
+    """Yield the results of the tasks of all chunks.
 
-    Workers that die take the blame of all that they were given. What was blamed too often is tried again in the end,
-    realization by realization and one at a time: then only the guilty one fails.
+    A dying worker counts against all its tasks. Chunks whose workers died too often are computed again at the end, one
+    realization at a time, so that only the one that kills workers fails.
     """
     starts, suspects = list(missing), []
     for index, outcome, error in answers(roll, realize_chunk, ((job, start) for start in starts)):

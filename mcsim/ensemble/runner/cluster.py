@@ -1,4 +1,4 @@
-"""Workers: clusters of this machine or of others, calls sent to them, and who is there to answer."""
+"""Workers: local or remote clusters, calls on them, and a record of who is present."""
 
 import logging
 import multiprocessing
@@ -19,7 +19,7 @@ from mcsim.ensemble.tasks import ATTEMPTS, check_same_packages, packages
 from mcsim.errors import InputError, RunError
 from mcsim.support.progress import Journal
 
-# Ctrl-C reaches all processes of a terminal, and it is the driver that ends the run; workers that lose it say nothing.
+# Ctrl-C reaches all processes of a terminal. The driver ends the run; workers that lose the driver stay silent.
 _WORKER_SETUP = """
 import logging, signal
 signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -28,20 +28,21 @@ logging.getLogger("distributed").setLevel(logging.CRITICAL)
 
 TURN_S = 30.0
 ALONE_S = 300.0
-"""How long a run waits for a worker when all are gone."""
+"""Time that a run waits for a worker if all are lost."""
 
 _KEPT_MEMORY = {f"MALLOC_{limit}_THRESHOLD_": str(2**28) for limit in ("TRIM", "MMAP")}
-"""For glibc, in bytes. A worker makes the same maps again and again; distributed's default gives their memory back to
-the system each time, and fetching its pages anew costs nearly as much as the transforms."""
+"""For glibc, in bytes. A worker makes maps of the same size repeatedly. distributed's default returns their memory to
+the system each time, and new pages cost nearly as much as the transforms."""
 
 
 @contextmanager
 def _script_left_alone() -> Iterator[None]:
-    """Keep processes that start meanwhile from running the script that this process runs.
+    """Keep child processes started in this block from running the main script.
 
-    multiprocessing runs it again in each of them, for functions that the script defines; those travel to workers by
-    value. A script without ``if __name__ == "__main__"`` would start workers of its own there. What is called
-    "__main__" by its specification is not run again (CPython, Lib/multiprocessing/spawn.py, ``_fixup_main_from_name``).
+    multiprocessing runs the script again in each of them, for the functions that it defines; those travel to workers by
+    value. A script without ``if __name__ == "__main__"`` would start workers of its own there. A module whose
+    specification names it "__main__" is not run again (CPython, Lib/multiprocessing/spawn.py,
+    ``_fixup_main_from_name``).
     """
     script = sys.modules["__main__"]
     before = script.__spec__
@@ -54,14 +55,14 @@ def _script_left_alone() -> Iterator[None]:
 
 @contextmanager
 def local_client(workers: int) -> Iterator[Client]:
-    """Client of a local cluster of single-threaded processes, whose ports are open to this machine alone.
+    """Yield the client of a local cluster of single-threaded processes, with ports open to this machine alone.
 
     Raises
     ------
     InputError
-        In a process that may have no others below it.
+        In a process that cannot have child processes.
     RunError
-        If its processes do not start.
+        If the workers do not start.
     """
     if multiprocessing.current_process().daemon:
         raise InputError(
@@ -90,7 +91,7 @@ def local_client(workers: int) -> Iterator[Client]:
                 )
             )
             client = stack.enter_context(Client(cluster))
-        except (OSError, RuntimeError) as error:  # what distributed says of processes that are late or die at once
+        except (OSError, RuntimeError) as error:  # distributed's errors for processes that are late or die at once
             raise RunError(
                 f"The worker processes did not start ({type(error).__name__}: {error}); run the same command again "
                 "when the machine is less busy or has more memory."
@@ -100,7 +101,7 @@ def local_client(workers: int) -> Iterator[Client]:
 
 @contextmanager
 def remote_client(scheduler: str) -> Iterator[Client]:
-    """Client of a scheduler that runs already, whose workers have the driver's packages.
+    """Yield the client of a running scheduler, whose workers have the driver's packages.
 
     Raises
     ------
@@ -117,8 +118,8 @@ def remote_client(scheduler: str) -> Iterator[Client]:
 
 
 def _refusal(scheduler: str, error: Exception) -> str:
-    """Why there is no connection."""
-    if scheduler.startswith("tls://") and isinstance(error, TypeError):  # of a call without an ssl_context
+    """Return a sentence on why there is no connection."""
+    if scheduler.startswith("tls://") and isinstance(error, TypeError):  # from a call without an ssl_context
         return (
             f"{scheduler} needs the certificates that Dask's configuration names in distributed.comm.tls, and it names "
             "none; give them as workflows/cluster/tls.yaml does."
@@ -133,10 +134,10 @@ def _refusal(scheduler: str, error: Exception) -> str:
 
 
 def _check_workers(client: Client) -> None:
-    """Refuse workers that cannot do what this driver would; those that join later are checked by their first task."""
+    """Raise InputError for workers with other packages; the first task checks those that join later."""
     for address, answer in client.run(packages, on_error="return").items():
         if isinstance(answer, CommClosedError):
-            continue  # it has left meanwhile
+            continue  # it has left
         if isinstance(answer, Exception):
             raise InputError(
                 f"The worker {address} cannot import mcsim ({type(answer).__name__}: {answer}); "
@@ -146,14 +147,14 @@ def _check_workers(client: Client) -> None:
 
 
 class Roll:
-    """Roll of the workers of a cluster: the log says who joins and who leaves.
+    """Record of the workers of a cluster; it logs who joins and who leaves.
 
     Parameters
     ----------
     client
-        Of the cluster.
+        Client of the cluster.
     journal
-        Log of a run; without one nothing is said.
+        Log of a run; by default none.
     """
 
     def __init__(self, client: Client, journal: Journal | None = None) -> None:
@@ -161,10 +162,10 @@ class Roll:
         self.there: dict[str, int] = client.nthreads()
 
     def call(self) -> int:
-        """Threads of the workers that are there now; lost ones of a cluster of this machine are replaced."""
+        """Return the number of threads of the present workers; replace lost ones of a local cluster."""
         now, cluster = self.client.nthreads(), self.client.cluster
         if isinstance(cluster, LocalCluster) and len(now) < len(cluster.worker_spec):
-            # A nanny gives up when its worker dies while it starts.
+            # A nanny gives up if its worker dies during the start.
             cluster.scale(len(cluster.worker_spec))
         if self.journal is not None:
             for verb, names in (("left", self.there.keys() - now.keys()), ("joined", now.keys() - self.there.keys())):
@@ -174,7 +175,7 @@ class Roll:
         return sum(now.values())
 
     def text(self) -> str:
-        """Who was there at the last call, in words, and where to watch them."""
+        """Return a text on the workers at the last call, and the address of the dashboard."""
         link = self.client.dashboard_link
         if not self.there:
             text = "no worker yet: waiting for one"
@@ -194,7 +195,7 @@ def _some(names: Iterable[str]) -> str:
 
 
 def death(error: KilledWorker) -> str:
-    """Why a call was given up: its workers died."""
+    """Return a clause on why a call was given up: its workers died."""
     return (
         f"each of the {error.allowed_failures + 1} workers that computed it died, the last of them "
         f"{error.last_worker.address} (out of memory?)"
@@ -209,22 +210,22 @@ def completed(
     Parameters
     ----------
     client
-        Such as :func:`local_client` gives, or one of any other cluster.
+        From :func:`local_client`, or of any other cluster.
     function
-        Importable on the workers; what it returns comes back to this process, so it should be small.
+        Importable on the workers; its result returns to this process, so it should be small.
     arguments
-        Tuples of positional arguments, one for every call; consumed as calls are sent, so it may be long, or lazy.
+        Tuples of positional arguments, one per call; consumed as calls are sent, so it may be lazy.
 
     Yields
     ------
     tuple
-        Index of the call and its result, in the order of completion. Three calls are in flight for every worker thread
-        that there is by then, so workers may join and leave.
+        Index of the call and its result, in the order of completion. Three calls are in flight for every present
+        worker thread, so workers may join and leave.
 
     Raises
     ------
     Exception
-        What a call raised; ``distributed.KilledWorker`` where its worker died every time.
+        The exception of a call; ``distributed.KilledWorker`` if its worker died every time.
     """
     for index, result, error in answers(Roll(client), function, arguments):
         if error is not None:
@@ -235,10 +236,10 @@ def completed(
 def answers(
     roll: Roll, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]
 ) -> Iterator[tuple[int, Any, Exception | None]]:
-    """As :func:`completed`, with what a call raised, if it did, as a third item."""
+    """Yield index, result and exception (or None) of every call; see :func:`completed`."""
     waiting = enumerate(arguments)
     numbers: dict[Future, int] = {}
-    # An object that can be called has no name but its type's.
+    # A callable object has no name but that of its type.
     name = getattr(function, "__name__", type(function).__name__)
 
     def fill() -> None:
@@ -249,7 +250,7 @@ def answers(
 
     fill()
     while numbers:
-        # Asked for in turns, for a call that no worker is left to answer would be waited for for ever.
+        # Wait with a time limit: without workers a call would never return.
         done, _ = _first_of(roll, list(numbers))
         for future in done:
             result: Any = None
@@ -258,7 +259,7 @@ def answers(
                 result = future.result(timeout=TURN_S)
             except TimeoutError as late:
                 if future.status != "error":
-                    continue  # its worker died with the result: another computes it again
+                    continue  # its worker died with the result; another computes it again
                 error = late
             except Exception as raised:
                 error = raised
@@ -267,7 +268,7 @@ def answers(
 
 
 def _in_words(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Task: a call whose sentences travel without what caused them, for some libraries' errors cannot be unpickled."""
+    """Call a function on a worker; drop the causes of its errors, as some cannot be unpickled."""
     try:
         return function(*arguments)
     except (InputError, RunError) as error:
@@ -276,7 +277,7 @@ def _in_words(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def _first_of(roll: Roll, flying: list[Future]) -> tuple[set[Future], set[Future]]:
-    """Futures that are done, at least one, and the others; RunError when no worker has been there for a while."""
+    """Return the finished futures, at least one, and the others; raise RunError if workers stay absent."""
     missed = 0
     while True:
         try:

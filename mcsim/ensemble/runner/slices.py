@@ -1,4 +1,4 @@
-"""Slices of an ensemble, run apart, become one store."""
+"""Merging of stores that hold slices of one ensemble."""
 
 import os
 import tempfile
@@ -29,7 +29,7 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
     Returns
     -------
     Result
-        ``store``, and how many realizations are ``finished``.
+        ``store``, and the number of realizations ``finished``.
 
     Raises
     ------

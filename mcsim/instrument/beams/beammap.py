@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import ceil, pi, sin
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, Self, get_args
 
 import ducc0
 import numpy as np
@@ -66,16 +66,15 @@ class BeamMap:
             check_mmax(mmax, lmax)
         # No order above lmax sin(cut) fits inside the cut, so that this holds the beam's whole power up to lmax.
         holds_all = min(lmax, ceil(lmax * sin(min(self.cut_rad, pi / 2))) + 32)
-        return blm_of_map(
-            self.image,
-            self.pixel_rad,
-            self.centre,
-            self.cut_rad,
-            lmax,
-            max(holds_all, mmax or 0),
-            projection=self.projection,
-            nthreads=nthreads,
-        )
+        return blm_of_map(self, lmax, max(holds_all, mmax or 0), nthreads)
+
+    def without_pixel_window(self) -> Self:
+        """Return the map with the window of its pixels divided out, for values that are means over the pixels."""
+        # A margin of zeros keeps what wraps around in the discrete transform off the other edge.
+        rows, columns = self.image.shape
+        shape = (rows + 2 * PEAK_BOX, columns + 2 * PEAK_BOX)
+        window = np.outer(np.sinc(np.fft.fftfreq(shape[0])), np.sinc(np.fft.rfftfreq(shape[1])))
+        return replace(self, image=np.fft.irfft2(np.fft.rfft2(self.image, shape) / window, shape)[:rows, :columns])
 
     def values(self, theta: NDArray[np.float64], phi: NDArray[np.float64]) -> NDArray[np.float64]:
         """Interpolate the response (cubic) at angles from the centre and azimuths from x towards y; 0 outside."""
@@ -94,7 +93,6 @@ def read_map(
     centre: tuple[float, float] | None = None,
     plane: int = 0,
     projection: Projection = "equidistant",
-    pixel_average: bool = False,
 ) -> BeamMap:
     """Read a beam map from the first image of a FITS file.
 
@@ -111,10 +109,8 @@ def read_map(
     plane
         Plane of a three-dimensional image (a WMAP beam file has side A, its noise, side B, its noise).
     projection
-        See :class:`BeamMap`.
-    pixel_average
-        True if the map's values are means over its pixels: their window is then divided out. False if they are
-        values at the pixel centres.
+        See :class:`BeamMap`. Values are those at the pixel centres; of means over the pixels take
+        :meth:`BeamMap.without_pixel_window`.
 
     Raises
     ------
@@ -130,8 +126,7 @@ def read_map(
     """
     image, header = _read_image(Path(path), plane)
     pixel_deg = _pixel_deg(header, path) if pixel_deg is None else pixel_deg
-    beam_map = placed(image, pixel_deg, cut_deg=cut_deg, centre=centre, projection=projection, origin=str(path))
-    return replace(beam_map, image=_divide_pixel_window(beam_map.image)) if pixel_average else beam_map
+    return placed(image, pixel_deg, cut_deg=cut_deg, centre=centre, projection=projection, origin=str(path))
 
 
 def placed(
@@ -219,23 +214,13 @@ def find_centre(image: NDArray[np.float64], origin: str = "the beam map") -> tup
     return float(column + box.sum(axis=0) @ offset / total), float(row + box.sum(axis=1) @ offset / total)
 
 
-def blm_of_map(
-    image: NDArray[np.float64],
-    pixel_rad: float,
-    centre: tuple[float, float],
-    cut_rad: float,
-    lmax: int,
-    mmax: int,
-    *,
-    projection: Projection = "equidistant",
-    nthreads: int = 1,
-) -> NDArray[np.complex128]:
+def blm_of_map(beam_map: BeamMap, lmax: int, mmax: int, nthreads: int = 1) -> NDArray[np.complex128]:
     """Sum a beam map into its harmonic coefficients, in the map's unit times sr.
 
     Parameters
     ----------
-    image, pixel_rad, centre, cut_rad, projection
-        As in :class:`BeamMap`.
+    beam_map
+        The map.
     lmax, mmax
         Largest degree and order.
     nthreads
@@ -259,14 +244,15 @@ def blm_of_map(
     elliptical Gaussian agrees with its closed form to 1e-10 at 5 pixels per FWHM, to 2e-7 at 2.3
     (tests/unit/test_beams_beammap.py).
     """
-    if lmax * pixel_rad > pi:
+    if lmax * beam_map.pixel_rad > pi:
         raise InputError(
-            f"lmax = {lmax} is beyond what pixels of {np.degrees(pixel_rad):g} deg resolve: "
-            f"at most {int(pi / pixel_rad)}"
+            f"lmax = {lmax} is beyond what pixels of {np.degrees(beam_map.pixel_rad):g} deg resolve: "
+            f"at most {int(pi / beam_map.pixel_rad)}"
         )
-    value, theta, phi = solid_angle_values(image, pixel_rad, centre, cut_rad, projection)
+    value, theta, phi = solid_angle_values(beam_map)
     if not np.any(value):
-        raise InputError(f"the beam map is zero within {np.degrees(cut_rad):g} deg of its centre: check centre and cut")
+        cut_deg = np.degrees(beam_map.cut_rad)
+        raise InputError(f"the beam map is zero within {cut_deg:g} deg of its centre: check centre and cut")
     alm = ducc0.sht.adjoint_synthesis_general(
         map=value[None],
         lmax=lmax,
@@ -285,18 +271,15 @@ def blm_of_map(
 
 
 def solid_angle_values(
-    image: NDArray[np.float64],
-    pixel_rad: float,
-    centre: tuple[float, float],
-    cut_rad: float,
-    projection: Projection = "equidistant",
+    beam_map: BeamMap,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return response times solid angle, theta and phi of the pixels within the cut that are not zero."""
-    x = (np.arange(image.shape[1]) - centre[0])[None, :] * pixel_rad
-    y = (np.arange(image.shape[0]) - centre[1])[:, None] * pixel_rad
+    image, pixel_rad = beam_map.image, beam_map.pixel_rad
+    x = (np.arange(image.shape[1]) - beam_map.centre[0])[None, :] * pixel_rad
+    y = (np.arange(image.shape[0]) - beam_map.centre[1])[:, None] * pixel_rad
     radius = np.hypot(x, y)
-    radius_of_cut, theta_of, stretch = _PROJECTIONS[projection]
-    inside = (radius <= radius_of_cut(np.asarray(cut_rad))) & (image != 0)
+    radius_of_cut, theta_of, stretch = _PROJECTIONS[beam_map.projection]
+    inside = (radius <= radius_of_cut(np.asarray(beam_map.cut_rad))) & (image != 0)
     phi = np.arctan2(*np.broadcast_arrays(y, x))[inside] % (2 * pi)
     radius = radius[inside]
     return image[inside] * pixel_rad**2 * stretch(radius), theta_of(radius), phi
@@ -316,7 +299,7 @@ _PROJECTIONS: dict[Projection, tuple[_Function, _Function, _Function]] = {
 
 
 def holds_image(path: str | Path) -> bool:
-    """Whether a FITS file holds an image, as beam maps do, and not just tables.
+    """Return True if a FITS file holds an image, as beam maps do, and not just tables.
 
     Raises
     ------
@@ -369,11 +352,3 @@ def _pixel_deg(header: fits.Header, path: str | Path) -> float:
             "resample or flip the image so that columns follow the beam's x, or give pixel_deg"
         )
     return step_x
-
-
-def _divide_pixel_window(image: NDArray[np.float64]) -> NDArray[np.float64]:
-    # A margin of zeros keeps what wraps around in the discrete transform off the other edge.
-    rows, columns = image.shape
-    shape = (rows + 2 * PEAK_BOX, columns + 2 * PEAK_BOX)
-    window = np.outer(np.sinc(np.fft.fftfreq(shape[0])), np.sinc(np.fft.rfftfreq(shape[1])))
-    return np.fft.irfft2(np.fft.rfft2(image, shape) / window, shape)[:rows, :columns]

@@ -76,7 +76,7 @@ def checked_blm(
 
 
 def _of_array(array: NDArray) -> NDArray[np.complex128]:
-    """Copy of an array as [m, l]: of healpy's m-major order with every m up to lmax, or of [m, l] itself."""
+    """Return a copy of an array as [m, l]: of healpy's m-major order with every m up to lmax, or of [m, l] itself."""
     lmax = alm_.lmax_of(array.size) if array.ndim == 1 else None
     if lmax is not None:
         return _unpacked(array, lmax, lmax)

@@ -89,7 +89,7 @@ def elliptical_blm(
 
 
 def _order(m: int, lmax: int, sigma_major: float, sigma_minor: float) -> NDArray[np.float64]:
-    """Coefficients m <= l <= lmax of one even order, with the major axis along x."""
+    """Return the coefficients m <= l <= lmax of one even order, with the major axis along x."""
     ell = np.arange(m, lmax + 1)
     kappa2 = ell * (ell + 1) + (1 - m**2) / 3
     # ive carries exp(-argument): the two exponents are joined so that neither overflows at large l.

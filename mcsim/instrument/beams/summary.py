@@ -166,16 +166,14 @@ _Response = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.floa
 
 
 def _measure_map(beam_map: BeamMap) -> tuple[float, float]:
-    """Integral, and negative over positive response, of a map."""
-    value, _, _ = solid_angle_values(
-        beam_map.image, beam_map.pixel_rad, beam_map.centre, beam_map.cut_rad, beam_map.projection
-    )
+    """Return the integral, and negative over positive response, of a map."""
+    value, _, _ = solid_angle_values(beam_map)
     positive = value[value > 0].sum()
     return float(value.sum()), float((positive - value.sum()) / positive)
 
 
 def _measure_blm(beam: Beam) -> float:
-    """Negative over positive response of coefficients."""
+    """Return the ratio of negative to positive response of coefficients."""
     # Twice the rings and azimuths that the coefficients need: the negative part alone is not band-limited.
     rings, azimuths = 2 * beam.lmax + 2, 4 * beam.mmax + 4
     pattern = ducc0.sht.synthesis_2d(
@@ -193,7 +191,7 @@ def _measure_blm(beam: Beam) -> float:
 
 
 def _half_power(response: _Response, reach: float) -> tuple[float, float, float, float, float]:
-    """Peak, half widths of the circular part, of the major and the minor axis (radians), major axis' angle (deg)."""
+    """Return peak, half widths of circular part, major and minor axis (radians), and the major axis' angle (deg)."""
     theta = np.linspace(0, reach, _RADII)
     phi = np.arange(_AZIMUTHS) * 2 * np.pi / _AZIMUTHS
     grid_phi, grid_theta = np.meshgrid(phi, theta, indexing="ij")
@@ -211,7 +209,7 @@ def _half_power(response: _Response, reach: float) -> tuple[float, float, float,
 
 
 def _first_crossing(theta: NDArray[np.float64], values: NDArray[np.float64], level: float) -> NDArray[np.float64]:
-    """Angle at which each row of ``values`` first falls below ``level``, linear in between; NaN where it never does."""
+    """Return the angle at which each row of ``values`` first falls below ``level``, interpolated, or NaN."""
     below = values < level
     last = np.argmax(below, axis=1)
     row = np.arange(len(values))

@@ -9,7 +9,7 @@ from mcsim.sphere.checks import check_angle
 
 
 def rotated(beam: Beam, angle: float) -> Beam:
-    """The beam turned about its own axis by ``angle`` radians, from x towards y.
+    """Return the beam turned about its own axis by ``angle`` radians, from x towards y.
 
     Notes
     -----
@@ -23,7 +23,7 @@ def rotated(beam: Beam, angle: float) -> Beam:
 
 
 def mirrored(beam: Beam) -> Beam:
-    r"""The beam of an instrument's other side, where the sides are mirror images in a plane through the spin axis.
+    r"""Return the beam of an instrument's other side, a mirror image in a plane through the spin axis.
 
     Notes
     -----

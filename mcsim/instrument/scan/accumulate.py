@@ -11,9 +11,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
+from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
 from mcsim.instrument.scan.pointing import BLOCK, PointingStream, fill_block, ring_pixel
-from mcsim.sphere.checks import check_nside, check_whole
+from mcsim.sphere.checks import check_whole
 
 _RANGES = 16
 _CHUNK = 1 << 21
@@ -22,10 +23,8 @@ _CACHE_LINE = 64
 
 def stream_sums(
     model: ScanModel,
-    nside: int,
+    grid: MapGrid,
     smax: int,
-    frame: str = "ecliptic",
-    time_range: tuple[float, float] = (0.0, 1.0),
     nthreads: int = 1,
     progress: Callable[[float], None] | None = None,
 ) -> NDArray[np.float64]:
@@ -35,12 +34,10 @@ def stream_sums(
     ----------
     model
         The survey.
-    nside, smax
-        HEALPix resolution, and largest s of the moments (>= 1).
-    frame
-        Frame of the pixels: "ecliptic", "galactic" or "equatorial".
-    time_range
-        Part of the survey, as fractions of its samples: (0, 0.5) is the first half.
+    grid
+        Pixels, and the part of the survey.
+    smax
+        Largest s of the moments (>= 1).
     nthreads
         Number of threads. The result does not depend on it, bit for bit; the memory does: one accumulator of
         8 (4 + 2 smax) bytes per pixel for each thread and one for the sum.
@@ -55,7 +52,7 @@ def stream_sums(
     Raises
     ------
     InputError
-        If nside is not a power of two, smax < 1, the frame is unknown, or the time range is empty.
+        If smax < 1, or the time range contains no sample.
 
     Notes
     -----
@@ -63,19 +60,16 @@ def stream_sums(
     in the order of time. Besides e^{-i s psi} a pixel sums its samples' unit vectors: their mean against the
     pixel's centre is the centroid offset. So at smax 2 a pixel is one cache line.
     """
-    check_nside(nside)
     check_whole(smax, "smax", 1)
-    start, stop = time_range
-    if not 0.0 <= start < stop <= 1.0:
-        raise InputError(f"time_range is ({start:g}, {stop:g}), but it must be an increasing pair within 0 and 1.")
-    tasks = [task for line in model.select(None) for task in _tasks(model, line, frame, start, stop)]
+    tasks = [task for line in model.select(None) for task in _tasks(model, line, grid)]
     if not tasks:
+        start, stop = grid.time_range
         raise InputError(f"time_range ({start:g}, {stop:g}) of {model.name!r} contains no sample; widen it.")
-    return _sum_of_tasks(tasks, nside, smax, max(1, nthreads), progress)
+    return _sum_of_tasks(tasks, grid.nside, smax, max(1, nthreads), progress)
 
 
 def pixel_sums(nside: int, smax: int) -> NDArray[np.float64]:
-    """Zeroed accumulator, shape (npix, 4 + 2 smax): hits, sums of the unit vector, of cos(s psi) and -sin(s psi)."""
+    """Return zeros, shape (npix, 4 + 2 smax): hits, sums of the unit vector, of cos(s psi) and of -sin(s psi)."""
     columns = 4 + 2 * smax
     memory = np.zeros(12 * nside * nside * columns + _CACHE_LINE // 8)
     # At smax 2 each pixel is one cache line, if the first one starts at its boundary.
@@ -119,9 +113,9 @@ class _Task:
             report(count)
 
 
-def _tasks(model: ScanModel, line: LineOfSight, frame: str, start: float, stop: float) -> Iterable[_Task]:
-    stream = PointingStream(model, line, frame)
-    first, last = round(start * stream.samples), round(stop * stream.samples)
+def _tasks(model: ScanModel, line: LineOfSight, grid: MapGrid) -> Iterable[_Task]:
+    stream = PointingStream(model, line, grid.frame)
+    first, last = (round(edge * stream.samples) for edge in grid.time_range)
     edges = [first + (last - first) * part // _RANGES for part in range(_RANGES + 1)]
     return [_Task(stream, low, high - low) for low, high in pairwise(edges) if high > low]
 
@@ -129,7 +123,7 @@ def _tasks(model: ScanModel, line: LineOfSight, frame: str, start: float, stop: 
 def _sum_of_tasks(
     tasks: list[_Task], nside: int, smax: int, nthreads: int, progress: Callable[[float], None] | None
 ) -> NDArray[np.float64]:
-    """Sum of all tasks, each into an accumulator of its own, added up in their order."""
+    """Sum all tasks, each into an accumulator of its own, added up in their order."""
     done, everything = [0], sum(task.count for task in tasks)
 
     def report(count: int) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from mcsim.instrument.scan.accumulate import means, stream_sums
+from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.model import ScanModel
 from mcsim.instrument.scan.moments import Moments
 from mcsim.support import folders
@@ -51,12 +52,14 @@ def cached_moments(
     progress: Callable[[float], None] | None = None,
     cache_dir: str | Path | None = None,
 ) -> Path:
-    """Folder with the streamed moments of a survey, computed if it is not there yet.
+    """Return the folder with the streamed moments of a survey, computed if it is not there yet.
 
     Parameters
     ----------
-    model, nside, smax, frame, time_range, nthreads, progress
+    model, smax, nthreads, progress
         As in :func:`mcsim.instrument.scan.accumulate.stream_sums`.
+    nside, frame, time_range
+        As in :class:`mcsim.instrument.scan.geometry.MapGrid`.
     lines_of_sight
         Names of the lines of sight to add up; None: the model's default ones.
     cache_dir
@@ -71,12 +74,12 @@ def cached_moments(
     Raises
     ------
     InputError
-        If the cache folder cannot be written, or as in ``stream_sums``.
+        If the cache folder cannot be written, or as in ``MapGrid`` and ``stream_sums``.
     """
 
     def fill(folder: Path) -> None:
         chosen = model if lines_of_sight is None else model.with_lines_of_sight(*lines_of_sight)
-        sums = stream_sums(chosen, nside, smax, frame, time_range, nthreads, progress)
+        sums = stream_sums(chosen, MapGrid(nside, frame, time_range), smax, nthreads, progress)
         Moments(nside, frame, **means(sums, nside, smax)).save(folder)
 
     name = f"moments-{moments_key(model, nside, smax, frame, lines_of_sight, time_range)}"

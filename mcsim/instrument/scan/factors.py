@@ -41,7 +41,7 @@ class ScanFactors:
 
 
 def sky_means(moments: Moments) -> NDArray[np.complex128]:
-    """Means of w_s over the observed pixels, shape (smax,)."""
+    """Return the means of w_s over the observed pixels, shape (smax,)."""
     seen = _seen(moments)
     return np.array([w[seen].mean() for w in moments.w])
 
@@ -49,7 +49,7 @@ def sky_means(moments: Moments) -> NDArray[np.complex128]:
 def latitude_means(
     moments: Moments, edges_deg: Sequence[float] = LATITUDE_EDGES_DEG
 ) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
-    """Hits and moments averaged over bins of |latitude|.
+    """Return hits and moments averaged over bins of |latitude|.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def latitude_means(
 def ring_means(
     moments: Moments,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.complex128]]:
-    """Colatitudes of the HEALPix rings, mean hits of their pixels over the sky's, and mean w_s of the observed ones.
+    """Return the HEALPix rings' colatitudes, mean hits over those of the sky, and mean w_s of observed pixels.
 
     Returns
     -------
@@ -115,7 +115,7 @@ def ring_means(
 
 
 def scan_factors(moments: Moments, ell: Sequence[int] = ELLS) -> ScanFactors:
-    """The three factors of a survey's moments (smax >= 2); those of L = 2, M = 0 mean what they say in ecliptic maps.
+    """Return the three factors of a survey's moments (smax >= 2); those of L = 2, M = 0 are meant for ecliptic maps.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def scan_factors(moments: Moments, ell: Sequence[int] = ELLS) -> ScanFactors:
 
 
 def limit_factors(model: ScanModel, ell: Sequence[int] = ELLS, line_of_sight: str | None = None) -> ScanFactors:
-    """The three factors in the exact long-time limit; where nothing is observed w_2 counts as 0."""
+    """Return the three factors in the exact long-time limit; where nothing is observed w_2 counts as 0."""
     theta, weights = limit_quadrature(model, line_of_sight)
     w2 = limit_moments(model, theta, 2, line_of_sight)[1][1].real
 
@@ -165,7 +165,7 @@ def limit_factors(model: ScanModel, ell: Sequence[int] = ELLS, line_of_sight: st
 
 
 def summary(title: str, moments: Moments) -> str:
-    """What ``mcsim scan`` prints: hits, sky means, w_2 by |latitude|, and the three factors."""
+    """Return what ``mcsim scan`` prints: hits, sky means, w_2 by |latitude|, and the three factors."""
     hits = moments.hits
     means = sky_means(moments)
     lines = [
@@ -204,7 +204,7 @@ def _complex_text(value: complex) -> str:
 
 
 def _f_ell(w2: Callable[[NDArray[np.float64]], NDArray[np.float64]], ell: Sequence[int]) -> NDArray[np.float64]:
-    """f_l by Gauss-Legendre quadrature of d^l_22 = ((1 + z)/2)^2 P^(0,4)_{l-2}(z)."""
+    """Return f_l by Gauss-Legendre quadrature of d^l_22 = ((1 + z)/2)^2 P^(0,4)_{l-2}(z)."""
     if min(ell) < 2:
         raise InputError(f"f_l is asked for at l = {min(ell)}, but it needs l >= 2.")
     # Twice the nodes that (d^l_22)^2 needs, for the kinks of w_2 at the caustics.

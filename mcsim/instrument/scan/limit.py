@@ -19,7 +19,7 @@ _TINY = 1e-18
 def limit_moments(
     model: ScanModel, theta: NDArray[np.float64], smax: int, line_of_sight: str | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
-    """Hits and orientation moments after infinite time, as functions of ecliptic colatitude.
+    """Return the hits and orientation moments after infinite time, as functions of ecliptic colatitude.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def limit_moments(
 
 
 def caustics(model: ScanModel, line_of_sight: str | None = None) -> NDArray[np.float64]:
-    """Ecliptic colatitudes in (0, pi), in radians and sorted, at which the limit of the hits is singular."""
+    """Return the ecliptic colatitudes in (0, pi), in radians and sorted, at which the limit of the hits is singular."""
     beta = math.radians(_line(model, line_of_sight).boresight_angle_deg)
     alpha = math.radians(model.precession_angle_deg)
     angles = []
@@ -101,7 +101,7 @@ def caustics(model: ScanModel, line_of_sight: str | None = None) -> NDArray[np.f
 def limit_quadrature(
     model: ScanModel, line_of_sight: str | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Nodes and weights for integrals over ecliptic colatitude of what has the limit's caustics.
+    """Return the nodes and weights for integrals over ecliptic colatitude of what has the limit's caustics.
 
     Returns
     -------
@@ -120,7 +120,7 @@ def limit_quadrature(
 
 
 def limit_harmonics(model: ScanModel, smax: int, lmax: int, line_of_sight: str | None = None) -> NDArray[np.complex128]:
-    """Spin-weighted harmonic coefficients w_{s,L0} of the limit's moments.
+    """Return the spin-weighted harmonic coefficients w_{s,L0} of the limit's moments.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def limit_harmonics(model: ScanModel, smax: int, lmax: int, line_of_sight: str |
 
 
 def _line(model: ScanModel, name: str | None) -> LineOfSight:
-    """The line of sight, if the model's precession is fast enough for a limit in colatitude alone."""
+    """Return the line of sight, if the model's precession is fast enough for a limit in colatitude alone."""
     if model.precession_angle_deg > 0.0 and model.orbit_period_s < _FAST_PRECESSION * abs(model.precession_period_s):
         raise InputError(
             f"scan model {model.name!r} precesses {model.orbit_period_s / abs(model.precession_period_s):.3g} times an "
@@ -158,7 +158,7 @@ def _line(model: ScanModel, name: str | None) -> LineOfSight:
 
 
 def _elliptic_nodes(roots: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Integral of 1/sqrt|(c-r1)(c-r2)(c-r3)(c-r4)| over [r2, r3], and nodes c uniform in its elliptic argument.
+    """Return the integral of 1/sqrt|(c-r1)(c-r2)(c-r3)(c-r4)| over [r2, r3], and nodes c uniform in its argument.
 
     ``roots`` has shape (4, n), sorted; the nodes have shape (_NODES, n).
     """
@@ -175,7 +175,7 @@ def _elliptic_nodes(roots: NDArray[np.float64]) -> tuple[NDArray[np.float64], ND
 
 
 def _harmonics(m: int, lmax: int, theta: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Y_lm(theta, 0) for l = m .. lmax by the three-term recurrence in l."""
+    """Return Y_lm(theta, 0) for l = m .. lmax by the three-term recurrence in l."""
     z = np.cos(theta)
     norm = math.sqrt(math.prod((2 * k + 1) / (2 * k) for k in range(1, m + 1)) / (4.0 * math.pi))
     previous, current = np.zeros_like(z), (-1) ** m * norm * np.sin(theta) ** m

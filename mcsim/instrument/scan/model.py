@@ -156,7 +156,7 @@ class ScanModel:
         return {"kind": "hit_averaged", "model": "scan-model.toml"}
 
     def line_of_sight(self, name: str) -> LineOfSight:
-        """The line of sight called ``name``; InputError if there is none."""
+        """Return the line of sight called ``name``; InputError if there is none."""
         for line in self.lines_of_sight:
             if line.name == name:
                 return line
@@ -164,7 +164,7 @@ class ScanModel:
         raise InputError(f"scan model {self.name!r} has no line of sight {name!r}: choose from {known}.")
 
     def pair(self, name: str) -> tuple[LineOfSight, LineOfSight]:
-        """The two lines of sight of the differencing assembly ``name``; InputError if there is none."""
+        """Return the two lines of sight of the differencing assembly ``name``; InputError if there is none."""
         if name not in self.pairs:
             known = ", ".join(self.pairs) or "none are defined"
             raise InputError(f"scan model {self.name!r} has no differencing pair {name!r}: choose from {known}.")
@@ -172,16 +172,16 @@ class ScanModel:
         return self.line_of_sight(side_a), self.line_of_sight(side_b)
 
     def select(self, names: str | list[str] | tuple[str, ...] | None) -> tuple[LineOfSight, ...]:
-        """The lines of sight called ``names``; the model's default ones if None."""
+        """Return the lines of sight called ``names``; the model's default ones if None."""
         names = [names] if isinstance(names, str) else names
         return tuple(self.line_of_sight(name) for name in (self.default_lines if names is None else names))
 
     def period_of_samples(self, line: LineOfSight) -> float:
-        """Time between samples of a line of sight, in seconds."""
+        """Return the time between samples of a line of sight, in seconds."""
         return self.sample_period_s if line.sample_period_s is None else line.sample_period_s
 
     def samples(self, line: LineOfSight) -> int:
-        """Number of samples of a line of sight in the whole survey."""
+        """Return the number of samples of a line of sight in the whole survey."""
         # The small number keeps 31557600 / 0.0512 from losing its last sample to rounding.
         return math.floor(self.duration_days * SECONDS_PER_DAY / self.period_of_samples(line) + 1e-6)
 
@@ -196,7 +196,7 @@ class ScanModel:
 
 
 def _toml(value: str | float | tuple[str, ...]) -> str:
-    """Text, number or list of texts as TOML, from which the same value is read, bit for bit."""
+    """Return a text, number or list of texts as TOML, from which the same value is read, bit for bit."""
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mcsim.errors import InputError
 from mcsim.instrument.scan.accumulate import means, stream_sums
-from mcsim.instrument.scan.geometry import FRAMES, check_frame
+from mcsim.instrument.scan.geometry import FRAMES, MapGrid, check_frame
 from mcsim.instrument.scan.limit import limit_moments
 from mcsim.instrument.scan.model import ScanModel
 from mcsim.instrument.scan.user_pointing import blocks_of_files, checked_samples, sums_of_samples
@@ -113,7 +113,7 @@ class Moments:
         0.55
         """
         survey = model if isinstance(model, ScanModel) else ScanModel.load(model)
-        sums = stream_sums(survey, nside, smax, frame, time_range, nthreads)
+        sums = stream_sums(survey, MapGrid(nside, frame, time_range), smax, nthreads)
         return cls(nside, frame, **means(sums, nside, smax))
 
     @classmethod
@@ -423,7 +423,7 @@ def _frame_of(coordsys: Any, frame: str | None, where: str) -> str:
 
 
 def _read_table(path: str | Path) -> tuple[dict[str, NDArray[np.float64]], dict[str, Any]]:
-    """Columns (upper-case names, flattened, float64) and HEALPix keywords of a file's first binary table."""
+    """Return columns (upper-case names, flattened, float64) and HEALPix keywords of a file's first binary table."""
     from astropy.io import fits
 
     try:

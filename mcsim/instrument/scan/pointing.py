@@ -19,7 +19,7 @@ _TAN_PI_8 = math.sqrt(2.0) - 1.0
 
 
 def _arctangent_coefficients(degree: int = 11) -> NDArray[np.float64]:
-    """Polynomial in t^2 of (2/pi) arctan(t)/t for 0 <= t <= tan(pi/8), to rounding."""
+    """Return the polynomial in t^2 of (2/pi) arctan(t)/t for 0 <= t <= tan(pi/8), to rounding."""
     chebyshev = np.polynomial.Chebyshev.interpolate(
         lambda v: np.arctan(np.sqrt(v)) / np.sqrt(v) * (2.0 / math.pi), degree, domain=[0.0, _TAN_PI_8**2]
     )
@@ -57,14 +57,14 @@ class PointingStream:
         self.to_frame = frame_matrix(frame)
 
     def start_turns(self, first: int) -> NDArray[np.float64]:
-        """Turns of spin, precession and orbit at sample ``first``, each in [0, 1), shape (3,)."""
+        """Return the turns of spin, precession and orbit at sample ``first``, each in [0, 1), shape (3,)."""
         return np.array([float((o + first * t) % 1) for o, t in zip(self._offsets, self._turns, strict=True)])
 
 
 def pointing(
     model: ScanModel, line: LineOfSight, first: int, count: int, frame: str = "ecliptic"
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Pointing of consecutive samples of one line of sight.
+    """Return the pointing of consecutive samples of one line of sight.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def pointing(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def quarter_turns(x, y):  # type: ignore[no-untyped-def]
-    """Longitude of (x, y) in quarter turns, in [0, 4): atan2 without branches or calls, for vector instructions."""
+    """Return the longitude of (x, y) in quarter turns, in [0, 4): atan2 without branches, for vector instructions."""
     width, height = abs(x), abs(y)
     large, small = max(width, height), min(width, height)
     steep = small > _TAN_PI_8 * large
@@ -112,7 +112,7 @@ def quarter_turns(x, y):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_block(turns, tables, geometry, to_frame, count, work):  # type: ignore[no-untyped-def]
-    """Directions and orientations of ``count`` <= BLOCK samples that start at ``turns``.
+    """Fill ``work`` with the directions and orientations of ``count`` <= BLOCK samples that start at ``turns``.
 
     ``work``, shape (6, BLOCK), takes n_x, n_y, n_z of the line of sight in the frame of the maps, cos psi and
     sin psi of the beam's x axis, and the longitude in quarter turns. Only elementwise arithmetic, so that the
@@ -154,7 +154,7 @@ def fill_block(turns, tables, geometry, to_frame, count, work):  # type: ignore[
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def ring_pixel(nside, turns, x, y, z):  # type: ignore[no-untyped-def]
-    """Pixel of a unit vector at longitude ``turns`` (quarter turns) in RING order (Gorski et al. 2005, section 5)."""
+    """Return the RING pixel of a unit vector at longitude ``turns`` in quarter turns (Gorski et al. 2005, sect. 5)."""
     height = abs(z)
     if height <= 2.0 / 3.0:
         base, slope = nside * (0.5 + turns), nside * z * 0.75

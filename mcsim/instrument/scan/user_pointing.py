@@ -76,7 +76,7 @@ def _blocks(path: Path, frame: str) -> Iterator[tuple[NDArray[np.float64], ...]]
 
 
 def _columns(path: Path, frame: str) -> tuple[list[Any], list[float]]:
-    """Columns theta, phi, psi, mapped into memory where the format allows it, and the factors to radians."""
+    """Return columns theta, phi, psi, mapped into memory where the format allows it, and the factors to radians."""
     factors = [1.0, 1.0, 1.0]
     if path.suffix == ".npz":
         with np.load(path, allow_pickle=False) as archive:
@@ -122,7 +122,7 @@ def _check_header(path: Path) -> None:
 
 
 def _rises(column: NDArray[np.float64]) -> bool:
-    """Whether the first rows rise, as time does."""
+    """Return True if the first rows rise, as time does."""
     return bool(np.all(np.diff(np.asarray(column[:_ROWS], dtype=np.float64)) > 0.0))
 
 

@@ -1,13 +1,23 @@
 """Maps from the differences of two beams: pairs of pixels, right-hand sides, conjugate gradients."""
 
 from mcsim.simulation.mapmaking.pairs import DifferencingScan, prepare
-from mcsim.simulation.mapmaking.rhs import SideMaps, rhs_from_maps, rhs_from_samples, side_maps
-from mcsim.simulation.mapmaking.solve import MapmakingReport, diagonal, solve
+from mcsim.simulation.mapmaking.rhs import (
+    DifferenceNoise,
+    Imbalance,
+    SideMaps,
+    rhs_from_maps,
+    rhs_from_samples,
+    side_maps,
+)
+from mcsim.simulation.mapmaking.solve import MapmakingReport, StoppingRule, diagonal, solve
 
 __all__ = [
+    "DifferenceNoise",
     "DifferencingScan",
+    "Imbalance",
     "MapmakingReport",
     "SideMaps",
+    "StoppingRule",
     "diagonal",
     "prepare",
     "rhs_from_maps",

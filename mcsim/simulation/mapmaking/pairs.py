@@ -15,11 +15,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
-from mcsim.instrument.scan.geometry import check_frame
+from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
 from mcsim.instrument.scan.pointing import BLOCK, PointingStream, fill_block, ring_pixel
 from mcsim.simulation.tod import chunks, sample_range
-from mcsim.sphere.checks import check_nside
 from mcsim.support import folders
 from mcsim.support.code import package_digest
 
@@ -41,10 +40,8 @@ class DifferencingScan:
     ----------
     model, side_a, side_b
         The survey and its two lines of sight, of one sampling rate.
-    nside, frame
-        Of the map.
-    time_range
-        Part of the survey, as fractions of its samples.
+    grid
+        Pixels of the map, and the part of the survey.
     hits_a, hits_b
         Samples with side A, side B in a pixel, shape (npix,).
     row_start
@@ -57,9 +54,7 @@ class DifferencingScan:
     model: ScanModel
     side_a: LineOfSight
     side_b: LineOfSight
-    nside: int
-    frame: str
-    time_range: tuple[float, float]
+    grid: MapGrid
     hits_a: NDArray[np.float64]
     hits_b: NDArray[np.float64]
     row_start: NDArray[np.int64]
@@ -69,35 +64,31 @@ class DifferencingScan:
     @property
     def npix(self) -> int:
         """Number of pixels."""
-        return int(self.hits_a.size)
+        return self.grid.npix
 
     @property
     def samples(self) -> int:
         """Number of differences."""
-        first, last = sample_range(self.model, self.side_a, self.time_range)
+        first, last = sample_range(self.model, self.side_a, self.grid.time_range)
         return last - first
 
 
 def prepare(
     model: ScanModel,
     pair: str,
-    nside: int,
-    frame: str = "ecliptic",
-    time_range: tuple[float, float] = (0.0, 1.0),
+    grid: MapGrid,
     cache_dir: str | Path | None = None,
     nthreads: int = 1,
     progress: Callable[[float], None] | None = None,
 ) -> DifferencingScan:
-    """Pairs of pixels of a differencing scan, computed once and memory-mapped from then on.
+    """Return the pairs of pixels of a differencing scan, computed once and memory-mapped from then on.
 
     Parameters
     ----------
     model, pair
         The survey and the name of one of its differencing pairs (assemblies).
-    nside, frame
-        Of the map: HEALPix resolution, and "ecliptic", "galactic" or "equatorial".
-    time_range
-        Part of the survey, as fractions of its samples.
+    grid
+        Pixels of the map, and the part of the survey.
     cache_dir
         Where to keep the pairs; None: the folder of :func:`mcsim.support.folders.default_cache_dir`.
     nthreads
@@ -108,8 +99,8 @@ def prepare(
     Raises
     ------
     InputError
-        If the pair is unknown or its sides are sampled at different rates, nside, frame or time range cannot be used,
-        or the cache cannot be written.
+        If the pair is unknown or its sides are sampled at different rates, the time range contains no sample, or the
+        cache cannot be written.
 
     Notes
     -----
@@ -117,48 +108,42 @@ def prepare(
     bytes for each ordered pair of pixels that was seen, at most 2 x samples. A year of W1, one sample in four (154
     million), at nside 128: each pair comes 4.3 times, 72 million ordered pairs, 0.43 GB, 20 s on two cores.
     """
-    check_nside(nside)
-    check_frame(frame)
-    side_a, side_b = model.pair(pair)
-    if model.period_of_samples(side_a) != model.period_of_samples(side_b):
+    sides = model.pair(pair)
+    period_a, period_b = (model.period_of_samples(side) for side in sides)
+    if period_a != period_b:
         raise InputError(
-            f"pair {pair!r} samples side A every {model.period_of_samples(side_a):g} s and side B every "
-            f"{model.period_of_samples(side_b):g} s, but a difference needs one rate; give both one sample_period_s."
+            f"pair {pair!r} samples side A every {period_a:g} s and side B every {period_b:g} s, but a difference "
+            "needs one rate; give both one sample_period_s."
         )
-    sample_range(model, side_a, time_range)
+    sample_range(model, sides[0], grid.time_range)
 
     def fill(folder: Path) -> None:
-        sides = (side_a, side_b)
-        _write(folder, model, sides, nside, frame, time_range, max(1, nthreads), progress or (lambda _: None))
+        _write(folder, model, sides, grid, max(1, nthreads), progress or (lambda _: None))
 
-    name = f"pairs-{_key(model, side_a, side_b, nside, frame, time_range)}"
-    folder = folders.cached(name, fill, cache_dir)
-    arrays = _load(folder, 12 * nside * nside)
-    return DifferencingScan(model, side_a, side_b, nside, frame, time_range, **arrays)
+    folder = folders.cached(f"pairs-{_key(model, sides, grid)}", fill, cache_dir)
+    return DifferencingScan(model, *sides, grid, **_load(folder, grid.npix))
 
 
 def parts(first: int, last: int) -> list[list[tuple[int, int]]]:
-    """Chunks of the samples first ... last - 1 in at most PARTS consecutive groups."""
+    """Return chunks of the samples first ... last - 1 in at most PARTS consecutive groups."""
     everything = chunks(first, last)
     edges = [len(everything) * part // PARTS for part in range(PARTS + 1)]
     return [everything[low:high] for low, high in pairwise(edges) if high > low]
 
 
-def _key(
-    model: ScanModel, side_a: LineOfSight, side_b: LineOfSight, nside: int, frame: str, time_range: tuple[float, float]
-) -> str:
-    """SHA-256 of every number that the pairs depend on."""
+def _key(model: ScanModel, sides: tuple[LineOfSight, LineOfSight], grid: MapGrid) -> str:
+    """Return the SHA-256 of every number that the pairs depend on."""
     everything = {
         "code": package_digest(["mcsim.instrument.scan", __name__], ["healpy", "numpy"]),
         "spin": [model.spin_period_s, model.spin_phase_deg],
         "precession": [model.precession_period_s, model.precession_angle_deg, model.precession_phase_deg],
         "orbit": [model.orbit_period_s, model.orbit_phase_deg],
         "duration_days": model.duration_days,
-        "sides": [[side.boresight_angle_deg, side.azimuth_deg] for side in (side_a, side_b)],
-        "sample_period_s": model.period_of_samples(side_a),
-        "time_range": [float(edge) for edge in time_range],
-        "nside": nside,
-        "frame": frame,
+        "sides": [[side.boresight_angle_deg, side.azimuth_deg] for side in sides],
+        "sample_period_s": model.period_of_samples(sides[0]),
+        "time_range": [float(edge) for edge in grid.time_range],
+        "nside": grid.nside,
+        "frame": grid.frame,
     }
     return hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()
 
@@ -183,25 +168,25 @@ def _write(
     folder: Path,
     model: ScanModel,
     sides: tuple[LineOfSight, LineOfSight],
-    nside: int,
-    frame: str,
-    time_range: tuple[float, float],
+    grid: MapGrid,
     nthreads: int,
     progress: Callable[[float], None],
 ) -> None:
-    first, last = sample_range(model, sides[0], time_range)
-    npix, path = 12 * nside * nside, folder / "samples.raw"
+    first, last = sample_range(model, sides[0], grid.time_range)
+    path = folder / "samples.raw"
     pixels = np.memmap(path, dtype=np.int32, mode="w+", shape=(2, last - first))
     with ThreadPoolExecutor(nthreads) as pool:
         jobs = [
-            pool.submit(_stream, PointingStream(model, line, frame), part, nside, pixels[side, part[0][0] - first :])
+            pool.submit(
+                _stream, PointingStream(model, line, grid.frame), part, grid.nside, pixels[side, part[0][0] - first :]
+            )
             for part in parts(first, last)
             for side, line in enumerate(sides)
         ]
         for done, job in enumerate(jobs):
             job.result()
             progress(0.5 * (done + 1) / len(jobs))
-        hits = [_counted(side, npix) for side in pixels]
+        hits = [_counted(side, grid.npix) for side in pixels]
         row_start, count_type = _write_rows(folder, pixels, hits[0] + hits[1], nthreads, pool, progress)
     for name, array in (("row_start", row_start), ("hits_a", hits[0]), ("hits_b", hits[1])):
         np.save(folder / f"{name}.npy", array)
@@ -242,7 +227,7 @@ def _stream(stream: PointingStream, part: list[tuple[int, int]], nside: int, pix
 
 
 def _bands(entries: NDArray[np.float64]) -> list[tuple[int, int]]:
-    """Bands of pixels with at most _BAND entries each (or one pixel)."""
+    """Return bands of pixels with at most _BAND entries each (or one pixel)."""
     total = np.concatenate([[0], np.cumsum(entries)])
     bands, low = [], 0
     while low < entries.size:
@@ -255,7 +240,7 @@ def _bands(entries: NDArray[np.float64]) -> list[tuple[int, int]]:
 def _band(
     pixels: NDArray[np.int32], entries: NDArray[np.float64], band: tuple[int, int]
 ) -> tuple[NDArray[np.int32], NDArray[np.uint32], NDArray[np.int64]]:
-    """Merged partners and counts of the pixels of a band, and the number of partners of each."""
+    """Return merged partners and counts of the pixels of a band, and the number of partners of each."""
     low, high = band
     edges = np.concatenate([[0], np.cumsum(entries[low:high])]).astype(np.int64)
     partner = np.empty(edges[-1], dtype=np.int32)
@@ -295,7 +280,7 @@ def _collect(pixel_a, pixel_b, low, high, cursor, partner):  # type: ignore[no-u
 
 @njit(cache=True, nogil=True)
 def _merge(edges, seen, partner, count, lengths):  # type: ignore[no-untyped-def]
-    """Merge equal partners of each row in place, in increasing order; returns the number that is left."""
+    """Merge equal partners of each row in place, in increasing order; return the number that is left."""
     out = 0
     for row in range(lengths.size):
         size = 0
@@ -316,7 +301,7 @@ def _merge(edges, seen, partner, count, lengths):  # type: ignore[no-untyped-def
 
 
 def _counted(pixel: NDArray[np.int32], npix: int) -> NDArray[np.float64]:
-    """Samples of every pixel, in pieces: numpy's count makes a copy of 8 bytes a sample."""
+    """Count the samples of every pixel, in pieces: numpy's count makes a copy of 8 bytes a sample."""
     total = np.zeros(npix)
     for first in range(0, pixel.size, COUNTED):
         total += np.bincount(pixel[first : first + COUNTED], minlength=npix)

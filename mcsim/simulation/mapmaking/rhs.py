@@ -2,27 +2,29 @@
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
-from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan.pointing import BLOCK, PointingStream, fill_block, ring_pixel
 from mcsim.simulation import convolve
 from mcsim.simulation.mapmaking.pairs import DifferencingScan, parts
 from mcsim.simulation.mapmaking.solve import check_imbalance
-from mcsim.simulation.tod import EPSILON, Stage, chunks, given, sample_range, samples, sky_signal, through
+from mcsim.simulation.tod import Stage, chunks, sample_range, samples, through
 from mcsim.sphere.healpix import Map
-from mcsim.sphere.sky import dipole_alm
 
 SideMaps = NDArray[np.float64]
 """S_0, then 2 Re S_s and 2 Im S_s for s = 1 ... mmax of one beam at pixel centres, in uK, shape (npix, 1 + 2 mmax)."""
 
 
 def side_maps(alm: NDArray[np.complex128], response: convolve.Response, nside: int, nthreads: int = 1) -> SideMaps:
-    """What one side sees at every pixel's centre in any orientation: T(psi) = S_0 + 2 Re sum_s e^{-i s psi} S_s."""
+    """Return what one side sees at every pixel's centre in any orientation.
+
+    T(psi) = S_0 + 2 Re sum_s e^{-i s psi} S_s.
+    """
     maps = np.zeros((12 * nside * nside, 1 + 2 * response.mmax))
     maps[:, 0] = convolve.circular_map(alm, response, nside, nthreads)
     for s, (real, imag) in convolve.spin_maps(alm, response, nside, nthreads).items():
@@ -30,17 +32,51 @@ def side_maps(alm: NDArray[np.complex128], response: convolve.Response, nside: i
     return maps
 
 
+@dataclass(frozen=True)
+class Imbalance:
+    """Transmission imbalance x of a differencing instrument: d = (1 + x) T_A - (1 - x) T_B, -1 < x < 1.
+
+    Parameters
+    ----------
+    true
+        Of the instrument.
+    fiducial
+        Of the map-making, which sums and solves with it; None: the true one.
+    """
+
+    true: float = 0.0
+    fiducial: float | None = None
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless both lie between -1 and 1."""
+        for x in (self.true, self.weight):
+            check_imbalance(x)
+
+    @property
+    def weight(self) -> float:
+        """Imbalance that differences are summed with."""
+        return self.true if self.fiducial is None else self.fiducial
+
+
+BALANCED = Imbalance()
+
+
+@dataclass(frozen=True)
+class DifferenceNoise:
+    """White noise of ``sigma0_uk`` per difference, drawn from generators that are spawned from ``rng``."""
+
+    sigma0_uk: float
+    rng: np.random.Generator
+
+
 def rhs_from_maps(
     scan: DifferencingScan,
     skies: Sequence[tuple[SideMaps, SideMaps]],
-    *,
-    x: float = 0.0,
-    x_assumed: float | None = None,
-    noise_sigma0_uk: float = 0.0,
-    rng: np.random.Generator | None = None,
+    imbalance: Imbalance = BALANCED,
+    noise: DifferenceNoise | None = None,
     nthreads: int = 1,
 ) -> NDArray[np.float64]:
-    """Right-hand sides of samples taken at their pixels' centres with their own orientations: the fast route.
+    """Return right-hand sides of samples taken at their pixels' centres with their own orientations.
 
     Parameters
     ----------
@@ -48,13 +84,9 @@ def rhs_from_maps(
         The pairs of pixels.
     skies
         For each right-hand side what sides A and B see (:func:`side_maps`). Several at once share the pointing and the
-        noise: a map and its circular twin, for example.
-    x
-        Transmission imbalance of the instrument, -1 < x < 1.
-    x_assumed
-        Imbalance that the map-maker believes in and solves with; None: the true one.
-    noise_sigma0_uk, rng
-        White noise per difference, in uK, and the generator it is drawn from (needed if there is noise).
+        noise: a map and its circular-beam control, for example.
+    imbalance, noise
+        Of the differences; None: no noise.
     nthreads
         Number of threads; the result does not depend on it, bit for bit.
 
@@ -66,30 +98,28 @@ def rhs_from_maps(
     Raises
     ------
     InputError
-        If an imbalance is out of range, maps have another nside, or noise is asked for without a generator.
+        If maps have another nside.
 
     Notes
     -----
     d = (1 + x) T_A(p_A, psi_A) - (1 - x) T_B(p_B, psi_B). The pointing is computed again for every call, which is as
     fast as reading it would be: 60 to 80 ns of one core per sample at nside 128 with mmax 2, and half as much again
-    for each further sky. Noise comes from one generator per chunk of the survey, spawned from ``rng``, so that
-    :func:`rhs_from_samples` draws the same.
+    for each further sky. Noise comes from one generator per chunk of the survey, so that :func:`rhs_from_samples` draws
+    the same.
     """
-    check_imbalance(x)
-    believed = x if x_assumed is None else x_assumed
-    check_imbalance(believed)
     side_a, side_b = (_stacked(scan, [sky[side] for sky in skies]) for side in (0, 1))
-    first, last = sample_range(scan.model, scan.side_a, scan.time_range)
-    noise = _ChunkNoise(noise_sigma0_uk, rng, chunks(first, last))
-    a, b = (PointingStream(scan.model, line, scan.frame) for line in (scan.side_a, scan.side_b))
-    gains = np.array([1.0 + x, x - 1.0, 1.0 + believed, believed - 1.0])
+    first, last = sample_range(scan.model, scan.side_a, scan.grid.time_range)
+    drawn = _ChunkNoise(noise, chunks(first, last))
+    a, b = (PointingStream(scan.model, line, scan.grid.frame) for line in (scan.side_a, scan.side_b))
+    x, weight = imbalance.true, imbalance.weight
+    gains = np.array([1.0 + x, x - 1.0, 1.0 + weight, weight - 1.0])
 
     def run(part: list[tuple[int, int]]) -> NDArray[np.float64]:
         rhs = np.zeros((scan.npix, len(skies)))
         for low, high in part:
             side_of_a = (a.start_turns(low), a.block_turns, a.tables, a.geometry, side_a)
             side_of_b = (b.start_turns(low), b.block_turns, b.tables, b.geometry, side_b)
-            _add_chunk(side_of_a, side_of_b, a.to_frame, scan.nside, gains, noise.draw(low, high), rhs)
+            _add_chunk(side_of_a, side_of_b, a.to_frame, scan.grid.nside, gains, drawn.draw(low, high), rhs)
         return rhs
 
     total = np.zeros((scan.npix, len(skies)))
@@ -101,87 +131,60 @@ def rhs_from_maps(
 
 def rhs_from_samples(
     scan: DifferencingScan,
-    alm: NDArray[np.complex128],
-    lmax: int,
-    beams: tuple[Beam, Beam],
-    *,
-    x: float = 0.0,
-    x_assumed: float | None = None,
+    stages: tuple[Sequence[Stage], Sequence[Stage]],
+    imbalance: Imbalance = BALANCED,
+    noise: DifferenceNoise | None = None,
     at_pixel_centres: bool = False,
-    dipole_uk: Sequence[float] | NDArray[np.float64] | None = None,
-    noise_sigma0_uk: float = 0.0,
-    rng: np.random.Generator | None = None,
-    pointing_stages: tuple[Sequence[Stage], Sequence[Stage]] = ((), ()),
-    signal_stages: tuple[Sequence[Stage], Sequence[Stage]] = ((), ()),
-    epsilon: float = EPSILON,
-    nthreads: int = 1,
 ) -> Map:
-    """Right-hand side of samples at their own directions and orientations, by interpolation: the referee.
+    """Return the right-hand side of samples at their own directions: the time-ordered reference.
 
     Parameters
     ----------
-    scan
-        The pairs of pixels.
-    alm, lmax
-        The sky in uK, shape (mcsim.sphere.alm.size(lmax),).
-    beams
-        Of sides A and B, each known up to at least ``lmax``.
-    x, x_assumed, noise_sigma0_uk, rng
+    scan, imbalance, noise
         As in :func:`rhs_from_maps`; the same generator gives the same noise.
-    at_pixel_centres, dipole_uk, epsilon, nthreads
-        As in :func:`mcsim.simulation.tod.observe`.
-    pointing_stages, signal_stages
-        Further stages of sides A and B before and after the sky's signal; they must keep the chunks as they come.
+    stages
+        What the samples of sides A and B pass through, :func:`mcsim.simulation.tod.sky_signal` among them; they must
+        keep the chunks as they come.
+    at_pixel_centres
+        As in :func:`mcsim.simulation.tod.samples`.
 
     Returns
     -------
     ndarray
         P^T d in uK, shape (npix,).
-
-    Raises
-    ------
-    InputError
-        If an imbalance is out of range, sky or beams do not fit ``lmax``, or noise is asked for without a generator.
     """
-    check_imbalance(x)
-    believed = x if x_assumed is None else x_assumed
-    check_imbalance(believed)
-    if dipole_uk is not None:
-        alm = alm + dipole_alm(dipole_uk, lmax)
-    noise = _ChunkNoise(noise_sigma0_uk, rng, chunks(*sample_range(scan.model, scan.side_a, scan.time_range)))
+    drawn = _ChunkNoise(noise, chunks(*sample_range(scan.model, scan.side_a, scan.grid.time_range)))
     streams = [
-        through(
-            samples(scan.model, line, scan.nside, scan.frame, scan.time_range, at_pixel_centres),
-            [*pointing_stages[side], sky_signal(alm, lmax, beams[side], epsilon, nthreads), *signal_stages[side]],
-        )
-        for side, line in enumerate((scan.side_a, scan.side_b))
+        through(samples(scan.model, line, scan.grid, at_pixel_centres), own)
+        for line, own in zip((scan.side_a, scan.side_b), stages, strict=True)
     ]
+    x, weight = imbalance.true, imbalance.weight
     rhs = np.zeros(scan.npix)
-    for (low, high), a, b in zip(noise.chunks, *streams, strict=True):
-        difference = (1.0 + x) * a.signal_uk - (1.0 - x) * b.signal_uk + noise.draw(low, high)
-        _scatter(a.pixel, b.pixel, difference, 1.0 + believed, believed - 1.0, rhs)
+    for (low, high), a, b in zip(drawn.chunks, *streams, strict=True):
+        difference = (1.0 + x) * a.signal_uk - (1.0 - x) * b.signal_uk + drawn.draw(low, high)
+        _scatter(a.pixel, b.pixel, difference, 1.0 + weight, weight - 1.0, rhs)
     return rhs
 
 
 class _ChunkNoise:
     """White noise by a generator per chunk, so that the order in which chunks are made does not matter."""
 
-    def __init__(self, sigma0_uk: float, rng: np.random.Generator | None, chunks: list[tuple[int, int]]) -> None:
-        self.sigma0_uk, self.chunks = sigma0_uk, chunks
+    def __init__(self, noise: DifferenceNoise | None, chunks: list[tuple[int, int]]) -> None:
+        self.sigma0_uk, self.chunks = 0.0 if noise is None else noise.sigma0_uk, chunks
         self._generators: dict[int, np.random.Generator] = {}
-        if sigma0_uk > 0.0:
-            children = given(rng, sigma0_uk).spawn(len(chunks))
+        if noise is not None and noise.sigma0_uk > 0.0:
+            children = noise.rng.spawn(len(chunks))
             self._generators = {low: child for (low, _), child in zip(chunks, children, strict=True)}
 
     def draw(self, low: int, high: int) -> NDArray[np.float64]:
-        """Noise of the chunk low ... high - 1 in uK; zeros if there is none."""
+        """Return the noise of the chunk low ... high - 1 in uK; zeros if there is none."""
         if not self._generators:
             return np.zeros(high - low)
         return self.sigma0_uk * self._generators[low].standard_normal(high - low)
 
 
 def _stacked(scan: DifferencingScan, maps: list[SideMaps]) -> NDArray[np.float64]:
-    """Maps of one side of all skies, shape (npix, skies, 1 + 2 mmax): what a sample needs lies together."""
+    """Stack the maps of one side of all skies, shape (npix, skies, 1 + 2 mmax): what a sample needs lies together."""
     for array in maps:
         if array.shape[0] != scan.npix:
             raise InputError(

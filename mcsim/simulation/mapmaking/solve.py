@@ -1,6 +1,5 @@
 """Maps from differences: the normal equations by preconditioned conjugate gradients."""
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
@@ -12,6 +11,32 @@ from numba import njit
 from mcsim.errors import InputError
 from mcsim.simulation.mapmaking.pairs import DifferencingScan
 from mcsim.sphere.healpix import Map
+
+
+@dataclass(frozen=True)
+class StoppingRule:
+    """When conjugate gradients stop.
+
+    Parameters
+    ----------
+    tol
+        Relative residual |b - N m| / |b| to reach, > 0.
+    max_iterations
+        Iterations after which to give up, >= 0; the report says whether the tolerance was reached.
+    """
+
+    tol: float = 1e-8
+    max_iterations: int = 500
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless tol > 0 and max_iterations >= 0."""
+        if not self.tol > 0.0:
+            raise InputError(f"tol is {self.tol:g}, but the relative residual to reach must be > 0.")
+        if self.max_iterations < 0:
+            raise InputError(f"max_iterations is {self.max_iterations}, but it must be >= 0.")
+
+
+DEFAULT_RULE = StoppingRule()
 
 
 @dataclass(frozen=True)
@@ -40,13 +65,11 @@ def solve(
     scan: DifferencingScan,
     rhs: Map,
     x: float = 0.0,
-    tol: float = 1e-8,
-    max_iterations: int = 500,
+    rule: StoppingRule = DEFAULT_RULE,
     start: Map | None = None,
-    callback: Callable[[int, Map, float], None] | None = None,
     nthreads: int = 1,
 ) -> tuple[Map, MapmakingReport]:
-    """Map that fits the differences best in the sense of least squares.
+    """Return the map that fits the differences best in the sense of least squares.
 
     Parameters
     ----------
@@ -55,15 +78,11 @@ def solve(
     rhs
         P^T d in uK, shape (npix,), as :mod:`mcsim.simulation.mapmaking.rhs` makes it for the same ``x``.
     x
-        Transmission imbalance that the map-maker believes in, -1 < x < 1.
-    tol
-        Relative residual |b - N m| / |b| to reach, > 0.
-    max_iterations
-        Iterations after which to give up, >= 0; the report says whether the tolerance was reached.
+        Fiducial transmission imbalance, -1 < x < 1.
+    rule
+        When to stop.
     start
         Map to start from, in uK, shape (npix,); None: zero.
-    callback
-        Called after each iteration with its number from 1, the map as it would be returned, and the relative residual.
     nthreads
         Number of threads; the result does not depend on it, bit for bit.
 
@@ -76,7 +95,7 @@ def solve(
     Raises
     ------
     InputError
-        If x, tol or max_iterations is out of range, or the right-hand side or the start does not fit the scan.
+        If x is out of range, or the right-hand side or the start does not fit the scan.
 
     Notes
     -----
@@ -89,7 +108,10 @@ def solve(
     half of the sky unobserved and take 120 iterations, nside 16 would save half of them. With samples at pixel centres
     and equal circular beams the map is the sky itself (tests/unit/test_mapmaking.py).
     """
-    _check(scan, x, tol, max_iterations, rhs, start)
+    check_imbalance(x)
+    _check_map(scan, rhs, "right-hand side")
+    if start is not None:
+        _check_map(scan, start, "starting map")
     weight = diagonal(scan, x)
     seen = weight > 0.0
     inverse = np.divide(1.0, weight, out=np.zeros_like(weight), where=seen)
@@ -99,16 +121,12 @@ def solve(
         # A matrix product would be threaded by the BLAS and its rounding depend on that; np.sum does not.
         return inverse * residual + np.where(seen, constant * np.sum(residual), 0.0)
 
-    def finished(map_uk: Map) -> Map:
-        offset = float(np.mean(map_uk[seen])) if x == 0.0 else 0.0
-        return np.where(seen, map_uk - offset, healpy.UNSEEN)
-
     with ThreadPoolExecutor(max(1, nthreads)) as pool:
         size = _norm(rhs)
         map_uk = np.zeros(scan.npix) if start is None else np.where(seen, start, 0.0)
         residual = rhs.copy() if start is None else rhs - apply_normal(scan, x, map_uk, pool, nthreads)
         direction, slope, history = np.zeros(scan.npix), 1.0, [_norm(residual) / size if size > 0.0 else 0.0]
-        while history[-1] > tol and len(history) <= max_iterations:
+        while history[-1] > rule.tol and len(history) <= rule.max_iterations:
             conditioned = precondition(residual)
             before, slope = slope, float(np.sum(residual * conditioned))
             direction = conditioned + (slope / before if len(history) > 1 else 0.0) * direction
@@ -117,21 +135,20 @@ def solve(
             map_uk += step * direction
             residual -= step * image
             history.append(_norm(residual) / size)
-            if callback is not None:
-                callback(len(history) - 1, finished(map_uk), history[-1])
         found = _norm(rhs - apply_normal(scan, x, map_uk, pool, nthreads)) / size if size > 0.0 else 0.0
-    report = MapmakingReport(len(history) - 1, history[-1] <= tol, found, tuple(history[1:]))
-    return finished(map_uk), report
+    report = MapmakingReport(len(history) - 1, history[-1] <= rule.tol, found, tuple(history[1:]))
+    offset = float(np.mean(map_uk[seen])) if x == 0.0 else 0.0
+    return np.where(seen, map_uk - offset, healpy.UNSEEN), report
 
 
 def diagonal(scan: DifferencingScan, x: float) -> Map:
-    """Sum of the squared weights with which each pixel enters, (1+x)^2 hits_a + (1-x)^2 hits_b, shape (npix,)."""
+    """Return each pixel's sum of squared weights, (1+x)^2 hits_a + (1-x)^2 hits_b, shape (npix,)."""
     weight: Map = (1.0 + x) ** 2 * scan.hits_a + (1.0 - x) ** 2 * scan.hits_b
     return weight
 
 
 def apply_normal(scan: DifferencingScan, x: float, map_uk: Map, pool: ThreadPoolExecutor, parts: int = 1) -> Map:
-    """The normal matrix on a map: D m - (1 - x^2) C m, with C the counts of pairs; unobserved pixels give 0.
+    """Apply the normal matrix to a map: D m - (1 - x^2) C m, C the counts of pairs; unobserved pixels give 0.
 
     Parameters
     ----------
@@ -162,19 +179,11 @@ def check_imbalance(x: float) -> None:
         raise InputError(f"the transmission imbalance is {x:g}, but it must lie between -1 and 1.")
 
 
-def _check(scan: DifferencingScan, x: float, tol: float, max_iterations: int, rhs: Map, start: Map | None) -> None:
-    check_imbalance(x)
-    if not tol > 0.0:
-        raise InputError(f"tol is {tol:g}, but the relative residual to reach must be > 0.")
-    if max_iterations < 0:
-        raise InputError(f"max_iterations is {max_iterations}, but it must be >= 0.")
-    for name, array in (("right-hand side", rhs), ("starting map", start)):
-        if array is None:
-            continue
-        if array.shape != (scan.npix,):
-            raise InputError(f"the {name} has shape {array.shape}, but nside {scan.nside} needs ({scan.npix},).")
-        if not np.all(np.isfinite(array)):
-            raise InputError(f"the {name} has values that are not finite; leave such samples out.")
+def _check_map(scan: DifferencingScan, map_: Map, name: str) -> None:
+    if map_.shape != (scan.npix,):
+        raise InputError(f"the {name} has shape {map_.shape}, but nside {scan.grid.nside} needs ({scan.npix},).")
+    if not np.all(np.isfinite(map_)):
+        raise InputError(f"the {name} has values that are not finite; leave such samples out.")
 
 
 def _norm(vector: Map) -> float:
