@@ -24,13 +24,13 @@ from mcsim.systematics import Effect
 
 SEED = 20121026
 STEPS = 4.0
-"""Steps at which templates are measured, to be well above the referee's interpolation."""
+"""Steps at which templates are measured, to be well above the interpolation of the time-ordered reference."""
 
 
 def main() -> None:
     """Print cosine, ratio of amplitudes and length of every response."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("model", help="TOML file of what is believed")
+    parser.add_argument("model", help="TOML file of the fiducial model")
     parser.add_argument("--channel", help="of the effects of a channel; default: the model's last one")
     parser.add_argument("--effects", nargs="*", help="default: all that do not draw; none of noise")
     parser.add_argument("--simulations", type=int, help="as given to mcsim diagnose")
