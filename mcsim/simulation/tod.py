@@ -173,8 +173,7 @@ def white_noise(sigma0_uk: float, rng: np.random.Generator) -> Stage:
 
     The result does not depend on how the samples are cut into chunks.
     """
-    if not 0.0 <= sigma0_uk < math.inf:
-        raise InputError(f"the noise per sample is {sigma0_uk:g} uK, but it must be finite and >= 0.")
+    check_noise(sigma0_uk)
 
     def stage(stream: Iterable[Samples]) -> Iterator[Samples]:
         for chunk in stream:
@@ -182,6 +181,12 @@ def white_noise(sigma0_uk: float, rng: np.random.Generator) -> Stage:
             yield replace(chunk, signal_uk=chunk.signal_uk + noise)
 
     return stage
+
+
+def check_noise(sigma0_uk: float) -> None:
+    """Raise InputError unless the noise per sample, uK, is finite and >= 0."""
+    if not 0.0 <= sigma0_uk < math.inf:
+        raise InputError(f"the noise per sample is {sigma0_uk:g} uK, but it must be finite and >= 0.")
 
 
 def through(stream: Iterable[Samples], stages: Iterable[Stage]) -> Iterable[Samples]:

@@ -96,7 +96,7 @@ def test_equal_round_beams_recover_the_sky(year, x):
 
 
 def test_map_is_that_of_the_whole_beams_solved_at_once(year):
-    """The sum of the twin and of the rest, against one solution from the differences of the whole beams."""
+    """The sum of the circular-beam control and of the rest, against one solution for the whole beams."""
     shared = survey(year(**ensemble(keep_maps=True)))
     channel = shared.channels[0]
     assert channel.side_b is not None
@@ -112,8 +112,8 @@ def test_map_is_that_of_the_whole_beams_solved_at_once(year):
     np.testing.assert_allclose(found, expected, atol=1e-6 * expected.std())
 
 
-def test_unequal_round_beams_leave_their_own_twin(year):
-    """Without power in m > 0 there is nothing to add to the twin; its map is neither that of A nor that of B."""
+def test_unequal_round_beams_have_their_own_control(year):
+    """Without power in m > 0 there is nothing to add to the control; its map is neither that of A nor that of B."""
     other = {"kind": "gaussian", "fwhm_arcmin": 200.0}
     equal, unequal = (realize(year(channel={"beam": ROUND, "beam_b": b})) for b in (ROUND, other))
     np.testing.assert_array_equal(unequal["biposh"], unequal["biposh_circular"])
@@ -143,14 +143,14 @@ def test_opposite_beams_cancel_what_equal_ones_show(year):
     np.testing.assert_allclose(beam_part(mirror)[0, mode, 2:], beam_part(same)[0, mode, 2:], atol=1e-9 * scale)
 
 
-def test_noise_is_shared_with_the_twin_and_independent_in_splits(year):
+def test_noise_is_shared_with_the_control_and_independent_in_splits(year):
     splits = {"nside": NSIDE, "splits": ["a", "b"], "pixel_window": "none"}
     quiet, noisy = (survey(year(channel={"noise": {"sigma0_uk": sigma}}, map=splits)) for sigma in (0.0, 1e5))
     assert noisy.map_names == ("W1:a", "W1:b")
     assert noisy.channels[0].maps[0].noise_uk is None
     hits = [m.moments.hits for m in noisy.channels[0].maps]
     assert hits[0].sum() == hits[1].sum() == noisy.channels[0].maps[0].pairs.samples * 2
-    # The twin has the noise of its map; what the beam adds to a_lm is the same with and without noise.
+    # The control has the noise of its map; what the beam adds to a_lm is the same with and without noise.
     alone, loud = (simulate.realize(shared, 0) for shared in (quiet, noisy))
     assert np.all(loud["cl"][[0, 2], 2:] > 1e3 * alone["cl"][[0, 2], 2:])
     np.testing.assert_allclose(loud["cl_circular"][0, 2:], loud["cl"][0, 2:], rtol=0.05)
@@ -243,9 +243,9 @@ def test_scans_that_cannot_be(year, scan, message):
 @pytest.mark.parametrize("other", [{}, {"beam_b": LONG | {"angle_deg": 70.0, "m_max": 0}}])
 def test_orders_that_were_left_out_come_back_on_both_sides(year, other):
     effect = config.Effect(name="beam_noncircularity", channel="W1", parameters={"amplitude": 1.0})
-    believed = year(channel={"beam": LONG | {"m_max": 0}} | other)
+    fiducial = year(channel={"beam": LONG | {"m_max": 0}} | other)
     whole = year(channel={side: beam | {"m_max": 4} for side, beam in ({"beam": LONG} | other).items()})
-    found, expected = survey(replace(believed, effects=(effect,))), survey(whole)
+    found, expected = survey(replace(fiducial, effects=(effect,))), survey(whole)
     for a, b in zip(found.channels, expected.channels, strict=True):
         np.testing.assert_array_equal(a.beam.blm, b.beam.blm)
         np.testing.assert_array_equal(a.side_b.beam.blm, b.side_b.beam.blm)

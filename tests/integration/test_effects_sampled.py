@@ -78,20 +78,20 @@ def test_both_routes_respond_alike(name, without):
     parameters = RESPONSES[name]
     changed = prepared(name, **parameters)
     default = simulate.maps(changed, 0)[0] - without[0]
-    referee = sampled.maps(changed, 0, epsilon=EPSILON)[0][1] - without[1]
-    product = default @ referee / np.sqrt((default @ default) * (referee @ referee))
-    amplitude = default @ referee / (default @ default)
-    print(f"{name}: rms {np.std(referee):.3f} uK, cosine {product:.5f}, sampled over default {amplitude:.4f}")
+    reference = sampled.maps(changed, 0, epsilon=EPSILON)[0][1] - without[1]
+    product = default @ reference / np.sqrt((default @ default) * (reference @ reference))
+    amplitude = default @ reference / (default @ default)
+    print(f"{name}: rms {np.std(reference):.3f} uK, cosine {product:.5f}, sampled over default {amplitude:.4f}")
     assert product > 0.99
     assert amplitude == pytest.approx(1.0, abs=0.02)
 
 
 def test_a_beam_with_all_of_its_orders_back_is_the_beam():
-    """In both routes, where a run believes in the circular part alone and the effect adds the rest."""
+    """In both routes, where the fiducial beam is the circular part alone and the effect adds the rest."""
     ellipse = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 320.0, "fwhm_minor_arcmin": 280.0, "angle_deg": 20.0}
-    believed = ellipse | {"m_max": 0}
-    whole, circular = (prepared(beam=beam, dipole_uk=0.0) for beam in (ellipse | {"m_max": 4}, believed))
-    restored = prepared("beam_noncircularity", beam=believed, dipole_uk=0.0, amplitude=1.0)
+    fiducial = ellipse | {"m_max": 0}
+    whole, circular = (prepared(beam=beam, dipole_uk=0.0) for beam in (ellipse | {"m_max": 4}, fiducial))
+    restored = prepared("beam_noncircularity", beam=fiducial, dipole_uk=0.0, amplitude=1.0)
     for route in (
         lambda one: simulate.maps(one, 0)[0],
         lambda one: sampled.maps(one, 0, epsilon=EPSILON)[0][1],
@@ -104,13 +104,13 @@ def test_a_beam_with_all_of_its_orders_back_is_the_beam():
 def test_samples_at_the_centres_lose_window_and_centroid(without):
     """The scatter of the samples in a pixel, which the default route does not know, keeps the two at a cosine of 0.97.
 
-    Without a dipole: its window would be believed when it is taken off.
+    Without a dipole: it is taken off with the fiducial window.
     """
     changed = prepared("pixelization", dipole_uk=0.0, amplitude=1.0)
     centred = [simulate.maps(changed, 0)[0], sampled.maps(changed, 0, epsilon=EPSILON)[0][1]]
-    default, referee = (map_uk - plain for map_uk, plain in zip(centred, without, strict=True))
-    assert default @ referee / np.sqrt((default @ default) * (referee @ referee)) > 0.96
-    assert default @ referee / (default @ default) == pytest.approx(1.0, abs=0.02)
+    default, reference = (map_uk - plain for map_uk, plain in zip(centred, without, strict=True))
+    assert default @ reference / np.sqrt((default @ default) * (reference @ reference)) > 0.96
+    assert default @ reference / (default @ default) == pytest.approx(1.0, abs=0.02)
     # At the centres both routes are exact.
     assert np.abs(centred[0] - centred[1]).max() < 1e-3
 

@@ -28,8 +28,8 @@ def realize(r: int = 0, **changes) -> dict[str, np.ndarray]:
     return simulate.realize(survey(config.load(table(**changes))), r)
 
 
-def test_known_twin_and_analysed_twin_agree() -> None:
-    """Without noise and mask the twin's a_lm are not analysed but known; a trace of noise takes the other route."""
+def test_known_and_analysed_control_agree() -> None:
+    """Without noise and mask the control's a_lm are not analysed but known; a trace of noise takes the other route."""
     iterated = {"iterations": 6, "summary_bin": 10}
     exact = realize(biposh=iterated)
     analysed = realize(channel=[channel(noise={"sigma0_uk": 1e-9})], biposh=iterated)
@@ -41,13 +41,13 @@ def test_known_twin_and_analysed_twin_agree() -> None:
     np.testing.assert_allclose(difference["analysed"], difference["exact"], atol=1e-4 * scale)
 
 
-def test_unpaired_run_gives_the_same_spectra_without_twins() -> None:
+def test_unpaired_run_gives_the_same_spectra_without_controls() -> None:
     paired, single = realize(), realize(**ensemble(paired=False))
     assert set(single) == {"biposh", "cl"}
     np.testing.assert_array_equal(single["biposh"], paired["biposh"])
 
 
-def test_twin_of_a_circular_beam_is_the_beam_itself() -> None:
+def test_control_of_a_circular_beam_is_the_beam_itself() -> None:
     values = realize(channel=[channel(beam={"kind": "gaussian", "fwhm_arcmin": 275.0})])
     np.testing.assert_array_equal(values["biposh"], values["biposh_circular"])
     assert np.all(values["cl"][0, 2:] > 0)
@@ -125,7 +125,7 @@ def test_mask_of_another_frame_and_resolution_with_a_soft_edge(tmp_path: Path) -
     np.testing.assert_allclose(weight, expected / np.sqrt(np.mean(expected**2)), rtol=1e-12)
     fraction = np.mean(expected**2) ** 2 / np.mean(expected**4)
     assert shared.sky_fractions == {"W1": pytest.approx(fraction, rel=1e-12)}
-    # Spectra are divided by <W^2>: the power of the twin is that of the whole sky within the sampling of what is left.
+    # Spectra are divided by <W^2>: the control has the power of the whole sky within the sampling of what is left.
     cl = [np.mean([realize(r, map=m)["cl_circular"][0, 10:] for r in range(8)], axis=0) for m in (soft, {"nside": 16})]
     modes = fraction * 8 * np.sum(2 * np.arange(10, 33) + 1)
     assert abs(np.mean(cl[0] / cl[1]) - 1.0) < 5 * np.sqrt(2.0 / modes)

@@ -319,6 +319,8 @@ def test_bad_input_to_the_solver_is_named(changes, message, scan):
     [
         (lambda: mapmaking.Imbalance(-1.5), "imbalance is -1.5"),
         (lambda: mapmaking.Imbalance(0.0, 2.0), "imbalance is 2,"),
+        (lambda: noise(-1.0, 1), "noise per sample is -1"),
+        (lambda: noise(np.nan, 1), "noise per sample is nan"),
         (lambda: mapmaking.StoppingRule(tol=0.0), "tol is 0,"),
         (lambda: mapmaking.StoppingRule(max_iterations=-1), "max_iterations is -1"),
         (lambda: MapGrid(3), "nside is 3"),

@@ -117,7 +117,7 @@ PT = channel({"kind": "parallel_transport", "psi0_deg": 20.0})
 
 @pytest.mark.parametrize("which", ["parallel transport", "limit"])
 def test_same_spectra_as_healpix(which, tmp_path):
-    """Binned A^{20} of the same skies agree within 1e-3 of the error bar of the ensemble's difference to its twins."""
+    """Binned A^{20} of the same skies agree within 1e-3 of the error bar of the paired difference."""
     nside, realizations = 128, 4
     pixels = PT
     if which == "limit":

@@ -86,14 +86,14 @@ def response(name: str, arguments: argparse.Namespace, plain: dict[str | None, t
     like = name if name == "beam_noncircularity" else None
     if like not in plain:
         without = prepared(None, arguments, like)
-        plain[like] = list(simulate.maps(without, 0, 2)), referee(without)
+        plain[like] = list(simulate.maps(without, 0, 2)), time_ordered(without)
     changed, (default_without, true_without) = prepared(name, arguments), plain[like]
     default = [m - p for m, p in zip(simulate.maps(changed, 0, 2), default_without, strict=True)]
-    true = [m - p for m, p in zip(referee(changed), true_without, strict=True)]
+    true = [m - p for m, p in zip(time_ordered(changed), true_without, strict=True)]
     return np.array([*default, *true])
 
 
-def referee(of: Survey) -> list[Map]:
+def time_ordered(of: Survey) -> list[Map]:
     return [map_uk for _, map_uk in sampled.maps(of, 0, nthreads=2, epsilon=1e-8)]
 
 

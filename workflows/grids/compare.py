@@ -21,7 +21,7 @@ from mcsim.simulation import simulate, survey
 SEED = 5
 
 
-def believed(lmax: int, grid: dict[str, object], orientation: dict[str, object], realizations: int) -> survey.Survey:
+def fiducial(lmax: int, grid: dict[str, object], orientation: dict[str, object], realizations: int) -> survey.Survey:
     """A survey with an elliptical beam."""
     size = 1024 / lmax
     beam = {
@@ -57,13 +57,13 @@ def binned(one: survey.Survey, realizations: int) -> tuple[np.ndarray, np.ndarra
     width = max(one.lmax // 20, 1)
     ell = np.arange(2, 2 + (one.lmax - 1) // width * width)
     factor = ell * (ell + 1) * (-1.0) ** ell / np.sqrt(2 * ell + 1)
-    plain, twin = [], []
+    plain, control = [], []
     for realization in range(realizations):
         found = simulate.realize(one, realization)
         plain.append(factor * found["biposh"][0, row, ell].real)
-        twin.append(factor * found["biposh_circular"][0, row, ell].real)
+        control.append(factor * found["biposh_circular"][0, row, ell].real)
     shape = (realizations, -1, width)
-    together, apart = np.array(plain), np.array(plain) - np.array(twin)
+    together, apart = np.array(plain), np.array(plain) - np.array(control)
     return together.reshape(shape).mean(axis=-1), apart.reshape(shape).mean(axis=-1)
 
 
@@ -96,8 +96,8 @@ def main() -> None:
         for title, pixels, rings in cases:
             # Moments that depend on latitude alone have no finer structure that a pixel would smooth.
             surveys = (
-                believed(lmax, {"nside": nside, "pixel_window": "none"}, pixels, count),
-                believed(lmax, {"grid": "gl"}, rings, count),
+                fiducial(lmax, {"nside": nside, "pixel_window": "none"}, pixels, count),
+                fiducial(lmax, {"grid": "gl"}, rings, count),
             )
             (first, _), (second, apart) = (binned(one, count) for one in surveys)
             gap = np.abs(first.mean(axis=0) - second.mean(axis=0))

@@ -13,7 +13,7 @@ from mcsim.instrument.scan.pointing import BLOCK, PointingStream, fill_block, ri
 from mcsim.simulation import convolve
 from mcsim.simulation.mapmaking.pairs import DifferencingScan, parts
 from mcsim.simulation.mapmaking.solve import check_imbalance
-from mcsim.simulation.tod import Stage, chunks, sample_range, samples, through
+from mcsim.simulation.tod import Stage, check_noise, chunks, sample_range, samples, through
 from mcsim.sphere.healpix import Map
 
 SideMaps = NDArray[np.float64]
@@ -67,6 +67,10 @@ class DifferenceNoise:
 
     sigma0_uk: float
     rng: np.random.Generator
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless sigma0_uk is finite and >= 0."""
+        check_noise(self.sigma0_uk)
 
 
 def rhs_from_maps(
