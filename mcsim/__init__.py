@@ -1,4 +1,4 @@
-"""mcsim: is the isotropy violation that I measure made by my instrument?
+"""Tell whether a measured isotropy violation is made by the instrument, and what a simulation of it lacks.
 
 Monte Carlo ensembles of isotropic skies seen through non-circular beams under a scan, their bipolar spherical harmonic
 (BipoSH) coefficients and power spectra, stored as xarray/Zarr; their prediction without Monte Carlo; and a diagnosis of

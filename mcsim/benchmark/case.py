@@ -39,6 +39,7 @@ class Prior:
     strongest: float = 20.0
 
     def __post_init__(self) -> None:
+        """Raise InputError for strengths or shares that cannot be drawn."""
         if not 0.0 < self.weakest < self.strongest:
             raise InputError(
                 f"an expected S/N from {self.weakest:g} to {self.strongest:g} is no range; give two numbers above 0, "

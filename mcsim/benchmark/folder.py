@@ -42,6 +42,7 @@ class Settings:
     simulations: int | None = None
 
     def __post_init__(self) -> None:
+        """Raise InputError for a share outside 0 to 1."""
         if not 0.0 <= self.sampled_share <= 1.0:
             raise InputError(f"a share of {self.sampled_share:g} made sample by sample is none; give 0 to 1.")
 

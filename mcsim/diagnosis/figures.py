@@ -323,7 +323,7 @@ def _matrix(result: DiagnosisResult, values: NDArray[np.float64], label: str, sc
 
 
 def _mollweide(axes: Axes, values: NDArray[np.float64]) -> Any:
-    """A RING map, longitude 0 in the middle and growing to the left."""
+    """Draw a RING map, longitude 0 in the middle and growing to the left."""
     nside = healpy.npix2nside(values.size)
     projector: Any = healpy.projector.MollweideProj(xsize=700)
     image = projector.projmap(values, lambda x, y, z: healpy.vec2pix(nside, x, y, z))

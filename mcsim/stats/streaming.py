@@ -90,7 +90,7 @@ def tree(node: Callable[[int], Sums | None], nodes: int) -> Sums | None:
 
 
 def standard_deviation(sums: Sums, name: str) -> NDArray[np.float64]:
-    """Standard deviation over realizations, of |x - mean| for complex x; NaN for fewer than two."""
+    """Return the standard deviation over realizations, of |x - mean| for complex x; NaN for fewer than two."""
     if sums.count < 2:
         return np.full(sums.square[name].shape, np.nan)
     return np.sqrt(sums.square[name] / (sums.count - 1))
@@ -107,7 +107,7 @@ def covariance(sums: Sums, name: str) -> Array:
 def jackknife(
     statistic: Callable[..., NDArray[np.float64]], *samples: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A statistic of means over realizations, and its error by leaving out one realization after the other.
+    """Return a statistic of means over realizations, and its error by leaving out one realization after the other.
 
     Parameters
     ----------

@@ -48,7 +48,7 @@ class BeamComa(Effect):
     angle_deg: float = 0.0
 
     def beam(self, beam: Beam, site: Site) -> Beam:
-        """Times the cubic polynomial."""
+        """Return the beam times the cubic polynomial."""
         if self.amplitude == 0.0:
             return beam
         form = shape(beam, 4)
@@ -69,7 +69,7 @@ class BeamComa(Effect):
 
     @classmethod
     def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
-        """The best k and angle: k is linear, the angle is searched."""
+        """Return the best k and angle: k is linear, the angle is searched."""
         if not precision.any():
             return cls()  # the data do not respond to it
         measured = precision @ coordinates

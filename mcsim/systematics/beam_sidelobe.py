@@ -75,11 +75,11 @@ class BeamSidelobe(Effect):
         return (cls(amplitude=cls.step), cls(amplitude=cls.step, quadrupole=1.0))
 
     def coordinates(self) -> Vector:
-        """(a - a q, a q): a ring with a quadrupole is a mixture of those of the basis."""
+        """Return (a - a q, a q): a ring with a quadrupole is a mixture of those of the basis."""
         return self.amplitude * np.array([1.0 - self.quadrupole, self.quadrupole])
 
     @classmethod
     def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
-        """a is the sum of both, q the share of the second."""
+        """Return the effect whose a is the sum of both, q the share of the second."""
         amplitude = float(coordinates.sum())
         return cls(amplitude=amplitude, quadrupole=float(coordinates[1]) / amplitude if amplitude else 0.0)

@@ -26,7 +26,7 @@ def spread_of(acting: Iterable[Effect]) -> float:
 
 
 def looked_at(acting: Iterable[Effect], sky: Alm, site: Site, seed: int, realization: int) -> Alm:
-    """The sky that a channel looks at, uK: what an effect draws depends on its name alone, not on the channel."""
+    """Return the sky that a channel looks at, uK; what an effect draws depends on its own name, not on the channel."""
     for effect in acting:
 
         def draw(stage: str, name: str = effect.name) -> np.random.Generator:

@@ -40,7 +40,7 @@ class GainDrift(Effect):
     phase_deg: float = 0.0
 
     def gain(self, time_s: Vector, site: Site) -> Vector | None:
-        """A wave of the period of the orbit."""
+        """Return a wave of the period of the orbit."""
         if self.amplitude == 0.0:
             return None
         turns = time_s / site.pointed(self.name).model.orbit_period_s

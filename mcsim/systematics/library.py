@@ -11,6 +11,7 @@ class Effects(UserDict[str, type[Effect]]):
     """Effects by name, printed one a line with scope, unit and cause."""
 
     def __repr__(self) -> str:
+        """Return a line for each effect."""
         width = max(map(len, self), default=0)
         return "\n".join(
             f"{name:<{width}}  {kind.scope}, {kind.unit}: {kind.cause}" for name, kind in sorted(self.items())

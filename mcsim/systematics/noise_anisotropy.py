@@ -56,7 +56,7 @@ class NoiseAnisotropy(Effect):
 
 
 def _of_file(path: str, frame: str, centres: NDArray[np.float64]) -> Map:
-    """A template at these directions in ``frame``."""
+    """Return a template at these directions in ``frame``."""
     values, found, _ = healpix.read_map(Path(path))
     if not np.all(np.isfinite(values)) or np.any(values == healpy.UNSEEN):
         raise InputError(f"{path} has pixels that are not finite or unseen; give a complete template.")

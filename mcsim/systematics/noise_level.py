@@ -24,7 +24,7 @@ class NoiseLevel(Effect):
     matched_filter = False
 
     def noise(self, site: Site) -> Map | None:
-        """The same factor everywhere."""
+        """Return the same factor everywhere."""
         if self.amplitude == 0.0:
             return None
         if self.amplitude <= -1.0:

@@ -46,7 +46,7 @@ class PointingOffset(Effect):
         return displaced(beam, np.deg2rad(self.angle_deg), np.deg2rad(self.amplitude / 60.0))
 
     def moved(self, theta: Vector, phi: Vector, psi: Vector) -> tuple[Vector, Vector, Vector] | None:
-        """The same rotation of every sample's direction and axes."""
+        """Return the same rotation of every sample's direction and axes."""
         if self.amplitude == 0.0:
             return theta, phi, psi
         distance, angle = np.deg2rad(self.amplitude / 60.0), np.deg2rad(self.angle_deg)

@@ -52,7 +52,7 @@ class QuadrupoleModulation(Effect):
 
     @classmethod
     def basis(cls) -> tuple[Self, ...]:
-        """The five components one by one."""
+        """Return the five components one by one."""
         return tuple(cls(amplitude=cls.step, components=tuple(map(float, row))) for row in np.eye(5))
 
     def coordinates(self) -> Vector:

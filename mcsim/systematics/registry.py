@@ -58,7 +58,7 @@ def catalogue() -> Library:
 
 
 def _flaw(kind: type[Effect]) -> str | None:
-    """What keeps a class from being a whole effect; None: nothing."""
+    """Say what keeps a class from being a whole effect; None: nothing."""
     own = {key for key, text in vars(kind).get("__annotations__", {}).items() if "ClassVar" not in str(text)}
     missing = own - {f.name for f in fields(kind)}
     if missing:

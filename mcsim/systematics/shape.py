@@ -58,7 +58,7 @@ class Shape:
         return float(np.sqrt(np.sqrt(4.0 * np.pi) * self.whole.blm[0, 0].real / self.peak / (2.0 * np.pi)))
 
     def with_added(self, added: Values, least: int, keep_integral: bool = True) -> Beam:
-        """The beam plus ``added`` (sr^-1, on the rings).
+        """Return the beam plus ``added`` (sr^-1, on the rings).
 
         Parameters
         ----------
@@ -109,7 +109,7 @@ def shape(beam: Beam, orders: int) -> Shape:
 
 
 def stretched(beam: Beam, along: float, across: float, angle: float, orders: int, least: int) -> Beam:
-    """The beam made ``along`` times as wide in the direction ``angle`` (from x towards y), ``across`` times across it.
+    """Make a beam ``along`` times as wide in the direction ``angle`` (from x towards y), ``across`` times across it.
 
     Notes
     -----
@@ -130,7 +130,7 @@ def stretched(beam: Beam, along: float, across: float, angle: float, orders: int
 
 
 def extended(beam: Beam) -> Beam:
-    """The beam continued beyond its lmax, to where nothing is left of it.
+    """Continue a beam beyond its lmax, to where nothing is left of it.
 
     Notes
     -----
@@ -180,7 +180,7 @@ def _falls(logarithm: np.polynomial.Polynomial, peak: float) -> bool:
 
 
 def displaced(beam: Beam, angle: float, distance: float) -> Beam:
-    """The beam with its centre moved by ``distance`` in the direction ``angle`` from x towards y, radians.
+    """Move the centre of a beam by ``distance`` in the direction ``angle`` from x towards y, radians.
 
     Notes
     -----
@@ -201,7 +201,7 @@ def displaced(beam: Beam, angle: float, distance: float) -> Beam:
 
 
 def smeared(beam: Beam, boresight: float, lag: float) -> Beam:
-    """The beam of a detector that answers late: its exponential trail along the circle about the spin axis.
+    """Return the beam of a detector that answers late: its exponential trail along the circle about the spin axis.
 
     Parameters
     ----------
@@ -239,7 +239,7 @@ def smeared(beam: Beam, boresight: float, lag: float) -> Beam:
 
 
 def trimmed(blm: Blm, like: Beam, least: int) -> Beam:
-    """A beam from coefficients made of those of ``like``, without the orders that hold next to nothing.
+    """Return a beam from coefficients made of those of ``like``, without the orders that hold next to nothing.
 
     Kept are the orders up to ``least``, those that ``like`` has, and as many as leave no more than NEGLECTED of the
     power beyond.
@@ -273,7 +273,7 @@ def _ladder(full: Blm) -> tuple[Values, Values, Values]:
 
 
 def _turning(full: Blm, axis: tuple[float, float, float]) -> Blm:
-    """axis . J applied to coefficients: i d/da of their rotation by a about the axis."""
+    """Apply axis . J to coefficients: i d/da of their rotation by a about the axis."""
     below, above, m = _ladder(full)
     raised, lowered = np.zeros_like(full), np.zeros_like(full)
     raised[1:] = below[1:] * full[:-1]

@@ -69,7 +69,7 @@ class Spectrum(Effect):
 
     @classmethod
     def basis(cls) -> tuple[Self, ...]:
-        """The bands one by one."""
+        """Return the bands one by one."""
         return tuple(cls(amplitude=cls.step, bands=tuple(map(float, row))) for row in np.eye(BANDS))
 
     def coordinates(self) -> Vector:

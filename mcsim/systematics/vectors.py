@@ -55,7 +55,7 @@ def along(effect: str, key: str, direction: tuple[float, ...], amplitude: float)
 
 
 def towards(lon_deg: float, lat_deg: float) -> Vector:
-    """Unit vector towards a longitude and a latitude, in degrees."""
+    """Return the unit vector towards a longitude and a latitude, in degrees."""
     lon, lat = np.deg2rad([lon_deg, lat_deg])
     return np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
 

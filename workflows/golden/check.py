@@ -158,8 +158,7 @@ def verdict(name: str, folder: Path) -> dict[str, Any]:
     mcsim.run(data | ({"effect": effects} if effects else {}), folder / f"data-{name}.zarr")
     with mcsim.open_ensemble(folder / f"data-{name}.zarr") as opened:
         maps = list(opened[next(str(key) for key in opened.data_vars if "map" in str(key))].values[0])
-    library = json.loads((HERE / "library.json").read_text())
-    left_out = [effect for effect in library if effect not in proposed]
+    left_out = [effect for effect in mcsim.effects() if effect not in proposed]
     out = folder / f"out-{name}"
     mcsim.diagnose(MODEL, maps, out, case=name, without=left_out, simulations=260, workers=2)
     found: dict[str, Any] = json.loads((out / "verdict.json").read_text())
