@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from mcsim.config import RunConfig
     from mcsim.config import load as load_config
     from mcsim.diagnosis.api import diagnose
+    from mcsim.ensemble.maps import write_maps
     from mcsim.ensemble.opening import open_ensemble, open_summary
     from mcsim.ensemble.prediction import predict
     from mcsim.ensemble.runner import merge, run
@@ -53,6 +54,7 @@ __all__ = [
     "open_summary",
     "predict",
     "run",
+    "write_maps",
 ]
 
 _HOME = {
@@ -73,6 +75,7 @@ _HOME = {
     "open_summary": "mcsim.ensemble.opening",
     "predict": "mcsim.ensemble.prediction",
     "run": "mcsim.ensemble.runner",
+    "write_maps": "mcsim.ensemble.maps",
 }
 
 

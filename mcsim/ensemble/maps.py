@@ -65,9 +65,9 @@ def write_maps(
 
     Examples
     --------
-    >>> import tempfile
-    >>> folder = Path(tempfile.mkdtemp()) / "observed"
-    >>> [path.name for path in write_maps("quickstart", folder, 3)[0].iterdir()]
+    >>> import mcsim
+    >>> [folder] = mcsim.write_maps("tiny", "tiny-maps", realizations=0)
+    >>> sorted(file.name for file in folder.iterdir())
     ['demo.fits']
     """
     run = source if isinstance(source, config.RunConfig) else config.load(source)

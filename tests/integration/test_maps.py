@@ -11,6 +11,7 @@ from distributed import Client
 
 from mcsim import config, open_ensemble
 from mcsim.diagnosis.observed_maps import read_maps
+from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.wiener_filter import model_of
 from mcsim.ensemble import maps as maps_
 from mcsim.ensemble import runner
@@ -41,7 +42,7 @@ def test_a_diagnosis_reads_what_is_written(tmp_path: Path) -> None:
     assert sorted(file.name for file in folder.iterdir()) == ["V1_a.fits", "V1_b.fits", "W1_a.fits", "W1_b.fits"]
     shared = survey(run)
     expected = simulate.maps(shared, 3)
-    for found, map_uk in zip(read_maps(model_of(shared), folder), expected, strict=True):
+    for found, map_uk in zip(read_maps(model_of(shared, DiagnosisSettings()), folder), expected, strict=True):
         np.testing.assert_array_equal(found, map_uk)
     header = fits.getheader(folder / "V1_b.fits", 1)
     told = {"ORDERING": "RING", "COORDSYS": "G", "NSIDE": 16, "TUNIT1": "uK", "RUN": "small", "REALIZ": 3}

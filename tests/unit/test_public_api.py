@@ -46,6 +46,7 @@ NAMES = [
     "open_summary",
     "predict",
     "run",
+    "write_maps",
 ]
 OBJECTS = [name for name in NAMES if name != "__version__"]
 
