@@ -76,8 +76,8 @@ class BipolarScan:
         In other frames than that of the maps only coefficients with M = 0 are measured.
         """
         found: list[tuple[Element, tuple[int, ...]]] = []
-        places = product(range(len(self._sources)), enumerate(FRAMES), enumerate(self.tables.modes))
-        for source, (view, frame), (row, mode) in places:
+        cells = product(range(len(self._sources)), enumerate(FRAMES), enumerate(self.tables.modes))
+        for source, (view, frame), (row, mode) in cells:
             alike, channel, _ = self._sources[source]
             turned = frame != self.model.frame and mode.M > 0
             if mode.L == 0 or turned or (channel is None and not mode.in_auto):
