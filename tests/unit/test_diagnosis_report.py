@@ -25,12 +25,12 @@ from mcsim.diagnosis.selection import attribute
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Element
 from mcsim.diagnosis.validation import Measured, Prediction, Shrink
-from mcsim.errors import InputError
 from mcsim.stats.detection import confusion, snr_needed
 from mcsim.stats.gaussian import SimulatedGaussian, residual_pvalue
 from mcsim.stats.look_elsewhere import calibrate
 from mcsim.support import resources
 from mcsim.support.numbers import measured, number, p_equals, probability
+from refusals import refused
 
 EVIL = "<script>alert('$x_')<img src=x onerror=alert(1)>"
 P, N = 30, 500
@@ -319,7 +319,7 @@ def test_result_comes_back_from_disk_as_it_was(diagnoses, pages, tmp_path, kind)
 
 
 def test_a_folder_without_a_diagnosis_is_named(tmp_path):
-    with pytest.raises(InputError, match=tmp_path.name):
+    with refused(tmp_path.name):
         DiagnosisResult.open(tmp_path)
 
 
