@@ -62,7 +62,7 @@ def data_of(run, name=None, channel=None, seed=77, **parameters):
     return survey(changed)
 
 
-def test_both_folds_hear_every_range_of_the_sky(small):
+def test_both_folds_have_every_range_of_the_sky(small):
     sky = [element for element in small.analysis.elements if element.name.startswith("sky/")]
     even, odd = ([element.ell for element in sky if element.fold == fold] for fold in (0, 1))
     assert even == odd

@@ -275,6 +275,7 @@ def test_power_of_one_template_is_the_known_one():
     assert low <= false <= high
 
 
+@pytest.mark.slow
 def test_draws_are_judged(learned, linear, tmp_path):
     records = draws(learned, 120, 2, Prior())
     assert [record.case for record in records] == [f"draw-{number:05d}" for number in range(120)]

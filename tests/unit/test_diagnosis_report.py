@@ -30,6 +30,7 @@ from mcsim.stats.gaussian import SimulatedGaussian, residual_pvalue
 from mcsim.stats.look_elsewhere import calibrate
 from mcsim.support import resources
 from mcsim.support.numbers import measured, number, p_equals, probability
+from mcsim.support.page import png
 from refusals import refused
 
 EVIL = "<script>alert('$x_')<img src=x onerror=alert(1)>"
@@ -168,8 +169,12 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def pages(diagnoses) -> Iterator[dict[str, str]]:
+    def quick(figure, dpi: int) -> bytes:
+        figure.set_layout_engine("none")  # which draws a figure twice
+        return png(figure, 30)
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report, "DOTS_PER_INCH", 30)
+        patch.setattr(report.page_, "png", quick)
         yield {kind: report.page(one) for kind, one in diagnoses.items()}
 
 

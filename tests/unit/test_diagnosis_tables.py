@@ -83,6 +83,7 @@ def judged(small, folder, table):
     return diagnose_data(tables.MeasuredSpectra(small, spectra, lambda jobs: [spectra(job) for job in jobs]), "table")
 
 
+@pytest.mark.slow
 def test_an_ellipticity_is_named_and_its_gap_shrinks(small, tmp_path):
     truth = config.Effect(name="beam_ellipticity", channel="W1", parameters={"amplitude": 0.3})
     found = judged(small, tmp_path, measured(with_effects(RUN, [truth])))
@@ -100,6 +101,7 @@ def test_an_ellipticity_is_named_and_its_gap_shrinks(small, tmp_path):
     assert "BipoSH L2M0d0, real" in report.page(found)
 
 
+@pytest.mark.slow
 def test_tables_of_the_model_have_no_gap(small, tmp_path):
     verdicts = [judged(small, tmp_path, measured(RUN, seed)).verdict for seed in range(100, 108)]
     # Eight draws of a uniform number: three or more below 0.05 once in 170 cases.
@@ -221,13 +223,14 @@ def test_correlated_bins_are_freed_of_what_others_predict(small, tmp_path):
     np.testing.assert_array_equal(turn[folds == 0], np.eye(len(folds))[folds == 0])
 
 
+@pytest.mark.slow
 def test_a_few_power_spectra_alone_are_judged(tmp_path):
     table = measured(RUN)
     few = table[(table["L"] == 0) & (table["ell_max"] < BINS[-1][1])]
     few["value"] *= 1.0 + 0.3 * np.arange(len(few))
     spectra = read(tmp_path, few)
     run = tables.estimator_for(RUN, spectra)
-    # Coma is not heard at all, and the spectrum has more components than there are numbers.
+    # Coma is not seen at all, and the spectrum has more components than there are numbers.
     proposed = ("beam_coma", "beam_width", "spectrum")
     analysis = tables.analysis_of_spectra(
         run, spectra, [name for name in systematics.catalogue() if name not in proposed]
