@@ -17,7 +17,7 @@ from mcsim.simulation import convolve, differencing, mapmaking, simulate
 from mcsim.simulation.survey import Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
-from refusals import refused
+from refusals import refused, unnamed
 
 from .conftest import ensemble, table
 
@@ -200,8 +200,7 @@ def test_maps_that_do_not_converge_are_failures_and_can_be_made_later(year, clie
     hasty = year({"max_iterations": 3}, ensemble={"realizations": 2, "seed": 1})
     result = runner.run(hasty, tmp_path / "s.zarr", client=client)
     assert (result.finished, [failure.realization for failure in result.failures]) == (0, [0, 1])
-    assert "map W1, the non-circular part: the map-making reached a relative residual of" in result.failures[0].reason
-    assert "in 3 iterations, not the tolerance 1e-08; raise max_iterations" in result.failures[0].reason
+    assert unnamed(result.failures[0].reason, "map W1", "3 iterations", "1e-08", "max_iterations") == []
     patient = year(ensemble={"realizations": 2, "seed": 1})
     assert runner.run(patient, tmp_path / "s.zarr", client=client).finished == 2
 

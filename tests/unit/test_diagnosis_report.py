@@ -167,15 +167,27 @@ class Page(HTMLParser):
         return " ".join(" ".join(self.words).split())
 
 
+class Pages(dict[str, str]):
+    """Each drawn when a test first asks for it: another process may have the other tests."""
+
+    def __init__(self, diagnoses: dict[str, DiagnosisResult]) -> None:
+        super().__init__()
+        self.diagnoses = diagnoses
+
+    def __missing__(self, kind: str) -> str:
+        self[kind] = report.page(self.diagnoses[kind])
+        return self[kind]
+
+
 @pytest.fixture(scope="module")
-def pages(diagnoses) -> Iterator[dict[str, str]]:
+def pages(diagnoses) -> Iterator[Pages]:
     def quick(figure, dpi: int) -> bytes:
         figure.set_layout_engine("none")  # which draws a figure twice
         return png(figure, 30)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report.page_, "png", quick)
-        yield {kind: report.page(one) for kind, one in diagnoses.items()}
+        yield Pages(diagnoses)
 
 
 @pytest.mark.parametrize("kind", VERDICTS)
