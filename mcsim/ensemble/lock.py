@@ -46,10 +46,13 @@ def locked(path: Path) -> Iterator[None]:
 
 def _make(lock: Path, path: Path) -> None:
     """Make the lock and its contents in one step, so that a killed process leaves a readable lock."""
-    with tempfile.NamedTemporaryFile("w", prefix=f".{path.name}.", dir=path.parent) as stream:
-        stream.write(f"{socket.gethostname()} {os.getpid()}")
-        stream.flush()
-        os.link(stream.name, lock)
+    descriptor, scratch = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(descriptor, "w") as stream:
+            stream.write(f"{socket.gethostname()} {os.getpid()}")
+        os.link(scratch, lock)
+    finally:
+        os.unlink(scratch)
 
 
 def _take_over(lock: Path, path: Path) -> None:

@@ -12,12 +12,12 @@ from distributed import Client
 import mcsim
 from mcsim import bipolar, config
 from mcsim.ensemble import prediction, runner
-from mcsim.errors import InputError
 from mcsim.instrument.beams.turn import mirrored
 from mcsim.simulation import convolve, differencing, mapmaking, simulate
 from mcsim.simulation.survey import Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
+from refusals import refused, unnamed
 
 from .conftest import ensemble, table
 
@@ -200,8 +200,7 @@ def test_maps_that_do_not_converge_are_failures_and_can_be_made_later(year, clie
     hasty = year({"max_iterations": 3}, ensemble={"realizations": 2, "seed": 1})
     result = runner.run(hasty, tmp_path / "s.zarr", client=client)
     assert (result.finished, [failure.realization for failure in result.failures]) == (0, [0, 1])
-    assert "map W1, the non-circular part: the map-making reached a relative residual of" in result.failures[0].reason
-    assert "in 3 iterations, not the tolerance 1e-08; raise max_iterations" in result.failures[0].reason
+    assert unnamed(result.failures[0].reason, "map W1", "3 iterations", "1e-08", "max_iterations") == []
     patient = year(ensemble={"realizations": 2, "seed": 1})
     assert runner.run(patient, tmp_path / "s.zarr", client=client).finished == 2
 
@@ -229,14 +228,14 @@ def test_part_of_the_sky(year, model: Path, tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("scan", "message"),
+    ("scan", "named"),
     [
-        ({"pair": "E"}, r"has no differencing pair 'E': choose from D\."),
-        ({"sample_period_s": 1e9}, r"has no sample every 1e\+09 s"),
+        ({"pair": "E"}, ("toy", "'E'", "D")),
+        ({"sample_period_s": 1e9}, ("toy", "1e+09 s", "duration_days")),
     ],
 )
-def test_scans_that_cannot_be(year, scan, message):
-    with pytest.raises(InputError, match=message):
+def test_scans_that_cannot_be(year, scan, named):
+    with refused(*named):
         survey(year(scan))
 
 

@@ -12,7 +12,7 @@ from distributed import Client
 
 from mcsim import open_ensemble, open_summary
 from mcsim.ensemble import repair, runner, store
-from mcsim.errors import InputError
+from refusals import refused
 
 from .conftest import ensemble, table
 
@@ -78,7 +78,7 @@ def test_old_stores_merge_into_a_new_one(old: Path, new: Path, client: Client, t
 
 
 def test_old_stores_of_another_seed_are_refused(old: Path, client: Client) -> None:
-    with pytest.raises(InputError, match=r"ensemble\.seed"):
+    with refused("old.zarr", "ensemble.seed", "7 -> 8"):
         runner.run(table(**ensemble(3, seed=8, keep_maps=True)), old, client=client)
 
 

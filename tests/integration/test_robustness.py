@@ -16,7 +16,8 @@ from distributed import Client
 from mcsim import config, open_ensemble, open_summary
 from mcsim.ensemble import runner, store
 from mcsim.ensemble.lock import locked
-from mcsim.errors import InputError, RunError
+from mcsim.errors import RunError
+from refusals import refused
 
 from .conftest import ensemble, table
 from .test_runner import assert_same
@@ -26,15 +27,15 @@ def test_second_writer_is_refused_by_name(small_store: Path, client: Client, tmp
     path = tmp_path / "x.zarr"
     lock = tmp_path / "x.zarr.lock"
     lock.write_text(f"{socket.gethostname()} {os.getppid()}")
-    with pytest.raises(InputError, match=f"process {os.getppid()} on {socket.gethostname()}"):
+    with refused("x.zarr", os.getppid(), socket.gethostname()):
         runner.run(table(), path, client=client)
     assert not path.exists()
     lock.unlink()
-    with locked(path), pytest.raises(InputError, match=f"process {os.getpid()} on {socket.gethostname()}"):
+    with locked(path), refused("x.zarr", os.getpid(), socket.gethostname()):
         runner.run(table(), path, client=client)
     assert not lock.exists()
     lock.write_text("another-host 1")
-    with pytest.raises(InputError, match="process 1 on another-host"):
+    with refused("x.zarr", 1, "another-host"):
         runner.run(table(), path, client=client)
     assert lock.exists()
 
@@ -72,7 +73,7 @@ def test_lost_summary_is_made_again(small_store: Path, client: Client, tmp_path:
     path = tmp_path / "x.zarr"
     shutil.copytree(small_store, path)
     shutil.rmtree(path / "summary")
-    with pytest.raises(InputError, match="has no summary"):
+    with refused("x.zarr", "summary", "--resume"):
         open_summary(path)
     assert runner.run(table(), path, client=client).computed == 0
     assert_same(path, small_store)
@@ -97,7 +98,7 @@ def test_merge_refuses_different_contents_and_leaves_nothing(small_store: Path, 
     kept = tmp_path / "kept.zarr"
     runner.run(table(**ensemble(2, keep_maps=True)), kept, client=client)
     for order in ([small_store, kept], [kept, small_store]):
-        with pytest.raises(InputError, match="keep_maps"):
+        with refused("ensemble.keep_maps", "True", "False"):
             runner.merge(order, tmp_path / "merged.zarr")
     assert sorted(p.name for p in tmp_path.glob("*.zarr")) == ["kept.zarr"]
 
@@ -120,7 +121,7 @@ def test_damaged_chunk_is_named_and_nothing_is_merged(small_store: Path, tmp_pat
     data = bytearray(chunk.read_bytes())
     data[len(data) // 2] ^= 0xFF
     chunk.write_bytes(bytes(data))
-    with pytest.raises(RunError, match=r"damaged\.zarr cannot be used"):
+    with refused("damaged.zarr", "--verify", "--resume", by=RunError):
         runner.merge([path], tmp_path / "merged.zarr")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["damaged.zarr"]
 
@@ -136,7 +137,7 @@ def test_bad_sky_is_found_before_a_store_is_made(client: Client, tmp_path: Path)
     for r in range(2):
         (tmp_path / f"sky_{r}.fits").write_text("not a map")
     sky = {"lmax": 32, "map": str(tmp_path / "sky_{realization}.fits")}
-    with pytest.raises(InputError, match=r"sky_0\.fits cannot be read as a HEALPix map"):
+    with refused("sky_0.fits"):
         runner.run(table(sky=sky, **ensemble(2)), tmp_path / "x.zarr", client=client)
     assert not list(tmp_path.glob("x.zarr*"))
 
@@ -153,7 +154,7 @@ def test_units_and_frames_of_skies(client: Client, tmp_path: Path) -> None:
         runner.run(table(sky={"lmax": 32, "map": str(tmp_path / "sky.fits")}, **ensemble(1)), path, client=client)
         spectra.append(open_ensemble(path).cl.values[..., 2:])
     np.testing.assert_allclose(spectra[0], spectra[1], rtol=1e-12)
-    for coord, unit, message in (("G", "uK", "is in galactic coordinates"), ("E", "Jy", "is in 'Jy'")):
+    for coord, unit, named in (("G", "uK", "galactic"), ("E", "Jy", "'Jy'")):
         healpy.write_map(tmp_path / "sky.fits", sky, column_units=unit, coord=coord, overwrite=True, dtype=np.float64)
-        with pytest.raises(InputError, match=message):
+        with refused("sky.fits", named):
             runner.run(table(sky={"lmax": 32, "map": str(tmp_path / "sky.fits")}), tmp_path / "bad.zarr", client=client)

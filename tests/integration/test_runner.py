@@ -1,5 +1,6 @@
 """The batch from configuration to store: resumption, extension, slices, refusals, and the same bits every time."""
 
+import errno
 import shutil
 from pathlib import Path
 
@@ -10,9 +11,9 @@ from distributed import Client
 
 from mcsim import config, open_ensemble
 from mcsim.ensemble import opening, runner, store
-from mcsim.errors import InputError
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
+from refusals import refused
 
 from .conftest import ensemble, table
 
@@ -123,30 +124,30 @@ def test_separate_processes_give_the_same_bits(small_store: Path, tmp_path: Path
 
 def test_another_configuration_is_refused_by_name(small_store: Path, client: Client) -> None:
     before = tree(small_store)
-    with pytest.raises(InputError, match=r"another configuration \(ensemble\.seed: 7 -> 8\)"):
+    with refused("ensemble.seed", "7 -> 8", "-o"):
         runner.run(table(**ensemble(seed=8)), small_store, client=client)
-    with pytest.raises(InputError, match=r"biposh\.L_max: 2 -> 1"):
+    with refused("biposh.L_max", "2 -> 1"):
         runner.run(table(biposh={"L_max": 1, "summary_bin": 10}), small_store, client=client)
-    with pytest.raises(InputError, match=r"keep_maps"):
+    with refused("ensemble.keep_maps", "False -> True"):
         runner.run(table(**ensemble(keep_maps=True)), small_store, client=client)
     assert tree(small_store) == before
 
 
 def test_resume_needs_a_store(client: Client, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no store .* to resume"):
+    with refused("none.zarr", "--resume"):
         runner.run(table(), tmp_path / "none.zarr", resume=True, client=client)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_foreign_folder_is_refused(client: Client, tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("precious")
-    with pytest.raises(InputError, match="not an ensemble store"):
+    with refused(tmp_path):
         runner.run(table(), tmp_path, client=client)
     assert (tmp_path / "thesis.tex").read_text() == "precious"
 
 
 def test_unreachable_scheduler(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"No Dask scheduler answers at tcp://127\.0\.0\.1:1 "):
+    with refused("tcp://127.0.0.1:1", "5 s"):
         runner.run(table(), tmp_path / "x.zarr", scheduler="tcp://127.0.0.1:1")
     assert list(tmp_path.iterdir()) == []
 
@@ -154,7 +155,7 @@ def test_unreachable_scheduler(tmp_path: Path) -> None:
 def test_unwritable_store(client: Client, tmp_path: Path) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("a file where a folder is needed")
-    with pytest.raises(InputError, match="cannot be written"):
+    with refused("x.zarr", "-o", errno=errno.ENOTDIR):
         runner.run(table(), blocked / "x.zarr", client=client)
     assert blocked.read_text() == "a file where a folder is needed"
 
@@ -194,8 +195,8 @@ def test_kept_maps(client: Client, tmp_path: Path) -> None:
 def test_merge_refuses_what_does_not_belong_together(small_store: Path, client: Client, tmp_path: Path) -> None:
     other = tmp_path / "other.zarr"
     runner.run(table(**ensemble(2, seed=8)), other, client=client)
-    with pytest.raises(InputError, match=r"differ \(ensemble\.seed: 7 -> 8\)"):
+    with refused("other.zarr", "small.zarr", "ensemble.seed", "7 -> 8"):
         runner.merge([small_store, other], tmp_path / "merged.zarr")
     assert not (tmp_path / "merged.zarr").exists()
-    with pytest.raises(InputError, match="exists already"):
+    with refused("other.zarr"):
         runner.merge([small_store], other)

@@ -46,6 +46,7 @@ from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Block, Element
 from mcsim.errors import InputError
+from refusals import refused
 
 ENTRIES = 24
 
@@ -154,10 +155,10 @@ def test_a_key_that_was_changed_is_found(folder):
     assert finished_cases(folder) == ["case-000"]
     assert open_key(folder, "case-000") == truth()
     write_key(folder, truth(kind="none", members=()))
-    with pytest.raises(InputError, match="SHA-256"):
+    with refused("case-000.json", "SHA-256"):
         open_key(folder, "case-000")
     seal(folder, "")
-    with pytest.raises(InputError, match="SHA-256"):
+    with refused("case-000.json", "SHA-256"):
         open_key(folder, "case-000")
     for text in ("{}", "[1]", "no key", '{"schema": 1, "members": [{"name": "beam_width"}], "without": []}'):
         key_path(folder, "case-000").write_text(text)
@@ -170,11 +171,11 @@ def test_a_key_that_was_changed_is_found(folder):
 
 def test_a_folder_that_is_no_challenge_is_refused(folder, tmp_path):
     for task in (run, score):
-        with pytest.raises(InputError, match="no challenge"):
+        with refused(tmp_path / "nothing"):
             task(tmp_path / "nothing", workers=0)
-    with pytest.raises(InputError, match="no verdicts"):
+    with refused(tmp_path, "verdicts"):
         score(folder, workers=0)
-    with pytest.raises(InputError, match=r"question\.json"):
+    with refused("question.json"):
         run(folder, workers=0)
     (folder / VERDICTS / "case-000").mkdir(parents=True)
     for text in ("{}", "no settings", '{"model": 3, "prior": {}, "sampled_share": 0.5, "simulations": null}'):
@@ -186,16 +187,16 @@ def test_a_folder_that_is_no_challenge_is_refused(folder, tmp_path):
 
 @pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
 def test_a_share_is_from_nothing_to_all(share):
-    with pytest.raises(InputError, match=f"{share:g}"):
+    with refused(share):
         Settings(config.load("quickstart"), sampled_share=share)
 
 
 @pytest.mark.parametrize("number", [0, -3])
 def test_a_number_of_cases_is_positive(number, tmp_path):
     settings = Settings(config.load("quickstart"), sampled_share=0.0)
-    with pytest.raises(InputError, match=f"{number}"):
+    with refused(number):
         make(settings, tmp_path / "made", number, 0, workers=0)
-    with pytest.raises(InputError, match=f"{number}"):
+    with refused(number):
         score_draws(settings, tmp_path / "made", number, 0, workers=0)
     assert not (tmp_path / "made").exists()
 
@@ -274,6 +275,7 @@ def test_power_of_one_template_is_the_known_one():
     assert low <= false <= high
 
 
+@pytest.mark.slow
 def test_draws_are_judged(learned, linear, tmp_path):
     records = draws(learned, 120, 2, Prior())
     assert [record.case for record in records] == [f"draw-{number:05d}" for number in range(120)]

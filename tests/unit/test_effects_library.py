@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from mcsim import systematics
-from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments, ScanModel
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.sphere.spectra import load
 from mcsim.systematics import registry
+from refusals import refused
 
 LMAX, NSIDE = 48, 8
 NAMES = {
@@ -141,15 +141,15 @@ def test_coma_off_the_possible_is_brought_to_the_nearest():
 
 
 def test_unknown_effects_and_parameters_are_named():
-    with pytest.raises(InputError, match="did you mean gain_drift"):
+    with refused("gain_drit", "gain_drift"):
         systematics.get("gain_drit")
-    with pytest.raises(InputError, match="choose from"):
+    with refused("zzz", "beam_coma", "gain_drift"):
         systematics.get("zzz")
-    with pytest.raises(InputError, match="it has amplitude, angle_deg"):
+    with refused("beam_coma", "angle", "amplitude", "angle_deg"):
         systematics.build("beam_coma", {"angle": 3.0})
-    with pytest.raises(InputError, match="finite number"):
+    with refused("amplitude", "large"):
         systematics.build("beam_coma", {"amplitude": "large"})
-    with pytest.raises(InputError, match="list of 5 numbers"):
+    with refused("components", "[1.0]", 5):
         systematics.build("quadrupole_modulation", {"components": [1.0]})
 
 
@@ -181,11 +181,11 @@ def test_packages_add_effects(registered):
 
 def test_broken_packages_are_named(registered):
     registered(EntryPoint("broken", "no_such_package:Thing", registry.ENTRY_POINTS))
-    with pytest.raises(InputError, match=r"effect broken of no_such_package:Thing cannot be loaded"):
+    with refused("broken", "no_such_package:Thing"):
         systematics.catalogue()
     registry.catalogue.cache_clear()
     registered(EntryPoint("beam", "mcsim.instrument.beams:Beam", registry.ENTRY_POINTS))
-    with pytest.raises(InputError, match="no class derived from"):
+    with refused("mcsim.instrument.beams:Beam", "mcsim.systematics.Effect"):
         systematics.catalogue()
 
 
@@ -230,5 +230,5 @@ def test_an_effect_that_is_not_whole_is_refused_when_it_is_loaded(kind, key, reg
             return kind
 
     registered(Entry("foreign", "package:Thing", registry.ENTRY_POINTS))
-    with pytest.raises(InputError, match=key):
+    with refused(key):
         systematics.catalogue()
