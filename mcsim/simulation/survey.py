@@ -12,7 +12,7 @@ from mcsim import config
 from mcsim.bipolar import Estimator, estimator
 from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
-from mcsim.instrument.scan.geometry import MapGrid
+from mcsim.instrument.scan import MapGrid
 from mcsim.simulation import convolve, mapmaking, tod
 from mcsim.simulation.channels import effects_on, refuse_pixel_effects, scan_model, site_b_of, site_of
 from mcsim.simulation.rings import Rings, limit_rings, parallel_transport_rings
@@ -232,7 +232,7 @@ def _channel_on_rings(run: config.RunConfig, spec: config.Channel, site: Site, a
         case config.ScanParallelTransport():
             grid = parallel_transport_rings(np.deg2rad(spec.scan.psi0_deg), orders, degree)
         case config.ScanHitAveraged():
-            grid = limit_rings(scan_model(spec, spec.scan, None), orders, degree, spec.scan.line_of_sight)
+            grid = limit_rings(scan_model(spec, spec.scan, None), orders, degree)
         case _:
             raise TypeError("the configuration refuses other scans on rings")
     unknown = scan.Moments(1, run.map.frame, np.full(12, np.nan), np.full((max(beam.mmax, 1), 12), np.nan + 0j))
@@ -313,11 +313,7 @@ def _moments(
             return scan.Moments.from_pointing_files([path], nside, smax, frame)
         case config.ScanHitAveraged():
             model = scan_model(spec, spec.scan, split)
-            lines = None if spec.scan.line_of_sight is None else [spec.scan.line_of_sight]
-            folder = scan.cached_moments(
-                model, nside, smax, frame, lines, grid.time_range, nthreads=nthreads, progress=progress
-            )
-            return scan.Moments.load(folder, mmap=True)
+            return scan.Moments.load(scan.cached_moments(model, grid, smax, nthreads, progress))
         case config.ScanMoments() | config.ScanDifferencing():
             raise TypeError("the caller reads files of moments, and a differencing scan has no moments")
 

@@ -7,7 +7,7 @@ from numba import njit
 from scipy.spatial.transform import Rotation
 
 from mcsim.errors import InputError
-from mcsim.instrument.scan.geometry import frame_matrix
+from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
 from mcsim.instrument.scan.pointing import pointing, quarter_turns, ring_pixel
 from mcsim.sphere.checks import check_nside, nside_of
@@ -128,7 +128,7 @@ def test_longitude_is_arctangent_to_rounding():
 
 def test_frames_and_resolutions_are_checked():
     with pytest.raises(InputError, match="frame is 'lunar'"):
-        frame_matrix("lunar")
+        MapGrid(16, "lunar")
     for nside in (0, 3, -4, 16384):
         with pytest.raises(InputError, match=f"nside is {nside}"):
             check_nside(nside)

@@ -2,41 +2,22 @@
 
 import math
 import tomllib
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from mcsim.errors import InputError
-from mcsim.instrument.scan.model import SECONDS_PER_DAY, ScanModel, model_from_table
+from mcsim.instrument.scan.model import SECONDS_PER_DAY, ScanModel, model_from_table, number
 from mcsim.sphere.checks import check_angle
 
-_COPIED = (
-    "spin_period_s",
-    "precession_period_s",
-    "precession_angle_deg",
-    "orbit_period_s",
-    "sample_period_s",
-)
+_COPIED = ("spin_period_s", "precession_period_s", "precession_angle_deg", "orbit_period_s", "sample_period_s")
 
 
-@dataclass(frozen=True)
-class Described:
-    """A survey's pointing and the amplitude of the dipole that it saw, in uK; None where nothing is said of it."""
+def read_described(path: str | Path) -> tuple[ScanModel, float | None]:
+    """Return how a survey was pointed, and the amplitude of the dipole that it saw, uK; None if nothing is said of it.
 
-    model: ScanModel
-    dipole_uk: float | None = None
-
-
-def read_described(path: str | Path) -> Described:
-    """Read how a survey was pointed.
-
-    Parameters
-    ----------
-    path
-        A scan model (:meth:`mcsim.instrument.scan.ScanModel.load`), or a survey's short description: a TOML file with
-        the periods and angles of a scan model, one ``boresight_angle_deg``, the number of ``samples``, the azimuth of
-        every channel about the spin axis in a table ``spin_azimuth_rad``, and optionally ``dipole_uk``. Its lines of
-        sight bear the names of the channels.
+    The file is a scan model (:meth:`mcsim.instrument.scan.ScanModel.load`), or a survey's short description: TOML with
+    the periods and angles of a scan model, one ``boresight_angle_deg``, the number of ``samples``, the azimuth of every
+    channel about the spin axis in a table ``spin_azimuth_rad``, and optionally ``dipole_uk``. Its lines of sight bear
+    the names of the channels.
 
     Raises
     ------
@@ -49,41 +30,19 @@ def read_described(path: str | Path) -> Described:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
         raise InputError(f"{path} is not a readable TOML file ({error}); give a scan model.") from None
     if "spin_azimuth_rad" not in table:
-        return Described(ScanModel.load(path))
+        return ScanModel.load(path), None
     azimuths = table["spin_azimuth_rad"]
-    wanted = {key: _number(table, key, path) for key in (*_COPIED, "boresight_angle_deg", "samples")}
     if not isinstance(azimuths, dict) or not azimuths:
         raise InputError(f"{path}: spin_azimuth_rad is {azimuths!r}; give a table, channel = radians.")
-    lines = [
-        {
-            "name": name,
-            "boresight_angle_deg": wanted["boresight_angle_deg"],
-            "azimuth_deg": math.degrees(_azimuth(azimuths, name, path)),
-        }
-        for name in azimuths
-    ]
-    model = model_from_table(
-        {
-            "schema": 1,
-            "name": path.stem,
-            **{key: wanted[key] for key in _COPIED},
-            "duration_days": wanted["samples"] * wanted["sample_period_s"] / SECONDS_PER_DAY,
-            "line_of_sight": lines,
-        },
-        str(path),
-    )
-    dipole = _number(table, "dipole_uk", path) if "dipole_uk" in table else None
-    return Described(model, dipole)
-
-
-def _azimuth(table: dict[str, Any], name: str, path: Path) -> float:
-    azimuth = _number(table, name, path)
-    check_angle(azimuth, f"{path}: spin_azimuth_rad of {name}")
-    return azimuth
-
-
-def _number(table: dict[str, Any], key: str, path: Path) -> float:
-    value = table.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{path}: {key} is {value!r}, but it must be a finite number.")
-    return float(value)
+    where = str(path)
+    boresight = number(table, "boresight_angle_deg", where)
+    lines = []
+    for name in azimuths:
+        azimuth = number(azimuths, name, where)
+        check_angle(azimuth, f"{where}: spin_azimuth_rad of {name}")
+        lines.append({"name": name, "boresight_angle_deg": boresight, "azimuth_deg": math.degrees(azimuth)})
+    copied = {key: number(table, key, where) for key in _COPIED}
+    days = number(table, "samples", where) * copied["sample_period_s"] / SECONDS_PER_DAY
+    model = {"schema": 1, "name": path.stem, **copied, "duration_days": days, "line_of_sight": lines}
+    dipole = number(table, "dipole_uk", where) if "dipole_uk" in table else None
+    return model_from_table(model, where), dipole

@@ -9,6 +9,7 @@ import healpy
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import eval_jacobi
+from scipy.stats import binned_statistic
 
 from mcsim.errors import InputError
 from mcsim.instrument.scan.limit import limit_moments, limit_quadrature
@@ -49,64 +50,30 @@ def sky_means(moments: Moments) -> NDArray[np.complex128]:
 def latitude_means(
     moments: Moments, edges_deg: Sequence[float] = LATITUDE_EDGES_DEG
 ) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
-    """Return hits and moments averaged over bins of |latitude|.
+    """Return hits over their mean over the sky, shape (n,), and moments, shape (smax, n), in bins of |latitude|.
 
-    Parameters
-    ----------
-    moments
-        Of any frame; the latitude is that of its frame.
-    edges_deg
-        Increasing edges of the bins in degrees, n + 1 of them.
-
-    Returns
-    -------
-    hits : ndarray, shape (n,)
-        Mean hits of all pixels, over their mean over the sky.
-    w : ndarray, shape (smax, n)
-        Mean w_s of the observed pixels; nan where a bin has none.
+    The latitude is that of the moments' frame, the edges are n + 1 in degrees. Unobserved pixels count for the hits
+    alone; w is nan where a bin has no other.
     """
     seen = _seen(moments)
-    theta = healpy.pix2ang(moments.nside, np.arange(moments.npix))[0]
-    which = np.digitize(np.abs(90.0 - np.degrees(theta)), edges_deg) - 1
-    # A pixel centre at the last edge, the pole, belongs to the last bin.
-    which[np.abs(90.0 - np.degrees(theta)) == edges_deg[-1]] = len(edges_deg) - 2
-    inside = (which >= 0) & (which < len(edges_deg) - 1)
-    size = len(edges_deg) - 1
-    with np.errstate(invalid="ignore", divide="ignore"):
-        counts = np.bincount(which[inside], minlength=size)
-        hits = np.bincount(which[inside], weights=moments.hits[inside], minlength=size) / counts
-        chosen = inside & seen
-        counts = np.bincount(which[chosen], minlength=size)
-        w = np.array(
-            [
-                (
-                    np.bincount(which[chosen], weights=w[chosen].real, minlength=size)
-                    + 1j * np.bincount(which[chosen], weights=w[chosen].imag, minlength=size)
-                )
-                / counts
-                for w in moments.w
-            ]
-        )
+    latitude = np.abs(90.0 - np.degrees(healpy.pix2ang(moments.nside, np.arange(moments.npix))[0]))
+    hits = binned_statistic(latitude, moments.hits, bins=edges_deg).statistic
+    w = binned_statistic(latitude[seen], moments.w[:, seen], bins=edges_deg).statistic
     return hits / moments.hits.mean(), w
 
 
 def ring_means(
     moments: Moments,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.complex128]]:
-    """Return the HEALPix rings' colatitudes, mean hits over those of the sky, and mean w_s of observed pixels.
+    """Return colatitudes of the HEALPix rings, their mean hits over those of the sky, and mean w_s of observed pixels.
 
-    Returns
-    -------
-    theta : ndarray, shape (4 nside - 1,)
-        In radians, from north to south.
-    hits : ndarray, shape (4 nside - 1,)
-    w : ndarray, shape (smax, 4 nside - 1)
-        0 in rings that were not observed.
+    From north to south: theta in radians and hits, shape (4 nside - 1,); w, shape (smax, 4 nside - 1), 0 in rings that
+    were not observed.
     """
     nside = moments.nside
     ring = np.arange(1, 4 * nside)
     size = 4 * np.minimum(np.minimum(ring, nside), 4 * nside - ring)
-    first = np.concatenate([[0], np.cumsum(size)[:-1]])
+    first = np.cumsum(size) - size
     theta = healpy.pix2ang(nside, first)[0]
     seen = np.asarray(moments.hits > 0.0, dtype=np.float64)
     observed = np.maximum(np.add.reduceat(seen, first), 1.0)
@@ -115,14 +82,9 @@ def ring_means(
 
 
 def scan_factors(moments: Moments, ell: Sequence[int] = ELLS) -> ScanFactors:
-    """Return the three factors of a survey's moments (smax >= 2); those of L = 2, M = 0 are meant for ecliptic maps.
+    """Return the three factors of a survey's moments (smax >= 2), f_l at the multipoles ``ell`` (>= 2).
 
-    Parameters
-    ----------
-    moments
-        With smax >= 2. Pixels that were not observed are left out of the means.
-    ell
-        Multipoles (>= 2) of f_l.
+    Those of L = 2, M = 0 are meant for ecliptic maps. Pixels that were not observed are left out.
 
     Notes
     -----
@@ -148,13 +110,13 @@ def scan_factors(moments: Moments, ell: Sequence[int] = ELLS) -> ScanFactors:
     )
 
 
-def limit_factors(model: ScanModel, ell: Sequence[int] = ELLS, line_of_sight: str | None = None) -> ScanFactors:
+def limit_factors(model: ScanModel, ell: Sequence[int] = ELLS) -> ScanFactors:
     """Return the three factors in the exact long-time limit; where nothing is observed w_2 counts as 0."""
-    theta, weights = limit_quadrature(model, line_of_sight)
-    w2 = limit_moments(model, theta, 2, line_of_sight)[1][1].real
+    theta, weights = limit_quadrature(model)
+    w2 = limit_moments(model, theta, 2)[1][1].real
 
     def at(z: NDArray[np.float64]) -> NDArray[np.float64]:
-        return limit_moments(model, np.arccos(z), 2, line_of_sight)[1][1].real
+        return limit_moments(model, np.arccos(z), 2)[1][1].real
 
     return ScanFactors(
         quadrupole_ratio=float(np.sum(weights * w2 * np.sin(theta) ** 2) / (4.0 / 3.0)),

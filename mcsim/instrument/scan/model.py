@@ -203,6 +203,7 @@ def _toml(value: str | float | tuple[str, ...]) -> str:
 _TABLES = {"schema", "line_of_sight", "lines_of_sight", "default_lines", "pairs", "source"}
 _TEXT = {"name", "description"}
 _NUMBERS = {f.name for f in fields(ScanModel)} - _TEXT - _TABLES
+_POSITIVE = {"spin_period_s", "orbit_period_s", "sample_period_s", "duration_days"}
 _OPTIONAL = {"spin_phase_deg", "precession_phase_deg", "orbit_phase_deg"}
 _LINE_NUMBERS = {"boresight_angle_deg", "azimuth_deg", "sample_period_s"}
 
@@ -215,7 +216,7 @@ def model_from_table(table: dict[str, Any], where: str) -> ScanModel:
         raise InputError(f"{where}: schema is {table.get('schema')!r}, but this version reads schema = 1.")
     if not isinstance(table.get("name"), str) or not table["name"]:
         raise InputError(f"{where}: key 'name' is missing; give the survey a name.")
-    numbers = {key: _number(table, key, where) for key in _NUMBERS if key in table or key not in _OPTIONAL}
+    numbers = {key: number(table, key, where) for key in _NUMBERS if key in table or key not in _OPTIONAL}
     lines = _lines(table.get("line_of_sight"), where)
     names = tuple(line.name for line in lines)
     default_lines = _group(table.get("default_lines", list(names)), names, "default_lines", where)
@@ -257,13 +258,13 @@ def _subtable(table: dict[str, Any], key: str, where: str) -> dict[str, Any]:
 def _group(value: Any, names: tuple[str, ...], label: str, where: str) -> tuple[str, ...]:
     if not isinstance(value, list) or not value:
         raise InputError(f"{where}: {label} is {value!r}, but it must be a list of names of lines of sight.")
-    for name in value:
-        if name not in names:
-            raise InputError(f"{where}: {label} names {name!r}, but the lines of sight are {', '.join(names)}.")
+    if unknown := [name for name in value if name not in names]:
+        raise InputError(f"{where}: {label} names {unknown[0]!r}, but the lines of sight are {', '.join(names)}.")
     return tuple(value)
 
 
-def _number(table: dict[str, Any], key: str, where: str) -> float:
+def number(table: dict[str, Any], key: str, where: str) -> float:
+    """Return the finite number of a key of a table; InputError, with ``where`` it stands, if there is none."""
     if key not in table:
         raise InputError(f"{where}: key {key!r} is missing; give a number.")
     value = table[key]
@@ -282,7 +283,7 @@ def _lines(tables: Any, where: str) -> tuple[LineOfSight, ...]:
         if not isinstance(name, str) or not name:
             raise InputError(f"{where}: a [[line_of_sight]] has no name; give it one.")
         inside = f"{where}, line of sight {name!r}"
-        numbers = {key: _number(table, key, inside) for key in _LINE_NUMBERS if key in table}
+        numbers = {key: number(table, key, inside) for key in _LINE_NUMBERS if key in table}
         if "boresight_angle_deg" not in numbers:
             raise InputError(f"{inside}: key 'boresight_angle_deg' is missing; give a number.")
         lines.append(LineOfSight(name=name, source=str(table.get("source", "")), **numbers))
@@ -299,8 +300,7 @@ def _check(model: ScanModel) -> None:
     for key in _NUMBERS:
         if not math.isfinite(getattr(model, key)):
             raise InputError(f"{where}: {key} is {getattr(model, key)}, but it must be a finite number.")
-    for key in ("spin_period_s", "orbit_period_s", "sample_period_s", "duration_days"):
-        if not getattr(model, key) > 0.0:
+        if key in _POSITIVE and not getattr(model, key) > 0.0:
             raise InputError(f"{where}: {key} is {getattr(model, key):g}, but it must be > 0.")
     if model.orbit_period_s < SECONDS_PER_DAY:
         raise InputError(
