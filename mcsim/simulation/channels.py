@@ -175,6 +175,6 @@ def _described(spec: config.Channel) -> tuple[systematics.Pointing | None, float
             return systematics.Pointing(model, model.line_of_sight(name)), dipole_uk
         case config.ScanHitAveraged():
             model = scan_model(spec, spec.scan, None)
-            lines = model.select(None)
+            lines = model.select()
             return (systematics.Pointing(model, lines[0]) if len(lines) == 1 else None), None
     return None, None

@@ -75,7 +75,7 @@ def limit_rings(model: ScanModel, orders: Iterable[int], degree: int) -> tuple[R
     1e-5 of what the beam adds, 1e-11 for parallel transport (tests/unit/test_rings.py).
     """
     orders = tuple(orders)
-    if len({line.boresight_angle_deg for line in model.select(None)}) > 1:
+    if len({line.boresight_angle_deg for line in model.select()}) > 1:
         raise InputError(
             f"scan model {model.name!r} has the lines of sight {', '.join(model.default_lines)} at different angles, "
             'but a grid of rings takes one; choose it with scan.line_of_sight, or set map.grid = "healpix".'

@@ -37,7 +37,7 @@ def stream_sums(
     """
     check_whole(smax, "smax", 1)
     tasks = []
-    for line in model.select(None):
+    for line in model.select():
         first, last = grid.sample_range(model, line)
         edges = [first + (last - first) * part // _RANGES for part in range(_RANGES + 1)]
         stream = PointingStream(model, line, grid.frame)

@@ -18,7 +18,7 @@ def scan_key(model: ScanModel, grid: MapGrid, smax: int = 0) -> str:
 
     Names and citations are left out. ``smax``: largest s of what is computed from them.
     """
-    lines = model.select(None)
+    lines = model.select()
     everything = {
         "code": package_digest(["mcsim.instrument.scan"], ["healpy", "numpy"]),
         "spin": [model.spin_period_s, model.spin_phase_deg],

@@ -24,7 +24,7 @@ ELLS = (50, 100, 200, 400)
 class ScanFactors:
     """Three answers to how much of the parallel-transport effect of m = 2 a scan leaves.
 
-    Parameters
+    Attributes
     ----------
     quadrupole_ratio
         L = 2, M = 0 BipoSH of the hit average over that of parallel transport with psi = 0, at every l (leading

@@ -21,16 +21,9 @@ _TINY = 1e-18
 def limit_moments(
     model: ScanModel, theta: NDArray[np.float64], smax: int
 ) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
-    """Return the hits and orientation moments after infinite time, as functions of ecliptic colatitude.
+    """Return hits and orientation moments of a model's first default line of sight after infinite time.
 
-    Parameters
-    ----------
-    model
-        The survey, whose first default line of sight is meant.
-    theta
-        Ecliptic colatitudes in radians, shape (n,).
-    smax
-        Largest s (>= 1).
+    ``theta`` are ecliptic colatitudes in radians, shape (n,).
 
     Returns
     -------
@@ -133,7 +126,7 @@ def _line(model: ScanModel) -> LineOfSight:
             f"scan model {model.name!r} precesses {model.orbit_period_s / abs(model.precession_period_s):.3g} times an "
             f"orbit, but the long-time limit needs more than {_FAST_PRECESSION:g}; stream its moments instead."
         )
-    return model.select(None)[0]
+    return model.select()[0]
 
 
 def _elliptic_nodes(roots: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
