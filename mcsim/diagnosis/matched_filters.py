@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from mcsim import systematics
 from mcsim.diagnosis.wiener_filter import FilteredMaps, Model, by_degree
-from mcsim.instrument.scan import MapGrid
-from mcsim.instrument.scan.cache import scan_key
+from mcsim.instrument.scan import MapGrid, scan_key
 from mcsim.simulation.survey import mean_gain
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm

@@ -7,11 +7,10 @@ from astropy.io import fits
 
 from mcsim.errors import InputError
 from mcsim.instrument.scan.accumulate import stream_sums
-from mcsim.instrument.scan.cache import cached_moments, scan_key
 from mcsim.instrument.scan.files import read_moments, write_moments_fits
 from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
-from mcsim.instrument.scan.moments import Moments
+from mcsim.instrument.scan.moments import Moments, cached_moments, scan_key
 from mcsim.instrument.scan.pointing import pointing
 from mcsim.support.folders import default_cache_dir
 

@@ -1,12 +1,11 @@
 """Scan models, pointing, orientation moments of the beam, and their exact long-time limit."""
 
-from mcsim.instrument.scan.cache import cached_moments
 from mcsim.instrument.scan.factors import limit_factors, scan_factors, summary
 from mcsim.instrument.scan.files import read_moments, write_moments_fits
 from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.limit import limit_moments
 from mcsim.instrument.scan.model import LineOfSight, ScanModel, read_described
-from mcsim.instrument.scan.moments import Moments
+from mcsim.instrument.scan.moments import Moments, cached_moments, scan_key
 
 __all__ = [
     "LineOfSight",
@@ -19,6 +18,7 @@ __all__ = [
     "read_described",
     "read_moments",
     "scan_factors",
+    "scan_key",
     "summary",
     "write_moments_fits",
 ]

@@ -223,7 +223,7 @@ def _toml(value: str | float | tuple[str, ...]) -> str:
 
 _TABLES = {"schema", "line_of_sight", "lines_of_sight", "default_lines", "pairs", "source"}
 _TEXT = {"name", "description"}
-_NUMBERS = {f.name for f in fields(ScanModel)} - _TEXT - _TABLES
+NUMBERS = {f.name for f in fields(ScanModel)} - _TEXT - _TABLES
 _POSITIVE = {"spin_period_s", "orbit_period_s", "sample_period_s", "duration_days"}
 _DESCRIBED = ("spin_period_s", "precession_period_s", "precession_angle_deg", "orbit_period_s", "sample_period_s")
 _OPTIONAL = {"spin_phase_deg", "precession_phase_deg", "orbit_phase_deg"}
@@ -232,13 +232,13 @@ _LINE_NUMBERS = {"boresight_angle_deg", "azimuth_deg", "sample_period_s"}
 
 def _from_table(table: dict[str, Any], where: str) -> ScanModel:
     """Build a scan model from a parsed TOML table; ``where`` names it in error messages."""
-    known = _NUMBERS | _TEXT | _TABLES - {"lines_of_sight"}
+    known = NUMBERS | _TEXT | _TABLES - {"lines_of_sight"}
     _refuse_unknown(table, known, where)
     if table.get("schema") != 1:
         raise InputError(f"{where}: schema is {table.get('schema')!r}, but this version reads schema = 1.")
     if not isinstance(table.get("name"), str) or not table["name"]:
         raise InputError(f"{where}: key 'name' is missing; give the survey a name.")
-    numbers = {key: _number(table, key, where) for key in _NUMBERS if key in table or key not in _OPTIONAL}
+    numbers = {key: _number(table, key, where) for key in NUMBERS if key in table or key not in _OPTIONAL}
     lines = _lines(table.get("line_of_sight"), where)
     names = tuple(line.name for line in lines)
     default_lines = _group(table.get("default_lines", list(names)), names, "default_lines", where)
@@ -249,7 +249,7 @@ def _from_table(table: dict[str, Any], where: str) -> ScanModel:
             raise InputError(f"{where}: pairs.{key} has {len(pair)} lines of sight, but a pair needs 2.")
         pairs[key] = (pair[0], pair[1])
     source = _subtable(table, "source", where)
-    _refuse_unknown(source, _NUMBERS, f"{where}, [source]")
+    _refuse_unknown(source, NUMBERS, f"{where}, [source]")
     try:
         return ScanModel(
             name=table["name"],
@@ -316,7 +316,7 @@ def _lines(tables: Any, where: str) -> tuple[LineOfSight, ...]:
 def _check(model: ScanModel) -> None:
     """Raise InputError if the numbers of a model describe no possible survey."""
     where = f"scan model {model.name!r}"
-    for key in _NUMBERS:
+    for key in NUMBERS:
         if not math.isfinite(getattr(model, key)):
             raise InputError(f"{where}: {key} is {getattr(model, key)}, but it must be a finite number.")
         if key in _POSITIVE and not getattr(model, key) > 0.0:

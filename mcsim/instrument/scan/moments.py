@@ -1,8 +1,9 @@
 """Orientation moments of a survey: what a pixel's map value needs to know about the scan."""
 
+import hashlib
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -15,9 +16,11 @@ from mcsim.errors import InputError
 from mcsim.instrument.scan.accumulate import stream_sums
 from mcsim.instrument.scan.geometry import MapGrid, check_frame
 from mcsim.instrument.scan.limit import limit_moments
-from mcsim.instrument.scan.model import ScanModel
+from mcsim.instrument.scan.model import NUMBERS, ScanModel
 from mcsim.instrument.scan.user_pointing import blocks_of_files, checked_samples, sums_of_samples
 from mcsim.sphere.checks import check_nside, check_shape, check_whole
+from mcsim.support import folders
+from mcsim.support.code import package_digest
 
 _META = "moments.json"
 _ARRAYS = ("hits", "w", "dtheta", "dphi")
@@ -114,7 +117,7 @@ class Moments:
         0.55
         """
         survey = model if isinstance(model, ScanModel) else ScanModel.load(model)
-        return cls.from_sums(stream_sums(survey, MapGrid(nside, frame, time_range), smax, nthreads), frame)
+        return cls._from_sums(stream_sums(survey, MapGrid(nside, frame, time_range), smax, nthreads), frame)
 
     @classmethod
     def from_pointing(
@@ -153,7 +156,7 @@ class Moments:
         shapes = [array.shape for array in arrays]
         if len(set(shapes)) > 1 or arrays[0].ndim != 1 or not arrays[0].size:
             raise InputError(f"theta, phi and psi have the shapes {shapes}; give three arrays of one length, (n,).")
-        return cls.from_sums(sums_of_samples([checked_samples(arrays, "the pointing")], nside, smax), frame)
+        return cls._from_sums(sums_of_samples([checked_samples(arrays, "the pointing")], nside, smax), frame)
 
     @classmethod
     def from_pointing_files(
@@ -179,10 +182,10 @@ class Moments:
             psi beyond two turns.
         """
         check_frame(frame)
-        return cls.from_sums(sums_of_samples(blocks_of_files(paths, frame), nside, smax), frame)
+        return cls._from_sums(sums_of_samples(blocks_of_files(paths, frame), nside, smax), frame)
 
     @classmethod
-    def from_sums(cls, sums: NDArray[np.float64], frame: str) -> Self:
+    def _from_sums(cls, sums: NDArray[np.float64], frame: str) -> Self:
         """Return the moments of an accumulator of :func:`mcsim.instrument.scan.accumulate.pixel_sums`."""
         nside, smax = math.isqrt(len(sums) // 12), sums.shape[1] // 2 - 2
         hits = sums[:, 0].copy()
@@ -308,9 +311,19 @@ class Moments:
 
     @classmethod
     def load(cls, folder: str | Path, mmap: bool = True) -> Self:
-        """Read what :meth:`save` wrote; InputError if the folder does not hold complete moments.
+        """Read what :meth:`save` wrote.
 
-        ``mmap``: map the files into memory, read-only and shared by all processes that do so, instead of copying them.
+        Parameters
+        ----------
+        folder
+            The folder.
+        mmap
+            Map the files into memory, read-only and shared by all processes that do so, instead of copying them.
+
+        Raises
+        ------
+        InputError
+            If the folder does not hold complete moments.
         """
         folder = Path(folder)
         mode: Any = "r" if mmap else None
@@ -323,3 +336,40 @@ class Moments:
             raise InputError(
                 f"folder {str(folder)!r} does not hold complete moments ({error}); delete it and compute them again."
             ) from None
+
+
+def scan_key(model: ScanModel, grid: MapGrid, smax: int = 0) -> str:
+    """Return the SHA-256 of all code and all numbers that the samples of a model's default lines of sight depend on.
+
+    Names and citations are left out. ``smax``: largest s of what is computed from them.
+    """
+    lines = [[line.boresight_angle_deg, line.azimuth_deg, model.period_of_samples(line)] for line in model.select()]
+    everything = [
+        package_digest(["mcsim.instrument.scan"], ["healpy", "numpy"]),
+        {name: float(getattr(model, name)) for name in NUMBERS},
+        lines,
+        [grid.nside, grid.frame, *(float(edge) for edge in grid.time_range)],
+        smax,
+    ]
+    return hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()
+
+
+def cached_moments(
+    model: ScanModel,
+    grid: MapGrid,
+    smax: int,
+    nthreads: int = 1,
+    progress: Callable[[float], None] | None = None,
+    cache_dir: str | Path | None = None,
+) -> Path:
+    """Return the folder, for :meth:`Moments.load`, with the moments of a survey's default lines of sight.
+
+    They are streamed (:func:`mcsim.instrument.scan.accumulate.stream_sums`) if they are not in the cache yet: that of
+    ``cache_dir``, or of :func:`mcsim.support.folders.default_cache_dir`. The folder appears complete or not at all;
+    InputError if it cannot be written.
+    """
+
+    def fill(folder: Path) -> None:
+        Moments._from_sums(stream_sums(model, grid, smax, nthreads, progress), grid.frame).save(folder)
+
+    return folders.cached(f"moments-{scan_key(model, grid, smax)}", fill, cache_dir)

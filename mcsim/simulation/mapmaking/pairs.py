@@ -14,8 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
-from mcsim.instrument.scan import LineOfSight, MapGrid, ScanModel
-from mcsim.instrument.scan.cache import scan_key
+from mcsim.instrument.scan import LineOfSight, MapGrid, ScanModel, scan_key
 from mcsim.instrument.scan.pointing import PointingStream, fill_samples
 from mcsim.simulation.tod import chunks
 from mcsim.support import folders
