@@ -30,13 +30,8 @@ def maps(
 
     The maps are in uK, shape (npix,), ``healpy.UNSEEN`` where nothing was observed. The sky and what effects draw are
     those of :func:`mcsim.simulation.simulate.maps`, the noise is a draw of its own. The threads of the interpolation do
-    not change the result; its accuracy ``epsilon`` is relative to the dipole where there is one.
-
-    Raises
-    ------
-    InputError
-        For a channel without known pointing, a differencing scan, or an effect on orientation moments, which
-        samples do not have.
+    not change the result; its accuracy ``epsilon`` is relative to the dipole where there is one. InputError as of
+    :func:`check`.
 
     Notes
     -----
@@ -68,7 +63,10 @@ def maps(
 
 
 def check(channel: Channel) -> None:
-    """Raise InputError for a channel that cannot be simulated sample by sample."""
+    """Raise InputError for a channel that cannot be simulated sample by sample.
+
+    That is one without known pointing, of a differencing scan, or with an effect on orientation moments.
+    """
     if channel.side_b is not None or channel.site.pointing is None:
         raise InputError(
             f"channel {channel.name} cannot be simulated sample by sample: its scan differences two beams, or when it "

@@ -91,12 +91,7 @@ def sky_signal(
     """Return a stage that adds the sky seen by a beam at the samples' own directions and orientations.
 
     ``alm`` is in uK and of ``lmax``, up to which the beam must be known; ``epsilon``, 1e-12 to 1e-2, is the relative
-    accuracy of the interpolation. Its threads do not change the result.
-
-    Raises
-    ------
-    InputError
-        If the sky does not have the size of ``lmax``, or the beam ends below it.
+    accuracy of the interpolation. Its threads do not change the result. InputError if the sky or the beam do not fit.
 
     Notes
     -----

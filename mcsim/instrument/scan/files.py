@@ -26,13 +26,8 @@ def read_moments(
 
     The table is the first binary table of the FITS file; RE_s + i IM_s is the mean of e^{-i s psi}. ``nside``, ``smax``
     and ``frame`` are what the file must have; None: any, and all orders that follow each other from s = 1. Where a file
-    has no COORDSYS, ``frame`` is taken for it.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, is NESTED, lacks a column, has another nside or frame, negative hits,
-        non-finite numbers, or a modulus above 1.
+    has no COORDSYS, ``frame`` is taken for it. InputError if the file cannot be read, is NESTED, lacks a column, has
+    another nside or frame, negative hits, non-finite numbers, or a modulus above 1.
     """
     where = f"moments file {str(path)!r}"
     if frame is not None:

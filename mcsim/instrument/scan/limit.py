@@ -23,7 +23,8 @@ def limit_moments(
 ) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
     """Return hits and orientation moments of a model's first default line of sight after infinite time.
 
-    ``theta`` are ecliptic colatitudes in radians, shape (n,).
+    ``theta`` are ecliptic colatitudes in radians, shape (n,). InputError if the precession is not much faster than the
+    orbit.
 
     Returns
     -------
@@ -32,11 +33,6 @@ def limit_moments(
         large, on a caustic itself, where the limit is infinite.
     w : ndarray, shape (smax, n)
         w[s - 1] = mean of e^{-i s psi}; 0 where nothing is observed. Real for even s, imaginary for odd s.
-
-    Raises
-    ------
-    InputError
-        If the precession is not much faster than the orbit, or theta is no colatitude.
 
     Notes
     -----

@@ -200,7 +200,7 @@ def read_described(path: Path) -> tuple[ScanModel, float | None]:
         azimuth = _number(azimuths, name, where)
         check_angle(azimuth, f"{where}: spin_azimuth_rad of {name}")
         lines.append({"name": name, "boresight_angle_deg": boresight, "azimuth_deg": math.degrees(azimuth)})
-    copied = {key: _number(table, key, where) for key in _DESCRIBED}
+    copied = {key: _number(table, key, where) for key in NUMBERS - _OPTIONAL - {"duration_days"}}
     days = _number(table, "samples", where) * copied["sample_period_s"] / SECONDS_PER_DAY
     model = {"schema": 1, "name": path.stem, **copied, "duration_days": days, "line_of_sight": lines}
     dipole = _number(table, "dipole_uk", where) if "dipole_uk" in table else None
@@ -225,15 +225,13 @@ _TABLES = {"schema", "line_of_sight", "lines_of_sight", "default_lines", "pairs"
 _TEXT = {"name", "description"}
 NUMBERS = {f.name for f in fields(ScanModel)} - _TEXT - _TABLES
 _POSITIVE = {"spin_period_s", "orbit_period_s", "sample_period_s", "duration_days"}
-_DESCRIBED = ("spin_period_s", "precession_period_s", "precession_angle_deg", "orbit_period_s", "sample_period_s")
 _OPTIONAL = {"spin_phase_deg", "precession_phase_deg", "orbit_phase_deg"}
 _LINE_NUMBERS = {"boresight_angle_deg", "azimuth_deg", "sample_period_s"}
 
 
 def _from_table(table: dict[str, Any], where: str) -> ScanModel:
     """Build a scan model from a parsed TOML table; ``where`` names it in error messages."""
-    known = NUMBERS | _TEXT | _TABLES - {"lines_of_sight"}
-    _refuse_unknown(table, known, where)
+    _refuse_unknown(table, NUMBERS | _TEXT | _TABLES - {"lines_of_sight"}, where)
     if table.get("schema") != 1:
         raise InputError(f"{where}: schema is {table.get('schema')!r}, but this version reads schema = 1.")
     if not isinstance(table.get("name"), str) or not table["name"]:
@@ -265,8 +263,7 @@ def _from_table(table: dict[str, Any], where: str) -> ScanModel:
 
 
 def _refuse_unknown(table: dict[str, Any], known: set[str], where: str) -> None:
-    unknown = sorted(set(table) - known)
-    if unknown:
+    if unknown := sorted(set(table) - known):
         raise InputError(f"{where}: unknown key {unknown[0]!r}; the keys are {', '.join(sorted(known))}.")
 
 

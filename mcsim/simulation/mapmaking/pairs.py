@@ -79,13 +79,8 @@ def prepare(
 
     ``pair`` names one of the model's differencing pairs (assemblies), ``cache_dir`` the folder to keep them in (None:
     :func:`mcsim.support.folders.default_cache_dir`); ``progress`` takes the fraction done. The result does not depend
-    on the threads, bit for bit.
-
-    Raises
-    ------
-    InputError
-        If the pair is unknown or its sides are sampled at different rates, the time range contains no sample, or the
-        cache cannot be written.
+    on the threads, bit for bit. InputError if the pair is unknown, its sides are sampled at different rates, the time
+    range contains no sample, or the cache cannot be written.
 
     Notes
     -----
