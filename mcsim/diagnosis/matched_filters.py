@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from mcsim import systematics
 from mcsim.diagnosis.wiener_filter import FilteredMaps, Model, by_degree
-from mcsim.instrument.scan.cache import moments_key
-from mcsim.simulation import tod
+from mcsim.instrument.scan import MapGrid, scan_key
 from mcsim.simulation.survey import mean_gain
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
@@ -117,9 +116,10 @@ def gain_of(effect: Effect, site: systematics.Site, share: tuple[float, float]) 
     in these.
     """
     pointing = site.pointed(effect.name)
-    where = moments_key(pointing.model, site.nside, 0, site.frame, [pointing.line.name], share)
+    grid = MapGrid(site.nside, site.frame, share)
+    where = scan_key(pointing.model.with_lines_of_sight(pointing.line.name), grid)
     period = pointing.model.period_of_samples(pointing.line)
-    times = period * np.linspace(*tod.sample_range(pointing.model, pointing.line, share), _TIMES)
+    times = period * np.linspace(*grid.sample_range(pointing.model, pointing.line), _TIMES)
     code = class_digest(type(effect)) + package_digest(["mcsim.systematics", "mcsim.simulation"])
     text = f"{effect!r} {pointing.line!r} {code}".encode()
     what = hashlib.sha256(text + np.asarray(effect.gain(times, site)).tobytes()).hexdigest()

@@ -89,7 +89,7 @@ def _moments(nside: int) -> str:
     part = (0.0, 0.05)
     scan.Moments.from_model(model, nside, 2, time_range=(0.0, 1e-5), nthreads=threads)
     seconds = _seconds(scan.Moments.from_model, model, nside, 2, time_range=part, nthreads=threads)
-    samples = part[1] * sum(model.samples(line) for line in model.select(None))
+    samples = part[1] * sum(model.samples(line) for line in model.select())
     return f"  orientation moments, s <= 2: {samples / seconds / 1e6:.1f} million samples/s on {threads} threads"
 
 

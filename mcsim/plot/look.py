@@ -97,9 +97,10 @@ def look_at_scan(
     loaded = scan.ScanModel.load(model)
     if sample_period_s is not None:
         loaded = loaded.with_sampling(sample_period_s)
-    lines = None if line_of_sight is None else [line_of_sight]
+    if line_of_sight is not None:
+        loaded = loaded.with_lines_of_sight(line_of_sight)
     with reporting("orientation moments", 1.0, "", quiet=False) as report:
-        folder = scan.cached_moments(loaded, nside, smax, frame, lines, nthreads=os.cpu_count() or 1, progress=report)
+        folder = scan.cached_moments(loaded, scan.MapGrid(nside, frame), smax, os.cpu_count() or 1, report)
     moments = scan.Moments.load(folder)
-    alone = loaded if frame == "ecliptic" and lines is None and len(loaded.default_lines) == 1 else None
+    alone = loaded if frame == "ecliptic" and line_of_sight is None and len(loaded.default_lines) == 1 else None
     return Look(loaded.name, scan.summary(loaded.name, moments), scan_figure(moments, loaded.name, alone))

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mcsim.instrument.scan import Moments, ScanModel, cached_moments
+from mcsim.instrument.scan import MapGrid, Moments, ScanModel, cached_moments
 from mcsim.systematics.base import Effect, Site, Wording
 
 
@@ -42,11 +42,10 @@ class OrientationAveraging(Effect):
         if self.amplitude == 0.0:
             return moments
         if self.model:
-            real, lines, part = ScanModel.load(self.model), None, (0.0, 1.0)
+            real, part = ScanModel.load(self.model), (0.0, 1.0)
         else:
             pointed = site.pointed(self.name)
-            real, lines, part = pointed.model, (pointed.line.name,), pointed.time_range
-        folder = cached_moments(real, moments.nside, moments.smax, moments.frame, lines, part)
-        other = Moments.load(folder)
+            real, part = pointed.model.with_lines_of_sight(pointed.line.name), pointed.time_range
+        other = Moments.load(cached_moments(real, MapGrid(moments.nside, moments.frame, part), moments.smax))
         mixed = (1.0 - self.amplitude) * moments.w + self.amplitude * other.w
         return replace(moments, w=np.where(other.hits > 0.0, mixed, moments.w))

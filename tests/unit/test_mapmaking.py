@@ -52,7 +52,7 @@ def beams() -> tuple[Beam, Beam]:
 
 def pointing_matrix(scan: mapmaking.DifferencingScan, x: float) -> np.ndarray:
     """P, dense, from the pointing of the model and healpy's pixels."""
-    first, last = tod.sample_range(MODEL, SIDES[0], scan.grid.time_range)
+    first, last = scan.grid.sample_range(MODEL, SIDES[0])
     matrix = np.zeros((last - first, scan.npix))
     for line, weight in zip((scan.side_a, scan.side_b), (1.0 + x, x - 1.0), strict=True):
         theta, phi, _ = pointing(MODEL, line, first, last - first, scan.grid.frame)
@@ -204,17 +204,17 @@ def test_right_hand_side_is_the_sum_over_samples(scan, sky, beams):
     np.testing.assert_allclose(found[0], expected, atol=1e-9 * np.abs(expected).max())
 
 
-def test_maps_of_sides_are_the_time_ordered_reference_at_pixel_centres(scan, sky, beams, monkeypatch):
+def test_maps_of_sides_are_the_time_ordered_reference_at_pixel_centres(scan, sky, beams, rhs_from_samples, monkeypatch):
     monkeypatch.setattr(tod, "CHUNK", 3000)
     sides = tuple(mapmaking.side_maps(sky, convolve.response(beam, LMAX), NSIDE) for beam in beams)
     imbalance = mapmaking.Imbalance(0.04, 0.01)
     fast = mapmaking.rhs_from_maps(scan, [sides], imbalance, noise(3.0, 5))[0]
-    slow = mapmaking.rhs_from_samples(scan, signals(sky, beams), imbalance, noise(3.0, 5), at_pixel_centres=True)
+    slow = rhs_from_samples(scan, signals(sky, beams), imbalance, noise(3.0, 5), at_pixel_centres=True)
     np.testing.assert_allclose(fast, slow, atol=1e-9 * np.abs(slow).max())
 
 
 @pytest.mark.parametrize("side", [0, 1])
-def test_stages_belong_to_their_side(side, scan, sky, beams):
+def test_stages_belong_to_their_side(side, scan, sky, beams, rhs_from_samples):
     """A gain of 1.5 on one side is a beam 1.5 times as strong there."""
 
     def louder(stream):
@@ -223,9 +223,9 @@ def test_stages_belong_to_their_side(side, scan, sky, beams):
 
     stages = signals(sky, beams)
     stages[side].append(louder)
-    found = mapmaking.rhs_from_samples(scan, stages)
+    found = rhs_from_samples(scan, stages)
     scaled = tuple(Beam((1.5 if k == side else 1.0) * beam.blm) for k, beam in enumerate(beams))
-    expected = mapmaking.rhs_from_samples(scan, signals(sky, scaled))
+    expected = rhs_from_samples(scan, signals(sky, scaled))
     np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
 
 

@@ -8,7 +8,7 @@ import pytest
 from mcsim import config
 from mcsim.ensemble.prediction import predict
 from mcsim.instrument import scan
-from mcsim.instrument.scan.limit import limit_harmonics, limit_moments, limit_quadrature
+from mcsim.instrument.scan.limit import limit_moments, limit_quadrature
 from mcsim.simulation import channels, convolve, rings, simulate
 from mcsim.simulation import survey as survey_
 from mcsim.sphere import alm as alm_
@@ -148,11 +148,13 @@ def test_prediction_has_the_limit():
     predicted = predict(run())
     shared = survey_.survey(run())
     (grid,) = shared.channels[0].rings
-    w20 = limit_harmonics(WMAP, 2, 2)[1, 2]
+    scale = np.sqrt(15.0 / (32.0 * np.pi))
+    theta, weights = limit_quadrature(WMAP)
+    # w_{2,20} of w_2 = sum_L w_{2,L0} (-2)Y_L0, where (-2)Y_20 = sqrt(15/32 pi) sin^2(theta).
+    w20 = 2.0 * np.pi * scale * np.sum(weights * limit_moments(WMAP, theta, 2)[1][1] * np.sin(theta) ** 2)
     transported = predict(run(channel=[channel({"kind": "parallel_transport"})]))
     from_rings = 2.0 * np.pi * np.sum(grid.phase.real * grid.weight * np.sin(grid.theta) ** 2) / (2.0 * np.pi)
     ratio = (predicted / transported)["biposh_difference_mean"].sel(mode="L2M0d0")[0, 10].item()
-    scale = np.sqrt(15.0 / (32.0 * np.pi))
     assert np.isclose(scale * from_rings, w20.real, rtol=1e-10)
     assert np.isclose(ratio.real, scan.limit_factors(WMAP, [2]).quadrupole_ratio, rtol=1e-8)
     assert predicted.attrs["left_out"] == "nothing"

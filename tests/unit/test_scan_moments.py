@@ -7,10 +7,10 @@ from astropy.io import fits
 
 from mcsim.errors import InputError
 from mcsim.instrument.scan.accumulate import stream_sums
-from mcsim.instrument.scan.cache import cached_moments, moments_key
+from mcsim.instrument.scan.files import read_moments, write_moments_fits
 from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
-from mcsim.instrument.scan.moments import Moments, read_moments_fits, write_moments_fits
+from mcsim.instrument.scan.moments import Moments, cached_moments, scan_key
 from mcsim.instrument.scan.pointing import pointing
 from mcsim.support.folders import default_cache_dir
 from refusals import refused
@@ -134,9 +134,9 @@ def test_save_and_load(tmp_path, mmap):
 def test_cache_computes_once_and_leaves_nothing_behind(tmp_path, monkeypatch):
     monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / "cache"))
     assert default_cache_dir() == tmp_path / "cache"
-    folder = cached_moments(MODEL, NSIDE, 2)
+    folder = cached_moments(MODEL, MapGrid(NSIDE), 2)
     stamp = (folder / "w.npy").stat().st_mtime_ns
-    assert cached_moments(MODEL, NSIDE, 2, nthreads=2) == folder
+    assert cached_moments(MODEL, MapGrid(NSIDE), 2, nthreads=2) == folder
     assert (folder / "w.npy").stat().st_mtime_ns == stamp
     assert [entry.name for entry in (tmp_path / "cache").iterdir()] == [folder.name]
     np.testing.assert_array_equal(Moments.load(folder).hits, Moments.from_model(MODEL, NSIDE, 2).hits)
@@ -147,26 +147,27 @@ def test_interrupted_computation_leaves_the_cache_empty(tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        cached_moments(MODEL, NSIDE, 2, progress=interrupt, cache_dir=tmp_path)
+        cached_moments(MODEL, MapGrid(NSIDE), 2, progress=interrupt, cache_dir=tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_cache_folder_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("")
     with refused("MCSIM_CACHE"):
-        cached_moments(MODEL, NSIDE, 2, cache_dir=tmp_path / "file")
+        cached_moments(MODEL, MapGrid(NSIDE), 2, cache_dir=tmp_path / "file")
 
 
 def test_key_depends_on_every_number_and_on_nothing_else():
-    base = moments_key(MODEL, NSIDE, 2, "ecliptic")
-    assert moments_key(replace(MODEL, name="other", source={"spin_period_s": "x"}), NSIDE, 2, "ecliptic") == base
-    assert moments_key(MODEL, NSIDE, 2, "ecliptic", ["A"]) == base
+    grid = MapGrid(NSIDE)
+    base = scan_key(MODEL, grid, 2)
+    assert scan_key(replace(MODEL, name="other", source={"spin_period_s": "x"}), grid, 2) == base
+    assert scan_key(MODEL.with_lines_of_sight("A"), grid, 2) == base
     changed = [
-        moments_key(MODEL, 32, 2, "ecliptic"),
-        moments_key(MODEL, NSIDE, 3, "ecliptic"),
-        moments_key(MODEL, NSIDE, 2, "galactic"),
-        moments_key(MODEL, NSIDE, 2, "ecliptic", ["B"]),
-        moments_key(MODEL, NSIDE, 2, "ecliptic", None, (0.0, 0.5)),
+        scan_key(MODEL, replace(grid, nside=32), 2),
+        scan_key(MODEL, grid, 3),
+        scan_key(MODEL, replace(grid, frame="galactic"), 2),
+        scan_key(MODEL.with_lines_of_sight("B"), grid, 2),
+        scan_key(MODEL, replace(grid, time_range=(0.0, 0.5)), 2),
     ]
     for name in [
         "spin_period_s",
@@ -179,7 +180,7 @@ def test_key_depends_on_every_number_and_on_nothing_else():
         "precession_phase_deg",
         "orbit_phase_deg",
     ]:
-        changed.append(moments_key(replace(MODEL, **{name: getattr(MODEL, name) + 1.0}), NSIDE, 2, "ecliptic"))
+        changed.append(scan_key(replace(MODEL, **{name: getattr(MODEL, name) + 1.0}), grid, 2))
     assert len({base, *changed}) == len(changed) + 1
 
 
@@ -187,11 +188,11 @@ def test_fits_round_trip(tmp_path):
     moments = Moments.from_model(MODEL, NSIDE, SMAX, "galactic")
     path = tmp_path / "moments.fits"
     write_moments_fits(path, moments)
-    back = read_moments_fits(path, NSIDE, SMAX, "galactic")
+    back = read_moments(path, NSIDE, SMAX, "galactic")
     assert (back.nside, back.frame, back.smax) == (NSIDE, "galactic", SMAX)
     for name in ("hits", "w", "dtheta", "dphi"):
         np.testing.assert_array_equal(getattr(back, name), getattr(moments, name))
-    assert read_moments_fits(path, smax=2).smax == 2
+    assert read_moments(path, smax=2).smax == 2
 
 
 def test_fits_as_healpy_writes_it(tmp_path):
@@ -203,7 +204,7 @@ def test_fits_as_healpy_writes_it(tmp_path):
     healpy.write_map(
         path, [hits, w.real, w.imag], coord="E", column_names=["HITS", "RE_1", "IM_1"], dtype=np.float32, overwrite=True
     )
-    back = read_moments_fits(path)
+    back = read_moments(path)
     assert back.frame == "ecliptic"
     assert back.dtheta is None
     np.testing.assert_array_equal(back.hits, hits)
@@ -270,23 +271,23 @@ def test_bad_fits_files_say_what_is_wrong(tmp_path, change, arguments, named):
     write_moments_fits(path, Moments(NSIDE, "ecliptic", fill * 10, np.full((2, npix), 0.1 + 0.1j), fill, fill))
     damaged(path, change)
     with refused(*named):
-        read_moments_fits(path, **arguments)
+        read_moments(path, **arguments)
 
 
 def test_missing_and_truncated_fits_files(tmp_path):
     path = tmp_path / "moments.fits"
     with refused(path.name):
-        read_moments_fits(path)
+        read_moments(path)
     write_moments_fits(path, Moments.parallel_transport(NSIDE, 0.0, 2))
     path.write_bytes(path.read_bytes()[:30000])
     with refused(path.name):
-        read_moments_fits(path)
+        read_moments(path)
     fits.PrimaryHDU(np.zeros((3, 3))).writeto(path, overwrite=True)
     with refused("moments.fits"):
-        read_moments_fits(path)
+        read_moments(path)
     path.write_text("not a fits file")
     with refused(path.name):
-        read_moments_fits(path)
+        read_moments(path)
 
 
 def write_pointing(folder, form, theta, phi, psi):
@@ -406,13 +407,13 @@ def test_centroids_in_other_units(tmp_path):
 
     damaged(path, in_degrees)  # while the header says rad
     with refused("moments.fits", "nside 16", "DTHETA", "DPHI", "TUNIT"):
-        read_moments_fits(path)
+        read_moments(path)
 
     for number in (6, 7):
         fits.setval(path, f"TUNIT{number}", value="deg", ext=1)
-    np.testing.assert_allclose(read_moments_fits(path).dtheta, moments.dtheta, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(read_moments(path).dtheta, moments.dtheta, rtol=1e-12, atol=1e-15)
     damaged(path, header("COORDSYS", "EQUATORIAL"))
-    assert read_moments_fits(path).frame == "equatorial"
+    assert read_moments(path).frame == "equatorial"
 
 
 def test_unreadable_user_pointing(tmp_path):
