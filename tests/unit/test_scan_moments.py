@@ -248,7 +248,7 @@ def header(key, value):
     [
         (drop("HITS"), {}, ("HITS", "NO_HITS")),
         (drop("IM_2"), {"smax": 2}, ("IM_2", "s = 2")),
-        (drop("RE_1"), {}, ("RE_1", "s = 1")),
+        (drop("RE_1"), {}, ("RE_1", "s = 2")),
         (drop("DPHI"), {}, ("DTHETA", "DPHI")),
         (put("HITS", np.nan), {}, ("HITS", "finite", "1 pixels", 5)),
         (put("RE_2", np.inf), {}, ("RE_2", "finite")),
