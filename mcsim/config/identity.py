@@ -17,11 +17,6 @@ def science(config: RunConfig) -> dict[str, Any]:
     keep_maps or the bins of the summary. A file is represented by the SHA-256 of its contents, a template by those of
     its files. Skies given one file per realization are represented by the part of their template with the placeholder
     and by the contents of realization 0; the others are not read.
-
-    Raises
-    ------
-    InputError
-        If a file does not exist.
     """
     plain = to_dict(config)
     for entry in paths.entries(plain):
@@ -43,37 +38,36 @@ def science(config: RunConfig) -> dict[str, Any]:
     }
 
 
+_MAP = {"grid": "healpix", "nside": None, "mask_frame": None, "mask_apodisation_deg": 0.0}
+_OF_KIND: dict[str, dict[str, Any]] = {
+    "moments": {"model": None, "line_of_sight": None},
+    "map": {"angle_deg": 0.0},
+    "blm": {"angle_deg": 0.0},
+}
+"""Defaults of the keys of a scan or beam that are younger than its kind."""
+
+
 def _leave_out_what_says_nothing(plain: dict[str, Any]) -> None:
     """Drop keys at their defaults, and the limit of iterations, on which no finished map depends.
 
     A run that does not use a key thus keeps its hash from before the key existed.
     """
-    section = plain["map"]
-    if section["grid"] == "healpix":
-        del section["grid"]
-    if section["nside"] is None:
-        del section["nside"]
-    if section["mask_frame"] is None:
-        del section["mask_frame"]
-    if section["mask_apodisation_deg"] == 0.0:
-        del section["mask_apodisation_deg"]
-    if not plain["effect"]:
-        del plain["effect"]
-    if plain["sky"]["dipole_uk"] is None:
-        del plain["sky"]["dipole_uk"]
+    _drop(plain, {"effect": []})
+    _drop(plain["map"], _MAP)
+    _drop(plain["sky"], {"dipole_uk": None})
     if (plain["sky"]["dipole_lon_deg"], plain["sky"]["dipole_lat_deg"]) == (264.0, 48.24):
         del plain["sky"]["dipole_lon_deg"], plain["sky"]["dipole_lat_deg"]
     for channel in plain["channel"]:
         channel["scan"].pop("max_iterations", None)
-        if channel["scan"]["kind"] == "moments":
-            for key in ("model", "line_of_sight"):
-                if channel["scan"][key] is None:
-                    del channel["scan"][key]
-        if channel["beam_b"] is None:
-            del channel["beam_b"]
-        for beam in (channel["beam"], channel.get("beam_b")):
-            if beam is not None and beam["kind"] in ("map", "blm") and beam["angle_deg"] == 0.0:
-                del beam["angle_deg"]
+        _drop(channel, {"beam_b": None})
+        for table in (channel["scan"], channel["beam"], channel.get("beam_b", {"kind": "none"})):
+            _drop(table, _OF_KIND.get(table["kind"], {}))
+
+
+def _drop(table: dict[str, Any], defaults: dict[str, Any]) -> None:
+    for key, value in defaults.items():
+        if table[key] == value:
+            del table[key]
 
 
 def digest(config: RunConfig) -> str:

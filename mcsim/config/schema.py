@@ -4,15 +4,9 @@ Every key states the unit of its number. A failed check raises ValueError whose 
 :mod:`mcsim.config.messages` completes the sentence.
 """
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import (
-    AfterValidator,
-    ConfigDict,
-    Field,
-    GetCoreSchemaHandler,
-    model_validator,
-)
+from pydantic import AfterValidator, ConfigDict, Field, GetCoreSchemaHandler, model_validator
 from pydantic.dataclasses import dataclass
 from pydantic_core import core_schema
 
@@ -25,7 +19,6 @@ from mcsim.config.values import (
     Fwhm,
     Label,
     PathText,
-    different,
     power_of_two,
     unique,
 )
@@ -234,20 +227,15 @@ class _OrObject:
         if not isinstance(value, arrays.Tabled):
             return value
         table = arrays.table_of(value)
-        kinds = {"blm": BeamBlm, "moments": ScanMoments, "hit_averaged": ScanHitAveraged}
-        return kinds[table.pop("kind")](**table)
+        return (BEAMS | SCANS)[table["kind"]](**table)
 
 
-Beam = Annotated[
-    BeamGaussian | BeamEllipticalGaussian | BeamMap | BeamBlm,
-    Field(discriminator="kind"),
-    _OrObject(),
-]
-Scan = Annotated[
-    ScanParallelTransport | ScanHitAveraged | ScanMoments | ScanPointing | ScanDifferencing,
-    Field(discriminator="kind"),
-    _OrObject(),
-]
+AnyBeam = BeamGaussian | BeamEllipticalGaussian | BeamMap | BeamBlm
+AnyScan = ScanParallelTransport | ScanHitAveraged | ScanMoments | ScanPointing | ScanDifferencing
+Beam = Annotated[AnyBeam, Field(discriminator="kind"), _OrObject()]
+Scan = Annotated[AnyScan, Field(discriminator="kind"), _OrObject()]
+BEAMS: dict[str, Any] = {each.kind: each for each in get_args(AnyBeam)}
+SCANS: dict[str, Any] = {each.kind: each for each in get_args(AnyScan)}
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -376,11 +364,11 @@ class RunConfig:
             )
         if self.biposh.L_max > lmax:
             raise ValueError(f"biposh.L_max = {self.biposh.L_max} is above the lmax of the analysis, {lmax}; lower it")
+        names = tuple(channel.name for channel in self.channels)
         try:
-            different([channel.name for channel in self.channels])
+            unique(names)
         except ValueError as error:
             raise ValueError(f"channel {error}") from None
-        names = [channel.name for channel in self.channels]
         for effect in self.effects:
             if effect.channel is not None and effect.channel not in names:
                 raise ValueError(

@@ -71,9 +71,9 @@ def _workers(nside: int, lmax: int, realizations: int) -> Iterator[str]:
     for workers in (1, 2):
         with tempfile.TemporaryDirectory() as folder, runner.local_client(workers) as client:
             warm = _run(nside, lmax, 0.0, 4 * workers)
-            runner.run(warm, Path(folder) / "bench.zarr", client=client)
+            runner.run(warm, Path(folder) / "bench.zarr", workers=client)
             run = _run(nside, lmax, 0.0, 4 * workers + realizations)
-            seconds = _seconds(runner.run, run, Path(folder) / "bench.zarr", client=client)
+            seconds = _seconds(runner.run, run, Path(folder) / "bench.zarr", workers=client)
             peak = max(client.run(_peak_bytes).values())
             rates.append(realizations / seconds)
         yield (

@@ -81,8 +81,7 @@ def predict(
 
 
 def _dataset(survey: Survey, found: dict[tuple[int, int], Means]) -> xr.Dataset:
-    run = survey.config
-    recipe = summary.Recipe(survey.pair_names, survey.estimator.modes, survey.lmax, run.biposh.summary_bin, paired=True)
+    run, layout = survey.config, plan.layout(survey)
     mean: dict[str, NDArray] = {
         "biposh": np.stack([found[pair].beam + found[pair].noise for pair in survey.pairs]),
         "biposh_circular": np.stack([found[pair].circular + found[pair].noise for pair in survey.pairs]),
@@ -97,25 +96,16 @@ def _dataset(survey: Survey, found: dict[tuple[int, int], Means]) -> xr.Dataset:
         spectra = name.replace("biposh", "cl")
         mean[spectra] = detectability.cl_of(survey, mean[name][:, monopole])
         scatter[spectra] = scatter[name][:, monopole] / degrees
-        mean[f"{name}_binned"] = recipe.binned(mean[name])
-        scatter[f"{name}_binned"] = _binned_variance(recipe, scatter[name])
+        mean[f"{name}_binned"] = summary.binned(layout, mean[name])
+        scatter[f"{name}_binned"] = variances = summary.binned(layout, scatter[name], power=2)
         if not name.endswith("difference"):
-            comoment[f"{name}_binned"] = scatter[f"{name}_binned"][..., None] * np.eye(len(recipe.edges) - 1)
+            comoment[f"{name}_binned"] = variances[..., None] * np.eye(variances.shape[-1])
     # Build the sums of two realizations with these variances, so that the summary's own code makes the dataset.
-    result = summary.dataset(recipe, Sums(2, mean, scatter, comoment), plan.attributes(run))
+    result = summary.dataset(layout, Sums(2, mean, scatter, comoment), plan.attributes(run))
     for name in mean:
         result[f"{name}_standard_error"].values[:] = np.sqrt(scatter[name] / run.ensemble.realizations)
     result["count"].values[...] = run.ensemble.realizations
     return result
-
-
-def _binned_variance(recipe: summary.Recipe, variance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the variance of the mean over a bin, for coefficients independent from ell to ell."""
-    scaled = recipe.factor**2 * variance
-    exists = np.isfinite(scaled)
-    total = np.add.reduceat(np.where(exists, scaled, 0.0), recipe.edges[:-1], axis=-1)
-    count = np.add.reduceat(exists, recipe.edges[:-1], axis=-1, dtype=np.int64)
-    return np.divide(total, count.astype(float) ** 2, out=np.full(total.shape, np.nan), where=count > 0)
 
 
 def _attributes(survey: Survey, L_moments: int | None) -> dict[str, Any]:
