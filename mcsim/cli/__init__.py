@@ -145,14 +145,7 @@ def diagnose(
 
     interrupt_once()
     found = judge(
-        model,
-        data,
-        output,
-        case=case,
-        without=without or (),
-        simulations=simulations,
-        workers=workers,
-        quiet=False,
+        model, data, output, case=case, without=without or (), simulations=simulations, workers=workers, quiet=False
     )
     print("\n".join(summary(found, output)))
 

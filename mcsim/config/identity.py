@@ -72,9 +72,13 @@ def _drop(table: dict[str, Any], defaults: dict[str, Any]) -> None:
 
 def digest(config: RunConfig) -> str:
     """Return the SHA-256 of the canonical JSON of :func:`science`, in hexadecimal."""
-    return hashlib.sha256(
-        json.dumps(science(config), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
-    ).hexdigest()
+    return digest_of(science(config))
+
+
+def digest_of(found: dict[str, Any]) -> str:
+    """Return the digest of a run from what :func:`science` returned."""
+    canonical = json.dumps(found, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()
 
 
 def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:

@@ -11,17 +11,7 @@ from pydantic.dataclasses import dataclass
 from pydantic_core import core_schema
 
 from mcsim.config import arrays
-from mcsim.config.values import (
-    NSIDE_MAX,
-    BeamOrder,
-    Degree,
-    Frame,
-    Fwhm,
-    Label,
-    PathText,
-    power_of_two,
-    unique,
-)
+from mcsim.config.values import NSIDE_MAX, BeamOrder, Degree, Frame, Fwhm, Label, PathText, power_of_two, unique
 
 _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, validate_by_name=True, validate_by_alias=True)
 
@@ -81,19 +71,12 @@ class Map:
         return self.nside or 0
 
     @model_validator(mode="after")
-    def _pixels_or_none(self) -> Self:
-        if self.grid == "healpix":
-            if self.nside is None:
-                raise ValueError("the key nside is missing; add it")
-            return self
-        given = {"nside": self.nside, "mask": self.mask, "splits": self.splits, "pixel_window": self.pixel_window}
-        for key, value in given.items():
-            if value and value != "none":
+    def _pixels_and_mask(self) -> Self:
+        if self.grid == "healpix" and self.nside is None:
+            raise ValueError("the key nside is missing; add it")
+        for key in ("nside", "mask", "splits", "pixel_window") if self.grid == "gl" else ():
+            if getattr(self, key) not in (None, (), "none"):
                 raise ValueError(f'{key} is given, but grid = "gl" has no pixels; remove {key} or set grid = "healpix"')
-        return self
-
-    @model_validator(mode="after")
-    def _mask_to_work_on(self) -> Self:
         if self.mask is None and (self.mask_frame is not None or self.mask_apodisation_deg > 0.0):
             key = "mask_frame" if self.mask_frame is not None else "mask_apodisation_deg"
             raise ValueError(f"{key} is given without a mask; add mask or remove {key}")

@@ -60,14 +60,11 @@ def variables(survey: Survey, found: dict[tuple[int, int], Means], joint: float)
         for b, ells in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
             binned[number, rows, b] = signal_to_noise(signal, anisotropic, spectra, f_sky, ells)
     text = "signal to noise in one sky of what the beam adds to its circular part"
+    jointly = "all maps and modes jointly (exact Fisher information)"
     return {
         "signal_to_noise": (("pair", "mode"), each, {"units": "1", "long_name": text}),
         "signal_to_noise_binned": (("pair", "mode", "bin"), binned, {"units": "1", "long_name": f"{text}, per bin"}),
-        "signal_to_noise_total": (
-            (),
-            joint,
-            {"units": "1", "long_name": f"{text}, all maps and modes jointly (exact Fisher information)"},
-        ),
+        "signal_to_noise_total": ((), joint, {"units": "1", "long_name": f"{text}, {jointly}"}),
     }
 
 

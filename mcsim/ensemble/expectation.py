@@ -54,16 +54,15 @@ def survey_of(source: Source, nthreads: int = 1) -> Survey:
 
 def scanned_beams(survey: Survey, L_max: int, nthreads: int = 1) -> tuple[ScannedBeam, ...]:
     """Return the beam, times the pixel window, and the moments up to degree ``L_max`` of every map."""
-    specs = {channel.name: channel.scan for channel in survey.config.channels}
-    for name, scan in specs.items():
-        if isinstance(scan, config.ScanDifferencing):
+    for spec in survey.config.channels:
+        if isinstance(spec.scan, config.ScanDifferencing):
             raise InputError(
-                f"Channel {name} reads two beams as a difference, which predictions do not cover; "
+                f"Channel {spec.name} reads two beams as a difference, which predictions do not cover; "
                 "predict the same model with hit_averaged instead."
             )
     return tuple(
-        ScannedBeam(channel.beam.blm * channel.window, _orientations(specs[channel.name], channel, m, L_max, nthreads))
-        for channel in survey.channels
+        ScannedBeam(channel.beam.blm * channel.window, _orientations(spec.scan, channel, m, L_max, nthreads))
+        for spec, channel in zip(survey.config.channels, survey.channels, strict=True)
         for m in channel.maps
     )
 

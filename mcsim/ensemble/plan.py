@@ -70,32 +70,20 @@ def exists(path: Path) -> bool:
 
 def layout(survey: Survey) -> Layout:
     """Return the layout of a new store."""
-    run = survey.config
-    bare = Layout(
-        run.ensemble.realizations,
-        1,
-        survey.map_names,
-        survey.pair_names,
-        survey.estimator.modes,
-        survey.lmax,
-        run.ensemble.paired,
-        12 * run.map.resolution**2 if run.ensemble.keep_maps else None,
-        frame=run.map.frame,
-        bin_width=run.biposh.summary_bin,
-    )
-    return _chunked(bare, run.compute.chunk)
+    return _layout(survey.config, survey.pair_names, survey.estimator.modes)
 
 
-def _chunked(bare: Layout, chunk: int | None) -> Layout:
-    """Return the layout with a chunk size: about 128 chunks, unless a chunk would exceed 64 MiB.
-
-    The tree of sums needs a power of two.
-    """
-    if chunk is not None:
+def _layout(run: config.RunConfig, pairs: tuple[str, ...], modes: tuple[Mode, ...]) -> Layout:
+    """Return a layout of about 128 chunks, unless one would exceed 64 MiB; the tree of sums needs a power of two."""
+    lmax, paired = config.analysis_lmax(run), run.ensemble.paired
+    kept_npix = 12 * run.map.resolution**2 if run.ensemble.keep_maps else None
+    more: dict[str, Any] = {"frame": run.map.frame, "bin_width": run.biposh.summary_bin}
+    bare = Layout(run.ensemble.realizations, 1, config.map_names(run), pairs, modes, lmax, paired, kept_npix, **more)
+    chunk = run.compute.chunk or 1
+    if run.compute.chunk is not None:
         while chunk // 2 >= bare.realizations:
             chunk //= 2
     else:
-        chunk = 1
         while chunk * CHUNKS < bare.realizations and 2 * chunk * bare.realization_bytes() <= CHUNK_BYTES:
             chunk *= 2
     return replace(bare, chunk=chunk)
@@ -171,7 +159,7 @@ def describe(source: str | Path, part: slice | None = None, workers: int | None 
     """
     run = config.load(source)
     check_effects(run)
-    wanted_now = len(wanted(run, part))
+    number = len(wanted(run, part))
     if run.sky.spectrum is not None:
         spectra.load(run.sky.spectrum, run.sky.lmax)
     mmax = [load_beam(channel, run.sky.lmax).mmax for channel in run.channels]
@@ -181,13 +169,7 @@ def describe(source: str | Path, part: slice | None = None, workers: int | None 
     names = config.map_names(run)
     both = run.biposh.pairs == "all"
     pairs = len(names) * (len(names) + 1) // 2 if both else len(names)
-    found = modes(run.biposh.L_max, both and len(names) > 1)
-    npix = 12 * nside**2
-    bare = Layout(
-        run.ensemble.realizations, 1, names, ("",) * pairs, found, lmax, run.ensemble.paired,
-        npix if run.ensemble.keep_maps else None,
-    )  # fmt: skip
-    planned = _chunked(bare, run.compute.chunk)
+    planned = _layout(run, ("",) * pairs, modes(run.biposh.L_max, both and len(names) > 1))
     splits = len(run.map.splits) or 1
     transform, estimation = _timed(nside, run.sky.lmax, lmax, run.biposh.L_max)
     transforms = sum(1.0 + 2.0 * m + splits * (2.0 + 4.0 * run.biposh.iterations) for m in mmax)
@@ -195,13 +177,13 @@ def describe(source: str | Path, part: slice | None = None, workers: int | None 
         transforms = sum(2.0 * m for m in mmax)
     estimates = pairs * (2 if run.ensemble.paired else 1)
     each_s = transform * transforms + estimation * estimates + differencing.seconds(run)
-    memory = 3e8 + 8.0 * npix * (6 + 2 * max(mmax)) + 16.0 * alm_.size(run.sky.lmax) * (6 + len(names) * 2)
+    memory = 3e8 + 96.0 * nside**2 * (6 + 2 * max(mmax)) + 16.0 * alm_.size(run.sky.lmax) * (6 + len(names) * 2)
     memory += planned.chunk * planned.realization_bytes()
-    disk = float(planned.realization_bytes()) * wanted_now
-    count, hours = workers or run.compute.workers, wanted_now * each_s / 3600.0
+    disk = float(planned.realization_bytes()) * number
+    count, hours = workers or run.compute.workers, number * each_s / 3600.0
     return "\n".join(
         [
-            f"{run.name}: {wanted_now} realizations in {-(-wanted_now // planned.chunk)} tasks",
+            f"{run.name}: {number} realizations in {-(-number // planned.chunk)} tasks",
             f"  memory  {memory / 1e9:.2f} GB per worker, {count} workers",
             f"  disk    {disk / 1e6:.1f} MB in about {planned.files()} files",
             f"  time    {each_s:.3g} s per realization and core, {hours:.3g} core-hours,"

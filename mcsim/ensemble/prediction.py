@@ -110,23 +110,23 @@ def _dataset(survey: Survey, found: dict[tuple[int, int], Means]) -> xr.Dataset:
 
 def _attributes(survey: Survey, L_moments: int | None) -> dict[str, Any]:
     run = survey.config
-    order = (
-        "leading order in their non-circular part" if L_moments is None else f"all orders, w_s up to L = {L_moments}"
-    )
-    weighted = any(m.weight is not None for channel in survey.channels for m in channel.maps)
+    order = "leading order in their non-circular part"
+    if L_moments is not None:
+        order = f"all orders, w_s up to L = {L_moments}"
+    mask = "full sky"
+    if any(m.weight is not None for channel in survey.channels for m in channel.maps):
+        mask = "weights W act as w_s -> W^2 w_s and on the errors; their own mode coupling is left out"
+    window, left_out = "none: rings without pixels", "nothing"
+    if run.map.grid == "healpix":
+        window = "divided out of a_lm by the analysis, so it cancels but for the noise"
+        left_out = "centroid offsets of the samples in a pixel, quadrature error of the analysis"
     return {
         "name": run.name,
         "prediction": f"from b_lm of the beams, {order}",
         "frame": run.map.frame,
         "digest": config.digest(run),
         "f_sky": min(detectability.sky_fraction(survey, pair) for pair in survey.pairs),
-        "mask": "weights W act as w_s -> W^2 w_s and on the errors; their own mode coupling is left out"
-        if weighted
-        else "full sky",
-        "pixel_window": "divided out of a_lm by the analysis, so it cancels but for the noise"
-        if run.map.grid == "healpix"
-        else "none: rings without pixels",
-        "left_out": "centroid offsets of the samples in a pixel, quadrature error of the analysis"
-        if run.map.grid == "healpix"
-        else "nothing",
+        "mask": mask,
+        "pixel_window": window,
+        "left_out": left_out,
     }

@@ -1,7 +1,5 @@
 """Check of a store, and removal of damaged parts so that a run computes them again."""
 
-import hashlib
-import json
 import re
 import shutil
 from collections.abc import Mapping
@@ -10,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mcsim.config.identity import digest_of
 from mcsim.ensemble import store
 from mcsim.ensemble.layout import Layout, listed
 from mcsim.ensemble.store import Damage
@@ -114,7 +113,6 @@ def broken_parts(path: Path) -> dict[str, str]:
     """Return the faults of parts other than realizations, by name."""
     attributes = store.attributes(path)
     broken = store.broken_parts(path)
-    canonical = json.dumps(attributes["science"], sort_keys=True, separators=(",", ":")).encode()
-    if hashlib.sha256(canonical).hexdigest() != attributes.get("digest"):
+    if digest_of(attributes["science"]) != attributes.get("digest"):
         broken["attributes"] = "the configuration in them does not have the hash that they state"
     return broken

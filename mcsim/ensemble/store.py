@@ -9,7 +9,7 @@ import shutil
 import tempfile
 import warnings
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -58,41 +58,32 @@ def check_writable(path: Path) -> Path:
 
 def create(path: Path, layout: Layout, attributes: Mapping[str, Any]) -> None:
     """Make an empty store at ``path``, complete or not at all."""
-    with refuse_unwritable(path):
+    with refuse_unwritable(path), ExitStack() as stack:
         path.parent.mkdir(parents=True, exist_ok=True)
-        scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
-    try:
-        with refuse_unwritable(path):
-            group = zarr.create_group(scratch / "new")
-            group.attrs.update({**attributes, "coordinates": "L M d parity"})
-            for name, (dim, values, attrs) in layout.coordinates().items():
-                dtype: Any = str if values.dtype == object else values.dtype
-                array = group.create_array(
-                    name, shape=values.shape, chunks=values.shape, dtype=dtype, dimension_names=[dim], **_WHOLE
-                )
-                array[:] = values
-                array.attrs.update(attrs)
-            sizes = layout.sizes()
-            whole = {**layout.variables(), "done": ((), "bool", "1", "finished")}
-            for name, (dims, dtype, unit, text) in whole.items():
-                shape = tuple(sizes[dim] for dim in ("realization", *dims))
-                fill: Any = {"bool": False, "complex128": complex(np.nan, np.nan)}.get(dtype, np.nan)
-                array = group.create_array(
-                    name,
-                    shape=shape,
-                    chunks=(layout.chunk, *shape[1:]),
-                    dtype=dtype,
-                    fill_value=fill,
-                    dimension_names=("realization", *dims),
-                    **_CODECS,
-                )
-                array.attrs.update({"units": unit, "long_name": text})
-            if layout.kept_npix is not None:
-                group[layout.kept_name].attrs.update(layout.kept_attributes())
-            _consolidate(scratch / "new")
-            os.replace(scratch / "new", path)
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+        scratch = tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent)
+        stack.callback(shutil.rmtree, scratch, ignore_errors=True)
+        group = zarr.create_group(Path(scratch) / "new")
+        group.attrs.update({**attributes, "coordinates": "L M d parity"})
+        for name, (dim, values, attrs) in layout.coordinates().items():
+            form: dict[str, Any] = {"dtype": str if values.dtype == object else values.dtype, **_WHOLE}
+            array = group.create_array(name, shape=values.shape, chunks=values.shape, dimension_names=[dim], **form)
+            array[:] = values
+            array.attrs.update(attrs)
+        sizes = layout.sizes()
+        whole = {**layout.variables(), "done": ((), "bool", "1", "finished")}
+        for name, (dims, dtype, unit, text) in whole.items():
+            dims = ("realization", *dims)
+            shape = tuple(sizes[dim] for dim in dims)
+            fill = {"bool": False, "complex128": complex(np.nan, np.nan)}.get(dtype, np.nan)
+            form = {"dtype": dtype, "fill_value": fill, **_CODECS}
+            array = group.create_array(
+                name, shape=shape, chunks=(layout.chunk, *shape[1:]), dimension_names=dims, **form
+            )
+            array.attrs.update({"units": unit, "long_name": text})
+        if layout.kept_npix is not None:
+            group[layout.kept_name].attrs.update(layout.kept_attributes())
+        _consolidate(Path(scratch) / "new")
+        os.replace(Path(scratch) / "new", path)
 
 
 def write(path: Path, first: int, values: Mapping[str, NDArray], done: NDArray[np.bool_]) -> None:
@@ -239,13 +230,8 @@ def write_summary(path: Path, summary: xr.Dataset) -> None:
     with faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", category=UserWarning)
-            summary.to_zarr(
-                Path(scratch) / "summary",
-                zarr_format=3,
-                consolidated=False,
-                encoding=dict.fromkeys(summary.variables, _CODECS),
-                write_empty_chunks=True,
-            )
+            form: Any = {"zarr_format": 3, "consolidated": False, "write_empty_chunks": True}
+            summary.to_zarr(Path(scratch) / "summary", encoding=dict.fromkeys(summary.variables, _CODECS), **form)
         shutil.rmtree(path / "summary", ignore_errors=True)
         os.replace(Path(scratch) / "summary", path / "summary")
         _consolidate(path)

@@ -132,9 +132,8 @@ def _finished(target: Path, run: config.RunConfig, wanted: range) -> bool:
 @contextmanager
 def _written_down(journal: Journal, run: config.RunConfig, wanted: range) -> Iterator[None]:
     """Log the start and the end of a run."""
-    journal.write(
-        f"start: {run.name}, realizations {wanted.start} to {wanted.stop - 1}, mcsim {dict(packages())['mcsim']}"
-    )
+    what = f"{run.name}, realizations {wanted.start} to {wanted.stop - 1}"
+    journal.write(f"start: {what}, mcsim {dict(packages())['mcsim']}")
     try:
         yield
     except BaseException as error:
@@ -170,21 +169,14 @@ def _run(client: Client, shared: Survey, target: Path, wanted: range, journal: J
         roll = Roll(client, journal)
         failures = _simulate(roll, target, run, wanted, journal)
         _summarise(roll, target, layout, journal.quiet)
-    except KilledWorker as error:
-        raise RunError(
-            f"The summary cannot be made, for {death(error)}; what is finished is stored in {target}, and the same "
-            "command goes on."
-        ) from error
-    except (CancelledError, CommClosedError) as error:
-        raise RunError(
-            f"The connection to the scheduler is lost; what is finished is stored in {target}, and the same command "
-            "goes on."
-        ) from error
+    except (KilledWorker, CancelledError, CommClosedError) as error:
+        lost = "The connection to the scheduler is lost"
+        reason = f"The summary cannot be made, for {death(error)}" if isinstance(error, KilledWorker) else lost
+        raise RunError(f"{reason}; what is finished is stored in {target}, and the same command goes on.") from error
     finished = int(store.done(target).sum())
     named = f" ({listed(failure.realization for failure in failures)})" if failures else ""
-    journal.write(
-        f"done: {finished} realizations stored, {finished - before} of them new, {len(failures)} failed{named}"
-    )
+    counts = f"{finished} realizations stored, {finished - before} of them new, {len(failures)} failed"
+    journal.write(f"done: {counts}{named}")
     return Result(target, finished, finished - before, tuple(failures), summarised=True)
 
 

@@ -55,25 +55,16 @@ def _script_left_alone() -> Iterator[None]:
 
 @contextmanager
 def local_client(workers: int) -> Iterator[Client]:
-    """Yield the client of a local cluster of single-threaded processes, with ports open to this machine alone.
-
-    Raises
-    ------
-    InputError
-        In a process that cannot have child processes.
-    RunError
-        If the workers do not start.
-    """
+    """Yield the client of a local cluster of single-threaded processes, with ports open to this machine alone."""
     if multiprocessing.current_process().daemon:
         raise InputError(
             "A worker of multiprocessing.Pool can start no workers of its own; call mcsim from the main process, or "
             "from a concurrent.futures.ProcessPoolExecutor."
         )
     single = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "DUCC0", "NUMBA")}
+    environment = dask.config.get("distributed.nanny.pre-spawn-environ") | single | _KEPT_MEMORY
     settings = {
-        "distributed.nanny.pre-spawn-environ": (
-            dask.config.get("distributed.nanny.pre-spawn-environ") | single | _KEPT_MEMORY
-        ),
+        "distributed.nanny.pre-spawn-environ": environment,
         "distributed.scheduler.allowed-failures": ATTEMPTS - 1,
         "distributed.worker.preload": [_WORKER_SETUP],
     }
@@ -101,21 +92,13 @@ def local_client(workers: int) -> Iterator[Client]:
 
 @contextmanager
 def remote_client(scheduler: str) -> Iterator[Client]:
-    """Yield the client of a running scheduler, whose workers have the driver's packages.
-
-    Raises
-    ------
-    InputError
-        If it does not answer, or one of its workers has other packages.
-    """
+    """Yield the client of a running scheduler, whose workers have the driver's packages."""
     try:
         client = Client(scheduler, timeout=5)
     except (OSError, ValueError, TypeError, RuntimeError) as error:
         certificates = "certificates that Dask's configuration names in distributed.comm.tls"
         if scheduler.startswith("tls://") and isinstance(error, TypeError):  # from a call without an ssl_context
-            refusal = (
-                f"{scheduler} needs the {certificates}, and it names none; give them as workflows/cluster/tls.yaml does"
-            )
+            refusal = f"{scheduler} needs the {certificates}, and it names none; see workflows/cluster/tls.yaml"
         elif isinstance(error, FatalCommClosedError):
             refusal = f"Nobody at {scheduler} accepts the {certificates}; take those of the scheduler's authority"
         else:
@@ -163,10 +146,8 @@ class Roll:
     def text(self) -> str:
         """Return a text on the workers at the last call, and the address of the dashboard."""
         link = self.client.dashboard_link
-        if not self.there:
-            text = "no worker yet: waiting for one"
-        else:
-            text = f"{_count(len(self.there))} with {sum(self.there.values())} threads"
+        threads = f"{_count(len(self.there))} with {sum(self.there.values())} threads"
+        text = threads if self.there else "no worker yet: waiting for one"
         return f"{text}; dashboard {link}" if find_spec("bokeh") and link else text
 
 
@@ -219,9 +200,7 @@ def answers(
 
     fill()
     while numbers:
-        # Wait with a time limit: without workers a call would never return.
-        done, _ = _first_of(roll, list(numbers))
-        for future in done:
+        for future in _first_of(roll, list(numbers)):
             result: Any = None
             killed: KilledWorker | None = None
             try:
@@ -245,12 +224,12 @@ def _in_words(function: Callable[..., Any], *arguments: Any) -> Any:
         raise
 
 
-def _first_of(roll: Roll, flying: list[Future]) -> tuple[set[Future], set[Future]]:
-    """Return the finished futures, at least one, and the others; raise RunError if workers stay absent."""
+def _first_of(roll: Roll, flying: list[Future]) -> set[Future]:
+    """Return the finished futures, at least one; raise RunError if workers stay absent: a call would never return."""
     missed = 0
     while True:
         try:
-            return tuple(wait(flying, timeout=TURN_S, return_when="FIRST_COMPLETED"))
+            return set(wait(flying, timeout=TURN_S, return_when="FIRST_COMPLETED")[0])
         except TimeoutError:
             missed = 0 if roll.call() else missed + 1
         if missed * TURN_S >= ALONE_S:
