@@ -95,22 +95,25 @@ def _kept(write: Callable[[Path], Any], what: str) -> Path:
         root.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".given.", dir=root) as scratch:
             write(Path(scratch))
-            digest = hashlib.sha256()
-            for path in sorted(Path(scratch).iterdir()):
-                digest.update(f"{path.name}\0{path.stat().st_size}\0".encode())
-                with path.open("rb") as stream:
-                    digest.update(hashlib.file_digest(stream, "sha256").digest())
+            contents = "\n".join(f"{sha256_of(path)} {path.name}" for path in sorted(Path(scratch).iterdir()))
 
             def move(folder: Path) -> None:
                 for path in Path(scratch).iterdir():
                     shutil.move(path, folder / path.name)
 
-            return folders.cached(f"given-{digest.hexdigest()}", move, root).absolute()
+            name = f"given-{hashlib.sha256(contents.encode()).hexdigest()}"
+            return folders.cached(name, move, root).absolute()
     except OSError as error:
         raise InputError(
             f"cache folder {str(root)!r} cannot take what is given as {what} ({error.strerror}); make room there, or "
             "set MCSIM_CACHE to one that can."
         ) from None
+
+
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 of a file, in hexadecimal."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _path(path: Path, key: str) -> str:

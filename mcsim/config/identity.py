@@ -2,10 +2,10 @@
 
 import hashlib
 import json
-from pathlib import Path
 from typing import Any
 
 from mcsim.config import paths
+from mcsim.config.arrays import sha256_of
 from mcsim.config.load import to_dict
 from mcsim.config.schema import RunConfig, analysis_lmax, pixel_window
 
@@ -20,7 +20,8 @@ def science(config: RunConfig) -> dict[str, Any]:
     """
     plain = to_dict(config)
     for entry in paths.entries(plain):
-        found = {label: _sha256(path) for label, path in paths.files(entry, config.map.splits, config.name).items()}
+        named = paths.files(entry, config.map.splits, config.name)
+        found = {label: f"sha256:{sha256_of(path)}" for label, path in named.items()}
         contents: Any = found[""] if list(found) == [""] else found
         if "realization" in entry.rule.placeholders:
             contents = {"template": paths.template_tail(entry.template), "first": contents}
@@ -101,8 +102,3 @@ def _leaves(value: Any, key: str) -> list[tuple[str, str]]:
     if isinstance(value, str) and value.startswith("sha256:"):
         return [(key, f"contents {value[:19]}")]
     return [(key, json.dumps(value))]
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as stream:
-        return f"sha256:{hashlib.file_digest(stream, 'sha256').hexdigest()}"

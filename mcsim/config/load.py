@@ -1,6 +1,7 @@
 """Read a run from TOML or a dict, and write it as JSON for a worker."""
 
 import json
+import os
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -72,7 +73,7 @@ def load(source: str | Path | Mapping[str, Any], base: str | Path | None = None)
     else:
         path = Path(source)
         where = str(source)
-        plain, folder = _read(path if paths.is_file(path) else resources.workflow(source))
+        plain, folder = _read(path if os.path.isfile(path) else resources.workflow(source))
     paths.make_absolute(plain, folder, where)
     paths.find_descriptions(plain)
     config = _validate(plain, where)

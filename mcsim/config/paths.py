@@ -73,20 +73,20 @@ def _tables(plain: dict[str, Any], key: str) -> list[dict[str, Any]]:
 def make_absolute(plain: dict[str, Any], base: Path, where: str) -> None:
     """Expand ${VAR} and make relative paths start from ``base``, in place; keep packaged names."""
     for entry in entries(plain):
-        if _is_packaged(entry):
-            continue
+        if not _is_packaged(entry):
+            entry.holder[entry.field] = _absolute(entry, base, where)
 
-        def expand(match: re.Match[str], entry: Entry = entry) -> str:
-            try:
-                return _literal(os.environ[match[1]], entry.rule)
-            except KeyError:
-                raise InputError(
-                    f"{where}: {entry.key} = {entry.template!r} uses the environment variable {match[1]}, which is "
-                    "not set; set it or write the folder out."
-                ) from None
 
-        path = _VARIABLE.sub(expand, entry.template)
-        entry.holder[entry.field] = os.path.normpath(os.path.join(_literal(str(base.absolute()), entry.rule), path))
+def _absolute(entry: Entry, base: Path, where: str) -> str:
+    for name in _VARIABLE.findall(entry.template):
+        if name not in os.environ:
+            raise InputError(
+                f"{where}: {entry.key} = {entry.template!r} uses the environment variable {name}, which is not set; "
+                "set it or write the folder out."
+            )
+    escaped = literal if entry.rule.placeholders else str
+    path = _VARIABLE.sub(lambda match: escaped(os.environ[match[1]]), entry.template)
+    return os.path.normpath(os.path.join(escaped(str(base.absolute())), path))
 
 
 def find_descriptions(plain: dict[str, Any]) -> None:
@@ -96,7 +96,7 @@ def find_descriptions(plain: dict[str, Any]) -> None:
         if not isinstance(scan, dict) or scan.get("kind") != "moments" or scan.get("model") is not None:
             continue
         beside = Path(str(scan.get("path"))).parent / DESCRIPTION
-        if is_file(beside):
+        if os.path.isfile(beside):  # False also for a name that no file system takes
             scan["model"] = str(beside)
 
 
@@ -135,18 +135,6 @@ def template_tail(template: str) -> str:
     return "/".join(parts[first:])
 
 
-def is_file(path: Path) -> bool:
-    """Return True for a file, False also for a name that no file system takes."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
-
-
-def _literal(text: str, rule: Rule) -> str:
-    return literal(text) if rule.placeholders else text
-
-
 def _is_packaged(entry: Entry) -> bool:
     return entry.rule.packaged is not None and entry.template in resources.names(entry.rule.packaged)
 
@@ -174,7 +162,7 @@ def _existing(entry: Entry, values: dict[str, Any], where: str) -> Path:
     if entry.rule.packaged is not None and _is_packaged(entry):
         return {"data": resources.spectrum, "scan_models": resources.scan_model}[entry.rule.packaged](entry.template)
     path = Path(entry.template.format(**values) if entry.rule.placeholders else entry.template)
-    if is_file(path):
+    if os.path.isfile(path):
         return path
     names = resources.names(entry.rule.packaged) if entry.rule.packaged else ()
     packaged = f" or one of the packaged names {', '.join(names)}" if names else ""

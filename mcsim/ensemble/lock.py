@@ -18,12 +18,9 @@ from mcsim.errors import InputError
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold the store for one run: a file ``{path}.lock`` beside it names host and process.
+    """Hold the store for one run, or raise InputError: a file ``{path}.lock`` beside it names host and process.
 
-    Raises
-    ------
-    InputError
-        If another run holds it. The lock of a dead process of this host is taken over.
+    The lock of a dead process of this host is taken over.
     """
     lock = path.absolute().with_name(f"{path.name}.lock")
     with ExitStack() as stack:
@@ -33,7 +30,9 @@ def locked(path: Path) -> Iterator[None]:
             with tempfile.NamedTemporaryFile("w", prefix=f".{path.name}.", dir=lock.parent) as scratch:
                 scratch.write(f"{socket.gethostname()} {os.getpid()}")
                 scratch.flush()
-                _hold(stack.enter_context(os.fdopen(os.dup(scratch.fileno()))).fileno())
+                held = stack.enter_context(Path(scratch.name).open())
+                with suppress(OSError):  # the kernel's lock tells other runs of this process; some disks have none
+                    fcntl.flock(held, fcntl.LOCK_EX)
                 while not _linked(scratch.name, lock):
                     _remove_if_dead(lock, path)
         try:
@@ -41,12 +40,6 @@ def locked(path: Path) -> Iterator[None]:
         finally:
             with suppress(OSError):  # if the disk has become read-only, the next run takes the lock over
                 lock.unlink()
-
-
-def _hold(descriptor: int) -> None:
-    """Hold the kernel's lock of the file, by which other runs of this process see that it is in use."""
-    with suppress(OSError):  # some file systems have none
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
 
 
 def _linked(scratch: str, lock: Path) -> bool:

@@ -78,7 +78,11 @@ def write_maps(
     wanted = plan.wanted(run, part)
     names = file_names(run)
     targets = {r: Path(folder) if alone else Path(folder) / f"{r:05d}" for r in wanted}
-    _refuse_what_is_there(Path(folder), list(targets.values()))
+    if Path(folder).exists() and not Path(folder).is_dir():
+        raise InputError(f"{folder} is a file; choose a folder with -o.")
+    for target in targets.values():
+        if target.exists() and (not target.is_dir() or any(target.iterdir())):
+            raise InputError(f"{target} is not empty, and nothing is written over; choose another folder with -o.")
     config.check_skies(run, wanted)
     threads = nthreads or os.cpu_count() or 1
     with reporting("orientation moments", 1.0, "", quiet) as report:
@@ -119,11 +123,3 @@ def file_names(run: config.RunConfig) -> dict[str, str]:
         if twice:
             raise InputError(f"The maps {name} and {twice[0]} would both be {file}; rename a channel or a split.")
     return names
-
-
-def _refuse_what_is_there(folder: Path, targets: list[Path]) -> None:
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder} is a file; choose a folder with -o.")
-    for target in targets:
-        if target.exists() and (not target.is_dir() or any(target.iterdir())):
-            raise InputError(f"{target} is not empty, and nothing is written over; choose another folder with -o.")

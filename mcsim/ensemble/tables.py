@@ -63,13 +63,7 @@ def table(summary: xr.Dataset) -> Table:
 
 
 def write(summary: xr.Dataset, output: str | Path) -> None:
-    """Write a summary or a prediction as Zarr (``.zarr``) or NetCDF (``.nc``), or its binned spectra (``.ecsv``).
-
-    Raises
-    ------
-    InputError
-        For another file extension, an existing Zarr group, or an output that cannot be written.
-    """
+    """Write a summary or a prediction as Zarr (``.zarr``) or NetCDF (``.nc``), or its binned spectra (``.ecsv``)."""
     target = Path(output)
     with unwritable(target, "choose another file"):
         if target.suffix == ".zarr":
@@ -108,18 +102,9 @@ def _for_netcdf(summary: xr.Dataset) -> xr.Dataset:
 
 
 def read_prediction(path: str | Path) -> xr.Dataset:
-    """Read the binned spectra that :func:`write` wrote.
+    """Read a prediction that :func:`write` wrote: of a table ``biposh{, _difference}_binned_{mean, standard_error}``.
 
-    Returns
-    -------
-    xarray.Dataset
-        ``biposh{, _difference}_binned_{mean, standard_error}`` with the coordinates of a summary; the attribute
-        ``prediction`` states the method. A Zarr group gives all predicted variables.
-
-    Raises
-    ------
-    InputError
-        For a file that is not a prediction.
+    The coordinates are those of a summary; the attribute ``prediction`` states the method.
     """
     source = Path(path)
     if not source.exists():

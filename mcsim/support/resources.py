@@ -4,7 +4,7 @@ An installed wheel has them inside the package; a source checkout (or an editabl
 ``scan_models`` and ``workflows`` beside the package, where people look for them.
 """
 
-from contextlib import suppress
+import os
 from pathlib import Path
 
 from mcsim.errors import InputError
@@ -45,9 +45,8 @@ def _find(noun: str, kind: str, suffix: str, name_or_path: str | Path) -> Path:
     if str(name_or_path) in names(kind):
         return _folder(kind) / f"{name_or_path}{suffix}"
     path = Path(name_or_path)
-    with suppress(OSError, ValueError):  # invalid names: too long, or with a NUL
-        if path.is_file():
-            return path.resolve()
+    if os.path.isfile(path):  # False also for a name that no file system takes
+        return path.resolve()
     raise InputError(
         f"{noun} {str(name_or_path)!r} is neither a file (looked for {str(path)!r}) nor packaged with mcsim; "
         f"give a path or one of: {', '.join(names(kind)) or 'none is packaged'}."

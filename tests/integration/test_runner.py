@@ -151,6 +151,13 @@ def test_unreachable_scheduler(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("workers", [0, -1])
+def test_a_run_without_workers_is_refused(workers: int, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=f"workers = {workers} is too small"):
+        runner.run(table(), tmp_path / "x.zarr", workers=workers)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_unwritable_store(client: Client, tmp_path: Path) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("a file where a folder is needed")
