@@ -20,7 +20,7 @@ def run(
     resume: Annotated[bool, Option("--resume", help="Check a store, repair it, and continue it.")] = False,
     realizations: Part = None,
     workers: Processes = None,
-    scheduler: Annotated[str | None, Option(metavar="ADDRESS", help="Of Dask: tcp://host:port or tls://...")] = None,
+    scheduler: Annotated[str | None, Option(metavar="ADDRESS", help="Running Dask scheduler, tcp://host:port.")] = None,
     dry_run: Annotated[bool, Option("--dry-run", help="Say memory, disk, files and time; compute nothing.")] = False,
 ) -> None:
     """Run an ensemble; continue it if it was interrupted; extend it if more realizations are asked for.
@@ -88,7 +88,7 @@ def plot(
     M: Annotated[int | None, Option("--M", help="Only this M.")] = None,
     d: Annotated[int | None, Option("--d", help="Only this d = l2 - l1.")] = None,
     pair: Annotated[str | None, Option(help='Pair of maps, for example "W1,W1"; default: the first.')] = None,
-    predict: Annotated[str | None, Option(metavar="CONFIG", help="Draw what it predicts; or predict's file.")] = None,
+    predict: Annotated[str | None, Option(metavar="CONFIG", help="Draw its prediction, or that of predict -o.")] = None,
     exact: Annotated[bool, Option("--exact", help="The prediction to all orders in the beam.")] = False,
 ) -> None:
     """Draw the binned spectra of a store with error bars, and optionally a prediction."""

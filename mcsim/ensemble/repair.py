@@ -4,7 +4,7 @@ import re
 import shutil
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,9 +49,8 @@ class Verdict:
         lines += [f"  {listed(damage.lost)}: {damage.reason}" for damage in self.damages if damage.lost]
         lines += [f"  {name}: {reason}" for name, reason in self.broken.items()]
         repair = "computes them again" if self.lost else "repairs this"
-        return "\n".join(
-            [*lines, f"  {self.finished} of {self.size} realizations are whole; mcsim run --resume {repair}."]
-        )
+        lines.append(f"  {self.finished} of {self.size} realizations are whole; mcsim run --resume {repair}.")
+        return "\n".join(lines)
 
 
 def verify(path: str | Path, quiet: bool = True) -> Verdict:
@@ -95,7 +94,7 @@ def mend(path: Path, layout: Layout, attributes: Mapping[str, Any], quiet: bool 
     verdict = verify(path, quiet)
     for damage in verdict.damages:
         store.discard(path, damage)
-    return Verdict(path, verdict.finished, verdict.size, verdict.damages, broken | verdict.broken)
+    return replace(verdict, broken=broken | verdict.broken)
 
 
 def _sweep(path: Path) -> None:
