@@ -4,31 +4,14 @@ Every key states the unit of its number. A failed check raises ValueError whose 
 :mod:`mcsim.config.messages` completes the sentence.
 """
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import (
-    AfterValidator,
-    ConfigDict,
-    Field,
-    GetCoreSchemaHandler,
-    model_validator,
-)
+from pydantic import AfterValidator, ConfigDict, Field, GetCoreSchemaHandler, model_validator
 from pydantic.dataclasses import dataclass
 from pydantic_core import core_schema
 
 from mcsim.config import arrays
-from mcsim.config.values import (
-    NSIDE_MAX,
-    BeamOrder,
-    Degree,
-    Frame,
-    Fwhm,
-    Label,
-    PathText,
-    different,
-    power_of_two,
-    unique,
-)
+from mcsim.config.values import NSIDE_MAX, BeamOrder, Degree, Frame, Fwhm, Label, PathText, power_of_two, unique
 
 _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, validate_by_name=True, validate_by_alias=True)
 
@@ -88,19 +71,12 @@ class Map:
         return self.nside or 0
 
     @model_validator(mode="after")
-    def _pixels_or_none(self) -> Self:
-        if self.grid == "healpix":
-            if self.nside is None:
-                raise ValueError("the key nside is missing; add it")
-            return self
-        given = {"nside": self.nside, "mask": self.mask, "splits": self.splits, "pixel_window": self.pixel_window}
-        for key, value in given.items():
-            if value and value != "none":
+    def _pixels_and_mask(self) -> Self:
+        if self.grid == "healpix" and self.nside is None:
+            raise ValueError("the key nside is missing; add it")
+        for key in ("nside", "mask", "splits", "pixel_window") if self.grid == "gl" else ():
+            if getattr(self, key) not in (None, (), "none"):
                 raise ValueError(f'{key} is given, but grid = "gl" has no pixels; remove {key} or set grid = "healpix"')
-        return self
-
-    @model_validator(mode="after")
-    def _mask_to_work_on(self) -> Self:
         if self.mask is None and (self.mask_frame is not None or self.mask_apodisation_deg > 0.0):
             key = "mask_frame" if self.mask_frame is not None else "mask_apodisation_deg"
             raise ValueError(f"{key} is given without a mask; add mask or remove {key}")
@@ -234,20 +210,15 @@ class _OrObject:
         if not isinstance(value, arrays.Tabled):
             return value
         table = arrays.table_of(value)
-        kinds = {"blm": BeamBlm, "moments": ScanMoments, "hit_averaged": ScanHitAveraged}
-        return kinds[table.pop("kind")](**table)
+        return (BEAMS | SCANS)[table["kind"]](**table)
 
 
-Beam = Annotated[
-    BeamGaussian | BeamEllipticalGaussian | BeamMap | BeamBlm,
-    Field(discriminator="kind"),
-    _OrObject(),
-]
-Scan = Annotated[
-    ScanParallelTransport | ScanHitAveraged | ScanMoments | ScanPointing | ScanDifferencing,
-    Field(discriminator="kind"),
-    _OrObject(),
-]
+AnyBeam = BeamGaussian | BeamEllipticalGaussian | BeamMap | BeamBlm
+AnyScan = ScanParallelTransport | ScanHitAveraged | ScanMoments | ScanPointing | ScanDifferencing
+Beam = Annotated[AnyBeam, Field(discriminator="kind"), _OrObject()]
+Scan = Annotated[AnyScan, Field(discriminator="kind"), _OrObject()]
+BEAMS: dict[str, Any] = {each.kind: each for each in get_args(AnyBeam)}
+SCANS: dict[str, Any] = {each.kind: each for each in get_args(AnyScan)}
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -376,11 +347,11 @@ class RunConfig:
             )
         if self.biposh.L_max > lmax:
             raise ValueError(f"biposh.L_max = {self.biposh.L_max} is above the lmax of the analysis, {lmax}; lower it")
+        names = tuple(channel.name for channel in self.channels)
         try:
-            different([channel.name for channel in self.channels])
+            unique(names)
         except ValueError as error:
             raise ValueError(f"channel {error}") from None
-        names = [channel.name for channel in self.channels]
         for effect in self.effects:
             if effect.channel is not None and effect.channel not in names:
                 raise ValueError(

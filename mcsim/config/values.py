@@ -4,7 +4,6 @@ A failed check raises ValueError whose text follows ``key = value``; :mod:`mcsim
 sentence.
 """
 
-from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo
@@ -33,16 +32,11 @@ def _label(value: str) -> str:
     return value
 
 
-def different(values: Sequence[str]) -> None:
-    """Raise ValueError if a name is given twice."""
+def unique(values: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names if none is given twice."""
     twice = [value for value in values if values.count(value) > 1]
     if twice:
         raise ValueError(f"names {twice[0]!r} twice; give every one its own name")
-
-
-def unique(values: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names if none is given twice."""
-    different(values)
     return values
 
 

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 from mcsim import config
 from mcsim.bipolar import Mode, estimate, estimator, modes
 from mcsim.bipolar.dataset import CONVENTION, NORMALISATION
-from mcsim.ensemble import opening, store, summary
+from mcsim.ensemble import opening, store
 from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError
 from mcsim.simulation import differencing
@@ -38,13 +38,7 @@ _PACKAGES = ("mcsim", "numpy", "healpy", "ducc0", "numba", "scipy", "dask", "dis
 
 
 def wanted(run: config.RunConfig, part: slice | None) -> range:
-    """Return the realizations to compute: all, or a slice ``A:B`` of them.
-
-    Raises
-    ------
-    InputError
-        If the slice is empty or reaches beyond the ensemble.
-    """
+    """Return the realizations to compute: all, or a slice ``A:B`` of them, which must lie within the ensemble."""
     total = run.ensemble.realizations
     if part is None:
         return range(total)
@@ -76,42 +70,23 @@ def exists(path: Path) -> bool:
 
 def layout(survey: Survey) -> Layout:
     """Return the layout of a new store."""
-    run = survey.config
-    bare = Layout(
-        run.ensemble.realizations,
-        1,
-        survey.map_names,
-        survey.pair_names,
-        survey.estimator.modes,
-        survey.lmax,
-        run.ensemble.paired,
-        12 * run.map.resolution**2 if run.ensemble.keep_maps else None,
-        frame=run.map.frame,
-    )
-    return _chunked(bare, run.compute.chunk)
+    return _layout(survey.config, survey.pair_names, survey.estimator.modes)
 
 
-def _chunked(bare: Layout, chunk: int | None) -> Layout:
-    """Return the layout with a chunk size: about 128 chunks, unless a chunk would exceed 64 MiB.
-
-    The tree of sums needs a power of two.
-    """
-    if chunk is not None:
+def _layout(run: config.RunConfig, pairs: tuple[str, ...], modes: tuple[Mode, ...]) -> Layout:
+    """Return a layout of about 128 chunks, unless one would exceed 64 MiB; the tree of sums needs a power of two."""
+    lmax, paired = config.analysis_lmax(run), run.ensemble.paired
+    kept_npix = 12 * run.map.resolution**2 if run.ensemble.keep_maps else None
+    more: dict[str, Any] = {"frame": run.map.frame, "bin_width": run.biposh.summary_bin}
+    bare = Layout(run.ensemble.realizations, 1, config.map_names(run), pairs, modes, lmax, paired, kept_npix, **more)
+    chunk = run.compute.chunk or 1
+    if run.compute.chunk is not None:
         while chunk // 2 >= bare.realizations:
             chunk //= 2
     else:
-        chunk = 1
         while chunk * CHUNKS < bare.realizations and 2 * chunk * bare.realization_bytes() <= CHUNK_BYTES:
             chunk *= 2
     return replace(bare, chunk=chunk)
-
-
-def recipe(survey: Survey) -> summary.Recipe:
-    """Return the recipe of the summary."""
-    run = survey.config
-    return summary.Recipe(
-        survey.pair_names, survey.estimator.modes, survey.lmax, run.biposh.summary_bin, run.ensemble.paired
-    )
 
 
 def attributes(run: config.RunConfig) -> dict[str, Any]:
@@ -129,16 +104,8 @@ def attributes(run: config.RunConfig) -> dict[str, Any]:
 
 
 def check_same(path: Path, run: config.RunConfig) -> None:
-    """Raise InputError unless a store has this configuration and its variables.
-
-    Raises
-    ------
-    InputError
-        With the keys that differ.
-    """
-    found = store.attributes(path)
-    changes = _changes(found, attributes(run))
-    if changes:
+    """Raise InputError, with the keys that differ, unless a store has this configuration and its variables."""
+    if changes := _changes(store.attributes(path), attributes(run)):
         raise InputError(
             f"{path} was made with another configuration ({'; '.join(changes)}); "
             "choose another store with -o, or restore the values."
@@ -147,14 +114,15 @@ def check_same(path: Path, run: config.RunConfig) -> None:
 
 def check_mergeable(path: Path, first: Mapping[str, Any], other: Path, second: Mapping[str, Any]) -> None:
     """Raise InputError if stores have different configurations."""
-    changes = _changes(first, second)
-    if changes:
+    if changes := _changes(first, second):
         raise InputError(f"{other} and {path} differ ({'; '.join(changes)}); merge slices of one configuration.")
 
 
 def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """Return the differences that keep two stores from being one ensemble: science, kept maps, mcsim's version."""
-    changes = [change for change in config.differences(old["science"], new["science"]) if not _of_summary(change)]
+    changes = config.differences(old["science"], new["science"])
+    # The bins of the summary, which earlier versions counted as science, may differ.
+    changes = [change for change in changes if not change.startswith("biposh.summary_bin: ")]
     for key, before, after in (
         ("ensemble.keep_maps", *(a["configuration"]["ensemble"]["keep_maps"] for a in (old, new))),
         ("version of mcsim", *(a["packages"]["mcsim"] for a in (old, new))),
@@ -164,60 +132,34 @@ def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     return changes
 
 
-def _of_summary(change: str) -> bool:
-    """Return True for a difference of the summary alone, whose bins earlier versions counted as science."""
-    return change.startswith("biposh.summary_bin: ")
-
-
-def stored(path: Path, realizations: int) -> tuple[Layout, summary.Recipe]:
-    """Return the layout and recipe of an existing store, with another number of realizations."""
+def stored(path: Path, realizations: int) -> Layout:
+    """Return the layout of an existing store, with another number of realizations."""
     with opening.open_ensemble(path) as found:
         attrs = found.attrs["configuration"]
-        pairs = tuple(str(pair) for pair in found["pair"].values)
         kept = found.sizes.get("pixel")
-        maps = tuple(str(name) for name in found["map_name"].values) if kept else ()
-        lmax, paired = found.sizes["ell"] - 1, "biposh_circular" in found
-        stored_modes = tuple(
-            Mode(int(L), int(M), int(d)) for L, M, d in zip(found["L"], found["M"], found["d"], strict=True)
+        indices = zip(*(found[name].values.tolist() for name in ("L", "M", "d")), strict=True)
+        return Layout(
+            realizations,
+            store.chunk(path),
+            tuple(found["map_name"].values.tolist()) if kept else (),
+            tuple(found["pair"].values.tolist()),
+            tuple(Mode(*each) for each in indices),
+            found.sizes["ell"] - 1,
+            "biposh_circular" in found,
+            kept,
+            frame=attrs["map"]["frame"],
+            bin_width=attrs["biposh"]["summary_bin"],
         )
-    layout = Layout(
-        realizations, store.chunk(path), maps, pairs, stored_modes, lmax, paired, kept, frame=attrs["map"]["frame"]
-    )
-    return layout, summary.Recipe(pairs, stored_modes, lmax, attrs["biposh"]["summary_bin"], paired)
 
 
 def describe(source: str | Path, part: slice | None = None, workers: int | None = None) -> str:
-    """Return a text on the cost of a run: realizations, tasks, memory, disk, files and time."""
+    """Return a text on the cost of a run: realizations, tasks, memory, disk, files and time.
+
+    It is estimated from the run's sizes, its beams, and one timed transform.
+    """
     run = config.load(source)
     check_effects(run)
-    planned = cost(run, wanted(run, part))
-    count = workers or run.compute.workers
-    hours = planned.realizations * planned.seconds_per_realization / 3600.0
-    return "\n".join(
-        [
-            f"{run.name}: {planned.realizations} realizations in {planned.tasks} tasks",
-            f"  memory  {planned.worker_bytes / 1e9:.2f} GB per worker, {count} workers",
-            f"  disk    {planned.store_bytes / 1e6:.1f} MB in about {planned.files} files",
-            f"  time    {planned.seconds_per_realization:.3g} s per realization and core, {hours:.3g} core-hours,"
-            f" {60.0 * hours / count:.3g} minutes with {count} workers on as many idle cores",
-        ]
-    )
-
-
-@dataclass(frozen=True)
-class Cost:
-    """Cost of a run: realizations, tasks, worker memory, disk, files, and processor time of the transforms."""
-
-    realizations: int
-    tasks: int
-    worker_bytes: float
-    store_bytes: float
-    files: int
-    seconds_per_realization: float
-
-
-def cost(run: config.RunConfig, realizations: range) -> Cost:
-    """Estimate the cost of a run from its sizes, its beams, and one timed transform."""
+    number = len(wanted(run, part))
     if run.sky.spectrum is not None:
         spectra.load(run.sky.spectrum, run.sky.lmax)
     mmax = [load_beam(channel, run.sky.lmax).mmax for channel in run.channels]
@@ -227,29 +169,26 @@ def cost(run: config.RunConfig, realizations: range) -> Cost:
     names = config.map_names(run)
     both = run.biposh.pairs == "all"
     pairs = len(names) * (len(names) + 1) // 2 if both else len(names)
-    found = modes(run.biposh.L_max, both and len(names) > 1)
-    npix = 12 * nside**2
-    bare = Layout(
-        run.ensemble.realizations, 1, names, ("",) * pairs, found, lmax, run.ensemble.paired,
-        npix if run.ensemble.keep_maps else None,
-    )  # fmt: skip
-    planned = _chunked(bare, run.compute.chunk)
+    planned = _layout(run, ("",) * pairs, modes(run.biposh.L_max, both and len(names) > 1))
     splits = len(run.map.splits) or 1
     transform, estimation = _timed(nside, run.sky.lmax, lmax, run.biposh.L_max)
     transforms = sum(1.0 + 2.0 * m + splits * (2.0 + 4.0 * run.biposh.iterations) for m in mmax)
     if run.map.grid == "gl":
         transforms = sum(2.0 * m for m in mmax)
     estimates = pairs * (2 if run.ensemble.paired else 1)
-    largest = max(mmax)
-    memory = 3e8 + 8.0 * npix * (6 + 2 * largest) + 16.0 * alm_.size(run.sky.lmax) * (6 + len(names) * 2)
+    each_s = transform * transforms + estimation * estimates + differencing.seconds(run)
+    memory = 3e8 + 96.0 * nside**2 * (6 + 2 * max(mmax)) + 16.0 * alm_.size(run.sky.lmax) * (6 + len(names) * 2)
     memory += planned.chunk * planned.realization_bytes()
-    return Cost(
-        len(realizations),
-        -(-len(realizations) // planned.chunk),
-        memory,
-        float(planned.realization_bytes()) * len(realizations),
-        planned.files(),
-        transform * transforms + estimation * estimates + differencing.seconds(run),
+    disk = float(planned.realization_bytes()) * number
+    count, hours = workers or run.compute.workers, number * each_s / 3600.0
+    return "\n".join(
+        [
+            f"{run.name}: {number} realizations in {-(-number // planned.chunk)} tasks",
+            f"  memory  {memory / 1e9:.2f} GB per worker, {count} workers",
+            f"  disk    {disk / 1e6:.1f} MB in about {planned.files()} files",
+            f"  time    {each_s:.3g} s per realization and core, {hours:.3g} core-hours,"
+            f" {60.0 * hours / count:.3g} minutes with {count} workers on as many idle cores",
+        ]
     )
 
 

@@ -77,7 +77,7 @@ def test_resume_computes_what_is_damaged_and_no_more(small_store: Path, client: 
     flip(copy / "biposh" / "c/2/0/0/0")  # in the last, incomplete chunk
     truncate(copy / "done" / "c/0")
     (copy / "cl" / "c/1/0/0.0123.partial").write_bytes(b"half a file")
-    result = runner.run(table(), copy, resume=True, client=client)
+    result = runner.run(table(), copy, resume=True, workers=client)
     assert (result.finished, result.computed) == (10, 6)
     assert_same(copy, small_store)
     assert {file.relative_to(copy) for file in copy.rglob("*")} == {
@@ -101,7 +101,7 @@ def test_metadata_coordinates_and_summary_are_made_again(
     assert not verdict.intact
     assert verdict.broken.keys() >= {"biposh", "L", "mode", "realization"}
     assert any(name.startswith("summary") for name in verdict.broken)
-    result = runner.run(table(), copy, resume=True, client=client)
+    result = runner.run(table(), copy, resume=True, workers=client)
     assert result.computed == 0
     assert_same(copy, small_store)
     assert repair.verify(copy).intact
@@ -112,7 +112,7 @@ def test_hash_that_is_not_that_of_the_configuration_is_named(small_store: Path, 
     root["attributes"]["digest"] = "0" * 64
     (copy / "zarr.json").write_text(json.dumps(root))
     assert "attributes" in repair.verify(copy).broken
-    runner.run(table(), copy, resume=True, client=client)
+    runner.run(table(), copy, resume=True, workers=client)
     assert_same(copy, small_store)
 
 
@@ -139,8 +139,8 @@ def test_rows_that_are_missing_are_never_summed(client: Client, copy: Path) -> N
     (copy / "biposh" / "c/1/0/0/0").unlink()
     shutil.rmtree(copy / "summary")
     with refused("copy.zarr", "4-7", "--resume", by=RunError):
-        runner.run(table(), copy, client=client)
-    assert runner.run(table(), copy, resume=True, client=client).computed == 4
+        runner.run(table(), copy, workers=client)
+    assert runner.run(table(), copy, resume=True, workers=client).computed == 4
 
 
 def test_verify_on_the_command_line(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -168,12 +168,12 @@ def test_attempts_are_bounded_and_the_others_finish(
         return real(shared, r)
 
     monkeypatch.setattr(simulate, "realize", realize)
-    result = runner.run(table(), tmp_path / "x.zarr", client=client)
+    result = runner.run(table(), tmp_path / "x.zarr", workers=client)
     assert [(f.realization, f.reason) for f in result.failures] == [(4, "MemoryError: no room for it")]
     assert (attempts[4], attempts[6], attempts[5]) == (tasks.ATTEMPTS, tasks.ATTEMPTS, 1)
     assert result.finished == 9
     monkeypatch.undo()
-    runner.run(table(), tmp_path / "x.zarr", client=client)
+    runner.run(table(), tmp_path / "x.zarr", workers=client)
     assert_same(tmp_path / "x.zarr", small_store)
 
 
@@ -198,7 +198,7 @@ def test_a_task_given_up_for_lost_does_not_undo_another(
 def test_other_packages_are_refused_by_name(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batch, "packages", lambda: (*tasks.packages()[:-1], ("numcodecs", "0.1")))
     with refused(socket.gethostname(), "numcodecs", version("numcodecs"), 0.1):
-        runner.run(table(), tmp_path / "x.zarr", client=client)
+        runner.run(table(), tmp_path / "x.zarr", workers=client)
 
 
 def test_completed_gives_every_result_once(client: Client) -> None:
@@ -295,9 +295,9 @@ def test_summary_whose_workers_die_is_a_sentence(
     shutil.rmtree(copy / "summary")
     monkeypatch.setattr(batch, "summarise_node", dying)
     with refused("3 workers", "tcp://10.0.0.7:1", "copy.zarr", by=RunError):
-        runner.run(table(), copy, client=client)
+        runner.run(table(), copy, workers=client)
     monkeypatch.undo()
-    runner.run(table(), copy, client=client)
+    runner.run(table(), copy, workers=client)
     assert_same(copy, small_store)
 
 
@@ -349,16 +349,16 @@ def test_sentence_of_a_call_stays_one_where_its_cause_cannot_be_unpickled(client
 
 def test_interrupted_slices_are_verified_by_what_they_hold(client: Client, tmp_path: Path) -> None:
     path = tmp_path / "slice.zarr"
-    runner.run(table(), path, realizations=slice(0, 5), client=client)
+    runner.run(table(), path, realizations=slice(0, 5), workers=client)
     verdict = repair.verify(path)
     assert (verdict.finished, verdict.size, verdict.intact) == (5, 10, True)
 
 
 def test_second_half_of_an_extension_is_repaired(small_store: Path, client: Client, tmp_path: Path) -> None:
     path = tmp_path / "x.zarr"
-    runner.run(table(**ensemble(3)), path, client=client)
+    runner.run(table(**ensemble(3)), path, workers=client)
     truncate(path / "L" / "c/0")
-    runner.run(table(), path, resume=True, client=client)
+    runner.run(table(), path, resume=True, workers=client)
     assert_same(path, small_store)
 
 
@@ -381,10 +381,10 @@ def test_disk_that_takes_no_more_stops_in_a_sentence_and_goes_on(
 
     monkeypatch.setattr(store, "write", write)
     with refused("x.zarr", "--resume", by=RunError, errno=number):
-        runner.run(table(), path, client=client)
+        runner.run(table(), path, workers=client)
     monkeypatch.undo()
     assert not (tmp_path / "x.zarr.lock").exists()
-    assert runner.run(table(), path, resume=True, client=client).finished == 10
+    assert runner.run(table(), path, resume=True, workers=client).finished == 10
     assert_same(path, small_store)
 
 
@@ -401,10 +401,10 @@ def test_store_that_is_deleted_during_the_run(
 
     monkeypatch.setattr(simulate, "realize", realize)
     with refused("x.zarr", "--verify", "--resume", by=RunError):
-        runner.run(table(), path, client=client)
+        runner.run(table(), path, workers=client)
     monkeypatch.undo()
     shutil.rmtree(path, ignore_errors=True)
-    runner.run(table(), path, client=client)
+    runner.run(table(), path, workers=client)
     assert_same(path, small_store)
 
 
@@ -429,7 +429,7 @@ def test_worker_that_dies_every_time_costs_its_realization_alone(
 
     with runner.local_client(2) as processes:
         processes.register_plugin(Poison())
-        result = runner.run(table(), path, client=processes)
+        result = runner.run(table(), path, workers=processes)
     (failure,) = result.failures
     assert failure.realization == 5
     death = r"each of the 2 workers that computed it died, the last of them tcp://127\.0\.0\.1:\d+ \(out of memory\?\)"

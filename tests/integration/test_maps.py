@@ -53,7 +53,7 @@ def test_a_diagnosis_reads_what_is_written(tmp_path: Path) -> None:
 
 def test_they_are_the_maps_that_a_store_keeps(client: Client, tmp_path: Path) -> None:
     run = table(**ensemble(3, keep_maps=True))
-    runner.run(run, tmp_path / "x.zarr", client=client)
+    runner.run(run, tmp_path / "x.zarr", workers=client)
     folders = write_maps(run, tmp_path / "maps", slice(1, 3))
     assert [folder.name for folder in folders] == ["00001", "00002"]
     kept = open_ensemble(tmp_path / "x.zarr").observed_map

@@ -51,7 +51,7 @@ def test_exact_prediction_is_the_mean_of_an_ensemble(kind: str, client: Client, 
             **ensemble(60),
         )
     )
-    runner.run(run, tmp_path / "x.zarr", client=client)
+    runner.run(run, tmp_path / "x.zarr", workers=client)
     stored, factor = open_ensemble(tmp_path / "x.zarr"), open_summary(tmp_path / "x.zarr").bin_factor
     expected = prediction.predict(run, exact=True)
 
@@ -81,7 +81,7 @@ def test_hit_average_fitted_with_parallel_transport_gives_the_factor_of_a20(tmp_
             {"name": "W1", "beam": BEAM, "scan": {"kind": "moments", "path": limit_moments(tmp_path / "m.fits", 64)}}
         ],
     )
-    tables.write_prediction(prediction.predict(hit), tmp_path / "hit.ecsv")
+    tables.write(prediction.predict(hit), tmp_path / "hit.ecsv")
     transported = table(channel=[{"name": "W1", "beam": BEAM, "scan": {"kind": "parallel_transport"}}])
     measured = beamfit.measurement(tmp_path / "hit.ecsv", transported, beamfit.Selection(kind="plain"))
     found = beamfit.fit(measured, transported, "constant")

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from mcsim import config
-from mcsim.config import arrays, paths
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments, ScanModel, write_moments_fits
@@ -232,8 +231,3 @@ def test_nothing_half_written_is_left() -> None:
     with pytest.raises(InputError):
         config.load(table({"spectrum": np.array([object()])}))
     assert all(path.name.startswith("given-") for path in folders.default_cache_dir().iterdir())
-
-
-def test_keys_of_files_are_those_of_the_paths() -> None:
-    assert {path.split(".")[1] for path in paths._RULES} == arrays.FILES
-    assert {path.split(".")[1] for path, rule in paths._RULES.items() if rule.placeholders} == arrays.TEMPLATES

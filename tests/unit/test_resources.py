@@ -40,15 +40,6 @@ def test_nothing_packaged_is_said(monkeypatch, tmp_path):
         resources.workflow("quickstart")
 
 
-def test_relative_path_starts_from_the_folder_given(layout, tmp_path):
-    model = tmp_path / "mine.toml"
-    model.write_text("")
-    assert resources.scan_model("mine.toml", relative_to=tmp_path) == model
-    assert resources.scan_model(Path("mine.toml"), relative_to=str(tmp_path)) == model
-    with refused("mine.toml"):
-        resources.scan_model("mine.toml", relative_to=tmp_path / "site")
-
-
 def test_packaged_name_wins_over_a_file_and_dot_slash_chooses_the_file(layout, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("wmap").write_text("")
