@@ -135,8 +135,7 @@ def fit(
     parallel transport give 0.6575 (tests/integration/test_prediction.py).
     """
     survey = survey_of(source, nthreads)
-    measured = data if isinstance(data, Measurement) else measurement(data, survey)
-    return _fit(templates(survey, measured, nthreads), name, knots, order)
+    return fit_models(measurement(data, survey), survey, [name], knots=knots, order=order, nthreads=nthreads)[0]
 
 
 def _fit(made: Templates, name: str, knots: int, order: Order) -> Fit:

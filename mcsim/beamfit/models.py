@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +9,7 @@ from scipy.interpolate import CubicSpline
 
 from mcsim.errors import InputError
 
-ModelName = Literal["constant", "linear", "spline", "orientation"]
-
-MODELS: tuple[str, ...] = get_args(ModelName)
+MODELS = ("constant", "linear", "spline", "orientation")
 
 
 @dataclass(frozen=True)

@@ -36,9 +36,13 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING) 
     suffix, chosen = _kind(path, table, selection.kind)
     scaling = scaling_of(path, table.meta)
     check_frame(path, str(table.meta.get("frame", frame)).lower(), frame)
-    label = _pair(path, table, selection.pair)
-    if label is not None:
-        table = table[[str(name) == label for name in table["pair"]]]
+    label = selection.pair
+    if "pair" in table.colnames:
+        labels = [str(name) for name in table["pair"]]
+        label = labels[0] if label is None else label
+        if label not in labels:
+            raise InputError(f"There is no pair {label} in {path}; choose among {'; '.join(dict.fromkeys(labels))}.")
+        table = table[[name == label for name in labels]]
     L, M, d, low, high = (_integers(path, table, name) for name in COLUMNS)
     wrong = np.flatnonzero((low < 0) | (low > high))
     if len(wrong):
@@ -133,16 +137,6 @@ def scaling_of(path: str | Path, meta: Any) -> Scaling:
         raise InputError(f'{path} has scaling {scaling!r}, which is not known; write "l(l+1)/2pi" or "none".')
     # The header of an exported summary defines the scaling of odd parity.
     return SUMMARY if bennett and spectrum and "hajian" in normalisation else Scaling(bennett, spectrum, summary=False)
-
-
-def _pair(path: str | Path, table: Table, pair: str | None) -> str | None:
-    if "pair" not in table.colnames:
-        return pair
-    labels = list(dict.fromkeys(str(name) for name in table["pair"]))
-    label = labels[0] if pair is None else pair
-    if label not in labels:
-        raise InputError(f"There is no pair {label} in {path}; choose among {'; '.join(labels)}.")
-    return label
 
 
 def in_uk2(path: str | Path, table: Table, name: str) -> NDArray[np.float64]:
