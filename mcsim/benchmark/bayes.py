@@ -13,8 +13,6 @@ from mcsim.benchmark.sampler import CaseSampler
 from mcsim.sphere import rng
 from mcsim.stats.detection import pair_log_marginals, posterior
 
-DRAWS = 256
-
 
 @dataclass(frozen=True, eq=False)
 class BayesClassifier:
@@ -79,9 +77,9 @@ class BayesClassifier:
 
     @cached_property
     def _normals(self) -> Vector:
-        """Antithetic standard normals, shape (draws, columns)."""
+        """Antithetic standard normals, shape (256, columns)."""
         columns = 2 * int(self.sampler.library.groups.sizes.max())
-        half = rng.generator(0, 0, "challenge/bayes").standard_normal((DRAWS // 2, columns))
+        half = rng.generator(0, 0, "challenge/bayes").standard_normal((128, columns))
         return np.concatenate([half, -half])
 
 

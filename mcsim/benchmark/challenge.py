@@ -121,8 +121,7 @@ def _measured(model: LearnedModel, member: Member, seed: int) -> Member:
     assert member.candidate is not None  # it is of the library
     candidate = model.candidates[member.candidate]
     for attempt in range(ATTEMPTS):
-        amplitude = SMALLER**attempt * member.parameters["amplitude"]
-        parameters = {**member.parameters, "amplitude": amplitude}
+        parameters = {**member.parameters, "amplitude": SMALLER**attempt * member.parameters["amplitude"]}
         effect = candidate.effect(**parameters)
         try:
             strength = model.expected_snr(candidate.table(effect))
@@ -147,9 +146,9 @@ def _without_none(value: Any) -> Any:
 def run(folder: str | Path, *, workers: int | None = None, quiet: bool = True) -> int:
     """Diagnose the cases of a challenge that have no verdict yet, without looking at the keys; return their number.
 
-    The folder, filled by :func:`make`, gets ``verdicts/case-NNN`` with ``verdict.json`` and
-    ``answer.json`` (the data vector and the fits behind the verdict). ``workers`` is the number of processes; None:
-    the model's; 0: this process. InputError if the folder holds no challenge.
+    The folder, filled by :func:`make`, gets ``verdicts/case-NNN`` with ``verdict.json`` and ``answer.json`` (the data
+    vector and the fits behind the verdict). ``workers`` is the number of processes; None: the model's; 0: this process.
+    InputError if the folder holds no challenge.
     """
     target = Path(folder)
     missing = [case for case in files.finished_cases(target) if not (target / files.VERDICTS / case).is_dir()]

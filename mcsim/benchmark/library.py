@@ -167,10 +167,7 @@ class LearnedModel(Library):
         return [data_vectors(replace(job, without=()))[:, self.rows] for job in jobs]
 
     def expected_snr(self, effect: config.Effect) -> float:
-        """Return the expected S/N of the mean response to an effect.
-
-        The mean is split into two halves of the skies, so that their noise does not count as signal.
-        """
+        """Return the expected S/N of the mean response, from two halves of the skies: noise is no part of it."""
         halves = self.simulate(after_jobs(self.context.run, self.context.analysis, [effect], SKIES))
         before = np.split(self.context.ensemble.reference[:SKIES], [len(halves[0])])
         changes = [(after - same).mean(axis=0) for after, same in zip(halves, before, strict=True)]

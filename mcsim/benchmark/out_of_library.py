@@ -32,10 +32,7 @@ class OutOfLibrary:
 def load(path: str) -> dict[str, type[Effect]]:
     """Load the effects that a Python file defines, by name.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be run, or defines no effect, or one whose name the library has.
+    InputError if the file cannot be run, or defines no effect, or one whose name the library has.
     """
     spec = importlib.util.spec_from_file_location(f"mcsim_out_of_library_{Path(path).stem}", path)
     if spec is None or spec.loader is None or not Path(path).is_file():

@@ -133,7 +133,7 @@ def _calibration(axes: Axes, score: Score) -> None:
 def _binned(axes: Axes, x: ArrayLike, hits: ArrayLike, label: str, colour: str = BLUE, bins: int = 8) -> None:
     """Draw the share of hits in bins of equal numbers of cases, with its 95 % interval."""
     x, hits = np.asarray(x), np.asarray(hits, dtype=bool)
-    if len(x) < 2:
+    if len(np.unique(x)) < 2:
         return
     edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, min(bins, max(len(x) // 8, 1)) + 1)))
     total, passed = (np.histogram(values, edges)[0] for values in (x, x[hits]))
