@@ -170,8 +170,8 @@ def challenge_make(
 ) -> None:
     """Draw effects, make the maps of the cases, seal the keys."""
     from mcsim import config
+    from mcsim.benchmark.challenge import make
     from mcsim.benchmark.folder import Settings
-    from mcsim.benchmark.make import make
 
     interrupt_once()
     file = None if inventions is None else str(inventions)
@@ -182,7 +182,7 @@ def challenge_make(
 @challenge.command("run")
 def challenge_run(folder: Folder, workers: Workers = None) -> None:
     """Diagnose all cases that have no verdict."""
-    from mcsim.benchmark.run import run as diagnose_all
+    from mcsim.benchmark.challenge import run as diagnose_all
 
     interrupt_once()
     print(f"{diagnose_all(folder, workers=workers, quiet=False)} cases diagnosed")

@@ -14,6 +14,9 @@ from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates
 # Nodes of the average over the part of the data outside the span of the templates.
 NODES = 40
 
+NEGLIGIBLE = 15.0
+"""Pairs whose best fit is less likely than the best pair's by more than this, in the logarithm, are left out."""
+
 
 def power(strength: float, columns: int, threshold: float, dimension: int, simulations: int | None) -> float:
     """Return the power of the nested test of one candidate.
@@ -230,3 +233,48 @@ def posterior(
     logs = np.concatenate([null.log_likelihood(total), np.where(K > 0, marginal, null.log_likelihood(total))], axis=-1)
     with np.errstate(divide="ignore"):  # what the prior excludes has a logarithm of minus infinity
         return special.softmax(logs + np.log(prior), axis=-1)
+
+
+def pair_log_marginals(
+    null: SimulatedGaussian,
+    y: NDArray[np.float64],
+    groups: WhitenedTemplates,
+    pairs: Sequence[tuple[int, int]],
+    norms: tuple[float, float],
+    normals: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the log marginal likelihood of pairs of groups, shape (pairs,), minus infinity for negligible ones.
+
+    White data ``y`` have shape (p,). The white norm s of each effect is uniform in log s within ``norms``, and its
+    direction isotropic: the prior density of K amplitudes is 1/(s^K A_K log(s_max/s_min)), A_K the area of the unit
+    sphere. The integral over the amplitudes of both is by importance sampling from the Gaussian about their joint best
+    fit, with standard ``normals`` of shape (draws, columns of a pair or more). Checked by brute force:
+    tests/unit/test_challenge.py.
+    """
+    total, along, gram = float(y @ y), groups.basis.T @ y, groups.basis.T @ groups.basis
+    fits = []
+    for i, j in pairs:
+        columns = np.r_[groups.start[i] : groups.start[i + 1], groups.start[j] : groups.start[j + 1]]
+        matrix = gram[np.ix_(columns, columns)] + 1e-9 * np.eye(len(columns))
+        theta = np.linalg.solve(matrix, along[columns])
+        fits.append((matrix, theta, max(total - float(along[columns] @ theta), 0.0)))
+    likelihoods = null.log_likelihood(np.array([chi2 for _, _, chi2 in fits]))
+    found = np.full(len(fits), -np.inf)
+    for number in np.flatnonzero(likelihoods > np.max(likelihoods, initial=-np.inf) - NEGLIGIBLE).tolist():
+        (matrix, theta, chi2), first = fits[number], groups.sizes[pairs[number][0]]
+        root = np.linalg.cholesky(matrix * null.curvature(chi2))
+        drawn = theta + np.linalg.solve(root.T, normals[:, : len(theta)].T).T
+        density = _log_prior(drawn[:, :first], norms) + _log_prior(drawn[:, first:], norms)
+        volume = 0.5 * len(theta) * np.log(2.0 * np.pi) - np.sum(np.log(np.diag(root)))
+        with np.errstate(divide="ignore"):  # no draw is within the norms
+            mean = special.logsumexp(density) - np.log(len(drawn))
+        found[number] = likelihoods[number] + mean + volume
+    return found
+
+
+def _log_prior(theta: NDArray[np.float64], norms: tuple[float, float]) -> NDArray[np.float64]:
+    """Return the log prior density of amplitudes in orthonormal white coordinates, shape (draws, K) to (draws,)."""
+    K, s, (low, high) = theta.shape[1], np.linalg.norm(theta, axis=1), norms
+    area = np.log(2.0) + 0.5 * K * np.log(np.pi) - special.gammaln(0.5 * K)
+    value = -K * np.log(np.maximum(s, 1e-300)) - area - np.log(np.log(high / low))
+    return np.where((s >= low) & (s <= high), value, -np.inf)

@@ -39,6 +39,14 @@ def unwritable(name: str | Path, remedy: str) -> Iterator[None]:
         raise InputError(f"{name} cannot be written ({error.strerror or error}); {remedy}.") from error
 
 
+def write_whole(path: Path, text: str) -> None:
+    """Write a file that appears complete or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    scratch = path.with_name(f".{path.name}.{os.getpid()}")
+    scratch.write_text(text)
+    os.replace(scratch, path)
+
+
 def writable(folder: Path) -> None:
     """Make a folder; raise InputError if nothing can be written into it."""
     with unwritable(folder, "choose another folder"):

@@ -31,7 +31,7 @@ def test_second_writer_is_refused_by_name(small_store: Path, client: Client, tmp
         runner.run(table(), path, workers=client)
     assert not path.exists()
     lock.unlink()
-    with locked(path), pytest.raises(InputError, match=f"process {os.getpid()} on {socket.gethostname()}"):
+    with locked(path), refused("x.zarr", os.getpid(), socket.gethostname()):
         runner.run(table(), path, workers=client)
     assert not lock.exists()
     lock.write_text("another-host 1")

@@ -12,10 +12,9 @@ from hypothesis import strategies as st
 from scipy import integrate, stats
 
 from mcsim import config, systematics
-from mcsim.benchmark import intervals
 from mcsim.benchmark.bayes import BayesClassifier
-from mcsim.benchmark.case import Drawn, Member, Prior, Truth
-from mcsim.benchmark.draws import Draw, draws, judge, powers
+from mcsim.benchmark.case import Drawn, Member, Prior, Record, Truth, pulls
+from mcsim.benchmark.challenge import _without_none, make, run
 from mcsim.benchmark.folder import (
     MAPS,
     SEAL,
@@ -28,24 +27,22 @@ from mcsim.benchmark.folder import (
     open_key,
     read_key,
     write_key,
-    write_whole,
 )
 from mcsim.benchmark.library import linear_model, reduced
-from mcsim.benchmark.make import _without_none, make
-from mcsim.benchmark.record import Record, pulls
 from mcsim.benchmark.report import lines, write
-from mcsim.benchmark.run import run
 from mcsim.benchmark.sampler import CaseSampler
-from mcsim.benchmark.score import _is_named, score, score_draws
-from mcsim.benchmark.signatures import SIGNATURES, any_place_right
-from mcsim.benchmark.summary import confusion, summarise
+from mcsim.benchmark.score import Draw, _is_named, draws, judge, powers, score, score_draws
+from mcsim.benchmark.summary import SIGNATURES, Score, any_place_right, confusion
 from mcsim.diagnosis.analysis import Analysis
+from mcsim.diagnosis.campaign import batch
 from mcsim.diagnosis.candidate import Candidate, TemplateBank, numbered
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Block, Element
 from mcsim.errors import InputError
+from mcsim.stats.look_elsewhere import global_test
+from mcsim.support.folders import write_whole
 from refusals import refused
 
 ENTRIES = 24
@@ -213,7 +210,7 @@ def test_a_run_in_toml_loads_as_the_same_run(name):
 
 
 def test_cases_do_not_depend_on_how_many_there_are(linear):
-    sampler = CaseSampler(Prior(), linear.library)
+    sampler = CaseSampler(Prior(), linear)
     few, many = sampler.kinds(3, 20), sampler.kinds(3, 400)
     assert many[:20] == few
     assert [sampler.draw(few, 3, case) for case in range(20)] == [sampler.draw(many, 3, case) for case in range(20)]
@@ -225,14 +222,14 @@ def test_cases_do_not_depend_on_how_many_there_are(linear):
 
 
 def test_what_is_left_out_rotates(linear):
-    sampler = CaseSampler(Prior(none=0, one=0, two=0, left_out=1), linear.library)
+    sampler = CaseSampler(Prior(none=0, one=0, two=0, left_out=1), linear)
     kinds = sampler.kinds(1, 6)
     names = [sampler.draw(kinds, 1, case).without[0] for case in range(6)]
     assert sorted(names[:3]) == sorted(names[3:]) == sorted(set(sampler.names))
 
 
 def test_an_effect_that_cannot_be_strong_enough_is_not_drawn(linear, monkeypatch):
-    library, prior = linear.library, Prior()
+    library, prior = linear, Prior()
     name = CaseSampler(prior, library).names[0]
     same = [index for index, candidate in enumerate(library.candidates) if candidate.name == name]
     columns = [column for index in same for column in library.candidates[index].columns]
@@ -244,7 +241,7 @@ def test_an_effect_that_cannot_be_strong_enough_is_not_drawn(linear, monkeypatch
 
 def test_strengths_are_the_drawn_ones(learned, linear):
     """Length of the response, by the covariance that the toy was made with; known to 5 % from 600 simulations."""
-    sampler = CaseSampler(Prior(none=0, one=1, two=0, left_out=0), linear.library)
+    sampler = CaseSampler(Prior(none=0, one=1, two=0, left_out=0), linear)
     kinds = sampler.kinds(1, 200)
     for case in range(200):
         (found,) = sampler.draw(kinds, 1, case).members
@@ -264,29 +261,33 @@ def test_a_prior_that_is_none_is_refused(wrong):
 
 def test_power_of_one_template_is_the_known_one():
     """One candidate of one column: the score test's power is a noncentral F's, no trials."""
-    found = powers(linear_model(toy(NAMES[:1], simulations=2400)), 1500, 4)
+    model = linear_model(toy(NAMES[:1], simulations=2400))
+    found = powers(model, 1500, 4)
     expected = np.interp(found.strengths, found.grid, found.finite)
     excess = np.sum(found.by_maximum) - expected.sum()
     # Data are 600 held-out simulations, each used two or three times: their noise is common to the draws.
     assert abs(excess) < 4.0 * np.sqrt(2.5 * np.sum(expected * (1.0 - expected)))
     assert found.limit[-1] > 0.99
-    false = np.sum(found.null_maximum <= 0.05)
-    low, high = stats.binom.ppf((1e-4, 1 - 1e-4), len(found.null_maximum), 0.05)
+    quiet = [global_test(model.null, x, model.groups, model.calibration) for x in model.data]
+    np.testing.assert_array_equal(found.null_gap, [one.pvalue for one in quiet])
+    false = sum(one.maximum <= 0.05 for one in quiet)
+    low, high = stats.binom.ppf((1e-4, 1 - 1e-4), len(quiet), 0.05)
     assert low <= false <= high
 
 
 @pytest.mark.slow
 def test_draws_are_judged(learned, linear, tmp_path):
-    records = draws(learned, 120, 2, Prior())
+    with batch(0) as call:
+        records = draws(learned, 120, 2, Prior(), call)
     assert [record.case for record in records] == [f"draw-{number:05d}" for number in range(120)]
-    score = summarise("toy", records, powers(linear, 300, 2))
+    found = Score("toy", records, powers(linear, 300, 2))
     strong = [record for record in records if record.kind == "one" and record.strength > 6]
     # Nearly orthogonal templates, far above the threshold: only the 5 % of true sets that are refused go wrong.
     wrong = sum(not record.right for record in strong)
     assert wrong <= stats.binom.ppf(1 - 1e-4, len(strong), 0.06)
     assert sum(record.bayes != record.truth for record in strong) <= 2
     assert all(record.distances[0] >= record.distances[-1] for record in records if record.kind == "left_out")
-    figures = {metric.name: metric for metric in score.metrics}
+    figures = {metric.name: metric for metric in found.metrics}
     assert figures["excess chi^2 removed, S/N >= 8"].value > 0.8
     assert abs(figures["excess chi^2 removed by an effect that does not act"].value) < 0.1
     # Named or not, so that choosing what to name has no say: unit normals, of n an error of their mean of 1/sqrt(n).
@@ -296,16 +297,16 @@ def test_draws_are_judged(learned, linear, tmp_path):
     assert abs(fitted.mean()) < 4.0 / np.sqrt(len(fitted))
     assert abs(fitted.std() - 1.0) < 4.0 / np.sqrt(2 * len(fitted))
     assert all(set(record.pulls) <= set(record.fitted) for record in records)
-    write(score, tmp_path / "score")
+    write(found, tmp_path / "score")
     page = (tmp_path / "score" / "report.html").read_text()
     assert "data:image/png;base64" in page
     assert "http" not in page
-    assert any("false alarms" in line for line in lines(score))
+    assert any("false alarms" in line for line in lines(found))
 
 
 def test_an_out_of_library_effect_is_called_unknown(linear):
     """A response at right angles to every template, at ten sigmas, in 40 skies: no name, but where noise adds one."""
-    here = linear.library
+    here = linear
     rng = np.random.default_rng(8)
     left = here.null.whiten_templates(here.templates)
     basis = np.linalg.qr(left)[0]
@@ -330,7 +331,7 @@ def test_an_out_of_library_effect_is_called_unknown(linear):
 def test_pairs_have_the_marginal_likelihood_of_brute_force():
     """Likelihood times prior of two amplitudes on a grid, against importance sampling; many simulations: Gaussian."""
     prior = Prior(none=0.2, one=0.5, two=0.3, left_out=0, invented=0, weakest=2.0, strongest=10.0)
-    here = linear_model(toy(NAMES[:2], simulations=20_000, common=0.3)).library
+    here = linear_model(toy(NAMES[:2], simulations=20_000, common=0.3))
     bayes = BayesClassifier(CaseSampler(prior, here))
     white = here.null.whiten_templates(here.templates)
     unit = white / np.linalg.norm(white, axis=0)
@@ -381,61 +382,6 @@ def test_an_effect_that_is_left_out_takes_only_its_own_columns_and_elements(lear
 # Figures
 
 
-@given(st.integers(1, 300).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
-def test_binomial_intervals_are_those_of_the_beta_distribution(counts):
-    k, n = counts
-    low, high = intervals.binomial_interval(k, n)
-    assert low == pytest.approx(stats.beta.ppf(0.025, k, n - k + 1) if k else 0.0, abs=1e-9)
-    assert high == pytest.approx(stats.beta.ppf(0.975, k + 1, n - k) if k < n else 1.0, abs=1e-9)
-
-
-def test_too_few_cases_meet_no_target():
-    for metric in (intervals.share("x", []), intervals.mean("x", [1.0]), intervals.width("x", [1.0, 2.0])):
-        assert np.isnan(metric.value)
-        assert metric.within("above 0", 0.0).met is None
-    assert intervals.removed("x", []).count == 0
-    assert intervals.share("x", [True] * 19 + [False]).within("", 0.95).met is True
-    assert intervals.share("x", [True] * 18 + [False]).within("", 0.95).met is False
-
-
-def test_ratios_are_those_of_the_sums():
-    gone = intervals.removed("x", [(10.0, 1.0), (20.0, 2.0), (1e-9, 3.0)])
-    assert gone.value == pytest.approx(0.8)
-    rng = np.random.default_rng(0)
-    x = rng.uniform(20, 100, 400)
-    delta_chi2 = [0.9 * x, x] + 15 * rng.standard_normal((2, 400))
-    # The sums' errors, 15 sqrt(400) of some 24,000 each, are 1.8 % together.
-    found = intervals.ratio("x", delta_chi2[1], delta_chi2[0])
-    assert found.value == pytest.approx(0.9, abs=4 * 0.018 * 0.9)
-    assert found.low < found.value < found.high
-
-
-def test_intervals_cover_what_they_say():
-    """Of 200 samples each interval holds the truth in 95 %; bootstrap of 60 cases: 93 % at least; 4 sigma."""
-    rng = np.random.default_rng(5)
-    hits = np.zeros(3)
-    for _ in range(200):
-        x = rng.standard_normal(60)
-        found = intervals.mean("", x), intervals.width("", x), intervals.ratio("", 5 + x, 4 + rng.standard_normal(60))
-        hits += [one.low < true < one.high for one, true in zip(found, (0.0, 1.0, 0.8), strict=True)]
-    assert np.all(hits >= stats.binom.ppf(stats.norm.cdf(-4), 200, [0.95, 0.90, 0.93]))
-    assert np.all(hits <= 199.5)
-
-
-def test_the_snr_at_a_power_is_that_of_the_probit():
-    rng = np.random.default_rng(0)
-    s = rng.uniform(1, 8, 3000)
-    found = intervals.snr_at_power("", s, rng.random(3000) < stats.norm.cdf(s - 3.0), 2.0)
-    truth = (3.0 + stats.norm.ppf(0.9)) / 2.0
-    assert found.low < truth < found.high
-    assert found.value == pytest.approx(truth, abs=0.1)
-    assert np.isnan(intervals.snr_at_power("", s, s > 0).value)
-    # Of one in twenty, a third of the resampled cases have none.
-    few = intervals.snr_at_power("", s[:20], s[:20] == s[:20].max())
-    assert few.low <= few.high
-    assert np.isfinite([few.value, few.low, few.high]).all()
-
-
 def test_pulls_are_those_of_constrained_components():
     assert pulls([1.0, 0.0, 3.0], (0.5, 2.0, 4.0), [0.5, 0.0, 2.0]) == (1.0, -0.5)
 
@@ -459,7 +405,7 @@ def test_what_counts_as_right():
     ]
     assert [one.right for one in records] == [True, False, True, True, False, False]
     assert [one.wrong_name for one in records] == [False, True, False, False, True, False]
-    figures = {figure.name: figure for figure in summarise("toy", records).metrics}
+    figures = {figure.name: figure for figure in Score("toy", records).metrics}
     assert figures["right effect, S/N >= 5, |rho| <= 0.7"].value == 0.5
     assert figures["truth in the set, S/N >= 5, |rho| > 0.9"].value == 1.0
     assert figures["unknown, S/N >= 8 beyond every triple"].value == 0.5

@@ -68,6 +68,11 @@ def test_choice_of_modes_range_kind_and_pair(tmp_path):
     assert read(tmp_path, made, pair="V1,V1", modes=["L2M0d2"]).value.tolist() == [6.0]
 
 
+def test_a_table_without_pairs_is_of_the_pair_that_is_named(tmp_path):
+    found = read(tmp_path, table(), pair="V1,W1")
+    assert (found.pair, len(found.value)) == ("V1,W1", 3)
+
+
 def test_parts_of_complex_modes_share_the_variance(tmp_path):
     made = table(M=[1, 0, 0], value_imag=[7.0, 0.0, 0.0])
     found = read(tmp_path, made, modes=["L2M1d0"])

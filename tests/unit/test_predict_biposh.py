@@ -9,8 +9,7 @@ from wignernj import wigner3j
 
 from mcsim.bipolar.modes import bennett_factor, to_bennett
 from mcsim.bipolar.theory.beam_biposh import ScannedBeam, beam_biposh
-from mcsim.bipolar.theory.cmb_biposh import cmb_biposh_leading, noise_biposh
-from mcsim.bipolar.theory.exact import cmb_biposh_exact
+from mcsim.bipolar.theory.cmb_biposh import cmb_biposh_exact, cmb_biposh_leading, noise_biposh
 from mcsim.bipolar.theory.harmonics import parallel_transport_harmonics
 from refusals import refused
 
