@@ -97,7 +97,7 @@ class CaseSampler:
 
     def _can_be_drawn(self, index: int) -> bool:
         largest = float(np.max(np.linalg.norm(self._white(index), axis=0)))
-        most = self.library.candidates[index].effect.max_amplitude
+        most = self.library.candidates[index].effect.parametrization.max_amplitude
         return largest > 0.0 if np.isinf(most) else most * largest >= self.prior.weakest
 
     def _member(self, draw: np.random.Generator, name: str) -> Member:
@@ -105,16 +105,16 @@ class CaseSampler:
         group = channels[int(draw.integers(len(channels)))]
         index = group[int(draw.integers(len(group)))]
         candidate, white, strength = self.library.candidates[index], self._white(index), self.prior.strength(draw)
-        gram = white.T @ white
+        gram, fit = white.T @ white, candidate.effect.parametrization
         values, vectors = np.linalg.eigh(gram)
         constrained = values > 1e-9 * values[-1]
         direction = draw.standard_normal(len(values))
         theta = vectors[:, constrained] @ (direction[constrained] / np.sqrt(values[constrained]))
-        effect = candidate.with_coordinates(np.abs(theta) if candidate.effect.sign else theta, gram)
+        effect = candidate.with_coordinates(np.abs(theta) if fit.sign else theta, gram)
         # The parameters reach only some directions, and coordinates need not be linear in the amplitude.
         for _ in range(30):
-            snr = np.linalg.norm(white @ effect.coordinates())
-            slope = np.log(np.linalg.norm(white @ effect.scaled(1.01).coordinates()) / snr) / np.log(1.01)
+            snr = np.linalg.norm(white @ fit.coordinates(effect))
+            slope = np.log(np.linalg.norm(white @ fit.coordinates(effect.scaled(1.01))) / snr) / np.log(1.01)
             effect = effect.scaled(float((strength / snr) ** (1.0 / slope)))
             if abs(snr / strength - 1.0) < 1e-9:
                 break
@@ -122,8 +122,8 @@ class CaseSampler:
             name,
             candidate.channel,
             {"amplitude": effect.amplitude, **effect.parameters()},
-            tuple(float(value) for value in effect.coordinates()),
-            float(np.linalg.norm(white @ effect.coordinates())),
+            tuple(float(value) for value in fit.coordinates(effect)),
+            float(np.linalg.norm(white @ fit.coordinates(effect))),
             index,
         )
 

@@ -6,6 +6,7 @@ Exit codes: 0 done, 1 failed realizations, 2 bad input, 130 interrupted.
 import json
 import os
 import sys
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated
 
@@ -246,15 +247,12 @@ def effects(name: Annotated[str | None, typer.Argument(metavar="EFFECT", help="O
     """List the library of effects: what a run can add and a diagnosis can find."""
     from mcsim import systematics as library
 
-    known = [library.get(name).name] if name is not None else None
-    for row in library.describe():
-        if known is not None and row["name"] not in known:
-            continue
-        parameters = ", ".join(f"{key} = {value!r}" for key, value in row["parameters"].items())
-        out.print(f"{row['name']} ({row['scope']}; amplitude in {row['unit']})", style="bold", markup=False)
+    for kind in library.catalogue().values() if name is None else [library.get(name)]:
+        parameters = ", ".join(f"{field.name} = {field.default!r}" for field in fields(kind))
+        out.print(f"{kind.name} ({kind.scope}; amplitude in {kind.unit})", style="bold", markup=False)
         out.print(f"  parameters  {parameters}", markup=False)
         for key in ("cause", "signature", "source"):
-            out.print(f"  {key:<11} {row[key]}", markup=False)
+            out.print(f"  {key:<11} {getattr(kind, key)}", markup=False)
 
 
 @app.command()

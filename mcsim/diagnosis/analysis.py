@@ -95,7 +95,7 @@ def analysis_of(
     model = model_of(survey(run, nthreads=nthreads, orders=settings.beam_orders), settings)
     candidates = numbered(
         [
-            Candidate(effect, channel, tuple(range(len(effect.basis()))), dict(fixed))
+            Candidate(effect, channel, tuple(range(len(effect.parametrization.basis()))), dict(fixed))
             for name, effect in systematics.catalogue().items()
             if name not in without
             for channel in ([None] if effect.scope == "common" else [channel.name for channel in run.channels])
@@ -121,7 +121,7 @@ def _applies(model: Model, kind: type[Effect], channel: str | None, settings: Ma
             return False
         if not any(owner.beam.mmax for owner in owners):
             return False
-    effect = replace(kind.basis()[0], **settings)
+    effect = systematics.basis_of(kind, settings)[0]
     try:
         for owner in owners:
             effect.gain(np.zeros(1), owner.site)

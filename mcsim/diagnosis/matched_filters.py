@@ -128,7 +128,7 @@ def matched_filter(model: Model, effect: Effect, channel: int | None) -> Matched
     where = 0 if channel is None else channel
     owner = model.survey.channels[where]
     parts = tuple(range(len(model.parts))) if channel is None else model.of(channel)
-    if not kind.matched_filter:
+    if not kind.parametrization.matched_filter:
         return None
     if kind.sky is not Effect.sky:
         return SkyFilter(effect, owner.site, parts, channel is None)

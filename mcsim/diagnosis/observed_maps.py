@@ -76,7 +76,7 @@ class ObservedMaps:
             index
             for index, candidate in enumerate(context.candidates)
             if context.sky_scatter[index] >= settings.sky_scatter
-            and not (candidate.random_response or candidate.effect.mean_response)
+            and not (candidate.random_response or candidate.effect.parametrization.mean_response)
         ]
         return context.bank.on_sky(t, context.candidates, random, self.respond, settings.constrained_skies)
 

@@ -69,4 +69,4 @@ class Responses:
 
     def _is_typical(self, effect: config.Effect) -> bool:
         kind = next(one.effect for one in self._analysis.candidates if one.name == effect.name)
-        return kind.mean_response and not kind.stochastic
+        return kind.parametrization.mean_response and not kind.parametrization.stochastic

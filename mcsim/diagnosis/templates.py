@@ -81,6 +81,6 @@ class TemplateBank:
                     response = respond([candidate.table(basis)], skies).mean(axis=0)
                 except InputError:
                     continue
-                step = basis.coordinates()[place]
+                step = basis.parametrization.coordinates(basis)[place]
                 result[:, column] = response / step - self.curvature[:, column] * step
         return result

@@ -75,7 +75,8 @@ def _channel(
     if site.dipole_uk.any() and acting:
         seen = seen + dipole_alm(site.dipole_uk, site.lmax)
         known = tod.sky_signal(-dipole_alm(site.dipole_uk, 1), 1, _cut(site.beam, 1), epsilon, nthreads)
-    observe = tod.sky_signal(seen, site.lmax, _beam(acting, site), epsilon, nthreads)
+    beam = systematics.seen_through(acting, site, [effect for effect in acting if not _moves(effect)])
+    observe = tod.sky_signal(seen, site.lmax, beam, epsilon, nthreads)
     sigma0 = next(spec.noise.sigma0_uk for spec in run.channels if spec.name == channel.name)
     for index, m in enumerate(channel.maps):
         share = (index / len(channel.maps), (index + 1) / len(channel.maps))
@@ -104,17 +105,6 @@ def check(channel: Channel) -> None:
 
 def _cut(beam: Beam, lmax: int) -> Beam:
     return replace(beam, blm=beam.blm[: lmax + 1, : lmax + 1])
-
-
-def _beam(acting: tuple[systematics.Effect, ...], site: systematics.Site) -> Beam:
-    """Return the beam about the true line of sight."""
-    beam = site.beam
-    for effect in acting:
-        beam = effect.beam(beam, site)
-    for effect in acting:
-        if not _moves(effect):
-            beam = effect.pointing(beam, site)
-    return beam
 
 
 def _moves(effect: systematics.Effect) -> bool:

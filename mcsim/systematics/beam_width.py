@@ -23,9 +23,7 @@ class BeamWidth(Effect):
     step = 0.005
 
     def beam(self, beam: Beam, site: Site) -> Beam:
-        """Stretched."""
-        if self.amplitude == 0.0:
-            return beam
+        """Stretch the beam."""
         if not -0.9 <= self.amplitude <= 9.0:
             raise InputError(
                 f"effect {self.name}: amplitude = {self.amplitude:g} leaves no beam to speak of; "

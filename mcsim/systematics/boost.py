@@ -10,8 +10,8 @@ from scipy.sparse.linalg import expm_multiply
 
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
-from mcsim.systematics.base import Alm, Draw, Site, Wording
-from mcsim.systematics.vectors import DirectedEffect
+from mcsim.systematics.base import Alm, DirectedEffect, Draw, Site, Wording
+from mcsim.systematics.parametrization import SkyVector
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,14 +43,10 @@ class Boost(DirectedEffect):
     signature = "L = 1, d = 1, growing as l: to be seen from l of about 1000 on."
     source = "Challinor & van Leeuwen 2002, Phys. Rev. D 65, 103001; Planck 2013 results XXVII"
     step = 1e-4
-    matched_filter = False
-    mean_response = True
-    max_amplitude = 0.01
+    parametrization = SkyVector(max_amplitude=0.01, mean_response=True, matched_filter=False)
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Boosted."""
-        if self.amplitude == 0.0:
-            return sky
+        """Boost the sky."""
         if abs(self.amplitude) >= 1.0:
             raise InputError(
                 f"effect {self.name}: amplitude = {self.amplitude:g} is not slower than light; keep it within +-1."

@@ -6,6 +6,7 @@ import numpy as np
 
 from mcsim.errors import InputError
 from mcsim.systematics.base import Effect, Map, Site, Wording
+from mcsim.systematics.parametrization import Parametrization
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +22,7 @@ class NoiseLevel(Effect):
     signature = "Autos only, flat in l, as the hits."
     source = "Jarosik et al. 2011, ApJS 192, 14 (sigma0 per channel, and its error)"
     step = 0.01
-    matched_filter = False
+    parametrization = Parametrization(matched_filter=False)
 
     def noise(self, site: Site) -> Map | None:
         """Return the same factor everywhere."""

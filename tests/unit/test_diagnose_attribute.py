@@ -18,7 +18,7 @@ from mcsim.diagnosis.validation import Measured, Prediction, Shrink
 from mcsim.stats.detection import cosines, detectable, log_evidence, posterior, snr_needed, snr_to_separate
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate
-from mcsim.systematics import Effect
+from mcsim.systematics import Effect, Parametrization
 
 P, N = 60, 800
 ALPHA = 0.05
@@ -26,7 +26,8 @@ ALPHA = 0.05
 
 def candidate(name: str, channel: str | None, columns: tuple[int, ...], settings=None, sign=0, largest=np.inf, **more):
     """Return a candidate of an effect that does nothing."""
-    attributes = {"name": name, "unit": "", "scope": "channel", "step": 1.0, "sign": sign, "max_amplitude": largest}
+    fitted = Parametrization(sign=sign, max_amplitude=largest)
+    attributes = {"name": name, "unit": "", "scope": "channel", "step": 1.0, "parametrization": fitted}
     return Candidate(type(name, (Effect,), attributes), channel, columns, settings or {}, **more)
 
 
