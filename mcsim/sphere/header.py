@@ -1,7 +1,13 @@
-"""Units of temperature and coordinate frames of maps, from FITS headers."""
+"""FITS files: opened so that a broken one is an error; units of temperature and coordinate frames in their headers."""
 
 import re
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from astropy.io import fits
+from astropy.utils.exceptions import AstropyUserWarning
 
 from mcsim.errors import InputError
 
@@ -21,6 +27,16 @@ _FRAMES = {
     "galactic": ("g", "gal", "galactic"),
     "equatorial": ("c", "q", "cel", "celestial", "equ", "equatorial", "icrs", "fk5", "j2000"),
 }
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[fits.HDUList]:
+    """Open a FITS file, gzipped or not; astropy's warning of a truncated one is raised."""
+    # Opened here, not by astropy, which leaves the file open when its own warning is raised.
+    with warnings.catch_warnings(), path.open("rb") as stream:
+        warnings.filterwarnings("error", message=".*truncated.*", category=AstropyUserWarning)
+        with fits.open(stream) as hdus:
+            yield hdus
 
 
 def frame_named(coordsys: object, where: str) -> str | None:

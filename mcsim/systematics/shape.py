@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.instrument.beams import Beam
+from mcsim.instrument.beams.coefficients import unpacked
 
 Blm = NDArray[np.complex128]
 Values = NDArray[np.float64]
@@ -71,11 +72,7 @@ class Shape:
         """
         lmax, mmax = self.original.lmax, min(self.orders, self.original.lmax)
         packed = ducc0.sht.analysis_2d(map=added[None], spin=0, lmax=lmax, mmax=mmax, geometry="GL", nthreads=1)[0]
-        blm = np.zeros((mmax + 1, lmax + 1), dtype=np.complex128)
-        end = 0
-        for m in range(mmax + 1):
-            start, end = end, end + lmax + 1 - m
-            blm[m, m:] = packed[start:end]
+        blm = unpacked(packed, lmax, mmax)
         blm[: self.original.mmax + 1] += self.original.blm
         if keep_integral:
             blm *= self.original.blm[0, 0].real / blm[0, 0].real
@@ -95,16 +92,7 @@ def shape(beam: Beam, orders: int) -> Shape:
     columns = 2 * highest + 2
     theta = np.asarray(ducc0.misc.GL_thetas(rings))[:, None]
     phi = (np.arange(columns) * 2.0 * np.pi / columns)[None, :]
-    values = ducc0.sht.synthesis_2d(
-        alm=whole.packed()[None],
-        lmax=whole.lmax,
-        mmax=whole.mmax,
-        spin=0,
-        ntheta=rings,
-        nphi=columns,
-        geometry="GL",
-        nthreads=1,
-    )[0]
+    values = whole.on_rings(rings, columns, "GL")
     return Shape(beam, whole, highest, theta, phi, values)
 
 

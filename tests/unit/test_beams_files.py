@@ -51,7 +51,7 @@ def test_lower_lmax_and_chosen_mmax(tmp_path, beam) -> None:
     ("lmax", "mmax", "named"),
     [
         (121, None, "stops at lmax = 120"),
-        (120, 7, "stops at mmax = 6"),
+        (120, 7, "mmax = 7 exceeds the largest order 6"),
         (5, 6, "mmax = 6 .* lmax = 5"),
         (0, None, "lmax = 0"),
     ],

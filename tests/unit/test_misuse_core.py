@@ -12,7 +12,6 @@ from mcsim import bipolar
 from mcsim.bipolar import theory
 from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
-from mcsim.instrument.beams.turn import rotated
 from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.limit import limit_moments
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
@@ -132,7 +131,7 @@ WRONG = {
     "ScanModel: year in days": lambda: replace(MODEL, orbit_period_s=365.25),
     "ScanModel: negative angle": lambda: replace(MODEL, precession_angle_deg=-22.5),
     "with_sampling: zero": lambda: MODEL.with_sampling(0.0),
-    "rotated: degrees": lambda: rotated(BEAM, 45.0),
+    "rotated: degrees": lambda: BEAM.rotated(45.0),
     "pointing: negative": lambda: pointing(MODEL, MODEL.lines_of_sight[0], -1, 5),
     "parallel_transport: NaN": lambda: scan.Moments.parallel_transport(NSIDE, np.nan),
     "parallel_transport: exchanged": lambda: scan.Moments.parallel_transport(45.0, NSIDE),
