@@ -241,7 +241,7 @@ def detectable_amplitude(null: SimulatedGaussian, t: Vector, looks: int, candida
     candidate
         The candidate.
     """
-    size = detectable(null, t, looks).typical
+    size = detectable(null, t, looks)
     if not np.isfinite(size):
         return None
     direction = np.zeros(t.shape[1])

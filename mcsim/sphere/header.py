@@ -69,19 +69,9 @@ def radians(unit: str) -> float:
 def to_uk(unit: str | None, path: Path, frequency_ghz: float | None = None) -> float:
     """Return the factor from a unit to uK of CMB (thermodynamic) temperature; 1 if the header gives none.
 
-    Parameters
-    ----------
-    unit
-        As in a header: uK, mK, K (CMB temperature unless they say antenna or RJ), or a brightness such as MJy/sr.
-    path
-        Path of the file, for messages.
-    frequency_ghz
-        Frequency of the channel; antenna temperature and brightness need it.
-
-    Raises
-    ------
-    InputError
-        For another unit, or if a needed frequency is missing.
+    ``unit`` is as in a header: uK, mK, K (CMB temperature unless they say antenna or RJ), or a brightness such as
+    MJy/sr; ``path`` names the file in messages. Antenna temperature and brightness need the channel's frequency. Raise
+    InputError for another unit, or if a needed frequency is missing.
 
     Notes
     -----

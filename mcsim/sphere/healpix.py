@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.sphere.checks import check_alm, check_complete, check_map, check_nside, check_whole
-from mcsim.sphere.header import frame_named
+from mcsim.sphere.header import frame_named, opened
 from mcsim.support.npy import read_npy
 
 Map = NDArray[np.float64]
@@ -50,21 +50,10 @@ def gradient(alm: Alm, nside: int, lmax: int, nthreads: int = 1) -> NDArray[np.f
 
 
 def analysis(map_: Map, lmax: int, iterations: int = 0, nthreads: int = 1) -> Alm:
-    """Return the coefficients of a map by ring-weighted quadrature and Jacobi iterations.
+    """Return the coefficients of a RING-ordered map, shape (npix,), by ring-weighted quadrature and Jacobi iterations.
 
-    Parameters
-    ----------
-    map_
-        RING-ordered map, shape (npix,).
-    lmax
-        Largest degree, <= 3 nside - 1.
-    iterations
-        Number of Jacobi iterations; each costs a synthesis and an adjoint synthesis.
-
-    Raises
-    ------
-    InputError
-        If the map is not a complete HEALPix map, or lmax exceeds 3 nside - 1.
+    Raise InputError if the map is not complete, or lmax exceeds 3 nside - 1. Each of the ``iterations`` costs a
+    synthesis and an adjoint synthesis.
 
     Notes
     -----
@@ -211,9 +200,7 @@ def read_pixel_window(path: Path, lmax: int, nside: int | None = None) -> NDArra
 
 def _fits_pixel_window(path: Path) -> tuple[NDArray, int | None]:
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", category=AstropyUserWarning)
-            table, header = fits.getdata(path, 1, header=True)
-            return np.asarray(table.field(0), dtype=float).ravel(), header.get("NSIDE")
+        with opened(path) as hdus:
+            return np.asarray(hdus[1].data.field(0), dtype=float).ravel(), hdus[1].header.get("NSIDE")
     except Exception as error:  # libraries raise errors of any type for a broken file
         raise InputError(f"{path} is not a FITS pixel window ({error}); give a HEALPix pixel_window file.") from error

@@ -72,19 +72,10 @@ def _normalise(jmin: int, n: int, factor: float, top_sign: float, out: NDArray[n
 
 @njit(cache=True, nogil=True)
 def threej_family(j2: int, j3: int, m2: int, m3: int, out: NDArray[np.float64]) -> tuple[int, int]:
-    """Write the 3j symbols (j j2 j3; -m2-m3 m2 m3) for every j to the start of ``out``.
+    """Write the 3j symbols (j j2 j3; -m2-m3 m2 m3) for every j to the start of ``out``, |m2| <= j2 and |m3| <= j3.
 
-    Parameters
-    ----------
-    j2, j3, m2, m3
-        Integers, |m2| <= j2 and |m3| <= j3.
-    out
-        Shape (>= 2 min(j2, j3) + 1,).
-
-    Returns
-    -------
-    jmin, n
-        ``out[i]`` belongs to j = jmin + i, i < n, with jmin = max(|j2 - j3|, |m2 + m3|).
+    ``out`` has the shape (>= 2 min(j2, j3) + 1,). Return jmin = max(|j2 - j3|, |m2 + m3|) and their number n:
+    ``out[i]`` belongs to j = jmin + i.
 
     Notes
     -----
@@ -115,17 +106,9 @@ def threej_family(j2: int, j3: int, m2: int, m3: int, out: NDArray[np.float64]) 
 def sixj_family(j2: int, j3: int, j4: int, j5: int, j6: int, out: NDArray[np.float64]) -> tuple[int, int]:
     """Write the 6j symbols {j j2 j3; j4 j5 j6} for every j to the start of ``out``.
 
-    Parameters
-    ----------
-    j2, j3, j4, j5, j6
-        Integers whose triads (j4, j2, j6) and (j4, j5, j3) satisfy the triangle conditions.
-    out
-        Shape (>= 2 min(j2, j3, j5, j6) + 1,).
-
-    Returns
-    -------
-    jmin, n
-        ``out[i]`` belongs to j = jmin + i, i < n, with jmin = max(|j2 - j3|, |j5 - j6|).
+    The triads (j4, j2, j6) and (j4, j5, j3) satisfy the triangle conditions. ``out`` has the shape
+    (>= 2 min(j2, j3, j5, j6) + 1,). Return jmin = max(|j2 - j3|, |j5 - j6|) and their number n: ``out[i]`` belongs to
+    j = jmin + i.
 
     Notes
     -----

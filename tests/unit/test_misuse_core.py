@@ -86,13 +86,9 @@ WRONG = {
     "analysis: two maps": lambda: healpix.analysis(np.stack([MAP, MAP]), LMAX),
     "pixel_window: nside": lambda: healpix.pixel_window(12, LMAX),
     "rotate_alm: another lmax": lambda: rotation.rotate_alm(BIGGER, LMAX, "galactic", "ecliptic"),
-    "rotate_map: not all pixels": lambda: rotation.rotate_map(MAP[:-1], "galactic", "ecliptic"),
     "rotate_pixels: not all pixels": lambda: rotation.rotate_pixels(MAP[:-1], "galactic", "ecliptic"),
     "rotate_pixels: frame": lambda: rotation.rotate_pixels(MAP, "G", "ecliptic"),
     "rotate_biposh: modes": lambda: rotation.rotate_biposh(np.zeros((3, 9), complex), MODES, "galactic", "ecliptic"),
-    "rotate_orientation_harmonics: shape": lambda: rotation.rotate_orientation_harmonics(
-        np.zeros((2, 3, 3), complex), "galactic", "ecliptic"
-    ),
     "gaussian_alm: negative": lambda: sky.gaussian_alm(-CL, np.random.default_rng(1)),
     "gaussian_alm: NaN": lambda: sky.gaussian_alm(np.nan * CL, np.random.default_rng(1)),
     "gaussian_alm: two spectra": lambda: sky.gaussian_alm(np.stack([CL, CL]), np.random.default_rng(1)),
