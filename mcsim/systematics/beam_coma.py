@@ -78,7 +78,6 @@ class BeamComa(Effect):
     name = "beam_coma"
     scope = "channel"
     unit = "k of 1 + k (u^3 - 3u)"
-    title = "beam coma"
     wording = Wording("k = {}")
     cause = "Third-order aberration of optics off the axis."
     signature = "L = 1 and 3, d = +-1, through w_1 and w_3; changes sign where the scan reverses (half1 - half2)."

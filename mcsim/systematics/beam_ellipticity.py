@@ -26,7 +26,6 @@ class BeamEllipticity(Effect):
     name = "beam_ellipticity"
     scope = "channel"
     unit = "major/minor - 1"
-    title = "beam ellipticity"
     wording = Wording("axis ratio {}", offset=1.0)
     cause = "Optics off the axis: defocus, coma-free astigmatism, or a horn that looks past the centre of the mirror."
     signature = "Even L, growing as l^2, fixed to the scan through w_2."

@@ -54,7 +54,6 @@ class BeamSidelobe(Effect):
     name = "beam_sidelobe"
     scope = "channel"
     unit = "fraction of the peak"
-    title = "beam sidelobe"
     wording = Wording("negative ring of {} of the peak", " %", 100.0, negative="ring of {} of the peak")
     cause = "Spill-over, struts or panels of the mirror; negative where two horns are subtracted."
     signature = "A halo at low l, pick-up of the plane and the dipole, and with q the m = 2 part of b_lm."

@@ -15,7 +15,6 @@ class BeamWidth(Effect):
     name = "beam_width"
     scope = "channel"
     unit = "fraction of the FWHM"
-    title = "beam width"
     wording = Wording("FWHM {} larger", " %", 100.0, negative="FWHM {} smaller")
     cause = "A beam mapped with an error of its width, or a focus that drifts."
     signature = "L = 0: the power falls off sooner, in this channel alone."

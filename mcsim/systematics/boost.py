@@ -18,15 +18,9 @@ from mcsim.systematics.parametrization import SkyVector
 class Boost(DirectedEffect):
     """The sky as an observer of velocity beta sees it: T(n) / (gamma (1 - beta . n')) in the direction n' of n.
 
-    Attributes
-    ----------
-    amplitude
-        Length of beta; ours is 1.23e-3.
-    lon_deg, lat_deg
-        Its direction in the frame of the maps.
-
     Notes
     -----
+    The amplitude is the length of beta, for us 1.23e-3; its direction is in the frame of the maps.
     Boosts along one axis are a group in the rapidity eta = artanh beta, and a temperature has the weight for which
     they are unitary: T' = exp(eta G) T, with G T = f T - grad f . grad T and f = the axis . n. With the axis at the
     pole, G takes a_lm to (l + 1) A_{l+1,m} at l + 1 and to -l A_lm at l - 1, A_lm^2 = (l^2 - m^2)/(4 l^2 - 1): exact to

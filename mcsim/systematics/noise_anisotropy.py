@@ -29,7 +29,6 @@ class NoiseAnisotropy(Effect):
     name = "noise_anisotropy"
     scope = "channel"
     unit = "fraction of the variance"
-    title = "noise anisotropy"
     wording = Wording("{} of the variance", " %", 100.0)
     cause = "Hits that are not those of the survey, flagged or lost samples, or noise that varies through the year."
     signature = "Autos only, L = 2, M = 0 of the ecliptic frame; the variance map of half differences."

@@ -16,7 +16,6 @@ class NoiseLevel(Effect):
     name = "noise_level"
     scope = "channel"
     unit = "fraction of sigma0"
-    title = "noise level"
     wording = Wording("{} more noise", " %", 100.0, negative="{} less noise")
     cause = "Noise estimated on other data, or a gain that is not the fiducial one."
     signature = "Autos only, flat in l, as the hits."

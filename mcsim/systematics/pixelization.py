@@ -20,7 +20,6 @@ class Pixelization(Effect):
     name = "pixelization"
     scope = "channel"
     unit = "1 = window and centroid ignored"
-    title = "pixelization"
     wording = Wording("{} of the window and the centroids of pixels left out", " %", 100.0)
     cause = "Simulations at the pixels' centres, where the survey has samples all over the pixels."
     signature = "Small scales, depending on nside, and the gradient of the sky at pixels that are hit unevenly."

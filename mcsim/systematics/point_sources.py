@@ -26,7 +26,6 @@ class PointSources(Effect):
     name = "point_sources"
     scope = "common"
     unit = "uK^2 sr"
-    title = "point sources"
     wording = Wording("C_ℓ = {}", " µK² sr")
     cause = "Radio galaxies below the limit of the catalogue."
     signature = "Flat C_l, in autos and crosses of all channels alike."

@@ -29,7 +29,6 @@ class PointingOffset(Effect):
     name = "pointing_offset"
     scope = "channel"
     unit = "arcmin"
-    title = "pointing offset"
     wording = Wording("{}", "′")
     cause = "A boresight calibrated on planets, thermal bending, or an error of the time stamps (along the scan)."
     signature = "The gradient of the sky along or across the scan, through w_1; acts on the dipole too."

@@ -26,7 +26,6 @@ class TimeConstant(Effect):
     name = "time_constant"
     scope = "channel"
     unit = "s"
-    title = "time constant"
     wording = Wording("{}", " ms", 1000.0)
     cause = "Heat capacity of a bolometer, or a filter in the electronics, not deconvolved."
     signature = "Lag and smear along beam x: nearly degenerate with a pointing offset along the scan, and with m = 2."

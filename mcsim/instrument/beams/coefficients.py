@@ -54,19 +54,10 @@ def unpacked(packed: NDArray, lmax: int, mmax: int) -> NDArray[np.complex128]:
 
 
 def choose_mmax(blm: NDArray[np.complex128], tolerance: float = MMAX_TOLERANCE) -> int:
-    """Choose the order above which a beam may be cut.
+    """Choose the order above which a beam may be cut: 0 if it is circular to round-off, else 2 or more.
 
-    Parameters
-    ----------
-    blm
-        Coefficients to a larger order than can matter, shape (mmax + 1, lmax + 1).
-    tolerance
-        Largest fraction of the power, over the degrees given, that may be neglected.
-
-    Returns
-    -------
-    int
-        0 for a beam that is circular to round-off, else the smallest m >= 2 that neglects no more than ``tolerance``.
+    It is the smallest that neglects no more than the fraction ``tolerance`` of the power over the degrees of ``blm``,
+    shape (mmax + 1, lmax + 1), which has a larger order than can matter.
 
     Notes
     -----
