@@ -40,12 +40,9 @@ def opened(path: Path) -> Iterator[fits.HDUList]:
 
 
 def frame_named(coordsys: object, where: str) -> str | None:
-    """Return the frame that a COORDSYS keyword names; None if it is missing or empty.
+    """Return the frame that a COORDSYS keyword of a file, ``where``, names; None if it is missing or empty.
 
-    Raises
-    ------
-    InputError
-        For a word that names none of the three frames; ``where`` names the file.
+    Raise InputError for a word that names none of the three frames.
     """
     word = str(coordsys or "").strip().lower()
     if word in _SILENT:

@@ -30,10 +30,7 @@ def geometry(nside: int) -> dict[str, Any]:
 def synthesis(alm: Alm, nside: int, lmax: int, spin: int = 0, nthreads: int = 1) -> NDArray[np.float64]:
     """Return the map of a_lm: (1, npix) from (1, size) at spin 0, else (2, npix) from E and B (2, size).
 
-    Raises
-    ------
-    InputError
-        If the coefficients do not fit ``lmax`` and ``spin``, or nside is not a whole number (any will do).
+    Raise InputError if the coefficients do not fit ``lmax`` and ``spin``, or nside is not whole (any number will do).
     """
     check_whole(nside, "nside", 1)
     check_alm(alm, lmax, shape=(2 if spin else 1,))
@@ -144,13 +141,8 @@ def _mean_legendre(pixels: NDArray[np.int64], nside: int, split: int, lmax: int)
 def read_map(path: Path) -> tuple[Map, str | None, str | None]:
     """Read the first map of a HEALPix FITS file in RING order, and its frame and unit if the header has them.
 
-    A .npy file holds an array of shape (npix,) in RING order; its frame and unit are None.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read as a HEALPix map, does not say whether it is RING or NESTED, or names an
-        unknown frame.
+    A .npy file holds an array of shape (npix,) in RING order; its frame and unit are None. Raise InputError if the file
+    cannot be read as a HEALPix map, does not say whether it is RING or NESTED, or names an unknown frame.
     """
     if path.suffix == ".npy":
         array = read_npy(path, "biuf").astype(np.float64)
@@ -177,10 +169,7 @@ def read_map(path: Path) -> tuple[Map, str | None, str | None]:
 def read_pixel_window(path: Path, lmax: int, nside: int | None = None) -> NDArray[np.float64]:
     """Read a temperature pixel window, shape (lmax + 1,), from a HEALPix FITS file or a .npy file.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, ends below lmax, states another ``nside``, or is not a window.
+    Raise InputError if the file cannot be read, ends below lmax, states another ``nside``, or is not a window.
     """
     window, found = (read_npy(path, "iuf"), None) if path.suffix == ".npy" else _fits_pixel_window(path)
     window = window.astype(np.float64)

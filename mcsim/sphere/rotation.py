@@ -18,10 +18,7 @@ FRAMES = {"ecliptic": "E", "galactic": "G", "equatorial": "C"}
 def rotation_matrix(frame_from: str, frame_to: str) -> NDArray[np.float64]:
     """Return R, shape (3, 3), with (components in ``frame_to``) = R (components in ``frame_from``).
 
-    Raises
-    ------
-    InputError
-        For a frame other than ecliptic, galactic or equatorial.
+    Raise InputError for a frame other than ecliptic, galactic or equatorial.
     """
     for frame in (frame_from, frame_to):
         if frame not in FRAMES:
@@ -86,12 +83,7 @@ def rotate_biposh(
     biposh
         Shape (..., n_mode, lmax + 1), of one map or of an ordered pair, at ell = l2 with d = l2 - l1.
     modes
-        (L, M, d) along the next-to-last axis: every M = 0..L of each (L, d), no M < 0.
-
-    Raises
-    ------
-    InputError
-        If an M of some (L, d) is missing.
+        (L, M, d) along the next-to-last axis: every M = 0..L of each (L, d), no M < 0; InputError if one is missing.
 
     Notes
     -----

@@ -30,10 +30,7 @@ Library = Mapping[str, type[Effect]]
 def catalogue() -> Library:
     """Return every effect by name, read-only: built in, then registered by other packages.
 
-    Raises
-    ------
-    InputError
-        If a registered effect cannot be loaded, is none, or bears a name that is taken.
+    Raise InputError if a registered effect cannot be loaded, is none, or bears a name that is taken.
     """
     found: dict[str, type[Effect]] = {}
     package = base.__name__.rpartition(".")[0]
@@ -108,11 +105,8 @@ def get(name: str, library: Library | None = None) -> type[Effect]:
 def build(kind: str | type[Effect], parameters: Mapping[str, Any], library: Library | None = None) -> Effect:
     """Build an effect, or the one of that name, from a table of parameters; those left out have their defaults.
 
-    Raises
-    ------
-    InputError
-        For an unknown name, a parameter that the effect does not have, or a value that is no finite number where one is
-        needed.
+    Raise InputError for an unknown name, a parameter that the effect does not have, or a value that is no finite number
+    where one is needed.
     """
     kind = get(kind, library) if isinstance(kind, str) else kind
     known = [f.name for f in fields(kind)]

@@ -278,19 +278,18 @@ class Beam:
 
     @property
     def lmax(self) -> int:
-        """Largest degree."""
+        """Return the largest degree."""
         return int(self.blm.shape[1]) - 1
 
     @property
     def mmax(self) -> int:
-        """Largest order."""
+        """Return the largest order."""
         return int(self.blm.shape[0]) - 1
 
     @property
     def window(self) -> NDArray[np.float64]:
-        """Window B_l of the circular part, shape (lmax + 1,)."""
-        window: NDArray[np.float64] = self.blm[0].real * np.sqrt(4 * np.pi / (2 * np.arange(self.lmax + 1) + 1))
-        return window
+        """Return the window B_l of the circular part, shape (lmax + 1,)."""
+        return np.asarray(self.blm[0].real * np.sqrt(4 * np.pi / (2 * np.arange(self.lmax + 1) + 1)))
 
     def truncated(self, mmax: int) -> Self:
         """Return the beam without its orders above ``mmax``; what it loses is added to ``neglected_power``."""
@@ -299,7 +298,7 @@ class Beam:
             return self
         power = power_by_order(self.blm)
         lost = (1 - self.neglected_power) * power[mmax + 1 :].sum() / power.sum()
-        return type(self)(self.blm[: mmax + 1].copy(), float(self.neglected_power + lost), self.integral)
+        return replace(self, blm=self.blm[: mmax + 1].copy(), neglected_power=float(self.neglected_power + lost))
 
     def circular(self) -> Self:
         """Return the m = 0 part."""
@@ -343,7 +342,7 @@ class Beam:
         if np.any((theta < 0.0) | (theta > np.pi)):
             raise InputError("theta must lie between 0 and pi radians: give the angle from the centre of the beam.")
         direction = np.stack([np.ravel(theta), np.ravel(phi) % (2 * np.pi)], axis=1)
-        values: NDArray[np.float64] = ducc0.sht.synthesis_general(
+        values = ducc0.sht.synthesis_general(
             alm=self.packed()[None],
             lmax=self.lmax,
             mmax=self.mmax,
@@ -351,5 +350,5 @@ class Beam:
             loc=direction,
             epsilon=1e-12,
             nthreads=nthreads,
-        )[0].reshape(np.shape(theta))
-        return values
+        )
+        return np.asarray(values[0].reshape(np.shape(theta)))

@@ -183,10 +183,7 @@ def find_centre(image: NDArray[np.float64], origin: str = "the beam map") -> tup
     that all rules agree on: for the WMAP maps 0.1 pixel is at stake, which is 1 to 5 % of the even orders but all of
     b_l1. Where odd orders matter, give the centre that the pointing refers to.
 
-    Raises
-    ------
-    InputError
-        If nothing in the image is positive, or the peak is less than 8 pixels from an edge.
+    Raise InputError if nothing in the image is positive, or the peak is less than 8 pixels from an edge.
     """
     row, column = (int(i) for i in np.unravel_index(np.argmax(image), image.shape))
     if not image[row, column] > 0:
@@ -264,13 +261,7 @@ _PROJECTIONS: dict[Projection, tuple[_Function, _Function, _Function]] = {
 
 
 def holds_image(path: str | Path) -> bool:
-    """Return True if a FITS file holds an image, as beam maps do, and not just tables.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read as FITS.
-    """
+    """Return True if a FITS file holds an image, as beam maps do, and not just tables; InputError for no FITS."""
     try:
         with opened(Path(path)) as hdus:
             return any(hdu.is_image and hdu.header.get("NAXIS", 0) >= 2 for hdu in hdus)
