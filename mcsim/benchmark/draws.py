@@ -12,7 +12,7 @@ from mcsim.benchmark.case import Drawn, Prior
 from mcsim.benchmark.library import LinearModel, linear_model
 from mcsim.benchmark.record import Record, best_possible, facts, pulls
 from mcsim.benchmark.sampler import CaseSampler
-from mcsim.diagnosis.batch import Batch
+from mcsim.diagnosis.campaign import Batch
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.selection import Attribution
 from mcsim.sphere import rng

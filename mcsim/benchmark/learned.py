@@ -16,8 +16,7 @@ from mcsim.benchmark.library import Library, reduced
 from mcsim.benchmark.out_of_library import library_with
 from mcsim.diagnosis.analysis import Job, analysis_of, data_vectors
 from mcsim.diagnosis.api import prepared
-from mcsim.diagnosis.batch import Batch, asking, batch
-from mcsim.diagnosis.campaign import after_jobs, seeded, with_effects
+from mcsim.diagnosis.campaign import Batch, after_jobs, asking, batch, seeded, with_effects
 from mcsim.diagnosis.context import DiagnosisContext, context
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps, read_maps
@@ -63,7 +62,7 @@ class LearnedModel:
         The mean is split into two halves of the skies, so that their noise does not count as signal.
         """
         null, reference, start, halves = self.library.null, self.context.ensemble.reference, 0, []
-        for after in self.simulate(after_jobs(self.context.run, self.context.analysis, [effect], SKIES)):
+        for after in self.simulate(after_jobs(self.context.analysis, [effect], SKIES)):
             change = (after - reference[start : start + len(after)]).mean(axis=0)
             halves.append(null.whiten_templates(change[:, None])[:, 0])
             start += len(after)
@@ -123,7 +122,7 @@ def _without(model: str, simulations: int | None, names: tuple[str, ...]) -> Lea
     if not names:
         return full
     analysis, ensemble, bank, rows = reduced(full.context, names)
-    return LearnedModel(context(full.context.run, analysis, ensemble, bank), rows)
+    return LearnedModel(context(analysis, ensemble, bank), rows)
 
 
 def _refuse(jobs: Sequence[Job]) -> list[Vector]:

@@ -9,13 +9,11 @@ from numpy.typing import NDArray
 
 from mcsim.benchmark.case import Answer, Identity, Member
 from mcsim.diagnosis.analysis import Analysis
-from mcsim.diagnosis.candidate import Candidate, columns_of, effects_at, numbered
+from mcsim.diagnosis.candidate import Candidate, TemplateBank, columns_of, effects_at, numbered
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.diagnosis.subsets import Subsets
-from mcsim.diagnosis.summaries import Element
-from mcsim.diagnosis.templates import TemplateBank
 from mcsim.diagnosis.validation import Halves, Prediction, Shrink
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import Fit, SimulatedGaussian, WhitenedTemplates
@@ -178,15 +176,9 @@ def reduced(
     """
     analysis = context.analysis
     kept = [candidate for candidate in analysis.candidates if candidate.name not in names]
-    gone = {candidate.label for candidate in analysis.candidates if candidate.name in names}
-
-    def matched_to_gone(element: Element) -> bool:
-        label = element.name.removeprefix("score/").rpartition("/")[0]
-        return element.statistic == "score" and label in gone
-
-    blocks = tuple(block for block in analysis.blocks if not all(map(matched_to_gone, block.elements)))
-    rows = np.flatnonzero([not matched_to_gone(element) for element in analysis.elements])
-    columns = np.array([column for candidate in kept for column in candidate.columns], dtype=np.int64)
+    blocks = tuple(block for block in analysis.blocks if all(one.candidate not in names for one in block.elements))
+    rows = np.flatnonzero([element.candidate not in names for element in analysis.elements])
+    columns = [column for column, label in enumerate(context.bank.labels) if label.effect not in names]
     without = tuple(sorted({*analysis.without, *names}))
-    fewer = Analysis(analysis.model, numbered(kept), blocks, without)
+    fewer = replace(analysis, candidates=numbered(kept), blocks=blocks, without=without)
     return fewer, context.ensemble.restrict(rows), context.bank.subset(rows, columns), rows

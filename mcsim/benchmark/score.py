@@ -1,6 +1,6 @@
 """Open the keys and score the verdicts; score draws of the data vector by the same metrics."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from mcsim.benchmark.library import Library, linear_model
 from mcsim.benchmark.record import Record, best_possible, facts, pulls
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.benchmark.summary import Score, summarise
+from mcsim.diagnosis.candidate import Candidate
 from mcsim.errors import InputError
 from mcsim.support.folders import writable
 
@@ -122,19 +123,25 @@ def _said(truth: Truth, verdict: Mapping[str, Any], answer: Mapping[str, Any], l
         "maximum": answer["maximum"],
         "verdict": verdict["verdict"],
         "answers": tuple(frozenset((effect["name"], effect["channel"]) for effect in one) for one in sets),
-        "pulls": _pulls(truth, answer, library),
+        "pulls": _pulls(truth, verdict, answer, library),
         **{key: reduction.get(key) for key in ("predicted", "achieved", "sigma")},
         "gaps": (reduction["gap_before"], reduction["gap_after"]) if reduction else None,
         "places": tuple((place["frame"], place["L"], place["parity"]) for place in verdict["where"][:3]),
     }
 
 
-def _pulls(truth: Truth, answer: Mapping[str, Any], library: Library) -> tuple[float, ...]:
+def _pulls(truth: Truth, verdict: Mapping[str, Any], answer: Mapping[str, Any], library: Library) -> tuple[float, ...]:
     """Return fitted less true components over their errors, where the only effect is named first."""
     if truth.kind != "one" or not answer["explanations"]:
         return ()
     (member,), best = truth.members, answer["explanations"][0]
     assert member.candidate is not None  # it is of the library
-    if best["proposals"] != [library.candidates[member.candidate].label]:
+    if not _is_named(verdict["effects"], library.candidates[member.candidate]):
         return ()
     return pulls(best["amplitudes"], member.coordinates, best["errors"])
+
+
+def _is_named(effects: Sequence[Mapping[str, Any]], candidate: Candidate) -> bool:
+    """Return True if the only effect of a verdict is the candidate, with its settings."""
+    identities = [(effect["name"], effect["channel"]) for effect in effects]
+    return identities == [candidate.identity] and candidate.settings.items() <= effects[0]["parameters"].items()

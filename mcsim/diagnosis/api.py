@@ -14,20 +14,18 @@ from numpy.typing import NDArray
 from mcsim import config, systematics
 from mcsim.diagnosis import campaign, measured_spectra, null_ensemble, report
 from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, data_vectors
-from mcsim.diagnosis.batch import asking, batch
+from mcsim.diagnosis.campaign import asking, batch
+from mcsim.diagnosis.candidate import TemplateBank
 from mcsim.diagnosis.context import DataSet, DiagnosisContext, context
 from mcsim.diagnosis.inference import diagnose_data
+from mcsim.diagnosis.measured_spectra import read_spectra
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.observed_maps import ObservedMaps, checked, read_maps
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.diagnosis.spectra import read_spectra
-from mcsim.diagnosis.templates import TemplateBank
 from mcsim.errors import InputError
 from mcsim.support import folders
 from mcsim.support.code import class_digest, package_digest
-
-Plan = Callable[[config.RunConfig, Analysis, int | None], campaign.Plan]
 
 CODE = ("config", "sphere", "stats", "instrument", "systematics", "bipolar", "simulation", "beamfit", "diagnosis")
 LIBRARIES = ("ducc0", "healpy", "numpy", "scipy")
@@ -55,7 +53,7 @@ def diagnose(
     data
         Folder with ``{channel}.fits`` or ``{channel}_{split}.fits``, uK; or the maps themselves, shape (npix,) each, in
         the order channel by channel, split by split; or a table of measured spectra
-        (:func:`mcsim.diagnosis.spectra.read_spectra`).
+        (:func:`mcsim.diagnosis.measured_spectra.read_spectra`).
     output
         Folder for ``verdict.json``, ``diagnosis.zarr`` and ``report.html``; None: nothing is written.
     case
@@ -97,11 +95,10 @@ def diagnose(
         maps = read_maps(analysis.model, data) if isinstance(data, str | Path) else checked(analysis.model, data)
     with batch(run.compute.workers if workers is None else workers) as call:
         with asking(call, quiet, task, "simulations of the model and of each effect") as ask:
-            plan = campaign.plan if table is None else measured_spectra.plan
-            ensemble, bank = _learned(run, analysis, simulations, ask, plan)
+            ensemble, bank = _learned(run, analysis, simulations, ask)
         with asking(call, quiet, task, "simulations of fitted effects") as ask:
-            known = context(run, analysis, ensemble if table is None else ensemble.of_mean(table.realizations), bank)
-            found: DataSet
+            known = context(analysis, ensemble if table is None else ensemble.of_mean(table.realizations), bank)
+            found: DataSet[Any]
             if table is not None:
                 found = measured_spectra.MeasuredSpectra(known, table, ask)
             else:
@@ -120,7 +117,7 @@ def prepared(
     simulations: int | None = None,
 ) -> DiagnosisContext:
     """Return what every set of maps is tested with, simulated or from the cache."""
-    return context(run, analysis, *_learned(run, analysis, simulations, ask))
+    return context(analysis, *_learned(run, analysis, simulations, ask))
 
 
 def _learned(
@@ -128,7 +125,6 @@ def _learned(
     analysis: Analysis,
     simulations: int | None,
     ask: campaign.Ask,
-    planned: Plan = campaign.plan,
 ) -> tuple[NullEnsemble, TemplateBank]:
     size = len(analysis.elements)
     if simulations is not None and simulations <= size:
@@ -138,12 +134,7 @@ def _learned(
         )
 
     def fill(scratch: Path) -> None:
-        plan = planned(run, analysis, simulations)
-        if simulations is None:
-            plan, results = campaign.simulated(plan, analysis, ask)
-        else:
-            results = ask(plan.jobs)
-        null_ensemble.save(scratch, *campaign.learned(analysis, plan, results))
+        null_ensemble.save(scratch, *campaign.learned(analysis, ask, simulations))
 
     return null_ensemble.load(folders.cached(f"diagnose/{_key(run, analysis, simulations)}.zarr", fill))
 
@@ -156,7 +147,7 @@ def _key(run: config.RunConfig, analysis: Analysis, simulations: int | None) -> 
     science = config.science(run)
     science["ensemble"] = {}
     effects = {candidate.effect for candidate in analysis.candidates}
-    effects |= {systematics.get(effect.name) for effect in run.effects}
+    effects |= {systematics.get(effect.name, dict(analysis.library)) for effect in run.effects}
     rest = [
         simulations,
         [[candidate.label, [repr(basis) for basis in candidate.basis]] for candidate in analysis.candidates],

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.diagnosis.candidate import Candidate, columns_of, parts_of
 from mcsim.diagnosis.context import DiagnosisContext
+from mcsim.diagnosis.localisation import Place
 from mcsim.diagnosis.partial_explanation import PartialExplanation
-from mcsim.diagnosis.places import Place
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.result import (
     CandidateResult,
@@ -49,7 +49,7 @@ class Findings:
     places, held_out, partial, notes
         Localisation, (prediction, reduction, data in words), what is detected beside "unknown", and remarks.
     residual_maps
-        From :func:`mcsim.diagnosis.residual_maps.standardised`; None without maps.
+        From :func:`mcsim.diagnosis.localisation.standardised`; None without maps.
     """
 
     x: Vector
@@ -213,7 +213,7 @@ def _candidates(context: DiagnosisContext, refined: Refined) -> Iterator[Candida
             name=candidate.name,
             channel=candidate.channel,
             settings=dict(candidate.settings),
-            unit=candidate.unit,
+            unit=candidate.effect.unit,
             label=candidate.title,
             columns=tuple(candidate.columns),
             amplitude=amplitude,

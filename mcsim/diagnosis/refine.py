@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.candidate import Candidate, columns_of, effects_at, parts_of
+from mcsim.diagnosis.candidate import Candidate, Respond, columns_of, effects_at, parts_of
 from mcsim.diagnosis.partial_explanation import Detection, PartialExplanation
 from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.diagnosis.templates import Respond
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import Fit, SimulatedGaussian, orthonormal
 from mcsim.stats.look_elsewhere import Calibration

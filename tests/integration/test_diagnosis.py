@@ -1,7 +1,7 @@
 """A small instrument from beginning to end: no gap, a gap that is explained, a simulator that is broken, bad data."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import healpy
@@ -11,7 +11,7 @@ from scipy.stats import kstest
 
 import mcsim
 from mcsim import config, systematics
-from mcsim.diagnosis import campaign, residual_maps
+from mcsim.diagnosis import campaign, localisation
 from mcsim.diagnosis.analysis import analysis_of, data_vectors
 from mcsim.diagnosis.campaign import with_effects
 from mcsim.diagnosis.context import context
@@ -51,8 +51,7 @@ def ask(jobs):
 def small():
     run = config.load(MODEL)
     analysis = analysis_of(run, without=[name for name in systematics.catalogue() if name not in PROPOSED])
-    plan = campaign.plan(run, analysis, simulations=260, time_ordered=False)
-    return context(run, analysis, *campaign.learned(analysis, plan, ask(plan.jobs)))
+    return context(analysis, *campaign.learned(analysis, ask, 260, time_ordered=False))
 
 
 def data_of(run, name=None, channel=None, seed=77, **parameters):
@@ -106,8 +105,8 @@ def mean_squares(learned, name=None, channel=None, skies=20, **parameters):
     count, rows = len(ensemble.bipolar_scan), []
     for realization in range(skies):
         filtered = wiener_filter(learned.analysis.model, list(simulate.maps(shared, realization)))
-        x = residual_maps.coarse_residuals(learned.analysis.model, filtered)
-        z = residual_maps.standardised(x, ensemble.residual_mean, ensemble.residual_scatter, count)
+        x = localisation.coarse_residuals(learned.analysis.model, filtered)
+        z = localisation.standardised(x, ensemble.residual_mean, ensemble.residual_scatter, count)
         rows.append(np.nanmean(z**2, axis=1))
     return np.array(rows)
 
@@ -121,13 +120,12 @@ def test_residual_maps_of_the_model_have_unit_rms(small, masked, tmp_path):
         healpy.write_map(path, seen.astype(float), dtype=np.float64)
         run = replace(small.run, map=replace(small.run.map, mask=str(path), mask_frame="ecliptic"))
         analysis = analysis_of(run, without=list(systematics.catalogue()))
-        plan = campaign.plan(run, analysis, simulations=260, time_ordered=False)
-        ensemble, _ = campaign.learned(analysis, plan, ask(plan.jobs))
+        ensemble, _ = campaign.learned(analysis, ask, 260, time_ordered=False)
         learned = SimpleNamespace(run=run, analysis=analysis, ensemble=ensemble)
         pixels = int(seen.sum())
         # Not the noise alone: the filter leaves much of the sky behind a mask.
         filtered = wiener_filter(analysis.model, list(simulate.maps(data_of(run), 0)))
-        x = residual_maps.coarse_residuals(analysis.model, filtered)[:, seen]
+        x = localisation.coarse_residuals(analysis.model, filtered)[:, seen]
         noise = np.sqrt([part.precision[seen] for part in analysis.model.parts])
         assert np.sqrt(np.mean((x / noise) ** 2)) > 1.2
     found = mean_squares(learned)
@@ -237,9 +235,8 @@ def test_nothing_is_asked_that_has_no_answer(kind, tmp_path):
             channels=tuple(replace(channel, scan=still) for channel in run.channels),
         )
     analysis = analysis_of(run)
-    answers = data_vectors(campaign.plan(run, analysis, simulations=4, time_ordered=False).jobs[0])[
-        :, : len(analysis.elements)
-    ]
+    first = next(iter(campaign.plan(analysis, 4, time_ordered=False).values()))
+    answers = data_vectors(first)[:, : len(analysis.elements)]
     dead = [
         element.name
         for element, spread in zip(analysis.elements, np.ptp(answers, axis=0), strict=True)
@@ -256,6 +253,28 @@ def test_orders_are_proposed_where_a_run_leaves_some_out(small):
         run = replace(small.run, channels=(replace(small.run.channels[0], beam=beam), small.run.channels[1]))
         analysis = analysis_of(run, without=[name for name in systematics.catalogue() if name != "beam_noncircularity"])
         assert [candidate.label for candidate in analysis.candidates] == expected
+
+
+def test_the_library_is_an_argument_that_workers_share(small):
+    @dataclass(frozen=True, kw_only=True)
+    class Louder(systematics.get("noise_level")):
+        name = "louder"
+        matched_filter = True
+
+    analysis = analysis_of(small.run, library={"louder": Louder})
+    assert {candidate.identity for candidate in analysis.candidates} == {("louder", "V1"), ("louder", "W1")}
+    run = with_effects(small.run, [config.Effect(name="louder", channel="W1", parameters={"amplitude": 0.5})])
+    rows = [data_vectors(replace(analysis.job(simulated), count=1))[0] for simulated in (small.run, run)]
+    assert rows[0].shape == (len(analysis.elements),)
+    matched = [element.candidate == "louder" and element.channels == ("W1",) for element in analysis.elements]
+    assert rows[1][matched] > rows[0][matched]
+
+
+def test_columns_and_matched_filters_know_their_candidate(small):
+    known = {candidate.name for candidate in small.candidates}
+    assert [label[:2] for label in small.bank.labels] == [c.identity for c in small.candidates for _ in c.columns]
+    for element in small.analysis.elements:
+        assert (element.candidate in known) if element.kind == "matched" else element.candidate is None
 
 
 def test_what_cannot_be_done_is_said_before_anything_is_learned(small, folder):
@@ -364,8 +383,8 @@ def test_responses_on_the_observed_sky_have_the_mean_of_those_on_any(small):
     ratios = []
     for realization in range(12):
         observed = shared_sky(analysis.model, list(simulate.maps(data_of(run, seed=5), realization)))
-        after = np.concatenate(ask(campaign.constrained_jobs(run, analysis, [effect], observed, range(8))))
-        before = np.concatenate(ask(campaign.constrained_jobs(run, analysis, [], observed, range(8))))
+        after = np.concatenate(ask(campaign.constrained_jobs(analysis, [effect], observed, range(8))))
+        before = np.concatenate(ask(campaign.constrained_jobs(analysis, [], observed, range(8))))
         response = small.null.whiten_templates(np.mean(after - before, axis=0)[:, None])[:, 0]
         ratios.append(response @ expected / (expected @ expected))
     scatter = np.std(ratios, ddof=1) / np.sqrt(len(ratios))

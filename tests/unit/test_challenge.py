@@ -36,16 +36,15 @@ from mcsim.benchmark.record import Record, pulls
 from mcsim.benchmark.report import lines, write
 from mcsim.benchmark.run import run
 from mcsim.benchmark.sampler import CaseSampler
-from mcsim.benchmark.score import score, score_draws
+from mcsim.benchmark.score import _is_named, score, score_draws
 from mcsim.benchmark.signatures import SIGNATURES, any_place_right
 from mcsim.benchmark.summary import confusion, summarise
 from mcsim.diagnosis.analysis import Analysis
-from mcsim.diagnosis.candidate import Candidate, numbered
+from mcsim.diagnosis.candidate import Candidate, TemplateBank, numbered
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Block, Element
-from mcsim.diagnosis.templates import TemplateBank
 from mcsim.errors import InputError
 
 ENTRIES = 24
@@ -63,11 +62,11 @@ def toy(names, simulations=800, seed=1, common=0.0):
     directions = np.sqrt(1.0 - common) * directions + np.sqrt(common) * directions[:, :1]
     templates = np.repeat(directions, 2, axis=0)
     elements = [Element(f"entry{i}", "map", ("A",), None, i % 2) for i in range(ENTRIES)]
-    blocks = [Block(tuple(elements), lambda model, filtered: np.zeros(ENTRIES))]
+    blocks = [Block(tuple(elements), lambda filtered: np.zeros(ENTRIES))]
     rows = [templates]
     for number, candidate in enumerate(candidates):
-        score = Element(f"score/{candidate.label}/0", "score", ("A",))
-        blocks.append(Block((score,), lambda model, filtered: np.zeros(1)))
+        score = Element(f"score/{candidate.label}/0", "score", ("A",), candidate=candidate.name)
+        blocks.append(Block((score,), lambda filtered: np.zeros(1)))
         row = np.zeros((1, columns))
         row[0, number] = 0.5
         rows.append(row)
@@ -75,11 +74,12 @@ def toy(names, simulations=800, seed=1, common=0.0):
     p = len(t)
     described = tuple(element for block in blocks for element in block.elements)
     ensemble = NullEnsemble(
-        rng.standard_normal((simulations, p)), np.zeros(p), described, np.zeros((24, p)), np.zeros((0, 0))
+        rng.standard_normal((simulations, p)), np.zeros(p), described, np.zeros((24, p)), *np.zeros((4, 0, 0))
     )
     model = SimpleNamespace(lmax=128, settings=DiagnosisSettings())
-    bank = TemplateBank(t, np.zeros_like(t), np.zeros_like(t))
-    return context(None, Analysis(model, candidates, tuple(blocks)), ensemble, bank)
+    labels = tuple(label for candidate in candidates for label in candidate.labels)
+    bank = TemplateBank(t, np.zeros_like(t), np.zeros_like(t), labels)
+    return context(Analysis(model, candidates, tuple(blocks)), ensemble, bank)
 
 
 NAMES = (("beam_width", "A"), ("noise_level", "A"), ("beam_ellipticity", "A"), ("beam_width", "B"), ("spectrum", None))
@@ -478,3 +478,12 @@ def test_every_effect_has_a_signature():
     assert any_place_right(["beam_ellipticity"], [("galactic", 2, "even"), ("ecliptic", 2, "even")])
     assert not any_place_right(["beam_ellipticity"], [("ecliptic", 1, "even"), (None, 0, "even")])
     assert any_place_right(["invented"], []) is None
+
+
+def test_an_effect_is_named_only_with_its_settings():
+    kind = systematics.get("beam_sidelobe")
+    ours = Candidate(kind, "W1", (0,), {"calibrated": "dipole"})
+    for settings, channel, named in (("dipole", "W1", True), ("none", "W1", False), ("dipole", "V1", False)):
+        effect = {"name": kind.name, "channel": channel, "parameters": {"calibrated": settings, "angle_deg": 3.0}}
+        assert _is_named([effect], ours) == named
+    assert not _is_named([], ours)

@@ -28,7 +28,7 @@ RUN = config.load(resources.workflow("quickstart"))
 
 def key(effect, settings=None, simulations=100, run=RUN):
     analysis = SimpleNamespace(
-        candidates=(Candidate(effect, None, (0,)),), elements=(), settings=settings or DiagnosisSettings()
+        candidates=(Candidate(effect, None, (0,)),), elements=(), settings=settings or DiagnosisSettings(), library=()
     )
     return api._key(run, analysis, simulations)
 

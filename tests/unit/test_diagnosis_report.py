@@ -15,10 +15,10 @@ from scipy import stats
 
 from mcsim import config, systematics
 from mcsim.diagnosis import figures as plots
-from mcsim.diagnosis import report, residual_maps, words
+from mcsim.diagnosis import localisation, report, words
 from mcsim.diagnosis.assemble import Findings, effects_of, held_out_pvalues, result_of
 from mcsim.diagnosis.candidate import Candidate, numbered
-from mcsim.diagnosis.places import Place
+from mcsim.diagnosis.localisation import Place
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import attribute
@@ -333,7 +333,7 @@ def test_tables_of_spectra_have_no_map_pictures(diagnoses, tmp_path):
 
 
 def test_largest_picture_leaves_the_page_small(diagnoses):
-    sky = np.random.default_rng(1).normal(size=(20, 12 * residual_maps.NSIDE**2))
+    sky = np.random.default_rng(1).normal(size=(20, 12 * localisation.NSIDE**2))
     sky[3] *= 2.0
     names, ends = tuple(f"W:{k}" for k in range(20)), np.tile([0.97, 1.03], (20, 1))
     figure = plots.residual_figure(replace(diagnoses["effect"], residual_maps=sky, maps=names, residual_range=ends))
@@ -373,9 +373,9 @@ def test_simulations_held_out_are_uniform():
 def test_coarse_residuals_add_up_the_pixels_of_each_coarse_one():
     nside, rng = 64, np.random.default_rng(6)
     residual = rng.normal(size=(2, 12 * nside**2))
-    found = residual_maps.coarse_residuals(SimpleNamespace(nside=nside), SimpleNamespace(residual=residual))
-    assert healpy.npix2nside(found.shape[1]) == residual_maps.NSIDE
-    inside = healpy.ang2pix(residual_maps.NSIDE, *healpy.pix2ang(nside, np.arange(residual.shape[1]))) == 2000
+    found = localisation.coarse_residuals(SimpleNamespace(nside=nside), SimpleNamespace(residual=residual))
+    assert healpy.npix2nside(found.shape[1]) == localisation.NSIDE
+    inside = healpy.ang2pix(localisation.NSIDE, *healpy.pix2ang(nside, np.arange(residual.shape[1]))) == 2000
     np.testing.assert_allclose(found[:, 2000], residual[:, inside].sum(axis=1))
 
 
@@ -384,7 +384,7 @@ def test_standardised_maps_have_unit_variance_for_any_number_of_simulations():
     drawn = 3.0 + 2.0 * rng.normal(size=(count + 1, 1, pixels))
     drawn[:, :, :10] = 0.0
     mean, scatter = drawn[1:].mean(axis=0), drawn[1:].std(axis=0, ddof=1)
-    z = residual_maps.standardised(drawn[0], mean, scatter, count)
+    z = localisation.standardised(drawn[0], mean, scatter, count)
     assert np.all(np.isnan(z[:, :10]))
     # Student's t with 11 degrees of freedom over its scatter: kurtosis 3 + 6/7; five standard errors.
     assert np.nanmean(z**2) == pytest.approx(1.0, abs=5.0 * np.sqrt((2.0 + 6.0 / 7.0) / pixels))

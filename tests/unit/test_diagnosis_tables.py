@@ -9,10 +9,11 @@ from astropy.table import Table
 from mcsim import bipolar, config, systematics
 from mcsim.diagnosis import campaign, report
 from mcsim.diagnosis import measured_spectra as tables
+from mcsim.diagnosis.analysis import Job
 from mcsim.diagnosis.campaign import with_effects
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.inference import diagnose_data
-from mcsim.diagnosis.spectra import read_spectra
+from mcsim.diagnosis.measured_spectra import read_spectra
 from mcsim.errors import InputError
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
@@ -73,9 +74,8 @@ def small(tmp_path_factory):
     analysis = tables.analysis_of_spectra(
         run, spectra, [name for name in systematics.catalogue() if name not in PROPOSED]
     )
-    plan = tables.plan(run, analysis, 300)
-    ensemble, bank = campaign.learned(analysis, plan, [spectra(job) for job in plan.jobs])
-    return context(run, analysis, ensemble.of_mean(SKIES), bank)
+    ensemble, bank = campaign.learned(analysis, lambda jobs: [spectra(job) for job in jobs], 300)
+    return context(analysis, ensemble.of_mean(SKIES), bank)
 
 
 def judged(small, folder, table):
@@ -122,7 +122,7 @@ def test_power_spectra_are_those_of_the_pair(tmp_path):
     cl = simulate.realize(survey(run), 3)["cl"][0]
     ell = np.arange(41)
     expected = [np.mean((ell * (ell + 1) / (2 * np.pi) * cl)[a : b + 1]) for a, b in BINS]
-    np.testing.assert_allclose(spectra.of(run, 3, 1)[0, : len(BINS)], expected, rtol=1e-12)
+    np.testing.assert_allclose(spectra(Job("", config.to_json(run), 3, 1))[0, : len(BINS)], expected, rtol=1e-12)
     assert [element.statistic for element in spectra.elements[: len(BINS)]] == ["cl"] * len(BINS)
     assert [element.fold for element in spectra.elements[: len(BINS)]] == [0, 1, 0, 1, 0, 1]
 
@@ -232,10 +232,13 @@ def test_a_few_power_spectra_alone_are_judged(tmp_path):
     analysis = tables.analysis_of_spectra(
         run, spectra, [name for name in systematics.catalogue() if name not in proposed]
     )
-    plan = tables.plan(run, analysis, 60)
-    ensemble, bank = campaign.learned(analysis, plan, [spectra(job) for job in plan.jobs])
-    learned = context(run, analysis, ensemble.of_mean(SKIES), bank)
-    found = diagnose_data(tables.MeasuredSpectra(learned, spectra, lambda jobs: [spectra(job) for job in jobs]), "few")
+
+    def ask(jobs):
+        return [spectra(job) for job in jobs]
+
+    ensemble, bank = campaign.learned(analysis, ask, 60)
+    learned = context(analysis, ensemble.of_mean(SKIES), bank)
+    found = diagnose_data(tables.MeasuredSpectra(learned, spectra, ask), "few")
     assert found.verdict["verdict"] != "none"
     assert "beam_coma" not in [effect["name"] for effect in found.verdict["effects"]]
     report.write(found, tmp_path / "report.html")

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.diagnosis.analysis import Job, analysis_of, data_vectors
 from mcsim.diagnosis.api import prepared
-from mcsim.diagnosis.batch import asking, batch
-from mcsim.diagnosis.campaign import seeded, with_effects
+from mcsim.diagnosis.campaign import asking, batch, seeded, with_effects
 from mcsim.systematics import Effect
 
 SEED = 20121026
