@@ -105,7 +105,7 @@ class LinearModel(Library):
 
         def respond(frozen: Fit) -> Vector:
             effects = effects_at(self.candidates, members, frozen)
-            return np.asarray(t @ np.concatenate([effect.coordinates() for effect in effects]))
+            return np.asarray(t @ np.concatenate([effect.parametrization.coordinates(effect) for effect in effects]))
 
         try:
             return replace(self.halves, x=x).reduction(t, respond)

@@ -65,7 +65,7 @@ class CaseSampler:
         for index, candidate in enumerate(self.library.candidates):
             largest = float(np.max(np.linalg.norm(self._white(index), axis=0)))
             # Of an effect without response and without a limit the product is NaN, which is not larger.
-            if candidate.effect.max_amplitude * largest >= self.prior.weakest:
+            if candidate.effect.parametrization.max_amplitude * largest >= self.prior.weakest:
                 found.setdefault(candidate.name, {}).setdefault(candidate.channel, []).append(index)
         return {name: list(channels.values()) for name, channels in found.items()}
 
@@ -81,20 +81,20 @@ class CaseSampler:
         group = channels[int(draw.integers(len(channels)))]
         index = group[int(draw.integers(len(group)))]
         candidate, white, strength = self.library.candidates[index], self._white(index), self.prior.strength(draw)
-        gram = white.T @ white
+        gram, fit = white.T @ white, candidate.effect.parametrization
         values, vectors = np.linalg.eigh(gram)
         constrained = values > 1e-9 * values[-1]
         direction = draw.standard_normal(len(values))
         theta = vectors[:, constrained] @ (direction[constrained] / np.sqrt(values[constrained]))
-        effect = candidate.with_coordinates(np.abs(theta) if candidate.effect.sign else theta, gram)
+        effect = candidate.with_coordinates(np.abs(theta) if fit.sign else theta, gram)
         # The parameters reach only some directions, and coordinates need not be linear in the amplitude.
         for _ in range(30):
-            snr = np.linalg.norm(white @ effect.coordinates())
-            slope = np.log(np.linalg.norm(white @ effect.scaled(1.01).coordinates()) / snr) / np.log(1.01)
+            snr = np.linalg.norm(white @ fit.coordinates(effect))
+            slope = np.log(np.linalg.norm(white @ fit.coordinates(effect.scaled(1.01))) / snr) / np.log(1.01)
             effect = effect.scaled(float((strength / snr) ** (1.0 / slope)))
             if abs(snr / strength - 1.0) < 1e-9:
                 break
-        coordinates = effect.coordinates()
+        coordinates = fit.coordinates(effect)
         parameters = {"amplitude": effect.amplitude, **effect.parameters()}
         reached = float(np.linalg.norm(white @ coordinates))
         return Member(name, candidate.channel, parameters, tuple(map(float, coordinates)), reached, index)

@@ -6,6 +6,7 @@ Exit codes: 0 done, 1 failed realizations, 2 bad input, 130 interrupted.
 import json
 import os
 import sys
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated
 
@@ -220,15 +221,12 @@ def effects(name: Annotated[str | None, Argument(metavar="EFFECT", help="Only th
     """List the library of effects: what a run can add and a diagnosis can find."""
     from mcsim import systematics as library
 
-    chosen = None if name is None else library.get(name).name
-    for row in library.describe():
-        if chosen not in (None, row["name"]):
-            continue
-        parameters = ", ".join(f"{key} = {value!r}" for key, value in row["parameters"].items())
-        typer.secho(f"{row['name']} ({row['scope']}; amplitude in {row['unit']})", bold=True)
+    for kind in library.catalogue().values() if name is None else [library.get(name)]:
+        parameters = ", ".join(f"{field.name} = {field.default!r}" for field in fields(kind))
+        typer.secho(f"{kind.name} ({kind.scope}; amplitude in {kind.unit})", bold=True)
         print(f"  parameters  {parameters}")
         for key in ("cause", "signature", "source"):
-            print(f"  {key:<11} {row[key]}")
+            print(f"  {key:<11} {getattr(kind, key)}")
 
 
 @app.command()

@@ -90,7 +90,7 @@ def analysis_of(
     model = model_of(survey(run, nthreads=nthreads, orders=settings.beam_orders, library=dict(known)), settings)
     candidates = numbered(
         [
-            Candidate(effect, channel, tuple(range(len(effect.basis()))), dict(fixed))
+            Candidate(effect, channel, tuple(range(len(effect.parametrization.basis()))), dict(fixed))
             for name, effect in known
             if name not in without
             for channel in ((None,) if effect.scope == "common" else model.channels)
@@ -122,7 +122,7 @@ def _applies(model: Model, kind: type[Effect], channel: str | None, settings: Ma
             return False
         if not any(owner.beam.mmax for owner in owners):
             return False
-    effect = replace(kind.basis()[0], **settings)
+    effect = systematics.basis_of(kind, settings)[0]
     try:
         for owner in owners:
             effect.gain(np.zeros(1), owner.site)

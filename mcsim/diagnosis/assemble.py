@@ -177,7 +177,7 @@ def _sigma(candidate: Candidate, theta: Vector, covariance: Vector) -> float:
     """
     scale = np.sqrt(np.diag(covariance))
     precision = np.asarray(np.linalg.pinv(covariance), dtype=np.float64)
-    constrained = candidate.effect.constrained(theta, precision)
+    constrained = candidate.effect.parametrization.constrained(theta, precision)
     slopes: Vector = np.zeros(len(theta))
     for k in np.flatnonzero((scale > 0.0) & ((constrained != 0.0) | (theta == 0.0))):
         step = scale[k] * np.eye(len(theta))[k]
@@ -241,7 +241,7 @@ def detectable_amplitude(null: SimulatedGaussian, t: Vector, looks: int, candida
     candidate
         The candidate.
     """
-    size = detectable(null, t, looks).typical
+    size = detectable(null, t, looks)
     if not np.isfinite(size):
         return None
     direction = np.zeros(t.shape[1])

@@ -11,7 +11,7 @@ from mcsim import config
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import Fit
-from mcsim.systematics import Effect
+from mcsim.systematics import Effect, basis_of
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -73,21 +73,21 @@ class Candidate:
     @property
     def basis(self) -> tuple[Effect, ...]:
         """Return the effects whose responses span it, one for each column."""
-        return tuple(replace(one, **self.settings) for one in self.effect.basis())
+        return basis_of(self.effect, self.settings)
 
     @property
     def random_response(self) -> bool:
         """Return True if its templates are measured from random draws, not from an effect that is taken away."""
-        return self.effect.stochastic and self.effect.sign >= 0
+        return self.effect.parametrization.stochastic and self.effect.parametrization.sign >= 0
 
     def with_coordinates(self, coordinates: Vector, precision: Matrix) -> Effect:
         """Return the effect nearest to coordinates in the metric ``precision``."""
-        return replace(self.effect.nearest(coordinates, precision), **self.settings)
+        return self.effect(**{**self.effect.parametrization.nearest(coordinates, precision), **self.settings})
 
     def fitted(self, coordinates: Vector, covariance: Matrix) -> Effect:
         """Return the effect nearest to fitted coordinates, as far as the data constrain them."""
         precision: Matrix = np.asarray(np.linalg.pinv(covariance), dtype=np.float64)
-        return self.with_coordinates(self.effect.constrained(coordinates, precision), precision)
+        return self.with_coordinates(self.effect.parametrization.constrained(coordinates, precision), precision)
 
     def detected(self, coordinates: Vector, covariance: Matrix) -> Effect:
         """Return :meth:`fitted`; raise InputError if the data do not constrain the effect at all."""
@@ -103,9 +103,9 @@ class Candidate:
 
     def allows(self, amplitudes: Vector) -> bool:
         """Return True if the amplitudes have the sign, and at most the size, that the effect can have."""
-        if self.effect.sign and bool(np.any(amplitudes < 0.0)):
+        if self.effect.parametrization.sign and bool(np.any(amplitudes < 0.0)):
             return False
-        return float(np.linalg.norm(amplitudes)) <= self.effect.max_amplitude
+        return float(np.linalg.norm(amplitudes)) <= self.effect.parametrization.max_amplitude
 
 
 def numbered(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:

@@ -32,7 +32,7 @@ def matched_filter(model: Model, effect: Effect, channel: int | None) -> Matched
     None if there is no such filter.
     """
     kind, owner = type(effect), model.survey.channels[channel or 0]
-    if not kind.matched_filter:
+    if not kind.parametrization.matched_filter:
         return None
     if kind.sky is not Effect.sky:
         return _sky_filter(model, effect, channel)

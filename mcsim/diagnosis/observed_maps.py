@@ -89,7 +89,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
 
     def _is_typical(self, effect: config.Effect) -> bool:
         kind = next(one.effect for one in self.context.candidates if one.name == effect.name)
-        return kind.mean_response and not kind.stochastic
+        return kind.parametrization.mean_response and not kind.parametrization.stochastic
 
     def templates(self) -> Rows:
         """Return the templates; those that depend on the very sky are measured on the observed one if it departs."""
@@ -97,14 +97,18 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         if global_test(context.null, self.x, context.groups, context.calibration).pvalue > settings.alpha:
             return t
         for candidate, scatter in zip(context.candidates, context.sky_scatter, strict=True):
-            if scatter < settings.sky_scatter or candidate.random_response or candidate.effect.mean_response:
+            if (
+                scatter < settings.sky_scatter
+                or candidate.random_response
+                or candidate.effect.parametrization.mean_response
+            ):
                 continue
             for place, (column, basis) in enumerate(zip(candidate.columns, candidate.basis, strict=True)):
                 try:
                     response = self.respond([candidate.table(basis)], settings.constrained_skies).mean(axis=0)
                 except InputError:
                     continue
-                step = basis.coordinates()[place]
+                step = basis.parametrization.coordinates(basis)[place]
                 t[:, column] = response / step - context.bank.curvature[:, column] * step
         return t
 

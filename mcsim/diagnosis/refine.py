@@ -86,9 +86,9 @@ class Refiner:
         for _ in range(self.settings.refine_rounds):
             changed = False
             for index, coordinates, covariance in self._to_try(found, tried):
-                columns, effect = list(candidates[index].columns), candidates[index].effect
+                columns, how = list(candidates[index].columns), candidates[index].effect.parametrization
                 nonlinear = self._is_nonlinear(columns, coordinates)
-                stochastic = effect.stochastic and (effect.sign == 0 or coordinates[0] > 0.0)
+                stochastic = how.stochastic and (how.sign == 0 or coordinates[0] > 0.0)
                 if not (nonlinear or stochastic) or self._has_settled(done.get(index), coordinates, covariance):
                     continue
                 done[index] = coordinates
@@ -142,12 +142,12 @@ class Refiner:
             try:
                 effects = effects_at(candidates, members, fitted)
                 tables = [candidates[member].table(effect) for member, effect in zip(members, effects, strict=True)]
-                stochastic = any(effect.stochastic for effect in effects)
+                stochastic = any(effect.parametrization.stochastic for effect in effects)
                 response = self.respond(tables, self._skies(stochastic)).mean(axis=0)
             except InputError:
                 return None
             t = t.copy()
-            at = np.concatenate([effect.coordinates() for effect in effects])
+            at = np.concatenate([effect.parametrization.coordinates(effect) for effect in effects])
             t[:, columns] += self._beyond(t[:, columns], at, response)
             before, fitted = fitted, self.null.fit(self.x, t[:, columns])
             if self._has_converged(before.amplitudes, fitted):
@@ -178,7 +178,8 @@ class Refiner:
         for factor in (1.0, 0.5):
             try:
                 effect = candidate.detected(factor * coordinates, covariance / factor**2)
-                return effect.coordinates(), self.respond([candidate.table(effect)], self._skies(stochastic))
+                response = self.respond([candidate.table(effect)], self._skies(stochastic))
+                return effect.parametrization.coordinates(effect), response
             except InputError:
                 continue
         return None
@@ -196,14 +197,16 @@ class Refiner:
         # Single ones too: a strong effect has a nonlinear response, and a stochastic one scatters it, until only a
         # mixture seems to be sufficient.
         ranked = [int(index) for index in np.argsort([-single.delta_chi2 for single in found.singles])]
-        stochastic = {candidates[index].identity for index in work if candidates[index].effect.stochastic}
+        stochastic = {
+            candidates[index].identity for index in work if candidates[index].effect.parametrization.stochastic
+        }
         for place, index in enumerate(ranked):
             single, candidate = found.singles[index], candidates[index]
             pvalue = float(self.calibration.global_pvalue(single.nested_pvalue))
-            detected = candidate.effect.stochastic and pvalue <= self.settings.stochastic_level
+            detected = candidate.effect.parametrization.stochastic and pvalue <= self.settings.stochastic_level
             if place < self.settings.tried or (detected and candidate.identity not in stochastic):
                 work.setdefault(index, (index, single.amplitudes, single.covariance))
-                if candidate.effect.stochastic:
+                if candidate.effect.parametrization.stochastic:
                     stochastic.add(candidate.identity)
         return list(work.values())
 

@@ -212,7 +212,7 @@ def _possible(
 ) -> bool:
     """Return True if the fitted amplitudes of all members are within their bounds."""
     effects = [candidates[member].effect for member in members]
-    if not any(effect.sign or np.isfinite(effect.max_amplitude) for effect in effects):
+    if not any(effect.parametrization.sign or np.isfinite(effect.parametrization.max_amplitude) for effect in effects):
         return True
     return within_bounds(candidates, members, null.fit(x, t[:, columns_of(candidates, members)]))
 

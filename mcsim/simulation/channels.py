@@ -10,7 +10,6 @@ import numpy as np
 from mcsim import config, systematics
 from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
-from mcsim.instrument.beams.turn import mirrored, rotated
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import rotation
 from mcsim.support import resources
@@ -27,7 +26,7 @@ def load_beam(channel: config.Channel, lmax: int) -> beams.Beam:
 def load_beam_b(channel: config.Channel, lmax: int) -> beams.Beam:
     """Return the beam of side B of a differencing channel, up to lmax: its own, or side A's mirrored."""
     if channel.beam_b is None:
-        return mirrored(load_beam(channel, lmax))
+        return load_beam(channel, lmax).mirrored()
     return _beam(channel.name, channel.beam_b, lmax)
 
 
@@ -39,12 +38,11 @@ def _beam(channel: str, spec: config.Beam, lmax: int) -> beams.Beam:
             major, minor = spec.fwhm_major_arcmin, spec.fwhm_minor_arcmin
             return beams.Beam.elliptical(major, minor, spec.angle_deg, lmax, mmax=spec.m_max)
         case config.BeamMap():
-            return rotated(
-                beams.Beam.from_map(load_beam_map(channel, spec), lmax, spec.m_max), np.deg2rad(spec.angle_deg)
-            )
+            beam = beams.Beam.from_map(load_beam_map(channel, spec), lmax, spec.m_max)
+            return beam.rotated(np.deg2rad(spec.angle_deg))
         case config.BeamBlm():
             file = config.channel_path(spec.path, channel)
-            return rotated(beams.Beam.from_blm(file, lmax, mmax=spec.m_max), np.deg2rad(spec.angle_deg))
+            return beams.Beam.from_blm(file, lmax, mmax=spec.m_max).rotated(np.deg2rad(spec.angle_deg))
 
 
 def load_beam_map(channel: str, spec: config.BeamMap) -> beams.BeamMap:

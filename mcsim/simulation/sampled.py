@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from mcsim import systematics
 from mcsim.errors import InputError
-from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import MapGrid
 from mcsim.simulation import simulate, tod
 from mcsim.simulation.survey import Channel, Survey
@@ -50,7 +49,8 @@ def maps(
             seen = seen + dipole_alm(site.dipole_uk, site.lmax)
             fiducial = replace(site.beam, blm=site.beam.blm[:2, :2])
             after.append(tod.sky_signal(-dipole_alm(site.dipole_uk, 1), 1, fiducial, epsilon, nthreads))
-        observe = tod.sky_signal(seen, site.lmax, _beam(channel), epsilon, nthreads)
+        beam = systematics.seen_through(acting, site, [effect for effect in acting if not _moves(effect)])
+        observe = tod.sky_signal(seen, site.lmax, beam, epsilon, nthreads)
         for index, m in enumerate(channel.maps):
             grid = MapGrid(site.nside, site.frame, (index / len(channel.maps), (index + 1) / len(channel.maps)))
             stages = list(after)
@@ -80,15 +80,9 @@ def check(channel: Channel) -> None:
             )
 
 
-def _beam(channel: Channel) -> Beam:
-    """Return the beam about the true line of sight."""
-    nowhere, beam = np.zeros(1), channel.site.beam
-    for effect in channel.effects:
-        beam = effect.beam(beam, channel.site)
-    for effect in channel.effects:
-        if effect.lags() is None and effect.moved(nowhere, nowhere, nowhere) is None:
-            beam = effect.pointing(beam, channel.site)
-    return beam
+def _moves(effect: systematics.Effect) -> bool:
+    nowhere = np.zeros(1)
+    return effect.lags() is not None or effect.moved(nowhere, nowhere, nowhere) is not None
 
 
 def _fiducial(channel: Channel, grid: MapGrid, delay_s: float = 0.0) -> Iterator[tod.Samples]:

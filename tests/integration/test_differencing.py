@@ -12,7 +12,6 @@ from distributed import Client
 import mcsim
 from mcsim import bipolar, config
 from mcsim.ensemble import prediction, runner
-from mcsim.instrument.beams.turn import mirrored
 from mcsim.simulation import convolve, differencing, mapmaking, simulate
 from mcsim.simulation.survey import Survey, survey
 from mcsim.sphere import alm as alm_
@@ -100,7 +99,7 @@ def test_map_is_that_of_the_whole_beams_solved_at_once(year):
     shared = survey(year(**ensemble(keep_maps=True)))
     channel = shared.channels[0]
     assert channel.side_b is not None
-    np.testing.assert_array_equal(channel.side_b.beam.blm, mirrored(channel.beam).blm)
+    np.testing.assert_array_equal(channel.side_b.beam.blm, channel.beam.mirrored().blm)
     sky = simulate.draw_sky(shared, 3)
     sides = [mapmaking.side_maps(sky, response, NSIDE) for response in (channel.response, channel.side_b.response)]
     (pairs,) = [m.pairs for m in channel.maps]

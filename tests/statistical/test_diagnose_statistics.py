@@ -145,8 +145,9 @@ def test_detectable_amplitude_is_unbiased():
     t = np.eye(p)[:, :1] * 0.5
     found = [detectable(drawn_null(rng, p, count), t, 20) for _ in range(60)]
     # The relative scatter of one is 1/sqrt(2 (n - p)) = 0.037, of their mean 0.005.
-    assert np.mean([one.limit for one in found]) == pytest.approx(4.305 / 0.5, rel=0.02)
-    assert all(one.amplitude > one.limit for one in found)
+    expected = snr_needed(1, 20, p, count) * np.sqrt(1.0 + 1.0 / count) / 0.5
+    assert np.mean(found) == pytest.approx(expected, rel=0.02)
+    assert expected > 4.305 / 0.5
 
 
 @pytest.mark.parametrize("cosine", [0.0, 0.7, -0.95])

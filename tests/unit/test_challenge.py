@@ -52,7 +52,9 @@ def toy(names, simulations=800, seed=1, common=0.0):
     """Learn effects with random templates, alike in both folds, and unit noise; ``common``: their cosine."""
     rng = np.random.default_rng(seed)
     kinds = [(systematics.get(name), channel) for name, channel in names]
-    candidates = numbered([Candidate(kind, channel, tuple(range(len(kind.basis())))) for kind, channel in kinds])
+    candidates = numbered(
+        [Candidate(kind, channel, tuple(range(len(kind.parametrization.basis())))) for kind, channel in kinds]
+    )
     columns = sum(len(candidate.columns) for candidate in candidates)
     directions = np.linalg.qr(rng.standard_normal((ENTRIES // 2, columns)))[0]
     directions = np.sqrt(1.0 - common) * directions + np.sqrt(common) * directions[:, :1]
@@ -235,7 +237,9 @@ def test_an_effect_that_cannot_be_strong_enough_is_not_drawn(linear, monkeypatch
     columns = [column for index in same for column in library.candidates[index].columns]
     strongest = max(library.null.expected_snr(library.templates[:, column]) for column in columns)
     for factor in (1.01, 0.99):
-        monkeypatch.setattr(library.candidates[same[0]].effect, "max_amplitude", factor * prior.weakest / strongest)
+        kind = library.candidates[same[0]].effect
+        largest = factor * prior.weakest / strongest
+        monkeypatch.setattr(kind, "parametrization", replace(kind.parametrization, max_amplitude=largest))
         assert (name in CaseSampler(prior, library).names) is (factor > 1)
 
 

@@ -11,7 +11,7 @@ from mcsim.diagnosis.selection import attribute
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate
-from mcsim.systematics import Effect
+from mcsim.systematics import Effect, Parametrization
 
 P = 50
 
@@ -25,6 +25,11 @@ class Push(Effect):
     unit = "push"
     cause = signature = ""
     step = 1.0
+
+
+class Unconstrained(Parametrization):
+    def constrained(self, coordinates, precision):
+        return 0.0 * coordinates
 
 
 class Instrument:
@@ -100,7 +105,7 @@ def test_what_data_tell_nothing_of_is_neither_heard_nor_simulated(monkeypatch):
     """However significant: an effect without an amplitude is none."""
     instrument = Instrument(bend=0.0, cross=0.0)
     x = instrument.response(12.0, 14.0) + 10.0 * instrument.sideways[1]
-    monkeypatch.setattr(Push, "constrained", classmethod(lambda cls, coordinates, precision: 0.0 * coordinates))
+    monkeypatch.setattr(Push, "parametrization", Unconstrained())
     found = instrument.refined(x)
     assert found.attribution.verdict == "unknown"
     assert found.partial is None

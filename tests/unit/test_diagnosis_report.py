@@ -62,7 +62,9 @@ def elements() -> list[Element]:
 def proposals() -> tuple[Candidate, ...]:
     chosen = (("beam_ellipticity", EVIL), ("pointing_offset", "V"), ("point_sources", None))
     kinds = [(systematics.get(name), channel) for name, channel in chosen]
-    return numbered([Candidate(kind, channel, tuple(range(len(kind.basis())))) for kind, channel in kinds])
+    return numbered(
+        [Candidate(kind, channel, tuple(range(len(kind.parametrization.basis())))) for kind, channel in kinds]
+    )
 
 
 def templates(nearest_candidates: bool) -> np.ndarray:
@@ -442,7 +444,7 @@ def test_elements_in_words():
 @pytest.mark.parametrize("name", systematics.catalogue())
 def test_amplitudes_of_every_effect_are_printed_with_their_error(name):
     kind = systematics.get(name)
-    effect = kind.basis()[0]
+    effect = systematics.basis_of(kind)[0]
     assert "±" in effect.describe(0.1 * kind.step)
     assert "±" not in effect.describe()
     assert "_" not in kind.label("W1").replace("C_ℓ", "")

@@ -247,7 +247,7 @@ def test_responses_are_linear_at_the_step(name):
         changed = systematics.seen_through([effect], site).blm[:4]
         return np.pad(changed, ((0, 4 - len(changed)), (0, 0))) - np.pad(beam.blm, ((0, 3), (0, 0)))
 
-    for effect in systematics.get(name).basis():
+    for effect in systematics.basis_of(systematics.get(name)):
         whole, half, opposite = (change(effect.scaled(factor)) for factor in (1.0, 0.5, -1.0))
         assert np.linalg.norm(whole - 2.0 * half) < 0.02 * np.linalg.norm(whole)
         assert np.linalg.norm(whole + opposite) < 0.04 * np.linalg.norm(whole)

@@ -64,7 +64,7 @@ def test_modulations_multiply_the_sky(site, sky, points):
     along = AXIS @ np.stack([x, y, z])
     np.testing.assert_allclose(at(found, points), at(sky, points) * (1.0 + 0.1 * along), atol=1e-8)
     basis = [(3 * z**2 - 1) / 2, 3**0.5 * x * z, 3**0.5 * y * z, 3**0.5 / 2 * (x**2 - y**2), 3**0.5 * x * y]
-    for effect, factor in zip(systematics.get("quadrupole_modulation").basis(), basis, strict=True):
+    for effect, factor in zip(systematics.basis_of(systematics.get("quadrupole_modulation")), basis, strict=True):
         found = effect.sky(sky, site, draw)
         np.testing.assert_allclose(at(found, points), at(sky, points) * (1.0 + effect.amplitude * factor), atol=1e-8)
     with refused("components", "zero"):
@@ -117,17 +117,18 @@ def test_spectrum_rescales_its_bands(site, sky):
 def test_spectrum_nearest_to_less_than_no_power_leaves_some():
     """Of two correlated bands the other one makes up for what the first cannot be."""
     kind = systematics.get("spectrum")
-    precision = np.eye(6)
+    fit, precision = kind.parametrization, np.eye(6)
     precision[0, 1] = precision[1, 0] = 0.5
     wanted = np.array([-1.49, 0.3, 0.1, 0.0, 0.0, 0.0])
-    found = kind.nearest(wanted, precision).coordinates()
+    found = fit.coordinates(kind(**fit.nearest(wanted, precision)))
     # The first is short by 0.5: the second is moved by - 0.5 * 0.5 / 1.
     np.testing.assert_allclose(found, [-0.99, 0.05, 0.1, 0.0, 0.0, 0.0], atol=1e-8)
-    np.testing.assert_allclose(kind.nearest(0.5 * wanted, precision).coordinates(), 0.5 * wanted, rtol=1e-12)
+    again = fit.coordinates(kind(**fit.nearest(0.5 * wanted, precision)))
+    np.testing.assert_allclose(again, 0.5 * wanted, rtol=1e-12)
 
 
 def test_bands_that_no_data_tell_stay_as_believed():
-    kind = systematics.get("spectrum")
+    fit = systematics.get("spectrum").parametrization
     errors = np.array([0.05, 0.02, 0.01, 0.02, 0.4, 7.0])
     correlation = np.eye(6)
     correlation[3, 4] = correlation[4, 3] = 0.5
@@ -135,11 +136,11 @@ def test_bands_that_no_data_tell_stay_as_believed():
     fitted = np.array([0.3, -0.01, 0.0, 0.1, 0.6, -12.0])
     # The fourth is what it is given that the fifth has not changed.
     given = [0.3, -0.01, 0.0, 0.1 - 0.5 * 0.02 * 0.6 / 0.4, 0.0, 0.0]
-    np.testing.assert_allclose(kind.constrained(fitted, precision), given, atol=1e-9)
+    np.testing.assert_allclose(fit.constrained(fitted, precision), given, atol=1e-9)
     fitted[4] = 1.5
-    np.testing.assert_allclose(kind.constrained(fitted, precision), [0.3, -0.01, 0.0, 0.1, 1.5, 0.0], atol=1e-9)
+    np.testing.assert_allclose(fit.constrained(fitted, precision), [0.3, -0.01, 0.0, 0.1, 1.5, 0.0], atol=1e-9)
     np.testing.assert_array_equal(
-        systematics.get("beam_ellipticity").constrained(fitted[:2], precision[:2, :2]), fitted[:2]
+        systematics.get("beam_ellipticity").parametrization.constrained(fitted[:2], precision[:2, :2]), fitted[:2]
     )
 
 

@@ -12,7 +12,6 @@ from mcsim import bipolar
 from mcsim.bipolar import theory
 from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
-from mcsim.instrument.beams.turn import rotated
 from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.limit import limit_moments
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
@@ -88,13 +87,9 @@ WRONG = {
     "analysis: two maps": lambda: healpix.analysis(np.stack([MAP, MAP]), LMAX),
     "pixel_window: nside": lambda: healpix.pixel_window(12, LMAX),
     "rotate_alm: another lmax": lambda: rotation.rotate_alm(BIGGER, LMAX, "galactic", "ecliptic"),
-    "rotate_map: not all pixels": lambda: rotation.rotate_map(MAP[:-1], "galactic", "ecliptic"),
     "rotate_pixels: not all pixels": lambda: rotation.rotate_pixels(MAP[:-1], "galactic", "ecliptic"),
     "rotate_pixels: frame": lambda: rotation.rotate_pixels(MAP, "G", "ecliptic"),
     "rotate_biposh: modes": lambda: rotation.rotate_biposh(np.zeros((3, 9), complex), MODES, "galactic", "ecliptic"),
-    "rotate_orientation_harmonics: shape": lambda: rotation.rotate_orientation_harmonics(
-        np.zeros((2, 3, 3), complex), "galactic", "ecliptic"
-    ),
     "gaussian_alm: negative": lambda: sky.gaussian_alm(-CL, np.random.default_rng(1)),
     "gaussian_alm: NaN": lambda: sky.gaussian_alm(np.nan * CL, np.random.default_rng(1)),
     "gaussian_alm: two spectra": lambda: sky.gaussian_alm(np.stack([CL, CL]), np.random.default_rng(1)),
@@ -133,7 +128,7 @@ WRONG = {
     "ScanModel: year in days": lambda: replace(MODEL, orbit_period_s=365.25),
     "ScanModel: negative angle": lambda: replace(MODEL, precession_angle_deg=-22.5),
     "with_sampling: zero": lambda: MODEL.with_sampling(0.0),
-    "rotated: degrees": lambda: rotated(BEAM, 45.0),
+    "rotated: degrees": lambda: BEAM.rotated(45.0),
     "pointing: negative": lambda: pointing(MODEL, MODEL.lines_of_sight[0], -1, 5),
     "parallel_transport: NaN": lambda: scan.Moments.parallel_transport(NSIDE, np.nan),
     "parallel_transport: exchanged": lambda: scan.Moments.parallel_transport(45.0, NSIDE),

@@ -52,16 +52,16 @@ def main() -> None:
     channel = arguments.channel or run.channels[-1].name
     for candidate in analysis.candidates:
         kind = candidate.effect
-        wanted = kind.name in arguments.effects if arguments.effects else not kind.stochastic
+        wanted = kind.name in arguments.effects if arguments.effects else not kind.parametrization.stochastic
         if not wanted or kind.noise is not Effect.noise or candidate.channel not in (None, channel):
             continue
         for number, basis in enumerate(candidate.basis):
             # An effect of one sign is the whole of it, as pixelization is.
-            effect = basis.scaled(STEPS) if kind.sign == 0 and STEPS * basis.amplitude < 1.0 else basis
+            effect = basis.scaled(STEPS) if kind.parametrization.sign == 0 and STEPS * basis.amplitude < 1.0 else basis
             changes = []
             for samples in (False, True):
                 up = seen([candidate.table(effect)], samples)
-                down = seen([candidate.table(effect.scaled(-1.0))], samples) if kind.sign == 0 else None
+                down = seen([candidate.table(effect.scaled(-1.0))], samples) if kind.parametrization.sign == 0 else None
                 change = up - without[samples] if down is None else 0.5 * (up - down)
                 changes.append(null.whiten_templates(change[:, None])[:, 0])
             default, time_ordered = changes
