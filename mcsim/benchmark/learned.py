@@ -22,6 +22,7 @@ from mcsim.diagnosis.context import DiagnosisContext, context
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps, read_maps
 from mcsim.diagnosis.result import DiagnosisResult
+from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.errors import RunError
 from mcsim.support.progress import reporting
 
@@ -73,7 +74,8 @@ class LearnedModel:
         """Return the expected S/N of the response to an effect in the sky and noise of one seed."""
         run = seeded(self.context.run, seed)
         fiducial = config.to_json(self.context.run)
-        jobs = [Job(fiducial, config.to_json(with_effects(run, effects)), 0, 1) for effects in ((), (effect,))]
+        runs = (config.to_json(with_effects(run, effects)) for effects in ((), (effect,)))
+        jobs = [Job(fiducial, one, 0, 1, settings=self.context.settings) for one in runs]
         before, after = self.simulate(jobs)
         return self.library.null.expected_snr(after[0] - before[0])
 
@@ -94,7 +96,7 @@ def workers_of(settings: Settings, workers: int | None, quiet: bool) -> Iterator
     run = settings.model
     with batch(run.compute.workers if workers is None else workers) as call:
         with asking(call, quiet) as ask:
-            prepared(run, analysis_of(run), ask, settings.simulations)
+            prepared(run, analysis_of(run, settings=DiagnosisSettings(simulations=settings.simulations)), ask)
         yield call
 
 
@@ -113,7 +115,7 @@ def learned_model(settings: Settings, without: tuple[str, ...] = ()) -> LearnedM
 @lru_cache(maxsize=1)
 def _full(model: str, simulations: int | None) -> LearnedModel:
     run = config.from_json(model)
-    found = prepared(run, analysis_of(run), _refuse, simulations)
+    found = prepared(run, analysis_of(run, settings=DiagnosisSettings(simulations=simulations)), _refuse)
     return LearnedModel(found, np.arange(len(found.analysis.elements)))
 
 

@@ -16,7 +16,7 @@ from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.diagnosis.subsets import Subsets
 from mcsim.diagnosis.summaries import Element
 from mcsim.diagnosis.templates import TemplateBank
-from mcsim.diagnosis.validation import Halves, Prediction, Shrink
+from mcsim.diagnosis.validation import Halves, HeldOut
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import Fit, SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration, GlobalTest, calibrate, global_test
@@ -126,7 +126,7 @@ class LinearModel:
     halves: Halves | None
     data: NDArray[np.float64]
 
-    def held_out_reduction(self, x: Vector, members: Sequence[int]) -> tuple[Prediction, Shrink] | None:
+    def held_out_reduction(self, x: Vector, members: Sequence[int]) -> HeldOut | None:
         """Fit candidates to one half of a data vector, and predict and measure the reduction of the other's excess.
 
         None if there are no halves, or if an effect cannot have the fitted amplitude.

@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,6 @@ from mcsim.errors import InputError
 from mcsim.support import folders
 from mcsim.support.code import class_digest, package_digest
 
-Plan = Callable[[config.RunConfig, Analysis, int | None], campaign.Plan]
-
 CODE = ("config", "sphere", "stats", "instrument", "systematics", "bipolar", "simulation", "beamfit", "diagnosis")
 LIBRARIES = ("ducc0", "healpy", "numpy", "scipy")
 """What the simulations of a model and their data vectors are computed with."""
@@ -40,10 +38,7 @@ def diagnose(
     output: str | Path | None = None,
     *,
     case: str | None = None,
-    without: Sequence[str] = (),
-    simulations: int | None = None,
     settings: DiagnosisSettings | None = None,
-    workers: int | None = None,
     quiet: bool = True,
 ) -> DiagnosisResult:
     """Diagnose the gap between a simulation and data.
@@ -51,7 +46,7 @@ def diagnose(
     Parameters
     ----------
     model
-        Fiducial model of sky, beams, scan and noise: a run.
+        Fiducial model of sky, beams, scan and noise: a run. Its ``compute.workers`` processes simulate.
     data
         Folder with ``{channel}.fits`` or ``{channel}_{split}.fits``, uK; or the maps themselves, shape (npix,) each, in
         the order channel by channel, split by split; or a table of measured spectra
@@ -60,14 +55,9 @@ def diagnose(
         Folder for ``verdict.json``, ``diagnosis.zarr`` and ``report.html``; None: nothing is written.
     case
         Name; default: that of the run.
-    without
-        Effects of the library that are no candidates.
-    simulations
-        Number for the covariance of the data vector; default: ten for every independent element.
     settings
-        Levels, cuts, bins and numbers of simulations; default: those of :class:`DiagnosisSettings`.
-    workers
-        Processes; default: the run's; 0: this one.
+        Effects that are no candidates, levels, cuts, bins and numbers of simulations; default: those of
+        :class:`~mcsim.diagnosis.settings.DiagnosisSettings`.
     quiet
         Report no progress.
 
@@ -79,10 +69,12 @@ def diagnose(
     Raises
     ------
     InputError
-        If a run or data cannot be used.
+        If a run, data or settings cannot be used.
     """
     run = model if isinstance(model, config.RunConfig) else config.load(model)
-    for effect in without:
+    settings = settings or DiagnosisSettings()
+    settings = replace(settings, without=tuple(settings.without))
+    for effect in settings.without:
         systematics.get(effect)
     if output is not None:
         folders.writable(Path(output))
@@ -91,21 +83,18 @@ def diagnose(
     table = read_spectra(data, run) if isinstance(data, str | Path) and Path(data).is_file() else None
     if table is not None:
         run, task = measured_spectra.estimator_for(run, table), table
-        analysis = measured_spectra.analysis_of_spectra(run, table, without, threads, settings)
+        analysis = measured_spectra.analysis_of_spectra(run, table, settings.without, threads, settings)
     else:
-        analysis = analysis_of(run, without, threads, settings)
+        analysis = analysis_of(run, settings.without, threads, settings)
         maps = read_maps(analysis.model, data) if isinstance(data, str | Path) else checked(analysis.model, data)
-    with batch(run.compute.workers if workers is None else workers) as call:
+    with batch(run.compute.workers) as call:
         with asking(call, quiet, task, "simulations of the model and of each effect") as ask:
-            plan = campaign.plan if table is None else measured_spectra.plan
-            ensemble, bank = _learned(run, analysis, simulations, ask, plan)
+            ensemble, bank = _learned(run, analysis, ask, campaign.plan if table is None else measured_spectra.plan)
         with asking(call, quiet, task, "simulations of fitted effects") as ask:
             known = context(run, analysis, ensemble if table is None else ensemble.of_mean(table.realizations), bank)
-            found: DataSet
-            if table is not None:
-                found = measured_spectra.MeasuredSpectra(known, table, ask)
-            else:
-                found = ObservedMaps(known, maps, ask)
+            found: DataSet = (
+                ObservedMaps(known, maps, ask) if table is None else measured_spectra.MeasuredSpectra(known, table, ask)
+            )
             diagnosis = diagnose_data(found, case or run.name)
     if output is not None:
         diagnosis.save(output)
@@ -113,24 +102,18 @@ def diagnose(
     return diagnosis
 
 
-def prepared(
-    run: config.RunConfig,
-    analysis: Analysis,
-    ask: campaign.Ask,
-    simulations: int | None = None,
-) -> DiagnosisContext:
+def prepared(run: config.RunConfig, analysis: Analysis, ask: campaign.Ask) -> DiagnosisContext:
     """Return what every set of maps is tested with, simulated or from the cache."""
-    return context(run, analysis, *_learned(run, analysis, simulations, ask))
+    return context(run, analysis, *_learned(run, analysis, ask, campaign.plan))
 
 
 def _learned(
     run: config.RunConfig,
     analysis: Analysis,
-    simulations: int | None,
     ask: campaign.Ask,
-    planned: Plan = campaign.plan,
+    planned: Callable[[config.RunConfig, Analysis, int | None], campaign.Plan],
 ) -> tuple[NullEnsemble, TemplateBank]:
-    size = len(analysis.elements)
+    size, simulations = len(analysis.elements), analysis.settings.simulations
     if simulations is not None and simulations <= size:
         raise InputError(
             f"{simulations} simulations are too few for the {size} elements of the data vector; give at least "
@@ -145,10 +128,10 @@ def _learned(
             results = ask(plan.jobs)
         null_ensemble.save(scratch, *campaign.learned(analysis, plan, results))
 
-    return null_ensemble.load(folders.cached(f"diagnose/{_key(run, analysis, simulations)}.zarr", fill))
+    return null_ensemble.load(folders.cached(f"diagnose/{_key(run, analysis)}.zarr", fill))
 
 
-def _key(run: config.RunConfig, analysis: Analysis, simulations: int | None) -> str:
+def _key(run: config.RunConfig, analysis: Analysis) -> str:
     """Return a hash of all that the simulations of a model depend on, the code that makes them included.
 
     Its name, its seed and its number of realizations do not count.
@@ -158,7 +141,6 @@ def _key(run: config.RunConfig, analysis: Analysis, simulations: int | None) -> 
     effects = {candidate.effect for candidate in analysis.candidates}
     effects |= {systematics.get(effect.name) for effect in run.effects}
     rest = [
-        simulations,
         [[candidate.label, [repr(basis) for basis in candidate.basis]] for candidate in analysis.candidates],
         asdict(analysis.settings),
         [element.name for element in analysis.elements],

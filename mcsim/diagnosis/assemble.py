@@ -1,159 +1,99 @@
 """Put a diagnosis together: fits, tests and held-out data become one :class:`DiagnosisResult`."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.diagnosis.candidate import Candidate, columns_of, parts_of
-from mcsim.diagnosis.context import DiagnosisContext
+from mcsim.diagnosis.candidate import Candidate, parts_of
+from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.partial_explanation import PartialExplanation
-from mcsim.diagnosis.places import Place
 from mcsim.diagnosis.refine import Refined
-from mcsim.diagnosis.result import (
-    CandidateResult,
-    ContrastResult,
-    DiagnosisResult,
-    EffectResult,
-    EffectSet,
-    GlobalResult,
-    HeldOut,
-)
+from mcsim.diagnosis.result import CandidateResult, DiagnosisResult, EffectResult, EffectSet, GlobalResult
 from mcsim.diagnosis.selection import Explanation
-from mcsim.diagnosis.validation import Prediction, Shrink, excess_of
+from mcsim.diagnosis.validation import HeldOut, excess_of
 from mcsim.errors import InputError
 from mcsim.stats.detection import detectable, snr_needed, snr_to_separate
 from mcsim.stats.gaussian import Fit, SimulatedGaussian, residual_pvalue
 
 Vector = NDArray[np.float64]
-Reduction = tuple[Prediction, Shrink, str]
-"""What was predicted, what was achieved, and on which data, in words."""
 
 TELLING = 12
 """Elements that are named where two sets differ."""
 
 
-@dataclass(frozen=True)
-class Findings:
-    """What was found in one case.
-
-    Attributes
-    ----------
-    x
-        Data vector, shape (p,).
-    refined
-        Final attribution and templates.
-    places, held_out, partial, notes
-        Localisation, (prediction, reduction, data in words), what is detected beside "unknown", and remarks.
-    residual_maps
-        From :func:`mcsim.diagnosis.residual_maps.standardised`; None without maps.
-    """
-
-    x: Vector
-    refined: Refined
-    places: Sequence[Place]
-    held_out: Reduction | None
-    partial: PartialExplanation | None
-    notes: Sequence[str]
-    residual_maps: Vector | None = None
-
-
 def result_of(
-    context: DiagnosisContext, case: str, findings: Findings, provenance: Mapping[str, Any] | None = None
+    data: DataSet, case: str, refined: Refined, reduction: HeldOut | None, notes: Sequence[str]
 ) -> DiagnosisResult:
-    """Return the result of a case; ``provenance`` is added to what every diagnosis states."""
-    ensemble, null = context.ensemble, context.null
-    found, candidates = findings.refined.attribution, context.candidates
-    partial, count = findings.partial, len(ensemble.simulations)
-    model = context.analysis.model
+    """Return the result of a case from its final attribution and the reduction on held-out data."""
+    context, found, partial = data.context, refined.attribution, refined.partial
+    ensemble, null, model = context.ensemble, context.null, context.analysis.model
+    gap, count, residuals = found.gap, len(ensemble.simulations), data.residual_maps()
     return DiagnosisResult(
         case=case,
         kind=found.verdict,
         test=GlobalResult(
-            found.gap.pvalue,
-            found.gap.omnibus,
-            found.gap.maximum,
-            found.gap.chi2,
-            found.gap.dimension,
-            excess_of(found.gap.chi2, found.gap.dimension, null.dof),
-            count,
+            pvalue=gap.pvalue,
+            omnibus=gap.omnibus,
+            best_candidate=gap.maximum,
+            chi2=gap.chi2,
+            dof=gap.dimension,
+            excess=excess_of(gap.chi2, gap.dimension, null.dof),
+            simulations=count,
         ),
         sets=tuple(
             EffectSet(
-                tuple(effects_of(one, candidates)),
-                tuple(one.members),
-                tuple(columns_of(candidates, one.members)),
-                tuple(one.fit.amplitudes.tolist()),
-                tuple(one.fit.errors.tolist()),
-                one.odds,
-                one.pvalue,
-                one.further,
-                excess_of(one.fit.chi2, one.fit.dimension, null.dof),
+                effects=tuple(effects_of(one, context.candidates)),
+                candidates=tuple(one.members),
+                coordinates=tuple(one.fit.amplitudes.tolist()),
+                errors=tuple(one.fit.errors.tolist()),
+                odds=one.odds,
+                pvalue=one.pvalue,
+                further=one.further,
+                excess=excess_of(one.fit.chi2, one.fit.dimension, null.dof),
             )
             for one in found.explanations
         ),
         contrasts=tuple(
-            ContrastResult(
-                one.first,
-                one.second,
-                one.separation,
-                tuple(one.elements[:TELLING].tolist()),
-                tuple(one.shares[:TELLING].tolist()),
-            )
-            for one in found.contrasts
+            replace(one, elements=one.elements[:TELLING], shares=one.shares[:TELLING]) for one in found.contrasts
         ),
         nearest=found.nearest,
         cosine=found.cosine,
-        partial=() if partial is None else tuple(effects_of(partial, candidates)),
+        partial=() if partial is None else tuple(effects_of(partial, context.candidates)),
         partial_left=None if partial is None else partial.left,
-        held_out=None if findings.held_out is None else _held_out(*findings.held_out),
-        places=tuple(findings.places),
-        candidates=tuple(_candidates(context, findings.refined)),
+        held_out=reduction,
+        places=tuple(data.places()),
+        candidates=tuple(_candidates(context, refined)),
         elements=context.analysis.elements,
         maps=tuple(part.name for part in model.parts),
-        data=findings.x,
+        data=data.x,
         mean=null.mean,
         standard_deviation=ensemble.simulations.std(axis=0, ddof=1),
-        templates=findings.refined.templates,
+        templates=refined.templates,
         correlation=found.correlation,
         held_out_pvalues=held_out_pvalues(ensemble.simulations, null),
         calibration=context.calibration.combined,
-        residual_maps=findings.residual_maps,
-        residual_range=None
-        if findings.residual_maps is None
-        else np.quantile(ensemble.residual_rms, [0.025, 0.975], axis=0).T,
+        residual_maps=residuals,
+        residual_range=None if residuals is None else np.quantile(ensemble.residual_rms, [0.025, 0.975], axis=0).T,
         frame=model.survey.config.map.frame,
-        notes=tuple(findings.notes),
+        notes=tuple(notes),
         settings=context.settings,
         provenance={
             "simulations of the model": count,
             "skies constrained by the data": context.settings.constrained_skies,
             "seed of the run": context.run.ensemble.seed,
-            **(provenance or {}),
+            **data.provenance(),
         },
         configuration=config.to_json(context.run),
-    )
-
-
-def _held_out(predicted: Prediction, achieved: Shrink, data: str) -> HeldOut:
-    return HeldOut(
-        predicted.fraction, achieved.fraction, achieved.before, achieved.after, achieved.probability_after, data
     )
 
 
 def effects_of(
     explanation: Explanation | PartialExplanation, candidates: Sequence[Candidate]
 ) -> Iterator[EffectResult]:
-    """Yield the effects of a set with amplitude, standard error, unit and parameters.
-
-    Raises
-    ------
-    InputError
-        If no effect has such an amplitude.
-    """
+    """Yield the effects of a set; raise InputError if no effect has such an amplitude."""
     for member, theta, covariance in parts_of(candidates, explanation.members, explanation.fit):
         candidate = candidates[member]
         effect, sigma = candidate.fitted(theta, covariance), _sigma(candidate, theta, covariance)
@@ -163,7 +103,10 @@ def effects_of(
             amplitude=effect.amplitude,
             sigma=sigma,
             unit=effect.unit,
-            parameters={key: _plain(value) for key, value in effect.parameters().items()},
+            parameters={
+                key: list(map(float, value)) if isinstance(value, tuple) else value
+                for key, value in effect.parameters().items()
+            },
             label=candidate.title,
             words=effect.describe(sigma),
         )
@@ -186,14 +129,9 @@ def _sigma(candidate: Candidate, theta: Vector, covariance: Vector) -> float:
     return float(np.sqrt(max(float(slopes @ covariance @ slopes), 0.0)))
 
 
-def _plain(value: Any) -> Any:
-    return [float(item) for item in value] if isinstance(value, tuple) else value
-
-
 def _candidates(context: DiagnosisContext, refined: Refined) -> Iterator[CandidateResult]:
     """Yield every candidate with its fit alone, what would be detected, and what is most like it."""
-    null, t = context.null, refined.templates
-    found, candidates = refined.attribution, context.candidates
+    null, t, found, candidates = context.null, refined.templates, refined.attribution, context.candidates
     p, N = null.dimension, len(context.ensemble.simulations)
     responds = np.any(t != 0.0, axis=0)
     rank = np.array([int(responds[list(one.columns)].sum()) for one in candidates])
@@ -206,7 +144,7 @@ def _candidates(context: DiagnosisContext, refined: Refined) -> Iterator[Candida
         others = [j for j, other in enumerate(candidates) if other.identity != candidate.identity]
         similar = max(others, key=lambda j: abs(found.correlation[k, j]), default=None)
         cosine = 0.0 if similar is None else abs(float(found.correlation[k, similar]))
-        strength = 0.0 if similar is None else float(snr_to_separate(np.array([cosine]))[0])
+        strength = 0.0 if similar is None else float(snr_to_separate(cosine))
         needed = snr_needed(min(len(columns), p), len(candidates), p, N)
         separable = float("nan") if size is None or similar is None else strength * size / needed
         yield CandidateResult(
@@ -234,19 +172,13 @@ def _candidates(context: DiagnosisContext, refined: Refined) -> Iterator[Candida
 def detectable_amplitude(null: SimulatedGaussian, t: Vector, looks: int, candidate: Candidate) -> float | None:
     """Return the smallest amplitude that is found in nine cases of ten, rms over directions; None: no response.
 
-    Parameters
-    ----------
-    null, t, looks
-        Null, templates of the candidate, shape (p, k), and number of candidates.
-    candidate
-        The candidate.
+    ``t`` are the templates of the candidate, shape (p, k), which is one of ``looks``.
     """
     size = detectable(null, t, looks).typical
     if not np.isfinite(size):
         return None
-    direction = np.zeros(t.shape[1])
-    direction[0] = size
-    return abs(candidate.with_coordinates(direction, np.eye(len(direction))).amplitude)
+    precision = np.eye(t.shape[1])
+    return abs(candidate.with_coordinates(size * precision[0], precision).amplitude)
 
 
 def _alone(index: int, single: Fit, candidates: Sequence[Candidate]) -> tuple[float, float, str]:

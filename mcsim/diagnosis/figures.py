@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
 
-from mcsim.diagnosis.result import CandidateResult, ContrastResult, DiagnosisResult
+from mcsim.diagnosis.result import CandidateResult, DiagnosisResult
+from mcsim.diagnosis.selection import Contrast
 from mcsim.diagnosis.summaries import KINDS
 from mcsim.diagnosis.words import sentence
 from mcsim.stats.detection import snr_to_separate
@@ -281,7 +282,7 @@ def calibration_figure(result: DiagnosisResult) -> Figure:
     return figure
 
 
-def contrast_figure(result: DiagnosisResult, one: ContrastResult) -> Figure:
+def contrast_figure(result: DiagnosisResult, one: Contrast) -> Figure:
     """Draw the elements in which two sets of effects differ most, with the data."""
     rows = [(k, share) for k, share in zip(one.elements, one.shares, strict=True) if share > 0.0][:8]
     where = [k for k, _ in rows]

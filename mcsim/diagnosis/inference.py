@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.assemble import Findings, Reduction, result_of
+from mcsim.diagnosis.assemble import result_of
 from mcsim.diagnosis.candidate import columns_of, tables_at
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.refine import Refined, Refiner, with_scatter
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import Attribution
-from mcsim.diagnosis.validation import Halves
+from mcsim.diagnosis.validation import Halves, HeldOut
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import Fit
 from mcsim.support.numbers import measured
@@ -36,10 +36,7 @@ def diagnose_data(data: DataSet, case: str) -> DiagnosisResult:
         If the data cannot be what they claim to be.
     """
     context = data.context
-    refiner = Refiner(
-        context.null, data.x, context.calibration, context.bank.curvature, data.respond, context.settings,
-        data.realizations,
-    )  # fmt: skip
+    refiner = Refiner(data)
     refined = refiner.run(data.templates(), context.candidates)
     found = refined.attribution
     exchanged = data.exchanged(found)
@@ -54,15 +51,12 @@ def diagnose_data(data: DataSet, case: str) -> DiagnosisResult:
     partial = None if exchanged else refined.partial
     if partial is None and not exchanged and found.verdict == "unknown":
         partial = refiner.detected_in(refined.templates, refined.candidates)
-    findings = Findings(
-        data.x, replace(refined, attribution=found), data.places(), reduction, partial, notes, data.residual_maps()
-    )
-    return result_of(context, case, findings, data.provenance())
+    return result_of(data, case, replace(refined, attribution=found, partial=partial), reduction, notes)
 
 
 def confirmed(
-    context: DiagnosisContext, found: Attribution, reduction: Reduction | None, notes: list[str]
-) -> tuple[Attribution, Reduction | None]:
+    context: DiagnosisContext, found: Attribution, reduction: HeldOut | None, notes: list[str]
+) -> tuple[Attribution, HeldOut | None]:
     """Return attribution and reduction if they hold once the best set is simulated.
 
     A set that increases the excess chi^2 of the held-out data, or reduces it by less than half of the prediction, both
@@ -72,13 +66,13 @@ def confirmed(
     if reduction is None:
         return found, None
     limit = context.settings.reduction_sigma
-    before, fraction, expected = reduction[1].before, reduction[1].fraction, reduction[0].fraction
+    before, fraction, expected = reduction.before, reduction.achieved, reduction.predicted
     increased = fraction.value * before.value + limit * fraction.sigma * abs(before.value) < 0.0
     short = expected.value - fraction.value > limit * np.hypot(expected.sigma, fraction.sigma)
     if increased or (short and before.value > 0.0 and fraction.value < 0.5 * min(expected.value, 1.0)):
         best = " and ".join(context.candidates[member].title for member in found.explanations[0].members)
-        does = f"raises the excess χ² of the other half from {before.value:.3g} to {reduction[1].after.value:.3g}"
-        if reduction[1].after.value < before.value:
+        does = f"raises the excess χ² of the other half from {before.value:.3g} to {reduction.after.value:.3g}"
+        if reduction.after.value < before.value:
             removed, forecast = 100.0 * fraction.value, 100.0 * expected.value
             does = f"removes {removed:.0f} % of the excess χ² of the other half, where {forecast:.0f} % were predicted"
         notes.append(f"The best fit, {best}, is not named: simulated with its amplitude from one half, it {does}.")
@@ -111,7 +105,7 @@ def _with_errors(data: DataSet, refined: Refined, found: Attribution) -> Attribu
     return replace(found, explanations=(own, *found.explanations[1:]))
 
 
-def reduction_of(data: DataSet, refined: Refined) -> Reduction | None:
+def reduction_of(data: DataSet, refined: Refined) -> HeldOut | None:
     """Fit one half of the data vector, freeze, add the effects to the simulator, and test the other half.
 
     None if there are no halves, one of them is hardly sensitive to the effects, or the half that is fitted asks for an
@@ -136,6 +130,6 @@ def reduction_of(data: DataSet, refined: Refined) -> Reduction | None:
         return change if matrix is None else matrix @ change
 
     try:
-        return *halves.reduction(t, respond, scatters), words
+        return halves.reduction(t, respond, scatters, words)
     except InputError:
         return None

@@ -20,16 +20,9 @@ Exact = Callable[[Matrix, tuple[int, ...], Fit], Matrix | None]
 class PartialExplanation:
     """Hold effects that are detected without explaining all of the excess chi^2.
 
-    Attributes
-    ----------
-    members
-        Indices of the candidates, in the order in which they were detected.
-    fit
-        Amplitudes of the members' columns, one member after the other.
-    left
-        Share of the excess chi^2 that they leave.
-    templates
-        That hold for the members together, shape (p_raw, K).
+    ``members`` are the indices of the candidates, in the order in which they were detected, and ``fit`` the amplitudes
+    of their columns; ``left`` is the share of the excess chi^2 that they leave. The ``templates``, shape (p_raw, K),
+    hold for the members together.
     """
 
     members: tuple[int, ...]
@@ -42,16 +35,8 @@ class PartialExplanation:
 class Detection:
     """Add the most significant candidate beside those that are detected already, until none is significant.
 
-    Attributes
-    ----------
-    null, x
-        Distribution of the data vector without an effect, and the data, shape (p_raw,).
-    candidates, calibration
-        Candidates, and their calibration.
-    exact
-        Simulates members at their amplitudes; None from it says that they cannot have them.
-    settings
-        Of the diagnosis.
+    ``null`` is the distribution of the data vector ``x``, shape (p_raw,), without an effect. ``exact`` simulates
+    members at their amplitudes; None from it says that they cannot have them.
     """
 
     null: SimulatedGaussian

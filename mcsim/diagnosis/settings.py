@@ -9,6 +9,10 @@ class DiagnosisSettings:
 
     Attributes
     ----------
+    without
+        Effects of the library that are no candidates.
+    simulations
+        Number for the covariance of the data vector; None: ``sims_per_element`` for every independent element.
     alpha
         Global p-value up to which the model does not describe the data.
     residual_level, further_level
@@ -92,6 +96,8 @@ class DiagnosisSettings:
         Correlation, in standard deviations of a chance one, from which on two elements are correlated.
     """
 
+    without: tuple[str, ...] = ()
+    simulations: int | None = None
     alpha: float = 0.05
     residual_level: float = 0.02
     further_level: float = 0.005

@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from mcsim.diagnosis.result import ContrastResult, DiagnosisResult, EffectResult, HeldOut
-from mcsim.diagnosis.validation import Measured
+from mcsim.diagnosis.result import DiagnosisResult, EffectResult
+from mcsim.diagnosis.selection import Contrast
+from mcsim.diagnosis.validation import HeldOut, Measured
 from mcsim.support.numbers import measured, number, p_equals
 
 AGREES, DISAGREES = 0.05, 0.005
@@ -135,7 +136,7 @@ def percent(fraction: Measured) -> str:
     return measured(100.0 * fraction.value, 100.0 * fraction.sigma, " %")
 
 
-def apart(result: DiagnosisResult, one: ContrastResult) -> str:
+def apart(result: DiagnosisResult, one: Contrast) -> str:
     """Return how far the predictions of two sets are apart, and what would tell them apart."""
     start = f"The predictions differ by {one.separation:.1f} standard deviations. "
     factor = (SEPARATION / one.separation) ** 2 if one.separation > 0.0 else float("inf")

@@ -17,6 +17,7 @@ from mcsim.diagnosis.campaign import with_effects
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps, read_maps
+from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.wiener_filter import shared_sky, wiener_filter
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
@@ -262,13 +263,13 @@ def test_what_cannot_be_done_is_said_before_anything_is_learned(small, folder):
     (folder / "file").write_text("")
     for changes, said in (
         ({"output": folder / "file"}, "cannot be written"),
-        ({"without": ["beam_elipticity"]}, "did you mean beam_ellipticity"),
+        ({"settings": DiagnosisSettings(without=("beam_elipticity",))}, "did you mean beam_ellipticity"),
         ({"data": [np.zeros(3072)]}, "1 maps were given, the model has 4"),
         ({"data": [np.zeros(48)] * 4}, "nside 2, the model 16"),
-        ({"simulations": 20}, "too few"),
+        ({"settings": DiagnosisSettings(simulations=20)}, "too few"),
     ):
         with pytest.raises(InputError, match=said):
-            mcsim.diagnose(**({"model": small.run, "data": folder, "workers": 1} | changes))
+            mcsim.diagnose(**({"model": small.run, "data": folder} | changes))
 
 
 def test_exchanged_channels_are_noticed(small):

@@ -16,7 +16,7 @@ from scipy import stats
 from mcsim import config, systematics
 from mcsim.diagnosis import figures as plots
 from mcsim.diagnosis import report, residual_maps, words
-from mcsim.diagnosis.assemble import Findings, effects_of, held_out_pvalues, result_of
+from mcsim.diagnosis.assemble import effects_of, held_out_pvalues, result_of
 from mcsim.diagnosis.candidate import Candidate, numbered
 from mcsim.diagnosis.places import Place
 from mcsim.diagnosis.refine import Refined
@@ -24,7 +24,7 @@ from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import attribute
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Element
-from mcsim.diagnosis.validation import Measured, Prediction, Shrink
+from mcsim.diagnosis.validation import HeldOut, Measured
 from mcsim.errors import InputError
 from mcsim.stats.detection import confusion, snr_needed
 from mcsim.stats.gaussian import SimulatedGaussian, residual_pvalue
@@ -123,17 +123,17 @@ def diagnosis(kind: str) -> DiagnosisResult:
         x += 15.0 * (strange - t @ np.linalg.lstsq(t, strange, rcond=None)[0]) / np.sqrt(P)
     found = attribute(context.null, x, t, context.candidates, context.calibration)
     where = [Place(context.analysis.elements[0], 9.1, 1e-8, 8.0), Place(context.analysis.elements[-2], 1.0, 0.7, 1.2)]
-    shrink = None
+    reduction = None
     if found.explanations:
-        shrink = (
-            Prediction(Measured(200.0, 20.0), Measured(0.93, 0.04)),
-            Shrink(Measured(215.0, 30.0), Measured(20.0, 9.0), Measured(0.907, 0.051), 0.4),
-            "half2 (frozen on half1)",
-        )
+        predicted, achieved = Measured(0.93, 0.04), Measured(0.907, 0.051)
+        before, after = Measured(215.0, 30.0), Measured(20.0, 9.0)
+        reduction = HeldOut(predicted, achieved, before, after, 0.4, "half2 (frozen on half1)")
     sky = np.random.default_rng(5).normal(size=(2, 12 * 8**2))
     sky[:, :60] = np.nan
-    findings = Findings(x, Refined(found, t, (), ()), where, shrink, None, ["a <b>note</b> & so"], sky)
-    return result_of(context, f"case <i>{kind}</i>", findings, {"level": 0.05})
+    data = SimpleNamespace(
+        context=context, x=x, places=lambda: where, residual_maps=lambda: sky, provenance=lambda: {"level": 0.05}
+    )
+    return result_of(data, f"case <i>{kind}</i>", Refined(found, t, ()), reduction, ["a <b>note</b> & so"])
 
 
 class Page(HTMLParser):
@@ -276,7 +276,8 @@ def test_sets_stand_side_by_side_with_what_tells_them_apart(diagnoses, pages):
 def test_best_set_is_taken_from_what_is_left(diagnoses):
     for kind in ("effect", "mixture"):
         result = diagnoses[kind]
-        t = result.templates[:, list(result.sets[0].columns)] @ np.array(result.sets[0].coordinates)
+        columns = [column for k in result.sets[0].candidates for column in result.candidates[k].columns]
+        t = result.templates[:, columns] @ np.array(result.sets[0].coordinates)
         np.testing.assert_allclose(result.prediction(0), t / result.standard_deviation)
         # 30 unit normals: their square exceeds 80 once in a million.
         assert np.sum(result.z_after**2) < 80.0 < np.sum(result.z**2)
