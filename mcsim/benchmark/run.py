@@ -49,7 +49,7 @@ def diagnose_case(settings: Settings, folder: str, case: str, without: tuple[str
     found = model.diagnose(case, target / MAPS / case)
     answer = {
         "evidence": [float(value) for value in found.data],
-        "maximum": found.test.best_candidate,
+        "maximum": found.test.maximum,
         "explanations": [
             {
                 "proposals": [model.library.candidates[member].label for member in one.candidates],

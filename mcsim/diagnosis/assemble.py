@@ -9,13 +9,11 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.diagnosis.candidate import Candidate, parts_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
-from mcsim.diagnosis.partial_explanation import PartialExplanation
 from mcsim.diagnosis.refine import Refined
-from mcsim.diagnosis.result import CandidateResult, DiagnosisResult, EffectResult, EffectSet, GlobalResult
-from mcsim.diagnosis.selection import Explanation
+from mcsim.diagnosis.result import CandidateResult, DiagnosisResult, EffectResult, EffectSet
 from mcsim.diagnosis.validation import HeldOut, excess_of
 from mcsim.errors import InputError
-from mcsim.stats.detection import detectable, snr_needed, snr_to_separate
+from mcsim.stats.detection import detectable, snr_to_separate
 from mcsim.stats.gaussian import Fit, SimulatedGaussian, residual_pvalue
 
 Vector = NDArray[np.float64]
@@ -30,22 +28,14 @@ def result_of(
     """Return the result of a case from its final attribution and the reduction on held-out data."""
     context, found, partial = data.context, refined.attribution, refined.partial
     ensemble, null, model = context.ensemble, context.null, context.analysis.model
-    gap, count, residuals = found.gap, len(ensemble.simulations), data.residual_maps()
+    candidates, residuals = context.candidates, data.residual_maps()
     return DiagnosisResult(
         case=case,
         kind=found.verdict,
-        test=GlobalResult(
-            pvalue=gap.pvalue,
-            omnibus=gap.omnibus,
-            best_candidate=gap.maximum,
-            chi2=gap.chi2,
-            dof=gap.dimension,
-            excess=excess_of(gap.chi2, gap.dimension, null.dof),
-            simulations=count,
-        ),
+        test=found.gap,
         sets=tuple(
             EffectSet(
-                effects=tuple(effects_of(one, context.candidates)),
+                effects=tuple(effects_of(candidates, one.members, one.fit)),
                 candidates=tuple(one.members),
                 coordinates=tuple(one.fit.amplitudes.tolist()),
                 errors=tuple(one.fit.errors.tolist()),
@@ -61,7 +51,7 @@ def result_of(
         ),
         nearest=found.nearest,
         cosine=found.cosine,
-        partial=() if partial is None else tuple(effects_of(partial, context.candidates)),
+        partial=() if partial is None else tuple(effects_of(candidates, partial.members, partial.fit)),
         partial_left=None if partial is None else partial.left,
         held_out=reduction,
         places=tuple(data.places()),
@@ -81,7 +71,7 @@ def result_of(
         notes=tuple(notes),
         settings=context.settings,
         provenance={
-            "simulations of the model": count,
+            "simulations of the model": len(ensemble.simulations),
             "skies constrained by the data": context.settings.constrained_skies,
             "seed of the run": context.run.ensemble.seed,
             **data.provenance(),
@@ -90,11 +80,9 @@ def result_of(
     )
 
 
-def effects_of(
-    explanation: Explanation | PartialExplanation, candidates: Sequence[Candidate]
-) -> Iterator[EffectResult]:
-    """Yield the effects of a set; raise InputError if no effect has such an amplitude."""
-    for member, theta, covariance in parts_of(candidates, explanation.members, explanation.fit):
+def effects_of(candidates: Sequence[Candidate], members: Sequence[int], fit: Fit) -> Iterator[EffectResult]:
+    """Yield the effects of a fit; raise InputError if no effect has such an amplitude."""
+    for member, theta, covariance in parts_of(candidates, members, fit):
         candidate = candidates[member]
         effect, sigma = candidate.fitted(theta, covariance), _sigma(candidate, theta, covariance)
         yield EffectResult(
@@ -132,21 +120,26 @@ def _sigma(candidate: Candidate, theta: Vector, covariance: Vector) -> float:
 def _candidates(context: DiagnosisContext, refined: Refined) -> Iterator[CandidateResult]:
     """Yield every candidate with its fit alone, what would be detected, and what is most like it."""
     null, t, found, candidates = context.null, refined.templates, refined.attribution, context.candidates
-    p, N = null.dimension, len(context.ensemble.simulations)
     responds = np.any(t != 0.0, axis=0)
     rank = np.array([int(responds[list(one.columns)].sum()) for one in candidates])
     pvalues = null.nested_test(np.array([s.delta_chi2 for s in found.singles]), found.gap.chi2, rank)
     for k, candidate in enumerate(candidates):
         columns = list(candidate.columns)
-        amplitude, sigma, words = _alone(k, found.singles[k], candidates)
-        size = detectable_amplitude(null, t[:, columns], len(candidates), candidate)
+        try:
+            (alone,) = effects_of(candidates, (k,), found.singles[k])
+            amplitude, sigma, words = alone.amplitude, alone.sigma, alone.words
+        except InputError:
+            amplitude, sigma, words = float("nan"), float("nan"), "no such amplitude"
+        reach, size = detectable(null, t[:, columns], len(candidates)), None
+        if np.isfinite(reach.typical):
+            precision = np.eye(len(columns))
+            size = abs(candidate.with_coordinates(reach.typical * precision[0], precision).amplitude)
         # Candidates that differ in settings only are variants of one effect.
         others = [j for j, other in enumerate(candidates) if other.identity != candidate.identity]
         similar = max(others, key=lambda j: abs(found.correlation[k, j]), default=None)
         cosine = 0.0 if similar is None else abs(float(found.correlation[k, similar]))
         strength = 0.0 if similar is None else float(snr_to_separate(cosine))
-        needed = snr_needed(min(len(columns), p), len(candidates), p, N)
-        separable = float("nan") if size is None or similar is None else strength * size / needed
+        separable = float("nan") if size is None or similar is None else strength * size / reach.strength
         yield CandidateResult(
             name=candidate.name,
             channel=candidate.channel,
@@ -167,28 +160,6 @@ def _candidates(context: DiagnosisContext, refined: Refined) -> Iterator[Candida
             separable=separable,
             separable_words=candidate.effect.format_amplitude(separable) if np.isfinite(separable) else "–",
         )
-
-
-def detectable_amplitude(null: SimulatedGaussian, t: Vector, looks: int, candidate: Candidate) -> float | None:
-    """Return the smallest amplitude that is found in nine cases of ten, rms over directions; None: no response.
-
-    ``t`` are the templates of the candidate, shape (p, k), which is one of ``looks``.
-    """
-    size = detectable(null, t, looks).typical
-    if not np.isfinite(size):
-        return None
-    precision = np.eye(t.shape[1])
-    return abs(candidate.with_coordinates(size * precision[0], precision).amplitude)
-
-
-def _alone(index: int, single: Fit, candidates: Sequence[Candidate]) -> tuple[float, float, str]:
-    """Return amplitude, standard error and words of a candidate; NaN where no effect has such an amplitude."""
-    try:
-        fitted = Explanation((index,), single, 1.0, single.pvalue, single.pvalue)
-        (effect,) = effects_of(fitted, candidates)
-    except InputError:
-        return float("nan"), float("nan"), "no such amplitude"
-    return effect.amplitude, effect.sigma, effect.words
 
 
 def held_out_pvalues(simulations: Vector, null: SimulatedGaussian) -> Vector:

@@ -186,11 +186,9 @@ class Refiner:
 
     def _has_converged(self, before: Vector, now: Fit) -> bool:
         """Return True if amplitudes have hardly moved, by their errors, or by their size if the errors are tiny."""
-        precision = np.linalg.pinv(now.covariance)
-        moved = now.amplitudes - before
-        size = float(now.amplitudes @ precision @ now.amplitudes)
-        limit = max(self.context.settings.settled_sigma**2, self.context.settings.settled_share**2 * size)
-        return float(moved @ precision @ moved) < limit
+        precision, settings = np.linalg.pinv(now.covariance), self.context.settings
+        moved, size = (float(v @ precision @ v) for v in (now.amplitudes - before, now.amplitudes))
+        return moved < max(settings.settled_sigma**2, settings.settled_share**2 * size)
 
     def _has_settled(self, before: Vector | None, now: Vector, covariance: Matrix) -> bool:
         if before is None:

@@ -15,8 +15,9 @@ from mcsim.diagnosis.places import Place
 from mcsim.diagnosis.selection import Contrast, Verdict
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Element
-from mcsim.diagnosis.validation import HeldOut, Measured
+from mcsim.diagnosis.validation import HeldOut, Measured, excess_of
 from mcsim.errors import InputError
+from mcsim.stats.look_elsewhere import GlobalTest
 
 Vector = NDArray[np.float64]
 
@@ -24,25 +25,6 @@ SCHEMA = 1
 STORE = "diagnosis.zarr"
 PLACES = 12
 """Groups in the localisation table of ``verdict.json`` and of the report."""
-
-
-@dataclass(frozen=True)
-class GlobalResult:
-    """Result of the test of the whole data vector.
-
-    ``pvalue``, uniform where the model is right, combines those of chi^2, ``omnibus``, and of the most significant
-    candidate with the look-elsewhere effect, ``best_candidate``. ``chi2`` is that of the ``dof`` independent directions
-    of the data vector; with a covariance from few ``simulations`` it is larger than dof on average. ``excess`` is
-    chi^2 - dof without that bias: zero on average where the model is right.
-    """
-
-    pvalue: float
-    omnibus: float
-    best_candidate: float
-    chi2: float
-    dof: int
-    excess: Measured
-    simulations: int
 
 
 @dataclass(frozen=True)
@@ -146,7 +128,7 @@ class DiagnosisResult:
     case, kind
         Name of the case; "none", "effect", "mixture", "degenerate" or "unknown".
     test
-        Test of the whole data vector.
+        Test of the whole data vector; with few simulations its chi^2 is too large on average, and ``excess`` is not.
     sets, contrasts
         Sets of effects that describe the data, the most probable first, and what would tell them apart.
     nearest, cosine
@@ -182,7 +164,7 @@ class DiagnosisResult:
 
     case: str
     kind: Verdict
-    test: GlobalResult
+    test: GlobalTest
     sets: tuple[EffectSet, ...]
     contrasts: tuple[Contrast, ...]
     nearest: int
@@ -220,6 +202,16 @@ class DiagnosisResult:
         return self.sets[0].effects if self.sets else ()
 
     @property
+    def simulations(self) -> int:
+        """Return the number of simulations that mean and covariance come from."""
+        return len(self.held_out_pvalues)
+
+    @property
+    def excess(self) -> Measured:
+        """Return the unbiased excess of chi^2 over its degrees of freedom, zero on average where the model is right."""
+        return excess_of(self.test.chi2, self.test.dimension, self.simulations - 1)
+
+    @property
     def z(self) -> Vector:
         """Return data less mean over scatter, shape (p,)."""
         return np.asarray((self.data - self.mean) / self.standard_deviation)
@@ -247,7 +239,7 @@ class DiagnosisResult:
         return {
             "schema": SCHEMA,
             "case": self.case,
-            "gap": {"p_value": self.test.pvalue, "statistic": self.test.chi2, "dof": self.test.dof},
+            "gap": {"p_value": self.test.pvalue, "statistic": self.test.chi2, "dof": self.test.dimension},
             "verdict": self.kind,
             "effects": sets[0] if sets else [],
             "alternatives": sets[1:],

@@ -141,10 +141,8 @@ def attribute(
 def _verdict(agrees: bool, explanations: Sequence[Explanation]) -> Verdict:
     if agrees:
         return "none"
-    if not explanations:
-        return "unknown"
-    if len(explanations) > 1:
-        return "degenerate"
+    if len(explanations) != 1:
+        return "degenerate" if explanations else "unknown"
     return "mixture" if len(explanations[0].members) > 1 else "effect"
 
 

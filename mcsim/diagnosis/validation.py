@@ -36,11 +36,6 @@ class HeldOut:
     pvalue_after: float
     data: str
 
-    @property
-    def expected_after(self) -> float:
-        """Return the excess that the prediction leaves."""
-        return self.before.value * (1.0 - self.predicted.value)
-
 
 @dataclass(frozen=True)
 class Halves:

@@ -214,10 +214,10 @@ def test_first_screen_says_what_was_tested_and_found(diagnoses, pages, kind):
 
 
 def test_global_chi2_is_near_its_degrees_of_freedom_where_the_model_is_right(diagnoses):
-    test = diagnoses["none"].test
+    test, excess = diagnoses["none"].test, diagnoses["none"].excess
     # The raw statistic is larger by (N - 1)/(N - 2 - p).
-    assert test.excess.value + test.dof == pytest.approx(test.chi2 * (N - 2 - P) / (N - 1))
-    assert abs(test.excess.value) < 4.0 * test.excess.sigma
+    assert excess.value + test.dimension == pytest.approx(test.chi2 * (N - 2 - P) / (N - 1))
+    assert abs(excess.value) < 4.0 * excess.sigma
 
 
 MARGINAL, AGREES = "marginally compatible", "agrees with the simulations"
@@ -447,8 +447,7 @@ def test_an_amplitude_at_the_edge_of_the_possible_has_an_error():
     kind = systematics.get("spectrum")
     errors = np.array([0.2, 0.02, 0.02, 0.02, 0.02, 0.02])
     less_than_nothing = SimpleNamespace(amplitudes=np.array([-1.1, 0, 0, 0, 0, 0]), covariance=np.diag(errors**2))
-    explanation = SimpleNamespace(members=(0,), fit=less_than_nothing)
-    (found,) = effects_of(explanation, [Candidate(kind, None, tuple(range(6)))])
+    (found,) = effects_of([Candidate(kind, None, tuple(range(6)))], (0,), less_than_nothing)
     assert found.amplitude == pytest.approx(0.99)
     # One error up is -0.9.
     assert found.sigma == pytest.approx((0.99 - 0.9) / 2.0, rel=1e-3)
@@ -458,7 +457,6 @@ def test_what_data_do_not_tell_is_no_part_of_an_error():
     kind = systematics.get("spectrum")
     errors = np.array([0.02, 0.02, 0.02, 0.02, 0.02, 0.4])
     fitted = SimpleNamespace(amplitudes=np.array([0.3, 0, 0, 0, 0, 1.0]), covariance=np.diag(errors**2))
-    explanation = SimpleNamespace(members=(0,), fit=fitted)
-    (found,) = effects_of(explanation, [Candidate(kind, None, tuple(range(6)))])
+    (found,) = effects_of([Candidate(kind, None, tuple(range(6)))], (0,), fitted)
     assert found.amplitude == pytest.approx(0.3)
     assert found.sigma == pytest.approx(0.02)
