@@ -17,6 +17,7 @@ from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, data_vectors
 from mcsim.diagnosis.batch import asking, batch
 from mcsim.diagnosis.context import DataSet, DiagnosisContext, context
 from mcsim.diagnosis.inference import diagnose_data
+from mcsim.diagnosis.measured_spectra import MeasuredSpectra
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.observed_maps import ObservedMaps, checked, read_maps
 from mcsim.diagnosis.result import DiagnosisResult
@@ -92,9 +93,7 @@ def diagnose(
             ensemble, bank = _learned(run, analysis, ask, campaign.plan if table is None else measured_spectra.plan)
         with asking(call, quiet, task, "simulations of fitted effects") as ask:
             known = context(run, analysis, ensemble if table is None else ensemble.of_mean(table.realizations), bank)
-            found: DataSet = (
-                ObservedMaps(known, maps, ask) if table is None else measured_spectra.MeasuredSpectra(known, table, ask)
-            )
+            found: DataSet = ObservedMaps(known, maps, ask) if table is None else MeasuredSpectra(known, table, ask)
             diagnosis = diagnose_data(found, case or run.name)
     if output is not None:
         diagnosis.save(output)

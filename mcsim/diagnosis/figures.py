@@ -22,11 +22,8 @@ from mcsim.support.numbers import measured, p_equals
 BLUE, RED, GREEN, AMBER = "#0072b2", "#d55e00", "#00785a", "#e69f00"
 _VERDICTS = {"none": GREEN, "effect": BLUE, "mixture": BLUE, "degenerate": "#8a5c00", "unknown": "#b04a00"}
 
-TOP = 15
-"""Candidates in the picture of those fitted alone; the table has all."""
-
-MAPS = 12
-"""Residual maps in the picture."""
+TOP, MAPS = 15, 12
+"""Candidates in the picture of those fitted alone, of which the table has all; and residual maps in theirs."""
 
 LIMIT = 8.0
 """Deviation at which the colours of the table of blocks end."""
@@ -39,13 +36,12 @@ def first_screen(result: DiagnosisResult) -> Figure:
     height = 2.6 + top
     figure = Figure(figsize=(9.6, height))
     figure.set_layout_engine("constrained", rect=(0.0, 0.0, 1.0, 1.0 - top / height), w_pad=0.15)
-    head = figure.text(
-        0.02, 1.0 - 0.3 / height, f" {_label(result.case, 60)}: {result.kind} ", va="center", fontsize=13
-    )
+    name = f" {_label(result.case, 60)}: {result.kind} "
+    head = figure.text(0.02, 1.0 - 0.3 / height, name, va="center", fontsize=13)
     head.set(color="white", fontweight="bold", in_layout=False)
     head.set_bbox({"facecolor": _VERDICTS[result.kind], "edgecolor": "none", "boxstyle": "round,pad=0.3"})
-    text = figure.text(0.02, 1.0 - 0.6 / height, "\n".join(lines), fontsize=10.5, va="top", linespacing=1.35)
-    text.set_in_layout(False)
+    style: dict[str, Any] = {"fontsize": 10.5, "va": "top", "linespacing": 1.35, "in_layout": False}
+    figure.text(0.02, 1.0 - 0.6 / height, "\n".join(lines), **style)
     left, right = figure.subplots(1, 2)
     _draw_excess(left, result)
     _draw_candidates(right, result, 6)
@@ -242,8 +238,7 @@ def calibration_figure(result: DiagnosisResult) -> Figure:
     inside = p >= rank[0]
     at = float(np.interp(p, rank, draws)) if inside else draws[0]
     shown = p if inside else rank[0] / 2.0
-    label = f"data, {p_equals(p)}"
-    right.plot(at, shown, "o" if inside else "v", color=RED, markersize=8, label=label)
+    right.plot(at, shown, "o" if inside else "v", color=RED, markersize=8, label=f"data, {p_equals(p)}")
     right.axhline(0.05, color="black", linewidth=0.8, linestyle="--")
     right.annotate("5 %", (draws[0], 0.05), xytext=(2, 3), textcoords="offset points", fontsize=8)
     right.set(xscale="log", yscale="log", ylim=(rank[0] / 3.0, 1.5), ylabel="fraction of draws below")

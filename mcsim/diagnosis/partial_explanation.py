@@ -79,16 +79,15 @@ class Detection:
         self, t: Matrix, members: tuple[int, ...], refused: set[int], before: Fit
     ) -> tuple[int, Fit] | None:
         """Return the most significant candidate beside the members, and their fit; None if none is significant."""
-        smallest, chosen = 1.0, None
+        options: list[tuple[float, int, Fit]] = []
         taken = {self.candidates[member].identity for member in members}
         for index, candidate in enumerate(self.candidates):
             if candidate.identity not in taken and index not in refused:
                 after = self._fit(t, (*members, index))
-                pvalue = self._pvalue(before, after)
-                allowed = within_bounds(self.candidates, (*members, index), after)
-                if allowed and (pvalue < smallest or chosen is None):
-                    smallest, chosen = pvalue, (index, after)
-        return chosen if chosen is not None and self._significant(smallest) else None
+                if within_bounds(self.candidates, (*members, index), after):
+                    options.append((self._pvalue(before, after), index, after))
+        best = min(options, key=lambda option: option[0], default=None)
+        return best[1:] if best is not None and self._significant(best[0]) else None
 
     def _fit(self, t: Matrix, members: tuple[int, ...]) -> Fit:
         return self.null.fit(self.x, t[:, columns_of(self.candidates, members)])

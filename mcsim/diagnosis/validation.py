@@ -78,9 +78,8 @@ class Halves:
         after = self.fresh.shift(self.fresh.mean + respond(frozen)[self.second])
         after = after.with_extra_covariance(*(one[self.second] for one in scatters))
         if scatters:
-            response = t @ frozen.amplitudes
-            here = _squares(self.fresh, response, scatters, self.second)
-            there = _squares(self.used, response, scatters, self.first)
+            draws = (t @ frozen.amplitudes)[:, None] + sum(np.sqrt(one.shape[1]) * one for one in scatters)
+            here, there = _squares(self.fresh, draws[self.second]), _squares(self.used, draws[self.first])
             noise = self.used.fit(x_used, t_used).covariance
             fall = expected_fall_of_draw(after, t_fresh, noise, excess(self.used, x_used), here, there)
         else:
@@ -88,10 +87,9 @@ class Halves:
         return held_out(self.fresh, after, x_fresh, fall, data)
 
 
-def _squares(null: SimulatedGaussian, response: Vector, scatters: Sequence[Matrix], rows: NDArray[np.int64]) -> Vector:
-    """Return the squared signal-to-noise ratios of the draws of a response."""
-    deviations = np.sum([np.sqrt(scatter.shape[1]) * scatter for scatter in scatters], axis=0)
-    return np.array([null.expected_snr(draw) ** 2 for draw in (response + deviations.T)[:, rows]])
+def _squares(null: SimulatedGaussian, draws: Matrix) -> Vector:
+    """Return the squared signal-to-noise ratios of draws of a response, shape (p, draws) to (draws,)."""
+    return np.asarray(null.hartlap_factor * np.sum(null.whiten_templates(draws) ** 2, axis=0))
 
 
 def excess(null: SimulatedGaussian, x: Vector) -> Measured:
@@ -155,9 +153,7 @@ def expected_fall_of_draw(
     return Measured(share * seen.value - lost, sigma)
 
 
-def held_out(
-    before: SimulatedGaussian, after: SimulatedGaussian, x: Vector, expected: Measured, data: str = ""
-) -> HeldOut:
+def held_out(before: SimulatedGaussian, after: SimulatedGaussian, x: Vector, expected: Measured, data: str) -> HeldOut:
     """Return the reduction of the excess chi^2 of data, shape (p_raw,), from one null distribution to another.
 
     ``expected`` is the fall of chi^2 that the fit to other data predicts.

@@ -1,10 +1,13 @@
 """Figure of a beam: its peak, its faint surroundings and its coefficients."""
 
+from typing import Any
+
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
@@ -64,19 +67,20 @@ def _pattern(beam: Beam, beam_map: BeamMap | None, reach_arcmin: float) -> NDArr
     return values / values.max()
 
 
+def _square(axes: Axes, values: NDArray[np.float64], side: float, unit: str, **style: Any) -> AxesImage:
+    """Draw values on a square of +-side around the centre of the beam."""
+    axes.set(xlabel=f"x, in-scan  [{unit}]", ylabel=f"y, cross-scan  [{unit}]")
+    return axes.imshow(values, origin="lower", extent=(-side, side, -side, side), **style)
+
+
 def _draw_peak(axes: Axes, beam: Beam, beam_map: BeamMap | None, summary: BeamSummary, reach: float) -> None:
     values = _pattern(beam, beam_map, reach)
-    extent = (-reach, reach, -reach, reach)
-    image = axes.imshow(
-        values, origin="lower", extent=extent, cmap="YlGnBu_r", vmin=0, vmax=1, interpolation="bilinear"
-    )
-    contours = axes.contour(
-        values, levels=_CONTOURS, extent=extent, colors=["w", "w", "w", "k", "k"], linewidths=[0.8, 0.8, 1.8, 0.8, 0.8]
-    )
+    image = _square(axes, values, reach, "arcmin", cmap="YlGnBu_r", vmin=0, vmax=1, interpolation="bilinear")
+    colours, widths = ["w", "w", "w", "k", "k"], [0.8, 0.8, 1.8, 0.8, 0.8]
+    contours = axes.contour(values, _CONTOURS, extent=image.get_extent(), colors=colours, linewidths=widths)
     axes.clabel(contours, fmt=lambda level: f"{level:.0%}", fontsize=7)
-    widths = f"{summary.fwhm_major_arcmin:.1f}′ × {summary.fwhm_minor_arcmin:.1f}′ FWHM"
-    axes.set_title(f"Peak: {widths}, ratio {summary.axis_ratio:.3f}", fontsize=10)
-    axes.set(xlabel="x, in-scan  [arcmin]", ylabel="y, cross-scan  [arcmin]")
+    fwhm = f"{summary.fwhm_major_arcmin:.1f}′ × {summary.fwhm_minor_arcmin:.1f}′ FWHM"
+    axes.set_title(f"Peak: {fwhm}, ratio {summary.axis_ratio:.3f}", fontsize=10)
     axes.figure.colorbar(image, ax=axes, label="response / peak", shrink=0.85, pad=0.02)
 
 
@@ -85,18 +89,9 @@ def _draw_faint(axes: Axes, beam: Beam, beam_map: BeamMap | None, reach: float) 
     unit, name = (60.0, "deg") if reach > 120 else (1.0, "arcmin")
     with np.errstate(divide="ignore"):
         above_floor = np.maximum(FLOOR_DB + 10 * np.log10(np.abs(values)), 0.0)
-    side = reach / unit
-    image = axes.imshow(
-        np.sign(values) * above_floor,
-        origin="lower",
-        extent=(-side, side, -side, side),
-        cmap=_SIGNED,
-        vmin=-FLOOR_DB,
-        vmax=FLOOR_DB,
-        interpolation="nearest",
-    )
+    style = {"cmap": _SIGNED, "vmin": -FLOOR_DB, "vmax": FLOOR_DB, "interpolation": "nearest"}
+    image = _square(axes, np.sign(values) * above_floor, reach / unit, name, **style)
     axes.set_title("Surroundings, with the sign of the response", fontsize=10)
-    axes.set(xlabel=f"x, in-scan  [{name}]", ylabel=f"y, cross-scan  [{name}]")
     bar = axes.figure.colorbar(image, ax=axes, shrink=0.85, pad=0.02)
     ticks = np.arange(-FLOOR_DB, FLOOR_DB + 1, 10).tolist()
     bar.set_ticks(ticks, labels=[_decibel_label(tick) for tick in ticks])

@@ -1,4 +1,4 @@
-"""A map of the sky inside a figure."""
+"""A map of the sky in Mollweide projection, inside a figure."""
 
 from typing import Any
 
@@ -10,10 +10,7 @@ from numpy.typing import NDArray
 
 
 def mollweide(axes: Axes, values: NDArray[np.float64], xsize: int, **style: Any) -> AxesImage:
-    """Draw a RING map in Mollweide projection, longitude 0 in the middle, increasing to the left; NaN stays empty.
-
-    ``xsize`` is the width in pixels; ``style`` goes to ``imshow``.
-    """
+    """Draw a RING map, ``xsize`` pixels wide, longitude 0 in the middle, increasing to the left; NaN stays empty."""
     nside = healpy.npix2nside(values.size)
     projector: Any = healpy.projector.MollweideProj(xsize=xsize)
     image = projector.projmap(values, lambda x, y, z: healpy.vec2pix(nside, x, y, z))

@@ -212,7 +212,7 @@ def frozen_fits(request) -> dict[str, np.ndarray]:
         after = SimulatedGaussian(after.mean + t_test @ best.amplitudes, after.whitening, count)
         x = signal + other + rng.normal(size=p)
         forecast = expected_fall(before, t_test, best.amplitudes, best.covariance)
-        shrink = held_out(before, after, x, forecast)
+        shrink = held_out(before, after, x, forecast, "others")
         left = signal - t_test @ best.amplitudes
         expected = 1.0 - (left @ left + other @ other) / (signal @ signal + other @ other)
         found["forecast"].append(forecast.value)
@@ -254,7 +254,7 @@ def test_forecast_drop_of_what_draws_is_the_drop():
         seen = excess(learning, x[:fitted])
         here, there = drawn[:, fitted:].sum(axis=1), drawn[:, :fitted].sum(axis=1)
         forecast = expected_fall_of_draw(after, t[fitted:, None], noise, seen, here, there)
-        shrink = held_out(before, after, x[fitted:], forecast)
+        shrink = held_out(before, after, x[fitted:], forecast, "others")
         differences.append(shrink.before.value - shrink.after.value - forecast.value)
         errors.append(forecast.sigma)
     assert abs(np.mean(differences)) < 4.0 * np.std(differences) / np.sqrt(len(differences))
