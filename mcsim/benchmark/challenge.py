@@ -167,7 +167,7 @@ def diagnose_case(settings: Settings, folder: Path, case: str, without: tuple[st
     found = diagnose_data(ObservedMaps(model.context, maps, model.simulate), case)
     answer = {
         "evidence": [float(value) for value in found.data],
-        "maximum": found.test.best_candidate,
+        "maximum": found.test.maximum,
         "explanations": [
             {
                 "proposals": [model.candidates[member].label for member in one.candidates],

@@ -17,8 +17,9 @@ from mcsim.diagnosis.campaign import Batch, after_jobs, asking, batch, seeded, w
 from mcsim.diagnosis.candidate import Candidate, TemplateBank, columns_of, effects_at, numbered
 from mcsim.diagnosis.context import DiagnosisContext, context
 from mcsim.diagnosis.null_ensemble import NullEnsemble
+from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.subsets import Subsets
-from mcsim.diagnosis.validation import Halves, Prediction, Shrink
+from mcsim.diagnosis.validation import Halves, HeldOut
 from mcsim.errors import InputError, RunError
 from mcsim.stats.gaussian import Fit, SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration, calibrate
@@ -94,7 +95,7 @@ class LinearModel(Library):
     halves: Halves | None
     data: NDArray[np.float64]
 
-    def held_out_reduction(self, x: Vector, members: Sequence[int]) -> tuple[Prediction, Shrink] | None:
+    def held_out_reduction(self, x: Vector, members: Sequence[int]) -> HeldOut | None:
         """Fit candidates to one half of a data vector, and predict and measure the reduction of the other's excess.
 
         None if there are no halves, or if an effect cannot have the fitted amplitude.
@@ -167,8 +168,8 @@ class LearnedModel(Library):
 
     def expected_snr_on_sky(self, effect: config.Effect, seed: int) -> float:
         """Return the expected S/N of the response to an effect in the sky and noise of one seed."""
-        run, fiducial = seeded(self.context.run, seed), config.to_json(self.context.run)
-        jobs = [Job(fiducial, config.to_json(with_effects(run, effects)), 0, 1) for effects in ((), (effect,))]
+        run = seeded(self.context.run, seed)
+        jobs = [replace(self.context.analysis.job(with_effects(run, one)), count=1) for one in ((), (effect,))]
         before, after = self.simulate(jobs)
         return self.null.expected_snr(after[0] - before[0])
 
@@ -186,7 +187,7 @@ def _learned(model: str, simulations: int | None, without: tuple[str, ...]) -> L
         known = context(analysis, ensemble, bank)
     else:
         run = config.from_json(model)
-        known = prepared(run, analysis_of(run), _refuse, simulations)
+        known = prepared(run, analysis_of(run, settings=DiagnosisSettings(simulations=simulations)), _refuse)
         rows = np.arange(len(known.analysis.elements))
     return LearnedModel(known.null, known.templates, known.candidates, known.calibration, rows, known)
 
@@ -204,5 +205,5 @@ def workers_of(settings: Settings, workers: int | None, quiet: bool) -> Iterator
     run = settings.model
     with batch(run.compute.workers if workers is None else workers) as call:
         with asking(call, quiet) as ask:
-            prepared(run, analysis_of(run), ask, settings.simulations)
+            prepared(run, analysis_of(run, settings=DiagnosisSettings(simulations=settings.simulations)), ask)
         yield call

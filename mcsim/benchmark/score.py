@@ -204,12 +204,11 @@ def _reduction(model: LinearModel, x: Vector, said: Attribution) -> dict[str, An
     found = model.held_out_reduction(x, said.explanations[0].members) if said.explanations else None
     if found is None:
         return {}
-    predicted, measured = found
     return {
-        "predicted": predicted.fraction.value,
-        "achieved": measured.fraction.value,
-        "sigma": measured.fraction.sigma,
-        "gaps": (measured.before.value, measured.after.value),
+        "predicted": found.predicted.value,
+        "achieved": found.achieved.value,
+        "sigma": found.achieved.sigma,
+        "gaps": (found.before.value, found.after.value),
     }
 
 
@@ -223,7 +222,7 @@ def _absent(model: LinearModel, draw: Draw, x: Vector, seed: int) -> tuple[float
         return None
     chosen = int(unlike[rng.generator(seed, draw.number, "challenge/absent").integers(len(unlike))])
     found = model.held_out_reduction(x, (chosen,))
-    return None if found is None else (found[1].before.value, found[1].after.value)
+    return None if found is None else (found.before.value, found.after.value)
 
 
 def powers(model: LinearModel, number: int, seed: int) -> Power:

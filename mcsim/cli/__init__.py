@@ -6,7 +6,7 @@ Exit codes: 0 done, 1 failed realizations, 2 bad input, 130 interrupted.
 import json
 import os
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -141,13 +141,16 @@ def diagnose(
     workers: Processes = None,
 ) -> None:
     """Test maps against a model, and find the effect that the model lacks: where, how large, and if adding it helps."""
+    from mcsim import config
     from mcsim.diagnosis.api import diagnose as judge
+    from mcsim.diagnosis.settings import DiagnosisSettings
     from mcsim.diagnosis.words import summary
 
     interrupt_once()
-    found = judge(
-        model, data, output, case=case, without=without or (), simulations=simulations, workers=workers, quiet=False
-    )
+    run, settings = config.load(model), DiagnosisSettings(without=tuple(without or ()), simulations=simulations)
+    if workers is not None:
+        run = replace(run, compute=replace(run.compute, workers=workers))
+    found = judge(run, data, output, case=case, settings=settings, quiet=False)
     print("\n".join(summary(found, output)))
 
 

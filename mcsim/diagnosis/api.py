@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from mcsim.diagnosis.campaign import asking, batch
 from mcsim.diagnosis.candidate import TemplateBank
 from mcsim.diagnosis.context import DataSet, DiagnosisContext, context
 from mcsim.diagnosis.inference import diagnose_data
-from mcsim.diagnosis.measured_spectra import read_spectra
+from mcsim.diagnosis.measured_spectra import MeasuredSpectra, read_spectra
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.observed_maps import ObservedMaps, checked, read_maps
 from mcsim.diagnosis.result import DiagnosisResult
@@ -38,10 +38,7 @@ def diagnose(
     output: str | Path | None = None,
     *,
     case: str | None = None,
-    without: Sequence[str] = (),
-    simulations: int | None = None,
     settings: DiagnosisSettings | None = None,
-    workers: int | None = None,
     quiet: bool = True,
 ) -> DiagnosisResult:
     """Diagnose the gap between a simulation and data.
@@ -49,7 +46,7 @@ def diagnose(
     Parameters
     ----------
     model
-        Fiducial model of sky, beams, scan and noise: a run.
+        Fiducial model of sky, beams, scan and noise: a run. Its ``compute.workers`` processes simulate.
     data
         Folder with ``{channel}.fits`` or ``{channel}_{split}.fits``, uK; or the maps themselves, shape (npix,) each, in
         the order channel by channel, split by split; or a table of measured spectra
@@ -58,14 +55,9 @@ def diagnose(
         Folder for ``verdict.json``, ``diagnosis.zarr`` and ``report.html``; None: nothing is written.
     case
         Name; default: that of the run.
-    without
-        Effects of the library that are no candidates.
-    simulations
-        Number for the covariance of the data vector; default: ten for every independent element.
     settings
-        Levels, cuts, bins and numbers of simulations; default: those of :class:`DiagnosisSettings`.
-    workers
-        Processes; default: the run's; 0: this one.
+        Effects that are no candidates, levels, cuts, bins and numbers of simulations; default: those of
+        :class:`~mcsim.diagnosis.settings.DiagnosisSettings`.
     quiet
         Report no progress.
 
@@ -77,10 +69,12 @@ def diagnose(
     Raises
     ------
     InputError
-        If a run or data cannot be used.
+        If a run, data or settings cannot be used.
     """
     run = model if isinstance(model, config.RunConfig) else config.load(model)
-    for effect in without:
+    settings = settings or DiagnosisSettings()
+    settings = replace(settings, without=tuple(settings.without))
+    for effect in settings.without:
         systematics.get(effect)
     if output is not None:
         folders.writable(Path(output))
@@ -89,20 +83,18 @@ def diagnose(
     table = read_spectra(data, run) if isinstance(data, str | Path) and Path(data).is_file() else None
     if table is not None:
         run, task = measured_spectra.estimator_for(run, table), table
-        analysis = measured_spectra.analysis_of_spectra(run, table, without, threads, settings)
+        analysis = measured_spectra.analysis_of_spectra(run, table, settings.without, threads, settings)
     else:
-        analysis = analysis_of(run, without, threads, settings)
+        analysis = analysis_of(run, settings.without, threads, settings)
         maps = read_maps(analysis.model, data) if isinstance(data, str | Path) else checked(analysis.model, data)
-    with batch(run.compute.workers if workers is None else workers) as call:
+    with batch(run.compute.workers) as call:
         with asking(call, quiet, task, "simulations of the model and of each effect") as ask:
-            ensemble, bank = _learned(run, analysis, simulations, ask)
+            ensemble, bank = _learned(run, analysis, ask)
         with asking(call, quiet, task, "simulations of fitted effects") as ask:
             known = context(analysis, ensemble if table is None else ensemble.of_mean(table.realizations), bank)
-            found: DataSet[Any]
-            if table is not None:
-                found = measured_spectra.MeasuredSpectra(known, table, ask)
-            else:
-                found = ObservedMaps(known, maps, ask)
+            found: DataSet[Any] = (
+                ObservedMaps(known, maps, ask) if table is None else MeasuredSpectra(known, table, ask)
+            )
             diagnosis = diagnose_data(found, case or run.name)
     if output is not None:
         diagnosis.save(output)
@@ -110,23 +102,17 @@ def diagnose(
     return diagnosis
 
 
-def prepared(
-    run: config.RunConfig,
-    analysis: Analysis,
-    ask: campaign.Ask,
-    simulations: int | None = None,
-) -> DiagnosisContext:
+def prepared(run: config.RunConfig, analysis: Analysis, ask: campaign.Ask) -> DiagnosisContext:
     """Return what every set of maps is tested with, simulated or from the cache."""
-    return context(analysis, *_learned(run, analysis, simulations, ask))
+    return context(analysis, *_learned(run, analysis, ask))
 
 
 def _learned(
     run: config.RunConfig,
     analysis: Analysis,
-    simulations: int | None,
     ask: campaign.Ask,
 ) -> tuple[NullEnsemble, TemplateBank]:
-    size = len(analysis.elements)
+    size, simulations = len(analysis.elements), analysis.settings.simulations
     if simulations is not None and simulations <= size:
         raise InputError(
             f"{simulations} simulations are too few for the {size} elements of the data vector; give at least "
@@ -136,10 +122,10 @@ def _learned(
     def fill(scratch: Path) -> None:
         null_ensemble.save(scratch, *campaign.learned(analysis, ask, simulations))
 
-    return null_ensemble.load(folders.cached(f"diagnose/{_key(run, analysis, simulations)}.zarr", fill))
+    return null_ensemble.load(folders.cached(f"diagnose/{_key(run, analysis)}.zarr", fill))
 
 
-def _key(run: config.RunConfig, analysis: Analysis, simulations: int | None) -> str:
+def _key(run: config.RunConfig, analysis: Analysis) -> str:
     """Return a hash of all that the simulations of a model depend on, the code that makes them included.
 
     Its name, its seed and its number of realizations do not count.
@@ -149,7 +135,6 @@ def _key(run: config.RunConfig, analysis: Analysis, simulations: int | None) -> 
     effects = {candidate.effect for candidate in analysis.candidates}
     effects |= {systematics.get(effect.name, dict(analysis.library)) for effect in run.effects}
     rest = [
-        simulations,
         [[candidate.label, [repr(basis) for basis in candidate.basis]] for candidate in analysis.candidates],
         asdict(analysis.settings),
         [element.name for element in analysis.elements],

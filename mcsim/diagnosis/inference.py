@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.assemble import Findings, Reduction, result_of
+from mcsim.diagnosis.assemble import result_of
 from mcsim.diagnosis.candidate import columns_of, tables_at
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.refine import Refined, Refiner, with_scatter
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import Attribution
-from mcsim.diagnosis.validation import Halves
+from mcsim.diagnosis.validation import Halves, HeldOut
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import Fit
 from mcsim.support.numbers import measured
@@ -23,8 +23,7 @@ Vector = NDArray[np.float64]
 def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
     """Diagnose observed maps or measured spectra; raise InputError if they cannot be what they claim to be."""
     context = data.context
-    tested = context.null, data.x, context.calibration, context.bank.curvature
-    refiner = Refiner(*tested, data.respond, context.settings, data.realizations)
+    refiner = Refiner(data)
     refined = refiner.run(data.templates(), context.candidates)
     found, partial, reduction = refined.attribution, refined.partial, None
     exchanged = data.exchanged(found)
@@ -37,14 +36,12 @@ def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
         found, reduction = confirmed(context, found, reduction_of(data, refined), notes)
     if partial is None and not exchanged and found.verdict == "unknown":
         partial = refiner.detected_in(refined.templates, refined.candidates)
-    refined = replace(refined, attribution=found)
-    findings = Findings(data.x, refined, data.places(), reduction, partial, notes, data.residual_maps())
-    return result_of(context, case, findings, data.provenance())
+    return result_of(data, case, replace(refined, attribution=found, partial=partial), reduction, notes)
 
 
 def confirmed(
-    context: DiagnosisContext, found: Attribution, reduction: Reduction | None, notes: list[str]
-) -> tuple[Attribution, Reduction | None]:
+    context: DiagnosisContext, found: Attribution, reduction: HeldOut | None, notes: list[str]
+) -> tuple[Attribution, HeldOut | None]:
     """Return attribution and reduction if they hold once the best set is simulated.
 
     A set that increases the excess chi^2 of the held-out data, or reduces it by less than half of the prediction, both
@@ -54,16 +51,15 @@ def confirmed(
     if reduction is None:
         return found, None
     limit = context.settings.reduction_sigma
-    before, fraction, expected = reduction[1].before, reduction[1].fraction, reduction[0].fraction
+    before, fraction, expected = reduction.before, reduction.achieved, reduction.predicted
     increased = fraction.value * before.value + limit * fraction.sigma * abs(before.value) < 0.0
     short = expected.value - fraction.value > limit * np.hypot(expected.sigma, fraction.sigma)
     if increased or (short and before.value > 0.0 and fraction.value < 0.5 * min(expected.value, 1.0)):
         best = " and ".join(context.candidates[member].title for member in found.explanations[0].members)
-        after = reduction[1].after.value
-        done, said = (f"{100.0 * one.value:.0f} %" for one in (fraction, expected))
-        does = f"raises the excess χ² of the other half from {before.value:.3g} to {after:.3g}"
-        if after < before.value:
-            does = f"removes {done} of the excess χ² of the other half, where {said} were predicted"
+        does = f"raises the excess χ² of the other half from {before.value:.3g} to {reduction.after.value:.3g}"
+        if reduction.after.value < before.value:
+            removed, forecast = 100.0 * fraction.value, 100.0 * expected.value
+            does = f"removes {removed:.0f} % of the excess χ² of the other half, where {forecast:.0f} % were predicted"
         notes.append(f"The best fit, {best}, is not named: simulated with its amplitude from one half, it {does}.")
         return found.unexplained(), None
     if before.value < before.sigma:
@@ -92,7 +88,7 @@ def _with_errors(data: DataSet[Any], refined: Refined, found: Attribution) -> At
     return replace(found, explanations=(own, *found.explanations[1:]))
 
 
-def reduction_of(data: DataSet[Any], refined: Refined) -> Reduction | None:
+def reduction_of(data: DataSet[Any], refined: Refined) -> HeldOut | None:
     """Fit one half of the data vector, freeze, add the effects to the simulator, and test the other half.
 
     None if there are no halves, one of them is hardly sensitive to the effects, or the half that is fitted asks for an
@@ -116,6 +112,6 @@ def reduction_of(data: DataSet[Any], refined: Refined) -> Reduction | None:
         return change
 
     try:
-        return *halves.reduction(t, respond, scatters), words
+        return halves.reduction(t, respond, scatters, words)
     except InputError:
         return None

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 class DiagnosisSettings:
     """Set levels, cuts, bins and numbers of simulations; each has a part in the key of the cache."""
 
+    without: tuple[str, ...] = ()  # effects of the library that are no candidates
+    simulations: int | None = None  # for the covariance of the data vector; None: sims_per_element for each
     alpha: float = 0.05  # global p-value up to which the model does not describe the data
     # A set of effects is accepted if the p-value of its residual is above the first level, and the global p-value of
     # the most significant further effect above the second. High levels lose true sets; low ones miss unknown effects.

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special, stats
-from scipy.optimize import brentq
+from scipy.optimize import brentq, newton
 
 from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates
 
@@ -90,14 +90,18 @@ def confusion(strength: ArrayLike, cosine: ArrayLike) -> NDArray[np.float64]:
 
 def snr_to_separate(cosine: ArrayLike, target: float = 0.95) -> NDArray[np.float64]:
     """Return the signal-to-noise ratio at which :func:`confusion` falls to 1 - target; infinite for a cosine of 1."""
-    rho = np.abs(np.asarray(cosine, dtype=float))
-    far = 1.0 - rho < 1e-12
-    low, high = np.zeros_like(rho), np.full_like(rho, 1e7)
-    for _ in range(60):
-        middle = (low + high) / 2.0
-        failed = confusion(middle, rho) > 1.0 - target
-        low, high = np.where(failed, middle, low), np.where(failed, high, middle)
-    return np.where(far, np.inf, high)
+    nearest = 1.0 - 1e-12
+    rho = np.minimum(np.abs(np.asarray(cosine, dtype=float)), nearest)
+    scale, ratio = np.sqrt(2.0 / (1.0 - rho)), np.sqrt((1.0 + rho) / (1.0 - rho))
+
+    def slope(a: NDArray[np.float64]) -> NDArray[np.float64]:
+        own, other = stats.norm.pdf(a), ratio * stats.norm.pdf(ratio * a)
+        return -own * (2.0 * special.ndtr(ratio * a) - 1.0) - other * (2.0 * special.ndtr(a) - 1.0)
+
+    # In a = s sqrt((1 - rho)/2) the curve is convex, and all roots are close above that of rho = 1.
+    first = np.full_like(rho, -special.ndtri(1.0 - target))
+    root = newton(lambda a: confusion(a * scale, rho) - (1.0 - target), first, slope)
+    return np.where(rho < nearest, root * scale, np.inf)
 
 
 def cosines(candidates: WhitenedTemplates) -> NDArray[np.float64]:

@@ -17,6 +17,7 @@ from mcsim.diagnosis.campaign import with_effects
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps, read_maps
+from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.wiener_filter import shared_sky, wiener_filter
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
@@ -282,13 +283,13 @@ def test_what_cannot_be_done_is_said_before_anything_is_learned(small, folder):
     (folder / "file").write_text("")
     for changes, named in (
         ({"output": folder / "file"}, (folder / "file",)),
-        ({"without": ["beam_elipticity"]}, ("beam_elipticity", "beam_ellipticity")),
+        ({"settings": DiagnosisSettings(without=("beam_elipticity",))}, ("beam_elipticity", "beam_ellipticity")),
         ({"data": [np.zeros(3072)]}, ("1 maps", 4)),
         ({"data": [np.zeros(48)] * 4}, ("V1:half1", "nside 2", 16)),
-        ({"simulations": 20}, ("20 simulations", 165, 330)),
+        ({"settings": DiagnosisSettings(simulations=20)}, ("20 simulations", 165, 330)),
     ):
         with refused(*named):
-            mcsim.diagnose(**({"model": small.run, "data": folder, "workers": 1} | changes))
+            mcsim.diagnose(**({"model": small.run, "data": folder} | changes))
 
 
 def test_exchanged_channels_are_noticed(small):

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from scipy.linalg import solve_triangular
 
-from mcsim.diagnosis.validation import SharedDraw, achieved, carried, excess, predicted
+from mcsim.diagnosis.validation import excess, expected_fall, expected_fall_of_draw, held_out
 from mcsim.stats.detection import confusion, detectable, posterior, power, snr_needed, snr_to_separate
 from mcsim.stats.gaussian import SimulatedGaussian, nested_pvalue, residual_pvalue
 from mcsim.stats.look_elsewhere import calibrate, global_test, scan_pvalues
@@ -212,18 +212,18 @@ def frozen_fits(request) -> dict[str, np.ndarray]:
         before, after = drawn_null(rng, p, count), drawn_null(rng, p, count)
         after = SimulatedGaussian(after.mean + t_test @ best.amplitudes, after.whitening, count)
         x = signal + other + rng.normal(size=p)
-        forecast = predicted(before, x, t_test, best.amplitudes, best.covariance)
-        shrink = achieved(before, after, x)
+        forecast = expected_fall(before, t_test, best.amplitudes, best.covariance)
+        shrink = held_out(before, after, x, forecast, "others")
         left = signal - t_test @ best.amplitudes
         expected = 1.0 - (left @ left + other @ other) / (signal @ signal + other @ other)
-        found["forecast"].append(forecast.delta_chi2.value)
-        found["forecast_sigma"].append(forecast.delta_chi2.sigma)
+        found["forecast"].append(forecast.value)
+        found["forecast_sigma"].append(forecast.sigma)
         found["drop"].append(shrink.before.value - shrink.after.value)
-        found["sigma"].append(shrink.fraction.sigma)
-        found["fraction"].append(shrink.fraction.value)
-        found["pull"].append((shrink.fraction.value - expected) / shrink.fraction.sigma)
+        found["sigma"].append(shrink.achieved.sigma)
+        found["fraction"].append(shrink.achieved.value)
+        found["pull"].append((shrink.achieved.value - expected) / shrink.achieved.sigma)
         found["before"].append(shrink.before.value)
-        found["after"].append(shrink.probability_after)
+        found["after"].append(shrink.pvalue_after)
     return {name: np.array(values) for name, values in found.items()} | {"gap": signal @ signal + other @ other}
 
 
@@ -253,17 +253,11 @@ def test_forecast_drop_of_what_draws_is_the_drop():
         )
         drawn = (t + np.sqrt(draws) * scatter.T) ** 2
         seen = excess(learning, x[:fitted])
-        forecast = carried(
-            before,
-            after,
-            x[fitted:],
-            t[fitted:, None],
-            noise,
-            SharedDraw(seen, drawn[:, fitted:].sum(axis=1), drawn[:, :fitted].sum(axis=1)),
-        )
-        shrink = achieved(before, after, x[fitted:])
-        differences.append(shrink.before.value - shrink.after.value - forecast.delta_chi2.value)
-        errors.append(forecast.delta_chi2.sigma)
+        here, there = drawn[:, fitted:].sum(axis=1), drawn[:, :fitted].sum(axis=1)
+        forecast = expected_fall_of_draw(after, t[fitted:, None], noise, seen, here, there)
+        shrink = held_out(before, after, x[fitted:], forecast, "others")
+        differences.append(shrink.before.value - shrink.after.value - forecast.value)
+        errors.append(forecast.sigma)
     assert abs(np.mean(differences)) < 4.0 * np.std(differences) / np.sqrt(len(differences))
     # Forecasts of the mean drop: the noise of the data that measure it is not in their error.
     assert 0.7 < np.mean(errors) / np.std(differences) < 1.2

@@ -14,7 +14,7 @@ from mcsim.diagnosis.inference import confirmed
 from mcsim.diagnosis.partial_explanation import Detection, Exact, PartialExplanation
 from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.diagnosis.validation import Measured, Prediction, Shrink
+from mcsim.diagnosis.validation import HeldOut, Measured
 from mcsim.stats.detection import cosines, detectable, log_evidence, posterior, snr_needed, snr_to_separate
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate
@@ -116,7 +116,7 @@ def test_twins_are_told_as_twins_with_what_parts_them():
     assert {e.members for e in found.explanations} == {(0,), (1,)}
     contrast = found.contrasts[0]
     assert contrast.elements[0] == 7
-    assert contrast.shares.sum() == pytest.approx(1.0)
+    assert sum(contrast.shares) == pytest.approx(1.0)
     assert contrast.separation < 2.0
     assert found.correlation[0, 1] > 0.99
     assert nearest_candidates.diagnose_maps(300.0 * t[:, 0], 1, template_error=0.0).verdict == "effect"
@@ -358,7 +358,7 @@ def test_four_effects_are_heard_where_no_set_of_three_suffices(bench):
     assert 0 not in filtered(signal, lambda t, members, fitted: other if 0 in members else t).members
 
 
-UNSURE = Prediction(Measured(0.0, 1e4), Measured(0.0, 100.0))
+UNSURE = Measured(0.0, 100.0)
 
 
 @pytest.mark.parametrize(("achieved", "named"), [(0.9, True), (-0.5, True), (-2.0, False)])
@@ -368,7 +368,7 @@ def test_set_that_opens_the_gap_is_not_named(bench, achieved, named):
     assert found.verdict == "effect"
     context = SimpleNamespace(candidates=bench.candidates, settings=DiagnosisSettings())
     after = Measured(100.0 * (1.0 - achieved), 10.0)
-    shrink = UNSURE, Shrink(Measured(100.0, 10.0), after, Measured(achieved, 0.5), 0.5), "half2"
+    shrink = HeldOut(UNSURE, Measured(achieved, 0.5), Measured(100.0, 10.0), after, 0.5, "half2")
     notes: list[str] = []
     judged, kept = confirmed(context, found, shrink, notes)
     assert (judged.verdict, kept is shrink, bool(notes)) == (
@@ -391,10 +391,10 @@ def test_set_that_opens_the_gap_is_not_named(bench, achieved, named):
 def test_set_that_closes_less_than_half_of_what_was_forecast_is_not_named(bench, achieved, forecast, error, named):
     found = bench.diagnose_maps(12.0 * bench.t[:, 3], 0)
     context = SimpleNamespace(candidates=bench.candidates, settings=DiagnosisSettings())
-    expected = Prediction(Measured(100.0 * forecast, 15.0), Measured(forecast, 0.15))
-    measured = Shrink(Measured(100.0, 10.0), Measured(100.0 * (1.0 - achieved), 10.0), Measured(achieved, error), 0.5)
+    before, after = Measured(100.0, 10.0), Measured(100.0 * (1.0 - achieved), 10.0)
+    shrink = HeldOut(Measured(forecast, 0.15), Measured(achieved, error), before, after, 0.5, "half2")
     notes: list[str] = []
-    judged, _ = confirmed(context, found, (expected, measured, "half2"), notes)
+    judged, _ = confirmed(context, found, shrink, notes)
     assert judged.verdict == ("effect" if named else "unknown")
     assert named or ("180" if achieved < 0.0 else "35 %") in notes[0]
 
@@ -407,7 +407,7 @@ def test_half_without_a_gap_measures_no_shrink(bench, before, after, named):
     context = SimpleNamespace(candidates=bench.candidates, settings=DiagnosisSettings())
     share = Measured(1.0 - after / before, 12.0)
     notes: list[str] = []
-    shrink = UNSURE, Shrink(Measured(before, 12.0), Measured(after, 12.0), share, 0.5), "half2"
+    shrink = HeldOut(UNSURE, share, Measured(before, 12.0), Measured(after, 12.0), 0.5, "half2")
     judged, kept = confirmed(context, found, shrink, notes)
     assert (judged.verdict, kept) == ("effect" if named else "unknown", None)
     assert ("No reduction" if named else "is not named") in notes[0]

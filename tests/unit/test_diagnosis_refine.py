@@ -1,6 +1,7 @@
 """Responses at the amplitudes that were found: bent ones, and two that change each other's."""
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -55,9 +56,10 @@ class Instrument:
         return np.tile(self.response(amplitudes.get("A", 0.0), amplitudes.get("B", 0.0)), (skies, 1))
 
     def refined(self, x: np.ndarray):
-        settings = DiagnosisSettings()
-        refiner = Refiner(self.null, x, self.calibration, self.curvature, self.respond, settings)
-        return refiner.run(self.t, self.candidates)
+        bank = SimpleNamespace(curvature=self.curvature)
+        context = SimpleNamespace(null=self.null, calibration=self.calibration, bank=bank, settings=DiagnosisSettings())
+        data = SimpleNamespace(context=context, x=x, respond=self.respond, realizations=1)
+        return Refiner(data).run(self.t, self.candidates)
 
 
 @pytest.mark.parametrize("amplitude", [15.0, -15.0])

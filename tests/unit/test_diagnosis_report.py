@@ -16,7 +16,7 @@ from scipy import stats
 from mcsim import config, systematics
 from mcsim.diagnosis import figures as plots
 from mcsim.diagnosis import localisation, report, words
-from mcsim.diagnosis.assemble import Findings, effects_of, held_out_pvalues, result_of
+from mcsim.diagnosis.assemble import effects_of, held_out_pvalues, result_of
 from mcsim.diagnosis.candidate import Candidate, numbered
 from mcsim.diagnosis.localisation import Place
 from mcsim.diagnosis.refine import Refined
@@ -24,7 +24,7 @@ from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import attribute
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Element
-from mcsim.diagnosis.validation import Measured, Prediction, Shrink
+from mcsim.diagnosis.validation import HeldOut, Measured
 from mcsim.stats.detection import confusion, snr_needed
 from mcsim.stats.gaussian import SimulatedGaussian, residual_pvalue
 from mcsim.stats.look_elsewhere import calibrate
@@ -126,17 +126,17 @@ def diagnosis(kind: str) -> DiagnosisResult:
         x += 15.0 * (strange - t @ np.linalg.lstsq(t, strange, rcond=None)[0]) / np.sqrt(P)
     found = attribute(context.null, x, t, context.candidates, context.calibration)
     where = [Place(context.analysis.elements[0], 9.1, 1e-8, 8.0), Place(context.analysis.elements[-2], 1.0, 0.7, 1.2)]
-    shrink = None
+    reduction = None
     if found.explanations:
-        shrink = (
-            Prediction(Measured(200.0, 20.0), Measured(0.93, 0.04)),
-            Shrink(Measured(215.0, 30.0), Measured(20.0, 9.0), Measured(0.907, 0.051), 0.4),
-            "half2 (frozen on half1)",
-        )
+        predicted, achieved = Measured(0.93, 0.04), Measured(0.907, 0.051)
+        before, after = Measured(215.0, 30.0), Measured(20.0, 9.0)
+        reduction = HeldOut(predicted, achieved, before, after, 0.4, "half2 (frozen on half1)")
     sky = np.random.default_rng(5).normal(size=(2, 12 * 8**2))
     sky[:, :60] = np.nan
-    findings = Findings(x, Refined(found, t, (), ()), where, shrink, None, ["a <b>note</b> & so"], sky)
-    return result_of(context, f"case <i>{kind}</i>", findings, {"level": 0.05})
+    data = SimpleNamespace(
+        context=context, x=x, places=lambda: where, residual_maps=lambda: sky, provenance=lambda: {"level": 0.05}
+    )
+    return result_of(data, f"case <i>{kind}</i>", Refined(found, t, ()), reduction, ["a <b>note</b> & so"])
 
 
 class Page(HTMLParser):
@@ -233,10 +233,10 @@ def test_first_screen_says_what_was_tested_and_found(diagnoses, pages, kind):
 
 
 def test_global_chi2_is_near_its_degrees_of_freedom_where_the_model_is_right(diagnoses):
-    test = diagnoses["none"].test
+    test, excess = diagnoses["none"].test, diagnoses["none"].excess
     # The raw statistic is larger by (N - 1)/(N - 2 - p).
-    assert test.excess.value + test.dof == pytest.approx(test.chi2 * (N - 2 - P) / (N - 1))
-    assert abs(test.excess.value) < 4.0 * test.excess.sigma
+    assert excess.value + test.dimension == pytest.approx(test.chi2 * (N - 2 - P) / (N - 1))
+    assert abs(excess.value) < 4.0 * excess.sigma
 
 
 MARGINAL, AGREES = "marginally compatible", "agrees with the simulations"
@@ -295,7 +295,8 @@ def test_sets_stand_side_by_side_with_what_tells_them_apart(diagnoses, pages):
 def test_best_set_is_taken_from_what_is_left(diagnoses):
     for kind in ("effect", "mixture"):
         result = diagnoses[kind]
-        t = result.templates[:, list(result.sets[0].columns)] @ np.array(result.sets[0].coordinates)
+        columns = [column for k in result.sets[0].candidates for column in result.candidates[k].columns]
+        t = result.templates[:, columns] @ np.array(result.sets[0].coordinates)
         np.testing.assert_allclose(result.prediction(0), t / result.standard_deviation)
         # 30 unit normals: their square exceeds 80 once in a million.
         assert np.sum(result.z_after**2) < 80.0 < np.sum(result.z**2)
@@ -465,8 +466,7 @@ def test_an_amplitude_at_the_edge_of_the_possible_has_an_error():
     kind = systematics.get("spectrum")
     errors = np.array([0.2, 0.02, 0.02, 0.02, 0.02, 0.02])
     less_than_nothing = SimpleNamespace(amplitudes=np.array([-1.1, 0, 0, 0, 0, 0]), covariance=np.diag(errors**2))
-    explanation = SimpleNamespace(members=(0,), fit=less_than_nothing)
-    (found,) = effects_of(explanation, [Candidate(kind, None, tuple(range(6)))])
+    (found,) = effects_of([Candidate(kind, None, tuple(range(6)))], (0,), less_than_nothing)
     assert found.amplitude == pytest.approx(0.99)
     # One error up is -0.9.
     assert found.sigma == pytest.approx((0.99 - 0.9) / 2.0, rel=1e-3)
@@ -476,7 +476,6 @@ def test_what_data_do_not_tell_is_no_part_of_an_error():
     kind = systematics.get("spectrum")
     errors = np.array([0.02, 0.02, 0.02, 0.02, 0.02, 0.4])
     fitted = SimpleNamespace(amplitudes=np.array([0.3, 0, 0, 0, 0, 1.0]), covariance=np.diag(errors**2))
-    explanation = SimpleNamespace(members=(0,), fit=fitted)
-    (found,) = effects_of(explanation, [Candidate(kind, None, tuple(range(6)))])
+    (found,) = effects_of([Candidate(kind, None, tuple(range(6)))], (0,), fitted)
     assert found.amplitude == pytest.approx(0.3)
     assert found.sigma == pytest.approx(0.02)

@@ -19,6 +19,7 @@ from mcsim import config
 from mcsim.diagnosis.analysis import Job, analysis_of, data_vectors
 from mcsim.diagnosis.api import prepared
 from mcsim.diagnosis.campaign import asking, batch, seeded, with_effects
+from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.systematics import Effect
 
 SEED = 20121026
@@ -35,16 +36,17 @@ def main() -> None:
     parser.add_argument("--simulations", type=int, help="as given to mcsim diagnose")
     arguments = parser.parse_args()
     run = config.load(arguments.model)
-    analysis = analysis_of(run, nthreads=os.cpu_count() or 1)
+    settings = DiagnosisSettings(simulations=arguments.simulations)
+    analysis = analysis_of(run, nthreads=os.cpu_count() or 1, settings=settings)
     with batch(run.compute.workers) as call, asking(call, quiet=False) as ask:
-        null = prepared(run, analysis, ask, arguments.simulations).null
+        null = prepared(run, analysis, ask).null
     plain = seeded(run, SEED)
     quiet = replace(plain, channels=tuple(replace(channel, noise=config.Noise()) for channel in plain.channels))
     fiducial = config.to_json(run)
 
     def seen(found: Sequence[config.Effect], samples: bool) -> NDArray[np.float64]:
         answer: NDArray[np.float64] = data_vectors(
-            Job(fiducial, config.to_json(with_effects(quiet, found)), 0, 1, samples)
+            Job(fiducial, config.to_json(with_effects(quiet, found)), 0, 1, samples, settings=settings)
         )[0]
         return answer
 
