@@ -50,7 +50,7 @@ class ScanModel:
     name
         Name of the mission or survey.
     spin_period_s
-        Spin period, > 0.
+        Spin period; negative turns backwards.
     precession_period_s
         Precession period about the anti-Sun direction; negative turns backwards.
     precession_angle_deg
@@ -299,7 +299,7 @@ def _check(model: ScanModel) -> None:
     for key in _NUMBERS:
         if not math.isfinite(getattr(model, key)):
             raise InputError(f"{where}: {key} is {getattr(model, key)}, but it must be a finite number.")
-    for key in ("spin_period_s", "orbit_period_s", "sample_period_s", "duration_days"):
+    for key in ("orbit_period_s", "sample_period_s", "duration_days"):
         if not getattr(model, key) > 0.0:
             raise InputError(f"{where}: {key} is {getattr(model, key):g}, but it must be > 0.")
     if model.orbit_period_s < SECONDS_PER_DAY:
@@ -308,6 +308,8 @@ def _check(model: ScanModel) -> None:
         )
     if model.duration_days > LONGEST_DAYS:
         raise InputError(f"{where}: duration_days is {model.duration_days:g}, more than a century; give days.")
+    if model.spin_period_s == 0.0:
+        raise InputError(f"{where}: spin_period_s is 0, but a survey spins; give seconds (negative: backwards).")
     if model.precession_period_s == 0.0:
         raise InputError(f"{where}: precession_period_s is 0; for no precession set precession_angle_deg = 0 instead.")
     if not 0.0 <= model.precession_angle_deg <= 90.0:
