@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +12,10 @@ from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair, quiet
 from mcsim.comparison.scene import Maps
 from mcsim.errors import InputError
-from mcsim.simulation import simulate
+from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
 from mcsim.systematics import Effect
+from mcsim.systematics.base import Pointing
 from mcsim.systematics.registry import catalogue
 
 Vector = NDArray[np.float64]
@@ -25,8 +27,8 @@ REDUNDANT = ("pixelization", "spectrum")
 class EffectDifference(Difference):
     """An effect of the library, linear in its coordinates."""
 
-    def __init__(self, kind: type[Effect], templates: Maps) -> None:
-        self.kind, self.templates = kind, templates
+    def __init__(self, kind: type[Effect], templates: Maps, run: config.RunConfig) -> None:
+        self.kind, self.templates, self.run = kind, templates, run
 
     def starts(self, state: State) -> list[Vector]:
         """Return the coordinates that fit best."""
@@ -35,6 +37,18 @@ class EffectDifference(Difference):
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
         """Return the maps with the effect's response."""
         return maps + np.tensordot(value, self.templates, 1)
+
+    def sampled(self, value: Vector, pair: ChannelPair, pointing: Pointing) -> Maps | None:
+        """Return the response of the time-ordered reference; None if the effect does not act on samples."""
+        assert pair.scene is not None
+        sky: Any = pair.scene.sky  # an array stands for a file
+        alone = replace(self.run, sky=replace(self.run.sky, spectrum=None, map=None, alm=sky))
+        sides = [alone, replace(alone, effects=(_table(self._effect(value), pair.name),))]
+        try:
+            bare, acting = (sampled.maps(survey(run, pair.scene.nthreads), 0, pair.scene.nthreads) for run in sides)
+        except InputError:
+            return None
+        return np.stack([more - less for (_, more), (_, less) in zip(acting, bare, strict=True)])
 
     def _effect(self, value: Vector) -> Effect:
         return self.kind.nearest(value, np.eye(value.size))
@@ -77,15 +91,19 @@ def effects_of(pair: ChannelPair, run: config.RunConfig) -> Iterator[EffectDiffe
         templates = []
         try:
             for effect in kind.basis():
-                acting = config.Effect(
-                    name=name,
-                    channel=pair.name if kind.scope == "channel" else None,
-                    parameters={"amplitude": effect.amplitude, **effect.parameters()},
-                )
-                made = simulate.maps(survey(replace(alone, effects=(acting,)), nthreads), 0, nthreads, sky)
+                acting = replace(alone, effects=(_table(effect, pair.name),))
+                made = simulate.maps(survey(acting, nthreads), 0, nthreads, sky)
                 scale = float(np.max(np.abs(effect.coordinates())))
                 templates.append(np.where(pair.seen, (made - bare) / scale, 0.0))
         except InputError:  # it depends on what the model does not say: a frequency, a pointing, a differencing scan
             continue
         if any(t.any() for t in templates):
-            yield EffectDifference(kind, np.stack(templates))
+            yield EffectDifference(kind, np.stack(templates), alone)
+
+
+def _table(effect: Effect, channel: str) -> config.Effect:
+    """Return an effect as a run names it."""
+    parameters = {"amplitude": effect.amplitude, **effect.parameters()}
+    return config.Effect(
+        name=effect.name, channel=channel if effect.scope == "channel" else None, parameters=parameters
+    )

@@ -37,6 +37,8 @@ class ChannelPair:
         What the model says of side A; None without a model.
     channel
         The same with everything that effects need; None without a model.
+    sky_of_maps
+        True if the scene's sky was taken from side A, and not from the model.
     """
 
     name: str
@@ -46,6 +48,7 @@ class ChannelPair:
     seen: NDArray[np.bool_]
     scene: Scene | None = None
     channel: Channel | None = None
+    sky_of_maps: bool = False
 
     @property
     def nside(self) -> int:
@@ -202,6 +205,5 @@ def _pair(
         truth = simulate.draw_sky(whole, 0)
         return ChannelPair(name, tuple(maps), a, b, seen, scene_of(channel, truth, nthreads), channel)
     empty = scene_of(channel, np.zeros(alm_.size(sky.lmax), complex), nthreads)
-    return ChannelPair(
-        name, tuple(maps), a, b, seen, replace(empty, sky=sky_in(np.where(seen, a, 0.0), seen, empty)), channel
-    )
+    shown = replace(empty, sky=sky_in(np.where(seen, a, 0.0), seen, empty))
+    return ChannelPair(name, tuple(maps), a, b, seen, shown, channel, sky_of_maps=True)

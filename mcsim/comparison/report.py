@@ -8,6 +8,7 @@ import healpy
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
 from mcsim.comparison.result import ChannelResult, ComparisonResult
@@ -90,16 +91,16 @@ def _draw_spectra(axes: Axes, channel: ChannelResult) -> None:
     lmax = 2 * nside
     ell = np.arange(2, lmax + 1)
     difference = channel.b - channel.a
-    for label, values, colour in (
-        ("A", channel.a, "#444444"),
-        ("B − A", difference, "#0072b2"),
-        ("explained", channel.explained, "#d55e00"),
-        ("left", difference - channel.explained, "#00785a"),
+    for label, values, colour, style in (
+        ("A", channel.a, "#444444", "-"),
+        ("B − A", difference, "#0072b2", "-"),
+        ("explained", channel.explained, "#d55e00", "--"),
+        ("left", difference - channel.explained, "#00785a", "-"),
     ):
         alm = healpix.analysis(np.where(channel.seen[0], values[0], 0.0), lmax)
         power = healpy.alm2cl(alm)[2:]
         if power.max() > 0.0:
-            axes.loglog(ell, ell * (ell + 1) / (2.0 * np.pi) * power, label=label, color=colour, lw=1.2)
+            axes.loglog(ell, ell * (ell + 1) / (2.0 * np.pi) * power, label=label, color=colour, ls=style, lw=1.2)
     axes.set(xlabel="degree l", ylabel="l(l + 1) C_l / 2π  [uK²]", title="by degree")
     axes.legend(frameon=False, fontsize=9)
 
@@ -119,5 +120,6 @@ def _draw_depth(axes: Axes, channel: ChannelResult) -> None:
     for label, values, colour in (("B − A", difference, "#0072b2"), ("left", left, "#00785a")):
         rms = np.sqrt(np.bincount(bins, values**2, edges.size - 1) / count)
         axes.loglog(middle, rms, "o-", ms=4, label=label, color=colour)
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set(xlabel="samples in a pixel", ylabel="rms  [uK]", title="by depth")
     axes.legend(frameon=False, fontsize=9)

@@ -1,18 +1,22 @@
 """What one channel of a simulation is made of, so that a part can be exchanged and the maps be made again."""
 
 from collections import OrderedDict
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
+import healpy
 import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.instrument.beams import Beam
-from mcsim.instrument.scan import Moments
-from mcsim.simulation import convolve
+from mcsim.instrument.scan import Moments, ScanModel
+from mcsim.instrument.scan.geometry import MapGrid
+from mcsim.simulation import convolve, tod
 from mcsim.simulation.survey import Channel
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
+from mcsim.systematics.base import Pointing
 
 Alm = NDArray[np.complex128]
 Maps = NDArray[np.float64]
@@ -20,6 +24,9 @@ Maps = NDArray[np.float64]
 
 KEPT = 4
 """Transforms that are kept: scenes with the same sky and beam differ in their moments alone."""
+
+EPSILON = 1e-7
+"""Accuracy of the interpolation of single samples."""
 
 WEAKEST = 1e-4
 """Share of its largest value below which a beam's window is not divided out."""
@@ -48,6 +55,12 @@ class Scene:
         Orientation moments of every split.
     nthreads
         Threads of the transforms.
+    psi
+        Sign and offset in radians of the samples' orientation, beside that of the model.
+    centred
+        True if samples stand at their pixels' centres.
+    motion
+        Scan model in place of the channel's; None: that.
     kept
         Transforms of scenes made from this one.
     """
@@ -57,6 +70,9 @@ class Scene:
     window: NDArray[np.float64]
     moments: tuple[Moments, ...]
     nthreads: int = 1
+    psi: tuple[int, float] = (1, 0.0)
+    centred: bool = False
+    motion: ScanModel | None = None
     kept: OrderedDict[tuple[bytes, ...], Transforms] = field(default_factory=OrderedDict, repr=False)
 
     @property
@@ -101,10 +117,43 @@ class Scene:
                 own += convolve.centroid_map(self._transforms.gradient, m)
         return made
 
-    def with_moments(self, change: NDArray[np.complex128] | None) -> "Scene":
-        """Return the scene with w_s times ``change[s - 1]``, or with conj(w_s) for None."""
-        moments = [replace(m, w=np.conj(m.w) if change is None else change[: m.smax, None] * m.w) for m in self.moments]
-        return replace(self, moments=tuple(moments))
+    def turned(self, angle: float) -> "Scene":
+        """Return the scene with all samples turned by an angle, in radians."""
+        orders = np.arange(1, self.moments[0].smax + 1)
+        phases = np.exp(-1j * orders * angle)[:, None]
+        moments = tuple(replace(m, w=phases * m.w) for m in self.moments)
+        return replace(self, moments=moments, psi=(self.psi[0], self.psi[1] + angle))
+
+    def reversed(self) -> "Scene":
+        """Return the scene with all samples' orientations of the other sign."""
+        moments = tuple(replace(m, w=np.conj(m.w)) for m in self.moments)
+        return replace(self, moments=moments, psi=(-self.psi[0], -self.psi[1]))
+
+    def sampled(self, pointing: Pointing, window: NDArray[np.float64]) -> Maps:
+        """Return the maps sample by sample, without the approximations of :meth:`maps`.
+
+        Parameters
+        ----------
+        pointing
+            Of the channel.
+        window
+            Pixel window that the spread of the samples makes by itself, shape (lmax + 1,).
+        """
+        factor = self.window if self.centred else self.window / window
+        sky = alm_.multiply(self.sky, factor, self.lmax)
+        signal = tod.sky_signal(sky, self.lmax, self.beam, EPSILON, self.nthreads)
+        model, count = self.motion or pointing.model, len(self.moments)
+        made = []
+        for i in range(count):
+            grid = MapGrid(self.nside, self.moments[0].frame, (i / count, (i + 1) / count))
+            made.append(tod.bin_samples(signal(self._pointed(tod.samples(model, pointing.line, grid))), self.nside)[0])
+        return np.stack(made)
+
+    def _pointed(self, samples: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
+        sign, offset = self.psi
+        for chunk in samples:
+            theta, phi = healpy.pix2ang(self.nside, chunk.pixel) if self.centred else (chunk.theta, chunk.phi)
+            yield replace(chunk, theta=theta, phi=phi, psi=sign * chunk.psi + offset)
 
 
 def scene_of(channel: Channel, sky: Alm, nthreads: int) -> Scene:

@@ -1,7 +1,7 @@
 """Find the smallest set of differences that turns the maps of side A into those of side B."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,18 +10,28 @@ from scipy.optimize import least_squares
 
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
-from mcsim.comparison.scene import Maps, Scene
+from mcsim.comparison.scene import Maps, Scene, sky_in
+from mcsim.systematics.base import Pointing
 
 Vector = NDArray[np.float64]
 
 EXPLAINED = 0.8
-"""Share of a difference map's variance that a set must explain to be named."""
+"""Share of a difference map's variance that a set must explain to be named, with orientation moments."""
+
+EXPLAINED_BY_SAMPLES = 0.95
+"""The same where single samples are simulated, or no simulation is needed."""
 
 FURTHER = 0.7
 """Share of what is left that a further difference must explain to be added."""
 
 LARGEST = 3
 """Differences that act together."""
+
+MEASURED = 4
+"""Sets of every size that are simulated sample by sample."""
+
+SAMPLES = 100_000_000
+"""Samples of the longest survey of which that is done."""
 
 KEPT = 3
 """Sets of every size from which larger ones are built."""
@@ -53,6 +63,9 @@ class Set:
 class Problem:
     """One channel, and what may differ in it.
 
+    Sets are searched with orientation moments; those that come first are simulated sample by sample as well, if the
+    pointing is known and no longer than :data:`SAMPLES`, and what that changes is added to their predictions.
+
     Attributes
     ----------
     pair
@@ -66,6 +79,7 @@ class Problem:
     pair: ChannelPair
     library: Sequence[Difference]
     others: dict[str, Maps]
+    _corrections: dict[tuple[int, bytes], Maps] = field(default_factory=dict, repr=False)
 
     @cached_property
     def _bare(self) -> Maps | None:
@@ -88,6 +102,8 @@ class Problem:
                 scene = difference.scene(scene, value, self.pair)
             if scene is not self.pair.scene:
                 maps = maps + (scene.maps() - self._bare)
+        for difference, value in members:
+            maps = maps + self._corrections.get((id(difference), value.tobytes()), 0.0)
         state = State(self.pair, scene, maps, self.others)
         for difference, value in members:
             state = replace(state, maps=difference.maps(state.maps, value, state))
@@ -97,13 +113,72 @@ class Problem:
         """Return the share of the variance that a set leaves."""
         return self._squares(self.state(members).maps) / self.total
 
+    @property
+    def needed(self) -> float:
+        """Share of the variance that a set must explain to be named."""
+        simple = self._pointing is not None or self.pair.scene is None
+        return EXPLAINED_BY_SAMPLES if simple else EXPLAINED
+
+    @property
+    def _pointing(self) -> Pointing | None:
+        return pointing_of(self.pair)
+
+    @cached_property
+    def _sampled(self) -> Maps:
+        assert self.pair.scene is not None
+        assert self._pointing is not None
+        return self.pair.scene.sampled(self._pointing, self.pair.scene.window)
+
+    def corrected(self, found: Set) -> Set:
+        """Return a set with its share measured sample by sample; what is smooth takes one more step."""
+        if self._pointing is None or self.pair.scene is None:
+            return found
+        for difference, value in found.members:
+            self._correct(difference, value)
+        found = replace(found, left=self.left(found.members))
+        for index, (difference, value) in enumerate(found.members):
+            if not difference.smooth:
+                continue
+            step = 1e-3 * max(float(np.abs(value).max()), 1.0)
+            ways = [self._moved(found, index, axis) for axis in step * np.eye(value.size)]
+            state = self.state(found.members)
+            moved = value + step * state.fit([self.state(way).maps - state.maps for way in ways])
+            self._correct(difference, moved)
+            members = (*found.members[:index], (difference, moved), *found.members[index + 1 :])
+            found = min(found, Set(members, self.left(members)), key=lambda one: one.left)
+        return found
+
+    def _moved(self, found: Set, index: int, by: Vector) -> tuple[tuple[Difference, Vector], ...]:
+        """Return a set's members with one value moved, and the same correction as before."""
+        difference, value = found.members[index]
+        moved = value + by
+        self._corrections[id(difference), moved.tobytes()] = self._corrections.get(
+            (id(difference), value.tobytes()), np.zeros_like(self.pair.a)
+        )
+        return (*found.members[:index], (difference, moved), *found.members[index + 1 :])
+
+    def _correct(self, difference: Difference, value: Vector) -> None:
+        """Keep what single samples change in the response to a difference."""
+        key, base = (id(difference), value.tobytes()), self.pair.scene
+        if key in self._corrections or base is None or self._bare is None or self._pointing is None:
+            return
+        scene = difference.scene(base, value, self.pair)
+        if scene is not base:
+            exact: Maps | None = scene.sampled(self._pointing, base.window) - self._sampled
+            fast = scene.maps() - self._bare
+        else:
+            exact = difference.sampled(value, self.pair, self._pointing)
+            fast = difference.maps(self.pair.a, value, self.state(())) - self.pair.a
+        if exact is not None:
+            self._corrections[key] = np.where(self.pair.seen, exact - fast, 0.0)
+
     def best(self, slow: bool = False) -> list[Set]:
         """Return sets of the smallest size that explains the difference, the best first; or of the best size tried.
 
         A larger set is taken only if its last member explains :data:`FURTHER` of what the smaller one leaves.
         """
         library = [d for d in self.library if slow or not d.slow]
-        found = sorted(self._extended((), library), key=lambda one: one.left)
+        found = self._sorted(self._extended((), library))
         chosen = found
         for _ in range(LARGEST - 1):
             if not found or found[0].left < ENOUGH:
@@ -121,6 +196,13 @@ class Problem:
                 break
             chosen = found
         return chosen
+
+    def _sorted(self, sets: Iterable[Set]) -> list[Set]:
+        """Return sets with the best one first, the first ones measured sample by sample."""
+        ranked = sorted(sets, key=lambda one: one.left)
+        promising = [one for one in ranked if one.left < 0.5][:MEASURED]
+        ranked[: len(promising)] = map(self.corrected, promising)
+        return sorted(ranked, key=lambda one: one.left)
 
     def _extended(self, members: tuple[tuple[Difference, Vector], ...], library: Sequence[Difference]) -> Iterator[Set]:
         """Yield a set with each further difference of the library, at its best value."""
@@ -170,7 +252,25 @@ class Problem:
         return self._refined(sets[0], index) if difference.smooth else sets[0]
 
 
-def alternatives(sets: Sequence[Set]) -> list[Set]:
+def pointing_of(pair: ChannelPair) -> Pointing | None:
+    """Return the pointing of a channel, where its single samples can be simulated."""
+    pointing = None if pair.channel is None else pair.channel.site.pointing
+    return None if pointing is None or pointing.model.samples(pointing.line) > SAMPLES else pointing
+
+
+def with_sharper_sky(pair: ChannelPair, iterations: int = 2) -> ChannelPair:
+    """Return a pair whose sky, which is taken from side A, makes its maps sample by sample too."""
+    scene, pointing = pair.scene, pointing_of(pair)
+    if scene is None or pointing is None:
+        return pair
+    for _ in range(iterations):
+        missing = np.where(pair.seen, pair.a - scene.sampled(pointing, scene.window), 0.0)
+        empty = replace(scene, sky=np.zeros_like(scene.sky))
+        scene = replace(scene, sky=scene.sky + sky_in(missing, pair.seen, empty, 2))
+    return replace(pair, scene=scene)
+
+
+def alternatives(sets: Sequence[Set], needed: float) -> list[Set]:
     """Return the other sets that explain a difference as well as the best one does."""
-    limit = ALIKE * sets[0].left + PRECISION
-    return [one for one in sets[1:] if one.left <= min(limit, 1.0 - EXPLAINED)]
+    limit = min(ALIKE * sets[0].left + PRECISION, 1.0 - needed)
+    return [one for one in sets[1:] if one.left <= limit]
