@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from mcsim.beamfit.api import fit
     from mcsim.bipolar.dataset import biposh
     from mcsim.comparison.api import compare
-    from mcsim.comparison.result import ComparisonResult
     from mcsim.config import RunConfig
     from mcsim.config import load as load_config
     from mcsim.diagnosis.api import diagnose
@@ -39,7 +38,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Beam",
-    "ComparisonResult",
     "Effect",
     "InputError",
     "Moments",
@@ -63,7 +61,6 @@ __all__ = [
 
 _HOME = {
     "Beam": "mcsim.instrument.beams",
-    "ComparisonResult": "mcsim.comparison.result",
     "Effect": "mcsim.systematics",
     "InputError": "mcsim.errors",
     "Moments": "mcsim.instrument.scan",
