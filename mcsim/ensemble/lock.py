@@ -27,14 +27,17 @@ def locked(path: Path) -> Iterator[None]:
         with refuse_unwritable(path):
             lock.parent.mkdir(parents=True, exist_ok=True)
             # A link makes the lock and its contents in one step, so that a killed process leaves a readable lock.
-            with tempfile.NamedTemporaryFile("w", prefix=f".{path.name}.", dir=lock.parent) as scratch:
-                scratch.write(f"{socket.gethostname()} {os.getpid()}")
-                scratch.flush()
-                held = stack.enter_context(Path(scratch.name).open())
+            descriptor, scratch = tempfile.mkstemp(prefix=f".{path.name}.", dir=lock.parent)
+            try:
+                with os.fdopen(descriptor, "wb", buffering=0) as stream:
+                    stream.write(f"{socket.gethostname()} {os.getpid()}".encode())
+                held = stack.enter_context(Path(scratch).open())
                 with suppress(OSError):  # the kernel's lock tells other runs of this process; some disks have none
                     fcntl.flock(held, fcntl.LOCK_EX)
-                while not _linked(scratch.name, lock):
+                while not _linked(scratch, lock):
                     _remove_if_dead(lock, path)
+            finally:
+                os.unlink(scratch)
         try:
             yield
         finally:

@@ -64,7 +64,7 @@ def test_full_disk(small_store: Path, client: Client, disk: Path) -> None:
 def test_disk_without_room_is_refused(client: Client, disk: Path) -> None:
     (disk / "ballast").write_bytes(bytes(1 << 20))
     assert remount(disk, "size=1m")
-    with refused("x.zarr.lock", "-o", errno=errno.ENOSPC) as kept:  # as a notebook keeps the last exception
+    with refused("x.zarr", "-o", errno=errno.ENOSPC) as kept:  # as a notebook keeps the last exception
         runner.run(table(), disk / "x.zarr", workers=client)
     assert kept.value.__cause__ is not None
     assert sorted(p.name for p in disk.iterdir()) == ["ballast"]

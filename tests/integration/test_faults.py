@@ -400,7 +400,7 @@ def test_store_that_is_deleted_during_the_run(
         return real(shared, r)
 
     monkeypatch.setattr(simulate, "realize", realize)
-    with refused("x.zarr", "--verify", "--resume", by=RunError):
+    with refused("x.zarr", "--resume", by=RunError):
         runner.run(table(), path, workers=client)
     monkeypatch.undo()
     shutil.rmtree(path, ignore_errors=True)
