@@ -17,6 +17,7 @@ from mcsim.simulation.survey import Channel
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.systematics.base import Pointing
+from mcsim.systematics.shape import displaced
 
 Alm = NDArray[np.complex128]
 Maps = NDArray[np.float64]
@@ -61,6 +62,8 @@ class Scene:
         True if samples stand at their pixels' centres.
     motion
         Scan model in place of the channel's; None: that.
+    late, step
+        Samples by which the signal of a pointing is attributed to an earlier one, and their distance in radians.
     kept
         Transforms of scenes made from this one.
     """
@@ -73,6 +76,8 @@ class Scene:
     psi: tuple[int, float] = (1, 0.0)
     centred: bool = False
     motion: ScanModel | None = None
+    late: float = 0.0
+    step: float = 0.0
     kept: OrderedDict[tuple[bytes, ...], Transforms] = field(default_factory=OrderedDict, repr=False)
 
     @property
@@ -88,7 +93,12 @@ class Scene:
     @cached_property
     def response(self) -> convolve.Response:
         """Beam times pixel window."""
-        return convolve.response(self.beam, self.lmax, self.window)
+        beam = self.beam
+        if self.late:
+            way = self.late * self.step
+            moved = displaced(beam, 0.0 if way >= 0.0 else np.pi, abs(way))
+            beam = moved.truncated(min(moved.mmax, self.moments[0].smax))
+        return convolve.response(beam, self.lmax, self.window)
 
     @property
     def _transforms(self) -> Transforms:
@@ -146,7 +156,13 @@ class Scene:
         made = []
         for i in range(count):
             grid = MapGrid(self.nside, self.moments[0].frame, (i / count, (i + 1) / count))
-            made.append(tod.bin_samples(signal(self._pointed(tod.samples(model, pointing.line, grid))), self.nside)[0])
+            stream: Iterable[tod.Samples] = tod.samples(model, pointing.line, grid)
+            if self.late:
+                seen = tod.samples(
+                    _ahead(model, self.late * model.period_of_samples(pointing.line)), pointing.line, grid
+                )
+                stream = (replace(there, pixel=here.pixel) for here, there in zip(stream, seen, strict=True))
+            made.append(tod.bin_samples(signal(self._pointed(stream)), self.nside)[0])
         return np.stack(made)
 
     def _pointed(self, samples: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
@@ -154,6 +170,16 @@ class Scene:
         for chunk in samples:
             theta, phi = healpy.pix2ang(self.nside, chunk.pixel) if self.centred else (chunk.theta, chunk.phi)
             yield replace(chunk, theta=theta, phi=phi, psi=sign * chunk.psi + offset)
+
+
+def _ahead(model: ScanModel, seconds: float) -> ScanModel:
+    """Return a scan model that is ``seconds`` further on its way at t = 0."""
+    ways = ("spin", "precession", "orbit")
+    phases = {
+        f"{way}_phase_deg": getattr(model, f"{way}_phase_deg") + 360.0 * seconds / getattr(model, f"{way}_period_s")
+        for way in ways
+    }
+    return replace(model, **phases)
 
 
 def scene_of(channel: Channel, sky: Alm, nthreads: int) -> Scene:

@@ -30,6 +30,9 @@ LARGEST = 3
 MEASURED = 4
 """Sets of every size that are simulated sample by sample."""
 
+WORTH = 0.9
+"""Share of the variance that a set may leave at most to be simulated sample by sample."""
+
 SAMPLES = 100_000_000
 """Samples of the longest survey of which that is done."""
 
@@ -200,7 +203,7 @@ class Problem:
     def _sorted(self, sets: Iterable[Set]) -> list[Set]:
         """Return sets with the best one first, the first ones measured sample by sample."""
         ranked = sorted(sets, key=lambda one: one.left)
-        promising = [one for one in ranked if one.left < 0.5][:MEASURED]
+        promising = [one for one in ranked if one.left < WORTH][:MEASURED]
         ranked[: len(promising)] = map(self.corrected, promising)
         return sorted(ranked, key=lambda one: one.left)
 
