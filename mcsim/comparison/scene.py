@@ -29,6 +29,9 @@ KEPT = 4
 EPSILON = 1e-7
 """Accuracy of the interpolation of single samples."""
 
+ITERATIONS = 25
+"""Largest number of iterations for the sky that maps show; holes of many pixels need more than they get."""
+
 WEAKEST = 1e-4
 """Share of its largest value below which a beam's window is not divided out."""
 
@@ -188,7 +191,7 @@ def scene_of(channel: Channel, sky: Alm, nthreads: int) -> Scene:
     return Scene(sky, channel.site.beam, channel.window, moments, nthreads)
 
 
-def sky_in(maps: Maps, seen: NDArray[np.bool_], empty: Scene, iterations: int = 3) -> Alm:
+def sky_in(maps: Maps, seen: NDArray[np.bool_], empty: Scene, tolerance: float = 1e-5) -> Alm:
     """Return the sky that a channel's maps show: their mean, with beam and pixel window divided out.
 
     Parameters
@@ -197,22 +200,26 @@ def sky_in(maps: Maps, seen: NDArray[np.bool_], empty: Scene, iterations: int = 
         Shape (split, npix) each; what is not seen is filled with the sky itself.
     empty
         Scene of the channel; its sky is not used.
-    iterations
-        Each takes off what the scene adds to the smoothed sky, and fills holes.
+    tolerance
+        Change of the sky, relative, at which iterations end; each takes off what the scene adds to the smoothed sky, and
+        fills holes.
     """
     factor = empty.response.factors[0].real
     inverse = np.divide(1.0, factor, out=np.zeros_like(factor), where=factor > WEAKEST * factor.max())
+    degrees = alm_.degrees(empty.lmax)
     count = np.maximum(seen.sum(axis=0), 1)
     holes = ~seen.any(axis=0)
     sky = np.zeros(alm_.size(empty.lmax), dtype=np.complex128)
     smooth = np.zeros(maps.shape[1])
     scene = empty
-    for _ in range(iterations + (20 if holes.any() else 0)):
+    for _ in range(ITERATIONS):
         extra = scene.maps() - smooth if sky.any() else np.zeros_like(maps)
         mean = np.where(seen, maps - extra, 0.0).sum(axis=0) / count
         whole = np.where(holes, smooth, mean)
         found = healpix.analysis(whole, empty.lmax, iterations=3, nthreads=empty.nthreads)
-        sky = alm_.multiply(found, inverse, empty.lmax)
+        before, sky = sky, alm_.multiply(found, inverse, empty.lmax)
+        if np.linalg.norm(factor[degrees] * (sky - before)) <= tolerance * np.linalg.norm(factor[degrees] * sky):
+            break
         scene = replace(empty, sky=sky)
         smooth = scene._transforms.circular
     return sky

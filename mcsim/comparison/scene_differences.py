@@ -18,7 +18,6 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import euler_angles, rotation_matrix
 
-
 _SMALL = 1e-3
 """Angle in radians over which the response to an offset of psi is linear."""
 
@@ -289,7 +288,7 @@ class LmaxCut(Difference):
 
     def starts(self, state: State) -> list[Vector]:
         assert state.scene is not None
-        lmax = min(state.scene.lmax, 2 * state.scene.nside)
+        lmax = min(state.scene.lmax, 3 * state.scene.nside - 1)
         a, b = (_mean_alm(side, state, lmax) for side in (state.maps, state.pair.b))
         degrees = alm_.degrees(lmax)
         weight = np.where(alm_.orders(lmax) == 0, 1.0, 2.0)

@@ -269,7 +269,7 @@ def with_sharper_sky(pair: ChannelPair, iterations: int = 2) -> ChannelPair:
     for _ in range(iterations):
         missing = np.where(pair.seen, pair.a - scene.sampled(pointing, scene.window), 0.0)
         empty = replace(scene, sky=np.zeros_like(scene.sky))
-        scene = replace(scene, sky=scene.sky + sky_in(missing, pair.seen, empty, 2))
+        scene = replace(scene, sky=scene.sky + sky_in(missing, pair.seen, empty, 1e-2))
     return replace(pair, scene=scene)
 
 

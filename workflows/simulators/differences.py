@@ -2,9 +2,8 @@
 
     python workflows/simulators/differences.py [identical|single|pair ...] [--skies 3]
 
-Side A is totalconvolve.py, side B the simulator of the row; litebird_sim's and TOAST's rows are left out where they are
-not installed. A row is right if the differences put in are the set named first, or one of the sets that the answer calls
-equally good.
+Side A is totalconvolve.py, side B the simulator of the row; rows of litebird_sim and TOAST are left out where they are
+not installed. A row is right if the differences put in are the set named first, or one that is called as good.
 """
 
 import argparse
@@ -67,6 +66,12 @@ def turned_about_pole(given: Inputs, degrees: float) -> Inputs:
     """Return inputs whose sky is turned about the z axis."""
     m = healpy.Alm.getlm(given.lmax)[1]
     return replace(given, sky=given.sky * np.exp(-1j * m * np.deg2rad(degrees)))
+
+
+def backwards(given: Inputs) -> Inputs:
+    """Return inputs whose instruments spin the other way round."""
+    models = [replace(c.model, spin_period_s=-c.model.spin_period_s) for c in given.channels]
+    return replace(given, channels=tuple(replace(c, model=m) for c, m in zip(given.channels, models, strict=True)))
 
 
 def each(maps: Maps, change: Callable[[np.ndarray], np.ndarray]) -> Maps:
@@ -152,7 +157,7 @@ def singles() -> Iterator[Case]:
         yield Case(
             L, f"dipole of {size:g} uK", ("dipole",), lambda i, size=size: with_dipole(simulated(L, i), size), "planck"
         )  # fmt: skip
-    yield Case(L, "spin of the other sign", ("spin_sign",), made(L, spin=-1), "litebird")
+    yield Case(L, "spin of the other sign", ("spin_sign",), lambda i: simulated(L, backwards(i)), "litebird")
     yield Case(L, "halves exchanged", ("split_exchanged",), lambda i: exchanged(simulated(L, i)))
     yield Case(
         H, "sky smoothed already", ("beam_window",), lambda i: simulated(H, with_sky(i, i.channels[0].beam.window)),
@@ -166,6 +171,13 @@ def singles() -> Iterator[Case]:
         yield Case(T, f"boresight {tilt:g} deg off", ("pointing_offset",), made(T, displaced_deg=tilt))
     yield Case(L, "its own precision (1e-5, single)", (), made(L, single_precision=True, epsilon=1e-5), "planck")
     yield Case(H, "nearest pixel of nside 512", (), made(H, finer=8, interpolated=False), circular=True)
+    S = "toast3"
+    yield Case(S, "SimTotalconvolve(calibrate=False)", ("calibration",), made(S, calibrate=False))
+    yield Case(S, "SimTotalconvolve(fwhm=4 arcmin)", ("beam_width",), made(S, fwhm_arcmin=4.0))
+    yield Case(S, "PixelsHealpix(nest=True)", ("ordering",), made(S, nest=True), "litebird")
+    for angle in (180.0, 45.0):
+        names = ("psi_offset",) if angle < 180.0 else ()
+        yield Case(S, f"detector turned by {angle:g} deg", names, made(S, turned_deg=angle), "planck")
     yield Case(H, "a beam without its shape", ("mmax_cut",), made(H))
     yield Case(
         T, "signal with its square, 1e-4/uK", ("unknown",), lambda i: each(simulated(T, i), lambda m: m + 1e-4 * m**2)

@@ -2,7 +2,7 @@
 
     python workflows/simulators/healpy_pipeline.py MODEL.toml FOLDER [--realization 0]
 
-The beam is its circular window, as in most such pipelines: a beam that is not circular makes a difference (mmax_cut = 0).
+The beam is its circular window, as in most such pipelines: a beam of another shape makes a difference (mmax_cut 0).
 """
 
 from collections.abc import Iterator

@@ -3,8 +3,7 @@
     pip install "litebird_sim==0.18.*"
     python workflows/simulators/litebird.py MODEL.toml FOLDER [--realization 0]
 
-Maps must be in ecliptic coordinates. litebird_sim's own map-makers solve for Q and U and take a part of what the beam's
-shape does out of I, so the samples are binned by inputs.binned.
+Its own map-makers solve for Q and U and take a part of what the beam's shape does out of I: samples are binned here.
 """
 
 from collections.abc import Iterator
@@ -12,11 +11,11 @@ from collections.abc import Iterator
 import ducc0
 import litebird_sim as lbs
 import numpy as np
-from inputs import Channel, Inputs, Maps, Vector, binned, parts
+from inputs import Channel, Inputs, Maps, Vector, binned, blocks, parts
 from numpy.typing import NDArray
 
-BLOCK_S = 10 * 86400.0
-"""Time that is simulated at once."""
+_ECLIPTIC = lbs.CoordinateSystem.Ecliptic
+_Block = tuple[NDArray[np.int64], Vector]
 
 
 class Strategy(lbs.SpinningScanningStrategy):
@@ -38,15 +37,12 @@ def simulate(
     mmax: int | None = None,
     nside_centering: int | None = None,
     step_s: float | None = None,
-    shift: int = 0,
-    spin: int = 1,
 ) -> Maps:
     """Return the maps of a run.
 
-    ``single_precision`` and ``epsilon`` are arguments of its BeamConvolutionParameters (its own defaults: True, 1e-5), as
-    are ``mmax``, and ``nside_centering`` of convolve_sky; ``step_s`` is its delta_time_s (default: a sample, which leaves
-    no interpolation between quaternions). ``turned_deg`` turns the instrument about its line of sight, ``shift`` sets
-    the start that many samples late, ``spin`` is the sign of the spin.
+    ``single_precision``, ``epsilon`` (its own defaults: True, 1e-5) and ``mmax`` are arguments of its
+    BeamConvolutionParameters, ``nside_centering`` of convolve_sky; ``step_s`` is its delta_time_s (default: a sample,
+    so that no quaternion is interpolated); ``turned_deg`` turns the instrument about its line of sight.
     """
     if inputs.frame != "ecliptic":
         raise ValueError(f"litebird_sim points in ecliptic coordinates; the run's maps are {inputs.frame}.")
@@ -58,55 +54,47 @@ def simulate(
         # An x axis along the radius; its psi, counted from east to north, is to ducc0 half a turn from ours.
         beam = beam * np.exp(-1j * np.pi * np.arange(len(beam)))[:, None]
         packed = np.concatenate([beam[m, m:] for m in range(len(beam))])
-        kept = channel.beam.mmax if mmax is None else mmax
+        highest = len(beam) - 1
+        kept = highest if mmax is None else mmax
         given = {
             "sky_alms": lbs.SphericalHarmonics(inputs.sky[None], inputs.lmax, inputs.lmax, coordinates=_ECLIPTIC),
-            "beam_alms": lbs.SphericalHarmonics(packed[None], inputs.lmax, channel.beam.mmax, coordinates=_ECLIPTIC),
+            "beam_alms": lbs.SphericalHarmonics(packed[None], inputs.lmax, highest, coordinates=_ECLIPTIC),
             "convolution_params": lbs.BeamConvolutionParameters(inputs.lmax, kept, single_precision, epsilon),
             "pointings_dtype": dtype,
             "nside_centering": nside_centering,
             "append_to_report": False,
         }
-        period = channel.model.period_of_samples(channel.line)
-        size = max(round(BLOCK_S / period), 1)
 
-        def signal(samples: range, given=given, channel=channel, period=period, size=size) -> Iterator[_Block]:
-            for first in range(samples.start, samples.stop, size):
-                count = min(size, samples.stop - first)
-                run = _pointed(channel, (first * period, count), step_s, turned_deg, spin, dtype)
-                pixel = base.ang2pix(run.observations[0].get_pointings(0)[0].astype(float)[:, :2])
-                if shift:
-                    run = _pointed(channel, ((first + shift) * period, count), step_s, turned_deg, spin, dtype)
+        def signal(samples: range, given=given, channel=channel) -> Iterator[_Block]:
+            for block in blocks(samples):
+                run = _pointed(channel, block, step_s, turned_deg, dtype)
                 run.convolve_sky(**given)
-                yield pixel[:count], run.observations[0].tod[0, :count].astype(float)
+                [seen] = run.observations
+                angles = seen.get_pointings(0)[0][: len(block), :2].astype(float)
+                yield base.ang2pix(angles), seen.tod[0, : len(block)].astype(float)
 
         for name, samples in parts(inputs, channel):
             maps[name] = binned(inputs.nside, signal(samples))
     return maps
 
 
-_ECLIPTIC = lbs.CoordinateSystem.Ecliptic
-_Block = tuple[NDArray[np.int64], Vector]
-
-
-def _pointed(
-    channel: Channel, span: tuple[float, int], step_s: float | None, turned_deg: float, spin: int, dtype: type
-):  # type: ignore[no-untyped-def]
-    model, line, (start_s, count) = channel.model, channel.line, span
+def _pointed(  # type: ignore[no-untyped-def]
+    channel: Channel, samples: range, step_s: float | None, turned_deg: float, dtype: type
+):
+    model, line = channel.model, channel.line
     period = model.period_of_samples(line)
+    start_s, length_s = samples.start * period, len(samples) * period
     imo = lbs.Imo(flatfile_location=lbs.PTEP_IMO_LOCATION)
-    run = lbs.Simulation(start_time=start_s, duration_s=count * period, random_seed=1, profile_time=False, imo=imo)
+    run = lbs.Simulation(start_time=start_s, duration_s=length_s, random_seed=1, profile_time=False, imo=imo)
     # Its precession and spin start half a turn later than ours; the delay makes the precession's phase.
     delay = (model.precession_phase_deg - 180.0) / 360.0 * model.precession_period_s
-    tilt, turns = np.deg2rad(model.precession_angle_deg), spin / model.spin_period_s
+    tilt, turns = np.deg2rad(model.precession_angle_deg), 1.0 / model.spin_period_s
     scan = Strategy(tilt, 1.0 / model.precession_period_s, turns, start_s)
-    scan.delay_s, scan.orbit_period_s = delay, model.orbit_period_s
-    scan.orbit_rad = np.deg2rad(model.orbit_phase_deg)
+    scan.delay_s, scan.orbit_period_s, scan.orbit_rad = delay, model.orbit_period_s, np.deg2rad(model.orbit_phase_deg)
     run.set_scanning_strategy(scan, delta_time_s=step_s or period, append_to_report=False)
     azimuth = np.deg2rad(model.spin_phase_deg + line.azimuth_deg - 180.0) - 2 * np.pi * delay * turns
-    run.set_instrument(
-        lbs.InstrumentInfo("one horn", np.deg2rad(turned_deg), np.deg2rad(line.boresight_angle_deg), azimuth)
-    )
+    turn, boresight = np.deg2rad([turned_deg, line.boresight_angle_deg])
+    run.set_instrument(lbs.InstrumentInfo("one horn", turn, boresight, azimuth))
     tod = lbs.TodDescription("tod", lbs.Units.K_CMB, dtype, "signal")
     run.create_observations(lbs.DetectorInfo(line.name, sampling_rate_hz=1.0 / period), tods=[tod])
     run.prepare_pointings(append_to_report=False)

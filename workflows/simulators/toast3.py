@@ -47,7 +47,7 @@ def simulate(
     for channel in inputs.channels:
         with tempfile.TemporaryDirectory() as folder:
             sky, beam = str(Path(folder) / "sky.fits"), str(Path(folder) / "beam.fits")
-            healpy.write_alm(sky, inputs.sky, lmax=inputs.lmax, out_dtype=np.float64)
+            healpy.write_alm(sky, inputs.sky, lmax=inputs.lmax, out_dtype=float)
             blm = channel.beam.blm[:, : inputs.lmax + 1]
             packed = np.concatenate([blm[m, m:] for m in range(len(blm))])
             healpy.write_alm(
