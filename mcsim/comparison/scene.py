@@ -201,8 +201,8 @@ def sky_in(maps: Maps, seen: NDArray[np.bool_], empty: Scene, tolerance: float =
     empty
         Scene of the channel; its sky is not used.
     tolerance
-        Change of the sky, relative, at which iterations end; each takes off what the scene adds to the smoothed sky, and
-        fills holes.
+        Relative change of the sky at which iterations end; each takes off what the scene adds to the smoothed sky,
+        and fills holes.
     """
     factor = empty.response.factors[0].real
     inverse = np.divide(1.0, factor, out=np.zeros_like(factor), where=factor > WEAKEST * factor.max())

@@ -24,6 +24,9 @@ EXPLAINED_BY_SAMPLES = 0.95
 FURTHER = 0.7
 """Share of what is left that a further difference must explain to be added."""
 
+SLIGHT = 0.1
+"""Share that a difference must explain to be fitted further, or to be one of several."""
+
 LARGEST = 3
 """Differences that act together."""
 
@@ -83,6 +86,7 @@ class Problem:
     library: Sequence[Difference]
     others: dict[str, Maps]
     _corrections: dict[tuple[int, bytes], Maps] = field(default_factory=dict, repr=False)
+    _tried: dict[tuple[tuple[int, bytes], ...], Set | None] = field(default_factory=dict, repr=False)
 
     @cached_property
     def _bare(self) -> Maps | None:
@@ -131,6 +135,14 @@ class Problem:
         assert self.pair.scene is not None
         assert self._pointing is not None
         return self.pair.scene.sampled(self._pointing, self.pair.scene.window)
+
+    @cached_property
+    def unmade(self) -> float:
+        """Rms in uK of what the simulation of side A, with the sky that its maps show, leaves of them."""
+        if self.pair.scene is None or self._bare is None:
+            return 0.0
+        made = self._bare if self._pointing is None else self._sampled
+        return float(np.sqrt(np.mean((self.pair.a - made)[self.pair.seen] ** 2)))
 
     def corrected(self, found: Set) -> Set:
         """Return a set with its share measured sample by sample; what is smooth takes one more step."""
@@ -189,6 +201,7 @@ class Problem:
             larger = [
                 one
                 for smaller in found[:KEPT]
+                if smaller.explains > SLIGHT
                 for one in self._extended(smaller.members, library)
                 if one.left < (1.0 - FURTHER) * smaller.left
             ]
@@ -209,16 +222,27 @@ class Problem:
 
     def _extended(self, members: tuple[tuple[Difference, Vector], ...], library: Sequence[Difference]) -> Iterator[Set]:
         """Yield a set with each further difference of the library, at its best value."""
-        state = self.state(members)
         present = {difference.name for difference, _ in members}
+        state: State | None = None
         for difference in library:
-            if difference.name in present or (difference.needs_scene and state.scene is None):
-                continue
-            tried = [(*members, (difference, value)) for value in difference.starts(state)]
-            if not tried:
-                continue
-            sets = sorted((Set(one, self.left(one)) for one in tried), key=lambda one: one.left)
-            yield self._refined(sets[0], len(members)) if difference.smooth else sets[0]
+            key = (*((id(d), v.tobytes()) for d, v in members), (id(difference), b""))
+            if key not in self._tried and difference.name not in present:
+                state = state or self.state(members)
+                self._tried[key] = self._with(difference, members, state)
+            found = self._tried.get(key)
+            if found is not None:
+                yield found
+
+    def _with(self, difference: Difference, members: tuple[tuple[Difference, Vector], ...], state: State) -> Set | None:
+        """Return a set with one more difference, at its best value; None if it has no value."""
+        if difference.needs_scene and state.scene is None:
+            return None
+        sets = [self._set((*members, (difference, value))) for value in difference.starts(state)]
+        best = min(sets, key=lambda one: one.left, default=None)
+        return self._refined(best, len(members)) if best is not None and difference.smooth else best
+
+    def _set(self, members: tuple[tuple[Difference, Vector], ...]) -> Set:
+        return Set(members, self.left(members))
 
     def _refined(self, start: Set, index: int) -> Set:
         """Return a set with the value of one smooth member fitted; of equal ones the first start stays."""
@@ -229,7 +253,8 @@ class Problem:
             maps = self.state([*members[:index], (difference, value), *members[index + 1 :]]).maps
             return np.asarray((self.pair.b - maps)[self.pair.seen])
 
-        if start.left >= 1.0 and not first.any():
+        without = self.left([*members[:index], *members[index + 1 :]])
+        if start.left > (1.0 - SLIGHT) * without:
             return start
         scale = np.maximum(np.abs(first), 0.1)
         fit = least_squares(residual, first, x_scale=scale, diff_step=1e-3, max_nfev=8, xtol=1e-7)
@@ -248,11 +273,12 @@ class Problem:
         return found
 
     def _again(self, difference: Difference, rest: tuple[tuple[Difference, Vector], ...], index: int) -> Set | None:
-        tried = [(*rest[:index], (difference, value), *rest[index:]) for value in difference.starts(self.state(rest))]
-        sets = sorted((Set(one, self.left(one)) for one in tried), key=lambda one: one.left)
-        if not sets:
-            return None
-        return self._refined(sets[0], index) if difference.smooth else sets[0]
+        sets = [
+            self._set((*rest[:index], (difference, value), *rest[index:]))
+            for value in difference.starts(self.state(rest))
+        ]
+        best = min(sets, key=lambda one: one.left, default=None)
+        return self._refined(best, index) if best is not None and difference.smooth else best
 
 
 def pointing_of(pair: ChannelPair) -> Pointing | None:

@@ -19,7 +19,7 @@ from mcsim.simulation import simulate, tod
 from mcsim.simulation.survey import survey
 from mcsim.sphere.rotation import rotate_alm
 
-NSIDE, LMAX = 32, 80
+NSIDE, LMAX = 32, 64
 MODEL = {
     "schema": 1,
     "name": "pair",
