@@ -64,6 +64,11 @@ class Set:
         """Share of the variance of the difference map."""
         return 1.0 - self.left
 
+    @property
+    def names(self) -> frozenset[str]:
+        """Of the differences, in any order."""
+        return frozenset(difference.name for difference, _ in self.members)
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -302,4 +307,8 @@ def with_sharper_sky(pair: ChannelPair, iterations: int = 2) -> ChannelPair:
 def alternatives(sets: Sequence[Set], needed: float) -> list[Set]:
     """Return the other sets that explain a difference as well as the best one does."""
     limit = min(ALIKE * sets[0].left + PRECISION, 1.0 - needed)
-    return [one for one in sets[1:] if one.left <= limit]
+    found = {sets[0].names: sets[0]}
+    for one in sets[1:]:
+        if one.left <= limit:
+            found.setdefault(one.names, one)
+    return list(found.values())[1:]
