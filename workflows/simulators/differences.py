@@ -275,7 +275,9 @@ def main() -> None:
     parser.add_argument("--only", default="", help="regular expression of the rows to make")
     given = parser.parse_args()
     if "identical" in given.tables:
-        print("| scan | side B | largest rms of the difference over the sky's | verdict |\n|---|---|---|---|", flush=True)
+        print(
+            "| scan | side B | largest rms of the difference over the sky's | verdict |\n|---|---|---|---|", flush=True
+        )
         for row in identical(given.skies):
             print(row, flush=True)
     print("\n| scan | side B | put in | rms / sky | named | explains % | as good | right | CPU s |")

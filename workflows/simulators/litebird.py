@@ -12,10 +12,8 @@ import ducc0
 import litebird_sim as lbs
 import numpy as np
 from inputs import Channel, Inputs, Maps, Vector, binned, blocks, parts
-from numpy.typing import NDArray
 
 _ECLIPTIC = lbs.CoordinateSystem.Ecliptic
-_Block = tuple[NDArray[np.int64], Vector]
 
 
 class Strategy(lbs.SpinningScanningStrategy):
@@ -45,27 +43,22 @@ def simulate(
     so that no quaternion is interpolated); ``turned_deg`` turns the instrument about its line of sight.
     """
     if inputs.frame != "ecliptic":
-        raise ValueError(f"litebird_sim points in ecliptic coordinates; the run's maps are {inputs.frame}.")
+        raise ValueError(f"litebird_sim points in ecliptic coordinates, the run's maps are {inputs.frame}.")
     base = ducc0.healpix.Healpix_Base(inputs.nside, "RING")
     dtype = np.float32 if single_precision else np.float64
     maps = {}
     for channel in inputs.channels:
-        beam = channel.beam.blm[:, : inputs.lmax + 1]
         # An x axis along the radius; its psi, counted from east to north, is to ducc0 half a turn from ours.
-        beam = beam * np.exp(-1j * np.pi * np.arange(len(beam)))[:, None]
-        packed = np.concatenate([beam[m, m:] for m in range(len(beam))])
-        highest = len(beam) - 1
+        highest, signs = channel.beam.mmax, (-1.0) ** np.arange(channel.beam.mmax + 1)
+        packed = np.concatenate([signs[m] * channel.beam.blm[m, m : inputs.lmax + 1] for m in range(highest + 1)])
         kept = highest if mmax is None else mmax
         given = {
             "sky_alms": lbs.SphericalHarmonics(inputs.sky[None], inputs.lmax, inputs.lmax, coordinates=_ECLIPTIC),
             "beam_alms": lbs.SphericalHarmonics(packed[None], inputs.lmax, highest, coordinates=_ECLIPTIC),
             "convolution_params": lbs.BeamConvolutionParameters(inputs.lmax, kept, single_precision, epsilon),
-            "pointings_dtype": dtype,
-            "nside_centering": nside_centering,
-            "append_to_report": False,
-        }
+        } | {"pointings_dtype": dtype, "nside_centering": nside_centering, "append_to_report": False}
 
-        def signal(samples: range, given=given, channel=channel) -> Iterator[_Block]:
+        def signal(samples: range, given=given, channel=channel) -> Iterator[tuple[Vector, Vector]]:
             for block in blocks(samples):
                 run = _pointed(channel, block, step_s, turned_deg, dtype)
                 run.convolve_sky(**given)
@@ -81,15 +74,14 @@ def simulate(
 def _pointed(  # type: ignore[no-untyped-def]
     channel: Channel, samples: range, step_s: float | None, turned_deg: float, dtype: type
 ):
-    model, line = channel.model, channel.line
-    period = model.period_of_samples(line)
+    model, line, period = channel.model, channel.line, channel.model.period_of_samples(channel.line)
     start_s, length_s = samples.start * period, len(samples) * period
     imo = lbs.Imo(flatfile_location=lbs.PTEP_IMO_LOCATION)
     run = lbs.Simulation(start_time=start_s, duration_s=length_s, random_seed=1, profile_time=False, imo=imo)
     # Its precession and spin start half a turn later than ours; the delay makes the precession's phase.
     delay = (model.precession_phase_deg - 180.0) / 360.0 * model.precession_period_s
     tilt, turns = np.deg2rad(model.precession_angle_deg), 1.0 / model.spin_period_s
-    scan = Strategy(tilt, 1.0 / model.precession_period_s, turns, start_s)
+    scan = Strategy(tilt, 1.0 / model.precession_period_s, turns)
     scan.delay_s, scan.orbit_period_s, scan.orbit_rad = delay, model.orbit_period_s, np.deg2rad(model.orbit_phase_deg)
     run.set_scanning_strategy(scan, delta_time_s=step_s or period, append_to_report=False)
     azimuth = np.deg2rad(model.spin_phase_deg + line.azimuth_deg - 180.0) - 2 * np.pi * delay * turns
