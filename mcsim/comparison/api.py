@@ -162,18 +162,7 @@ def _result(
     if chosen and problem is not None:
         explained = problem.state(chosen[0].members).maps - pair.a
     described = [_described(one, pair.name, problem) for one in chosen if problem is not None]
-    same = (
-        [
-            tuple(
-                DifferenceResult(*equal[:1], pair.name, equal[1], equal[2], d.explains, {}, d.met) if k == i else own
-                for k, own in enumerate(described[0])
-            )
-            for i, (d, (difference, value)) in enumerate(zip(described[0], chosen[0].members, strict=True))
-            for equal in difference.equivalent(value)
-        ]
-        if described
-        else []
-    )
+    same = [other for one, own in zip(chosen, described, strict=False) for other in _equivalent(one, own)]
     nearest = _described(sets[0], pair.name, problem)[0] if sets and problem is not None else None
     scene, noise = pair.scene, np.nan
     if sides.run is not None and scene is not None:
@@ -192,6 +181,7 @@ def _result(
         noncircular_rms_uk=np.nan if scene is None else _rms(scene.noncircular()[seen]),
         noise_rms_uk=noise,
         left_rms_uk=_rms((pair.b - pair.a - explained)[seen]),
+        unmade_rms_uk=problem.unmade if verdict == "unknown" and problem is not None else 0.0,
         a=pair.a,
         b=pair.b,
         explained=explained,
@@ -213,6 +203,15 @@ def _described(found: Set, channel: str, problem: Problem | None) -> tuple[Diffe
             )
         )  # fmt: skip
     return tuple(described)
+
+
+def _equivalent(found: Set, own: tuple[DifferenceResult, ...]) -> list[tuple[DifferenceResult, ...]]:
+    """Return the sets that make the same maps under other names."""
+    return [
+        (*own[:i], replace(d, name=name, amplitude=amplitude, unit=unit, parameters={}), *own[i + 1 :])
+        for i, (d, (difference, value)) in enumerate(zip(own, found.members, strict=True))
+        for name, amplitude, unit in difference.equivalent(value)
+    ]
 
 
 def _rms(values: NDArray[np.float64]) -> float:

@@ -48,6 +48,8 @@ class ChannelResult:
     rms_uk, sky_rms_uk, noncircular_rms_uk, noise_rms_uk, left_rms_uk
         Of the difference; of the sky without monopole and dipole; of what the beam's shape adds; of the noise that the
         model has; and of what is left. NaN where no model says it.
+    unmade_rms_uk
+        Of what the simulation of side A leaves of its maps, if the verdict is "unknown"; else 0.
     a, b, explained, seen
         Maps, uK, shape (split, npix), ``explained`` the part of b - a that the set makes.
     hits
@@ -65,6 +67,7 @@ class ChannelResult:
     noncircular_rms_uk: float
     noise_rms_uk: float
     left_rms_uk: float
+    unmade_rms_uk: float
     a: Maps
     b: Maps
     explained: Maps
@@ -93,6 +96,11 @@ class ChannelResult:
                 if near is None or near.explains < 0.01
                 else f"; nearest is {near.name}, which explains {100 * near.explains:.0f} %"
             )
+            if self.unmade_rms_uk > 0.2 * self.rms_uk:
+                hint += (
+                    f". The model makes side A itself to {number(self.unmade_rms_uk)} uK rms only: "
+                    "check it, or give it the sky (sky.alm), which maps with many holes do not show"
+                )
             return f"{self.name}: different by {size}, in a way that no difference of the library explains{hint}."
         named = " and ".join(f"{d.name} = {number(d.amplitude)} {d.unit}" for d in self.differences)
         others = [" and ".join(d.name for d in one) for one in self.alternatives]

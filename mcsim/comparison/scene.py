@@ -17,6 +17,7 @@ from mcsim.simulation.survey import Channel
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.systematics.base import Pointing
+from mcsim.systematics.shape import displaced
 
 Alm = NDArray[np.complex128]
 Maps = NDArray[np.float64]
@@ -27,6 +28,9 @@ KEPT = 4
 
 EPSILON = 1e-7
 """Accuracy of the interpolation of single samples."""
+
+ITERATIONS = 25
+"""Largest number of iterations for the sky that maps show; holes of many pixels need more than they get."""
 
 WEAKEST = 1e-4
 """Share of its largest value below which a beam's window is not divided out."""
@@ -61,6 +65,8 @@ class Scene:
         True if samples stand at their pixels' centres.
     motion
         Scan model in place of the channel's; None: that.
+    late, step
+        Samples by which the signal of a pointing is attributed to an earlier one, and their distance in radians.
     kept
         Transforms of scenes made from this one.
     """
@@ -73,6 +79,8 @@ class Scene:
     psi: tuple[int, float] = (1, 0.0)
     centred: bool = False
     motion: ScanModel | None = None
+    late: float = 0.0
+    step: float = 0.0
     kept: OrderedDict[tuple[bytes, ...], Transforms] = field(default_factory=OrderedDict, repr=False)
 
     @property
@@ -88,7 +96,12 @@ class Scene:
     @cached_property
     def response(self) -> convolve.Response:
         """Beam times pixel window."""
-        return convolve.response(self.beam, self.lmax, self.window)
+        beam = self.beam
+        if self.late:
+            way = self.late * self.step
+            moved = displaced(beam, 0.0 if way >= 0.0 else np.pi, abs(way))
+            beam = moved.truncated(min(moved.mmax, self.moments[0].smax))
+        return convolve.response(beam, self.lmax, self.window)
 
     @property
     def _transforms(self) -> Transforms:
@@ -146,7 +159,13 @@ class Scene:
         made = []
         for i in range(count):
             grid = MapGrid(self.nside, self.moments[0].frame, (i / count, (i + 1) / count))
-            made.append(tod.bin_samples(signal(self._pointed(tod.samples(model, pointing.line, grid))), self.nside)[0])
+            stream: Iterable[tod.Samples] = tod.samples(model, pointing.line, grid)
+            if self.late:
+                seen = tod.samples(
+                    _ahead(model, self.late * model.period_of_samples(pointing.line)), pointing.line, grid
+                )
+                stream = (replace(there, pixel=here.pixel) for here, there in zip(stream, seen, strict=True))
+            made.append(tod.bin_samples(signal(self._pointed(stream)), self.nside)[0])
         return np.stack(made)
 
     def _pointed(self, samples: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
@@ -156,13 +175,23 @@ class Scene:
             yield replace(chunk, theta=theta, phi=phi, psi=sign * chunk.psi + offset)
 
 
+def _ahead(model: ScanModel, seconds: float) -> ScanModel:
+    """Return a scan model that is ``seconds`` further on its way at t = 0."""
+    ways = ("spin", "precession", "orbit")
+    phases = {
+        f"{way}_phase_deg": getattr(model, f"{way}_phase_deg") + 360.0 * seconds / getattr(model, f"{way}_period_s")
+        for way in ways
+    }
+    return replace(model, **phases)
+
+
 def scene_of(channel: Channel, sky: Alm, nthreads: int) -> Scene:
     """Return the scene of a channel of a survey, without its effects."""
     moments = tuple(m.moments for m in channel.maps)
     return Scene(sky, channel.site.beam, channel.window, moments, nthreads)
 
 
-def sky_in(maps: Maps, seen: NDArray[np.bool_], empty: Scene, iterations: int = 3) -> Alm:
+def sky_in(maps: Maps, seen: NDArray[np.bool_], empty: Scene, tolerance: float = 1e-5) -> Alm:
     """Return the sky that a channel's maps show: their mean, with beam and pixel window divided out.
 
     What a map of that nside cannot hold, above l = 3 nside - 1, is zero.
@@ -173,23 +202,27 @@ def sky_in(maps: Maps, seen: NDArray[np.bool_], empty: Scene, iterations: int = 
         Shape (split, npix) each; what is not seen is filled with the sky itself.
     empty
         Scene of the channel; its sky is not used.
-    iterations
-        Each takes off what the scene adds to the smoothed sky, and fills holes.
+    tolerance
+        Relative change of the sky at which iterations end; each takes off what the scene adds to the smoothed sky,
+        and fills holes.
     """
     factor = empty.response.factors[0].real
     inverse = np.divide(1.0, factor, out=np.zeros_like(factor), where=factor > WEAKEST * factor.max())
+    degrees = alm_.degrees(empty.lmax)
     count = np.maximum(seen.sum(axis=0), 1)
     holes = ~seen.any(axis=0)
     sky = np.zeros(alm_.size(empty.lmax), dtype=np.complex128)
     smooth = np.zeros(maps.shape[1])
     scene = empty
-    for _ in range(iterations + (20 if holes.any() else 0)):
+    for _ in range(ITERATIONS):
         extra = scene.maps() - smooth if sky.any() else np.zeros_like(maps)
         mean = np.where(seen, maps - extra, 0.0).sum(axis=0) / count
         whole = np.where(holes, smooth, mean)
         shown = min(empty.lmax, 3 * empty.nside - 1)
         found = healpix.analysis(whole, shown, iterations=3, nthreads=empty.nthreads)
-        sky = alm_.multiply(alm_.resize(found, shown, empty.lmax), inverse, empty.lmax)
+        before, sky = sky, alm_.multiply(alm_.resize(found, shown, empty.lmax), inverse, empty.lmax)
+        if np.linalg.norm(factor[degrees] * (sky - before)) <= tolerance * np.linalg.norm(factor[degrees] * sky):
+            break
         scene = replace(empty, sky=sky)
         smooth = scene._transforms.circular
     return sky

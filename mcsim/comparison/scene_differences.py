@@ -13,12 +13,13 @@ from mcsim.comparison.differences import Difference, State, Vector
 from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.scene import WEAKEST, Maps, Scene
 from mcsim.instrument.scan import Moments
-from mcsim.instrument.scan.geometry import MapGrid
-from mcsim.simulation import tod
+from mcsim.instrument.scan.pointing import pointing
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import euler_angles, rotation_matrix
-from mcsim.systematics.shape import displaced
+
+_SMALL = 1e-3
+"""Angle in radians over which the response to an offset of psi is linear."""
 
 
 class PsiOffset(Difference):
@@ -29,10 +30,17 @@ class PsiOffset(Difference):
     smooth = True
 
     def starts(self, state: State) -> list[Vector]:
+        """Return the small angle that fits, and a grid; a beam of even orders is the same half a turn on."""
         assert state.scene is not None
-        if not state.scene.noncircular().any():
+        orders = np.flatnonzero(state.scene.beam.blm.any(axis=1))
+        if orders.max(initial=0) == 0:
             return []
-        return [np.array([float(angle)]) for angle in (90, 180, -90, 5, -5, 30, -30, 150, -150)]
+        slope = state.scene.turned(_SMALL).maps() - state.scene.maps()
+        small = np.rad2deg(_SMALL * state.fit([slope])[0])
+        angles = [90.0, *(sign * angle for angle in (30.0, 60.0) for sign in (1, -1))]
+        if (orders % 2).any():
+            angles += [180.0, -90.0, 120.0, -120.0, 150.0, -150.0]
+        return [np.array([angle]) for angle in (small, *angles)]
 
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
         return scene.turned(float(np.deg2rad(value[0])))
@@ -149,6 +157,7 @@ class TimeShift(Difference):
 
     name, unit = "time_shift", "samples"
     met = "time stamps at the end of an integration instead of its middle"
+    smooth = True
 
     def starts(self, state: State) -> list[Vector]:
         """Return the shift that fits best, if it is small beside the beam: farther on, the sky is another one."""
@@ -166,17 +175,15 @@ class TimeShift(Difference):
         return [np.array([value])]
 
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
-        ahead = value[0] * _radians_per_sample(pair)
-        beam = displaced(scene.beam, 0.0 if ahead >= 0.0 else np.pi, abs(ahead))
-        return replace(scene, beam=beam.truncated(min(beam.mmax, scene.moments[0].smax)))
+        return replace(scene, late=float(value[0]), step=_radians_per_sample(pair))
 
 
 def _radians_per_sample(pair: ChannelPair) -> float:
     """Return the median distance between consecutive samples of a channel."""
     assert pair.channel is not None
-    pointing = pair.channel.site.pointed("time_shift")
-    first = next(iter(tod.samples(pointing.model, pointing.line, MapGrid(pair.nside, pair.channel.site.frame))))
-    n = healpy.ang2vec(first.theta[:4096], first.phi[:4096])
+    pointed = pair.channel.site.pointed("time_shift")
+    theta, phi, _ = pointing(pointed.model, pointed.line, 0, 4096)
+    n = healpy.ang2vec(theta, phi)
     return float(np.median(np.arccos(np.clip(np.sum(n[1:] * n[:-1], axis=1), -1.0, 1.0))))
 
 
@@ -281,7 +288,7 @@ class LmaxCut(Difference):
 
     def starts(self, state: State) -> list[Vector]:
         assert state.scene is not None
-        lmax = min(state.scene.lmax, 2 * state.scene.nside)
+        lmax = min(state.scene.lmax, 3 * state.scene.nside - 1)
         a, b = (_mean_alm(side, state, lmax) for side in (state.maps, state.pair.b))
         degrees = alm_.degrees(lmax)
         weight = np.where(alm_.orders(lmax) == 0, 1.0, 2.0)

@@ -24,11 +24,17 @@ EXPLAINED_BY_SAMPLES = 0.95
 FURTHER = 0.7
 """Share of what is left that a further difference must explain to be added."""
 
+SLIGHT = 0.1
+"""Share that a difference must explain to be fitted further, or to be one of several."""
+
 LARGEST = 3
 """Differences that act together."""
 
 MEASURED = 4
 """Sets of every size that are simulated sample by sample."""
+
+WORTH = 0.9
+"""Share of the variance that a set may leave at most to be simulated sample by sample."""
 
 SAMPLES = 100_000_000
 """Samples of the longest survey of which that is done."""
@@ -58,6 +64,11 @@ class Set:
         """Share of the variance of the difference map."""
         return 1.0 - self.left
 
+    @property
+    def names(self) -> frozenset[str]:
+        """Of the differences, in any order."""
+        return frozenset(difference.name for difference, _ in self.members)
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -80,6 +91,7 @@ class Problem:
     library: Sequence[Difference]
     others: dict[str, Maps]
     _corrections: dict[tuple[int, bytes], Maps] = field(default_factory=dict, repr=False)
+    _tried: dict[tuple[tuple[int, bytes], ...], Set | None] = field(default_factory=dict, repr=False)
 
     @cached_property
     def _bare(self) -> Maps | None:
@@ -128,6 +140,14 @@ class Problem:
         assert self.pair.scene is not None
         assert self._pointing is not None
         return self.pair.scene.sampled(self._pointing, self.pair.scene.window)
+
+    @cached_property
+    def unmade(self) -> float:
+        """Rms in uK of what the simulation of side A, with the sky that its maps show, leaves of them."""
+        if self.pair.scene is None or self._bare is None:
+            return 0.0
+        made = self._bare if self._pointing is None else self._sampled
+        return float(np.sqrt(np.mean((self.pair.a - made)[self.pair.seen] ** 2)))
 
     def corrected(self, found: Set) -> Set:
         """Return a set with its share measured sample by sample; what is smooth takes one more step."""
@@ -186,6 +206,7 @@ class Problem:
             larger = [
                 one
                 for smaller in found[:KEPT]
+                if smaller.explains > SLIGHT
                 for one in self._extended(smaller.members, library)
                 if one.left < (1.0 - FURTHER) * smaller.left
             ]
@@ -200,22 +221,33 @@ class Problem:
     def _sorted(self, sets: Iterable[Set]) -> list[Set]:
         """Return sets with the best one first, the first ones measured sample by sample."""
         ranked = sorted(sets, key=lambda one: one.left)
-        promising = [one for one in ranked if one.left < 0.5][:MEASURED]
+        promising = [one for one in ranked if one.left < WORTH][:MEASURED]
         ranked[: len(promising)] = map(self.corrected, promising)
         return sorted(ranked, key=lambda one: one.left)
 
     def _extended(self, members: tuple[tuple[Difference, Vector], ...], library: Sequence[Difference]) -> Iterator[Set]:
         """Yield a set with each further difference of the library, at its best value."""
-        state = self.state(members)
         present = {difference.name for difference, _ in members}
+        state: State | None = None
         for difference in library:
-            if difference.name in present or (difference.needs_scene and state.scene is None):
-                continue
-            tried = [(*members, (difference, value)) for value in difference.starts(state)]
-            if not tried:
-                continue
-            sets = sorted((Set(one, self.left(one)) for one in tried), key=lambda one: one.left)
-            yield self._refined(sets[0], len(members)) if difference.smooth else sets[0]
+            key = (*((id(d), v.tobytes()) for d, v in members), (id(difference), b""))
+            if key not in self._tried and difference.name not in present:
+                state = state or self.state(members)
+                self._tried[key] = self._with(difference, members, state)
+            found = self._tried.get(key)
+            if found is not None:
+                yield found
+
+    def _with(self, difference: Difference, members: tuple[tuple[Difference, Vector], ...], state: State) -> Set | None:
+        """Return a set with one more difference, at its best value; None if it has no value."""
+        if difference.needs_scene and state.scene is None:
+            return None
+        sets = [self._set((*members, (difference, value))) for value in difference.starts(state)]
+        best = min(sets, key=lambda one: one.left, default=None)
+        return self._refined(best, len(members)) if best is not None and difference.smooth else best
+
+    def _set(self, members: tuple[tuple[Difference, Vector], ...]) -> Set:
+        return Set(members, self.left(members))
 
     def _refined(self, start: Set, index: int) -> Set:
         """Return a set with the value of one smooth member fitted; of equal ones the first start stays."""
@@ -226,7 +258,8 @@ class Problem:
             maps = self.state([*members[:index], (difference, value), *members[index + 1 :]]).maps
             return np.asarray((self.pair.b - maps)[self.pair.seen])
 
-        if start.left >= 1.0 and not first.any():
+        without = self.left([*members[:index], *members[index + 1 :]])
+        if start.left > (1.0 - SLIGHT) * without:
             return start
         scale = np.maximum(np.abs(first), 0.1)
         fit = least_squares(residual, first, x_scale=scale, diff_step=1e-3, max_nfev=8, xtol=1e-7)
@@ -245,11 +278,12 @@ class Problem:
         return found
 
     def _again(self, difference: Difference, rest: tuple[tuple[Difference, Vector], ...], index: int) -> Set | None:
-        tried = [(*rest[:index], (difference, value), *rest[index:]) for value in difference.starts(self.state(rest))]
-        sets = sorted((Set(one, self.left(one)) for one in tried), key=lambda one: one.left)
-        if not sets:
-            return None
-        return self._refined(sets[0], index) if difference.smooth else sets[0]
+        sets = [
+            self._set((*rest[:index], (difference, value), *rest[index:]))
+            for value in difference.starts(self.state(rest))
+        ]
+        best = min(sets, key=lambda one: one.left, default=None)
+        return self._refined(best, index) if best is not None and difference.smooth else best
 
 
 def pointing_of(pair: ChannelPair) -> Pointing | None:
@@ -266,11 +300,15 @@ def with_sharper_sky(pair: ChannelPair, iterations: int = 2) -> ChannelPair:
     for _ in range(iterations):
         missing = np.where(pair.seen, pair.a - scene.sampled(pointing, scene.window), 0.0)
         empty = replace(scene, sky=np.zeros_like(scene.sky))
-        scene = replace(scene, sky=scene.sky + sky_in(missing, pair.seen, empty, 2))
+        scene = replace(scene, sky=scene.sky + sky_in(missing, pair.seen, empty, 1e-2))
     return replace(pair, scene=scene)
 
 
 def alternatives(sets: Sequence[Set], needed: float) -> list[Set]:
     """Return the other sets that explain a difference as well as the best one does."""
     limit = min(ALIKE * sets[0].left + PRECISION, 1.0 - needed)
-    return [one for one in sets[1:] if one.left <= limit]
+    found = {sets[0].names: sets[0]}
+    for one in sets[1:]:
+        if one.left <= limit:
+            found.setdefault(one.names, one)
+    return list(found.values())[1:]

@@ -20,7 +20,7 @@ from mcsim.simulation import simulate, tod
 from mcsim.simulation.survey import survey
 from mcsim.sphere.rotation import rotate_alm
 
-NSIDE, LMAX = 32, 80
+NSIDE, LMAX = 32, 64
 MODEL = {
     "schema": 1,
     "name": "pair",
@@ -135,11 +135,46 @@ def test_a_mirrored_beam_is_named_or_is_the_turn_that_makes_the_same_maps(simula
     assert channel.left < 0.01
 
 
+def test_a_turn_of_a_degree_is_not_taken_for_a_turn_of_half_a_circle_more(simulator, side_a):
+    found = mcsim.compare(side_a, simulator(psi=lambda p: p + np.deg2rad(1.0)), simulator.run)
+    (channel,) = found.channels
+    assert channel.differences[0].name == "psi_offset"
+    assert channel.differences[0].amplitude == pytest.approx(1.0, rel=1e-3)
+
+
+def test_time_stamps_of_half_a_sample_are_named():
+    beam = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 660.0, "fwhm_minor_arcmin": 540.0}
+    scan = {"kind": "hit_averaged", "model": "litebird", "sample_period_s": 31.0}
+    channel = {"name": "T", "beam": beam, "scan": scan}
+    run = config.load(MODEL | {"sky": {"spectrum": "wmap7", "lmax": 30}, "map": {"nside": 16}, "channel": [channel]})
+    whole = survey(run)
+    pointing, sky = whole.channels[0].site.pointed(""), simulate.draw_sky(whole, 0)
+    observe = tod.sky_signal(sky, 30, whole.channels[0].site.beam, 1e-8, 1)
+    model = pointing.model
+    later = replace(
+        model,
+        spin_phase_deg=180.0 * 31.0 / model.spin_period_s,
+        precession_phase_deg=180.0 * 31.0 / model.precession_period_s,
+        orbit_phase_deg=180.0 * 31.0 / model.orbit_period_s,
+    )
+
+    def made(seen: mcsim.ScanModel) -> NDArray[np.float64]:
+        both = (tod.samples(m, pointing.line, MapGrid(16, "ecliptic")) for m in (model, seen))
+        stream = (replace(there, pixel=here.pixel) for here, there in zip(*both, strict=True))
+        return tod.bin_samples(observe(stream), 16)[0]
+
+    found = mcsim.compare([made(model)], [made(later)], run)
+    assert names(found) == ["time_shift"]
+    assert found.channels[0].differences[0].amplitude == pytest.approx(0.5, rel=0.01)
+
+
 def test_two_differences_are_both_named(simulator, side_a):
     side_b = scaled(simulator(psi=lambda p: p + np.pi / 2), 1.002)
     found = mcsim.compare(side_a, side_b, simulator.run)
     assert found.verdict == "mixture"
     assert sorted(names(found)) == ["calibration", "psi_offset"]
+    sets = [frozenset(d.name for d in one) for one in found.channels[0].alternatives]
+    assert sets == [{"calibration", "beam_turned"}], "one set, in one order"
 
 
 def test_an_effect_of_the_library_is_named(simulator, side_a):
