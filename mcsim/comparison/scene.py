@@ -178,6 +178,7 @@ def sky_in(maps: Maps, seen: NDArray[np.bool_], empty: Scene, iterations: int = 
     inverse = np.divide(1.0, factor, out=np.zeros_like(factor), where=factor > WEAKEST * factor.max())
     count = np.maximum(seen.sum(axis=0), 1)
     holes = ~seen.any(axis=0)
+    lmax = min(empty.lmax, 3 * empty.nside - 1)  # no map shows more
     sky = np.zeros(alm_.size(empty.lmax), dtype=np.complex128)
     smooth = np.zeros(maps.shape[1])
     scene = empty
@@ -185,8 +186,8 @@ def sky_in(maps: Maps, seen: NDArray[np.bool_], empty: Scene, iterations: int = 
         extra = scene.maps() - smooth if sky.any() else np.zeros_like(maps)
         mean = np.where(seen, maps - extra, 0.0).sum(axis=0) / count
         whole = np.where(holes, smooth, mean)
-        found = healpix.analysis(whole, empty.lmax, iterations=3, nthreads=empty.nthreads)
-        sky = alm_.multiply(found, inverse, empty.lmax)
+        found = healpix.analysis(whole, lmax, iterations=3, nthreads=empty.nthreads)
+        sky = alm_.multiply(alm_.resize(found, lmax, empty.lmax), inverse, empty.lmax)
         scene = replace(empty, sky=sky)
         smooth = scene._transforms.circular
     return sky
