@@ -30,6 +30,8 @@ from refusals import refused
 
 NAMES = [
     "Beam",
+    "ComparisonResult",
+    "DiagnosisSettings",
     "Effect",
     "InputError",
     "Moments",
@@ -37,6 +39,7 @@ NAMES = [
     "ScanModel",
     "__version__",
     "biposh",
+    "compare",
     "diagnose",
     "effects",
     "fit",
