@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from mcsim.beamfit.api import fit
     from mcsim.bipolar.dataset import biposh
     from mcsim.comparison.api import compare
-    from mcsim.comparison.result import ComparisonResult
     from mcsim.config import RunConfig
     from mcsim.config import load as load_config
     from mcsim.diagnosis.api import diagnose
@@ -40,7 +39,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Beam",
-    "ComparisonResult",
     "DiagnosisSettings",
     "Effect",
     "InputError",
@@ -65,7 +63,6 @@ __all__ = [
 
 _HOME = {
     "Beam": "mcsim.instrument.beams",
-    "ComparisonResult": "mcsim.comparison.result",
     "DiagnosisSettings": "mcsim.diagnosis.settings",
     "Effect": "mcsim.systematics",
     "InputError": "mcsim.errors",

@@ -165,6 +165,8 @@ def scene_of(channel: Channel, sky: Alm, nthreads: int) -> Scene:
 def sky_in(maps: Maps, seen: NDArray[np.bool_], empty: Scene, iterations: int = 3) -> Alm:
     """Return the sky that a channel's maps show: their mean, with beam and pixel window divided out.
 
+    What a map of that nside cannot hold, above l = 3 nside - 1, is zero.
+
     Parameters
     ----------
     maps, seen
@@ -178,7 +180,6 @@ def sky_in(maps: Maps, seen: NDArray[np.bool_], empty: Scene, iterations: int = 
     inverse = np.divide(1.0, factor, out=np.zeros_like(factor), where=factor > WEAKEST * factor.max())
     count = np.maximum(seen.sum(axis=0), 1)
     holes = ~seen.any(axis=0)
-    lmax = min(empty.lmax, 3 * empty.nside - 1)  # no map shows more
     sky = np.zeros(alm_.size(empty.lmax), dtype=np.complex128)
     smooth = np.zeros(maps.shape[1])
     scene = empty
@@ -186,8 +187,9 @@ def sky_in(maps: Maps, seen: NDArray[np.bool_], empty: Scene, iterations: int = 
         extra = scene.maps() - smooth if sky.any() else np.zeros_like(maps)
         mean = np.where(seen, maps - extra, 0.0).sum(axis=0) / count
         whole = np.where(holes, smooth, mean)
-        found = healpix.analysis(whole, lmax, iterations=3, nthreads=empty.nthreads)
-        sky = alm_.multiply(alm_.resize(found, lmax, empty.lmax), inverse, empty.lmax)
+        shown = min(empty.lmax, 3 * empty.nside - 1)
+        found = healpix.analysis(whole, shown, iterations=3, nthreads=empty.nthreads)
+        sky = alm_.multiply(alm_.resize(found, shown, empty.lmax), inverse, empty.lmax)
         scene = replace(empty, sky=sky)
         smooth = scene._transforms.circular
     return sky

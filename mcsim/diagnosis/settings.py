@@ -24,6 +24,8 @@ class DiagnosisSettings:
         most significant further effect above the second. High levels lose true sets; low ones miss unknown effects.
     max_effects
         Largest number of effects that act together.
+    named_probability
+        Posterior probability below which the accepted sets of a faint gap are not named.
     odds_cut
         Explanations that are less probable than the best by this factor are left out.
     template_error
@@ -124,6 +126,7 @@ class DiagnosisSettings:
     residual_level: float = 0.02
     further_level: float = 0.005
     max_effects: int = 3
+    named_probability: float = 0.5
     odds_cut: float = 100.0
     template_error: float = 0.01
     prior_snr: tuple[float, ...] = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0, 512.0, 1024.0)

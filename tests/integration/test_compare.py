@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 import mcsim
 from mcsim import config
 from mcsim.cli import app
+from mcsim.comparison.result import ComparisonResult
 from mcsim.ensemble.maps import write_map
 from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.simulation import simulate, tod
@@ -82,7 +83,7 @@ def side_a(simulator: Simulator) -> Maps:
     return simulator()
 
 
-def names(found: mcsim.ComparisonResult) -> list[str]:
+def names(found: ComparisonResult) -> list[str]:
     return [d.name for channel in found.channels for d in channel.differences]
 
 

@@ -30,7 +30,6 @@ from refusals import refused
 
 NAMES = [
     "Beam",
-    "ComparisonResult",
     "DiagnosisSettings",
     "Effect",
     "InputError",
