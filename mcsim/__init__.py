@@ -7,8 +7,8 @@ order.
 
 Ensembles: `run`, `merge`, `open_ensemble`, `open_summary`; configurations: `load_config`, `RunConfig`.
 Instrument: `Beam`, `ScanModel`, `Moments`, and what they make of one sky: `observe`.
-Statistics: `biposh` of maps at hand, `predict` of a run, `fit` of an effective beam, `diagnose` of maps, `compare`
-of two simulations.
+Statistics: `biposh` of maps at hand, `predict` of a run, `fit` of an effective beam, `diagnose` of maps with
+`DiagnosisSettings`, `compare` of two simulations.
 Systematic effects: `effects`, and `Effect` to write one. Bad input raises `InputError`.
 
 Names are loaded when they are first used, so that ``import mcsim`` costs little.
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from mcsim.config import RunConfig
     from mcsim.config import load as load_config
     from mcsim.diagnosis.api import diagnose
+    from mcsim.diagnosis.settings import DiagnosisSettings
     from mcsim.ensemble.maps import write_maps
     from mcsim.ensemble.opening import open_ensemble, open_summary
     from mcsim.ensemble.prediction import predict
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Beam",
+    "DiagnosisSettings",
     "Effect",
     "InputError",
     "Moments",
@@ -61,6 +63,7 @@ __all__ = [
 
 _HOME = {
     "Beam": "mcsim.instrument.beams",
+    "DiagnosisSettings": "mcsim.diagnosis.settings",
     "Effect": "mcsim.systematics",
     "InputError": "mcsim.errors",
     "Moments": "mcsim.instrument.scan",

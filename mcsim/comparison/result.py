@@ -121,6 +121,15 @@ class ComparisonResult:
         Name.
     channels
         One result for every channel.
+
+    Examples
+    --------
+    >>> import mcsim
+    >>> run = mcsim.load_config("tiny")
+    >>> [here] = mcsim.write_maps(run, "compare-same", realizations=0)
+    >>> found = mcsim.compare(here, here, run)
+    >>> found.verdict, found.accuracy, len(found.channels)
+    ('identical', 0.0, 1)
     """
 
     case: str

@@ -56,8 +56,8 @@ def diagnose(
     case
         Name; default: that of the run.
     settings
-        Effects that are no candidates, levels, cuts, bins and numbers of simulations; default: those of
-        :class:`~mcsim.diagnosis.settings.DiagnosisSettings`.
+        Library of effects, those that are no candidates, levels, cuts, bins and numbers of simulations; default:
+        those of :class:`~mcsim.diagnosis.settings.DiagnosisSettings`.
     quiet
         Report no progress.
 
@@ -73,9 +73,10 @@ def diagnose(
     """
     run = model if isinstance(model, config.RunConfig) else config.load(model)
     settings = settings or DiagnosisSettings()
-    settings = replace(settings, without=tuple(settings.without))
+    library = systematics.catalogue() if settings.library is None else systematics.checked(settings.library)
+    settings = replace(settings, without=tuple(settings.without), library=None)
     for effect in settings.without:
-        systematics.get(effect)
+        systematics.get(effect, library)
     if output is not None:
         folders.writable(Path(output))
     threads = os.cpu_count() or 1
@@ -83,9 +84,9 @@ def diagnose(
     table = read_spectra(data, run) if isinstance(data, str | Path) and Path(data).is_file() else None
     if table is not None:
         run, task = measured_spectra.estimator_for(run, table), table
-        analysis = measured_spectra.analysis_of_spectra(run, table, settings.without, threads, settings)
+        analysis = measured_spectra.analysis_of_spectra(run, table, settings.without, threads, settings, library)
     else:
-        analysis = analysis_of(run, settings.without, threads, settings)
+        analysis = analysis_of(run, settings.without, threads, settings, library)
         maps = read_maps(analysis.model, data) if isinstance(data, str | Path) else checked(analysis.model, data)
     with batch(run.compute.workers) as call:
         with asking(call, quiet, task, "simulations of the model and of each effect") as ask:

@@ -2,7 +2,7 @@
 
 from mcsim.systematics.base import Alm, Draw, Effect, Map, Pointing, Site, Wording, looked_at, seen_through, spread_of
 from mcsim.systematics.parametrization import Parametrization
-from mcsim.systematics.registry import Library, basis_of, build, catalogue, effects, get
+from mcsim.systematics.registry import Library, basis_of, build, catalogue, checked, effects, get
 
 __all__ = [
     "Alm",
@@ -17,6 +17,7 @@ __all__ = [
     "basis_of",
     "build",
     "catalogue",
+    "checked",
     "effects",
     "get",
     "looked_at",

@@ -57,6 +57,19 @@ def catalogue() -> Library:
     return MappingProxyType(found)
 
 
+def checked(library: Library) -> Library:
+    """Return a library as it was given; raise InputError if one of its effects is none, or bears another name."""
+    for name, kind in library.items():
+        if not (isinstance(kind, type) and issubclass(kind, Effect)):
+            raise InputError(f"effect {name} of the library is {kind!r}; give a class derived from mcsim.Effect.")
+        flaw = _flaw(kind)
+        if flaw is None and kind.name != name:
+            flaw = f"calls itself {kind.name}"
+        if flaw is not None:
+            raise InputError(f"effect {name} of the library {flaw}; mend or leave it out.")
+    return library
+
+
 def _flaw(kind: type[Effect]) -> str | None:
     """Say what keeps a class from being a whole effect; None: nothing."""
     own = {key for key, text in vars(kind).get("__annotations__", {}).items() if "ClassVar" not in str(text)}

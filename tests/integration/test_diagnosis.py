@@ -11,7 +11,7 @@ from scipy.stats import kstest
 
 import mcsim
 from mcsim import config, systematics
-from mcsim.diagnosis import campaign, localisation
+from mcsim.diagnosis import api, campaign, localisation
 from mcsim.diagnosis.analysis import analysis_of, data_vectors
 from mcsim.diagnosis.campaign import with_effects
 from mcsim.diagnosis.context import context
@@ -23,6 +23,7 @@ from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
 from mcsim.stats.look_elsewhere import global_test
+from mcsim.systematics import Parametrization
 from refusals import refused
 
 PROPOSED = ("beam_ellipticity", "pointing_offset", "noise_level", "dipole_modulation")
@@ -43,6 +44,14 @@ MODEL = {
         for name, frequency, line in (("V1", 61.0, "A"), ("W1", 94.0, "B"))
     ],
 }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Louder(systematics.get("noise_level")):
+    """An effect that is in no catalogue."""
+
+    name = "louder"
+    parametrization = Parametrization()
 
 
 def ask(jobs):
@@ -258,13 +267,6 @@ def test_orders_are_proposed_where_a_run_leaves_some_out(small):
 
 
 def test_the_library_is_an_argument_that_workers_share(small):
-    quiet = systematics.get("noise_level")
-
-    @dataclass(frozen=True, kw_only=True)
-    class Louder(quiet):
-        name = "louder"
-        parametrization = replace(quiet.parametrization, matched_filter=True)
-
     analysis = analysis_of(small.run, library={"louder": Louder})
     assert {candidate.identity for candidate in analysis.candidates} == {("louder", "V1"), ("louder", "W1")}
     run = with_effects(small.run, [config.Effect(name="louder", channel="W1", parameters={"amplitude": 0.5})])
@@ -272,6 +274,29 @@ def test_the_library_is_an_argument_that_workers_share(small):
     assert rows[0].shape == (len(analysis.elements),)
     matched = [element.candidate == "louder" and element.channels == ("W1",) for element in analysis.elements]
     assert rows[1][matched] > rows[0][matched]
+
+
+def test_a_diagnosis_knows_the_library_that_it_is_given(small, tmp_path, monkeypatch):
+    """And names an effect that is in no catalogue; ``without`` is read in that library too."""
+    monkeypatch.setenv("MCSIM_CACHE", str(tmp_path))
+    monkeypatch.setattr(api, "batch", lambda workers: campaign.batch(0))  # in this process
+    run = small.run
+    louder = config.Effect(name="louder", channel="W1", parameters={"amplitude": 0.2})
+    seeded = replace(run, ensemble=replace(run.ensemble, seed=77))
+    maps = list(simulate.maps(survey(with_effects(seeded, [louder]), library={"louder": Louder}), 0))
+    settings = DiagnosisSettings(library={"louder": Louder}, simulations=320)
+    found = mcsim.diagnose(run, maps, tmp_path / "out", settings=settings)
+    assert {(one.name, one.channel) for one in found.candidates} == {("louder", "V1"), ("louder", "W1")}
+    assert found.to_json()["verdict"] == "effect"
+    assert [(one["name"], one["channel"]) for one in found.to_json()["effects"]] == [("louder", "W1")]
+    assert type(found).open(tmp_path / "out").settings == found.settings
+    for changes, named in (
+        ({"without": ("noise_level",)}, ("noise_level",)),
+        ({"library": {"other": Louder}}, ("other", "louder")),
+        ({"library": {"louder": "louder"}}, ("louder", "mcsim.Effect")),
+    ):
+        with refused(*named):
+            mcsim.diagnose(run, maps, settings=replace(settings, **changes))
 
 
 def test_columns_and_matched_filters_know_their_candidate(small):

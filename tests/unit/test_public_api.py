@@ -30,6 +30,7 @@ from refusals import refused
 
 NAMES = [
     "Beam",
+    "DiagnosisSettings",
     "Effect",
     "InputError",
     "Moments",

@@ -125,7 +125,7 @@ def phase(pid: int, traces: Path) -> str:
         time.sleep(0.0002)
     text = trace.read_text()[before:]
     found = {line.split(" in ")[-1] for line in text.splitlines() if "/mcsim/" in line}
-    written = [line for line in text.splitlines() if "mcsim/store.py" in line and line.endswith(" in write")]
+    written = [line for line in text.splitlines() if store.__file__ in line and line.endswith(" in write")]
     if written:
         number = int(written[0].split("line ")[1].split()[0])
         line = Path(store.__file__).read_text().splitlines()[number - 1]

@@ -133,7 +133,7 @@ def noise_biposh(modes: Sequence[Indices], variance: NDArray[np.complex128], lma
     -----
     A^{LM}_{l1 l2} = v_LM sqrt((2 l1+1)(2 l2+1)/(4pi (2L+1))) C^{L0}_{l1 0 l2 0}: in the Bennett normalisation
     v_LM/sqrt(4pi), for every l. It follows from int Y* Y V, without the convolution
-    (tests/unit/test_predict_cmb_biposh.py compares with an explicit sum).
+    (tests/unit/test_predict_biposh.py compares with an explicit sum).
     """
     check_modes(modes)
     check_whole(lmax, "lmax")
