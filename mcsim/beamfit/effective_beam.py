@@ -14,6 +14,7 @@ from mcsim.beamfit.likelihood import Comparison, Solution, compare, size, solve,
 from mcsim.beamfit.models import Model, model
 from mcsim.beamfit.table import read_table
 from mcsim.beamfit.templates import ORDERS, Order, Polynomial, Templates, templates
+from mcsim.config.preparation import frame_of
 from mcsim.ensemble import store
 from mcsim.ensemble.expectation import Source, survey_of
 from mcsim.errors import InputError
@@ -278,7 +279,7 @@ def measurement(
     """
     if isinstance(data, Measurement):
         return data
-    path, frame = Path(data), survey_of(source).config.map.frame
+    path, frame = Path(data), survey_of(source).frame
     if path.is_dir():
         measured = from_store(path, selection)
         _check_frame(path, frame)
@@ -288,7 +289,7 @@ def measurement(
 
 
 def _check_frame(path: Path, frame: str) -> None:
-    found = store.attributes(path)["configuration"]["map"]["frame"]
+    found = frame_of(store.attributes(path)["configuration"])
     if found != frame:
         raise InputError(f"{path} is in the {found} frame, the configuration in the {frame} one; rotate one of them.")
 

@@ -145,7 +145,7 @@ def make_case(settings: Settings, folder: str, truth: Truth) -> None:
         write_key(target, truth)
     with appearing(target / MAPS / case) as scratch:
         for name, map_uk in maps_of(settings.model, truth, settings.out_of_library):
-            _write_map(scratch / f"{name.replace(':', '_')}.fits", map_uk, settings.model.map.frame)
+            _write_map(scratch / f"{name.replace(':', '_')}.fits", map_uk, config.prepared_grid(settings.model)[1])
         plain = {**config.to_dict(settings.model), "name": case}
         (scratch / "model.toml").write_text(tomli_w.dumps(_without_none(plain)), encoding="utf-8")
         (scratch / "question.json").write_text(json.dumps({"without": list(truth.without)}) + "\n")

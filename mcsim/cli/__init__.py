@@ -51,7 +51,15 @@ def _options(
     """Tell whether a measured isotropy violation is made by the instrument."""
 
 
-for _command in (ensembles.run, ensembles.merge, ensembles.info, ensembles.plot, ensembles.predict, ensembles.maps):
+for _command in (
+    ensembles.run,
+    ensembles.merge,
+    ensembles.info,
+    ensembles.plot,
+    ensembles.predict,
+    ensembles.maps,
+    ensembles.prepare,
+):
     app.command()(_command)
 
 
@@ -155,11 +163,19 @@ def diagnose(
     without: Annotated[list[str] | None, typer.Option(metavar="EFFECT", help="Do not propose it; repeatable.")] = None,
     simulations: Simulations = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Local processes; default: the configuration's.")] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say simulations, memory and time; simulate none.")
+    ] = False,
 ) -> None:
     """Test maps against a model, and find the effect that the model lacks: where, how large, and if adding it helps."""
     from mcsim.diagnosis.api import diagnose as judge
     from mcsim.diagnosis.words import summary
 
+    if dry_run:
+        from mcsim.diagnosis.api import describe
+
+        out.print(describe(model, without or (), simulations, workers), markup=False)
+        return
     interrupt_once()
     found = judge(
         model,

@@ -173,6 +173,20 @@ def maps(
     out.print(f"wrote maps of {len(found)} realization{'' if len(found) == 1 else 's'} to {folder}", markup=False)
 
 
+def prepare(
+    config: Config,
+    maps: Annotated[
+        list[str], typer.Argument(metavar="MAP...", help="CHANNEL.fits or CHANNEL_SPLIT.fits, or NAME=FILE.")
+    ],
+    folder: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to fill; nothing is replaced.")],
+) -> None:
+    """Prepare observed maps as CONFIG prepares its simulated maps, by the steps of [[preparation]]."""
+    from mcsim.ensemble.prepare import prepare_files
+
+    for path in prepare_files(config, maps, folder):
+        out.print(f"wrote {path}", markup=False)
+
+
 def _slice(text: str | None) -> slice | None:
     if text is None:
         return None

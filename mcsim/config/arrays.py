@@ -16,7 +16,7 @@ import numpy as np
 from mcsim.errors import InputError
 from mcsim.support import folders
 
-TEMPLATES = {"alm", "map", "mask", "path", "model"}
+TEMPLATES = {"alm", "map", "mask", "path", "model", "window", "own_window", "templates"}
 """Keys that name files and may contain placeholders such as {channel}."""
 
 FILES = TEMPLATES | {"spectrum", "pixel_window", "template"}
@@ -49,7 +49,7 @@ def in_files(value: Any, key: str = "") -> Any:
     if isinstance(value, Mapping):
         return {name: in_files(item, name) for name, item in value.items()}
     if isinstance(value, list | tuple):
-        return [in_files(item) for item in value]
+        return [in_files(item, key) for item in value]
     if isinstance(value, Tabled):
         table = table_of(value)
         return table.popitem()[1] if key in FILES else table

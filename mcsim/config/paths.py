@@ -38,6 +38,10 @@ _RULES = {
     "scan.path": _Rule(placeholders=("channel", "split")),
     "scan.model": _Rule(packaged="scan_models", placeholders=("channel", "split")),
     "effect.template": _Rule(),
+    "preparation.mask": _Rule(placeholders=("channel", "split")),
+    "preparation.window": _Rule(placeholders=("channel",)),
+    "preparation.own_window": _Rule(placeholders=("channel",)),
+    "preparation.templates": _Rule(placeholders=("channel",)),
 }
 
 
@@ -45,8 +49,8 @@ class Entry(NamedTuple):
     """One key that names a file (or a family of files) in the plain dict of a run."""
 
     key: str  # as in messages: channel[W1].beam.path
-    holder: dict[str, Any]  # the table that contains it
-    field: str  # its name in that table
+    holder: Any  # the table, or list, that contains it
+    field: str | int  # its name or place there
     rule: _Rule
     channels: tuple[str, ...]  # channels that it applies to
 
@@ -80,6 +84,11 @@ def entries(plain: dict[str, Any]) -> Iterator[Entry]:
     effects = plain.get("effect")
     for number, table in enumerate(effects if isinstance(effects, list) else []):
         sections.append(("effect", f"effect[{number}]", table, every))
+    steps = plain.get("preparation")
+    for number, table in enumerate(steps if isinstance(steps, list) else []):
+        own = table.get("channels") if isinstance(table, dict) else None
+        names = tuple(map(str, own)) if isinstance(own, list) and own else every
+        sections.append(("preparation", f"preparation[{number}]", table, names))
     for section, where, holder, speaks_of in sections:
         for path, rule in _RULES.items():
             table_name, field = path.split(".")
@@ -87,6 +96,9 @@ def entries(plain: dict[str, Any]) -> Iterator[Entry]:
                 value = holder.get(field)
                 if isinstance(value, str) and value.strip() and value not in rule.words:
                     yield Entry(f"{where}.{field}", holder, field, rule, speaks_of)
+                for place, item in enumerate(value if isinstance(value, list) else []):
+                    if isinstance(item, str) and item.strip():
+                        yield Entry(f"{where}.{field}[{place}]", value, place, rule, speaks_of)
 
 
 def make_absolute(plain: dict[str, Any], base: Path, where: str) -> None:

@@ -8,7 +8,6 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     AfterValidator,
-    ConfigDict,
     Field,
     GetCoreSchemaHandler,
     model_validator,
@@ -16,7 +15,8 @@ from pydantic import (
 from pydantic.dataclasses import dataclass
 from pydantic_core import core_schema
 
-from mcsim.config import arrays
+from mcsim.config import arrays, values
+from mcsim.config.preparation import Step, check_steps
 from mcsim.config.values import (
     NSIDE_MAX,
     BeamOrder,
@@ -30,7 +30,7 @@ from mcsim.config.values import (
     unique,
 )
 
-_STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, validate_by_name=True, validate_by_alias=True)
+_STRICT = values.STRICT
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -334,8 +334,9 @@ class RunConfig:
         The skies, and the pixels and frame of the maps.
     channels
         Beams under scans; in TOML the tables ``[[channel]]``.
-    effects
-        Changes of the simulation, such as :func:`mcsim.effects` lists; in TOML the tables ``[[effect]]``.
+    effects, preparation
+        Changes of the simulation, such as :func:`mcsim.effects` lists, and of its maps before the analysis; in TOML
+        the tables ``[[effect]]`` and ``[[preparation]]``.
     biposh, ensemble, compute
         Settings of the estimator, of the realizations and seed, and of the computation.
 
@@ -356,13 +357,15 @@ class RunConfig:
     map: Map
     channels: Annotated[tuple[Channel, ...], Field(alias="channel", min_length=1)]
     effects: Annotated[tuple[Effect, ...], Field(alias="effect")] = ()
+    preparation: tuple[Step, ...] = ()
     biposh: Biposh = Biposh()
     ensemble: Ensemble = Ensemble()
     compute: Compute = Compute()
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        limit = 3 * self.map.resolution - 1
+        names = [channel.name for channel in self.channels]
+        limit, of = check_steps(self.preparation, self.map.resolution, self.map.frame, names)
         lmax = analysis_lmax(self)
         key = "biposh.lmax" if self.biposh.lmax is not None else "biposh.lmax (by default sky.lmax)"
         if lmax > self.sky.lmax:
@@ -371,16 +374,15 @@ class RunConfig:
             _check_rings(self)
         elif lmax > limit:
             raise ValueError(
-                f"{key} = {lmax} is above 3 nside - 1 = {limit} of map.nside = {self.map.nside}; "
+                f"{key} = {lmax} is above 3 nside - 1 = {limit} of {of}; "
                 f"set biposh.lmax to at most {limit} or raise nside"
             )
         if self.biposh.L_max > lmax:
             raise ValueError(f"biposh.L_max = {self.biposh.L_max} is above the lmax of the analysis, {lmax}; lower it")
         try:
-            different([channel.name for channel in self.channels])
+            different(names)
         except ValueError as error:
             raise ValueError(f"channel {error}") from None
-        names = [channel.name for channel in self.channels]
         for effect in self.effects:
             if effect.channel is not None and effect.channel not in names:
                 raise ValueError(
@@ -391,10 +393,8 @@ class RunConfig:
             for key in ("beam", "beam_b"):
                 m_max = getattr(getattr(channel, key), "m_max", None)
                 if m_max is not None and m_max > self.sky.lmax:
-                    raise ValueError(
-                        f"channel[{channel.name}].{key}.m_max = {m_max} is above sky.lmax = {self.sky.lmax}; "
-                        "lower m_max"
-                    )
+                    where = f"channel[{channel.name}].{key}.m_max = {m_max}"
+                    raise ValueError(f"{where} is above sky.lmax = {self.sky.lmax}; lower m_max")
         return self
 
 
@@ -420,6 +420,7 @@ def _check_rings(run: RunConfig) -> None:
             )
     for key, given in (
         ("ensemble.keep_maps = true", run.ensemble.keep_maps),
+        ("[[preparation]]", bool(run.preparation)),
         ('biposh.weighting = "hits"', run.biposh.weighting == "hits"),
         (f"biposh.iterations = {run.biposh.iterations}", run.biposh.iterations > 0),
     ):

@@ -7,12 +7,14 @@ sentence.
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationInfo
 
 from mcsim.config import arrays
 
 NSIDE_MAX = 8192
 LMAX_MAX = 32768
+
+STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, validate_by_name=True, validate_by_alias=True)
 
 
 def power_of_two(value: int) -> int:

@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,9 @@ from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.spectra import read_spectra
 from mcsim.diagnosis.templates import TemplateBank
+from mcsim.ensemble.plan import cost
 from mcsim.errors import InputError
+from mcsim.simulation import power
 from mcsim.support import folders
 from mcsim.support.code import class_digest, package_digest
 
@@ -94,6 +96,9 @@ def diagnose(
         analysis = measured_spectra.analysis_of_spectra(run, table, without, threads, settings)
     else:
         analysis = analysis_of(run, without, threads, settings)
+    power.check(analysis.model.survey)
+    maps: Sequence[NDArray[np.float64]] = ()
+    if table is None:
         maps = read_maps(analysis.model, data) if isinstance(data, str | Path) else checked(analysis.model, data)
     with batch(run.compute.workers if workers is None else workers) as call:
         with asking(call, quiet, task, "simulations of the model and of each effect") as ask:
@@ -107,10 +112,41 @@ def diagnose(
             else:
                 found = ObservedMaps(known, maps, ask)
             diagnosis = diagnose_data(found, case or run.name)
+    if table is None:
+        diagnosis = replace(diagnosis, warnings=_warnings(analysis))
     if output is not None:
         diagnosis.save(output)
         report.write(diagnosis, Path(output) / "report.html")
     return diagnosis
+
+
+def describe(
+    model: str | Path | Mapping[str, Any] | config.RunConfig,
+    without: Sequence[str] = (),
+    simulations: int | None = None,
+    workers: int | None = None,
+) -> str:
+    """Return a text on the cost of a diagnosis of maps: simulations, memory, time, and that of preparing the maps."""
+    run = model if isinstance(model, config.RunConfig) else config.load(model)
+    analysis = analysis_of(run, without, os.cpu_count() or 1)
+    power.check(analysis.model.survey)
+    count = sum(job.count for job in campaign.plan(run, analysis, simulations).jobs)
+    each, processes = cost(run, range(count)), workers or run.compute.workers
+    hours = count * each.seconds_per_realization / 3600.0
+    lines = [
+        f"{run.name}: at most {count} simulations before data, for a data vector of {len(analysis.elements)}",
+        f"  memory  {each.worker_bytes / 1e9:.2f} GB per worker, {processes} workers",
+        *([f"  prepare {each.preparation}"] if each.preparation else []),
+        f"  time    {each.seconds_per_realization:.3g} s per simulation and core, {hours:.3g} core-hours,"
+        f" {60.0 * hours / processes:.3g} minutes with {processes} workers on as many idle cores",
+    ]
+    return "\n".join(lines)
+
+
+def _warnings(analysis: Analysis) -> tuple[str, ...]:
+    """Return a sentence on sky power that maps of a real sky hold and the simulations lack, if there is any."""
+    found = power.neglected(analysis.model.survey)
+    return () if found is None else (f"{found} Simulated data whose own sky ends there are not concerned.",)
 
 
 def prepared(

@@ -125,7 +125,7 @@ def result_of(
         residual_range=None
         if findings.residual_maps is None
         else np.quantile(ensemble.residual_rms, [0.025, 0.975], axis=0).T,
-        frame=model.survey.config.map.frame,
+        frame=model.survey.frame,
         notes=tuple(findings.notes),
         settings=context.settings,
         provenance={

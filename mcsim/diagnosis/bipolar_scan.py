@@ -55,7 +55,7 @@ class BipolarScan:
     @cached_property
     def _layout(self) -> tuple[tuple[Element, Pick], ...]:
         """Return the numbers, each with the array, row, range and part that it is taken from."""
-        frame = self.model.survey.config.map.frame
+        frame = self.model.survey.frame
         found: list[tuple[Element, Pick]] = []
         for key, element in self._sources:
             for view in FRAMES:
@@ -90,7 +90,7 @@ class BipolarScan:
         return tuple(found)
 
     def _coefficients(self, filtered: FilteredMaps) -> dict[tuple[str, str], NDArray[np.complex128]]:
-        lmax, frame = self.model.lmax, self.model.survey.config.map.frame
+        lmax, frame = self.model.lmax, self.model.survey.frame
         inverse = np.divide(1.0, self.model.cl, out=np.zeros(lmax + 1), where=self.model.cl > 0)
         modes = [(mode.L, mode.M, mode.d) for mode in self.tables.modes]
         found = {}
@@ -111,7 +111,7 @@ class BipolarScan:
 
     @cached_property
     def _power_elements(self) -> tuple[Element, ...]:
-        frame = self.model.survey.config.map.frame
+        frame = self.model.survey.frame
         elements = []
         for a, b in combinations_with_replacement(range(len(self.model.parts)), 2):
             names = [self.model.parts[i].name.partition(":") for i in (a, b)]

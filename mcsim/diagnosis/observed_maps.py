@@ -170,7 +170,7 @@ def _read(model: Model, part: int, path: Path) -> Map:
             f"{path} does not exist; the model has a map {model.parts[part].name}, give it under that name."
         )
     map_, frame, unit = healpix.read_map(path)
-    expected = model.survey.config.map.frame
+    expected = model.survey.frame
     if frame not in (None, expected):
         raise InputError(f"{path} is in {frame} coordinates, the model in {expected}; rotate the map.")
     frequency = model.survey.channels[model.parts[part].channel].site.frequency_ghz

@@ -224,6 +224,8 @@ class DiagnosisResult:
         Settings of the diagnosis; numbers of simulations, the seed and the data, by name.
     configuration
         The run that is the model, as JSON.
+    warnings
+        What makes the verdict unreliable if the data are what they seem, first of all.
     """
 
     case: str
@@ -254,6 +256,7 @@ class DiagnosisResult:
     settings: DiagnosisSettings
     provenance: dict[str, Any]
     configuration: str
+    warnings: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> dict[str, Any]:
@@ -315,6 +318,7 @@ class DiagnosisResult:
                 if one.detectable is not None
             ],
             "notes": list(self.notes),
+            **({"warnings": list(self.warnings)} if self.warnings else {}),
         }
 
     def to_dataset(self) -> xr.Dataset:

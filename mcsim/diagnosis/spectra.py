@@ -186,7 +186,7 @@ def _mode(path: str | Path, line: Any, scaling: Scaling) -> Mode:
 
 
 def _frame(path: str | Path, meta: Any, run: config.RunConfig, needed: bool) -> str:
-    frame = run.map.frame
+    frame = config.prepared_grid(run)[1]
     found = str(meta.get("frame", "" if needed else frame)).lower()
     if not found:
         raise InputError(f'{path} does not say its frame; add frame: "{frame}" to its meta, if that is the one.')

@@ -132,7 +132,7 @@ def _label(model: Model, part: int) -> tuple[str, str | None]:
 
 
 def _frame(model: Model) -> str:
-    return model.survey.config.map.frame
+    return model.survey.frame
 
 
 def _beam_block(model: Model, part: int) -> Block:

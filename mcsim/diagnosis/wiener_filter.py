@@ -134,7 +134,7 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
         raise InputError("a diagnosis needs the spectrum of the sky; give sky.spectrum.")
     if survey.config.map.grid == "gl":
         raise InputError('a diagnosis compares maps of pixels; give the model map.grid = "healpix" and map.nside.')
-    lmax, nside = survey.lmax, survey.config.map.resolution
+    lmax, nside = survey.lmax, survey.nside
     cl = survey.cl[: lmax + 1]
     response = np.stack([_response(channel, lmax) for channel in survey.channels])
     parts = []

@@ -151,6 +151,7 @@ def apart(result: DiagnosisResult, one: ContrastResult) -> str:
 def summary(result: DiagnosisResult, folder: Path) -> list[str]:
     """Return a summary for the command line, about ten lines."""
     rows = [
+        *(("warning", warning) for warning in result.warnings),
         ("case", result.case),
         ("tested", tested(result)),
         ("global test", chi2(result)),

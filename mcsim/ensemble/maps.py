@@ -94,7 +94,7 @@ def write_maps(
             try:
                 with appearing(target) as scratch:
                     for name, map_uk in made:
-                        write_map(scratch / names[name], map_uk, run.map.frame, [*header, ("REALIZ", r)])
+                        write_map(scratch / names[name], map_uk, shared.frame, [*header, ("REALIZ", r)])
             except OSError as error:
                 reason = error.strerror or str(error)
                 raise InputError(f"{target} cannot be written ({reason}); choose another folder with -o.") from error

@@ -12,11 +12,13 @@ import numpy as np
 from mcsim import config
 from mcsim.bipolar import Mode, estimate, estimator, modes
 from mcsim.bipolar.dataset import CONVENTION, NORMALISATION
+from mcsim.config.preparation import frame_of
 from mcsim.ensemble import opening, store, summary
 from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError
 from mcsim.simulation import differencing
 from mcsim.simulation.channels import check_effects, load_beam
+from mcsim.simulation.preparation import preparation
 from mcsim.simulation.survey import Survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rng, spectra
@@ -85,8 +87,8 @@ def layout(survey: Survey) -> Layout:
         survey.estimator.modes,
         survey.lmax,
         run.ensemble.paired,
-        12 * run.map.resolution**2 if run.ensemble.keep_maps else None,
-        frame=run.map.frame,
+        12 * survey.nside**2 if run.ensemble.keep_maps else None,
+        frame=survey.frame,
     )
     return _chunked(bare, run.compute.chunk)
 
@@ -181,7 +183,7 @@ def stored(path: Path, realizations: int) -> tuple[Layout, summary.Recipe]:
             Mode(int(L), int(M), int(d)) for L, M, d in zip(found["L"], found["M"], found["d"], strict=True)
         )
     layout = Layout(
-        realizations, store.chunk(path), maps, pairs, stored_modes, lmax, paired, kept, frame=attrs["map"]["frame"]
+        realizations, store.chunk(path), maps, pairs, stored_modes, lmax, paired, kept, frame=frame_of(attrs)
     )
     return layout, summary.Recipe(pairs, stored_modes, lmax, attrs["biposh"]["summary_bin"], paired)
 
@@ -198,6 +200,7 @@ def describe(source: str | Path, part: slice | None = None, workers: int | None 
             f"{run.name}: {planned.realizations} realizations in {planned.tasks} tasks",
             f"  memory  {planned.worker_bytes / 1e9:.2f} GB per worker, {count} workers",
             f"  disk    {planned.store_bytes / 1e6:.1f} MB in about {planned.files} files",
+            *([f"  prepare {planned.preparation}"] if planned.preparation else []),
             f"  time    {planned.seconds_per_realization:.3g} s per realization and core, {hours:.3g} core-hours,"
             f" {60.0 * hours / count:.3g} minutes with {count} workers on as many idle cores",
         ]
@@ -206,7 +209,7 @@ def describe(source: str | Path, part: slice | None = None, workers: int | None 
 
 @dataclass(frozen=True)
 class Cost:
-    """Cost of a run: realizations, tasks, worker memory, disk, files, and processor time of the transforms."""
+    """Cost of a run: realizations, tasks, worker memory, disk, files and processor time; of preparing, in words."""
 
     realizations: int
     tasks: int
@@ -214,6 +217,7 @@ class Cost:
     store_bytes: float
     files: int
     seconds_per_realization: float
+    preparation: str = ""
 
 
 def cost(run: config.RunConfig, realizations: range) -> Cost:
@@ -228,10 +232,10 @@ def cost(run: config.RunConfig, realizations: range) -> Cost:
     both = run.biposh.pairs == "all"
     pairs = len(names) * (len(names) + 1) // 2 if both else len(names)
     found = modes(run.biposh.L_max, both and len(names) > 1)
-    npix = 12 * nside**2
+    npix, kept = 12 * nside**2, 12 * config.prepared_grid(run)[0] ** 2
     bare = Layout(
         run.ensemble.realizations, 1, names, ("",) * pairs, found, lmax, run.ensemble.paired,
-        npix if run.ensemble.keep_maps else None,
+        kept if run.ensemble.keep_maps else None,
     )  # fmt: skip
     planned = _chunked(bare, run.compute.chunk)
     splits = len(run.map.splits) or 1
@@ -239,18 +243,28 @@ def cost(run: config.RunConfig, realizations: range) -> Cost:
     transforms = sum(1.0 + 2.0 * m + splits * (2.0 + 4.0 * run.biposh.iterations) for m in mmax)
     if run.map.grid == "gl":
         transforms = sum(2.0 * m for m in mmax)
+    extra = splits * (1 + run.ensemble.paired) * sum(_transforms(run, channel) for channel in run.channels)
     estimates = pairs * (2 if run.ensemble.paired else 1)
     largest = max(mmax)
     memory = 3e8 + 8.0 * npix * (6 + 2 * largest) + 16.0 * alm_.size(run.sky.lmax) * (6 + len(names) * 2)
-    memory += planned.chunk * planned.realization_bytes()
+    memory += planned.chunk * planned.realization_bytes() + (40.0 * npix if run.preparation else 0.0)
+    grid = f"nside {nside} to {config.prepared_grid(run)[0]}"
+    words = f"{extra:g} further transforms per realization and {40e-9 * npix:.2g} GB per worker, {grid}"
     return Cost(
         len(realizations),
         -(-len(realizations) // planned.chunk),
         memory,
         float(planned.realization_bytes()) * len(realizations),
         planned.files(),
-        transform * transforms + estimation * estimates + differencing.seconds(run),
+        transform * (transforms + extra) + estimation * estimates + differencing.seconds(run),
+        words if run.preparation else "",
     )
+
+
+def _transforms(run: config.RunConfig, channel: config.Channel) -> int:
+    """Return the number of transforms that prepare a map of a channel."""
+    steps = preparation(run, channel, run.map.splits[0] if run.map.splits else None)
+    return 0 if steps is None else sum(step.transforms for step in steps.steps)
 
 
 def _timed(nside: int, lmax_sky: int, lmax: int, L_max: int) -> tuple[float, float]:

@@ -60,7 +60,9 @@ def maps(
     """
     sky = simulate.draw_sky(survey, realization)
     return [
-        found for channel in survey.channels for found in _channel(survey, channel, sky, realization, nthreads, epsilon)
+        found
+        for channel in survey.making.channels
+        for found in _channel(survey, channel, sky, realization, nthreads, epsilon)
     ]
 
 
@@ -84,7 +86,8 @@ def _channel(
             stream = known(stream)
         if sigma0 > 0.0:
             stream = _noisy(stream, channel, sigma0, rng.generator(seed, realization, f"noise/{m.name}"))
-        yield m.name, tod.bin_samples(stream, nside)[0]
+        map_uk = tod.bin_samples(stream, nside)[0]
+        yield m.name, map_uk if m.preparation is None else m.preparation.apply(map_uk)
 
 
 def check(channel: Channel) -> None:

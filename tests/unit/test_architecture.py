@@ -78,6 +78,7 @@ PUBLIC = {
         "load",
         "map_names",
         "pixel_window",
+        "prepared_grid",
         "resolved",
         "science",
         "sky_path",

@@ -1,0 +1,119 @@
+r"""Sky power above ``sky.lmax`` that pixels see all the same, against what their statistics tolerate.
+
+The pixels of a map have the variance R = sigma^2 + sum_{l > l_a} v_l beyond the degrees l_a that are analysed, with
+v_l = (2l + 1)/4pi C_l B_l^2 w_l^2 after beam, pixel window and preparation. If the simulations lack the v_l above
+``sky.lmax``, N pixels measure an excess chi^2 of N v/R where chance gives sqrt(2 N): the most sensitive statistic is
+moved by s = sqrt(N/2) v/R standard deviations, and the chi^2 of the whole data vector by s^2. ``TOLERANCE`` keeps s^2
+at 1/4, small against sqrt(2 N_dof) of any data vector, and false alarms of 5 % within half a percent.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim import config
+from mcsim.errors import InputError
+from mcsim.simulation import windows
+from mcsim.simulation.channels import load_beam
+from mcsim.simulation.survey import Channel, Survey
+from mcsim.sphere import spectra
+
+TOLERANCE = 0.5
+"""Standard deviations by which neglected power may move the variance of the pixels of a map."""
+
+SIGNAL_FLOOR = 1e-3
+"""Least noise over the rms of the sky, for maps without noise: that of the diagnosis."""
+
+REACH, HIGHEST = 24, 8192
+"""Degrees that are looked at: up to 24 nside of the prepared pixels, and this many."""
+
+
+@dataclass(frozen=True)
+class Neglected:
+    """Power above ``sky.lmax`` that the pixels of a map see.
+
+    Attributes
+    ----------
+    name, nside
+        Map, and resolution of its pixels.
+    lmax, needed
+        The ``sky.lmax`` of the run and the least that is enough.
+    spectrum, last
+        Where C_l are from, and the last degree there.
+    rms_uk, shift
+        Of the neglected power per pixel, and what it does to the variance of all pixels, in standard deviations.
+    """
+
+    name: str
+    nside: int
+    lmax: int
+    needed: int
+    spectrum: str
+    last: int
+    rms_uk: float
+    shift: float
+
+    def __str__(self) -> str:
+        """Say it in a sentence with the remedy."""
+        remedy = f"set sky.lmax to at least {self.needed} (biposh.lmax may stay)"
+        if self.last < self.needed:
+            remedy += f", with a spectrum that reaches it: {self.spectrum} ends at {self.last}"
+        return (
+            f"sky.lmax = {self.lmax} leaves out sky power of {self.rms_uk:.2g} uK rms that the pixels of map "
+            f"{self.name} (nside {self.nside}) see; it moves their variance by {self.shift:.3g} standard deviations, "
+            f"where at most {TOLERANCE:g} are tolerable; {remedy}."
+        )
+
+
+def neglected(survey: Survey) -> Neglected | None:
+    """Return the power that the worst map of a survey misses; None if all is tolerable or there is no spectrum."""
+    run = survey.config
+    if run.sky.spectrum is None or run.map.grid != "healpix":
+        return None
+    top = max(run.sky.lmax, min(REACH * survey.nside, HIGHEST))
+    last = spectra.last(run.sky.spectrum)
+    known = spectra.load(run.sky.spectrum, min(last, top))
+    ell = np.arange(top + 1)
+    # Beyond its end the spectrum goes on with constant D_l, which is more than any CMB has.
+    end = known.size - 1
+    beyond = known[-1] * (end * (end + 1.0)) / np.maximum(ell * (ell + 1.0), 1.0)
+    cl = np.where(ell <= end, np.resize(known, top + 1), beyond)
+    found = []
+    for spec, channel in zip(run.channels, survey.channels, strict=True):
+        seen = (2 * ell + 1) / (4.0 * np.pi) * cl * _window(run, spec, channel, top) ** 2
+        tail = np.append(np.cumsum(seen[:0:-1])[::-1], 0.0)
+        for m in channel.maps:
+            used = m.moments.hits > 0 if m.weight is None else m.weight > 0
+            noise = 0.0 if m.noise_uk is None else float(np.mean(m.noise_uk[used] ** 2))
+            total = noise + tail[survey.lmax] + SIGNAL_FLOOR**2 * float(seen.sum())
+            shift = np.sqrt(used.sum() / 2.0) * tail / total
+            needed = survey.lmax + int(np.argmax(shift[survey.lmax :] <= TOLERANCE))
+            missing, own = float(np.sqrt(tail[run.sky.lmax])), float(shift[run.sky.lmax])
+            if own > TOLERANCE:
+                found.append(
+                    Neglected(m.name, survey.nside, run.sky.lmax, needed, run.sky.spectrum, last, missing, own)
+                )
+    return max(found, key=lambda one: one.needed, default=None)
+
+
+def check(survey: Survey) -> None:
+    """Raise InputError if the run says how its maps are prepared and these would see more sky than is simulated."""
+    if survey.config.preparation and (found := neglected(survey)):
+        raise InputError(str(found))
+
+
+def _window(run: config.RunConfig, spec: config.Channel, channel: Channel, lmax: int) -> NDArray[np.float64]:
+    """Return B_l times pixel window and preparation of a channel, up to an lmax beyond the sky's."""
+    circular = spec if isinstance(spec.beam, config.BeamGaussian) else replace(spec, beam=replace(spec.beam, m_max=0))
+    try:
+        window = load_beam(circular, lmax).window.copy()
+    except InputError:  # a file that ends earlier: go on as a Gaussian
+        known = load_beam(circular, run.sky.lmax).window
+        end, ell = known.size - 1, np.arange(lmax + 1)
+        falls = np.log(max(abs(known[-1]), 1e-30)) / (end * (end + 1.0))
+        window = np.where(ell <= end, np.resize(known, lmax + 1), np.exp(falls * ell * (ell + 1.0)))
+    steps = channel.maps[0].preparation
+    if config.pixel_window(run, spec) != "none":
+        window *= windows.of_pixels(run.map.resolution, lmax)
+    return window if steps is None else window * steps.beam_window(lmax) * steps.pixel_window(lmax)
