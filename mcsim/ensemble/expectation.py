@@ -92,7 +92,7 @@ def _orientations(
     smax = channel.beam.mmax
     if channel.rings is not None:
         return _orientations_on_rings(channel.rings, smax, L_max)
-    if isinstance(scan, config.ScanParallelTransport) and m.weight is None:
+    if isinstance(scan, config.ScanParallelTransport) and m.weight is None and m.preparation is None:
         return parallel_transport_harmonics(smax, L_max, float(np.deg2rad(scan.psi0_deg)))
     w = np.asarray(m.moments.w[:smax])
     return orientation_harmonics(w if m.weight is None else w * m.weight**2, L_max, nthreads=nthreads)

@@ -1,6 +1,6 @@
 """Perfect skies at nside 256, prepared by ``mcsim.prepare`` to nside 32, tested against the model that declares it.
 
-    python workflows/preparation/check.py [--skies 200] [--workers 2] [-o FILE.json]
+    python workflows/preparation/check.py [--skies 200] [--seed 2026] [--lmax L] [--workers 2] [-o FILE.json]
 
 The skies have the model's spectrum up to l = 767 (all that nside 256 holds), its beams and its noise, and a monopole
 and dipole of their own. They are averaged to nside 32, and monopole and dipole outside a mask are subtracted. The
@@ -72,7 +72,7 @@ def needed() -> tuple[int, str]:
     raise AssertionError("a model with sky.lmax = 95 was not refused")
 
 
-def skies(run: mcsim.RunConfig, count: int):
+def skies(run: mcsim.RunConfig, count: int, seed: int):
     """Yield the prepared maps of perfect skies, made with another seed and all the power that nside 256 holds."""
     made = survey(
         replace(
@@ -80,7 +80,7 @@ def skies(run: mcsim.RunConfig, count: int):
             preparation=(),
             map=replace(run.map, mask=None),
             sky=replace(run.sky, lmax=3 * FINE - 1),
-            ensemble=replace(run.ensemble, seed=2026),
+            ensemble=replace(run.ensemble, seed=seed),
         )
     )
     x, y, z = healpy.pix2vec(FINE, np.arange(12 * FINE**2))
@@ -92,25 +92,29 @@ def main() -> None:
     """Print the p-values' distribution, and write it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--skies", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=2026)
+    parser.add_argument("--lmax", type=int, help="sky.lmax of the model; default: what it needs")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("-o", "--output", type=Path)
     chosen = parser.parse_args()
     lmax, refusal = needed()
     print(f"refused: {refusal}", flush=True)
-    run = model(lmax)
+    run = model(chosen.lmax or lmax)
     analysis = analysis_of(run, [name for name in mcsim.effects() if name not in PROPOSED])
     with batch(chosen.workers) as call, asking(call, False, data_vectors, "simulations of the model") as ask:
         context = prepared(run, analysis, ask, None)
     groups = context.null.whiten_groups(context.templates, [one.columns for one in context.candidates])
-    pvalues, omnibus = [], []
-    for maps in skies(run, chosen.skies):
+    pvalues, omnibus, pulls = [], [], []
+    for maps in skies(run, chosen.skies, chosen.seed):
         x = analysis.data_vector(maps)
         pvalues.append(global_test(context.null, x, groups, context.calibration).pvalue)
         omnibus.append(context.null.pvalue(x))
+        fits = [context.null.fit(x, context.templates[:, list(one.columns)]) for one in context.candidates]
+        pulls.append([fit.amplitudes[0] / fit.errors[0] for fit in fits])
     alarms = int(np.sum(np.array(pvalues) <= 0.05))
     low, high = stats.binom.interval(0.95, chosen.skies, 0.05)
     result = {
-        "sky_lmax": lmax,
+        "sky_lmax": run.sky.lmax,
         "skies": chosen.skies,
         "simulations": len(context.ensemble.simulations),
         "elements": len(analysis.elements),
@@ -119,6 +123,9 @@ def main() -> None:
         "false_alarms_at_5_percent": alarms,
         "interval": [int(low), int(high)],
         "smallest": float(min(pvalues)),
+        "mean_pulls": dict(
+            zip((one.label for one in context.candidates), np.mean(pulls, axis=0).tolist(), strict=True)
+        ),
         "p_values": pvalues,
     }
     print({key: value for key, value in result.items() if key != "p_values"})
