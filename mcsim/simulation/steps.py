@@ -197,8 +197,8 @@ class Weighted(Step):
         return np.where(self.mask == 0.0, 0.0, self.mask * map_uk)
 
     def noise(self, power: Map) -> Map:
-        """Return the power of the product."""
-        return np.asarray(self.local(power * self.mask**2))
+        """Return the power of the product, 0 where the mask is."""
+        return np.where(self.mask == 0.0, 0.0, power * self.mask**2)
 
     def local(self, values: NDArray) -> NDArray:
         """Return the values; pixels of weight 0 have no data."""

@@ -194,7 +194,8 @@ def test_rotation_moves_maps_and_orientations(rng):
 
 CASES = {
     "average": [{"kind": "degrade", "nside": COARSE}],
-    "masked": [{"kind": "mask", "mask": SOFT}, {"kind": "degrade", "nside": COARSE}],
+    "apodised": [{"kind": "mask", "mask": SOFT}, {"kind": "degrade", "nside": COARSE}],
+    "masked": [{"kind": "mask", "mask": BAND}, {"kind": "degrade", "nside": COARSE}],
     "smoothed": [{"kind": "smooth", "fwhm_arcmin": 500.0}, {"kind": "degrade", "nside": COARSE}],
     "harmonics": [{"kind": "degrade", "nside": COARSE, "method": "harmonics"}],
     "rotated": [{"kind": "rotate", "frame": "galactic"}],
