@@ -218,14 +218,12 @@ class DiagnosisResult:
         nothing was observed, shape (map, npix); None without maps.
     residual_range
         Smallest and largest rms of such maps in 95 % of the simulations, shape (map, 2).
-    frame, notes
-        Of the maps; remarks.
+    frame, notes, warnings
+        Of the maps; remarks; what makes the verdict unreliable for maps of a real sky.
     settings, provenance
         Settings of the diagnosis; numbers of simulations, the seed and the data, by name.
     configuration
         The run that is the model, as JSON.
-    warnings
-        What makes the verdict unreliable if the data are what they seem, first of all.
     """
 
     case: str

@@ -87,7 +87,7 @@ PUBLIC = {
     ],
     "mcsim.errors": ["InputError", "RunError"],
     "mcsim.support.resources": ["names", "scan_model", "spectrum", "workflow"],
-    "mcsim.sphere.spectra": ["load"],
+    "mcsim.sphere.spectra": ["last", "load"],
 }
 
 
