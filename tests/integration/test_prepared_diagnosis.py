@@ -26,7 +26,7 @@ def model(lmax=150, steps=True):
             "name": name,
             "frequency_ghz": frequency,
             "beam": {"kind": "gaussian", "fwhm_arcmin": 150.0},
-            "noise": {"sigma0_uk": 60.0},
+            "noise": {"sigma0_uk": 600.0},
             "scan": {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 30.0, "line_of_sight": line},
         }
         for name, frequency, line in (("V1", 61.0, "A"), ("W1", 94.0, "B"))
