@@ -2,13 +2,14 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import healpy
 import numpy as np
 import pytest
 
 import mcsim
-from mcsim import config
+from mcsim import cli, config
 from mcsim.diagnosis import report, words
 from mcsim.diagnosis.api import describe
 from mcsim.ensemble import plan
@@ -98,3 +99,50 @@ def test_the_cost_of_a_preparation_is_said():
     text = describe(run, without=[name for name in mcsim.effects() if name not in PROPOSED])
     assert "nside 64 to 16" in text
     assert "prepare" not in plan.describe(config.to_dict(model(steps=False)))
+
+
+TOML = """
+schema = 1
+name = "cli"
+[sky]
+spectrum = "wmap7"
+lmax = {lmax}
+[map]
+nside = 32
+[[channel]]
+name = "V"
+beam = {{ kind = "gaussian", fwhm_arcmin = 240.0 }}
+noise = {{ sigma0_uk = 30.0 }}
+scan = {{ kind = "parallel_transport" }}
+[[preparation]]
+kind = "degrade"
+nside = 8
+[biposh]
+lmax = 16
+"""
+
+
+def test_commands_prepare_maps_and_refuse_too_little_sky(tmp_path, monkeypatch, capsys):
+    def mcsim_(*words):
+        monkeypatch.setattr("sys.argv", ["mcsim", *map(str, words)])
+        code = 0
+        try:
+            cli.main()
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        return code, capsys.readouterr()
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "enough.toml").write_text(TOML.format(lmax=60))
+    (tmp_path / "low.toml").write_text(TOML.format(lmax=18))
+    healpy.write_map("V.fits", np.arange(12.0 * 32**2), dtype=np.float64, column_units="uK")
+    code, said = mcsim_("prepare", "enough.toml", "V.fits", "-o", "out")
+    assert (code, said.out.strip()) == (0, f"wrote {Path('out/V.fits')}")
+    assert np.array_equal(healpy.read_map("out/V.fits"), healpy.ud_grade(healpy.read_map("V.fits"), 8))
+    assert mcsim_("predict", "enough.toml")[0] == 0
+    for command in (("predict", "low.toml"), ("run", "low.toml"), ("diagnose", "low.toml", "out", "-o", "verdict")):
+        code, said = mcsim_(*command)
+        assert code == 2
+        assert said.err.count("\n") == 1
+        assert "set sky.lmax to" in said.err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["V.fits", "enough.toml", "low.toml", "out"]
