@@ -97,7 +97,7 @@ def test_the_cost_of_a_preparation_is_said():
     assert "prepare 16 further transforms" in plan.describe(config.to_dict(smoothed))
     text = describe(run, without=[name for name in mcsim.effects() if name not in PROPOSED])
     assert "nside 64 to 16" in text
-    assert "prepare" not in plan.describe(config.to_dict(model(steps=False)))
+    assert "further transforms" not in plan.describe(config.to_dict(model(steps=False)))
 
 
 TOML = """
@@ -144,4 +144,5 @@ def test_commands_prepare_maps_and_refuse_too_little_sky(tmp_path, monkeypatch, 
         assert code == 2
         assert said.err.count("\n") == 1
         assert "set sky.lmax to" in said.err
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["V.fits", "enough.toml", "low.toml", "out"]
+    written = {path.name for path in tmp_path.rglob("*") if path.is_file()}
+    assert written == {"V.fits", "enough.toml", "low.toml"}
