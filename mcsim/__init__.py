@@ -31,8 +31,7 @@ if TYPE_CHECKING:
     from mcsim.instrument.beams import Beam
     from mcsim.instrument.scan import Moments, ScanModel
     from mcsim.simulation.observe import observe
-    from mcsim.systematics import Effect
-    from mcsim.systematics.library import effects
+    from mcsim.systematics import Effect, effects
 
     __version__: str
 
@@ -68,7 +67,7 @@ _HOME = {
     "ScanModel": "mcsim.instrument.scan",
     "biposh": "mcsim.bipolar.dataset",
     "diagnose": "mcsim.diagnosis.api",
-    "effects": "mcsim.systematics.library",
+    "effects": "mcsim.systematics",
     "fit": "mcsim.beamfit.api",
     "load_config": "mcsim.config:load",
     "merge": "mcsim.ensemble.runner",

@@ -1,13 +1,14 @@
 """Settings of all tests: reproducible hypothesis, a cache of their own, one thread each, and what is slow."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 # Before numpy is loaded: processes that run side by side would take each other's cores.
 for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_threads, "1")
 
+import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
@@ -22,6 +23,31 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(os.environ, "MCSIM_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture(scope="session")
+def rhs_from_samples() -> Callable[..., np.ndarray]:
+    """The time-ordered reference of differencing: every sample of both sides at its own direction."""
+    from mcsim.simulation import tod
+    from mcsim.simulation.mapmaking.rhs import BALANCED, noise_by_chunk
+
+    def made(scan, stages, imbalance=BALANCED, noise=None, at_pixel_centres=False):
+        """P^T d in uK, shape (npix,); the stages are of sides A and B, and keep the chunks as they come."""
+        pieces = tod.chunks(*scan.grid.sample_range(scan.model, scan.side_a))
+        draw = noise_by_chunk(noise, pieces)
+        streams = [
+            tod.through(tod.samples(scan.model, line, scan.grid, at_pixel_centres), own)
+            for line, own in zip((scan.side_a, scan.side_b), stages, strict=True)
+        ]
+        x, weight = imbalance.true, imbalance.weight
+        rhs = np.zeros(scan.npix)
+        for (low, high), a, b in zip(pieces, *streams, strict=True):
+            difference = (1.0 + x) * a.signal_uk - (1.0 - x) * b.signal_uk + draw(low, high)
+            np.add.at(rhs, a.pixel, (1.0 + weight) * difference)
+            np.add.at(rhs, b.pixel, (weight - 1.0) * difference)
+        return rhs
+
+    return made
 
 
 SLOW = {"integration", "statistical"}

@@ -6,7 +6,7 @@ import numpy as np
 
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
-from mcsim.systematics import Effect
+from mcsim.systematics import Effect, Parametrization
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +44,7 @@ class Nonlinearity(Effect):
     cause = "An amplifier near saturation."
     signature = "The square of the dipole, and the sky times the dipole."
     step = 1e-7
-    matched_filter = False
+    parametrization = Parametrization(matched_filter=False)
 
     def sky(self, sky, site, draw):
         """With its square, up to the sky's own degree."""
@@ -66,7 +66,7 @@ class Crosstalk(Effect):
     cause = "Multiplexed readout."
     signature = "An echo of the sky along the scan."
     step = 0.002
-    matched_filter = False
+    parametrization = Parametrization(matched_filter=False)
 
     def lags(self):
         """Now, and then."""

@@ -3,7 +3,7 @@
 import numpy as np
 from gain_step import GainStep
 
-from mcsim.systematics.base import build
+from mcsim.systematics import build
 
 DAYS = 86400.0 * np.array([0.0, 90.0, 92.0, 365.0])
 

@@ -4,8 +4,7 @@ from mcsim.beamfit.data import QUADRUPOLE, Measurement, Selection, from_store, w
 from mcsim.beamfit.effective_beam import Fit, comparisons, fit, fit_each, fit_models, measurement
 from mcsim.beamfit.likelihood import Comparison, Solution, compare, solve, solve_each
 from mcsim.beamfit.models import MODELS
-from mcsim.beamfit.orientation import Orientation, orientation
-from mcsim.beamfit.report import report
+from mcsim.beamfit.report import Orientation, orientation, report
 from mcsim.beamfit.table import read_table
 from mcsim.beamfit.templates import ORDERS
 

@@ -33,11 +33,6 @@ class Selection:
         "difference" to the circular-beam controls (default if they exist) or "plain".
     pair
         Label of the pair of maps; by default the first.
-
-    Raises
-    ------
-    InputError
-        For modes that cannot exist or repeat, an empty range, or another kind.
     """
 
     modes: Sequence[str] = QUADRUPOLE
@@ -46,7 +41,7 @@ class Selection:
     pair: str | None = None
 
     def __post_init__(self) -> None:
-        """Check the values."""
+        """Raise InputError for modes that cannot exist or repeat, an empty range, or another kind."""
         if isinstance(self.modes, str) or not self.modes or len(set(self.parsed)) < len(self.modes):
             raise InputError(f"modes = {self.modes!r} are no different labels; give some such as ['L2M0d0'].")
         if self.kind is not None and self.kind not in get_args(Kind):
@@ -101,10 +96,9 @@ class Measurement:
 
     Attributes
     ----------
-    origin, pair
-        Source of the data, and their pair of maps; ``None``: the only map.
-    kind
-        "plain", or "difference" to the circular-beam controls.
+    origin, pair, kind
+        Source of the data, their pair of maps (``None``: the only map), and "plain" or "difference" to the
+        circular-beam controls.
     rows, scaling
         Mode, part and bin of each element, and the scaling of all.
     value, covariance
@@ -158,14 +152,7 @@ def project(
 
 
 def from_store(path: str | Path, selection: Selection = EVERYTHING) -> Measurement:
-    """Read the mean of an ensemble, with the covariance of its data vector over all modes and bins.
-
-    Parameters
-    ----------
-    path
-        Store.
-    selection
-        Modes, bins of the summary, kind and pair.
+    """Read the mean of an ensemble, with the covariance of its data vector over all modes and bins of the summary.
 
     Raises
     ------
@@ -191,50 +178,36 @@ def from_store(path: str | Path, selection: Selection = EVERYTHING) -> Measureme
         raise InputError(f"no bin of {path} lies within ell = {first} ... {last}; its bins are {width} wide, widen it.")
     drawn = realizations(path, rows, SUMMARY, chosen, label)
     measured = np.atleast_1d(np.isfinite(drawn).all(axis=0))
-    absent = set(selection.parsed) - {row.mode for row, keep in zip(rows, measured, strict=True) if keep}
-    if absent:
+    kept = tuple(row for row, keep in zip(rows, measured, strict=True) if keep)
+    if absent := set(selection.parsed) - {row.mode for row in kept}:
         raise InputError(f"{path} has no {min(absent).name} for the pair {label} at these ell; leave the mode out.")
     drawn = drawn[:, measured]
-    covariance = np.cov(drawn.T, ddof=1).reshape(drawn.shape[1], -1)
-    kept = tuple(row for row, keep in zip(rows, measured, strict=True) if keep)
-    value = drawn.mean(axis=0)
-    return Measurement(
-        str(path), label, chosen, kept, SUMMARY, value, covariance / len(drawn), len(drawn), realizations=drawn
-    )
+    value, covariance = drawn.mean(axis=0), _covariance(drawn) / len(drawn)
+    return Measurement(str(path), label, chosen, kept, SUMMARY, value, covariance, len(drawn), drawn)
 
 
 def with_covariance_of(measured: Measurement, path: str | Path, pair: str | None = None) -> Measurement:
     """Return the data of a measurement with the covariance of one realization of an ensemble that models it.
 
-    Parameters
-    ----------
-    measured
-        Usually from a table; its own errors are not used.
-    path
-        Store with the modes and degrees of the measurement.
-    pair
-        Label of the pair in the store; by default that of the measurement, or the store's first.
-
-    Raises
-    ------
-    InputError
-        If the store lacks a mode or degree of the measurement.
+    The measurement is usually from a table, whose own errors are not used. ``pair`` is a label of the store; by default
+    that of the measurement, or the store's first. InputError if the store lacks a mode or degree of the measurement.
     """
     with opening.open_ensemble(path) as ensemble:
         labels = [str(name) for name in ensemble["pair"].values]
     label = pair or (measured.pair if measured.pair in labels else labels[0])
     drawn = realizations(path, measured.rows, measured.scaling, measured.kind, label)
-    covariance = np.cov(drawn.T, ddof=1).reshape(drawn.shape[1], -1)
-    return replace(measured, covariance=covariance, simulations=len(drawn))
+    return replace(measured, covariance=_covariance(drawn), simulations=len(drawn))
+
+
+def _covariance(drawn: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the sample covariance of data vectors, shape (N, p) to (p, p)."""
+    return np.atleast_2d(np.cov(drawn.T, ddof=1))
 
 
 def realizations(path: str | Path, rows: Sequence[Row], scaling: Scaling, kind: str, pair: str) -> NDArray[np.float64]:
     """Return data vectors of all finished realizations of a store, shape (N, rows), read chunk by chunk.
 
-    Raises
-    ------
-    InputError
-        If the store has another lmax or lacks the pair, a mode or the circular-beam controls.
+    InputError if the store has another lmax or lacks the pair, a mode or the circular-beam controls.
     """
     target = Path(path)
     with opening.open_ensemble(target) as ensemble:

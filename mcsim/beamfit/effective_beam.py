@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import optimize, stats
 
 from mcsim.beamfit.data import EVERYTHING, Measurement, Selection, from_store, with_covariance_of
 from mcsim.beamfit.likelihood import Comparison, Solution, compare, size, solve, solve_each, whitening
 from mcsim.beamfit.models import Model, model
-from mcsim.beamfit.table import read_table
+from mcsim.beamfit.table import check_frame, read_table
 from mcsim.beamfit.templates import ORDERS, Order, Polynomial, Templates, templates
 from mcsim.config.preparation import frame_of
 from mcsim.ensemble import store
@@ -29,19 +29,17 @@ class Fit:
 
     Attributes
     ----------
-    measured
-        Data vector and its covariance.
-    model
-        Model of f_l, without a parameter that the data do not constrain (the imaginary part of ``orientation``).
-    order
-        "leading", or "exact" to all orders in the beam.
+    measured, model
+        Data vector, and model of f_l without a parameter that the data do not constrain (the imaginary part of
+        ``orientation``).
+    order, beyond_leading
+        "leading", or "exact" to all orders in the beam; and the size in sigma of the higher ones at the best fit,
+        ``None`` if leading order was requested.
     offset, design
         The expected data are offset + design @ parameters, uK^2: shapes (p,), (p, K); if ``order`` is "exact",
         this is their tangent at the best fit.
     solution
         Parameters, their covariance, chi2, its degrees of freedom and probability.
-    beyond_leading
-        Size in sigma of the higher orders at the best fit; ``None`` if leading order was requested.
     each
         Fits of every realization, if made by :func:`fit_each`.
     """
@@ -71,13 +69,17 @@ class Fit:
         width = np.sqrt(np.einsum("kl,km,ml->l", functions, self.solution.covariance, functions))
         return self.solution.parameters @ functions, width
 
-    def pulls(self, truth: Sequence[float]) -> NDArray[np.float64]:
+    def pulls(self, truth: ArrayLike) -> NDArray[np.float64]:
         """Return (estimate - truth)/error of every realization and parameter, shape (N, K)."""
-        return np.array([(one.parameters - truth) / one.errors for one in self.each])
+        return np.array([(one.parameters - np.asarray(truth)) / one.errors for one in self.each])
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers, for JSON."""
         solution = self.solution
+
+        def named(values: NDArray[np.float64]) -> dict[str, float]:
+            return dict(zip(self.model.parameters, values.tolist(), strict=True))
+
         result: dict[str, Any] = {
             "model": self.model.name,
             "order": self.order,
@@ -86,23 +88,19 @@ class Fit:
             "pair": self.measured.pair,
             "kind": self.measured.kind,
             "modes": [mode.name for mode in self.measured.modes],
-            "parameters": dict(zip(self.model.parameters, solution.parameters.tolist(), strict=True)),
-            "errors": dict(zip(self.model.parameters, solution.errors.tolist(), strict=True)),
+            "parameters": named(solution.parameters),
+            "errors": named(solution.errors),
             "correlation": solution.correlation.tolist(),
-            "chi2": solution.chi2,
-            "dof": solution.dof,
-            "reduced_chi2": solution.reduced_chi2,
-            "probability": solution.probability,
-            "simulations": solution.simulations,
+            **{key: getattr(solution, key) for key in ("chi2", "dof", "reduced_chi2", "probability", "simulations")},
         }
         if self.each:
             estimates = np.array([one.parameters for one in self.each])
-            pulls = self.pulls(solution.parameters.tolist())
+            pulls = self.pulls(solution.parameters)
             uniform = stats.kstest([one.probability for one in self.each], "uniform")
             result["realizations"] = {
                 "count": len(self.each),
-                "mean": dict(zip(self.model.parameters, estimates.mean(axis=0).tolist(), strict=True)),
-                "pull_width": dict(zip(self.model.parameters, pulls.std(axis=0, ddof=1).tolist(), strict=True)),
+                "mean": named(estimates.mean(axis=0)),
+                "pull_width": named(pulls.std(axis=0, ddof=1)),
                 "probability_uniform": float(uniform.pvalue),
             }
         return result
@@ -117,22 +115,10 @@ def fit(
     order: Order = "auto",
     nthreads: int = 1,
 ) -> Fit:
-    """Fit effective beams b_l2^eff = f_l b_l2 to measured or simulated BipoSH.
+    """Fit one model of f_l; see :func:`mcsim.fit`, and :func:`mcsim.beamfit.models.model` for its name and knots.
 
-    Parameters
-    ----------
-    data
-        Result of :func:`measurement`; or the path of a store or table, of which the quadrupole is fitted.
-    source
-        Configuration of the spectrum, the beams and the scan whose b_l2 are rescaled: often the beam of the data under
-        parallel transport.
-    name, knots
-        Model of f_l: "constant", "linear", "spline" or "orientation"; see :func:`mcsim.beamfit.models.model`.
-    order
-        "leading": leading order in the beam's non-circular part. "exact": all orders. "auto": all orders if the higher
-        ones exceed :data:`NEGLIGIBLE` sigma of the data.
-    nthreads
-        Number of threads.
+    ``order`` is "leading" (in the beam's non-circular part), "exact" (all orders) or "auto": all orders if the higher
+    ones exceed :data:`NEGLIGIBLE` sigma of the data.
 
     Raises
     ------
@@ -150,8 +136,7 @@ def fit(
     parallel transport give 0.6575 (tests/integration/test_prediction.py).
     """
     survey = survey_of(source, nthreads)
-    measured = data if isinstance(data, Measurement) else measurement(data, survey)
-    return _fit(templates(survey, measured, nthreads), name, knots, order)
+    return fit_models(measurement(data, survey), survey, [name], knots=knots, order=order, nthreads=nthreads)[0]
 
 
 def _fit(made: Templates, name: str, knots: int, order: Order) -> Fit:
@@ -189,31 +174,17 @@ def fit_models(
     order: Order = "auto",
     nthreads: int = 1,
 ) -> list[Fit]:
-    """Fit several models to the same data and to the same order: to all orders if one model needs it.
+    """Fit several models to the same data as :func:`fit` does, to the same order: all orders if one model needs them.
 
-    Parameters
-    ----------
-    measured
-        Result of :func:`measurement`.
-    source, knots, order, nthreads
-        As for :func:`fit`.
-    names
-        Names of the models.
-
-    Raises
-    ------
-    InputError
-        As :func:`fit`, and for no model or a repeated one.
+    InputError as well for no model or a repeated one.
     """
     if not names or len(set(names)) < len(names):
         raise InputError(f"the models {', '.join(names) or '(none)'} are not different ones; name each model once.")
     made = templates(survey_of(source, nthreads), measured, nthreads)
     fits = [_fit(made, name, knots, order) for name in names]
-    if len({one.order for one in fits}) == 1:
-        return fits
-    return [
-        one if one.order == "exact" else _fit(made, name, knots, "exact") for one, name in zip(fits, names, strict=True)
-    ]
+    if len({one.order for one in fits}) > 1:
+        fits = [one if one.order == "exact" else _fit(made, one.model.name, knots, "exact") for one in fits]
+    return fits
 
 
 def _solve(measured: Measurement, offset: NDArray[np.float64], design: NDArray[np.float64]) -> Solution:
@@ -223,16 +194,15 @@ def _solve(measured: Measurement, offset: NDArray[np.float64], design: NDArray[n
 def _minimise(measured: Measurement, expected: Polynomial, start: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the parameters that minimise chi^2."""
     white = whitening(measured.value, expected.linear, measured.covariance, measured.simulations)
-    found = optimize.least_squares(
-        lambda theta: white @ (measured.value - expected.at(theta)),
-        start,
-        jac=lambda theta: -white @ expected.derivative(theta),
-        method="lm",
-        x_scale="jac",
-        xtol=1e-13,
-        ftol=1e-13,
-        gtol=1e-13,
-    )
+
+    def residual(theta: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(white @ (measured.value - expected.at(theta)))
+
+    def slope(theta: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(-white @ expected.derivative(theta))
+
+    limits = {"xtol": 1e-13, "ftol": 1e-13, "gtol": 1e-13}
+    found = optimize.least_squares(residual, start, jac=slope, method="lm", x_scale="jac", **limits)
     if not found.success:
         raise InputError(
             f"the fit of {measured.origin} to all orders does not converge ({found.message}); choose a simpler model."
@@ -241,13 +211,7 @@ def _minimise(measured: Measurement, expected: Polynomial, start: NDArray[np.flo
 
 
 def fit_each(found: Fit) -> Fit:
-    """Return a fit with the fits of every realization, on the tangent at the best fit of their mean.
-
-    Raises
-    ------
-    InputError
-        If the data are not from an ensemble.
-    """
+    """Return a fit of an ensemble with the fits of every realization, on the tangent at the best fit of their mean."""
     if found.measured.realizations is None:
         raise InputError(f"{found.measured.origin} is no ensemble; fits of single realizations need a store.")
     return replace(found, each=tuple(solve_each(found.measured.realizations - found.offset, found.design)))
@@ -265,10 +229,8 @@ def measurement(
     ----------
     data
         A store (a folder): its mean, with the covariance of its realizations over their number; or an ECSV table.
-    source
-        Configuration, whose frame the data must have.
-    selection
-        Modes, multipoles, kind and pair.
+    source, selection
+        Configuration, whose frame the data must have, and the modes, multipoles, kind and pair that are fitted.
     covariance
         Store that models the data: the covariance of one of its realizations replaces that of the data.
 
@@ -282,16 +244,10 @@ def measurement(
     path, frame = Path(data), survey_of(source).frame
     if path.is_dir():
         measured = from_store(path, selection)
-        _check_frame(path, frame)
+        check_frame(path, frame_of(store.attributes(path)["configuration"]), frame)
     else:
         measured = read_table(path, frame, selection)
     return measured if covariance is None else with_covariance_of(measured, covariance, selection.pair)
-
-
-def _check_frame(path: Path, frame: str) -> None:
-    found = frame_of(store.attributes(path)["configuration"])
-    if found != frame:
-        raise InputError(f"{path} is in the {found} frame, the configuration in the {frame} one; rotate one of them.")
 
 
 def _unseen(design: NDArray[np.float64], measured: Measurement) -> bool:

@@ -19,10 +19,9 @@ class Solution:
     ----------
     parameters, covariance
         Estimates and the covariance of their distribution about the truth, shape (K,) and (K, K).
-    square, dof
-        r'C^-1 r of the residual r with the given covariance C, and the number of data minus K.
-    probability
-        P-value: probability of a square at least as large if the model is true.
+    square, dof, probability
+        r'C^-1 r of the residual r with the given covariance C, the number of data minus K, and the p-value: the
+        probability of a square at least as large if the model is true.
     residual
         Data minus best fit, shape (p,).
     simulations
@@ -67,19 +66,11 @@ def solve(
     covariance: NDArray[np.float64],
     simulations: int | None = None,
 ) -> Solution:
-    """Fit a linear model by generalised least squares.
+    """Fit templates, the columns of ``design``, shape (p, K), to data, shape (p,), by generalised least squares.
 
-    Parameters
-    ----------
-    data
-        Data vector, shape (p,).
-    design
-        Templates as columns, shape (p, K), of rank K < p.
-    covariance
-        Covariance of the data, shape (p, p); with ``simulations`` proportional to a sample covariance.
-    simulations
-        Number N of independent draws behind the sample covariance, which subtracts their mean and is independent of
-        the data; ``None``: the covariance is known.
+    The design has rank K < p. With ``simulations`` the covariance, shape (p, p), is proportional to the sample
+    covariance of so many independent draws, which subtracts their mean and is independent of the data; ``None``: it is
+    known.
 
     Raises
     ------
@@ -118,13 +109,7 @@ def solve(
 def whitening(
     data: NDArray[np.float64], design: NDArray[np.float64], covariance: NDArray[np.float64], simulations: int | None
 ) -> NDArray[np.float64]:
-    """Check the arguments of :func:`solve`; return the inverse Cholesky factor of the covariance, shape (p, p).
-
-    Raises
-    ------
-    InputError
-        As :func:`solve`.
-    """
+    """Check the arguments of :func:`solve`; return the inverse Cholesky factor of the covariance, shape (p, p)."""
     p, K = design.shape
     if data.shape != (p,) or covariance.shape != (p, p):
         raise InputError(
@@ -162,16 +147,10 @@ def size(change: NDArray[np.float64], covariance: NDArray[np.float64], simulatio
 
 @dataclass(frozen=True)
 class Comparison:
-    """Test of a model against one that contains it.
+    """Test of a model against one that contains it and adds ``added`` parameters.
 
-    Attributes
-    ----------
-    drop
-        Decrease of chi^2; for an estimated covariance ``added`` times the F statistic.
-    added
-        Number of parameters that the larger model adds.
-    probability
-        P-value: probability of at least this decrease if the smaller model is true.
+    ``drop`` is the decrease of chi^2, for an estimated covariance ``added`` times the F statistic; ``probability`` the
+    p-value: the probability of at least this decrease if the smaller model is true.
     """
 
     drop: float
@@ -206,20 +185,9 @@ def compare(small: Solution, large: Solution) -> Comparison:
 
 
 def solve_each(realizations: NDArray[np.float64], design: NDArray[np.float64]) -> list[Solution]:
-    """Fit every realization with the covariance of all the others, so that each is independent of its own weights.
-
-    Parameters
-    ----------
-    realizations
-        Data vectors, shape (N, p).
-    design
-        Templates as columns, shape (p, K).
-    """
+    """Fit every realization, shape (N, p), with the covariance of all the others, which is independent of it."""
     count = len(realizations)
     deviation = realizations - realizations.mean(axis=0)
     scatter = deviation.T @ deviation
-    solutions = []
-    for data, own in zip(realizations, deviation, strict=True):
-        others = scatter - count / (count - 1.0) * np.outer(own, own)
-        solutions.append(solve(data, design, others / (count - 2.0), count - 1))
-    return solutions
+    others = (scatter - count / (count - 1.0) * np.outer(own, own) for own in deviation)
+    return [solve(data, design, s / (count - 2.0), count - 1) for data, s in zip(realizations, others, strict=True)]

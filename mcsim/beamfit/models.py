@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,23 +9,14 @@ from scipy.interpolate import CubicSpline
 
 from mcsim.errors import InputError
 
-ModelName = Literal["constant", "linear", "spline", "orientation"]
-
-MODELS: tuple[str, ...] = get_args(ModelName)
+MODELS = ("constant", "linear", "spline", "orientation")
 
 
 @dataclass(frozen=True)
 class Model:
-    """f_l = sum_k theta_k g_k(l).
+    """f_l = sum_k theta_k g_k(l): one of :data:`MODELS`, and the names of its parameters theta_k.
 
-    Attributes
-    ----------
-    name
-        One of :data:`MODELS`.
-    parameters
-        Names of the theta_k.
-    functions
-        Function of ell, shape (n,), that returns g_k(ell), shape (K, n); complex for ``orientation`` alone.
+    ``functions`` maps ell, shape (n,), to g_k(ell), shape (K, n); complex for ``orientation`` alone.
     """
 
     name: str
@@ -37,16 +27,9 @@ class Model:
 def model(name: str, ell_range: tuple[int, int], knots: int = 4) -> Model:
     """Build a model.
 
-    Parameters
-    ----------
-    name
-        "constant": alpha. "linear": alpha + beta l. "spline": a natural cubic spline, linear outside, whose
-        parameters are its values at ``knots`` equidistant multipoles. "orientation": a complex constant, as
-        :func:`mcsim.beamfit.orientation.orientation` reads it.
-    ell_range
-        First and last l of the spline.
-    knots
-        Number of knots of the spline, >= 3.
+    "constant": alpha. "linear": alpha + beta l. "spline": a natural cubic spline from the first to the last l of
+    ``ell_range``, linear outside, whose parameters are its values at ``knots`` >= 3 equidistant multipoles.
+    "orientation": a complex constant, as :func:`mcsim.beamfit.orientation` reads it.
 
     Raises
     ------

@@ -1,7 +1,6 @@
 """Measured BipoSH spectra from a table: ECSV with columns L, M, d, ell_min, ell_max, value, error."""
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,20 +17,12 @@ COLUMNS = ("L", "M", "d", "ell_min", "ell_max")
 
 
 def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING) -> Measurement:
-    """Read binned spectra with independent errors.
+    """Read binned spectra with independent errors from an ECSV table, which must have the frame of the model.
 
-    Parameters
-    ----------
-    path
-        ECSV table. Columns L, M, d, ell_min, ell_max, value, error, and value_imag if parts are imaginary;
-        ``value`` is the mean over ell_min <= l2 <= ell_max, d = l2 - l1, with its unit. The header's ``meta`` holds
-        ``normalisation`` ("Bennett", "WMAP" or "Hajian-Souradeep"), ``scaling`` ("l(l+1)/2pi" or "none") and
-        optionally ``frame``. ``mcsim info --export`` writes such tables, with a column ``pair`` and, for paired
-        ensembles, ``value_difference`` and so on.
-    frame
-        Frame of the model, which the table must have.
-    selection
-        Modes, bins, kind and pair.
+    Columns are L, M, d, ell_min, ell_max, value, error, and value_imag if parts are imaginary; ``value`` is the mean
+    over ell_min <= l2 <= ell_max, d = l2 - l1, with its unit. The header's ``meta`` holds ``normalisation`` ("Bennett",
+    "WMAP" or "Hajian-Souradeep"), ``scaling`` ("l(l+1)/2pi" or "none") and optionally ``frame``. ``mcsim info
+    --export`` writes such tables, with a column ``pair`` and, for paired ensembles, ``value_difference`` and so on.
 
     Raises
     ------
@@ -44,12 +35,14 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING) 
         raise InputError(f"{path} has no column {missing[0]}; give {', '.join(COLUMNS)}, value and error.")
     suffix, chosen = _kind(path, table, selection.kind)
     scaling = scaling_of(path, table.meta)
-    found = str(table.meta.get("frame", frame)).lower()
-    if found != frame:
-        raise InputError(f"{path} is in the {found} frame, the configuration in the {frame} one; rotate one of them.")
-    label = _pair(path, table, selection.pair)
-    if label is not None:
-        table = table[[str(name) == label for name in table["pair"]]]
+    check_frame(path, str(table.meta.get("frame", frame)).lower(), frame)
+    label = selection.pair
+    if "pair" in table.colnames:
+        labels = [str(name) for name in table["pair"]]
+        label = labels[0] if label is None else label
+        if label not in labels:
+            raise InputError(f"There is no pair {label} in {path}; choose among {'; '.join(dict.fromkeys(labels))}.")
+        table = table[[name == label for name in labels]]
     L, M, d, low, high = (_integers(path, table, name) for name in COLUMNS)
     wrong = np.flatnonzero((low < 0) | (low > high))
     if len(wrong):
@@ -58,39 +51,41 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING) 
     first, last = selection.ell_range or (0, int(high.max()))
     real, error = (in_uk2(path, table, f"{name}{suffix}") for name in ("value", "error"))
     rows: list[Row] = []
-    values: list[float] = []
-    errors: list[float] = []
+    values: list[NDArray[np.float64]] = []
+    errors: list[NDArray[np.float64]] = []
     for mode in selection.parsed:
+        if mode.parity == "odd" and not scaling.summary and scaling.bennett:
+            raise InputError(
+                f"{path}: {mode.name} has odd parity, which the Bennett normalisation does not have; leave it out."
+            )
+        same = np.flatnonzero((L == mode.L) & (M == mode.M) & (d == mode.d) & (low >= first) & (high <= last))
         for imaginary in parts(mode):
             part = in_uk2(path, table, f"value_imag{suffix}") if imaginary else real
-            if mode.parity == "odd" and not scaling.summary and scaling.bennett:
-                raise InputError(
-                    f"{path}: {mode.name} has odd parity, which the Bennett normalisation does not have; leave it out."
-                )
-            same = (L == mode.L) & (M == mode.M) & (d == mode.d) & (low >= first) & (high <= last)
-            for number in np.flatnonzero(same).tolist():
-                rows.append(Row(mode, int(low[number]), int(high[number]), imaginary))
-                values.append(float(part[number]))
-                # The error of a mode with M > 0 is that of its modulus; its two parts share the variance equally.
-                errors.append(float(error[number]) * (1.0 if mode.M == 0 else np.sqrt(0.5)))
+            rows += [Row(mode, int(low[i]), int(high[i]), imaginary) for i in same]
+            values.append(part[same])
+            # The error of a mode with M > 0 is that of its modulus; its two parts share the variance equally.
+            errors.append(error[same] * (1.0 if mode.M == 0 else np.sqrt(0.5)))
     if not rows:
         raise InputError(
             f"{path} has no row of {', '.join(selection.modes)} within ell = {first} ... {last}; choose others."
         )
     if len(set(rows)) < len(rows):
         raise InputError(f"{path} gives a bin of one mode twice; keep one row of each.")
-    _check(path, rows, values, errors)
-    value, variance = np.array(values), np.array(errors) ** 2
-    return Measurement(str(path), label, chosen, tuple(rows), scaling, value, np.diag(variance), None)
+    value, sigma = np.concatenate(values), np.concatenate(errors)
+    bad = np.flatnonzero(~(np.isfinite(value) & np.isfinite(sigma) & (sigma > 0.0)))
+    if len(bad):
+        row = rows[bad[0]]
+        raise InputError(
+            f"{path}: {row.mode.name} at ell = {row.ell_min}-{row.ell_max} has value {value[bad[0]]:g}, error "
+            f"{sigma[bad[0]]:g}; give finite values with errors above 0, or leave the row out."
+        )
+    return Measurement(str(path), label, chosen, tuple(rows), scaling, value, np.diag(sigma**2), None)
 
 
-def _check(path: str | Path, rows: Sequence[Row], values: Sequence[float], errors: Sequence[float]) -> None:
-    for row, value, error in zip(rows, values, errors, strict=True):
-        if not (np.isfinite(value) and np.isfinite(error) and error > 0.0):
-            raise InputError(
-                f"{path}: {row.mode.name} at ell = {row.ell_min}-{row.ell_max} has value {value:g}, error {error:g}; "
-                "give finite values with errors above 0, or leave the row out."
-            )
+def check_frame(path: str | Path, found: str, wanted: str) -> None:
+    """Raise InputError if data are in another frame than the configuration."""
+    if found != wanted:
+        raise InputError(f"{path} is in the {found} frame, the configuration in the {wanted} one; rotate one of them.")
 
 
 def _integers(path: str | Path, table: Table, name: str) -> NDArray[np.int64]:
@@ -142,16 +137,6 @@ def scaling_of(path: str | Path, meta: Any) -> Scaling:
         raise InputError(f'{path} has scaling {scaling!r}, which is not known; write "l(l+1)/2pi" or "none".')
     # The header of an exported summary defines the scaling of odd parity.
     return SUMMARY if bennett and spectrum and "hajian" in normalisation else Scaling(bennett, spectrum, summary=False)
-
-
-def _pair(path: str | Path, table: Table, pair: str | None) -> str | None:
-    if "pair" not in table.colnames:
-        return pair
-    labels = list(dict.fromkeys(str(name) for name in table["pair"]))
-    label = labels[0] if pair is None else pair
-    if label not in labels:
-        raise InputError(f"There is no pair {label} in {path}; choose among {'; '.join(labels)}.")
-    return label
 
 
 def in_uk2(path: str | Path, table: Table, name: str) -> NDArray[np.float64]:

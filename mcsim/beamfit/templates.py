@@ -25,10 +25,7 @@ TRIAL_MOMENTS = 16
 class Polynomial:
     """Data as a polynomial of second degree in the parameters theta.
 
-    Attributes
-    ----------
-    constant, linear, quadratic
-        Coefficients in uK^2, shapes (p,), (p, K) and, symmetric in the last two axes, (p, K, K).
+    The coefficients, in uK^2, have shapes (p,), (p, K) and, symmetric in the last two axes, (p, K, K).
     """
 
     constant: NDArray[np.float64]
@@ -52,20 +49,8 @@ class Polynomial:
 class Templates:
     """Prediction of binned data for a survey's beams with b_l2 times f_l.
 
-    Attributes
-    ----------
-    measured
-        Data vector, which defines the bins.
-    survey
-        Survey with beams, scans and spectrum.
-    pair
-        Indices of the maps.
-    beams
-        Beams of these maps, with moments of high degree.
-    nthreads
-        Number of threads.
-    known
-        Exact data computed so far, by f_l: nested models share them.
+    The measurement defines the bins, ``pair`` the indices of the maps; ``beams`` are those of these maps, with moments
+    of high degree. ``known`` keeps the exact data computed so far, by f_l: nested models share them.
     """
 
     measured: Measurement

@@ -1,13 +1,12 @@
-"""Describe one case of a challenge: the effects that act in it, and the prior that they are drawn from."""
+"""Describe one case of a challenge: what it is drawn from, what acts in it, and what was answered."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from mcsim import config
 from mcsim.errors import InputError
 
 Vector = NDArray[np.float64]
@@ -17,7 +16,10 @@ Identity = tuple[str, str | None]
 Answer = frozenset[Identity]
 """Effects that act together; the empty set: no effect."""
 
-KINDS: tuple[Kind, ...] = ("none", "one", "two", "left_out", "invented")
+Place = tuple[str | None, int | None, str | None]
+"""Frame, L and parity of a place, None where it has none."""
+
+KINDS: tuple[Kind, ...] = get_args(Kind)
 IN_LIBRARY = ("none", "one", "two")
 """Kinds of cases whose effects the diagnosis can name."""
 
@@ -64,19 +66,10 @@ class Prior:
 class Member:
     """One effect that acts in a case.
 
-    Attributes
-    ----------
-    name, channel, parameters
-        As in ``[[effect]]`` of a run, amplitude included.
-    coordinates
-        Linear components of the effect.
-    strength
-        Expected S/N: whitened norm of its response in the data vector of this very sky; of a stochastic effect, of its
-        mean response.
-    candidate
-        Index among the candidates of the full library; None: an out-of-library effect.
-    response
-        Response of the data vector to an out-of-library effect, which has no template.
+    Name, channel and parameters are those of ``[[effect]]`` of a run, amplitude included; the coordinates are the
+    effect's linear components. The strength is the expected S/N: the whitened norm of the response in the data vector
+    of this very sky, or of the mean response if the effect is stochastic. ``candidate`` is an index among those of the
+    full library; None: an effect that no library has, whose response of the data vector is kept instead.
     """
 
     name: str
@@ -92,24 +85,13 @@ class Member:
         """Return name and channel."""
         return self.name, self.channel
 
-    def table(self) -> config.Effect:
-        """Return the effect as ``[[effect]]`` of a run."""
-        return config.Effect(name=self.name, channel=self.channel, parameters=dict(self.parameters))
-
 
 @dataclass(frozen=True, kw_only=True)
 class Drawn:
-    """What was drawn for a case.
+    """Effects that act in a case, and names of those that the diagnosis must not propose.
 
-    Attributes
-    ----------
-    kind
-        "none", "one" or "two" effects of the library; "left_out": one that is taken out of the library before the case
-        is diagnosed; "invented": one that no library has.
-    members
-        Effects that act.
-    without
-        Effects that the diagnosis must not propose.
+    The kind is "none", "one" or "two" effects of the library; "left_out": one that is taken out of the library before
+    the case is diagnosed; "invented": one that no library has.
     """
 
     kind: Kind
@@ -129,21 +111,96 @@ class Drawn:
 
 @dataclass(frozen=True, kw_only=True)
 class Truth(Drawn):
-    """Content of a key.
+    """Content of a key: name of the case, seed of the data, whether the maps were made sample by sample.
 
-    Attributes
-    ----------
-    case
-        Name of the case.
-    seed
-        Seed of the simulated data.
-    sampled
-        True if the maps were made sample by sample.
-    nonce
-        256 random bits, in hexadecimal: without them a short list of possible keys could be tried against the seal.
+    The nonce is 256 random bits, in hexadecimal: without them a short list of possible keys could be tried against the
+    seal.
     """
 
     case: str
     seed: int
     sampled: bool
     nonce: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record:
+    """One case after its key is opened; the names are keys of ``score.json``.
+
+    Attributes
+    ----------
+    case, kind, truth
+        Name and kind of the case, and the effects that act.
+    strength, columns
+        Expected S/N of all effects together, and number of linear components of a single one.
+    rival, distances
+        Largest cosine of the response with a candidate that does not act, and the S/N that the best one, two and three
+        candidates, none of them acting, leave of the response.
+    p_value, maximum, verdict, answers
+        p-value of the global test, and of the most significant candidate alone, look-elsewhere effect included; the
+        verdict, and the accepted sets of effects, the best first.
+    bayes, bayes_right
+        Most probable set of the Bayes-optimal classifier, and the probability that this gives it; None and NaN where
+        the truth is none of its hypotheses.
+    pulls, fitted
+        Fitted less true components over their errors, where the only effect was named; and named or not.
+    predicted, achieved, sigma
+        Fractional reduction of the excess chi^2 on held-out data, and the error of the measured one; None: not
+        measured.
+    gaps, absent
+        Excess chi^2 of held-out data before and after the named effects are added; after one that does not act.
+    places, sampled
+        (frame, L, parity) of the three most significant places, None: not looked for; True if the maps were made sample
+        by sample.
+    """
+
+    case: str
+    kind: Kind
+    truth: Answer
+    strength: float
+    columns: int
+    rival: float
+    distances: tuple[float, ...]
+    p_value: float
+    maximum: float
+    verdict: str
+    answers: tuple[Answer, ...]
+    bayes: Answer | None = None
+    bayes_right: float = np.nan
+    pulls: tuple[float, ...] = ()
+    fitted: tuple[float, ...] = ()
+    predicted: float | None = None
+    achieved: float | None = None
+    sigma: float | None = None
+    gaps: tuple[float, float] | None = None
+    absent: tuple[float, float] | None = None
+    places: tuple[Place, ...] | None = None
+    sampled: bool = False
+
+    @property
+    def best(self) -> Answer | None:
+        """Return the set of effects that is named first."""
+        return self.answers[0] if self.answers else None
+
+    @property
+    def in_library(self) -> bool:
+        """Return True if the library has all effects that act."""
+        return self.kind in IN_LIBRARY
+
+    @property
+    def right(self) -> bool:
+        """Return True if the truth is named first, or called unknown where the library does not have it."""
+        if not self.in_library:
+            return self.verdict == "unknown"
+        return self.verdict == "none" if not self.truth else self.best == self.truth
+
+    @property
+    def wrong_name(self) -> bool:
+        """Return True if one effect is named, without an alternative, that does not act."""
+        return self.verdict == "effect" and self.best is not None and not self.best <= self.truth
+
+
+def pulls(fitted: ArrayLike, true: ArrayLike, errors: ArrayLike) -> tuple[float, ...]:
+    """Return fitted less true components over their errors, without components that the data do not constrain."""
+    difference, sigma = np.asarray(fitted) - np.asarray(true), np.asarray(errors)
+    return tuple(float(value) for value in difference[sigma > 0.0] / sigma[sigma > 0.0])

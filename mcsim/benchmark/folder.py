@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from mcsim import config
 from mcsim.benchmark.case import Member, Prior, Truth
 from mcsim.benchmark.out_of_library import load
 from mcsim.errors import InputError
+from mcsim.support.folders import write_whole
 
 SETTINGS, MAPS, KEYS, SEAL, VERDICTS = "challenge.json", "cases", "keys", "SEAL", "verdicts"
 
@@ -19,20 +19,11 @@ SETTINGS, MAPS, KEYS, SEAL, VERDICTS = "challenge.json", "cases", "keys", "SEAL"
 class Settings:
     """Settings that all cases of a challenge share.
 
-    Attributes
-    ----------
-    model
-        Run that the diagnosis takes for a description of the data.
-    prior
-        Distribution that the effects are drawn from.
-    sampled_share
-        Share of the maps that are made sample by sample, by another route than that which the diagnosis simulates with.
-        Maps with out-of-library effects always are.
-    out_of_library
-        Python file with classes of effects that no library has; None: there are none. Not known of a challenge that was
-        read from its folder.
-    simulations
-        Number of simulations for the covariance of the data vector; default: ten for each element.
+    ``model`` is the run that the diagnosis takes for a description of the data. ``sampled_share`` of the maps, and all
+    with out-of-library effects, are made sample by sample, by another route than that which the diagnosis simulates
+    with. ``out_of_library`` is a Python file with classes of effects that no library has; None: there are none, or they
+    are not known because the challenge was read from its folder. ``simulations`` is the number for the covariance of
+    the data vector; default: ten for each element.
     """
 
     model: config.RunConfig
@@ -82,14 +73,6 @@ def read_json(path: Path, remedy: str) -> Any:
         raise InputError(f"{path} cannot be read ({error}); {remedy}.") from error
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Write a file that appears complete or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
-    scratch.write_text(text)
-    os.replace(scratch, path)
-
-
 def key_path(folder: Path, case: str) -> Path:
     """Return the path of the key of a case."""
     return folder / KEYS / f"{case}.json"
@@ -106,10 +89,9 @@ def read_key(folder: Path, case: str) -> Truth:
     plain = read_json(path, "restore the key, or make the challenge again")
     try:
         del plain["schema"]
-        members = tuple(
-            Member(**{**row, "coordinates": tuple(row["coordinates"]), "response": tuple(row["response"])})
-            for row in plain.pop("members")
-        )
+        for member in plain["members"]:
+            member |= {"coordinates": tuple(member["coordinates"]), "response": tuple(member["response"])}
+        members = tuple(Member(**member) for member in plain.pop("members"))
         return Truth(members=members, without=tuple(plain.pop("without")), **plain)
     except (KeyError, TypeError) as error:
         raise InputError(f"{path} cannot be read as a key ({error}); make the challenge again.") from error
@@ -121,13 +103,7 @@ def key_hash(folder: Path, case: str) -> str:
 
 
 def open_key(folder: Path, case: str) -> Truth:
-    """Read the key of a case that has not changed since it was sealed.
-
-    Raises
-    ------
-    InputError
-        If the key is missing or unreadable, or if its hash is not the one published with the maps.
-    """
+    """Read the key of a case; InputError if it has changed since its hash was published with the maps."""
     truth = read_key(folder, case)
     seal = (folder / MAPS / case / SEAL).read_text().split()
     if seal[:1] != [key_hash(folder, case)]:

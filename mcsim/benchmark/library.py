@@ -1,27 +1,31 @@
-"""Describe the candidates of a diagnosis in whitened coordinates, and judge data vectors that are linear in them."""
+"""Describe what cases are judged with: candidates and templates, and a model that is learned once per process."""
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.benchmark.case import Answer, Identity, Member
-from mcsim.diagnosis.analysis import Analysis
-from mcsim.diagnosis.candidate import Candidate, columns_of, effects_at, numbered
-from mcsim.diagnosis.context import DiagnosisContext
+from mcsim import config
+from mcsim.benchmark.case import Identity, Member, Vector
+from mcsim.benchmark.folder import Settings
+from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, data_vectors
+from mcsim.diagnosis.api import prepared
+from mcsim.diagnosis.campaign import Batch, after_jobs, asking, batch, seeded, with_effects
+from mcsim.diagnosis.candidate import Candidate, TemplateBank, columns_of, effects_at, numbered
+from mcsim.diagnosis.context import DiagnosisContext, context
 from mcsim.diagnosis.null_ensemble import NullEnsemble
-from mcsim.diagnosis.selection import Attribution, attribute
+from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.subsets import Subsets
-from mcsim.diagnosis.summaries import Element
-from mcsim.diagnosis.templates import TemplateBank
-from mcsim.diagnosis.validation import Halves, Prediction, Shrink
-from mcsim.errors import InputError
+from mcsim.diagnosis.validation import Halves, HeldOut
+from mcsim.errors import InputError, RunError
 from mcsim.stats.gaussian import Fit, SimulatedGaussian, WhitenedTemplates
-from mcsim.stats.look_elsewhere import Calibration, GlobalTest, calibrate, global_test
+from mcsim.stats.look_elsewhere import Calibration, calibrate
 
-Vector = NDArray[np.float64]
+SKIES = 6
+"""Skies that an expected S/N is the mean of."""
 
 HELD_OUT = 0.25
 """Share of the simulations that serve as data, and not for the covariance."""
@@ -31,27 +35,15 @@ HELD_OUT = 0.25
 class Library:
     """Candidates of a diagnosis, their templates, and the noise model that they are tested with.
 
-    Attributes
-    ----------
-    null
-        Distribution of the data vector, of p_raw elements, without any effect.
-    templates
-        Response per unit coordinate, shape (p_raw, K).
-    candidates
-        Effects that can be named.
-    calibration
-        Look-elsewhere correction of the candidates.
+    ``null`` describes the data vector, of p_raw elements, without any effect; the templates are its response per unit
+    coordinate, shape (p_raw, K); ``rows`` are the elements of the full data vector that it uses.
     """
 
     null: SimulatedGaussian
     templates: NDArray[np.float64]
     candidates: Sequence[Candidate]
     calibration: Calibration
-
-    @classmethod
-    def of(cls, context: DiagnosisContext) -> "Library":
-        """Take the library from what a diagnosis has learned."""
-        return cls(context.null, context.templates, context.candidates, context.calibration)
+    rows: NDArray[np.int64]
 
     @cached_property
     def groups(self) -> WhitenedTemplates:
@@ -76,18 +68,13 @@ class Library:
 
     def cosines(self, response: Vector) -> Vector:
         """Return the cosine of a response, shape (p_raw,), with the span of each candidate, shape (candidates,)."""
-        white = self.null.whiten_templates(response[:, None])[:, 0]
+        white = self.null.whiten_templates(response)
         size = float(np.linalg.norm(white))
         return np.sqrt(self.groups.delta_chi2(white)) / size if size > 0.0 else np.zeros(len(self.candidates))
 
-    def rival(self, response: Vector, truth: Answer) -> float:
-        """Return the largest cosine of a response with a candidate that is not among the effects of ``truth``."""
-        others = [identity not in truth for identity in self.identities]
-        return float(np.max(self.cosines(response)[others], initial=0.0))
-
     def distances(self, response: Vector, largest: int = 3) -> tuple[float, ...]:
         """Return the S/N that the best sets of 1, 2, ..., ``largest`` candidates leave of a response."""
-        white = self.null.whiten_templates(response[:, None])[:, 0]
+        white = self.null.whiten_templates(response)
         search = Subsets(self.null, white, self.groups, self.candidates, self.calibration)
         found, best = [], search.total
         for size in range(1, largest + 1):
@@ -96,49 +83,30 @@ class Library:
             found.append(float(np.sqrt(self.null.hartlap_factor * max(best, 0.0))))
         return tuple(found)
 
-    def test(self, x: Vector) -> GlobalTest:
-        """Test a data vector for any departure from the model."""
-        return global_test(self.null, x, self.groups, self.calibration)
-
-    def attribute(self, x: Vector) -> Attribution:
-        """Attribute a data vector to effects of the library."""
-        return attribute(self.null, x, self.templates, self.candidates, self.calibration)
-
 
 @dataclass(frozen=True, eq=False)
-class LinearModel:
-    """A model whose responses are straight lines: simulated data vectors plus templates times coordinates.
+class LinearModel(Library):
+    """A library whose responses are straight lines: simulated data vectors plus templates times coordinates.
 
-    Attributes
-    ----------
-    library
-        Whose covariance does not know the simulations that serve as data.
-    rows
-        Elements of the full data vector that it uses.
-    halves
-        The two folds of the data vector; None: there are none.
-    data
-        Data vectors without an effect, shape (n, p_raw).
+    Its covariance does not know the simulations that serve as ``data`` without an effect, shape (n, p_raw). ``halves``
+    are the two folds of the data vector; None: there are none.
     """
 
-    library: Library
-    rows: NDArray[np.int64]
     halves: Halves | None
     data: NDArray[np.float64]
 
-    def held_out_reduction(self, x: Vector, members: Sequence[int]) -> tuple[Prediction, Shrink] | None:
+    def held_out_reduction(self, x: Vector, members: Sequence[int]) -> HeldOut | None:
         """Fit candidates to one half of a data vector, and predict and measure the reduction of the other's excess.
 
         None if there are no halves, or if an effect cannot have the fitted amplitude.
         """
         if self.halves is None:
             return None
-        candidates = self.library.candidates
-        t = self.library.templates[:, columns_of(candidates, members)]
+        t = self.templates[:, columns_of(self.candidates, members)]
 
         def respond(frozen: Fit) -> Vector:
-            effects = effects_at(candidates, members, frozen)
-            return np.asarray(t @ np.concatenate([effect.coordinates() for effect in effects]))
+            effects = effects_at(self.candidates, members, frozen)
+            return np.asarray(t @ np.concatenate([effect.parametrization.coordinates(effect) for effect in effects]))
 
         try:
             return replace(self.halves, x=x).reduction(t, respond)
@@ -146,47 +114,96 @@ class LinearModel:
             return None
 
 
-def linear_model(context: DiagnosisContext, without: Sequence[str] = ()) -> LinearModel:
+def linear_model(known: DiagnosisContext, without: Sequence[str] = ()) -> LinearModel:
     """Make the linear model of a diagnosis, without some effects; a quarter of its simulations become data.
 
     Templates are exact here: neither their errors nor the scatter of stochastic effects play a part.
     """
-    analysis, ensemble, bank, rows = reduced(context, without)
+    analysis, ensemble, bank, rows = reduced(known, without)
     kept = len(ensemble.simulations) - int(HELD_OUT * len(ensemble.simulations))
     seen = replace(ensemble, simulations=ensemble.simulations[:kept])
     candidates = tuple(replace(candidate, shape_error=None) for candidate in analysis.candidates)
-    null, templates = seen.gaussian, bank.significant(ensemble.spread, context.settings)
+    null, templates = seen.gaussian, bank.significant(ensemble.spread, known.settings)
     groups = null.whiten_groups(templates, [candidate.columns for candidate in candidates])
-    library = Library(null, templates, candidates, calibrate(null, groups))
-    halves = Halves.of(seen, np.zeros(len(templates)))
-    return LinearModel(library, rows, halves, ensemble.simulations[kept:] + ensemble.offset)
+    halves, data = Halves.of(seen, np.zeros(len(templates))), ensemble.simulations[kept:] + ensemble.offset
+    return LinearModel(null, templates, candidates, calibrate(null, groups), rows, halves, data)
 
 
 def reduced(
-    context: DiagnosisContext, names: Collection[str]
+    known: DiagnosisContext, names: Collection[str]
 ) -> tuple[Analysis, NullEnsemble, TemplateBank, NDArray[np.int64]]:
     """Leave effects out of a library without learning anything again.
 
     Their candidates, the columns of their templates and the elements that are matched filters of them go. An element
     does not depend on the others, so the rest is what ``mcsim diagnose --without`` learns from the same simulations.
-
-    Returns
-    -------
-    tuple
-        Analysis, null ensemble and templates without the effects, and the elements of the full data vector that they
-        keep.
+    The last array holds the elements of the full data vector that are kept.
     """
-    analysis = context.analysis
+    analysis = known.analysis
     kept = [candidate for candidate in analysis.candidates if candidate.name not in names]
-    gone = {candidate.label for candidate in analysis.candidates if candidate.name in names}
-
-    def matched_to_gone(element: Element) -> bool:
-        label = element.name.removeprefix("score/").rpartition("/")[0]
-        return element.statistic == "score" and label in gone
-
-    blocks = tuple(block for block in analysis.blocks if not all(map(matched_to_gone, block.elements)))
-    rows = np.flatnonzero([not matched_to_gone(element) for element in analysis.elements])
-    columns = np.array([column for candidate in kept for column in candidate.columns], dtype=np.int64)
+    blocks = tuple(block for block in analysis.blocks if all(one.candidate not in names for one in block.elements))
+    rows = np.flatnonzero([element.candidate not in names for element in analysis.elements])
+    columns = [column for column, label in enumerate(known.bank.labels) if label.effect not in names]
     without = tuple(sorted({*analysis.without, *names}))
-    fewer = Analysis(analysis.model, numbered(kept), blocks, without)
-    return fewer, context.ensemble.restrict(rows), context.bank.subset(rows, columns), rows
+    fewer = replace(analysis, candidates=numbered(kept), blocks=blocks, without=without)
+    return fewer, known.ensemble.restrict(rows), known.bank.subset(rows, columns), rows
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedModel(Library):
+    """A library with all that cases of a model are diagnosed with."""
+
+    context: DiagnosisContext
+
+    def simulate(self, jobs: Sequence[Job]) -> list[Vector]:
+        """Return the data vectors of simulations that are made in this process."""
+        return [data_vectors(replace(job, without=()))[:, self.rows] for job in jobs]
+
+    def expected_snr(self, effect: config.Effect) -> float:
+        """Return the expected S/N of the mean response, from two halves of the skies: noise is no part of it."""
+        halves = self.simulate(after_jobs(self.context.analysis, [effect], SKIES))
+        before = np.split(self.context.ensemble.reference[:SKIES], [len(halves[0])])
+        changes = [(after - same).mean(axis=0) for after, same in zip(halves, before, strict=True)]
+        first, second = (self.null.whiten_templates(change) for change in changes)
+        return float(np.sqrt(max(self.null.hartlap_factor * float(first @ second), 0.0)))
+
+    def expected_snr_on_sky(self, effect: config.Effect, seed: int) -> float:
+        """Return the expected S/N of the response to an effect in the sky and noise of one seed."""
+        run = seeded(self.context.run, seed)
+        jobs = [replace(self.context.analysis.job(with_effects(run, one)), count=1) for one in ((), (effect,))]
+        before, after = self.simulate(jobs)
+        return self.null.expected_snr(after[0] - before[0])
+
+
+def learned_model(settings: Settings, without: tuple[str, ...] = ()) -> LearnedModel:
+    """Return a model that was learned before, without some effects; RunError if it is not in the cache."""
+    return _learned(config.to_json(settings.model), settings.simulations, without)
+
+
+@lru_cache(maxsize=3)
+def _learned(model: str, simulations: int | None, without: tuple[str, ...]) -> LearnedModel:
+    if without:
+        full = _learned(model, simulations, ()).context
+        analysis, ensemble, bank, rows = reduced(full, without)
+        known = context(analysis, ensemble, bank)
+    else:
+        run = config.from_json(model)
+        known = prepared(run, analysis_of(run, settings=DiagnosisSettings(simulations=simulations)), _refuse)
+        rows = np.arange(len(known.analysis.elements))
+    return LearnedModel(known.null, known.templates, known.candidates, known.calibration, rows, known)
+
+
+def _refuse(jobs: Sequence[Job]) -> list[Vector]:
+    raise RunError("the simulations of the model are not in the cache of this worker; let all workers share one cache.")
+
+
+@contextmanager
+def workers_of(settings: Settings, workers: int | None, quiet: bool) -> Iterator[Batch]:
+    """Start processes for as long as the block lasts, and learn the model with them if it is not in the cache.
+
+    ``workers`` None: as many as the model says; 0: this process.
+    """
+    run = settings.model
+    with batch(run.compute.workers if workers is None else workers) as call:
+        with asking(call, quiet) as ask:
+            prepared(run, analysis_of(run, settings=DiagnosisSettings(simulations=settings.simulations)), ask)
+        yield call

@@ -1,24 +1,37 @@
-"""Load effects that no library has from a Python file."""
+"""Load effects that no library has from a Python file, and simulate the response of the data vector to them."""
 
 import importlib.util
 import inspect
 import sys
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
-from mcsim import systematics
+from mcsim import config, systematics
+from mcsim.benchmark.case import Vector
+from mcsim.diagnosis.analysis import Job, data_vectors
+from mcsim.diagnosis.campaign import Batch, with_effects
 from mcsim.errors import InputError
 from mcsim.systematics import Effect, Library
+
+SKIES = 2
+"""Skies that the response to an out-of-library effect is the mean of."""
+
+
+@dataclass(frozen=True)
+class OutOfLibrary:
+    """An effect that no library has, in one channel, and the response of the data vector per unit of its amplitude."""
+
+    kind: type[Effect]
+    channel: str | None
+    response: Vector
 
 
 @lru_cache(maxsize=4)
 def load(path: str) -> dict[str, type[Effect]]:
     """Load the effects that a Python file defines, by name.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be run, or defines no effect, or one whose name the library has.
+    InputError if the file cannot be run, or defines no effect, or one whose name the library has.
     """
     spec = importlib.util.spec_from_file_location(f"mcsim_out_of_library_{Path(path).stem}", path)
     if spec is None or spec.loader is None or not Path(path).is_file():
@@ -44,3 +57,32 @@ def load(path: str) -> dict[str, type[Effect]]:
 def library_with(path: str | None) -> Library | None:
     """Return the catalogue with the effects of a file; None, the catalogue itself, without a file."""
     return None if path is None else {**systematics.catalogue(), **load(path)}
+
+
+def responses(run: config.RunConfig, file: str, call: Batch) -> dict[str, list[OutOfLibrary]]:
+    """Simulate the response to a unit of each effect of a file, by name: sample by sample, without noise."""
+    channels = [channel.name for channel in run.channels]
+    units = [
+        (channel, kind(amplitude=kind.step))
+        for kind in load(file).values()
+        for channel in ([None] if kind.scope == "common" else channels)
+    ]
+    # An effect of no strength: the dipole is seen and subtracted only where there is some effect.
+    idle = [config.Effect(name="beam_width", channel=name, parameters={"amplitude": 0.0}) for name in channels]
+    added = [
+        config.Effect(name=one.name, channel=channel, parameters={"amplitude": one.amplitude, **one.parameters()})
+        for channel, one in units
+    ]
+    quiet = replace(run, channels=tuple(replace(channel, noise=config.Noise()) for channel in run.channels))
+    runs = [with_effects(quiet, [*idle, *more]) for more in ((), *([one] for one in added))]
+    jobs = [(Job(config.to_json(run), config.to_json(one), 0, SKIES, True), file) for one in runs]
+    simulated = dict(call(_data_vectors, jobs))
+    before, *after = (simulated[index].mean(axis=0) for index in range(len(jobs)))
+    result: dict[str, list[OutOfLibrary]] = {}
+    for (channel, one), mean in zip(units, after, strict=True):
+        result.setdefault(one.name, []).append(OutOfLibrary(type(one), channel, (mean - before) / one.amplitude))
+    return result
+
+
+def _data_vectors(job: Job, file: str) -> Vector:
+    return data_vectors(job, library_with(file))

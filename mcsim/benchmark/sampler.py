@@ -5,38 +5,16 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mcsim.benchmark.case import KINDS, Drawn, Kind, Member, Prior
+from mcsim.benchmark.case import KINDS, Drawn, Kind, Member, Prior, Vector
 from mcsim.benchmark.library import Library
+from mcsim.benchmark.out_of_library import OutOfLibrary
 from mcsim.sphere import rng
-from mcsim.systematics import Effect
-
-Vector = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class OutOfLibrary:
-    """An effect that no library has, in one channel, and the response of the data vector per unit of its amplitude."""
-
-    kind: type[Effect]
-    channel: str | None
-    response: Vector
 
 
 @dataclass(frozen=True)
 class CaseSampler:
-    """Draws of cases.
-
-    Attributes
-    ----------
-    prior
-        Distribution that is drawn from.
-    library
-        All effects that can be named.
-    out_of_library
-        Effects that no library has, by name, channel by channel.
-    """
+    """Draw cases from a prior: effects of a library, and effects that no library has, by name, channel by channel."""
 
     prior: Prior
     library: Library
@@ -54,12 +32,11 @@ class CaseSampler:
             order = rng.generator(seed, 0, "challenge/rotation").permutation(len(self.names))
             name = self.names[order[turn % len(order)]]
             return Drawn(kind=kind, members=(self._member(draw, name),), without=(name,))
-        members: list[Member] = []
+        members: dict[tuple[str, str | None], Member] = {}
         while len(members) < {"none": 0, "one": 1, "two": 2}[kind]:
             found = self._member(draw, self.names[int(draw.integers(len(self.names)))])
-            if found.identity not in [member.identity for member in members]:
-                members.append(found)
-        return Drawn(kind=kind, members=tuple(members))
+            members.setdefault(found.identity, found)
+        return Drawn(kind=kind, members=tuple(members.values()))
 
     def kinds(self, seed: int, count: int, out_of_library: bool = False) -> list[Kind]:
         """Draw the kinds of the first cases of a challenge; that of a case does not depend on their number."""
@@ -72,8 +49,9 @@ class CaseSampler:
         """Effects that can reach the smallest expected S/N at an amplitude that is possible."""
         return list(self._groups)
 
+    @cached_property
     def weights(self) -> Vector:
-        """Return the prior probability of each candidate as the only effect, shape (candidates,)."""
+        """Prior probability of each candidate as the only effect, shape (candidates,)."""
         total = np.zeros(len(self.library.candidates))
         for channels in self._groups.values():
             for group in channels:
@@ -85,54 +63,49 @@ class CaseSampler:
         """Candidates that can be drawn: name by name, channel by channel."""
         found: dict[str, dict[str | None, list[int]]] = {}
         for index, candidate in enumerate(self.library.candidates):
-            if self._can_be_drawn(index):
+            largest = float(np.max(np.linalg.norm(self._white(index), axis=0)))
+            # Of an effect without response and without a limit the product is NaN, which is not larger.
+            if candidate.effect.parametrization.max_amplitude * largest >= self.prior.weakest:
                 found.setdefault(candidate.name, {}).setdefault(candidate.channel, []).append(index)
         return {name: list(channels.values()) for name, channels in found.items()}
 
-    def _white(self, index: int) -> NDArray[np.float64]:
-        """Templates of a candidate in units of their standard deviations, shape (p, k)."""
+    def _white(self, index: int) -> Vector:
+        """Return the templates of a candidate in units of their standard deviations, shape (p, k)."""
         null = self.library.null
         t = self.library.templates[:, list(self.library.candidates[index].columns)]
         return np.sqrt(null.hartlap_factor) * null.whiten_templates(t)
 
-    def _can_be_drawn(self, index: int) -> bool:
-        largest = float(np.max(np.linalg.norm(self._white(index), axis=0)))
-        most = self.library.candidates[index].effect.max_amplitude
-        return largest > 0.0 if np.isinf(most) else most * largest >= self.prior.weakest
-
     def _member(self, draw: np.random.Generator, name: str) -> Member:
+        """Draw channel, settings, strength and direction of an effect of the library."""
         channels = self._groups[name]
         group = channels[int(draw.integers(len(channels)))]
         index = group[int(draw.integers(len(group)))]
         candidate, white, strength = self.library.candidates[index], self._white(index), self.prior.strength(draw)
-        gram = white.T @ white
+        gram, fit = white.T @ white, candidate.effect.parametrization
         values, vectors = np.linalg.eigh(gram)
         constrained = values > 1e-9 * values[-1]
         direction = draw.standard_normal(len(values))
         theta = vectors[:, constrained] @ (direction[constrained] / np.sqrt(values[constrained]))
-        effect = candidate.with_coordinates(np.abs(theta) if candidate.effect.sign else theta, gram)
+        effect = candidate.with_coordinates(np.abs(theta) if fit.sign else theta, gram)
         # The parameters reach only some directions, and coordinates need not be linear in the amplitude.
         for _ in range(30):
-            snr = np.linalg.norm(white @ effect.coordinates())
-            slope = np.log(np.linalg.norm(white @ effect.scaled(1.01).coordinates()) / snr) / np.log(1.01)
+            snr = np.linalg.norm(white @ fit.coordinates(effect))
+            slope = np.log(np.linalg.norm(white @ fit.coordinates(effect.scaled(1.01))) / snr) / np.log(1.01)
             effect = effect.scaled(float((strength / snr) ** (1.0 / slope)))
             if abs(snr / strength - 1.0) < 1e-9:
                 break
-        return Member(
-            name,
-            candidate.channel,
-            {"amplitude": effect.amplitude, **effect.parameters()},
-            tuple(float(value) for value in effect.coordinates()),
-            float(np.linalg.norm(white @ effect.coordinates())),
-            index,
-        )
+        coordinates = fit.coordinates(effect)
+        parameters = {"amplitude": effect.amplitude, **effect.parameters()}
+        reached = float(np.linalg.norm(white @ coordinates))
+        return Member(name, candidate.channel, parameters, tuple(map(float, coordinates)), reached, index)
 
     def _out_of_library(self, draw: np.random.Generator, name: str) -> Member:
+        """Draw channel and strength of an effect that no library has."""
         group = self.out_of_library[name]
         one = group[int(draw.integers(len(group)))]
         strength = self.prior.strength(draw)
         amplitude = strength / self.library.null.expected_snr(one.response)
         effect = one.kind(amplitude=amplitude)
         parameters = {"amplitude": effect.amplitude, **effect.parameters()}
-        response = tuple(float(value) for value in amplitude * one.response)
+        response = tuple(map(float, amplitude * one.response))
         return Member(name, one.channel, parameters, (amplitude,), strength, response=response)

@@ -1,44 +1,46 @@
-"""Open the keys and score the verdicts; score draws of the data vector by the same metrics."""
+"""Score the verdicts on full skies beside their keys, and draws of the data vector, without maps, like them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mcsim.benchmark import report
-from mcsim.benchmark.bayes import BayesClassifier
-from mcsim.benchmark.case import Truth
-from mcsim.benchmark.draws import draws, powers
+from mcsim.benchmark.bayes import BayesClassifier, facts
+from mcsim.benchmark.case import Drawn, Prior, Record, Truth, Vector, pulls
 from mcsim.benchmark.folder import VERDICTS, Settings, finished_cases, open_key, read_json
-from mcsim.benchmark.learned import learned_model, workers_of
-from mcsim.benchmark.library import Library, linear_model
-from mcsim.benchmark.record import Record, best_possible, facts, pulls
+from mcsim.benchmark.library import Library, LinearModel, learned_model, linear_model, workers_of
 from mcsim.benchmark.sampler import CaseSampler
-from mcsim.benchmark.summary import Score, summarise
+from mcsim.benchmark.summary import ALPHA, Power, Score
+from mcsim.diagnosis.campaign import Batch
+from mcsim.diagnosis.candidate import Candidate
+from mcsim.diagnosis.context import DiagnosisContext
+from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.errors import InputError
+from mcsim.sphere import rng
+from mcsim.stats.detection import power
+from mcsim.stats.look_elsewhere import GlobalTest, global_test
 from mcsim.support.folders import writable
 
+CASES_PER_TASK = 20
 DETECTIONS = 4000
 """Draws of single effects that are tested for detection alone."""
+
+UNLIKE = 0.3
+"""Cosine below which an effect that does not act is unlike those that do."""
+
+STRONG = 8.0
+"""Expected S/N from which on an effect that does not act is added as well."""
 
 
 def score(folder: str | Path, *, workers: int | None = None, quiet: bool = True) -> Score:
     """Check the seals of a challenge, open the keys, and compare them with the verdicts.
 
-    Parameters
-    ----------
-    folder
-        With cases, keys and verdicts. It gets ``score/score.json``, ``score/report.html`` and ``score/score.png``.
-    workers
-        Processes that learn the model again, should it not be in the cache; default: the model's; 0: this process.
-    quiet
-        Report no progress.
-
-    Raises
-    ------
-    InputError
-        If there is no verdict, or one cannot be read, or a key is not the sealed one.
+    The folder gets ``score/score.json``, ``score/report.html`` and ``score/score.png``. ``workers`` are the processes
+    that learn the model again, should it not be in the cache; None: the model's; 0: this process. InputError if there
+    is no verdict, or one cannot be read, or a key is not the sealed one.
     """
     target = Path(folder)
     made = finished_cases(target)
@@ -48,15 +50,12 @@ def score(folder: str | Path, *, workers: int | None = None, quiet: bool = True)
     settings, truths = Settings.read(target), [open_key(target, case) for case in cases]
     with workers_of(settings, workers, quiet):
         pass  # now the model is in the cache
-    library = learned_model(settings).library
-    bayes = BayesClassifier(CaseSampler(settings.prior, library))
+    bayes = BayesClassifier(CaseSampler(settings.prior, learned_model(settings)))
     # Cases of one library after each other: a smaller library takes a second.
     order = sorted(truths, key=lambda truth: truth.without)
     records = [_record(settings, truth, target / VERDICTS / truth.case, bayes) for truth in order]
-    title = f"{len(cases)} full skies" + (
-        f" of {len(made)}; the others have no verdict" if len(cases) < len(made) else ""
-    )
-    result = summarise(title, sorted(records, key=lambda record: record.case))
+    others = f" of {len(made)}; the others have no verdict" if len(cases) < len(made) else ""
+    result = Score(f"{len(cases)} full skies{others}", sorted(records, key=lambda record: record.case))
     report.write(result, target / "score")
     return result
 
@@ -64,22 +63,10 @@ def score(folder: str | Path, *, workers: int | None = None, quiet: bool = True)
 def score_draws(
     settings: Settings, folder: str | Path, number: int, seed: int, *, workers: int | None = None, quiet: bool = True
 ) -> Score:
-    """Score draws of a model's data vector; see :func:`mcsim.benchmark.draws.draws`.
+    """Score draws of a model's data vector (:func:`draws`), and write the score into a folder.
 
-    Parameters
-    ----------
-    settings
-        Model, prior and number of simulations.
-    folder
-        Gets ``score.json``, ``report.html`` and ``score.png``.
-    number
-        Number of draws; :data:`DETECTIONS` more are tested for detection alone.
-    seed
-        Of the draws.
-    workers
-        Number of processes; default: the model's; 0: this process.
-    quiet
-        Report no progress.
+    :data:`DETECTIONS` more draws are tested for detection alone. ``workers`` is the number of processes; None: the
+    model's; 0: this process.
     """
     if number < 1:
         raise InputError(f"a score of {number} draws is none; ask for at least 1.")
@@ -87,8 +74,8 @@ def score_draws(
     with workers_of(settings, workers, quiet) as call:
         context = learned_model(settings).context
         records = draws(context, number, seed, settings.prior, call)
-    power = powers(linear_model(context), DETECTIONS, seed)
-    result = summarise(f"{number} draws of the data vector", records, power)
+    found = powers(linear_model(context), DETECTIONS, seed)
+    result = Score(f"{number} draws of the data vector", records, found)
     report.write(result, Path(folder))
     return result
 
@@ -108,8 +95,7 @@ def _record(settings: Settings, truth: Truth, folder: Path, bayes: BayesClassifi
         strength=members[0].strength if len(members) == 1 else full.null.expected_snr(response),
         sampled=truth.sampled,
         **said,
-        **facts(truth, response[model.rows], model.library),
-        **best_possible(truth, x, bayes),
+        **facts(truth, x, response[model.rows], model, bayes),
     )
 
 
@@ -122,19 +108,147 @@ def _said(truth: Truth, verdict: Mapping[str, Any], answer: Mapping[str, Any], l
         "maximum": answer["maximum"],
         "verdict": verdict["verdict"],
         "answers": tuple(frozenset((effect["name"], effect["channel"]) for effect in one) for one in sets),
-        "pulls": _pulls(truth, answer, library),
+        "pulls": _pulls(truth, verdict, answer, library),
         **{key: reduction.get(key) for key in ("predicted", "achieved", "sigma")},
         "gaps": (reduction["gap_before"], reduction["gap_after"]) if reduction else None,
         "places": tuple((place["frame"], place["L"], place["parity"]) for place in verdict["where"][:3]),
     }
 
 
-def _pulls(truth: Truth, answer: Mapping[str, Any], library: Library) -> tuple[float, ...]:
+def _pulls(truth: Truth, verdict: Mapping[str, Any], answer: Mapping[str, Any], library: Library) -> tuple[float, ...]:
     """Return fitted less true components over their errors, where the only effect is named first."""
     if truth.kind != "one" or not answer["explanations"]:
         return ()
     (member,), best = truth.members, answer["explanations"][0]
     assert member.candidate is not None  # it is of the library
-    if best["proposals"] != [library.candidates[member.candidate].label]:
+    if not _is_named(verdict["effects"], library.candidates[member.candidate]):
         return ()
     return pulls(best["amplitudes"], member.coordinates, best["errors"])
+
+
+def _is_named(effects: Sequence[Mapping[str, Any]], candidate: Candidate) -> bool:
+    """Return True if the only effect of a verdict is the candidate, with its settings."""
+    identities = [(effect["name"], effect["channel"]) for effect in effects]
+    return identities == [candidate.identity] and candidate.settings.items() <= effects[0]["parameters"].items()
+
+
+@dataclass(frozen=True, eq=False)
+class Draw:
+    """Number of a draw, what it is, and the response of the data vector of its library, shape (p_raw,)."""
+
+    number: int
+    drawn: Drawn
+    response: Vector
+
+
+def draws(context: DiagnosisContext, number: int, seed: int, prior: Prior, call: Batch) -> list[Record]:
+    """Draw data vectors and judge them by :func:`mcsim.diagnosis.selection.attribute`; one record for each draw.
+
+    x = data vector of a simulation without effects that is not in the covariance (the first one again when all have
+    been used), plus templates times coordinates: responses are straight lines here, and templates exact. What they are
+    not, and everything else that a map goes through, is tested by full skies. Out-of-library effects have no template
+    and are not drawn.
+    """
+    full = linear_model(context)
+    sampler = CaseSampler(prior, full)
+    kinds = sampler.kinds(seed, number)
+    by_library: dict[tuple[str, ...], list[Draw]] = {}
+    for case in range(number):
+        drawn = sampler.draw(kinds, seed, case)
+        by_library.setdefault(drawn.without, []).append(Draw(case, drawn, full.response(drawn.members)))
+    tasks = []
+    for names, cases in by_library.items():
+        model = linear_model(context, names) if names else full
+        posed = [replace(draw, response=draw.response[model.rows]) for draw in cases]
+        tasks += [(model, prior, seed, posed[i : i + CASES_PER_TASK]) for i in range(0, len(posed), CASES_PER_TASK)]
+    return sorted((record for _, found in call(judge, tasks) for record in found), key=lambda record: record.case)
+
+
+def judge(model: LinearModel, prior: Prior, seed: int, cases: Sequence[Draw]) -> list[Record]:
+    """Judge draws of one library."""
+    bayes = BayesClassifier(CaseSampler(prior, model))
+    found = []
+    for draw in cases:
+        x = model.data[draw.number % len(model.data)] + draw.response
+        said = attribute(model.null, x, model.templates, model.candidates, model.calibration)
+        record = Record(
+            case=f"draw-{draw.number:05d}",
+            strength=model.null.expected_snr(draw.response),
+            p_value=said.gap.pvalue,
+            maximum=said.gap.maximum,
+            verdict=said.verdict,
+            answers=tuple(frozenset(model.identities[m] for m in one.members) for one in said.explanations),
+            absent=_absent(model, draw, x, seed),
+            **facts(draw.drawn, x, draw.response, model, bayes),
+            **_fitted(said, draw.drawn),
+            **_reduction(model, x, said),
+        )
+        found.append(record)
+    return found
+
+
+def _fitted(said: Attribution, drawn: Drawn) -> dict[str, Any]:
+    """Return the pulls of the only effect, where it was named, and named or not."""
+    if drawn.kind != "one":
+        return {}
+    (member,) = drawn.members
+    assert member.candidate is not None  # it is of the library
+    alone = said.singles[member.candidate]
+    fitted = pulls(alone.amplitudes, member.coordinates, alone.errors)
+    named = bool(said.explanations) and said.explanations[0].members == (member.candidate,)
+    return {"pulls": fitted if named else (), "fitted": fitted}
+
+
+def _reduction(model: LinearModel, x: Vector, said: Attribution) -> dict[str, Any]:
+    """Return the reduction of the excess chi^2 of held-out data by the effects that are named first."""
+    found = model.held_out_reduction(x, said.explanations[0].members) if said.explanations else None
+    if found is None:
+        return {}
+    return {
+        "predicted": found.predicted.value,
+        "achieved": found.achieved.value,
+        "sigma": found.achieved.sigma,
+        "gaps": (found.before.value, found.after.value),
+    }
+
+
+def _absent(model: LinearModel, draw: Draw, x: Vector, seed: int) -> tuple[float, float] | None:
+    """Return the excess chi^2 before and after one effect that neither acts nor is like the one that does."""
+    if draw.drawn.kind != "one" or model.null.expected_snr(draw.response) < STRONG:
+        return None
+    acts = np.array([identity in draw.drawn.identities for identity in model.identities])
+    unlike = np.flatnonzero(~acts & (model.cosines(draw.response) < UNLIKE) & (model.groups.sizes > 0))
+    if not len(unlike):
+        return None
+    chosen = int(unlike[rng.generator(seed, draw.number, "challenge/absent").integers(len(unlike))])
+    found = model.held_out_reduction(x, (chosen,))
+    return None if found is None else (found.before.value, found.after.value)
+
+
+def powers(model: LinearModel, number: int, seed: int) -> Power:
+    """Test draws of single effects with an expected S/N from 1 to 9 for detection, without attribution."""
+    only = Prior(none=0.0, one=1.0, two=0.0, left_out=0.0, invented=0.0, weakest=1.0, strongest=9.0)
+    sampler = CaseSampler(only, model)
+    kinds = sampler.kinds(seed, number)
+    drawn = [sampler.draw(kinds, seed, case).members for case in range(number)]
+
+    def test(x: Vector) -> GlobalTest:
+        return global_test(model.null, x, model.groups, model.calibration)
+
+    tested = [test(model.data[case % len(model.data)] + model.response(one)) for case, one in enumerate(drawn)]
+    grid = np.linspace(0.5, 9.0, 35)
+    columns, counts = np.unique([len(members[0].coordinates) for members in drawn], return_counts=True)
+
+    def mean_power(simulations: int | None) -> Vector:
+        rest = ALPHA / model.calibration.tests, model.null.dimension, simulations
+        return np.average([[power(s, int(k), *rest) for s in grid] for k in columns], axis=0, weights=counts)
+
+    return Power(
+        strengths=np.array([members[0].strength for members in drawn]),
+        by_maximum=np.array([one.maximum <= ALPHA for one in tested]),
+        by_gap=np.array([one.pvalue <= ALPHA for one in tested]),
+        grid=grid,
+        limit=mean_power(None),
+        finite=mean_power(model.null.n_sims),
+        null_gap=np.array([test(x).pvalue for x in model.data]),
+    )

@@ -1,17 +1,16 @@
-"""Summarise records of cases: metrics with targets, and confusion matrices."""
+"""Summarise records of cases: metrics with targets, confusion matrices, and places of the effects' signatures."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from mcsim.benchmark.case import Answer
-from mcsim.benchmark.draws import Power
-from mcsim.benchmark.intervals import Metric, mean, ratio, removed, share, snr_at_power, width
-from mcsim.benchmark.record import Record
-from mcsim.benchmark.signatures import any_place_right
+from mcsim.benchmark.case import KINDS, Answer, Place, Record, Vector
+from mcsim.stats.intervals import Metric, mean, ratio, removed, share, snr_at_power, width
 
 ALPHA = 0.05
 """Level of the global test."""
@@ -23,91 +22,94 @@ called unknown; and from which on the reduction of the excess chi^2 is measured.
 DISTINCT, DEGENERATE = 0.7, 0.9
 """Cosine with another candidate up to which an effect can be told apart, and beyond which it cannot."""
 
+TRUTHS = ("none", "", "two", "left out", "out of library")
+ANSWERS = ("none", "", "mixture", "mixture, wrong", "set with the truth", "set without it", "unknown")
+"""Rows (by kind of case) and columns of a confusion matrix; names of single effects stand in place of the empty one."""
+
 
 @dataclass(frozen=True, eq=False)
 class Confusion:
     """Number of cases by truth and answer, shape (truths, answers)."""
 
-    truths: tuple[str, ...]
-    answers: tuple[str, ...]
+    truths: list[str]
+    answers: list[str]
     counts: NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class Unlisted:
-    """Cases with one effect that the library did not have; the names are keys of ``score.json``."""
+@dataclass(frozen=True, eq=False)
+class Power:
+    """Detection of single effects against their expected S/N.
 
-    name: str
-    cases: int
-    unknown: int
-    wrong_single_name: int
-    mean_distance: float | None
+    Of every draw: ``strengths`` (expected S/N), and whether the largest matched filter (``by_maximum``) and the global
+    test (``by_gap``) detect it at 5 %. On the ``grid`` of S/N: the mean power after Bonferroni over the library with
+    infinitely many simulations (``limit``) and with those that there are (``finite``). Of data vectors without an
+    effect: the p-values of the global test (``null_gap``).
+    """
+
+    strengths: Vector
+    by_maximum: NDArray[np.bool_]
+    by_gap: NDArray[np.bool_]
+    grid: Vector
+    limit: Vector
+    finite: Vector
+    null_gap: Vector
 
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Benchmark score of a set of records.
-
-    Attributes
-    ----------
-    title
-        What the records are of.
-    metrics
-        In the order of what they measure: detection, naming, unknown effects, amplitudes, reduction, places.
-    all_cases, library_cases, bayes
-        Confusion of the diagnosis in all cases and in those of the library, and of the Bayes classifier in the latter.
-    unlisted
-        Cases by the effect that the library did not have.
-    records, power
-        What the score was made of.
-    """
+    """Benchmark score of records; the title says what they are of, the power belongs to draws."""
 
     title: str
-    metrics: tuple[Metric, ...]
-    all_cases: Confusion
-    library_cases: Confusion
-    bayes: Confusion
-    unlisted: tuple[Unlisted, ...]
-    records: tuple[Record, ...]
-    power: Power | None
+    records: Sequence[Record]
+    power: Power | None = None
+
+    @cached_property
+    def metrics(self) -> tuple[Metric, ...]:
+        """Metrics in the order of what they measure; their fields are keys of ``score.json``."""
+        topics = (_naming, _against_bayes, _unknown, _amplitudes, _reductions, _places)
+        return (*_detection(self), *(metric for topic in topics for metric in topic(self.records)))
+
+    @property
+    def in_library(self) -> list[Record]:
+        """Return the records that the Bayes classifier has answered: the library has the truth."""
+        return [record for record in self.records if record.bayes is not None]
+
+    @property
+    def null_pvalues(self) -> Vector:
+        """Return the p-values of the global test of data without an effect."""
+        quiet = [record.p_value for record in self.records if record.kind == "none"]
+        return np.array(quiet) if self.power is None else self.power.null_gap
+
+    @property
+    def unlisted(self) -> list[dict[str, Any]]:
+        """Return counts of cases by the one effect that the library did not have; keys are those of ``score.json``."""
+        found: dict[str, list[Record]] = {}
+        for record in self.records:
+            if not record.in_library:
+                ((name, _),) = record.truth
+                found.setdefault(name, []).append(record)
+        return [_counts(name, rows) for name, rows in sorted(found.items())]
 
 
-def summarise(title: str, records: Sequence[Record], power: Power | None = None) -> Score:
-    """Summarise records, of draws with the power of detection."""
-    known = [record for record in records if record.bayes is not None]
-    return Score(
-        title=title,
-        metrics=(
-            *_detection(records, power),
-            *_naming(records),
-            *_against_bayes(known),
-            *_unknown(records),
-            *_amplitudes(records),
-            *_reductions(records),
-            *_places(records),
-        ),
-        all_cases=confusion(records),
-        library_cases=confusion(known),
-        bayes=confusion(known, bayes=True),
-        unlisted=_unlisted(records),
-        records=tuple(records),
-        power=power,
-    )
+def _counts(name: str, rows: Sequence[Record]) -> dict[str, Any]:
+    distances = [row.distances[-1] for row in rows if row.distances]
+    return {
+        "name": name,
+        "cases": len(rows),
+        "unknown": sum(row.verdict == "unknown" for row in rows),
+        "wrong_single_name": sum(row.wrong_name for row in rows),
+        "mean_distance": float(np.mean(distances)) if distances else None,
+    }
 
 
-def null_pvalues(records: Sequence[Record], power: Power | None) -> NDArray[np.float64]:
-    """Return the p-values of the global test of data without an effect."""
-    return np.array([r.p_value for r in records if r.kind == "none"]) if power is None else power.null_gap
-
-
-def _detection(records: Sequence[Record], power: Power | None) -> list[Metric]:
-    quiet = null_pvalues(records, power)
+def _detection(score: Score) -> list[Metric]:
+    quiet, power = score.null_pvalues, score.power
     false = share("false alarms, 5 % nominal", quiet <= ALPHA)
     found = [false.against("5 % within the interval", false.low <= ALPHA <= false.high)]
     if len(quiet) >= 5:
         p = float(stats.kstest(quiet, "uniform").pvalue)
         name = "p-values without an effect: p of Kolmogorov and Smirnov"
-        found.append(Metric(name, p, np.nan, np.nan, len(quiet)).within("above 0.01", 0.01))
+        found.append(Metric(name, len(quiet), p).within("above 0.01", 0.01))
     if power is not None:
         # The limit rises with the S/N.
         limit = float(np.interp(0.9, power.limit, power.grid, left=np.nan, right=np.nan))
@@ -115,7 +117,7 @@ def _detection(records: Sequence[Record], power: Power | None) -> list[Metric]:
         best = snr_at_power(f"{name}, matched filters", power.strengths, power.by_maximum, limit)
         found.append(best.within("within 10 % of the limit", high=1.1))
         found.append(snr_at_power(f"{name}, global test", power.strengths, power.by_gap, limit))
-    strong = [r.p_value <= ALPHA for r in records if r.kind == "one" and r.strength >= NAMED]
+    strong = [r.p_value <= ALPHA for r in score.records if r.kind == "one" and r.strength >= NAMED]
     return [*found, share(f"single effects detected, S/N >= {NAMED:g}", strong)]
 
 
@@ -124,60 +126,58 @@ def _naming(records: Sequence[Record]) -> list[Metric]:
     distinct = [r.right for r in ones if r.rival <= DISTINCT]
     between = [r.right for r in ones if DISTINCT < r.rival <= DEGENERATE]
     degenerate = [r.truth in r.answers for r in ones if r.rival > DEGENERATE]
-    single, degenerate_name = f"right effect, S/N >= {NAMED:g}", f"truth in the set, S/N >= {NAMED:g}"
+    single, several = f"right effect, S/N >= {NAMED:g}", f"truth in the set, S/N >= {NAMED:g}"
     return [
         share(f"{single}, |rho| <= {DISTINCT:g}", distinct).within("at least 95 %", 0.95),
         share(f"{single}, {DISTINCT:g} < |rho| <= {DEGENERATE:g}", between),
-        share(f"{degenerate_name}, |rho| > {DEGENERATE:g}", degenerate).within("at least 95 %", 0.95),
+        share(f"{several}, |rho| > {DEGENERATE:g}", degenerate).within("at least 95 %", 0.95),
         share("truth in the set, two effects", [r.truth in r.answers for r in records if r.kind == "two"]),
     ]
 
 
-def _against_bayes(known: Sequence[Record]) -> list[Metric]:
-    if not known:
-        return []
+def _against_bayes(records: Sequence[Record]) -> list[Metric]:
+    known = [r for r in records if r.bayes is not None]
     right = np.array([r.right for r in known], dtype=float)
     best = np.array([r.bayes == r.truth for r in known], dtype=float)
     stated = np.array([r.bayes_right for r in known])
-    return [
+    metrics = [
         share("right answer, diagnosis, truth in the library", right > 0),
         share("right answer, Bayes, truth in the library", best > 0),
         mean("right answers, Bayes less diagnosis", best - right).within("at most 0.02", high=0.02),
         mean("right answers of Bayes, stated probability less share", stated - best),
     ]
+    return metrics if known else []
 
 
 def _unknown(records: Sequence[Record]) -> list[Metric]:
     outside = [r for r in records if not r.in_library]
     far = [r for r in outside if r.distances and r.distances[-1] >= FAR]
     near = [r for r in outside if r.distances and r.distances[0] >= FAR > r.distances[-1]]
-    single = "wrong single name"
+    detected = [r.wrong_name for r in records if r.verdict != "none"]
+
+    def wrong(where: str, values: Sequence[bool]) -> Metric:
+        return share(f"wrong single name, {where}", values).within("at most 5 %", high=0.05)
+
     return [
         share(f"unknown, S/N >= {FAR:g} beyond every triple", [r.right for r in far]).within("at least 90 %", 0.9),
         share(f"unknown, S/N >= {FAR:g} beyond every single effect, not triple", [r.right for r in near]),
         share("unknown, out-of-library effects", [r.right for r in outside if r.kind == "invented"]),
-        share(f"{single}, S/N >= {FAR:g} beyond the library", [r.wrong_name for r in [*far, *near]]).within(
-            "at most 5 %", high=0.05
-        ),
-        share(f"{single}, truth in the library", [r.wrong_name for r in records if r.in_library]).within(
-            "at most 5 %", high=0.05
-        ),
-        share(f"{single}, all cases with a detection", [r.wrong_name for r in records if r.verdict != "none"]),
+        wrong(f"S/N >= {FAR:g} beyond the library", [r.wrong_name for r in [*far, *near]]),
+        wrong("truth in the library", [r.wrong_name for r in records if r.in_library]),
+        share("wrong single name, all cases with a detection", detected),
     ]
 
 
 def _amplitudes(records: Sequence[Record]) -> list[Metric]:
     strong = [r for r in records if r.strength >= NAMED]
-    named, fitted = ([pull for r in strong for pull in getattr(r, key)] for key in ("pulls", "fitted"))
-
-    def pulls(which: str, values: Sequence[float]) -> tuple[Metric, Metric]:
-        title = f"pulls {which}, S/N >= {NAMED:g}"
-        return mean(f"{title}: mean", values), width(f"{title}: width", values)
-
-    acting, chosen = pulls("of the effect that acts", fitted), pulls("where named", named)
+    found = []
     # Naming selects fluctuations upwards: the targets hold without it where that is known.
-    first, rest = (acting, chosen) if fitted else (chosen, ())
-    return [first[0].within("within 0.1", -0.1, 0.1), first[1].within("0.9 to 1.1", 0.9, 1.1), *rest]
+    for which, key in (("of the effect that acts", "fitted"), ("where named", "pulls")):
+        values = [pull for r in strong for pull in getattr(r, key)]
+        title = f"pulls {which}, S/N >= {NAMED:g}"
+        if values or key == "pulls":
+            found += [mean(f"{title}: mean", values), width(f"{title}: width", values)]
+    return [found[0].within("within 0.1", -0.1, 0.1), found[1].within("0.9 to 1.1", 0.9, 1.1), *found[2:]]
 
 
 def _reductions(records: Sequence[Record]) -> list[Metric]:
@@ -206,37 +206,30 @@ def _places(records: Sequence[Record]) -> list[Metric]:
 
 def confusion(records: Sequence[Record], bayes: bool = False) -> Confusion:
     """Count cases by truth and answer of the diagnosis or of the Bayes classifier."""
-    rows = [(_truth(record), _bayes(record) if bayes else _answer(record)) for record in records]
-    order = {"none": 0, "mixture": 2, "mixture, wrong": 3, "set with the truth": 4, "set without it": 5, "unknown": 6}
-    last = {"none": 0, "two": 2, "left out": 3, "out of library": 4}
-    truths = sorted({row[0] for row in rows}, key=lambda name: (last.get(name, 1), name))
-    answers = sorted({row[1] for row in rows}, key=lambda name: (order.get(name, 1), name))
-    counts = np.zeros((len(truths), len(answers)), dtype=np.int64)
-    for truth, answer in rows:
-        counts[truths.index(truth), answers.index(answer)] += 1
-    return Confusion(tuple(truths), tuple(answers), counts)
+    rows = [(_truth(r), _named(r.bayes, r.truth) if bayes else _answer(r)) for r in records]
+    truths, answers = _sorted({row[0] for row in rows}, TRUTHS), _sorted({row[1] for row in rows}, ANSWERS)
+    counts = [rows.count((truth, answer)) for truth in truths for answer in answers]
+    return Confusion(truths, answers, np.array(counts, dtype=np.int64).reshape(len(truths), len(answers)))
+
+
+def _sorted(names: Collection[str], order: Sequence[str]) -> list[str]:
+    return sorted(names, key=lambda name: (order.index(name if name in order else ""), name))
 
 
 def _truth(record: Record) -> str:
-    if record.kind == "one":
-        return next(iter(record.truth))[0]
-    return {"none": "none", "two": "two", "left_out": "left out", "invented": "out of library"}[record.kind]
+    return TRUTHS[KINDS.index(record.kind)] or next(iter(record.truth))[0]
 
 
 def _answer(record: Record) -> str:
-    if record.verdict in ("none", "unknown"):
-        return record.verdict
     if record.verdict == "degenerate":
         return "set with the truth" if record.truth in record.answers else "set without it"
-    return _named(record.best, record.truth)
-
-
-def _bayes(record: Record) -> str:
-    return _named(record.bayes, record.truth) if record.bayes else "none"
+    return "unknown" if record.verdict == "unknown" else _named(record.best, record.truth)
 
 
 def _named(answer: Answer | None, truth: Answer) -> str:
-    assert answer  # a verdict that names something has a set
+    """Return the column of a set of effects."""
+    if not answer:
+        return "none"
     if len(answer) > 1:
         return "mixture" if answer == truth else "mixture, wrong"
     ((name, _),) = answer
@@ -244,18 +237,49 @@ def _named(answer: Answer | None, truth: Answer) -> str:
     return f"{name}, other channel" if other else name
 
 
-def _unlisted(records: Sequence[Record]) -> tuple[Unlisted, ...]:
-    found: dict[str, list[Record]] = {}
-    for record in records:
-        if not record.in_library:
-            found.setdefault(next(iter(record.truth))[0], []).append(record)
-    return tuple(
-        Unlisted(
-            name,
-            len(rows),
-            sum(row.verdict == "unknown" for row in rows),
-            sum(row.wrong_name for row in rows),
-            float(np.mean(distances)) if (distances := [row.distances[-1] for row in rows if row.distances]) else None,
-        )
-        for name, rows in sorted(found.items())
-    )
+class Signature(NamedTuple):
+    """Frame, L and parity that an effect can show in; empty: any."""
+
+    frame: str = ""
+    L: tuple[int, ...] = ()
+    parity: str = ""
+
+    def matches(self, place: Place) -> bool:
+        """Return True if a place is right in frame, L and parity."""
+        frame, L, parity = place
+        right = (not self.frame or frame == self.frame) and (not self.L or L in self.L)
+        return right and (not self.parity or parity in (None, self.parity))
+
+
+# From the table of signatures of the library: the frame that an effect is fixed to, and L of the coefficients that it
+# makes (0: power spectra and variances). An effect at an angle to the scan turns even parity to odd, so that those with
+# an angle have either; a vector on the sky points anywhere and belongs to no frame.
+SIGNATURES = {
+    "beam_ellipticity": Signature("ecliptic", (2, 4)),
+    "beam_coma": Signature("ecliptic", (1, 3)),
+    "beam_sidelobe": Signature("", (0, 1, 2)),
+    "beam_width": Signature("", (0,), "even"),
+    "beam_noncircularity": Signature("ecliptic", (1, 2, 3, 4)),
+    "pointing_offset": Signature("ecliptic", (1,)),
+    "time_constant": Signature("ecliptic", (1, 2)),
+    "gain_drift": Signature("ecliptic", (0, 1, 2)),
+    "dipole_residual": Signature("", (1,)),
+    "transmission_imbalance": Signature("ecliptic"),
+    "noise_anisotropy": Signature("ecliptic", (0, 2), "even"),
+    "noise_level": Signature("", (0,), "even"),
+    "foreground_residual": Signature("galactic"),
+    "point_sources": Signature("", (0,), "even"),
+    "dipole_modulation": Signature("", (1,), "even"),
+    "quadrupole_modulation": Signature("", (2,), "even"),
+    "boost": Signature("", (1,), "even"),
+    "pixelization": Signature("", (0, 1)),
+    "mapmaking_convergence": Signature("ecliptic"),
+    "orientation_averaging": Signature("ecliptic", (2,)),
+    "spectrum": Signature("", (0,), "even"),
+}
+
+
+def any_place_right(names: Sequence[str], places: Sequence[Place]) -> bool | None:
+    """Return True if a place is right for one of the effects; None if none of them has a known signature."""
+    known = [SIGNATURES[name] for name in names if name in SIGNATURES]
+    return any(signature.matches(place) for signature in known for place in places) if known else None

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.bipolar.modes import Mode, modes
+from mcsim.bipolar.modes import Mode, existing, modes
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.checks import check_alm, check_finite, check_whole
@@ -49,21 +49,11 @@ def estimator(L_max: int, lmax: int, both_orders: bool = False) -> Estimator:
 def estimate(
     tables: Estimator, alm_x: NDArray[np.complex128], alm_y: NDArray[np.complex128] | None = None
 ) -> NDArray[np.complex128]:
-    """Return the BipoSH coefficients of one map, or of an ordered pair of maps.
+    """Return A^{LM}_{l2 - d, l2} of one map, or of the ordered pair of maps that carry l1 and l2.
 
-    Parameters
-    ----------
-    tables
-        From :func:`estimator`.
-    alm_x, alm_y
-        Coefficients of the maps that carry l1 and l2, shape (alm.size(lmax),), m-major order; without ``alm_y`` both
-        are ``alm_x``.
-
-    Returns
-    -------
-    ndarray
-        A^{LM}_{l2 - d, l2}, shape (modes, lmax + 1), in the square of the input's unit. NaN where the coefficient does
-        not exist (l1 < 0, l1 > lmax, the triangle of l1, l2, L), and for one map in the modes that repeat others.
+    The coefficients of the maps are in m-major order, shape (alm.size(lmax),). The result has shape (modes, lmax + 1)
+    and the square of their unit; NaN where a coefficient does not exist (l1 < 0, l1 > lmax, the triangle of l1, l2, L),
+    and for one map in the modes that repeat others.
 
     Raises
     ------
@@ -83,13 +73,11 @@ def estimate(
     x = _parts(alm_x)
     y = x if alm_y is None else _parts(alm_y)
     result = np.full((len(tables.modes), tables.lmax + 1), complex(np.nan, np.nan))
-    l2 = np.arange(tables.lmax + 1)
     for b in tables.bands:
         if auto and b.d < 0:
             continue
         total = np.zeros((b.L_max - b.L_min + 1, 2, tables.lmax + 1))
         _accumulate(x, y, tables.lmax, b, total)
-        l1 = l2 - b.d
         for row, mode in enumerate(tables.modes):
             if (mode.M, mode.d) != (b.M, b.d) or (auto and not mode.in_auto):
                 continue
@@ -97,7 +85,7 @@ def estimate(
             if mode.M == 0:
                 # The sum counts m > 0 twice; of m and -m together only this part remains.
                 real, imag = (real, 0.0 * imag) if mode.parity == "even" else (0.0 * real, imag)
-            exists = (l1 >= 0) & (l1 <= tables.lmax) & (l1 + l2 >= mode.L)
+            exists = existing(mode.L, mode.d, tables.lmax)
             result[row, exists] = (real + 1j * imag)[exists]
     return result
 

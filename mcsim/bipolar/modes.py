@@ -43,13 +43,7 @@ def modes(L_max: int, both_orders: bool) -> tuple[Mode, ...]:
 
 
 def parse_mode(name: str) -> Mode:
-    """Read a mode from its label, for example ``L2M0d-2``.
-
-    Raises
-    ------
-    InputError
-        For another form of label, or a mode that cannot exist.
-    """
+    """Read a mode from its label, for example ``L2M0d-2``; InputError for another label or one that cannot exist."""
     try:
         L, rest = name.removeprefix("L").split("M")
         M, d = rest.split("d")

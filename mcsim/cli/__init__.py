@@ -6,14 +6,15 @@ Exit codes: 0 done, 1 failed realizations, 2 bad input, 130 interrupted.
 import json
 import os
 import sys
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
+from typer import Argument, Option
 
 from mcsim.cli import ensembles
-from mcsim.cli.common import Config, Png, Simulations, Workers, interrupt_once, out, save
+from mcsim.cli.common import Config, Png, Processes, Simulations, Workers, interrupt_once, save
 from mcsim.errors import InputError, RunError
 
 app = typer.Typer(
@@ -30,7 +31,7 @@ def main() -> None:
     try:
         app()
     except (InputError, RunError) as error:
-        Console(stderr=True, highlight=False, soft_wrap=True).print(f"mcsim: {error}", markup=False)
+        print(f"mcsim: {error}", file=sys.stderr)
         sys.exit(2 if isinstance(error, InputError) else 1)
 
 
@@ -38,16 +39,15 @@ def _version(asked: bool) -> None:
     if asked:
         from importlib.metadata import version
 
-        out.print(f"mcsim {version('mcsim')}", markup=False)
+        print(f"mcsim {version('mcsim')}")
         raise typer.Exit
 
 
+Version = Annotated[bool, Option("--version", callback=_version, is_eager=True, help="Say the version and exit.")]
+
+
 @app.callback()
-def _options(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say the version and exit.")
-    ] = False,
-) -> None:
+def _options(version: Version = False) -> None:
     """Tell whether a measured isotropy violation is made by the instrument."""
 
 
@@ -65,30 +65,19 @@ for _command in (
 
 @app.command()
 def fit(
-    data: Annotated[str, typer.Argument(metavar="DATA", help="Store, or ECSV table of binned spectra.")],
+    data: Annotated[str, Argument(metavar="DATA", help="Store, or ECSV table of binned spectra.")],
     config: Config,
-    model: Annotated[
-        list[str] | None, typer.Option("--model", help="constant, linear, spline or orientation; may be repeated.")
-    ] = None,
-    ell_min: Annotated[int, typer.Option(min=0, help="First ell of the data.")] = 2,
-    ell_max: Annotated[int | None, typer.Option(min=2, help="Last ell of the data.")] = None,
-    pair: Annotated[str | None, typer.Option(help="Pair of maps; default: the only one.")] = None,
-    mode: Annotated[
-        list[str] | None, typer.Option("--mode", help="Such as L2M0d0; may be repeated; default: A20 at d = 0 and 2.")
-    ] = None,
-    kind: Annotated[
-        str | None,
-        typer.Option(help="plain, or difference to the circular-beam controls; default: difference where known."),
-    ] = None,
-    order: Annotated[
-        str, typer.Option(help="leading or exact (all orders in the beam); auto: exact where the data tell them apart.")
-    ] = "auto",
-    covariance: Annotated[
-        Path | None, typer.Option(metavar="STORE", help="Take the covariance of one of its realizations.")
-    ] = None,
-    knots: Annotated[int, typer.Option(min=2, help="Of a spline.")] = 4,
-    each: Annotated[bool, typer.Option("--each", help="Fit every realization of a store too, for the pulls.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    model: Annotated[list[str] | None, Option(help="constant, linear, spline or orientation; repeatable.")] = None,
+    ell_min: Annotated[int, Option(min=0, help="First ell of the data.")] = 2,
+    ell_max: Annotated[int | None, Option(min=2, help="Last ell of the data.")] = None,
+    pair: Annotated[str | None, Option(help="Pair of maps; default: the only one.")] = None,
+    mode: Annotated[list[str] | None, Option(help="Such as L2M0d0; repeatable; default: A20 at d = 0 and 2.")] = None,
+    kind: Annotated[str | None, Option(help="plain, or difference to the controls, the default where known.")] = None,
+    order: Annotated[str, Option(help="leading, exact, or auto: exact where the data tell them apart.")] = "auto",
+    covariance: Annotated[Path | None, Option(metavar="STORE", help="Covariance of one of its realizations.")] = None,
+    knots: Annotated[int, Option(min=2, help="Of a spline.")] = 4,
+    each: Annotated[bool, Option("--each", help="Fit every realization of a store too, for the pulls.")] = False,
+    as_json: Annotated[bool, Option("--json", help="Print JSON.")] = False,
     output: Png = None,
 ) -> None:
     """Fit an effective beam, b_l2 f_l with f_l = alpha or alpha + beta l, to measured or simulated spectra."""
@@ -108,44 +97,42 @@ def fit(
     if as_json:
         print(json.dumps([one.to_dict() for one in fits], indent=2))
     else:
-        out.print(beamfit.report(fits), markup=False)
+        print(beamfit.report(fits))
     save(fit_figure(fits), output or Path("fit.png"))
 
 
 @app.command()
 def beam(
-    source: Annotated[str, typer.Argument(metavar="BEAM", help="Beam map or b_lm (FITS), or a CONFIG.")],
-    lmax: Annotated[int, typer.Option(min=2, max=8192, help="Degree of the coefficients.")] = 2048,
-    m_max: Annotated[int | None, typer.Option(min=0, help="Order; default: chosen from the beam.")] = None,
-    pixel_deg: Annotated[
-        float | None, typer.Option(help="Side of a pixel of a beam map; default: its header's.")
-    ] = None,
+    source: Annotated[str, Argument(metavar="BEAM", help="Beam map or b_lm (FITS), or a CONFIG.")],
+    lmax: Annotated[int, Option(min=2, max=8192, help="Degree of the coefficients.")] = 2048,
+    m_max: Annotated[int | None, Option(min=0, help="Order; default: chosen from the beam.")] = None,
+    pixel_deg: Annotated[float | None, Option(help="Side of a pixel of a beam map; default: its header's.")] = None,
     output: Png = None,
 ) -> None:
     """Print a beam's solid angle, widths, B_l and b_lm; draw it."""
     from mcsim.plot.look import look_at_beams
 
     for number, look in enumerate(look_at_beams(source, lmax, m_max, pixel_deg)):
-        out.print(look.text, markup=False)
+        print(look.text)
         target = output or Path("beam.png")
         save(look.figure, target if number == 0 else target.with_stem(f"{target.stem}-{look.name}"))
 
 
 @app.command()
 def scan(
-    model: Annotated[str, typer.Argument(metavar="MODEL", help="Scan model: a packaged name such as wmap, or TOML.")],
-    nside: Annotated[int, typer.Option(help="Resolution of the moments.")] = 256,
-    smax: Annotated[int, typer.Option(min=2, help="Largest s of the moments w_s.")] = 4,
-    frame: Annotated[str, typer.Option(help="ecliptic, galactic or equatorial.")] = "ecliptic",
-    sample_period_s: Annotated[float | None, typer.Option(help="Time between samples; default: the model's.")] = None,
-    line_of_sight: Annotated[str | None, typer.Option(help="One of the model's lines of sight.")] = None,
+    model: Annotated[str, Argument(metavar="MODEL", help="Scan model: a packaged name such as wmap, or TOML.")],
+    nside: Annotated[int, Option(help="Resolution of the moments.")] = 256,
+    smax: Annotated[int, Option(min=2, help="Largest s of the moments w_s.")] = 4,
+    frame: Annotated[str, Option(help="ecliptic, galactic or equatorial.")] = "ecliptic",
+    sample_period_s: Annotated[float | None, Option(help="Time between samples; default: the model's.")] = None,
+    line_of_sight: Annotated[str | None, Option(help="One of the model's lines of sight.")] = None,
     output: Png = None,
 ) -> None:
     """Print the hits, the orientation moments and the three factors of a scan; draw them."""
     from mcsim.plot.look import look_at_scan
 
     look = look_at_scan(model, nside, smax, frame, sample_period_s, line_of_sight)
-    out.print(look.text, markup=False)
+    print(look.text)
     save(look.figure, output or Path(f"scan-{look.name}.png"))
 
 
@@ -153,67 +140,55 @@ def scan(
 def diagnose(
     model: Config,
     data: Annotated[
-        Path,
-        typer.Argument(
-            metavar="DATA", help="Folder with CHANNEL.fits or CHANNEL_SPLIT.fits, or an ECSV table of measured spectra."
-        ),
+        Path, Argument(metavar="DATA", help="Folder with CHANNEL.fits or CHANNEL_SPLIT.fits, or ECSV table of spectra.")
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for verdict and report.")],
-    case: Annotated[str | None, typer.Option(help="Name of the case; default: that of the model.")] = None,
-    without: Annotated[list[str] | None, typer.Option(metavar="EFFECT", help="Do not propose it; repeatable.")] = None,
+    output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Folder for verdict and report.")],
+    case: Annotated[str | None, Option(help="Name of the case; default: that of the model.")] = None,
+    without: Annotated[list[str] | None, Option(metavar="EFFECT", help="Do not propose it; repeatable.")] = None,
     simulations: Simulations = None,
-    workers: Annotated[int | None, typer.Option(min=1, help="Local processes; default: the configuration's.")] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say simulations, memory and time; simulate none.")
-    ] = False,
+    workers: Processes = None,
+    dry_run: Annotated[bool, Option("--dry-run", help="Say simulations, memory and time; simulate none.")] = False,
 ) -> None:
     """Test maps against a model, and find the effect that the model lacks: where, how large, and if adding it helps."""
+    from mcsim import config
+    from mcsim.diagnosis.api import describe
     from mcsim.diagnosis.api import diagnose as judge
+    from mcsim.diagnosis.settings import DiagnosisSettings
     from mcsim.diagnosis.words import summary
 
-    if dry_run:
-        from mcsim.diagnosis.api import describe
-
-        out.print(describe(model, without or (), simulations, workers), markup=False)
-        return
     interrupt_once()
-    found = judge(
-        model,
-        data,
-        output,
-        case=case,
-        without=without or (),
-        simulations=simulations,
-        workers=workers,
-        quiet=False,
-    )
-    out.print("\n".join(summary(found, output)), markup=False, highlight=False, soft_wrap=True)
+    run, settings = config.load(model), DiagnosisSettings(without=tuple(without or ()), simulations=simulations)
+    if workers is not None:
+        run = replace(run, compute=replace(run.compute, workers=workers))
+    if dry_run:
+        print(describe(run, settings))
+        return
+    found = judge(run, data, output, case=case, settings=settings, quiet=False)
+    print("\n".join(summary(found, output)))
 
 
 challenge = typer.Typer(help="Benchmark the diagnosis on effects that are drawn and sealed.", no_args_is_help=True)
 app.add_typer(challenge, name="challenge")
 
-Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the challenge.")]
-Target = Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to fill.")]
+Folder = Annotated[Path, Argument(metavar="DIR", help="Folder of the challenge.")]
+Target = Annotated[Path, Option("-o", "--output", metavar="DIR", help="Folder to fill.")]
 
 
 @challenge.command("make")
 def challenge_make(
     model: Config,
     output: Target,
-    cases: Annotated[int, typer.Option(min=1, help="Number of cases.")] = 200,
-    seed: Annotated[int, typer.Option(min=0, help="Of the draws; keep it as secret as the keys.")] = 0,
-    sampled_share: Annotated[float, typer.Option(min=0.0, max=1.0, help="Share of maps made sample by sample.")] = 0.5,
-    inventions: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Python file with effects that no library has.")
-    ] = None,
+    cases: Annotated[int, Option(min=1, help="Number of cases.")] = 200,
+    seed: Annotated[int, Option(min=0, help="Of the draws; keep it as secret as the keys.")] = 0,
+    sampled_share: Annotated[float, Option(min=0.0, max=1.0, help="Share of maps made sample by sample.")] = 0.5,
+    inventions: Annotated[Path | None, Option(metavar="FILE", help="Python file of effects in no library.")] = None,
     simulations: Simulations = None,
     workers: Workers = None,
 ) -> None:
     """Draw effects, make the maps of the cases, seal the keys."""
     from mcsim import config
+    from mcsim.benchmark.challenge import make
     from mcsim.benchmark.folder import Settings
-    from mcsim.benchmark.make import make
 
     interrupt_once()
     file = None if inventions is None else str(inventions)
@@ -224,10 +199,10 @@ def challenge_make(
 @challenge.command("run")
 def challenge_run(folder: Folder, workers: Workers = None) -> None:
     """Diagnose all cases that have no verdict."""
-    from mcsim.benchmark.run import run as diagnose_all
+    from mcsim.benchmark.challenge import run as diagnose_all
 
     interrupt_once()
-    out.print(f"{diagnose_all(folder, workers=workers, quiet=False)} cases diagnosed", markup=False)
+    print(f"{diagnose_all(folder, workers=workers, quiet=False)} cases diagnosed")
 
 
 @challenge.command("score")
@@ -235,15 +210,15 @@ def challenge_score(folder: Folder, workers: Workers = None) -> None:
     """Open the keys and score the verdicts."""
     from mcsim.benchmark import report, score
 
-    out.print("\n".join(report.lines(score.score(folder, workers=workers, quiet=False))), markup=False)
+    print("\n".join(report.lines(score.score(folder, workers=workers, quiet=False))))
 
 
 @challenge.command("draws")
 def challenge_draws(
     model: Config,
     output: Target,
-    number: Annotated[int, typer.Option(min=1, help="Number of draws.")] = 1000,
-    seed: Annotated[int, typer.Option(min=0, help="Of the draws.")] = 0,
+    number: Annotated[int, Option(min=1, help="Number of draws.")] = 1000,
+    seed: Annotated[int, Option(min=0, help="Of the draws.")] = 0,
     simulations: Simulations = None,
     workers: Workers = None,
 ) -> None:
@@ -254,44 +229,39 @@ def challenge_draws(
 
     shared = Settings(config.load(model), simulations=simulations)
     found = score.score_draws(shared, output, number, seed, workers=workers, quiet=False)
-    out.print("\n".join(report.lines(found)), markup=False)
+    print("\n".join(report.lines(found)))
 
 
 @app.command()
-def effects(name: Annotated[str | None, typer.Argument(metavar="EFFECT", help="Only this one.")] = None) -> None:
+def effects(name: Annotated[str | None, Argument(metavar="EFFECT", help="Only this one.")] = None) -> None:
     """List the library of effects: what a run can add and a diagnosis can find."""
     from mcsim import systematics as library
 
-    known = [library.get(name).name] if name is not None else None
-    for row in library.describe():
-        if known is not None and row["name"] not in known:
-            continue
-        parameters = ", ".join(f"{key} = {value!r}" for key, value in row["parameters"].items())
-        out.print(f"{row['name']} ({row['scope']}; amplitude in {row['unit']})", style="bold", markup=False)
-        out.print(f"  parameters  {parameters}", markup=False)
+    for kind in library.catalogue().values() if name is None else [library.get(name)]:
+        parameters = ", ".join(f"{field.name} = {field.default!r}" for field in fields(kind))
+        typer.secho(f"{kind.name} ({kind.scope}; amplitude in {kind.unit})", bold=True)
+        print(f"  parameters  {parameters}")
         for key in ("cause", "signature", "source"):
-            out.print(f"  {key:<11} {row[key]}", markup=False)
+            print(f"  {key:<11} {getattr(kind, key)}")
 
 
 @app.command()
 def bench(
-    nside: Annotated[int, typer.Option(help="Resolution of the maps.")] = 512,
-    lmax: Annotated[int, typer.Option(min=2, help="Degree of the analysis.")] = 1024,
-    repeats: Annotated[int, typer.Option(min=1, help="Pairs of timings.")] = 5,
+    nside: Annotated[int, Option(help="Resolution of the maps.")] = 512,
+    lmax: Annotated[int, Option(min=2, help="Degree of the analysis.")] = 1024,
+    repeats: Annotated[int, Option(min=1, help="Pairs of timings.")] = 5,
 ) -> None:
     """Measure this machine: a realization over the transforms that it needs, workers, moments."""
     from mcsim.ensemble.bench import bench as measure
 
     for line in measure(nside, lmax, repeats):
-        out.print(line, markup=False)
+        print(line)
 
 
 @app.command()
 def config(
-    name: Annotated[
-        str | None, typer.Argument(metavar="CONFIG", help="Check this configuration and print it resolved.")
-    ] = None,
-    schema: Annotated[bool, typer.Option("--schema", help="Print the JSON schema of the TOML file.")] = False,
+    name: Annotated[str | None, Argument(metavar="CONFIG", help="Check it and print it resolved.")] = None,
+    schema: Annotated[bool, Option("--schema", help="Print the JSON schema of the TOML file.")] = False,
 ) -> None:
     """Check a configuration, or print the schema of all."""
     from mcsim import config as config_

@@ -5,19 +5,16 @@ from pathlib import Path
 from types import FrameType
 from typing import Annotated
 
-import typer
-from rich.console import Console
+from typer import Argument, Option
 
 from mcsim.errors import InputError
 
-out = Console(highlight=False, soft_wrap=True)
-
-Config = Annotated[str, typer.Argument(metavar="CONFIG", help="TOML file, or a packaged workflow such as quickstart.")]
-Workers = Annotated[int | None, typer.Option(min=0, help="Processes; 0: this one; default: the model's.")]
-Simulations = Annotated[
-    int | None, typer.Option(min=50, help="For the covariance of the data vector; default: ten per element.")
-]
-Png = Annotated[Path | None, typer.Option("-o", "--output", metavar="PNG", help="Picture to write.")]
+Config = Annotated[str, Argument(metavar="CONFIG", help="TOML file, or a packaged workflow such as quickstart.")]
+Workers = Annotated[int | None, Option(min=0, help="Processes; 0: this one; default: the model's.")]
+Simulations = Annotated[int | None, Option(min=50, help="For the data covariance; default: ten per element.")]
+Processes = Annotated[int | None, Option(min=1, help="Local processes; default: the configuration's.")]
+Part = Annotated[str | None, Option(metavar="A:B", help="Only realizations A to B - 1; default: all.")]
+Png = Annotated[Path | None, Option("-o", "--output", metavar="PNG", help="Picture to write.")]
 
 
 def interrupt_once() -> None:
@@ -38,4 +35,4 @@ def save(figure, path: Path) -> None:  # type: ignore[no-untyped-def]
         figure.savefig(path)
     except (OSError, ValueError) as error:
         raise InputError(f"{path} cannot be written ({error}); choose another file with -o.") from error
-    out.print(f"wrote {path}", markup=False)
+    print(f"wrote {path}")

@@ -6,29 +6,22 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
-from mcsim.cli.common import Config, Png, interrupt_once, out, save
+from mcsim.cli.common import Config, Part, Png, Processes, interrupt_once, save
 from mcsim.errors import InputError
 
-Store = Annotated[Path, typer.Argument(metavar="STORE", help="Folder that mcsim run wrote.")]
+Store = Annotated[Path, Argument(metavar="STORE", help="Folder that mcsim run wrote.")]
 
 
 def run(
     config: Config,
-    store: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="STORE", help="Default: NAME.zarr here.")
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Check a store, repair it, and continue it.")] = False,
-    realizations: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Only realizations A to B - 1, for slices that merge joins.")
-    ] = None,
-    workers: Annotated[int | None, typer.Option(min=1, help="Local processes; default: the configuration's.")] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Running Dask scheduler, tcp://host:port or tls://host:port.")
-    ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say memory, disk, files and time; compute nothing.")
-    ] = False,
+    store: Annotated[Path | None, Option("-o", "--output", metavar="STORE", help="Default: NAME.zarr here.")] = None,
+    resume: Annotated[bool, Option("--resume", help="Check a store, repair it, and continue it.")] = False,
+    realizations: Part = None,
+    workers: Processes = None,
+    scheduler: Annotated[str | None, Option(metavar="ADDRESS", help="Running Dask scheduler, tcp://host:port.")] = None,
+    dry_run: Annotated[bool, Option("--dry-run", help="Say memory, disk, files and time; compute nothing.")] = False,
 ) -> None:
     """Run an ensemble; continue it if it was interrupted; extend it if more realizations are asked for.
 
@@ -44,15 +37,13 @@ def run(
     if dry_run:
         from mcsim.ensemble import plan
 
-        out.print(plan.describe(config, part, workers), markup=False)
+        print(plan.describe(config, part, workers))
         return
     interrupt_once()
     try:
         from mcsim.ensemble import runner
 
-        result = runner.run(
-            config, store, resume=resume, realizations=part, workers=workers, scheduler=scheduler, quiet=False
-        )
+        result = runner.run(config, store, resume=resume, realizations=part, workers=scheduler or workers, quiet=False)
     except KeyboardInterrupt:
         print("mcsim: interrupted; run the same command again to continue.", file=sys.stderr)
         raise typer.Exit(130) from None
@@ -60,8 +51,8 @@ def run(
 
 
 def merge(
-    slices: Annotated[list[Path], typer.Argument(metavar="STORE...", help="Stores of slices of one ensemble.")],
-    store: Annotated[Path, typer.Option("-o", "--output", metavar="STORE", help="Store to make.")],
+    slices: Annotated[list[Path], Argument(metavar="STORE...", help="Stores of slices of one ensemble.")],
+    store: Annotated[Path, Option("-o", "--output", metavar="STORE", help="Store to make.")],
 ) -> None:
     """Join slices that were run with --realizations A:B."""
     from mcsim.ensemble import runner
@@ -71,41 +62,34 @@ def merge(
 
 def info(
     store: Store,
-    export: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Write the summary: .nc (NetCDF) or .ecsv (table of binned spectra)."),
-    ] = None,
-    verify: Annotated[
-        bool, typer.Option("--verify", help="Read every file, name damaged realizations; exit code 1 if there are any.")
-    ] = False,
+    export: Annotated[Path | None, Option(metavar="FILE", help="Write the summary: .nc, .zarr or .ecsv.")] = None,
+    verify: Annotated[bool, Option("--verify", help="Read every file; exit code 1 if anything is damaged.")] = False,
 ) -> None:
     """Describe a store; export its summary; verify it."""
     if verify:
         from mcsim.ensemble import repair
 
         verdict = repair.verify(store, quiet=False)
-        out.print(verdict.text(), markup=False)
+        print(verdict.text())
         raise typer.Exit(0 if verdict.intact else 1)
-    from mcsim.ensemble import describe
+    from mcsim.ensemble import describe, opening, tables
 
-    out.print(describe.describe(store), markup=False)
+    print(describe.describe(store))
     if export is not None:
-        describe.export(store, export)
-        out.print(f"wrote {export}", markup=False)
+        with opening.open_summary(store) as summary:
+            tables.write(summary.load(), export)
+        print(f"wrote {export}")
 
 
 def plot(
     store: Store,
     output: Png = None,
-    L: Annotated[int | None, typer.Option("--L", help="Only this L.")] = None,
-    M: Annotated[int | None, typer.Option("--M", help="Only this M.")] = None,
-    d: Annotated[int | None, typer.Option("--d", help="Only this d = l2 - l1.")] = None,
-    pair: Annotated[str | None, typer.Option(help='Pair of maps, for example "W1,W1"; default: the first.')] = None,
-    predict: Annotated[
-        str | None,
-        typer.Option(metavar="CONFIG", help="Draw what this run should give, too; or a file of mcsim predict -o."),
-    ] = None,
-    exact: Annotated[bool, typer.Option("--exact", help="The prediction to all orders in the beam.")] = False,
+    L: Annotated[int | None, Option("--L", help="Only this L.")] = None,
+    M: Annotated[int | None, Option("--M", help="Only this M.")] = None,
+    d: Annotated[int | None, Option("--d", help="Only this d = l2 - l1.")] = None,
+    pair: Annotated[str | None, Option(help='Pair of maps, for example "W1,W1"; default: the first.')] = None,
+    predict: Annotated[str | None, Option(metavar="CONFIG", help="Draw its prediction, or that of predict -o.")] = None,
+    exact: Annotated[bool, Option("--exact", help="The prediction to all orders in the beam.")] = False,
 ) -> None:
     """Draw the binned spectra of a store with error bars, and optionally a prediction."""
     from mcsim.ensemble import prediction, tables
@@ -126,34 +110,26 @@ def plot(
 
 def predict(
     config: Config,
-    exact: Annotated[bool, typer.Option("--exact", help="To all orders in the beam; default: leading order.")] = False,
-    snr: Annotated[bool, typer.Option("--snr", help="Add the signal to noise of every mode.")] = False,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write it: .zarr, or .ecsv (binned).")
-    ] = None,
+    exact: Annotated[bool, Option("--exact", help="To all orders in the beam; default: leading order.")] = False,
+    snr: Annotated[bool, Option("--snr", help="Add the signal to noise of every mode.")] = False,
+    output: Annotated[Path | None, Option("-o", "--output", metavar="FILE", help=".zarr, .nc or .ecsv.")] = None,
 ) -> None:
     """Predict the summary of a run without Monte Carlo."""
-    from mcsim.ensemble import prediction, tables
+    from mcsim.ensemble import describe, prediction, tables
 
     expected = prediction.predict(config, exact=exact, snr=snr, nthreads=os.cpu_count() or 1)
-    out.print(tables.describe_prediction(expected), markup=False)
+    print(describe.describe_prediction(expected))
     if output is not None:
-        tables.write_prediction(expected, output)
-        out.print(f"wrote {output}", markup=False)
+        tables.write(expected, output)
+        print(f"wrote {output}")
 
 
 def maps(
     config: Config,
-    folder: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to fill; nothing is replaced.")],
-    realization: Annotated[
-        int | None, typer.Option(metavar="N", help="Only this one, its files directly in DIR.")
-    ] = None,
-    realizations: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Realizations A to B - 1; default: all of the ensemble.")
-    ] = None,
-    sample_by_sample: Annotated[
-        bool, typer.Option("--sample-by-sample", help="By the time-ordered reference, where the pointing is known.")
-    ] = False,
+    folder: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Folder to fill; nothing is replaced.")],
+    realization: Annotated[int | None, Option(metavar="N", help="Only this one, its files directly in DIR.")] = None,
+    realizations: Part = None,
+    sample_by_sample: Annotated[bool, Option("--sample-by-sample", help="By the time-ordered reference.")] = False,
 ) -> None:
     """Write the maps of a run as FITS files, which mcsim diagnose can read.
 
@@ -170,21 +146,19 @@ def maps(
     except KeyboardInterrupt:
         print("mcsim: interrupted; folders that exist are complete.", file=sys.stderr)
         raise typer.Exit(130) from None
-    out.print(f"wrote maps of {len(found)} realization{'' if len(found) == 1 else 's'} to {folder}", markup=False)
+    print(f"wrote maps of {len(found)} realization{'' if len(found) == 1 else 's'} to {folder}")
 
 
 def prepare(
     config: Config,
-    maps: Annotated[
-        list[str], typer.Argument(metavar="MAP...", help="CHANNEL.fits or CHANNEL_SPLIT.fits, or NAME=FILE.")
-    ],
-    folder: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to fill; nothing is replaced.")],
+    maps: Annotated[list[str], Argument(metavar="MAP...", help="CHANNEL.fits or CHANNEL_SPLIT.fits, or NAME=FILE.")],
+    folder: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Folder to fill; nothing is replaced.")],
 ) -> None:
     """Prepare observed maps as CONFIG prepares its simulated maps, by the steps of [[preparation]]."""
     from mcsim.ensemble.prepare import prepare_files
 
     for path in prepare_files(config, maps, folder):
-        out.print(f"wrote {path}", markup=False)
+        print(f"wrote {path}")
 
 
 def _slice(text: str | None) -> slice | None:
@@ -197,16 +171,13 @@ def _slice(text: str | None) -> slice | None:
 
 
 def _report(result) -> None:  # type: ignore[no-untyped-def]
-    if result.computed == 0 and not result.failures and result.summarised:
-        out.print(f"{result.store} is finished: {result.finished} realizations; its summary is new.", markup=False)
-    elif result.computed == 0 and not result.failures:
-        out.print(f"{result.store} is finished: {result.finished} realizations, nothing to do.", markup=False)
+    if result.computed == 0 and not result.failures:
+        more = "; its summary is new" if result.summarised else ", nothing to do"
+        print(f"{result.store} is finished: {result.finished} realizations{more}.")
     else:
-        out.print(f"{result.store}: {result.finished} realizations, {result.computed} of them new.", markup=False)
+        print(f"{result.store}: {result.finished} realizations, {result.computed} of them new.")
     for failure in result.failures[:10]:
-        out.print(f"realization {failure.realization} failed: {failure.reason}", markup=False)
+        print(f"realization {failure.realization} failed: {failure.reason}")
     if result.failures:
-        out.print(
-            f"{len(result.failures)} realizations failed; run the same command again to retry them.", markup=False
-        )
+        print(f"{len(result.failures)} realizations failed; run the same command again to retry them.")
         raise typer.Exit(1)

@@ -9,18 +9,41 @@ import shutil
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from mcsim.errors import InputError
 from mcsim.support import folders
 
-TEMPLATES = {"alm", "map", "mask", "path", "model", "window", "own_window", "templates"}
-"""Keys that name files and may contain placeholders such as {channel}."""
 
-FILES = TEMPLATES | {"spectrum", "pixel_window", "template"}
-"""Keys that name files."""
+class Rule(NamedTuple):
+    """Rules of a key that names files: the kind of packaged name, the words and the placeholders that it may hold."""
+
+    packaged: str | None = None
+    words: tuple[str, ...] = ()
+    placeholders: tuple[str, ...] = ()
+
+
+RULES = {
+    "sky.spectrum": Rule(packaged="data"),
+    "sky.alm": Rule(placeholders=("realization",)),
+    "sky.map": Rule(placeholders=("realization",)),
+    "map.mask": Rule(placeholders=("channel", "split")),
+    "map.pixel_window": Rule(words=("computed", "none")),
+    "beam.path": Rule(placeholders=("channel",)),
+    "beam_b.path": Rule(placeholders=("channel",)),
+    "scan.path": Rule(placeholders=("channel", "split")),
+    "scan.model": Rule(packaged="scan_models", placeholders=("channel", "split")),
+    "effect.template": Rule(),
+    "preparation.mask": Rule(placeholders=("channel", "split")),
+    "preparation.window": Rule(placeholders=("channel",)),
+    "preparation.own_window": Rule(placeholders=("channel",)),
+    "preparation.templates": Rule(placeholders=("channel",)),
+}
+
+_TEMPLATES = {path.split(".")[1] for path, rule in RULES.items() if rule.placeholders}
+_FILES = {path.split(".")[1] for path in RULES}
 
 
 @runtime_checkable
@@ -32,19 +55,10 @@ class Tabled(Protocol):
 
 
 def in_files(value: Any, key: str = "") -> Any:
-    """Return a table of a run with its arrays and objects replaced by paths of files.
+    """Return a table, list or value of a run with its arrays and objects replaced by paths of files.
 
-    Parameters
-    ----------
-    value
-        Table, list or value. An array under a key that names a file is written; another becomes a list.
-    key
-        Key of the value.
-
-    Raises
-    ------
-    InputError
-        For an array of objects or with a unit or mask, or if the cache cannot be written.
+    An array under a key that names a file is written; another becomes a list. An array of objects, or with a unit or
+    mask, is refused.
     """
     if isinstance(value, Mapping):
         return {name: in_files(item, name) for name, item in value.items()}
@@ -52,9 +66,9 @@ def in_files(value: Any, key: str = "") -> Any:
         return [in_files(item, key) for item in value]
     if isinstance(value, Tabled):
         table = table_of(value)
-        return table.popitem()[1] if key in FILES else table
+        return table.popitem()[1] if key in _FILES else table
     if hasattr(value, "__array__") and np.ndim(value) > 0:
-        return file_of(value, key) if key in FILES else np.asarray(value).tolist()
+        return _file_of(value, key) if key in _FILES else np.asarray(value).tolist()
     return value
 
 
@@ -63,10 +77,10 @@ def table_of(given: Tabled) -> dict[str, str]:
     table: dict[str, str] = {}
     folder = _kept(lambda scratch: table.update(given.as_table(scratch)), type(given).__name__)
     key, name = table.popitem()
-    return {**table, key: _literal(folder / name, key)}
+    return {**table, key: _path(folder / name, key)}
 
 
-def file_of(given: Any, key: str) -> str:
+def _file_of(given: Any, key: str) -> str:
     """Write an array to the cache; return the path of its .npy file, named after the key."""
     if getattr(given, "unit", None) is not None or isinstance(given, np.ma.MaskedArray):
         own = "a mask of its own" if isinstance(given, np.ma.MaskedArray) else f"the unit {given.unit}"
@@ -75,7 +89,7 @@ def file_of(given: Any, key: str) -> str:
     if array.dtype.kind not in "biufc":
         raise InputError(f"the array {key} is of type {array.dtype}; give numbers.")
     folder = _kept(lambda scratch: np.save(scratch / f"{key}.npy", array), key)
-    return _literal(folder / f"{key}.npy", key)
+    return _path(folder / f"{key}.npy", key)
 
 
 def _kept(write: Callable[[Path], Any], what: str) -> Path:
@@ -85,17 +99,14 @@ def _kept(write: Callable[[Path], Any], what: str) -> Path:
         root.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".given.", dir=root) as scratch:
             write(Path(scratch))
-            digest = hashlib.sha256()
-            for path in sorted(Path(scratch).iterdir()):
-                digest.update(f"{path.name}\0{path.stat().st_size}\0".encode())
-                with path.open("rb") as stream:
-                    digest.update(hashlib.file_digest(stream, "sha256").digest())
+            contents = "\n".join(f"{sha256_of(path)} {path.name}" for path in sorted(Path(scratch).iterdir()))
 
             def move(folder: Path) -> None:
                 for path in Path(scratch).iterdir():
                     shutil.move(path, folder / path.name)
 
-            return folders.cached(f"given-{digest.hexdigest()}", move, root).absolute()
+            name = f"given-{hashlib.sha256(contents.encode()).hexdigest()}"
+            return folders.cached(name, move, root).absolute()
     except OSError as error:
         raise InputError(
             f"cache folder {str(root)!r} cannot take what is given as {what} ({error.strerror}); make room there, or "
@@ -103,6 +114,16 @@ def _kept(write: Callable[[Path], Any], what: str) -> Path:
         ) from None
 
 
-def _literal(path: Path, key: str) -> str:
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 of a file, in hexadecimal."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _path(path: Path, key: str) -> str:
+    return literal(str(path)) if key in _TEMPLATES else str(path)
+
+
+def literal(text: str) -> str:
     """Escape the braces of a folder's name: they are not placeholders."""
-    return str(path).replace("{", "{{").replace("}", "}}") if key in TEMPLATES else str(path)
+    return text.replace("{", "{{").replace("}", "}}")

@@ -2,10 +2,10 @@
 
 import hashlib
 import json
-from pathlib import Path
 from typing import Any
 
 from mcsim.config import paths
+from mcsim.config.arrays import sha256_of
 from mcsim.config.load import to_dict
 from mcsim.config.schema import RunConfig, analysis_lmax, pixel_window
 
@@ -17,15 +17,11 @@ def science(config: RunConfig) -> dict[str, Any]:
     realizations, keep_maps or the bins of the summary. A file is represented by the SHA-256 of its contents, a
     template by those of its files. Skies given one file per realization are represented by the part of their template
     with the placeholder and by the contents of realization 0; the others are not read.
-
-    Raises
-    ------
-    InputError
-        If a file does not exist.
     """
     plain = to_dict(config)
     for entry in paths.entries(plain):
-        found = {label: _sha256(path) for label, path in paths.files(entry, config.map.splits, config.name).items()}
+        named = paths.files(entry, config.map.splits, config.name)
+        found = {label: f"sha256:{sha256_of(path)}" for label, path in named.items()}
         contents: Any = found[""] if list(found) == [""] else found
         if "realization" in entry.rule.placeholders:
             contents = {"template": paths.template_tail(entry.template), "first": contents}
@@ -47,45 +43,47 @@ def science(config: RunConfig) -> dict[str, Any]:
     }
 
 
+_MAP = {"grid": "healpix", "nside": None, "mask_frame": None, "mask_apodisation_deg": 0.0}
+_OF_KIND: dict[str, dict[str, Any]] = {
+    "moments": {"model": None, "line_of_sight": None},
+    "map": {"angle_deg": 0.0},
+    "blm": {"angle_deg": 0.0},
+}
+"""Defaults of the keys of a scan or beam that are younger than its kind."""
+
+
 def _leave_out_what_says_nothing(plain: dict[str, Any]) -> None:
     """Drop keys at their defaults, and the limit of iterations, on which no finished map depends.
 
     A run that does not use a key thus keeps its hash from before the key existed.
     """
-    section = plain["map"]
-    if section["grid"] == "healpix":
-        del section["grid"]
-    if section["nside"] is None:
-        del section["nside"]
-    if section["mask_frame"] is None:
-        del section["mask_frame"]
-    if section["mask_apodisation_deg"] == 0.0:
-        del section["mask_apodisation_deg"]
-    for name in ("effect", "preparation"):
-        if not plain[name]:
-            del plain[name]
-    if plain["sky"]["dipole_uk"] is None:
-        del plain["sky"]["dipole_uk"]
+    _drop(plain, {"effect": [], "preparation": []})
+    _drop(plain["map"], _MAP)
+    _drop(plain["sky"], {"dipole_uk": None})
     if (plain["sky"]["dipole_lon_deg"], plain["sky"]["dipole_lat_deg"]) == (264.0, 48.24):
         del plain["sky"]["dipole_lon_deg"], plain["sky"]["dipole_lat_deg"]
     for channel in plain["channel"]:
         channel["scan"].pop("max_iterations", None)
-        if channel["scan"]["kind"] == "moments":
-            for key in ("model", "line_of_sight"):
-                if channel["scan"][key] is None:
-                    del channel["scan"][key]
-        if channel["beam_b"] is None:
-            del channel["beam_b"]
-        for beam in (channel["beam"], channel.get("beam_b")):
-            if beam is not None and beam["kind"] in ("map", "blm") and beam["angle_deg"] == 0.0:
-                del beam["angle_deg"]
+        _drop(channel, {"beam_b": None})
+        for table in (channel["scan"], channel["beam"], channel.get("beam_b", {"kind": "none"})):
+            _drop(table, _OF_KIND.get(table["kind"], {}))
+
+
+def _drop(table: dict[str, Any], defaults: dict[str, Any]) -> None:
+    for key, value in defaults.items():
+        if table[key] == value:
+            del table[key]
 
 
 def digest(config: RunConfig) -> str:
     """Return the SHA-256 of the canonical JSON of :func:`science`, in hexadecimal."""
-    return hashlib.sha256(
-        json.dumps(science(config), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
-    ).hexdigest()
+    return digest_of(science(config))
+
+
+def digest_of(found: dict[str, Any]) -> str:
+    """Return the digest of a run from what :func:`science` returned."""
+    canonical = json.dumps(found, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()
 
 
 def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
@@ -108,8 +106,3 @@ def _leaves(value: Any, key: str) -> list[tuple[str, str]]:
     if isinstance(value, str) and value.startswith("sha256:"):
         return [(key, f"contents {value[:19]}")]
     return [(key, json.dumps(value))]
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as stream:
-        return f"sha256:{hashlib.file_digest(stream, 'sha256').hexdigest()}"

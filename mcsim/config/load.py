@@ -1,6 +1,7 @@
 """Read a run from TOML or a dict, and write it as JSON for a worker."""
 
 import json
+import os
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -73,7 +74,7 @@ def load(source: str | Path | Mapping[str, Any], base: str | Path | None = None)
     else:
         path = Path(source)
         where = str(source)
-        plain, folder = _read(path if _is_file(path) else resources.workflow(source))
+        plain, folder = _read(path if os.path.isfile(path) else resources.workflow(source))
     paths.make_absolute(plain, folder, where)
     paths.find_descriptions(plain)
     config = _validate(plain, where)
@@ -126,13 +127,6 @@ def json_schema() -> dict[str, Any]:
     return _ADAPTER.json_schema(by_alias=True)
 
 
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except (OSError, ValueError):  # an invalid name
-        return False
-
-
 def _read(path: Path) -> tuple[dict[str, Any], Path]:
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -159,9 +153,9 @@ def _plain(source: Mapping[str, Any], where: str) -> dict[str, Any]:
 
     try:
         plain: dict[str, Any] = json.loads(json.dumps(dict(source), default=convert))
+    except InputError:
+        raise
     except (TypeError, ValueError, RecursionError) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(
             f"{where} cannot be read ({error}); give a dict with the structure of the TOML file."
         ) from None
@@ -182,12 +176,8 @@ def _with_parameters(plain: dict[str, Any]) -> dict[str, Any]:
     tables = plain.get("effect")
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
         return plain
-    own = ("name", "channel")
-    folded = [
-        {
-            **{key: value for key, value in table.items() if key in own},
-            "parameters": {key: value for key, value in table.items() if key not in own},
-        }
-        for table in tables
-    ]
+    folded = []
+    for table in tables:
+        own = {key: table[key] for key in ("name", "channel") if key in table}
+        folded.append({**own, "parameters": {key: table[key] for key in table if key not in own}})
     return {**plain, "effect": folded}

@@ -11,7 +11,7 @@ from pydantic_core import ErrorDetails
 
 from mcsim.config import preparation, schema
 
-# Table -> its possible classes. The kind of a beam or scan, which pydantic puts into the location, selects one.
+# Table -> its class. The kind of a beam or scan, which pydantic puts into the location, selects one of several.
 _TABLES: dict[tuple[str, ...], type] = {
     (): schema.RunConfig,
     ("sky",): schema.Sky,
@@ -23,20 +23,10 @@ _TABLES: dict[tuple[str, ...], type] = {
     ("compute",): schema.Compute,
     **{("preparation", step.kind): step for step in preparation.STEPS},
     **{
-        ("channel", side, kind): beam
-        for side in ("beam", "beam_b")
-        for kind, beam in (
-            ("gaussian", schema.BeamGaussian),
-            ("elliptical_gaussian", schema.BeamEllipticalGaussian),
-            ("map", schema.BeamMap),
-            ("blm", schema.BeamBlm),
-        )
+        ("channel", key, kind): table
+        for key, tables in (("beam", schema.BEAMS), ("beam_b", schema.BEAMS), ("scan", schema.SCANS))
+        for kind, table in tables.items()
     },
-    ("channel", "scan", "parallel_transport"): schema.ScanParallelTransport,
-    ("channel", "scan", "hit_averaged"): schema.ScanHitAveraged,
-    ("channel", "scan", "moments"): schema.ScanMoments,
-    ("channel", "scan", "pointing"): schema.ScanPointing,
-    ("channel", "scan", "differencing"): schema.ScanDifferencing,
 }
 _TOML_NAMES = {"schema_version": "schema", "channels": "channel", "effects": "effect"}
 _REPEATED = {"channel": "[[channel]]", "effect": "[[effect]]", "preparation": "[[preparation]]"}

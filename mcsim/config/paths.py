@@ -7,6 +7,7 @@ from pathlib import Path
 from string import Formatter
 from typing import Any, NamedTuple
 
+from mcsim.config.arrays import RULES, Rule, literal
 from mcsim.config.messages import label
 from mcsim.config.schema import RunConfig
 from mcsim.errors import InputError
@@ -19,39 +20,13 @@ _VARIABLE = re.compile(r"\$\{([A-Za-z_][A-Za-z0-9_]*)\}")
 _NUMBER_FORMAT = re.compile(r"(0?[1-9]?d)?")
 
 
-class _Rule(NamedTuple):
-    """Rules of a key: the kind of packaged name, the words and the placeholders that it may contain."""
-
-    packaged: str | None = None
-    words: tuple[str, ...] = ()
-    placeholders: tuple[str, ...] = ()
-
-
-_RULES = {
-    "sky.spectrum": _Rule(packaged="data"),
-    "sky.alm": _Rule(placeholders=("realization",)),
-    "sky.map": _Rule(placeholders=("realization",)),
-    "map.mask": _Rule(placeholders=("channel", "split")),
-    "map.pixel_window": _Rule(words=("computed", "none")),
-    "beam.path": _Rule(placeholders=("channel",)),
-    "beam_b.path": _Rule(placeholders=("channel",)),
-    "scan.path": _Rule(placeholders=("channel", "split")),
-    "scan.model": _Rule(packaged="scan_models", placeholders=("channel", "split")),
-    "effect.template": _Rule(),
-    "preparation.mask": _Rule(placeholders=("channel", "split")),
-    "preparation.window": _Rule(placeholders=("channel",)),
-    "preparation.own_window": _Rule(placeholders=("channel",)),
-    "preparation.templates": _Rule(placeholders=("channel",)),
-}
-
-
 class Entry(NamedTuple):
     """One key that names a file (or a family of files) in the plain dict of a run."""
 
     key: str  # as in messages: channel[W1].beam.path
     holder: Any  # the table, or list, that contains it
     field: str | int  # its name or place there
-    rule: _Rule
+    rule: Rule
     channels: tuple[str, ...]  # channels that it applies to
 
     @property
@@ -72,25 +47,21 @@ def sky_path(template: str, realization: int) -> Path:
 
 def entries(plain: dict[str, Any]) -> Iterator[Entry]:
     """Yield every key of the plain dict (as in TOML) that names files; the schema checks the types."""
-    channels = plain.get("channel")
-    tables = [channel for channel in channels if isinstance(channel, dict)] if isinstance(channels, list) else []
-    every = tuple(str(table.get("name")) for table in tables)
+    channels = _tables(plain, "channel")
+    every = tuple(str(table.get("name")) for table in channels)
     sections: list[tuple[str, str, Any, tuple[str, ...]]] = [
         (name, name, plain.get(name), every) for name in ("sky", "map")
     ]
-    for number, table in enumerate(tables):
+    for number, table in enumerate(channels):
         key = f"channel[{label(table, number)}]"
         sections += [(part, f"{key}.{part}", table.get(part), (every[number],)) for part in ("beam", "beam_b", "scan")]
-    effects = plain.get("effect")
-    for number, table in enumerate(effects if isinstance(effects, list) else []):
-        sections.append(("effect", f"effect[{number}]", table, every))
-    steps = plain.get("preparation")
-    for number, table in enumerate(steps if isinstance(steps, list) else []):
-        own = table.get("channels") if isinstance(table, dict) else None
+    sections += [("effect", f"effect[{n}]", table, every) for n, table in enumerate(_tables(plain, "effect"))]
+    for number, table in enumerate(_tables(plain, "preparation")):
+        own = table.get("channels")
         names = tuple(map(str, own)) if isinstance(own, list) and own else every
         sections.append(("preparation", f"preparation[{number}]", table, names))
     for section, where, holder, speaks_of in sections:
-        for path, rule in _RULES.items():
+        for path, rule in RULES.items():
             table_name, field = path.split(".")
             if table_name == section and isinstance(holder, dict):
                 value = holder.get(field)
@@ -101,47 +72,45 @@ def entries(plain: dict[str, Any]) -> Iterator[Entry]:
                         yield Entry(f"{where}.{field}[{place}]", value, place, rule, speaks_of)
 
 
+def _tables(plain: dict[str, Any], key: str) -> list[dict[str, Any]]:
+    given = plain.get(key)
+    return [table for table in given if isinstance(table, dict)] if isinstance(given, list) else []
+
+
 def make_absolute(plain: dict[str, Any], base: Path, where: str) -> None:
     """Expand ${VAR} and make relative paths start from ``base``, in place; keep packaged names."""
     for entry in entries(plain):
-        if _is_packaged(entry):
-            continue
+        if not _is_packaged(entry):
+            entry.holder[entry.field] = _absolute(entry, base, where)
 
-        def expand(match: re.Match[str], entry: Entry = entry) -> str:
-            try:
-                return _literal(os.environ[match[1]], entry.rule)
-            except KeyError:
-                raise InputError(
-                    f"{where}: {entry.key} = {entry.template!r} uses the environment variable {match[1]}, which is "
-                    "not set; set it or write the folder out."
-                ) from None
 
-        path = _VARIABLE.sub(expand, entry.template)
-        entry.holder[entry.field] = os.path.normpath(os.path.join(_literal(str(base.absolute()), entry.rule), path))
+def _absolute(entry: Entry, base: Path, where: str) -> str:
+    for name in _VARIABLE.findall(entry.template):
+        if name not in os.environ:
+            raise InputError(
+                f"{where}: {entry.key} = {entry.template!r} uses the environment variable {name}, which is not set; "
+                "set it or write the folder out."
+            )
+    escaped = literal if entry.rule.placeholders else str
+    path = _VARIABLE.sub(lambda match: escaped(os.environ[match[1]]), entry.template)
+    return os.path.normpath(os.path.join(escaped(str(base.absolute())), path))
 
 
 def find_descriptions(plain: dict[str, Any]) -> None:
     """Set, in place, the model of channels without one to the ``scan.toml`` beside their moments."""
-    channels = plain.get("channel")
-    for channel in channels if isinstance(channels, list) else []:
-        scan = channel.get("scan") if isinstance(channel, dict) else None
+    for channel in _tables(plain, "channel"):
+        scan = channel.get("scan")
         if not isinstance(scan, dict) or scan.get("kind") != "moments" or scan.get("model") is not None:
             continue
         beside = Path(str(scan.get("path"))).parent / DESCRIPTION
-        try:
-            if beside.is_file():
-                scan["model"] = str(beside)
-        except (OSError, ValueError):  # a name that no file system takes
-            continue
+        if os.path.isfile(beside):  # False also for a name that no file system takes
+            scan["model"] = str(beside)
 
 
 def files(entry: Entry, splits: Sequence[str], where: str, realization: int = 0) -> dict[str, Path]:
     """Return the files of an entry, by the values of its placeholders ("W1,half1"; "" without any).
 
-    Raises
-    ------
-    InputError
-        For an unknown or malformed placeholder, {split} without splits, or a missing file.
+    Unknown or malformed placeholders, {split} without splits, and missing files are refused.
     """
     used = _placeholders(entry, where)
     if "split" in used and not splits:
@@ -152,9 +121,8 @@ def files(entry: Entry, splits: Sequence[str], where: str, realization: int = 0)
     found = {}
     for channel in entry.channels if "channel" in used else [""]:
         for split in splits if "split" in used else [""]:
-            found[",".join(value for value in (channel, split) if value)] = _existing(
-                entry, {"channel": channel, "split": split, "realization": realization}, where
-            )
+            values = {"channel": channel, "split": split, "realization": realization}
+            found[",".join(value for value in (channel, split) if value)] = _existing(entry, values, where)
     return found
 
 
@@ -174,35 +142,26 @@ def template_tail(template: str) -> str:
     return "/".join(parts[first:])
 
 
-def _literal(text: str, rule: _Rule) -> str:
-    """Escape the braces of a folder's name: they are not placeholders."""
-    return text.replace("{", "{{").replace("}", "}}") if rule.placeholders else text
-
-
 def _is_packaged(entry: Entry) -> bool:
     return entry.rule.packaged is not None and entry.template in resources.names(entry.rule.packaged)
 
 
 def _placeholders(entry: Entry, where: str) -> set[str]:
-    rule = entry.rule
-    if not rule.placeholders:
+    known = entry.rule.placeholders
+    if not known:
         return set()
-    allowed = ", ".join(f"{{{name}}}" for name in rule.placeholders)
-    wrong = InputError(
-        f"{where}: {entry.key} = {entry.template!r} has a placeholder that is not understood here; use {allowed} only, "
-        "and double a brace that is part of a name."
-    )
     try:
         parts = [part for part in Formatter().parse(entry.template) if part[1] is not None]
+        for _, name, spec, conversion in parts:
+            number = name == "realization" and _NUMBER_FORMAT.fullmatch(spec or "")
+            if name not in known or conversion or (spec and not number):
+                raise ValueError(name)
     except ValueError:
-        raise wrong from None
-    for _, name, spec, conversion in parts:
-        if (
-            name not in rule.placeholders
-            or conversion
-            or (spec and not (name == "realization" and _NUMBER_FORMAT.fullmatch(spec)))
-        ):
-            raise wrong
+        allowed = ", ".join(f"{{{name}}}" for name in known)
+        raise InputError(
+            f"{where}: {entry.key} = {entry.template!r} has a placeholder that is not understood here; use {allowed} "
+            "only, and double a brace that is part of a name."
+        ) from None
     return {str(part[1]) for part in parts}
 
 
@@ -210,16 +169,10 @@ def _existing(entry: Entry, values: dict[str, Any], where: str) -> Path:
     if entry.rule.packaged is not None and _is_packaged(entry):
         return {"data": resources.spectrum, "scan_models": resources.scan_model}[entry.rule.packaged](entry.template)
     path = Path(entry.template.format(**values) if entry.rule.placeholders else entry.template)
-    try:
-        if path.is_file():
-            return path
-    except (OSError, ValueError):  # a name that no file system takes
-        pass
-    packaged = (
-        f" or one of the packaged names {', '.join(resources.names(entry.rule.packaged))}"
-        if entry.rule.packaged
-        else ""
-    )
+    if os.path.isfile(path):
+        return path
+    names = resources.names(entry.rule.packaged) if entry.rule.packaged else ()
+    packaged = f" or one of the packaged names {', '.join(names)}" if names else ""
     raise InputError(
         f"{where}: {entry.key} names the file {str(path)!r}, which does not exist; give an existing one{packaged}."
     )

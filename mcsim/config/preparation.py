@@ -3,10 +3,10 @@
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from mcsim.config.values import NSIDE_MAX, STRICT, Frame, Fwhm, Label, PathText, power_of_two
+from mcsim.config.values import STRICT, Frame, Fwhm, Label, Nside, PathText
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -18,7 +18,7 @@ class Degrade:
     """
 
     kind: Literal["degrade"] = "degrade"
-    nside: Annotated[int, Field(ge=1, le=NSIDE_MAX), AfterValidator(power_of_two)]
+    nside: Nside
     method: Literal["average", "harmonics"] = "average"
 
 

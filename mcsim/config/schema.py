@@ -4,36 +4,18 @@ Every key states the unit of its number. A failed check raises ValueError whose 
 :mod:`mcsim.config.messages` completes the sentence.
 """
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import (
-    AfterValidator,
-    Field,
-    GetCoreSchemaHandler,
-    model_validator,
-)
+from pydantic import AfterValidator, Field, GetCoreSchemaHandler, model_validator
 from pydantic.dataclasses import dataclass
 from pydantic_core import core_schema
 
-from mcsim.config import arrays, values
+from mcsim.config import arrays
 from mcsim.config.preparation import Step, check_steps
-from mcsim.config.values import (
-    NSIDE_MAX,
-    BeamOrder,
-    Degree,
-    Frame,
-    Fwhm,
-    Label,
-    PathText,
-    different,
-    power_of_two,
-    unique,
-)
-
-_STRICT = values.STRICT
+from mcsim.config.values import STRICT, BeamOrder, Degree, Frame, Fwhm, Label, Nside, PathText, power_of_two, unique
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Sky:
     """Isotropic Gaussian skies from ``spectrum``, or skies given as a_lm or map files (a template: {realization}).
 
@@ -59,7 +41,7 @@ class Sky:
         return self
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Map:
     """Pixels, frame, mask, splits and pixel window.
 
@@ -73,7 +55,7 @@ class Map:
     of its soft edge.
     """
 
-    nside: Annotated[int, Field(ge=1, le=NSIDE_MAX), AfterValidator(power_of_two)] | None = None
+    nside: Nside | None = None
     grid: Literal["healpix", "gl"] = "healpix"
     frame: Frame = "ecliptic"
     mask: PathText | None = None
@@ -88,26 +70,19 @@ class Map:
         return self.nside or 0
 
     @model_validator(mode="after")
-    def _pixels_or_none(self) -> Self:
-        if self.grid == "healpix":
-            if self.nside is None:
-                raise ValueError("the key nside is missing; add it")
-            return self
-        given = {"nside": self.nside, "mask": self.mask, "splits": self.splits, "pixel_window": self.pixel_window}
-        for key, value in given.items():
-            if value and value != "none":
+    def _pixels_and_mask(self) -> Self:
+        if self.grid == "healpix" and self.nside is None:
+            raise ValueError("the key nside is missing; add it")
+        for key in ("nside", "mask", "splits", "pixel_window") if self.grid == "gl" else ():
+            if getattr(self, key) not in (None, (), "none"):
                 raise ValueError(f'{key} is given, but grid = "gl" has no pixels; remove {key} or set grid = "healpix"')
-        return self
-
-    @model_validator(mode="after")
-    def _mask_to_work_on(self) -> Self:
         if self.mask is None and (self.mask_frame is not None or self.mask_apodisation_deg > 0.0):
             key = "mask_frame" if self.mask_frame is not None else "mask_apodisation_deg"
             raise ValueError(f"{key} is given without a mask; add mask or remove {key}")
         return self
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class BeamGaussian:
     """Circular Gaussian."""
 
@@ -115,7 +90,7 @@ class BeamGaussian:
     fwhm_arcmin: Fwhm
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class BeamEllipticalGaussian:
     """Elliptical Gaussian; ``angle_deg`` is that of the major axis, from the beam's x axis towards y."""
 
@@ -135,7 +110,7 @@ class BeamEllipticalGaussian:
         return self
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class BeamMap:
     """Two-dimensional beam map in FITS.
 
@@ -154,7 +129,7 @@ class BeamMap:
     m_max: BeamOrder = None
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class BeamBlm:
     """File of b_lm; ``angle_deg`` rotates the beam about its axis, from x towards y."""
 
@@ -164,7 +139,7 @@ class BeamBlm:
     m_max: BeamOrder = None
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class ScanParallelTransport:
     """Parallel transport: one sample at every pixel centre, at the angle ``psi0_deg`` from e_theta."""
 
@@ -172,7 +147,7 @@ class ScanParallelTransport:
     psi0_deg: float = 0.0
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class ScanHitAveraged:
     """Orientation moments of a scan model: a packaged name or a TOML file."""
 
@@ -182,7 +157,7 @@ class ScanHitAveraged:
     line_of_sight: PathText | None = None
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class ScanMoments:
     """Orientation moments from a FITS file.
 
@@ -196,7 +171,7 @@ class ScanMoments:
     line_of_sight: PathText | None = None
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class ScanPointing:
     """Orientation moments from a file of pointings: theta, phi, psi[, time]."""
 
@@ -204,7 +179,7 @@ class ScanPointing:
     path: PathText
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class ScanDifferencing:
     """A differencing pair of a scan model; maps are made from (1+x) T_A - (1-x) T_B, x the transmission imbalance.
 
@@ -234,30 +209,25 @@ class _OrObject:
         if not isinstance(value, arrays.Tabled):
             return value
         table = arrays.table_of(value)
-        kinds = {"blm": BeamBlm, "moments": ScanMoments, "hit_averaged": ScanHitAveraged}
-        return kinds[table.pop("kind")](**table)
+        return (BEAMS | SCANS)[table["kind"]](**table)
 
 
-Beam = Annotated[
-    BeamGaussian | BeamEllipticalGaussian | BeamMap | BeamBlm,
-    Field(discriminator="kind"),
-    _OrObject(),
-]
-Scan = Annotated[
-    ScanParallelTransport | ScanHitAveraged | ScanMoments | ScanPointing | ScanDifferencing,
-    Field(discriminator="kind"),
-    _OrObject(),
-]
+AnyBeam = BeamGaussian | BeamEllipticalGaussian | BeamMap | BeamBlm
+AnyScan = ScanParallelTransport | ScanHitAveraged | ScanMoments | ScanPointing | ScanDifferencing
+Beam = Annotated[AnyBeam, Field(discriminator="kind"), _OrObject()]
+Scan = Annotated[AnyScan, Field(discriminator="kind"), _OrObject()]
+BEAMS: dict[str, Any] = {each.kind: each for each in get_args(AnyBeam)}
+SCANS: dict[str, Any] = {each.kind: each for each in get_args(AnyScan)}
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Noise:
     """White noise per sample; the variance of a pixel is sigma0_uk^2 / hits. Differencing: per difference."""
 
     sigma0_uk: Annotated[float, Field(ge=0.0)] = 0.0
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Channel:
     """One detector or band: a beam under a scan, with noise.
 
@@ -281,7 +251,7 @@ class Channel:
         return self
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Biposh:
     """Settings of the estimator; ``lmax``: by default the sky's; ``iterations``: Jacobi iterations of the analysis."""
 
@@ -293,7 +263,7 @@ class Biposh:
     pairs: Literal["all", "auto"] = "all"
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Ensemble:
     """Realizations 0 .. realizations - 1 of the seed; ``paired`` adds the circular-beam control of each."""
 
@@ -303,7 +273,7 @@ class Ensemble:
     keep_maps: bool = False
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Compute:
     """Settings of the computation; no result depends on them. ``chunk``: realizations per task (default: chosen)."""
 
@@ -311,7 +281,7 @@ class Compute:
     chunk: Annotated[int, Field(ge=1, le=2**20), AfterValidator(power_of_two)] | None = None
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Effect:
     """Named change of the simulation; in TOML its ``parameters`` are keys of the table ``[[effect]]``."""
 
@@ -320,7 +290,7 @@ class Effect:
     parameters: dict[str, float | str | tuple[float, ...]] = Field(default_factory=dict)
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class RunConfig:
     """Configuration of a run, from :func:`mcsim.load_config`; frozen: ``dataclasses.replace`` makes another one.
 
@@ -364,7 +334,7 @@ class RunConfig:
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        names = [channel.name for channel in self.channels]
+        names = tuple(channel.name for channel in self.channels)
         limit, of = check_steps(self.preparation, self.map.resolution, self.map.frame, names)
         lmax = analysis_lmax(self)
         key = "biposh.lmax" if self.biposh.lmax is not None else "biposh.lmax (by default sky.lmax)"
@@ -380,7 +350,7 @@ class RunConfig:
         if self.biposh.L_max > lmax:
             raise ValueError(f"biposh.L_max = {self.biposh.L_max} is above the lmax of the analysis, {lmax}; lower it")
         try:
-            different(names)
+            unique(names)
         except ValueError as error:
             raise ValueError(f"channel {error}") from None
         for effect in self.effects:

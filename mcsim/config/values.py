@@ -4,7 +4,6 @@ A failed check raises ValueError whose text follows ``key = value``; :mod:`mcsim
 sentence.
 """
 
-from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationInfo
@@ -35,16 +34,11 @@ def _label(value: str) -> str:
     return value
 
 
-def different(values: Sequence[str]) -> None:
-    """Raise ValueError if a name is given twice."""
+def unique(values: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names if none is given twice."""
     twice = [value for value in values if values.count(value) > 1]
     if twice:
         raise ValueError(f"names {twice[0]!r} twice; give every one its own name")
-
-
-def unique(values: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names if none is given twice."""
-    different(values)
     return values
 
 
@@ -61,6 +55,7 @@ def _in_file(value: Any, info: ValidationInfo) -> Any:
 
 Label = Annotated[str, AfterValidator(_label)]
 PathText = Annotated[str, BeforeValidator(_in_file), AfterValidator(_not_empty)]
+Nside = Annotated[int, Field(ge=1, le=NSIDE_MAX), AfterValidator(power_of_two)]
 Degree = Annotated[int, Field(ge=2, le=LMAX_MAX)]
 BeamOrder = Annotated[int, Field(ge=0, le=LMAX_MAX)] | None
 Fwhm = Annotated[float, Field(gt=0.0, le=10800.0)]

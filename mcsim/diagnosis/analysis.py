@@ -1,6 +1,6 @@
 """An analysis: model, candidate effects and data vector; and the task that simulates data vectors."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -9,44 +9,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config, systematics
-from mcsim.diagnosis.bipolar_scan import BipolarScan
 from mcsim.diagnosis.candidate import Candidate, numbered
-from mcsim.diagnosis.matched_filters import MatchedFilter, matched_filter
-from mcsim.diagnosis.residual_maps import coarse_residuals
+from mcsim.diagnosis.localisation import BipolarScan, coarse_residuals
+from mcsim.diagnosis.matched_filters import matched_filter
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Block, Element, blocks_of
-from mcsim.diagnosis.wiener_filter import Model, model_of, shared_sky, wiener_filter
+from mcsim.diagnosis.wiener_filter import Map, Model, model_of, shared_sky, wiener_filter
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.systematics import Effect, Library
 
-Map = NDArray[np.float64]
+Vector = NDArray[np.float64]
+Kinds = tuple[tuple[str, type[Effect]], ...]
+"""Effects of a library by name, as they are sent to workers."""
 
 _OTHER_NOISE = 1_000_000
 
 
 @dataclass(frozen=True)
 class Analysis:
-    """Define what is measured and which effects may be there.
+    """Define what is measured and which effects may be there."""
 
-    Attributes
-    ----------
-    model
-        Fiducial survey.
-    candidates
-        Effects that may be there.
-    blocks
-        Of which the data vector consists, the matched filters of the candidates last.
-    without
-        Effects of the library that are left out.
-    """
+    model: Model  # fiducial survey
+    candidates: tuple[Candidate, ...]  # effects that may be there
+    blocks: tuple[Block, ...]  # of which the data vector consists, the matched filters of the candidates last
+    without: tuple[str, ...] = ()  # effects of the library that are left out
+    library: Kinds = field(default_factory=lambda: kinds_of(None))  # effects that are known
+    of_maps: bool = True  # False: the data vector is a table of spectra
 
-    model: Model
-    candidates: tuple[Candidate, ...]
-    blocks: tuple[Block, ...]
-    without: tuple[str, ...] = ()
+    @property
+    def run(self) -> config.RunConfig:
+        """Return the configuration of the fiducial survey."""
+        return self.model.survey.config
 
     @property
     def settings(self) -> DiagnosisSettings:
@@ -58,18 +54,23 @@ class Analysis:
         """Return the descriptions of the elements of the data vector."""
         return tuple(element for block in self.blocks for element in block.elements)
 
-    def data_vector(self, maps: Sequence[Map], nthreads: int = 1, bipolar_scan: bool = False) -> NDArray[np.float64]:
-        """Return the data vector, shape (p,), and on request the bipolar scan and coarse residuals behind it."""
-        filtered = wiener_filter(self.model, maps, nthreads)
-        found = [block.values(self.model, filtered) for block in self.blocks]
-        if bipolar_scan:
-            found += [self.bipolar_scan.values(filtered), coarse_residuals(self.model, filtered).ravel()]
-        return np.concatenate(found)
-
     @cached_property
     def bipolar_scan(self) -> BipolarScan:
         """Return the scan that localises a departure from the model."""
         return BipolarScan(self.model)
+
+    def data_vector(self, maps: Sequence[Map], bipolar_scan: bool = False) -> Vector:
+        """Return the data vector, shape (p,), and on request the bipolar scan and coarse residuals behind it."""
+        filtered = wiener_filter(self.model, maps)
+        found = [np.atleast_1d(block.values(filtered)) for block in self.blocks]
+        if bipolar_scan:
+            found += [self.bipolar_scan.values(filtered), coarse_residuals(self.model, filtered).ravel()]
+        return np.concatenate(found)
+
+    def job(self, simulated: config.RunConfig) -> "Job":
+        """Return a job of no realization yet that simulates a run and analyses it."""
+        fiducial, own = config.to_json(self.run), config.to_json(simulated)
+        return Job(fiducial, own, 0, 0, without=self.without, settings=self.settings, library=self.library)
 
 
 def analysis_of(
@@ -77,33 +78,33 @@ def analysis_of(
     without: Sequence[str] = (),
     nthreads: int = 1,
     settings: DiagnosisSettings | None = None,
+    library: Library | None = None,
 ) -> Analysis:
-    """Define the analysis of data that ``run`` claims to describe.
+    """Define the analysis of data that ``run``, with the effects that are modelled already, claims to describe.
 
-    Parameters
-    ----------
-    run
-        Fiducial model, with the effects that are modelled already.
-    without
-        Effects of the library that are no candidates.
-    nthreads
-        Threads for what is computed once.
-    settings
-        Default: those of :class:`DiagnosisSettings`.
+    Effects of the library (default: built-in and registered ones), which the run may name as well, are candidates
+    where they apply, but those called in ``without``. ``nthreads`` compute what is computed once.
     """
     settings = settings or DiagnosisSettings()
-    model = model_of(survey(run, nthreads=nthreads, orders=settings.beam_orders), settings)
+    known = kinds_of(library)
+    model = model_of(survey(run, nthreads=nthreads, orders=settings.beam_orders, library=dict(known)), settings)
     candidates = numbered(
         [
-            Candidate(effect, channel, tuple(range(len(effect.basis()))), dict(fixed))
-            for name, effect in systematics.catalogue().items()
+            Candidate(effect, channel, tuple(range(len(effect.parametrization.basis()))), dict(fixed))
+            for name, effect in known
             if name not in without
-            for channel in ([None] if effect.scope == "common" else [channel.name for channel in run.channels])
+            for channel in ((None,) if effect.scope == "common" else model.channels)
             for fixed in effect.variants
             if _applies(model, effect, channel, fixed)
         ]
     )
-    return Analysis(model, candidates, (*blocks_of(model), *_matched_blocks(model, candidates)), tuple(without))
+    blocks = (*blocks_of(model), *_matched_blocks(model, candidates))
+    return Analysis(model, candidates, blocks, tuple(without), known)
+
+
+def kinds_of(library: Library | None) -> Kinds:
+    """Return the effects of a library; None: built-in and registered ones."""
+    return tuple((systematics.catalogue() if library is None else library).items())
 
 
 def _applies(model: Model, kind: type[Effect], channel: str | None, settings: Mapping[str, Any]) -> bool:
@@ -116,12 +117,12 @@ def _applies(model: Model, kind: type[Effect], channel: str | None, settings: Ma
         return False
     owners = [c for c in model.survey.channels if channel in (None, c.name)]
     if kind.orientations is not Effect.orientations:
-        specs = {spec.name: spec for spec in model.survey.config.channels}
-        if not all(isinstance(specs[owner.name].scan, config.ScanParallelTransport) for owner in owners):
+        scans = [spec.scan for spec in model.survey.config.channels if channel in (None, spec.name)]
+        if not all(isinstance(scan, config.ScanParallelTransport) for scan in scans):
             return False
         if not any(owner.beam.mmax for owner in owners):
             return False
-    effect = replace(kind.basis()[0], **settings)
+    effect = systematics.basis_of(kind, settings)[0]
     try:
         for owner in owners:
             effect.gain(np.zeros(1), owner.site)
@@ -135,71 +136,47 @@ def _applies(model: Model, kind: type[Effect], channel: str | None, settings: Ma
     return not (quiet and kind.noise is not Effect.noise)
 
 
-def _matched_blocks(model: Model, candidates: Sequence[Candidate]) -> list[Block]:
-    names = [channel.name for channel in model.survey.channels]
-    blocks = []
+def _matched_blocks(model: Model, candidates: Sequence[Candidate]) -> Iterator[Block]:
     for candidate in candidates:
-        where = None if candidate.channel is None else names.index(candidate.channel)
+        channels = model.channels if candidate.channel is None else (candidate.channel,)
+        where = None if candidate.channel is None else model.channels.index(candidate.channel)
         for number, basis in enumerate(candidate.basis):
             found = matched_filter(model, basis, where)
             if found is not None:
-                blocks.append(_matched_block(candidate, number, found, names))
-    return blocks
-
-
-def _matched_block(candidate: Candidate, number: int, matched: MatchedFilter, names: Sequence[str]) -> Block:
-    channels = tuple(names) if candidate.channel is None else (candidate.channel,)
-    element = Element(
-        f"score/{candidate.label}/{number}",
-        "score",
-        channels,
-        kind="matched",
-        component=f"component {number + 1}" if len(candidate.columns) > 1 else None,
-        effect=candidate.title,
-    )
-    return Block((element,), lambda model, filtered: np.array([matched(model, filtered)]))
+                component = f"component {number + 1}" if len(candidate.columns) > 1 else None
+                name, words = f"score/{candidate.label}/{number}", candidate.title
+                alike = Element(name, "score", channels, kind="matched", effect=words, candidate=candidate.name)
+                yield Block((replace(alike, component=component),), found)
 
 
 @dataclass(frozen=True)
 class Job:
-    """Describe the simulations of one task, small enough to send.
+    """Describe the simulations of one task, small enough to send."""
 
-    Attributes
-    ----------
-    fiducial, simulated
-        JSON of the runs that filter and that are simulated; they differ in effects, noise and seed.
-    first, count
-        Realizations.
-    sample_by_sample
-        Simulate with the time-ordered reference, not with the default route.
-    without
-        Effects that are no candidates.
-    bipolar_scan
-        Measure the bipolar scan and the coarse residual maps as well.
-    observed
-        Filtered sky of the data, coefficients up to the model's lmax: the skies are then constrained by it.
-    settings
-        Of the analysis.
-    """
-
-    fiducial: str
-    simulated: str
-    first: int
+    fiducial: str  # JSON of the run that filters; it differs from the simulated one in effects, noise and seed
+    simulated: str  # JSON
+    first: int  # realization
     count: int
-    sample_by_sample: bool = False
-    without: tuple[str, ...] = ()
-    bipolar_scan: bool = False
-    observed: NDArray[np.complex128] | None = None
+    sample_by_sample: bool = False  # simulate with the time-ordered reference, not with the default route
+    without: tuple[str, ...] = ()  # effects that are no candidates
+    bipolar_scan: bool = False  # measure the bipolar scan and the coarse residual maps as well
+    observed: NDArray[np.complex128] | None = None  # filtered sky of the data, which then constrains the skies
     settings: DiagnosisSettings = field(default_factory=DiagnosisSettings)
+    library: Kinds = field(default_factory=lambda: kinds_of(None))
+
+    @property
+    def definition(self) -> tuple[str, tuple[str, ...], DiagnosisSettings, Kinds]:
+        """Return what the analysis follows from."""
+        return self.fiducial, self.without, self.settings, self.library
 
 
-def data_vectors(job: Job, library: Library | None = None) -> NDArray[np.float64]:
+def data_vectors(job: Job, library: Library | None = None) -> Vector:
     """Return the data vectors of simulations, shape (count, p), with bipolar scan and coarse residuals if asked for.
 
-    This is the task that a worker runs. ``library``: effects that the simulated run may name; default: the catalogue.
+    This is the task that a worker runs. ``library``: effects that the simulated run may name; default: the job's.
     """
-    analysis = _analysis(job.fiducial, job.without, job.settings)
-    shared = _survey(job.simulated) if library is None else survey(config.from_json(job.simulated), library=library)
+    analysis = _analysis(*job.definition)
+    shared = _survey(job.simulated, job.library if library is None else kinds_of(library))
     rows = []
     for realization in range(job.first, job.first + job.count):
         if job.sample_by_sample:
@@ -207,8 +184,8 @@ def data_vectors(job: Job, library: Library | None = None) -> NDArray[np.float64
         else:
             sky = None
             if job.observed is not None:
-                model = (job.fiducial, job.without, job.settings)
-                sky = _constrained_sky(*model, job.observed.tobytes(), shared.config.ensemble.seed, realization)
+                seed = shared.config.ensemble.seed
+                sky = _constrained_sky(job.definition, job.observed.tobytes(), seed, realization)
             maps = list(simulate.maps(shared, realization, sky=sky))
         rows.append(analysis.data_vector(maps, bipolar_scan=job.bipolar_scan))
     return np.stack(rows)
@@ -216,7 +193,7 @@ def data_vectors(job: Job, library: Library | None = None) -> NDArray[np.float64
 
 @lru_cache(maxsize=32)
 def _constrained_sky(
-    fiducial: str, without: tuple[str, ...], settings: DiagnosisSettings, observed: bytes, seed: int, realization: int
+    definition: tuple[Any, ...], observed: bytes, seed: int, realization: int
 ) -> NDArray[np.complex128]:
     """Return a constrained realization: a sky s + (s^_data - s^_drawn), with s^_drawn filtered from maps of s.
 
@@ -225,22 +202,21 @@ def _constrained_sky(
     Hoffman & Ribak, ApJ 380, L5 (1991). The noise of these maps is independent of that of the realization itself:
     otherwise sky and noise would be correlated, and every response too small by the filter of s^.
     """
-    model = _analysis(fiducial, without, settings).model
+    model = _analysis(*definition).model
     run = model.survey.config
     drawn = replace(model.survey, config=replace(run, ensemble=replace(run.ensemble, seed=seed)))
     sky = simulate.draw_sky(drawn, realization)
     filtered = shared_sky(model, list(simulate.maps(drawn, realization + _OTHER_NOISE, sky=sky)))
-    return np.asarray(
-        sky + alm_.resize(np.frombuffer(observed, dtype=np.complex128) - filtered, model.lmax, run.sky.lmax)
-    )
+    difference = np.frombuffer(observed, dtype=np.complex128) - filtered
+    return np.asarray(sky + alm_.resize(difference, model.lmax, run.sky.lmax))
 
 
 @lru_cache(maxsize=2)
-def _survey(simulated: str) -> Survey:
+def _survey(simulated: str, kinds: Kinds) -> Survey:
     """Keep the last surveys: jobs of a run follow each other, and a gain drift takes a pass over the pointing."""
-    return survey(config.from_json(simulated))
+    return survey(config.from_json(simulated), library=dict(kinds))
 
 
 @lru_cache(maxsize=1)
-def _analysis(fiducial: str, without: tuple[str, ...], settings: DiagnosisSettings) -> Analysis:
-    return analysis_of(config.from_json(fiducial), without, settings=settings)
+def _analysis(fiducial: str, without: tuple[str, ...], settings: DiagnosisSettings, kinds: Kinds) -> Analysis:
+    return analysis_of(config.from_json(fiducial), without, settings=settings, library=dict(kinds))

@@ -1,160 +1,88 @@
 """Put a diagnosis together: fits, tests and held-out data become one :class:`DiagnosisResult`."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.diagnosis.candidate import Candidate, columns_of, parts_of
-from mcsim.diagnosis.context import DiagnosisContext
-from mcsim.diagnosis.partial_explanation import PartialExplanation
-from mcsim.diagnosis.places import Place
+from mcsim.diagnosis.candidate import Candidate, parts_of
+from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.refine import Refined
-from mcsim.diagnosis.result import (
-    CandidateResult,
-    ContrastResult,
-    DiagnosisResult,
-    EffectResult,
-    EffectSet,
-    GlobalResult,
-    HeldOut,
-)
-from mcsim.diagnosis.selection import Explanation
-from mcsim.diagnosis.validation import Prediction, Shrink, excess_of
+from mcsim.diagnosis.result import CandidateResult, DiagnosisResult, EffectResult, EffectSet
+from mcsim.diagnosis.validation import HeldOut, excess_of
 from mcsim.errors import InputError
 from mcsim.stats.detection import detectable, snr_needed, snr_to_separate
 from mcsim.stats.gaussian import Fit, SimulatedGaussian, residual_pvalue
 
 Vector = NDArray[np.float64]
-Reduction = tuple[Prediction, Shrink, str]
-"""What was predicted, what was achieved, and on which data, in words."""
 
 TELLING = 12
 """Elements that are named where two sets differ."""
 
 
-@dataclass(frozen=True)
-class Findings:
-    """What was found in one case.
-
-    Attributes
-    ----------
-    x
-        Data vector, shape (p,).
-    refined
-        Final attribution and templates.
-    places, held_out, partial, notes
-        Localisation, (prediction, reduction, data in words), what is detected beside "unknown", and remarks.
-    residual_maps
-        From :func:`mcsim.diagnosis.residual_maps.standardised`; None without maps.
-    """
-
-    x: Vector
-    refined: Refined
-    places: Sequence[Place]
-    held_out: Reduction | None
-    partial: PartialExplanation | None
-    notes: Sequence[str]
-    residual_maps: Vector | None = None
-
-
 def result_of(
-    context: DiagnosisContext, case: str, findings: Findings, provenance: Mapping[str, Any] | None = None
+    data: DataSet, case: str, refined: Refined, reduction: HeldOut | None, notes: Sequence[str]
 ) -> DiagnosisResult:
-    """Return the result of a case; ``provenance`` is added to what every diagnosis states."""
-    ensemble, null = context.ensemble, context.null
-    found, candidates = findings.refined.attribution, context.candidates
-    partial, count = findings.partial, len(ensemble.simulations)
-    model = context.analysis.model
+    """Return the result of a case from its final attribution and the reduction on held-out data."""
+    context, found, partial = data.context, refined.attribution, refined.partial
+    ensemble, null, model = context.ensemble, context.null, context.analysis.model
+    candidates, residuals = context.candidates, data.residual_maps()
     return DiagnosisResult(
         case=case,
         kind=found.verdict,
-        test=GlobalResult(
-            found.gap.pvalue,
-            found.gap.omnibus,
-            found.gap.maximum,
-            found.gap.chi2,
-            found.gap.dimension,
-            excess_of(found.gap.chi2, found.gap.dimension, null.dof),
-            count,
-        ),
+        test=found.gap,
         sets=tuple(
             EffectSet(
-                tuple(effects_of(one, candidates)),
-                tuple(one.members),
-                tuple(columns_of(candidates, one.members)),
-                tuple(one.fit.amplitudes.tolist()),
-                tuple(one.fit.errors.tolist()),
-                one.odds,
-                one.pvalue,
-                one.further,
-                excess_of(one.fit.chi2, one.fit.dimension, null.dof),
+                effects=tuple(effects_of(candidates, one.members, one.fit)),
+                candidates=tuple(one.members),
+                coordinates=tuple(one.fit.amplitudes.tolist()),
+                errors=tuple(one.fit.errors.tolist()),
+                odds=one.odds,
+                pvalue=one.pvalue,
+                further=one.further,
+                excess=excess_of(one.fit.chi2, one.fit.dimension, null.dof),
             )
             for one in found.explanations
         ),
         contrasts=tuple(
-            ContrastResult(
-                one.first,
-                one.second,
-                one.separation,
-                tuple(one.elements[:TELLING].tolist()),
-                tuple(one.shares[:TELLING].tolist()),
-            )
-            for one in found.contrasts
+            replace(one, elements=one.elements[:TELLING], shares=one.shares[:TELLING]) for one in found.contrasts
         ),
         nearest=found.nearest,
         cosine=found.cosine,
-        partial=() if partial is None else tuple(effects_of(partial, candidates)),
+        partial=() if partial is None else tuple(effects_of(candidates, partial.members, partial.fit)),
         partial_left=None if partial is None else partial.left,
-        held_out=None if findings.held_out is None else _held_out(*findings.held_out),
-        places=tuple(findings.places),
-        candidates=tuple(_candidates(context, findings.refined)),
+        held_out=reduction,
+        places=tuple(data.places()),
+        candidates=tuple(_candidates(context, refined)),
         elements=context.analysis.elements,
         maps=tuple(part.name for part in model.parts),
-        data=findings.x,
+        data=data.x,
         mean=null.mean,
         standard_deviation=ensemble.simulations.std(axis=0, ddof=1),
-        templates=findings.refined.templates,
+        templates=refined.templates,
         correlation=found.correlation,
         held_out_pvalues=held_out_pvalues(ensemble.simulations, null),
         calibration=context.calibration.combined,
-        residual_maps=findings.residual_maps,
-        residual_range=None
-        if findings.residual_maps is None
-        else np.quantile(ensemble.residual_rms, [0.025, 0.975], axis=0).T,
-        frame=model.survey.frame,
-        notes=tuple(findings.notes),
+        residual_maps=residuals,
+        residual_range=None if residuals is None else np.quantile(ensemble.residual_rms, [0.025, 0.975], axis=0).T,
+        frame=model.frame,
+        notes=tuple(notes),
         settings=context.settings,
         provenance={
-            "simulations of the model": count,
+            "simulations of the model": len(ensemble.simulations),
             "skies constrained by the data": context.settings.constrained_skies,
             "seed of the run": context.run.ensemble.seed,
-            **(provenance or {}),
+            **data.provenance(),
         },
         configuration=config.to_json(context.run),
     )
 
 
-def _held_out(predicted: Prediction, achieved: Shrink, data: str) -> HeldOut:
-    return HeldOut(
-        predicted.fraction, achieved.fraction, achieved.before, achieved.after, achieved.probability_after, data
-    )
-
-
-def effects_of(
-    explanation: Explanation | PartialExplanation, candidates: Sequence[Candidate]
-) -> Iterator[EffectResult]:
-    """Yield the effects of a set with amplitude, standard error, unit and parameters.
-
-    Raises
-    ------
-    InputError
-        If no effect has such an amplitude.
-    """
-    for member, theta, covariance in parts_of(candidates, explanation.members, explanation.fit):
+def effects_of(candidates: Sequence[Candidate], members: Sequence[int], fit: Fit) -> Iterator[EffectResult]:
+    """Yield the effects of a fit; raise InputError if no effect has such an amplitude."""
+    for member, theta, covariance in parts_of(candidates, members, fit):
         candidate = candidates[member]
         effect, sigma = candidate.fitted(theta, covariance), _sigma(candidate, theta, covariance)
         yield EffectResult(
@@ -163,7 +91,10 @@ def effects_of(
             amplitude=effect.amplitude,
             sigma=sigma,
             unit=effect.unit,
-            parameters={key: _plain(value) for key, value in effect.parameters().items()},
+            parameters={
+                key: list(map(float, value)) if isinstance(value, tuple) else value
+                for key, value in effect.parameters().items()
+            },
             label=candidate.title,
             words=effect.describe(sigma),
         )
@@ -177,7 +108,7 @@ def _sigma(candidate: Candidate, theta: Vector, covariance: Vector) -> float:
     """
     scale = np.sqrt(np.diag(covariance))
     precision = np.asarray(np.linalg.pinv(covariance), dtype=np.float64)
-    constrained = candidate.effect.constrained(theta, precision)
+    constrained = candidate.effect.parametrization.constrained(theta, precision)
     slopes: Vector = np.zeros(len(theta))
     for k in np.flatnonzero((scale > 0.0) & ((constrained != 0.0) | (theta == 0.0))):
         step = scale[k] * np.eye(len(theta))[k]
@@ -186,34 +117,35 @@ def _sigma(candidate: Candidate, theta: Vector, covariance: Vector) -> float:
     return float(np.sqrt(max(float(slopes @ covariance @ slopes), 0.0)))
 
 
-def _plain(value: Any) -> Any:
-    return [float(item) for item in value] if isinstance(value, tuple) else value
-
-
 def _candidates(context: DiagnosisContext, refined: Refined) -> Iterator[CandidateResult]:
     """Yield every candidate with its fit alone, what would be detected, and what is most like it."""
-    null, t = context.null, refined.templates
-    found, candidates = refined.attribution, context.candidates
-    p, N = null.dimension, len(context.ensemble.simulations)
+    null, t, found, candidates = context.null, refined.templates, refined.attribution, context.candidates
     responds = np.any(t != 0.0, axis=0)
     rank = np.array([int(responds[list(one.columns)].sum()) for one in candidates])
     pvalues = null.nested_test(np.array([s.delta_chi2 for s in found.singles]), found.gap.chi2, rank)
     for k, candidate in enumerate(candidates):
         columns = list(candidate.columns)
-        amplitude, sigma, words = _alone(k, found.singles[k], candidates)
-        size = detectable_amplitude(null, t[:, columns], len(candidates), candidate)
+        try:
+            (alone,) = effects_of(candidates, (k,), found.singles[k])
+            amplitude, sigma, words = alone.amplitude, alone.sigma, alone.words
+        except InputError:
+            amplitude, sigma, words = float("nan"), float("nan"), "no such amplitude"
+        reach, size = detectable(null, t[:, columns], len(candidates)), None
+        needed = snr_needed(max(int(rank[k]), 1), len(candidates), null.dimension, null.n_sims)
+        if np.isfinite(reach):
+            precision = np.eye(len(columns))
+            size = abs(candidate.with_coordinates(reach * precision[0], precision).amplitude)
         # Candidates that differ in settings only are variants of one effect.
         others = [j for j, other in enumerate(candidates) if other.identity != candidate.identity]
         similar = max(others, key=lambda j: abs(found.correlation[k, j]), default=None)
         cosine = 0.0 if similar is None else abs(float(found.correlation[k, similar]))
-        strength = 0.0 if similar is None else float(snr_to_separate(np.array([cosine]))[0])
-        needed = snr_needed(min(len(columns), p), len(candidates), p, N)
+        strength = 0.0 if similar is None else float(snr_to_separate(cosine))
         separable = float("nan") if size is None or similar is None else strength * size / needed
         yield CandidateResult(
             name=candidate.name,
             channel=candidate.channel,
             settings=dict(candidate.settings),
-            unit=candidate.unit,
+            unit=candidate.effect.unit,
             label=candidate.title,
             columns=tuple(candidate.columns),
             amplitude=amplitude,
@@ -229,34 +161,6 @@ def _candidates(context: DiagnosisContext, refined: Refined) -> Iterator[Candida
             separable=separable,
             separable_words=candidate.effect.format_amplitude(separable) if np.isfinite(separable) else "–",
         )
-
-
-def detectable_amplitude(null: SimulatedGaussian, t: Vector, looks: int, candidate: Candidate) -> float | None:
-    """Return the smallest amplitude that is found in nine cases of ten, rms over directions; None: no response.
-
-    Parameters
-    ----------
-    null, t, looks
-        Null, templates of the candidate, shape (p, k), and number of candidates.
-    candidate
-        The candidate.
-    """
-    size = detectable(null, t, looks).typical
-    if not np.isfinite(size):
-        return None
-    direction = np.zeros(t.shape[1])
-    direction[0] = size
-    return abs(candidate.with_coordinates(direction, np.eye(len(direction))).amplitude)
-
-
-def _alone(index: int, single: Fit, candidates: Sequence[Candidate]) -> tuple[float, float, str]:
-    """Return amplitude, standard error and words of a candidate; NaN where no effect has such an amplitude."""
-    try:
-        fitted = Explanation((index,), single, 1.0, single.pvalue, single.pvalue)
-        (effect,) = effects_of(fitted, candidates)
-    except InputError:
-        return float("nan"), float("nan"), "no such amplitude"
-    return effect.amplitude, effect.sigma, effect.words
 
 
 def held_out_pvalues(simulations: Vector, null: SimulatedGaussian) -> Vector:

@@ -1,24 +1,32 @@
-"""Plan the simulations that a diagnosis needs, and turn them into a null ensemble and templates."""
+"""Plan and run the simulations that a diagnosis needs, and turn them into a null ensemble and templates."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from functools import cache
+from itertools import starmap
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.diagnosis.analysis import Analysis, Job
-from mcsim.diagnosis.candidate import Candidate
+from mcsim.diagnosis.analysis import Analysis, Job, data_vectors
+from mcsim.diagnosis.candidate import Candidate, TemplateBank
+from mcsim.diagnosis.localisation import rms
 from mcsim.diagnosis.null_ensemble import NullEnsemble
-from mcsim.diagnosis.residual_maps import rms
-from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.diagnosis.templates import TemplateBank
+from mcsim.ensemble import runner
 from mcsim.stats.gaussian import SimulatedGaussian
+from mcsim.support.progress import reporting
 from mcsim.systematics import Effect
 
-Ask = Callable[[Sequence[Job]], list[NDArray[np.float64]]]
+Rows = NDArray[np.float64]
+Task = Callable[[Job], Rows]
+Ask = Callable[[Sequence[Job]], list[Rows]]
 """Return the results of jobs, in order; in this process or on a cluster."""
+
+Batch = Callable[[Callable[..., Any], Iterable[tuple[Any, ...]]], Iterator[tuple[int, Any]]]
+"""Call a function with tuples of arguments; yield (index, result) in the order of completion."""
 
 _PER_TASK = 10
 _CONSTRAINED_PER_TASK = 4
@@ -27,99 +35,130 @@ _CONSTRAINED_PER_TASK = 4
 _COVARIANCE, _RESPONSE = (0x6D63 * 1_000 + stream for stream in (1, 2))
 
 
-@dataclass(frozen=True)
-class Plan:
-    """List jobs and their purposes; the result of each is an array (count, p)."""
+@contextmanager
+def batch(workers: int) -> Iterator[Batch]:
+    """Open a cluster of ``workers`` processes at the first call; with 0 call in this process."""
+    with ExitStack() as stack:
 
-    jobs: tuple[Job, ...]
-    purposes: tuple[tuple[Any, ...], ...]
+        @cache
+        def client() -> Any:
+            return stack.enter_context(runner.local_client(workers))
+
+        def call(function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> Iterator[tuple[int, Any]]:
+            if workers == 0:
+                return enumerate(starmap(function, arguments))
+            return runner.completed(client(), function, arguments)
+
+        yield call
 
 
-def plan(run: config.RunConfig, analysis: Analysis, simulations: int | None = None, time_ordered: bool = True) -> Plan:
-    """List all simulations from which :func:`learned` estimates null ensemble and templates.
+@contextmanager
+def asking(call: Batch, quiet: bool, task: Task = data_vectors, stage: str = "simulations") -> Iterator[Ask]:
+    """Give the function that runs jobs; all that it runs is one stage of the progress."""
+    done = 0.0
+    with reporting(stage, 0.0, "skies", quiet) as report:
 
-    Parameters
-    ----------
-    run, analysis
-        Fiducial model and its analysis.
-    simulations
-        Number for the covariance; default: ``settings.sims_per_element`` for every element of the data vector, of
-        which :func:`simulated` leaves some out.
-    time_ordered
-        Compare with the time-ordered reference if every channel's pointing is known.
+        def ask(jobs: Sequence[Job]) -> list[Rows]:
+            nonlocal done
+            results = {}
+            report.expect(float(sum(job.count for job in jobs)))
+            for index, result in call(task, ((job,) for job in jobs)):
+                results[index] = result
+                done += jobs[index].count
+                report(done)
+            return [results[index] for index in range(len(jobs))]
+
+        yield ask
+
+
+class Purpose(NamedTuple):
+    """Say what a job is for; ``number`` is its first realization, or the column of a response of this sign."""
+
+    kind: Literal["time-ordered", "default", "null", "reference", "response"]
+    number: int
+    sign: int = 0
+
+
+def plan(analysis: Analysis, simulations: int | None = None, time_ordered: bool = True) -> dict[Purpose, Job]:
+    """Return all jobs from which :func:`learned` estimates null ensemble and templates.
+
+    ``simulations`` for the covariance are by default ``settings.sims_per_element`` for every element of the data
+    vector. The default route is compared with the time-ordered reference if that is wanted, and every channel's
+    pointing is known.
     """
-    settings, fiducial = analysis.settings, config.to_json(run)
+    settings, run = analysis.settings, analysis.run
     wanted = settings.sims_per_element * len(analysis.elements) if simulations is None else simulations
-    jobs, purposes = [], []
-
-    def add(purpose: tuple[Any, ...], simulated: config.RunConfig, first: int, count: int) -> None:
-        job = Job(fiducial, config.to_json(simulated), first, count, purpose[0] == "time-ordered", analysis.without)
-        scanned = purpose[0] == "null" and first < settings.scan_sims
-        jobs.append(replace(job, bipolar_scan=scanned, settings=settings))
-        purposes.append(purpose)
-
     base = seeded(run, _RESPONSE)
-    if time_ordered and all(c.site.pointing is not None for c in analysis.model.survey.channels):
+    jobs: dict[Purpose, Job] = {}
+    known = all(channel.site.pointing is not None for channel in analysis.model.survey.channels)
+    if time_ordered and analysis.of_maps and known:
         quiet = replace(base, channels=tuple(replace(c, noise=config.Noise()) for c in base.channels))
-        for sky in range(settings.time_ordered_skies):
-            add(("time-ordered", sky), quiet, sky, 1)
-            add(("default", sky), quiet, sky, 1)
-    for first in range(0, wanted, _PER_TASK):
-        add(("null", first), seeded(run, _COVARIANCE), first, min(_PER_TASK, wanted - first))
-    for first in range(0, settings.noisy_skies, _PER_TASK):
-        add(("reference", first), base, first, min(_PER_TASK, settings.noisy_skies - first))
+        for job in _split(analysis.job(quiet), range(settings.time_ordered_skies), 1):
+            jobs[Purpose("time-ordered", job.first)] = replace(job, sample_by_sample=True)
+            jobs[Purpose("default", job.first)] = job
+    for job in _split(analysis.job(seeded(run, _COVARIANCE)), range(wanted)):
+        jobs[Purpose("null", job.first)] = replace(job, bipolar_scan=job.first < settings.scan_sims)
+    for job in _split(analysis.job(base), range(settings.noisy_skies)):
+        jobs[Purpose("reference", job.first)] = job
     for candidate, column, sign, effect in _steps(analysis):
-        count = skies(candidate, analysis.model.lmax, settings)
-        add(("response", column, sign), with_effects(base, [candidate.table(effect)]), 0, count)
-    return Plan(tuple(jobs), tuple(purposes))
+        acting = analysis.job(with_effects(base, [candidate.table(effect)]))
+        jobs[Purpose("response", column, sign)] = replace(acting, count=skies(analysis, candidate))
+    return jobs
 
 
-def simulated(plan: Plan, analysis: Analysis, ask: Ask) -> tuple[Plan, list[NDArray[np.float64]]]:
-    """Run those jobs of a plan that are needed, and return them with their results.
+def _split(job: Job, realizations: range, size: int = _PER_TASK) -> list[Job]:
+    """Return jobs of at most ``size`` of these realizations each."""
+    stop = realizations.stop
+    return [replace(job, first=first, count=min(size, stop - first)) for first in range(realizations.start, stop, size)]
 
-    Some elements are redundant: the first simulations tell how many are independent, and so how many simulations are
-    needed.
-    """
-    size, settings = len(analysis.elements), analysis.settings
-    pilot = settings.pilot_sims_per_element * size
-    first = [k for k, job in enumerate(plan.jobs) if plan.purposes[k][0] == "null" and job.first < pilot]
-    results = dict(zip(first, ask([plan.jobs[k] for k in first]), strict=True))
-    drawn = np.concatenate([result[:, :size] for result in results.values()])
-    independent = SimulatedGaussian.from_simulations(drawn, floor=settings.redundant).dimension
-    rest = [
-        k
-        for k, job in enumerate(plan.jobs)
-        if k not in results and (plan.purposes[k][0] != "null" or job.first < settings.sims_per_element * independent)
-    ]
-    results |= zip(rest, ask([plan.jobs[k] for k in rest]), strict=True)
-    kept = sorted(results)
-    needed = Plan(tuple(plan.jobs[k] for k in kept), tuple(plan.purposes[k] for k in kept))
-    return needed, [results[k] for k in kept]
+
+def _steps(analysis: Analysis) -> Iterator[tuple[Candidate, int, int, Effect]]:
+    """Yield candidate, column, sign and effect of every response that is simulated."""
+    for candidate in analysis.candidates:
+        for column, effect in zip(candidate.columns, candidate.basis, strict=True):
+            for sign in (1, -1):
+                if candidate.effect.parametrization.sign in (0, sign):
+                    yield candidate, column, sign, effect.scaled(sign)
+
+
+def skies(analysis: Analysis, candidate: Candidate) -> int:
+    """Return the number of skies over which the response to a candidate is averaged."""
+    settings = analysis.settings
+    if not analysis.of_maps:
+        return settings.table_skies
+    if candidate.random_response:
+        return settings.noisy_skies
+    fewest = settings.channel_skies
+    if candidate.channel is None:
+        fewest = settings.typical_skies if candidate.effect.parametrization.mean_response else settings.common_skies
+    return min(max(fewest, -(-settings.response_modes // analysis.model.lmax**2)), settings.noisy_skies)
 
 
 def learned(
-    analysis: Analysis, plan: Plan, results: Sequence[NDArray[np.float64]]
+    analysis: Analysis, ask: Ask, simulations: int | None = None, time_ordered: bool = True
 ) -> tuple[NullEnsemble, TemplateBank]:
-    """Return the null ensemble and the templates that the results of a plan make up.
+    """Simulate the model, and the same skies with every candidate: return null ensemble and templates.
 
     A template is [x(+step) - x(-step)]/(2 step), of the same skies; if the effect has one sign, [x(step) - x(0)]/step.
+    Arguments are those of :func:`plan`; some elements are redundant, and by default the first simulations tell how
+    many are independent, and so how many simulations are needed.
     """
-    size = len(analysis.elements)
-    by_purpose = dict(zip(plan.purposes, results, strict=True))
+    size, jobs = len(analysis.elements), plan(analysis, simulations, time_ordered)
+    results = _results(analysis, jobs, ask, simulations is None)
 
-    def stacked(kind: str) -> NDArray[np.float64]:
-        rows = [by_purpose[purpose][:, :size] for purpose in plan.purposes if purpose[0] == kind]
+    def stacked(kind: str) -> Rows:
+        rows = [result[:, :size] for purpose, result in results.items() if purpose.kind == kind]
         return np.concatenate(rows) if rows else np.zeros((0, size))
 
     reference = stacked("reference")
-    shape = (size, sum(len(candidate.columns) for candidate in analysis.candidates))
-    matrix, curvature, error = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    labels = tuple(label for candidate in analysis.candidates for label in candidate.labels)
+    matrix, curvature, error = np.zeros((3, size, len(labels)))
     for candidate, column, sign, effect in _steps(analysis):
-        other = by_purpose.get(("response", column, -sign))
+        other = results.get(Purpose("response", column, -sign))
         if sign < 0 and other is not None:
             continue  # done with the other sign
-        here = by_purpose["response", column, sign]
-        step = effect.coordinates()[candidate.columns.index(column)]
+        here = results[Purpose("response", column, sign)]
+        step = effect.parametrization.coordinates(effect)[candidate.columns.index(column)]
         same = reference[: len(here)]
         if other is None:
             each = (here - same) / step
@@ -128,80 +167,52 @@ def learned(
             curvature[:, column] = np.mean(here + other - 2.0 * same, axis=0) / (2.0 * step**2)
         matrix[:, column] = each.mean(axis=0)
         error[:, column] = each.std(axis=0, ddof=1) / np.sqrt(len(each))
-    time_ordered, default = stacked("time-ordered"), stacked("default")
-    offset = np.mean(time_ordered - default, axis=0) if len(time_ordered) else np.zeros(size)
-    rest = [result[:, size:] for job, result in zip(plan.jobs, results, strict=True) if job.bipolar_scan]
-    scan, coarse = _scanned(analysis, np.concatenate(rest))
-    ensemble = NullEnsemble(
-        stacked("null"),
-        offset,
-        analysis.elements,
-        reference,
-        scan,
-        coarse.mean(axis=0),
-        coarse.std(axis=0, ddof=1),
-        rms(coarse),
-        analysis.settings.redundant,
-    )
-    return ensemble, TemplateBank(matrix, error, curvature)
+    offset = np.zeros(size)
+    if analysis.of_maps and len(default := stacked("default")):
+        offset = np.mean(stacked("time-ordered") - default, axis=0)
+    # Behind the data vector come bipolar scan and coarse residuals; measured spectra have neither.
+    rest = np.concatenate([results[purpose][:, size:] for purpose in results if jobs[purpose].bipolar_scan])
+    numbers = len(analysis.bipolar_scan.elements) if analysis.of_maps else 0
+    coarse = rest[:, numbers:].reshape(len(rest), len(analysis.model.parts), -1)
+    vectors = stacked("null"), offset, analysis.elements, reference
+    residuals = coarse.mean(axis=0), coarse.std(axis=0, ddof=1), rms(coarse)
+    ensemble = NullEnsemble(*vectors, rest[:, :numbers], *residuals, analysis.settings.redundant)
+    return ensemble, TemplateBank(matrix, error, curvature, labels)
 
 
-def _scanned(analysis: Analysis, rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Split what follows the data vectors into bipolar scan, shape (n, numbers), and coarse residuals, (n, map, npix).
+def _results(analysis: Analysis, jobs: dict[Purpose, Job], ask: Ask, pilot: bool) -> dict[Purpose, Rows]:
+    """Run jobs; after a pilot, only as many simulations of the model as the independent elements need."""
 
-    Measured spectra have neither.
-    """
-    numbers = len(analysis.bipolar_scan.elements) if rows.shape[1] else 0
-    return rows[:, :numbers], rows[:, numbers:].reshape(len(rows), len(analysis.model.parts), -1)
+    def run(wanted: Sequence[Purpose]) -> dict[Purpose, Rows]:
+        return dict(zip(wanted, ask([jobs[purpose] for purpose in wanted]), strict=True))
+
+    if not pilot:
+        return run(list(jobs))
+    size, settings = len(analysis.elements), analysis.settings
+    few = settings.pilot_sims_per_element * size
+    first = run([one for one in jobs if one.kind == "null" and one.number < few])
+    drawn = np.concatenate([result[:, :size] for result in first.values()])
+    independent = SimulatedGaussian.from_simulations(drawn, floor=settings.redundant).dimension
+    enough = settings.sims_per_element * independent
+    found = first | run([one for one in jobs if one not in first and (one.kind != "null" or one.number < enough)])
+    return {purpose: found[purpose] for purpose in jobs if purpose in found}
 
 
-def after_jobs(
-    run: config.RunConfig, analysis: Analysis, found: Sequence[config.Effect], skies: int | None = None
-) -> list[Job]:
+def after_jobs(analysis: Analysis, found: Sequence[config.Effect], skies: int | None = None) -> list[Job]:
     """List two jobs that simulate the model with effects, over the skies with which responses are measured."""
     total = analysis.settings.noisy_skies if skies is None else skies
-    half = -(-total // 2)
-    job = _job(run, analysis, found)
-    return [replace(job, first=first, count=min(half, total - first)) for first in (0, half)]
+    return _split(_with(analysis, found), range(total), -(-total // 2))
 
 
 def constrained_jobs(
-    run: config.RunConfig,
-    analysis: Analysis,
-    found: Sequence[config.Effect],
-    observed: NDArray[np.complex128],
-    realizations: range,
+    analysis: Analysis, found: Sequence[config.Effect], observed: NDArray[np.complex128], realizations: range
 ) -> list[Job]:
     """List jobs that simulate the model with effects, over skies that are constrained by an observed one."""
-    job = replace(_job(run, analysis, found), observed=observed)
-    return [
-        replace(job, first=first, count=min(_CONSTRAINED_PER_TASK, realizations.stop - first))
-        for first in range(realizations.start, realizations.stop, _CONSTRAINED_PER_TASK)
-    ]
+    return _split(replace(_with(analysis, found), observed=observed), realizations, _CONSTRAINED_PER_TASK)
 
 
-def _job(run: config.RunConfig, analysis: Analysis, found: Sequence[config.Effect]) -> Job:
-    changed = config.to_json(with_effects(seeded(run, _RESPONSE), found))
-    return Job(config.to_json(run), changed, 0, 0, without=analysis.without, settings=analysis.settings)
-
-
-def _steps(analysis: Analysis) -> Iterator[tuple[Candidate, int, int, Effect]]:
-    """Yield candidate, column, sign and effect of every response that is simulated."""
-    for candidate in analysis.candidates:
-        for column, effect in zip(candidate.columns, candidate.basis, strict=True):
-            for sign in (1, -1):
-                if candidate.effect.sign in (0, sign):
-                    yield candidate, column, sign, effect.scaled(sign)
-
-
-def skies(candidate: Candidate, lmax: int, settings: DiagnosisSettings) -> int:
-    """Return the number of skies over which the response to a candidate is averaged."""
-    if candidate.random_response:
-        return settings.noisy_skies
-    fewest = settings.channel_skies
-    if candidate.channel is None:
-        fewest = settings.typical_skies if candidate.effect.mean_response else settings.common_skies
-    return min(max(fewest, -(-settings.response_modes // lmax**2)), settings.noisy_skies)
+def _with(analysis: Analysis, found: Sequence[config.Effect]) -> Job:
+    return analysis.job(with_effects(seeded(analysis.run, _RESPONSE), found))
 
 
 def with_effects(run: config.RunConfig, found: Sequence[config.Effect]) -> config.RunConfig:

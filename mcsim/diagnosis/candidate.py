@@ -1,50 +1,46 @@
-"""Candidates: effects that may be in the data, and what a joint fit says of each."""
+"""Candidates: effects that may be in the data, the response of the data vector to each, and what a fit says of them."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
+from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import Fit
-from mcsim.systematics import Effect
+from mcsim.systematics import Effect, basis_of
 
 Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+Respond = Callable[[Sequence[config.Effect], int], Matrix]
+"""Return the changes of the data vector by effects in a number of simulated skies, shape (skies, p)."""
+
+
+class Column(NamedTuple):
+    """Identify a column of templates: effect, channel (None: all), parameters that are not fitted, and component."""
+
+    effect: str
+    channel: str | None
+    settings: tuple[tuple[str, Any], ...]
+    component: int
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """Describe one effect in one channel, or in all of them, with fixed settings.
-
-    Attributes
-    ----------
-    effect
-        Class of the effect.
-    channel
-        Name of the channel; None: all.
-    columns
-        Its columns in the matrix of templates, one for each of its linear components.
-    settings
-        Parameters that are not fitted.
-    prior
-        Weight relative to the other candidates.
-    shape_error
-        Relative error of its templates in white norm; None: that of the settings.
-    scatter
-        Deviations of its response from the mean one if it is stochastic, for
-        :meth:`~mcsim.stats.gaussian.SimulatedGaussian.with_extra_covariance`; None if they are not known.
-    """
+    """Describe one effect in one channel, or in all of them, with fixed settings."""
 
     effect: type[Effect]
-    channel: str | None
-    columns: tuple[int, ...]
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    prior: float = 1.0
-    shape_error: float | None = None
-    scatter: NDArray[np.float64] | None = field(default=None, compare=False)
+    channel: str | None  # None: all
+    columns: tuple[int, ...]  # in the matrix of templates, one for each of its linear components
+    settings: Mapping[str, Any] = field(default_factory=dict)  # parameters that are not fitted
+    prior: float = 1.0  # weight relative to the other candidates
+    shape_error: float | None = None  # relative error of its templates in white norm; None: that of the settings
+    # Deviations of its response from the mean one if it is stochastic, shape (p, draws), as
+    # SimulatedGaussian.with_extra_covariance takes them; None if they are not known.
+    scatter: Matrix | None = field(default=None, compare=False)
 
     @property
     def name(self) -> str:
@@ -52,47 +48,48 @@ class Candidate:
         return self.effect.name
 
     @property
-    def unit(self) -> str:
-        """Return the unit of the amplitude."""
-        return self.effect.unit
-
-    @property
     def identity(self) -> tuple[str, str | None]:
         """Return name and channel: candidates that share them differ only in settings and exclude each other."""
         return self.name, self.channel
 
     @property
+    def labels(self) -> tuple[Column, ...]:
+        """Return the identity of each of its columns."""
+        return tuple(Column(*self.identity, tuple(self.settings.items()), k) for k in range(len(self.columns)))
+
+    @property
     def label(self) -> str:
         """Return name, channel and settings as text."""
-        settings = ", ".join(f"{key} = {value}" for key, value in self.settings.items())
-        return f"{self.name} ({self.channel or 'all'}{', ' + settings if settings else ''})"
+        return f"{self.name} ({', '.join((self.channel or 'all', *self._settings()))})"
 
     @property
     def title(self) -> str:
         """Return the effect in words, with channel and settings."""
-        settings = (f"{key} = {value}" for key, value in self.settings.items())
-        return ", ".join((self.effect.label(self.channel), *settings))
+        return ", ".join((self.effect.label(self.channel), *self._settings()))
+
+    def _settings(self) -> Iterator[str]:
+        return (f"{key} = {value}" for key, value in self.settings.items())
 
     @property
     def basis(self) -> tuple[Effect, ...]:
         """Return the effects whose responses span it, one for each column."""
-        return tuple(replace(one, **self.settings) for one in self.effect.basis())
+        return basis_of(self.effect, self.settings)
 
     @property
     def random_response(self) -> bool:
         """Return True if its templates are measured from random draws, not from an effect that is taken away."""
-        return self.effect.stochastic and self.effect.sign >= 0
+        return self.effect.parametrization.stochastic and self.effect.parametrization.sign >= 0
 
-    def with_coordinates(self, coordinates: Vector, precision: NDArray[np.float64]) -> Effect:
+    def with_coordinates(self, coordinates: Vector, precision: Matrix) -> Effect:
         """Return the effect nearest to coordinates in the metric ``precision``."""
-        return replace(self.effect.nearest(coordinates, precision), **self.settings)
+        return self.effect(**{**self.effect.parametrization.nearest(coordinates, precision), **self.settings})
 
-    def fitted(self, coordinates: Vector, covariance: NDArray[np.float64]) -> Effect:
+    def fitted(self, coordinates: Vector, covariance: Matrix) -> Effect:
         """Return the effect nearest to fitted coordinates, as far as the data constrain them."""
-        precision: NDArray[np.float64] = np.asarray(np.linalg.pinv(covariance), dtype=np.float64)
-        return self.with_coordinates(self.effect.constrained(coordinates, precision), precision)
+        precision: Matrix = np.asarray(np.linalg.pinv(covariance), dtype=np.float64)
+        return self.with_coordinates(self.effect.parametrization.constrained(coordinates, precision), precision)
 
-    def detected(self, coordinates: Vector, covariance: NDArray[np.float64]) -> Effect:
+    def detected(self, coordinates: Vector, covariance: Matrix) -> Effect:
         """Return :meth:`fitted`; raise InputError if the data do not constrain the effect at all."""
         effect = self.fitted(coordinates, covariance)
         if effect.amplitude == 0.0:
@@ -101,24 +98,24 @@ class Candidate:
 
     def table(self, effect: Effect) -> config.Effect:
         """Return the effect as an ``[[effect]]`` of a run."""
-        return config.Effect(
-            name=effect.name, channel=self.channel, parameters={"amplitude": effect.amplitude, **effect.parameters()}
-        )
+        parameters = {"amplitude": effect.amplitude, **effect.parameters()}
+        return config.Effect(name=effect.name, channel=self.channel, parameters=parameters)
 
     def allows(self, amplitudes: Vector) -> bool:
         """Return True if the amplitudes have the sign, and at most the size, that the effect can have."""
-        if self.effect.sign and bool(np.any(amplitudes < 0.0)):
+        if self.effect.parametrization.sign and bool(np.any(amplitudes < 0.0)):
             return False
-        return float(np.linalg.norm(amplitudes)) <= self.effect.max_amplitude
+        return float(np.linalg.norm(amplitudes)) <= self.effect.parametrization.max_amplitude
 
 
 def numbered(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
     """Return the candidates with consecutive columns."""
-    edges = np.cumsum([0, *(len(candidate.columns) for candidate in candidates)])
-    return tuple(
-        replace(candidate, columns=tuple(range(int(start), int(start) + len(candidate.columns))))
-        for candidate, start in zip(candidates, edges[:-1], strict=True)
-    )
+    found, start = [], 0
+    for candidate in candidates:
+        stop = start + len(candidate.columns)
+        found.append(replace(candidate, columns=tuple(range(start, stop))))
+        start = stop
+    return tuple(found)
 
 
 def columns_of(candidates: Sequence[Candidate], members: Sequence[int]) -> list[int]:
@@ -128,7 +125,7 @@ def columns_of(candidates: Sequence[Candidate], members: Sequence[int]) -> list[
 
 def parts_of(
     candidates: Sequence[Candidate], members: Sequence[int], found: Fit
-) -> Iterator[tuple[int, NDArray[np.float64], NDArray[np.float64]]]:
+) -> Iterator[tuple[int, Vector, Matrix]]:
     """Yield each member of a fit of :func:`columns_of`, its amplitudes and their covariance."""
     start = 0
     for member in members:
@@ -144,13 +141,55 @@ def within_bounds(candidates: Sequence[Candidate], members: Sequence[int], found
 
 def effects_at(candidates: Sequence[Candidate], members: Sequence[int], found: Fit) -> list[Effect]:
     """Return the effects nearest to a fit; raise InputError if one cannot have its amplitude."""
-    return [
-        candidates[member].detected(amplitudes, covariance)
-        for member, amplitudes, covariance in parts_of(candidates, members, found)
-    ]
+    return [candidates[member].detected(*part) for member, *part in parts_of(candidates, members, found)]
 
 
 def tables_at(candidates: Sequence[Candidate], members: Sequence[int], found: Fit) -> list[config.Effect]:
     """Return :func:`effects_at` as ``[[effect]]`` of a run."""
     effects = effects_at(candidates, members, found)
     return [candidates[member].table(effect) for member, effect in zip(members, effects, strict=True)]
+
+
+@dataclass(frozen=True)
+class TemplateBank:
+    """Hold the responses of the data vector to all linear components of all candidates, shape (p, K) each."""
+
+    matrix: Matrix  # per unit of each coordinate
+    error: Matrix  # standard error of the matrix
+    curvature: Matrix  # half the second derivative
+    labels: tuple[Column, ...]  # identity of each column
+
+    def subset(self, rows: NDArray[np.int64], columns: Sequence[int]) -> "TemplateBank":
+        """Return some elements and some columns."""
+        cut = np.ix_(rows, np.asarray(columns, dtype=np.int64))
+        labels = tuple(self.labels[column] for column in columns)
+        return TemplateBank(self.matrix[cut], self.error[cut], self.curvature[cut], labels)
+
+    def _squares(self, spread: Vector) -> tuple[Vector, Vector]:
+        """Return the squared norms of error and matrix over the spread of the data vector, shape (K,) each."""
+        return np.sum((self.error / spread[:, None]) ** 2, axis=0), np.sum((self.matrix / spread[:, None]) ** 2, axis=0)
+
+    def significant(self, spread: Vector, settings: DiagnosisSettings) -> Matrix:
+        """Return the matrix; noisy columns without the elements that are only noise.
+
+        ``spread`` is the standard deviation of the data vector, shape (p,).
+        """
+        noise, size = self._squares(spread)
+        clear = np.abs(self.matrix) > settings.clean_sigma * self.error
+        return np.where((noise > settings.noisy_share * size) & ~clear, 0.0, self.matrix)
+
+    def sky_scatter(self, spread: Vector, candidates: Sequence[Candidate], skies: Sequence[int]) -> Vector:
+        """Return the rms scatter of the response among skies over the mean response, shape (candidates,).
+
+        Norms are of elements over their standard deviation ``spread``, all columns of a candidate together; ``skies``
+        is the number of skies of each candidate's response. Infinite if all columns are noise.
+        """
+        noise, size = self._squares(spread)
+        found = []
+        for candidate, number in zip(candidates, skies, strict=True):
+            rows = list(candidate.columns)
+            # A column of nothing but noise says nothing of the others.
+            clear = size[rows] > 2.0 * noise[rows]
+            ratio = number * noise[rows] / np.maximum(size[rows] - noise[rows], 1e-300)
+            found.append(float(np.sqrt(np.mean(ratio[clear]))) if clear.any() else np.inf)
+        return np.array(found)

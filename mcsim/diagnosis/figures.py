@@ -3,7 +3,6 @@
 import textwrap
 from typing import Any
 
-import healpy
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
@@ -11,9 +10,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
 
-from mcsim.diagnosis.result import CandidateResult, ContrastResult, DiagnosisResult
+from mcsim.diagnosis.result import CandidateResult, DiagnosisResult
+from mcsim.diagnosis.selection import Contrast
 from mcsim.diagnosis.summaries import KINDS
 from mcsim.diagnosis.words import sentence
+from mcsim.plot.sky import mollweide
 from mcsim.stats.detection import snr_to_separate
 from mcsim.support.numbers import measured, p_equals
 
@@ -21,11 +22,8 @@ from mcsim.support.numbers import measured, p_equals
 BLUE, RED, GREEN, AMBER = "#0072b2", "#d55e00", "#00785a", "#e69f00"
 _VERDICTS = {"none": GREEN, "effect": BLUE, "mixture": BLUE, "degenerate": "#8a5c00", "unknown": "#b04a00"}
 
-TOP = 15
-"""Candidates in the picture of those fitted alone; the table has all."""
-
-MAPS = 12
-"""Residual maps in the picture."""
+TOP, MAPS = 15, 12
+"""Candidates in the picture of those fitted alone, of which the table has all; and residual maps in theirs."""
 
 LIMIT = 8.0
 """Deviation at which the colours of the table of blocks end."""
@@ -33,23 +31,17 @@ LIMIT = 8.0
 
 def first_screen(result: DiagnosisResult) -> Figure:
     """Draw the verdict in one picture: sentence, excess before and after, and the candidates that matter most."""
-    lines = textwrap.wrap(_plain(sentence(result)), 110)
+    lines = textwrap.wrap(sentence(result).replace("$", r"\$"), 110)
     top = 0.8 + 0.24 * len(lines)
     height = 2.6 + top
     figure = Figure(figsize=(9.6, height))
     figure.set_layout_engine("constrained", rect=(0.0, 0.0, 1.0, 1.0 - top / height), w_pad=0.15)
-    figure.text(
-        0.02,
-        1.0 - 0.3 / height,
-        f" {_plain(_short(result.case, 60))}: {result.kind} ",
-        fontsize=13,
-        fontweight="bold",
-        color="white",
-        va="center",
-        bbox={"facecolor": _VERDICTS[result.kind], "edgecolor": "none", "boxstyle": "round,pad=0.3"},
-    ).set_in_layout(False)
-    text = figure.text(0.02, 1.0 - 0.6 / height, "\n".join(lines), fontsize=10.5, va="top", linespacing=1.35)
-    text.set_in_layout(False)
+    name = f" {_label(result.case, 60)}: {result.kind} "
+    head = figure.text(0.02, 1.0 - 0.3 / height, name, va="center", fontsize=13)
+    head.set(color="white", fontweight="bold", in_layout=False)
+    head.set_bbox({"facecolor": _VERDICTS[result.kind], "edgecolor": "none", "boxstyle": "round,pad=0.3"})
+    style: dict[str, Any] = {"fontsize": 10.5, "va": "top", "linespacing": 1.35, "in_layout": False}
+    figure.text(0.02, 1.0 - 0.6 / height, "\n".join(lines), **style)
     left, right = figure.subplots(1, 2)
     _draw_excess(left, result)
     _draw_candidates(right, result, 6)
@@ -64,36 +56,28 @@ def excess_figure(result: DiagnosisResult) -> Figure:
 
 
 def _draw_excess(axes: Axes, result: DiagnosisResult) -> None:
-    found = result.held_out
-    expected = None if found is None else found.expected_after
-    rows, of = [("model", result.test.excess, RED)], "all data"
+    found, expected = result.held_out, 0.0
+    rows, of = [("model", result.excess, RED)], "all data"
     if found is not None:
         rows, of = [("model", found.before, RED), ("with the effects", found.after, BLUE)], f"data: {found.data}"
+        expected = found.before.value * (1.0 - found.predicted.value)
+        axes.plot([expected] * 2, [0.6, 1.4], color="black", linestyle=":", linewidth=1.8, label="predicted", zorder=3)
+        axes.legend(frameon=False, fontsize=8)
     elif result.sets:
         rows.append(("after the fit", result.sets[0].excess, BLUE))
         of = "the data that were fitted"
+    beside: dict[str, Any] = {"xytext": (6, 0), "textcoords": "offset points", "va": "center", "fontsize": 9}
     for row, (_, one, colour) in enumerate(rows):
-        axes.barh(row, one.value, height=0.62, color=colour)
-        axes.errorbar(one.value, row, xerr=one.sigma, color="black", capsize=3, linewidth=1.2)
-        axes.annotate(
-            measured(one.value, one.sigma),
-            (max(one.value + one.sigma, 0.0), row),
-            xytext=(6, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=9,
-        )
+        axes.barh(row, one.value, 0.62, color=colour, xerr=one.sigma, capsize=3, error_kw={"linewidth": 1.2})
+        axes.annotate(measured(one.value, one.sigma), (max(one.value + one.sigma, 0.0), row), **beside)
     axes.set_yticks(range(len(rows)), [label for label, *_ in rows])
     axes.set_ylim(len(rows) - 0.45, -0.55)
-    if expected is not None:
-        axes.plot([expected] * 2, [0.6, 1.4], color="black", linestyle=":", linewidth=1.8, label="predicted")
-        axes.legend(frameon=False, fontsize=8)
     reach = max(one.value + one.sigma for _, one, _ in rows)
-    low = min(0.0, *(one.value - one.sigma for _, one, _ in rows), expected or 0.0)
+    low = min(0.0, expected, *(one.value - one.sigma for _, one, _ in rows))
     axes.set_xlim(1.1 * low, max(1.4 * reach, -0.35 * low, 1.0))
     axes.axvline(0.0, color="black", linewidth=0.8)
     axes.spines["left"].set_visible(False)
-    axes.set_xlabel(f"excess $\\chi^2$ (0: the model is right)\n{_plain(_short(of, 60))}", fontsize=9)
+    axes.set_xlabel(f"excess $\\chi^2$ (0: the model is right)\n{_label(of, 60)}", fontsize=9)
     _bare(axes)
 
 
@@ -109,7 +93,7 @@ def _draw_candidates(axes: Axes, result: DiagnosisResult, count: int) -> None:
     rows = result.ranked[:count]
     colours = [_colour(result, row) for row in rows]
     axes.barh(range(len(rows)), [row.significance for row in rows], height=0.7, color=colours)
-    axes.set_yticks(range(len(rows)), [_plain(_short(row.label, 46)) for row in rows], fontsize=8)
+    axes.set_yticks(range(len(rows)), [_label(row.label, 46) for row in rows], fontsize=8)
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.set_xlim(0.0, None)
     shown = [("blue: best set", BLUE), ("amber: an alternative", AMBER)]
@@ -132,30 +116,30 @@ def blocks_figure(result: DiagnosisResult) -> Figure:
     ]
     names = sorted(set(columns), key=lambda name: (name == "several channels", name))
     kinds = list(dict.fromkeys(element.family for element in result.elements))
-    tables = []
-    for z in (result.z, result.z_after):
-        if z is not None:
-            table = np.full((len(kinds), len(names)), np.nan)
-            for element, column, value in zip(result.elements, columns, z, strict=True):
-                at = kinds.index(element.family), names.index(column)
-                if not abs(table[at]) >= abs(value):
-                    table[at] = value
-            tables.append(table)
-    width = 3.4 + len(tables) * (0.62 * len(names) + 0.3)
+    at = np.array(
+        [(kinds.index(e.family), names.index(column)) for e, column in zip(result.elements, columns, strict=True)]
+    )
+    panels = (
+        {"before": result.z} if result.z_after is None else {"before": result.z, "after the best fit": result.z_after}
+    )
+    width = 3.4 + len(panels) * (0.62 * len(names) + 0.3)
     figure = Figure(figsize=(width, 2.6 + 0.27 * len(kinds)), layout="constrained")
-    grid = figure.subplots(1, len(tables), sharey=True, squeeze=False)[0]
+    grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     shown: Any = None
-    for axes, table, title in zip(grid, tables, ("before", "after the best fit"), strict=False):
+    for axes, (title, z) in zip(grid, panels.items(), strict=True):
+        table = np.full((len(kinds), len(names)), np.nan)
+        # The largest deviation of each kind and map is written last, and stays.
+        order = np.argsort(np.abs(z))
+        table[tuple(at[order].T)] = z[order]
         axes.set_facecolor("#e6e6e6")
         shown = axes.imshow(table, cmap="RdBu_r", vmin=-LIMIT, vmax=LIMIT, aspect="auto")
         for (row, column), value in np.ndenumerate(table):
             if np.isfinite(value):
                 colour = "white" if abs(value) > 0.62 * LIMIT else "black"
                 axes.text(column, row, f"{value:+.1f}", ha="center", va="center", fontsize=7, color=colour)
-        axes.set_xticks(
-            range(len(names)), [_plain(_short(name, 22)) for name in names], rotation=45, ha="right", fontsize=8
-        )
-        axes.set_yticks(range(len(kinds)), [_plain(_short(kind, 52)) for kind in kinds], fontsize=8)
+        labels = [_label(name, 22) for name in names]
+        axes.set_xticks(range(len(names)), labels, rotation=45, ha="right", fontsize=8)
+        axes.set_yticks(range(len(kinds)), [_label(kind, 52) for kind in kinds], fontsize=8)
         axes.set_title(title, fontsize=10)
     label = "largest deviation [standard deviations]\ngrey: not measured"
     figure.colorbar(shown, ax=list(grid), label=label, extend="both", location="bottom", shrink=0.6, aspect=40)
@@ -174,34 +158,22 @@ def elements_figure(result: DiagnosisResult) -> Figure:
     if result.z_after is not None:
         axes.plot(place, result.z_after[order], "o", markersize=3.2, color=BLUE, label="after the best fit")
     sorted_kinds = [result.elements[k].kind for k in order]
+    grey: dict[str, Any] = {"color": "0.6", "linewidth": 0.6}
+    line = {"arrowstyle": "-", "shrinkA": 0.0, "shrinkB": 0.0, "relpos": (0.0, 0.0), **grey}
+    tilted: dict[str, Any] = {"rotation": 35, "rotation_mode": "anchor", "fontsize": 8, "arrowprops": line}
+    coordinates: dict[str, Any] = {"xycoords": axes.get_xaxis_transform(), "textcoords": "axes fraction"}
     for number, kind in enumerate(kinds):
         own = place[[one == kind for one in sorted_kinds]]
-        axes.axvline(own[0] - 0.5, color="0.6", linewidth=0.6)
+        axes.axvline(own[0] - 0.5, **grey)
         # Names stand apart from each other, whatever the number of elements of each kind.
-        axes.annotate(
-            _plain(KINDS.get(kind, kind)),
-            (own.mean(), 1.0),
-            xycoords=axes.get_xaxis_transform(),
-            xytext=((number + 0.3) / len(kinds), 1.09),
-            textcoords="axes fraction",
-            rotation=35,
-            rotation_mode="anchor",
-            fontsize=8,
-            arrowprops={
-                "arrowstyle": "-",
-                "color": "0.6",
-                "linewidth": 0.6,
-                "shrinkA": 0.0,
-                "shrinkB": 0.0,
-                "relpos": (0.0, 0.0),
-            },
-        )
+        name, beyond = _label(KINDS.get(kind, kind), 60), ((number + 0.3) / len(kinds), 1.09)
+        axes.annotate(name, (own.mean(), 1.0), beyond, **coordinates, **tilted)
     axes.set_yscale("symlog", linthresh=5.0)
     largest = max(float(np.max(np.abs(result.z))), 5.0)
-    axes.set_yticks(*_ticks(largest))
-    axes.set_ylim(-1.2 * largest, 1.2 * largest)
-    axes.set_xlim(-1.0, len(order))
-    axes.set_xlabel("element of the data vector")
+    ticks = [tick for tick in (0.0, 2.0, 5.0, 10.0, 30.0, 100.0, 300.0, 1000.0) if tick <= largest]
+    axes.set_yticks([*(-tick for tick in ticks[:0:-1]), *ticks])
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.set(xlim=(-1.0, len(order)), ylim=(-1.2 * largest, 1.2 * largest), xlabel="element of the data vector")
     axes.set_ylabel("deviation [standard deviations]\n(logarithmic beyond 5)")
     figure.legend(loc="outside lower right", frameon=False, fontsize=8, ncols=2)
     return figure
@@ -219,13 +191,15 @@ def residual_figure(result: DiagnosisResult) -> Figure | None:
     figure = Figure(figsize=(4.9 * columns, 2.8 * rows + 0.8), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
     shown: Any = None
+    # Sharp pixels: smoothed ones make the file three times as large.
+    style: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -4.0, "vmax": 4.0, "interpolation": "nearest"}
     for axes, k in zip(grid, chosen, strict=False):
-        shown = _mollweide(axes, result.residual_maps[k])
-        name = _plain(_short(result.maps[k].replace(":", " "), 40))
+        shown = mollweide(axes, result.residual_maps[k], 700, **style)
+        name = _label(result.maps[k].replace(":", " "), 40)
         low, high = result.residual_range[k]
         axes.set_title(f"{name}: rms {rms[k]:.2f} (simulations {low:.2f} to {high:.2f})", fontsize=9)
     for axes in grid:
-        axes.set(xticks=[], yticks=[], frame_on=False)
+        axes.set_axis_off()
     label = "residual over the scatter of simulations"
     figure.colorbar(shown, ax=list(grid), orientation="horizontal", shrink=0.5, aspect=35, extend="both", label=label)
     return figure
@@ -254,26 +228,21 @@ def calibration_figure(result: DiagnosisResult) -> Figure:
     low, high = stats.binom.interval(0.95, len(held), 1.0 / bins)
     left.axhspan(low, high, color="0.88", zorder=0)
     left.axhline(len(held) / bins, color="black", linewidth=0.8)
-    left.set_xlim(0.0, 1.0)
-    left.set_ylim(0.0, None)
+    left.set(xlim=(0.0, 1.0), ylim=(0.0, None), ylabel=f"number of {len(held)} simulations")
     left.set_xlabel(r"p-value of the $\chi^2$ of each simulation")
-    left.set_ylabel(f"number of {len(held)} simulations")
     left.set_title("grey: 95 % of bins if uniform", fontsize=9)
     draws = np.maximum(np.sort(result.calibration), 1e-12)
     rank = (1.0 + np.arange(len(draws))) / (1.0 + len(draws))
     right.plot(draws, rank, color=BLUE, label="draws of the model")
-    p = max(result.test.pvalue, 1e-300)
+    p = result.test.pvalue
     inside = p >= rank[0]
     at = float(np.interp(p, rank, draws)) if inside else draws[0]
     shown = p if inside else rank[0] / 2.0
-    right.plot(
-        at, shown, "o" if inside else "v", color=RED, markersize=8, label=f"data, {p_equals(result.test.pvalue)}"
-    )
+    right.plot(at, shown, "o" if inside else "v", color=RED, markersize=8, label=f"data, {p_equals(p)}")
     right.axhline(0.05, color="black", linewidth=0.8, linestyle="--")
     right.annotate("5 %", (draws[0], 0.05), xytext=(2, 3), textcoords="offset points", fontsize=8)
-    right.set(xscale="log", yscale="log", ylim=(rank[0] / 3.0, 1.5))
+    right.set(xscale="log", yscale="log", ylim=(rank[0] / 3.0, 1.5), ylabel="fraction of draws below")
     right.set_xlabel(r"smaller p-value: $\chi^2$ or best candidate")
-    right.set_ylabel("fraction of draws below")
     right.set_title("" if inside else "triangle: below all draws", fontsize=9)
     right.legend(frameon=False, fontsize=8, loc="lower right")
     for axes in (left, right):
@@ -281,19 +250,19 @@ def calibration_figure(result: DiagnosisResult) -> Figure:
     return figure
 
 
-def contrast_figure(result: DiagnosisResult, one: ContrastResult) -> Figure:
+def contrast_figure(result: DiagnosisResult, one: Contrast) -> Figure:
     """Draw the elements in which two sets of effects differ most, with the data."""
     rows = [(k, share) for k, share in zip(one.elements, one.shares, strict=True) if share > 0.0][:8]
     where = [k for k, _ in rows]
     figure = Figure(figsize=(8.4, 1.6 + 0.36 * len(rows)), layout="constrained")
     axes = figure.subplots()
     for which, colour, marker, shift in ((one.first, BLUE, "D", -0.14), (one.second, AMBER, "s", 0.14)):
-        label = _plain(_short(result.sets[which].label, 90))
+        label = _label(result.sets[which].label, 90)
         at = np.arange(len(rows)) + shift
         axes.plot(result.prediction(which)[where], at, marker, color=colour, linestyle="none", label=label)
     z = result.z[where]
     axes.errorbar(z, range(len(rows)), xerr=1.0, fmt="o", color="black", markersize=4, capsize=2, label="data")
-    labels = [f"{_plain(_short(result.elements[k].words, 64))}  ({100 * share:.0f} %)" for k, share in rows]
+    labels = [f"{_label(result.elements[k].words, 64)}  ({100 * share:.0f} %)" for k, share in rows]
     axes.set_yticks(range(len(rows)), labels, fontsize=8)
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.axvline(0.0, color="0.6", linewidth=0.8, zorder=0)
@@ -304,7 +273,7 @@ def contrast_figure(result: DiagnosisResult, one: ContrastResult) -> Figure:
 
 
 def _matrix(result: DiagnosisResult, values: NDArray[np.float64], label: str, scale: dict[str, Any]) -> Figure:
-    labels = [_plain(_short(one.label, 44)) for one in result.candidates]
+    labels = [_label(one.label, 44) for one in result.candidates]
     side = 3.2 + max(2.4, 0.15 * len(labels))
     figure = Figure(figsize=(side, side + 0.8), layout="constrained")
     axes = figure.subplots()
@@ -322,33 +291,11 @@ def _matrix(result: DiagnosisResult, values: NDArray[np.float64], label: str, sc
     return figure
 
 
-def _mollweide(axes: Axes, values: NDArray[np.float64]) -> Any:
-    """Draw a RING map, longitude 0 in the middle and growing to the left."""
-    nside = healpy.npix2nside(values.size)
-    projector: Any = healpy.projector.MollweideProj(xsize=700)
-    image = projector.projmap(values, lambda x, y, z: healpy.vec2pix(nside, x, y, z))
-    image = np.ma.masked_invalid(np.where(np.isneginf(image), np.nan, image))
-    # Sharp pixels: smoothed ones make the file three times as large.
-    style: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -4.0, "vmax": 4.0, "interpolation": "nearest"}
-    return axes.imshow(image, origin="lower", extent=projector.get_extent(), **style)
-
-
-def _ticks(largest: float) -> tuple[list[float], list[str]]:
-    values = [v for v in (5.0, 10.0, 30.0, 100.0, 300.0, 1000.0) if v <= max(5.0, largest)]
-    both = [*(-v for v in reversed(values)), -2.0, 0.0, 2.0, *values]
-    return both, [f"{v:g}" for v in both]
-
-
-def _short(text: str, width: int) -> str:
-    """Text with its middle left out where it is long: labels differ at both ends."""
-    return text if len(text) <= width else f"{text[: width // 2]}…{text[len(text) - (width - 1) // 2 :]}"
-
-
-def _plain(text: str) -> str:
-    """Text that matplotlib does not take for mathematics."""
-    return text.replace("$", r"\$")
+def _label(text: str, width: int) -> str:
+    """Return text with its middle left out where it is long, as labels differ at both ends, and without mathematics."""
+    short = text if len(text) <= width else f"{text[: width // 2]}…{text[len(text) - (width - 1) // 2 :]}"
+    return short.replace("$", r"\$")
 
 
 def _bare(axes: Axes) -> None:
-    for sign in ("top", "right"):
-        axes.spines[sign].set_visible(False)
+    axes.spines[["top", "right"]].set_visible(False)

@@ -1,17 +1,18 @@
 """Infer from one data set whether, where, by which effects and how far it departs from the model."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.assemble import Findings, Reduction, result_of
+from mcsim.diagnosis.assemble import result_of
 from mcsim.diagnosis.candidate import columns_of, tables_at
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.refine import Refined, Refiner, with_scatter
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import Attribution
-from mcsim.diagnosis.validation import Halves
+from mcsim.diagnosis.validation import Halves, HeldOut
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import Fit
 from mcsim.support.numbers import measured
@@ -19,50 +20,28 @@ from mcsim.support.numbers import measured
 Vector = NDArray[np.float64]
 
 
-def diagnose_data(data: DataSet, case: str) -> DiagnosisResult:
-    """Diagnose observed maps or measured spectra.
-
-    Parameters
-    ----------
-    data
-        :class:`~mcsim.diagnosis.observed_maps.ObservedMaps` or
-        :class:`~mcsim.diagnosis.measured_spectra.MeasuredSpectra`.
-    case
-        Name of the case.
-
-    Raises
-    ------
-    InputError
-        If the data cannot be what they claim to be.
-    """
+def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
+    """Diagnose observed maps or measured spectra; raise InputError if they cannot be what they claim to be."""
     context = data.context
-    refiner = Refiner(
-        context.null, data.x, context.calibration, context.bank.curvature, data.respond, context.settings,
-        data.realizations,
-    )  # fmt: skip
+    refiner = Refiner(data)
     refined = refiner.run(data.templates(), context.candidates)
-    found = refined.attribution
+    found, partial, reduction = refined.attribution, refined.partial, None
     exchanged = data.exchanged(found)
     notes = [*exchanged, *data.notes()]
     if exchanged:
         # An order of the maps in which the model fits says more than any effect.
-        found = found.unexplained()
-    reduction = None
-    if found.explanations:
+        found, partial = found.unexplained(), None
+    elif found.explanations:
         found = _with_errors(data, refined, found)
         found, reduction = confirmed(context, found, reduction_of(data, refined), notes)
-    partial = None if exchanged else refined.partial
     if partial is None and not exchanged and found.verdict == "unknown":
         partial = refiner.detected_in(refined.templates, refined.candidates)
-    findings = Findings(
-        data.x, replace(refined, attribution=found), data.places(), reduction, partial, notes, data.residual_maps()
-    )
-    return result_of(context, case, findings, data.provenance())
+    return result_of(data, case, replace(refined, attribution=found, partial=partial), reduction, notes)
 
 
 def confirmed(
-    context: DiagnosisContext, found: Attribution, reduction: Reduction | None, notes: list[str]
-) -> tuple[Attribution, Reduction | None]:
+    context: DiagnosisContext, found: Attribution, reduction: HeldOut | None, notes: list[str]
+) -> tuple[Attribution, HeldOut | None]:
     """Return attribution and reduction if they hold once the best set is simulated.
 
     A set that increases the excess chi^2 of the held-out data, or reduces it by less than half of the prediction, both
@@ -72,27 +51,25 @@ def confirmed(
     if reduction is None:
         return found, None
     limit = context.settings.reduction_sigma
-    before, fraction, expected = reduction[1].before, reduction[1].fraction, reduction[0].fraction
+    before, fraction, expected = reduction.before, reduction.achieved, reduction.predicted
     increased = fraction.value * before.value + limit * fraction.sigma * abs(before.value) < 0.0
     short = expected.value - fraction.value > limit * np.hypot(expected.sigma, fraction.sigma)
     if increased or (short and before.value > 0.0 and fraction.value < 0.5 * min(expected.value, 1.0)):
         best = " and ".join(context.candidates[member].title for member in found.explanations[0].members)
-        does = f"raises the excess χ² of the other half from {before.value:.3g} to {reduction[1].after.value:.3g}"
-        if reduction[1].after.value < before.value:
+        does = f"raises the excess χ² of the other half from {before.value:.3g} to {reduction.after.value:.3g}"
+        if reduction.after.value < before.value:
             removed, forecast = 100.0 * fraction.value, 100.0 * expected.value
             does = f"removes {removed:.0f} % of the excess χ² of the other half, where {forecast:.0f} % were predicted"
         notes.append(f"The best fit, {best}, is not named: simulated with its amplitude from one half, it {does}.")
         return found.unexplained(), None
     if before.value < before.sigma:
-        notes.append(
-            "No reduction on held-out data is given: they show no excess χ² by themselves "
-            f"({measured(before.value, before.sigma)})."
-        )
+        own = measured(before.value, before.sigma)
+        notes.append(f"No reduction on held-out data is given: they show no excess χ² by themselves ({own}).")
         return found, None
     return found, reduction
 
 
-def _with_errors(data: DataSet, refined: Refined, found: Attribution) -> Attribution:
+def _with_errors(data: DataSet[Any], refined: Refined, found: Attribution) -> Attribution:
     """Return the attribution, the best set with the errors that its amplitudes have with its effects in the data.
 
     The scatter of stochastic effects is known already: the fit was made with it.
@@ -101,9 +78,9 @@ def _with_errors(data: DataSet, refined: Refined, found: Attribution) -> Attribu
     if any(refined.candidates[member].scatter is not None for member in best.members):
         return found
     try:
-        pair = data.respond.pair(tables_at(context.candidates, best.members, best.fit))
+        pair = data.pair(tables_at(context.candidates, best.members, best.fit))
     except InputError:
-        return found  # between what was fitted and what can be
+        pair = None  # between what was fitted and what can be
     if pair is None:
         return found
     t = refined.templates[:, columns_of(context.candidates, best.members)]
@@ -111,7 +88,7 @@ def _with_errors(data: DataSet, refined: Refined, found: Attribution) -> Attribu
     return replace(found, explanations=(own, *found.explanations[1:]))
 
 
-def reduction_of(data: DataSet, refined: Refined) -> Reduction | None:
+def reduction_of(data: DataSet[Any], refined: Refined) -> HeldOut | None:
     """Fit one half of the data vector, freeze, add the effects to the simulator, and test the other half.
 
     None if there are no halves, one of them is hardly sensitive to the effects, or the half that is fitted asks for an
@@ -122,20 +99,19 @@ def reduction_of(data: DataSet, refined: Refined) -> Reduction | None:
     members, best = refined.attribution.explanations[0].members, refined.attribution.explanations[0].fit
     t = refined.templates[:, columns_of(context.candidates, members)]
     scatters = [one for one in (refined.candidates[member].scatter for member in members) if one is not None]
-    ensemble, x, snr = context.ensemble, data.x, context.null.expected_snr(t @ best.amplitudes)
+    snr = context.null.expected_snr(t @ best.amplitudes)
     matrix, words = data.halves()
-    if matrix is not None:
-        ensemble, x, t, scatters = ensemble.remix(matrix), matrix @ x, matrix @ t, [matrix @ one for one in scatters]
-    halves = Halves.of(ensemble, x)
+    t, scatters = matrix @ t, [matrix @ one for one in scatters]
+    halves = Halves.of(context.ensemble.remix(matrix), matrix @ data.x)
     if halves is None or halves.expected_snr(t @ best.amplitudes) < context.settings.half_snr_share * snr:
         return None
 
     def respond(frozen: Fit) -> Vector:
         acting = tables_at(context.candidates, members, frozen)
-        change: Vector = data.respond(acting, context.settings.constrained_skies).mean(axis=0)
-        return change if matrix is None else matrix @ change
+        change: Vector = matrix @ data.respond(acting, context.settings.constrained_skies).mean(axis=0)
+        return change
 
     try:
-        return *halves.reduction(t, respond, scatters), words
+        return halves.reduction(t, respond, scatters, words)
     except InputError:
         return None

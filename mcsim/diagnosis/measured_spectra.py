@@ -2,26 +2,27 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from itertools import combinations_with_replacement, product
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim import config, systematics
-from mcsim.beamfit.data import parts
+from mcsim import config
+from mcsim.beamfit.data import Row, Scaling, parts, project
+from mcsim.beamfit.table import COLUMNS, in_uk2, read_ecsv, scaling_of
 from mcsim.bipolar import Mode
-from mcsim.diagnosis import campaign
-from mcsim.diagnosis.analysis import Analysis, Job, analysis_of
-from mcsim.diagnosis.campaign import Ask, Plan
-from mcsim.diagnosis.context import DiagnosisContext
-from mcsim.diagnosis.places import Place, places
-from mcsim.diagnosis.selection import Attribution
+from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, kinds_of
+from mcsim.diagnosis.context import DataSet
+from mcsim.diagnosis.localisation import Place, places
 from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.diagnosis.spectra import Spectra
 from mcsim.diagnosis.summaries import Block, Element
 from mcsim.errors import InputError
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import survey
 from mcsim.sphere.rotation import FRAMES, rotate_biposh
-from mcsim.systematics import Effect
+from mcsim.systematics import Effect, Library
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -30,9 +31,153 @@ _SPECTRAL_HOOKS = ("sky", "beam", "pointing", "spread", "orientations", "noise")
 """Hooks that change spectra of a map. A drift of the gain does so in the lowest degrees only and is no candidate."""
 
 
+class Pair(NamedTuple):
+    """Describe a pair of maps: its label in tables and stores, and channel and split (None: no splits) of each map."""
+
+    label: str
+    channels: tuple[str, str]
+    splits: tuple[str | None, str | None]
+
+    @property
+    def auto(self) -> bool:
+        """Return True if both maps are the same."""
+        return self.channels[0] == self.channels[1] and self.splits[0] == self.splits[1]
+
+
+@dataclass(frozen=True)
+class Spectra:
+    """Hold a table of measured spectra; it is also the task of a worker that simulates them."""
+
+    path: str
+    frame: str
+    rows: tuple[Row, ...]  # what each number is
+    pairs: tuple[Pair, ...]  # the pair of maps that it is of
+    scaling: Scaling  # of all numbers
+    value: Vector  # uK^2, shape (p,)
+    error: Vector  # the same, NaN where the table has none
+    realizations: int  # skies that the values are the mean of
+
+    @property
+    def elements(self) -> tuple[Element, ...]:
+        """Return the description of every number; bins are in fold 0 and 1 alternately."""
+        bins = sorted({(row.ell_min, row.ell_max) for row in self.rows})
+        normalisation = "Bennett" if self.scaling.bennett else "Hajian-Souradeep"
+        scale = f"{normalisation} times {'l(l+1)/2pi' if self.scaling.spectrum else '1'}"
+        found = []
+        for (mode, low, high, imaginary), pair in zip(self.rows, self.pairs, strict=True):
+            what = f"BipoSH {mode.name}, {'imaginary' if imaginary else 'real'}" if mode.L else "spectrum"
+            name, statistic = f"{what}/{pair.label}/{low}-{high}, {scale}", "biposh" if mode.L else "cl"
+            split = pair.splits[0] if pair.splits[0] == pair.splits[1] else None
+            own = Element(name, statistic, tuple(dict.fromkeys(pair.channels)), split, bins.index((low, high)) % 2)
+            own = replace(own, ell=(low, high), L=mode.L, M=mode.M, parity=mode.parity, frame=self.frame)
+            found.append(replace(own, kind="table", component=f"{what}, {scale}"))
+        return tuple(found)
+
+    def __call__(self, job: Job) -> Vector:
+        """Return the same numbers of simulations, shape (count, p), by the function that runs an ensemble.
+
+        This is the task that a worker runs.
+        """
+        shared = survey(config.from_json(job.simulated), library=dict(job.library))
+        biposh = np.stack([simulate.realize(shared, job.first + r)["biposh"] for r in range(job.count)])
+        columns = []
+        for row, pair in zip(self.rows, self.pairs, strict=True):
+            where = shared.pair_names.index(pair.label), shared.estimator.modes.index(row.mode)
+            columns.append(project([row], self.scaling, {row.mode: biposh[:, *where]}))
+        return np.concatenate(columns, axis=1)
+
+
+def read_spectra(path: str | Path, run: config.RunConfig) -> Spectra:
+    """Read measured spectra that a run claims to describe; raise InputError if they say too little or go beyond it.
+
+    The file is an ECSV table as for :func:`mcsim.beamfit.read_table`, with rows L = M = d = 0 for power spectra, which
+    in the Bennett normalisation are C_l. Several pairs stand together; without a column ``pair`` the table belongs to
+    the first map. Without ``value_imag`` only real parts are used; ``error`` may be left out. The header's ``meta``
+    must give ``normalisation``, ``scaling`` and, unless all rows have L = 0, ``frame``; ``realizations`` says of how
+    many skies the values are the mean (default: 1).
+    """
+    table = read_ecsv(path)
+    missing = [name for name in (*COLUMNS, "value") if name not in table.colnames]
+    if missing:
+        raise InputError(f"{path} has no column {missing[0]}; give {', '.join(COLUMNS)} and value.")
+    scaling, known, lmax = scaling_of(path, table.meta), _pairs(run), config.analysis_lmax(run)
+    real, imag, stated = (
+        in_uk2(path, table, name) if name in table.colnames else np.full(len(table), np.nan)
+        for name in ("value", "value_imag", "error")
+    )
+    found: dict[tuple[Row, Pair], tuple[float, float]] = {}
+    for number, line in enumerate(table):
+        label = str(line["pair"]) if "pair" in table.colnames else next(iter(known))
+        if label not in known:
+            raise InputError(f"{path}: {label} is no pair of the model's maps; use one of {'; '.join(known)}.")
+        L, M, d, low, high = (int(line[name]) for name in COLUMNS)
+        mode, pair = Mode(L, M, d), known[label]
+        _check_row(path, Row(mode, low, high, False), pair, scaling, lmax)
+        for imaginary in parts(mode):
+            key, value = (Row(mode, low, high, imaginary), pair), float((imag if imaginary else real)[number])
+            if imaginary and not np.isfinite(value):
+                continue
+            if not np.isfinite(value):
+                raise InputError(f"{path}: {mode.name} at ell = {low}-{high} is {value:g}; leave the row out.")
+            if key in found:
+                raise InputError(f"{path} gives a bin of one mode twice; keep one row of each.")
+            # The error of a mode with M > 0 is that of its modulus; its two parts share the variance.
+            found[key] = value, float(stated[number]) * (1.0 if M == 0 else np.sqrt(0.5))
+    if not found:
+        raise InputError(f"{path} has no finite value; give the measured bins.")
+    (rows, pairs), (value, error) = zip(*found, strict=True), np.array(list(found.values())).T
+    frame, count = _frame_and_skies(path, table.meta, config.prepared_grid(run)[1], any(row.mode.L for row in rows))
+    return Spectra(str(path), frame, rows, pairs, scaling, value, error, count)
+
+
+def _pairs(run: config.RunConfig) -> dict[str, Pair]:
+    """Return every pair of maps of a run by its label, the first map's own first."""
+    identities = product((channel.name for channel in run.channels), run.map.splits or (None,))
+    maps = zip(config.map_names(run), identities, strict=True)
+    pairs = combinations_with_replacement(maps, 2)
+    return {f"{x},{y}": Pair(f"{x},{y}", (one[0], two[0]), (one[1], two[1])) for (x, one), (y, two) in pairs}
+
+
+def _check_row(path: str | Path, row: Row, pair: Pair, scaling: Scaling, lmax: int) -> None:
+    """Raise InputError for a mode or a bin that the pair does not have."""
+    mode, low, high, _ = row
+    if not (0 <= mode.M <= mode.L and abs(mode.d) <= mode.L):
+        raise InputError(f"{path}: the mode {mode.name} does not exist; it needs 0 <= M <= L and |d| <= L.")
+    if mode.parity == "odd" and scaling.bennett and not scaling.summary:
+        raise InputError(
+            f"{path}: {mode.name} has odd parity, which the Bennett normalisation does not have; leave it out."
+        )
+    if not 0 <= low <= high <= lmax:
+        raise InputError(
+            f"{path}: the bin ell = {low} ... {high} is not within 0 ... {lmax}, the model's analysis; leave the "
+            "row out or raise sky.lmax."
+        )
+    ell = np.arange(low, high + 1)
+    other = ell - mode.d
+    exists = (other >= 0) & (other <= lmax) & (other + ell >= mode.L)
+    if not exists.any() or (pair.auto and not mode.in_auto):
+        raise InputError(
+            f"{path}: there is no {mode.name} of {pair.label} at l2 = {low} ... {high}, or it repeats another; leave "
+            "the row out."
+        )
+
+
+def _frame_and_skies(path: str | Path, meta: Any, frame: str, needed: bool) -> tuple[str, int]:
+    """Return the frame of a table, which is that of the model and said if ``needed``, and the skies of its mean."""
+    found = str(meta.get("frame", "" if needed else frame)).lower()
+    if not found:
+        raise InputError(f'{path} does not say its frame; add frame: "{frame}" to its meta, if that is the one.')
+    if found != frame:
+        raise InputError(f"{path} is in the {found} frame, the model in the {frame} one; set map.frame to {found}.")
+    count = meta.get("realizations", 1)
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+        raise InputError(f"{path} is the mean of {count!r} realizations; give a whole number from 1 in its meta.")
+    return found, count
+
+
 def estimator_for(run: config.RunConfig, measured: Spectra) -> config.RunConfig:
     """Return the run with the estimator that a table needs: its L, its pairs, and no circular-beam control."""
-    both = any(name.partition(",")[0] != name.partition(",")[2] for name in measured.pairs)
+    both = not all(pair.auto for pair in measured.pairs)
     biposh = replace(run.biposh, L_max=max(row.mode.L for row in measured.rows), pairs="all" if both else "auto")
     return replace(run, biposh=biposh, ensemble=replace(run.ensemble, paired=False, keep_maps=False))
 
@@ -43,71 +188,26 @@ def analysis_of_spectra(
     without: Sequence[str] = (),
     nthreads: int = 1,
     settings: DiagnosisSettings | None = None,
+    library: Library | None = None,
 ) -> Analysis:
-    """Define the analysis of a table: effects that change spectra, and the numbers of the table as data vector."""
-    excluded = [name for name, kind in systematics.catalogue().items() if not _changes_spectra(kind)]
-    analysis = analysis_of(run, (*without, *excluded), nthreads, settings)
-    return replace(analysis, blocks=(Block(measured.elements, lambda model, filtered: measured.value),))
+    """Define the analysis of a table: effects that change spectra, and the numbers of the table as data vector.
 
-
-def _changes_spectra(kind: type[Effect]) -> bool:
-    return any(getattr(kind, hook) is not getattr(Effect, hook) for hook in _SPECTRAL_HOOKS)
-
-
-def plan(run: config.RunConfig, analysis: Analysis, simulations: int | None = None) -> Plan:
-    """List all simulations for a table: of the model, and of the same skies with every effect and without it."""
-    whole = campaign.plan(run, analysis, simulations, time_ordered=False)
-    count = analysis.settings.table_skies
-    jobs = (
-        replace(job, count=count) if purpose[0] == "response" else job
-        for job, purpose in zip(whole.jobs, whole.purposes, strict=True)
-    )
-    return Plan(tuple(jobs), whole.purposes)
-
-
-@dataclass(frozen=True)
-class TableResponses:
-    """Simulate responses of measured spectra to effects, over the skies with which templates are measured."""
-
-    context: DiagnosisContext
-    ask: Ask
-
-    def __call__(self, found: Sequence[config.Effect], skies: int) -> Matrix:
-        """Return changes of the data vector, shape (rows, p), in the skies of the reference, whatever ``skies`` is."""
-        reference = self.context.ensemble.reference
-        after = np.concatenate(self.ask(self._jobs(found)))
-        changes: Matrix = after - reference[: len(after)]
-        return changes
-
-    def pair(self, found: Sequence[config.Effect]) -> None:
-        """Return None: the errors of the fit are those of the table's simulations."""
-
-    def _jobs(self, found: Sequence[config.Effect]) -> list[Job]:
-        planned = plan(self.context.run, self.context.analysis, 0)
-        return [
-            replace(job, simulated=config.to_json(campaign.with_effects(config.from_json(job.simulated), found)))
-            for job, purpose in zip(planned.jobs, planned.purposes, strict=True)
-            if purpose[0] == "reference"
-        ]
+    Arguments are those of :func:`~mcsim.diagnosis.analysis.analysis_of`.
+    """
+    excluded = [
+        name
+        for name, kind in kinds_of(library)
+        if all(getattr(kind, hook) is getattr(Effect, hook) for hook in _SPECTRAL_HOOKS)
+    ]
+    analysis = analysis_of(run, (*without, *excluded), nthreads, settings, library)
+    return replace(analysis, blocks=(Block(measured.elements, lambda filtered: measured.value),), of_maps=False)
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredSpectra:
-    """Offer a table of spectra as a data set; see :class:`mcsim.diagnosis.context.DataSet`.
+class MeasuredSpectra(DataSet[Spectra]):
+    """Offer a table of spectra as a data set.
 
-    Attributes
-    ----------
-    context
-        Model, simulations, contracted by :meth:`~mcsim.diagnosis.null_ensemble.NullEnsemble.of_mean`, and templates.
-    measured
-        The table.
-    ask
-        Runs further simulations, with effects at the amplitudes that are found.
-
-    Raises
-    ------
-    InputError
-        If the numbers cannot be in the unit, or the mean of as many skies, as the table says.
+    The simulations in its context are contracted by :meth:`~mcsim.diagnosis.null_ensemble.NullEnsemble.of_mean`.
 
     Notes
     -----
@@ -118,40 +218,40 @@ class MeasuredSpectra:
     imaginary.
     """
 
-    context: DiagnosisContext
-    measured: Spectra
-    ask: Ask
-
     def __post_init__(self) -> None:
-        """Refuse what the table cannot be."""
-        _check(self.measured, self.context)
+        """Refuse numbers that cannot be in the unit, or the mean of as many skies, as the table says."""
+        measured, context, limits = self.data, self.context, self.context.settings
+        path, value = measured.path, measured.value
+        power = np.array([row.mode.L == 0 for row in measured.rows])
+        size = np.abs(value) / np.sqrt(np.mean(context.ensemble.simulations**2, axis=0))
+        unit = "is the unit in its header the right one, and the scaling?"
+        if power.any() and not 1.0 / limits.cl_ratio < (ratio := np.median(size[power])) < limits.cl_ratio:
+            raise InputError(f"{path}: C_l are {ratio:.2g} times the model's, beyond {limits.cl_ratio:g}; {unit}")
+        if not power.all() and (ratio := np.median(size[~power])) > limits.biposh_ratio:
+            raise InputError(
+                f"{path}: BipoSH are {ratio:.2g} times as large as the simulations', beyond {limits.biposh_ratio:g}; "
+                f"{unit}"
+            )
+        if 1.0 - context.null.pvalue(value) < limits.small_chi2_pvalue:
+            raise InputError(
+                f"{path} departs from the model by chi^2 = {context.null.chi2(value):.2g} in {context.null.dimension} "
+                f"numbers, far less than a mean of {measured.realizations} skies can; say of how many in its meta "
+                "(realizations), or correct its unit."
+            )
 
     @property
     def realizations(self) -> int:
         """Return the number of skies of which the values are the mean."""
-        return self.measured.realizations
+        return self.data.realizations
 
     @property
     def x(self) -> Vector:
-        """Return the values of the table."""
-        return self.measured.value
-
-    @cached_property
-    def respond(self) -> TableResponses:
-        """Return what simulates responses."""
-        return TableResponses(self.context, self.ask)
-
-    def templates(self) -> Matrix:
-        """Return the templates."""
-        return self.context.templates
-
-    def exchanged(self, found: Attribution) -> list[str]:
-        """Return nothing: a table has no maps to exchange."""
-        return []
+        """Return the values of the table, shape (p,)."""
+        return self.data.value
 
     def notes(self) -> list[str]:
         """Return a sentence if the table's errors are far from the scatter of the simulations."""
-        ratio = float(np.median(self.measured.error / self.context.ensemble.simulations.std(axis=0, ddof=1)))
+        ratio = float(np.median(self.data.error / self.context.ensemble.simulations.std(axis=0, ddof=1)))
         if not np.isfinite(ratio) or 0.5 < ratio < 2.0:
             return []
         return [
@@ -182,7 +282,7 @@ class MeasuredSpectra:
 
     def places(self) -> list[Place]:
         """Rank the numbers of the table, and their rotations to other frames."""
-        measured, simulations = self.measured, self.context.ensemble.simulations
+        measured, simulations = self.data, self.context.ensemble.simulations
         views = list(_views(measured))
         matrix = np.stack([np.zeros(len(measured.rows)), *(row for _, row in views)])[1:]
         drawn = np.concatenate([simulations, simulations @ matrix.T], axis=1)
@@ -190,35 +290,9 @@ class MeasuredSpectra:
         values = np.concatenate([measured.value, matrix @ measured.value])
         return places(values, drawn, elements, self.context.settings.place_pvalue)
 
-    def residual_maps(self) -> None:
-        """Return None: there are no maps."""
-
     def provenance(self) -> dict[str, str | int]:
         """Return the file of the table, and the number of skies."""
-        return {"table": self.measured.path, "skies behind the mean": self.realizations}
-
-
-def _check(measured: Spectra, context: DiagnosisContext) -> None:
-    limits = context.settings
-    power = np.array([row.mode.L == 0 for row in measured.rows])
-    size = np.abs(measured.value) / np.sqrt(np.mean(context.ensemble.simulations**2, axis=0))
-    unit = "is the unit in its header the right one, and the scaling?"
-    if power.any() and not 1.0 / limits.cl_ratio < np.median(size[power]) < limits.cl_ratio:
-        raise InputError(
-            f"{measured.path}: C_l are {np.median(size[power]):.2g} times the model's, beyond {limits.cl_ratio:g}; "
-            f"{unit}"
-        )
-    if not power.all() and np.median(size[~power]) > limits.biposh_ratio:
-        raise InputError(
-            f"{measured.path}: BipoSH are {np.median(size[~power]):.2g} times as large as the simulations', beyond "
-            f"{limits.biposh_ratio:g}; {unit}"
-        )
-    if 1.0 - context.null.pvalue(measured.value) < limits.small_chi2_pvalue:
-        raise InputError(
-            f"{measured.path} departs from the model by chi^2 = {context.null.chi2(measured.value):.2g} in "
-            f"{context.null.dimension} numbers, far less than a mean of {measured.realizations} skies can; say of how "
-            "many in its meta (realizations), or correct its unit."
-        )
+        return {"table": self.data.path, "skies behind the mean": self.realizations}
 
 
 def _views(measured: Spectra) -> Iterator[tuple[Element, Vector]]:
@@ -239,7 +313,5 @@ def _views(measured: Spectra) -> Iterator[tuple[Element, Vector]]:
             if frame != measured.frame:
                 turned = rotate_biposh(unit, [(m.L, m.M, m.d) for m in family], measured.frame, frame)[:, 0, 0]
                 own = measured.elements[number]
-                yield (
-                    replace(own, name=f"{own.name} {frame}", frame=frame),
-                    turned.imag if row.imaginary else turned.real,
-                )
+                own = replace(own, name=f"{own.name} {frame}", frame=frame)
+                yield own, turned.imag if row.imaginary else turned.real

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -11,46 +11,30 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from mcsim.diagnosis.candidate import Column, TemplateBank
 from mcsim.diagnosis.summaries import Element
-from mcsim.diagnosis.templates import TemplateBank
 from mcsim.stats.gaussian import SimulatedGaussian
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class NullEnsemble:
-    """Hold data vectors of simulations without any candidate effect.
+    """Hold data vectors of simulations without any candidate effect; measured spectra have no scan and residuals."""
 
-    Attributes
-    ----------
-    simulations
-        Shape (N, p).
-    offset
-        Mean of the time-ordered reference less that of the default route for the same skies, shape (p,).
-    elements
-        Descriptions of the p elements.
-    reference
-        Data vectors of the skies with which responses are measured, shape (skies, p).
-    bipolar_scan
-        Bipolar scan of the first simulations, shape (n, numbers).
-    residual_mean, residual_scatter, residual_rms
-        Mean and standard deviation of the coarse residual maps of the same, shape (map, npix), and the rms of each over
-        this scatter, shape (n, map); without any element for measured spectra.
-    redundant
-        Directions with less than this fraction of the largest variance are left out.
-    """
-
-    simulations: NDArray[np.float64]
-    offset: NDArray[np.float64]
+    simulations: Matrix  # (N, p)
+    offset: Vector  # mean of the time-ordered reference less that of the default route for the same skies, (p,)
     elements: tuple[Element, ...]
-    reference: NDArray[np.float64]
-    bipolar_scan: NDArray[np.float64]
-    residual_mean: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
-    residual_scatter: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
-    residual_rms: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
-    redundant: float = 1e-4
+    reference: Matrix  # data vectors of the skies with which responses are measured, (skies, p)
+    bipolar_scan: Matrix  # of the first n simulations, (n, numbers)
+    residual_mean: Matrix  # of their coarse residual maps, (map, npix)
+    residual_scatter: Matrix  # standard deviation of the same
+    residual_rms: Matrix  # rms of each over this scatter, (n, map)
+    redundant: float = 1e-4  # directions with less than this fraction of the largest variance are left out
 
     @cached_property
-    def spread(self) -> NDArray[np.float64]:
+    def spread(self) -> Vector:
         """Return the standard deviation of every element, shape (p,)."""
         return np.asarray(self.simulations.std(axis=0))
 
@@ -61,22 +45,14 @@ class NullEnsemble:
 
     def restrict(self, rows: NDArray[np.int64]) -> "NullEnsemble":
         """Return the ensemble of some elements."""
-        return replace(
-            self,
-            simulations=self.simulations[:, rows],
-            offset=self.offset[rows],
-            elements=tuple(self.elements[row] for row in rows),
-            reference=self.reference[:, rows],
-        )
+        elements = tuple(self.elements[row] for row in rows)
+        simulations, reference = self.simulations[:, rows], self.reference[:, rows]
+        return replace(self, simulations=simulations, offset=self.offset[rows], elements=elements, reference=reference)
 
-    def remix(self, matrix: NDArray[np.float64]) -> "NullEnsemble":
+    def remix(self, matrix: Matrix) -> "NullEnsemble":
         """Return the ensemble of as many linear combinations of the elements, shape (p, p)."""
-        return replace(
-            self,
-            simulations=self.simulations @ matrix.T,
-            offset=matrix @ self.offset,
-            reference=self.reference @ matrix.T,
-        )
+        simulations, reference = self.simulations @ matrix.T, self.reference @ matrix.T
+        return replace(self, simulations=simulations, offset=matrix @ self.offset, reference=reference)
 
     def of_mean(self, realizations: int) -> "NullEnsemble":
         """Return the ensemble of the mean of several skies.
@@ -93,29 +69,16 @@ class NullEnsemble:
 
 
 def save(path: Path, ensemble: NullEnsemble, bank: TemplateBank) -> None:
-    """Write an ensemble and the templates to a new Zarr store."""
-    dataset = xr.Dataset(
-        {
-            "simulations": (("simulation", "element"), ensemble.simulations, {"long_name": "data vector of the model"}),
-            "offset": ("element", ensemble.offset, {"long_name": "time-ordered reference less default route"}),
-            "matrix": (("element", "column"), bank.matrix, {"long_name": "response per unit coordinate"}),
-            "curvature": (("element", "column"), bank.curvature, {"long_name": "half the second derivative"}),
-            "error": (("element", "column"), bank.error, {"long_name": "standard error of the response"}),
-            "reference": (("sky", "element"), ensemble.reference, {"long_name": "data vector of the responses' skies"}),
-            "bipolar_scan": (("scanned", "number"), ensemble.bipolar_scan, {"long_name": "bipolar scan of the model"}),
-            "residual_mean": (("map", "pixel"), ensemble.residual_mean, {"long_name": "mean of coarse residual maps"}),
-            "residual_scatter": (
-                ("map", "pixel"),
-                ensemble.residual_scatter,
-                {"long_name": "scatter of the same"},
-            ),
-            "residual_rms": (("scanned", "map"), ensemble.residual_rms, {"long_name": "rms of coarse residual maps"}),
-        },
-        attrs={
-            "elements": json.dumps([asdict(element) for element in ensemble.elements]),
-            "redundant": ensemble.redundant,
-        },
-    )
+    """Write an ensemble and the templates to a new Zarr store: every array by its name."""
+    values = {f.name: getattr(one, f.name) for one in (ensemble, bank) for f in fields(one)}
+    arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+    attributes = {
+        "elements": json.dumps([asdict(element) for element in ensemble.elements]),
+        "columns": json.dumps(bank.labels),
+        "redundant": ensemble.redundant,
+    }
+    dims = {name: tuple(f"{name}_{axis}" for axis in range(array.ndim)) for name, array in arrays.items()}
+    dataset = xr.Dataset({name: (dims[name], array) for name, array in arrays.items()}, attrs=attributes)
     dataset.to_zarr(path, mode="w", consolidated=False)
 
 
@@ -124,8 +87,9 @@ def load(path: Path) -> tuple[NullEnsemble, TemplateBank]:
     with xr.open_zarr(path, consolidated=False) as dataset:
         arrays = {str(name): np.asarray(values) for name, values in dataset.data_vars.items()}
         elements = tuple(_element(row) for row in json.loads(dataset.attrs["elements"]))
+        columns = tuple(Column(e, c, tuple(map(tuple, s)), k) for e, c, s, k in json.loads(dataset.attrs["columns"]))
         redundant = float(dataset.attrs["redundant"])
-    bank = TemplateBank(**{name: arrays.pop(name) for name in ("matrix", "error", "curvature")})
+    bank = TemplateBank(arrays.pop("matrix"), arrays.pop("error"), arrays.pop("curvature"), columns)
     return NullEnsemble(**arrays, elements=elements, redundant=redundant), bank
 
 

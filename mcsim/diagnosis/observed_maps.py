@@ -3,107 +3,135 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 from pathlib import Path
 
 import healpy
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.campaign import Ask
-from mcsim.diagnosis.context import DiagnosisContext
-from mcsim.diagnosis.places import Place, places
-from mcsim.diagnosis.residual_maps import standardised
-from mcsim.diagnosis.responses import Responses
+from mcsim import config
+from mcsim.diagnosis.campaign import constrained_jobs
+from mcsim.diagnosis.context import DataSet
+from mcsim.diagnosis.localisation import Place, places, standardised
 from mcsim.diagnosis.selection import Attribution
-from mcsim.diagnosis.wiener_filter import Model, shared_sky
+from mcsim.diagnosis.wiener_filter import Model, Part, shared_sky
+from mcsim.ensemble.maps import file_names
 from mcsim.errors import InputError
 from mcsim.sphere import header, healpix
 from mcsim.stats.look_elsewhere import global_test
 
 Map = NDArray[np.float64]
 Vector = NDArray[np.float64]
+Rows = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class ObservedMaps:
-    """Offer observed maps as a data set; see :class:`mcsim.diagnosis.context.DataSet`.
+class ObservedMaps(DataSet[Sequence[Map]]):
+    """Offer observed maps, from :func:`read_maps` or :func:`checked`, as a data set.
 
-    Attributes
-    ----------
-    context
-        Model, simulations and templates.
-    observed
-        Maps in the order of the model's, from :func:`read_maps` or :func:`checked`.
-    ask
-        Runs further simulations, with effects at the amplitudes that are found.
+    Responses to effects are simulated in skies that the filtered maps constrain.
     """
 
-    context: DiagnosisContext
-    observed: Sequence[Map]
-    ask: Ask
-
-    realizations = 1
-
     @cached_property
-    def _measured(self) -> tuple[Vector, Vector, Vector]:
-        """Data vector, bipolar scan and coarse residuals."""
+    def _measured(self) -> tuple[Vector, Vector, Map]:
+        """Return data vector, bipolar scan and coarse residuals, shape (map, npix)."""
         analysis, ensemble = self.context.analysis, self.context.ensemble
         size = len(analysis.elements)
-        found = analysis.data_vector(self.observed, bipolar_scan=True)
+        found = analysis.data_vector(self.data, bipolar_scan=True)
         x, scan, coarse = np.split(found, [size, size + ensemble.bipolar_scan.shape[1]])
         return x, scan, coarse.reshape(ensemble.residual_mean.shape)
 
     @property
     def x(self) -> Vector:
-        """Return the data vector."""
+        """Return the data vector, shape (p,)."""
         return self._measured[0]
 
     @cached_property
-    def respond(self) -> Responses:
-        """Return what simulates responses in skies that are constrained by these maps."""
-        context = self.context
-        sky = shared_sky(context.analysis.model, self.observed)
-        return Responses(context.run, context.analysis, context.ensemble.reference, sky, self.ask)
+    def _sky(self) -> NDArray[np.complex128]:
+        return shared_sky(self.context.analysis.model, self.data)
 
-    def templates(self) -> NDArray[np.float64]:
+    @cached_property
+    def _before(self) -> list[Vector]:
+        """Return data vectors of constrained skies without any effect, as many as were needed so far."""
+        return []
+
+    def respond(self, found: Sequence[config.Effect], skies: int) -> Rows:
+        """Return changes of the data vector in ``skies`` constrained skies, shape (rows, p).
+
+        Effects with a mean response are simulated in typical skies instead: the observed sky has its power already.
+        """
+        typical = [effect for effect in found if self._is_typical(effect)]
+        others = [effect for effect in found if not self._is_typical(effect)]
+        shift = super().respond(typical, skies) if typical else np.zeros((1, len(self.x)))
+        if not others:
+            return shift
+        before, after = self._constrained(others, skies)
+        return shift.mean(axis=0) + after - before
+
+    def pair(self, found: Sequence[config.Effect]) -> tuple[Rows, Rows]:
+        """Return data vectors of the same skies without effects and with them, shape (rows, p) each."""
+        if any(self._is_typical(effect) for effect in found):
+            return self.context.ensemble.reference, self._simulated(found)
+        return self._constrained(found, self.context.settings.constrained_skies)
+
+    def _constrained(self, found: Sequence[config.Effect], skies: int) -> tuple[Rows, Rows]:
+        """Return data vectors of constrained skies without effects and with them, shape (skies, p) each."""
+
+        def simulated(found: Sequence[config.Effect], first: int) -> Rows:
+            jobs = constrained_jobs(self.context.analysis, found, self._sky, range(first, skies))
+            return np.concatenate(self.ask(jobs))
+
+        after = simulated(found, 0)
+        if len(self._before) < skies:
+            self._before.extend(simulated((), len(self._before)))
+        return np.stack(self._before[:skies]), after
+
+    def _is_typical(self, effect: config.Effect) -> bool:
+        kind = next(one.effect for one in self.context.candidates if one.name == effect.name)
+        return kind.parametrization.mean_response and not kind.parametrization.stochastic
+
+    def templates(self) -> Rows:
         """Return the templates; those that depend on the very sky are measured on the observed one if it departs."""
-        context, t = self.context, self.context.templates
-        settings = context.settings
-        groups = context.null.whiten_groups(t, [candidate.columns for candidate in context.candidates])
-        if global_test(context.null, self.x, groups, context.calibration).pvalue > settings.alpha:
+        context, t, settings = self.context, self.context.templates.copy(), self.context.settings
+        if global_test(context.null, self.x, context.groups, context.calibration).pvalue > settings.alpha:
             return t
-        random = [
-            index
-            for index, candidate in enumerate(context.candidates)
-            if context.sky_scatter[index] >= settings.sky_scatter
-            and not (candidate.random_response or candidate.effect.mean_response)
-        ]
-        return context.bank.on_sky(t, context.candidates, random, self.respond, settings.constrained_skies)
+        for candidate, scatter in zip(context.candidates, context.sky_scatter, strict=True):
+            if (
+                scatter < settings.sky_scatter
+                or candidate.random_response
+                or candidate.effect.parametrization.mean_response
+            ):
+                continue
+            for place, (column, basis) in enumerate(zip(candidate.columns, candidate.basis, strict=True)):
+                try:
+                    response = self.respond([candidate.table(basis)], settings.constrained_skies).mean(axis=0)
+                except InputError:
+                    continue
+                step = basis.parametrization.coordinates(basis)[place]
+                t[:, column] = response / step - context.bank.curvature[:, column] * step
+        return t
 
     def exchanged(self, found: Attribution) -> list[str]:
         """Return orders of the maps in which the model fits, unless it fits as they are or one effect explains it."""
         context, level = self.context, self.context.settings.exchanged_pvalue
         if found.gap.omnibus > level or (found.explanations and len(found.explanations[0].members) == 1):
             return []
-        names = [part.name for part in context.analysis.model.parts]
-        notes = []
-        for order in exchanges(names):
-            p = context.null.pvalue(context.analysis.data_vector([self.observed[i] for i in order]))
+        parts, notes = context.analysis.model.parts, []
+        for order in exchanges(parts):
+            p = context.null.pvalue(context.analysis.data_vector([self.data[i] for i in order]))
             if p > level:
-                moved = [f"{names[i]} as {name}" for name, i in zip(names, order, strict=True) if names[i] != name]
-                notes.append(f"The model fits (p = {p:.2g}) with maps exchanged: {', '.join(moved)}.")
+                moved = [f"{parts[i].name} as {part.name}" for part, i in zip(parts, order, strict=True)]
+                pairs = ", ".join(words for k, words in enumerate(moved) if order[k] != k)
+                notes.append(f"The model fits (p = {p:.2g}) with maps exchanged: {pairs}.")
         return notes
 
-    def notes(self) -> list[str]:
-        """Return nothing: maps need no note."""
-        return []
-
-    def halves(self) -> tuple[None, str]:
-        """Return no matrix, since the noise of the folds is independent, and the folds in words."""
-        splits = self.context.run.map.splits
-        if len(splits) < 2:
-            return None, "odd degrees, alternate pixels"
-        return None, f"{' and '.join(splits[1::2])} (frozen on {' and '.join(splits[::2])})"
+    def halves(self) -> tuple[Rows, str]:
+        """Return the identity, since the noise of the folds is independent, and the folds in words."""
+        splits, words = self.context.run.map.splits, "odd degrees, alternate pixels"
+        if len(splits) > 1:
+            words = f"{' and '.join(splits[1::2])} (frozen on {' and '.join(splits[::2])})"
+        return np.eye(len(self.x)), words
 
     def places(self) -> list[Place]:
         """Rank the bipolar scan, and those elements of the data vector that are no matched filters."""
@@ -115,70 +143,47 @@ class ObservedMaps:
         elements = (*analysis.bipolar_scan.elements, *(analysis.elements[i] for i in own))
         return places(np.concatenate([self._measured[1], shifted]), drawn, elements, self.context.settings.place_pvalue)
 
-    def residual_maps(self) -> NDArray[np.float64]:
+    def residual_maps(self) -> Rows:
         """Return the residual maps over the scatter of those of simulations, shape (map, npix)."""
         ensemble = self.context.ensemble
         drawn = len(ensemble.bipolar_scan)
         return standardised(self._measured[2], ensemble.residual_mean, ensemble.residual_scatter, drawn)
 
-    def provenance(self) -> dict[str, str | int]:
-        """Return nothing."""
-        return {}
-
 
 def read_maps(model: Model, folder: str | Path) -> list[Map]:
-    """Read the maps of every channel and split, in the order of the model's.
+    """Read the maps of every channel and split, in the order of the model's, uK.
 
-    Parameters
-    ----------
-    model
-        Fiducial model.
-    folder
-        With ``{channel}.fits``, or ``{channel}_{split}.fits`` where the model has splits; HEALPix in uK (or the unit
-        of its header), ``healpy.UNSEEN`` if not observed, in RING order or with a header that says another.
-
-    Raises
-    ------
-    InputError
-        If a file is missing or unreadable, has another nside, frame or unit, or values that are no map of this survey:
-        not finite, constant, without what the fiducial scan hits, or far from the size of the model.
+    The folder has ``{channel}.fits``, or ``{channel}_{split}.fits`` where the model has splits: HEALPix in uK (or the
+    unit of its header), ``healpy.UNSEEN`` if not observed, in RING order or with a header that says another. InputError
+    is raised if a file is missing or unreadable, has another nside, frame or unit, or values that are no map of this
+    survey: not finite, constant, without what the fiducial scan hits, or far from the size of the model.
     """
-    folder = Path(folder)
+    folder, names = Path(folder), file_names(model.survey.config)
     if not folder.is_dir():
-        raise InputError(f"{folder} is no folder; give one with the observed maps, {_file_name(model, 0)} and so on.")
-    return [_read(model, i, folder / _file_name(model, i)) for i in range(len(model.parts))]
+        first = names[model.parts[0].name]
+        raise InputError(f"{folder} is no folder; give one with the observed maps, {first} and so on.")
+    return [_read(model, part, folder / names[part.name]) for part in model.parts]
 
 
 def checked(model: Model, maps: Sequence[Map]) -> list[Map]:
     """Check maps given as arrays, in the order of the model's, uK, like those of a folder."""
     if len(maps) != len(model.parts):
         raise InputError(f"{len(maps)} maps were given, the model has {len(model.parts)}; give one for each.")
-    return [
-        _checked(model, i, np.asarray(map_, dtype=np.float64), f"map {model.parts[i].name}")
-        for i, map_ in enumerate(maps)
-    ]
+    arrays = [np.asarray(map_, dtype=np.float64) for map_ in maps]
+    return [_checked(model, part, map_, f"map {part.name}") for part, map_ in zip(model.parts, arrays, strict=True)]
 
 
-def _file_name(model: Model, part: int) -> str:
-    channel, _, split = model.parts[part].name.partition(":")
-    return f"{channel}_{split}.fits" if split else f"{channel}.fits"
-
-
-def _read(model: Model, part: int, path: Path) -> Map:
+def _read(model: Model, part: Part, path: Path) -> Map:
     if not path.is_file():
-        raise InputError(
-            f"{path} does not exist; the model has a map {model.parts[part].name}, give it under that name."
-        )
+        raise InputError(f"{path} does not exist; the model has a map {part.name}, give it under that name.")
     map_, frame, unit = healpix.read_map(path)
-    expected = model.survey.frame
-    if frame not in (None, expected):
-        raise InputError(f"{path} is in {frame} coordinates, the model in {expected}; rotate the map.")
-    frequency = model.survey.channels[model.parts[part].channel].site.frequency_ghz
-    factor = header.to_uk(unit, path, frequency)
+    if frame not in (None, model.frame):
+        raise InputError(f"{path} is in {frame} coordinates, the model in {model.frame}; rotate the map.")
+    factor = header.to_uk(unit, path, model.survey.channels[part.channel].site.frequency_ghz)
     return _checked(model, part, np.where(map_ == healpy.UNSEEN, map_, factor * map_), str(path))
 
 
-def _checked(model: Model, part: int, map_: Map, name: str) -> Map:
+def _checked(model: Model, part: Part, map_: Map, name: str) -> Map:
     """Return the map if it can be of the survey."""
     if map_.shape != (12 * model.nside**2,):
         size = healpy.npix2nside(map_.size) if map_.ndim == 1 and healpy.isnpixok(map_.size) else None
@@ -188,9 +193,8 @@ def _checked(model: Model, part: int, map_: Map, name: str) -> Map:
     if broken:
         raise InputError(f"{name} has {broken} pixels that are not finite; mark what was not observed as UNSEEN.")
     unseen = map_ == healpy.UNSEEN
-    fiducial = model.parts[part].precision > 0
+    fiducial, limits = part.precision > 0, model.settings
     lost = float(np.mean(unseen[fiducial]))
-    limits = model.settings
     if lost > limits.missing_share:
         raise InputError(
             f"{name} leaves out {100 * lost:.0f} % of the pixels that the fiducial scan hits, at most "
@@ -209,32 +213,22 @@ def _checked(model: Model, part: int, map_: Map, name: str) -> Map:
     return map_
 
 
-def expected_rms(model: Model, part: int) -> float:
+def expected_rms(model: Model, part: Part) -> float:
     """Return the rms over the sky that the model expects in a map, sky and noise, uK."""
-    whole = model.survey
-    assert whole.cl is not None  # a model of a diagnosis has a spectrum
-    channel = whole.channels[model.parts[part].channel]
-    response = channel.response.factors[0].real
-    ell = np.arange(response.size)
-    sky = float(np.sum((2 * ell + 1) / (4 * np.pi) * whole.cl * response**2))
-    precision = model.parts[part].precision
-    return float(np.sqrt(sky + np.mean(1.0 / precision[precision > 0])))
+    cl, response = model.survey.cl, model.survey.channels[part.channel].response.factors[0].real
+    assert cl is not None  # a model of a diagnosis has a spectrum
+    sky = float(np.sum((2 * np.arange(cl.size) + 1) / (4 * np.pi) * cl * response**2))
+    return float(np.sqrt(sky + np.mean(1.0 / part.precision[part.precision > 0])))
 
 
-def exchanges(names: Sequence[str]) -> list[tuple[int, ...]]:
+def exchanges(parts: Sequence[Part]) -> list[tuple[int, ...]]:
     """Return the orders of the maps in which two channels, or two splits of all channels, are exchanged."""
-    places = {name: place for place, name in enumerate(names)}
-    channels = list(dict.fromkeys(name.partition(":")[0] for name in names))
-    splits = list(dict.fromkeys(name.partition(":")[2] for name in names))
+    places = {(part.channel, part.split): place for place, part in enumerate(parts)}
     found = []
-    for kind, values in ((0, channels), (2, splits)):
-        for i, one in enumerate(values):
-            for other in values[:i]:
-                swap = {one: other, other: one}
-                order = []
-                for name in names:
-                    parts = list(name.partition(":"))
-                    parts[kind] = swap.get(parts[kind], parts[kind])
-                    order.append(places["".join(parts)])
-                found.append(tuple(order))
+    for one, other in combinations(dict.fromkeys(channel for channel, _ in places), 2):
+        channels = {one: other, other: one}
+        found.append(tuple(places[channels.get(channel, channel), split] for channel, split in places))
+    for first, second in combinations(dict.fromkeys(split for _, split in places), 2):
+        splits = {first: second, second: first}
+        found.append(tuple(places[channel, splits.get(split, split)] for channel, split in places))
     return found

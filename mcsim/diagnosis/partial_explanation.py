@@ -20,16 +20,9 @@ Exact = Callable[[Matrix, tuple[int, ...], Fit], Matrix | None]
 class PartialExplanation:
     """Hold effects that are detected without explaining all of the excess chi^2.
 
-    Attributes
-    ----------
-    members
-        Indices of the candidates, in the order in which they were detected.
-    fit
-        Amplitudes of the members' columns, one member after the other.
-    left
-        Share of the excess chi^2 that they leave.
-    templates
-        That hold for the members together, shape (p_raw, K).
+    ``members`` are the indices of the candidates, in the order in which they were detected, and ``fit`` the amplitudes
+    of their columns; ``left`` is the share of the excess chi^2 that they leave. The ``templates``, shape (p_raw, K),
+    hold for the members together.
     """
 
     members: tuple[int, ...]
@@ -42,16 +35,8 @@ class PartialExplanation:
 class Detection:
     """Add the most significant candidate beside those that are detected already, until none is significant.
 
-    Attributes
-    ----------
-    null, x
-        Distribution of the data vector without an effect, and the data, shape (p_raw,).
-    candidates, calibration
-        Candidates, and their calibration.
-    exact
-        Simulates members at their amplitudes; None from it says that they cannot have them.
-    settings
-        Of the diagnosis.
+    ``null`` is the distribution of the data vector ``x``, shape (p_raw,), without an effect. ``exact`` simulates
+    members at their amplitudes; None from it says that they cannot have them.
     """
 
     null: SimulatedGaussian
@@ -94,16 +79,15 @@ class Detection:
         self, t: Matrix, members: tuple[int, ...], refused: set[int], before: Fit
     ) -> tuple[int, Fit] | None:
         """Return the most significant candidate beside the members, and their fit; None if none is significant."""
-        smallest, chosen = 1.0, None
+        options: list[tuple[float, int, Fit]] = []
         taken = {self.candidates[member].identity for member in members}
         for index, candidate in enumerate(self.candidates):
             if candidate.identity not in taken and index not in refused:
                 after = self._fit(t, (*members, index))
-                pvalue = self._pvalue(before, after)
-                allowed = within_bounds(self.candidates, (*members, index), after)
-                if allowed and (pvalue < smallest or chosen is None):
-                    smallest, chosen = pvalue, (index, after)
-        return chosen if chosen is not None and self._significant(smallest) else None
+                if within_bounds(self.candidates, (*members, index), after):
+                    options.append((self._pvalue(before, after), index, after))
+        best = min(options, key=lambda option: option[0], default=None)
+        return best[1:] if best is not None and self._significant(best[0]) else None
 
     def _fit(self, t: Matrix, members: tuple[int, ...]) -> Fit:
         return self.null.fit(self.x, t[:, columns_of(self.candidates, members)])

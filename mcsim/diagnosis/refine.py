@@ -2,18 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.diagnosis.candidate import Candidate, columns_of, effects_at, parts_of
+from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.partial_explanation import Detection, PartialExplanation
 from mcsim.diagnosis.selection import Attribution, attribute
-from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.diagnosis.templates import Respond
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import Fit, SimulatedGaussian, orthonormal
-from mcsim.stats.look_elsewhere import Calibration
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -23,54 +22,26 @@ Matrix = NDArray[np.float64]
 class Refined:
     """Hold an attribution with responses at the amplitudes that it names.
 
-    Attributes
-    ----------
-    attribution
-        Final.
-    templates
-        That it used, shape (p, K).
-    candidates
-        With the scatter of stochastic ones, at the amplitudes at which they were simulated.
-    simulated
-        Candidates whose response was simulated at its amplitude.
-    partial
-        What is detected if no set of candidates is accepted.
+    The ``templates``, shape (p, K), and the ``candidates``, with the scatter of stochastic ones, are those at the
+    amplitudes that were simulated; ``partial`` is what is detected if no set of candidates is accepted.
     """
 
     attribution: Attribution
     templates: Matrix
     candidates: tuple[Candidate, ...]
-    simulated: tuple[int, ...]
     partial: PartialExplanation | None = None
 
 
 @dataclass(frozen=True)
 class Refiner:
-    """Attribute, simulate what was named at its amplitude, and attribute again until nothing changes.
+    """Attribute, simulate what was named at its amplitude, and attribute again until nothing changes."""
 
-    Attributes
-    ----------
-    null, x
-        Distribution of the data vector without an effect, and the data, shape (p,).
-    calibration
-        Of the candidates.
-    curvature
-        Half the second derivative of the response to every component, shape (p, K).
-    respond
-        Simulates responses.
-    settings
-        Of the diagnosis.
-    skies
-        Number of skies of which the data are the mean.
-    """
+    data: DataSet
 
-    null: SimulatedGaussian
-    x: Vector
-    calibration: Calibration
-    curvature: Matrix
-    respond: Respond
-    settings: DiagnosisSettings
-    skies: int = 1
+    @property
+    def context(self) -> DiagnosisContext:
+        """Return the model, its simulations and templates."""
+        return self.data.context
 
     def run(self, t: Matrix, candidates: Sequence[Candidate]) -> Refined:
         """Refine templates ``t``, shape (p, K), and the attribution.
@@ -84,12 +55,12 @@ class Refiner:
         t, tried = t.copy(), list(candidates)
         done: dict[int, Vector] = {}
         found = self._attribute(t, tried)
-        for _ in range(self.settings.refine_rounds):
+        for _ in range(self.context.settings.refine_rounds):
             changed = False
             for index, coordinates, covariance in self._to_try(found, tried):
-                columns, effect = list(candidates[index].columns), candidates[index].effect
+                columns, how = list(candidates[index].columns), candidates[index].effect.parametrization
                 nonlinear = self._is_nonlinear(columns, coordinates)
-                stochastic = effect.stochastic and (effect.sign == 0 or coordinates[0] > 0.0)
+                stochastic = how.stochastic and (how.sign == 0 or coordinates[0] > 0.0)
                 if not (nonlinear or stochastic) or self._has_settled(done.get(index), coordinates, covariance):
                     continue
                 done[index] = coordinates
@@ -102,7 +73,7 @@ class Refiner:
                 response = changes.mean(axis=0)
                 if stochastic:
                     # The scatter of one draw about the mean of as many as there are.
-                    share = (1.0 / self.skies + 1.0 / len(changes)) / (len(changes) - 1.0)
+                    share = (1.0 / self.data.realizations + 1.0 / len(changes)) / (len(changes) - 1.0)
                     scatter = np.sqrt(share) * (changes - response).T
                     tried[index] = replace(tried[index], scatter=scatter, shape_error=None)
                 if nonlinear:
@@ -110,28 +81,26 @@ class Refiner:
             if not changed:
                 break
             found = self._attribute(t, tried)
-        partial = None
+        detected = None
         if found.verdict == "unknown":
-            partial = self.detected_in(t, tried)
-            if partial is not None and len(partial.members) <= self.settings.max_effects:
-                together = self._attribute(partial.templates, tried)
+            detected = self.detected_in(t, tried)
+            if detected is not None and len(detected.members) <= self.context.settings.max_effects:
+                together = self._attribute(detected.templates, tried)
                 if together.explanations:
-                    t, found, partial = partial.templates, together, None
-        return Refined(found, t, tuple(tried), tuple(done), partial)
+                    t, found, detected = detected.templates, together, None
+        return Refined(found, t, tuple(tried), detected)
 
     def detected_in(self, t: Matrix, candidates: Sequence[Candidate]) -> PartialExplanation | None:
         """Return the effects that are detected, each set simulated together at its amplitudes."""
-
-        def exact(t: Matrix, members: tuple[int, ...], fitted: Fit) -> Matrix | None:
-            return self._together(t, candidates, members, fitted)
-
-        return Detection(self.null, self.x, candidates, self.calibration, exact, self.settings).run(t)
+        known, exact = self.context, partial(self._together, candidates)
+        return Detection(known.null, self.data.x, candidates, known.calibration, exact, known.settings).run(t)
 
     def _attribute(self, t: Matrix, candidates: Sequence[Candidate]) -> Attribution:
-        return attribute(self.null, self.x, t, candidates, self.calibration, self.settings)
+        known = self.context
+        return attribute(known.null, self.data.x, t, candidates, known.calibration, known.settings)
 
     def _together(
-        self, t: Matrix, candidates: Sequence[Candidate], members: tuple[int, ...], fitted: Fit
+        self, candidates: Sequence[Candidate], t: Matrix, members: tuple[int, ...], fitted: Fit
     ) -> Matrix | None:
         """Return templates that are exact for effects that act together, at about their fitted amplitudes.
 
@@ -139,24 +108,24 @@ class Refiner:
         amplitudes diverge round by round.
         """
         columns = np.array(columns_of(candidates, members))
-        for _ in range(self.settings.joint_rounds):
+        for _ in range(self.context.settings.joint_rounds):
             try:
                 effects = effects_at(candidates, members, fitted)
                 tables = [candidates[member].table(effect) for member, effect in zip(members, effects, strict=True)]
-                stochastic = any(effect.stochastic for effect in effects)
-                response = self.respond(tables, self._skies(stochastic)).mean(axis=0)
+                stochastic = any(effect.parametrization.stochastic for effect in effects)
+                response = self.data.respond(tables, self._skies(stochastic)).mean(axis=0)
             except InputError:
                 return None
             t = t.copy()
-            at = np.concatenate([effect.coordinates() for effect in effects])
+            at = np.concatenate([effect.parametrization.coordinates(effect) for effect in effects])
             t[:, columns] += self._beyond(t[:, columns], at, response)
-            before, fitted = fitted, self.null.fit(self.x, t[:, columns])
+            before, fitted = fitted, self.context.null.fit(self.data.x, t[:, columns])
             if self._has_converged(before.amplitudes, fitted):
                 return t
         return None
 
     def _skies(self, stochastic: bool) -> int:
-        return self.settings.scatter_skies if stochastic else self.settings.constrained_skies
+        return self.context.settings.scatter_skies if stochastic else self.context.settings.constrained_skies
 
     def _beyond(self, t: Matrix, at: Vector, response: Vector) -> Matrix:
         """Return what makes templates, shape (p, k), exact at coordinates: the response beyond their sum.
@@ -165,7 +134,7 @@ class Refiner:
         its fitted coordinate, does not change.
         """
         parts = t * at
-        weights = np.sum(self.null.whiten_templates(parts) ** 2, axis=0)
+        weights = np.sum(self.context.null.whiten_templates(parts) ** 2, axis=0)
         shares = np.divide(weights, at * weights.sum(), out=np.zeros_like(at), where=weights > 0.0)
         return np.outer(response - parts.sum(axis=1), shares)
 
@@ -179,7 +148,8 @@ class Refiner:
         for factor in (1.0, 0.5):
             try:
                 effect = candidate.detected(factor * coordinates, covariance / factor**2)
-                return effect.coordinates(), self.respond([candidate.table(effect)], self._skies(stochastic))
+                response = self.data.respond([candidate.table(effect)], self._skies(stochastic))
+                return effect.parametrization.coordinates(effect), response
             except InputError:
                 continue
         return None
@@ -197,48 +167,44 @@ class Refiner:
         # Single ones too: a strong effect has a nonlinear response, and a stochastic one scatters it, until only a
         # mixture seems to be sufficient.
         ranked = [int(index) for index in np.argsort([-single.delta_chi2 for single in found.singles])]
-        stochastic = {candidates[index].identity for index in work if candidates[index].effect.stochastic}
+        stochastic = {
+            candidates[index].identity for index in work if candidates[index].effect.parametrization.stochastic
+        }
         for place, index in enumerate(ranked):
             single, candidate = found.singles[index], candidates[index]
-            pvalue = float(self.calibration.global_pvalue(single.nested_pvalue))
-            detected = candidate.effect.stochastic and pvalue <= self.settings.stochastic_level
-            if place < self.settings.tried or (detected and candidate.identity not in stochastic):
+            pvalue = float(self.context.calibration.global_pvalue(single.nested_pvalue))
+            detected = candidate.effect.parametrization.stochastic and pvalue <= self.context.settings.stochastic_level
+            if place < self.context.settings.tried or (detected and candidate.identity not in stochastic):
                 work.setdefault(index, (index, single.amplitudes, single.covariance))
-                if candidate.effect.stochastic:
+                if candidate.effect.parametrization.stochastic:
                     stochastic.add(candidate.identity)
         return list(work.values())
 
     def _is_nonlinear(self, columns: list[int], coordinates: Vector) -> bool:
         """Return True if the second derivative matters at these coordinates."""
-        shift = self.curvature[:, columns] @ coordinates**2
+        shift = self.context.bank.curvature[:, columns] @ coordinates**2
         crossed = float(np.sum(np.abs(coordinates)) ** 2) / max(float(coordinates @ coordinates), 1e-300)
-        size = float(np.linalg.norm(self.null.whiten_templates(shift[:, None])))
-        return crossed * size > self.settings.nonlinear_sigma
+        size = float(np.linalg.norm(self.context.null.whiten_templates(shift[:, None])))
+        return crossed * size > self.context.settings.nonlinear_sigma
 
     def _has_converged(self, before: Vector, now: Fit) -> bool:
         """Return True if amplitudes have hardly moved, by their errors, or by their size if the errors are tiny."""
-        precision = np.linalg.pinv(now.covariance)
-        moved = now.amplitudes - before
-        size = float(now.amplitudes @ precision @ now.amplitudes)
-        limit = max(self.settings.settled_sigma**2, self.settings.settled_share**2 * size)
-        return float(moved @ precision @ moved) < limit
+        precision, settings = np.linalg.pinv(now.covariance), self.context.settings
+        moved, size = (float(v @ precision @ v) for v in (now.amplitudes - before, now.amplitudes))
+        return moved < max(settings.settled_sigma**2, settings.settled_share**2 * size)
 
     def _has_settled(self, before: Vector | None, now: Vector, covariance: Matrix) -> bool:
         if before is None:
             return False
         moved = now - before
-        return float(moved @ np.linalg.pinv(covariance) @ moved) < self.settings.settled_sigma**2
+        return float(moved @ np.linalg.pinv(covariance) @ moved) < self.context.settings.settled_sigma**2
 
 
 def with_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, before: Matrix, after: Matrix) -> Fit:
-    """Return a fit with the errors that its amplitudes have with the effects in the data.
+    """Return a fit of templates, shape (p_raw, K), with the errors of its amplitudes with the effects in the data.
 
-    Parameters
-    ----------
-    null, t, found
-        Distribution of the data vector, templates, shape (p_raw, K), and the fit of these.
-    before, after
-        Data vectors of the same skies without the effects and with them at their amplitudes, shape (skies, p_raw).
+    ``before`` and ``after`` are data vectors of the same skies without the effects and with them at their amplitudes,
+    shape (skies, p_raw).
 
     Notes
     -----

@@ -27,15 +27,7 @@ class Picture:
 
 
 def write(result: DiagnosisResult, path: str | Path) -> None:
-    """Write a diagnosis as one HTML file that needs nothing else, not even a network.
-
-    Parameters
-    ----------
-    result
-        Of one case.
-    path
-        Of the file; its folder must exist.
-    """
+    """Write a diagnosis as one HTML file, in a folder that exists, that needs nothing else, not even a network."""
     Path(path).write_text(page(result), encoding="utf-8")
 
 
@@ -43,13 +35,7 @@ def page(result: DiagnosisResult) -> str:
     """Return the page as text; whatever comes from configurations or data is escaped."""
     return page_.render(
         Path(__file__).with_name("report.html.j2"),
-        {
-            "measured": measured,
-            "number": number,
-            "parameters": parameters,
-            "probability": probability,
-            "p_equals": p_equals,
-        },
+        {one.__name__: one for one in (measured, number, parameters, probability, p_equals)},
         result=result,
         words=words,
         settings=asdict(result.settings),
@@ -72,17 +58,12 @@ def _value(value: Any) -> str:
 
 
 def _pictures(result: DiagnosisResult) -> dict[str, Picture]:
-    largest = max(zip(abs(result.z), result.elements, strict=True), key=lambda pair: pair[0])
-    drawn: dict[str, tuple[Figure | None, str]] = {
+    z, element = max(zip(abs(result.z), result.elements, strict=True), key=lambda pair: pair[0])
+    first, largest = f"the first is {result.ranked[0].label}", f"the largest is {z:.1f}, {element.words}"
+    drawn = {
         "excess": (figures.excess_figure(result), "Bars: excess chi-squared of the model, and with the effects."),
-        "candidates": (
-            figures.candidates_figure(result),
-            f"Bars: candidates fitted alone, ranked; the first is {result.ranked[0].label}.",
-        ),
-        "blocks": (
-            figures.blocks_figure(result),
-            f"Table of deviations by kind and map; the largest is {largest[0]:.1f}, {largest[1].words}.",
-        ),
+        "candidates": (figures.candidates_figure(result), f"Bars: candidates fitted alone, ranked; {first}."),
+        "blocks": (figures.blocks_figure(result), f"Table of deviations by kind and map; {largest}."),
         "elements": (figures.elements_figure(result), "Points: deviation of every element before and after the fit."),
         "residual": (figures.residual_figure(result), "Sky maps of the residuals over the scatter of simulations."),
         "correlation": (figures.correlation_figure(result), "Matrix: correlation of the responses of candidates."),

@@ -11,12 +11,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.places import Place
-from mcsim.diagnosis.selection import Verdict
+from mcsim.diagnosis.localisation import Place
+from mcsim.diagnosis.selection import Contrast, Verdict
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Element
-from mcsim.diagnosis.validation import Measured
+from mcsim.diagnosis.validation import HeldOut, Measured, excess_of
 from mcsim.errors import InputError
+from mcsim.stats.look_elsewhere import GlobalTest
 
 Vector = NDArray[np.float64]
 
@@ -24,34 +25,6 @@ SCHEMA = 1
 STORE = "diagnosis.zarr"
 PLACES = 12
 """Groups in the localisation table of ``verdict.json`` and of the report."""
-
-
-@dataclass(frozen=True)
-class GlobalResult:
-    """Result of the test of the whole data vector.
-
-    Attributes
-    ----------
-    pvalue
-        Calibrated combination of the next two; uniform where the model is right.
-    omnibus, best_candidate
-        p-value of chi^2, and of the most significant candidate with the look-elsewhere effect.
-    chi2, dof
-        Of the data against the simulations, in the independent directions of the data vector; with a covariance from
-        few simulations chi^2 is larger than dof on average.
-    excess
-        chi^2 - dof without that bias: zero on average where the model is right.
-    simulations
-        Number that mean and covariance come from.
-    """
-
-    pvalue: float
-    omnibus: float
-    best_candidate: float
-    chi2: float
-    dof: int
-    excess: Measured
-    simulations: int
 
 
 @dataclass(frozen=True)
@@ -76,21 +49,18 @@ class EffectSet:
     ----------
     effects, candidates
         The effects, and their indices among the candidates.
-    columns, coordinates, errors
-        Columns of the templates that belong to them, fitted linear coordinates and standard errors.
+    coordinates, errors
+        Fitted linear coordinates, those of one effect after the other, and standard errors.
     odds
         Posterior odds against the best set.
-    pvalue
-        Of the residual that the fit leaves.
+    pvalue, excess
+        Of the residual that the fit leaves: p-value, and excess chi^2.
     further
-        Of the most significant further candidate, with the look-elsewhere effect.
-    excess
-        Excess chi^2 that the fit leaves.
+        p-value of the most significant further candidate, with the look-elsewhere effect.
     """
 
     effects: tuple[EffectResult, ...]
     candidates: tuple[int, ...]
-    columns: tuple[int, ...]
     coordinates: tuple[float, ...]
     errors: tuple[float, ...]
     odds: float
@@ -105,47 +75,13 @@ class EffectSet:
 
 
 @dataclass(frozen=True)
-class ContrastResult:
-    """Two sets, the distance of their predictions in standard deviations, and the elements that make it up."""
-
-    first: int
-    second: int
-    separation: float
-    elements: tuple[int, ...]
-    shares: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """Excess chi^2 of data that the fit did not use, before and after the effects are added to the simulator.
-
-    ``predicted`` and ``achieved`` are fractional reductions; ``data`` names the held-out data; ``pvalue_after`` is that
-    of what remains there.
-    """
-
-    predicted: Measured
-    achieved: Measured
-    before: Measured
-    after: Measured
-    pvalue_after: float
-    data: str
-
-    @property
-    def expected_after(self) -> float:
-        """Return the excess that the prediction leaves."""
-        return self.before.value * (1.0 - self.predicted.value)
-
-
-@dataclass(frozen=True)
 class CandidateResult:
     """A candidate effect: its fit alone, the amplitude that would be detected, and the candidate most like it.
 
     Attributes
     ----------
-    name, channel, settings, unit, label
-        Of the effect; ``channel`` None: acts in all.
-    columns
-        Of the templates.
+    name, channel, settings, unit, label, columns
+        Of the effect; ``channel`` None: acts in all; and its columns of the templates.
     amplitude, sigma, words
         Fitted alone, NaN where no effect has such an amplitude; and as people read it.
     delta_chi2, pvalue
@@ -192,7 +128,7 @@ class DiagnosisResult:
     case, kind
         Name of the case; "none", "effect", "mixture", "degenerate" or "unknown".
     test
-        Test of the whole data vector.
+        Test of the whole data vector; with few simulations its chi^2 is too large on average, and ``excess`` is not.
     sets, contrasts
         Sets of effects that describe the data, the most probable first, and what would tell them apart.
     nearest, cosine
@@ -228,9 +164,9 @@ class DiagnosisResult:
 
     case: str
     kind: Verdict
-    test: GlobalResult
+    test: GlobalTest
     sets: tuple[EffectSet, ...]
-    contrasts: tuple[ContrastResult, ...]
+    contrasts: tuple[Contrast, ...]
     nearest: int
     cosine: float
     partial: tuple[EffectResult, ...]
@@ -267,6 +203,16 @@ class DiagnosisResult:
         return self.sets[0].effects if self.sets else ()
 
     @property
+    def simulations(self) -> int:
+        """Return the number of simulations that mean and covariance come from."""
+        return len(self.held_out_pvalues)
+
+    @property
+    def excess(self) -> Measured:
+        """Return the unbiased excess of chi^2 over its degrees of freedom, zero on average where the model is right."""
+        return excess_of(self.test.chi2, self.test.dimension, self.simulations - 1)
+
+    @property
     def z(self) -> Vector:
         """Return data less mean over scatter, shape (p,)."""
         return np.asarray((self.data - self.mean) / self.standard_deviation)
@@ -274,8 +220,8 @@ class DiagnosisResult:
     def prediction(self, index: int) -> Vector:
         """Return the change of every element by a set of effects over the scatter, shape (p,)."""
         one = self.sets[index]
-        change: Vector = self.templates[:, list(one.columns)] @ np.array(one.coordinates) / self.standard_deviation
-        return change
+        columns = [column for member in one.candidates for column in self.candidates[member].columns]
+        return np.asarray(self.templates[:, columns] @ np.array(one.coordinates) / self.standard_deviation)
 
     @property
     def z_after(self) -> Vector | None:
@@ -294,27 +240,17 @@ class DiagnosisResult:
         return {
             "schema": SCHEMA,
             "case": self.case,
-            "gap": {"p_value": self.test.pvalue, "statistic": self.test.chi2, "dof": self.test.dof},
+            "gap": {"p_value": self.test.pvalue, "statistic": self.test.chi2, "dof": self.test.dimension},
             "verdict": self.kind,
             "effects": sets[0] if sets else [],
             "alternatives": sets[1:],
             "odds": [one.odds for one in self.sets],
             "where": [_place_json(place) for place in self.places[:PLACES]],
-            "shrink": None if self.held_out is None else _shrink_json(self.held_out),
+            "shrink": None if self.held_out is None else _held_out_json(self.held_out),
             "nearest": {"name": near.name, "channel": near.channel, "cosine": self.cosine},
             "heard": [_effect_json(effect) for effect in self.partial],
             "left": self.partial_left,
-            "detectable": [
-                {
-                    "name": one.name,
-                    "channel": one.channel,
-                    "amplitude_90": one.detectable,
-                    "unit": one.unit,
-                    "settings": one.settings,
-                }
-                for one in self.candidates
-                if one.detectable is not None
-            ],
+            "detectable": [_detectable_json(one) for one in self.candidates if one.detectable is not None],
             "notes": list(self.notes),
             **({"warnings": list(self.warnings)} if self.warnings else {}),
         }
@@ -325,21 +261,18 @@ class DiagnosisResult:
         Attribute ``result`` holds, as JSON, all that is no array.
         """
         rest = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ARRAYS}
-        named = {name: (dims, getattr(self, name), {"long_name": words}) for name, (dims, words) in _ARRAYS.items()}
+        variables: dict[str, tuple[Any, ...]] = {
+            "z": ("element", self.z, {"long_name": "data less mean, over scatter", "units": "1"}),
+            "place_z": ("place", [p.z for p in self.places], {"long_name": "normal deviate of a group"}),
+            "place_p": ("place", [p.p for p in self.places], {"long_name": "p-value, look-elsewhere included"}),
+        }
+        for name, (dims, words) in _ARRAYS.items():
+            if getattr(self, name) is not None:
+                variables[name] = (dims, getattr(self, name), {"long_name": words})
+        for name, words in _OF_CANDIDATES.items():
+            variables[name] = ("candidate", [getattr(one, name) for one in self.candidates], {"long_name": words})
         return xr.Dataset(
-            {name: row for name, row in named.items() if row[1] is not None}
-            | {
-                "z": ("element", self.z, {"long_name": "data less mean, over scatter", "units": "1"}),
-                "amplitude": ("candidate", [c.amplitude for c in self.candidates], {"long_name": "fitted alone"}),
-                "sigma": (
-                    "candidate",
-                    [c.sigma for c in self.candidates],
-                    {"long_name": "standard error"},
-                ),
-                "delta_chi2": ("candidate", [c.delta_chi2 for c in self.candidates], {"long_name": "fall of chi^2"}),
-                "place_z": ("place", [p.z for p in self.places], {"long_name": "normal deviate of a group"}),
-                "place_p": ("place", [p.p for p in self.places], {"long_name": "p-value, look-elsewhere included"}),
-            },
+            variables,
             coords={
                 "element": _texts(one.name for one in self.elements),
                 "description": ("element", _texts(one.words for one in self.elements)),
@@ -347,7 +280,7 @@ class DiagnosisResult:
                 "unit": ("candidate", _texts(one.unit for one in self.candidates)),
             }
             | ({} if self.residual_maps is None else {"map": _texts(self.maps)}),
-            attrs={"result": json.dumps({key: _plain(value) for key, value in rest.items()})},
+            attrs={"result": json.dumps(rest, default=asdict)},
         )
 
     def save(self, folder: str | Path) -> None:
@@ -387,6 +320,7 @@ _ARRAYS = {
     "residual_maps": (("map", "pixel"), "residual over the scatter of simulations, RING"),
     "residual_range": (("map", "end"), "smallest and largest rms of 95 % of the simulations"),
 }
+_OF_CANDIDATES = {"amplitude": "fitted alone", "sigma": "standard error", "delta_chi2": "fall of chi^2"}
 
 
 def _effect_json(effect: EffectResult) -> dict[str, Any]:
@@ -398,10 +332,7 @@ def _place_json(place: Place) -> dict[str, Any]:
     return {
         "statistic": {"score": "map", "noise": "cl"}.get(e.statistic, e.statistic),
         "channels": list(e.channels),
-        "split": e.split,
-        "L": e.L,
-        "M": e.M,
-        "parity": e.parity,
+        **{key: getattr(e, key) for key in ("split", "L", "M", "parity")},
         "ell": None if e.ell is None else list(e.ell),
         "frame": e.frame,
         "z": place.z,
@@ -409,7 +340,12 @@ def _place_json(place: Place) -> dict[str, Any]:
     }
 
 
-def _shrink_json(found: HeldOut) -> dict[str, Any]:
+def _detectable_json(one: CandidateResult) -> dict[str, Any]:
+    named = {key: getattr(one, key) for key in ("name", "channel", "unit", "settings")}
+    return named | {"amplitude_90": one.detectable}
+
+
+def _held_out_json(found: HeldOut) -> dict[str, Any]:
     return {
         "predicted": found.predicted.value,
         "achieved": found.achieved.value,
@@ -427,13 +363,6 @@ def _shrink_json(found: HeldOut) -> dict[str, Any]:
 def _texts(words: Any) -> NDArray[np.object_]:
     """Return texts as objects: Zarr 3 has no stable form for numpy's texts of fixed length."""
     return np.array(list(words), dtype=object)
-
-
-def _plain(value: Any) -> Any:
-    """Return dataclasses as dictionaries, also inside tuples."""
-    if isinstance(value, tuple):
-        return [_plain(item) for item in value]
-    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
 
 
 def _typed(kind: Any, value: Any) -> Any:

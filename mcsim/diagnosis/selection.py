@@ -1,8 +1,7 @@
 """Select the smallest sets of candidates that explain the data, and what would tell these sets apart."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import combinations
 from typing import Literal
 
@@ -16,6 +15,8 @@ from mcsim.stats.detection import cosines
 from mcsim.stats.gaussian import Fit, SimulatedGaussian
 from mcsim.stats.look_elsewhere import Calibration, GlobalTest, global_test
 
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
 Verdict = Literal["none", "effect", "mixture", "degenerate", "unknown"]
 
 # Subsets that are solved at once; bounds the memory to some 100 MB.
@@ -24,19 +25,11 @@ CHUNK = 1000
 
 @dataclass(frozen=True)
 class Explanation:
-    """Describe an accepted set of candidates.
+    """Describe an accepted set of candidates, the ``members``, by their indices.
 
-    Attributes
-    ----------
-    members
-        Indices of the candidates.
-    fit
-        Amplitudes of the members' columns, one member after the other.
-    odds
-        Posterior odds relative to the best explanation, <= 1.
-    pvalue, further
-        p-value of the residual, with errors of the templates tolerated, and global p-value of the most significant
-        further candidate.
+    ``fit`` has the amplitudes of their columns, one member after the other; ``odds`` are posterior odds relative to
+    the best explanation, <= 1; ``pvalue`` is that of the residual, with errors of the templates tolerated, and
+    ``further`` the global p-value of the most significant further candidate.
     """
 
     members: tuple[int, ...]
@@ -48,24 +41,18 @@ class Explanation:
 
 @dataclass(frozen=True)
 class Contrast:
-    """Say what would tell two explanations apart.
+    """Say what would tell two explanations, given by their indices, apart.
 
-    Attributes
-    ----------
-    first, second
-        Indices into the explanations.
-    separation
-        White norm of the difference of their fitted predictions.
-    elements, shares
-        Elements of the data vector, the most discriminating first, and their shares of the squared norm; shares add up
-        to 1 and can be negative.
+    ``separation`` is the white norm of the difference of their fitted predictions; ``elements`` of the data vector
+    stand with the most discriminating first, beside their ``shares`` of the squared norm, which add up to 1 and can be
+    negative.
     """
 
     first: int
     second: int
     separation: float
-    elements: NDArray[np.int64]
-    shares: NDArray[np.float64]
+    elements: tuple[int, ...]
+    shares: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -79,8 +66,8 @@ class Attribution:
         "effect" or "mixture".
     gap
         Global test of the data against the model.
-    explanations
-        Minimal accepted sets, the most probable first; empty for "none" and "unknown".
+    explanations, contrasts
+        Minimal accepted sets, the most probable first, and each pair of them; empty for "none" and "unknown".
     nearest, cosine
         Candidate that lowers chi^2 most, and the cosine between its best fit and the departure from the model, without
         noise.
@@ -96,7 +83,7 @@ class Attribution:
     nearest: int
     cosine: float
     singles: tuple[Fit, ...]
-    correlation: NDArray[np.float64]
+    correlation: Matrix
     contrasts: tuple[Contrast, ...]
 
     def unexplained(self) -> "Attribution":
@@ -106,24 +93,16 @@ class Attribution:
 
 def attribute(
     null: SimulatedGaussian,
-    x: NDArray[np.float64],
-    t: NDArray[np.float64],
+    x: Vector,
+    t: Matrix,
     candidates: Sequence[Candidate],
     calibration: Calibration,
     settings: DiagnosisSettings | None = None,
 ) -> Attribution:
-    """Attribute a departure from the model to the smallest sets of candidates that explain it.
+    """Attribute a departure of data, shape (p_raw,), from the model to the smallest sets of candidates that explain it.
 
-    Parameters
-    ----------
-    null, x
-        Distribution of the data vector without an effect, and the data, shape (p_raw,).
-    t
-        Templates per unit amplitude, shape (p_raw, K).
-    candidates, calibration
-        Candidates on those templates, and :func:`~mcsim.stats.look_elsewhere.calibrate` of them in this order.
-    settings
-        Levels; default: those of :class:`DiagnosisSettings`.
+    ``null`` is the distribution of the data vector without an effect; ``t`` are templates per unit amplitude, shape
+    (p_raw, K); ``calibration`` is :func:`~mcsim.stats.look_elsewhere.calibrate` of the candidates in this order.
 
     Notes
     -----
@@ -139,18 +118,14 @@ def attribute(
     """
     settings = settings or DiagnosisSettings()
     groups = null.whiten_groups(t, [candidate.columns for candidate in candidates])
-    searches = list(_searches(null, x, t, candidates, calibration, settings))
     y = null.whiten(x)
     found = global_test(null, x, groups, calibration)
     delta_chi2 = groups.delta_chi2(y)
     nearest = int(np.argmax(delta_chi2))
     signal = null.hartlap_factor * delta_chi2[nearest] - groups.sizes[nearest]
     excess = max(null.hartlap_factor * float(y @ y) - null.dimension, signal, 1e-300)
-    explanations: tuple[Explanation, ...] = ()
-    if found.pvalue <= settings.alpha:
-        possible = partial(_possible, x, t, candidates)
-        cut = float(np.log(settings.odds_cut))
-        explanations = tuple(_explanations(x, t, candidates, _accepted(searches, possible), cut))
+    selection = _Selection(null, x, t, candidates, calibration, settings)
+    explanations = tuple(selection.explanations()) if found.pvalue <= settings.alpha else ()
     return Attribution(
         verdict=_verdict(found.pvalue > settings.alpha, explanations),
         gap=found,
@@ -159,37 +134,16 @@ def attribute(
         cosine=float(np.sqrt(max(signal, 0.0) / excess)),
         singles=tuple(null.fit(x, t[:, list(candidate.columns)]) for candidate in candidates),
         correlation=cosines(groups),
-        contrasts=tuple(_contrasts(null, t, candidates, explanations)),
+        contrasts=tuple(selection.contrasts(explanations)),
     )
 
 
 def _verdict(agrees: bool, explanations: Sequence[Explanation]) -> Verdict:
     if agrees:
         return "none"
-    if not explanations:
-        return "unknown"
-    if len(explanations) > 1:
-        return "degenerate"
+    if len(explanations) != 1:
+        return "degenerate" if explanations else "unknown"
     return "mixture" if len(explanations[0].members) > 1 else "effect"
-
-
-def _searches(
-    null: SimulatedGaussian,
-    x: NDArray[np.float64],
-    t: NDArray[np.float64],
-    candidates: Sequence[Candidate],
-    calibration: Calibration,
-    settings: DiagnosisSettings,
-) -> Iterator[Subsets]:
-    """Yield a search of sets without a member whose scatter is known, and one for each combination of such members."""
-    scatters = {index: c.scatter for index, c in enumerate(candidates) if c.scatter is not None}
-    for size in range(settings.max_effects + 1):
-        for members in combinations(scatters, size):
-            if len({candidates[index].identity for index in members}) < size:
-                continue
-            wide = null.with_extra_covariance(*(scatters[index] for index in members))
-            groups = wide.whiten_groups(t, [c.columns for c in candidates])
-            yield Subsets(wide, wide.whiten(x), groups, candidates, calibration, settings, members)
 
 
 @dataclass(frozen=True, order=True)
@@ -203,39 +157,84 @@ class _Accepted:
     null: SimulatedGaussian = field(compare=False)
 
 
-def _possible(
-    x: NDArray[np.float64],
-    t: NDArray[np.float64],
-    candidates: Sequence[Candidate],
-    null: SimulatedGaussian,
-    members: tuple[int, ...],
-) -> bool:
-    """Return True if the fitted amplitudes of all members are within their bounds."""
-    effects = [candidates[member].effect for member in members]
-    if not any(effect.sign or np.isfinite(effect.max_amplitude) for effect in effects):
-        return True
-    return within_bounds(candidates, members, null.fit(x, t[:, columns_of(candidates, members)]))
+@dataclass(frozen=True)
+class _Selection:
+    """Select among sets of candidates; fields are the arguments of :func:`attribute`."""
 
+    null: SimulatedGaussian
+    x: Vector
+    t: Matrix
+    candidates: Sequence[Candidate]
+    calibration: Calibration
+    settings: DiagnosisSettings
 
-def _accepted(
-    searches: Sequence[Subsets], possible: Callable[[SimulatedGaussian, tuple[int, ...]], bool]
-) -> list[_Accepted]:
-    """Return minimal sufficient sets that are possible, unless their evidence is below the best one's by the cut."""
-    accepted: list[_Accepted] = []
-    settings = searches[0].settings
-    best, unknown, cut = -np.inf, searches[0].unknown, np.log(settings.odds_cut)
-    for size in range(1, settings.max_effects + 1):
-        fresh: list[_Accepted] = []
-        for search in searches:
-            # With thousands of sets to choose from, some triple comes close to anything; so does a wide scatter.
-            doubted = size > 1 or bool(search.scattered)
-            least = max(best - cut, unknown if doubted else -np.inf)
-            for subsets in search.rows(size, [found.members for found in accepted]):
-                sufficient = _sufficient(search, subsets, least, doubted)
-                fresh += [one for one in sufficient if possible(one.null, one.members)]
-        accepted += fresh
-        best = max([best, *(found.evidence for found in fresh)])
-    return accepted
+    def explanations(self) -> Iterator[Explanation]:
+        """Yield the most probable first; of those that differ only in settings the most probable one."""
+        seen: set[frozenset[tuple[str, str | None]]] = set()
+        ranked = sorted(self._accepted(), reverse=True)
+        for found in ranked:
+            identity = frozenset(self.candidates[member].identity for member in found.members)
+            lost = ranked[0].evidence - found.evidence
+            if lost <= np.log(self.settings.odds_cut) and identity not in seen:
+                seen.add(identity)
+                best = self._fit(found.null, found.members)
+                yield Explanation(found.members, best, float(np.exp(-lost)), found.pvalue, found.further)
+
+    def contrasts(self, explanations: Sequence[Explanation]) -> Iterator[Contrast]:
+        """Yield each pair of explanations with the elements in which their predictions differ most."""
+        null = self.null
+        predictions = [self.t[:, columns_of(self.candidates, one.members)] @ one.fit.amplitudes for one in explanations]
+        for first, second in combinations(range(len(predictions)), 2):
+            difference = predictions[first] - predictions[second]
+            white = null.whiten_templates(difference[:, None])[:, 0]
+            squared = float(white @ white)
+            shares = difference * (null.whitening.T @ white) / np.sqrt(1.0 + 1.0 / null.n_sims) / max(squared, 1e-300)
+            order = np.argsort(-shares)
+            yield Contrast(first, second, float(np.sqrt(squared)), tuple(order.tolist()), tuple(shares[order].tolist()))
+
+    def _accepted(self) -> list[_Accepted]:
+        """Return minimal sufficient sets that are possible and whose evidence is not below the best by the cut."""
+        accepted: list[_Accepted] = []
+        searches = list(self._searches())
+        best, unknown, cut = -np.inf, searches[0].unknown, np.log(self.settings.odds_cut)
+        for size in range(1, self.settings.max_effects + 1):
+            fresh: list[_Accepted] = []
+            for search in searches:
+                # With thousands of sets to choose from, some triple comes close to anything; so does a wide scatter.
+                doubted = size > 1 or bool(search.scattered)
+                least = max(best - cut, unknown if doubted else -np.inf)
+                for subsets in search.rows(size, [found.members for found in accepted]):
+                    fresh += filter(self._possible, _sufficient(search, subsets, least, doubted))
+            accepted += fresh
+            best = max([best, *(found.evidence for found in fresh)])
+        return accepted
+
+    def _searches(self) -> Iterator[Subsets]:
+        """Yield a search of sets without a member whose scatter is known, and one for each combination of such members.
+
+        Combinations of candidates that exclude each other are left out.
+        """
+        scatters = {index: c.scatter for index, c in enumerate(self.candidates) if c.scatter is not None}
+        for size in range(self.settings.max_effects + 1):
+            for members in combinations(scatters, size):
+                if len({self.candidates[index].identity for index in members}) < size:
+                    continue
+                wide = self.null.with_extra_covariance(*(scatters[index] for index in members))
+                groups = wide.whiten_groups(self.t, [c.columns for c in self.candidates])
+                y = wide.whiten(self.x)
+                yield Subsets(wide, y, groups, self.candidates, self.calibration, self.settings, members)
+
+    def _possible(self, found: _Accepted) -> bool:
+        """Return True if the fitted amplitudes of all members are within their bounds."""
+        effects = [self.candidates[member].effect for member in found.members]
+        if not any(
+            effect.parametrization.sign or np.isfinite(effect.parametrization.max_amplitude) for effect in effects
+        ):
+            return True
+        return within_bounds(self.candidates, found.members, self._fit(found.null, found.members))
+
+    def _fit(self, null: SimulatedGaussian, members: tuple[int, ...]) -> Fit:
+        return null.fit(self.x, self.t[:, columns_of(self.candidates, members)])
 
 
 def _sufficient(search: Subsets, subsets: NDArray[np.int64], least: float, doubted: bool) -> Iterator[_Accepted]:
@@ -252,41 +251,3 @@ def _sufficient(search: Subsets, subsets: NDArray[np.int64], least: float, doubt
             members = tuple(int(member) for member in subsets[row])
             numbers = float(solved.evidence[row]), members, float(solved.pvalue[row]), float(beside)
             yield _Accepted(*numbers, search.null)
-
-
-def _explanations(
-    x: NDArray[np.float64],
-    t: NDArray[np.float64],
-    candidates: Sequence[Candidate],
-    accepted: Sequence[_Accepted],
-    cut: float,
-) -> Iterator[Explanation]:
-    """Yield the most probable first; of those that differ only in settings the most probable one."""
-    seen: set[frozenset[tuple[str, str | None]]] = set()
-    ranked = sorted(accepted, reverse=True)
-    for found in ranked:
-        identity = frozenset(candidates[member].identity for member in found.members)
-        lost = ranked[0].evidence - found.evidence
-        if lost <= cut and identity not in seen:
-            seen.add(identity)
-            best = found.null.fit(x, t[:, columns_of(candidates, found.members)])
-            yield Explanation(found.members, best, float(np.exp(-lost)), found.pvalue, found.further)
-
-
-def _contrasts(
-    null: SimulatedGaussian,
-    t: NDArray[np.float64],
-    candidates: Sequence[Candidate],
-    explanations: Sequence[Explanation],
-) -> Iterator[Contrast]:
-    """Yield each pair of explanations with the elements in which their predictions differ most."""
-    predictions = [
-        t[:, columns_of(candidates, explanation.members)] @ explanation.fit.amplitudes for explanation in explanations
-    ]
-    for first, second in combinations(range(len(predictions)), 2):
-        difference = predictions[first] - predictions[second]
-        white = null.whiten_templates(difference[:, None])[:, 0]
-        squared = float(white @ white)
-        shares = difference * (null.whitening.T @ white) / np.sqrt(1.0 + 1.0 / null.n_sims) / max(squared, 1e-300)
-        order = np.argsort(-shares)
-        yield Contrast(first, second, float(np.sqrt(squared)), order, shares[order])

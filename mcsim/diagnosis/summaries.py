@@ -1,63 +1,42 @@
 """The data vector: a short vector of summary statistics, each with a description."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from itertools import pairwise
+from dataclasses import dataclass, field, replace
+from itertools import pairwise, product
 
 import healpy
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.matched_filters import normalised_difference, sky_of
-from mcsim.diagnosis.wiener_filter import FilteredMaps, Model, by_degree
+from mcsim.diagnosis.matched_filters import normalised_difference
+from mcsim.diagnosis.wiener_filter import FilteredMaps, Map, Model, by_degree
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotation_matrix
 
-Map = NDArray[np.float64]
 Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Element:
-    """Describe one element of the data vector.
+    """Describe one element of the data vector."""
 
-    Attributes
-    ----------
-    name
-        Unique.
-    statistic
-        "map": residual maps against the sky and the scan; "cl"; "biposh"; "noise"; "score": matched filter.
-    channels, split
-        Whose; no split if all maps of a channel count.
-    fold
-        0 or 1 if there is a similar element whose noise is independent: a fit may use the one and be tested with the
-        other. None if there is none.
-    ell
-        Range of degrees, None if all or none.
-    L, M, parity, frame
-        As for BipoSH coefficients, if they apply.
-    kind
-        What is measured, one of the keys of :data:`KINDS`.
-    component
-        Which of the numbers that are alike in all else, in words: "real", "x", "even pixels".
-    effect
-        Of a matched filter, the effect that it is matched to, in words.
-    """
-
-    name: str
-    statistic: str
+    name: str  # unique, for people: what an element is of stands in the other fields
+    statistic: str  # "map": residual maps against sky and scan; "cl"; "biposh"; "noise"; "score": matched filter
     channels: tuple[str, ...]
-    split: str | None = None
+    split: str | None = None  # None if all maps of a channel count
+    # 0 or 1 if there is a similar element whose noise is independent: a fit may use the one and be tested with the
+    # other. None if there is none.
     fold: int | None = None
-    ell: tuple[int, int] | None = None
-    L: int | None = None
+    ell: tuple[int, int] | None = None  # range of degrees, None if all or none
+    L: int | None = None  # L, M, parity and frame are as for BipoSH coefficients, if they apply
     M: int | None = None
     parity: str | None = None
     frame: str | None = None
-    kind: str = "other"
-    component: str | None = None
-    effect: str | None = None
+    kind: str = "other"  # what is measured, one of the keys of KINDS
+    component: str | None = None  # which of the numbers that are alike in all else: "real", "x", "even pixels"
+    effect: str | None = None  # of a matched filter, the effect that it is matched to, in words
+    candidate: str | None = None  # the name of that effect
 
     @property
     def family(self) -> str:
@@ -95,23 +74,21 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Block:
-    """Compute some elements together."""
+    """Compute some elements together: numbers of shape (elements,), or the only one."""
 
     elements: tuple[Element, ...]
-    values: Callable[[Model, FilteredMaps], Vector] = field(repr=False)
+    values: Callable[[FilteredMaps], Vector | float] = field(repr=False)
 
 
 def blocks_of(model: Model) -> tuple[Block, ...]:
     """Return the blocks that do not depend on a candidate: about 30 elements a channel, and some of the sky."""
-    blocks = [_beam_block(model, i) for i in range(len(model.parts))]
-    blocks += [_additive_block(model, i) for i in range(len(model.parts))]
-    blocks += [_plane_block(model, i) for i in range(len(model.parts))]
+    parts = range(len(model.parts))
+    blocks = [block(model, i) for block in (_beam_block, _dipole_block, _plane_block) for i in parts]
     for channel in range(len(model.response)):
         blocks += [_noise_block(model, channel), _linearity_block(model, channel)]
         if len(model.of(channel)) > 1:
             blocks.append(_repeated_block(model, channel))
-    contrast = _contrast_block(model)
-    return (*blocks, *([contrast] if contrast else []), _sky_block(model), _isotropy_block(model))
+    return (*blocks, *_contrast_blocks(model), _sky_block(model), _isotropy_block(model))
 
 
 def bins(low: int, high: int, number: int) -> list[tuple[int, int]]:
@@ -126,79 +103,53 @@ def scales(lmax: int) -> list[tuple[int, int]]:
     return [(a, b - 1) for a, b in pairwise(edges)]
 
 
-def _label(model: Model, part: int) -> tuple[str, str | None]:
-    channel, _, split = model.parts[part].name.partition(":")
-    return channel, split or None
+def _of_map(model: Model, part: int) -> Element:
+    """Describe what the elements of a map have in common; maps of a channel are in fold 0 and 1 alternately."""
+    own = model.parts[part]
+    members = model.of(own.channel)
+    fold = members.index(part) % 2 if len(members) > 1 else None
+    return Element(own.name, "map", (model.channels[own.channel],), own.split, fold, frame=model.frame)
 
 
-def _frame(model: Model) -> str:
-    return model.survey.frame
+def _height(frame: str, to: str, nside: int) -> Map:
+    """Return the sine of the latitude in another frame of every pixel, RING, shape (npix,)."""
+    height: Map = rotation_matrix(frame, to)[2] @ np.stack(healpy.pix2vec(nside, np.arange(12 * nside**2)))
+    return height
 
 
 def _beam_block(model: Model, part: int) -> Block:
     """Project D_s(l) on B_l l^s, the change of a beam at order s, in few bins."""
-    channel, split = _label(model, part)
-    frame, lmax = _frame(model), model.lmax
-    ell = np.arange(lmax + 1)
-    beam = model.survey.channels[model.parts[part].channel].site.beam
+    whole, own, settings = _of_map(model, part), model.parts[part], model.settings
+    ell = np.arange(model.lmax + 1)
+    beam = model.survey.channels[own.channel].site.beam
+    top = settings.beam_orders if part == model.of(own.channel)[0] else settings.split_beam_orders
     kernels, elements = [], []
-    first, split_orders = part == model.of(model.parts[part].channel)[0], model.settings.split_beam_orders
-    for s in range(min(model.settings.beam_orders if first else split_orders, model.parts[part].moments.smax) + 1):
-        shape = beam.blm[0, : lmax + 1].real * (ell / lmax) ** max(s, 1)
-        for low, high in bins(2, lmax, model.settings.beam_bins[s]):
+    for s in range(min(top, own.moments.smax) + 1):
+        shape = beam.blm[0, : model.lmax + 1].real * (ell / model.lmax) ** max(s, 1)
+        # Above these orders the channel's sum is measured, in the place of its first map.
+        alike = whole if s <= settings.split_beam_orders else replace(whole, split=None, fold=None)
+        alike = replace(alike, L=s, M=0, parity="even", kind="beam")
+        for low, high in bins(2, model.lmax, settings.beam_bins[s]):
             kernel = np.where((ell >= low) & (ell <= high), shape, 0.0)
-            for quadrature in ("re", "im") if s else ("re",):
-                kernels.append((s, quadrature, kernel))
-                elements.append(
-                    Element(
-                        f"beam/{model.parts[part].name}/m{s}{quadrature}/{low}-{high}",
-                        "map",
-                        (channel,),
-                        split if s <= split_orders else None,
-                        _fold(model, part) if s <= split_orders else None,
-                        (low, high),
-                        L=s,
-                        M=0,
-                        parity="even",
-                        frame=frame,
-                        kind="beam",
-                        component={"re": "real" if s else None, "im": "imaginary"}[quadrature],
-                    )
-                )
+            for short, component in (("re", "real" if s else None), ("im", "imaginary"))[: 2 if s else 1]:
+                kernels.append((s, short, kernel))
+                name = f"beam/{own.name}/m{s}{short}/{low}-{high}"
+                elements.append(replace(alike, name=name, ell=(low, high), component=component))
 
-    def values(model: Model, filtered: FilteredMaps) -> Vector:
-        found = [
-            np.dot(kernel, getattr(filtered.orders[part, s], _PARTS[quadrature])) for s, quadrature, kernel in kernels
-        ]
-        return np.array(found)
+    def values(filtered: FilteredMaps) -> Vector:
+        orders = {"re": filtered.orders[part].real, "im": filtered.orders[part].imag}
+        return np.array([np.dot(kernel, orders[short][s]) for s, short, kernel in kernels])
 
     return Block(tuple(elements), values)
 
 
-_PARTS = {"re": "real", "im": "imag"}
-
-
-def _additive_block(model: Model, part: int) -> Block:
+def _dipole_block(model: Model, part: int) -> Block:
     """Measure the dipole of the residual: x, y, z."""
-    channel, split = _label(model, part)
-    elements = tuple(
-        Element(
-            f"dipole/{model.parts[part].name}/{axis}",
-            "map",
-            (channel,),
-            split,
-            _fold(model, part),
-            (1, 1),
-            L=1,
-            frame=_frame(model),
-            kind="dipole",
-            component=axis,
-        )
-        for axis in "xyz"
-    )
+    alike = replace(_of_map(model, part), ell=(1, 1), L=1, kind="dipole")
+    elements = tuple(replace(alike, name=f"dipole/{alike.name}/{axis}", component=axis) for axis in "xyz")
     one, two = alm_.start(model.lmax, 0) + 1, alm_.start(model.lmax, 1) + 1
 
-    def values(model: Model, filtered: FilteredMaps) -> Vector:
+    def values(filtered: FilteredMaps) -> Vector:
         alm = filtered.adjoint[part]
         return np.array([-alm[two].real, alm[two].imag, alm[one].real])
 
@@ -207,91 +158,51 @@ def _additive_block(model: Model, part: int) -> Block:
 
 def _plane_block(model: Model, part: int) -> Block:
     """Measure the residual along the Galactic plane, against its mean over the sky."""
-    channel, split = _label(model, part)
-    matrix = rotation_matrix(_frame(model), "galactic")
-    height = matrix[2] @ np.stack(healpy.pix2vec(model.nside, np.arange(12 * model.nside**2)))
-    profile = 1.0 / (1.0 + (height / model.settings.plane_width) ** 2)
+    profile = 1.0 / (1.0 + (_height(model.frame, "galactic", model.nside) / model.settings.plane_width) ** 2)
     profile -= profile.mean()
-    element = Element(
-        f"plane/{model.parts[part].name}",
-        "map",
-        (channel,),
-        split,
-        _fold(model, part),
-        (2, model.settings.large_scales),
-        L=2,
-        M=0,
-        parity="even",
-        frame="galactic",
-        kind="plane",
-    )
-
-    def values(model: Model, filtered: FilteredMaps) -> Vector:
-        return np.array([float(filtered.residual[part] @ profile)])
-
-    return Block((element,), values)
+    whole = replace(_of_map(model, part), ell=(2, model.settings.large_scales), frame="galactic", kind="plane")
+    element = replace(whole, name=f"plane/{whole.name}", L=2, M=0, parity="even")
+    return Block((element,), lambda filtered: float(filtered.residual[part] @ profile))
 
 
 def _noise_block(model: Model, channel: int) -> Block:
     """Measure variance over expectation in bands of ecliptic latitude, alternate pixels apart."""
-    parts = model.of(channel)
-    name = model.survey.channels[channel].name
-    matrix = rotation_matrix(_frame(model), "ecliptic")
-    x, y, z = healpy.pix2vec(model.nside, np.arange(12 * model.nside**2))
-    height = np.abs(matrix[2] @ np.stack([x, y, z]))
-    alternate = np.arange(height.size) % 2
+    parts, name = model.of(channel), model.channels[channel]
+    height = np.abs(_height(model.frame, "ecliptic", model.nside))
     seen = np.all([model.parts[i].precision > 0 for i in parts[:2]], axis=0)
     rows, elements = [], []
-    for half in (0, 1):
-        for low, high in pairwise(model.settings.latitude_edges):
-            band = seen & (height >= low) & (height <= high) & (alternate == half)
-            if not band.any():
-                continue  # behind a mask, or never scanned
-            rows.append(band.astype(float))
-            elements.append(
-                Element(
-                    f"noise/{name}/{low:g}-{high:g}/pixels{half}",
-                    "noise",
-                    (name,),
-                    None,
-                    half,
-                    L=0,
-                    frame="ecliptic",
-                    kind="noise",
-                    component=f"|sin β| {low:g}–{high:g}, {'odd' if half else 'even'} pixels",
-                )
-            )
+    for half, (low, high) in product((0, 1), pairwise(model.settings.latitude_edges)):
+        band = seen & (height >= low) & (height <= high) & (np.arange(height.size) % 2 == half)
+        if not band.any():
+            continue  # behind a mask, or never scanned
+        rows.append(band.astype(float))
+        own = Element(f"noise/{name}/{low:g}-{high:g}/pixels{half}", "noise", (name,), fold=half, L=0, kind="noise")
+        words = f"|sin β| {low:g}–{high:g}, {'odd' if half else 'even'} pixels"
+        elements.append(replace(own, frame="ecliptic", component=words))
     bands = np.stack(rows)
-
-    def values(model: Model, filtered: FilteredMaps) -> Vector:
-        found: Vector = bands @ normalised_difference(model, filtered, parts)
-        return found
-
-    return Block(tuple(elements), values)
+    return Block(tuple(elements), lambda filtered: np.asarray(bands @ normalised_difference(model, filtered, parts)))
 
 
 def _linearity_block(model: Model, channel: int) -> Block:
     """Correlate the residual with the square of the sky: a gain that depends on the signal."""
-    parts, name = model.of(channel), model.survey.channels[channel].name
+    parts, name = model.of(channel), model.channels[channel]
 
-    def values(model: Model, filtered: FilteredMaps) -> Vector:
-        return np.array([sum(np.dot(filtered.residual[i], filtered.expected[i] ** 2) for i in parts)])
+    def value(filtered: FilteredMaps) -> float:
+        return float(sum(np.dot(filtered.residual[i], filtered.expected[i] ** 2) for i in parts))
 
-    return Block((Element(f"square/{name}", "map", (name,), kind="square"),), values)
+    return Block((Element(f"square/{name}", "map", (name,), kind="square"),), value)
 
 
 def _repeated_block(model: Model, channel: int) -> Block:
     """Measure the residual power common to the channel's first two maps, and that of their difference."""
-    first, second = model.of(channel)[:2]
-    name = model.survey.channels[channel].name
+    (first, second), name = model.of(channel)[:2], model.channels[channel]
     ranges = scales(model.lmax)
     elements = tuple(
-        Element(f"{kind}/{name}/{low}-{high}", "cl", (name,), None, None, (low, high), L=0, kind=kind)
-        for kind in ("common", "difference")
-        for low, high in ranges
+        Element(f"{kind}/{name}/{low}-{high}", "cl", (name,), ell=(low, high), L=0, kind=kind)
+        for kind, (low, high) in product(("common", "difference"), ranges)
     )
 
-    def values(model: Model, filtered: FilteredMaps) -> Vector:
+    def values(filtered: FilteredMaps) -> Vector:
         a, b = filtered.adjoint[first], filtered.adjoint[second]
         common, apart = by_degree(a, b, model.lmax), by_degree(a - b, a - b, model.lmax)
         return np.array([power[low : high + 1].sum() for power in (common, apart) for low, high in ranges])
@@ -299,37 +210,24 @@ def _repeated_block(model: Model, channel: int) -> Block:
     return Block(elements, values)
 
 
-def _contrast_block(model: Model) -> Block | None:
+def _contrast_blocks(model: Model) -> list[Block]:
     """Measure the power of the contrast of lowest and highest frequency, common to two splits, by Galactic latitude."""
-    channels = model.survey.channels
-    frequencies = [channel.site.frequency_ghz for channel in channels]
+    frequencies = [channel.site.frequency_ghz for channel in model.survey.channels]
     known = sorted({f for f in frequencies if f is not None})
-    if len(known) < 2 or any(len(model.of(c)) < 2 for c in range(len(channels))):
-        return None
+    if len(known) < 2 or any(len(model.of(c)) < 2 for c in range(len(frequencies))):
+        return []
     groups = [[c for c, f in enumerate(frequencies) if f == end] for end in (known[0], known[-1])]
     top = min(model.settings.large_scales, model.lmax)
     nside = max(1, 1 << (top // 3).bit_length() - 1) * 2
-    matrix = rotation_matrix(_frame(model), "galactic")
-    height = np.abs(matrix[2] @ np.stack(healpy.pix2vec(nside, np.arange(12 * nside * nside))))
-    bands = np.stack(
-        [(height >= low) & (height <= high) for low, high in pairwise(model.settings.latitude_edges)]
-    ).astype(float)
-    names = tuple(channels[c].name for group in groups for c in group)
+    height, ranges = np.abs(_height(model.frame, "galactic", nside)), list(pairwise(model.settings.latitude_edges))
+    bands = np.stack([(height >= low) & (height <= high) for low, high in ranges]).astype(float)
+    names = tuple(model.channels[c] for group in groups for c in group)
+    alike = Element("contrast", "map", names, ell=(2, top), L=0, frame="galactic", kind="contrast")
     elements = tuple(
-        Element(
-            f"contrast/{low:g}-{high:g}",
-            "map",
-            names,
-            ell=(2, top),
-            L=0,
-            frame="galactic",
-            kind="contrast",
-            component=f"|sin b| {low:g}–{high:g}",
-        )
-        for low, high in pairwise(model.settings.latitude_edges)
+        replace(alike, name=f"contrast/{low:g}-{high:g}", component=f"|sin b| {low:g}–{high:g}") for low, high in ranges
     )
 
-    def smoothed(model: Model, filtered: FilteredMaps, split: int) -> Map:
+    def smoothed(filtered: FilteredMaps, split: int) -> Map:
         total = np.zeros(alm_.size(model.lmax), dtype=np.complex128)
         for group, sign in zip(groups, (1.0, -1.0), strict=True):
             for c in group:
@@ -342,38 +240,36 @@ def _contrast_block(model: Model) -> Block | None:
         found: Map = healpix.synthesis(low[None], nside, top)[0]
         return found
 
-    def values(model: Model, filtered: FilteredMaps) -> Vector:
-        found: Vector = bands @ (smoothed(model, filtered, 0) * smoothed(model, filtered, 1))
-        return found
-
-    return Block(elements, values)
+    return [Block(elements, lambda filtered: np.asarray(bands @ (smoothed(filtered, 0) * smoothed(filtered, 1))))]
 
 
 def _sky_block(model: Model) -> Block:
     """Measure the spectrum of the sky over its expectation, minus one, odd and even degrees apart."""
-    names = tuple(channel.name for channel in model.survey.channels)
-    large = [(2, 11), (12, 40)] if model.lmax > model.settings.large_scales else []
-    ranges = [*large, *bins(41 if large else 2, model.lmax, model.settings.sky_bins - len(large))]
-    ell = np.arange(model.lmax + 1)
+    lmax = model.lmax
+    large = [(2, 11), (12, 40)] if lmax > model.settings.large_scales else []
+    ranges = [*large, *bins(41 if large else 2, lmax, model.settings.sky_bins - len(large))]
+    ell = np.arange(lmax + 1)
     rows, elements = [], []
-    for fold, parity in enumerate(("even", "odd")):
-        for low, high in ranges:
-            weight = np.where((ell >= low) & (ell <= high) & (ell % 2 == fold), 2.0 * ell + 1.0, 0.0)
-            if weight.any():
-                rows.append(weight / weight.sum())
-                name, which = f"sky/{low}-{high}/{parity}", f"{parity} degrees"
-                own = Element(name, "cl", names, None, fold, (low, high), L=0, kind="sky", component=which)
-                elements.append(own)
-    means = np.stack(rows)
+    for (fold, parity), (low, high) in product(enumerate(("even", "odd")), ranges):
+        weight = np.where((ell >= low) & (ell <= high) & (ell % 2 == fold), 2.0 * ell + 1.0, 0.0)
+        if weight.any():
+            rows.append(weight / weight.sum())
+            own = Element(f"sky/{low}-{high}/{parity}", "cl", model.channels, fold=fold, ell=(low, high), L=0)
+            elements.append(replace(own, kind="sky", component=f"{parity} degrees"))
+    means, expected = np.stack(rows), model.cl * model.sky_power
 
-    def values(model: Model, filtered: FilteredMaps) -> Vector:
-        found: Vector = means @ sky_of(model, filtered)
-        return found
+    def values(filtered: FilteredMaps) -> Vector:
+        power = by_degree(filtered.sky, filtered.sky, lmax) / (2 * ell + 1)
+        ratio = np.divide(power, expected, out=np.ones(lmax + 1), where=expected > 0)
+        return np.asarray(means @ (ratio - 1.0))
 
     return Block(tuple(elements), values)
 
 
-_FORMS = {"zz": "3z² − 1", "xx": "x² − y²"}
+_FORMS = {"x": (1, 1), "y": (1, 1), "z": (1, 0), "zz": (2, 0), "xz": (2, 1), "yz": (2, 1), "xx": (2, 2), "xy": (2, 2)}
+"""L and M of real forms."""
+
+_FORM_WORDS = {"zz": "3z² − 1", "xx": "x² − y²"}
 
 
 def _isotropy_block(model: Model) -> Block:
@@ -381,52 +277,20 @@ def _isotropy_block(model: Model) -> Block:
 
     S^-1 s^ is cut to two ranges of degrees, one for each fold.
     """
-    names = tuple(channel.name for channel in model.survey.channels)
-    lmax, nside = model.lmax, model.nside
+    lmax, nside, ell = model.lmax, model.nside, np.arange(model.lmax + 1)
     x, y, z = healpy.pix2vec(nside, np.arange(12 * nside**2))
     forms = np.stack([x, y, z, 1.5 * z**2 - 0.5, x * z, y * z, x**2 - y**2, x * y])
-    named = (
-        ("x", 1, 1),
-        ("y", 1, 1),
-        ("z", 1, 0),
-        ("zz", 2, 0),
-        ("xz", 2, 1),
-        ("yz", 2, 1),
-        ("xx", 2, 2),
-        ("xy", 2, 2),
-    )
-    ranges = bins(2, lmax, 2)
-    elements = tuple(
-        Element(
-            f"isotropy/{form}/{low}-{high}",
-            "biposh",
-            names,
-            None,
-            fold,
-            (low, high),
-            L,
-            M,
-            "even",
-            _frame(model),
-            kind="isotropy",
-            component=_FORMS.get(form, form),
-        )
-        for fold, (low, high) in enumerate(ranges)
-        for form, L, M in named
-    )
-    ell = np.arange(lmax + 1)
-    inverse = np.divide(1.0, model.cl, out=np.zeros(lmax + 1), where=model.cl > 0)
-    filters = [np.where((ell >= low) & (ell <= high), inverse, 0.0) for low, high in ranges]
+    filters, elements = [], []
+    for fold, (low, high) in enumerate(bins(2, lmax, 2)):
+        filters.append(np.where((ell >= low) & (ell <= high), model.inverse_cl, 0.0))
+        alike = Element("isotropy", "biposh", model.channels, None, fold, (low, high), frame=model.frame)
+        for form, (L, M) in _FORMS.items():
+            own = replace(alike, name=f"isotropy/{form}/{low}-{high}", L=L, M=M, parity="even")
+            elements.append(replace(own, kind="isotropy", component=_FORM_WORDS.get(form, form)))
 
-    def values(model: Model, filtered: FilteredMaps) -> Vector:
+    def values(filtered: FilteredMaps) -> Vector:
         sky = healpix.synthesis(filtered.sky[None], nside, lmax)[0]
         weighted = [healpix.synthesis(alm_.multiply(filtered.sky, f, lmax)[None], nside, lmax)[0] for f in filters]
         return np.concatenate([forms @ (sky * field) for field in weighted])
 
-    return Block(elements, values)
-
-
-def _fold(model: Model, part: int) -> int | None:
-    """Return the place of a map among its channel's, alternately 0 and 1; None for the only one."""
-    members = model.of(model.parts[part].channel)
-    return members.index(part) % 2 if len(members) > 1 else None
+    return Block(tuple(elements), values)

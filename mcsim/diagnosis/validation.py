@@ -22,35 +22,27 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class Shrink:
-    """Hold the excess chi^2 before and after, its fractional reduction, and the p-value of what is left."""
+class HeldOut:
+    """Hold the excess chi^2 of data that were not fitted, before and after the effects are added to the simulator.
 
+    ``predicted`` and ``achieved`` are fractional reductions; ``pvalue_after`` is that of what remains; ``data`` names
+    the held-out data.
+    """
+
+    predicted: Measured
+    achieved: Measured
     before: Measured
     after: Measured
-    fraction: Measured
-    probability_after: float
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """Hold the expected fall of chi^2, and the fraction of the excess that this is."""
-
-    delta_chi2: Measured
-    fraction: Measured
+    pvalue_after: float
+    data: str
 
 
 @dataclass(frozen=True)
 class Halves:
-    """Split the data vector into two parts with independent noise: one is fitted, the other one judges.
+    """Split the data vector x, shape (p,), into two parts with independent noise: one is fitted, the other one judges.
 
-    Attributes
-    ----------
-    x
-        Data, shape (p,).
-    used, fresh
-        Null distributions of the elements of fold 0, which are fitted, and of fold 1.
-    first, second
-        These elements.
+    ``used`` and ``fresh`` are the null distributions of the elements of fold 0, which are fitted, and of fold 1;
+    ``first`` and ``second`` are these elements.
     """
 
     x: Vector
@@ -73,18 +65,12 @@ class Halves:
         return min(self.used.expected_snr(change[self.first]), self.fresh.expected_snr(change[self.second]))
 
     def reduction(
-        self, t: Matrix, respond: Callable[[Fit], Vector], scatters: Sequence[Matrix] = ()
-    ) -> tuple[Prediction, Shrink]:
-        """Fit templates to one part, freeze the amplitudes, and measure the reduction of the excess in the other.
+        self, t: Matrix, respond: Callable[[Fit], Vector], scatters: Sequence[Matrix] = (), data: str = ""
+    ) -> HeldOut:
+        """Fit templates, shape (p, K), to one part, freeze the amplitudes, and measure the reduction in the other.
 
-        Parameters
-        ----------
-        t
-            Templates, shape (p, K).
-        respond
-            Returns the response of the data vector to the frozen fit, shape (p,).
-        scatters
-            Deviations of stochastic responses from their mean, shape (p, draws) each.
+        ``respond`` returns the response of the data vector to the frozen fit, shape (p,); ``scatters`` are deviations
+        of stochastic responses from their mean, shape (p, draws) each; ``data`` names the part that judges.
         """
         t_used, t_fresh = t[self.first], t[self.second]
         x_used, x_fresh = self.x[self.first], self.x[self.second]
@@ -92,22 +78,18 @@ class Halves:
         after = self.fresh.shift(self.fresh.mean + respond(frozen)[self.second])
         after = after.with_extra_covariance(*(one[self.second] for one in scatters))
         if scatters:
-            response = t @ frozen.amplitudes
-            shared = SharedDraw(
-                excess(self.used, x_used),
-                _squares(self.fresh, response, scatters, self.second),
-                _squares(self.used, response, scatters, self.first),
-            )
-            expected = carried(self.fresh, after, x_fresh, t_fresh, self.used.fit(x_used, t_used).covariance, shared)
+            draws = (t @ frozen.amplitudes)[:, None] + sum(np.sqrt(one.shape[1]) * one for one in scatters)
+            here, there = _squares(self.fresh, draws[self.second]), _squares(self.used, draws[self.first])
+            noise = self.used.fit(x_used, t_used).covariance
+            fall = expected_fall_of_draw(after, t_fresh, noise, excess(self.used, x_used), here, there)
         else:
-            expected = predicted(self.fresh, x_fresh, t_fresh, frozen.amplitudes, frozen.covariance)
-        return expected, achieved(self.fresh, after, x_fresh)
+            fall = expected_fall(self.fresh, t_fresh, frozen.amplitudes, frozen.covariance)
+        return held_out(self.fresh, after, x_fresh, fall, data)
 
 
-def _squares(null: SimulatedGaussian, response: Vector, scatters: Sequence[Matrix], rows: NDArray[np.int64]) -> Vector:
-    """Return the squared signal-to-noise ratios of the draws of a response."""
-    deviations = np.sum([np.sqrt(scatter.shape[1]) * scatter for scatter in scatters], axis=0)
-    return np.array([null.expected_snr(draw) ** 2 for draw in (response + deviations.T)[:, rows]])
+def _squares(null: SimulatedGaussian, draws: Matrix) -> Vector:
+    """Return the squared signal-to-noise ratios of draws of a response, shape (p, draws) to (draws,)."""
+    return np.asarray(null.hartlap_factor * np.sum(null.whiten_templates(draws) ** 2, axis=0))
 
 
 def excess(null: SimulatedGaussian, x: Vector) -> Measured:
@@ -129,17 +111,10 @@ def excess_of(chi2: float, p: int, n: int) -> Measured:
     return Measured(value, float(np.sqrt(2.0 * ((p + length) ** 2 + (p + 2.0 * length) * (d - 2)) / (d - 4))))
 
 
-def predicted(test: SimulatedGaussian, x: Vector, t: Matrix, amplitudes: Vector, covariance: Matrix) -> Prediction:
-    """Return the fall of chi^2 to expect on data that were not fitted.
+def expected_fall(test: SimulatedGaussian, t: Matrix, amplitudes: Vector, covariance: Matrix) -> Measured:
+    """Return the fall of chi^2 to expect on data that were not fitted, with null ``test`` and templates (p_test, K).
 
-    Parameters
-    ----------
-    test, x
-        Null distribution and data that judge, shape (p_test,).
-    t
-        Templates of the frozen amplitudes in these data, shape (p_test, K).
-    amplitudes, covariance
-        From the fit to other data, shape (K,), (K, K).
+    ``amplitudes``, shape (K,), are frozen; ``covariance`` is that of their fit to other data.
 
     Notes
     -----
@@ -152,42 +127,18 @@ def predicted(test: SimulatedGaussian, x: Vector, t: Matrix, amplitudes: Vector,
     product = fisher @ covariance
     delta_chi2 = float(amplitudes @ fisher @ amplitudes) - 2.0 * float(np.trace(product))
     variance = 4.0 * float(amplitudes @ product @ fisher @ amplitudes) + 4.0 * float(np.trace(product @ product))
-    return _of_excess(Measured(delta_chi2, float(np.sqrt(variance))), excess(test, x))
+    return Measured(delta_chi2, float(np.sqrt(variance)))
 
 
-@dataclass(frozen=True)
-class SharedDraw:
-    """Hold what data that were fitted say of a random response that other data share.
-
-    Attributes
-    ----------
-    seen
-        Excess chi^2 of the data that were fitted.
-    here, there
-        Squared signal-to-noise ratios of draws of the response in the data that judge, and in those that were fitted,
-        shape (draws,).
-    """
-
-    seen: Measured
-    here: Vector
-    there: Vector
-
-
-def carried(
-    test: SimulatedGaussian, wide: SimulatedGaussian, x: Vector, t: Matrix, covariance: Matrix, shared: SharedDraw
-) -> Prediction:
+def expected_fall_of_draw(
+    wide: SimulatedGaussian, t: Matrix, covariance: Matrix, seen: Measured, here: Vector, there: Vector
+) -> Measured:
     """Return the fall of chi^2 to expect for a stochastic effect: all data see the same draw.
 
-    Parameters
-    ----------
-    test, x, t
-        As in :func:`predicted`.
-    wide
-        Null distribution of the same data with the scatter of the effect.
-    covariance
-        Of the frozen amplitudes, from noise alone, shape (K, K).
-    shared
-        What the fitted data say of the draw.
+    ``wide`` is the null distribution of the data that judge, with the scatter of the effect, and ``t`` are its
+    templates, shape (p_test, K); ``covariance`` is that of the frozen amplitudes from noise alone, and ``seen`` the
+    excess chi^2 of the data that were fitted. ``here`` and ``there``, shape (draws,), are squared signal-to-noise
+    ratios of draws of the response in the data that judge, and in those that were fitted.
 
     Notes
     -----
@@ -195,21 +146,17 @@ def carried(
     frozen amplitudes, F of the wide distribution. How closely the squares of a draw keep to that ratio is part of its
     error.
     """
-    share = float(np.mean(shared.here) / np.mean(shared.there))
+    share = float(np.mean(here) / np.mean(there))
     white = wide.whiten_templates(t)
     lost = wide.hartlap_factor * float(np.trace(white.T @ white @ covariance))
-    sigma = float(np.hypot(share * shared.seen.sigma, np.std(shared.here - share * shared.there, ddof=1)))
-    return _of_excess(Measured(share * shared.seen.value - lost, sigma), excess(test, x))
+    sigma = float(np.hypot(share * seen.sigma, np.std(here - share * there, ddof=1)))
+    return Measured(share * seen.value - lost, sigma)
 
 
-def _of_excess(delta_chi2: Measured, before: Measured) -> Prediction:
-    fraction = delta_chi2.value / before.value
-    sigma = float(np.hypot(delta_chi2.sigma, fraction * before.sigma)) / abs(before.value)
-    return Prediction(delta_chi2, Measured(fraction, sigma))
-
-
-def achieved(before: SimulatedGaussian, after: SimulatedGaussian, x: NDArray[np.float64]) -> Shrink:
+def held_out(before: SimulatedGaussian, after: SimulatedGaussian, x: Vector, expected: Measured, data: str) -> HeldOut:
     """Return the reduction of the excess chi^2 of data, shape (p_raw,), from one null distribution to another.
+
+    ``expected`` is the fall of chi^2 that the fit to other data predicts.
 
     Notes
     -----
@@ -218,6 +165,8 @@ def achieved(before: SimulatedGaussian, after: SimulatedGaussian, x: NDArray[np.
     errors of the covariances add 2 ((p + G1)^2 + (1 - A)^2 (p + G0)^2)/(d2 - 4)/G0^2. Pulls: tests/statistical.
     """
     first, last = excess(before, x), excess(after, x)
+    share = expected.value / first.value
+    forecast = Measured(share, float(np.hypot(expected.sigma, share * first.sigma)) / abs(first.value))
     fraction = 1.0 - last.value / first.value
     p, d2 = before.dimension, before.dof - before.dimension + 1
     shift = before.whiten_templates((after.mean - before.mean)[:, None])[:, 0]
@@ -226,7 +175,7 @@ def achieved(before: SimulatedGaussian, after: SimulatedGaussian, x: NDArray[np.
     moved = max(before.hartlap_factor * float(shift @ shift) - p * (1.0 / before.n_sims + 1.0 / after.n_sims), 0.0)
     along = before.hartlap_factor * float(shift @ before.whiten(x))
     mismatch = max(moved - 2.0 * fraction * along + fraction**2 * distance, 0.0)
-    data = (4.0 * mismatch + 2.0 * p * fraction**2) * (d2 - 2) / (d2 - 4)
+    noise = (4.0 * mismatch + 2.0 * p * fraction**2) * (d2 - 2) / (d2 - 4)
     scatter = 2.0 * ((p + length) ** 2 + (1.0 - fraction) ** 2 * (p + distance) ** 2) / (d2 - 4)
-    sigma = float(np.sqrt(data + scatter)) / abs(first.value)
-    return Shrink(first, last, Measured(fraction, sigma), after.pvalue(x))
+    sigma = float(np.sqrt(noise + scatter)) / abs(first.value)
+    return HeldOut(forecast, Measured(fraction, sigma), first, last, after.pvalue(x), data)

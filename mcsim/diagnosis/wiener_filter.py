@@ -12,7 +12,7 @@ each order gives that of every beam.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import cached_property, reduce
 
 import ducc0
 import healpy
@@ -23,73 +23,57 @@ from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.errors import InputError
 from mcsim.instrument.scan import Moments
 from mcsim.simulation import convolve
-from mcsim.simulation.survey import Channel, Survey
+from mcsim.simulation.survey import Survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
 
 Map = NDArray[np.float64]
 Alm = NDArray[np.complex128]
+Cl = NDArray[np.float64]
+"""Shape (lmax + 1,)."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """Describe one map of the data: its place in the survey, and its weights.
-
-    Attributes
-    ----------
-    channel
-        Index of its channel.
-    name
-        As the survey names it.
-    moments
-        Orientation moments of its samples.
-    precision
-        Inverse variance of the noise of every pixel in uK^-2, shape (npix,), zero where unobserved or masked.
-    noise_power
-        Of the noise in the harmonic coefficients of the map when its pixels count alike, uK^2 sr.
-    """
+    """Describe one map of the data: its place in the survey, and its weights."""
 
     channel: int
-    name: str
-    moments: Moments
-    precision: Map
-    noise_power: float
+    name: str  # in the survey
+    split: str | None  # None if there are none
+    moments: Moments  # of the orientations of its samples
+    precision: Map  # inverse variance of the noise of every pixel, uK^-2, (npix,); 0 where unobserved or masked
+    noise_power: float  # of the noise in the map's a_lm when its pixels count alike, uK^2 sr
 
 
 @dataclass(frozen=True)
 class Model:
-    """Describe the fiducial survey for the filter.
+    """Describe the fiducial survey for the filter."""
 
-    Attributes
-    ----------
-    survey
-        Without effects, with moments up to the orders that are measured.
-    lmax, nside
-        Highest degree of the sky and the matched filters, and resolution of the maps.
-    cl
-        Spectrum of the sky, shape (lmax + 1,), uK^2.
-    response
-        B_l w_l of every channel, shape (channel, lmax + 1).
-    parts
-        The maps in order.
-    dipole
-        Dipole that the survey sees besides, coefficients up to lmax, uK.
-    sky_power
-        Of s^, E|s^_lm|^2 / C_l = C_l / (C_l + N_l) in the isotropic approximation, shape (lmax + 1,).
-    settings
-        Of the diagnosis.
-    """
-
-    survey: Survey
-    lmax: int
+    survey: Survey  # without effects, with moments up to the orders that are measured
+    lmax: int  # highest degree of the sky and the matched filters
     nside: int
-    cl: NDArray[np.float64]
-    response: NDArray[np.float64]
-    parts: tuple[Part, ...]
-    dipole: Alm
-    sky_power: NDArray[np.float64]
+    cl: Cl  # spectrum of the sky, uK^2
+    response: NDArray[np.float64]  # B_l w_l of every channel, (channel, lmax + 1)
+    parts: tuple[Part, ...]  # the maps in order
+    dipole: Alm  # that the survey sees besides, up to lmax, uK
+    sky_power: Cl  # of s^: E|s^_lm|^2 / C_l = C_l / (C_l + N_l) in the isotropic approximation
     settings: DiagnosisSettings
+
+    @property
+    def frame(self) -> str:
+        """Return the frame of the maps."""
+        return self.survey.frame
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Return the names of the channels."""
+        return tuple(channel.name for channel in self.survey.channels)
+
+    @cached_property
+    def inverse_cl(self) -> Cl:
+        """Return 1/C_l, zero where C_l is, uK^-2."""
+        return np.divide(1.0, self.cl, out=np.zeros(self.lmax + 1), where=self.cl > 0)
 
     def of(self, channel: int) -> tuple[int, ...]:
         """Return the indices of the channel's maps."""
@@ -98,45 +82,29 @@ class Model:
 
 @dataclass(frozen=True)
 class FilteredMaps:
-    """Hold one set of maps after the filter.
+    """Hold one set of maps after the filter."""
 
-    Attributes
-    ----------
-    sky
-        s^ up to the model's lmax, uK.
-    expected
-        P_i s^, shape (map, npix), uK.
-    residual
-        r_i, shape (map, npix), uK^-1.
-    adjoint
-        Spin-0 adjoint synthesis of every r_i, shape (map, size).
-    orders
-        D_s(l) of every map, shape (map, beam_orders + 1, lmax + 1), complex; s = 0 is real. The sky in it has the
-        dipole. Above split_beam_orders the channel's sum stands in its first map.
-    """
-
-    sky: Alm
-    expected: NDArray[np.float64]
-    residual: NDArray[np.float64]
-    adjoint: NDArray[np.complex128]
+    sky: Alm  # s^ up to the model's lmax, uK
+    expected: NDArray[np.float64]  # P_i s^, (map, npix), uK
+    residual: NDArray[np.float64]  # r_i, (map, npix), uK^-1
+    adjoint: NDArray[np.complex128]  # spin-0 adjoint synthesis of every r_i, (map, size)
+    # D_s(l) of every map, (map, beam_orders + 1, lmax + 1); s = 0 is real. The sky in it has the dipole. Above
+    # split_beam_orders the channel's sum stands in its first map.
     orders: NDArray[np.complex128]
 
 
 def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
-    """Prepare a survey for the filter.
+    """Prepare a survey for the filter; raise InputError if a diagnosis cannot take it.
 
-    Raises
-    ------
-    InputError
-        If the sky has no spectrum, or a channel reads differences of two beams.
+    It needs a spectrum of the sky, pixels, and no channel that reads differences of two beams.
     """
     if survey.cl is None:
         raise InputError("a diagnosis needs the spectrum of the sky; give sky.spectrum.")
-    if survey.config.map.grid == "gl":
+    run, lmax = survey.config, survey.lmax
+    if run.map.grid == "gl":
         raise InputError('a diagnosis compares maps of pixels; give the model map.grid = "healpix" and map.nside.')
-    lmax, nside = survey.lmax, survey.nside
     cl = survey.cl[: lmax + 1]
-    response = np.stack([_response(channel, lmax) for channel in survey.channels])
+    response = np.stack([channel.response.factors[0, : lmax + 1].real for channel in survey.channels])
     parts = []
     for index, channel in enumerate(survey.channels):
         if channel.side_b is not None:
@@ -146,49 +114,34 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
             )
         power = np.sum((2 * np.arange(lmax + 1) + 1) / (4 * np.pi) * cl * response[index] ** 2)
         floor = settings.noise_floor * float(np.sqrt(power))
-        for m in channel.maps:
+        for m, split in zip(channel.maps, run.map.splits or (None,), strict=True):
             seen = m.moments.hits > 0
             if m.weight is not None:
                 seen = seen & (m.weight > 0)
             variance = floor**2 + (0.0 if m.noise_uk is None else m.noise_uk**2)
             precision = np.where(seen, 1.0 / np.broadcast_to(variance, seen.shape), 0.0)
             noise_power = 4 * np.pi / seen.size * float(np.mean(1.0 / precision[seen]))
-            parts.append(Part(index, m.name, m.moments, precision, noise_power))
+            parts.append(Part(index, m.name, split, m.moments, precision, noise_power))
     gain = sum(response[part.channel] ** 2 / part.noise_power for part in parts)
     sky_power = cl * gain / (1.0 + cl * gain)
     dipole = dipole_alm(survey.channels[0].site.dipole_uk, lmax)
-    return Model(survey, lmax, nside, cl, response, tuple(parts), dipole, sky_power, settings)
+    return Model(survey, lmax, survey.nside, cl, response, tuple(parts), dipole, sky_power, settings)
 
 
-def _response(channel: Channel, lmax: int) -> NDArray[np.float64]:
-    response: NDArray[np.float64] = channel.response.factors[0, : lmax + 1].real
-    return response
-
-
-def wiener_filter(model: Model, maps: Sequence[Map], nthreads: int = 1) -> FilteredMaps:
-    """Filter a set of maps.
-
-    Parameters
-    ----------
-    model
-        From :func:`model_of`.
-    maps
-        One for every part, uK, shape (npix,); ``healpy.UNSEEN`` or NaN is not observed.
-    nthreads
-        Threads of the transforms.
-    """
-    lmax, nside, top = model.lmax, model.nside, model.settings.beam_orders
-    clean, seen = _clean(model, maps, nthreads)
-    sky = _sky(model, clean, nthreads)
+def wiener_filter(model: Model, maps: Sequence[Map]) -> FilteredMaps:
+    """Filter maps of all parts, uK, shape (npix,) each; ``healpy.UNSEEN`` or NaN is not observed."""
+    lmax, top = model.lmax, model.settings.beam_orders
+    clean, seen = _clean(model, maps)
+    sky = _sky(model, clean)
     looked_at = sky + model.dipole
-    geometry = healpix.geometry(nside)
+    transform = {"lmax": lmax, "nthreads": 1, **healpix.geometry(model.nside)}
     expected = np.empty((len(model.parts), seen[0].size))
     residual, adjoint = np.empty_like(expected), np.empty((len(model.parts), sky.size), dtype=np.complex128)
     orders = np.zeros((len(model.parts), top + 1, lmax + 1), dtype=np.complex128)
     k = np.sqrt(4 * np.pi / (2 * np.arange(lmax + 1) + 1))
-    made = convolve.CircularMaps(nside, lmax, nthreads)
-    for channel in range(len(model.response)):
-        through = alm_.multiply(sky, model.response[channel], lmax)
+    made = convolve.CircularMaps(model.nside, lmax)
+    for channel, response in enumerate(model.response):
+        through = alm_.multiply(sky, response, lmax)
         members = model.of(channel)
         window = model.survey.channels[channel].window[: lmax + 1]
         for i in members:
@@ -197,62 +150,51 @@ def wiener_filter(model: Model, maps: Sequence[Map], nthreads: int = 1) -> Filte
             if part.moments.dtheta is not None:
                 expected[i] += convolve.centroid_map(made.gradient(through), part.moments)
             residual[i] = np.where(seen[i], part.precision * (clean[i] - expected[i]), 0.0)
-            adjoint[i] = ducc0.sht.adjoint_synthesis(
-                map=residual[i][None], spin=0, lmax=lmax, nthreads=nthreads, **geometry
-            )[0]
+            adjoint[i] = ducc0.sht.adjoint_synthesis(map=residual[i][None], spin=0, **transform)[0]
             orders[i, 0] = window * k * by_degree(looked_at, adjoint[i], lmax)
         for i, s, together in _transforms(model, members):
             turned = np.zeros((2, residual.shape[1]))
             for j in together:
                 convolve.turned(residual[j], model.parts[j].moments, s, turned)
-            electric, magnetic = ducc0.sht.adjoint_synthesis(
-                map=turned, spin=s, lmax=lmax, nthreads=nthreads, **geometry
-            )
+            electric, magnetic = ducc0.sht.adjoint_synthesis(map=turned, spin=s, **transform)
             # ducc0's sign: S_s is minus the synthesis of E = Re(k b) a, B = Im(k b) a.
-            orders[i, s] = (
-                -2.0 * window * k * (by_degree(looked_at, electric, lmax) + 1j * by_degree(looked_at, magnetic, lmax))
-            )
+            both = by_degree(looked_at, electric, lmax) + 1j * by_degree(looked_at, magnetic, lmax)
+            orders[i, s] = -2.0 * window * k * both
     return FilteredMaps(sky, expected, residual, adjoint, orders)
 
 
-def shared_sky(model: Model, maps: Sequence[Map], nthreads: int = 1) -> Alm:
+def shared_sky(model: Model, maps: Sequence[Map]) -> Alm:
     """Return the filtered sky s^ of a set of maps, up to the model's lmax, uK."""
-    return _sky(model, _clean(model, maps, nthreads)[0], nthreads)
+    return _sky(model, _clean(model, maps)[0])
 
 
-def _clean(model: Model, maps: Sequence[Map], nthreads: int) -> tuple[list[Map], list[NDArray[np.bool_]]]:
+def _clean(model: Model, maps: Sequence[Map]) -> tuple[list[Map], list[NDArray[np.bool_]]]:
     """Return maps with zeros in pixels that the fiducial scan does not hit, and where something was observed.
 
     Pixels that the data lack and the simulations have are filled with the filtered sky: zeros would be a departure of
     their own.
     """
-    seen = [
-        (part.precision > 0) & (map_ != healpy.UNSEEN) & np.isfinite(map_)
-        for part, map_ in zip(model.parts, maps, strict=True)
-    ]
+    hit = [part.precision > 0 for part in model.parts]
+    seen = [h & (map_ != healpy.UNSEEN) & np.isfinite(map_) for h, map_ in zip(hit, maps, strict=True)]
     clean = [np.where(observed, map_, 0.0) for observed, map_ in zip(seen, maps, strict=True)]
-    holes = {
-        i: (part.precision > 0) & ~observed
-        for i, (part, observed) in enumerate(zip(model.parts, seen, strict=True))
-        if np.any((part.precision > 0) & ~observed)
-    }
+    holes = {i: hit[i] & ~seen[i] for i in range(len(hit)) if np.any(hit[i] & ~seen[i])}
     for _ in range(model.settings.hole_iterations if holes else 0):
-        sky = _sky(model, clean, nthreads)
+        sky = _sky(model, clean)
         for i, hole in holes.items():
             through = alm_.multiply(sky, model.response[model.parts[i].channel], model.lmax)
-            smooth = healpix.synthesis(through[None], model.nside, model.lmax, nthreads=nthreads)[0]
+            smooth = healpix.synthesis(through[None], model.nside, model.lmax)[0]
             clean[i] = np.where(hole, smooth, clean[i])
     return clean, seen
 
 
-def _sky(model: Model, clean: Sequence[Map], nthreads: int) -> Alm:
+def _sky(model: Model, clean: Sequence[Map]) -> Alm:
     lmax = model.lmax
     total = np.zeros(alm_.size(lmax), dtype=np.complex128)
     gain = np.zeros(lmax + 1)
     for channel, response in enumerate(model.response):
         members = model.of(channel)
         together = reduce(np.add, [clean[i] / model.parts[i].noise_power for i in members])
-        total += alm_.multiply(healpix.analysis(together, lmax, nthreads=nthreads), response, lmax)
+        total += alm_.multiply(healpix.analysis(together, lmax), response, lmax)
         gain += response**2 * sum(1.0 / model.parts[i].noise_power for i in members)
     return alm_.multiply(total, model.cl / (1.0 + model.cl * gain), lmax)
 
@@ -267,8 +209,8 @@ def _transforms(model: Model, members: tuple[int, ...]) -> Iterator[tuple[int, i
             yield filtered[0], s, filtered
 
 
-def by_degree(a: Alm, b: Alm, lmax: int) -> NDArray[np.float64]:
-    """Return the sum over all m of a_lm conj(b_lm) for two real fields, shape (lmax + 1,)."""
+def by_degree(a: Alm, b: Alm, lmax: int) -> Cl:
+    """Return the sum over all m of a_lm conj(b_lm) for two real fields."""
     product = a.real * b.real + a.imag * b.imag
     product[lmax + 1 :] *= 2.0
     return np.asarray(np.bincount(alm_.degrees(lmax), weights=product, minlength=lmax + 1), dtype=np.float64)

@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from mcsim.diagnosis.result import ContrastResult, DiagnosisResult, EffectResult, HeldOut
+from mcsim.diagnosis.result import DiagnosisResult, EffectResult
+from mcsim.diagnosis.selection import Contrast
 from mcsim.diagnosis.validation import Measured
 from mcsim.support.numbers import measured, number, p_equals
 
@@ -27,13 +28,16 @@ def sentence(result: DiagnosisResult) -> str:
         return f"The model describes the data ({p})."
     start = f"The model does not describe the data ({p})"
     if result.kind == "unknown":
-        return f"{start}, and no effect of the library explains why.{_partly(result)}"
+        partly = ""
+        if len(result.partial) > 1 and result.partial_left is not None:
+            left = f"{100 * result.partial_left:.0f} % of the excess χ²"
+            partly = f" Detected are {_effects(result.partial)}; they leave {left}."
+        return f"{start}, and no effect of the library explains why.{partly}"
     if result.kind == "degenerate":
         shown = [_effects(one.effects) for one in result.sets[: SETS + 1]]
         more = len(result.sets) - len(shown)
-        return f"{start}. It does with {'; or with '.join(shown)}" + (
-            f"; or with {more} more set{'s' * (more > 1)}." if more else "."
-        )
+        shown += [f"{more} more set{'s' * (more > 1)}"] * (more > 0)
+        return f"{start}. It does with {'; or with '.join(shown)}."
     return f"{start}. It does with {_effects(result.effects)}."
 
 
@@ -41,22 +45,16 @@ def _effects(effects: Sequence[EffectResult]) -> str:
     return " and ".join(f"{effect.label} ({effect.words})" for effect in effects)
 
 
-def _partly(result: DiagnosisResult) -> str:
-    if len(result.partial) < 2 or result.partial_left is None:
-        return ""
-    return f" Detected are {_effects(result.partial)}; they leave {100 * result.partial_left:.0f} % of the excess χ²."
-
-
 def tested(result: DiagnosisResult) -> str:
     """Return what was tested: elements, maps, simulations and candidates."""
-    test, splits = result.test, len({one.split for one in result.elements if one.split})
+    splits = len({one.split for one in result.elements if one.split})
     source = f"{len(result.maps)} maps" + (f" ({splits} splits)" if splits > 1 else "")
     if result.residual_maps is None:
         source = "a table of spectra"
     return (
-        f"{len(result.elements)} elements of the data vector, {test.dof} of them independent, measured from {source}; "
-        f"{test.simulations} simulations of the model; {len(result.candidates)} candidate effects, alone and up to "
-        f"{result.settings.max_effects} together"
+        f"{len(result.elements)} elements of the data vector, {result.test.dimension} of them independent, measured "
+        f"from {source}; {result.simulations} simulations of the model; {len(result.candidates)} candidate effects, "
+        f"alone and up to {result.settings.max_effects} together"
     )
 
 
@@ -94,29 +92,25 @@ def status(result: DiagnosisResult) -> str:
 
 def chi2(result: DiagnosisResult) -> str:
     """Return the unbiased chi^2 of the data vector, its degrees of freedom and the global p-value."""
-    test = result.test
-    value = number(test.excess.value + test.dof, 4)
-    return f"χ² = {value} for {test.dof} degrees of freedom; global {p_equals(test.pvalue)}"
+    dof = result.test.dimension
+    value = number(result.excess.value + dof, 4)
+    return f"χ² = {value} for {dof} degrees of freedom; global {p_equals(result.test.pvalue)}"
 
 
 def residual(pvalue: float) -> str:
     """Return how a residual with this p-value compares with the simulations."""
-    if pvalue > AGREES:
-        return f"agrees with the simulations ({p_equals(pvalue)})"
-    if pvalue > DISAGREES:
-        return f"is only marginally compatible with the simulations ({p_equals(pvalue)})"
-    return f"does not agree with the simulations ({p_equals(pvalue)})"
+    how = "agrees" if pvalue > AGREES else "is only marginally compatible" if pvalue > DISAGREES else "does not agree"
+    return f"{how} with the simulations ({p_equals(pvalue)})"
 
 
 def held_out(result: DiagnosisResult) -> str:
     """Return what adding the effects to the simulator does to data that the fit did not use."""
     found = result.held_out
     if found is None:
-        if result.sets:
-            return "Not measured: the held-out data hardly respond to the effects, or show no excess χ² by themselves."
-        return "Not measured: no effect was added to the simulator."
+        why = "the held-out data hardly respond to the effects, or show no excess χ² by themselves"
+        return f"Not measured: {why if result.sets else 'no effect was added to the simulator'}."
     left = f"what remains there {residual(found.pvalue_after)}"
-    if not quotable(found):
+    if found.before.value <= 0.0 or found.achieved.sigma >= LARGEST_ERROR:
         before, after = (measured(one.value, one.sigma) for one in (found.before, found.after))
         return f"Excess χ² of {found.data} too small to measure a reduction: {before} before, {after} after; {left}."
     return (
@@ -125,17 +119,12 @@ def held_out(result: DiagnosisResult) -> str:
     )
 
 
-def quotable(found: HeldOut) -> bool:
-    """Return True if the fractional reduction is measured well enough to be quoted."""
-    return found.before.value > 0.0 and found.achieved.sigma < LARGEST_ERROR
-
-
 def percent(fraction: Measured) -> str:
     """Return a fraction with its error in per cent."""
     return measured(100.0 * fraction.value, 100.0 * fraction.sigma, " %")
 
 
-def apart(result: DiagnosisResult, one: ContrastResult) -> str:
+def apart(result: DiagnosisResult, one: Contrast) -> str:
     """Return how far the predictions of two sets are apart, and what would tell them apart."""
     start = f"The predictions differ by {one.separation:.1f} standard deviations. "
     factor = (SEPARATION / one.separation) ** 2 if one.separation > 0.0 else float("inf")
@@ -150,13 +139,9 @@ def apart(result: DiagnosisResult, one: ContrastResult) -> str:
 
 def summary(result: DiagnosisResult, folder: Path) -> list[str]:
     """Return a summary for the command line, about ten lines."""
-    rows = [
-        *(("warning", warning) for warning in result.warnings),
-        ("case", result.case),
-        ("tested", tested(result)),
-        ("global test", chi2(result)),
-        ("verdict", f"{result.kind}. {status(result)}"),
-    ]
+    rows = [("warning", warning) for warning in result.warnings]
+    rows += [("case", result.case), ("tested", tested(result)), ("global test", chi2(result))]
+    rows.append(("verdict", f"{result.kind}. {status(result)}"))
     shown = result.sets[: SETS + 1]
     for one in shown:
         rows += [("or" if one is not shown[0] else "effect", _numbered(one.effects))]

@@ -1,7 +1,6 @@
 """Speed of mcsim on this machine, relative to the transforms that a realization needs."""
 
 import os
-import statistics
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -21,12 +20,7 @@ from mcsim.sphere.sky import gaussian_alm
 def bench(nside: int = 512, lmax: int = 1024, repeats: int = 5) -> Iterator[str]:
     """Measure transforms, a realization relative to them, workers and their memory, moments; yield lines of text.
 
-    Parameters
-    ----------
-    nside, lmax
-        Size of the maps and of the analysis.
-    repeats
-        Number of paired timings, of the transforms and of the realization; medians of the ratios are given.
+    Transforms and realization are timed in ``repeats`` pairs; medians of the ratios are given.
     """
     _run(nside, lmax, 0.0, 1)  # refuses invalid sizes
     yield f"nside {nside}, lmax {lmax}, m_max 2, L_max 2, paired; one thread; medians of {repeats} interleaved pairs"
@@ -59,11 +53,10 @@ def _realization(nside: int, lmax: int, repeats: int) -> Iterator[str]:
     ):
         shared = survey(_run(nside, lmax, sigma0_uk, 1))
         simulate.realize(shared, 0)
-        pairs = [
-            (_seconds(transforms, scalars, analyses), _seconds(simulate.realize, shared, r)) for r in range(repeats)
-        ]
-        ratio = statistics.median(whole / bare for bare, whole in pairs)
-        yield f"  realization {label}: ratio {ratio:.2f}, {statistics.median(whole for _, whole in pairs):.2f} s"
+        bare, whole = np.array(
+            [(_seconds(transforms, scalars, analyses), _seconds(simulate.realize, shared, r)) for r in range(repeats)]
+        ).T
+        yield f"  realization {label}: ratio {np.median(whole / bare):.2f}, {np.median(whole):.2f} s"
 
 
 def _workers(nside: int, lmax: int, realizations: int) -> Iterator[str]:
@@ -71,9 +64,9 @@ def _workers(nside: int, lmax: int, realizations: int) -> Iterator[str]:
     for workers in (1, 2):
         with tempfile.TemporaryDirectory() as folder, runner.local_client(workers) as client:
             warm = _run(nside, lmax, 0.0, 4 * workers)
-            runner.run(warm, Path(folder) / "bench.zarr", client=client)
+            runner.run(warm, Path(folder) / "bench.zarr", workers=client)
             run = _run(nside, lmax, 0.0, 4 * workers + realizations)
-            seconds = _seconds(runner.run, run, Path(folder) / "bench.zarr", client=client)
+            seconds = _seconds(runner.run, run, Path(folder) / "bench.zarr", workers=client)
             peak = max(client.run(_peak_bytes).values())
             rates.append(realizations / seconds)
         yield (
@@ -89,7 +82,7 @@ def _moments(nside: int) -> str:
     part = (0.0, 0.05)
     scan.Moments.from_model(model, nside, 2, time_range=(0.0, 1e-5), nthreads=threads)
     seconds = _seconds(scan.Moments.from_model, model, nside, 2, time_range=part, nthreads=threads)
-    samples = part[1] * sum(model.samples(line) for line in model.select(None))
+    samples = part[1] * sum(model.samples(line) for line in model.select())
     return f"  orientation moments, s <= 2: {samples / seconds / 1e6:.1f} million samples/s on {threads} threads"
 
 

@@ -1,15 +1,18 @@
-"""Text about a store, and export of its summary to other formats."""
+"""Texts about a store and about a prediction."""
 
-import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from mcsim.ensemble import opening, store
-from mcsim.ensemble.tables import lines, strongest, table
-from mcsim.errors import InputError
+from mcsim.ensemble.tables import spectra, strongest
+
+NEGLIGIBLE = 1e-6
+"""Fraction of its error, or of the largest signal to noise, below which a predicted value counts as zero."""
+
+ROWS = 40
+"""Number of bins of a prediction that are shown."""
 
 
 def describe(path: str | Path) -> str:
@@ -23,9 +26,10 @@ def describe(path: str | Path) -> str:
         pairs = [str(pair) for pair in ensemble["pair"].values]
         paired = "biposh_circular" in ensemble
     run, controls = attributes["configuration"], ", with circular-beam controls" if paired else ""
+    grid = "rings without pixels" if run["map"].get("grid") == "gl" else f"nside {run['map']['nside']}"
     found = [
         f"{target}: {run['name']}, {int(done.sum())} of {done.size} realizations finished",
-        f"  maps      {_grid(run['map'])}, {run['map']['frame']} frame, lmax {sizes['ell'] - 1}",
+        f"  maps      {grid}, {run['map']['frame']} frame, lmax {sizes['ell'] - 1}",
         f"  seed      {run['ensemble']['seed']}",
         f"  pairs     {'; '.join(pairs)}",
         f"  modes     {sizes['mode']}, L <= {run['biposh']['L_max']}{controls}",
@@ -35,56 +39,49 @@ def describe(path: str | Path) -> str:
     ]
     if (target / "summary").is_dir():
         with opening.open_summary(target) as summary:
-            rows = strongest(summary, "_difference" if paired else "", count=5)
-            found += ["  strongest binned spectra (mean over error):", *lines(rows)] if rows else []
+            rows = list(strongest(summary, "_difference" if paired else "").head(5).itertuples())
+        found += ["  strongest binned spectra (mean over error):"] if rows else []
+        for row in rows:
+            bounds = f"l = {row.bin_first}-{row.bin_last}"
+            found.append(f"    {row.pair}  {row.mode:8s} {bounds:14s} {row.value:.4g} uK^2, {row.sigma:.1f} sigma")
     return "\n".join(found)
 
 
-def _grid(section: dict[str, Any]) -> str:
-    return "rings without pixels" if section.get("grid") == "gl" else f"nside {section['nside']}"
+def describe_prediction(prediction: xr.Dataset) -> str:
+    """Return a text on a prediction: its order, its strongest binned spectra, and its signal to noise if present."""
+    attrs = prediction.attrs
+    text = [f"{attrs['name']}: {attrs['prediction']}, f_sky = {attrs['f_sky']:.3g}, {attrs['frame']} frame"]
+    text += _spectra(prediction)
+    if "signal_to_noise" not in prediction:
+        return "\n".join(text)
+    total = float(prediction["signal_to_noise_total"])
+    text.append(f"  signal to noise of one sky, all maps and modes jointly: {total:.4g}")
+    if np.isinf(total):
+        text.append("  (maps without noise see the same sky through different beams: nothing hides the beams)")
+    each = prediction["signal_to_noise"].to_series().fillna(0.0).nlargest(8)
+    for (pair, mode), value in each[each > NEGLIGIBLE * each.max()].items():
+        bins = prediction["signal_to_noise_binned"].sel(pair=pair, mode=mode)
+        best = bins[int(bins.fillna(0.0).argmax("bin"))]
+        at = f"l = {int(best['bin_first'])}-{int(best['bin_last'])}"
+        text.append(f"    {pair}  {mode:8s} {value:8.3g}, most of it at {at} ({float(best):.3g})")
+    return "\n".join(text)
 
 
-def export(path: str | Path, output: str | Path) -> None:
-    """Write the summary of a store as NetCDF (``.nc``) or its binned spectra as an ECSV table (``.ecsv``).
-
-    Raises
-    ------
-    InputError
-        For another file extension, or an output that cannot be written.
-    """
-    target = Path(output)
-    with opening.open_summary(path) as stored:
-        summary = stored.load()
-        try:
-            if target.suffix == ".nc":
-                _real(summary).to_netcdf(target, engine="scipy")
-            elif target.suffix == ".ecsv":
-                table(summary).write(target, format="ascii.ecsv", overwrite=True)
-            else:
-                raise InputError(
-                    f"{target} ends in {target.suffix or 'nothing'}; choose .nc (NetCDF) or .ecsv (table)."
-                )
-        except OSError as error:
-            raise InputError(f"{target} cannot be written ({error.strerror or error}); choose another file.") from error
-
-
-def _real(summary: xr.Dataset) -> xr.Dataset:
-    """Split complex variables into pairs ``_re``, ``_im``, which NetCDF can hold."""
-    parts = {}
-    for name, variable in summary.data_vars.items():
-        if np.iscomplexobj(variable):
-            parts[f"{name}_re"], parts[f"{name}_im"] = variable.real, variable.imag
-            parts[f"{name}_re"].attrs, parts[f"{name}_im"].attrs = variable.attrs, variable.attrs
-        else:
-            parts[str(name)] = variable.astype("int32") if variable.dtype == np.int64 else variable
-    # NetCDF has no nested attributes: they are stored as text.
-    attributes = {name: value if isinstance(value, str) else json.dumps(value) for name, value in summary.attrs.items()}
-    real = xr.Dataset(parts, attrs=attributes)
-    for name, coordinate in real.coords.items():
-        if coordinate.dtype == np.int64:
-            real = real.assign_coords({name: coordinate.astype("int32")})
-        elif coordinate.dtype.kind in "OT":
-            real = real.assign_coords(
-                {name: (coordinate.dims, np.array([str(label) for label in coordinate.values]), coordinate.attrs)}
-            )
-    return real
+def _spectra(prediction: xr.Dataset) -> list[str]:
+    """Return lines for the bins of the strongest spectra, whole spectra if there is room."""
+    text = ["  binned means in uK^2, errors of the mean of an isotropic ensemble:"]
+    text.append(f"    {'pair':<16} {'mode':<9} {'l':<11} {'value':>22} {'error':>10}")
+    rows = spectra(prediction, "")
+    best = strongest(prediction, "")
+    best = best[best["sigma"] > NEGLIGIBLE]
+    if best.empty:
+        return ["  no spectrum with L > 0 differs from zero"]
+    shown = max(1, ROWS // prediction.sizes["bin"])
+    for pair, mode in zip(best["pair"][:shown], best["mode"][:shown], strict=True):
+        for row in rows[(rows["pair"] == pair) & (rows["mode"] == mode)].dropna().itertuples():
+            bounds = f"{row.bin_first}-{row.bin_last}"
+            value = row.value if row.value.imag else row.value.real
+            text.append(f"    {pair:<16} {mode:<9} {bounds:<11} {value:>22.4g} {row.error:>10.3g}")
+    if len(best) > shown:
+        text.append(f"    and {len(best) - shown} weaker spectra: write all with -o FILE.ecsv")
+    return text

@@ -26,12 +26,9 @@ def _total_cl(survey: Survey, found: dict[tuple[int, int], Means], pair: tuple[i
 
 def sky_fraction(survey: Survey, pair: tuple[int, int]) -> float:
     """Return <W_x W_y>^2 / <W_x^2 W_y^2>."""
-    maps = [m for channel in survey.channels for m in channel.maps]
-    weights = [maps[i].weight for i in pair]
-    if all(weight is None for weight in weights):
-        return 1.0
-    product = np.prod([np.ones(maps[pair[0]].moments.npix) if w is None else w for w in weights], axis=0)
-    return float(product.mean() ** 2 / np.mean(product**2))
+    weights = [np.ones(1) if m.weight is None else m.weight for channel in survey.channels for m in channel.maps]
+    x, y = (weights[index] for index in pair)
+    return float(np.mean(x * y) ** 2 / np.mean((x * y) ** 2))
 
 
 def variance_of(survey: Survey, found: dict[tuple[int, int], Means], pair: tuple[int, int]) -> NDArray[np.float64]:
@@ -63,14 +60,11 @@ def variables(survey: Survey, found: dict[tuple[int, int], Means], joint: float)
         for b, ells in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
             binned[number, rows, b] = signal_to_noise(signal, anisotropic, spectra, f_sky, ells)
     text = "signal to noise in one sky of what the beam adds to its circular part"
+    jointly = "all maps and modes jointly (exact Fisher information)"
     return {
         "signal_to_noise": (("pair", "mode"), each, {"units": "1", "long_name": text}),
         "signal_to_noise_binned": (("pair", "mode", "bin"), binned, {"units": "1", "long_name": f"{text}, per bin"}),
-        "signal_to_noise_total": (
-            (),
-            joint,
-            {"units": "1", "long_name": f"{text}, all maps and modes jointly (exact Fisher information)"},
-        ),
+        "signal_to_noise_total": ((), joint, {"units": "1", "long_name": f"{text}, {jointly}"}),
     }
 
 
@@ -78,9 +72,7 @@ def joint_signal_to_noise(survey: Survey, found: dict[tuple[int, int], Means]) -
     """Return the root of the Fisher information of all maps; infinite for several without noise."""
     size, lmax = len(survey.map_names), survey.lmax
     stored = survey.estimator.modes
-    modes = [
-        mode for mode in stored if mode[0] > 0 and mode[2] >= 0 and not (mode[2] == 0 and mode[0] % 2 and size == 1)
-    ]
+    modes = [mode for mode in stored if mode.L > 0 and mode.d >= 0]
     cl = np.empty((size, size, lmax + 1))
     signal = np.zeros((size, size, len(modes), lmax + 1), dtype=np.complex128)
     for x, y in found:

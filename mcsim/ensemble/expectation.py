@@ -22,7 +22,6 @@ from mcsim.bipolar.theory import (
 from mcsim.bipolar.theory.harmonics import spin_functions
 from mcsim.errors import InputError
 from mcsim.simulation import survey as survey_
-from mcsim.simulation.rings import Rings
 from mcsim.simulation.survey import Channel, Survey, SurveyMap
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
@@ -37,12 +36,7 @@ L_MOMENTS = 64
 class Means:
     """Means of an ordered pair of maps, uK^2, shape (mode, lmax + 1), NaN where one map repeats another mode.
 
-    Attributes
-    ----------
-    beam, circular
-        Means of the signal, through the beams and through their circular parts.
-    noise
-        Means of the noise.
+    They are those of the signal through the beams and through their circular parts, and of the noise.
     """
 
     beam: NDArray[np.complex128]
@@ -60,16 +54,15 @@ def survey_of(source: Source, nthreads: int = 1) -> Survey:
 
 def scanned_beams(survey: Survey, L_max: int, nthreads: int = 1) -> tuple[ScannedBeam, ...]:
     """Return the beam, times the pixel window, and the moments up to degree ``L_max`` of every map."""
-    specs = {channel.name: channel.scan for channel in survey.config.channels}
-    for name, scan in specs.items():
-        if isinstance(scan, config.ScanDifferencing):
+    for spec in survey.config.channels:
+        if isinstance(spec.scan, config.ScanDifferencing):
             raise InputError(
-                f"Channel {name} reads two beams as a difference, which predictions do not cover; "
+                f"Channel {spec.name} reads two beams as a difference, which predictions do not cover; "
                 "predict the same model with hit_averaged instead."
             )
     return tuple(
-        ScannedBeam(channel.beam.blm * channel.window, _orientations(specs[channel.name], channel, m, L_max, nthreads))
-        for channel in survey.channels
+        ScannedBeam(channel.beam.blm * channel.window, _orientations(spec.scan, channel, m, L_max, nthreads))
+        for spec, channel in zip(survey.config.channels, survey.channels, strict=True)
         for m in channel.maps
     )
 
@@ -91,43 +84,25 @@ def _orientations(
 ) -> NDArray[np.complex128]:
     smax = channel.beam.mmax
     if channel.rings is not None:
-        return _orientations_on_rings(channel.rings, smax, L_max)
+        # The moments depend on colatitude alone; the quadrature on rings is exact.
+        result = np.zeros((smax + 1, L_max + 1, 2 * L_max + 1), dtype=np.complex128)
+        result[0, 0, L_max] = np.sqrt(4.0 * np.pi)
+        for rings in channel.rings:
+            harmonics = spin_functions(rings.s, L_max, rings.theta)[rings.s]
+            result[rings.s, :, L_max] = rings.phase * (harmonics @ rings.weight)
+        return result
     if isinstance(scan, config.ScanParallelTransport) and m.weight is None and m.preparation is None:
         return parallel_transport_harmonics(smax, L_max, float(np.deg2rad(scan.psi0_deg)))
     w = np.asarray(m.moments.w[:smax])
     return orientation_harmonics(w if m.weight is None else w * m.weight**2, L_max, nthreads=nthreads)
 
 
-def _orientations_on_rings(grid: tuple[Rings, ...], smax: int, L_max: int) -> NDArray[np.complex128]:
-    """Return w_{s,L0} of moments that depend on colatitude alone; the quadrature on rings is exact."""
-    result = np.zeros((smax + 1, L_max + 1, 2 * L_max + 1), dtype=np.complex128)
-    result[0, 0, L_max] = np.sqrt(4.0 * np.pi)
-    for rings in grid:
-        harmonics = spin_functions(rings.s, L_max, rings.theta)[rings.s]
-        result[rings.s, :, L_max] = rings.phase * (harmonics @ rings.weight)
-    return result
-
-
 def means(
     survey: Survey, beams: tuple[ScannedBeam, ...], pair: tuple[int, int], exact: bool, nthreads: int = 1
 ) -> Means:
-    """Return the means of a pair of maps in all modes of the survey.
+    """Return the means of a pair of maps (indices) in all modes of the survey, whose beams are :func:`scanned_beams`.
 
-    Parameters
-    ----------
-    survey, beams
-        The survey and its :func:`scanned_beams`.
-    pair
-        Indices of the maps.
-    exact
-        To all orders in the beam, instead of leading order in its non-circular part.
-    nthreads
-        Number of threads.
-
-    Raises
-    ------
-    InputError
-        For a survey without a spectrum.
+    They are of leading order in the non-circular part of the beams, or of all orders if ``exact``.
     """
     cl = spectrum(survey)
     x, y = beams[pair[0]], beams[pair[1]]
@@ -140,20 +115,14 @@ def means(
     noise = np.zeros_like(signal)
     if pair[0] == pair[1]:
         noise = noise_mean(survey, pair[0], modes)
-        repeated = [row for row, mode in enumerate(survey.estimator.modes) if not mode.in_auto]
+        repeated = [row for row, mode in enumerate(modes) if not mode.in_auto]
         for array in (signal, circular, noise):
             array[repeated] = np.nan
     return Means(signal, circular, noise)
 
 
 def spectrum(survey: Survey) -> NDArray[np.float64]:
-    """Return C_l of the sky.
-
-    Raises
-    ------
-    InputError
-        For a survey without a spectrum.
-    """
+    """Return C_l of the sky; raise InputError for a survey without a spectrum."""
     if survey.cl is None:
         raise InputError(
             f"{survey.config.name} takes its skies from files and names no spectrum; add sky.spectrum for a prediction."

@@ -1,4 +1,4 @@
-"""Layout of an ensemble store: dimensions, variables, chunks and sizes."""
+"""Layout of an ensemble store: dimensions, variables, coordinates, chunks and sizes."""
 
 import math
 from collections.abc import Iterable
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:  # stored ensembles open without the numerics, which load slowly
     from mcsim.bipolar import Mode
@@ -13,7 +14,7 @@ if TYPE_CHECKING:  # stored ensembles open without the numerics, which load slow
 
 @dataclass(frozen=True)
 class Layout:
-    """Layout of a store: realizations, realizations per task, maps, pairs, modes, degrees."""
+    """Layout of a store: realizations, realizations per task, maps, pairs, modes, degrees, width of the bins in ell."""
 
     realizations: int
     chunk: int
@@ -25,16 +26,13 @@ class Layout:
     kept_npix: int | None
     kept_name: str = "observed_map"
     frame: str = ""
+    bin_width: int = 50
 
     def variables(self) -> dict[str, tuple[tuple[str, ...], str, str, str]]:
         """Return dimensions, type, unit and long name of every array over realizations."""
+        coefficients = "BipoSH coefficient A^{LM}_{l2-d,l2} at ell = l2"
         spectra = {
-            "biposh": (
-                ("pair", "mode", "ell"),
-                "complex128",
-                "uK^2",
-                "BipoSH coefficient A^{LM}_{l2-d,l2} at ell = l2",
-            ),
+            "biposh": (("pair", "mode", "ell"), "complex128", "uK^2", coefficients),
             "cl": (("pair", "ell"), "float64", "uK^2", "power spectrum C_l"),
         }
         found = dict(spectra)
@@ -44,6 +42,30 @@ class Layout:
         if self.kept_npix is not None:
             found[self.kept_name] = (("map_name", "pixel"), "float32", "uK", "simulated map, HEALPix RING")
         return found
+
+    def coordinates(self) -> dict[str, tuple[str, NDArray, dict[str, str]]]:
+        """Return dimension, values and attributes of every coordinate; labels are arrays of objects."""
+        numbers = {
+            "realization": ("realization", range(self.realizations), "index of the realization"),
+            "ell": ("ell", range(self.lmax + 1), "degree l2"),
+            "L": ("mode", [mode.L for mode in self.modes], "bipolar degree"),
+            "M": ("mode", [mode.M for mode in self.modes], "bipolar order"),
+            "d": ("mode", [mode.d for mode in self.modes], "l2 - l1"),
+        }
+        labels = {
+            "pair": ("pair", self.pairs, "ordered pair of maps X,Y: l1 is of X, l2 of Y"),
+            "mode": ("mode", [mode.name for mode in self.modes], "BipoSH mode"),
+            "parity": ("mode", [mode.parity for mode in self.modes], "parity of l1 + l2 + L"),
+        }
+        if self.kept_npix is not None:
+            labels["map_name"] = ("map_name", self.maps, "map")
+        return {
+            name: (dim, np.array(values), {"units": "1", "long_name": text})
+            for name, (dim, values, text) in numbers.items()
+        } | {
+            name: (dim, np.array(values, dtype=object), {"long_name": text})
+            for name, (dim, values, text) in labels.items()
+        }
 
     def kept_attributes(self) -> dict[str, str | int | float]:
         """Return the attributes of kept maps besides unit and long name."""
@@ -64,10 +86,8 @@ class Layout:
     def realization_bytes(self) -> int:
         """Return the uncompressed size of one realization in bytes."""
         sizes = self.sizes()
-        return sum(
-            int(np.prod([sizes[dim] for dim in dims])) * np.dtype(dtype).itemsize
-            for dims, dtype, _, _ in self.variables().values()
-        )
+        shapes = [(np.dtype(dtype), [sizes[dim] for dim in dims]) for dims, dtype, _, _ in self.variables().values()]
+        return sum(dtype.itemsize * math.prod(shape) for dtype, shape in shapes)
 
     def files(self) -> int:
         """Return the number of files of the finished store, coordinates and metadata included."""
@@ -78,12 +98,8 @@ class Layout:
 
 def listed(numbers: Iterable[int]) -> str:
     """Return realization numbers as text: ``realizations 3, 7-9``."""
-    ranges: list[list[int]] = []
-    for number in sorted(int(n) for n in numbers):
-        if ranges and number == ranges[-1][1] + 1:
-            ranges[-1][1] = number
-        else:
-            ranges.append([number, number])
-    found = [f"{a}" if a == b else f"{a}-{b}" for a, b in ranges]
+    every = np.unique(np.fromiter(numbers, int))
+    runs = np.split(every, np.flatnonzero(np.diff(every) > 1) + 1)
+    found = [f"{run[0]}" if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs]
     shown = ", ".join(found[:8]) + (f" and {len(found) - 8} more ranges" if len(found) > 8 else "")
-    return f"{'realization' if len(ranges) == 1 and ranges[0][0] == ranges[0][1] else 'realizations'} {shown}"
+    return f"{'realization' if len(every) == 1 else 'realizations'} {shown}"

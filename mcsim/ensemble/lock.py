@@ -1,79 +1,70 @@
-"""Lock of a store: one run at a time writes to it."""
+"""Lock of a store: one run at a time writes to it.
+
+The package filelock does not replace this module: on file systems that cannot exchange two names, such as NFS, its
+lock of a dead process stays for ever.
+"""
 
 import fcntl
 import os
 import socket
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import NoReturn
 
+from mcsim.ensemble.store import refuse_unwritable
 from mcsim.errors import InputError
-
-_held: set[Path] = set()
-"""Absolute paths of the locks that this process holds."""
 
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold the store for one run: a file ``{path}.lock`` beside it names host and process.
+    """Hold the store for one run, or raise InputError: a file ``{path}.lock`` beside it names host and process.
 
-    Raises
-    ------
-    InputError
-        If another run holds it. The lock of a dead process of this host is taken over.
+    The lock of a dead process of this host is taken over.
     """
     lock = path.absolute().with_name(f"{path.name}.lock")
-    while True:
-        try:
+    with ExitStack() as stack:
+        with refuse_unwritable(path):
             lock.parent.mkdir(parents=True, exist_ok=True)
-            _make(lock, path)
-            break
-        except FileExistsError:
-            _take_over(lock, path)
-        except OSError as error:
-            reason = error.strerror or str(error)
-            raise InputError(f"{lock} cannot be written ({reason}); choose a writable folder with -o.") from error
-    _held.add(lock)
+            # A link makes the lock and its contents in one step, so that a killed process leaves a readable lock.
+            with tempfile.NamedTemporaryFile("w", prefix=f".{path.name}.", dir=lock.parent) as scratch:
+                scratch.write(f"{socket.gethostname()} {os.getpid()}")
+                scratch.flush()
+                held = stack.enter_context(Path(scratch.name).open())
+                with suppress(OSError):  # the kernel's lock tells other runs of this process; some disks have none
+                    fcntl.flock(held, fcntl.LOCK_EX)
+                while not _linked(scratch.name, lock):
+                    _remove_if_dead(lock, path)
+        try:
+            yield
+        finally:
+            with suppress(OSError):  # if the disk has become read-only, the next run takes the lock over
+                lock.unlink()
+
+
+def _linked(scratch: str, lock: Path) -> bool:
     try:
-        yield
-    finally:
-        _held.discard(lock)
-        with suppress(OSError):  # if the disk has become read-only, the next run takes the lock over
-            lock.unlink()
+        os.link(scratch, lock)
+    except FileExistsError:
+        return False
+    return True
 
 
-def _make(lock: Path, path: Path) -> None:
-    """Make the lock and its contents in one step, so that a killed process leaves a readable lock."""
-    with tempfile.NamedTemporaryFile("w", prefix=f".{path.name}.", dir=path.parent) as stream:
-        stream.write(f"{socket.gethostname()} {os.getpid()}")
-        stream.flush()
-        os.link(stream.name, lock)
-
-
-def _take_over(lock: Path, path: Path) -> None:
+def _remove_if_dead(lock: Path, path: Path) -> None:
     """Remove the lock of a dead process; raise InputError for that of a live one."""
     with suppress(FileNotFoundError), lock.open() as stream:
-        try:
-            host, number = stream.read().split()
-            process = int(number)
-        except ValueError:
-            host, process = "an unknown host", 0
-        dead = lock not in _held if process == os.getpid() else not _alive(process)
-        if host == socket.gethostname() and dead:
-            # If several processes find a dead lock, one removes it, and none removes a newer lock.
-            fcntl.flock(stream, fcntl.LOCK_EX)
-            if os.fstat(stream.fileno()).st_ino == lock.stat().st_ino:
-                lock.unlink()
-            return
-        _refuse(lock, path, host, process)
-
-
-def _refuse(lock: Path, path: Path, host: str, process: int) -> NoReturn:
-    raise InputError(
-        f"Another run writes to {path} (process {process} on {host}); wait for it, or remove {lock} if it is gone."
-    )
+        host, _, number = stream.read().partition(" ")
+        process = int(number) if number.isdecimal() else 0
+        own = process == os.getpid()
+        if host == socket.gethostname() and process and (own or not _alive(process)):
+            with suppress(BlockingIOError):  # another run of this process holds it
+                fcntl.flock(stream, fcntl.LOCK_EX | (fcntl.LOCK_NB if own else 0))
+                # If several processes find a dead lock, one removes it, and none removes a newer lock.
+                if os.fstat(stream.fileno()).st_ino == lock.stat().st_ino:
+                    lock.unlink()
+                return
+        holder = f"process {process} on {host}" if process else "process 0 on an unknown host"
+        raise InputError(f"Another run writes to {path} ({holder}); wait for it, or remove {lock} if it is gone.")
 
 
 def _alive(process: int) -> bool:

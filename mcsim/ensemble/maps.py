@@ -12,8 +12,8 @@ from mcsim import config
 from mcsim.ensemble import plan
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
-from mcsim.simulation.survey import Survey, survey
-from mcsim.support.folders import appearing, writable
+from mcsim.simulation.survey import survey
+from mcsim.support.folders import appearing, unwritable, writable
 from mcsim.support.progress import reporting
 
 _COORDINATES = {"ecliptic": "E", "galactic": "G", "equatorial": "C"}
@@ -73,11 +73,16 @@ def write_maps(
     run = source if isinstance(source, config.RunConfig) else config.load(source)
     if run.map.grid != "healpix":
         raise InputError(f'{run.name} has map.grid = "{run.map.grid}" and so no pixels; set map.grid = "healpix".')
-    alone = realizations is not None and not isinstance(realizations, slice)
-    wanted = plan.wanted(run, _slice(realizations))
+    alone = not isinstance(realizations, slice | None)
+    part = realizations if isinstance(realizations, slice | None) else slice(int(realizations), int(realizations) + 1)
+    wanted = plan.wanted(run, part)
     names = file_names(run)
     targets = {r: Path(folder) if alone else Path(folder) / f"{r:05d}" for r in wanted}
-    _refuse_what_is_there(Path(folder), list(targets.values()))
+    if Path(folder).exists() and not Path(folder).is_dir():
+        raise InputError(f"{folder} is a file; choose a folder with -o.")
+    for target in targets.values():
+        if target.exists() and (not target.is_dir() or any(target.iterdir())):
+            raise InputError(f"{target} is not empty, and nothing is written over; choose another folder with -o.")
     config.check_skies(run, wanted)
     threads = nthreads or os.cpu_count() or 1
     with reporting("orientation moments", 1.0, "", quiet) as report:
@@ -87,17 +92,17 @@ def write_maps(
             sampled.check(channel)
     simulate.draw_sky(shared, wanted.start)  # finds bad sky files before a folder is made
     writable(Path(folder) if not alone else Path(folder).absolute().parent)
-    header = [("RUN", _ascii(run.name)), ("DIGEST", config.digest(run))]
+    ascii_name = run.name.encode("ascii", "backslashreplace").decode()  # as FITS headers require
+    header = [("RUN", ascii_name), ("DIGEST", config.digest(run))]
     with reporting("maps", float(len(wanted)), "realizations", quiet) as report:
         for number, (r, target) in enumerate(targets.items()):
-            made = _maps(shared, r, sample_by_sample, threads)
-            try:
-                with appearing(target) as scratch:
-                    for name, map_uk in made:
-                        write_map(scratch / names[name], map_uk, shared.frame, [*header, ("REALIZ", r)])
-            except OSError as error:
-                reason = error.strerror or str(error)
-                raise InputError(f"{target} cannot be written ({reason}); choose another folder with -o.") from error
+            if sample_by_sample:
+                made = dict(sampled.maps(shared, r, threads))
+            else:
+                made = dict(zip(shared.map_names, simulate.maps(shared, r, threads), strict=True))
+            with unwritable(target, "choose another folder with -o"), appearing(target) as scratch:
+                for name, map_uk in made.items():
+                    write_map(scratch / names[name], map_uk, shared.frame, [*header, ("REALIZ", r)])
             report(number + 1.0)
     return list(targets.values())
 
@@ -111,41 +116,10 @@ def write_map(path: Path, map_uk: NDArray[np.float64], frame: str, header: list[
 
 
 def file_names(run: config.RunConfig) -> dict[str, str]:
-    """Return the file name of every map of a run: ``{channel}.fits`` or ``{channel}_{split}.fits``.
-
-    Raises
-    ------
-    InputError
-        If two maps would have the same file.
-    """
+    """Return the file name of every map of a run: ``{channel}.fits`` or ``{channel}_{split}.fits``."""
     names = {name: f"{name.replace(':', '_')}.fits" for name in config.map_names(run)}
     for name, file in names.items():
         twice = [other for other, own in names.items() if own == file and other != name]
         if twice:
             raise InputError(f"The maps {name} and {twice[0]} would both be {file}; rename a channel or a split.")
     return names
-
-
-def _maps(shared: Survey, realization: int, sample_by_sample: bool, nthreads: int) -> list[tuple[str, NDArray]]:
-    if sample_by_sample:
-        return sampled.maps(shared, realization, nthreads)
-    return list(zip(shared.map_names, simulate.maps(shared, realization, nthreads), strict=True))
-
-
-def _refuse_what_is_there(folder: Path, targets: list[Path]) -> None:
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder} is a file; choose a folder with -o.")
-    for target in targets:
-        if target.exists() and (not target.is_dir() or any(target.iterdir())):
-            raise InputError(f"{target} is not empty, and nothing is written over; choose another folder with -o.")
-
-
-def _slice(realizations: int | slice | None) -> slice | None:
-    if realizations is None or isinstance(realizations, slice):
-        return realizations
-    return slice(int(realizations), int(realizations) + 1)
-
-
-def _ascii(name: str) -> str:
-    """Return a name in ASCII, as FITS headers require."""
-    return name.encode("ascii", "backslashreplace").decode()

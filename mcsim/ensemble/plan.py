@@ -13,7 +13,7 @@ from mcsim import config
 from mcsim.bipolar import Mode, estimate, estimator, modes
 from mcsim.bipolar.dataset import CONVENTION, NORMALISATION
 from mcsim.config.preparation import frame_of
-from mcsim.ensemble import opening, store, summary
+from mcsim.ensemble import opening, store
 from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError
 from mcsim.simulation import differencing
@@ -40,13 +40,7 @@ _PACKAGES = ("mcsim", "numpy", "healpy", "ducc0", "numba", "scipy", "dask", "dis
 
 
 def wanted(run: config.RunConfig, part: slice | None) -> range:
-    """Return the realizations to compute: all, or a slice ``A:B`` of them.
-
-    Raises
-    ------
-    InputError
-        If the slice is empty or reaches beyond the ensemble.
-    """
+    """Return the realizations to compute: all, or a slice ``A:B`` of them, which must lie within the ensemble."""
     total = run.ensemble.realizations
     if part is None:
         return range(total)
@@ -78,42 +72,24 @@ def exists(path: Path) -> bool:
 
 def layout(survey: Survey) -> Layout:
     """Return the layout of a new store."""
-    run = survey.config
-    bare = Layout(
-        run.ensemble.realizations,
-        1,
-        survey.map_names,
-        survey.pair_names,
-        survey.estimator.modes,
-        survey.lmax,
-        run.ensemble.paired,
-        12 * survey.nside**2 if run.ensemble.keep_maps else None,
-        frame=survey.frame,
-    )
-    return _chunked(bare, run.compute.chunk)
+    return _layout(survey.config, survey.pair_names, survey.estimator.modes)
 
 
-def _chunked(bare: Layout, chunk: int | None) -> Layout:
-    """Return the layout with a chunk size: about 128 chunks, unless a chunk would exceed 64 MiB.
-
-    The tree of sums needs a power of two.
-    """
-    if chunk is not None:
+def _layout(run: config.RunConfig, pairs: tuple[str, ...], modes: tuple[Mode, ...]) -> Layout:
+    """Return a layout of about 128 chunks, unless one would exceed 64 MiB; the tree of sums needs a power of two."""
+    lmax, paired = config.analysis_lmax(run), run.ensemble.paired
+    nside, frame = config.prepared_grid(run)
+    kept_npix = 12 * nside**2 if run.ensemble.keep_maps else None
+    more: dict[str, Any] = {"frame": frame, "bin_width": run.biposh.summary_bin}
+    bare = Layout(run.ensemble.realizations, 1, config.map_names(run), pairs, modes, lmax, paired, kept_npix, **more)
+    chunk = run.compute.chunk or 1
+    if run.compute.chunk is not None:
         while chunk // 2 >= bare.realizations:
             chunk //= 2
     else:
-        chunk = 1
         while chunk * CHUNKS < bare.realizations and 2 * chunk * bare.realization_bytes() <= CHUNK_BYTES:
             chunk *= 2
     return replace(bare, chunk=chunk)
-
-
-def recipe(survey: Survey) -> summary.Recipe:
-    """Return the recipe of the summary."""
-    run = survey.config
-    return summary.Recipe(
-        survey.pair_names, survey.estimator.modes, survey.lmax, run.biposh.summary_bin, run.ensemble.paired
-    )
 
 
 def attributes(run: config.RunConfig) -> dict[str, Any]:
@@ -131,16 +107,8 @@ def attributes(run: config.RunConfig) -> dict[str, Any]:
 
 
 def check_same(path: Path, run: config.RunConfig) -> None:
-    """Raise InputError unless a store has this configuration and its variables.
-
-    Raises
-    ------
-    InputError
-        With the keys that differ.
-    """
-    found = store.attributes(path)
-    changes = _changes(found, attributes(run))
-    if changes:
+    """Raise InputError, with the keys that differ, unless a store has this configuration and its variables."""
+    if changes := _changes(store.attributes(path), attributes(run)):
         raise InputError(
             f"{path} was made with another configuration ({'; '.join(changes)}); "
             "choose another store with -o, or restore the values."
@@ -149,14 +117,15 @@ def check_same(path: Path, run: config.RunConfig) -> None:
 
 def check_mergeable(path: Path, first: Mapping[str, Any], other: Path, second: Mapping[str, Any]) -> None:
     """Raise InputError if stores have different configurations."""
-    changes = _changes(first, second)
-    if changes:
+    if changes := _changes(first, second):
         raise InputError(f"{other} and {path} differ ({'; '.join(changes)}); merge slices of one configuration.")
 
 
 def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """Return the differences that keep two stores from being one ensemble: science, kept maps, mcsim's version."""
-    changes = [change for change in config.differences(old["science"], new["science"]) if not _of_summary(change)]
+    changes = config.differences(old["science"], new["science"])
+    # The bins of the summary, which earlier versions counted as science, may differ.
+    changes = [change for change in changes if not change.startswith("biposh.summary_bin: ")]
     for key, before, after in (
         ("ensemble.keep_maps", *(a["configuration"]["ensemble"]["keep_maps"] for a in (old, new))),
         ("version of mcsim", *(a["packages"]["mcsim"] for a in (old, new))),
@@ -166,61 +135,64 @@ def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     return changes
 
 
-def _of_summary(change: str) -> bool:
-    """Return True for a difference of the summary alone, whose bins earlier versions counted as science."""
-    return change.startswith("biposh.summary_bin: ")
-
-
-def stored(path: Path, realizations: int) -> tuple[Layout, summary.Recipe]:
-    """Return the layout and recipe of an existing store, with another number of realizations."""
+def stored(path: Path, realizations: int) -> Layout:
+    """Return the layout of an existing store, with another number of realizations."""
     with opening.open_ensemble(path) as found:
         attrs = found.attrs["configuration"]
-        pairs = tuple(str(pair) for pair in found["pair"].values)
         kept = found.sizes.get("pixel")
-        maps = tuple(str(name) for name in found["map_name"].values) if kept else ()
-        lmax, paired = found.sizes["ell"] - 1, "biposh_circular" in found
-        stored_modes = tuple(
-            Mode(int(L), int(M), int(d)) for L, M, d in zip(found["L"], found["M"], found["d"], strict=True)
+        indices = zip(*(found[name].values.tolist() for name in ("L", "M", "d")), strict=True)
+        return Layout(
+            realizations,
+            store.chunk(path),
+            tuple(found["map_name"].values.tolist()) if kept else (),
+            tuple(found["pair"].values.tolist()),
+            tuple(Mode(*each) for each in indices),
+            found.sizes["ell"] - 1,
+            "biposh_circular" in found,
+            kept,
+            frame=frame_of(attrs),
+            bin_width=attrs["biposh"]["summary_bin"],
         )
-    layout = Layout(
-        realizations, store.chunk(path), maps, pairs, stored_modes, lmax, paired, kept, frame=frame_of(attrs)
-    )
-    return layout, summary.Recipe(pairs, stored_modes, lmax, attrs["biposh"]["summary_bin"], paired)
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Cost of a run: layout of its store, memory of a worker in bytes, processor time of a realization in seconds."""
+
+    layout: Layout
+    memory: float
+    each_s: float
+    preparation: str  # what preparing the maps adds, in words
+
+    def lines(self, number: int, workers: int) -> list[str]:
+        """Return lines on memory, preparation and time for a number of realizations."""
+        hours = number * self.each_s / 3600.0
+        return [
+            f"  memory  {self.memory / 1e9:.2f} GB per worker, {workers} workers",
+            *([f"  prepare {self.preparation}"] if self.preparation else []),
+            f"  time    {self.each_s:.3g} s per realization and core, {hours:.3g} core-hours,"
+            f" {60.0 * hours / workers:.3g} minutes with {workers} workers on as many idle cores",
+        ]
 
 
 def describe(source: str | Path, part: slice | None = None, workers: int | None = None) -> str:
     """Return a text on the cost of a run: realizations, tasks, memory, disk, files and time."""
     run = config.load(source)
     check_effects(run)
-    planned = cost(run, wanted(run, part))
-    count = workers or run.compute.workers
-    hours = planned.realizations * planned.seconds_per_realization / 3600.0
+    number, found = len(wanted(run, part)), cost(run)
+    memory, *rest = found.lines(number, workers or run.compute.workers)
+    disk = float(found.layout.realization_bytes()) * number
     return "\n".join(
         [
-            f"{run.name}: {planned.realizations} realizations in {planned.tasks} tasks",
-            f"  memory  {planned.worker_bytes / 1e9:.2f} GB per worker, {count} workers",
-            f"  disk    {planned.store_bytes / 1e6:.1f} MB in about {planned.files} files",
-            *([f"  prepare {planned.preparation}"] if planned.preparation else []),
-            f"  time    {planned.seconds_per_realization:.3g} s per realization and core, {hours:.3g} core-hours,"
-            f" {60.0 * hours / count:.3g} minutes with {count} workers on as many idle cores",
+            f"{run.name}: {number} realizations in {-(-number // found.layout.chunk)} tasks",
+            memory,
+            f"  disk    {disk / 1e6:.1f} MB in about {found.layout.files()} files",
+            *rest,
         ]
     )
 
 
-@dataclass(frozen=True)
-class Cost:
-    """Cost of a run: realizations, tasks, worker memory, disk, files and processor time; of preparing, in words."""
-
-    realizations: int
-    tasks: int
-    worker_bytes: float
-    store_bytes: float
-    files: int
-    seconds_per_realization: float
-    preparation: str = ""
-
-
-def cost(run: config.RunConfig, realizations: range) -> Cost:
+def cost(run: config.RunConfig) -> Cost:
     """Estimate the cost of a run from its sizes, its beams, and one timed transform."""
     if run.sky.spectrum is not None:
         spectra.load(run.sky.spectrum, run.sky.lmax)
@@ -231,40 +203,24 @@ def cost(run: config.RunConfig, realizations: range) -> Cost:
     names = config.map_names(run)
     both = run.biposh.pairs == "all"
     pairs = len(names) * (len(names) + 1) // 2 if both else len(names)
-    found = modes(run.biposh.L_max, both and len(names) > 1)
-    npix, kept = 12 * nside**2, 12 * config.prepared_grid(run)[0] ** 2
-    bare = Layout(
-        run.ensemble.realizations, 1, names, ("",) * pairs, found, lmax, run.ensemble.paired,
-        kept if run.ensemble.keep_maps else None,
-    )  # fmt: skip
-    planned = _chunked(bare, run.compute.chunk)
+    planned = _layout(run, ("",) * pairs, modes(run.biposh.L_max, both and len(names) > 1))
     splits = len(run.map.splits) or 1
     transform, estimation = _timed(nside, run.sky.lmax, lmax, run.biposh.L_max)
     transforms = sum(1.0 + 2.0 * m + splits * (2.0 + 4.0 * run.biposh.iterations) for m in mmax)
     if run.map.grid == "gl":
         transforms = sum(2.0 * m for m in mmax)
-    extra = splits * (1 + run.ensemble.paired) * sum(_transforms(run, channel) for channel in run.channels)
+    memory = 3e8 + 96.0 * nside**2 * (6 + 2 * max(mmax)) + 16.0 * alm_.size(run.sky.lmax) * (6 + len(names) * 2)
+    memory += planned.chunk * planned.realization_bytes()
+    words = ""
+    if run.preparation:
+        steps = [preparation(run, channel, split) for channel in run.channels for split in run.map.splits or (None,)]
+        extra = (1 + run.ensemble.paired) * sum(each.transforms for each in steps if each is not None)
+        transforms, memory = transforms + extra, memory + 480.0 * nside**2
+        grid = f"nside {nside} to {config.prepared_grid(run)[0]}"
+        words = f"{extra:g} further transforms per realization and {480e-9 * nside**2:.2g} GB per worker, {grid}"
     estimates = pairs * (2 if run.ensemble.paired else 1)
-    largest = max(mmax)
-    memory = 3e8 + 8.0 * npix * (6 + 2 * largest) + 16.0 * alm_.size(run.sky.lmax) * (6 + len(names) * 2)
-    memory += planned.chunk * planned.realization_bytes() + (40.0 * npix if run.preparation else 0.0)
-    grid = f"nside {nside} to {config.prepared_grid(run)[0]}"
-    words = f"{extra:g} further transforms per realization and {40e-9 * npix:.2g} GB per worker, {grid}"
-    return Cost(
-        len(realizations),
-        -(-len(realizations) // planned.chunk),
-        memory,
-        float(planned.realization_bytes()) * len(realizations),
-        planned.files(),
-        transform * (transforms + extra) + estimation * estimates + differencing.seconds(run),
-        words if run.preparation else "",
-    )
-
-
-def _transforms(run: config.RunConfig, channel: config.Channel) -> int:
-    """Return the number of transforms that prepare a map of a channel."""
-    steps = preparation(run, channel, run.map.splits[0] if run.map.splits else None)
-    return 0 if steps is None else sum(step.transforms for step in steps.steps)
+    each_s = transform * transforms + estimation * estimates + differencing.seconds(run)
+    return Cost(planned, memory, each_s, words)
 
 
 def _timed(nside: int, lmax_sky: int, lmax: int, L_max: int) -> tuple[float, float]:

@@ -83,8 +83,7 @@ def predict(
 
 
 def _dataset(survey: Survey, found: dict[tuple[int, int], Means]) -> xr.Dataset:
-    run = survey.config
-    recipe = summary.Recipe(survey.pair_names, survey.estimator.modes, survey.lmax, run.biposh.summary_bin, paired=True)
+    run, layout = survey.config, plan.layout(survey)
     mean: dict[str, NDArray] = {
         "biposh": np.stack([found[pair].beam + found[pair].noise for pair in survey.pairs]),
         "biposh_circular": np.stack([found[pair].circular + found[pair].noise for pair in survey.pairs]),
@@ -99,46 +98,37 @@ def _dataset(survey: Survey, found: dict[tuple[int, int], Means]) -> xr.Dataset:
         spectra = name.replace("biposh", "cl")
         mean[spectra] = detectability.cl_of(survey, mean[name][:, monopole])
         scatter[spectra] = scatter[name][:, monopole] / degrees
-        mean[f"{name}_binned"] = recipe.binned(mean[name])
-        scatter[f"{name}_binned"] = _binned_variance(recipe, scatter[name])
+        mean[f"{name}_binned"] = summary.binned(layout, mean[name])
+        scatter[f"{name}_binned"] = variances = summary.binned(layout, scatter[name], power=2)
         if not name.endswith("difference"):
-            comoment[f"{name}_binned"] = scatter[f"{name}_binned"][..., None] * np.eye(len(recipe.edges) - 1)
+            comoment[f"{name}_binned"] = variances[..., None] * np.eye(variances.shape[-1])
     # Build the sums of two realizations with these variances, so that the summary's own code makes the dataset.
-    result = summary.dataset(recipe, Sums(2, mean, scatter, comoment), plan.attributes(run))
+    result = summary.dataset(layout, Sums(2, mean, scatter, comoment), plan.attributes(run))
     for name in mean:
         result[f"{name}_standard_error"].values[:] = np.sqrt(scatter[name] / run.ensemble.realizations)
     result["count"].values[...] = run.ensemble.realizations
     return result
 
 
-def _binned_variance(recipe: summary.Recipe, variance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the variance of the mean over a bin, for coefficients independent from ell to ell."""
-    scaled = recipe.factor**2 * variance
-    exists = np.isfinite(scaled)
-    total = np.add.reduceat(np.where(exists, scaled, 0.0), recipe.edges[:-1], axis=-1)
-    count = np.add.reduceat(exists, recipe.edges[:-1], axis=-1, dtype=np.int64)
-    return np.divide(total, count.astype(float) ** 2, out=np.full(total.shape, np.nan), where=count > 0)
-
-
 def _attributes(survey: Survey, L_moments: int | None) -> dict[str, Any]:
     run = survey.config
-    order = (
-        "leading order in their non-circular part" if L_moments is None else f"all orders, w_s up to L = {L_moments}"
-    )
-    weighted = any(m.weight is not None for channel in survey.channels for m in channel.maps)
+    order = "leading order in their non-circular part"
+    if L_moments is not None:
+        order = f"all orders, w_s up to L = {L_moments}"
+    mask = "full sky"
+    if any(m.weight is not None for channel in survey.channels for m in channel.maps):
+        mask = "weights W act as w_s -> W^2 w_s and on the errors; their own mode coupling is left out"
+    window, left_out = "none: rings without pixels", "nothing"
+    if run.map.grid == "healpix":
+        window = "divided out of a_lm by the analysis, so it cancels but for the noise"
+        left_out = "centroid offsets of the samples in a pixel, quadrature error of the analysis"
     return {
         "name": run.name,
         "prediction": f"from b_lm of the beams, {order}",
         "frame": survey.frame,
         "digest": config.digest(run),
         "f_sky": min(detectability.sky_fraction(survey, pair) for pair in survey.pairs),
-        "mask": "weights W act as w_s -> W^2 w_s and on the errors; their own mode coupling is left out"
-        if weighted
-        else "full sky",
-        "pixel_window": "divided out of a_lm by the analysis, so it cancels but for the noise"
-        if run.map.grid == "healpix"
-        else "none: rings without pixels",
-        "left_out": "centroid offsets of the samples in a pixel, quadrature error of the analysis"
-        if run.map.grid == "healpix"
-        else "nothing",
+        "mask": mask,
+        "pixel_window": window,
+        "left_out": left_out,
     }

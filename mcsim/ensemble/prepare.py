@@ -13,7 +13,7 @@ from mcsim.errors import InputError
 from mcsim.simulation.preparation import preparation
 from mcsim.sphere import header, healpix
 from mcsim.sphere.checks import UNSEEN_BELOW, check_map
-from mcsim.support.folders import appearing, writable
+from mcsim.support.folders import appearing, unwritable, writable
 
 Map = NDArray[np.float64]
 Source = str | Path | Mapping[str, Any] | config.RunConfig
@@ -126,12 +126,9 @@ def prepare_files(source: Source, files: Sequence[str], folder: str | Path) -> l
     done = prepare(dict(_read(run, names, file) for file in files), run)
     writable(target.absolute().parent)
     keywords = [("RUN", run.name.encode("ascii", "backslashreplace").decode()), ("DIGEST", config.digest(run))]
-    try:
-        with appearing(target) as scratch:
-            for name, map_uk in done.items():
-                write_map(scratch / names[name], map_uk, config.prepared_grid(run)[1], keywords)
-    except OSError as error:
-        raise InputError(f"{target} cannot be written ({error.strerror}); choose another folder with -o.") from error
+    with unwritable(target, "choose another folder with -o"), appearing(target) as scratch:
+        for name, map_uk in done.items():
+            write_map(scratch / names[name], map_uk, config.prepared_grid(run)[1], keywords)
     return [target / names[name] for name in done]
 
 

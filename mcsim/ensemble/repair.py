@@ -1,15 +1,14 @@
 """Check of a store, and removal of damaged parts so that a run computes them again."""
 
-import hashlib
-import json
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from mcsim.config.identity import digest_of
 from mcsim.ensemble import store
 from mcsim.ensemble.layout import Layout, listed
 from mcsim.ensemble.store import Damage
@@ -21,16 +20,9 @@ THREADS = 4
 
 @dataclass(frozen=True)
 class Verdict:
-    """Result of reading every file of a store.
+    """Result of reading every file of a store: ``finished`` of ``size`` realizations are intact.
 
-    Attributes
-    ----------
-    finished, size
-        Number of intact realizations, and of those that the store has room for.
-    damages
-        Damaged chunks of realizations.
-    broken
-        Faults of other parts, by name: metadata, coordinates, summary.
+    ``broken`` names the faults of parts other than realizations: metadata, coordinates, summary.
     """
 
     path: Path
@@ -57,48 +49,37 @@ class Verdict:
         lines += [f"  {listed(damage.lost)}: {damage.reason}" for damage in self.damages if damage.lost]
         lines += [f"  {name}: {reason}" for name, reason in self.broken.items()]
         repair = "computes them again" if self.lost else "repairs this"
-        return "\n".join(
-            [*lines, f"  {self.finished} of {self.size} realizations are whole; mcsim run --resume {repair}."]
-        )
+        lines.append(f"  {self.finished} of {self.size} realizations are whole; mcsim run --resume {repair}.")
+        return "\n".join(lines)
 
 
 def verify(path: str | Path, quiet: bool = True) -> Verdict:
-    """Read every chunk of every array and check its checksum.
-
-    Raises
-    ------
-    InputError
-        If there is no store at ``path``.
-    """
+    """Read every chunk of every array and check its checksum."""
     target = Path(path)
     broken = broken_parts(target)
     if "done" in broken:
         return Verdict(target, 0, 0, (), broken)
     finished = 0
-    damages = []
+    damages: list[Damage] = []
     size, chunk = store.size(target), store.chunk(target)
-    with reporting("verification", float(size), "realizations", quiet) as report:
-        for start, count, damage in _examined(target, size, chunk, set(broken)):
+
+    def examined(start: int) -> tuple[int, Damage | None]:
+        """Return the number of intact realizations of a chunk, and its damage."""
+        damage = store.examine(target, start, broken)
+        try:
+            done = int(store.done(target, start, start + chunk).sum())
+        except RunError:
+            return 0, damage
+        return done - len(damage.lost if damage else ()), damage
+
+    with reporting("verification", float(size), "realizations", quiet) as report, ThreadPoolExecutor(THREADS) as pool:
+        starts = range(0, size, chunk)
+        for start, (count, damage) in zip(starts, pool.map(examined, starts), strict=True):
             if damage is not None:
                 damages.append(damage)
             finished += count
             report(float(min(start + chunk, size)), sum(len(d.lost) for d in damages))
     return Verdict(target, finished, size, tuple(damages), broken)
-
-
-def _examined(path: Path, size: int, chunk: int, broken: set[str]) -> Iterator[tuple[int, int, Damage | None]]:
-    """Yield start, number of intact realizations and damage of every chunk; a few at a time to save memory."""
-
-    def one(start: int) -> tuple[int, int, Damage | None]:
-        damage = store.examine(path, start, broken)
-        try:
-            done = int(store.done(path, start, start + chunk).sum())
-        except RunError:
-            return start, 0, damage
-        return start, done - len(damage.lost if damage else ()), damage
-
-    with ThreadPoolExecutor(THREADS) as pool:
-        yield from pool.map(one, range(0, size, chunk))
 
 
 def mend(path: Path, layout: Layout, attributes: Mapping[str, Any], quiet: bool = True) -> Verdict:
@@ -113,7 +94,7 @@ def mend(path: Path, layout: Layout, attributes: Mapping[str, Any], quiet: bool 
     verdict = verify(path, quiet)
     for damage in verdict.damages:
         store.discard(path, damage)
-    return Verdict(path, verdict.finished, verdict.size, verdict.damages, broken | verdict.broken)
+    return replace(verdict, broken=broken | verdict.broken)
 
 
 def _sweep(path: Path) -> None:
@@ -122,17 +103,15 @@ def _sweep(path: Path) -> None:
         left.unlink(missing_ok=True)
     scratch = re.compile(rf"\.{re.escape(path.name)}\.[a-z0-9_]{{8}}")  # tempfile's names
     for left in [entry for entry in path.absolute().parent.iterdir() if scratch.fullmatch(entry.name)]:
-        if left.is_dir():
-            shutil.rmtree(left, ignore_errors=True)
-        else:
+        if left.is_file():
             left.unlink(missing_ok=True)
+        shutil.rmtree(left, ignore_errors=True)
 
 
 def broken_parts(path: Path) -> dict[str, str]:
     """Return the faults of parts other than realizations, by name."""
     attributes = store.attributes(path)
     broken = store.broken_parts(path)
-    canonical = json.dumps(attributes["science"], sort_keys=True, separators=(",", ":")).encode()
-    if hashlib.sha256(canonical).hexdigest() != attributes.get("digest"):
+    if digest_of(attributes["science"]) != attributes.get("digest"):
         broken["attributes"] = "the configuration in them does not have the hash that they state"
     return broken

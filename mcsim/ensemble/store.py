@@ -9,7 +9,7 @@ import shutil
 import tempfile
 import warnings
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -22,6 +22,7 @@ from zarr.codecs import ZstdCodec
 
 from mcsim.ensemble.layout import Layout, listed
 from mcsim.errors import InputError, RunError
+from mcsim.support.folders import unwritable
 
 _CODECS: dict[str, Any] = {"compressors": (ZstdCodec(level=1, checksum=True),)}
 # Write chunks of fill values too, so that a missing file means damage.
@@ -45,70 +46,50 @@ class Damage:
 
 
 def check_writable(path: Path) -> Path:
-    """Check that a store can be made, without making anything; return the innermost existing folder.
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be written.
-    """
+    """Check that a store can be made, without making anything; return the innermost existing folder."""
     folder = path.absolute().parent
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
-    with _refuse_unwritable(path):
+    with refuse_unwritable(path):
         for place in (folder, path) if path.is_dir() else (folder,):
             tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=place).cleanup()
     return folder
 
 
 def create(path: Path, layout: Layout, attributes: Mapping[str, Any]) -> None:
-    """Make an empty store at ``path``, complete or not at all.
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be written.
-    """
-    with _refuse_unwritable(path):
+    """Make an empty store at ``path``, complete or not at all."""
+    with refuse_unwritable(path), ExitStack() as stack:
         path.parent.mkdir(parents=True, exist_ok=True)
-        scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
-    try:
-        with _refuse_unwritable(path):
-            group = zarr.create_group(scratch / "new")
-            group.attrs.update({**attributes, "coordinates": "L M d parity"})
-            _write_coordinates(group, layout)
-            sizes = layout.sizes()
-            whole = {**layout.variables(), "done": ((), "bool", "1", "finished")}
-            for name, (dims, dtype, unit, text) in whole.items():
-                shape = tuple(sizes[dim] for dim in ("realization", *dims))
-                fill: Any = {"bool": False, "complex128": complex(np.nan, np.nan)}.get(dtype, np.nan)
-                array = group.create_array(
-                    name,
-                    shape=shape,
-                    chunks=(layout.chunk, *shape[1:]),
-                    dtype=dtype,
-                    fill_value=fill,
-                    dimension_names=("realization", *dims),
-                    **_CODECS,
-                )
-                array.attrs.update({"units": unit, "long_name": text})
-            if layout.kept_npix is not None:
-                group[layout.kept_name].attrs.update(layout.kept_attributes())
-            _consolidate(scratch / "new")
-            os.replace(scratch / "new", path)
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+        scratch = tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent)
+        stack.callback(shutil.rmtree, scratch, ignore_errors=True)
+        group = zarr.create_group(Path(scratch) / "new")
+        group.attrs.update({**attributes, "coordinates": "L M d parity"})
+        for name, (dim, values, attrs) in layout.coordinates().items():
+            form: dict[str, Any] = {"dtype": str if values.dtype == object else values.dtype, **_WHOLE}
+            array = group.create_array(name, shape=values.shape, chunks=values.shape, dimension_names=[dim], **form)
+            array[:] = values
+            array.attrs.update(attrs)
+        sizes = layout.sizes()
+        whole = {**layout.variables(), "done": ((), "bool", "1", "finished")}
+        for name, (dims, dtype, unit, text) in whole.items():
+            dims = ("realization", *dims)
+            shape = tuple(sizes[dim] for dim in dims)
+            fill = {"bool": False, "complex128": complex(np.nan, np.nan)}.get(dtype, np.nan)
+            form = {"dtype": dtype, "fill_value": fill, **_CODECS}
+            array = group.create_array(
+                name, shape=shape, chunks=(layout.chunk, *shape[1:]), dimension_names=dims, **form
+            )
+            array.attrs.update({"units": unit, "long_name": text})
+        if layout.kept_npix is not None:
+            group[layout.kept_name].attrs.update(layout.kept_attributes())
+        _consolidate(Path(scratch) / "new")
+        os.replace(Path(scratch) / "new", path)
 
 
 def write(path: Path, first: int, values: Mapping[str, NDArray], done: NDArray[np.bool_]) -> None:
     """Write whole chunks of realizations from ``first`` on; ``done`` is written last.
 
     ``values`` holds arrays of shape (n, ...); rows that are not done are stored as NaN.
-
-    Raises
-    ------
-    RunError
-        If the store cannot be written.
     """
     with faults_named(path):
         group = _open(path, "r+")
@@ -119,13 +100,7 @@ def write(path: Path, first: int, values: Mapping[str, NDArray], done: NDArray[n
 
 
 def read(path: Path, start: int, stop: int, maps: bool = False) -> dict[str, NDArray]:
-    """Read the arrays over realizations ``start`` to ``stop``, with ``done``; kept maps only if ``maps``.
-
-    Raises
-    ------
-    RunError
-        If an array is missing or damaged.
-    """
+    """Read the arrays over realizations ``start`` to ``stop``, with ``done``; kept maps only if ``maps``."""
     with faults_named(path):
         group = _open(path)
         left_out = {"realization"} if maps else {"realization", MAP, FORMER_MAP}
@@ -145,26 +120,24 @@ def examine(path: Path, start: int, leave_out: Collection[str] = ()) -> Damage |
     with faults_named(path):
         group = _open(path)
         last = _member(group, "done")
-        stop = min(start + last.chunks[0], last.shape[0])
-        names = [name for name in variables(path) if name not in ("realization", "done", *leave_out)]
-    try:
-        rows = {"done": np.asarray(last[start:stop])}
-    except _FAULTS as error:
-        return Damage(start, tuple(range(start, stop)), f"done: {_reason(error)}")
-    for name in names:
+        numbers = np.arange(start, min(start + last.chunks[0], last.shape[0]))
+        names = [name for name in _variables(path) if name not in leave_out]
+    rows: dict[str, NDArray] = {}
+    for name in ("done", *names):
         try:
-            rows[name] = np.asarray(_member(group, name)[start:stop])
+            rows[name] = np.asarray(_member(group, name)[start : start + len(numbers)])
         except _FAULTS as error:
-            return Damage(start, _indices(start, rows["done"]), f"{name}: {_reason(error)}")
-    absent = _absent(rows)
-    return Damage(start, _indices(start, absent), "numbers are missing") if absent.any() else None
+            lost = numbers[rows["done"]] if rows else numbers
+            return Damage(start, tuple(lost.tolist()), f"{name}: {_reason(error)}")
+    lost = numbers[_absent(rows)]
+    return Damage(start, tuple(lost.tolist()), "numbers are missing") if lost.size else None
 
 
 def discard(path: Path, damage: Damage) -> None:
     """Delete a damaged chunk, ``done`` first, so that an interrupted call leaves nothing that looks intact."""
     with faults_named(path):
         group = _open(path)
-        for name in ("done", *(name for name in variables(path) if name not in ("realization", "done"))):
+        for name in ("done", *_variables(path)):
             array = _member(group, name)
             key = array.metadata.encode_chunk_key((damage.start // array.chunks[0], *(0,) * (array.ndim - 1)))
             (path / name / key).unlink(missing_ok=True)
@@ -206,12 +179,6 @@ def restore(path: Path, layout: Layout, update: Mapping[str, Any]) -> None:
                 os.replace(file, target)
 
 
-def variables(path: Path) -> list[str]:
-    """Return the names of the arrays over realizations, even if their files are missing."""
-    with faults_named(path):
-        return [name for name, metadata in _remembered(path).items() if _over_realizations(metadata)]
-
-
 def done(path: Path, start: int = 0, stop: int | None = None) -> NDArray[np.bool_]:
     """Return True for each finished realization from ``start`` to ``stop``; by default of all."""
     with faults_named(path):
@@ -225,13 +192,7 @@ def size(path: Path) -> int:
 
 
 def attributes(path: Path) -> dict[str, Any]:
-    """Return the attributes of a store.
-
-    Raises
-    ------
-    InputError
-        If there is no mcsim store at ``path``.
-    """
+    """Return the attributes of a store; raise InputError if there is none at ``path``."""
     try:
         found = dict(_open(path).attrs)
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -248,11 +209,11 @@ def chunk(path: Path) -> int:
 
 
 def extend(path: Path, realizations: int, update: Mapping[str, Any]) -> None:
-    """Grow a store to more realizations; keep the finished ones.
+    """Grow a store to more realizations, keep the finished ones, and change attributes.
 
     ``done``, whose length is that of the store, grows last: another call completes an interrupted one.
     """
-    with _refuse_unwritable(path):
+    with refuse_unwritable(path):
         group = _open(path, "r+")
         growing = {name: array for name, array in group.arrays() if _over_realizations(array)}
         last = growing.pop("done")
@@ -269,22 +230,10 @@ def write_summary(path: Path, summary: xr.Dataset) -> None:
     with faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", category=UserWarning)
-            summary.to_zarr(
-                Path(scratch) / "summary",
-                zarr_format=3,
-                consolidated=False,
-                encoding=dict.fromkeys(summary.variables, _CODECS),
-                write_empty_chunks=True,
-            )
+            form: Any = {"zarr_format": 3, "consolidated": False, "write_empty_chunks": True}
+            summary.to_zarr(Path(scratch) / "summary", encoding=dict.fromkeys(summary.variables, _CODECS), **form)
         shutil.rmtree(path / "summary", ignore_errors=True)
         os.replace(Path(scratch) / "summary", path / "summary")
-        _consolidate(path)
-
-
-def amend(path: Path, update: Mapping[str, Any]) -> None:
-    """Change attributes of a store."""
-    with faults_named(path):
-        _open(path, "r+").attrs.update(update)
         _consolidate(path)
 
 
@@ -293,37 +242,13 @@ def summarised(path: Path) -> tuple[int, list[int]]:
     if not (path / "summary").is_dir():
         return 0, []
     with faults_named(path):
-        group = _open(path / "summary")
-        count, first = (np.asarray(_member(group, name)[...]) for name in ("count", "bin_first"))
+        count, first = (np.asarray(_member(_open(path / "summary"), name)[...]) for name in ("count", "bin_first"))
         return int(count), first.tolist()
-
-
-def _write_coordinates(group: zarr.Group, layout: Layout) -> None:
-    _index(group, "realization", np.arange(layout.realizations), "index of the realization")
-    _index(group, "ell", np.arange(layout.lmax + 1), "degree l2")
-    _labels(group, "pair", layout.pairs, "ordered pair of maps X,Y: l1 is of X, l2 of Y")
-    _labels(group, "mode", [mode.name for mode in layout.modes], "BipoSH mode")
-    for name, text in (("L", "bipolar degree"), ("M", "bipolar order"), ("d", "l2 - l1")):
-        _index(group, name, np.array([getattr(mode, name) for mode in layout.modes]), text, "mode")
-    _labels(group, "parity", [mode.parity for mode in layout.modes], "parity of l1 + l2 + L", "mode")
-    if layout.kept_npix is not None:
-        _labels(group, "map_name", layout.maps, "map")
 
 
 def _open(path: Path, mode: Literal["r", "r+"] = "r") -> zarr.Group:
     """Open the group without its consolidated metadata, which may be out of date."""
     return zarr.open_group(path, mode=mode, use_consolidated=False)
-
-
-def _index(group: zarr.Group, name: str, values: NDArray[np.int64], text: str, dim: str | None = None) -> None:
-    array = group.create_array(name, data=values, chunks=values.shape, dimension_names=[dim or name], **_WHOLE)
-    array.attrs.update({"units": "1", "long_name": text})
-
-
-def _labels(group: zarr.Group, name: str, values, text: str, dim: str | None = None) -> None:  # type: ignore[no-untyped-def]
-    array = group.create_array(name, shape=(len(values),), dtype=str, dimension_names=[dim or name], **_WHOLE)
-    array[:] = np.array(values, dtype=object)
-    array.attrs["long_name"] = text
 
 
 def _member(group: zarr.Group, name: str) -> zarr.Array:
@@ -343,6 +268,12 @@ def _remembered(path: Path) -> dict[str, Any]:
     return {} if consolidated is None else dict(consolidated.flattened_metadata)
 
 
+def _variables(path: Path) -> list[str]:
+    """Return the names of the arrays over realizations but ``done``, even if their files are missing."""
+    found = [name for name, metadata in _remembered(path).items() if _over_realizations(metadata)]
+    return [name for name in found if name not in ("realization", "done")]
+
+
 def _form(metadata: dict[str, Any]) -> str:
     """Return metadata as text without the length, which an interrupted extension may have changed."""
     shape = metadata.pop("shape", ())
@@ -357,10 +288,6 @@ def _absent(rows: Mapping[str, NDArray]) -> NDArray[np.bool_]:
             missing = np.isnan(values).reshape(len(values), -1)
             absent |= missing.any(axis=1) if name.startswith("cl") else missing.all(axis=1)
     return absent & rows["done"]
-
-
-def _indices(start: int, rows: NDArray[np.bool_]) -> tuple[int, ...]:
-    return tuple(int(start + row) for row in np.flatnonzero(rows))
 
 
 def _reason(error: BaseException) -> str:
@@ -379,9 +306,9 @@ def faults_named(path: Path) -> Iterator[None]:
     """Turn zarr's errors for a damaged or vanished store, or a full disk, into one sentence."""
     try:
         yield
+    except (RunError, InputError):
+        raise
     except _FAULTS as error:
-        if isinstance(error, RunError | InputError):
-            raise
         remedy = "repair its disk" if isinstance(error, OSError) else "mcsim info --verify says what is damaged"
         raise RunError(
             f"The store {path} cannot be used ({type(error).__name__}: {_reason(error)}); {remedy}, and mcsim run "
@@ -389,10 +316,6 @@ def faults_named(path: Path) -> Iterator[None]:
         ) from error
 
 
-@contextmanager
-def _refuse_unwritable(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise InputError(f"The store {path} cannot be written ({reason}); choose a writable folder with -o.") from error
+def refuse_unwritable(path: Path) -> AbstractContextManager[None]:
+    """Turn errors of the file system into one sentence."""
+    return unwritable(f"The store {path}", "choose a writable folder with -o")

@@ -1,8 +1,7 @@
 """Summary of an ensemble: means, errors and binned spectra with their covariance."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -11,37 +10,9 @@ from numpy.typing import NDArray
 
 from mcsim.bipolar import Mode, bennett_factor
 from mcsim.config.preparation import frame_of
+from mcsim.ensemble.layout import Layout
 from mcsim.stats import streaming
 from mcsim.stats.streaming import Sums
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """Definition of a summary: the labels of the spectra and the width of their bins in ell."""
-
-    pairs: tuple[str, ...]
-    modes: tuple[Mode, ...]
-    lmax: int
-    bin_width: int
-    paired: bool
-
-    @cached_property
-    def edges(self) -> NDArray[np.int64]:
-        """First ell of every bin, and lmax + 1."""
-        return np.append(np.arange(0, self.lmax + 1, self.bin_width), self.lmax + 1)
-
-    @cached_property
-    def factor(self) -> NDArray[np.float64]:
-        """Factor from the raw to the binned coefficients, shape (mode, lmax + 1); see :func:`bin_factor`."""
-        return np.stack([bin_factor(mode, self.lmax) for mode in self.modes])
-
-    def binned(self, biposh: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Return the mean of factor * A over the existing coefficients of each bin, shape (..., mode, bin)."""
-        scaled = self.factor * biposh
-        exists = np.isfinite(scaled)
-        total = np.add.reduceat(np.where(exists, scaled, 0.0), self.edges[:-1], axis=-1)
-        count = np.add.reduceat(exists, self.edges[:-1], axis=-1, dtype=np.int64)
-        return np.divide(total, count, out=np.full(total.shape, np.nan + 0j), where=count > 0)
 
 
 def bin_factor(mode: Mode, lmax: int) -> NDArray[np.float64]:
@@ -58,43 +29,56 @@ def bin_factor(mode: Mode, lmax: int) -> NDArray[np.float64]:
     return spectrum * np.where(ell % 2 == 0, 1.0, -1.0) * ((2.0 * other + 1.0) * (2.0 * ell + 1.0)) ** -0.25
 
 
-def reduce_rows(recipe: Recipe, rows: Mapping[str, NDArray], first: int) -> Sums | None:
-    """Reduce consecutive realizations to statistics, by the tree of their indices.
+@lru_cache(maxsize=2)
+def _factors(modes: tuple[Mode, ...], lmax: int) -> NDArray[np.float64]:
+    """Return the factors of all modes, shape (mode, lmax + 1)."""
+    return np.stack([bin_factor(mode, lmax) for mode in modes])
 
-    Parameters
-    ----------
-    recipe
-        Definition of the summary.
-    rows
-        Arrays over realizations as stored, with ``done``.
-    first
-        Index of the first row; a multiple of the smallest power of two that is not below the number of rows.
+
+def first_ells(layout: Layout) -> NDArray[np.int64]:
+    """Return the first ell of every bin of the summary."""
+    return np.arange(0, layout.lmax + 1, layout.bin_width)
+
+
+def binned(layout: Layout, values: NDArray, power: int = 1) -> NDArray:
+    """Return the mean of factor * A over the existing coefficients of each bin, shape (..., mode, bin).
+
+    With ``power`` 2 the values are variances of coefficients, independent from ell to ell; return that of the mean.
+    """
+    scaled = _factors(layout.modes, layout.lmax) ** power * values
+    exists = np.isfinite(scaled)
+    total = np.add.reduceat(np.where(exists, scaled, 0.0), first_ells(layout), axis=-1)
+    count = np.add.reduceat(exists, first_ells(layout), axis=-1, dtype=np.int64)
+    return np.divide(total, count**power, out=np.full_like(total, np.nan), where=count > 0)
+
+
+def reduce_rows(layout: Layout, rows: Mapping[str, NDArray], first: int) -> Sums | None:
+    """Reduce consecutive realizations, arrays as stored with ``done``, to statistics, by the tree of their indices.
+
+    ``first``, the index of the first row, is a multiple of the smallest power of two not below the number of rows.
     """
 
     def node(row: int) -> Sums | None:
         if not rows["done"][row]:
             return None
         values = {name: array[row] for name, array in rows.items() if name != "done"}
-        if recipe.paired:
+        if layout.paired:
             for name in ("biposh", "cl"):
                 values[f"{name}_difference"] = values[name] - values[f"{name}_circular"]
-        binned = {f"{name}_binned": recipe.binned(values[name]) for name in values if name.startswith("biposh")}
-        return streaming.leaf(values | binned, covariance_of=tuple(binned))
+        bins = {f"{name}_binned": binned(layout, values[name]) for name in values if name.startswith("biposh")}
+        return streaming.leaf(values | bins, covariance_of=tuple(bins))
 
     return streaming.tree(node, len(rows["done"]))
 
 
 _MEANING = {
-    "biposh": "BipoSH coefficients",
-    "biposh_circular": "BipoSH coefficients of the circular-beam control",
-    "biposh_difference": "BipoSH coefficients, non-circular minus circular-beam control",
-    "cl": "power spectrum",
-    "cl_circular": "power spectrum of the circular-beam control",
-    "cl_difference": "power spectrum, non-circular minus circular-beam control",
+    "": "",
+    "_circular": " of the circular-beam control",
+    "_difference": ", non-circular minus circular-beam control",
 }
 
 
-def dataset(recipe: Recipe, sums: Sums, attributes: Mapping[str, Any]) -> xr.Dataset:
+def dataset(layout: Layout, sums: Sums, attributes: Mapping[str, Any]) -> xr.Dataset:
     """Return the summary as a dataset: ``{variable}_{mean, standard_error, standard_deviation}``, raw and binned.
 
     The provenance among the store's ``attributes`` is copied into the summary.
@@ -105,46 +89,37 @@ def dataset(recipe: Recipe, sums: Sums, attributes: Mapping[str, Any]) -> xr.Dat
     variables: dict[str, tuple[Sequence[str], NDArray, dict[str, str]]] = {}
     for name in sums.mean:
         raw = name.removesuffix("_binned")
+        kind = raw.removeprefix("biposh").removeprefix("cl")
         last = "ell" if raw == name else "bin"
         dims = ("pair", last) if raw.startswith("cl") else ("pair", "mode", last)
-        scale = "l(l+1)/2pi A, mean over the bin, " if raw != name else ""
+        meaning = ("power spectrum" if raw.startswith("cl") else "BipoSH coefficients") + _MEANING[kind]
+        if raw != name:
+            meaning = f"l(l+1)/2pi A, mean over the bin, {meaning}"
         deviation = streaming.standard_deviation(sums, name)
         for suffix, array, text in (
             ("mean", sums.mean[name], "mean"),
             ("standard_error", deviation / np.sqrt(sums.count), "standard error of the mean"),
             ("standard_deviation", deviation, "standard deviation of one realization"),
         ):
-            variables[f"{name}_{suffix}"] = (dims, array, _units(f"{scale}{_MEANING[raw]}: {text}"))
+            variables[f"{name}_{suffix}"] = (dims, array, {"units": "uK^2", "long_name": f"{meaning}: {text}"})
         if name in sums.comoment:
-            text = f"{scale}{_MEANING[raw]}: covariance of one realization between bins"
+            text = f"{meaning}: covariance of one realization between bins"
             array = streaming.covariance(sums, name)
-            variables[f"{name}_covariance"] = ((*dims, "bin_2"), array, _units(text, "uK^4"))
-    variables["bin_factor"] = (
-        ("mode", "ell"),
-        recipe.factor,
-        {"units": "1", "long_name": "factor from raw coefficients to binned ones"},
-    )
+            variables[f"{name}_covariance"] = ((*dims, "bin_2"), array, {"units": "uK^4", "long_name": text})
+    own = {"units": "1", "long_name": "factor from raw coefficients to binned ones"}
+    variables["bin_factor"] = (("mode", "ell"), _factors(layout.modes, layout.lmax).copy(), own)
     variables["count"] = ((), np.array(sums.count), {"units": "1", "long_name": "number of realizations"})
-    first, stop = recipe.edges[:-1], recipe.edges[1:]
-    coordinates = {
-        "pair": ("pair", np.array(recipe.pairs, dtype=object), {"long_name": "ordered pair of maps"}),
-        "mode": ("mode", np.array([m.name for m in recipe.modes], dtype=object), {"long_name": "BipoSH mode"}),
-        "ell": ("ell", np.arange(recipe.lmax + 1), {"units": "1", "long_name": "degree l2"}),
-        "bin": ("bin", (first + stop - 1) / 2.0, {"units": "1", "long_name": "middle of the bin in ell"}),
-        "bin_2": ("bin_2", (first + stop - 1) / 2.0, {"units": "1", "long_name": "the other bin of a covariance"}),
-        "bin_first": ("bin", first, {"units": "1", "long_name": "first ell of the bin"}),
-        "bin_last": ("bin", stop - 1, {"units": "1", "long_name": "last ell of the bin"}),
-        "parity": ("mode", np.array([m.parity for m in recipe.modes], dtype=object), {"long_name": "of l1 + l2 + L"}),
-        **{
-            name: ("mode", np.array([getattr(m, name) for m in recipe.modes]), {"units": "1", "long_name": text})
-            for name, text in (("L", "bipolar degree"), ("M", "bipolar order"), ("d", "l2 - l1"))
-        },
-    }
+    first = first_ells(layout)
+    final = np.append(first[1:] - 1, layout.lmax)
+    coordinates = {k: v for k, v in layout.coordinates().items() if k not in ("realization", "map_name")}
+    for name, dim, values, text in (
+        ("bin", "bin", (first + final) / 2.0, "middle of the bin in ell"),
+        ("bin_2", "bin_2", (first + final) / 2.0, "the other bin of a covariance"),
+        ("bin_first", "bin", first, "first ell of the bin"),
+        ("bin_last", "bin", final, "last ell of the bin"),
+    ):
+        coordinates[name] = (dim, values, {"units": "1", "long_name": text})
     origin = {name: attributes[name] for name in ("digest", "conventions", "packages")}
     run = {"name": attributes["configuration"]["name"], "frame": frame_of(attributes["configuration"])}
     normalisation = "Hajian-Souradeep; binned: see bin_factor"
     return xr.Dataset(variables, coordinates, {**run, **origin, "normalisation": normalisation})
-
-
-def _units(text: str, unit: str = "uK^2") -> dict[str, str]:
-    return {"units": unit, "long_name": text}

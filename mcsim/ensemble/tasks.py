@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.ensemble import store, summary
+from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError, RunError
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import Survey, survey
@@ -35,18 +36,8 @@ class Failure:
 class Job:
     """Parameters shared by all tasks of a run; each task carries them, so they are small.
 
-    Attributes
-    ----------
-    text, digest
-        Configuration as JSON, and the hash of it and of its files.
-    path
-        Store.
-    chunk
-        Number of realizations per task.
-    first, stop
-        Wanted realizations: first ... stop - 1.
-    packages
-        Versions of the driver, see :func:`packages`.
+    ``text`` is the configuration as JSON, ``digest`` the hash of it and of its files, ``path`` the store, ``chunk`` the
+    number of realizations per task; wanted are ``first`` to ``stop - 1``; ``packages`` are the versions of the driver.
     """
 
     text: str
@@ -65,13 +56,7 @@ def packages() -> tuple[tuple[str, str], ...]:
 
 
 def check_same_packages(where: str, theirs: Iterable[tuple[str, str]], own: Iterable[tuple[str, str]]) -> None:
-    """Raise InputError unless a worker's versions, ``theirs``, are the driver's, ``own``.
-
-    Raises
-    ------
-    InputError
-        With the package and both versions.
-    """
+    """Raise InputError unless a worker's versions, ``theirs``, are the driver's, ``own``."""
     found = dict(theirs)
     wrong = [f"{name} {found.get(name)} for {number}" for name, number in own if found.get(name) != number]
     if wrong:
@@ -152,16 +137,16 @@ def empty(count: int, like: NDArray) -> NDArray:
     return np.full((count, *like.shape[1:]), False if like.dtype == bool else np.nan, like.dtype)
 
 
-def summarise_node(path: str, recipe: summary.Recipe, start: int, stop: int, chunk: int) -> Sums | None:
+def summarise_node(path: str, layout: Layout, start: int, stop: int) -> Sums | None:
     """Return the statistics of the realizations of a node of the tree, read chunk by chunk."""
     target = Path(path)
-    starts = range(start, stop, chunk)
+    starts = range(start, stop, layout.chunk)
 
     def node(index: int) -> Sums | None:
         first = starts[index]
-        end = min(first + chunk, stop)
+        end = min(first + layout.chunk, stop)
         if not store.done(target, first, end).any():
             return None
-        return summary.reduce_rows(recipe, store.read(target, first, end), first)
+        return summary.reduce_rows(layout, store.read(target, first, end), first)
 
     return streaming.tree(node, len(starts))

@@ -1,10 +1,13 @@
 """Figure of a beam: its peak, its faint surroundings and its coefficients."""
 
+from typing import Any
+
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
@@ -47,70 +50,48 @@ def beam_figure(beam: Beam, beam_map: BeamMap | None = None, title: str = "") ->
         figure.suptitle(title, fontsize=13, fontweight="bold")
     fwhm = summary.fwhm_major_arcmin if np.isfinite(summary.fwhm_major_arcmin) else np.degrees(0.5) * 60
     _draw_peak(peak_axes, beam, beam_map, summary, 1.25 * fwhm)
-    reach = 5 * fwhm if beam_map is None else 1.05 * _data_reach_arcmin(beam_map)
+    # To the outermost pixel with data inside the cut of a map.
+    reach = 5 * fwhm if beam_map is None else 1.05 * _ARCMIN * float(solid_angle_values(beam_map)[1].max())
     _draw_faint(faint_axes, beam, beam_map, min(reach, 90 * 60))
     _draw_blm(blm_axes, beam)
     return figure
 
 
-def _data_reach_arcmin(beam_map: BeamMap) -> float:
-    """Return the largest distance from the centre of a pixel with data inside the cut."""
-    _, theta, _ = solid_angle_values(beam_map)
-    return float(theta.max() * _ARCMIN)
-
-
 def _pattern(beam: Beam, beam_map: BeamMap | None, reach_arcmin: float) -> NDArray[np.float64]:
-    """Return the response over its peak on a square of +-reach in theta (cos phi, sin phi); row = y."""
+    """Return the response over the largest in a square of +-reach in theta (cos phi, sin phi); row = y."""
     axis = np.linspace(-reach_arcmin, reach_arcmin, _PIXELS) / _ARCMIN
     x, y = np.meshgrid(axis, axis)
     theta, phi = np.hypot(x, y), np.arctan2(y, x)
-    if beam_map is None:
-        values = np.where(theta <= np.pi, beam.values(np.minimum(theta, np.pi), phi), 0.0)
-    else:
-        values = np.where(theta <= beam_map.cut_rad, beam_map.values(np.minimum(theta, beam_map.cut_rad), phi), 0.0)
-    return values
+    shown, end = (beam, np.pi) if beam_map is None else (beam_map, beam_map.cut_rad)
+    values = np.where(theta <= end, shown.values(np.minimum(theta, end), phi), 0.0)
+    return values / values.max()
+
+
+def _square(axes: Axes, values: NDArray[np.float64], side: float, unit: str, **style: Any) -> AxesImage:
+    """Draw values on a square of +-side around the centre of the beam."""
+    axes.set(xlabel=f"x, in-scan  [{unit}]", ylabel=f"y, cross-scan  [{unit}]")
+    return axes.imshow(values, origin="lower", extent=(-side, side, -side, side), **style)
 
 
 def _draw_peak(axes: Axes, beam: Beam, beam_map: BeamMap | None, summary: BeamSummary, reach: float) -> None:
     values = _pattern(beam, beam_map, reach)
-    values /= values.max()
-    extent = (-reach, reach, -reach, reach)
-    image = axes.imshow(
-        values, origin="lower", extent=extent, cmap="YlGnBu_r", vmin=0, vmax=1, interpolation="bilinear"
-    )
-    contours = axes.contour(
-        values, levels=_CONTOURS, extent=extent, colors=["w", "w", "w", "k", "k"], linewidths=[0.8, 0.8, 1.8, 0.8, 0.8]
-    )
+    image = _square(axes, values, reach, "arcmin", cmap="YlGnBu_r", vmin=0, vmax=1, interpolation="bilinear")
+    colours, widths = ["w", "w", "w", "k", "k"], [0.8, 0.8, 1.8, 0.8, 0.8]
+    contours = axes.contour(values, _CONTOURS, extent=image.get_extent(), colors=colours, linewidths=widths)
     axes.clabel(contours, fmt=lambda level: f"{level:.0%}", fontsize=7)
-    axes.set_title(
-        f"Peak: {summary.fwhm_major_arcmin:.1f}′ × {summary.fwhm_minor_arcmin:.1f}′ FWHM, "
-        f"ratio {summary.axis_ratio:.3f}",
-        fontsize=10,
-    )
-    axes.set_xlabel("x, in-scan  [arcmin]")
-    axes.set_ylabel("y, cross-scan  [arcmin]")
+    fwhm = f"{summary.fwhm_major_arcmin:.1f}′ × {summary.fwhm_minor_arcmin:.1f}′ FWHM"
+    axes.set_title(f"Peak: {fwhm}, ratio {summary.axis_ratio:.3f}", fontsize=10)
     axes.figure.colorbar(image, ax=axes, label="response / peak", shrink=0.85, pad=0.02)
 
 
 def _draw_faint(axes: Axes, beam: Beam, beam_map: BeamMap | None, reach: float) -> None:
     values = _pattern(beam, beam_map, reach)
-    values /= values.max()
     unit, name = (60.0, "deg") if reach > 120 else (1.0, "arcmin")
     with np.errstate(divide="ignore"):
         above_floor = np.maximum(FLOOR_DB + 10 * np.log10(np.abs(values)), 0.0)
-    side = reach / unit
-    image = axes.imshow(
-        np.sign(values) * above_floor,
-        origin="lower",
-        extent=(-side, side, -side, side),
-        cmap=_SIGNED,
-        vmin=-FLOOR_DB,
-        vmax=FLOOR_DB,
-        interpolation="nearest",
-    )
+    style = {"cmap": _SIGNED, "vmin": -FLOOR_DB, "vmax": FLOOR_DB, "interpolation": "nearest"}
+    image = _square(axes, np.sign(values) * above_floor, reach / unit, name, **style)
     axes.set_title("Surroundings, with the sign of the response", fontsize=10)
-    axes.set_xlabel(f"x, in-scan  [{name}]")
-    axes.set_ylabel(f"y, cross-scan  [{name}]")
     bar = axes.figure.colorbar(image, ax=axes, shrink=0.85, pad=0.02)
     ticks = np.arange(-FLOOR_DB, FLOOR_DB + 1, 10).tolist()
     bar.set_ticks(ticks, labels=[_decibel_label(tick) for tick in ticks])
@@ -131,16 +112,13 @@ def _draw_blm(axes: Axes, beam: Beam) -> None:
     colours = ["#222222", *colormaps["viridis"](np.linspace(0.1, 0.9, max(len(drawn) - 1, 1)))]
     for m, colour in zip(drawn, colours, strict=False):
         size = scale[m:] * np.abs(beam.blm[m, m:])
-        axes.semilogy(
-            ell[m:], size, color=colour, linewidth=2.0 if m in (0, 2) else 1.1, ls="--" if m % 2 else "-", label=f"{m}"
-        )
-    axes.set_ylim(1e-6, 2)
-    axes.set_xlim(0, beam.lmax)
+        width, dashes = 2.0 if m in (0, 2) else 1.1, "--" if m % 2 else "-"
+        axes.semilogy(ell[m:], size, dashes, color=colour, linewidth=width, label=f"{m}")
+    axes.set(xlim=(0, beam.lmax), ylim=(1e-6, 2), xlabel="multipole ℓ")
     axes.xaxis.set_major_locator(MaxNLocator(6))
     axes.grid(which="major", color="#dddddd", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.set_xlabel("multipole ℓ")
     axes.set_ylabel(r"$|b_{\ell m}|\,\sqrt{4\pi/(2\ell+1)}$   ($m=0$: $|B_\ell|$)")
     beyond = f"; {beam.neglected_power:.1e} of the power beyond" if beam.neglected_power > 0 else ""
     axes.set_title(f"Coefficients, m ≤ {beam.mmax}{beyond}", fontsize=10)

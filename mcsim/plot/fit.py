@@ -7,7 +7,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mcsim.beamfit import Fit
-from mcsim.beamfit.data import Scaling
 
 _COLOURS = {"constant": "#c44e22", "linear": "#1f5fa8", "spline": "#3c8c3c", "orientation": "#7b4fa3"}
 
@@ -31,10 +30,12 @@ def fit_figure(fits: Sequence[Fit]) -> Figure:
     figure = Figure(figsize=(4.4 * (len(columns) + 1), 5.4), layout="constrained")
     figure.suptitle(f"{measured.origin}: {measured.kind} spectra", fontsize=11)
     axes = figure.subplots(2, len(columns) + 1, height_ratios=(2.2, 1.0), squeeze=False)
-    errors = np.sqrt(np.diag(measured.covariance))
+    errors, scaling = np.sqrt(np.diag(measured.covariance)), measured.scaling
+    quantity = r"\ell(\ell+1)A/2\pi" if scaling.spectrum else "A"
+    centres = np.array([0.5 * (row.ell_min + row.ell_max) for row in measured.rows])
     for column, (mode, imaginary) in enumerate(columns):
         here = [i for i, row in enumerate(measured.rows) if (row.mode, row.imaginary) == (mode, imaginary)]
-        x = np.array([0.5 * (measured.rows[i].ell_min + measured.rows[i].ell_max) for i in here])
+        x = centres[here]
         above, below = axes[0, column], axes[1, column]
         above.errorbar(x, measured.value[here], errors[here], fmt="o", color="0.2", markersize=3.5, capsize=2)
         for number, one in enumerate(fits):
@@ -46,20 +47,14 @@ def fit_figure(fits: Sequence[Fit]) -> Figure:
         part = (r"\mathrm{Im}\," if imaginary else r"\mathrm{Re}\,") if mode.M > 0 or imaginary else ""
         first = r"\ell" if mode.d == 0 else rf"\ell{-mode.d:+d}"
         above.set_title(rf"${part}A^{{{mode.L}{mode.M}}}_{{{first},\ell}}$", fontsize=10)
-        above.set_ylabel(_unit(measured.scaling))
+        above.set_ylabel(rf"${quantity}$  [$\mu$K$^2$], {'Bennett' if scaling.bennett else 'Hajian-Souradeep'}")
         above.legend(fontsize=8, frameon=False)
-        below.set_ylabel(r"residual / $\sigma$")
+        below.set(xlabel=r"multipole $\ell$", ylabel=r"residual / $\sigma$")
         for one_axes in (above, below):
             one_axes.axhline(0.0, color="0.6", linewidth=0.8, zorder=0)
-        below.set_xlabel(r"multipole $\ell$")
     _factors(axes[0, -1], fits)
     _words(axes[1, -1], fits)
     return figure
-
-
-def _unit(scaling: Scaling) -> str:
-    name = r"\ell(\ell+1)A/2\pi" if scaling.spectrum else "A"
-    return rf"${name}$  [$\mu$K$^2$], {'Bennett' if scaling.bennett else 'Hajian-Souradeep'}"
 
 
 def _factors(axes: Axes, fits: Sequence[Fit]) -> None:
@@ -82,12 +77,12 @@ def _words(axes: Axes, fits: Sequence[Fit]) -> None:
     axes.set_axis_off()
     lines = []
     for one in fits:
-        solution = one.solution
-        values = zip(one.model.parameters, solution.parameters, solution.errors, strict=True)
-        shown = [rf"{name} = {value:.4g} ± {error:.2g}" for name, value, error in values][:2]
-        if len(solution.parameters) > 2:
-            shown = [f"{len(solution.parameters)} parameters"]
-        lines.append(f"{one.model.name}: {', '.join(shown)}")
-        lines.append(rf"   $\chi^2$/dof = {solution.chi2:.1f}/{solution.dof} = {solution.reduced_chi2:.2f}")
-        lines.append(f"   p = {solution.probability:.2g}")
+        found = one.solution
+        values = zip(one.model.parameters, found.parameters, found.errors, strict=True)
+        shown = ", ".join(f"{name} = {value:.4g} ± {error:.2g}" for name, value, error in values)
+        lines += [
+            f"{one.model.name}: {shown if len(found.parameters) <= 2 else f'{len(found.parameters)} parameters'}",
+            rf"   $\chi^2$/dof = {found.chi2:.1f}/{found.dof} = {found.reduced_chi2:.2f}",
+            f"   p = {found.probability:.2g}",
+        ]
     axes.text(0.0, 0.95, "\n".join(lines), transform=axes.transAxes, fontsize=8, va="top")

@@ -30,15 +30,9 @@ def look_at_beams(
 ) -> Iterator[Look]:
     """Yield the text and figure of the beams of a run configuration, of a beam map, or of a file of b_lm.
 
-    Parameters
-    ----------
-    source
-        A TOML configuration or packaged workflow (every channel is shown), or a FITS file: an image is a beam map, a
-        table holds b_lm.
-    lmax, m_max
-        Degree and order of the coefficients; m_max by default from the beam.
-    pixel_deg
-        Side of a pixel of a beam map in degrees; by default from its header.
+    ``source`` is a TOML configuration or packaged workflow (every channel is shown), or a FITS file: an image is a beam
+    map, a table holds b_lm. ``m_max`` is by default chosen from the beam, and ``pixel_deg``, the side of a pixel of a
+    beam map in degrees, read from its header.
     """
     path = Path(source)
     if path.is_dir() or (not path.exists() and path.suffix not in ("", ".toml")):
@@ -74,32 +68,19 @@ def look_at_scan(
 ) -> Look:
     """Return a scan model's hits, orientation moments and reduction of a beam's ellipticity, in text and figure.
 
-    Progress is reported on standard error.
-
-    Parameters
-    ----------
-    model
-        Packaged name or TOML file.
-    nside, smax, frame
-        Resolution, highest spin and frame of the moments, which are cached.
-    sample_period_s
-        Time between samples in seconds; by default the model's.
-    line_of_sight
-        One of the model's lines of sight; by default its default ones.
-
-    Raises
-    ------
-    InputError
-        For an invalid model, line of sight or size.
+    ``model`` is a packaged name or a TOML file. Moments of spin up to ``smax`` in ``frame`` are cached. The time
+    between samples, in seconds, and the line of sight are by default the model's. Progress is reported on standard
+    error. An invalid model, line of sight or size raises InputError.
     """
     if smax < 2:
         raise InputError(f"smax = {smax} is too small for a look at a scan, which is about w_2; take 2 or more.")
     loaded = scan.ScanModel.load(model)
     if sample_period_s is not None:
         loaded = loaded.with_sampling(sample_period_s)
-    lines = None if line_of_sight is None else [line_of_sight]
+    if line_of_sight is not None:
+        loaded = loaded.with_lines_of_sight(line_of_sight)
     with reporting("orientation moments", 1.0, "", quiet=False) as report:
-        folder = scan.cached_moments(loaded, nside, smax, frame, lines, nthreads=os.cpu_count() or 1, progress=report)
+        folder = scan.cached_moments(loaded, scan.MapGrid(nside, frame), smax, os.cpu_count() or 1, report)
     moments = scan.Moments.load(folder)
-    alone = loaded if frame == "ecliptic" and lines is None and len(loaded.default_lines) == 1 else None
+    alone = loaded if frame == "ecliptic" and line_of_sight is None and len(loaded.default_lines) == 1 else None
     return Look(loaded.name, scan.summary(loaded.name, moments), scan_figure(moments, loaded.name, alone))

@@ -1,8 +1,5 @@
 """Figure of a scan: orientation of the beam and <cos 2 psi> over the sky, hits and w_2 by latitude."""
 
-from typing import Any
-
-import healpy
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -13,6 +10,7 @@ from mcsim.instrument.scan.factors import ring_means
 from mcsim.instrument.scan.limit import limit_moments
 from mcsim.instrument.scan.model import ScanModel
 from mcsim.instrument.scan.moments import Moments
+from mcsim.plot.sky import mollweide
 
 
 def scan_figure(moments: Moments, title: str = "", model: ScanModel | None = None) -> Figure:
@@ -47,25 +45,17 @@ def scan_figure(moments: Moments, title: str = "", model: ScanModel | None = Non
     figure = Figure(figsize=(11.0, 7.0), layout="constrained")
     figure.suptitle(title)
     axes = figure.subplots(2, 2, height_ratios=(1.0, 0.8))
-    mean_psi = np.degrees(-0.5 * np.angle(w2))
-    _mollweide(axes[0, 0], mean_psi, "twilight_shifted", (-90.0, 90.0), "degrees, modulo 180")
+    _panel(axes[0, 0], np.degrees(-0.5 * np.angle(w2)), "twilight_shifted", 90.0, "degrees, modulo 180")
     axes[0, 0].set_title(r"mean orientation $\bar\psi = -\frac{1}{2}\,\arg w_2$")
-    _mollweide(axes[0, 1], w2.real, "RdBu", (-1.0, 1.0), "")
+    _panel(axes[0, 1], w2.real, "RdBu", 1.0, "")
     axes[0, 1].set_title(r"$\langle\cos 2\psi\rangle = \mathrm{Re}\,w_2$")
     _against_latitude(axes[1, 0], axes[1, 1], moments, model)
     return figure
 
 
-def _mollweide(axes: Axes, values: NDArray[np.float64], colours: str, limits: tuple[float, float], unit: str) -> None:
-    """Draw a RING map in Mollweide projection, longitude 0 in the middle, increasing to the left."""
-    nside = healpy.npix2nside(values.size)
-    projector: Any = healpy.projector.MollweideProj(xsize=1200)
-    image = projector.projmap(values, lambda x, y, z: healpy.vec2pix(nside, x, y, z))
-    image = np.ma.masked_invalid(np.where(np.isneginf(image), np.nan, image))
-    shown = axes.imshow(
-        image, origin="lower", extent=projector.get_extent(), cmap=colours, vmin=limits[0], vmax=limits[1]
-    )
-    axes.set_axis_off()
+def _panel(axes: Axes, values: NDArray[np.float64], colours: str, limit: float, unit: str) -> None:
+    """Draw a map with a colour bar that is symmetric about zero."""
+    shown = mollweide(axes, values, 1200, cmap=colours, vmin=-limit, vmax=limit)
     axes.figure.colorbar(shown, ax=axes, orientation="horizontal", shrink=0.6, pad=0.02, label=unit)
 
 
@@ -77,23 +67,11 @@ def _against_latitude(hits_axes: Axes, w_axes: Axes, moments: Moments, model: Sc
     if model is not None:
         fine = np.radians(np.linspace(0.02, 179.98, 4000))
         density, limit = limit_moments(model, fine, 2)
-        hits_axes.plot(
-            90.0 - np.degrees(fine), density, color="black", linewidth=0.7, linestyle="--", label="long-time limit"
-        )
-        w_axes.plot(
-            90.0 - np.degrees(fine),
-            limit[1].real,
-            color="black",
-            linewidth=0.7,
-            linestyle="--",
-            label="long-time limit",
-        )
-    hits_axes.set_ylim(0.0, 1.15 * float(hits.max()))
-    hits_axes.set_ylabel("hits / mean")
+        for axes, values in ((hits_axes, density), (w_axes, limit[1].real)):
+            axes.plot(90.0 - np.degrees(fine), values, "--", color="black", linewidth=0.7, label="long-time limit")
+    hits_axes.set(ylim=(0.0, 1.15 * float(hits.max())), ylabel="hits / mean")
     w_axes.set_ylabel(r"Re $w_2$")
     w_axes.axhline(0.0, color="0.6", linewidth=0.6)
     for axes in (hits_axes, w_axes):
-        axes.set_xlim(-90.0, 90.0)
-        axes.set_xticks(range(-90, 91, 30))
-        axes.set_xlabel(f"{moments.frame} latitude [degrees]")
+        axes.set(xlim=(-90.0, 90.0), xticks=range(-90, 91, 30), xlabel=f"{moments.frame} latitude [degrees]")
         axes.legend(frameon=False)

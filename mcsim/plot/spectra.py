@@ -46,20 +46,19 @@ def ensemble_figure(
             raise InputError(f"There is no pair {label} in {path}; choose among {'; '.join(pairs)}.")
         chosen = summary.sel(pair=label).load()
     keep = np.ones(chosen.sizes["mode"], dtype=bool)
-    for name, value in (("L", L), ("M", M), ("d", d)):
-        if value is not None:
-            keep &= chosen[name].values == value
+    wanted = {name: value for name, value in (("L", L), ("M", M), ("d", d)) if value is not None}
+    for name, value in wanted.items():
+        keep &= chosen[name].values == value
     if L is None and np.any(chosen["L"].values > 0):
         keep &= chosen["L"].values > 0
-    modes = chosen.isel(mode=np.flatnonzero(keep))
     # Modes that only pairs have (d < 0) are all NaN for an auto spectrum: nothing to draw.
-    modes = modes.isel(mode=np.flatnonzero(np.isfinite(modes["biposh_binned_mean"].values).any(axis=-1)))
+    keep &= np.isfinite(chosen["biposh_binned_mean"].values).any(axis=-1)
+    modes = chosen.isel(mode=np.flatnonzero(keep))
     if modes.sizes["mode"] == 0:
-        wanted = ", ".join(f"{name} = {value}" for name, value in (("L", L), ("M", M), ("d", d)) if value is not None)
-        raise InputError(f"{path} has no mode with {wanted or 'finite values'}; mcsim info names what it holds.")
-    panels = sorted({(int(a), int(b)) for a, b in zip(modes["L"].values, modes["M"].values, strict=True)})
+        asked = ", ".join(f"{name} = {value}" for name, value in wanted.items())
+        raise InputError(f"{path} has no mode with {asked or 'finite values'}; mcsim info names what it holds.")
     expected = None if prediction is None else _matching(prediction, label, modes)
-    return _draw(modes, panels, f"{path}: {label}, {int(modes['count'])} realizations", expected)
+    return _draw(modes, f"{path}: {label}, {int(modes['count'])} realizations", expected)
 
 
 def _matching(prediction: xr.Dataset, pair: str, modes: xr.Dataset) -> xr.Dataset:
@@ -73,7 +72,8 @@ def _matching(prediction: xr.Dataset, pair: str, modes: xr.Dataset) -> xr.Datase
         ) from None
 
 
-def _draw(modes: xr.Dataset, panels: list[tuple[int, int]], title: str, expected: xr.Dataset | None = None) -> Figure:
+def _draw(modes: xr.Dataset, title: str, expected: xr.Dataset | None) -> Figure:
+    panels = sorted({(int(a), int(b)) for a, b in zip(modes["L"].values, modes["M"].values, strict=True)})
     columns = min(3, len(panels))
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(5.2 * columns, 3.6 * rows + 0.4), layout="constrained")
@@ -88,8 +88,8 @@ def _draw(modes: xr.Dataset, panels: list[tuple[int, int]], title: str, expected
                 _expected(axes, expected.isel(mode=index), colour, paired)
         axes.axhline(0.0, color="0.6", linewidth=0.8, zorder=0)
         axes.set_title(f"L = {L}, M = {M}", fontsize=10)
-        axes.set_xlabel(r"multipole $\ell = l_2$")
-        axes.set_ylabel(rf"$\ell(\ell+1)\hat{{A}}^{{{L}{M}}}/2\pi$  [$\mu$K$^2$]")
+        quantity = rf"$\ell(\ell+1)\hat{{A}}^{{{L}{M}}}/2\pi$  [$\mu$K$^2$]"
+        axes.set(xlabel=r"multipole $\ell = l_2$", ylabel=quantity)
         axes.legend(fontsize=8, frameon=False)
     notes = [r"$\hat{A}$: Bennett normalisation (odd parity: Hajian-Souradeep, rescaled alike)"]
     if paired:
@@ -112,46 +112,34 @@ def _parts(one: xr.Dataset) -> list[bool]:
     return [str(one["parity"].values) == "odd"] if int(one["M"]) == 0 else [False, True]
 
 
+def _component(one: xr.Dataset, name: str, imaginary: bool) -> np.ndarray:
+    values = one[name].values
+    return np.asarray(values.imag if imaginary else values.real)
+
+
 def _expected(axes: Axes, one: xr.Dataset, colour: str, paired: bool) -> None:
     """Draw the prediction of one mode, a line for each part."""
-    values = one[f"biposh{'_difference' if paired else ''}_binned_mean"].values
+    name = f"biposh{'_difference' if paired else ''}_binned_mean"
     for imaginary in _parts(one):
-        axes.plot(
-            _abscissa(one),
-            values.imag if imaginary else values.real,
-            color=colour,
-            linewidth=1.0,
-            linestyle=":" if imaginary and int(one["M"]) > 0 else "--",
-        )
+        dashes = ":" if imaginary and int(one["M"]) > 0 else "--"
+        axes.plot(_abscissa(one), _component(one, name, imaginary), dashes, color=colour, linewidth=1.0)
 
 
 def _spectrum(axes: Axes, one: xr.Dataset, colour: str, paired: bool) -> None:
     """Draw one mode: points with errors and, if paired, the band of the plain mean behind them."""
     d, M, odd = int(one["d"]), int(one["M"]), str(one["parity"].values) == "odd"
-
-    def component(name: str, imaginary: bool) -> np.ndarray:
-        values = one[name].values
-        return np.asarray(values.imag if imaginary else values.real)
-
-    name = "biposh_difference_binned" if paired else "biposh_binned"
+    name, x = f"biposh{'_difference' if paired else ''}_binned", _abscissa(one)
+    # The two parts of a mode with M > 0 share the variance of its modulus.
+    share = 1.0 if M == 0 else np.sqrt(0.5)
+    error = share * one[f"{name}_standard_error"].values
     for imaginary in _parts(one):
         label = f"d = {d}" + (f", {'imaginary' if imaginary else 'real'}" if M > 0 or odd else "")
-        # The two parts of a mode with M > 0 share the variance of its modulus.
-        share = 1.0 if M == 0 else np.sqrt(0.5)
-        x = _abscissa(one)
+        filling, marker = "white" if imaginary and M > 0 else colour, "s" if imaginary else "o"
+        values = _component(one, f"{name}_mean", imaginary)
         axes.errorbar(
-            x,
-            component(f"{name}_mean", imaginary),
-            share * one[f"{name}_standard_error"].values,
-            fmt="o" if not imaginary else "s",
-            markersize=3.5,
-            markerfacecolor="white" if imaginary and M > 0 else colour,
-            color=colour,
-            linewidth=1.0,
-            capsize=2,
-            label=label,
+            x, values, error, fmt=marker, ms=3.5, mfc=filling, color=colour, linewidth=1.0, capsize=2, label=label
         )
         if paired and M == 0:
-            middle = component("biposh_binned_mean", imaginary)
+            middle = _component(one, "biposh_binned_mean", imaginary)
             width = share * one["biposh_binned_standard_error"].values
             axes.fill_between(x, middle - width, middle + width, color=colour, alpha=0.15, linewidth=0)

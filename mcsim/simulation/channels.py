@@ -10,7 +10,6 @@ import numpy as np
 from mcsim import config, systematics
 from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
-from mcsim.instrument.beams.turn import mirrored, rotated
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import rotation
 from mcsim.support import resources
@@ -27,7 +26,7 @@ def load_beam(channel: config.Channel, lmax: int) -> beams.Beam:
 def load_beam_b(channel: config.Channel, lmax: int) -> beams.Beam:
     """Return the beam of side B of a differencing channel, up to lmax: its own, or side A's mirrored."""
     if channel.beam_b is None:
-        return mirrored(load_beam(channel, lmax))
+        return load_beam(channel, lmax).mirrored()
     return _beam(channel.name, channel.beam_b, lmax)
 
 
@@ -39,12 +38,11 @@ def _beam(channel: str, spec: config.Beam, lmax: int) -> beams.Beam:
             major, minor = spec.fwhm_major_arcmin, spec.fwhm_minor_arcmin
             return beams.Beam.elliptical(major, minor, spec.angle_deg, lmax, mmax=spec.m_max)
         case config.BeamMap():
-            return rotated(
-                beams.Beam.from_map(load_beam_map(channel, spec), lmax, spec.m_max), np.deg2rad(spec.angle_deg)
-            )
+            beam = beams.Beam.from_map(load_beam_map(channel, spec), lmax, spec.m_max)
+            return beam.rotated(np.deg2rad(spec.angle_deg))
         case config.BeamBlm():
             file = config.channel_path(spec.path, channel)
-            return rotated(beams.Beam.from_blm(file, lmax, mmax=spec.m_max), np.deg2rad(spec.angle_deg))
+            return beams.Beam.from_blm(file, lmax, mmax=spec.m_max).rotated(np.deg2rad(spec.angle_deg))
 
 
 def load_beam_map(channel: str, spec: config.BeamMap) -> beams.BeamMap:
@@ -62,9 +60,10 @@ def load_beam_map(channel: str, spec: config.BeamMap) -> beams.BeamMap:
 def scan_model(
     spec: config.Channel, chosen: config.ScanHitAveraged | config.ScanDifferencing, split: str | None
 ) -> scan.ScanModel:
-    """Return the scan model of a channel, at the sampling that the channel asks for."""
-    template = config.channel_path(chosen.model, spec.name, split)
-    model = scan.ScanModel.load(str(template))
+    """Return the scan model of a channel, at the sampling and with the line of sight that the channel asks for."""
+    model = scan.ScanModel.load(str(config.channel_path(chosen.model, spec.name, split)))
+    if isinstance(chosen, config.ScanHitAveraged) and chosen.line_of_sight is not None:
+        model = model.with_lines_of_sight(chosen.line_of_sight)
     return model if chosen.sample_period_s is None else model.with_sampling(chosen.sample_period_s)
 
 
@@ -73,11 +72,8 @@ def effects_on(
 ) -> tuple[systematics.Effect, ...]:
     """Return the effects of a run that act in a channel, in their order.
 
-    Raises
-    ------
-    InputError
-        For an effect or a parameter that is not known, and for an effect that names a channel and is common to all,
-        or the other way round.
+    InputError for an effect or a parameter that is not known, and for an effect that names a channel and is common to
+    all, or the other way round.
     """
     acting = []
     for entry in run.effects:
@@ -92,13 +88,7 @@ def effects_on(
 
 
 def check_effects(run: config.RunConfig) -> None:
-    """Refuse a run with an effect that is not known, or cannot act where it is put; no map is made.
-
-    Raises
-    ------
-    InputError
-        As a run of it would.
-    """
+    """Refuse a run with an effect that is not known, or cannot act where it is put, as the run would; make no map."""
     for spec in run.channels:
         acting = effects_on(run, spec.name)
         if not acting:
@@ -163,12 +153,12 @@ def _whole(load: Callable[[config.Channel, int], beams.Beam], spec: config.Chann
 
 
 def _with_m_max(spec: config.Channel, m_max: int | None) -> config.Channel:
-    beam_b = None if spec.beam_b is None else _cut_at(spec.beam_b, m_max)
-    return replace(spec, beam=_cut_at(spec.beam, m_max), beam_b=beam_b)
-
-
-def _cut_at(spec: config.Beam, m_max: int | None) -> config.Beam:
-    return spec if isinstance(spec, config.BeamGaussian) else replace(spec, m_max=m_max)
+    """Return a channel whose beams have another m_max."""
+    beam, beam_b = (
+        each if each is None or isinstance(each, config.BeamGaussian) else replace(each, m_max=m_max)
+        for each in (spec.beam, spec.beam_b)
+    )
+    return replace(spec, beam=beam or spec.beam, beam_b=beam_b)
 
 
 def _described(spec: config.Channel) -> tuple[systematics.Pointing | None, float | None]:
@@ -176,14 +166,13 @@ def _described(spec: config.Channel) -> tuple[systematics.Pointing | None, float
     match spec.scan:
         case config.ScanMoments() if spec.scan.model is not None:
             file = resources.scan_model(str(config.channel_path(spec.scan.model, spec.name)))
-            known = scan.read_described(file)
-            names = [line.name for line in known.model.lines_of_sight]
-            wanted = spec.scan.line_of_sight or spec.name
-            if spec.scan.line_of_sight is None and wanted not in names:
-                return None, known.dipole_uk
-            return systematics.Pointing(known.model, known.model.line_of_sight(wanted)), known.dipole_uk
+            model, dipole_uk = scan.read_described(file)
+            name = spec.scan.line_of_sight or spec.name
+            if spec.scan.line_of_sight is None and name not in [line.name for line in model.lines_of_sight]:
+                return None, dipole_uk
+            return systematics.Pointing(model, model.line_of_sight(name)), dipole_uk
         case config.ScanHitAveraged():
             model = scan_model(spec, spec.scan, None)
-            lines = model.select(None if spec.scan.line_of_sight is None else [spec.scan.line_of_sight])
+            lines = model.select()
             return (systematics.Pointing(model, lines[0]) if len(lines) == 1 else None), None
     return None, None

@@ -39,13 +39,7 @@ class Response:
 
 
 def response(beam: Beam, lmax: int, window: NDArray[np.float64] | None = None) -> Response:
-    """Return the response of a beam known up to at least ``lmax``, times a pixel window of shape (>= lmax + 1,).
-
-    Raises
-    ------
-    InputError
-        If beam or window end below ``lmax``.
-    """
+    """Return the response of a beam times a pixel window, shape (>= lmax + 1,); InputError if one ends before lmax."""
     if beam.lmax < lmax:
         raise InputError(f"the beam ends at l = {beam.lmax}, below the lmax {lmax} of the sky; compute it further.")
     k = np.sqrt(4.0 * np.pi / (2.0 * np.arange(lmax + 1) + 1.0))
@@ -66,13 +60,7 @@ def circular_map(alm: NDArray[np.complex128], response: Response, nside: int, nt
 
 
 class CircularMaps:
-    """Maps of skies that a circular beam has smoothed; the last is kept, for the next channel with an equal beam.
-
-    Parameters
-    ----------
-    nside, lmax, nthreads
-        As in :func:`mcsim.sphere.healpix.synthesis`.
-    """
+    """Maps of skies that a circular beam has smoothed; the last is kept, for the next channel with an equal beam."""
 
     def __init__(self, nside: int, lmax: int, nthreads: int = 1) -> None:
         self._grid = (nside, lmax)
@@ -126,10 +114,7 @@ def spin_maps(
 def noncircular_map(maps: dict[int, NDArray[np.float64]], moments: Moments) -> healpix.Map:
     """Return 2 Re sum_{s > 0} w_s S_s, what the non-circular part of the beam adds under a scan, uK, shape (npix,).
 
-    Raises
-    ------
-    InputError
-        If the moments have fewer orders than the maps, or another nside.
+    InputError if the moments have fewer orders than the maps, or another nside.
     """
     highest = max(maps, default=0)
     if moments.smax < highest:
@@ -169,12 +154,7 @@ def _add_turned(map_, w, total):  # type: ignore[no-untyped-def]
 def centroid_map(gradient: NDArray[np.float64], moments: Moments) -> healpix.Map:
     """Return d . grad S_0 for samples whose mean position is off the pixel centre by d, uK, shape (npix,).
 
-    Parameters
-    ----------
-    gradient
-        d/dtheta and 1/sin(theta) d/dphi of S_0, shape (2, npix), uK per radian.
-    moments
-        With ``dtheta`` and ``dphi``.
+    The gradient is d/dtheta and 1/sin(theta) d/dphi of S_0, shape (2, npix), uK/rad; d is the moments'.
     """
     if moments.dtheta is None or moments.dphi is None:
         raise InputError("the moments have no centroids (dtheta, dphi); leave the centroid map out.")

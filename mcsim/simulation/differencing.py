@@ -1,7 +1,7 @@
 """Maps of one sky from the differences of two beams: side maps, right-hand sides, conjugate gradients."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,22 +16,6 @@ Map = NDArray[np.float64]
 
 SECONDS_PER_SAMPLE = 1.5e-7
 """Time of one core for a difference: 100 ns for two right-hand sides, the rest for 26 iterations (W1, nside 128)."""
-
-
-@dataclass(frozen=True)
-class Solved:
-    """Maps in uK, shape (npix,), 0 where nothing was observed.
-
-    Attributes
-    ----------
-    circular
-        What the circular parts of both beams see, each side its own, and the noise.
-    difference
-        What the rest of the beams adds; the map is the sum of the two.
-    """
-
-    circular: Map
-    difference: Map
 
 
 def sides(run: config.RunConfig) -> dict[str, str]:
@@ -63,26 +47,13 @@ def maps(
     seed: int,
     realization: int,
     nthreads: int = 1,
-) -> Iterator[tuple[SurveyMap, Solved]]:
-    """Yield the maps of a differencing channel, one for each split of its survey.
+) -> Iterator[tuple[SurveyMap, Map, Map]]:
+    """Yield the maps of a differencing channel, in two parts, for every split of its survey.
 
-    Parameters
-    ----------
-    channel
-        With ``side_b``.
-    sky
-        Coefficients up to the sky's lmax, uK.
-    dipole
-        What of the sky is taken off the differences again with the fiducial beams, of the same shape; None: nothing.
-    seed, realization
-        They fix the noise, which the map and its circular-beam control share.
-    nthreads
-        Threads; they do not change the result.
-
-    Raises
-    ------
-    RuntimeError
-        If the conjugate gradients do not converge.
+    The first is what the circular parts of both beams see, each side its own, and the noise; the second what the rest
+    of the beams adds: uK, shape (npix,), 0 where nothing was observed. ``sky`` has coefficients up to its lmax, uK, and
+    of ``dipole`` in it the fiducial beams take off the differences what they see. Seed and realization fix the noise.
+    A RuntimeError says that the conjugate gradients do not converge.
 
     Notes
     -----
@@ -112,13 +83,8 @@ def maps(
         if removed is not None:
             known = mapmaking.rhs_from_maps(m.pairs, removed, mapmaking.Imbalance(x), nthreads=nthreads)[0]
             control, complete = control - known, complete - known
-        yield (
-            m,
-            Solved(
-                _solve(m, side_b, control, start, "the circular-beam control", nthreads),
-                _solve(m, side_b, complete - control, None, "the non-circular part", nthreads),
-            ),
-        )
+        circular = _solve(m, side_b, control, start, "the circular-beam control", nthreads)
+        yield m, circular, _solve(m, side_b, complete - control, None, "the non-circular part", nthreads)
 
 
 def _solve(m: SurveyMap, side_b: SideB, rhs: Map, start: Map | None, what: str, nthreads: int) -> Map:

@@ -61,8 +61,6 @@ def observe(
     (3072,)
     """
     sky, lmax = alm_.whole(alm, "alm")
-    if beam.lmax < lmax:
-        raise InputError(f"the beam ends at lmax = {beam.lmax}, the sky at {lmax}; give the beam up to lmax = {lmax}.")
     if moments.smax < beam.mmax:
         raise InputError(
             f"the moments end at s = {moments.smax}, the beam at m = {beam.mmax}; compute moments with "

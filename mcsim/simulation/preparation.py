@@ -39,6 +39,11 @@ class Preparation:
     nside: int
     frame: str
 
+    @property
+    def transforms(self) -> int:
+        """Return the number of scalar transforms of one map."""
+        return sum(step.transforms for step in self.steps)
+
     def apply(self, map_uk: Map) -> Map:
         """Return the prepared map, uK, ``healpy.UNSEEN`` where nothing was observed, before as after."""
         check_map(map_uk)
@@ -65,7 +70,7 @@ class Preparation:
         for step in self.steps:
             power = step.noise(power)
         band = 1.0 / healpy.nside2pixarea(self.nside)
-        if any(step.transforms for step in self.steps):
+        if self.transforms:
             ell = np.arange(3 * fine)
             window = self.beam_window(ell[-1]) * self.pixel_window(ell[-1])
             band = float(np.sum((2 * ell + 1) / (4 * np.pi) * window**2))

@@ -12,7 +12,6 @@ polynomial of known degree in cos(theta) (for odd s, and sin(theta)): rules for 
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from itertools import pairwise
 
 import ducc0
 import numba
@@ -21,8 +20,8 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh_tridiagonal
 
 from mcsim.errors import InputError
-from mcsim.instrument.scan.limit import caustics, limit_moments
-from mcsim.instrument.scan.model import ScanModel
+from mcsim.instrument.scan import ScanModel
+from mcsim.instrument.scan.limit import caustics, graded_rule, limit_moments
 from mcsim.simulation.convolve import Response
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.checks import check_alm, check_angle
@@ -42,14 +41,8 @@ _FEW = 3e8
 class Rings:
     """Rings that integrate over the sphere what stands beside one moment.
 
-    Attributes
-    ----------
-    s, phase
-        w_s is ``phase`` times a real number everywhere.
-    theta
-        Colatitudes, shape (ring,).
-    weight
-        sum(weight f(theta)) is the integral of w_s / phase times f over the sphere, shape (ring,).
+    w_s is ``phase`` times a real number everywhere. ``theta`` are colatitudes, shape (ring,), and sum(weight f(theta))
+    is the integral of w_s / phase times f over the sphere.
     """
 
     s: int
@@ -65,26 +58,12 @@ def parallel_transport_rings(psi0: float, orders: Iterable[int], degree: int) ->
     return _rings(lambda theta: {s: np.full(theta.size, w) for s, w in moments.items()}, np.empty(0), degree)
 
 
-def limit_rings(
-    model: ScanModel, orders: Iterable[int], degree: int, line_of_sight: str | None = None
-) -> tuple[Rings, ...]:
+def limit_rings(model: ScanModel, orders: Iterable[int], degree: int) -> tuple[Rings, ...]:
     """Return the rings for the exact long-time limit of a scan model, in ecliptic coordinates.
 
-    Parameters
-    ----------
-    model
-        The survey.
-    orders
-        The orders s >= 1 that the beam has.
-    degree
-        Highest degree of the sky plus that of the analysis.
-    line_of_sight
-        Name; None: the model's default one.
-
-    Raises
-    ------
-    InputError
-        If the survey has no such limit, several default lines of sight, or leaves a part of the sky out.
+    ``orders`` are those s >= 1 that the beam has, ``degree`` is the highest degree of the sky plus that of the
+    analysis. InputError if the survey has no such limit, default lines of sight at different angles, or leaves a part
+    of the sky out.
 
     Notes
     -----
@@ -96,15 +75,14 @@ def limit_rings(
     1e-5 of what the beam adds, 1e-11 for parallel transport (tests/unit/test_rings.py).
     """
     orders = tuple(orders)
-    lines = model.default_lines if line_of_sight is None else (line_of_sight,)
-    if len({model.line_of_sight(name).boresight_angle_deg for name in lines}) > 1:
+    if len({line.boresight_angle_deg for line in model.select()}) > 1:
         raise InputError(
-            f"scan model {model.name!r} has the lines of sight {', '.join(lines)} at different angles, but a grid of "
-            'rings takes one; choose it with scan.line_of_sight, or set map.grid = "healpix".'
+            f"scan model {model.name!r} has the lines of sight {', '.join(model.default_lines)} at different angles, "
+            'but a grid of rings takes one; choose it with scan.line_of_sight, or set map.grid = "healpix".'
         )
 
     def moments(theta: Vector) -> dict[int, Alm]:
-        density, w = limit_moments(model, theta, max(orders, default=1), lines[0])
+        density, w = limit_moments(model, theta, max(orders, default=1))
         if not density.all():
             raise InputError(
                 f"scan model {model.name!r} leaves a part of the sky out, which rings cannot weight; set map.grid = "
@@ -112,27 +90,13 @@ def limit_rings(
             )
         return {s: w[s - 1] for s in orders}
 
-    return _rings(moments, caustics(model, lines[0]), degree)
+    return _rings(moments, caustics(model), degree)
 
 
 def noncircular_alm(alm: Alm, response: Response, rings: Iterable[Rings], lmax: int, nthreads: int = 1) -> Alm:
     """Return a_lm up to ``lmax`` of 2 Re sum_{s > 0} w_s S_s: what the non-circular part of the beam adds under a scan.
 
-    Parameters
-    ----------
-    alm
-        The sky up to the response's lmax, uK.
-    response
-        Of the beam.
-    rings
-        For the sum of the two lmax.
-    lmax
-        Of the result, no more than the response's.
-
-    Raises
-    ------
-    InputError
-        If the sky is not of the response's lmax, or ``lmax`` exceeds it.
+    The sky, uK, must be of the response's lmax and ``lmax`` no larger; the rings are those of the sum of the two.
     """
     check_alm(alm, response.lmax, "the sky")
     if lmax > response.lmax:
@@ -212,7 +176,7 @@ def _times_sine_power(alm, real, imag, s, start, result):  # type: ignore[no-unt
 
 def _rings(moments: Callable[[Vector], dict[int, Alm]], breaks: Vector, degree: int) -> tuple[Rings, ...]:
     """Return rules up to a degree for moments that are smooth between the breaks."""
-    theta, weight = _fine_rule(breaks, degree)
+    theta, weight = graded_rule(breaks, lambda half: int(100 + degree * half))
     found = []
     for s, w in moments(theta).items():
         largest = w[np.argmax(np.abs(w))]
@@ -257,20 +221,6 @@ def _nodes(length: float, degree: int) -> int:
     A node is needed for every two thirds of a wavelength at its middle, and some for the last digits.
     """
     return min(degree // 2 + 1, int(0.25 * degree * length + 4.0 * (degree * length) ** (1.0 / 3.0)) + 12)
-
-
-def _fine_rule(breaks: Vector, degree: int) -> tuple[Vector, Vector]:
-    """Return a double-exponential rule (Takahasi & Mori 1974) between the breaks, fine enough for a degree."""
-    edges = np.concatenate([[0.0], breaks, [np.pi]])
-    thetas, weights = [], []
-    for low, high in pairwise(edges):
-        half = 0.5 * (high - low)
-        steps, step = np.linspace(-3.2, 3.2, 2 * int(100 + degree * half) + 1, retstep=True)
-        thetas.append(low + half * (1.0 + np.tanh(0.5 * np.pi * np.sinh(steps))))
-        speed = 0.5 * np.pi * np.cosh(steps) / np.cosh(0.5 * np.pi * np.sinh(steps)) ** 2
-        weights.append(2.0 * np.pi * half * step * speed * np.sin(thetas[-1]))
-    theta, weight = np.concatenate(thetas), np.concatenate(weights)
-    return theta[weight > 0.0], weight[weight > 0.0]
 
 
 def _gauss(x: Vector, weight: Vector, count: int) -> tuple[Vector, Vector]:

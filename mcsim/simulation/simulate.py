@@ -184,8 +184,8 @@ def _map_parts(
     nside, seed, nthreads = run.map.resolution, run.ensemble.seed, made.nthreads
     seen, dipole = _seen(survey, channel, sky, realization)
     if channel.side_b is not None:
-        for m, solved in differencing.maps(channel, seen, dipole, seed, realization, nthreads):
-            yield m, MapParts(solved.circular, None, solved.difference)
+        for m, circular_uk, rest_uk in differencing.maps(channel, seen, dipole, seed, realization, nthreads):
+            yield m, MapParts(circular_uk, None, rest_uk)
         return
     circular = _circular(survey, channel, seen, dipole)
     spins = convolve.spin_maps(seen, channel.response, nside, nthreads)

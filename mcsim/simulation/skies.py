@@ -24,11 +24,8 @@ SMALLEST_UK = 0.01
 def read_alm(path: Path, lmax: int, frame: str) -> Alm:
     """Read the coefficients of a sky up to ``lmax``, uK, from a file of ``healpy.write_alm`` or ``numpy.save``.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, ends below ``lmax``, states another frame or a unit that is no CMB temperature, or
-        has values that are not finite or of no sky in uK.
+    InputError if the file cannot be read, ends below ``lmax``, states another frame or a unit that is no CMB
+    temperature, or has values that are not finite or of no sky in uK.
     """
     if path.suffix == ".npy":
         given = read_npy(path)
@@ -61,21 +58,10 @@ def _read_fits_alm(path: Path) -> tuple[Alm, int, fits.Header]:
 
 
 def read_map(path: Path, lmax: int, frame: str, frequency_ghz: float | None = None) -> Alm:
-    """Read a HEALPix map of the whole sky and return its coefficients up to ``lmax``, uK.
+    """Read a HEALPix map of the whole sky and return its coefficients up to ``lmax`` <= 3 nside - 1, uK.
 
-    Parameters
-    ----------
-    path, lmax
-        The file, and the largest degree, up to 3 nside - 1 of it.
-    frame
-        Of the run: the file's, where it states one.
-    frequency_ghz
-        Of the run's channels, where they have one in common: antenna temperature and brightness need it.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be used so.
+    ``frame`` is the run's, and the file's where it states one; ``frequency_ghz`` is what the run's channels have in
+    common: antenna temperature and brightness need it. InputError if the file cannot be used so.
     """
     map_, found, unit = healpix.read_map(path)
     nside = healpy.npix2nside(map_.size)

@@ -217,7 +217,9 @@ class Rotated(Step):
 
     def apply(self, map_uk: Map) -> Map:
         """Return the rotated map."""
-        return rotation.rotate_map(_complete(map_uk, "rotate"), self.before, self.after)
+        lmax = 2 * self.nside
+        alm = healpix.analysis(_complete(map_uk, "rotate"), lmax, iterations=3)
+        return healpix.synthesis(rotation.rotate_alm(alm, lmax, self.before, self.after)[None], self.nside, lmax)[0]
 
     def beam_window(self, lmax: int) -> NDArray[np.float64]:
         """Return 1 up to 2 nside, where the harmonics end."""

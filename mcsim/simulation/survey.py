@@ -12,7 +12,7 @@ from mcsim import config
 from mcsim.bipolar import Estimator, estimator
 from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
-from mcsim.instrument.scan.geometry import MapGrid
+from mcsim.instrument.scan import MapGrid
 from mcsim.simulation import convolve, mapmaking, tod
 from mcsim.simulation.channels import effects_on, refuse_pixel_effects, scan_model, site_b_of, site_of
 from mcsim.simulation.preparation import Preparation, preparation
@@ -26,12 +26,10 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True)
 class SurveyMap:
-    """One map of a realization.
+    """One map of a realization, ``channel`` or ``channel:split``.
 
     Attributes
     ----------
-    name
-        ``channel`` or ``channel:split``.
     moments
         Orientation moments of the samples in it; of a differencing scan the hits of both sides, and NaN.
     weight
@@ -74,16 +72,12 @@ class SideB:
 
     Attributes
     ----------
-    beam, response
-        Beam of side B, effects included.
-    fiducial
-        Beam of side B without effects.
-    scan
-        Transmission imbalance, noise per difference, and convergence of the map-making.
+    beam, response, fiducial
+        Beam of side B with effects, its response, and the beam without effects.
+    scan, imbalance
+        Fiducial transmission imbalance, which map-making uses, and its convergence; the true imbalance.
     sigma0_uk
         White noise per difference.
-    imbalance
-        True transmission imbalance; that of ``scan`` is the fiducial one, which map-making uses.
     iterations_short
         How many iterations before convergence the map-making stops.
     """
@@ -187,16 +181,11 @@ def survey(
     orders: int = 0,
     library: Library | None = None,
 ) -> Survey:
-    """Load or compute everything that the realizations of a run share.
+    """Load or compute everything that the realizations of a run share; InputError for files that do not fit it.
 
     Moments of scan models, and pairs of pixels of differencing scans, are computed once, cached on disk and
     memory-mapped, so that workers share them. ``orders``: moments up to this order even where the beam needs fewer (of
     a file of moments, all that it has). ``library``: the effects that the run may name; default: the catalogue.
-
-    Raises
-    ------
-    InputError
-        For files that are missing, unreadable, or do not fit the configuration.
     """
     lmax = config.analysis_lmax(run)
     cl = None if run.sky.spectrum is None else spectra.load(run.sky.spectrum, run.sky.lmax)
@@ -226,13 +215,11 @@ def _channel(
     if run.map.grid == "gl":
         return _channel_on_rings(run, spec, site, acting)
     window = _window(run, spec)
-    spread = spread_of(acting)
     beam = seen_through(acting, site)
     splits = run.map.splits or (None,)
     maps = []
     for index, split in enumerate(splits):
         grid = MapGrid(run.map.resolution, run.map.frame, (index / len(splits), (index + 1) / len(splits)))
-        name = spec.name if split is None else f"{spec.name}:{split}"
         pairs = None
         if isinstance(spec.scan, config.ScanDifferencing):
             model = scan_model(spec, spec.scan, split)
@@ -248,11 +235,12 @@ def _channel(
                 moments = _moments(spec, split, grid, max(smax, 1), nthreads, progress)
             # An effect may give the beam higher orders than a file of moments has: they are left out.
             beam = beam.truncated(moments.smax) if acting and moments.smax < beam.mmax else beam
-        m = _survey_map(run, spec, split, name, moments, pairs)
-        maps.append(_with_effects(m, acting, site, grid.time_range, spread))
+        maps.append(_with_effects(_survey_map(run, spec, split, moments, pairs), acting, site, grid.time_range))
     # A pixel whose samples keep closer to its centre blurs less; the window is a Gaussian in all but name.
-    response = convolve.response(beam, run.sky.lmax, window ** (spread * spread))
-    side_b = _side_b(spec, window ** (spread * spread), site, acting)
+    spread = spread_of(acting)
+    seen_window = window ** (spread * spread)
+    response = convolve.response(beam, run.sky.lmax, seen_window)
+    side_b = _side_b(spec, seen_window, site, acting)
     return Channel(spec.name, beam, response, window, tuple(maps), site, acting, side_b)
 
 
@@ -291,7 +279,7 @@ def _channel_on_rings(run: config.RunConfig, spec: config.Channel, site: Site, a
         case config.ScanParallelTransport():
             grid = parallel_transport_rings(np.deg2rad(spec.scan.psi0_deg), orders, degree)
         case config.ScanHitAveraged():
-            grid = limit_rings(scan_model(spec, spec.scan, None), orders, degree, spec.scan.line_of_sight)
+            grid = limit_rings(scan_model(spec, spec.scan, None), orders, degree)
         case _:
             raise TypeError("the configuration refuses other scans on rings")
     unknown = scan.Moments(1, run.map.frame, np.full(12, np.nan), np.full((max(beam.mmax, 1), 12), np.nan + 0j))
@@ -299,12 +287,7 @@ def _channel_on_rings(run: config.RunConfig, spec: config.Channel, site: Site, a
     return Channel(spec.name, beam, response, np.ones(run.sky.lmax + 1), (m,), site, acting, rings=grid)
 
 
-def _side_b(
-    spec: config.Channel,
-    window: NDArray[np.float64],
-    site: Site,
-    acting: tuple[Effect, ...],
-) -> SideB | None:
+def _side_b(spec: config.Channel, window: NDArray[np.float64], site: Site, acting: tuple[Effect, ...]) -> SideB | None:
     if not isinstance(spec.scan, config.ScanDifferencing):
         return None
     other = site_b_of(site, spec)
@@ -316,15 +299,9 @@ def _side_b(
     return SideB(beam, response, other.beam, spec.scan, spec.noise.sigma0_uk, imbalance, short)
 
 
-def _with_effects(
-    m: SurveyMap,
-    acting: tuple[Effect, ...],
-    site: Site,
-    share: tuple[float, float],
-    spread: float,
-) -> SurveyMap:
+def _with_effects(m: SurveyMap, acting: tuple[Effect, ...], site: Site, share: tuple[float, float]) -> SurveyMap:
     """Return the map with what effects make of its moments, noise and gain."""
-    moments, noise = m.moments, m.noise_uk
+    moments, noise, spread = m.moments, m.noise_uk, spread_of(acting)
     for effect in acting:
         moments = effect.orientations(moments, site)
         factor = effect.noise(site)
@@ -363,20 +340,15 @@ def _window(run: config.RunConfig, spec: config.Channel) -> NDArray[np.float64]:
 def _moments(
     spec: config.Channel, split: str | None, grid: MapGrid, smax: int, nthreads: int, progress: Progress | None
 ) -> scan.Moments:
-    nside, frame = grid.nside, grid.frame
     match spec.scan:
         case config.ScanParallelTransport():
-            return scan.Moments.parallel_transport(nside, spec.scan.psi0_deg, smax, frame)
+            return scan.Moments.parallel_transport(grid.nside, spec.scan.psi0_deg, smax, grid.frame)
         case config.ScanPointing():
             path = config.channel_path(spec.scan.path, spec.name, split)
-            return scan.Moments.from_pointing_files([path], nside, smax, frame)
+            return scan.Moments.from_pointing_files([path], grid.nside, smax, grid.frame)
         case config.ScanHitAveraged():
             model = scan_model(spec, spec.scan, split)
-            lines = None if spec.scan.line_of_sight is None else [spec.scan.line_of_sight]
-            folder = scan.cached_moments(
-                model, nside, smax, frame, lines, grid.time_range, nthreads=nthreads, progress=progress
-            )
-            return scan.Moments.load(folder, mmap=True)
+            return scan.Moments.load(scan.cached_moments(model, grid, smax, nthreads, progress))
         case config.ScanMoments() | config.ScanDifferencing():
             raise TypeError("the caller reads files of moments, and a differencing scan has no moments")
 
@@ -397,10 +369,11 @@ def _survey_map(
     run: config.RunConfig,
     spec: config.Channel,
     split: str | None,
-    name: str,
     moments: scan.Moments,
     pairs: mapmaking.DifferencingScan | None,
 ) -> SurveyMap:
+    """Return a map without effects: moments, weights of its pixels, and noise."""
+    name = spec.name if split is None else f"{spec.name}:{split}"
     observed = moments.hits > 0
     if not observed.any():
         raise InputError(

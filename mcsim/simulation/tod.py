@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
-from mcsim.instrument.scan.geometry import MapGrid, check_time_range
-from mcsim.instrument.scan.model import LineOfSight, ScanModel
-from mcsim.instrument.scan.pointing import BLOCK, PointingStream, fill_block, ring_pixel
+from mcsim.instrument.scan import LineOfSight, MapGrid, ScanModel
+from mcsim.instrument.scan.pointing import PointingStream, fill_samples
 from mcsim.sphere.checks import check_alm, check_nside, check_shape
 from mcsim.sphere.healpix import Map
 
@@ -40,7 +39,7 @@ EPSILON = 1e-10
 class Samples:
     """Consecutive samples of one line of sight; every array has shape (n,).
 
-    Parameters
+    Attributes
     ----------
     time_s
         Time since the start of the survey, in seconds.
@@ -63,55 +62,27 @@ class Samples:
 Stage = Callable[[Iterable[Samples]], Iterator[Samples]]
 
 
-def sample_range(model: ScanModel, line: LineOfSight, time_range: tuple[float, float]) -> tuple[int, int]:
-    """Return the first sample of a part of the survey (fractions of its samples) and the first one after it.
-
-    Raises
-    ------
-    InputError
-        If the range is no increasing pair within 0 and 1, or contains no sample.
-    """
-    check_time_range(time_range)
-    start, stop = time_range
-    number = model.samples(line)
-    first, last = round(start * number), round(stop * number)
-    if first == last:
-        raise InputError(f"time_range ({start:g}, {stop:g}) of {model.name!r} contains no sample; widen it.")
-    return first, last
-
-
 def chunks(first: int, last: int) -> list[tuple[int, int]]:
     """Cut the samples first ... last - 1 into chunks, from each one's first sample to the one after its last."""
     return [(low, min(low + CHUNK, last)) for low in range(first, last, CHUNK)]
 
 
 def samples(model: ScanModel, line: LineOfSight, grid: MapGrid, at_pixel_centres: bool = False) -> Iterator[Samples]:
-    """Yield the pointing of a survey in chunks of at most CHUNK samples, signal zero.
+    """Yield the pointing of a line of sight in chunks of at most CHUNK samples, signal zero.
 
-    Parameters
-    ----------
-    model, line
-        The survey and one of its lines of sight.
-    grid
-        Pixels, and the part of the survey.
-    at_pixel_centres
-        Move every sample to the centre of its pixel and keep its psi as it is: what orientation moments assume.
+    ``at_pixel_centres``: move every sample to the centre of its pixel and keep its psi: what orientation moments
+    assume.
     """
-    nside = grid.nside
-    first, last = sample_range(model, line, grid.time_range)
     stream = PointingStream(model, line, grid.frame)
     period = model.period_of_samples(line)
-    centres = healpy.pix2ang(nside, np.arange(grid.npix)) if at_pixel_centres else None
-    for low, high in chunks(first, last):
-        count = high - low
-        angles = np.empty((3, count))
-        pixel = np.empty(count, dtype=np.int64)
-        start = stream.start_turns(low)
-        _point(start, stream.block_turns, stream.tables, stream.geometry, stream.to_frame, nside, angles, pixel)
+    for low, high in chunks(*grid.sample_range(model, line)):
+        angles, pixel = np.empty((3, high - low)), np.empty(high - low, dtype=np.int64)
+        fill_samples(stream.at(low), high - low, grid.nside, angles, pixel)
         theta, phi, psi = angles
-        if centres is not None:
-            theta, phi = centres[0][pixel], centres[1][pixel]
-        yield Samples(period * np.arange(low, high, dtype=np.float64), theta, phi, psi, pixel, np.zeros(count))
+        if at_pixel_centres:
+            theta, phi = healpy.pix2ang(grid.nside, pixel)
+        time_s = period * np.arange(low, high, dtype=np.float64)
+        yield Samples(time_s, theta, phi, psi, pixel, np.zeros(high - low))
 
 
 def sky_signal(
@@ -119,21 +90,8 @@ def sky_signal(
 ) -> Stage:
     """Return a stage that adds the sky seen by a beam at the samples' own directions and orientations.
 
-    Parameters
-    ----------
-    alm, lmax
-        The sky in uK, shape (mcsim.sphere.alm.size(lmax),).
-    beam
-        Known up to at least ``lmax``.
-    epsilon
-        Relative accuracy of the interpolation, 1e-12 to 1e-2.
-    nthreads
-        Threads of the interpolation; the result does not depend on them.
-
-    Raises
-    ------
-    InputError
-        If the sky does not have the size of ``lmax``, or the beam ends below it.
+    ``alm`` is in uK and of ``lmax``, up to which the beam must be known; ``epsilon``, 1e-12 to 1e-2, is the relative
+    accuracy of the interpolation. Its threads do not change the result. InputError if the sky or the beam do not fit.
 
     Notes
     -----
@@ -168,16 +126,18 @@ def sky_signal(
     return stage
 
 
-def white_noise(sigma0_uk: float, rng: np.random.Generator) -> Stage:
+def white_noise(sigma0_uk: float, rng: np.random.Generator, factor: Map | None = None) -> Stage:
     """Return a stage that adds white noise of ``sigma0_uk`` per sample, drawn in the order of time.
 
-    The result does not depend on how the samples are cut into chunks.
+    ``factor``: of the standard deviation in every pixel, shape (npix,). The result does not depend on how the samples
+    are cut into chunks.
     """
     check_noise(sigma0_uk)
 
     def stage(stream: Iterable[Samples]) -> Iterator[Samples]:
         for chunk in stream:
             noise = sigma0_uk * rng.standard_normal(chunk.signal_uk.size)
+            noise = noise if factor is None else noise * factor[chunk.pixel]
             yield replace(chunk, signal_uk=chunk.signal_uk + noise)
 
     return stage
@@ -207,21 +167,13 @@ def bin_samples(stream: Iterable[Samples], nside: int) -> tuple[Map, Map]:
                 f"a sample is in pixel {chunk.pixel.max()}, but nside {nside} has {hits.size}; give its own nside."
             )
         _add(chunk.pixel, chunk.signal_uk, total, hits)
-    seen = hits > 0.0
-    return np.divide(total, hits, out=np.full(hits.size, healpy.UNSEEN), where=seen), hits
+    return np.divide(total, hits, out=np.full(hits.size, healpy.UNSEEN), where=hits > 0.0), hits
 
 
 def observe(
     model: ScanModel, line: LineOfSight, grid: MapGrid, stages: Iterable[Stage], at_pixel_centres: bool = False
 ) -> tuple[Map, Map]:
-    """Return the map of a survey, sample by sample, and its hits, as :func:`bin_samples` does.
-
-    Parameters
-    ----------
-    model, line, grid, at_pixel_centres
-        As in :func:`samples`.
-    stages
-        What the samples pass through: pointing stages, :func:`sky_signal`, signal stages, :func:`white_noise`.
+    """Return the map of :func:`samples` that pass through stages, and its hits, as :func:`bin_samples` does.
 
     Notes
     -----
@@ -233,24 +185,6 @@ def observe(
     tests/integration/test_time_ordered.py has a case of nside 64).
     """
     return bin_samples(through(samples(model, line, grid, at_pixel_centres), stages), grid.nside)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _point(start, block_turns, tables, geometry, to_frame, nside, angles, pixel):  # type: ignore[no-untyped-def]
-    work = np.empty((6, BLOCK))
-    turns = np.empty(3)
-    for block in range((pixel.size + BLOCK - 1) // BLOCK):
-        first = block * BLOCK
-        count = min(BLOCK, pixel.size - first)
-        for axis in range(3):
-            turns[axis] = (start[axis] + block * block_turns[axis]) % 1.0
-        fill_block(turns, tables, geometry, to_frame, count, work)
-        for k in range(count):
-            x, y, z = work[0, k], work[1, k], work[2, k]
-            angles[0, first + k] = math.atan2(math.sqrt(x * x + y * y), z)
-            angles[1, first + k] = work[5, k] * (0.5 * math.pi)
-            angles[2, first + k] = math.atan2(work[4, k], work[3, k])
-            pixel[first + k] = ring_pixel(nside, work[5, k], x, y, z)
 
 
 @njit(cache=True, nogil=True)

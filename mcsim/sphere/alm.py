@@ -42,13 +42,7 @@ def orders(lmax: int) -> NDArray[np.int64]:
 
 
 def multiply(alm: NDArray[np.complex128], factor: NDArray, lmax: int) -> NDArray[np.complex128]:
-    """Return f_l a_lm for a factor f_l of shape (>= lmax + 1,), real or complex.
-
-    Raises
-    ------
-    InputError
-        If the sizes do not fit ``lmax``.
-    """
+    """Return f_l a_lm for a factor f_l of shape (>= lmax + 1,), real or complex; InputError for other sizes."""
     _check_size(alm, lmax)
     if np.ndim(factor) != 1 or len(factor) <= lmax:
         raise InputError(f"the factor f_l has shape {np.shape(factor)}, but lmax = {lmax} needs (>= {lmax + 1},).")
@@ -69,10 +63,7 @@ def resize(alm: NDArray[np.complex128], lmax: int, new_lmax: int) -> NDArray[np.
 def whole(given: ArrayLike, name: str) -> tuple[NDArray[np.complex128], int]:
     """Return given coefficients and their lmax; ``name`` names them in messages.
 
-    Raises
-    ------
-    InputError
-        If they are not complex, not those of a map with every m up to lmax, or not finite.
+    Raise InputError if they are not complex, not those of a map with every m up to lmax, or not finite.
     """
     alm = np.asarray(given)
     lmax = lmax_of(alm.size) if alm.ndim == 1 and np.iscomplexobj(alm) else None

@@ -48,8 +48,8 @@ def check_alm(alm: Any, lmax: int, name: str = "alm", shape: tuple[int, ...] = (
         raise InputError(f"{name} is {kind}, but coefficients are a complex numpy array in healpy's order.")
     wanted = (*shape, alm_.size(lmax))
     if alm.shape != wanted:
-        found = (math.isqrt(8 * alm.shape[-1] + 1) - 3) // 2 if alm.ndim else -1
-        of = f" (as of lmax = {found})" if alm.ndim and found >= 0 and alm_.size(found) == alm.shape[-1] else ""
+        found = alm_.lmax_of(alm.shape[-1]) if alm.ndim else None
+        of = "" if found is None else f" (as of lmax = {found})"
         raise InputError(f"{name} has shape {alm.shape}{of}, but lmax = {lmax} needs {wanted}; use alm.resize.")
 
 

@@ -60,16 +60,7 @@ def _rising(x: Table, k: int) -> Table:
 def band(L_max: int, M: int, d: int, lmax: int) -> Band:
     r"""Return the tables of the Clebsch-Gordan band of order M and offset d = l2 - l1 for l2 <= lmax.
 
-    Parameters
-    ----------
-    L_max
-        Largest L, >= max(|d|, M).
-    M
-        Order, 0 <= M <= L_max.
-    d
-        l2 - l1, -L_max <= d <= L_max.
-    lmax
-        Largest l2.
+    0 <= M <= L_max and -L_max <= d <= L_max.
 
     Notes
     -----

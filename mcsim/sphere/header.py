@@ -1,7 +1,13 @@
-"""Units of temperature and coordinate frames of maps, from FITS headers."""
+"""FITS files: opened so that a broken one is an error; units of temperature and coordinate frames in their headers."""
 
 import re
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from astropy.io import fits
+from astropy.utils.exceptions import AstropyUserWarning
 
 from mcsim.errors import InputError
 
@@ -23,13 +29,20 @@ _FRAMES = {
 }
 
 
-def frame_named(coordsys: object, where: str) -> str | None:
-    """Return the frame that a COORDSYS keyword names; None if it is missing or empty.
+@contextmanager
+def opened(path: Path) -> Iterator[fits.HDUList]:
+    """Open a FITS file, gzipped or not; astropy's warning of a truncated one is raised."""
+    # Opened here, not by astropy, which leaves the file open when its own warning is raised.
+    with warnings.catch_warnings(), path.open("rb") as stream:
+        warnings.filterwarnings("error", message=".*truncated.*", category=AstropyUserWarning)
+        with fits.open(stream) as hdus:
+            yield hdus
 
-    Raises
-    ------
-    InputError
-        For a word that names none of the three frames; ``where`` names the file.
+
+def frame_named(coordsys: object, where: str) -> str | None:
+    """Return the frame that a COORDSYS keyword of a file, ``where``, names; None if it is missing or empty.
+
+    Raise InputError for a word that names none of the three frames.
     """
     word = str(coordsys or "").strip().lower()
     if word in _SILENT:
@@ -53,19 +66,9 @@ def radians(unit: str) -> float:
 def to_uk(unit: str | None, path: Path, frequency_ghz: float | None = None) -> float:
     """Return the factor from a unit to uK of CMB (thermodynamic) temperature; 1 if the header gives none.
 
-    Parameters
-    ----------
-    unit
-        As in a header: uK, mK, K (CMB temperature unless they say antenna or RJ), or a brightness such as MJy/sr.
-    path
-        Path of the file, for messages.
-    frequency_ghz
-        Frequency of the channel; antenna temperature and brightness need it.
-
-    Raises
-    ------
-    InputError
-        For another unit, or if a needed frequency is missing.
+    ``unit`` is as in a header: uK, mK, K (CMB temperature unless they say antenna or RJ), or a brightness such as
+    MJy/sr; ``path`` names the file in messages. Antenna temperature and brightness need the channel's frequency. Raise
+    InputError for another unit, or if a needed frequency is missing.
 
     Notes
     -----

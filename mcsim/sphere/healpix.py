@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.sphere.checks import check_alm, check_complete, check_map, check_nside, check_whole
-from mcsim.sphere.header import frame_named
+from mcsim.sphere.header import frame_named, opened
 from mcsim.support.npy import read_npy
 
 Map = NDArray[np.float64]
@@ -30,10 +30,7 @@ def geometry(nside: int) -> dict[str, Any]:
 def synthesis(alm: Alm, nside: int, lmax: int, spin: int = 0, nthreads: int = 1) -> NDArray[np.float64]:
     """Return the map of a_lm: (1, npix) from (1, size) at spin 0, else (2, npix) from E and B (2, size).
 
-    Raises
-    ------
-    InputError
-        If the coefficients do not fit ``lmax`` and ``spin``, or nside is not a whole number (any will do).
+    Raise InputError if the coefficients do not fit ``lmax`` and ``spin``, or nside is not whole (any number will do).
     """
     check_whole(nside, "nside", 1)
     check_alm(alm, lmax, shape=(2 if spin else 1,))
@@ -50,21 +47,10 @@ def gradient(alm: Alm, nside: int, lmax: int, nthreads: int = 1) -> NDArray[np.f
 
 
 def analysis(map_: Map, lmax: int, iterations: int = 0, nthreads: int = 1) -> Alm:
-    """Return the coefficients of a map by ring-weighted quadrature and Jacobi iterations.
+    """Return the coefficients of a RING-ordered map, shape (npix,), by ring-weighted quadrature and Jacobi iterations.
 
-    Parameters
-    ----------
-    map_
-        RING-ordered map, shape (npix,).
-    lmax
-        Largest degree, <= 3 nside - 1.
-    iterations
-        Number of Jacobi iterations; each costs a synthesis and an adjoint synthesis.
-
-    Raises
-    ------
-    InputError
-        If the map is not a complete HEALPix map, or lmax exceeds 3 nside - 1.
+    Raise InputError if the map is not complete, or lmax exceeds 3 nside - 1. Each of the ``iterations`` costs a
+    synthesis and an adjoint synthesis.
 
     Notes
     -----
@@ -163,13 +149,8 @@ def _mean_legendre(pixels: NDArray[np.int64], nside: int, split: int, lmax: int)
 def read_map(path: Path) -> tuple[Map, str | None, str | None]:
     """Read the first map of a HEALPix FITS file in RING order, and its frame and unit if the header has them.
 
-    A .npy file holds an array of shape (npix,) in RING order; its frame and unit are None.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read as a HEALPix map, does not say whether it is RING or NESTED, or names an
-        unknown frame.
+    A .npy file holds an array of shape (npix,) in RING order; its frame and unit are None. Raise InputError if the file
+    cannot be read as a HEALPix map, does not say whether it is RING or NESTED, or names an unknown frame.
     """
     if path.suffix == ".npy":
         array = read_npy(path, "biuf").astype(np.float64)
@@ -196,10 +177,7 @@ def read_map(path: Path) -> tuple[Map, str | None, str | None]:
 def read_pixel_window(path: Path, lmax: int, nside: int | None = None) -> NDArray[np.float64]:
     """Read a temperature pixel window, shape (lmax + 1,), from a HEALPix FITS file or a .npy file.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, ends below lmax, states another ``nside``, or is not a window.
+    Raise InputError if the file cannot be read, ends below lmax, states another ``nside``, or is not a window.
     """
     window, found = (read_npy(path, "iuf"), None) if path.suffix == ".npy" else _fits_pixel_window(path)
     window = window.astype(np.float64)
@@ -219,9 +197,7 @@ def read_pixel_window(path: Path, lmax: int, nside: int | None = None) -> NDArra
 
 def _fits_pixel_window(path: Path) -> tuple[NDArray, int | None]:
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", category=AstropyUserWarning)
-            table, header = fits.getdata(path, 1, header=True)
-            return np.asarray(table.field(0), dtype=float).ravel(), header.get("NSIDE")
+        with opened(path) as hdus:
+            return np.asarray(hdus[1].data.field(0), dtype=float).ravel(), hdus[1].header.get("NSIDE")
     except Exception as error:  # libraries raise errors of any type for a broken file
         raise InputError(f"{path} is not a FITS pixel window ({error}); give a HEALPix pixel_window file.") from error

@@ -17,7 +17,7 @@ Mask = NDArray[np.float64]
 def read_mask(
     path: Path, nside: int, frame: str = "ecliptic", mask_frame: str | None = None, apodisation_deg: float = 0.0
 ) -> Mask:
-    """Read the weights of the pixels of a map from a HEALPix FITS file.
+    """Read the weights of the pixels, shape (12 nside^2,) in RING order, from a HEALPix FITS file.
 
     Parameters
     ----------
@@ -30,11 +30,6 @@ def read_mask(
     apodisation_deg
         Width of the soft edge (:func:`apodise`), >= 0.
 
-    Returns
-    -------
-    ndarray
-        RING order, shape (12 nside^2,), between 0 and 1.
-
     Raises
     ------
     InputError
@@ -43,9 +38,8 @@ def read_mask(
 
     Notes
     -----
-    The nside is changed by ``healpy.ud_grade``: coarser pixels are copied, finer ones are averaged. The
-    frame is changed pixel by pixel (:func:`mcsim.sphere.rotation.rotate_pixels`) at the finer of the two resolutions.
-    The edge is apodised last, so that its width does not depend on the resolution of the file.
+    The nside is changed by ``healpy.ud_grade``, the frame pixel by pixel (:func:`mcsim.sphere.rotation.rotate_pixels`)
+    at the finer of the two resolutions. The edge is apodised last: its width does not depend on the file's resolution.
     """
     check_nside(nside)
     mask, stated, _ = healpix.read_map(path)
@@ -71,12 +65,7 @@ def read_mask(
 def apodise(mask: Mask, width: float) -> Mask:
     r"""Return the mask times a soft edge, which rises from 0 at its zeros to 1 at a distance ``width``.
 
-    Parameters
-    ----------
-    mask
-        Weights in RING order, shape (npix,).
-    width
-        Width of the edge in radians, >= 0.
+    ``mask`` are weights in RING order, shape (npix,); the width of the edge is in radians, >= 0.
 
     Notes
     -----

@@ -8,17 +8,10 @@ from mcsim.sphere.checks import check_whole
 
 
 def generator(seed: int, realization: int, stage: str) -> np.random.Generator:
-    """Return the generator of one stage of one realization.
+    """Return the generator of one ``stage`` of one realization, whose index is 0 or more, of a run with this seed.
 
-    Parameters
-    ----------
-    seed
-        The run's seed.
-    realization
-        Index of the realization, >= 0.
-    stage
-        What is drawn, for example ``"sky"`` or ``"noise/W1/half1"``. Stages are named, not counted, so that a
-        new channel does not change another channel's draw; the CRC-32 of the name is the second spawn key.
+    The stage is what is drawn, for example ``"sky"`` or ``"noise/W1/half1"``. Stages are named, not counted, so that a
+    new channel does not change another channel's draw; the CRC-32 of the name is the second spawn key.
     """
     check_whole(seed, "seed")
     check_whole(realization, "realization")

@@ -1,4 +1,4 @@
-"""Rotations of a_lm, maps, BipoSH and moments between ecliptic, galactic and equatorial frames (J2000)."""
+"""Rotations of a_lm, maps and BipoSH between ecliptic, galactic and equatorial frames (J2000)."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from mcsim.errors import InputError
-from mcsim.sphere import healpix
-from mcsim.sphere.checks import check_alm, check_map, check_shape
+from mcsim.sphere.checks import check_alm, check_map
 
 FRAMES = {"ecliptic": "E", "galactic": "G", "equatorial": "C"}
 
@@ -19,10 +18,7 @@ FRAMES = {"ecliptic": "E", "galactic": "G", "equatorial": "C"}
 def rotation_matrix(frame_from: str, frame_to: str) -> NDArray[np.float64]:
     """Return R, shape (3, 3), with (components in ``frame_to``) = R (components in ``frame_from``).
 
-    Raises
-    ------
-    InputError
-        For a frame other than ecliptic, galactic or equatorial.
+    Raise InputError for a frame other than ecliptic, galactic or equatorial.
     """
     for frame in (frame_from, frame_to):
         if frame not in FRAMES:
@@ -64,53 +60,10 @@ def _frame_D(L: int, frame_from: str, frame_to: str) -> NDArray[np.complex128]:
 def rotate_alm(
     alm: NDArray[np.complex128], lmax: int, frame_from: str, frame_to: str, nthreads: int = 1
 ) -> NDArray[np.complex128]:
-    """Return the a_lm of a real field in another frame.
-
-    Parameters
-    ----------
-    alm
-        healpy order, shape (size(lmax),).
-    lmax
-        Highest degree.
-    frame_from, frame_to
-        "ecliptic", "galactic" or "equatorial".
-    nthreads
-        Threads of the transform.
-
-    Returns
-    -------
-    ndarray
-        Shape (size(lmax),).
-
-    Raises
-    ------
-    InputError
-        For an unknown frame, or coefficients that are not of ``lmax``.
-    """
+    """Return the a_lm of a real field, shape (size(lmax),), in another frame; InputError for another shape."""
     check_alm(alm, lmax)
     alpha, beta, gamma = euler_angles(rotation_matrix(frame_from, frame_to))
     return np.asarray(ducc0.sht.rotate_alm(alm, lmax, gamma, beta, alpha, nthreads=nthreads))
-
-
-def rotate_map(sky: NDArray[np.float64], frame_from: str, frame_to: str, nthreads: int = 1) -> NDArray[np.float64]:
-    """Return a full-sky HEALPix map (RING) in another frame, through its a_lm up to 2 nside.
-
-    Raises
-    ------
-    InputError
-        For a map with unobserved pixels; use :func:`rotate_pixels` for those, masks and hit counts.
-
-    Notes
-    -----
-    Multipoles above 2 nside are lost: a map that has power there, or sharp edges, rings.
-    """
-    nside = check_map(sky)
-    if np.any(~np.isfinite(sky)) or np.any(sky == hp.UNSEEN):
-        raise InputError("the map has unobserved pixels, which a_lm cannot rotate; use rotate_pixels for it.")
-    lmax = 2 * nside
-    alm = healpix.analysis(sky, lmax, iterations=3, nthreads=nthreads)
-    rotated = rotate_alm(alm, lmax, frame_from, frame_to, nthreads)
-    return healpix.synthesis(rotated[None], nside, lmax, nthreads=nthreads)[0]
 
 
 def rotate_pixels(values: NDArray, frame_from: str, frame_to: str) -> NDArray:
@@ -123,26 +76,14 @@ def rotate_pixels(values: NDArray, frame_from: str, frame_to: str) -> NDArray:
 def rotate_biposh(
     biposh: NDArray[np.complex128], modes: Sequence[tuple[int, int, int]], frame_from: str, frame_to: str
 ) -> NDArray[np.complex128]:
-    """Return A^{LM}_{l1 l2} in another frame.
+    """Return A^{LM}_{l1 l2} in another frame, the same modes in the same order.
 
     Parameters
     ----------
     biposh
         Shape (..., n_mode, lmax + 1), of one map or of an ordered pair, at ell = l2 with d = l2 - l1.
     modes
-        (L, M, d) along the next-to-last axis: every M = 0..L of each (L, d), no M < 0.
-    frame_from, frame_to
-        "ecliptic", "galactic" or "equatorial".
-
-    Returns
-    -------
-    ndarray
-        The same modes in ``frame_to``.
-
-    Raises
-    ------
-    InputError
-        If an M of some (L, d) is missing.
+        (L, M, d) along the next-to-last axis: every M = 0..L of each (L, d), no M < 0; InputError if one is missing.
 
     Notes
     -----
@@ -164,30 +105,4 @@ def rotate_biposh(
         turned = np.einsum("mn,n...->m...", _frame_D(L, frame_from, frame_to)[L:], np.stack(negative + positive))
         for M in range(L + 1):
             rotated[..., rows[L, M, d], :] = turned[M]
-    return rotated
-
-
-def rotate_orientation_harmonics(w: NDArray[np.complex128], frame_from: str, frame_to: str) -> NDArray[np.complex128]:
-    """Return w_{s,LM} of the orientation moments in another frame, with psi from its e_theta.
-
-    Parameters
-    ----------
-    w
-        Shape (smax + 1, L_max + 1, 2 L_max + 1), ``w[s, L, L_max + M]``.
-    frame_from, frame_to
-        "ecliptic", "galactic" or "equatorial".
-
-    Returns
-    -------
-    ndarray
-        The same shape.
-    """
-    if w.ndim != 3:
-        raise InputError(f"w has shape {w.shape}, but (smax + 1, L_max + 1, 2 L_max + 1) is needed.")
-    L_max = w.shape[1] - 1
-    check_shape(w, (len(w), L_max + 1, 2 * L_max + 1), "w")
-    rotated = np.zeros_like(w)
-    for L in range(L_max + 1):
-        span = slice(L_max - L, L_max + L + 1)
-        rotated[:, L, span] = w[:, L, span] @ _frame_D(L, frame_from, frame_to).T
     return rotated

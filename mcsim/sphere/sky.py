@@ -14,27 +14,11 @@ from mcsim.sphere.checks import check_cl, check_whole
 def gaussian_alm(cl: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.complex128]:
     """Draw the coefficients of an isotropic Gaussian sky.
 
-    Parameters
-    ----------
-    cl
-        Power spectrum C_l in uK^2, shape (lmax + 1,), non-negative.
-    rng
-        Random generator; 2 * size(lmax) standard normal numbers are drawn.
-
-    Returns
-    -------
-    ndarray
-        a_lm in uK, shape (size(lmax),), with E|a_lm|^2 = C_l; a_l0 is real.
-
-    Raises
-    ------
-    InputError
-        If the spectrum is not one-dimensional, finite and non-negative.
+    ``cl`` is C_l in uK^2, shape (lmax + 1,), finite and non-negative; 2 * size(lmax) standard normal numbers are drawn.
+    Return a_lm in uK, shape (size(lmax),), with E|a_lm|^2 = C_l; a_l0 is real.
     """
     lmax = np.size(cl) - 1
     check_cl(cl, lmax)
-    if cl.min() < 0.0:
-        raise InputError(f"the spectrum is {cl.min():g} at l = {cl.argmin()}, but C_l must be >= 0; correct it.")
     alm = rng.standard_normal(2 * alm_.size(lmax)).view(np.complex128)
     alm[: lmax + 1] = alm[: lmax + 1].real * np.sqrt(2.0)
     alm *= np.sqrt(cl / 2.0)[alm_.degrees(lmax)]

@@ -1,19 +1,17 @@
 """Angular power spectra C_l in uK^2, from a packaged name, a text table or a FITS file."""
 
 import gzip
-import io
 import re
 import warnings
 import zlib
 from pathlib import Path
 
 import numpy as np
-from astropy.io import fits
-from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.sphere.checks import check_whole
+from mcsim.sphere.header import opened
 from mcsim.support import resources
 from mcsim.support.npy import read_npy
 
@@ -157,15 +155,11 @@ def _refuse_d_l(path: Path, header: str) -> None:
         )
 
 
-def _contents(path: Path) -> bytes:
-    contents = path.read_bytes()
-    return gzip.decompress(contents) if path.suffix == ".gz" else contents
-
-
 def _read_text(path: Path) -> tuple[NDArray[np.float64], str, bool]:
     """Read C_l in uK^2, the header lines, and True if they state a unit."""
     try:
-        lines = _contents(path).decode().splitlines()
+        contents = path.read_bytes()
+        lines = (gzip.decompress(contents) if path.suffix == ".gz" else contents).decode().splitlines()
     except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
         raise InputError(
             f"power spectrum {str(path)!r} cannot be read as text ({error}); give a text table or a FITS file."
@@ -209,14 +203,12 @@ def _read_text(path: Path) -> tuple[NDArray[np.float64], str, bool]:
 def _read_fits(path: Path) -> tuple[NDArray[np.float64], str, bool]:
     """Read C_l in uK^2, the column's name, and True if it states a unit."""
     try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("error", ".*truncated.*", AstropyUserWarning)
-            with fits.open(io.BytesIO(_contents(path))) as hdus:
-                header = hdus[1].header
-                columns = [
-                    np.ravel(np.ma.filled(hdus[1].data.field(i), np.nan)).astype(np.float64)
-                    for i in range(min(2, len(hdus[1].columns)))
-                ]
+        with opened(path) as hdus:
+            header = hdus[1].header
+            columns = [
+                np.ravel(np.ma.filled(hdus[1].data.field(i), np.nan)).astype(np.float64)
+                for i in range(min(2, len(hdus[1].columns)))
+            ]
     except Exception as error:  # libraries raise errors of any type for a broken file
         raise InputError(
             f"power spectrum {str(path)!r} cannot be read as a FITS table ({error}); "

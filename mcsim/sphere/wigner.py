@@ -32,8 +32,7 @@ def _minimal_at_both_ends(
         below = lower[i] * out[i - 1] if i > 0 else 0.0
         out[i + 1] = -(diagonal[i] * out[i] + below) / upper[i]
         if abs(out[i + 1]) > _HUGE:
-            for k in range(i + 2):
-                out[k] /= _HUGE
+            out[: i + 2] /= _HUGE
         if i >= 1 and abs(out[i + 1]) <= abs(out[i]):
             join = i + 1
             break
@@ -46,45 +45,31 @@ def _minimal_at_both_ends(
         above = upper[i] * out[i + 1] if i < n - 1 else 0.0
         out[i - 1] = -(diagonal[i] * out[i] + above) / lower[i]
         if abs(out[i - 1]) > _HUGE:
-            for k in range(i - 1, n):
-                out[k] /= _HUGE
+            out[i - 1 : n] /= _HUGE
     overlap = forward0 * out[start] + forward1 * out[start + 1] + forward2 * out[start + 2]
     ratio = overlap / (forward0**2 + forward1**2 + forward2**2)
-    for k in range(start):
-        out[k] *= ratio
+    out[:start] *= ratio
 
 
 @njit(cache=True, nogil=True)
 def _normalise(jmin: int, n: int, factor: float, top_sign: float, out: NDArray[np.float64]) -> None:
     """Scale to factor sum_j (2j+1) f_j^2 = 1 with the given sign at the top."""
-    largest = 0.0
-    for i in range(n):
-        largest = max(largest, abs(out[i]))
+    largest = np.abs(out[:n]).max()
     norm = 0.0
     for i in range(n):
         norm += (2.0 * (jmin + i) + 1.0) * (out[i] / largest) ** 2
     scale = 1.0 / (largest * np.sqrt(norm * factor))
     if out[n - 1] * top_sign < 0.0:
         scale = -scale
-    for i in range(n):
-        out[i] *= scale
+    out[:n] *= scale
 
 
 @njit(cache=True, nogil=True)
 def threej_family(j2: int, j3: int, m2: int, m3: int, out: NDArray[np.float64]) -> tuple[int, int]:
-    """Write the 3j symbols (j j2 j3; -m2-m3 m2 m3) for every j to the start of ``out``.
+    """Write the 3j symbols (j j2 j3; -m2-m3 m2 m3) for every j to the start of ``out``, |m2| <= j2 and |m3| <= j3.
 
-    Parameters
-    ----------
-    j2, j3, m2, m3
-        Integers, |m2| <= j2 and |m3| <= j3.
-    out
-        Shape (>= 2 min(j2, j3) + 1,).
-
-    Returns
-    -------
-    jmin, n
-        ``out[i]`` belongs to j = jmin + i, i < n, with jmin = max(|j2 - j3|, |m2 + m3|).
+    ``out`` has the shape (>= 2 min(j2, j3) + 1,). Return jmin = max(|j2 - j3|, |m2 + m3|) and their number n:
+    ``out[i]`` belongs to j = jmin + i.
 
     Notes
     -----
@@ -115,17 +100,9 @@ def threej_family(j2: int, j3: int, m2: int, m3: int, out: NDArray[np.float64]) 
 def sixj_family(j2: int, j3: int, j4: int, j5: int, j6: int, out: NDArray[np.float64]) -> tuple[int, int]:
     """Write the 6j symbols {j j2 j3; j4 j5 j6} for every j to the start of ``out``.
 
-    Parameters
-    ----------
-    j2, j3, j4, j5, j6
-        Integers whose triads (j4, j2, j6) and (j4, j5, j3) satisfy the triangle conditions.
-    out
-        Shape (>= 2 min(j2, j3, j5, j6) + 1,).
-
-    Returns
-    -------
-    jmin, n
-        ``out[i]`` belongs to j = jmin + i, i < n, with jmin = max(|j2 - j3|, |j5 - j6|).
+    The triads (j4, j2, j6) and (j4, j5, j3) satisfy the triangle conditions. ``out`` has the shape
+    (>= 2 min(j2, j3, j5, j6) + 1,). Return jmin = max(|j2 - j3|, |j5 - j6|) and their number n: ``out[i]`` belongs to
+    j = jmin + i.
 
     Notes
     -----

@@ -1,35 +1,28 @@
 """Power of the tests, separation of similar effects, and Bayesian model comparison."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special, stats
-from scipy.optimize import brentq
+from scipy.optimize import brentq, newton
 
 from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates
 
 # Nodes of the average over the part of the data outside the span of the templates.
 NODES = 40
 
+NEGLIGIBLE = 15.0
+"""Pairs whose best fit is less likely than the best pair's by more than this, in the logarithm, are left out."""
+
 
 def power(strength: float, columns: int, threshold: float, dimension: int, simulations: int | None) -> float:
-    """Return the power of the nested test of one candidate.
+    """Return the power of the nested test of one candidate of K columns.
 
-    Parameters
-    ----------
-    strength
-        Signal-to-noise ratio s = sqrt(theta'F theta), F with the true covariance.
-    columns
-        K of the candidate.
-    threshold
-        p-value below which the candidate is detected: 0.05/20 for Bonferroni over 20 candidates.
-    dimension
-        p.
-    simulations
-        N; ``None``: the covariance is known.
+    ``strength`` is the signal-to-noise ratio s = sqrt(theta'F theta), F with the true covariance; ``threshold`` the
+    p-value below which the candidate is detected (0.05/20 for Bonferroni over 20 candidates); ``dimension`` p;
+    ``simulations`` N, ``None`` for a known covariance.
 
     Notes
     -----
@@ -65,50 +58,21 @@ def snr_needed(
     return float(brentq(lambda s: power(s, columns, alpha / tests, dimension, simulations) - target, 0.0, high))
 
 
-@dataclass(frozen=True)
-class Detectable:
-    """Hold the smallest amplitude of a candidate that is detected with the stated power.
-
-    Attributes
-    ----------
-    amplitude, limit
-        Norm of the amplitudes of the candidate's columns in their least favourable direction, with these simulations
-        and with infinitely many; infinite if the data do not respond to some direction.
-    typical
-        The same for the root mean square response over directions, with these simulations.
-    strength
-        Signal-to-noise ratio at ``amplitude``.
-    """
-
-    amplitude: float
-    limit: float
-    typical: float
-    strength: float
-
-
 def detectable(
     null: SimulatedGaussian, t: NDArray[np.float64], tests: int, alpha: float = 0.05, target: float = 0.9
-) -> Detectable:
-    """Return the smallest detectable amplitude of a candidate with columns ``t``, shape (p_raw, K), in one unit.
+) -> float:
+    """Return the smallest amplitude at which a candidate with columns ``t``, shape (p_raw, K), in one unit is detected.
 
-    The Fisher matrix is that of the sample covariance without its bias: F = (n - p - 1)/n t_w't_w.
+    It is the norm of the amplitudes of its columns, for the root mean square response over their directions; infinite
+    if the data do not respond. The Fisher matrix is that of the sample covariance without its bias:
+    F = (n - p - 1)/n t_w't_w. Other parameters are those of :func:`snr_needed`.
     """
     white = null.whiten_templates(t)
     response = null.hartlap_factor * np.linalg.eigvalsh(white.T @ white)
     # The data may have fewer elements than the effect has components.
     columns = max(int(np.sum(response > 1e-12 * response[-1])), 1)
-    finite = snr_needed(columns, tests, null.dimension, null.n_sims, alpha, target)
-    limit = snr_needed(columns, tests, null.dimension, None, alpha, target)
-    unconstrained = response[0] <= 1e-12 * response[-1] or response[-1] == 0.0
-    least = 0.0 if unconstrained else float(np.sqrt(response[0]))
     mean = float(np.sqrt(np.mean(np.maximum(response, 0.0))))
-    return Detectable(
-        amplitude=finite / least if least else np.inf,
-        # The data's mean is known as well where simulations are many.
-        limit=limit / (least * np.sqrt(1.0 + 1.0 / null.n_sims)) if least else np.inf,
-        typical=finite / mean if mean else np.inf,
-        strength=finite,
-    )
+    return snr_needed(columns, tests, null.dimension, null.n_sims, alpha, target) / mean if mean else np.inf
 
 
 def confusion(strength: ArrayLike, cosine: ArrayLike) -> NDArray[np.float64]:
@@ -126,14 +90,18 @@ def confusion(strength: ArrayLike, cosine: ArrayLike) -> NDArray[np.float64]:
 
 def snr_to_separate(cosine: ArrayLike, target: float = 0.95) -> NDArray[np.float64]:
     """Return the signal-to-noise ratio at which :func:`confusion` falls to 1 - target; infinite for a cosine of 1."""
-    rho = np.abs(np.asarray(cosine, dtype=float))
-    far = 1.0 - rho < 1e-12
-    low, high = np.zeros_like(rho), np.full_like(rho, 1e7)
-    for _ in range(60):
-        middle = (low + high) / 2.0
-        failed = confusion(middle, rho) > 1.0 - target
-        low, high = np.where(failed, middle, low), np.where(failed, high, middle)
-    return np.where(far, np.inf, high)
+    nearest = 1.0 - 1e-12
+    rho = np.minimum(np.abs(np.asarray(cosine, dtype=float)), nearest)
+    scale, ratio = np.sqrt(2.0 / (1.0 - rho)), np.sqrt((1.0 + rho) / (1.0 - rho))
+
+    def slope(a: NDArray[np.float64]) -> NDArray[np.float64]:
+        own, other = stats.norm.pdf(a), ratio * stats.norm.pdf(ratio * a)
+        return -own * (2.0 * special.ndtr(ratio * a) - 1.0) - other * (2.0 * special.ndtr(a) - 1.0)
+
+    # In a = s sqrt((1 - rho)/2) the curve is convex, and all roots are close above that of rho = 1.
+    first = np.full_like(rho, -special.ndtri(1.0 - target))
+    root = newton(lambda a: confusion(a * scale, rho) - (1.0 - target), first, slope)
+    return np.where(rho < nearest, root * scale, np.inf)
 
 
 def cosines(candidates: WhitenedTemplates) -> NDArray[np.float64]:
@@ -155,17 +123,9 @@ def log_evidence(
 ) -> NDArray[np.float64]:
     """Return the log-evidence (marginal likelihood) under a broad prior of the amplitudes.
 
-    Parameters
-    ----------
-    null
-        Distribution of the data vector without an effect.
-    total, delta_chi2
-        chi^2 of the data, and its fall when the templates are fitted.
-    columns
-        Rank K of the templates.
-    widths
-        Prior: in orthonormal white coordinates the amplitudes are normal with one of these standard deviations, all
-        equally probable. Powers of two are flat in the logarithm of the signal-to-noise ratio.
+    ``total`` is chi^2 of the data, ``delta_chi2`` its fall when templates of rank K, ``columns``, are fitted. In
+    orthonormal white coordinates the amplitudes are normal with one of the standard deviations ``widths``, all equally
+    probable; powers of two are flat in the logarithm of the signal-to-noise ratio.
 
     Notes
     -----
@@ -187,29 +147,19 @@ def posterior(
     candidates: WhitenedTemplates,
     strengths: NDArray[np.float64],
     prior: NDArray[np.float64],
-    weights: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
-    """Return the posterior probability of each candidate and of none: the Bayes-optimal classifier of a prior.
+    """Return the posterior probability of none and of each candidate: the Bayes-optimal classifier of a prior.
 
     Parameters
     ----------
-    null
-        Distribution of the data vector without an effect.
-    x
-        Data, shape (..., p_raw).
+    null, x
+        Distribution of the data vector without an effect, and data, shape (..., p_raw); the result is (..., 1 + C).
     candidates
         Bases of C hypotheses; a mixture is one whose group has the columns of all its effects.
     strengths
-        Signal-to-noise ratios that the prior allows, the same for all candidates, in steps of less than 1.
+        Signal-to-noise ratios that the prior allows, equally, for all candidates, in steps of less than 1.
     prior
         Of none and each candidate, shape (1 + C,), >= 0, any scale.
-    weights
-        Of the strengths, any scale; equal by default.
-
-    Returns
-    -------
-    ndarray
-        Shape (..., 1 + C), none first.
 
     Notes
     -----
@@ -220,13 +170,57 @@ def posterior(
     total = np.sum(y**2, axis=-1, keepdims=True)
     T, K = candidates.delta_chi2(y), candidates.sizes
     w = null.curvature(total - T)[..., None]
-    share = np.ones(len(strengths)) if weights is None else np.asarray(weights)
     root = np.sqrt(T)[..., None]
     order = np.maximum(K, 1)[:, None] / 2.0
     z = np.maximum(w * strengths * root, 1e-8)
     log_sphere = special.gammaln(order) + (1.0 - order) * np.log(z / 2.0) + np.log(special.ive(order - 1.0, z)) + z
     above = -0.5 * w * (strengths**2 + root**2) + log_sphere
-    marginal = null.log_likelihood(total - T) + special.logsumexp(above, b=share / share.sum(), axis=-1)
+    marginal = null.log_likelihood(total - T) + special.logsumexp(above, b=1.0 / len(strengths), axis=-1)
     logs = np.concatenate([null.log_likelihood(total), np.where(K > 0, marginal, null.log_likelihood(total))], axis=-1)
     with np.errstate(divide="ignore"):  # what the prior excludes has a logarithm of minus infinity
         return special.softmax(logs + np.log(prior), axis=-1)
+
+
+def pair_log_marginals(
+    null: SimulatedGaussian,
+    y: NDArray[np.float64],
+    groups: WhitenedTemplates,
+    pairs: Sequence[tuple[int, int]],
+    norms: tuple[float, float],
+    normals: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the log marginal likelihood of pairs of groups, shape (pairs,), minus infinity for negligible ones.
+
+    White data ``y`` have shape (p,). The white norm s of each effect is uniform in log s within ``norms``, and its
+    direction isotropic: the prior density of K amplitudes is 1/(s^K A_K log(s_max/s_min)), A_K the area of the unit
+    sphere. The integral over the amplitudes of both is by importance sampling from the Gaussian about their joint best
+    fit, with standard ``normals`` of shape (draws, columns of a pair or more). Checked by brute force:
+    tests/unit/test_challenge.py.
+    """
+    total, along, gram = float(y @ y), groups.basis.T @ y, groups.basis.T @ groups.basis
+    fits = []
+    for i, j in pairs:
+        columns = np.r_[groups.start[i] : groups.start[i + 1], groups.start[j] : groups.start[j + 1]]
+        matrix = gram[np.ix_(columns, columns)] + 1e-9 * np.eye(len(columns))
+        theta = np.linalg.solve(matrix, along[columns])
+        fits.append((matrix, theta, max(total - float(along[columns] @ theta), 0.0)))
+    likelihoods = null.log_likelihood(np.array([chi2 for _, _, chi2 in fits]))
+    found = np.full(len(fits), -np.inf)
+    for number in np.flatnonzero(likelihoods > np.max(likelihoods, initial=-np.inf) - NEGLIGIBLE).tolist():
+        (matrix, theta, chi2), first = fits[number], groups.sizes[pairs[number][0]]
+        root = np.linalg.cholesky(matrix * null.curvature(chi2))
+        drawn = theta + np.linalg.solve(root.T, normals[:, : len(theta)].T).T
+        density = _log_prior(drawn[:, :first], norms) + _log_prior(drawn[:, first:], norms)
+        volume = 0.5 * len(theta) * np.log(2.0 * np.pi) - np.sum(np.log(np.diag(root)))
+        with np.errstate(divide="ignore"):  # no draw is within the norms
+            mean = special.logsumexp(density) - np.log(len(drawn))
+        found[number] = likelihoods[number] + mean + volume
+    return found
+
+
+def _log_prior(theta: NDArray[np.float64], norms: tuple[float, float]) -> NDArray[np.float64]:
+    """Return the log prior density of amplitudes in orthonormal white coordinates, shape (draws, K) to (draws,)."""
+    K, s, (low, high) = theta.shape[1], np.linalg.norm(theta, axis=1), norms
+    area = np.log(2.0) + 0.5 * K * np.log(np.pi) - special.gammaln(0.5 * K)
+    value = -K * np.log(np.maximum(s, 1e-300)) - area - np.log(np.log(high / low))
+    return np.where((s >= low) & (s <= high), value, -np.inf)

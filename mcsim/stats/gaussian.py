@@ -104,21 +104,11 @@ class SimulatedGaussian:
     def from_simulations(
         cls, simulations: NDArray[np.float64], offset: NDArray[np.float64] | None = None, floor: float = 1e-8
     ) -> "SimulatedGaussian":
-        """Estimate mean and covariance.
+        """Estimate mean and covariance from simulations, shape (N, p_raw).
 
-        Parameters
-        ----------
-        simulations
-            Shape (N, p_raw).
-        offset
-            Known difference between the mean of the data and that of the simulations, shape (p_raw,).
-        floor
-            Eigenvalues of the correlation matrix below this fraction of the largest are left out.
-
-        Raises
-        ------
-        InputError
-            If an element is not finite or constant, or there are fewer than p + 7 simulations.
+        ``offset``: known difference between the mean of the data and that of the simulations, shape (p_raw,).
+        Eigenvalues of the correlation matrix below the fraction ``floor`` of the largest are left out. Raise InputError
+        if an element is not finite or constant, or there are fewer than p + 7 simulations.
         """
         mean = simulations.mean(axis=0)
         centred = simulations - mean
@@ -207,14 +197,7 @@ class SimulatedGaussian:
         return float(along @ along)
 
     def fit(self, x: NDArray[np.float64], t: NDArray[np.float64]) -> Fit:
-        """Fit templates by generalised least squares.
-
-        Parameters
-        ----------
-        x
-            Data, shape (p_raw,).
-        t
-            Templates, shape (p_raw, K), per unit of each amplitude.
+        """Fit templates ``t``, shape (p_raw, K), to data ``x``, shape (p_raw,), by generalised least squares.
 
         Notes
         -----
@@ -267,10 +250,8 @@ class SimulatedGaussian:
     def with_extra_covariance(self, *draws: NDArray[np.float64]) -> "SimulatedGaussian":
         """Add independent Gaussian covariances, each known from a few draws.
 
-        Parameters
-        ----------
-        draws
-            Deviations d with R = d @ d.T, shape (p_raw, n_draws): draws less their mean over sqrt(n_draws - 1).
+        Each is given by deviations d with R = d @ d.T, shape (p_raw, n_draws): draws less their mean over
+        sqrt(n_draws - 1).
 
         Notes
         -----
@@ -308,18 +289,10 @@ def ledoit_wolf(white: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def residual_pvalue(chi2: ArrayLike, dimension: ArrayLike, n: int, allowance: ArrayLike = 0.0) -> NDArray[np.float64]:
-    """Return the probability of a larger chi^2.
+    """Return the probability of a larger chi^2 of the residual after K columns have been fitted, or of the data.
 
-    Parameters
-    ----------
-    chi2
-        Of the residual after K columns have been fitted, or of the data themselves.
-    dimension
-        q = p - K.
-    n
-        Number of simulations less one.
-    allowance
-        Squared signal-to-noise ratio of an error of the model that is tolerated.
+    ``dimension`` is q = p - K, ``n`` the number of simulations less one, ``allowance`` the squared signal-to-noise
+    ratio of an error of the model that is tolerated.
 
     Notes
     -----
@@ -337,18 +310,9 @@ def nested_pvalue(
 ) -> NDArray[np.float64]:
     """Return the probability that templates absent from the data lower chi^2 by at least this much.
 
-    Parameters
-    ----------
-    delta_chi2
-        Fall of chi^2 when ``columns`` further templates are fitted.
-    chi2
-        Before that.
-    columns
-        Number K of the further templates; the probability is 1 for none.
-    dimension
-        Degrees of freedom before: p, less the templates that have been fitted already.
-    n, allowance
-        As for :func:`residual_pvalue`.
+    chi^2 falls by ``delta_chi2`` from ``chi2`` when K further templates, ``columns``, are fitted; the probability is 1
+    for none. ``dimension`` counts the degrees of freedom before: p, less the templates that have been fitted already.
+    ``n`` and ``allowance`` are those of :func:`residual_pvalue`.
 
     Notes
     -----

@@ -131,19 +131,10 @@ def global_test(
 def scan_pvalues(
     x: NDArray[np.float64], simulations: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the deviations of many correlated numbers and their global p-values.
+    """Return the deviations of many correlated numbers ``x``, shape (..., B), and their global p-values.
 
-    Parameters
-    ----------
-    x
-        Shape (..., B).
-    simulations
-        Shape (N, B), N >= 20.
-
-    Returns
-    -------
-    z, p
-        Shape (..., B): normal deviate of each, and the probability that the largest |z| of all is at least as large.
+    The deviations are normal deviates; the p-value of one is the probability that the largest |z| of all is at least as
+    large. ``simulations`` has the shape (N, B), N >= 20.
 
     Notes
     -----

@@ -37,7 +37,7 @@ class Sums:
 
 
 def leaf(values: dict[str, Array], covariance_of: tuple[str, ...] = ()) -> Sums:
-    """Statistics of one realization."""
+    """Return the statistics of one realization."""
     square = {name: np.zeros(np.shape(x)) for name, x in values.items()}
     comoment = {
         name: np.zeros((*values[name].shape, values[name].shape[-1]), values[name].dtype) for name in covariance_of
@@ -46,7 +46,7 @@ def leaf(values: dict[str, Array], covariance_of: tuple[str, ...] = ()) -> Sums:
 
 
 def combine(a: Sums | None, b: Sums | None) -> Sums | None:
-    """Statistics of the union of two disjoint sets (Chan, Golub & LeVeque 1983); ``None`` is the empty set."""
+    """Return the statistics of two disjoint sets together (Chan, Golub & LeVeque 1983); ``None`` is the empty set."""
     if a is None or b is None:
         return b if a is None else a
     count = a.count + b.count
@@ -65,12 +65,7 @@ def combine(a: Sums | None, b: Sums | None) -> Sums | None:
 def tree(node: Callable[[int], Sums | None], nodes: int) -> Sums | None:
     """Combine nodes 0 ... nodes - 1 of one level of the binary tree.
 
-    Parameters
-    ----------
-    node
-        Gives the statistics of one node, ``None`` if it is empty; each is asked for once, in order.
-    nodes
-        How many there are.
+    ``node`` gives the statistics of one of them, ``None`` if it is empty; each is asked for once, in order.
 
     Notes
     -----
@@ -97,7 +92,7 @@ def standard_deviation(sums: Sums, name: str) -> NDArray[np.float64]:
 
 
 def covariance(sums: Sums, name: str) -> Array:
-    """Covariance E (x - mean) conj(x - mean)^T over the last axis; NaN for fewer than two realizations."""
+    """Return the covariance E (x - mean) conj(x - mean)^T over the last axis; NaN for fewer than two realizations."""
     if sums.count < 2:
         return np.full(sums.comoment[name].shape, np.nan)
     result: Array = sums.comoment[name] / (sums.count - 1)
@@ -109,12 +104,7 @@ def jackknife(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return a statistic of means over realizations, and its error by leaving out one realization after the other.
 
-    Parameters
-    ----------
-    statistic
-        Function of the mean of each sample.
-    samples
-        Shape (realization, ...), of the same realizations.
+    ``statistic`` is a function of the mean of each sample; samples have the shape (realization, ...).
     """
     number = len(samples[0])
     left_out = np.array([statistic(*(np.delete(s, r, axis=0).mean(axis=0) for s in samples)) for r in range(number)])

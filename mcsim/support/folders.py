@@ -30,14 +30,29 @@ def appearing(path: Path) -> Iterator[Path]:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
+@contextmanager
+def unwritable(name: str | Path, remedy: str) -> Iterator[None]:
+    """Turn the file system's refusal to write into an InputError."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{name} cannot be written ({error.strerror or error}); {remedy}.") from error
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file that appears complete or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    scratch = path.with_name(f".{path.name}.{os.getpid()}")
+    scratch.write_text(text)
+    os.replace(scratch, path)
+
+
 def writable(folder: Path) -> None:
     """Make a folder; raise InputError if nothing can be written into it."""
-    try:
+    with unwritable(folder, "choose another folder"):
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
-    except OSError as error:
-        raise InputError(f"{folder} cannot be written ({error.strerror}); choose another folder.") from None
 
 
 def default_cache_dir() -> Path:
@@ -50,21 +65,9 @@ def default_cache_dir() -> Path:
 
 
 def cached(name: str, fill: Callable[[Path], None], cache_dir: str | Path | None = None) -> Path:
-    """Return a folder of the cache; fill it first if it does not exist.
+    """Return a folder of the cache (default: :func:`default_cache_dir`); if it does not exist, ``fill`` an empty one.
 
-    Parameters
-    ----------
-    name
-        Name of the folder; it identifies everything that the content depends on.
-    fill
-        Function that writes the content into an empty folder.
-    cache_dir
-        Root of the cache; None: :func:`default_cache_dir`.
-
-    Raises
-    ------
-    InputError
-        If the cache cannot be written.
+    The name of the folder identifies everything that its content depends on.
     """
     root = default_cache_dir() if cache_dir is None else Path(cache_dir)
     folder = root / name

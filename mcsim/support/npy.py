@@ -9,22 +9,7 @@ from mcsim.errors import InputError
 
 
 def read_npy(path: str | Path, kind: str = "biufc", ndims: tuple[int, ...] = (1,)) -> NDArray:
-    """Read a .npy file.
-
-    Parameters
-    ----------
-    path
-        The file.
-    kind
-        Allowed ``dtype.kind`` letters; by default any numbers.
-    ndims
-        Allowed numbers of dimensions.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or has another type or shape.
-    """
+    """Read a .npy file, of the allowed ``dtype.kind`` letters (by default any numbers) and numbers of dimensions."""
     try:
         array = np.load(path, allow_pickle=False)
     except Exception as error:  # libraries raise errors of any type for a broken file

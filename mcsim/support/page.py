@@ -4,19 +4,15 @@ import base64
 import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import jinja2
 
-
-class Drawing(Protocol):
-    """A figure of matplotlib."""
-
-    def savefig(self, fname: Any, **settings: Any) -> None:
-        """Write it."""
+if TYPE_CHECKING:  # matplotlib loads slowly
+    from matplotlib.figure import Figure
 
 
-def png(figure: Drawing, dpi: int) -> bytes:
+def png(figure: "Figure", dpi: int) -> bytes:
     """Return a figure as PNG, the same bytes for the same figure."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi, facecolor="white", metadata={"Software": None})

@@ -8,40 +8,40 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 
-class Reporter(Protocol):
-    """Function that shows the progress."""
+class Reporter:
+    """Count of finished units of work, of which ``expect`` may announce more; this one shows nothing."""
+
+    def __init__(self, total: float, unit: str) -> None:
+        self.total, self.unit, self.start = total, unit, time.monotonic()
 
     def __call__(self, finished: float, failed: int = 0) -> None:
         """Show that ``finished`` units are done, ``failed`` of them unsuccessfully."""
 
     def expect(self, more: float) -> None:
         """Add ``more`` units to the total."""
+        self.total += more
+
+    def rate(self, finished: float, failed: int) -> str:
+        """Return units per second since the start as text."""
+        rate = finished / max(time.monotonic() - self.start, 1e-9)
+        speed = f"{rate:.3g} {self.unit}/s" if self.unit else ""
+        return f"{speed}, {failed} failed" if failed else speed
 
 
 @contextmanager
 def reporting(label: str, total: float, unit: str, quiet: bool = False, every_s: float = 60.0) -> Iterator[Reporter]:
-    """Yield a function that reports progress on standard error.
+    """Yield a function that reports progress on standard error: a bar on a terminal, or a line every ``every_s``.
 
-    Parameters
-    ----------
-    label, unit
-        Name of the work, and of what is counted.
-    total
-        Number of units; 0 if :meth:`Reporter.expect` says later how many there are.
-    quiet
-        Report nothing.
-    every_s
-        Seconds between lines if standard error is not a terminal.
+    ``total`` is the number of units; 0 if :meth:`Reporter.expect` says later how many there are.
     """
     console = Console(stderr=True)
     if quiet:
-        yield _Silent()
+        yield Reporter(total, unit)
     elif console.is_terminal:
         columns = (
             TextColumn("{task.description}"),
@@ -75,66 +75,39 @@ class Journal:
             Console(stderr=True, highlight=False, soft_wrap=True).print(line, markup=False)
 
 
-class _Silent:
-    def __call__(self, finished: float, failed: int = 0) -> None:
-        pass
-
-    def expect(self, more: float) -> None:
-        pass
-
-
-class _Rate:
-    """Units per second since the start, and the time left."""
-
-    def __init__(self, total: float, unit: str) -> None:
-        self.total, self.unit, self.start = total, unit, time.monotonic()
-
-    def text(self, finished: float, failed: int) -> str:
-        rate = finished / max(time.monotonic() - self.start, 1e-9)
-        speed = f"{rate:.3g} {self.unit}/s" if self.unit else ""
-        return f"{speed}, {failed} failed" if failed else speed
-
-    def left_s(self, finished: float) -> float:
-        elapsed = time.monotonic() - self.start
-        return elapsed * (self.total - finished) / finished if finished else float("inf")
-
-
-class _Bar:
+class _Bar(Reporter):
     def __init__(self, bar: Progress, label: str, total: float, unit: str) -> None:
-        self.bar, self.rate = bar, _Rate(total, unit)
-        self.task = bar.add_task(label, total=total, rate="")
+        super().__init__(total, unit)
+        self.bar, self.task = bar, bar.add_task(label, total=total, rate="")
 
     def __call__(self, finished: float, failed: int = 0) -> None:
-        self.bar.update(self.task, completed=finished, rate=self.rate.text(finished, failed))
+        self.bar.update(self.task, completed=finished, rate=self.rate(finished, failed))
 
     def expect(self, more: float) -> None:
-        self.rate.total += more
-        self.bar.update(self.task, total=self.rate.total)
+        super().expect(more)
+        self.bar.update(self.task, total=self.total)
 
 
-class _Lines:
+class _Lines(Reporter):
     def __init__(self, console: Console, label: str, total: float, unit: str, every_s: float) -> None:
-        self.console, self.label, self.unit, self.every_s, self.grows = console, label, unit, every_s, total == 0.0
-        self.rate, self.last, self.state = _Rate(total, unit), time.monotonic(), (0.0, 0)
+        super().__init__(total, unit)
+        self.console, self.label, self.every_s, self.grows = console, label, every_s, total == 0.0
+        self.last, self.state = self.start, (0.0, 0)
 
     def __call__(self, finished: float, failed: int = 0) -> None:
         now, self.state = time.monotonic(), (finished, failed)
-        if now - self.last >= self.every_s or (finished >= self.rate.total and not self.grows):
+        if now - self.last >= self.every_s or (finished >= self.total and not self.grows):
             self.last = now
             self._print(finished, failed)
 
-    def expect(self, more: float) -> None:
-        self.rate.total += more
-
     def close(self) -> None:
-        if self.grows and self.rate.total:
+        if self.grows and self.total:
             self._print(*self.state)
 
     def _print(self, finished: float, failed: int) -> None:
-        total = self.rate.total
-        share = f"{finished:g}/{total:g} {self.unit}" if self.unit else f"{100 * finished / total:.0f} %"
-        speed, left = self.rate.text(finished, failed), self.rate.left_s(finished)
-        parts = [share, speed, f"{left:.0f} s left" if 0 < left < float("inf") else ""]
+        share = f"{finished:g}/{self.total:g} {self.unit}" if self.unit else f"{100 * finished / self.total:.0f} %"
+        left_s = (time.monotonic() - self.start) * (self.total - finished) / finished if finished else 0.0
+        parts = [share, self.rate(finished, failed), f"{left_s:.0f} s left" if left_s > 0.0 else ""]
         self.console.print(
             f"{self.label}: {', '.join(part for part in parts if part)}", highlight=False, soft_wrap=True
         )

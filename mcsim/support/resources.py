@@ -4,6 +4,7 @@ An installed wheel has them inside the package; a source checkout (or an editabl
 ``scan_models`` and ``workflows`` beside the package, where people look for them.
 """
 
+import os
 from pathlib import Path
 
 from mcsim.errors import InputError
@@ -11,33 +12,22 @@ from mcsim.errors import InputError
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
-def scan_model(name_or_path: str | Path, relative_to: str | Path | None = None) -> Path:
-    """Find a scan model.
+def scan_model(name_or_path: str | Path) -> Path:
+    """Find a scan model: a packaged name, for example ``"wmap"``, or the path of a TOML file; refuse anything else.
 
-    Parameters
-    ----------
-    name_or_path
-        Name of a packaged model, for example ``"wmap"``, or the path of a TOML file. A packaged name wins: write
-        ``./wmap`` for a file of that name.
-    relative_to
-        Folder that a relative path starts from; default: the working folder.
-
-    Raises
-    ------
-    InputError
-        If it is neither a packaged name nor an existing file.
+    A packaged name wins: write ``./wmap`` for a file of that name.
     """
-    return _find("scan model", "scan_models", ".toml", name_or_path, relative_to)
+    return _find("scan model", "scan_models", ".toml", name_or_path)
 
 
-def workflow(name_or_path: str | Path, relative_to: str | Path | None = None) -> Path:
+def workflow(name_or_path: str | Path) -> Path:
     """Find a run configuration: a packaged name, for example ``"quickstart"``, or a path. See :func:`scan_model`."""
-    return _find("run configuration", "workflows", ".toml", name_or_path, relative_to)
+    return _find("run configuration", "workflows", ".toml", name_or_path)
 
 
-def spectrum(name_or_path: str | Path, relative_to: str | Path | None = None) -> Path:
+def spectrum(name_or_path: str | Path) -> Path:
     """Find a power spectrum: a packaged name, for example ``"wmap7"``, or a path. See :func:`scan_model`."""
-    return _find("power spectrum", "data", ".txt", name_or_path, relative_to)
+    return _find("power spectrum", "data", ".txt", name_or_path)
 
 
 def names(kind: str) -> tuple[str, ...]:
@@ -51,15 +41,12 @@ def _folder(kind: str) -> Path:
     return inside if inside.is_dir() else _PACKAGE.parent / kind
 
 
-def _find(noun: str, kind: str, suffix: str, name_or_path: str | Path, relative_to: str | Path | None) -> Path:
+def _find(noun: str, kind: str, suffix: str, name_or_path: str | Path) -> Path:
     if str(name_or_path) in names(kind):
         return _folder(kind) / f"{name_or_path}{suffix}"
-    path = Path(relative_to or ".") / name_or_path
-    try:
-        if path.is_file():
-            return path.resolve()
-    except (OSError, ValueError):  # invalid names: too long, or with a NUL
-        pass
+    path = Path(name_or_path)
+    if os.path.isfile(path):  # False also for a name that no file system takes
+        return path.resolve()
     raise InputError(
         f"{noun} {str(name_or_path)!r} is neither a file (looked for {str(path)!r}) nor packaged with mcsim; "
         f"give a path or one of: {', '.join(names(kind)) or 'none is packaged'}."

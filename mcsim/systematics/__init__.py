@@ -1,8 +1,8 @@
 """The library of effects: one file each, found by name; other packages add theirs by entry points."""
 
-from mcsim.systematics.base import Alm, Draw, Effect, Map, Pointing, Site, Wording
-from mcsim.systematics.compose import looked_at, seen_through, spread_of
-from mcsim.systematics.registry import Library, build, catalogue, describe, get
+from mcsim.systematics.base import Alm, Draw, Effect, Map, Pointing, Site, Wording, looked_at, seen_through, spread_of
+from mcsim.systematics.parametrization import Parametrization
+from mcsim.systematics.registry import Library, basis_of, build, catalogue, effects, get
 
 __all__ = [
     "Alm",
@@ -10,12 +10,14 @@ __all__ = [
     "Effect",
     "Library",
     "Map",
+    "Parametrization",
     "Pointing",
     "Site",
     "Wording",
+    "basis_of",
     "build",
     "catalogue",
-    "describe",
+    "effects",
     "get",
     "looked_at",
     "seen_through",

@@ -6,7 +6,7 @@ and orientation moments) and the sample-by-sample one, so that an effect that is
 a candidate of a diagnosis, or acts in the time-ordered reference is one and the same.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Literal, Self
 
@@ -16,30 +16,22 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import LineOfSight, Moments, ScanModel
+from mcsim.sphere import rng
 from mcsim.support.numbers import measured
+from mcsim.systematics.parametrization import Parametrization, Vector
 
 Alm = NDArray[np.complex128]
 Map = NDArray[np.float64]
-Vector = NDArray[np.float64]
 Draw = Callable[[str], np.random.Generator]
 """From the name of a stage to its stream of random numbers in this realization."""
 
 
 @dataclass(frozen=True)
 class Pointing:
-    """Describe how one channel of a survey was pointed, as a function of time.
-
-    Attributes
-    ----------
-    model, line
-        The scan and the channel's line of sight.
-    time_range
-        Part of the survey in this map, as fractions of its samples.
-    """
+    """Describe how one channel of a survey was pointed: the scan, and the channel's line of sight."""
 
     model: ScanModel
     line: LineOfSight
-    time_range: tuple[float, float] = (0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -126,7 +118,8 @@ class Wording:
 class Effect:
     """Derive an effect from this class, whose hooks change nothing.
 
-    A subclass is a frozen dataclass whose fields are its parameters, ``amplitude`` first; zero amplitude is no effect.
+    A subclass is a frozen dataclass whose fields are its parameters, ``amplitude`` first. Zero amplitude is no effect:
+    ``sky``, ``beam`` and ``pointing`` are not called then, and what the other hooks return changes nothing.
 
     Attributes
     ----------
@@ -142,21 +135,10 @@ class Effect:
         What makes it, how it shows, and where that is from: one sentence each, for people.
     step
         Amplitude at which responses are measured: small enough to be linear.
-    matched_filter
-        True if the data vector of a diagnosis has a matched filter for it: not if a hook draws random numbers, nor if
-        dipoles, variances, spectra and modulations, which are always measured, contain all of it.
-    stochastic
-        True if a hook draws random numbers, at positive amplitudes at least.
-    mean_response
-        True if a diagnosis uses the mean response over skies, not that of the observed sky: for a change of power
-        alone, whose response in one sky depends on fluctuations that the spectra have anyway.
-    sign
-        Sign of the amplitudes at which responses are measured; 0: both. If it is not 0, a negative amplitude is
-        unphysical, and a diagnosis does not name it.
-    max_amplitude
-        Largest physical amplitude, in absolute value; a diagnosis names no larger one.
     variants
         Fixed parameters with which the effect is a candidate, one candidate for each.
+    parametrization
+        How a diagnosis fits it; left out: the amplitude alone, of either sign.
 
     Examples
     --------
@@ -190,14 +172,20 @@ class Effect:
     signature: ClassVar[str]
     source: ClassVar[str] = ""
     step: ClassVar[float]
-    matched_filter: ClassVar[bool] = True
-    sign: ClassVar[Literal[-1, 0, 1]] = 0
-    stochastic: ClassVar[bool] = False
-    mean_response: ClassVar[bool] = False
-    max_amplitude: ClassVar[float] = np.inf
     variants: ClassVar[tuple[Mapping[str, Any], ...]] = ({},)
+    parametrization: ClassVar[Parametrization] = Parametrization()
 
     amplitude: float = 0.0
+
+    def __init_subclass__(cls) -> None:
+        """Refuse a class that says itself how it is fitted: nobody would read it there."""
+        super().__init_subclass__()
+        misplaced = [key for key in vars(cls) if key in dir(Parametrization) and not key.startswith("_")]
+        if misplaced:
+            raise InputError(
+                f"effect {cls.__name__} says {', '.join(misplaced)} itself; let its parametrization say it, as in "
+                "parametrization = Parametrization(stochastic=True)."
+            )
 
     # Stages, in the order in which they act.
 
@@ -243,34 +231,7 @@ class Effect:
         """Return (weight, delay in seconds) of the earlier signals in a sample; None: as :meth:`moved`."""
         return None
 
-    # How the effect is parametrised for a linear fit.
-
-    @classmethod
-    def basis(cls) -> tuple[Self, ...]:
-        """Return effects of amplitude ``step`` whose responses span those of all parameters, to first order."""
-        return (cls(amplitude=cls.step),)
-
-    def coordinates(self) -> Vector:
-        """Return the linear components: the response is the sum of coordinates times that of the basis per step."""
-        return np.array([self.amplitude])
-
-    @classmethod
-    def constrained(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Vector:
-        """Return the fitted coordinates that the data constrain, and zeros; by default all of them.
-
-        Parameters
-        ----------
-        coordinates
-            Shape (basis,).
-        precision
-            Inverse of their covariance, shape (basis, basis).
-        """
-        return coordinates
-
-    @classmethod
-    def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
-        """Return the effect whose coordinates are nearest in the metric ``precision``, shape (k, k)."""
-        return cls(amplitude=float(coordinates[0]))
+    # What people and configurations read.
 
     def parameters(self) -> dict[str, Any]:
         """Return all parameters but the amplitude, by name."""
@@ -304,59 +265,83 @@ class Effect:
         """Return amplitude, error and direction as people read them."""
         return " ".join(filter(None, (self.format_amplitude(self.amplitude, sigma), self.direction())))
 
+    def along(self, parameter: str) -> Vector:
+        """Return the vector of length ``amplitude`` along a parameter; InputError where that is zero."""
+        direction = np.array(getattr(self, parameter))
+        norm = float(np.linalg.norm(direction))
+        if norm == 0.0:
+            raise InputError(f"effect {self.name}: {parameter} are all zero; give a direction, or amplitude = 0.")
+        return np.asarray(self.amplitude * direction / norm)
+
     def scaled(self, factor: float) -> Self:
         """Return the same effect with ``factor`` times the amplitude."""
         return replace(self, amplitude=factor * self.amplitude)
 
 
+@dataclass(frozen=True, kw_only=True)
+class DirectedEffect(Effect):
+    """Derive an effect from this class whose parameter is a vector in the frame of the maps.
+
+    Attributes
+    ----------
+    amplitude
+        Length.
+    lon_deg, lat_deg
+        Direction.
+    """
+
+    lon_deg: float = 0.0
+    lat_deg: float = 0.0
+
+    @property
+    def vector(self) -> Vector:
+        """Return the components x, y, z."""
+        lon, lat = np.deg2rad([self.lon_deg, self.lat_deg])
+        return self.amplitude * np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+
+    def direction(self) -> str:
+        """Return longitude and latitude in the frame of the maps."""
+        return f"towards longitude {self.lon_deg:.0f}°, latitude {self.lat_deg:.0f}°".replace("-", "−")
+
+
+def seen_through(acting: Sequence[Effect], site: Site, displacing: Sequence[Effect] | None = None) -> Beam:
+    """Return the beam about the fiducial line of sight: every effect on its shape first, then all that displaces it.
+
+    ``displacing``: the effects that displace the line of sight; default: all.
+    """
+    beam = site.beam
+    for effect in acting:
+        beam = effect.beam(beam, site) if effect.amplitude != 0.0 else beam
+    for effect in acting if displacing is None else displacing:
+        beam = effect.pointing(beam, site) if effect.amplitude != 0.0 else beam
+    return beam
+
+
+def spread_of(acting: Iterable[Effect]) -> float:
+    """Return the factor by which the samples' offsets from the centre of their pixel shrink."""
+    return float(np.prod([effect.spread() for effect in acting]))
+
+
+def looked_at(acting: Iterable[Effect], sky: Alm, site: Site, seed: int, realization: int) -> Alm:
+    """Return the sky that a channel looks at, uK; what an effect draws depends on its own name, not on the channel."""
+    for effect in acting:
+        if effect.amplitude == 0.0:
+            continue
+
+        def draw(stage: str, name: str = effect.name) -> np.random.Generator:
+            return rng.generator(seed, realization, f"effect/{name}/{stage}")
+
+        sky = effect.sky(sky, site, draw)
+    return sky
+
+
 def scan_direction(angle_deg: float, period_deg: float = 360.0) -> str:
     """Return a direction in the frame of the beam, x along the scan, in words."""
     angle = (angle_deg + period_deg / 2.0) % period_deg - period_deg / 2.0
-    named = {0.0: "along the scan", 90.0: "across the scan"}
-    if period_deg > 180.0:
-        named |= {180.0: "against the scan"}
-    for at, words in named.items():
+    for at, words in ((0.0, "along the scan"), (90.0, "across the scan"), (180.0, "against the scan")):
         if abs(abs(angle) - at) < _NAMED_WITHIN_DEG:
             return words
     return f"at {angle:.0f}° to the scan".replace("-", "−")
 
 
 _NAMED_WITHIN_DEG = 5.0
-
-
-def polar(coordinates: Vector, multiple: int = 1) -> tuple[float, float]:
-    """Return norm, and angle in degrees, of a (cos, sin) pair whose angle counts ``multiple`` times."""
-    x, y = (float(value) for value in coordinates)
-    return float(np.hypot(x, y)), float(np.rad2deg(np.arctan2(y, x)) / multiple)
-
-
-def build(kind: type[Effect], parameters: Mapping[str, Any]) -> Effect:
-    """Build an effect from a table of parameters.
-
-    Raises
-    ------
-    InputError
-        For a parameter that the effect does not have, or a value that is no finite number where one is needed.
-    """
-    known = {f.name: f for f in fields(kind)}
-    values: dict[str, Any] = {}
-    for key, value in parameters.items():
-        if key not in known:
-            raise InputError(f"effect {kind.name} has no parameter {key!r}; it has {', '.join(known)}.")
-        values[key] = _checked(kind.name, key, value, getattr(kind(), key))
-    return kind(**values)
-
-
-def _checked(effect: str, key: str, value: Any, default: Any) -> Any:
-    if isinstance(default, str):
-        if isinstance(value, str):
-            return value
-        raise InputError(f"effect {effect}: {key} = {value!r} must be a text.")
-    if isinstance(default, tuple):
-        if isinstance(value, list | tuple) and (not default or len(value) == len(default)):
-            return tuple(float(_checked(effect, key, item, 0.0)) for item in value)
-        size = f"{len(default)} numbers" if default else "numbers"
-        raise InputError(f"effect {effect}: {key} = {value!r} must be a list of {size}.")
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise InputError(f"effect {effect}: {key} = {value!r} must be a finite number.")
-    return float(value)

@@ -1,18 +1,58 @@
 """A beam that leans to one side."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from mcsim.instrument.beams import Beam
-from mcsim.systematics.base import Effect, Site, Vector, Wording
+from mcsim.systematics.base import Effect, Site, Wording
+from mcsim.systematics.parametrization import Parametrization, Vector
 from mcsim.systematics.shape import shape
 
 _WHOLE_SIGMAS = 7.0
 _FADED_SIGMAS = 9.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class _FourAngles(Parametrization):
+    """Fit k and angle by the responses at 0, 45, 90 and 135 degrees."""
+
+    def basis(self) -> tuple[Mapping[str, Any], ...]:
+        """Return the four angles."""
+        return tuple({"angle_deg": angle} for angle in (0.0, 45.0, 90.0, 135.0))
+
+    def coordinates(self, effect: Any) -> Vector:
+        """Return the coefficients of the four responses that give the response at the angle."""
+        return effect.amplitude * _weights(np.deg2rad(effect.angle_deg))
+
+    def nearest(self, coordinates: Vector, precision: NDArray[np.float64]) -> dict[str, Any]:
+        """Return the best k and angle: k is linear, the angle is searched."""
+        if not precision.any():
+            return {"amplitude": 0.0}  # the data do not respond to it
+        measured = precision @ coordinates
+
+        def missed(angle: float) -> float:
+            weights = _weights(angle)
+            return -(max(float(weights @ measured), 0.0) ** 2) / float(weights @ precision @ weights)
+
+        tried = np.linspace(0.0, 2.0 * np.pi, 181)
+        first = tried[int(np.argmin([missed(angle) for angle in tried]))]
+        near = (first - 0.05, first + 0.05)
+        angle = minimize_scalar(missed, bounds=near, method="bounded", options={"xatol": 1e-9}).x
+        weights = _weights(angle)
+        amplitude = max(float(weights @ measured), 0.0) / float(weights @ precision @ weights)
+        return {"amplitude": amplitude, "angle_deg": float(np.rad2deg(angle)) % 360.0}
+
+
+def _weights(angle: float) -> Vector:
+    """Of the responses at 0, 45, 90 and 135 degrees in that at ``angle`` radians, from their m = 1 and m = 3 parts."""
+    c1, s1, c3, s3 = np.cos(angle), np.sin(angle), np.cos(3.0 * angle), np.sin(3.0 * angle)
+    even, odd = (c1 - c3) / np.sqrt(2.0), (s1 + s3) / np.sqrt(2.0)
+    return 0.5 * np.array([c1 + c3, odd + even, s1 - s3, odd - even])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,58 +78,20 @@ class BeamComa(Effect):
     name = "beam_coma"
     scope = "channel"
     unit = "k of 1 + k (u^3 - 3u)"
-    title = "beam coma"
     wording = Wording("k = {}")
     cause = "Third-order aberration of optics off the axis."
     signature = "L = 1 and 3, d = +-1, through w_1 and w_3; changes sign where the scan reverses (half1 - half2)."
     source = "Born & Wolf, Principles of Optics, Sec. 5.3, in the lowest Hermite order that keeps the centroid"
     step = 0.01
+    parametrization = _FourAngles()
 
     angle_deg: float = 0.0
 
     def beam(self, beam: Beam, site: Site) -> Beam:
         """Return the beam times the cubic polynomial."""
-        if self.amplitude == 0.0:
-            return beam
         form = shape(beam, 4)
         radius = form.theta / form.sigma
         u = radius * np.cos(form.phi - np.deg2rad(self.angle_deg))
         fading = np.clip((_FADED_SIGMAS - radius) / (_FADED_SIGMAS - _WHOLE_SIGMAS), 0.0, 1.0)
         near = fading**3 * (10.0 - 15.0 * fading + 6.0 * fading**2)
         return form.with_added(self.amplitude * form.values * near * (u**3 - 3.0 * u), 3)
-
-    @classmethod
-    def basis(cls) -> tuple[Self, ...]:
-        """At 0, 45, 90 and 135 degrees."""
-        return tuple(cls(amplitude=cls.step, angle_deg=angle) for angle in (0.0, 45.0, 90.0, 135.0))
-
-    def coordinates(self) -> Vector:
-        """Coefficients of the responses at 0, 45, 90 and 135 degrees that give the response at the angle."""
-        return self.amplitude * _weights(np.deg2rad(self.angle_deg))
-
-    @classmethod
-    def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
-        """Return the best k and angle: k is linear, the angle is searched."""
-        if not precision.any():
-            return cls()  # the data do not respond to it
-        measured = precision @ coordinates
-
-        def missed(angle: float) -> float:
-            weights = _weights(angle)
-            return -(max(float(weights @ measured), 0.0) ** 2) / float(weights @ precision @ weights)
-
-        tried = np.linspace(0.0, 2.0 * np.pi, 181)
-        first = tried[int(np.argmin([missed(angle) for angle in tried]))]
-        angle = minimize_scalar(
-            missed, bounds=(first - 0.05, first + 0.05), method="bounded", options={"xatol": 1e-9}
-        ).x
-        weights = _weights(angle)
-        amplitude = max(float(weights @ measured), 0.0) / float(weights @ precision @ weights)
-        return cls(amplitude=amplitude, angle_deg=float(np.rad2deg(angle)) % 360.0)
-
-
-def _weights(angle: float) -> Vector:
-    """Of the responses at 0, 45, 90 and 135 degrees in that at ``angle`` radians, from their m = 1 and m = 3 parts."""
-    c1, s1, c3, s3 = np.cos(angle), np.sin(angle), np.cos(3.0 * angle), np.sin(3.0 * angle)
-    even, odd = (c1 - c3) / np.sqrt(2.0), (s1 + s3) / np.sqrt(2.0)
-    return 0.5 * np.array([c1 + c3, odd + even, s1 - s3, odd - even])

@@ -1,14 +1,13 @@
 """A beam that is more elongated than the fiducial one."""
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
-from mcsim.systematics.base import Effect, Site, Vector, Wording, polar, scan_direction
+from mcsim.systematics.base import Effect, Site, Wording, scan_direction
+from mcsim.systematics.parametrization import Angle
 from mcsim.systematics.shape import stretched
 
 
@@ -27,19 +26,17 @@ class BeamEllipticity(Effect):
     name = "beam_ellipticity"
     scope = "channel"
     unit = "major/minor - 1"
-    title = "beam ellipticity"
     wording = Wording("axis ratio {}", offset=1.0)
     cause = "Optics off the axis: defocus, coma-free astigmatism, or a horn that looks past the centre of the mirror."
     signature = "Even L, growing as l^2, fixed to the scan through w_2."
     source = "Joshi et al. arXiv:1210.7318, Sec. IV; Fosalba et al. 2002, Phys. Rev. D 65, 063003"
     step = 0.02
+    parametrization = Angle(multiple=2)
 
     angle_deg: float = 0.0
 
     def beam(self, beam: Beam, site: Site) -> Beam:
-        """Stretched along the angle and squeezed across it."""
-        if self.amplitude == 0.0:
-            return beam
+        """Stretch the beam along the angle and squeeze it across."""
         if abs(self.amplitude) > 2.0:
             raise InputError(
                 f"effect {self.name}: amplitude = {self.amplitude:g} is no beam to speak of; keep it within +-2."
@@ -48,22 +45,6 @@ class BeamEllipticity(Effect):
         if self.amplitude < 0.0:
             angle += np.pi / 2
         return stretched(beam, np.sqrt(ratio), 1.0 / np.sqrt(ratio), angle, 32, 2)
-
-    @classmethod
-    def basis(cls) -> tuple[Self, ...]:
-        """Along the scan, and at 45 degrees to it."""
-        return (cls(amplitude=cls.step), cls(amplitude=cls.step, angle_deg=45.0))
-
-    def coordinates(self) -> Vector:
-        """(e cos 2 angle, e sin 2 angle)."""
-        angle = 2.0 * np.deg2rad(self.angle_deg)
-        return self.amplitude * np.array([np.cos(angle), np.sin(angle)])
-
-    @classmethod
-    def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
-        """Norm and half the angle."""
-        amplitude, angle_deg = polar(coordinates, 2)
-        return cls(amplitude=amplitude, angle_deg=angle_deg)
 
     def direction(self) -> str:
         """Return the direction in the frame of the beam."""

@@ -30,9 +30,7 @@ class BeamNoncircularity(Effect):
     step = 0.05
 
     def beam(self, beam: Beam, site: Site) -> Beam:
-        """With a share of the orders that were left out."""
-        if self.amplitude == 0.0:
-            return beam
+        """Add a share of the orders that were left out."""
         whole, kept = site.whole_beam(self.name), site.beam.mmax + 1
         blm = np.zeros((max(beam.mmax, whole.mmax) + 1, beam.lmax + 1), dtype=np.complex128)
         blm[: beam.mmax + 1] = beam.blm

@@ -1,17 +1,37 @@
 """A ring of low response around the beam."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
-from mcsim.systematics.base import Effect, Site, Vector, Wording
+from mcsim.systematics.base import Effect, Site, Wording
+from mcsim.systematics.parametrization import Parametrization, Vector
 from mcsim.systematics.shape import shape
 
 CALIBRATIONS = ("none", "dipole")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _RoundAndQuadrupole(Parametrization):
+    """Fit a ring as a mixture of a round one and one with all of its quadrupole, q = 1."""
+
+    def basis(self) -> tuple[Mapping[str, Any], ...]:
+        """Return both rings."""
+        return {}, {"quadrupole": 1.0}
+
+    def coordinates(self, effect: Any) -> Vector:
+        """Return (a - a q, a q)."""
+        return np.array([1.0 - effect.quadrupole, effect.quadrupole]) * effect.amplitude
+
+    def nearest(self, coordinates: Vector, precision: NDArray[np.float64]) -> dict[str, Any]:
+        """Return a, the sum of both, and q, the share of the second."""
+        amplitude = float(coordinates.sum())
+        return {"amplitude": amplitude, "quadrupole": float(coordinates[1]) / amplitude if amplitude else 0.0}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,12 +54,12 @@ class BeamSidelobe(Effect):
     name = "beam_sidelobe"
     scope = "channel"
     unit = "fraction of the peak"
-    title = "beam sidelobe"
     wording = Wording("negative ring of {} of the peak", " %", 100.0, negative="ring of {} of the peak")
     cause = "Spill-over, struts or panels of the mirror; negative where two horns are subtracted."
     signature = "A halo at low l, pick-up of the plane and the dipole, and with q the m = 2 part of b_lm."
     source = "Barnes et al. 2003, ApJS 148, 51 (WMAP's sidelobes, negative and positive); the shape is a model"
     step = 1e-5
+    parametrization = _RoundAndQuadrupole()
     variants = ({"calibrated": "none"}, {"calibrated": "dipole"})
 
     quadrupole: float = 0.0
@@ -48,9 +68,7 @@ class BeamSidelobe(Effect):
     calibrated: str = "none"
 
     def beam(self, beam: Beam, site: Site) -> Beam:
-        """With the ring taken off."""
-        if self.amplitude == 0.0:
-            return beam
+        """Take the ring off."""
         if self.calibrated not in CALIBRATIONS:
             raise InputError(
                 f"effect {self.name}: calibrated = {self.calibrated!r} must be one of {', '.join(CALIBRATIONS)}."
@@ -68,18 +86,3 @@ class BeamSidelobe(Effect):
             return changed
         scale = beam.blm[0, 1].real / changed.blm[0, 1].real
         return Beam(scale * changed.blm, changed.neglected_power, changed.integral)
-
-    @classmethod
-    def basis(cls) -> tuple[Self, ...]:
-        """Round, and with all of its quadrupole."""
-        return (cls(amplitude=cls.step), cls(amplitude=cls.step, quadrupole=1.0))
-
-    def coordinates(self) -> Vector:
-        """Return (a - a q, a q): a ring with a quadrupole is a mixture of those of the basis."""
-        return self.amplitude * np.array([1.0 - self.quadrupole, self.quadrupole])
-
-    @classmethod
-    def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
-        """Return the effect whose a is the sum of both, q the share of the second."""
-        amplitude = float(coordinates.sum())
-        return cls(amplitude=amplitude, quadrupole=float(coordinates[1]) / amplitude if amplitude else 0.0)

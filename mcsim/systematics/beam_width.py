@@ -15,7 +15,6 @@ class BeamWidth(Effect):
     name = "beam_width"
     scope = "channel"
     unit = "fraction of the FWHM"
-    title = "beam width"
     wording = Wording("FWHM {} larger", " %", 100.0, negative="FWHM {} smaller")
     cause = "A beam mapped with an error of its width, or a focus that drifts."
     signature = "L = 0: the power falls off sooner, in this channel alone."
@@ -23,9 +22,7 @@ class BeamWidth(Effect):
     step = 0.005
 
     def beam(self, beam: Beam, site: Site) -> Beam:
-        """Stretched."""
-        if self.amplitude == 0.0:
-            return beam
+        """Stretch the beam."""
         if not -0.9 <= self.amplitude <= 9.0:
             raise InputError(
                 f"effect {self.name}: amplitude = {self.amplitude:g} leaves no beam to speak of; "

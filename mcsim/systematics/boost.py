@@ -10,23 +10,17 @@ from scipy.sparse.linalg import expm_multiply
 
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
-from mcsim.systematics.base import Alm, Draw, Site, Wording
-from mcsim.systematics.vectors import DirectedEffect
+from mcsim.systematics.base import Alm, DirectedEffect, Draw, Site, Wording
+from mcsim.systematics.parametrization import SkyVector
 
 
 @dataclass(frozen=True, kw_only=True)
 class Boost(DirectedEffect):
     """The sky as an observer of velocity beta sees it: T(n) / (gamma (1 - beta . n')) in the direction n' of n.
 
-    Attributes
-    ----------
-    amplitude
-        Length of beta; ours is 1.23e-3.
-    lon_deg, lat_deg
-        Its direction in the frame of the maps.
-
     Notes
     -----
+    The amplitude is the length of beta, for us 1.23e-3; its direction is in the frame of the maps.
     Boosts along one axis are a group in the rapidity eta = artanh beta, and a temperature has the weight for which
     they are unitary: T' = exp(eta G) T, with G T = f T - grad f . grad T and f = the axis . n. With the axis at the
     pole, G takes a_lm to (l + 1) A_{l+1,m} at l + 1 and to -l A_lm at l - 1, A_lm^2 = (l^2 - m^2)/(4 l^2 - 1): exact to
@@ -43,14 +37,10 @@ class Boost(DirectedEffect):
     signature = "L = 1, d = 1, growing as l: to be seen from l of about 1000 on."
     source = "Challinor & van Leeuwen 2002, Phys. Rev. D 65, 103001; Planck 2013 results XXVII"
     step = 1e-4
-    matched_filter = False
-    mean_response = True
-    max_amplitude = 0.01
+    parametrization = SkyVector(max_amplitude=0.01, mean_response=True, matched_filter=False)
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Boosted."""
-        if self.amplitude == 0.0:
-            return sky
+        """Boost the sky."""
         if abs(self.amplitude) >= 1.0:
             raise InputError(
                 f"effect {self.name}: amplitude = {self.amplitude:g} is not slower than light; keep it within +-1."

@@ -2,22 +2,14 @@
 
 from dataclasses import dataclass
 
-from mcsim.systematics.base import Alm, Draw, Site, Wording
+from mcsim.systematics.base import Alm, DirectedEffect, Draw, Site, Wording
+from mcsim.systematics.parametrization import SkyVector
 from mcsim.systematics.product import multiplied
-from mcsim.systematics.vectors import DirectedEffect
 
 
 @dataclass(frozen=True, kw_only=True)
 class DipoleModulation(DirectedEffect):
-    """The sky times 1 + A . n, in every channel.
-
-    Attributes
-    ----------
-    amplitude
-        Length of A.
-    lon_deg, lat_deg
-        Its direction in the frame of the maps.
-    """
+    """The sky times 1 + A . n, in every channel."""
 
     name = "dipole_modulation"
     scope = "common"
@@ -28,11 +20,9 @@ class DipoleModulation(DirectedEffect):
     signature = "L = 1, d = 1, the same in every channel and split, at all l."
     source = "Gordon et al. 2005, Phys. Rev. D 72, 103002"
     step = 0.01
-    matched_filter = False
+    parametrization = SkyVector(matched_filter=False)
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Modulated."""
-        if self.amplitude == 0.0:
-            return sky
-        a, b, c = self.coordinates()
+        """Modulate the sky."""
+        a, b, c = self.vector
         return sky + multiplied(sky, site.lmax, lambda x, y, z: a * x + b * y + c * z, 1)

@@ -3,21 +3,13 @@
 from dataclasses import dataclass
 
 from mcsim.sphere.sky import dipole_alm
-from mcsim.systematics.base import Alm, Draw, Site, Wording
-from mcsim.systematics.vectors import DirectedEffect
+from mcsim.systematics.base import Alm, DirectedEffect, Draw, Site, Wording
+from mcsim.systematics.parametrization import SkyVector
 
 
 @dataclass(frozen=True, kw_only=True)
 class DipoleResidual(DirectedEffect):
-    """A dipole d . n is left in the channel, the same at all times.
-
-    Attributes
-    ----------
-    amplitude
-        Length of d, uK.
-    lon_deg, lat_deg
-        Its direction in the frame of the maps.
-    """
+    """A dipole d . n is left in the channel, the same at all times."""
 
     name = "dipole_residual"
     scope = "channel"
@@ -28,10 +20,8 @@ class DipoleResidual(DirectedEffect):
     signature = "l = 1, the same in both halves."
     source = "Hinshaw et al. 2009, ApJS 180, 225 (the dipole and its error)"
     step = 0.5
-    matched_filter = False
+    parametrization = SkyVector(matched_filter=False)
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """With the dipole added."""
-        if self.amplitude == 0.0:
-            return sky
-        return sky + dipole_alm(self.coordinates(), site.lmax)
+        """Add the dipole."""
+        return sky + dipole_alm(self.vector, site.lmax)

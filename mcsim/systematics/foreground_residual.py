@@ -6,15 +6,16 @@ from pathlib import Path
 
 import healpy
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
+from mcsim.sphere.checks import check_complete
 from mcsim.sphere.rotation import rotate_alm
 from mcsim.sphere.sky import gaussian_alm
-from mcsim.systematics import product
 from mcsim.systematics.base import Alm, Draw, Effect, Site, Wording
+from mcsim.systematics.parametrization import Parametrization, Vector
+from mcsim.systematics.product import multiplied
 
 REFERENCE_GHZ = 94.0
 _SLOPE = -2.5
@@ -53,16 +54,13 @@ class ForegroundResidual(Effect):
     )
     source = "Bennett et al. 2013, ApJS 208, 20, Sec. 5 (residuals of cleaned bands); the morphology is a model"
     step = 5.0
-    matched_filter = False
-    stochastic = True
+    parametrization = Parametrization(stochastic=True, matched_filter=False)
 
     spectral_index: float = 2.0
     template: str = ""
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """With the residual added."""
-        if self.amplitude == 0.0:
-            return sky
+        """Add the residual."""
         scale = self.amplitude * (site.frequency(self.name) / REFERENCE_GHZ) ** self.spectral_index
         if self.template:
             return sky + scale * _of_file(self.template, site.lmax, site.frame)
@@ -78,10 +76,10 @@ def _drawn(lmax: int, rng: np.random.Generator) -> Alm:
     patches = gaussian_alm(cl, rng)
     patches[0] += np.sqrt(4.0 * np.pi)
 
-    def plane(x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64]) -> NDArray[np.float64]:
+    def plane(x: Vector, y: Vector, z: Vector) -> Vector:
         return 1.0 / (1.0 + (z / _PLANE) ** 2)
 
-    return _unit_rms(product.multiplied(patches, lmax, plane, _PROFILE_DEGREE), lmax)
+    return _unit_rms(multiplied(patches, lmax, plane, _PROFILE_DEGREE), lmax)
 
 
 def _unit_rms(alm: Alm, lmax: int) -> Alm:
@@ -94,8 +92,9 @@ def _unit_rms(alm: Alm, lmax: int) -> Alm:
 def _of_file(path: str, lmax: int, frame: str) -> Alm:
     """Coefficients of a template in ``frame``, rms 1."""
     values, found, _ = healpix.read_map(Path(path))
-    if not np.all(np.isfinite(values)) or np.any(values == healpy.UNSEEN) or not np.any(values):
-        raise InputError(f"{path} has pixels that are not finite or unseen, or is zero; give a complete template.")
+    check_complete(values, path)
+    if not np.any(values):
+        raise InputError(f"{path} is zero in every pixel; give a complete template.")
     top = min(lmax, 2 * healpy.npix2nside(values.size))
     alm = healpix.analysis(values, top, iterations=3)
     turned = rotate_alm(alm_.resize(alm, top, lmax), lmax, found or "galactic", frame)

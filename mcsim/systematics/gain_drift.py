@@ -1,12 +1,11 @@
 """A gain that follows the year."""
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mcsim.systematics.base import Effect, Site, Vector, Wording, polar
+from mcsim.systematics.base import Effect, Site, Wording
+from mcsim.systematics.parametrization import Angle, Vector
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +35,7 @@ class GainDrift(Effect):
     )
     source = "Jarosik et al. 2007, ApJS 170, 263, Sec. 2 (gain model and its residuals)"
     step = 2e-4
+    parametrization = Angle(parameter="phase_deg")
 
     phase_deg: float = 0.0
 
@@ -45,19 +45,3 @@ class GainDrift(Effect):
             return None
         turns = time_s / site.pointed(self.name).model.orbit_period_s
         return np.asarray(self.amplitude * np.cos(2.0 * np.pi * turns - np.deg2rad(self.phase_deg)))
-
-    @classmethod
-    def basis(cls) -> tuple[Self, ...]:
-        """Cosine and sine."""
-        return (cls(amplitude=cls.step), cls(amplitude=cls.step, phase_deg=90.0))
-
-    def coordinates(self) -> Vector:
-        """Amplitudes of the cosine and the sine of the year."""
-        phase = np.deg2rad(self.phase_deg)
-        return self.amplitude * np.array([np.cos(phase), np.sin(phase)])
-
-    @classmethod
-    def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
-        """Norm and phase."""
-        amplitude, phase_deg = polar(coordinates)
-        return cls(amplitude=amplitude, phase_deg=phase_deg)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from mcsim.systematics.base import Effect, Wording
+from mcsim.systematics.parametrization import Parametrization
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,8 +19,8 @@ class MapmakingConvergence(Effect):
     signature = "Stripes in the frame of the scan, at the largest scales; acts on differencing scans only."
     source = "Hinshaw et al. 2003, ApJS 148, 63, Sec. 3 (iterations of the map-making)"
     step = 1.0
-    sign = 1
+    parametrization = Parametrization(sign=1)
 
     def differencing(self, imbalance: float, iterations_short: int) -> tuple[float, int]:
-        """Fewer iterations."""
+        """Add to the missing iterations."""
         return imbalance, iterations_short + round(self.amplitude)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.sphere import healpix
+from mcsim.sphere.checks import check_complete
 from mcsim.sphere.rotation import rotation_matrix
 from mcsim.systematics.base import Effect, Map, Site, Wording
 
@@ -28,7 +29,6 @@ class NoiseAnisotropy(Effect):
     name = "noise_anisotropy"
     scope = "channel"
     unit = "fraction of the variance"
-    title = "noise anisotropy"
     wording = Wording("{} of the variance", " %", 100.0)
     cause = "Hits that are not those of the survey, flagged or lost samples, or noise that varies through the year."
     signature = "Autos only, L = 2, M = 0 of the ecliptic frame; the variance map of half differences."
@@ -38,7 +38,7 @@ class NoiseAnisotropy(Effect):
     template: str = ""
 
     def noise(self, site: Site) -> Map | None:
-        """1 + a t."""
+        """Return 1 + a t."""
         if self.amplitude == 0.0:
             return None
         centres = np.stack(healpy.pix2vec(site.nside, np.arange(12 * site.nside**2)))
@@ -58,7 +58,6 @@ class NoiseAnisotropy(Effect):
 def _of_file(path: str, frame: str, centres: NDArray[np.float64]) -> Map:
     """Return a template at these directions in ``frame``."""
     values, found, _ = healpix.read_map(Path(path))
-    if not np.all(np.isfinite(values)) or np.any(values == healpy.UNSEEN):
-        raise InputError(f"{path} has pixels that are not finite or unseen; give a complete template.")
+    check_complete(values, path)
     seen = rotation_matrix(frame, found or frame) @ centres
     return np.asarray(values[healpy.vec2pix(healpy.npix2nside(values.size), *seen)])

@@ -6,6 +6,7 @@ import numpy as np
 
 from mcsim.errors import InputError
 from mcsim.systematics.base import Effect, Map, Site, Wording
+from mcsim.systematics.parametrization import Parametrization
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,13 +16,12 @@ class NoiseLevel(Effect):
     name = "noise_level"
     scope = "channel"
     unit = "fraction of sigma0"
-    title = "noise level"
     wording = Wording("{} more noise", " %", 100.0, negative="{} less noise")
     cause = "Noise estimated on other data, or a gain that is not the fiducial one."
     signature = "Autos only, flat in l, as the hits."
     source = "Jarosik et al. 2011, ApJS 192, 14 (sigma0 per channel, and its error)"
     step = 0.01
-    matched_filter = False
+    parametrization = Parametrization(matched_filter=False)
 
     def noise(self, site: Site) -> Map | None:
         """Return the same factor everywhere."""

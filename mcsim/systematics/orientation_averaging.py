@@ -4,8 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mcsim.instrument.scan import Moments, ScanModel, cached_moments
+from mcsim.instrument.scan import MapGrid, Moments, ScanModel, cached_moments
 from mcsim.systematics.base import Effect, Site, Wording
+from mcsim.systematics.parametrization import Parametrization
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,21 +33,20 @@ class OrientationAveraging(Effect):
     signature = "L = 2, M = 0 falls to 0.66 of what parallel transport gives, and other M appear."
     source = "Joshi et al. arXiv:1210.7318, Sec. V"
     step = 0.05
-    sign = 1
+    parametrization = Parametrization(sign=1)
     variants = ({"model": "wmap"},)
 
     model: str = ""
 
     def orientations(self, moments: Moments, site: Site) -> Moments:
-        """Mixed; pixels that the real scan does not reach stay as they are."""
+        """Mix the moments; pixels that the real scan does not reach stay as they are."""
         if self.amplitude == 0.0:
             return moments
         if self.model:
-            real, lines, part = ScanModel.load(self.model), None, (0.0, 1.0)
+            real = ScanModel.load(self.model)
         else:
             pointed = site.pointed(self.name)
-            real, lines, part = pointed.model, (pointed.line.name,), pointed.time_range
-        folder = cached_moments(real, moments.nside, moments.smax, moments.frame, lines, part)
-        other = Moments.load(folder)
+            real = pointed.model.with_lines_of_sight(pointed.line.name)
+        other = Moments.load(cached_moments(real, MapGrid(moments.nside, moments.frame), moments.smax))
         mixed = (1.0 - self.amplitude) * moments.w + self.amplitude * other.w
         return replace(moments, w=np.where(other.hits > 0.0, mixed, moments.w))

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from mcsim.systematics.base import Effect, Wording
+from mcsim.systematics.parametrization import Parametrization
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,14 +20,13 @@ class Pixelization(Effect):
     name = "pixelization"
     scope = "channel"
     unit = "1 = window and centroid ignored"
-    title = "pixelization"
     wording = Wording("{} of the window and the centroids of pixels left out", " %", 100.0)
     cause = "Simulations at the pixels' centres, where the survey has samples all over the pixels."
     signature = "Small scales, depending on nside, and the gradient of the sky at pixels that are hit unevenly."
     source = "Gorski et al. 2005, ApJ 622, 759, Sec. 6 (window functions)"
     step = 0.1
-    max_amplitude = 2.0
+    parametrization = Parametrization(max_amplitude=2.0)
 
     def spread(self) -> float:
-        """1 - amplitude."""
+        """Return 1 - amplitude."""
         return 1.0 - self.amplitude

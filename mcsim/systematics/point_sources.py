@@ -7,6 +7,7 @@ import numpy as np
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.systematics.base import Alm, Draw, Effect, Site, Wording
+from mcsim.systematics.parametrization import Parametrization
 
 _NARROWEST = 5
 
@@ -25,21 +26,15 @@ class PointSources(Effect):
     name = "point_sources"
     scope = "common"
     unit = "uK^2 sr"
-    title = "point sources"
     wording = Wording("C_ℓ = {}", " µK² sr")
     cause = "Radio galaxies below the limit of the catalogue."
     signature = "Flat C_l, in autos and crosses of all channels alike."
     source = "Tegmark & Efstathiou 1996, MNRAS 281, 1297; Wright et al. 2009, ApJS 180, 283"
     step = 1e-4
-    matched_filter = False
-    stochastic = True
-    mean_response = True
-    sign = -1
+    parametrization = Parametrization(sign=-1, stochastic=True, mean_response=True, matched_filter=False)
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """With the sources added."""
-        if self.amplitude == 0.0:
-            return sky
+        """Add the sources, or take their power away."""
         if self.amplitude > 0.0:
             return sky + gaussian_alm(np.full(site.lmax + 1, self.amplitude), draw("sources"))
         power = _power_around(sky, site.lmax)

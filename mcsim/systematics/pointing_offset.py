@@ -1,13 +1,12 @@
 """A line of sight that is displaced from the fiducial one."""
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim.instrument.beams import Beam
-from mcsim.systematics.base import Effect, Site, Vector, Wording, polar, scan_direction
+from mcsim.systematics.base import Effect, Site, Wording, scan_direction
+from mcsim.systematics.parametrization import Angle, Vector
 from mcsim.systematics.shape import displaced
 
 
@@ -30,23 +29,21 @@ class PointingOffset(Effect):
     name = "pointing_offset"
     scope = "channel"
     unit = "arcmin"
-    title = "pointing offset"
     wording = Wording("{}", "′")
     cause = "A boresight calibrated on planets, thermal bending, or an error of the time stamps (along the scan)."
     signature = "The gradient of the sky along or across the scan, through w_1; acts on the dipole too."
     source = "Jarosik et al. 2007, ApJS 170, 263 (boresights); Mitra et al. 2011, ApJS 193, 5"
     step = 0.2
+    parametrization = Angle()
 
     angle_deg: float = 0.0
 
     def pointing(self, beam: Beam, site: Site) -> Beam:
-        """Displaced."""
-        if self.amplitude == 0.0:
-            return beam
+        """Displace the beam."""
         return displaced(beam, np.deg2rad(self.angle_deg), np.deg2rad(self.amplitude / 60.0))
 
     def moved(self, theta: Vector, phi: Vector, psi: Vector) -> tuple[Vector, Vector, Vector] | None:
-        """Return the same rotation of every sample's direction and axes."""
+        """Rotate every sample's direction and axes in the same way."""
         if self.amplitude == 0.0:
             return theta, phi, psi
         distance, angle = np.deg2rad(self.amplitude / 60.0), np.deg2rad(self.angle_deg)
@@ -64,22 +61,6 @@ class PointingOffset(Effect):
         # x . e_theta = -x_z / sin(theta) and x . e_phi = (n x x)_z / sin(theta), as the two are orthogonal.
         turned = np.arctan2(line[0] * axis[1] - line[1] * axis[0], -axis[2])
         return np.arctan2(width, line[2]), np.arctan2(line[1], line[0]) % (2.0 * np.pi), turned
-
-    @classmethod
-    def basis(cls) -> tuple[Self, ...]:
-        """Along and across the scan."""
-        return (cls(amplitude=cls.step), cls(amplitude=cls.step, angle_deg=90.0))
-
-    def coordinates(self) -> Vector:
-        """Arcmin along x and y."""
-        angle = np.deg2rad(self.angle_deg)
-        return self.amplitude * np.array([np.cos(angle), np.sin(angle)])
-
-    @classmethod
-    def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
-        """Norm and angle."""
-        amplitude, angle_deg = polar(coordinates)
-        return cls(amplitude=amplitude, angle_deg=angle_deg)
 
     def direction(self) -> str:
         """Return the direction in the frame of the beam."""

@@ -1,14 +1,12 @@
 """A sky with more power along some axes."""
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mcsim.systematics.base import Alm, Draw, Effect, Site, Vector, Wording
+from mcsim.systematics.base import Alm, Draw, Effect, Site, Wording
+from mcsim.systematics.parametrization import Components, Vector
 from mcsim.systematics.product import multiplied
-from mcsim.systematics.vectors import along
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,15 +31,13 @@ class QuadrupoleModulation(Effect):
     signature = "L = 2, the same in every channel and split: nearly degenerate with m = 2 in one channel."
     source = "Ackerman, Carroll & Wise 2007, Phys. Rev. D 75, 083502, with a modulation of the sky in place of P(k)"
     step = 0.01
-    matched_filter = False
+    parametrization = Components(parameter="components", count=5, matched_filter=False)
 
     components: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 0.0)
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Modulated."""
-        if self.amplitude == 0.0:
-            return sky
-        q = self.coordinates()
+        """Modulate the sky."""
+        q = self.along("components")
 
         def field(x: Vector, y: Vector, z: Vector) -> Vector:
             root = np.sqrt(3.0)
@@ -49,18 +45,3 @@ class QuadrupoleModulation(Effect):
             return np.asarray(diagonal + root * (q[1] * x * z + q[2] * y * z + q[4] * x * y))
 
         return sky + multiplied(sky, site.lmax, field, 2)
-
-    @classmethod
-    def basis(cls) -> tuple[Self, ...]:
-        """Return the five components one by one."""
-        return tuple(cls(amplitude=cls.step, components=tuple(map(float, row))) for row in np.eye(5))
-
-    def coordinates(self) -> Vector:
-        """Amplitude times the unit vector along the components."""
-        return along(self.name, "components", self.components, self.amplitude)
-
-    @classmethod
-    def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
-        """Norm and direction."""
-        norm = float(np.linalg.norm(coordinates))
-        return cls(amplitude=norm, components=tuple(map(float, coordinates / norm))) if norm else cls()

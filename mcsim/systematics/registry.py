@@ -3,18 +3,21 @@
 import difflib
 import inspect
 import pkgutil
+from collections import UserDict
 from collections.abc import Mapping
 from dataclasses import fields
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
-from math import isfinite
+from math import inf, isfinite
+from sys import float_info
 from types import MappingProxyType
 from typing import Any
 
 from mcsim.errors import InputError
 from mcsim.systematics import base
 from mcsim.systematics.base import Effect
+from mcsim.systematics.parametrization import Parametrization
 
 ENTRY_POINTS = "mcsim.effects"
 """Group of entry points under which a package names its effects."""
@@ -27,10 +30,7 @@ Library = Mapping[str, type[Effect]]
 def catalogue() -> Library:
     """Return every effect by name, read-only: built in, then registered by other packages.
 
-    Raises
-    ------
-    InputError
-        If a registered effect cannot be loaded, is none, or bears a name that is taken.
+    Raise InputError if a registered effect cannot be loaded, is none, or bears a name that is taken.
     """
     found: dict[str, type[Effect]] = {}
     package = base.__name__.rpartition(".")[0]
@@ -68,19 +68,20 @@ def _flaw(kind: type[Effect]) -> str | None:
             return f"has no {key}: it needs a text"
     if getattr(kind, "scope", None) not in ("channel", "common"):
         return 'has no scope: it needs "channel" or "common"'
-    for key in ("step", "max_amplitude"):
-        value = getattr(kind, key, None)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0.0:
+    fit: Any = kind.parametrization
+    step = getattr(kind, "step", None)
+    if not isinstance(fit, Parametrization):
+        return f"has parametrization = {fit!r}: it needs a mcsim.systematics.Parametrization"
+    for key, value, largest in (("step", step, float_info.max), ("max_amplitude", fit.max_amplitude, inf)):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value <= largest:
             return f"has {key} = {value!r}: it needs a number above 0"
-    if not isfinite(kind.step):
-        return f"has step = {kind.step!r}: it needs a finite number"
-    if kind.sign not in (-1, 0, 1):
-        return f"has sign = {kind.sign!r}: it needs -1, 0 or 1"
+    if fit.sign not in (-1, 0, 1):
+        return f"has sign = {fit.sign!r}: it needs -1, 0 or 1"
     try:
-        basis = kind.basis()
-        sizes = {effect.coordinates().shape for effect in basis}
+        basis = basis_of(kind)
+        sizes = {fit.coordinates(effect).shape for effect in basis}
         for variant in kind.variants:
-            base.build(kind, variant)
+            build(kind, variant)
     except Exception as error:  # whatever a foreign class does
         return f"cannot be made ({type(error).__name__}: {error})"
     if not basis or sizes != {(len(basis),)}:
@@ -101,22 +102,83 @@ def get(name: str, library: Library | None = None) -> type[Effect]:
     return known[name]
 
 
-def build(name: str, parameters: Mapping[str, Any], library: Library | None = None) -> Effect:
-    """Return the effect called ``name`` with these parameters; those left out have their defaults."""
-    return base.build(get(name, library), parameters)
+def build(kind: str | type[Effect], parameters: Mapping[str, Any], library: Library | None = None) -> Effect:
+    """Build an effect, or the one of that name, from a table of parameters; those left out have their defaults.
+
+    Raise InputError for an unknown name, a parameter that the effect does not have, or a value that is no finite number
+    where one is needed.
+    """
+    kind = get(kind, library) if isinstance(kind, str) else kind
+    known = [f.name for f in fields(kind)]
+    values: dict[str, Any] = {}
+    for key, value in parameters.items():
+        if key not in known:
+            raise InputError(f"effect {kind.name} has no parameter {key!r}; it has {', '.join(known)}.")
+        values[key] = _checked(f"effect {kind.name}: {key}", value, getattr(kind(), key))
+    return kind(**values)
 
 
-def describe() -> list[dict[str, Any]]:
-    """Describe every effect, with the defaults of its parameters."""
-    return [
-        {
-            "name": kind.name,
-            "scope": kind.scope,
-            "unit": kind.unit,
-            "parameters": {f.name: f.default for f in fields(kind)},
-            "cause": kind.cause,
-            "signature": kind.signature,
-            "source": kind.source,
-        }
-        for kind in catalogue().values()
-    ]
+def _checked(what: str, value: Any, default: Any) -> Any:
+    """Return a value of the type of the default."""
+    if isinstance(default, str):
+        if isinstance(value, str):
+            return value
+        raise InputError(f"{what} = {value!r} must be a text.")
+    if isinstance(default, tuple):
+        if isinstance(value, list | tuple) and (not default or len(value) == len(default)):
+            return tuple(float(_checked(what, item, 0.0)) for item in value)
+        size = f"{len(default)} numbers" if default else "numbers"
+        raise InputError(f"{what} = {value!r} must be a list of {size}.")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
+        raise InputError(f"{what} = {value!r} must be a finite number.")
+    return float(value)
+
+
+def basis_of(kind: type[Effect], settings: Mapping[str, Any] | None = None) -> tuple[Effect, ...]:
+    """Return the effects, of amplitude ``step``, whose responses span those of all parameters but the ``settings``."""
+    return tuple(
+        kind(**{"amplitude": kind.step, **parameters, **(settings or {})})
+        for parameters in kind.parametrization.basis()
+    )
+
+
+class Effects(UserDict[str, type[Effect]]):
+    """Effects by name, printed one a line with scope, unit and cause."""
+
+    def __repr__(self) -> str:
+        """Return a line for each effect."""
+        width = max(map(len, self), default=0)
+        return "\n".join(
+            f"{name:<{width}}  {kind.scope}, {kind.unit}: {kind.cause}" for name, kind in sorted(self.items())
+        )
+
+    def _ipython_key_completions_(self) -> list[Any]:
+        return sorted(self)
+
+
+def effects() -> Effects:
+    """Return the library of effects: what a run can add and a diagnosis can find.
+
+    Returns
+    -------
+    mapping
+        Name -> class derived from :class:`mcsim.Effect`; printing it lists scope, unit of the amplitude and cause. It
+        is a copy: changing it changes no run. Other packages add effects under the entry points ``mcsim.effects``.
+
+    Raises
+    ------
+    InputError
+        If an effect of another package cannot be loaded, is none, or has a name that is taken.
+
+    Examples
+    --------
+    >>> import mcsim
+    >>> library = mcsim.effects()
+    >>> "beam_ellipticity" in library
+    True
+    >>> library["beam_ellipticity"](amplitude=0.05, angle_deg=30.0)
+    BeamEllipticity(amplitude=0.05, angle_deg=30.0)
+    >>> library["beam_ellipticity"].unit
+    'major/minor - 1'
+    """
+    return Effects(catalogue())

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.instrument.beams import Beam
+from mcsim.instrument.beams.coefficients import unpacked
 
 Blm = NDArray[np.complex128]
 Values = NDArray[np.float64]
@@ -24,20 +25,10 @@ _FITTED = 0.6
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Values of a beam on rings about its centre.
+    """Values, sr^-1, shape (rings, columns), of a beam on rings about its centre, which can hold m up to ``orders``.
 
-    Attributes
-    ----------
-    original
-        The beam.
-    whole
-        The same continued to a degree at which nothing is left of it.
-    orders
-        Largest m that the rings can hold.
-    theta, phi
-        Angle from the centre, shape (rings, 1), and azimuth from beam x, shape (1, columns), radians.
-    values
-        Of ``whole``, sr^-1, shape (rings, columns).
+    They are those of ``whole``, the ``original`` beam continued to a degree at which nothing is left of it. ``theta``
+    is the angle from the centre, shape (rings, 1), ``phi`` the azimuth from beam x, shape (1, columns), radians.
     """
 
     original: Beam
@@ -49,33 +40,22 @@ class Shape:
 
     @property
     def peak(self) -> float:
-        """Value at the centre, sr^-1."""
+        """Return the value at the centre, sr^-1."""
         return float(self.whole.values(np.zeros(1), np.zeros(1))[0])
 
     @property
     def sigma(self) -> float:
-        """Sigma of the Gaussian that has the beam's solid angle (integral over central value), radians."""
+        """Return sigma of the Gaussian that has the beam's solid angle (integral over central value), radians."""
         return float(np.sqrt(np.sqrt(4.0 * np.pi) * self.whole.blm[0, 0].real / self.peak / (2.0 * np.pi)))
 
     def with_added(self, added: Values, least: int, keep_integral: bool = True) -> Beam:
-        """Return the beam plus ``added`` (sr^-1, on the rings).
+        """Return the beam plus ``added``, like ``values``; the result is kept up to the order ``least`` in any case.
 
-        Parameters
-        ----------
-        added
-            Shape as ``values``.
-        least
-            Order up to which the result is kept in any case.
-        keep_integral
-            Scale the sum to the integral that the beam had.
+        ``keep_integral``: scale the sum to the integral that the beam had.
         """
         lmax, mmax = self.original.lmax, min(self.orders, self.original.lmax)
         packed = ducc0.sht.analysis_2d(map=added[None], spin=0, lmax=lmax, mmax=mmax, geometry="GL", nthreads=1)[0]
-        blm = np.zeros((mmax + 1, lmax + 1), dtype=np.complex128)
-        end = 0
-        for m in range(mmax + 1):
-            start, end = end, end + lmax + 1 - m
-            blm[m, m:] = packed[start:end]
+        blm = unpacked(packed, lmax, mmax)
         blm[: self.original.mmax + 1] += self.original.blm
         if keep_integral:
             blm *= self.original.blm[0, 0].real / blm[0, 0].real
@@ -83,7 +63,7 @@ class Shape:
 
 
 def shape(beam: Beam, orders: int) -> Shape:
-    """Values of a beam on rings that hold ``orders`` more orders than the beam has.
+    """Return the values of a beam on rings that hold ``orders`` more orders than the beam has.
 
     Notes
     -----
@@ -95,16 +75,7 @@ def shape(beam: Beam, orders: int) -> Shape:
     columns = 2 * highest + 2
     theta = np.asarray(ducc0.misc.GL_thetas(rings))[:, None]
     phi = (np.arange(columns) * 2.0 * np.pi / columns)[None, :]
-    values = ducc0.sht.synthesis_2d(
-        alm=whole.packed()[None],
-        lmax=whole.lmax,
-        mmax=whole.mmax,
-        spin=0,
-        ntheta=rings,
-        nphi=columns,
-        geometry="GL",
-        nthreads=1,
-    )[0]
+    values = whole.on_rings(rings, columns, "GL")
     return Shape(beam, whole, highest, theta, phi, values)
 
 
@@ -174,7 +145,7 @@ def extended(beam: Beam) -> Beam:
 
 
 def _falls(logarithm: np.polynomial.Polynomial, peak: float) -> bool:
-    """Whether a quadratic that bends upwards gets to the tail before it turns."""
+    """Return True if a quadratic that bends upwards gets to the tail before it turns."""
     turn = -logarithm.coef[1] / (2.0 * logarithm.coef[2])
     return bool(turn > 1.0 and logarithm(turn) < np.log(_TAIL * peak))
 
@@ -191,7 +162,7 @@ def displaced(beam: Beam, angle: float, distance: float) -> Beam:
     reach = beam.lmax * abs(distance)
     steps = max(1, int(np.ceil(2.0 * reach)))
     full = _both_signs(beam, beam.mmax + 16 + int(np.ceil(1.5 * reach)))
-    axis = (-np.sin(angle), np.cos(angle), 0.0)
+    axis = (-np.sin(angle), np.cos(angle))
     for _ in range(steps):
         term = full.copy()
         for order in range(1, 20):
@@ -203,14 +174,8 @@ def displaced(beam: Beam, angle: float, distance: float) -> Beam:
 def smeared(beam: Beam, boresight: float, lag: float) -> Beam:
     """Return the beam of a detector that answers late: its exponential trail along the circle about the spin axis.
 
-    Parameters
-    ----------
-    beam
-        With x the direction of motion.
-    boresight
-        Angle of the line of sight from the spin axis, radians.
-    lag
-        Angle through which the spin turns in one time constant, radians.
+    Beam x is the direction of motion, ``boresight`` the angle of the line of sight from the spin axis, and ``lag`` the
+    angle through which the spin turns in one time constant, radians.
 
     Notes
     -----
@@ -252,7 +217,7 @@ def trimmed(blm: Blm, like: Beam, least: int) -> Beam:
 
 
 def _both_signs(beam: Beam, mmax: int) -> Blm:
-    """b_lm for m from -mmax to mmax, shape (2 mmax + 1, lmax + 1); zeros where the beam has none."""
+    """Return b_lm for m from -mmax to mmax, shape (2 mmax + 1, lmax + 1); zeros where the beam has none."""
     full = np.zeros((2 * mmax + 1, beam.lmax + 1), dtype=np.complex128)
     full[mmax : mmax + beam.mmax + 1] = beam.blm
     for m in range(1, beam.mmax + 1):
@@ -261,7 +226,7 @@ def _both_signs(beam: Beam, mmax: int) -> Blm:
 
 
 def _ladder(full: Blm) -> tuple[Values, Values, Values]:
-    """Factors of the coefficients one order below and one above in (J_+ b)_m and (J_- b)_m, and m as a column."""
+    """Return the factors of the coefficients one order below in (J_+ b)_m, one above in (J_- b)_m; m as a column."""
     mmax, lmax = len(full) // 2, full.shape[1] - 1
     m = np.arange(-mmax, mmax + 1, dtype=float)[:, None]
     ell = np.arange(lmax + 1, dtype=float)[None, :]
@@ -272,11 +237,11 @@ def _ladder(full: Blm) -> tuple[Values, Values, Values]:
     return below, above, m
 
 
-def _turning(full: Blm, axis: tuple[float, float, float]) -> Blm:
-    """Apply axis . J to coefficients: i d/da of their rotation by a about the axis."""
-    below, above, m = _ladder(full)
+def _turning(full: Blm, axis: tuple[float, float]) -> Blm:
+    """Apply axis . J, the axis (x, y, 0), to coefficients: i d/da of their rotation by a about the axis."""
+    below, above, _ = _ladder(full)
     raised, lowered = np.zeros_like(full), np.zeros_like(full)
     raised[1:] = below[1:] * full[:-1]
     lowered[:-1] = above[:-1] * full[1:]
-    x, y, z = axis
-    return 0.5 * x * (raised + lowered) - 0.5j * y * (raised - lowered) + z * m * full
+    x, y = axis
+    return 0.5 * x * (raised + lowered) - 0.5j * y * (raised - lowered)

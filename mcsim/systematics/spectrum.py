@@ -1,7 +1,7 @@
 """A sky whose power spectrum is not the fiducial one."""
 
 from dataclasses import dataclass
-from typing import Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,8 +9,8 @@ from scipy.optimize import lsq_linear
 
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
-from mcsim.systematics.base import Alm, Draw, Effect, Site, Vector, Wording
-from mcsim.systematics.vectors import along
+from mcsim.systematics.base import Alm, Draw, Effect, Site, Wording
+from mcsim.systematics.parametrization import Components, Vector
 
 BANDS = 6
 
@@ -23,6 +23,29 @@ KNOWN = 0.25
 
 DETECTED = 3.0
 """Standard errors by which a band that is constrained worse has to change to be fitted all the same."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Bands(Components):
+    """Fit the fractional changes of the bands."""
+
+    def constrained(self, coordinates: Vector, precision: NDArray[np.float64]) -> Vector:
+        """Set bands to zero that are neither constrained nor detected, such as those beyond the analysed degrees."""
+        errors = np.sqrt(np.diag(np.linalg.pinv(precision)))
+        silent = (errors > KNOWN) & (np.abs(coordinates) < DETECTED * errors)
+        found = np.where(silent, 0.0, coordinates)
+        rows = np.flatnonzero(~silent)
+        shift = precision[np.ix_(rows, np.flatnonzero(silent))] @ coordinates[silent]
+        found[rows] += np.linalg.lstsq(precision[np.ix_(rows, rows)], shift, rcond=None)[0]
+        return found
+
+    def nearest(self, coordinates: Vector, precision: NDArray[np.float64]) -> dict[str, Any]:
+        """Return norm and direction, of what leaves every band some power."""
+        if np.min(coordinates) < LEAST:
+            values, vectors = np.linalg.eigh(precision)
+            root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+            coordinates = lsq_linear(root, root @ coordinates, bounds=(LEAST, np.inf)).x
+        return super().nearest(coordinates, precision)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,16 +70,13 @@ class Spectrum(Effect):
     signature = "L = 0, every channel alike."
     source = "Follows from the definition"
     step = 0.02
-    matched_filter = False
-    mean_response = True
+    parametrization = _Bands(parameter="bands", count=BANDS, mean_response=True, matched_filter=False)
 
     bands: tuple[float, ...] = (1.0,) * BANDS
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Rescaled by the square root."""
-        if self.amplitude == 0.0:
-            return sky
-        change = self.coordinates()
+        """Rescale the bands by the square roots of their changes in power."""
+        change = self.along("bands")
         if np.min(change) < -1.0:
             raise InputError(
                 f"effect {self.name}: a band changes by {np.min(change):g}, leaving negative power; keep it above -1."
@@ -66,34 +86,3 @@ class Spectrum(Effect):
         factor = np.sqrt(1.0 + change[np.searchsorted(edges, ell, side="right")])
         factor[:2] = 1.0
         return alm_.multiply(sky, factor, site.lmax)
-
-    @classmethod
-    def basis(cls) -> tuple[Self, ...]:
-        """Return the bands one by one."""
-        return tuple(cls(amplitude=cls.step, bands=tuple(map(float, row))) for row in np.eye(BANDS))
-
-    def coordinates(self) -> Vector:
-        """Fractional change of every band."""
-        return along(self.name, "bands", self.bands, self.amplitude)
-
-    @classmethod
-    def constrained(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Vector:
-        """Set bands to zero that are neither constrained nor detected, such as those beyond the analysed degrees."""
-        errors = np.sqrt(np.diag(np.linalg.pinv(precision)))
-        silent = (errors > KNOWN) & (np.abs(coordinates) < DETECTED * errors)
-        found = np.where(silent, 0.0, coordinates)
-        rows = np.flatnonzero(~silent)
-        shift = precision[np.ix_(rows, np.flatnonzero(silent))] @ coordinates[silent]
-        found[rows] += np.linalg.lstsq(precision[np.ix_(rows, rows)], shift, rcond=None)[0]
-        return found
-
-    @classmethod
-    def nearest(cls, coordinates: Vector, precision: NDArray[np.float64]) -> Self:
-        """Norm and direction, of what leaves every band some power."""
-        found = coordinates
-        if np.min(coordinates) < LEAST:
-            values, vectors = np.linalg.eigh(precision)
-            root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-            found = lsq_linear(root, root @ coordinates, bounds=(LEAST, np.inf)).x
-        norm = float(np.linalg.norm(found))
-        return cls(amplitude=norm, bands=tuple(map(float, found / norm))) if norm else cls()

@@ -26,7 +26,6 @@ class TimeConstant(Effect):
     name = "time_constant"
     scope = "channel"
     unit = "s"
-    title = "time constant"
     wording = Wording("{}", " ms", 1000.0)
     cause = "Heat capacity of a bolometer, or a filter in the electronics, not deconvolved."
     signature = "Lag and smear along beam x: nearly degenerate with a pointing offset along the scan, and with m = 2."
@@ -34,16 +33,14 @@ class TimeConstant(Effect):
     step = 0.001
 
     def pointing(self, beam: Beam, site: Site) -> Beam:
-        """Trailing along the circle of the spin."""
-        if self.amplitude == 0.0:
-            return beam
+        """Trail the beam along the circle of the spin."""
         pointed = site.pointed(self.name)
         model = pointed.model
         turns = 1.0 / model.spin_period_s + np.cos(np.deg2rad(model.precession_angle_deg)) / model.precession_period_s
         return smeared(beam, np.deg2rad(pointed.line.boresight_angle_deg), 2.0 * np.pi * turns * self.amplitude)
 
     def lags(self) -> tuple[tuple[float, float], ...] | None:
-        """Nodes of the exponential: exact for polynomials in time of degree 13."""
+        """Return the nodes of the exponential: exact for polynomials in time of degree 13."""
         if self.amplitude == 0.0:
             return ((1.0, 0.0),)
         ages, weights = np.polynomial.laguerre.laggauss(_NODES)

@@ -12,7 +12,6 @@ class TransmissionImbalance(Effect):
     name = "transmission_imbalance"
     scope = "channel"
     unit = "x"
-    title = "transmission imbalance"
     wording = Wording("x = {}")
     cause = "Losses in the two arms of a differencing radiometer, measured with an error."
     signature = "Stripes of the dipole along the scan; acts on differencing scans only."

@@ -49,5 +49,5 @@ def ensemble(realizations: int = 10, seed: int = 7, **more: Any) -> dict[str, An
 def small_store(client: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The small run, finished; tests must not write to it."""
     path = tmp_path_factory.mktemp("store") / "small.zarr"
-    runner.run(config.load(table()), path, client=client)
+    runner.run(config.load(table()), path, workers=client)
     return path

@@ -12,12 +12,11 @@ from distributed import Client
 import mcsim
 from mcsim import bipolar, config
 from mcsim.ensemble import prediction, runner
-from mcsim.errors import InputError
-from mcsim.instrument.beams.turn import mirrored
 from mcsim.simulation import convolve, differencing, mapmaking, simulate
 from mcsim.simulation.survey import Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
+from refusals import refused, unnamed
 
 from .conftest import ensemble, table
 
@@ -100,7 +99,7 @@ def test_map_is_that_of_the_whole_beams_solved_at_once(year):
     shared = survey(year(**ensemble(keep_maps=True)))
     channel = shared.channels[0]
     assert channel.side_b is not None
-    np.testing.assert_array_equal(channel.side_b.beam.blm, mirrored(channel.beam).blm)
+    np.testing.assert_array_equal(channel.side_b.beam.blm, channel.beam.mirrored().blm)
     sky = simulate.draw_sky(shared, 3)
     sides = [mapmaking.side_maps(sky, response, NSIDE) for response in (channel.response, channel.side_b.response)]
     (pairs,) = [m.pairs for m in channel.maps]
@@ -170,7 +169,7 @@ def test_masked_batch_has_a_mean_field_which_the_difference_is_free_of(
     theta, _ = healpy.pix2ang(NSIDE, np.arange(12 * NSIDE**2))
     healpy.write_map(tmp_path / "m.fits", (np.abs(theta - np.pi / 2) > 0.3).astype(float), dtype=np.float64)
     masked = {"nside": NSIDE, "mask": str(tmp_path / "m.fits"), "mask_apodisation_deg": 15.0}
-    assert runner.run(year(map=masked), tmp_path / "s.zarr", client=client).failures == ()
+    assert runner.run(year(map=masked), tmp_path / "s.zarr", workers=client).failures == ()
     found = mcsim.open_summary(tmp_path / "s.zarr").load().sel(mode="L2M0d0", pair="W1,W1")
     bins = slice(1, 3)
     mean = {k: found[f"biposh_{k}_binned_mean"].values.real[bins] for k in ("circular", "difference")}
@@ -190,7 +189,7 @@ def test_chunks_and_slices_give_the_same_bits(year, client: Client, tmp_path: Pa
     for name, chunk, parts in (("a", 4, [None]), ("b", 1, [slice(2, 3), slice(0, 2), slice(3, 4)])):
         run = year(channel={"noise": {"sigma0_uk": 10.0}}, compute={"chunk": chunk}, **ensemble(4))
         for part in parts:
-            runner.run(run, tmp_path / f"{name}.zarr", realizations=part, client=client)
+            runner.run(run, tmp_path / f"{name}.zarr", realizations=part, workers=client)
         stores.append(mcsim.open_ensemble(tmp_path / f"{name}.zarr").load())
     for variable in ("biposh", "biposh_circular", "cl", "cl_circular"):
         np.testing.assert_array_equal(stores[0][variable], stores[1][variable])
@@ -198,12 +197,11 @@ def test_chunks_and_slices_give_the_same_bits(year, client: Client, tmp_path: Pa
 
 def test_maps_that_do_not_converge_are_failures_and_can_be_made_later(year, client: Client, tmp_path: Path):
     hasty = year({"max_iterations": 3}, ensemble={"realizations": 2, "seed": 1})
-    result = runner.run(hasty, tmp_path / "s.zarr", client=client)
+    result = runner.run(hasty, tmp_path / "s.zarr", workers=client)
     assert (result.finished, [failure.realization for failure in result.failures]) == (0, [0, 1])
-    assert "map W1, the non-circular part: the map-making reached a relative residual of" in result.failures[0].reason
-    assert "in 3 iterations, not the tolerance 1e-08; raise max_iterations" in result.failures[0].reason
+    assert unnamed(result.failures[0].reason, "map W1", "3 iterations", "1e-08", "max_iterations") == []
     patient = year(ensemble={"realizations": 2, "seed": 1})
-    assert runner.run(patient, tmp_path / "s.zarr", client=client).finished == 2
+    assert runner.run(patient, tmp_path / "s.zarr", workers=client).finished == 2
 
 
 def test_threads_do_not_change_a_map(year):
@@ -229,14 +227,14 @@ def test_part_of_the_sky(year, model: Path, tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("scan", "message"),
+    ("scan", "named"),
     [
-        ({"pair": "E"}, r"has no differencing pair 'E': choose from D\."),
-        ({"sample_period_s": 1e9}, r"has no sample every 1e\+09 s"),
+        ({"pair": "E"}, ("toy", "'E'", "D")),
+        ({"sample_period_s": 1e9}, ("toy", "1e+09 s", "duration_days")),
     ],
 )
-def test_scans_that_cannot_be(year, scan, message):
-    with pytest.raises(InputError, match=message):
+def test_scans_that_cannot_be(year, scan, named):
+    with refused(*named):
         survey(year(scan))
 
 

@@ -12,7 +12,7 @@ from scipy import stats
 
 from mcsim import beamfit, config
 from mcsim.beamfit.data import SUMMARY, Row, parts, project
-from mcsim.ensemble import prediction, tables
+from mcsim.ensemble import describe, prediction, tables
 from mcsim.instrument import scan
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import Survey, survey
@@ -131,7 +131,7 @@ def test_joint_signal_to_noise_is_at_least_that_of_every_mode_and_less_than_infi
     assert float(each.max()) < float(autos) < total < np.inf
     bins = np.sqrt((expected["signal_to_noise_binned"] ** 2).sum("bin"))
     xr.testing.assert_allclose(bins.where(np.isfinite(each)), each, rtol=1e-10)
-    assert "jointly" in tables.describe_prediction(expected)
+    assert "jointly" in describe.describe_prediction(expected)
     # What all maps say together does not depend on which pairs the ensemble keeps.
     run = shared.config
     autos = prediction.predict(survey(replace(run, biposh=replace(run.biposh, pairs="auto"))), snr=True)
@@ -167,7 +167,7 @@ def test_a_mask_acts_through_its_square(tmp_path: Path) -> None:
 def test_a_plain_spectrum_is_fitted_with_its_noise(tmp_path: Path) -> None:
     """Noise of uneven hits has a quadrupole of its own, which is no part of the factor."""
     shared = two_channels(tmp_path, 60.0)
-    tables.write_prediction(prediction.predict(shared), tmp_path / "two.ecsv")
+    tables.write(prediction.predict(shared), tmp_path / "two.ecsv")
     for pair in ("A,A", "A,B"):
         measured = beamfit.measurement(tmp_path / "two.ecsv", shared, beamfit.Selection(kind="plain", pair=pair))
         found = beamfit.fit(measured, shared, order="leading")

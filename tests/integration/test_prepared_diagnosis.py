@@ -12,11 +12,13 @@ import mcsim
 from mcsim import cli, config
 from mcsim.diagnosis import report, words
 from mcsim.diagnosis.api import describe
+from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.ensemble import plan
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 
 PROPOSED = ("beam_ellipticity", "noise_level", "dipole_modulation")
+SETTINGS = DiagnosisSettings(without=tuple(name for name in mcsim.effects() if name not in PROPOSED))
 FINE, COARSE = 64, 16
 MASK = (np.abs(healpy.pix2vec(COARSE, np.arange(12 * COARSE**2))[2]) > 0.25).astype(float)
 
@@ -62,8 +64,7 @@ def data(run, *effects, seed=99):
 
 
 def diagnosed(run, maps, folder=None):
-    without = [name for name in mcsim.effects() if name not in PROPOSED]
-    return mcsim.diagnose(run, maps, folder, without=without, simulations=300, workers=0)
+    return mcsim.diagnose(run, maps, folder, settings=replace(SETTINGS, simulations=300))
 
 
 @pytest.mark.slow
@@ -95,7 +96,7 @@ def test_the_cost_of_a_preparation_is_said():
     assert "prepare 0 further transforms" in plan.describe(config.to_dict(run))
     # Two channels, map and control, four transforms each.
     assert "prepare 16 further transforms" in plan.describe(config.to_dict(smoothed))
-    text = describe(run, without=[name for name in mcsim.effects() if name not in PROPOSED])
+    text = describe(run, SETTINGS)
     assert "nside 64 to 16" in text
     assert "further transforms" not in plan.describe(config.to_dict(model(steps=False)))
 

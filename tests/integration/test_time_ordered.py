@@ -75,11 +75,11 @@ def test_window_and_centroid_explain_what_pixels_do(sky, beam, moments):
     assert np.std(left) < 0.025 * np.std(found[seen])
 
 
-def test_differencing_at_true_pointing_differs_by_what_pixels_do(sky, beam, tmp_path):
+def test_differencing_at_true_pointing_differs_by_what_pixels_do(sky, beam, rhs_from_samples, tmp_path):
     """Two-beam map from interpolated samples against the one from spin maps, with and without the pixel window."""
     scan = mapmaking.prepare(MODEL, "WMAP", HALF, cache_dir=tmp_path)
     rule, stages = mapmaking.StoppingRule(1e-6), [tod.sky_signal(sky, LMAX, beam, 1e-7)]
-    solutions = [mapmaking.solve(scan, mapmaking.rhs_from_samples(scan, (stages, stages)), rule=rule)[0]]
+    solutions = [mapmaking.solve(scan, rhs_from_samples(scan, (stages, stages)), rule=rule)[0]]
     for window in (None, healpix.pixel_window(NSIDE, LMAX)):
         side = mapmaking.side_maps(sky, convolve.response(beam, LMAX, window), NSIDE)
         solutions.append(mapmaking.solve(scan, mapmaking.rhs_from_maps(scan, [(side, side)])[0], rule=rule)[0])

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from scipy.linalg import solve_triangular
 
-from mcsim.diagnosis.validation import SharedDraw, achieved, carried, excess, predicted
+from mcsim.diagnosis.validation import excess, expected_fall, expected_fall_of_draw, held_out
 from mcsim.stats.detection import confusion, detectable, posterior, power, snr_needed, snr_to_separate
 from mcsim.stats.gaussian import SimulatedGaussian, nested_pvalue, residual_pvalue
 from mcsim.stats.look_elsewhere import calibrate, global_test, scan_pvalues
@@ -145,8 +145,9 @@ def test_detectable_amplitude_is_unbiased():
     t = np.eye(p)[:, :1] * 0.5
     found = [detectable(drawn_null(rng, p, count), t, 20) for _ in range(60)]
     # The relative scatter of one is 1/sqrt(2 (n - p)) = 0.037, of their mean 0.005.
-    assert np.mean([one.limit for one in found]) == pytest.approx(4.305 / 0.5, rel=0.02)
-    assert all(one.amplitude > one.limit for one in found)
+    expected = snr_needed(1, 20, p, count) * np.sqrt(1.0 + 1.0 / count) / 0.5
+    assert np.mean(found) == pytest.approx(expected, rel=0.02)
+    assert expected > 4.305 / 0.5
 
 
 @pytest.mark.parametrize("cosine", [0.0, 0.7, -0.95])
@@ -211,18 +212,18 @@ def frozen_fits(request) -> dict[str, np.ndarray]:
         before, after = drawn_null(rng, p, count), drawn_null(rng, p, count)
         after = SimulatedGaussian(after.mean + t_test @ best.amplitudes, after.whitening, count)
         x = signal + other + rng.normal(size=p)
-        forecast = predicted(before, x, t_test, best.amplitudes, best.covariance)
-        shrink = achieved(before, after, x)
+        forecast = expected_fall(before, t_test, best.amplitudes, best.covariance)
+        shrink = held_out(before, after, x, forecast, "others")
         left = signal - t_test @ best.amplitudes
         expected = 1.0 - (left @ left + other @ other) / (signal @ signal + other @ other)
-        found["forecast"].append(forecast.delta_chi2.value)
-        found["forecast_sigma"].append(forecast.delta_chi2.sigma)
+        found["forecast"].append(forecast.value)
+        found["forecast_sigma"].append(forecast.sigma)
         found["drop"].append(shrink.before.value - shrink.after.value)
-        found["sigma"].append(shrink.fraction.sigma)
-        found["fraction"].append(shrink.fraction.value)
-        found["pull"].append((shrink.fraction.value - expected) / shrink.fraction.sigma)
+        found["sigma"].append(shrink.achieved.sigma)
+        found["fraction"].append(shrink.achieved.value)
+        found["pull"].append((shrink.achieved.value - expected) / shrink.achieved.sigma)
         found["before"].append(shrink.before.value)
-        found["after"].append(shrink.probability_after)
+        found["after"].append(shrink.pvalue_after)
     return {name: np.array(values) for name, values in found.items()} | {"gap": signal @ signal + other @ other}
 
 
@@ -252,17 +253,11 @@ def test_forecast_drop_of_what_draws_is_the_drop():
         )
         drawn = (t + np.sqrt(draws) * scatter.T) ** 2
         seen = excess(learning, x[:fitted])
-        forecast = carried(
-            before,
-            after,
-            x[fitted:],
-            t[fitted:, None],
-            noise,
-            SharedDraw(seen, drawn[:, fitted:].sum(axis=1), drawn[:, :fitted].sum(axis=1)),
-        )
-        shrink = achieved(before, after, x[fitted:])
-        differences.append(shrink.before.value - shrink.after.value - forecast.delta_chi2.value)
-        errors.append(forecast.delta_chi2.sigma)
+        here, there = drawn[:, fitted:].sum(axis=1), drawn[:, :fitted].sum(axis=1)
+        forecast = expected_fall_of_draw(after, t[fitted:, None], noise, seen, here, there)
+        shrink = held_out(before, after, x[fitted:], forecast, "others")
+        differences.append(shrink.before.value - shrink.after.value - forecast.value)
+        errors.append(forecast.sigma)
     assert abs(np.mean(differences)) < 4.0 * np.std(differences) / np.sqrt(len(differences))
     # Forecasts of the mean drop: the noise of the data that measure it is not in their error.
     assert 0.7 < np.mean(errors) / np.std(differences) < 1.2

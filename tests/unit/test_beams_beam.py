@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from mcsim.errors import InputError
 from mcsim.instrument.beams import MMAX_TOLERANCE, Beam, choose_mmax
 from mcsim.instrument.beams.coefficients import power_by_order
+from refusals import refused
 
 
 def random_blm(lmax: int, mmax: int) -> np.ndarray:
@@ -86,24 +86,24 @@ def test_values_are_the_elliptical_gaussian() -> None:
 
 @pytest.mark.parametrize("mmax", [-1, 11])
 def test_truncation_to_no_order_is_refused(mmax) -> None:
-    with pytest.raises(InputError, match=f"mmax = {mmax}"):
+    with refused("mmax", mmax):
         Beam.gaussian(60, 10).truncated(mmax)
 
 
 @pytest.mark.parametrize(
     ("change", "named"),
-    [((1, 3, np.nan), "not finite"), ((0, 0, -1.0), "integrates to"), ((0, 0, 0.0), "integrates to")],
+    [((1, 3, np.nan), ("finite",)), ((0, 0, -1.0), ("positive",)), ((0, 0, 0.0), ("positive",))],
 )
 def test_normalize_refuses(change, named) -> None:
     m, ell, value = change
     blm = random_blm(8, 3)
     blm[m, ell] = value
-    with pytest.raises(InputError, match=named):
+    with refused(*named):
         Beam.normalized(blm, None, "a test beam")
 
 
 def test_normalize_refuses_orders_that_are_not_there() -> None:
-    with pytest.raises(InputError, match="mmax = 5 exceeds the largest order 3"):
+    with refused("mmax", 5, 3):
         Beam.normalized(random_blm(8, 3), 5, "a test beam")
 
 

@@ -6,9 +6,9 @@ from astropy.io import fits
 from scipy.special import gammaln
 
 from mcsim import config
-from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam, BeamMap, blm_of_map, find_centre, read_map
 from mcsim.simulation.channels import load_beam_map
+from refusals import refused
 
 PIXEL_DEG = 0.04
 PIXEL = np.radians(PIXEL_DEG)
@@ -101,9 +101,9 @@ def test_centre_is_column_and_row(tmp_path) -> None:
     # So in a run's configuration, whose key is centre_pixel.
     channel = {"kind": "map", "path": str(path), "centre_pixel": (50.0, 25.0)}
     np.testing.assert_array_equal(load_beam_map("W1", config.BeamMap(**channel)).centre, (50, 25))
-    with pytest.raises(InputError, match=r"column, row"):
+    with refused("(column, row)"):
         read_map(path, centre=(25, 50))
-    with pytest.raises(InputError, match=r"column, row"):
+    with refused("(column, row)"):
         read_map(path, centre=(25, 70))
 
 
@@ -244,7 +244,7 @@ def test_logarithmic_map_is_refused(tmp_path) -> None:
     theta, phi = directions(100, (50, 50))
     path = write(tmp_path / "beam.fits", 60.0 + 10.0 * np.log10(ellipse(theta, phi) + 1e-6))
     fits.setval(path, "BUNIT", value="dBi")
-    with pytest.raises(InputError, match="dBi"):
+    with refused("beam.fits", "dBi"):
         read_map(path)
 
 
@@ -256,20 +256,20 @@ def small_image() -> np.ndarray:
 @pytest.mark.parametrize(
     ("change", "options", "named"),
     [
-        ("none", {"lmax": 100, "mmax": 101}, "mmax = 101"),
-        ("none", {"lmax": 5000}, "lmax = 5000 is beyond .* at most 4500"),
-        ("none", {"cut_deg": 0.0}, "cut_deg = 0.0"),
-        ("none", {"cut_deg": 0.05}, "less than 2 pixels"),
-        ("none", {"cut_deg": 120.0}, "at most 90"),
-        ("none", {"projection": "mercator"}, "'mercator' is not one of"),
-        ("none", {"centre": (50.0, 20.0)}, "outside"),
-        ("none", {"pixel_deg": -0.04}, "pixel"),
-        ("nan", {}, "1 values that are not finite"),
-        ("zero", {}, "no positive value"),
-        ("negative", {}, "no positive value"),
-        ("negative total", {}, "integrates to"),
-        ("edge", {}, "less than 8 pixels from an edge"),
-        ("empty inside", {"centre": (3.0, 3.0), "cut_deg": 0.1}, "is zero within 0.1 deg"),
+        ("none", {"lmax": 100, "mmax": 101}, ("mmax", 101)),
+        ("none", {"lmax": 5000}, ("lmax", 5000, 4500)),
+        ("none", {"cut_deg": 0.0}, ("cut_deg", 0.0)),
+        ("none", {"cut_deg": 0.05}, ("cut_deg", 0.05)),
+        ("none", {"cut_deg": 120.0}, ("cut_deg", 120.0, 90)),
+        ("none", {"projection": "mercator"}, ("projection", "mercator")),
+        ("none", {"centre": (50.0, 20.0)}, ("centre", "(50.0, 20.0)")),
+        ("none", {"pixel_deg": -0.04}, ("pixel", -0.04)),
+        ("nan", {}, ("beam.fits", 1, "finite")),
+        ("zero", {}, ("beam.fits", "positive")),
+        ("negative", {}, ("beam.fits", "positive")),
+        ("negative total", {}, ("positive",)),
+        ("edge", {}, ("beam.fits", 8, "(24, 40)")),
+        ("empty inside", {"centre": (3.0, 3.0), "cut_deg": 0.1}, ("zero", 0.1)),
     ],
 )
 def test_unusable_map_is_refused(tmp_path, change, options, named) -> None:
@@ -288,7 +288,7 @@ def test_unusable_map_is_refused(tmp_path, change, options, named) -> None:
         image[:10, :10] = 0
     path = write(tmp_path / "beam.fits", image)
     degrees = {key: options.pop(key) for key in ("lmax", "mmax") if key in options}
-    with pytest.raises(InputError, match=named):
+    with refused(*named):
         Beam.from_map(read_map(path, **options), **{"lmax": 100, **degrees})
 
 
@@ -301,16 +301,16 @@ def test_unusable_headers_are_refused(tmp_path) -> None:
     cube = write(tmp_path / "cube.fits", np.stack([image, image]))
     line = write(tmp_path / "line.fits", image[20])
     for path, named in [
-        (bare, "give pixel_deg"),
-        (oblong, "must be equal and positive"),
-        (mirrored, "must be equal and positive"),
-        (radians, "CUNIT1 = 'rad'"),
-        (line, "1 dimensions"),
-        (tmp_path / "absent.fits", "does not exist"),
+        (bare, ("bare.fits", "CDELT1", "CDELT2", "pixel_deg")),
+        (oblong, ("oblong.fits", 0.04, 0.05)),
+        (mirrored, ("mirrored.fits", -0.04, 0.04)),
+        (radians, ("radians.fits", "CUNIT1", "rad")),
+        (line, ("line.fits", 1)),
+        (tmp_path / "absent.fits", ("absent.fits",)),
     ]:
-        with pytest.raises(InputError, match=named):
+        with refused(*named):
             Beam.from_map(path, 100)
-    with pytest.raises(InputError, match=r"plane = 2 .* planes 0 to 1"):
+    with refused("cube.fits", "plane", 2, 0, 1):
         read_map(cube, plane=2)
 
 
@@ -319,10 +319,6 @@ def test_truncated_empty_and_foreign_files_are_refused(tmp_path) -> None:
     (tmp_path / "truncated.fits").write_bytes(whole[:6000])
     (tmp_path / "text.fits").write_text("not a beam")
     fits.HDUList([fits.PrimaryHDU()]).writeto(tmp_path / "empty.fits")
-    for name, named in [
-        ("truncated", "cannot be read as a FITS image"),
-        ("text", "cannot be read as a FITS image"),
-        ("empty", "holds no image"),
-    ]:
-        with pytest.raises(InputError, match=named):
+    for name in ("truncated", "text", "empty"):
+        with refused(f"{name}.fits"):
             Beam.from_map(tmp_path / f"{name}.fits", 100)

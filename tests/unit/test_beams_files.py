@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.sphere import alm as alm_
+from refusals import refused
 
 
 def write(path, beam: Beam, scale: float = 1.0):
@@ -50,43 +50,43 @@ def test_lower_lmax_and_chosen_mmax(tmp_path, beam) -> None:
 @pytest.mark.parametrize(
     ("lmax", "mmax", "named"),
     [
-        (121, None, "stops at lmax = 120"),
-        (120, 7, "stops at mmax = 6"),
-        (5, 6, "mmax = 6 .* lmax = 5"),
-        (0, None, "lmax = 0"),
+        (121, None, ("beam.alm.fits", "lmax", 120, 121)),
+        (120, 7, ("beam.alm.fits", "mmax", 6, 7)),
+        (5, 6, ("mmax", 6, "lmax", 5)),
+        (0, None, ("lmax", 0)),
     ],
 )
 def test_more_than_the_file_holds_is_refused(tmp_path, beam, lmax, mmax, named) -> None:
-    with pytest.raises(InputError, match=named):
+    with refused(*named):
         Beam.from_blm(write(tmp_path / "beam.alm.fits", beam), lmax, mmax)
 
 
 @pytest.mark.parametrize(
     ("index", "value", "named"),
     [
-        ((0, 7), 0.5j, "complex coefficients at m = 0"),
-        ((2, 9), complex(np.inf), "not finite"),
-        ((0, 0), complex(-1.0), "integrates to"),
-        ((1, 100), complex(50.0), "pointed at the pole"),
+        ((0, 7), 0.5j, ("m = 0", "complex")),
+        ((2, 9), complex(np.inf), ("finite",)),
+        ((0, 0), complex(-1.0), ("positive",)),
+        ((1, 100), complex(50.0), ("m = 0", "pole")),
     ],
 )
 def test_coefficients_that_are_no_beam_are_refused(tmp_path, beam, index, value, named) -> None:
     blm = beam.blm.copy()
     blm[index] = value
     path = write(tmp_path / "beam.alm.fits", SimpleNamespace(blm=blm, lmax=120, mmax=6))
-    with pytest.raises(InputError, match=named):
+    with refused(*named):
         Beam.from_blm(path, 120)
 
 
 @pytest.mark.parametrize("power", [-0.5, 0.5])
 def test_other_normalisation_in_l_is_refused(tmp_path, beam, power) -> None:
     path = write(tmp_path / "beam.alm.fits", Beam(beam.blm * (2.0 * np.arange(121) + 1.0) ** power))
-    with pytest.raises(InputError, match="B_1"):
+    with refused("B_1", "B_0"):
         Beam.from_blm(path, 120)
 
 
 def test_all_zero_file_is_refused(tmp_path, beam) -> None:
-    with pytest.raises(InputError, match="at m = 0"):
+    with refused("m = 0", "pole"):
         Beam.from_blm(write(tmp_path / "beam.alm.fits", Beam(0 * beam.blm)), 120)
 
 
@@ -96,7 +96,7 @@ def test_unreadable_files_are_refused(tmp_path, beam) -> None:
     (tmp_path / "text.fits").write_text("not a beam")
     fits.PrimaryHDU(np.ones((3, 3))).writeto(tmp_path / "image.fits")
     for name in ("truncated", "text", "image"):
-        with pytest.raises(InputError, match="cannot be read as FITS coefficients"):
+        with refused(f"{name}.fits"):
             Beam.from_blm(tmp_path / f"{name}.fits", 100)
-    with pytest.raises(InputError, match="do not exist"):
+    with refused("absent.fits"):
         Beam.from_blm(tmp_path / "absent.fits", 100)

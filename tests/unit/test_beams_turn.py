@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from mcsim.instrument.beams import Beam
-from mcsim.instrument.beams.turn import mirrored, rotated
 
 LMAX = 40
 
@@ -23,16 +22,16 @@ THETA, PHI = (angles.ravel() for angles in np.meshgrid(np.linspace(0.01, 0.4, 7)
 
 
 def test_rotated_turns_from_x_towards_y(beam):
-    np.testing.assert_allclose(rotated(beam, 0.7).values(THETA, PHI + 0.7), beam.values(THETA, PHI), rtol=1e-10)
+    np.testing.assert_allclose(beam.rotated(0.7).values(THETA, PHI + 0.7), beam.values(THETA, PHI), rtol=1e-10)
     ellipse = Beam.elliptical(700.0, 500.0, 0.0, LMAX, mmax=4)
     np.testing.assert_allclose(
-        rotated(ellipse, np.deg2rad(30.0)).blm, Beam.elliptical(700.0, 500.0, 30.0, LMAX, mmax=4).blm, atol=1e-12
+        ellipse.rotated(np.deg2rad(30.0)).blm, Beam.elliptical(700.0, 500.0, 30.0, LMAX, mmax=4).blm, atol=1e-12
     )
 
 
 def test_mirrored_exchanges_x_and_minus_x(beam):
-    np.testing.assert_allclose(mirrored(beam).values(THETA, np.pi - PHI), beam.values(THETA, PHI), rtol=1e-10)
-    np.testing.assert_allclose(mirrored(mirrored(beam)).blm, beam.blm, rtol=1e-15)
+    np.testing.assert_allclose(beam.mirrored().values(THETA, np.pi - PHI), beam.values(THETA, PHI), rtol=1e-10)
+    np.testing.assert_allclose(beam.mirrored().mirrored().blm, beam.blm, rtol=1e-15)
 
 
 def test_mirrored_is_the_other_side_of_a_mirror_through_the_spin_axis(beam):
@@ -50,5 +49,5 @@ def test_mirrored_is_the_other_side_of_a_mirror_through_the_spin_axis(beam):
     direction = side_a + np.array([0.05, 0.2, -0.1])
     direction /= np.linalg.norm(direction)
     seen = beam.values(*angles(direction, side_a))
-    np.testing.assert_allclose(mirrored(beam).values(*angles(mirror @ direction, mirror @ side_a)), seen, rtol=1e-10)
+    np.testing.assert_allclose(beam.mirrored().values(*angles(mirror @ direction, mirror @ side_a)), seen, rtol=1e-10)
     assert abs(beam.values(*angles(mirror @ direction, mirror @ side_a)) / seen - 1.0) > 0.01

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from mcsim import config
-from mcsim.config import arrays, paths
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments, ScanModel, write_moments_fits
@@ -16,6 +15,7 @@ from mcsim.simulation import channels, simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.support import folders
+from refusals import refused
 
 NSIDE, LMAX = 16, 32
 ELLIPSE = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 300.0, "fwhm_minor_arcmin": 250.0}
@@ -133,7 +133,7 @@ def test_beam_survives_exactly() -> None:
 
 def test_beam_that_ends_below_the_sky_is_refused() -> None:
     run = config.load(table(beam=Beam.gaussian(300.0, LMAX - 1)))
-    with pytest.raises(InputError, match=str(LMAX)):
+    with refused("lmax", LMAX - 1, LMAX):
         survey(run)
 
 
@@ -190,13 +190,13 @@ def test_arrays_under_other_keys_become_lists() -> None:
     [np.ma.masked_array(CL, CL > 0.1), np.array(["a", "b"]), np.array([object()])],
 )
 def test_arrays_that_say_more_than_numbers_are_refused(given) -> None:
-    with pytest.raises(InputError, match="spectrum"):
+    with refused("spectrum"):
         config.load(table({"spectrum": given}))
 
 
 def test_unit_of_an_array_is_not_dropped() -> None:
     units = pytest.importorskip("astropy.units")
-    with pytest.raises(InputError, match="K2"):
+    with refused("K2"):
         config.load(table({"spectrum": CL * units.K**2}))
 
 
@@ -222,7 +222,7 @@ def test_arrays_of_a_wrong_size_are_refused(changes) -> None:
 def test_unwritable_cache_is_named(tmp_path, monkeypatch) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / "file"))
-    with pytest.raises(InputError, match="MCSIM_CACHE"):
+    with refused("MCSIM_CACHE"):
         config.load(table())
 
 
@@ -231,8 +231,3 @@ def test_nothing_half_written_is_left() -> None:
     with pytest.raises(InputError):
         config.load(table({"spectrum": np.array([object()])}))
     assert all(path.name.startswith("given-") for path in folders.default_cache_dir().iterdir())
-
-
-def test_keys_of_files_are_those_of_the_paths() -> None:
-    assert {path.split(".")[1] for path in paths._RULES} == arrays.FILES
-    assert {path.split(".")[1] for path, rule in paths._RULES.items() if rule.placeholders} == arrays.TEMPLATES

@@ -26,11 +26,11 @@ class Tilt(Effect):
 RUN = config.load(resources.workflow("quickstart"))
 
 
-def key(effect, settings=None, simulations=100, run=RUN):
+def key(effect, settings=None, run=RUN):
     analysis = SimpleNamespace(
-        candidates=(Candidate(effect, None, (0,)),), elements=(), settings=settings or DiagnosisSettings()
+        candidates=(Candidate(effect, None, (0,)),), elements=(), settings=settings or DiagnosisSettings(), library=()
     )
-    return api._key(run, analysis, simulations)
+    return api._key(run, analysis)
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ def test_an_effect_with_other_code_is_learned_anew(plugin):
 def test_every_setting_has_a_part_in_the_key(plugin, field):
     effect = importlib.import_module("effects_of_a_user").Tilt
     value = getattr(DiagnosisSettings(), field.name)
-    other = replace(DiagnosisSettings(), **{field.name: (1.0,) if isinstance(value, tuple) else value + 1})
+    other = replace(DiagnosisSettings(), **{field.name: (1.0,) if isinstance(value, tuple) else (value or 0) + 1})
     assert key(effect, other) != key(effect)
 
 
@@ -63,4 +63,3 @@ def test_name_seed_and_number_of_realizations_do_not_count(plugin):
     effect = importlib.import_module("effects_of_a_user").Tilt
     other = replace(RUN, name="other", ensemble=replace(RUN.ensemble, seed=9, realizations=3))
     assert key(effect, run=other) == key(effect)
-    assert key(effect, simulations=None) != key(effect)

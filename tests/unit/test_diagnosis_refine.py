@@ -1,6 +1,7 @@
 """Responses at the amplitudes that were found: bent ones, and two that change each other's."""
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from mcsim.diagnosis.selection import attribute
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate
-from mcsim.systematics import Effect
+from mcsim.systematics import Effect, Parametrization
 
 P = 50
 
@@ -25,6 +26,11 @@ class Push(Effect):
     unit = "push"
     cause = signature = ""
     step = 1.0
+
+
+class Unconstrained(Parametrization):
+    def constrained(self, coordinates, precision):
+        return 0.0 * coordinates
 
 
 class Instrument:
@@ -50,9 +56,10 @@ class Instrument:
         return np.tile(self.response(amplitudes.get("A", 0.0), amplitudes.get("B", 0.0)), (skies, 1))
 
     def refined(self, x: np.ndarray):
-        settings = DiagnosisSettings()
-        refiner = Refiner(self.null, x, self.calibration, self.curvature, self.respond, settings)
-        return refiner.run(self.t, self.candidates)
+        bank = SimpleNamespace(curvature=self.curvature)
+        context = SimpleNamespace(null=self.null, calibration=self.calibration, bank=bank, settings=DiagnosisSettings())
+        data = SimpleNamespace(context=context, x=x, respond=self.respond, realizations=1)
+        return Refiner(data).run(self.t, self.candidates)
 
 
 @pytest.mark.parametrize("amplitude", [15.0, -15.0])
@@ -100,7 +107,7 @@ def test_what_data_tell_nothing_of_is_neither_heard_nor_simulated(monkeypatch):
     """However significant: an effect without an amplitude is none."""
     instrument = Instrument(bend=0.0, cross=0.0)
     x = instrument.response(12.0, 14.0) + 10.0 * instrument.sideways[1]
-    monkeypatch.setattr(Push, "constrained", classmethod(lambda cls, coordinates, precision: 0.0 * coordinates))
+    monkeypatch.setattr(Push, "parametrization", Unconstrained())
     found = instrument.refined(x)
     assert found.attribution.verdict == "unknown"
     assert found.partial is None

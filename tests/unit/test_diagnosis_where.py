@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mcsim.diagnosis.places import places
+from mcsim.diagnosis.localisation import places
 from mcsim.diagnosis.summaries import Element
 
 KINDS = [("V1", "ecliptic", 2), ("W1", "ecliptic", 2), ("W2", "ecliptic", 2), ("V1", "galactic", 1), ("W1", None, 0)]

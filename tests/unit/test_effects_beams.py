@@ -8,7 +8,6 @@ import pytest
 from scipy.special import sph_harm_y
 
 from mcsim import systematics
-from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.beams.gaussian import SIGMA_PER_FWHM
 from mcsim.instrument.scan import ScanModel
@@ -17,6 +16,7 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.sphere.spectra import load
 from mcsim.systematics.shape import displaced, extended, shape, smeared, stretched
+from refusals import refused
 
 FWHM = 88.0
 
@@ -121,7 +121,7 @@ def test_sidelobe_by_quadrature():
     assert found.window[0] < 1.0
     calibrated = kind(amplitude=0.01, calibrated="dipole").beam(beam, site_of(beam))
     assert calibrated.window[1] == pytest.approx(beam.window[1], rel=1e-14)
-    with pytest.raises(InputError, match="calibrated = 'monopole' must be one of none, dipole"):
+    with refused("calibrated", "monopole", "none", "dipole"):
         kind(amplitude=0.01, calibrated="monopole").beam(beam, site_of(beam))
 
 
@@ -231,7 +231,7 @@ def test_orders_that_were_left_out_come_back():
     np.testing.assert_array_equal(found.blm, expected)
     assert found.neglected_power == whole.neglected_power
     for kept in (site_of(believed), replace(site_of(whole), whole=lambda: whole)):
-        with pytest.raises(InputError, match=r"on channel W1 adds the orders of the beam that m_max leaves out"):
+        with refused("beam_noncircularity", "W1", "m_max"):
             kind(amplitude=1.0).beam(kept.beam, kept)
 
 
@@ -247,7 +247,7 @@ def test_responses_are_linear_at_the_step(name):
         changed = systematics.seen_through([effect], site).blm[:4]
         return np.pad(changed, ((0, 4 - len(changed)), (0, 0))) - np.pad(beam.blm, ((0, 3), (0, 0)))
 
-    for effect in systematics.get(name).basis():
+    for effect in systematics.basis_of(systematics.get(name)):
         whole, half, opposite = (change(effect.scaled(factor)) for factor in (1.0, 0.5, -1.0))
         assert np.linalg.norm(whole - 2.0 * half) < 0.02 * np.linalg.norm(whole)
         assert np.linalg.norm(whole + opposite) < 0.04 * np.linalg.norm(whole)
@@ -268,9 +268,9 @@ def test_what_is_no_beam_is_refused():
     beam = Beam.gaussian(FWHM, 48)
     site = site_of(beam)
     for name, amplitude in (("beam_ellipticity", 2.5), ("beam_width", -0.95)):
-        with pytest.raises(InputError, match=rf"effect {name}: amplitude = {amplitude:g}"):
+        with refused(name, "amplitude", amplitude):
             systematics.get(name)(amplitude=amplitude).beam(beam, site)
-    with pytest.raises(InputError, match=r"width_sigmas = 0\.1"):
+    with refused("width_sigmas", 0.1):
         systematics.get("beam_sidelobe")(amplitude=0.1, width_sigmas=0.1).beam(beam, site)
-    with pytest.raises(InputError, match="effect time_constant on channel W1 depends on when and how"):
+    with refused("time_constant", "W1", "scan.model"):
         systematics.get("time_constant")(amplitude=0.1).pointing(beam, replace(site, pointing=None))

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from mcsim import systematics
-from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments, ScanModel
 from mcsim.sphere import alm as alm_
@@ -16,6 +15,7 @@ from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotate_alm, rotate_pixels
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.sphere.spectra import load
+from refusals import refused
 
 LMAX, NSIDE = 64, 16
 TOWARDS = {"lon_deg": 200.0, "lat_deg": 30.0}
@@ -64,10 +64,10 @@ def test_modulations_multiply_the_sky(site, sky, points):
     along = AXIS @ np.stack([x, y, z])
     np.testing.assert_allclose(at(found, points), at(sky, points) * (1.0 + 0.1 * along), atol=1e-8)
     basis = [(3 * z**2 - 1) / 2, 3**0.5 * x * z, 3**0.5 * y * z, 3**0.5 / 2 * (x**2 - y**2), 3**0.5 * x * y]
-    for effect, factor in zip(systematics.get("quadrupole_modulation").basis(), basis, strict=True):
+    for effect, factor in zip(systematics.basis_of(systematics.get("quadrupole_modulation")), basis, strict=True):
         found = effect.sky(sky, site, draw)
         np.testing.assert_allclose(at(found, points), at(sky, points) * (1.0 + effect.amplitude * factor), atol=1e-8)
-    with pytest.raises(InputError, match="components are all zero"):
+    with refused("components", "zero"):
         systematics.get("quadrupole_modulation")(amplitude=0.1, components=(0.0,) * 5).sky(sky, site, draw)
 
 
@@ -92,7 +92,7 @@ def test_boost_keeps_the_power_and_is_undone_by_the_opposite_one(site, sky):
     assert np.sum(weight * np.abs(found) ** 2) == pytest.approx(np.sum(weight * np.abs(sky) ** 2), rel=1e-12)
     again = kind(amplitude=-0.3, **TOWARDS).sky(found, site, draw)
     np.testing.assert_allclose(again, sky, atol=1e-10 * np.abs(sky).max())
-    with pytest.raises(InputError, match="is not slower than light"):
+    with refused("boost", "amplitude", 1):
         kind(amplitude=1.0, **TOWARDS).sky(sky, site, draw)
 
 
@@ -110,24 +110,25 @@ def test_spectrum_rescales_its_bands(site, sky):
     factor = np.ones(LMAX + 1)
     factor[edges[1] : edges[2]], factor[edges[2] : edges[3]] = np.sqrt(1.3), np.sqrt(1.4)
     np.testing.assert_allclose(found, sky * factor[ell], rtol=1e-14)
-    with pytest.raises(InputError, match="a band changes by -2"):
+    with refused("spectrum", -2):
         systematics.get("spectrum")(amplitude=2.0, bands=(-1.0, 0.0, 0.0, 0.0, 0.0, 0.0)).sky(sky, site, draw)
 
 
 def test_spectrum_nearest_to_less_than_no_power_leaves_some():
     """Of two correlated bands the other one makes up for what the first cannot be."""
     kind = systematics.get("spectrum")
-    precision = np.eye(6)
+    fit, precision = kind.parametrization, np.eye(6)
     precision[0, 1] = precision[1, 0] = 0.5
     wanted = np.array([-1.49, 0.3, 0.1, 0.0, 0.0, 0.0])
-    found = kind.nearest(wanted, precision).coordinates()
+    found = fit.coordinates(kind(**fit.nearest(wanted, precision)))
     # The first is short by 0.5: the second is moved by - 0.5 * 0.5 / 1.
     np.testing.assert_allclose(found, [-0.99, 0.05, 0.1, 0.0, 0.0, 0.0], atol=1e-8)
-    np.testing.assert_allclose(kind.nearest(0.5 * wanted, precision).coordinates(), 0.5 * wanted, rtol=1e-12)
+    again = fit.coordinates(kind(**fit.nearest(0.5 * wanted, precision)))
+    np.testing.assert_allclose(again, 0.5 * wanted, rtol=1e-12)
 
 
 def test_bands_that_no_data_tell_stay_as_believed():
-    kind = systematics.get("spectrum")
+    fit = systematics.get("spectrum").parametrization
     errors = np.array([0.05, 0.02, 0.01, 0.02, 0.4, 7.0])
     correlation = np.eye(6)
     correlation[3, 4] = correlation[4, 3] = 0.5
@@ -135,11 +136,11 @@ def test_bands_that_no_data_tell_stay_as_believed():
     fitted = np.array([0.3, -0.01, 0.0, 0.1, 0.6, -12.0])
     # The fourth is what it is given that the fifth has not changed.
     given = [0.3, -0.01, 0.0, 0.1 - 0.5 * 0.02 * 0.6 / 0.4, 0.0, 0.0]
-    np.testing.assert_allclose(kind.constrained(fitted, precision), given, atol=1e-9)
+    np.testing.assert_allclose(fit.constrained(fitted, precision), given, atol=1e-9)
     fitted[4] = 1.5
-    np.testing.assert_allclose(kind.constrained(fitted, precision), [0.3, -0.01, 0.0, 0.1, 1.5, 0.0], atol=1e-9)
+    np.testing.assert_allclose(fit.constrained(fitted, precision), [0.3, -0.01, 0.0, 0.1, 1.5, 0.0], atol=1e-9)
     np.testing.assert_array_equal(
-        systematics.get("beam_ellipticity").constrained(fitted[:2], precision[:2, :2]), fitted[:2]
+        systematics.get("beam_ellipticity").parametrization.constrained(fitted[:2], precision[:2, :2]), fitted[:2]
     )
 
 
@@ -173,7 +174,7 @@ def test_foregrounds_are_fixed_to_the_galaxy_and_grow_with_frequency(site, sky):
     assert values[latitude < 10].mean() > 0.0
     low = kind(amplitude=3.0, spectral_index=1.0).sky(sky, replace(site, frequency_ghz=47.0), draw) - sky
     np.testing.assert_allclose(low, 0.5 * drawn, atol=1e-12)
-    with pytest.raises(InputError, match="channel W1 has none; give its frequency_ghz"):
+    with refused("W1", "frequency_ghz"):
         kind(amplitude=3.0).sky(sky, replace(site, frequency_ghz=None), draw)
 
 
@@ -186,7 +187,7 @@ def test_noise_after_a_template(site, tmp_path):
     galactic = kind(amplitude=0.3, template=path).noise(replace(site, frame="galactic"))
     # A pixel's centre in the other frame is up to 0.055 rad off, half a diagonal.
     np.testing.assert_allclose(galactic, rotate_pixels(1.0 + 0.3 * pattern, "ecliptic", "galactic"), atol=0.034)
-    with pytest.raises(InputError, match="makes a variance negative"):
+    with refused("noise_anisotropy", "amplitude", -1.1):
         kind(amplitude=-1.1, template=path).noise(site)
 
 
@@ -198,7 +199,7 @@ def test_foregrounds_after_a_template(site, sky, tmp_path):
     values = healpix.synthesis(found[None], NSIDE, LMAX)[0]
     np.testing.assert_allclose(values, 2.0 * template / np.sqrt(np.mean(template**2)), rtol=0.0, atol=5e-3)
     healpy.write_map(path.replace("template", "zero"), 0.0 * template, dtype=np.float64)
-    with pytest.raises(InputError, match="give a complete template"):
+    with refused("zero.fits"):
         systematics.get("foreground_residual")(amplitude=2.0, template=path.replace("template", "zero")).sky(
             sky, site, draw
         )
@@ -218,7 +219,7 @@ def test_noise_is_strongest_at_the_ecliptic_poles_in_every_frame(site):
         systematics.get("noise_level")(amplitude=0.1).noise(site), np.full(12 * NSIDE**2, 1.1**2)
     )
     for name, amplitude in (("noise_anisotropy", 1.5), ("noise_anisotropy", -0.6), ("noise_level", -1.0)):
-        with pytest.raises(InputError, match=f"effect {name}"):
+        with refused(name):
             systematics.get(name)(amplitude=amplitude).noise(site)
 
 
@@ -226,7 +227,7 @@ def test_gain_follows_the_year(site):
     effect = systematics.get("gain_drift")(amplitude=0.01, phase_deg=90.0)
     year = site.pointing.model.orbit_period_s
     np.testing.assert_allclose(effect.gain(year * np.array([0.0, 0.25, 0.75]), site), [0.0, 0.01, -0.01], atol=1e-15)
-    with pytest.raises(InputError, match="effect gain_drift on channel W1"):
+    with refused("gain_drift", "W1", "scan.model"):
         effect.gain(np.zeros(1), replace(site, pointing=None))
 
 
@@ -239,7 +240,7 @@ def test_orientations_are_mixed_with_those_of_the_scan(site):
     found = effect.orientations(believed, site)
     np.testing.assert_allclose(found.w[:, seen], (0.75 * believed.w + 0.25 * real.w)[:, seen])
     np.testing.assert_array_equal(found.w[:, ~seen], believed.w[:, ~seen])
-    with pytest.raises(InputError, match="depends on when and how"):
+    with refused("orientation_averaging", "W1", "scan.model"):
         effect.orientations(believed, replace(site, pointing=None))
 
 

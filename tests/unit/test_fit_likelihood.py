@@ -7,6 +7,7 @@ from scipy import stats
 from mcsim.beamfit import compare, solve, solve_each
 from mcsim.beamfit.likelihood import size
 from mcsim.errors import InputError
+from refusals import refused
 
 RNG = np.random.default_rng(11)
 P, K = 8, 2
@@ -61,7 +62,7 @@ def test_comparison_of_nested_models():
     # Adding one parameter lowers chi2 by its squared significance.
     assert test.drop == pytest.approx((large.parameters[1] / large.errors[1]) ** 2, rel=1e-9)
     assert test.probability == pytest.approx(2.0 * stats.norm.sf(np.sqrt(test.drop)), rel=1e-9)
-    with pytest.raises(InputError, match="exchange them"):
+    with refused("parameters"):
         compare(large, small)
 
 
@@ -74,18 +75,18 @@ def test_each_realization_is_weighted_by_the_others():
 
 
 @pytest.mark.parametrize(
-    ("design", "covariance", "simulations", "message"),
+    ("design", "covariance", "simulations", "named"),
     [
-        (np.eye(P), COVARIANCE, None, "8 data cannot be fitted with 8 parameters"),
-        (DESIGN, COVARIANCE, P + 2, "10 realizations are too few"),
-        (DESIGN, np.diag([1.0] * (P - 1) + [0.0]), None, "datum 7 has no scatter"),
-        (DESIGN, np.ones((P, P)), None, "not positive definite"),
-        (DESIGN[:, [0, 0]], COVARIANCE, None, "cannot tell the parameters"),
-        (0.0 * DESIGN, COVARIANCE, None, "cannot tell the parameters"),
+        (np.eye(P), COVARIANCE, None, ("8 data", "8 parameters")),
+        (DESIGN, COVARIANCE, P + 2, ("10 realizations", "11 realizations")),
+        (DESIGN, np.diag([1.0] * (P - 1) + [0.0]), None, ("datum 7",)),
+        (DESIGN, np.ones((P, P)), None, ("covariance", "definite")),
+        (DESIGN[:, [0, 0]], COVARIANCE, None, ("parameters",)),
+        (0.0 * DESIGN, COVARIANCE, None, ("parameters",)),
     ],
 )
-def test_refusals(design, covariance, simulations, message):
-    with pytest.raises(InputError, match=message):
+def test_refusals(design, covariance, simulations, named):
+    with refused(*named):
         solve(DATA, design, covariance, simulations)
 
 

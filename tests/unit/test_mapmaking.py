@@ -7,7 +7,6 @@ import healpy
 import numpy as np
 import pytest
 
-from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import ScanModel
 from mcsim.instrument.scan.geometry import MapGrid
@@ -17,6 +16,7 @@ from mcsim.simulation import convolve, mapmaking, tod
 from mcsim.simulation.mapmaking import pairs
 from mcsim.simulation.mapmaking.solve import apply_normal
 from mcsim.sphere.sky import dipole_alm, gaussian_alm
+from refusals import refused
 
 # Two sides that are no mirror images, and rates that see the whole sky at nside 32 in 400,000 samples.
 SIDES = (LineOfSight("A", 70.5, 2.0), LineOfSight("B", 68.0, 177.0))
@@ -52,7 +52,7 @@ def beams() -> tuple[Beam, Beam]:
 
 def pointing_matrix(scan: mapmaking.DifferencingScan, x: float) -> np.ndarray:
     """P, dense, from the pointing of the model and healpy's pixels."""
-    first, last = tod.sample_range(MODEL, SIDES[0], scan.grid.time_range)
+    first, last = scan.grid.sample_range(MODEL, SIDES[0])
     matrix = np.zeros((last - first, scan.npix))
     for line, weight in zip((scan.side_a, scan.side_b), (1.0 + x, x - 1.0), strict=True):
         theta, phi, _ = pointing(MODEL, line, first, last - first, scan.grid.frame)
@@ -136,7 +136,7 @@ def test_pairs_are_computed_once(tmp_path, monkeypatch):
 def test_damaged_pairs_are_refused(tmp_path):
     mapmaking.prepare(MODEL, "D", SHORT, cache_dir=tmp_path)
     next(tmp_path.glob("*/partner.raw")).write_bytes(b"")
-    with pytest.raises(InputError, match="does not hold complete pairs"):
+    with refused(next(tmp_path.iterdir())):
         mapmaking.prepare(MODEL, "D", SHORT, cache_dir=tmp_path)
 
 
@@ -204,17 +204,17 @@ def test_right_hand_side_is_the_sum_over_samples(scan, sky, beams):
     np.testing.assert_allclose(found[0], expected, atol=1e-9 * np.abs(expected).max())
 
 
-def test_maps_of_sides_are_the_time_ordered_reference_at_pixel_centres(scan, sky, beams, monkeypatch):
+def test_maps_of_sides_are_the_time_ordered_reference_at_pixel_centres(scan, sky, beams, rhs_from_samples, monkeypatch):
     monkeypatch.setattr(tod, "CHUNK", 3000)
     sides = tuple(mapmaking.side_maps(sky, convolve.response(beam, LMAX), NSIDE) for beam in beams)
     imbalance = mapmaking.Imbalance(0.04, 0.01)
     fast = mapmaking.rhs_from_maps(scan, [sides], imbalance, noise(3.0, 5))[0]
-    slow = mapmaking.rhs_from_samples(scan, signals(sky, beams), imbalance, noise(3.0, 5), at_pixel_centres=True)
+    slow = rhs_from_samples(scan, signals(sky, beams), imbalance, noise(3.0, 5), at_pixel_centres=True)
     np.testing.assert_allclose(fast, slow, atol=1e-9 * np.abs(slow).max())
 
 
 @pytest.mark.parametrize("side", [0, 1])
-def test_stages_belong_to_their_side(side, scan, sky, beams):
+def test_stages_belong_to_their_side(side, scan, sky, beams, rhs_from_samples):
     """A gain of 1.5 on one side is a beam 1.5 times as strong there."""
 
     def louder(stream):
@@ -223,9 +223,9 @@ def test_stages_belong_to_their_side(side, scan, sky, beams):
 
     stages = signals(sky, beams)
     stages[side].append(louder)
-    found = mapmaking.rhs_from_samples(scan, stages)
+    found = rhs_from_samples(scan, stages)
     scaled = tuple(Beam((1.5 if k == side else 1.0) * beam.blm) for k, beam in enumerate(beams))
-    expected = mapmaking.rhs_from_samples(scan, signals(sky, scaled))
+    expected = rhs_from_samples(scan, signals(sky, scaled))
     np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
 
 
@@ -301,55 +301,55 @@ def test_unseen_pixels_say_so(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "named"),
     [
-        ({"x": 1.0}, "imbalance is 1,"),
-        ({"rhs": np.zeros(5)}, r"right-hand side has shape \(5,\)"),
-        ({"rhs": np.full(192, np.nan)}, "right-hand side has values that are not finite"),
-        ({"start": np.zeros(5)}, r"starting map has shape \(5,\)"),
+        ({"x": 1.0}, ("imbalance", 1)),
+        ({"rhs": np.zeros(5)}, ("(5,)", "(192,)")),
+        ({"rhs": np.full(192, np.nan)}, ("right-hand", "finite")),
+        ({"start": np.zeros(5)}, ("map", "(5,)", "(192,)")),
     ],
 )
-def test_bad_input_to_the_solver_is_named(changes, message, scan):
-    with pytest.raises(InputError, match=message):
+def test_bad_input_to_the_solver_is_named(changes, named, scan):
+    with refused(*named):
         mapmaking.solve(**({"scan": scan, "rhs": np.zeros(scan.npix)} | changes))
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("make", "named"),
     [
-        (lambda: mapmaking.Imbalance(-1.5), "imbalance is -1.5"),
-        (lambda: mapmaking.Imbalance(0.0, 2.0), "imbalance is 2,"),
-        (lambda: noise(-1.0, 1), "noise per sample is -1"),
-        (lambda: noise(np.nan, 1), "noise per sample is nan"),
-        (lambda: mapmaking.StoppingRule(tol=0.0), "tol is 0,"),
-        (lambda: mapmaking.StoppingRule(max_iterations=-1), "max_iterations is -1"),
-        (lambda: MapGrid(3), "nside is 3"),
-        (lambda: MapGrid(4, "solar"), "frame is 'solar'"),
-        (lambda: MapGrid(4, time_range=(0.3, 0.1)), "time_range is"),
+        (lambda: mapmaking.Imbalance(-1.5), ("imbalance", -1.5)),
+        (lambda: mapmaking.Imbalance(0.0, 2.0), ("imbalance", 2)),
+        (lambda: noise(-1.0, 1), ("noise", "-1 uK")),
+        (lambda: noise(np.nan, 1), ("noise", "nan uK")),
+        (lambda: mapmaking.StoppingRule(tol=0.0), ("tol", 0)),
+        (lambda: mapmaking.StoppingRule(max_iterations=-1), ("max_iterations", -1)),
+        (lambda: MapGrid(3), ("nside", 3)),
+        (lambda: MapGrid(4, "solar"), ("frame", "solar")),
+        (lambda: MapGrid(4, time_range=(0.3, 0.1)), ("time_range", "(0.3, 0.1)")),
     ],
 )
-def test_bad_settings_are_named(make, message):
-    with pytest.raises(InputError, match=message):
+def test_bad_settings_are_named(make, named):
+    with refused(*named):
         make()
 
 
 def test_maps_of_another_nside_are_refused(scan):
-    with pytest.raises(InputError, match="have 12 pixels, but the scan has 192"):
+    with refused(12, 192):
         mapmaking.rhs_from_maps(scan, [(np.zeros((12, 1)), np.zeros((192, 1)))])
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "named"),
     [
-        ({"pair": "X"}, "no differencing pair 'X'"),
-        ({"grid": MapGrid(4, time_range=(0.0, 1e-9))}, "contains no sample"),
-        ({"cache_dir": "/dev/null/pairs"}, "cannot be written"),
+        ({"pair": "X"}, ("'X'", "D, R")),
+        ({"grid": MapGrid(4, time_range=(0.0, 1e-9))}, ("time_range", "(0, 1e-09)")),
+        ({"cache_dir": "/dev/null/pairs"}, ("/dev/null/pairs", "MCSIM_CACHE")),
         (
             {"model": replace(MODEL, lines_of_sight=(SIDES[0], replace(SIDES[1], sample_period_s=50.0)))},
-            "needs one rate",
+            ("78.9 s", "50 s", "sample_period_s"),
         ),
     ],
 )
-def test_bad_input_to_the_pairs_is_named(changes, message, tmp_path):
-    with pytest.raises(InputError, match=message):
+def test_bad_input_to_the_pairs_is_named(changes, named, tmp_path):
+    with refused(*named):
         mapmaking.prepare(**({"model": MODEL, "pair": "D", "grid": SHORT, "cache_dir": tmp_path} | changes))

@@ -12,7 +12,6 @@ from mcsim import bipolar
 from mcsim.bipolar import theory
 from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
-from mcsim.instrument.beams.turn import rotated
 from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.limit import limit_moments
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
@@ -20,6 +19,7 @@ from mcsim.instrument.scan.pointing import pointing
 from mcsim.simulation import convolve, rings, skies, tod
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import header, healpix, mask, rng, rotation, sky
+from refusals import refused
 
 LMAX, NSIDE = 16, 8
 MODEL = ScanModel("toy", 129.3, -3600.0, 22.5, 31557600.0, 2.0, 0.2, (LineOfSight("A", 70.5),), ("A",))
@@ -87,13 +87,9 @@ WRONG = {
     "analysis: two maps": lambda: healpix.analysis(np.stack([MAP, MAP]), LMAX),
     "pixel_window: nside": lambda: healpix.pixel_window(12, LMAX),
     "rotate_alm: another lmax": lambda: rotation.rotate_alm(BIGGER, LMAX, "galactic", "ecliptic"),
-    "rotate_map: not all pixels": lambda: rotation.rotate_map(MAP[:-1], "galactic", "ecliptic"),
     "rotate_pixels: not all pixels": lambda: rotation.rotate_pixels(MAP[:-1], "galactic", "ecliptic"),
     "rotate_pixels: frame": lambda: rotation.rotate_pixels(MAP, "G", "ecliptic"),
     "rotate_biposh: modes": lambda: rotation.rotate_biposh(np.zeros((3, 9), complex), MODES, "galactic", "ecliptic"),
-    "rotate_orientation_harmonics: shape": lambda: rotation.rotate_orientation_harmonics(
-        np.zeros((2, 3, 3), complex), "galactic", "ecliptic"
-    ),
     "gaussian_alm: negative": lambda: sky.gaussian_alm(-CL, np.random.default_rng(1)),
     "gaussian_alm: NaN": lambda: sky.gaussian_alm(np.nan * CL, np.random.default_rng(1)),
     "gaussian_alm: two spectra": lambda: sky.gaussian_alm(np.stack([CL, CL]), np.random.default_rng(1)),
@@ -132,7 +128,7 @@ WRONG = {
     "ScanModel: year in days": lambda: replace(MODEL, orbit_period_s=365.25),
     "ScanModel: negative angle": lambda: replace(MODEL, precession_angle_deg=-22.5),
     "with_sampling: zero": lambda: MODEL.with_sampling(0.0),
-    "rotated: degrees": lambda: rotated(BEAM, 45.0),
+    "rotated: degrees": lambda: BEAM.rotated(45.0),
     "pointing: negative": lambda: pointing(MODEL, MODEL.lines_of_sight[0], -1, 5),
     "parallel_transport: NaN": lambda: scan.Moments.parallel_transport(NSIDE, np.nan),
     "parallel_transport: exchanged": lambda: scan.Moments.parallel_transport(45.0, NSIDE),
@@ -229,13 +225,13 @@ def test_brightness_becomes_temperature(unit):
 
 @pytest.mark.parametrize("unit", ["uK_RJ", "K_RJ", "mK,antenna", "MJy/sr"])
 def test_antenna_temperature_needs_a_frequency(unit):
-    with pytest.raises(InputError, match="frequency_ghz"):
+    with refused("frequency_ghz"):
         header.to_uk(unit, PATH)
 
 
 @pytest.mark.parametrize("unit", ["Jy", "uK^2", "V", "counts", "dT/T", "K/K", "m", "%", "y_SZ", "MK2", "Kcmx", "s"])
 def test_units_of_something_else_are_refused(unit):
-    with pytest.raises(InputError, match=r"map\.fits"):
+    with refused("map.fits"):
         header.to_uk(unit, PATH, 94.0)
 
 
@@ -254,7 +250,7 @@ def test_frames_of_headers(word, frame):
 
 
 def test_unknown_frame_is_refused():
-    with pytest.raises(InputError, match="HELIO"):
+    with refused("COORDSYS", "HELIO"):
         header.frame_named("HELIO", "map.fits")
 
 
@@ -281,7 +277,7 @@ def test_maps_of_both_orders_and_explicit_pixels(tmp_path):
 
 @pytest.mark.parametrize("keywords", [{"ORDERING": None}, {"ORDERING": "UPWARDS"}, {"COORDSYS": "X"}])
 def test_maps_that_do_not_say_what_they_are(tmp_path, keywords):
-    with pytest.raises(InputError, match=next(iter(keywords))):
+    with refused(next(iter(keywords))):
         healpix.read_map(write_map(tmp_path / "map.fits", **keywords))
 
 
@@ -295,13 +291,13 @@ def test_sky_maps(tmp_path):
     expected = skies.read_map(write_map(path), LMAX, "ecliptic")
     found = skies.read_map(write_map(path, TUNIT1="K_RJ"), LMAX, "ecliptic", frequency_ghz=94.0)
     np.testing.assert_allclose(found, 1e6 * antenna(94.0) * expected, rtol=1e-6, atol=1e-9)
-    for keywords, values, name in (
-        ({"TUNIT1": "K_RJ"}, MAP, "frequency_ghz"),
-        ({"COORDSYS": "G"}, MAP, "galactic"),
-        ({"TUNIT1": None}, 1e-6 * MAP, "is it in K"),
-        ({}, UNSEEN, "unseen"),
+    for keywords, values, named in (
+        ({"TUNIT1": "K_RJ"}, MAP, ("frequency_ghz",)),
+        ({"COORDSYS": "G"}, MAP, ("galactic",)),
+        ({"TUNIT1": None}, 1e-6 * MAP, (0.01, "TUNIT")),
+        ({}, UNSEEN, ("unseen",)),
     ):
-        with pytest.raises(InputError, match=name):
+        with refused(*named):
             skies.read_map(write_map(path, values, **keywords), LMAX, "ecliptic")
 
 
@@ -318,15 +314,15 @@ def test_sky_alm(tmp_path):
     np.testing.assert_allclose(skies.read_alm(written(ALM, TUNIT2="mK"), LMAX, "ecliptic"), 1e3 * ALM)
     np.testing.assert_array_equal(skies.read_alm(written(0.0 * ALM), LMAX, "ecliptic"), 0.0 * ALM)
     turned = np.where(np.arange(ALM.size) <= LMAX, 1j, 1.0) * ALM
-    for alm, keywords, name in (
-        (SMALLER, {}, "up to l = 8"),
-        (HOLED, {}, "not finite"),
-        (1e-6 * ALM, {}, "is it in K"),
-        (turned, {}, "complex a_l0"),
-        (ALM, {"COORDSYS": "G"}, "galactic"),
-        (ALM, {"TUNIT2": "Jy"}, "Jy"),
+    for alm, keywords, named in (
+        (SMALLER, {}, ("l = 8", 16)),
+        (HOLED, {}, ("finite",)),
+        (1e-6 * ALM, {}, (0.01, "TUNIT")),
+        (turned, {}, ("a_l0", "complex")),
+        (ALM, {"COORDSYS": "G"}, ("galactic",)),
+        (ALM, {"TUNIT2": "Jy"}, ("Jy",)),
     ):
-        with pytest.raises(InputError, match=name):
+        with refused("alm.fits", *named):
             skies.read_alm(written(alm, **keywords), LMAX, "ecliptic")
 
 
@@ -338,15 +334,15 @@ def test_masks(tmp_path):
     healpy.write_map(nested, healpy.reorder(half, r2n=True), nest=True, dtype=np.float64, coord="E")
     np.testing.assert_array_equal(mask.read_mask(nested, NSIDE), half)
     for values, keywords, name in (
-        (100.0 * half, {}, "outside 0"),
-        (np.where(half > 0, 1.0, healpy.UNSEEN), {}, "outside 0"),
-        (np.where(half > 0, 1.0, np.nan), {}, "outside 0"),
+        (100.0 * half, {}, "0 ... 1"),
+        (np.where(half > 0, 1.0, healpy.UNSEEN), {}, "0 ... 1"),
+        (np.where(half > 0, 1.0, np.nan), {}, "0 ... 1"),
         (half, {"ORDERING": None}, "ORDERING"),
         (half, {"COORDSYS": "HORIZON"}, "HORIZON"),
     ):
-        with pytest.raises(InputError, match=name):
+        with refused("mask.fits", name):
             mask.read_mask(write_map(path, values, **keywords), NSIDE)
-    with pytest.raises(InputError, match="nside"):
+    with refused("nside", 12):
         mask.read_mask(write_map(path, half), 12)
 
 
@@ -372,5 +368,5 @@ def test_pixel_windows(tmp_path):
         (np.nan * window, NSIDE),
         (np.arange(LMAX + 1.0), NSIDE),
     ):
-        with pytest.raises(InputError, match=r"window\.fits"):
+        with refused("window.fits"):
             healpix.read_pixel_window(written(bad, nside), LMAX, NSIDE)

@@ -10,8 +10,7 @@ from wignernj import wigner3j
 
 from mcsim.bipolar.modes import existing
 from mcsim.bipolar.theory.beam_biposh import ScannedBeam, beam_biposh
-from mcsim.bipolar.theory.cmb_biposh import cmb_biposh_leading
-from mcsim.bipolar.theory.exact import cmb_biposh_exact
+from mcsim.bipolar.theory.cmb_biposh import cmb_biposh_exact, cmb_biposh_leading
 
 LMAX, MMAX = 6, 4
 CL = 1.0 / (1.0 + np.arange(LMAX + 1)) ** 2

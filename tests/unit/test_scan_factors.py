@@ -4,11 +4,11 @@ import healpy
 import numpy as np
 import pytest
 
-from mcsim.errors import InputError
 from mcsim.instrument.scan import Moments, ScanModel
 from mcsim.instrument.scan.factors import latitude_means, limit_factors, ring_means, scan_factors, sky_means, summary
 from mcsim.instrument.scan.limit import limit_moments
 from mcsim.plot.scan import scan_figure
+from refusals import refused
 
 WMAP = ScanModel.load(Path(__file__).parents[2] / "scan_models" / "wmap.toml")
 NSIDE = 64
@@ -108,11 +108,11 @@ def test_summary_says_what_each_number_is(year):
 def test_what_cannot_be_answered_is_refused(year):
     short = Moments(year.nside, year.frame, year.hits, year.w[:1])
     for function in (scan_factors, scan_figure):
-        with pytest.raises(InputError, match="end at s = 1"):
+        with refused("s = 1", "s = 2", "smax"):
             function(short)
-    with pytest.raises(InputError, match="f_l is asked for at l = 1"):
+    with refused("f_l", "l = 1", "l >= 2"):
         scan_factors(year, (1, 2))
-    with pytest.raises(InputError, match="no hits at all"):
+    with refused("hits"):
         sky_means(Moments(1, "ecliptic", np.zeros(12), np.zeros((1, 12), dtype=complex)))
 
 

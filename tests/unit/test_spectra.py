@@ -9,6 +9,7 @@ from astropy.io import fits
 
 from mcsim.errors import InputError
 from mcsim.sphere import spectra
+from refusals import refused
 
 CL = np.array([0.0, 0.0, 1200.0, 557.0, 310.5])
 
@@ -80,33 +81,33 @@ def test_ascii_table_of_fits(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "named"),
     [
-        ("", "has no rows; give the two columns"),
-        ("# only a header\n", "has no rows"),
-        ("2 1\n3 1\n5 1\n", "no row for ell = 4; give every ell"),
-        ("3 1\n4 1\n5 1\n", "no row for ell = 2"),
-        ("2 1\n999999999999 1\n", "no row for ell = 3"),
-        ("2 1\n3 nan\n4 1\n", "C_l = nan at l = 3, which is not finite"),
-        ("2 1\n3 inf\n4 1\n", "C_l = inf at l = 3, which is not finite"),
-        ("2 1\n3 1\n4 -2.5\n", "C_l = -2.5 at l = 4, which is negative"),
-        ("2 1\n3 1\n", "ends at l = 3, but lmax = 4 is wanted; lower lmax"),
-        ("2 1\n2 1\n3 1\n4 1\n", r"line 2: '2 1' is not a row .* occurs once"),
-        ("2 1\n2.5 1\n", r"line 2: '2\.5 1' is not a row"),
-        ("-2 1\n", "line 1: '-2 1' is not a row"),
-        ("nan 1\n", "line 1: 'nan 1' is not a row"),
-        ("inf 1\n", "line 1: 'inf 1' is not a row"),
-        ("ell cl\n2 1\n", "line 1: 'ell cl' is not a row of the two columns"),
-        ("2 1000 3 4 5\n", "is not a row of the two columns"),
-        ("# ell D_ell\n2 1\n", "seems to hold D_l"),
-        ("# l Dl [uK^2]\n2 1\n", "seems to hold D_l"),
-        ("# l, l(l+1)C_l/2pi\n2 1\n", "seems to hold D_l"),
+        ("", ("cl.txt", "rows")),
+        ("# only a header\n", ("cl.txt", "rows")),
+        ("2 1\n3 1\n5 1\n", ("ell = 4",)),
+        ("3 1\n4 1\n5 1\n", ("ell = 2",)),
+        ("2 1\n999999999999 1\n", ("ell = 3",)),
+        ("2 1\n3 nan\n4 1\n", ("C_l", "nan", "l = 3")),
+        ("2 1\n3 inf\n4 1\n", ("C_l", "inf", "l = 3")),
+        ("2 1\n3 1\n4 -2.5\n", ("C_l", -2.5, "l = 4")),
+        ("2 1\n3 1\n", ("l = 3", "lmax", 4)),
+        ("2 1\n2 1\n3 1\n4 1\n", ("line 2", "'2 1'")),
+        ("2 1\n2.5 1\n", ("line 2", "'2.5 1'")),
+        ("-2 1\n", ("line 1", "'-2 1'")),
+        ("nan 1\n", ("line 1", "'nan 1'")),
+        ("inf 1\n", ("line 1", "'inf 1'")),
+        ("ell cl\n2 1\n", ("line 1", "ell")),
+        ("2 1000 3 4 5\n", ("line 1", "'2 1000 3 4 5'")),
+        ("# ell D_ell\n2 1\n", ("D_l",)),
+        ("# l Dl [uK^2]\n2 1\n", ("D_l",)),
+        ("# l, l(l+1)C_l/2pi\n2 1\n", ("D_l",)),
     ],
 )
-def test_wrong_text_tables(tmp_path, text, message):
+def test_wrong_text_tables(tmp_path, text, named):
     path = tmp_path / "cl.txt"
     path.write_text(text)
-    with pytest.raises(InputError, match=message):
+    with refused(*named):
         spectra.load(path, 4)
 
 
@@ -118,7 +119,7 @@ def test_binary_rubbish_and_broken_compression(tmp_path):
     ):
         path = tmp_path / name
         path.write_bytes(contents)
-        with pytest.raises(InputError, match="cannot be read as text"):
+        with refused(path):
             spectra.load(path, 2)
 
 
@@ -126,20 +127,20 @@ def test_binary_rubbish_and_broken_compression(tmp_path):
 def test_truncated_fits(tmp_path, kept):
     path = write_fits(tmp_path / "cl.fits", "uK^2", cl=np.ones(4000))
     path.write_bytes(path.read_bytes()[:kept])
-    with pytest.raises(InputError, match="cannot be read as a FITS table"):
+    with refused("cl.fits"):
         spectra.load(path, 4)
 
 
 @pytest.mark.parametrize(
-    ("unit", "name", "message"),
+    ("unit", "name", "named"),
     [
-        ("Jy^2", "TT", r"has the unit 'Jy\^2'; convert it to uK\^2"),
-        ("uK", "TT", "unit 'uK'"),
-        ("uK^2", "D_ELL", "seems to hold D_l"),
+        ("Jy^2", "TT", ("'Jy^2'", "uK^2")),
+        ("uK", "TT", ("'uK'", "uK^2")),
+        ("uK^2", "D_ELL", ("D_l",)),
     ],
 )
-def test_wrong_fits_columns(tmp_path, unit, name, message):
-    with pytest.raises(InputError, match=message):
+def test_wrong_fits_columns(tmp_path, unit, name, named):
+    with refused(*named):
         spectra.load(write_fits(tmp_path / "cl.fits", unit, name), 4)
 
 
@@ -173,27 +174,27 @@ def test_units_of_text_tables(tmp_path, header, factor):
 
 
 @pytest.mark.parametrize(
-    ("table", "header", "message"),
+    ("table", "header", "named"),
     [
-        (1e-12 * LCDM, "", "convert it to uK"),
-        (1e-12 * LCDM, "ell C_ell [uK^2]", "convert it to uK"),
-        (1e-6 * LCDM, "", "convert it to uK"),
-        (1e6 * LCDM, "", "convert it to uK"),
-        (LCDM, "ell C_ell [K^2]", "convert it to uK"),
-        (D_L, "", "seems to hold D_l"),
-        (D_L[:31], "", "seems to hold D_l"),
-        (1e-12 * D_L, "", "convert it to uK"),
-        (LCDM, "l DlTT", "seems to hold D_l"),
-        (LCDM, "l D_l_TT", "seems to hold D_l"),
-        (LCDM, "l TT, dimensionless", "dimensionless"),
-        (LCDM, "C_l in uK^2, was K^2", "several units"),
-        (LCDM, "C_l in uK_RJ^2", "unit"),
-        (LCDM, "C_l in mK antenna ^2", "unit"),
+        (1e-12 * LCDM, "", ("uK^2", "TUNIT1")),
+        (1e-12 * LCDM, "ell C_ell [uK^2]", ("uK^2", "TUNIT1")),
+        (1e-6 * LCDM, "", ("uK^2", "TUNIT1")),
+        (1e6 * LCDM, "", ("uK^2", "TUNIT1")),
+        (LCDM, "ell C_ell [K^2]", ("uK^2", "TUNIT1")),
+        (D_L, "", ("D_l",)),
+        (D_L[:31], "", ("D_l",)),
+        (1e-12 * D_L, "", ("uK^2", "TUNIT1")),
+        (LCDM, "l DlTT", ("D_l",)),
+        (LCDM, "l D_l_TT", ("D_l",)),
+        (LCDM, "l TT, dimensionless", ("dimensionless",)),
+        (LCDM, "C_l in uK^2, was K^2", ("units",)),
+        (LCDM, "C_l in uK_RJ^2", ("unit", "uK^2")),
+        (LCDM, "C_l in mK antenna ^2", ("unit", "uK^2")),
     ],
 )
-def test_tables_in_other_units_or_of_d_l(tmp_path, table, header, message):
+def test_tables_in_other_units_or_of_d_l(tmp_path, table, header, named):
     path = write_text(tmp_path / "cl.txt", table, header)
-    with pytest.raises(InputError, match=message):
+    with refused(*named):
         spectra.load(path, 20)
     with pytest.raises(InputError):
         spectra.load(write_fits(tmp_path / "cl.fits", cl=table) if not header else path, 20)
@@ -222,7 +223,7 @@ def test_other_skies_are_accepted(tmp_path, table, header):
 @pytest.mark.parametrize(("table", "header"), [(100.0 + 0.0 * ELL, ""), (D_L, "ell C_ell [uK^2]")])
 def test_a_table_that_may_be_d_l_is_taken_with_a_warning(tmp_path, table, header):
     path = write_text(tmp_path / "cl.txt", table, header)
-    with pytest.warns(UserWarning, match="seems to hold D_l"):
+    with pytest.warns(UserWarning, match="D_l"):
         found = spectra.load(path, 5)
     np.testing.assert_allclose(found[2:], table[2:6], rtol=1e-8)
 
@@ -239,16 +240,16 @@ def test_fits_with_a_column_of_ell(tmp_path):
 
 
 def test_fits_that_starts_at_the_quadrupole(tmp_path):
-    with pytest.raises(InputError, match="start at ell = 2"):
+    with refused("ell = 2"):
         spectra.load(write_fits(tmp_path / "cl.fits", "uK^2", cl=LCDM[2:]), 20)
 
 
 def test_lmax_is_whole():
     for lmax in (-3, 2.5):
-        with pytest.raises(InputError, match="lmax"):
+        with refused("lmax"):
             spectra.load("wmap7", lmax)
 
 
 def test_missing_file_lists_the_packaged_names(tmp_path):
-    with pytest.raises(InputError, match="one of: planck2018, wmap7"):
+    with refused("none.txt", "planck2018", "wmap7"):
         spectra.load(tmp_path / "none.txt", 4)

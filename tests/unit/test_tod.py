@@ -8,7 +8,6 @@ import healpy
 import numpy as np
 import pytest
 
-from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import ScanModel
 from mcsim.instrument.scan.geometry import MapGrid
@@ -17,6 +16,7 @@ from mcsim.instrument.scan.pointing import pointing
 from mcsim.simulation import tod
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.sky import dipole_alm, gaussian_alm
+from refusals import refused
 
 LINE = LineOfSight("A", 70.5, 12.0)
 MODEL = ScanModel("toy", 129.3, -3600.0, 22.5, 31557600.0, 11.0, 10.0, (LINE,), ("A",))
@@ -165,28 +165,28 @@ def test_stages_act_where_they_are_put(sky, beam, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "named"),
     [
-        ({"time_range": (0.5, 0.5)}, r"time_range is \(0.5, 0.5\)"),
-        ({"time_range": (0.0, 1e-9)}, "contains no sample"),
-        ({"nside": 12}, "nside is 12"),
-        ({"frame": "solar"}, "frame is 'solar'"),
+        ({"time_range": (0.5, 0.5)}, ("time_range", "(0.5, 0.5)")),
+        ({"time_range": (0.0, 1e-9)}, ("time_range", "(0, 1e-09)")),
+        ({"nside": 12}, ("nside", 12)),
+        ({"frame": "solar"}, ("frame", "solar")),
     ],
 )
-def test_bad_grids_are_named(changes, message):
-    with pytest.raises(InputError, match=message):
+def test_bad_grids_are_named(changes, named):
+    with refused(*named):
         tod.observe(MODEL, LINE, MapGrid(**({"nside": NSIDE} | changes)), [])
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
-    [({"lmax": 30}, "lmax = 30"), ({"beam": Beam.gaussian(900.0, 20)}, "ends at l = 20")],
+    ("changes", "named"),
+    [({"lmax": 30}, ("lmax", 30, "(861,)", "(496,)")), ({"beam": Beam.gaussian(900.0, 20)}, ("l = 20", "lmax", 40))],
 )
-def test_skies_and_beams_that_do_not_fit_are_named(changes, message, sky, beam):
-    with pytest.raises(InputError, match=message):
+def test_skies_and_beams_that_do_not_fit_are_named(changes, named, sky, beam):
+    with refused(*named):
         tod.sky_signal(**({"alm": sky, "lmax": LMAX, "beam": beam} | changes))
 
 
 def test_dipole_needs_its_degree():
-    with pytest.raises(InputError, match="lmax of a dipole is 0"):
+    with refused("lmax", 0):
         dipole_alm([0.0, 0.0, 1.0], 0)

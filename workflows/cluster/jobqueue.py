@@ -27,7 +27,7 @@ def main() -> int:
     with kind() as cluster, Client(cluster) as client:
         cluster.adapt(minimum_jobs=1, maximum_jobs=chosen.jobs)
         client.wait_for_workers(1)
-        result = mcsim.run(chosen.config, chosen.store, client=client, quiet=False)
+        result = mcsim.run(chosen.config, chosen.store, workers=client, quiet=False)
     for failure in result.failures:
         print(f"realization {failure.realization} failed: {failure.reason}", file=sys.stderr)
     return int(bool(result.failures))

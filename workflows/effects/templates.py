@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.diagnosis.analysis import Job, analysis_of, data_vectors
 from mcsim.diagnosis.api import prepared
-from mcsim.diagnosis.batch import asking, batch
-from mcsim.diagnosis.campaign import seeded, with_effects
+from mcsim.diagnosis.campaign import asking, batch, seeded, with_effects
+from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.systematics import Effect
 
 SEED = 20121026
@@ -36,16 +36,17 @@ def main() -> None:
     parser.add_argument("--simulations", type=int, help="as given to mcsim diagnose")
     arguments = parser.parse_args()
     run = config.load(arguments.model)
-    analysis = analysis_of(run, nthreads=os.cpu_count() or 1)
+    settings = DiagnosisSettings(simulations=arguments.simulations)
+    analysis = analysis_of(run, nthreads=os.cpu_count() or 1, settings=settings)
     with batch(run.compute.workers) as call, asking(call, quiet=False) as ask:
-        null = prepared(run, analysis, ask, arguments.simulations).null
+        null = prepared(run, analysis, ask).null
     plain = seeded(run, SEED)
     quiet = replace(plain, channels=tuple(replace(channel, noise=config.Noise()) for channel in plain.channels))
     fiducial = config.to_json(run)
 
     def seen(found: Sequence[config.Effect], samples: bool) -> NDArray[np.float64]:
         answer: NDArray[np.float64] = data_vectors(
-            Job(fiducial, config.to_json(with_effects(quiet, found)), 0, 1, samples)
+            Job(fiducial, config.to_json(with_effects(quiet, found)), 0, 1, samples, settings=settings)
         )[0]
         return answer
 
@@ -53,16 +54,16 @@ def main() -> None:
     channel = arguments.channel or run.channels[-1].name
     for candidate in analysis.candidates:
         kind = candidate.effect
-        wanted = kind.name in arguments.effects if arguments.effects else not kind.stochastic
+        wanted = kind.name in arguments.effects if arguments.effects else not kind.parametrization.stochastic
         if not wanted or kind.noise is not Effect.noise or candidate.channel not in (None, channel):
             continue
         for number, basis in enumerate(candidate.basis):
             # An effect of one sign is the whole of it, as pixelization is.
-            effect = basis.scaled(STEPS) if kind.sign == 0 and STEPS * basis.amplitude < 1.0 else basis
+            effect = basis.scaled(STEPS) if kind.parametrization.sign == 0 and STEPS * basis.amplitude < 1.0 else basis
             changes = []
             for samples in (False, True):
                 up = seen([candidate.table(effect)], samples)
-                down = seen([candidate.table(effect.scaled(-1.0))], samples) if kind.sign == 0 else None
+                down = seen([candidate.table(effect.scaled(-1.0))], samples) if kind.parametrization.sign == 0 else None
                 change = up - without[samples] if down is None else 0.5 * (up - down)
                 changes.append(null.whiten_templates(change[:, None])[:, 0])
             default, time_ordered = changes

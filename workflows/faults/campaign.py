@@ -99,7 +99,7 @@ def drive(path: Path, scheduler: str | None, answer: Path, resume: bool, workers
         os.dup2(sink, 1)
         os.dup2(sink, 2)
         try:
-            result = runner.run(configuration(), path, resume=resume, scheduler=scheduler, workers=workers)
+            result = runner.run(configuration(), path, resume=resume, workers=scheduler or workers)
             found = {
                 "computed": result.computed,
                 "finished": result.finished,

@@ -59,18 +59,18 @@ def against_samples(nside: int, period_s: float) -> None:
 
 def against_the_limit() -> None:
     """Ring means and pixel scatter of streamed w_2 against the exact limit, by sampling and by duration."""
-    model = scan.ScanModel.load("wmap")
+    model = scan.ScanModel.load("wmap").with_lines_of_sight("A")
     start = time.perf_counter()
     theta = healpy.pix2ang(LIMIT_NSIDE, np.arange(12 * LIMIT_NSIDE**2))[0]
     colatitude, rings = np.unique(np.round(theta, 10), return_inverse=True)
-    exact = scan.limit_moments(model, colatitude, 2, "A")[1][1].real
+    exact = scan.limit_moments(model, colatitude, 2)[1][1].real
     print(f"limit at nside {LIMIT_NSIDE}: {time.perf_counter() - start:.3f} s")
     wide = over_pixels(model, rings)
-    distance = np.min(np.abs(colatitude[:, None] - caustics(model, "A")), axis=1)
+    distance = np.min(np.abs(colatitude[:, None] - caustics(model)), axis=1)
     for period, years in ((3.2, 1), (0.4, 1), (0.1, 0.25), (0.1, 1), (0.1, 4), (0.0512, 1)):
         start = time.perf_counter()
         scanned = replace(model.with_sampling(period), duration_days=365.25 * years)
-        moments = scan.Moments.from_model(scanned.with_lines_of_sight("A"), LIMIT_NSIDE, 2, nthreads=2)
+        moments = scan.Moments.from_model(scanned, LIMIT_NSIDE, 2, nthreads=2)
         took = time.perf_counter() - start
         w = moments.w[1].real
         mean = np.bincount(rings, moments.hits * w) / np.maximum(np.bincount(rings, moments.hits), 1)
@@ -91,7 +91,7 @@ def over_pixels(model: scan.ScanModel, rings: np.ndarray) -> np.ndarray:
     fine = LIMIT_NSIDE * PARTS
     pixel = np.arange(12 * fine**2)
     colatitude, row = np.unique(np.round(healpy.pix2ang(fine, pixel, nest=True)[0], 10), return_inverse=True)
-    density, w = scan.limit_moments(model, colatitude, 2, "A")
+    density, w = scan.limit_moments(model, colatitude, 2)
     parent = rings[healpy.nest2ring(LIMIT_NSIDE, pixel // PARTS**2)]
     return np.bincount(parent, (density * w[1].real)[row]) / np.bincount(parent, density[row])
 

@@ -27,8 +27,8 @@ AMPLITUDE_UK, LONGITUDE_DEG, LATITUDE_DEG = 3364.5, 263.99, 48.26
 def leaked_map(shared: Survey, channel: Channel, sky: np.ndarray) -> np.ndarray:
     """Return what the non-circular part of the beam adds to the map of the dipole, uK."""
     if channel.side_b is not None:
-        ((_, solved),) = differencing.maps(channel, sky, None, seed=0, realization=0, nthreads=2)
-        return solved.difference
+        ((_, _, difference),) = differencing.maps(channel, sky, None, seed=0, realization=0, nthreads=2)
+        return difference
     spins = convolve.spin_maps(sky, channel.response, channel.site.nside, nthreads=2)
     return convolve.noncircular_map(spins, channel.maps[0].moments)
 

@@ -66,7 +66,7 @@ def straight_line(part: np.ndarray, whole: np.ndarray, ell: np.ndarray) -> tuple
 def factors() -> dict[float, str]:
     """What the paper calls ~0.45, three numbers, in the limit of a long survey with the lines of sight of W1."""
     model = scan.ScanModel.load("wmap_focal_plane")
-    sides = [scan.limit_factors(model, line_of_sight=line) for line in ("W1A", "W1B")]
+    sides = [scan.limit_factors(model.with_lines_of_sight(line)) for line in ("W1A", "W1B")]
     return {
         float(np.mean([sign.quadrupole_ratio for sign in sides])): "mean of $w_2$ that A$^{20}$ sees",
         float(np.mean([sign.sky_mean for sign in sides])): "sky mean of $w_2$",

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 import mcsim
+from mcsim.diagnosis.settings import DiagnosisSettings
 
 HERE = Path(__file__).parent
 TOLERANCE = 1e-9
@@ -158,9 +159,9 @@ def verdict(name: str, folder: Path) -> dict[str, Any]:
     mcsim.run(data | ({"effect": effects} if effects else {}), folder / f"data-{name}.zarr")
     with mcsim.open_ensemble(folder / f"data-{name}.zarr") as opened:
         maps = list(opened[next(str(key) for key in opened.data_vars if "map" in str(key))].values[0])
-    left_out = [effect for effect in mcsim.effects() if effect not in proposed]
+    left_out = tuple(effect for effect in mcsim.effects() if effect not in proposed)
     out = folder / f"out-{name}"
-    mcsim.diagnose(MODEL, maps, out, case=name, without=left_out, simulations=260, workers=2)
+    mcsim.diagnose(MODEL, maps, out, case=name, settings=DiagnosisSettings(without=left_out, simulations=260))
     found: dict[str, Any] = json.loads((out / "verdict.json").read_text())
     return found
 

@@ -65,7 +65,7 @@ def sub_pixels(nside: int, pixel: np.ndarray) -> np.ndarray:
 def density(model: ScanModel, lines: tuple[str, ...], theta: np.ndarray) -> np.ndarray:
     """Hits per solid angle over their sky mean in the limit of endless time, mean of lines of sight and sub-pixels."""
     table = np.linspace(theta.min(), theta.max(), 20_001)
-    hits = np.mean([scan.limit_moments(model, table, 1, line)[0] for line in lines], axis=0)
+    hits = np.mean([scan.limit_moments(model.with_lines_of_sight(line), table, 1)[0] for line in lines], axis=0)
     return np.asarray(np.interp(theta, table, hits)).mean(axis=1)
 
 

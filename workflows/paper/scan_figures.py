@@ -15,7 +15,7 @@ SAMPLE_PERIOD_S = 0.2048
 def moments() -> tuple[scan.ScanModel, scan.Moments]:
     """Scan model and one year of its orientation moments, from the cache where they are there already."""
     model = scan.ScanModel.load("wmap").with_sampling(SAMPLE_PERIOD_S)
-    folder = scan.cached_moments(model, NSIDE, 2, nthreads=2)
+    folder = scan.cached_moments(model, scan.MapGrid(NSIDE), 2, nthreads=2)
     return model, scan.Moments.load(folder)
 
 

@@ -91,7 +91,7 @@ def reference(path: Path) -> NDArray[np.float64]:
 def orientations() -> NDArray[np.complex128]:
     """w_{s,LM} of one year of the Planck-like scan, ecliptic."""
     model = scan.ScanModel.load("planck").with_sampling(SAMPLE_PERIOD_S)
-    moments = scan.Moments.load(scan.cached_moments(model, NSIDE, 2, nthreads=2))
+    moments = scan.Moments.load(scan.cached_moments(model, scan.MapGrid(NSIDE), 2, nthreads=2))
     print(f"scan: BipoSH factor over parallel transport {scan.scan_factors(moments).quadrupole_ratio:.3f}")
     return orientation_harmonics(np.asarray(moments.w), 2)
 

@@ -20,7 +20,7 @@ from scipy import stats
 import mcsim
 from mcsim.diagnosis.analysis import analysis_of, data_vectors
 from mcsim.diagnosis.api import prepared
-from mcsim.diagnosis.batch import asking, batch
+from mcsim.diagnosis.campaign import asking, batch
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.stats.look_elsewhere import global_test
@@ -102,7 +102,7 @@ def main() -> None:
     run = model(chosen.lmax or lmax)
     analysis = analysis_of(run, [name for name in mcsim.effects() if name not in PROPOSED])
     with batch(chosen.workers) as call, asking(call, False, data_vectors, "simulations of the model") as ask:
-        context = prepared(run, analysis, ask, None)
+        context = prepared(run, analysis, ask)
     groups = context.null.whiten_groups(context.templates, [one.columns for one in context.candidates])
     pvalues, omnibus, pulls = [], [], []
     for maps in skies(run, chosen.skies, chosen.seed):

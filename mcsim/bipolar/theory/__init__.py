@@ -5,9 +5,8 @@ each checks the other.
 """
 
 from mcsim.bipolar.theory.beam_biposh import ScannedBeam, beam_biposh
-from mcsim.bipolar.theory.cmb_biposh import cmb_biposh_leading, noise_biposh
+from mcsim.bipolar.theory.cmb_biposh import cmb_biposh_exact, cmb_biposh_leading, noise_biposh
 from mcsim.bipolar.theory.detectability import Spectra, fisher_information, isotropic_variance, signal_to_noise
-from mcsim.bipolar.theory.exact import cmb_biposh_exact
 from mcsim.bipolar.theory.harmonics import orientation_harmonics, parallel_transport_harmonics
 
 __all__ = [

@@ -62,10 +62,9 @@ class ScannedBeam:
     def response(self, lmax: int) -> NDArray[np.complex128]:
         """Return k_l b_ls for s = -smax..smax, shape (2 smax + 1, lmax + 1), zero beyond the beam's lmax."""
         top = min(lmax, self.blm.shape[1] - 1)
+        k = np.sqrt(4 * np.pi / (2.0 * np.arange(top + 1) + 1))
         positive = np.zeros((self.smax + 1, lmax + 1), dtype=np.complex128)
-        positive[:, : top + 1] = self.blm[: self.smax + 1, : top + 1] * np.sqrt(
-            4 * np.pi / (2.0 * np.arange(top + 1) + 1)
-        )
+        positive[:, : top + 1] = self.blm[: self.smax + 1, : top + 1] * k
         sign = (-1.0) ** np.arange(self.smax, 0, -1)
         return np.concatenate([sign[:, None] * positive[:0:-1].conj(), positive])
 
@@ -76,21 +75,9 @@ class ScannedBeam:
 
 
 def beam_biposh(beam: ScannedBeam, mode: Indices, lmax: int) -> NDArray[np.complex128]:
-    """Return B^{LM}_{l1 l2} of a beam under any scan.
+    """Return B^{LM}_{l2-d, l2} of a beam under any scan at l2 = 0..lmax, complex, NaN where it does not exist.
 
-    Parameters
-    ----------
-    beam
-        Beam and orientation moments.
-    mode
-        (L, M, d), with d = l2 - l1 of either sign and any |M| <= L.
-    lmax
-        Highest l1 and l2.
-
-    Returns
-    -------
-    ndarray
-        B^{LM}_{l2-d, l2} at l2 = 0..lmax, complex, NaN where it does not exist.
+    The mode is (L, M, d), with d = l2 - l1 of either sign and any |M| <= L; lmax is the highest l1 and l2.
 
     Raises
     ------

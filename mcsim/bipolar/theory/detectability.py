@@ -12,14 +12,9 @@ from mcsim.sphere.checks import check_cl, check_shape
 
 
 class Spectra(NamedTuple):
-    """Total power spectra of a map X, or of a pair X, Y, uK^2.
+    """Total power spectra of a map X, or of a pair X, Y: beam^2 signal + noise, uK^2, shape (lmax + 1,).
 
-    Attributes
-    ----------
-    x, y
-        Beam^2 signal + noise of the maps, shape (lmax + 1,); for one map leave out ``y`` and ``cross``.
-    cross
-        C_l^{XY}, shape (lmax + 1,).
+    ``cross`` is C_l^{XY}; for one map leave out ``y`` and ``cross``.
     """
 
     x: NDArray[np.float64]
@@ -28,19 +23,9 @@ class Spectra(NamedTuple):
 
 
 def isotropic_variance(modes: Sequence[Indices], spectra: Spectra) -> NDArray[np.float64]:
-    """Return E|A^{LM}_{l1 l2}|^2 of an isotropic sky.
+    """Return E|A^{LM}_{l1 l2}|^2 of an isotropic sky for modes (L, M, d), L > 0, of a map or a pair.
 
-    Parameters
-    ----------
-    modes
-        (L, M, d) each, L > 0.
-    spectra
-        Of the map or of the pair.
-
-    Returns
-    -------
-    ndarray
-        uK^4, shape (n_mode, lmax + 1), NaN where the mode does not exist.
+    In uK^4, shape (n_mode, lmax + 1), NaN where the mode does not exist.
 
     Notes
     -----
@@ -75,25 +60,10 @@ def signal_to_noise(
     f_sky: float = 1.0,
     ell_range: tuple[int, int] | None = None,
 ) -> NDArray[np.float64]:
-    """Return the signal to noise of each mode, summed over a range of ell.
+    """Return the signal to noise of each mode, shape (n_mode,), from the first to the last l2 of a range; default: all.
 
-    Parameters
-    ----------
-    biposh
-        Expected A^{LM}_{l1 l2} in uK^2 (Hajian-Souradeep), shape (n_mode, lmax + 1).
-    modes
-        (L, M, d) of each row, L > 0, M >= 0.
-    spectra
-        Of the map or of the pair.
-    f_sky
-        Observed fraction of the sky, 0 < f_sky <= 1.
-    ell_range
-        First and last l2; all by default.
-
-    Returns
-    -------
-    ndarray
-        Shape (n_mode,). M > 0 includes its mirror -M.
+    ``biposh`` is the expected A^{LM}_{l1 l2} in uK^2 (Hajian-Souradeep), shape (n_mode, lmax + 1), of the modes (L, M,
+    d), L > 0, M >= 0; M > 0 includes its mirror -M. ``f_sky`` is the observed fraction of the sky, 0 < f_sky <= 1.
 
     Notes
     -----
@@ -119,23 +89,11 @@ def fisher_information(
 ) -> float:
     """Return the information 1/2 Tr[C^-1 dC C^-1 dC] of a BipoSH signal in all maps jointly.
 
-    Parameters
-    ----------
-    biposh
-        dA^{LM}_{l1 l2} of every ordered pair of maps per unit of the parameter, uK^2, shape (n_map, n_map, n_mode,
-        lmax + 1).
-    modes
-        (L, M, d) with M >= 0 and d >= 0: d < 0 belongs to the exchanged pair. L = 0 is the part of C_l.
-    cl_total
-        Total spectra and cross-spectra of the maps, uK^2, shape (n_map, n_map, lmax + 1); degrees where this is
-        singular (such as l = 0, 1 without power) are left out.
-    f_sky
-        Observed fraction of the sky.
-
-    Returns
-    -------
-    float
-        1/variance of the best unbiased estimate of a small amplitude.
+    It is 1/variance of the best unbiased estimate of a small amplitude. ``biposh`` holds dA^{LM}_{l1 l2} of every
+    ordered pair of maps per unit of the parameter, uK^2, shape (n_map, n_map, n_mode, lmax + 1); the modes (L, M, d)
+    have M >= 0 and d >= 0: d < 0 belongs to the exchanged pair, L = 0 is the part of C_l. ``cl_total`` are the total
+    spectra and cross-spectra of the maps, uK^2, shape (n_map, n_map, lmax + 1); degrees where this is singular (such as
+    l = 0, 1 without power) are left out.
 
     Raises
     ------
@@ -153,9 +111,8 @@ def fisher_information(
     for L, M, d in modes:
         if M < 0 or d < 0:
             raise InputError(f"mode L={L}, M={M}, d={d} repeats information of M >= 0, d >= 0; leave it out.")
-    n_map = len(cl_total)
-    check_shape(cl_total, (n_map, n_map, cl_total.shape[-1]), "cl_total")
-    check_shape(biposh, (n_map, n_map, len(modes), cl_total.shape[-1]), "biposh")
+    n_map, lmax = len(cl_total), cl_total.shape[-1] - 1
+    check_shape(cl_total, (n_map, n_map, lmax + 1), "cl_total")
     spectra = np.moveaxis(cl_total, -1, 0)
     inverse = np.zeros_like(spectra)
     diagonal = np.einsum("lxx->lx", spectra)
@@ -166,7 +123,6 @@ def fisher_information(
     usable, scale, correlation = usable[regular], scale[regular], correlation[regular]
     inverse[usable] = np.linalg.inv(correlation) / (scale[:, :, None] * scale[:, None, :])
     total = 0.0
-    lmax = cl_total.shape[-1] - 1
     for i, (L, M, d) in enumerate(modes):
         l2 = np.flatnonzero(existing(L, d, lmax))
         signal = np.moveaxis(biposh[:, :, i, l2], -1, 0)

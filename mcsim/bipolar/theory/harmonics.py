@@ -15,21 +15,9 @@ from mcsim.sphere.healpix import geometry
 
 
 def orientation_harmonics(w: NDArray[np.complex128], L_max: int, nthreads: int = 1) -> NDArray[np.complex128]:
-    """Return w_{s,LM} of moment maps, for every M.
+    """Return w_{s,LM} of moment maps, w_s(n) = <e^{-i s psi}> for s = 1..smax, HEALPix RING, shape (smax, npix).
 
-    Parameters
-    ----------
-    w
-        w_s(n) = <e^{-i s psi}> for s = 1..smax, HEALPix RING, shape (smax, npix).
-    L_max
-        Highest degree.
-    nthreads
-        Threads of the transforms.
-
-    Returns
-    -------
-    ndarray
-        Shape (smax + 1, L_max + 1, 2 L_max + 1), as the module describes; w_0 = 1 everywhere.
+    The moment w_0 is 1 everywhere.
 
     Raises
     ------
@@ -53,40 +41,17 @@ def orientation_harmonics(w: NDArray[np.complex128], L_max: int, nthreads: int =
     for s in range(1, min(smax, L_max) + 1):
         conjugate = np.stack([w[s - 1].real, -w[s - 1].imag]) * area
         gradient, curl = ducc0.sht.adjoint_synthesis(map=conjugate, spin=s, lmax=L_max, nthreads=nthreads, **grid)
-        _fill_spin(result[s], s, gradient, curl, L_max)
+        # w_{s,LM} = (-1)^{s+M} conj((conj w_s)_{L,-M}) from E and B of the spin-(+s) field conj(w_s).
+        for M in range(L_max + 1):
+            low, first = max(M, s), alm_.start(L_max, M)
+            span = slice(first + low, first + L_max + 1)
+            result[s, low:, L_max - M] = -((-1) ** (s + M)) * (gradient[span] + 1j * curl[span]).conj()
+            result[s, low:, L_max + M] = -((-1) ** s) * (gradient[span] - 1j * curl[span])
     return result
 
 
-def _fill_spin(
-    target: NDArray[np.complex128],
-    s: int,
-    gradient: NDArray[np.complex128],
-    curl: NDArray[np.complex128],
-    L_max: int,
-) -> None:
-    """Fill w_{s,LM} = (-1)^{s+M} conj((conj w_s)_{L,-M}) from E and B of the spin-(+s) field conj(w_s)."""
-    for M in range(L_max + 1):
-        low = max(M, s)
-        span = slice(alm_.start(L_max, M) + low, alm_.start(L_max, M) + L_max + 1)
-        sign = (-1) ** (s + M)
-        target[low:, L_max - M] = -sign * (gradient[span] + 1j * curl[span]).conj()
-        target[low:, L_max + M] = -((-1) ** s) * (gradient[span] - 1j * curl[span])
-
-
 def parallel_transport_harmonics(smax: int, L_max: int, psi0: float = 0.0) -> NDArray[np.complex128]:
-    """Return w_{s,L0} of w_s = e^{-i s psi0} everywhere, exactly.
-
-    Parameters
-    ----------
-    smax, L_max
-        Highest spin and degree.
-    psi0
-        The constant orientation in radians.
-
-    Returns
-    -------
-    ndarray
-        Shape (smax + 1, L_max + 1, 2 L_max + 1), as the module describes.
+    """Return w_{s,L0} of w_s = e^{-i s psi0} everywhere, psi0 in radians, exactly.
 
     Notes
     -----

@@ -4,7 +4,7 @@ import os
 from asyncio import CancelledError
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from distributed.comm.core import CommClosedError
 
 from mcsim import config
 from mcsim.ensemble import plan, repair, store, summary
-from mcsim.ensemble.layout import listed
+from mcsim.ensemble.layout import Layout, listed
 from mcsim.ensemble.lock import locked
 from mcsim.ensemble.runner.cluster import Roll, answers, death, local_client, remote_client
 from mcsim.ensemble.tasks import Failure, Job, packages, realize_chunk, summarise_node
@@ -45,9 +45,7 @@ def run(
     *,
     resume: bool = False,
     realizations: slice | None = None,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    client: Client | None = None,
+    workers: int | str | Client | None = None,
     quiet: bool = True,
 ) -> Result:
     """Run an ensemble, or continue or extend a stored one.
@@ -63,12 +61,9 @@ def run(
     realizations
         Compute only these; :func:`merge` joins such slices.
     workers
-        Processes of the local cluster; default: the configuration's.
-    scheduler
-        Address of a running scheduler, ``tcp://host:port`` (or ``tls://``, with the keys that Dask's configuration
-        names), whose workers share the file system.
-    client
-        An existing client, left open.
+        Number of processes of a local cluster; default: the configuration's. Or the address of a running scheduler,
+        ``tcp://host:port`` (or ``tls://``, with the keys that Dask's configuration names), whose workers share the file
+        system; or an existing ``distributed.Client``, which is left open.
     quiet
         Report no progress on standard error.
 
@@ -96,6 +91,8 @@ def run(
     >>> mcsim.run("tiny", "tiny.zarr").computed  # all is there already
     0
     """
+    if isinstance(workers, int) and workers < 1:
+        raise InputError(f"workers = {workers} is too small; give at least 1, or the address of a scheduler.")
     loaded = source if isinstance(source, config.RunConfig) else config.load(source)
     wanted = plan.wanted(loaded, realizations)
     target = Path(path) if path is not None else plan.default_store(loaded, realizations)
@@ -110,8 +107,8 @@ def run(
     config.check_skies(loaded, wanted)
     journal = Journal(target, quiet)
     with ExitStack() as stack:
-        if client is None and scheduler is not None:
-            client = stack.enter_context(remote_client(scheduler))
+        if isinstance(workers, str):
+            workers = stack.enter_context(remote_client(workers))
         with reporting("orientation moments", 1.0, "", quiet) as report:
             shared = survey(loaded, nthreads=os.cpu_count() or 1, progress=report)
         power.check(shared)
@@ -122,9 +119,9 @@ def run(
             _mend(target, shared, journal, quiet)
             if _finished(target, loaded, wanted):
                 return Result(target, int(store.done(target).sum()), 0, ())
-        if client is None:
-            client = stack.enter_context(local_client(workers or loaded.compute.workers))
-        return _run(client, shared, target, wanted, journal)
+        if not isinstance(workers, Client):
+            workers = stack.enter_context(local_client(workers or loaded.compute.workers))
+        return _run(workers, shared, target, wanted, journal)
 
 
 def _finished(target: Path, run: config.RunConfig, wanted: range) -> bool:
@@ -138,9 +135,8 @@ def _finished(target: Path, run: config.RunConfig, wanted: range) -> bool:
 @contextmanager
 def _written_down(journal: Journal, run: config.RunConfig, wanted: range) -> Iterator[None]:
     """Log the start and the end of a run."""
-    journal.write(
-        f"start: {run.name}, realizations {wanted.start} to {wanted.stop - 1}, mcsim {dict(packages())['mcsim']}"
-    )
+    what = f"{run.name}, realizations {wanted.start} to {wanted.stop - 1}"
+    journal.write(f"start: {what}, mcsim {dict(packages())['mcsim']}")
     try:
         yield
     except BaseException as error:
@@ -160,36 +156,30 @@ def _mend(target: Path, shared: Survey, journal: Journal, quiet: bool) -> None:
 
 def _run(client: Client, shared: Survey, target: Path, wanted: range, journal: Journal) -> Result:
     """Make or extend the store, compute what is missing, summarise."""
-    run = shared.config
+    run, layout = shared.config, plan.layout(shared)
     if not target.exists():
-        store.create(target, plan.layout(shared), plan.attributes(run))
+        store.create(target, layout, plan.attributes(run))
     plan.check_same(target, run)
-    if run.ensemble.realizations > store.size(target):
+    size, found = store.size(target), store.attributes(target)["configuration"]
+    if run.ensemble.realizations > size:
         store.extend(target, run.ensemble.realizations, plan.attributes(run))
-    found = store.attributes(target)["configuration"]
-    if found["biposh"]["summary_bin"] != run.biposh.summary_bin:
-        biposh = found["biposh"] | {"summary_bin": run.biposh.summary_bin}
-        store.amend(target, {"configuration": found | {"biposh": biposh}})
+    elif found["biposh"]["summary_bin"] != layout.bin_width:
+        biposh = found["biposh"] | {"summary_bin": layout.bin_width}
+        store.extend(target, size, {"configuration": found | {"biposh": biposh}})
+    layout = replace(layout, realizations=store.size(target), chunk=store.chunk(target))
     before = int(store.done(target).sum())
     try:
         roll = Roll(client, journal)
         failures = _simulate(roll, target, run, wanted, journal)
-        _summarise(roll, target, plan.recipe(shared), journal.quiet)
-    except KilledWorker as error:
-        raise RunError(
-            f"The summary cannot be made, for {death(error)}; what is finished is stored in {target}, and the same "
-            "command goes on."
-        ) from error
-    except (CancelledError, CommClosedError) as error:
-        raise RunError(
-            f"The connection to the scheduler is lost; what is finished is stored in {target}, and the same command "
-            "goes on."
-        ) from error
+        _summarise(roll, target, layout, journal.quiet)
+    except (KilledWorker, CancelledError, CommClosedError) as error:
+        lost = "The connection to the scheduler is lost"
+        reason = f"The summary cannot be made, for {death(error)}" if isinstance(error, KilledWorker) else lost
+        raise RunError(f"{reason}; what is finished is stored in {target}, and the same command goes on.") from error
     finished = int(store.done(target).sum())
     named = f" ({listed(failure.realization for failure in failures)})" if failures else ""
-    journal.write(
-        f"done: {finished} realizations stored, {finished - before} of them new, {len(failures)} failed{named}"
-    )
+    counts = f"{finished} realizations stored, {finished - before} of them new, {len(failures)} failed"
+    journal.write(f"done: {counts}{named}")
     return Result(target, finished, finished - before, tuple(failures), summarised=True)
 
 
@@ -227,43 +217,35 @@ def _outcomes(
     realization at a time, so that only the one that kills workers fails.
     """
     starts, suspects = list(missing), []
-    for index, outcome, error in answers(roll, realize_chunk, ((job, start) for start in starts)):
-        if error is None:
+    for index, outcome, killed in answers(roll, realize_chunk, ((job, start) for start in starts)):
+        if killed is None:
             yield outcome
-        elif not isinstance(error, KilledWorker):
-            raise error
         else:
             suspects.append(starts[index])
-            journal.write(f"tried again, one by one: {listed(missing[starts[index]])}, for {death(error)}", aloud=True)
+            journal.write(f"tried again, one by one: {listed(missing[starts[index]])}, for {death(killed)}", aloud=True)
     for start in suspects:
         for r in missing[start]:
-            for _, outcome, error in answers(roll, realize_chunk, [(job, start, r)]):
-                if error is None:
-                    yield outcome
-                elif not isinstance(error, KilledWorker):
-                    raise error
-                else:
-                    yield 0, [Failure(r, death(error))]
+            for _, outcome, killed in answers(roll, realize_chunk, [(job, start, r)]):
+                yield outcome if killed is None else (0, [Failure(r, death(killed))])
 
 
-def _summarise(roll: Roll, target: Path, recipe: summary.Recipe, quiet: bool) -> None:
-    chunk, size = store.chunk(target), store.size(target)
-    node = chunk
+def _summarise(roll: Roll, target: Path, layout: Layout, quiet: bool) -> None:
+    size, node = layout.realizations, layout.chunk
     while node * 16 < size:
         node *= 2
-    calls = [(str(target.absolute()), recipe, a, min(a + node, size), chunk) for a in range(0, size, node)]
+    calls = [(str(target.absolute()), layout, a, min(a + node, size)) for a in range(0, size, node)]
     arriving, arrived = answers(roll, summarise_node, calls), dict[int, Sums | None]()
     with reporting("summary", float(len(calls)), "nodes", quiet) as report:
 
         def result(index: int) -> Sums | None:
             while index not in arrived:
-                number, sums, error = next(arriving)
-                if error is not None:
-                    raise error
+                number, sums, killed = next(arriving)
+                if killed is not None:
+                    raise killed
                 arrived[number] = sums
             report(index + 1.0)
             return arrived.pop(index)
 
         total = streaming.tree(result, len(calls))
     if total is not None:
-        store.write_summary(target, summary.dataset(recipe, total, store.attributes(target)))
+        store.write_summary(target, summary.dataset(layout, total, store.attributes(target)))

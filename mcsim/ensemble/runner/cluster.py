@@ -55,25 +55,16 @@ def _script_left_alone() -> Iterator[None]:
 
 @contextmanager
 def local_client(workers: int) -> Iterator[Client]:
-    """Yield the client of a local cluster of single-threaded processes, with ports open to this machine alone.
-
-    Raises
-    ------
-    InputError
-        In a process that cannot have child processes.
-    RunError
-        If the workers do not start.
-    """
+    """Yield the client of a local cluster of single-threaded processes, with ports open to this machine alone."""
     if multiprocessing.current_process().daemon:
         raise InputError(
             "A worker of multiprocessing.Pool can start no workers of its own; call mcsim from the main process, or "
             "from a concurrent.futures.ProcessPoolExecutor."
         )
     single = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "DUCC0", "NUMBA")}
+    environment = dask.config.get("distributed.nanny.pre-spawn-environ") | single | _KEPT_MEMORY
     settings = {
-        "distributed.nanny.pre-spawn-environ": (
-            dask.config.get("distributed.nanny.pre-spawn-environ") | single | _KEPT_MEMORY
-        ),
+        "distributed.nanny.pre-spawn-environ": environment,
         "distributed.scheduler.allowed-failures": ATTEMPTS - 1,
         "distributed.worker.preload": [_WORKER_SETUP],
     }
@@ -101,36 +92,22 @@ def local_client(workers: int) -> Iterator[Client]:
 
 @contextmanager
 def remote_client(scheduler: str) -> Iterator[Client]:
-    """Yield the client of a running scheduler, whose workers have the driver's packages.
-
-    Raises
-    ------
-    InputError
-        If it does not answer, or one of its workers has other packages.
-    """
+    """Yield the client of a running scheduler, whose workers have the driver's packages."""
     try:
         client = Client(scheduler, timeout=5)
     except (OSError, ValueError, TypeError, RuntimeError) as error:
-        raise InputError(_refusal(scheduler, error)) from error
+        certificates = "certificates that Dask's configuration names in distributed.comm.tls"
+        if scheduler.startswith("tls://") and isinstance(error, TypeError):  # from a call without an ssl_context
+            refusal = f"{scheduler} needs the {certificates}, and it names none; see workflows/cluster/tls.yaml"
+        elif isinstance(error, FatalCommClosedError):
+            refusal = f"Nobody at {scheduler} accepts the {certificates}; take those of the scheduler's authority"
+        else:
+            why = type(error).__name__
+            refusal = f"No Dask scheduler answers at {scheduler} within 5 s ({why}); start one or correct the address"
+        raise InputError(f"{refusal}.") from error
     with client:
         _check_workers(client)
         yield client
-
-
-def _refusal(scheduler: str, error: Exception) -> str:
-    """Return a sentence on why there is no connection."""
-    if scheduler.startswith("tls://") and isinstance(error, TypeError):  # from a call without an ssl_context
-        return (
-            f"{scheduler} needs the certificates that Dask's configuration names in distributed.comm.tls, and it names "
-            "none; give them as workflows/cluster/tls.yaml does."
-        )
-    if isinstance(error, FatalCommClosedError):
-        return (
-            f"Nobody at {scheduler} accepts the certificates that Dask's configuration names in distributed.comm.tls; "
-            "take those of the scheduler's authority."
-        )
-    why = type(error).__name__
-    return f"No Dask scheduler answers at {scheduler} within 5 s ({why}); start one or correct the address."
 
 
 def _check_workers(client: Client) -> None:
@@ -147,15 +124,7 @@ def _check_workers(client: Client) -> None:
 
 
 class Roll:
-    """Record of the workers of a cluster; it logs who joins and who leaves.
-
-    Parameters
-    ----------
-    client
-        Client of the cluster.
-    journal
-        Log of a run; by default none.
-    """
+    """Record of the workers of a cluster; it logs who joins and who leaves."""
 
     def __init__(self, client: Client, journal: Journal | None = None) -> None:
         self.client, self.journal = client, journal
@@ -177,10 +146,8 @@ class Roll:
     def text(self) -> str:
         """Return a text on the workers at the last call, and the address of the dashboard."""
         link = self.client.dashboard_link
-        if not self.there:
-            text = "no worker yet: waiting for one"
-        else:
-            text = f"{_count(len(self.there))} with {sum(self.there.values())} threads"
+        threads = f"{_count(len(self.there))} with {sum(self.there.values())} threads"
+        text = threads if self.there else "no worker yet: waiting for one"
         return f"{text}; dashboard {link}" if find_spec("bokeh") and link else text
 
 
@@ -195,7 +162,7 @@ def _some(names: Iterable[str]) -> str:
 
 
 def death(error: KilledWorker) -> str:
-    """Return a clause on why a call was given up: its workers died."""
+    """Return a clause on why a call was given up."""
     return (
         f"each of the {error.allowed_failures + 1} workers that computed it died, the last of them "
         f"{error.last_worker.address} (out of memory?)"
@@ -205,38 +172,21 @@ def death(error: KilledWorker) -> str:
 def completed(
     client: Client, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]
 ) -> Iterator[tuple[int, Any]]:
-    """Call a function on the workers of a cluster, with a bounded number of calls in flight.
+    """Call a function on the workers of a cluster; yield the index and the result of each call as it completes.
 
-    Parameters
-    ----------
-    client
-        From :func:`local_client`, or of any other cluster.
-    function
-        Importable on the workers; its result returns to this process, so it should be small.
-    arguments
-        Tuples of positional arguments, one per call; consumed as calls are sent, so it may be lazy.
-
-    Yields
-    ------
-    tuple
-        Index of the call and its result, in the order of completion. Three calls are in flight for every present
-        worker thread, so workers may join and leave.
-
-    Raises
-    ------
-    Exception
-        The exception of a call; ``distributed.KilledWorker`` if its worker died every time.
+    ``arguments`` may be lazy: three calls are in flight for every present worker thread, so workers may join and leave.
+    The exception of a call is raised, ``distributed.KilledWorker`` if its worker died every time.
     """
-    for index, result, error in answers(Roll(client), function, arguments):
-        if error is not None:
-            raise error
+    for index, result, killed in answers(Roll(client), function, arguments):
+        if killed is not None:
+            raise killed
         yield index, result
 
 
 def answers(
     roll: Roll, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]
-) -> Iterator[tuple[int, Any, Exception | None]]:
-    """Yield index, result and exception (or None) of every call; see :func:`completed`."""
+) -> Iterator[tuple[int, Any, KilledWorker | None]]:
+    """Yield index, result and, if its worker died every time, this error of every call; see :func:`completed`."""
     waiting = enumerate(arguments)
     numbers: dict[Future, int] = {}
     # A callable object has no name but that of its type.
@@ -250,20 +200,18 @@ def answers(
 
     fill()
     while numbers:
-        # Wait with a time limit: without workers a call would never return.
-        done, _ = _first_of(roll, list(numbers))
-        for future in done:
+        for future in _first_of(roll, list(numbers)):
             result: Any = None
-            error: Exception | None = None
+            killed: KilledWorker | None = None
             try:
                 result = future.result(timeout=TURN_S)
-            except TimeoutError as late:
-                if future.status != "error":
-                    continue  # its worker died with the result; another computes it again
-                error = late
-            except Exception as raised:
-                error = raised
-            yield numbers.pop(future), result, error
+            except TimeoutError:
+                if future.status == "error":
+                    raise
+                continue  # its worker died with the result; another computes it again
+            except KilledWorker as error:
+                killed = error
+            yield numbers.pop(future), result, killed
         fill()
 
 
@@ -276,12 +224,12 @@ def _in_words(function: Callable[..., Any], *arguments: Any) -> Any:
         raise
 
 
-def _first_of(roll: Roll, flying: list[Future]) -> tuple[set[Future], set[Future]]:
-    """Return the finished futures, at least one, and the others; raise RunError if workers stay absent."""
+def _first_of(roll: Roll, flying: list[Future]) -> set[Future]:
+    """Return the finished futures, at least one; raise RunError if workers stay absent: a call would never return."""
     missed = 0
     while True:
         try:
-            return tuple(wait(flying, timeout=TURN_S, return_when="FIRST_COMPLETED"))
+            return set(wait(flying, timeout=TURN_S, return_when="FIRST_COMPLETED")[0])
         except TimeoutError:
             missed = 0 if roll.call() else missed + 1
         if missed * TURN_S >= ALONE_S:

@@ -53,7 +53,7 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
     for other in sources[1:]:
         plan.check_mergeable(sources[0], first, other, store.attributes(other))
     size = max(store.size(source) for source in sources)
-    layout, recipe = plan.stored(sources[0], size)
+    layout = plan.stored(sources[0], size)
     first["configuration"]["ensemble"]["realizations"] = size
     with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=store.check_writable(target)) as folder:
         scratch = Path(folder) / "merged"
@@ -63,9 +63,9 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
                 stop = min(start + layout.chunk, size)
                 _merge_chunk(sources, scratch, start, stop)
                 report(float(stop))
-        total = summarise_node(str(scratch), recipe, 0, size, layout.chunk)
+        total = summarise_node(str(scratch), layout, 0, size)
         if total is not None:
-            store.write_summary(scratch, summary.dataset(recipe, total, first))
+            store.write_summary(scratch, summary.dataset(layout, total, first))
         target.parent.mkdir(parents=True, exist_ok=True)
         os.replace(scratch, target)
     return Result(target, int(store.done(target).sum()), 0, (), summarised=total is not None)

@@ -1,6 +1,6 @@
 """What a beam is to the rest of the package: its harmonic coefficients, normalised and cut in m."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import pi
 from pathlib import Path
 from typing import Self
@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.instrument.beams.beammap import DEFAULT_CUT_DEG, BeamMap, placed, read_map
-from mcsim.instrument.beams.coefficients import check_mmax, choose_mmax, power_by_order
+from mcsim.instrument.beams.coefficients import check_mmax, choose_mmax, cut, power_by_order
 from mcsim.instrument.beams.files import checked_blm
 from mcsim.instrument.beams.gaussian import elliptical_blm
-from mcsim.sphere.checks import check_finite
+from mcsim.sphere.checks import check_angle, check_finite
 from mcsim.support.npy import read_npz
 
 DEFAULT_LMAX = 2048
@@ -232,7 +232,7 @@ class Beam:
         """
         if isinstance(source, str | Path) and Path(source).suffix == ".npz":
             return cls._saved(source, lmax, mmax)
-        blm, origin = checked_blm(source, lmax, mmax)
+        blm, origin = checked_blm(source, lmax)
         return cls.normalized(blm, mmax, origin)
 
     @classmethod
@@ -242,12 +242,9 @@ class Beam:
             beam = cls(arrays["blm"], float(arrays["neglected_power"]), float(arrays["integral"]))
         except (KeyError, TypeError) as error:
             raise InputError(f"{path} holds no beam ({error}): write it with Beam.save") from None
-        if beam.lmax < (lmax or 0):
-            raise InputError(f"{path} stops at lmax = {beam.lmax}, below the lmax = {lmax} asked for: lower lmax")
         if beam.mmax < (mmax or 0):
             raise InputError(f"{path} stops at mmax = {beam.mmax}, below the mmax = {mmax} asked for: lower mmax")
-        if lmax is not None and lmax < beam.lmax:
-            beam = cls(beam.blm[: lmax + 1, : lmax + 1].copy(), beam.neglected_power, beam.integral)
+        beam = replace(beam, blm=cut(beam.blm, lmax, str(path)).copy())
         return beam if mmax is None else beam.truncated(mmax)
 
     def save(self, path: str | Path) -> None:
@@ -260,26 +257,12 @@ class Beam:
         return {"kind": "blm", "path": "beam.npz"}
 
     @classmethod
-    def normalized(
-        cls, blm: NDArray[np.complex128], mmax: int | None, origin: str, neglected_power: float = 0.0
-    ) -> Self:
+    def normalized(cls, blm: NDArray[np.complex128], mmax: int | None, origin: str) -> Self:
         """Return a beam with B_0 = 1 from coefficients in any unit.
 
-        Parameters
-        ----------
-        blm
-            Coefficients, shape (>= mmax + 1, lmax + 1), to the largest order that is known.
-        mmax
-            Order to cut at; ``None`` takes that of :func:`choose_mmax`.
-        origin
-            What the coefficients are of, for messages.
-        neglected_power
-            Fraction of the power that ``blm`` lacks already.
-
-        Raises
-        ------
-        InputError
-            If a coefficient is not finite, the integral of the beam is not positive, or it has no order ``mmax``.
+        ``blm`` has the shape (>= mmax + 1, lmax + 1), to the largest order that is known; ``mmax`` is the order to cut
+        at (None: that of :func:`choose_mmax`), ``origin`` says in messages what they are of. Raise InputError if a
+        coefficient is not finite, the integral of the beam is not positive, or it has no order ``mmax``.
         """
         if not np.all(np.isfinite(blm)):
             raise InputError(f"{origin} has coefficients that are not finite: repair it before use")
@@ -290,24 +273,23 @@ class Beam:
             check_mmax(mmax, blm.shape[1] - 1)
             if mmax >= len(blm):
                 raise InputError(f"mmax = {mmax} exceeds the largest order {len(blm) - 1} of {origin}: lower mmax")
-        whole = cls(blm / integral, neglected_power, integral)
+        whole = cls(blm / integral, integral=integral)
         return whole.truncated(choose_mmax(blm) if mmax is None else mmax)
 
     @property
     def lmax(self) -> int:
-        """Largest degree."""
+        """Return the largest degree."""
         return int(self.blm.shape[1]) - 1
 
     @property
     def mmax(self) -> int:
-        """Largest order."""
+        """Return the largest order."""
         return int(self.blm.shape[0]) - 1
 
     @property
     def window(self) -> NDArray[np.float64]:
-        """Window B_l of the circular part, shape (lmax + 1,)."""
-        window: NDArray[np.float64] = self.blm[0].real * np.sqrt(4 * np.pi / (2 * np.arange(self.lmax + 1) + 1))
-        return window
+        """Return the window B_l of the circular part, shape (lmax + 1,)."""
+        return np.asarray(self.blm[0].real * np.sqrt(4 * np.pi / (2 * np.arange(self.lmax + 1) + 1)))
 
     def truncated(self, mmax: int) -> Self:
         """Return the beam without its orders above ``mmax``; what it loses is added to ``neglected_power``."""
@@ -316,7 +298,7 @@ class Beam:
             return self
         power = power_by_order(self.blm)
         lost = (1 - self.neglected_power) * power[mmax + 1 :].sum() / power.sum()
-        return type(self)(self.blm[: mmax + 1].copy(), float(self.neglected_power + lost), self.integral)
+        return replace(self, blm=self.blm[: mmax + 1].copy(), neglected_power=float(self.neglected_power + lost))
 
     def circular(self) -> Self:
         """Return the m = 0 part."""
@@ -326,25 +308,41 @@ class Beam:
         """Return the coefficients in healpy's m-major order, m up to mmax only."""
         return np.concatenate([self.blm[m, m:] for m in range(self.mmax + 1)])
 
+    def rotated(self, angle: float) -> Self:
+        """Return the beam turned about its own axis by ``angle`` radians, from x towards y: e^{-i m angle} b_lm."""
+        check_angle(angle, "the angle of a beam")
+        if angle == 0.0:
+            return self
+        return replace(self, blm=np.exp(-1j * angle * np.arange(self.mmax + 1))[:, None] * self.blm)
+
+    def mirrored(self) -> Self:
+        """Return the beam of an instrument's other side, a mirror image in a plane through the spin axis.
+
+        Notes
+        -----
+        A mirror plane through the spin axis s sends side A's boresight n to side B's, and s to itself. A cross product
+        changes sign in a mirror: x_A = s x n_A goes to -x_B, and y_A, which points towards s, to y_B. So side B is side
+        A with x -> -x in the beam's own frame, B'(theta, phi) = B(theta, pi - phi), and b_lm becomes (-1)^m conj(b_lm):
+        what leads in the scan on one side trails on the other. WMAP is built so: the azimuths of its horns about the
+        spin axis are a on side A and 180 deg - a on side B to 0.2 deg (scan_models/wmap_focal_plane.toml), where a half
+        turn about the spin axis would have made them a and 180 deg + a.
+        """
+        return replace(self, blm=(-1.0) ** np.arange(self.mmax + 1)[:, None] * self.blm.conj())
+
+    def on_rings(self, rings: int, columns: int, geometry: str) -> NDArray[np.float64]:
+        """Return the values in sr^-1 on the rings of one of ducc0's geometries, shape (rings, columns)."""
+        shape = {"lmax": self.lmax, "mmax": self.mmax, "ntheta": rings, "nphi": columns, "geometry": geometry}
+        return np.asarray(ducc0.sht.synthesis_2d(alm=self.packed()[None], spin=0, nthreads=1, **shape))[0]
+
     def values(self, theta: NDArray[np.float64], phi: NDArray[np.float64], nthreads: int = 1) -> NDArray[np.float64]:
-        """Evaluate the beam, as far as its lmax and mmax resolve it.
+        """Return the beam in sr^-1, as far as its lmax and mmax resolve it, in the shape of ``theta``.
 
-        Parameters
-        ----------
-        theta, phi
-            Angle from the beam's centre and azimuth from its x axis towards y, radians, of one shape.
-        nthreads
-            Number of threads.
-
-        Returns
-        -------
-        ndarray
-            B in sr^-1, in the shape of ``theta``.
+        ``theta``, ``phi``: angle from the beam's centre and azimuth from its x axis towards y, radians, of one shape.
         """
         if np.any((theta < 0.0) | (theta > np.pi)):
             raise InputError("theta must lie between 0 and pi radians: give the angle from the centre of the beam.")
         direction = np.stack([np.ravel(theta), np.ravel(phi) % (2 * np.pi)], axis=1)
-        values: NDArray[np.float64] = ducc0.sht.synthesis_general(
+        values = ducc0.sht.synthesis_general(
             alm=self.packed()[None],
             lmax=self.lmax,
             mmax=self.mmax,
@@ -352,5 +350,5 @@ class Beam:
             loc=direction,
             epsilon=1e-12,
             nthreads=nthreads,
-        )[0].reshape(np.shape(theta))
-        return values
+        )
+        return np.asarray(values[0].reshape(np.shape(theta)))

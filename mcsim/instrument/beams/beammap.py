@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from mcsim.errors import InputError
-from mcsim.instrument.beams._fits import opened
-from mcsim.instrument.beams.coefficients import check_lmax, check_mmax
+from mcsim.instrument.beams.coefficients import check_lmax, check_mmax, unpacked
 from mcsim.sphere.checks import check_finite
+from mcsim.sphere.header import opened
 from mcsim.support.npy import read_npy
 
 Projection = Literal["equidistant", "orthographic", "equal_area"]
@@ -100,22 +100,13 @@ def read_map(
     ----------
     path
         FITS file (may be gzipped); column = beam x (in-scan), row = beam y.
-    pixel_deg
-        Side of a pixel in degrees; ``None`` takes CDELT1 = CDELT2 (degrees) of the header.
-    cut_deg
-        Angle from the centre beyond which the map is not used, degrees.
-    centre
-        Column and row of the beam's centre, from 0; ``None`` takes the centroid (:func:`find_centre`).
+    pixel_deg, cut_deg, centre
+        As for :meth:`mcsim.instrument.beams.Beam.from_map`.
     plane
         Plane of a three-dimensional image (a WMAP beam file has side A, its noise, side B, its noise).
     projection
         See :class:`BeamMap`. Values are those at the pixel centres; of means over the pixels take
         :meth:`BeamMap.without_pixel_window`.
-
-    Raises
-    ------
-    InputError
-        If the file, the pixel size, the cut, the centre or the image cannot be used.
 
     Notes
     -----
@@ -192,10 +183,7 @@ def find_centre(image: NDArray[np.float64], origin: str = "the beam map") -> tup
     that all rules agree on: for the WMAP maps 0.1 pixel is at stake, which is 1 to 5 % of the even orders but all of
     b_l1. Where odd orders matter, give the centre that the pointing refers to.
 
-    Raises
-    ------
-    InputError
-        If nothing in the image is positive, or the peak is less than 8 pixels from an edge.
+    Raise InputError if nothing in the image is positive, or the peak is less than 8 pixels from an edge.
     """
     row, column = (int(i) for i in np.unravel_index(np.argmax(image), image.shape))
     if not image[row, column] > 0:
@@ -217,24 +205,8 @@ def find_centre(image: NDArray[np.float64], origin: str = "the beam map") -> tup
 def blm_of_map(beam_map: BeamMap, lmax: int, mmax: int, nthreads: int = 1) -> NDArray[np.complex128]:
     """Sum a beam map into its harmonic coefficients, in the map's unit times sr.
 
-    Parameters
-    ----------
-    beam_map
-        The map.
-    lmax, mmax
-        Largest degree and order.
-    nthreads
-        Number of threads.
-
-    Returns
-    -------
-    ndarray
-        b_lm, shape (mmax + 1, lmax + 1).
-
-    Raises
-    ------
-    InputError
-        If the pixels are too coarse for lmax, or nothing but zeros lies inside the cut.
+    Return b_lm, shape (mmax + 1, lmax + 1); raise InputError if the pixels are too coarse for lmax, or nothing but
+    zeros lies inside the cut.
 
     Notes
     -----
@@ -253,21 +225,11 @@ def blm_of_map(beam_map: BeamMap, lmax: int, mmax: int, nthreads: int = 1) -> ND
     if not np.any(value):
         cut_deg = np.degrees(beam_map.cut_rad)
         raise InputError(f"the beam map is zero within {cut_deg:g} deg of its centre: check centre and cut")
+    where = np.stack([theta, phi], axis=1)
     alm = ducc0.sht.adjoint_synthesis_general(
-        map=value[None],
-        lmax=lmax,
-        mmax=mmax,
-        spin=0,
-        loc=np.stack([theta, phi], axis=1),
-        epsilon=1e-12,
-        nthreads=nthreads,
+        map=value[None], lmax=lmax, mmax=mmax, spin=0, loc=where, epsilon=1e-12, nthreads=nthreads
     )[0]
-    blm = np.zeros((mmax + 1, lmax + 1), dtype=np.complex128)
-    end = 0
-    for m in range(mmax + 1):
-        start, end = end, end + lmax + 1 - m
-        blm[m, m:] = alm[start:end]
-    return blm
+    return unpacked(alm, lmax, mmax)
 
 
 def solid_angle_values(
@@ -299,13 +261,7 @@ _PROJECTIONS: dict[Projection, tuple[_Function, _Function, _Function]] = {
 
 
 def holds_image(path: str | Path) -> bool:
-    """Return True if a FITS file holds an image, as beam maps do, and not just tables.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read as FITS.
-    """
+    """Return True if a FITS file holds an image, as beam maps do, and not just tables; InputError for no FITS."""
     try:
         with opened(Path(path)) as hdus:
             return any(hdu.is_image and hdu.header.get("NAXIS", 0) >= 2 for hdu in hdus)

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
+from mcsim.sphere import alm as alm_
 
 MMAX_TOLERANCE = 4e-4
 """Largest fraction of a beam's power that :func:`choose_mmax` leaves beyond m_max."""
@@ -13,13 +14,13 @@ CIRCULAR_POWER = 1e-20
 
 
 def check_lmax(lmax: int) -> None:
-    """Refuse a degree that is no degree."""
+    """Raise InputError unless ``lmax`` is a degree of a beam."""
     if not isinstance(lmax, int | np.integer) or lmax < 1:
         raise InputError(f"lmax = {lmax} must be a whole number of 1 or more for a beam")
 
 
 def check_mmax(mmax: int, lmax: int) -> None:
-    """Refuse an order that no coefficient up to ``lmax`` has."""
+    """Raise InputError for an order that no coefficient up to ``lmax`` has."""
     if not isinstance(mmax, int | np.integer) or not 0 <= mmax <= lmax:
         raise InputError(
             f"mmax = {mmax} of a beam must be whole and lie between 0 and its lmax = {lmax}: lower mmax or raise lmax"
@@ -27,26 +28,36 @@ def check_mmax(mmax: int, lmax: int) -> None:
 
 
 def power_by_order(blm: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Sum over l of |b_lm|^2, both signs of m together, shape (mmax + 1,)."""
+    """Return the sum over l of |b_lm|^2, both signs of m together, shape (mmax + 1,)."""
     power: NDArray[np.float64] = np.sum(np.abs(blm) ** 2, axis=1)
     power[1:] *= 2
     return power
 
 
+def cut(blm: NDArray[np.complex128], lmax: int | None, origin: str) -> NDArray[np.complex128]:
+    """Return coefficients up to ``lmax`` (None: all); InputError, which names their origin, if they stop before it."""
+    own = blm.shape[1] - 1
+    lmax = own if lmax is None else lmax
+    check_lmax(lmax)
+    if lmax > own:
+        raise InputError(f"{origin} stops at lmax = {own}, below the lmax = {lmax} asked for: lower lmax")
+    return blm[: lmax + 1, : lmax + 1]
+
+
+def unpacked(packed: NDArray, lmax: int, mmax: int) -> NDArray[np.complex128]:
+    """Return coefficients in healpy's m-major order, with m up to ``mmax``, as [m, l]."""
+    blm = np.zeros((mmax + 1, lmax + 1), dtype=np.complex128)
+    for m in range(mmax + 1):
+        start = alm_.start(lmax, m)
+        blm[m, m:] = packed[start + m : start + lmax + 1]
+    return blm
+
+
 def choose_mmax(blm: NDArray[np.complex128], tolerance: float = MMAX_TOLERANCE) -> int:
-    """Choose the order above which a beam may be cut.
+    """Choose the order above which a beam may be cut: 0 if it is circular to round-off, else 2 or more.
 
-    Parameters
-    ----------
-    blm
-        Coefficients to a larger order than can matter, shape (mmax + 1, lmax + 1).
-    tolerance
-        Largest fraction of the power, over the degrees given, that may be neglected.
-
-    Returns
-    -------
-    int
-        0 for a beam that is circular to round-off, else the smallest m >= 2 that neglects no more than ``tolerance``.
+    It is the smallest that neglects no more than the fraction ``tolerance`` of the power over the degrees of ``blm``,
+    shape (mmax + 1, lmax + 1), which has a larger order than can matter.
 
     Notes
     -----

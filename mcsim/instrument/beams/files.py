@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
-from mcsim.instrument.beams._fits import opened
-from mcsim.instrument.beams.coefficients import check_lmax, check_mmax, power_by_order
+from mcsim.instrument.beams.coefficients import cut, power_by_order, unpacked
 from mcsim.sphere import alm as alm_
+from mcsim.sphere.header import opened
 from mcsim.support.npy import read_npy
 
 LEAST_CIRCULAR_POWER = 0.5
@@ -18,23 +18,10 @@ LEAST_FIRST_WINDOW = 0.8
 """B_1 = <cos theta> over the beam: 0.98 for a FWHM of 20 deg; 0.58 where b_l0 is B_l itself, 1.7 where 2l + 1 is."""
 
 
-def checked_blm(
-    source: str | Path | NDArray, lmax: int | None = None, mmax: int | None = None
-) -> tuple[NDArray[np.complex128], str]:
-    """Read and check coefficients of a beam; :meth:`mcsim.instrument.beams.Beam.from_blm` says what of.
+def checked_blm(source: str | Path | NDArray, lmax: int | None = None) -> tuple[NDArray[np.complex128], str]:
+    """Return b_lm, shape (source's mmax + 1, lmax + 1), and what they are of, for messages.
 
-    Returns
-    -------
-    blm : ndarray
-        Shape (source's mmax + 1, lmax + 1).
-    origin : str
-        What they are of, for messages.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, the array has another shape, the source stops before lmax or mmax, has a complex
-        b_l0, another normalisation in l, or is not pointed at the pole.
+    What is read, and what is refused, says :meth:`mcsim.instrument.beams.Beam.from_blm`.
     """
     if isinstance(source, str | Path):
         path, origin = Path(source), str(source)
@@ -42,16 +29,7 @@ def checked_blm(
     else:
         origin = "the array of b_lm"
         blm = _of_array(np.asarray(source))
-    file_lmax, file_mmax = blm.shape[1] - 1, blm.shape[0] - 1
-    lmax = file_lmax if lmax is None else lmax
-    check_lmax(lmax)
-    if mmax is not None:
-        check_mmax(mmax, lmax)
-    if lmax > file_lmax:
-        raise InputError(f"{origin} stops at lmax = {file_lmax}, below the lmax = {lmax} asked for: lower lmax")
-    if mmax is not None and mmax > file_mmax:
-        raise InputError(f"{origin} stops at mmax = {file_mmax}, below the mmax = {mmax} asked for: lower mmax")
-    blm = blm[: lmax + 1, : lmax + 1]
+    blm = cut(blm, lmax, origin)
     if not np.all(np.isfinite(blm)):
         raise InputError(f"{origin} has coefficients that are not finite: repair it before use")
     if np.max(np.abs(blm[0].imag)) > REALITY_TOLERANCE * np.max(np.abs(blm[0])):
@@ -79,21 +57,13 @@ def _of_array(array: NDArray) -> NDArray[np.complex128]:
     """Return a copy of an array as [m, l]: of healpy's m-major order with every m up to lmax, or of [m, l] itself."""
     lmax = alm_.lmax_of(array.size) if array.ndim == 1 else None
     if lmax is not None:
-        return _unpacked(array, lmax, lmax)
+        return unpacked(array, lmax, lmax)
     if array.ndim != 2 or not 0 < array.shape[0] <= array.shape[1]:
         raise InputError(
             f"an array of b_lm has the shape {array.shape}: give healpy's order with every m up to lmax, or [m, l] of "
             "shape (mmax + 1, lmax + 1)"
         )
     return np.triu(array).astype(np.complex128)
-
-
-def _unpacked(packed: NDArray, lmax: int, mmax: int) -> NDArray[np.complex128]:
-    blm = np.zeros((mmax + 1, lmax + 1), dtype=np.complex128)
-    for m in range(mmax + 1):
-        start = alm_.start(lmax, m)
-        blm[m, m:] = packed[start + m : start + lmax + 1]
-    return blm
 
 
 def _read(path: Path) -> NDArray[np.complex128]:
@@ -108,4 +78,4 @@ def _read(path: Path) -> NDArray[np.complex128]:
         raise InputError(
             f"{path} cannot be read as FITS coefficients with columns index, real, imaginary ({error})"
         ) from error
-    return _unpacked(packed, lmax, mmax)
+    return unpacked(packed, lmax, mmax)

@@ -18,26 +18,8 @@ def elliptical_blm(
 ) -> NDArray[np.complex128]:
     """Return the coefficients of an elliptical Gaussian beam, to a larger order than can matter.
 
-    Parameters
-    ----------
-    fwhm_major_arcmin, fwhm_minor_arcmin
-        Full widths at half maximum along the axes in arcmin, major >= minor > 0, at most 1200.
-    angle_deg
-        Direction of the major axis, in degrees from the beam's x axis towards y; b_l2 is positive at 0.
-    lmax
-        Largest degree.
-    mmax
-        Order that must be among them. Odd orders vanish.
-
-    Returns
-    -------
-    ndarray
-        b_lm, shape (>= mmax + 1, lmax + 1), with b_00 = 1/sqrt(4pi) up to the accuracy below.
-
-    Raises
-    ------
-    InputError
-        If a width, the angle, lmax or mmax is out of range.
+    Return b_lm, shape (>= mmax + 1, lmax + 1), with b_00 = 1/sqrt(4pi) up to the accuracy below. Parameters, and what
+    is refused, are those of :meth:`mcsim.instrument.beams.Beam.elliptical`.
 
     Notes
     -----

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import ducc0
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,6 +26,8 @@ class BeamSummary:
     ----------
     source
         ``"map"`` or ``"blm"``.
+    beam
+        The beam.
     solid_angle_sr
         Integral of the response over its peak, steradian.
     fwhm_circular_arcmin
@@ -38,15 +39,12 @@ class BeamSummary:
         Integral of the negative response over that of the positive (a number >= 0).
     centroid_arcmin
         Mean offset of the response from the centre along x and y, from b_11.
-    ells, window, ratios
-        Degrees, B_l there, and |b_lm / b_l0| there, shape (mmax + 1, len(ells)).
-    last_window
-        B_l at lmax.
-    lmax, mmax, neglected_power, integral
-        As in :class:`mcsim.instrument.beams.Beam`.
+    ells
+        Degrees at which the coefficients are listed.
     """
 
     source: str
+    beam: Beam
     solid_angle_sr: float
     fwhm_circular_arcmin: float
     fwhm_major_arcmin: float
@@ -55,23 +53,23 @@ class BeamSummary:
     negative_over_positive: float
     centroid_arcmin: tuple[float, float]
     ells: tuple[int, ...]
-    window: NDArray[np.float64]
-    ratios: NDArray[np.float64]
-    lmax: int
-    mmax: int
-    last_window: float
-    neglected_power: float
-    integral: float
-
-    @property
-    def solid_angle_arcmin2(self) -> float:
-        """Solid angle in square arcmin."""
-        return float(self.solid_angle_sr * _ARCMIN**2)
 
     @property
     def axis_ratio(self) -> float:
-        """Major over minor full width, >= 1."""
+        """Return major over minor full width, >= 1."""
         return float(self.fwhm_major_arcmin / self.fwhm_minor_arcmin)
+
+    @property
+    def window(self) -> NDArray[np.float64]:
+        """Return B_l at the listed degrees."""
+        return self.beam.window[list(self.ells)]
+
+    @property
+    def ratios(self) -> NDArray[np.float64]:
+        """Return |b_lm / b_l0| at the listed degrees, shape (mmax + 1, len(ells))."""
+        blm = np.abs(self.beam.blm[:, list(self.ells)])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return blm / blm[0]
 
 
 def summarize(beam: Beam, beam_map: BeamMap | None = None, ells: tuple[int, ...] = DEFAULT_ELLS) -> BeamSummary:
@@ -94,40 +92,32 @@ def summarize(beam: Beam, beam_map: BeamMap | None = None, ells: tuple[int, ...]
     1/r^2 = a + b cos 2 phi + c sin 2 phi is fitted to it. Widths of elliptical Gaussians come back within 0.1 %
     (tests/unit/test_beams_summary.py).
     """
-    listed = [ell for ell in ells if ell <= beam.lmax]
     # Half the width of a Gaussian of the same solid angle; sidelobes and elongation only make the search longer.
     response: _Response
     if beam_map is None:
-        total, negative, response = 1.0, _measure_blm(beam), beam.values
-        highest = float(beam.values(np.zeros(1), np.zeros(1))[0])
+        # Twice the rings and azimuths that the coefficients need: the negative part alone is not band-limited.
+        rings = 2 * beam.lmax + 2
+        weight = np.sin((np.arange(rings) + 0.5) * np.pi / rings)[:, None]
+        value, response = beam.on_rings(rings, 4 * beam.mmax + 4, "F1") * weight, beam.values
+        total, highest = 1.0, float(beam.values(np.zeros(1), np.zeros(1))[0])
     else:
-        total, negative = _measure_map(beam_map)
-        response = beam_map.values
-        highest = float(beam_map.image.max())
+        value, response = solid_angle_values(beam_map)[0], beam_map.values
+        total, highest = float(value.sum()), float(beam_map.image.max())
     reach = min(8 * np.sqrt(total / highest * np.log(2) / np.pi), np.pi)
     peak, circular, major, minor, angle_deg = _half_power(response, reach)
     # b_11 = -sqrt(3/8pi) <sin(theta) exp(-i phi)>
     offset = -np.sqrt(8 * np.pi / 3) * beam.blm[1, 1] if beam.mmax >= 1 else 0j
-    window = beam.window
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratios = np.abs(beam.blm[:, listed]) / np.abs(beam.blm[0, listed])
     return BeamSummary(
         source="blm" if beam_map is None else "map",
+        beam=beam,
         solid_angle_sr=total / peak,
         fwhm_circular_arcmin=2 * circular * _ARCMIN,
         fwhm_major_arcmin=2 * major * _ARCMIN,
         fwhm_minor_arcmin=2 * minor * _ARCMIN,
         angle_deg=angle_deg,
-        negative_over_positive=negative,
+        negative_over_positive=float(-value[value < 0].sum() / value[value > 0].sum()),
         centroid_arcmin=(float(offset.real) * _ARCMIN, -float(offset.imag) * _ARCMIN),
-        ells=tuple(listed),
-        window=window[listed],
-        ratios=ratios,
-        lmax=beam.lmax,
-        mmax=beam.mmax,
-        last_window=float(window[-1]),
-        neglected_power=beam.neglected_power,
-        integral=beam.integral,
+        ells=tuple(ell for ell in ells if ell <= beam.lmax),
     )
 
 
@@ -139,55 +129,32 @@ def format_summary(summary: BeamSummary) -> str:
         orientation = f"major axis {summary.angle_deg:+.1f} deg from x towards y"
     # Adding 0.0 turns a rounded -0.0 into 0.0.
     x, y = (round(offset, 3) + 0.0 for offset in summary.centroid_arcmin)
+    beam, last = summary.beam, summary.beam.window[-1]
     lines = [
-        f"solid angle          {summary.solid_angle_sr:.4e} sr = {summary.solid_angle_arcmin2:.2f} arcmin^2",
+        f"solid angle          {summary.solid_angle_sr:.4e} sr = {summary.solid_angle_sr * _ARCMIN**2:.2f} arcmin^2",
         f"FWHM, circular part  {summary.fwhm_circular_arcmin:.2f} arcmin",
         f"FWHM, major x minor  {summary.fwhm_major_arcmin:.2f} x {summary.fwhm_minor_arcmin:.2f} arcmin",
         f"axis ratio           {summary.axis_ratio:.4f}, {orientation}",
         f"mean offset          ({x:+.3f}, {y:+.3f}) arcmin in (x, y)",
         f"negative response    {summary.negative_over_positive:.2e} of the positive",
-        f"integral             {summary.integral:.6g} (unit of the source x sr), divided out so that B_0 = 1",
-        f"lmax, mmax           {summary.lmax}, {summary.mmax}: {summary.neglected_power:.1e} of the power beyond mmax",
+        f"integral             {beam.integral:.6g} (unit of the source x sr), divided out so that B_0 = 1",
+        f"lmax, mmax           {beam.lmax}, {beam.mmax}: {beam.neglected_power:.1e} of the power beyond mmax",
     ]
-    if summary.source == "blm" and abs(summary.last_window) > BAND_LIMITED_WINDOW:
+    if summary.source == "blm" and abs(last) > BAND_LIMITED_WINDOW:
         lines.append(
-            f"note                 B_l is still {summary.last_window:.2g} at lmax = {summary.lmax}: widths, solid "
+            f"note                 B_l is still {last:.2g} at lmax = {beam.lmax}: widths, solid "
             "angle and negative response are those of the beam cut there"
         )
-    orders = [m for m in range(1, min(summary.mmax, _LISTED_ORDERS) + 1) if np.any(summary.ratios[m] > 0)]
+    window, table = summary.window, summary.ratios
+    orders = [m for m in range(1, min(beam.mmax, _LISTED_ORDERS) + 1) if np.any(table[m] > 0)]
     lines += ["", "     l          B_l" + "".join(f"{f'|b_l{m}/b_l0|':>14}" for m in orders)]
     for i, ell in enumerate(summary.ells):
-        ratios = "".join(f"{summary.ratios[m, i]:14.3e}" for m in orders)
-        lines.append(f"{ell:6d} {summary.window[i]:12.6f}{ratios}")
+        ratios = "".join(f"{table[m, i]:14.3e}" for m in orders)
+        lines.append(f"{ell:6d} {window[i]:12.6f}{ratios}")
     return "\n".join(lines)
 
 
 _Response = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
-
-
-def _measure_map(beam_map: BeamMap) -> tuple[float, float]:
-    """Return the integral, and negative over positive response, of a map."""
-    value, _, _ = solid_angle_values(beam_map)
-    positive = value[value > 0].sum()
-    return float(value.sum()), float((positive - value.sum()) / positive)
-
-
-def _measure_blm(beam: Beam) -> float:
-    """Return the ratio of negative to positive response of coefficients."""
-    # Twice the rings and azimuths that the coefficients need: the negative part alone is not band-limited.
-    rings, azimuths = 2 * beam.lmax + 2, 4 * beam.mmax + 4
-    pattern = ducc0.sht.synthesis_2d(
-        alm=beam.packed()[None],
-        lmax=beam.lmax,
-        mmax=beam.mmax,
-        spin=0,
-        ntheta=rings,
-        nphi=azimuths,
-        geometry="F1",
-        nthreads=1,
-    )[0]
-    weighted = pattern * np.sin((np.arange(rings) + 0.5) * np.pi / rings)[:, None]
-    return float(-weighted[weighted < 0].sum() / weighted[weighted > 0].sum())
 
 
 def _half_power(response: _Response, reach: float) -> tuple[float, float, float, float, float]:

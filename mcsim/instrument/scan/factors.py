@@ -9,11 +9,14 @@ import healpy
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import eval_jacobi
+from scipy.stats import binned_statistic
 
 from mcsim.errors import InputError
 from mcsim.instrument.scan.limit import limit_moments, limit_quadrature
 from mcsim.instrument.scan.model import ScanModel
 from mcsim.instrument.scan.moments import Moments
+
+Vector = NDArray[np.float64]
 
 LATITUDE_EDGES_DEG = tuple(range(0, 91, 10))
 ELLS = (50, 100, 200, 400)
@@ -23,7 +26,7 @@ ELLS = (50, 100, 200, 400)
 class ScanFactors:
     """Three answers to how much of the parallel-transport effect of m = 2 a scan leaves.
 
-    Parameters
+    Attributes
     ----------
     quadrupole_ratio
         L = 2, M = 0 BipoSH of the hit average over that of parallel transport with psi = 0, at every l (leading
@@ -37,7 +40,7 @@ class ScanFactors:
     quadrupole_ratio: float
     sky_mean: float
     ell: NDArray[np.int64]
-    f_ell: NDArray[np.float64]
+    f_ell: Vector
 
 
 def sky_means(moments: Moments) -> NDArray[np.complex128]:
@@ -48,65 +51,29 @@ def sky_means(moments: Moments) -> NDArray[np.complex128]:
 
 def latitude_means(
     moments: Moments, edges_deg: Sequence[float] = LATITUDE_EDGES_DEG
-) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
-    """Return hits and moments averaged over bins of |latitude|.
+) -> tuple[Vector, NDArray[np.complex128]]:
+    """Return hits over their mean over the sky, shape (n,), and moments, shape (smax, n), in bins of |latitude|.
 
-    Parameters
-    ----------
-    moments
-        Of any frame; the latitude is that of its frame.
-    edges_deg
-        Increasing edges of the bins in degrees, n + 1 of them.
-
-    Returns
-    -------
-    hits : ndarray, shape (n,)
-        Mean hits of all pixels, over their mean over the sky.
-    w : ndarray, shape (smax, n)
-        Mean w_s of the observed pixels; nan where a bin has none.
+    The latitude is that of the moments' frame, the edges are n + 1 in degrees. Unobserved pixels count for the hits
+    alone; w is nan where a bin has no other.
     """
     seen = _seen(moments)
-    theta = healpy.pix2ang(moments.nside, np.arange(moments.npix))[0]
-    which = np.digitize(np.abs(90.0 - np.degrees(theta)), edges_deg) - 1
-    # A pixel centre at the last edge, the pole, belongs to the last bin.
-    which[np.abs(90.0 - np.degrees(theta)) == edges_deg[-1]] = len(edges_deg) - 2
-    inside = (which >= 0) & (which < len(edges_deg) - 1)
-    size = len(edges_deg) - 1
-    with np.errstate(invalid="ignore", divide="ignore"):
-        counts = np.bincount(which[inside], minlength=size)
-        hits = np.bincount(which[inside], weights=moments.hits[inside], minlength=size) / counts
-        chosen = inside & seen
-        counts = np.bincount(which[chosen], minlength=size)
-        w = np.array(
-            [
-                (
-                    np.bincount(which[chosen], weights=w[chosen].real, minlength=size)
-                    + 1j * np.bincount(which[chosen], weights=w[chosen].imag, minlength=size)
-                )
-                / counts
-                for w in moments.w
-            ]
-        )
+    latitude = np.abs(90.0 - np.degrees(healpy.pix2ang(moments.nside, np.arange(moments.npix))[0]))
+    hits = binned_statistic(latitude, moments.hits, bins=edges_deg).statistic
+    w = binned_statistic(latitude[seen], moments.w[:, seen], bins=edges_deg).statistic
     return hits / moments.hits.mean(), w
 
 
-def ring_means(
-    moments: Moments,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.complex128]]:
-    """Return the HEALPix rings' colatitudes, mean hits over those of the sky, and mean w_s of observed pixels.
+def ring_means(moments: Moments) -> tuple[Vector, Vector, NDArray[np.complex128]]:
+    """Return colatitudes of the HEALPix rings, their mean hits over those of the sky, and mean w_s of observed pixels.
 
-    Returns
-    -------
-    theta : ndarray, shape (4 nside - 1,)
-        In radians, from north to south.
-    hits : ndarray, shape (4 nside - 1,)
-    w : ndarray, shape (smax, 4 nside - 1)
-        0 in rings that were not observed.
+    From north to south: theta in radians and hits, shape (4 nside - 1,); w, shape (smax, 4 nside - 1), 0 in rings that
+    were not observed.
     """
     nside = moments.nside
     ring = np.arange(1, 4 * nside)
     size = 4 * np.minimum(np.minimum(ring, nside), 4 * nside - ring)
-    first = np.concatenate([[0], np.cumsum(size)[:-1]])
+    first = np.cumsum(size) - size
     theta = healpy.pix2ang(nside, first)[0]
     seen = np.asarray(moments.hits > 0.0, dtype=np.float64)
     observed = np.maximum(np.add.reduceat(seen, first), 1.0)
@@ -115,14 +82,9 @@ def ring_means(
 
 
 def scan_factors(moments: Moments, ell: Sequence[int] = ELLS) -> ScanFactors:
-    """Return the three factors of a survey's moments (smax >= 2); those of L = 2, M = 0 are meant for ecliptic maps.
+    """Return the three factors of a survey's moments (smax >= 2), f_l at the multipoles ``ell`` (>= 2).
 
-    Parameters
-    ----------
-    moments
-        With smax >= 2. Pixels that were not observed are left out of the means.
-    ell
-        Multipoles (>= 2) of f_l.
+    Those of L = 2, M = 0 are meant for ecliptic maps. Pixels that were not observed are left out.
 
     Notes
     -----
@@ -133,34 +95,43 @@ def scan_factors(moments: Moments, ell: Sequence[int] = ELLS) -> ScanFactors:
     if moments.smax < 2:
         raise InputError(f"the moments end at s = {moments.smax}, but the factors need s = 2; use smax >= 2.")
     seen = _seen(moments)
-    weight = np.sin(healpy.pix2ang(moments.nside, np.arange(moments.npix))[0][seen]) ** 2
+    colatitude = healpy.pix2ang(moments.nside, np.arange(moments.npix))[0][seen]
+    rings, _, w = ring_means(moments)
     w2 = moments.w[1].real[seen]
-    theta, _, w = ring_means(moments)
-
-    def at(z: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.interp(np.arccos(z), theta, w[1].real)
-
-    return ScanFactors(
-        quadrupole_ratio=float(np.sum(w2 * weight) / np.sum(weight)),
-        sky_mean=float(w2.mean()),
-        ell=np.array(ell),
-        f_ell=_f_ell(at, ell),
-    )
+    return _factors(colatitude, np.ones(w2.size), w2, ell, lambda theta: np.interp(theta, rings, w[1].real))
 
 
-def limit_factors(model: ScanModel, ell: Sequence[int] = ELLS, line_of_sight: str | None = None) -> ScanFactors:
+def limit_factors(model: ScanModel, ell: Sequence[int] = ELLS) -> ScanFactors:
     """Return the three factors in the exact long-time limit; where nothing is observed w_2 counts as 0."""
-    theta, weights = limit_quadrature(model, line_of_sight)
-    w2 = limit_moments(model, theta, 2, line_of_sight)[1][1].real
 
-    def at(z: NDArray[np.float64]) -> NDArray[np.float64]:
-        return limit_moments(model, np.arccos(z), 2, line_of_sight)[1][1].real
+    def w2(theta: Vector) -> Vector:
+        return limit_moments(model, theta, 2)[1][1].real
 
+    theta, weights = limit_quadrature(model)
+    return _factors(theta, weights, w2(theta), ell, w2)
+
+
+def _factors(
+    theta: Vector, weights: Vector, w2: Vector, ell: Sequence[int], w2_at: Callable[[Vector], Vector]
+) -> ScanFactors:
+    """Return the factors of Re w_2 at colatitudes with weights; f_l by Gauss-Legendre quadrature of a function of them.
+
+    d^l_22 = ((1 + z)/2)^2 P^(0,4)_{l-2}(z), z = cos(theta).
+    """
+    if min(ell) < 2:
+        raise InputError(f"f_l is asked for at l = {min(ell)}, but it needs l >= 2.")
+    # Twice the nodes that (d^l_22)^2 needs, for the kinks of w_2 at the caustics.
+    size = 2 * max(ell) + 512
+    nodes = ducc0.misc.GL_thetas(size)
+    z = np.cos(nodes)
+    weighted = ducc0.misc.GL_weights(size, 1) / (2.0 * math.pi) * w2_at(nodes) * ((1.0 + z) / 2.0) ** 4
+    f_ell = [math.fsum(weighted * eval_jacobi(n - 2, 0, 4, z) ** 2) * (2 * n + 1) / 2.0 for n in ell]
+    weighting = weights * np.sin(theta) ** 2
     return ScanFactors(
-        quadrupole_ratio=float(np.sum(weights * w2 * np.sin(theta) ** 2) / (4.0 / 3.0)),
-        sky_mean=float(np.sum(weights * w2) / 2.0),
+        quadrupole_ratio=float(np.sum(weighting * w2) / np.sum(weighting)),
+        sky_mean=float(np.sum(weights * w2) / np.sum(weights)),
         ell=np.array(ell),
-        f_ell=_f_ell(at, ell),
+        f_ell=np.array(f_ell),
     )
 
 
@@ -201,14 +172,3 @@ def _seen(moments: Moments) -> NDArray[np.bool_]:
 def _complex_text(value: complex) -> str:
     # Adding 0.0 after rounding turns -0.0 into 0.0.
     return f"{round(value.real, 4) + 0.0:.4f}{round(value.imag, 4) + 0.0:+.4f}i"
-
-
-def _f_ell(w2: Callable[[NDArray[np.float64]], NDArray[np.float64]], ell: Sequence[int]) -> NDArray[np.float64]:
-    """Return f_l by Gauss-Legendre quadrature of d^l_22 = ((1 + z)/2)^2 P^(0,4)_{l-2}(z)."""
-    if min(ell) < 2:
-        raise InputError(f"f_l is asked for at l = {min(ell)}, but it needs l >= 2.")
-    # Twice the nodes that (d^l_22)^2 needs, for the kinks of w_2 at the caustics.
-    size = 2 * max(ell) + 512
-    z, weights = np.cos(ducc0.misc.GL_thetas(size)), ducc0.misc.GL_weights(size, 1) / (2.0 * math.pi)
-    weighted = weights * w2(z) * ((1.0 + z) / 2.0) ** 4
-    return np.array([math.fsum(weighted * eval_jacobi(n - 2, 0, 4, z) ** 2) * (2 * n + 1) / 2.0 for n in ell])

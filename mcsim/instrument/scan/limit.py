@@ -1,6 +1,8 @@
 """Exact long-time limit of hits and orientation moments for incommensurate spin, precession and orbit."""
 
 import math
+from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,20 +19,12 @@ _TINY = 1e-18
 
 
 def limit_moments(
-    model: ScanModel, theta: NDArray[np.float64], smax: int, line_of_sight: str | None = None
+    model: ScanModel, theta: NDArray[np.float64], smax: int
 ) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
-    """Return the hits and orientation moments after infinite time, as functions of ecliptic colatitude.
+    """Return hits and orientation moments of a model's first default line of sight after infinite time.
 
-    Parameters
-    ----------
-    model
-        The survey.
-    theta
-        Ecliptic colatitudes in radians, shape (n,).
-    smax
-        Largest s (>= 1).
-    line_of_sight
-        Name of the line of sight; None: the first of the model's default ones.
+    ``theta`` are ecliptic colatitudes in radians, shape (n,). InputError if the precession is not much faster than the
+    orbit.
 
     Returns
     -------
@@ -39,11 +33,6 @@ def limit_moments(
         large, on a caustic itself, where the limit is infinite.
     w : ndarray, shape (smax, n)
         w[s - 1] = mean of e^{-i s psi}; 0 where nothing is observed. Real for even s, imaginary for odd s.
-
-    Raises
-    ------
-    InputError
-        If the precession is not much faster than the orbit, or the line of sight is unknown.
 
     Notes
     -----
@@ -58,7 +47,7 @@ def limit_moments(
     (tests/unit/test_scan_limit.py).
     """
     check_whole(smax, "smax", 1)
-    line = _line(model, line_of_sight)
+    line = _line(model)
     if not np.all((np.asarray(theta) >= 0.0) & (np.asarray(theta) <= math.pi)):
         raise InputError("theta must lie between 0 and pi; give ecliptic colatitudes in radians.")
     theta = np.atleast_1d(np.asarray(theta, dtype=np.float64))
@@ -88,9 +77,9 @@ def limit_moments(
     return density, w
 
 
-def caustics(model: ScanModel, line_of_sight: str | None = None) -> NDArray[np.float64]:
+def caustics(model: ScanModel) -> NDArray[np.float64]:
     """Return the ecliptic colatitudes in (0, pi), in radians and sorted, at which the limit of the hits is singular."""
-    beta = math.radians(_line(model, line_of_sight).boresight_angle_deg)
+    beta = math.radians(_line(model).boresight_angle_deg)
     alpha = math.radians(model.precession_angle_deg)
     angles = []
     for gamma in (0.5 * math.pi - alpha, 0.5 * math.pi + alpha):
@@ -98,63 +87,42 @@ def caustics(model: ScanModel, line_of_sight: str | None = None) -> NDArray[np.f
     return np.unique([angle for angle in angles if 1e-12 < angle < math.pi - 1e-12])
 
 
-def limit_quadrature(
-    model: ScanModel, line_of_sight: str | None = None
+def limit_quadrature(model: ScanModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return theta and weights: sum(weights f(theta)) is the integral of f(theta) sin(theta) over 0 to pi.
+
+    f may have the caustics of the limit.
+    """
+    theta, weight = graded_rule(caustics(model), lambda _: _GRADED)
+    return theta, weight / (2.0 * math.pi)
+
+
+def graded_rule(
+    breaks: NDArray[np.float64], count: Callable[[float], int]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the nodes and weights for integrals over ecliptic colatitude of what has the limit's caustics.
+    """Return colatitudes and weights: sum(weights f(theta)) is the integral over the sphere of an f that has breaks.
 
-    Returns
-    -------
-    theta, weights
-        sum(weights * f(theta)) is the integral of f(theta) sin(theta) over 0..pi: a double-exponential rule
-        (Takahasi & Mori 1974) between each pair of neighbouring caustics, whose weak singularities (logarithms and
-        their inverses) it absorbs.
+    Between two of them it is a double-exponential rule (Takahasi & Mori 1974) of 2 ``count`` (half their distance) + 1
+    points, which absorbs weak singularities there (logarithms and their inverses).
     """
-    breaks = np.concatenate([[0.0], caustics(model, line_of_sight), [math.pi]])
-    steps = np.linspace(-3.2, 3.2, 2 * _GRADED + 1)
-    position = np.tanh(0.5 * math.pi * np.sinh(steps))
-    weight = 0.5 * math.pi * np.cosh(steps) / np.cosh(0.5 * math.pi * np.sinh(steps)) ** 2 * (steps[1] - steps[0])
-    middle, half = 0.5 * (breaks[1:] + breaks[:-1]), 0.5 * (breaks[1:] - breaks[:-1])
-    theta = (middle[:, np.newaxis] + half[:, np.newaxis] * position).ravel()
-    return theta, (half[:, np.newaxis] * weight).ravel() * np.sin(theta)
+    thetas, weights = [], []
+    for low, high in pairwise([0.0, *breaks, math.pi]):
+        half = 0.5 * (high - low)
+        steps, step = np.linspace(-3.2, 3.2, 2 * count(half) + 1, retstep=True)
+        thetas.append(low + half * (1.0 + np.tanh(0.5 * np.pi * np.sinh(steps))))
+        speed = 0.5 * np.pi * np.cosh(steps) / np.cosh(0.5 * np.pi * np.sinh(steps)) ** 2
+        weights.append(2.0 * np.pi * half * step * speed * np.sin(thetas[-1]))
+    theta, weight = np.concatenate(thetas), np.concatenate(weights)
+    return theta[weight > 0.0], weight[weight > 0.0]
 
 
-def limit_harmonics(model: ScanModel, smax: int, lmax: int, line_of_sight: str | None = None) -> NDArray[np.complex128]:
-    """Return the spin-weighted harmonic coefficients w_{s,L0} of the limit's moments.
-
-    Parameters
-    ----------
-    model, smax, line_of_sight
-        As in :func:`limit_moments`.
-    lmax
-        Largest L.
-
-    Returns
-    -------
-    ndarray, shape (smax, lmax + 1)
-        Element [s - 1, L] of w_s = sum_L w_{s,L0} (-s)Y_L0; 0 for L < s. The other M vanish.
-
-    Notes
-    -----
-    (-s)Y_L0(theta) = Y_Ls(theta, 0), so the coefficient is 2 pi int w_s(theta) Y_Ls(theta, 0) sin(theta) dtheta.
-    """
-    theta, weights = limit_quadrature(model, line_of_sight)
-    _, w = limit_moments(model, theta, smax, line_of_sight)
-    coefficients = np.zeros((smax, lmax + 1), dtype=np.complex128)
-    for s in range(1, smax + 1):
-        for degree, harmonic in enumerate(_harmonics(s, lmax, theta), start=s):
-            coefficients[s - 1, degree] = 2.0 * math.pi * np.sum(weights * w[s - 1] * harmonic)
-    return coefficients
-
-
-def _line(model: ScanModel, name: str | None) -> LineOfSight:
-    """Return the line of sight, if the model's precession is fast enough for a limit in colatitude alone."""
+def _line(model: ScanModel) -> LineOfSight:
+    """Return the first default line of sight; InputError if its model precesses too slowly for such a limit."""
     if model.precession_angle_deg > 0.0 and model.orbit_period_s < _FAST_PRECESSION * abs(model.precession_period_s):
         raise InputError(
             f"scan model {model.name!r} precesses {model.orbit_period_s / abs(model.precession_period_s):.3g} times an "
             f"orbit, but the long-time limit needs more than {_FAST_PRECESSION:g}; stream its moments instead."
         )
-    return model.line_of_sight(model.default_lines[0] if name is None else name)
+    return model.select()[0]
 
 
 def _elliptic_nodes(roots: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -172,17 +140,3 @@ def _elliptic_nodes(roots: NDArray[np.float64]) -> tuple[NDArray[np.float64], ND
     sn, cn, _, _ = ellipj(argument, 1.0 - complement)
     gap = lower / (r3 - r1)
     return 2.0 * quarter_period / np.sqrt(scale), r1 + lower / (cn**2 + gap * sn**2)
-
-
-def _harmonics(m: int, lmax: int, theta: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return Y_lm(theta, 0) for l = m .. lmax by the three-term recurrence in l."""
-    z = np.cos(theta)
-    norm = math.sqrt(math.prod((2 * k + 1) / (2 * k) for k in range(1, m + 1)) / (4.0 * math.pi))
-    previous, current = np.zeros_like(z), (-1) ** m * norm * np.sin(theta) ** m
-    harmonics = []
-    for degree in range(m, lmax + 1):
-        harmonics.append(current)
-        ahead = math.sqrt((4 * (degree + 1) ** 2 - 1) / ((degree + 1) ** 2 - m * m))
-        behind = math.sqrt((degree**2 - m * m) / (4 * degree**2 - 1)) if degree else 0.0
-        previous, current = current, ahead * (z * current - behind * previous)
-    return harmonics

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mcsim.errors import InputError
+from mcsim.sphere.checks import check_angle
 from mcsim.support import resources
 
 SECONDS_PER_DAY = 86400.0
@@ -18,20 +19,10 @@ LONGEST_DAYS = 36525.0
 
 @dataclass(frozen=True)
 class LineOfSight:
-    """Direction of one beam in the spin frame (z = spin axis).
+    """Direction of one beam in the spin frame (z = spin axis), for example ``"W1A"``, and where its numbers come from.
 
-    Parameters
-    ----------
-    name
-        For example ``"A"`` or ``"W1A"``.
-    boresight_angle_deg
-        Angle between the spin axis and the line of sight, strictly between 0 and 180 degrees.
-    azimuth_deg
-        Azimuth about the spin axis at spin phase 0, in degrees.
-    sample_period_s
-        Time between samples, where it differs from the model's; None: the model's.
-    source
-        Where the numbers come from.
+    The boresight angle to the spin axis lies strictly between 0 and 180 degrees, the azimuth about it is that at spin
+    phase 0. ``sample_period_s`` is the time between samples, where it differs from the model's.
     """
 
     name: str
@@ -134,13 +125,7 @@ class ScanModel:
         (129.3, 22.5)
         """
         path = resources.scan_model(name_or_path)
-        try:
-            table = tomllib.loads(path.read_bytes().decode("utf-8"))
-        except OSError as error:
-            raise InputError(f"scan model {str(path)!r} cannot be read: {error.strerror}; give a TOML file.") from None
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-            raise InputError(f"scan model {str(path)!r} is not valid TOML: {error}.") from None
-        return model_from_table(table, str(path))
+        return _from_table(_read_toml(path), str(path))
 
     def as_table(self, folder: Path) -> dict[str, str]:
         """Write the model as TOML into a folder; return the table that stands for it in a run."""
@@ -171,7 +156,7 @@ class ScanModel:
         side_a, side_b = self.pairs[name]
         return self.line_of_sight(side_a), self.line_of_sight(side_b)
 
-    def select(self, names: str | list[str] | tuple[str, ...] | None) -> tuple[LineOfSight, ...]:
+    def select(self, names: str | list[str] | tuple[str, ...] | None = None) -> tuple[LineOfSight, ...]:
         """Return the lines of sight called ``names``; the model's default ones if None."""
         names = [names] if isinstance(names, str) else names
         return tuple(self.line_of_sight(name) for name in (self.default_lines if names is None else names))
@@ -195,6 +180,42 @@ class ScanModel:
         return replace(self, default_lines=tuple(line.name for line in self.select(names)))
 
 
+def read_described(path: Path) -> tuple[ScanModel, float | None]:
+    """Return how a survey was pointed, and the amplitude of the dipole that it saw, uK; None if nothing is said of it.
+
+    The file is a scan model, or a survey's short description: TOML with the periods and angles of a scan model, one
+    ``boresight_angle_deg``, the number of ``samples``, the azimuth of every channel about the spin axis in a table
+    ``spin_azimuth_rad``, and optionally ``dipole_uk``. Its lines of sight bear the names of the channels. InputError if
+    the file cannot be read, lacks a number, or is of neither kind.
+    """
+    table, where = _read_toml(path), str(path)
+    if "spin_azimuth_rad" not in table:
+        return _from_table(table, where), None
+    azimuths = table["spin_azimuth_rad"]
+    if not isinstance(azimuths, dict) or not azimuths:
+        raise InputError(f"{where}: spin_azimuth_rad is {azimuths!r}; give a table, channel = radians.")
+    boresight = _number(table, "boresight_angle_deg", where)
+    lines = []
+    for name in azimuths:
+        azimuth = _number(azimuths, name, where)
+        check_angle(azimuth, f"{where}: spin_azimuth_rad of {name}")
+        lines.append({"name": name, "boresight_angle_deg": boresight, "azimuth_deg": math.degrees(azimuth)})
+    copied = {key: _number(table, key, where) for key in NUMBERS - _OPTIONAL - {"duration_days"}}
+    days = _number(table, "samples", where) * copied["sample_period_s"] / SECONDS_PER_DAY
+    model = {"schema": 1, "name": path.stem, **copied, "duration_days": days, "line_of_sight": lines}
+    dipole = _number(table, "dipole_uk", where) if "dipole_uk" in table else None
+    return _from_table(model, where), dipole
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_bytes().decode("utf-8"))
+    except OSError as error:
+        raise InputError(f"scan model {str(path)!r} cannot be read: {error.strerror}; give a TOML file.") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"scan model {str(path)!r} is not valid TOML: {error}.") from None
+
+
 def _toml(value: str | float | tuple[str, ...]) -> str:
     """Return a text, number or list of texts as TOML, from which the same value is read, bit for bit."""
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
@@ -202,20 +223,20 @@ def _toml(value: str | float | tuple[str, ...]) -> str:
 
 _TABLES = {"schema", "line_of_sight", "lines_of_sight", "default_lines", "pairs", "source"}
 _TEXT = {"name", "description"}
-_NUMBERS = {f.name for f in fields(ScanModel)} - _TEXT - _TABLES
+NUMBERS = {f.name for f in fields(ScanModel)} - _TEXT - _TABLES
+_POSITIVE = {"spin_period_s", "orbit_period_s", "sample_period_s", "duration_days"}
 _OPTIONAL = {"spin_phase_deg", "precession_phase_deg", "orbit_phase_deg"}
 _LINE_NUMBERS = {"boresight_angle_deg", "azimuth_deg", "sample_period_s"}
 
 
-def model_from_table(table: dict[str, Any], where: str) -> ScanModel:
+def _from_table(table: dict[str, Any], where: str) -> ScanModel:
     """Build a scan model from a parsed TOML table; ``where`` names it in error messages."""
-    known = _NUMBERS | _TEXT | _TABLES - {"lines_of_sight"}
-    _refuse_unknown(table, known, where)
+    _refuse_unknown(table, NUMBERS | _TEXT | _TABLES - {"lines_of_sight"}, where)
     if table.get("schema") != 1:
         raise InputError(f"{where}: schema is {table.get('schema')!r}, but this version reads schema = 1.")
     if not isinstance(table.get("name"), str) or not table["name"]:
         raise InputError(f"{where}: key 'name' is missing; give the survey a name.")
-    numbers = {key: _number(table, key, where) for key in _NUMBERS if key in table or key not in _OPTIONAL}
+    numbers = {key: _number(table, key, where) for key in NUMBERS if key in table or key not in _OPTIONAL}
     lines = _lines(table.get("line_of_sight"), where)
     names = tuple(line.name for line in lines)
     default_lines = _group(table.get("default_lines", list(names)), names, "default_lines", where)
@@ -226,7 +247,7 @@ def model_from_table(table: dict[str, Any], where: str) -> ScanModel:
             raise InputError(f"{where}: pairs.{key} has {len(pair)} lines of sight, but a pair needs 2.")
         pairs[key] = (pair[0], pair[1])
     source = _subtable(table, "source", where)
-    _refuse_unknown(source, _NUMBERS, f"{where}, [source]")
+    _refuse_unknown(source, NUMBERS, f"{where}, [source]")
     try:
         return ScanModel(
             name=table["name"],
@@ -242,8 +263,7 @@ def model_from_table(table: dict[str, Any], where: str) -> ScanModel:
 
 
 def _refuse_unknown(table: dict[str, Any], known: set[str], where: str) -> None:
-    unknown = sorted(set(table) - known)
-    if unknown:
+    if unknown := sorted(set(table) - known):
         raise InputError(f"{where}: unknown key {unknown[0]!r}; the keys are {', '.join(sorted(known))}.")
 
 
@@ -257,9 +277,8 @@ def _subtable(table: dict[str, Any], key: str, where: str) -> dict[str, Any]:
 def _group(value: Any, names: tuple[str, ...], label: str, where: str) -> tuple[str, ...]:
     if not isinstance(value, list) or not value:
         raise InputError(f"{where}: {label} is {value!r}, but it must be a list of names of lines of sight.")
-    for name in value:
-        if name not in names:
-            raise InputError(f"{where}: {label} names {name!r}, but the lines of sight are {', '.join(names)}.")
+    if unknown := [name for name in value if name not in names]:
+        raise InputError(f"{where}: {label} names {unknown[0]!r}, but the lines of sight are {', '.join(names)}.")
     return tuple(value)
 
 
@@ -286,9 +305,7 @@ def _lines(tables: Any, where: str) -> tuple[LineOfSight, ...]:
         if "boresight_angle_deg" not in numbers:
             raise InputError(f"{inside}: key 'boresight_angle_deg' is missing; give a number.")
         lines.append(LineOfSight(name=name, source=str(table.get("source", "")), **numbers))
-    names = [line.name for line in lines]
-    for name in names:
-        if names.count(name) > 1:
+        if [line.name for line in lines].count(name) > 1:
             raise InputError(f"{where}: two lines of sight are called {name!r}; names must differ.")
     return tuple(lines)
 
@@ -296,11 +313,10 @@ def _lines(tables: Any, where: str) -> tuple[LineOfSight, ...]:
 def _check(model: ScanModel) -> None:
     """Raise InputError if the numbers of a model describe no possible survey."""
     where = f"scan model {model.name!r}"
-    for key in _NUMBERS:
+    for key in NUMBERS:
         if not math.isfinite(getattr(model, key)):
             raise InputError(f"{where}: {key} is {getattr(model, key)}, but it must be a finite number.")
-    for key in ("spin_period_s", "orbit_period_s", "sample_period_s", "duration_days"):
-        if not getattr(model, key) > 0.0:
+        if key in _POSITIVE and not getattr(model, key) > 0.0:
             raise InputError(f"{where}: {key} is {getattr(model, key):g}, but it must be > 0.")
     if model.orbit_period_s < SECONDS_PER_DAY:
         raise InputError(

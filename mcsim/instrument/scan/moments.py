@@ -1,8 +1,9 @@
 """Orientation moments of a survey: what a pixel's map value needs to know about the scan."""
 
+import hashlib
 import json
-import warnings
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -12,16 +13,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mcsim.errors import InputError
-from mcsim.instrument.scan.accumulate import means, stream_sums
-from mcsim.instrument.scan.geometry import FRAMES, MapGrid, check_frame
+from mcsim.instrument.scan.accumulate import stream_sums
+from mcsim.instrument.scan.geometry import MapGrid, check_frame
 from mcsim.instrument.scan.limit import limit_moments
-from mcsim.instrument.scan.model import ScanModel
+from mcsim.instrument.scan.model import NUMBERS, ScanModel
 from mcsim.instrument.scan.user_pointing import blocks_of_files, checked_samples, sums_of_samples
-from mcsim.sphere.checks import check_nside, check_shape, check_whole, nside_of
-from mcsim.sphere.header import frame_named, radians
+from mcsim.sphere.checks import check_nside, check_shape, check_whole
+from mcsim.support import folders
+from mcsim.support.code import package_digest
 
 _META = "moments.json"
 _ARRAYS = ("hits", "w", "dtheta", "dphi")
+_PIXELS = 1 << 18
+"""Whose centroids are computed at once, to save memory."""
 
 
 @dataclass(frozen=True)
@@ -113,8 +117,7 @@ class Moments:
         0.55
         """
         survey = model if isinstance(model, ScanModel) else ScanModel.load(model)
-        sums = stream_sums(survey, MapGrid(nside, frame, time_range), smax, nthreads)
-        return cls(nside, frame, **means(sums, nside, smax))
+        return cls._from_sums(stream_sums(survey, MapGrid(nside, frame, time_range), smax, nthreads), frame)
 
     @classmethod
     def from_pointing(
@@ -153,8 +156,7 @@ class Moments:
         shapes = [array.shape for array in arrays]
         if len(set(shapes)) > 1 or arrays[0].ndim != 1 or not arrays[0].size:
             raise InputError(f"theta, phi and psi have the shapes {shapes}; give three arrays of one length, (n,).")
-        sums = sums_of_samples([checked_samples(arrays, "the pointing")], nside, smax)
-        return cls(nside, frame, **means(sums, nside, smax))
+        return cls._from_sums(sums_of_samples([checked_samples(arrays, "the pointing")], nside, smax), frame)
 
     @classmethod
     def from_pointing_files(
@@ -180,7 +182,26 @@ class Moments:
             psi beyond two turns.
         """
         check_frame(frame)
-        return cls(nside, frame, **means(sums_of_samples(blocks_of_files(paths, frame), nside, smax), nside, smax))
+        return cls._from_sums(sums_of_samples(blocks_of_files(paths, frame), nside, smax), frame)
+
+    @classmethod
+    def _from_sums(cls, sums: NDArray[np.float64], frame: str) -> Self:
+        """Return the moments of an accumulator of :func:`mcsim.instrument.scan.accumulate.pixel_sums`."""
+        nside, smax = math.isqrt(len(sums) // 12), sums.shape[1] // 2 - 2
+        hits = sums[:, 0].copy()
+        inverse = np.divide(1.0, hits, out=np.zeros_like(hits), where=hits > 0.0)
+        w = np.empty((smax, hits.size), dtype=np.complex128)
+        for s in range(smax):
+            w[s].real = sums[:, 4 + 2 * s] * inverse
+            w[s].imag = sums[:, 5 + 2 * s] * inverse
+        dtheta, dphi = np.empty_like(hits), np.empty_like(hits)
+        for first in range(0, hits.size, _PIXELS):
+            part = slice(first, min(first + _PIXELS, hits.size))
+            theta, phi = healpy.pix2ang(nside, np.arange(part.start, part.stop))
+            x, y, z = (sums[part, axis] * inverse[part] for axis in (1, 2, 3))
+            dtheta[part] = np.cos(theta) * (x * np.cos(phi) + y * np.sin(phi)) - np.sin(theta) * z
+            dphi[part] = y * np.cos(phi) - x * np.sin(phi)
+        return cls(nside, frame, hits, w, dtheta, dphi)
 
     @classmethod
     def parallel_transport(cls, nside: int, psi0_deg: float = 0.0, smax: int = 4, frame: str = "ecliptic") -> Self:
@@ -254,9 +275,11 @@ class Moments:
         """
         check_nside(nside)
         survey = model if isinstance(model, ScanModel) else ScanModel.load(model)
+        if line_of_sight is not None:
+            survey = survey.with_lines_of_sight(line_of_sight)
         theta, _ = healpy.pix2ang(nside, np.arange(12 * nside * nside))
         rings, ring = np.unique(theta, return_inverse=True)
-        density, w = limit_moments(survey, rings, smax, line_of_sight)
+        density, w = limit_moments(survey, rings, smax)
         return cls(nside, "ecliptic", density[ring] / density[ring].mean(), w[:, ring])
 
     @property
@@ -315,135 +338,38 @@ class Moments:
             ) from None
 
 
-def read_moments_fits(
-    path: str | Path, nside: int | None = None, smax: int | None = None, frame: str | None = None
-) -> Moments:
-    """Read moments from a HEALPix table with columns HITS, RE_s, IM_s[, DTHETA, DPHI].
+def scan_key(model: ScanModel, grid: MapGrid, smax: int = 0) -> str:
+    """Return the SHA-256 of all code and all numbers that the samples of a model's default lines of sight depend on.
 
-    Parameters
-    ----------
-    path
-        FITS file; the table is the first binary table. RE_s + i IM_s is the mean of e^{-i s psi}.
-    nside
-        Resolution that the file must have; None: any.
-    smax
-        Largest s to read, which the file must have; None: all columns that follow each other from s = 1.
-    frame
-        Frame that the file must have. Where the file has no COORDSYS it is taken as given here.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, is NESTED, lacks a column, has another nside or frame, negative hits,
-        non-finite numbers, or a modulus above 1.
+    Names and citations are left out. ``smax``: largest s of what is computed from them.
     """
-    columns, header = _read_table(path)
-    where = f"moments file {str(path)!r}"
-    if "HITS" not in columns:
-        raise InputError(f"{where} has no column HITS; the columns are {', '.join(columns)}.")
-    hits = columns["HITS"]
-    found = nside_of(hits.size, where)
-    if nside is not None and found != nside:
-        raise InputError(f"{where} has nside {found}, but the maps have nside {nside}; use moments at nside {nside}.")
-    if header["NSIDE"] not in (None, found):
-        raise InputError(f"{where} says NSIDE = {header['NSIDE']} but has {hits.size} pixels; write it again.")
-    if str(header["ORDERING"]).strip().upper() != "RING":
-        raise InputError(f"{where} has ORDERING = {header['ORDERING']!r}, but it must be RING; reorder it first.")
-    frame = _frame_of(header["COORDSYS"], frame, where)
-    if smax is None:
-        smax = 0
-        while f"RE_{smax + 1}" in columns and f"IM_{smax + 1}" in columns:
-            smax += 1
-        smax = max(smax, 1)
-    needed = [f"{part}_{s}" for s in range(1, smax + 1) for part in ("RE", "IM")]
-    for name in needed:
-        if name not in columns:
-            raise InputError(f"{where} has no column {name}, but moments up to s = {smax} are needed.")
-    offsets = [name for name in ("DTHETA", "DPHI") if name in columns]
-    if len(offsets) == 1:
-        raise InputError(f"{where} has {offsets[0]} alone; give both DTHETA and DPHI or neither.")
-    seen = hits > 0.0
-    for name in ("HITS", *needed, *offsets):
-        bad = ~np.isfinite(columns[name] if name == "HITS" else np.where(seen, columns[name], 0.0))
-        if bad.any():
-            raise InputError(f"{where}: column {name} is not finite in {bad.sum()} pixels, first {np.argmax(bad)}.")
-    if hits.min() < 0.0:
-        raise InputError(f"{where}: HITS is {hits.min():g} in pixel {hits.argmin()}, but it must be >= 0.")
-    w = np.empty((smax, hits.size), dtype=np.complex128)
-    for s in range(1, smax + 1):
-        w[s - 1] = np.where(seen, columns[f"RE_{s}"] + 1j * columns[f"IM_{s}"], 0.0)
-    # Single precision may exceed 1 by 6e-8.
-    largest = np.abs(w).max(initial=0.0)
-    if largest > 1.0 + 1e-6:
-        raise InputError(f"{where}: a moment has modulus {largest:g}, but means of e^(-i s psi) are <= 1.")
-    centroid = [np.where(seen, columns[name], 0.0) for name in offsets]
-    farthest = max((float(np.abs(offset).max()) for offset in centroid), default=0.0)
-    if farthest > 2.0 * healpy.max_pixrad(found):
-        raise InputError(
-            f"{where}: samples lie {farthest:g} rad from their pixel's centre, but a pixel of nside {found} "
-            f"reaches {healpy.max_pixrad(found):.3g}; give DTHETA and DPHI in radians, or their unit in TUNIT."
-        )
-    return Moments(found, frame, hits, w, *centroid)
+    lines = [[line.boresight_angle_deg, line.azimuth_deg, model.period_of_samples(line)] for line in model.select()]
+    everything = [
+        package_digest(["mcsim.instrument.scan"], ["healpy", "numpy"]),
+        {name: float(getattr(model, name)) for name in NUMBERS},
+        lines,
+        [grid.nside, grid.frame, *(float(edge) for edge in grid.time_range)],
+        smax,
+    ]
+    return hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()
 
 
-def write_moments_fits(path: str | Path, moments: Moments) -> None:
-    """Write moments as a HEALPix table that :func:`read_moments_fits` reads, overwriting ``path``."""
-    from astropy.io import fits
+def cached_moments(
+    model: ScanModel,
+    grid: MapGrid,
+    smax: int,
+    nthreads: int = 1,
+    progress: Callable[[float], None] | None = None,
+    cache_dir: str | Path | None = None,
+) -> Path:
+    """Return the folder, for :meth:`Moments.load`, with the moments of a survey's default lines of sight.
 
-    arrays = {"HITS": moments.hits}
-    for s in range(1, moments.smax + 1):
-        arrays[f"RE_{s}"], arrays[f"IM_{s}"] = moments.w[s - 1].real, moments.w[s - 1].imag
-    if moments.dtheta is not None and moments.dphi is not None:
-        arrays["DTHETA"], arrays["DPHI"] = moments.dtheta, moments.dphi
-    units = {"DTHETA": "rad", "DPHI": "rad"}
-    table = fits.BinTableHDU.from_columns(
-        [fits.Column(name=name, format="D", unit=units.get(name), array=array) for name, array in arrays.items()]
-    )
-    table.header["PIXTYPE"] = "HEALPIX"
-    table.header["ORDERING"] = "RING"
-    table.header["COORDSYS"] = FRAMES[moments.frame]
-    table.header["NSIDE"] = moments.nside
-    table.header["FIRSTPIX"], table.header["LASTPIX"] = 0, moments.npix - 1
-    table.header["INDXSCHM"] = "IMPLICIT"
-    table.header["COMMENT"] = "RE_s + i IM_s: mean of exp(-i s psi); psi from e_theta (south) towards e_phi (east)"
-    table.writeto(path, overwrite=True)
+    They are streamed (:func:`mcsim.instrument.scan.accumulate.stream_sums`) if they are not in the cache yet: that of
+    ``cache_dir``, or of :func:`mcsim.support.folders.default_cache_dir`. The folder appears complete or not at all;
+    InputError if it cannot be written.
+    """
 
+    def fill(folder: Path) -> None:
+        Moments._from_sums(stream_sums(model, grid, smax, nthreads, progress), grid.frame).save(folder)
 
-def _frame_of(coordsys: Any, frame: str | None, where: str) -> str:
-    if frame is not None:
-        check_frame(frame)
-    named = frame_named(coordsys, where)
-    if named is None:
-        if frame is None:
-            raise InputError(f"{where} has no COORDSYS; write E, G or C there.")
-        return frame
-    if frame is not None and named != frame:
-        raise InputError(f"{where} is in {named} coordinates, but the maps are {frame}; use moments of that frame.")
-    return named
-
-
-def _read_table(path: str | Path) -> tuple[dict[str, NDArray[np.float64]], dict[str, Any]]:
-    """Return columns (upper-case names, flattened, float64) and HEALPix keywords of a file's first binary table."""
-    from astropy.io import fits
-
-    try:
-        # A truncated file warns when opened and fails when read: one message is enough.
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with fits.open(path) as hdus:
-                table = next((hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU)), None)
-                if table is None:
-                    raise ValueError("it has no binary table")
-                columns = {
-                    name.upper(): np.array(table.data[name], dtype=np.float64).ravel() for name in table.columns.names
-                }
-                for column in table.columns:
-                    if column.unit and column.name.upper() in ("DTHETA", "DPHI"):
-                        columns[column.name.upper()] *= radians(column.unit)
-                header = {key: table.header.get(key) for key in ("NSIDE", "ORDERING", "COORDSYS")}
-    except Exception as error:  # libraries raise whatever a broken file makes of them
-        raise InputError(f"moments file {str(path)!r} cannot be read: {error}; give a complete FITS table.") from None
-    sizes = {array.size for array in columns.values()}
-    if len(sizes) != 1:
-        raise InputError(f"moments file {str(path)!r} has columns of different sizes {sorted(sizes)}; write it again.")
-    return columns, header
+    return folders.cached(f"moments-{scan_key(model, grid, smax)}", fill, cache_dir)

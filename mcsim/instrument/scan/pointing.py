@@ -7,9 +7,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mcsim.instrument.scan.geometry import frame_matrix
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
 from mcsim.sphere.checks import check_whole
+from mcsim.sphere.rotation import rotation_matrix
 
 BLOCK = 512
 """Samples whose trigonometry is done together: the work arrays of a block stay in the processor's first caches."""
@@ -42,53 +42,63 @@ class PointingStream:
 
     def __init__(self, model: ScanModel, line: LineOfSight, frame: str) -> None:
         step = Fraction(model.period_of_samples(line))
-        self.samples = model.samples(line)
-        self._turns = [
-            step / Fraction(p) for p in (model.spin_period_s, model.precession_period_s, model.orbit_period_s)
-        ]
+        periods = (model.spin_period_s, model.precession_period_s, model.orbit_period_s)
+        self._turns = [step / Fraction(period) for period in periods]
         offsets_deg = (model.spin_phase_deg + line.azimuth_deg, model.precession_phase_deg, model.orbit_phase_deg)
         self._offsets = [Fraction(offset) / 360 for offset in offsets_deg]
-        in_block = np.array([[float(k * turn % 1) for k in range(BLOCK)] for turn in self._turns])
-        angles = _TWO_PI * in_block
-        self.tables = np.ascontiguousarray(np.stack([np.cos(angles), np.sin(angles)], axis=1))
-        self.block_turns = np.array([float(BLOCK * turn % 1) for turn in self._turns])
+        angles = _TWO_PI * np.array([[float(k * turn % 1) for k in range(BLOCK)] for turn in self._turns])
         boresight, precession = math.radians(line.boresight_angle_deg), math.radians(model.precession_angle_deg)
-        self.geometry = np.array([math.cos(boresight), math.sin(boresight), math.cos(precession), math.sin(precession)])
-        self.to_frame = frame_matrix(frame)
+        self._constant = (
+            np.array([float(BLOCK * turn % 1) for turn in self._turns]),
+            np.ascontiguousarray(np.stack([np.cos(angles), np.sin(angles)], axis=1)),
+            np.array([math.cos(boresight), math.sin(boresight), math.cos(precession), math.sin(precession)]),
+            np.ascontiguousarray(rotation_matrix("ecliptic", frame)),
+        )
 
-    def start_turns(self, first: int) -> NDArray[np.float64]:
-        """Return the turns of spin, precession and orbit at sample ``first``, each in [0, 1), shape (3,)."""
-        return np.array([float((o + first * t) % 1) for o, t in zip(self._offsets, self._turns, strict=True)])
+    def at(self, first: int) -> tuple[NDArray[np.float64], ...]:
+        """Return where the samples from ``first`` on start, as :func:`fill_block` takes it.
+
+        These are the turns of spin, precession and orbit at ``first`` and in a block, shape (3,), the table of cosines
+        and sines in a block, shape (3, 2, BLOCK), those of boresight and precession angle, shape (4,), and the rotation
+        to the frame of the maps, shape (3, 3).
+        """
+        turns = [float((o + first * t) % 1) for o, t in zip(self._offsets, self._turns, strict=True)]
+        return np.array(turns), *self._constant
 
 
 def pointing(
     model: ScanModel, line: LineOfSight, first: int, count: int, frame: str = "ecliptic"
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the pointing of consecutive samples of one line of sight.
-
-    Parameters
-    ----------
-    model, line
-        The survey and one of its lines of sight.
-    first, count
-        Index of the first sample (>= 0) and number of samples.
-    frame
-        "ecliptic", "galactic" or "equatorial".
-
-    Returns
-    -------
-    theta, phi, psi
-        Colatitude, longitude in [0, 2 pi) and orientation of the beam's x axis from e_theta towards e_phi in
-        (-pi, pi], in radians, each of shape (count,).
-    """
+) -> tuple[NDArray[np.float64], ...]:
+    """Return theta, phi in [0, 2 pi) and psi in (-pi, pi] of ``count`` samples from ``first`` on, radians."""
     check_whole(first, "first")
     check_whole(count, "count")
-    stream = PointingStream(model, line, frame)
-    theta, phi, psi = np.empty(count), np.empty(count), np.empty(count)
-    _angles(
-        stream.start_turns(first), stream.block_turns, stream.tables, stream.geometry, stream.to_frame, theta, phi, psi
-    )
-    return theta, phi, psi
+    angles = np.empty((3, count))
+    fill_samples(PointingStream(model, line, frame).at(first), count, 1, angles, None)
+    return tuple(angles)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fill_samples(start, count, nside, angles, pixels):  # type: ignore[no-untyped-def]
+    """Fill in theta, phi and psi, shape (3, count), and RING pixels, shape (count,), of samples; None: leave it out."""
+    work = np.empty((6, BLOCK))
+    for first in range(0, count, BLOCK):
+        size = min(BLOCK, count - first)
+        fill_block(start, first, size, work)
+        if pixels is not None:
+            fill_pixels(nside, work, pixels[first : first + size])
+        if angles is not None:
+            for k in range(size):
+                x, y = work[0, k], work[1, k]
+                angles[0, first + k] = math.atan2(math.sqrt(x * x + y * y), work[2, k])
+                angles[1, first + k] = work[5, k] * (0.5 * math.pi)
+                angles[2, first + k] = math.atan2(work[4, k], work[3, k])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fill_pixels(nside, work, pixels):  # type: ignore[no-untyped-def]
+    """Fill in the RING pixels of the first samples of a block that :func:`fill_block` left in ``work``."""
+    for k in range(pixels.size):
+        pixels[k] = ring_pixel(nside, work[5, k], work[0, k], work[1, k], work[2, k])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -111,16 +121,22 @@ def quarter_turns(x, y):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_block(turns, tables, geometry, to_frame, count, work):  # type: ignore[no-untyped-def]
-    """Fill ``work`` with the directions and orientations of ``count`` <= BLOCK samples that start at ``turns``.
+def fill_block(start, first, count, work):  # type: ignore[no-untyped-def]
+    """Fill ``work`` with directions and orientations of ``count`` <= BLOCK samples: the one loop that all scans share.
 
-    ``work``, shape (6, BLOCK), takes n_x, n_y, n_z of the line of sight in the frame of the maps, cos psi and
-    sin psi of the beam's x axis, and the longitude in quarter turns. Only elementwise arithmetic, so that the
-    compiler uses vector instructions.
+    ``start`` is that of :meth:`PointingStream.at`; ``first`` counts from there and is a multiple of BLOCK. ``work``,
+    shape (6, BLOCK), takes n_x, n_y, n_z of the line of sight in the frame of the maps, cos psi and sin psi of the
+    beam's x axis, and the longitude in quarter turns. Only elementwise arithmetic, so that the compiler uses vector
+    instructions.
     """
-    cos_a, sin_a = math.cos(_TWO_PI * turns[0]), math.sin(_TWO_PI * turns[0])
-    cos_p, sin_p = math.cos(_TWO_PI * turns[1]), math.sin(_TWO_PI * turns[1])
-    cos_o, sin_o = math.cos(_TWO_PI * turns[2]), math.sin(_TWO_PI * turns[2])
+    turns, block_turns, tables, geometry, to_frame = start
+    block = first // BLOCK
+    spin = _TWO_PI * ((turns[0] + block * block_turns[0]) % 1.0)
+    precession = _TWO_PI * ((turns[1] + block * block_turns[1]) % 1.0)
+    orbit = _TWO_PI * ((turns[2] + block * block_turns[2]) % 1.0)
+    cos_a, sin_a = math.cos(spin), math.sin(spin)
+    cos_p, sin_p = math.cos(precession), math.sin(precession)
+    cos_o, sin_o = math.cos(orbit), math.sin(orbit)
     cos_b, sin_b, cos_t, sin_t = geometry[0], geometry[1], geometry[2], geometry[3]
     f00, f01, f02 = to_frame[0, 0], to_frame[0, 1], to_frame[0, 2]
     f10, f11, f12 = to_frame[1, 0], to_frame[1, 1], to_frame[1, 2]
@@ -171,20 +187,3 @@ def ring_pixel(nside, turns, x, y, z):  # type: ignore[no-untyped-def]
     if z > 0.0:
         return 2 * ring * (ring - 1) + column
     return 12 * nside * nside - 2 * ring * (ring + 1) + column
-
-
-@njit(cache=True, nogil=True)
-def _angles(start, block_turns, tables, geometry, to_frame, theta, phi, psi):  # type: ignore[no-untyped-def]
-    work = np.empty((6, BLOCK))
-    turns = np.empty(3)
-    for block in range((theta.size + BLOCK - 1) // BLOCK):
-        first = block * BLOCK
-        count = min(BLOCK, theta.size - first)
-        for axis in range(3):
-            turns[axis] = (start[axis] + block * block_turns[axis]) % 1.0
-        fill_block(turns, tables, geometry, to_frame, count, work)
-        for k in range(count):
-            x, y = work[0, k], work[1, k]
-            theta[first + k] = math.atan2(math.sqrt(x * x + y * y), work[2, k])
-            phi[first + k] = work[5, k] * (0.5 * math.pi)
-            psi[first + k] = math.atan2(work[4, k], work[3, k])

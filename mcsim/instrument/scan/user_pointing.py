@@ -25,19 +25,9 @@ _ENOUGH_ROWS = 10
 
 
 def sums_of_samples(blocks: Iterable[Sequence[NDArray]], nside: int, smax: int) -> NDArray[np.float64]:
-    """Return the sums per pixel, as of :func:`mcsim.instrument.scan.accumulate.pixel_sums`, of blocks of samples.
+    """Return the sums per pixel (:func:`mcsim.instrument.scan.accumulate.pixel_sums`) of blocks of samples.
 
-    Parameters
-    ----------
-    blocks
-        theta, phi, psi in radians, shape (n,) each, as :func:`blocks_of_files` and :func:`checked_samples` give them.
-    nside, smax
-        HEALPix resolution, and largest s (>= 1).
-
-    Raises
-    ------
-    InputError
-        If nside or smax is out of range.
+    A block is theta, phi, psi in radians, shape (n,) each, as of :func:`blocks_of_files` and :func:`checked_samples`.
     """
     check_nside(nside)
     check_whole(smax, "smax", 1)

@@ -6,7 +6,6 @@ from mcsim.simulation.mapmaking.rhs import (
     Imbalance,
     SideMaps,
     rhs_from_maps,
-    rhs_from_samples,
     side_maps,
 )
 from mcsim.simulation.mapmaking.solve import MapmakingReport, StoppingRule, diagonal, solve
@@ -21,7 +20,6 @@ __all__ = [
     "diagonal",
     "prepare",
     "rhs_from_maps",
-    "rhs_from_samples",
     "side_maps",
     "solve",
 ]

@@ -1,6 +1,5 @@
 """Pairs of pixels that a differencing scan sees at once: counted, merged, kept on disk, shared by all realizations."""
 
-import hashlib
 import json
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -15,10 +14,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
-from mcsim.instrument.scan.geometry import MapGrid
-from mcsim.instrument.scan.model import LineOfSight, ScanModel
-from mcsim.instrument.scan.pointing import BLOCK, PointingStream, fill_block, ring_pixel
-from mcsim.simulation.tod import chunks, sample_range
+from mcsim.instrument.scan import LineOfSight, MapGrid, ScanModel, scan_key
+from mcsim.instrument.scan.pointing import PointingStream, fill_samples
+from mcsim.simulation.tod import chunks
 from mcsim.support import folders
 from mcsim.support.code import package_digest
 
@@ -34,14 +32,10 @@ _META = "pairs.json"
 
 @dataclass(frozen=True)
 class DifferencingScan:
-    """What map-making needs to know about the pointing of two beams that are read as a difference.
+    """What map-making needs to know about the pointing of two beams of one sampling rate that are read as a difference.
 
-    Parameters
+    Attributes
     ----------
-    model, side_a, side_b
-        The survey and its two lines of sight, of one sampling rate.
-    grid
-        Pixels of the map, and the part of the survey.
     hits_a, hits_b
         Samples with side A, side B in a pixel, shape (npix,).
     row_start
@@ -69,7 +63,7 @@ class DifferencingScan:
     @property
     def samples(self) -> int:
         """Number of differences."""
-        first, last = sample_range(self.model, self.side_a, self.grid.time_range)
+        first, last = self.grid.sample_range(self.model, self.side_a)
         return last - first
 
 
@@ -83,24 +77,10 @@ def prepare(
 ) -> DifferencingScan:
     """Return the pairs of pixels of a differencing scan, computed once and memory-mapped from then on.
 
-    Parameters
-    ----------
-    model, pair
-        The survey and the name of one of its differencing pairs (assemblies).
-    grid
-        Pixels of the map, and the part of the survey.
-    cache_dir
-        Where to keep the pairs; None: the folder of :func:`mcsim.support.folders.default_cache_dir`.
-    nthreads
-        Number of threads; the result does not depend on it, bit for bit.
-    progress
-        Called with the fraction done.
-
-    Raises
-    ------
-    InputError
-        If the pair is unknown or its sides are sampled at different rates, the time range contains no sample, or the
-        cache cannot be written.
+    ``pair`` names one of the model's differencing pairs (assemblies), ``cache_dir`` the folder to keep them in (None:
+    :func:`mcsim.support.folders.default_cache_dir`); ``progress`` takes the fraction done. The result does not depend
+    on the threads, bit for bit. InputError if the pair is unknown, its sides are sampled at different rates, the time
+    range contains no sample, or the cache cannot be written.
 
     Notes
     -----
@@ -115,37 +95,22 @@ def prepare(
             f"pair {pair!r} samples side A every {period_a:g} s and side B every {period_b:g} s, but a difference "
             "needs one rate; give both one sample_period_s."
         )
-    sample_range(model, sides[0], grid.time_range)
+    first, last = grid.sample_range(model, sides[0])
+    streams = [PointingStream(model, side, grid.frame) for side in sides]
 
     def fill(folder: Path) -> None:
-        _write(folder, model, sides, grid, max(1, nthreads), progress or (lambda _: None))
+        _write(folder, streams, parts(chunks(first, last)), grid, max(1, nthreads), progress or (lambda _: None))
 
-    folder = folders.cached(f"pairs-{_key(model, sides, grid)}", fill, cache_dir)
+    code = package_digest([__name__, "mcsim.simulation.tod"])
+    seen = scan_key(model.with_lines_of_sight(*(side.name for side in sides)), grid)
+    folder = folders.cached(f"pairs-{seen[:32]}-{code[:32]}", fill, cache_dir)
     return DifferencingScan(model, *sides, grid, **_load(folder, grid.npix))
 
 
-def parts(first: int, last: int) -> list[list[tuple[int, int]]]:
-    """Return chunks of the samples first ... last - 1 in at most PARTS consecutive groups."""
-    everything = chunks(first, last)
-    edges = [len(everything) * part // PARTS for part in range(PARTS + 1)]
-    return [everything[low:high] for low, high in pairwise(edges) if high > low]
-
-
-def _key(model: ScanModel, sides: tuple[LineOfSight, LineOfSight], grid: MapGrid) -> str:
-    """Return the SHA-256 of every number that the pairs depend on."""
-    everything = {
-        "code": package_digest(["mcsim.instrument.scan", __name__], ["healpy", "numpy"]),
-        "spin": [model.spin_period_s, model.spin_phase_deg],
-        "precession": [model.precession_period_s, model.precession_angle_deg, model.precession_phase_deg],
-        "orbit": [model.orbit_period_s, model.orbit_phase_deg],
-        "duration_days": model.duration_days,
-        "sides": [[side.boresight_angle_deg, side.azimuth_deg] for side in sides],
-        "sample_period_s": model.period_of_samples(sides[0]),
-        "time_range": [float(edge) for edge in grid.time_range],
-        "nside": grid.nside,
-        "frame": grid.frame,
-    }
-    return hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()
+def parts(pieces: list[tuple[int, int]]) -> list[list[tuple[int, int]]]:
+    """Cut chunks into at most PARTS consecutive groups."""
+    edges = [len(pieces) * part // PARTS for part in range(PARTS + 1)]
+    return [pieces[low:high] for low, high in pairwise(edges) if high > low]
 
 
 def _load(folder: Path, npix: int) -> dict[str, Any]:
@@ -166,22 +131,26 @@ def _load(folder: Path, npix: int) -> dict[str, Any]:
 
 def _write(
     folder: Path,
-    model: ScanModel,
-    sides: tuple[LineOfSight, LineOfSight],
+    streams: list[PointingStream],
+    shares: list[list[tuple[int, int]]],
     grid: MapGrid,
     nthreads: int,
     progress: Callable[[float], None],
 ) -> None:
-    first, last = sample_range(model, sides[0], grid.time_range)
+    """Write the pairs of two streams of pointing, whose chunks threads share out."""
+    first, last = shares[0][0][0], shares[-1][-1][1]
     path = folder / "samples.raw"
     pixels = np.memmap(path, dtype=np.int32, mode="w+", shape=(2, last - first))
+
+    def run(stream: PointingStream, share: list[tuple[int, int]], own: NDArray[np.int32]) -> None:
+        for low, high in share:
+            fill_samples(stream.at(low), high - low, grid.nside, None, own[low - first : high - first])
+
     with ThreadPoolExecutor(nthreads) as pool:
         jobs = [
-            pool.submit(
-                _stream, PointingStream(model, line, grid.frame), part, grid.nside, pixels[side, part[0][0] - first :]
-            )
-            for part in parts(first, last)
-            for side, line in enumerate(sides)
+            pool.submit(run, stream, share, own)
+            for share in shares
+            for stream, own in zip(streams, pixels, strict=True)
         ]
         for done, job in enumerate(jobs):
             job.result()
@@ -220,12 +189,6 @@ def _write_rows(
     return np.cumsum(row_start), np.dtype(count_type)
 
 
-def _stream(stream: PointingStream, part: list[tuple[int, int]], nside: int, pixels: NDArray[np.int32]) -> None:
-    for low, high in part:
-        own, start = pixels[low - part[0][0] : high - part[0][0]], stream.start_turns(low)
-        _pixels(start, stream.block_turns, stream.tables, stream.geometry, stream.to_frame, nside, own)
-
-
 def _bands(entries: NDArray[np.float64]) -> list[tuple[int, int]]:
     """Return bands of pixels with at most _BAND entries each (or one pixel)."""
     total = np.concatenate([[0], np.cumsum(entries)])
@@ -249,20 +212,6 @@ def _band(
     lengths = np.empty(high - low, dtype=np.int64)
     size = _merge(edges, np.zeros(entries.size, dtype=np.uint32), partner, count, lengths)
     return partner[:size], count[:size], lengths
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _pixels(start, block_turns, tables, geometry, to_frame, nside, pixels):  # type: ignore[no-untyped-def]
-    work = np.empty((6, BLOCK))
-    turns = np.empty(3)
-    for block in range((pixels.size + BLOCK - 1) // BLOCK):
-        first = block * BLOCK
-        size = min(BLOCK, pixels.size - first)
-        for axis in range(3):
-            turns[axis] = (start[axis] + block * block_turns[axis]) % 1.0
-        fill_block(turns, tables, geometry, to_frame, size, work)
-        for k in range(size):
-            pixels[first + k] = ring_pixel(nside, work[5, k], work[0, k], work[1, k], work[2, k])
 
 
 @njit(cache=True, nogil=True)

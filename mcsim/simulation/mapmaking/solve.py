@@ -15,15 +15,7 @@ from mcsim.sphere.healpix import Map
 
 @dataclass(frozen=True)
 class StoppingRule:
-    """When conjugate gradients stop.
-
-    Parameters
-    ----------
-    tol
-        Relative residual |b - N m| / |b| to reach, > 0.
-    max_iterations
-        Iterations after which to give up, >= 0; the report says whether the tolerance was reached.
-    """
+    """Conjugate gradients stop at the relative residual |b - N m| / |b| of ``tol``, > 0, or give up."""
 
     tol: float = 1e-8
     max_iterations: int = 500
@@ -43,16 +35,8 @@ DEFAULT_RULE = StoppingRule()
 class MapmakingReport:
     """How a solution was reached.
 
-    Parameters
-    ----------
-    iterations
-        Iterations made.
-    converged
-        Whether the residual asked for was reached.
-    relative_residual
-        |b - N m| / |b| of the map that is returned, computed afresh from it.
-    history
-        The same after each iteration, as the recurrence of the method has it.
+    ``relative_residual`` is |b - N m| / |b| of the map that is returned, computed afresh from it; ``history`` has the
+    same after each iteration, as the recurrence of the method has it.
     """
 
     iterations: int
@@ -69,28 +53,12 @@ def solve(
     start: Map | None = None,
     nthreads: int = 1,
 ) -> tuple[Map, MapmakingReport]:
-    """Return the map that fits the differences best in the sense of least squares.
+    """Return the map that fits the differences best in the sense of least squares, uK, and how it was reached.
 
-    Parameters
-    ----------
-    scan
-        The pairs of pixels.
-    rhs
-        P^T d in uK, shape (npix,), as :mod:`mcsim.simulation.mapmaking.rhs` makes it for the same ``x``.
-    x
-        Fiducial transmission imbalance, -1 < x < 1.
-    rule
-        When to stop.
-    start
-        Map to start from, in uK, shape (npix,); None: zero.
-    nthreads
-        Number of threads; the result does not depend on it, bit for bit.
-
-    Returns
-    -------
-    map, report
-        Map in uK, shape (npix,), ``healpy.UNSEEN`` where no sample fell. With x = 0 differences say nothing about the
-        monopole: the mean of the observed pixels is zero then.
+    ``rhs`` is P^T d in uK, shape (npix,), as :mod:`mcsim.simulation.mapmaking.rhs` makes it for the same fiducial
+    imbalance ``x``, -1 < x < 1; ``start`` is a map to start from (None: zero). The map is ``healpy.UNSEEN`` where no
+    sample fell. With x = 0 differences say nothing about the monopole: the mean of the observed pixels is zero then.
+    The result does not depend on the threads, bit for bit.
 
     Raises
     ------
@@ -150,15 +118,7 @@ def diagonal(scan: DifferencingScan, x: float) -> Map:
 def apply_normal(scan: DifferencingScan, x: float, map_uk: Map, pool: ThreadPoolExecutor, parts: int = 1) -> Map:
     """Apply the normal matrix to a map: D m - (1 - x^2) C m, C the counts of pairs; unobserved pixels give 0.
 
-    Parameters
-    ----------
-    scan, x
-        The pairs and the transmission imbalance, -1 < x < 1.
-    map_uk
-        Shape (npix,).
-    pool, parts
-        Threads that share out the rows, in ``parts`` pieces. Each row is summed by one of them: bit for bit the same
-        for any number.
+    Threads share out the rows in ``parts`` pieces. Each row is summed by one of them: the same bits for any number.
     """
     result = np.empty(scan.npix)
     edges = np.searchsorted(scan.row_start, np.linspace(0, scan.partner.size, parts + 1)[1:-1])

@@ -11,29 +11,20 @@ from scipy.optimize import minimize
 
 Vector = NDArray[np.float64]
 
-RESAMPLED = 1000
-"""Resampled sets of cases of a bootstrap interval."""
-
 
 @dataclass(frozen=True)
 class Metric:
-    """A measured metric; the names are keys of ``score.json``.
+    """A measured number with its 95 % interval, and a target.
 
-    Attributes
-    ----------
-    name, value, low, high, count
-        Name, value, ends of its 95 % interval, and number of cases; NaN where there are too few.
-    target
-        Target in words; "": there is none.
-    met
-        True if the target is met; None if there is none, or too few cases.
+    ``count`` is the number of cases; value and ends of the interval are NaN where that is too small. The target is
+    in words, "" if there is none; ``met`` is None if there is none, or too few cases.
     """
 
     name: str
-    value: float
-    low: float
-    high: float
     count: int
+    value: float = np.nan
+    low: float = np.nan
+    high: float = np.nan
     target: str = ""
     met: bool | None = None
 
@@ -57,17 +48,17 @@ def binomial_interval(k: int, n: int) -> tuple[float, float]:
 def share(name: str, hits: Sequence[bool] | NDArray[np.bool_]) -> Metric:
     """Return the share of cases that are hits, with its exact binomial interval."""
     k, n = int(np.sum(hits)), len(hits)
-    return Metric(name, k / n if n else np.nan, *binomial_interval(k, n), n)
+    return Metric(name, n, k / n if n else np.nan, *binomial_interval(k, n))
 
 
 def mean(name: str, values: Sequence[float] | Vector) -> Metric:
     """Return the mean of at least two values, with its Student interval."""
     n = len(values)
     if n < 2:
-        return Metric(name, np.nan, np.nan, np.nan, n)
+        return Metric(name, n)
     value = float(np.mean(values))
     low, high = value + stats.sem(values) * stats.t.ppf((0.025, 0.975), n - 1)
-    return Metric(name, value, float(low), float(high), n)
+    return Metric(name, n, value, float(low), float(high))
 
 
 def width(name: str, values: Sequence[float] | Vector) -> Metric:
@@ -90,19 +81,16 @@ def removed(name: str, before_after: Sequence[tuple[float, float]]) -> Metric:
     return replace(found, value=1.0 - found.value, low=1.0 - found.high, high=1.0 - found.low)
 
 
-def _bootstrapped(name: str, statistic: Callable[..., Any], *samples: ArrayLike) -> Metric:
+def _bootstrapped(name: str, statistic: Callable[..., Any], *samples: ArrayLike, resampled: int = 1000) -> Metric:
+    """Return a statistic of at least three cases, with its percentile interval over resampled cases."""
     arrays = [np.asarray(sample, dtype=float) for sample in samples]
-    if (n := len(arrays[0])) < 3:
-        return Metric(name, np.nan, np.nan, np.nan, n)
-    return Metric(name, float(statistic(*arrays)), *_percentiles(statistic, arrays, RESAMPLED), n)
-
-
-def _percentiles(statistic: Callable[..., Any], samples: Sequence[Vector], count: int) -> tuple[float, float]:
-    """Return the 95 % percentile interval of a statistic of resampled cases."""
-    found = stats.bootstrap(
-        samples, statistic, n_resamples=count, paired=True, method="percentile", random_state=np.random.default_rng(0)
+    n, draw = len(arrays[0]), np.random.default_rng(0)
+    if n < 3:
+        return Metric(name, n)
+    low, high = stats.bootstrap(
+        arrays, statistic, n_resamples=resampled, paired=True, method="percentile", random_state=draw
     ).confidence_interval
-    return float(found.low), float(found.high)
+    return Metric(name, n, float(statistic(*arrays)), float(low), float(high))
 
 
 def snr_at_power(
@@ -113,19 +101,17 @@ def snr_at_power(
     With its bootstrap interval; NaN where there are fewer than 20 cases, or all or none are found.
     """
     if len(strengths) < 20 or found.all() or not found.any():
-        return Metric(name, np.nan, np.nan, np.nan, len(strengths))
+        return Metric(name, len(strengths))
 
     def solved(s: Vector, hit: Vector) -> float:
         if hit.all() or not hit.any():  # of resampled cases: the S/N is outside the drawn ones
-            return float(s.min() if hit.all() else s.max())
+            return float(s.min() if hit.all() else s.max()) / unit
         sign = np.where(hit, 1.0, -1.0)
 
         def loss(parameters: Vector) -> float:
             return -float(np.sum(stats.norm.logcdf(sign * (np.exp(parameters[1]) * (s - parameters[0])))))
 
         best = minimize(loss, np.array([np.median(s[hit == 0]) + 1.0, 0.0]), method="Nelder-Mead").x
-        return float(best[0] + stats.norm.ppf(power) * np.exp(-best[1]))
+        return float(best[0] + stats.norm.ppf(power) * np.exp(-best[1])) / unit
 
-    samples = [np.asarray(strengths), np.asarray(found, dtype=float)]
-    low, high = _percentiles(solved, samples, 100)
-    return Metric(name, solved(*samples) / unit, low / unit, high / unit, len(strengths))
+    return _bootstrapped(name, solved, strengths, found, resampled=100)

@@ -1,0 +1,197 @@
+"""Make a challenge, maps in which effects may act and sealed keys that say which, and diagnose its cases."""
+
+import json
+import secrets
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from mcsim import config
+from mcsim.benchmark import folder as files
+from mcsim.benchmark.case import Drawn, Member, Truth, Vector
+from mcsim.benchmark.folder import Settings
+from mcsim.benchmark.library import LearnedModel, learned_model, workers_of
+from mcsim.benchmark.out_of_library import library_with, responses
+from mcsim.benchmark.sampler import CaseSampler
+from mcsim.diagnosis.campaign import Batch, seeded, with_effects
+from mcsim.diagnosis.inference import diagnose_data
+from mcsim.diagnosis.observed_maps import ObservedMaps, read_maps
+from mcsim.ensemble.maps import file_names, write_map
+from mcsim.errors import InputError
+from mcsim.simulation import sampled, simulate
+from mcsim.simulation.survey import survey
+from mcsim.sphere import rng
+from mcsim.support.folders import appearing, writable
+from mcsim.support.progress import reporting
+
+EPSILON = 1e-7
+"""Error of the interpolation of samples, relative to the dipole: 0.3 nK."""
+
+SMALLER = 0.7
+"""Factor between one trial of an amplitude and the next."""
+
+ATTEMPTS = 16
+STRONGER = 1.5
+"""Largest ratio of the simulated to the drawn expected S/N."""
+
+
+def make(
+    settings: Settings, folder: str | Path, cases: int, seed: int, *, workers: int | None = None, quiet: bool = True
+) -> Path:
+    """Make those of a number of cases of a challenge that are not there yet; return the folder.
+
+    It gets ``cases/case-NNN`` (maps, model.toml, question.json, SEAL), ``keys/case-NNN.json`` and ``challenge.json``. A
+    folder can be filled in several calls, and a call that was interrupted repeated. The seed of the draws is kept among
+    the keys, because it determines them. ``workers`` is the number of processes; None: the model's; 0: this process.
+    InputError if the run cannot be used, or the folder holds a challenge with other settings.
+    """
+    if cases < 1:
+        raise InputError(f"a challenge of {cases} cases is none; ask for at least 1.")
+    target, file = Path(folder), settings.out_of_library
+    if file is not None:
+        settings = replace(settings, out_of_library=(file := str(Path(file).resolve())))
+    for channel in survey(settings.model).channels if settings.sampled_share > 0.0 or file else ():
+        sampled.check(channel)
+    writable(target)
+    settings.write(target, seed)
+    missing = [number for number in range(cases) if not (target / files.MAPS / f"case-{number:03d}").is_dir()]
+    if not missing:
+        return target
+    with workers_of(settings, workers, quiet) as call:
+        sampler = CaseSampler(settings.prior, learned_model(settings))
+        kinds = sampler.kinds(seed, cases, file is not None)
+        if file is not None and any(kinds[number] == "invented" for number in missing):
+            sampler = replace(sampler, out_of_library=responses(settings.model, file, call))
+        drawn = [_truth(sampler.draw(kinds, seed, number), seed, number, settings.sampled_share) for number in missing]
+        _each_case(call, make_case, [(settings, target, truth) for truth in drawn], quiet)
+    return target
+
+
+def _truth(drawn: Drawn, seed: int, number: int, sampled_share: float) -> Truth:
+    """Return the key of a case as far as it is drawn: without measured strengths and nonce."""
+    draw = rng.generator(seed, number, "challenge/data")
+    # Far from the seeds that people choose, and from those that a diagnosis learns with.
+    own = int(draw.integers(2**40, 2**62))
+    by_sample = bool(draw.random() < sampled_share) or drawn.kind == "invented"
+    return Truth(**vars(drawn), case=f"case-{number:03d}", seed=own, sampled=by_sample)
+
+
+def make_case(settings: Settings, folder: Path, truth: Truth) -> None:
+    """Make maps, seal and key of one case: the key first; the folder of the maps, complete, last."""
+    case, run = truth.case, settings.model
+    names = file_names(run)
+    if files.key_path(folder, case).is_file():
+        truth = files.read_key(folder, case)
+    else:
+        members = truth.members
+        if truth.kind != "invented":
+            members = tuple(_measured(learned_model(settings), member, truth.seed) for member in members)
+        truth = replace(truth, members=members, nonce=secrets.token_hex(32))
+        files.write_key(folder, truth)
+    with appearing(folder / files.MAPS / case) as scratch:
+        for name, map_uk in maps_of(run, truth, settings.out_of_library):
+            write_map(scratch / names[name], map_uk, config.prepared_grid(run)[1])
+        plain = {**config.to_dict(run), "name": case}
+        (scratch / "model.toml").write_text(tomli_w.dumps(_without_none(plain)), encoding="utf-8")
+        (scratch / "question.json").write_text(json.dumps({"without": list(truth.without)}) + "\n")
+        (scratch / files.SEAL).write_text(f"{files.key_hash(folder, case)}  {files.KEYS}/{case}.json\n")
+
+
+def maps_of(run: config.RunConfig, truth: Truth, file: str | None = None) -> list[tuple[str, Vector]]:
+    """Simulate the maps of a case, uK, by name."""
+    acting = [config.Effect(name=m.name, channel=m.channel, parameters=dict(m.parameters)) for m in truth.members]
+    data = seeded(with_effects(run, acting), truth.seed)
+    shared = survey(data, library=library_with(file))
+    if truth.sampled:
+        return sampled.maps(shared, 0, epsilon=EPSILON)
+    return list(zip(shared.map_names, simulate.maps(shared, 0), strict=True))
+
+
+def _measured(model: LearnedModel, member: Member, seed: int) -> Member:
+    """Return a member with the expected S/N that it has in simulations.
+
+    The amplitude is lowered where the drawn one is impossible, or where the effect, no longer linear, would be much
+    stronger than was drawn. The S/N of a stochastic effect is that of its mean response, that of any other one belongs
+    to the very sky and noise of the case.
+    """
+    assert member.candidate is not None  # it is of the library
+    candidate = model.candidates[member.candidate]
+    for attempt in range(ATTEMPTS):
+        parameters = {**member.parameters, "amplitude": SMALLER**attempt * member.parameters["amplitude"]}
+        effect = candidate.effect(**parameters)
+        try:
+            strength = model.expected_snr(candidate.table(effect))
+        except InputError:
+            continue
+        if strength > STRONGER * member.strength and attempt + 1 < ATTEMPTS:
+            continue
+        coordinates = tuple(float(value) for value in effect.parametrization.coordinates(effect))
+        if not candidate.effect.parametrization.stochastic:
+            strength = model.expected_snr_on_sky(candidate.table(effect), seed)
+        return replace(member, parameters=parameters, coordinates=coordinates, strength=strength)
+    raise InputError(f"effect {member.name} can have no amplitude that is strong enough; leave it out.")
+
+
+def _without_none(value: Any) -> Any:
+    """Return nested tables without what is None or an empty list: TOML has neither."""
+    if isinstance(value, dict):
+        return {key: _without_none(one) for key, one in value.items() if one is not None and one != []}
+    return [_without_none(one) for one in value] if isinstance(value, list) else value
+
+
+def run(folder: str | Path, *, workers: int | None = None, quiet: bool = True) -> int:
+    """Diagnose the cases of a challenge that have no verdict yet, without looking at the keys; return their number.
+
+    The folder, filled by :func:`make`, gets ``verdicts/case-NNN`` with ``verdict.json`` and ``answer.json`` (the data
+    vector and the fits behind the verdict). ``workers`` is the number of processes; None: the model's; 0: this process.
+    InputError if the folder holds no challenge.
+    """
+    target = Path(folder)
+    missing = [case for case in files.finished_cases(target) if not (target / files.VERDICTS / case).is_dir()]
+    settings = Settings.read(target)
+    if missing:
+        # Cases of one library follow each other, so that a worker seldom changes its library.
+        ordered = sorted((_without(target, case), case) for case in missing)
+        with workers_of(settings, workers, quiet) as call:
+            _each_case(call, diagnose_case, [(settings, target, case, names) for names, case in ordered], quiet)
+    return len(missing)
+
+
+def diagnose_case(settings: Settings, folder: Path, case: str, without: tuple[str, ...]) -> None:
+    """Write the verdict of one case; its folder appears complete or not at all."""
+    model = learned_model(settings, without)
+    maps = read_maps(model.context.analysis.model, folder / files.MAPS / case)
+    found = diagnose_data(ObservedMaps(model.context, maps, model.simulate), case)
+    answer = {
+        "evidence": [float(value) for value in found.data],
+        "maximum": found.test.maximum,
+        "explanations": [
+            {
+                "proposals": [model.candidates[member].label for member in one.candidates],
+                "amplitudes": list(one.coordinates),
+                "errors": list(one.errors),
+            }
+            for one in found.sets
+        ],
+    }
+    with appearing(folder / files.VERDICTS / case) as scratch:
+        (scratch / "verdict.json").write_text(json.dumps(found.to_json(), indent=1, allow_nan=False) + "\n")
+        (scratch / "answer.json").write_text(json.dumps(answer) + "\n")
+
+
+def _each_case(call: Batch, task: Callable[..., None], arguments: Sequence[tuple[Any, ...]], quiet: bool) -> None:
+    """Run a task for every case, in any order, and report progress."""
+    with reporting("cases", float(len(arguments)), "cases", quiet) as report:
+        for done, _ in enumerate(call(task, arguments), 1):
+            report(float(done))
+
+
+def _without(folder: Path, case: str) -> tuple[str, ...]:
+    path = folder / files.MAPS / case / "question.json"
+    try:
+        return tuple(files.read_json(path, "restore it")["without"])
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path} does not say which effects are left out ({error}); restore it.") from error

@@ -1,0 +1,149 @@
+"""Files of moments: HEALPix tables in FITS, and the arrays of an object that a run was given in place of a file."""
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import healpy
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from mcsim.errors import InputError
+from mcsim.instrument.scan.geometry import check_frame
+from mcsim.instrument.scan.moments import Moments
+from mcsim.sphere.checks import nside_of
+from mcsim.sphere.header import frame_named, radians
+from mcsim.sphere.rotation import FRAMES
+from mcsim.support.npy import read_npz
+
+
+def read_moments(
+    path: str | Path, nside: int | None = None, smax: int | None = None, frame: str | None = None
+) -> Moments:
+    """Read moments from a HEALPix table with columns HITS, RE_s, IM_s[, DTHETA, DPHI], or from the .npz file of a run.
+
+    The table is the first binary table of the FITS file; RE_s + i IM_s is the mean of e^{-i s psi}. ``nside``, ``smax``
+    and ``frame`` are what the file must have; None: any, and all orders that follow each other from s = 1. Where a file
+    has no COORDSYS, ``frame`` is taken for it. InputError if the file cannot be read, is NESTED, lacks a column, has
+    another nside or frame, negative hits, non-finite numbers, or a modulus above 1.
+    """
+    where = f"moments file {str(path)!r}"
+    if frame is not None:
+        check_frame(frame)
+    found = _from_npz(path, where) if Path(path).suffix == ".npz" else _from_fits(path, where, smax, frame)
+    if nside not in (None, found.nside):
+        raise InputError(f"{where} has nside {found.nside}, but the maps have nside {nside}; use moments of it.")
+    if frame not in (None, found.frame):
+        raise InputError(
+            f"{where} is in {found.frame} coordinates, but the maps are {frame}; use moments of that frame."
+        )
+    if smax is not None and found.smax < smax:
+        raise InputError(f"{where} ends at s = {found.smax}, but {smax} is needed; compute moments with smax={smax}.")
+    return found if smax is None else replace(found, w=found.w[:smax])
+
+
+def _from_npz(path: str | Path, where: str) -> Moments:
+    arrays = read_npz(path)
+    try:
+        return Moments(int(arrays.pop("nside")), str(arrays.pop("frame")), **arrays)
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{where} holds no moments ({error}); write it again.") from None
+
+
+def _from_fits(path: str | Path, where: str, smax: int | None, frame: str | None) -> Moments:
+    """Read a HEALPix table, up to ``smax`` if it is given; ``frame`` is its own if it states none."""
+    columns, header = _read_table(path, where)
+    if "HITS" not in columns:
+        raise InputError(f"{where} has no column HITS; the columns are {', '.join(columns)}.")
+    hits = columns["HITS"]
+    nside = nside_of(hits.size, where)
+    if header["NSIDE"] not in (None, nside):
+        raise InputError(f"{where} says NSIDE = {header['NSIDE']} but has {hits.size} pixels; write it again.")
+    if str(header["ORDERING"]).strip().upper() != "RING":
+        raise InputError(f"{where} has ORDERING = {header['ORDERING']!r}, but it must be RING; reorder it first.")
+    stated = frame_named(header["COORDSYS"], where) or frame
+    if stated is None:
+        raise InputError(f"{where} has no COORDSYS; write E, G or C there.")
+    if smax is None:
+        smax = 1
+        while f"RE_{smax + 1}" in columns and f"IM_{smax + 1}" in columns:
+            smax += 1
+    needed = [f"{part}_{s}" for s in range(1, smax + 1) for part in ("RE", "IM")]
+    for name in needed:
+        if name not in columns:
+            raise InputError(f"{where} has no column {name}, but moments up to s = {smax} are needed.")
+    offsets = [name for name in ("DTHETA", "DPHI") if name in columns]
+    if len(offsets) == 1:
+        raise InputError(f"{where} has {offsets[0]} alone; give both DTHETA and DPHI or neither.")
+    seen = hits > 0.0
+    for name in ("HITS", *needed, *offsets):
+        if name != "HITS":
+            columns[name] = np.where(seen, columns[name], 0.0)
+        bad = ~np.isfinite(columns[name])
+        if bad.any():
+            raise InputError(f"{where}: column {name} is not finite in {bad.sum()} pixels, first {np.argmax(bad)}.")
+    if hits.min() < 0.0:
+        raise InputError(f"{where}: HITS is {hits.min():g} in pixel {hits.argmin()}, but it must be >= 0.")
+    w = np.array([columns[f"RE_{s}"] + 1j * columns[f"IM_{s}"] for s in range(1, smax + 1)])
+    # Single precision may exceed 1 by 6e-8.
+    largest = np.abs(w).max(initial=0.0)
+    if largest > 1.0 + 1e-6:
+        raise InputError(f"{where}: a moment has modulus {largest:g}, but means of e^(-i s psi) are <= 1.")
+    farthest = max((float(np.abs(columns[name]).max()) for name in offsets), default=0.0)
+    if farthest > 2.0 * healpy.max_pixrad(nside):
+        raise InputError(
+            f"{where}: samples lie {farthest:g} rad from their pixel's centre, but a pixel of nside {nside} "
+            f"reaches {healpy.max_pixrad(nside):.3g}; give DTHETA and DPHI in radians, or their unit in TUNIT."
+        )
+    return Moments(nside, stated, hits, w, *(columns[name] for name in offsets))
+
+
+def _read_table(path: str | Path, where: str) -> tuple[dict[str, NDArray[np.float64]], dict[str, Any]]:
+    """Return columns (upper-case names, flattened, float64) and HEALPix keywords of a file's first binary table."""
+    try:
+        # A truncated file warns when opened and fails when read: one message is enough.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with fits.open(path) as hdus:
+                table = next((hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU)), None)
+                if table is None:
+                    raise ValueError("it has no binary table")
+                columns = {
+                    name.upper(): np.array(table.data[name], dtype=np.float64).ravel() for name in table.columns.names
+                }
+                for column in table.columns:
+                    if column.unit and column.name.upper() in ("DTHETA", "DPHI"):
+                        columns[column.name.upper()] *= radians(column.unit)
+                header = {key: table.header.get(key) for key in ("NSIDE", "ORDERING", "COORDSYS")}
+    except Exception as error:  # libraries raise whatever a broken file makes of them
+        raise InputError(f"{where} cannot be read: {error}; give a complete FITS table.") from None
+    sizes = {array.size for array in columns.values()}
+    if len(sizes) != 1:
+        raise InputError(f"{where} has columns of different sizes {sorted(sizes)}; write it again.")
+    return columns, header
+
+
+def write_moments_fits(path: str | Path, moments: Moments) -> None:
+    """Write moments as a HEALPix table that :func:`read_moments` reads, overwriting ``path``."""
+    arrays = {"HITS": moments.hits}
+    for s, w in enumerate(moments.w, start=1):
+        arrays[f"RE_{s}"], arrays[f"IM_{s}"] = w.real, w.imag
+    if moments.dtheta is not None and moments.dphi is not None:
+        arrays["DTHETA"], arrays["DPHI"] = moments.dtheta, moments.dphi
+    units = {"DTHETA": "rad", "DPHI": "rad"}
+    table = fits.BinTableHDU.from_columns(
+        [fits.Column(name=name, format="D", unit=units.get(name), array=array) for name, array in arrays.items()]
+    )
+    table.header.update(
+        PIXTYPE="HEALPIX",
+        ORDERING="RING",
+        COORDSYS=FRAMES[moments.frame],
+        NSIDE=moments.nside,
+        FIRSTPIX=0,
+        LASTPIX=moments.npix - 1,
+        INDXSCHM="IMPLICIT",
+        COMMENT="RE_s + i IM_s: mean of exp(-i s psi); psi from e_theta (south) towards e_phi (east)",
+    )
+    table.writeto(path, overwrite=True)

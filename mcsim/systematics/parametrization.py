@@ -1,0 +1,143 @@
+"""How an effect is parametrised for a linear fit. This stands beside its physics, which knows nothing of a fit."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parametrization:
+    """Fit the amplitude of an effect alone; derived classes fit further parameters with it.
+
+    An effect has linear components, k in number: its response is the sum of its coordinates times the responses of the
+    effects of the basis, each per unit of amplitude.
+
+    Attributes
+    ----------
+    sign
+        Sign of the amplitudes at which responses are measured; 0: both. If it is not 0, a negative amplitude is
+        unphysical, and a diagnosis does not name it.
+    max_amplitude
+        Largest physical amplitude, in absolute value; a diagnosis names no larger one.
+    stochastic
+        True if a hook draws random numbers, at positive amplitudes at least.
+    mean_response
+        True if a diagnosis uses the mean response over skies, not that of the observed sky: for a change of power
+        alone, whose response in one sky depends on fluctuations that the spectra have anyway.
+    matched_filter
+        True if the data vector of a diagnosis has a matched filter for it: not if a hook draws random numbers, nor if
+        dipoles, variances, spectra and modulations, which are always measured, contain all of it.
+    """
+
+    sign: Literal[-1, 0, 1] = 0
+    max_amplitude: float = np.inf
+    stochastic: bool = False
+    mean_response: bool = False
+    matched_filter: bool = True
+
+    def basis(self) -> tuple[Mapping[str, Any], ...]:
+        """Return the parameters of the k effects whose responses span all others; their amplitude is the step."""
+        return ({},)
+
+    def coordinates(self, effect: Any) -> Vector:
+        """Return the coordinates of an effect, shape (k,)."""
+        return np.array([effect.amplitude])
+
+    def constrained(self, coordinates: Vector, precision: NDArray[np.float64]) -> Vector:
+        """Return the fitted coordinates that the data constrain, and zeros; by default all of them.
+
+        ``precision`` is the inverse of their covariance, shape (k, k).
+        """
+        return coordinates
+
+    def nearest(self, coordinates: Vector, precision: NDArray[np.float64]) -> dict[str, Any]:
+        """Return amplitude and parameters of the effect nearest to coordinates in the metric ``precision``, (k, k)."""
+        return {"amplitude": float(coordinates[0])}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Angle(Parametrization):
+    """Fit amplitude and angle as the coordinates amplitude cos(angle) and amplitude sin(angle).
+
+    Attributes
+    ----------
+    parameter
+        Name of the angle, in degrees.
+    multiple
+        How often the angle counts: 2 for an axis, which is the same again after half a turn.
+    """
+
+    parameter: str = "angle_deg"
+    multiple: int = 1
+
+    def basis(self) -> tuple[Mapping[str, Any], ...]:
+        """Return cosine and sine."""
+        return {}, {self.parameter: 90.0 / self.multiple}
+
+    def coordinates(self, effect: Any) -> Vector:
+        """Return the amplitudes of cosine and sine."""
+        angle = self.multiple * np.deg2rad(getattr(effect, self.parameter))
+        return effect.amplitude * np.array([np.cos(angle), np.sin(angle)])
+
+    def nearest(self, coordinates: Vector, precision: NDArray[np.float64]) -> dict[str, Any]:
+        """Return norm and angle."""
+        x, y = coordinates
+        angle_deg = np.rad2deg(np.arctan2(y, x)) / self.multiple
+        return {"amplitude": float(np.hypot(x, y)), self.parameter: float(angle_deg)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Components(Parametrization):
+    """Fit amplitude and direction of a vector as its components.
+
+    Attributes
+    ----------
+    parameter
+        Name of the direction, a tuple of numbers whose length does not matter.
+    count
+        Number of components.
+    """
+
+    parameter: str
+    count: int
+
+    def basis(self) -> tuple[Mapping[str, Any], ...]:
+        """Return the components one by one."""
+        return tuple({self.parameter: tuple(map(float, row))} for row in np.eye(self.count))
+
+    def coordinates(self, effect: Any) -> Vector:
+        """Return the components."""
+        return np.asarray(effect.along(self.parameter))
+
+    def nearest(self, coordinates: Vector, precision: NDArray[np.float64]) -> dict[str, Any]:
+        """Return norm and direction; no direction of zeros."""
+        norm = float(np.linalg.norm(coordinates))
+        return {"amplitude": norm} | ({self.parameter: tuple(map(float, coordinates / norm))} if norm else {})
+
+
+@dataclass(frozen=True, kw_only=True)
+class SkyVector(Parametrization):
+    """Fit amplitude, ``lon_deg`` and ``lat_deg`` of an effect as the components of its ``vector``."""
+
+    def basis(self) -> tuple[Mapping[str, Any], ...]:
+        """Return the vectors along x, y and z."""
+        return {}, {"lon_deg": 90.0}, {"lat_deg": 90.0}
+
+    def coordinates(self, effect: Any) -> Vector:
+        """Return the components x, y, z."""
+        return np.asarray(effect.vector)
+
+    def nearest(self, coordinates: Vector, precision: NDArray[np.float64]) -> dict[str, Any]:
+        """Return norm, longitude from 0 to 360 and latitude; zeros for no vector."""
+        x, y, z = coordinates
+        lon_deg, lat_deg = np.rad2deg([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))])
+        return {
+            "amplitude": float(np.linalg.norm(coordinates)),
+            "lon_deg": float(lon_deg % 360.0),
+            "lat_deg": float(lat_deg),
+        }
