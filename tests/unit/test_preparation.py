@@ -305,7 +305,7 @@ def test_too_little_sky_is_refused_where_a_preparation_is_declared(tmp_path):
     for call in (
         lambda: mcsim.run(low, tmp_path / "low.zarr", quiet=True),
         lambda: mcsim.predict(low),
-        lambda: mcsim.diagnose(low, [np.zeros(12 * COARSE**2)]),
+        lambda: mcsim.diagnose(low, [np.zeros(12 * COARSE**2)], tmp_path / "new" / "verdict"),
     ):
         with refused("sky.lmax", 20, needed):
             call()
