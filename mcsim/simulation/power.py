@@ -25,7 +25,7 @@ TOLERANCE = 0.5
 """Standard deviations by which neglected power may move the variance of the pixels of a map before it is refused."""
 
 ENOUGH = 0.1
-"""The same for the ``sky.lmax`` that is called enough."""
+"""The same for the ``sky.lmax`` that is called enough; above it a diagnosis of prepared maps says what is left out."""
 
 SIGNAL_FLOOR = 1e-3
 """Least noise over the rms of the sky, for maps without noise: that of the diagnosis."""
@@ -64,15 +64,21 @@ class Neglected:
         remedy = f"set sky.lmax to {self.needed} or more (biposh.lmax may stay)"
         if self.last < self.needed:
             remedy += f", with a spectrum that reaches it: {self.spectrum} ends at {self.last}"
+        harm = f"where at most {TOLERANCE:g} are tolerable"
+        if self.shift <= TOLERANCE:
+            harm = "and fitted noise levels and beam widths about as much"
         return (
             f"sky.lmax = {self.lmax} leaves out sky power of {self.rms_uk:.2g} uK rms that the pixels of map "
             f"{self.name} (nside {self.nside}) see; it moves their variance by {self.shift:.3g} standard deviations, "
-            f"where at most {TOLERANCE:g} are tolerable; {remedy}."
+            f"{harm}; {remedy}."
         )
 
 
 def neglected(survey: Survey) -> Neglected | None:
-    """Return the power that the worst map of a survey misses; None if all is tolerable or there is no spectrum."""
+    """Return the power that the worst map of a survey misses; None without a spectrum, or if it is tolerable.
+
+    Where maps are prepared, whose simulations and data may reach further than any sky.lmax, it must be negligible.
+    """
     run = survey.config
     if run.sky.spectrum is None or run.map.grid != "healpix":
         return None
@@ -95,16 +101,17 @@ def neglected(survey: Survey) -> Neglected | None:
             shift = np.sqrt(used.sum() / 2.0) * tail / total
             needed = survey.lmax + int(np.argmax(shift[survey.lmax :] <= ENOUGH))
             missing, own = float(np.sqrt(tail[run.sky.lmax])), float(shift[run.sky.lmax])
-            if own > TOLERANCE:
+            if own > (ENOUGH if run.preparation else TOLERANCE):
                 found.append(
                     Neglected(m.name, survey.nside, run.sky.lmax, needed, run.sky.spectrum, last, missing, own)
                 )
-    return max(found, key=lambda one: one.needed, default=None)
+    worst = max(found, key=lambda one: one.shift, default=None)
+    return worst and replace(worst, needed=max(one.needed for one in found))
 
 
 def check(survey: Survey) -> None:
     """Raise InputError if the run says how its maps are prepared and these would see more sky than is simulated."""
-    if survey.config.preparation and (found := neglected(survey)):
+    if survey.config.preparation and (found := neglected(survey)) and found.shift > TOLERANCE:
         raise InputError(str(found))
 
 

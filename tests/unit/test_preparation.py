@@ -1,6 +1,7 @@
 """Each step of a preparation against healpy, brute force or Monte Carlo; and the check of the sky power."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import healpy
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import mcsim
 from mcsim import config
 from mcsim.config import preparation as declared
+from mcsim.diagnosis.api import _warnings
 from mcsim.ensemble.prepare import prepare_files
 from mcsim.simulation import power, sampled, simulate, windows
 from mcsim.simulation.preparation import preparation
@@ -16,7 +18,7 @@ from mcsim.simulation.steps import Average, Filled, Regression, Rotated, Weighte
 from mcsim.simulation.survey import survey
 from mcsim.sphere import healpix, rotation
 from mcsim.sphere.sky import gaussian_alm
-from refusals import refused
+from refusals import refused, unnamed
 
 FINE, COARSE = 32, 8
 NPIX = 12 * FINE**2
@@ -314,6 +316,19 @@ def test_too_little_sky_is_refused_where_a_preparation_is_declared(tmp_path):
     enough = survey(replace(low, sky=replace(low.sky, lmax=needed)))
     power.check(enough)
     assert power.neglected(enough) is None
+
+
+def test_a_sky_that_is_accepted_and_still_too_small_is_told():
+    run = run_with({"kind": "degrade", "nside": COARSE})
+    for lmax in range(20, 60):
+        shared = survey(replace(run, sky=replace(run.sky, lmax=lmax)))
+        if (found := power.neglected(shared)).shift <= power.TOLERANCE:
+            break
+    power.check(shared)
+    assert found.shift > power.ENOUGH
+    assert unnamed(str(found), lmax, "V", found.needed) == []
+    assert str(power.TOLERANCE) not in str(found)
+    assert _warnings(SimpleNamespace(model=SimpleNamespace(survey=shared)))[0].startswith(str(found))
 
 
 @pytest.mark.parametrize(
