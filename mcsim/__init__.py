@@ -7,7 +7,8 @@ order.
 
 Ensembles: `run`, `merge`, `open_ensemble`, `open_summary`; configurations: `load_config`, `RunConfig`.
 Instrument: `Beam`, `ScanModel`, `Moments`, and what they make of one sky: `observe`.
-Statistics: `biposh` of maps at hand, `predict` of a run, `fit` of an effective beam, `prepare` and `diagnose` of maps.
+Statistics: `biposh` of maps at hand, `predict` of a run, `fit` of an effective beam, `prepare` and `diagnose` of maps,
+`compare` of two simulations.
 Systematic effects: `effects`, and `Effect` to write one. Bad input raises `InputError`.
 
 Names are loaded when they are first used, so that ``import mcsim`` costs little.
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mcsim.beamfit.api import fit
     from mcsim.bipolar.dataset import biposh
+    from mcsim.comparison.api import compare
     from mcsim.config import RunConfig
     from mcsim.config import load as load_config
     from mcsim.diagnosis.api import diagnose
@@ -44,6 +46,7 @@ __all__ = [
     "ScanModel",
     "__version__",
     "biposh",
+    "compare",
     "diagnose",
     "effects",
     "fit",
@@ -66,6 +69,7 @@ _HOME = {
     "RunConfig": "mcsim.config",
     "ScanModel": "mcsim.instrument.scan",
     "biposh": "mcsim.bipolar.dataset",
+    "compare": "mcsim.comparison.api",
     "diagnose": "mcsim.diagnosis.api",
     "effects": "mcsim.systematics",
     "fit": "mcsim.beamfit.api",

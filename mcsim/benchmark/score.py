@@ -18,6 +18,7 @@ from mcsim.diagnosis.campaign import Batch
 from mcsim.diagnosis.candidate import Candidate
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.selection import Attribution, attribute
+from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.errors import InputError
 from mcsim.sphere import rng
 from mcsim.stats.detection import power
@@ -170,7 +171,8 @@ def judge(model: LinearModel, prior: Prior, seed: int, cases: Sequence[Draw]) ->
     found = []
     for draw in cases:
         x = model.data[draw.number % len(model.data)] + draw.response
-        said = attribute(model.null, x, model.templates, model.candidates, model.calibration)
+        tested = attribute(model.null, x, model.templates, model.candidates, model.calibration)
+        said = tested.if_named(DiagnosisSettings())
         record = Record(
             case=f"draw-{draw.number:05d}",
             strength=model.null.expected_snr(draw.response),

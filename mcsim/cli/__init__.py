@@ -167,6 +167,29 @@ def diagnose(
     print("\n".join(summary(found, output)))
 
 
+@app.command()
+def compare(
+    a: Annotated[Path, typer.Argument(metavar="A", help="Folder of maps, or a configuration.")],
+    b: Annotated[Path, typer.Argument(metavar="B", help="The same skies from another simulation.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the result and report.")],
+    model: Annotated[
+        Path | None, typer.Option(metavar="CONFIG", help="What A simulates; default: model.toml in or beside A or B.")
+    ] = None,
+    accuracy: Annotated[float, typer.Option(help="Rms over the sky's up to which maps may be identical.")] = 1e-3,
+    fail_above: Annotated[
+        float | None, typer.Option(min=0.0, help="Exit with code 1 if the rms over the sky's is above this.")
+    ] = None,
+) -> None:
+    """Explain why two simulations of the same skies differ: by what, where, how much, and what is left."""
+    from mcsim.comparison.api import compare as compare_
+
+    found = compare_(a, b, model, output, accuracy=accuracy, quiet=False)
+    print(found)
+    print(f"written: {output / 'compare.json'}, {output / 'report.html'}")
+    if fail_above is not None and found.accuracy > fail_above:
+        raise typer.Exit(1)
+
+
 challenge = typer.Typer(help="Benchmark the diagnosis on effects that are drawn and sealed.", no_args_is_help=True)
 app.add_typer(challenge, name="challenge")
 

@@ -50,6 +50,8 @@ def result_of(
             replace(one, elements=one.elements[:TELLING], shares=one.shares[:TELLING]) for one in found.contrasts
         ),
         nearest=found.nearest,
+        faint=found.faint,
+        probability=found.probability,
         cosine=found.cosine,
         partial=() if partial is None else tuple(effects_of(candidates, partial.members, partial.fit)),
         partial_left=None if partial is None else partial.left,
@@ -131,7 +133,8 @@ def _candidates(context: DiagnosisContext, refined: Refined) -> Iterator[Candida
         except InputError:
             amplitude, sigma, words = float("nan"), float("nan"), "no such amplitude"
         reach, size = detectable(null, t[:, columns], len(candidates)), None
-        needed = snr_needed(max(int(rank[k]), 1), len(candidates), null.dimension, null.n_sims)
+        rows = min(max(int(rank[k]), 1), null.dimension)
+        needed = snr_needed(rows, len(candidates), null.dimension, null.n_sims)
         if np.isfinite(reach):
             precision = np.eye(len(columns))
             size = abs(candidate.with_coordinates(reach * precision[0], precision).amplitude)

@@ -25,7 +25,7 @@ def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
     context = data.context
     refiner = Refiner(data)
     refined = refiner.run(data.templates(), context.candidates)
-    found, partial, reduction = refined.attribution, refined.partial, None
+    found, partial, reduction = refined.attribution.if_named(context.settings), refined.partial, None
     exchanged = data.exchanged(found)
     notes = [*exchanged, *data.notes()]
     if exchanged:
@@ -34,7 +34,7 @@ def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
     elif found.explanations:
         found = _with_errors(data, refined, found)
         found, reduction = confirmed(context, found, reduction_of(data, refined), notes)
-    if partial is None and not exchanged and found.verdict == "unknown":
+    if partial is None and not exchanged and not found.faint and found.verdict == "unknown":
         partial = refiner.detected_in(refined.templates, refined.candidates)
     return result_of(data, case, replace(refined, attribution=found, partial=partial), reduction, notes)
 

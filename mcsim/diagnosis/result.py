@@ -160,6 +160,8 @@ class DiagnosisResult:
         Settings of the diagnosis; numbers of simulations, the seed and the data, by name.
     configuration
         The run that is the model, as JSON.
+    faint, probability
+        True if sets describe the data, but are less probable than all else together; their posterior probability.
     """
 
     case: str
@@ -191,6 +193,8 @@ class DiagnosisResult:
     provenance: dict[str, Any]
     configuration: str
     warnings: tuple[str, ...] = ()
+    faint: bool = False
+    probability: float = 1.0
 
     @property
     def verdict(self) -> dict[str, Any]:
@@ -237,11 +241,13 @@ class DiagnosisResult:
         """Return ``verdict.json`` of schema 1."""
         near = self.candidates[self.nearest]
         sets = [[_effect_json(effect) for effect in one.effects] for one in self.sets]
+        faint = {"faint": True, "probability": self.probability} if self.faint else {}
         return {
             "schema": SCHEMA,
             "case": self.case,
             "gap": {"p_value": self.test.pvalue, "statistic": self.test.chi2, "dof": self.test.dimension},
             "verdict": self.kind,
+            **faint,
             "effects": sets[0] if sets else [],
             "alternatives": sets[1:],
             "odds": [one.odds for one in self.sets],

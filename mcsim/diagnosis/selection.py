@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from mcsim.diagnosis.candidate import Candidate, columns_of, within_bounds
 from mcsim.diagnosis.settings import DiagnosisSettings
@@ -75,6 +76,11 @@ class Attribution:
         Fit of each candidate alone.
     correlation
         Largest canonical correlation of each pair of candidates, shape (C, C).
+    probability
+        Posterior probability of the accepted sets beside no effect, an unknown effect and every other effect alone;
+        the three kinds (no effect, known, unknown) are equally probable before, and look-elsewhere is charged for.
+    faint
+        True if that is too small for a name.
     """
 
     verdict: Verdict
@@ -85,6 +91,14 @@ class Attribution:
     singles: tuple[Fit, ...]
     correlation: Matrix
     contrasts: tuple[Contrast, ...]
+    probability: float = 1.0
+    faint: bool = False
+
+    def if_named(self, settings: DiagnosisSettings) -> "Attribution":
+        """Return the attribution without its explanations if these are less probable than all else together."""
+        if not self.explanations or self.probability >= settings.named_probability:
+            return self
+        return replace(self.unexplained(), faint=True)
 
     def unexplained(self) -> "Attribution":
         """Return the same attribution with the verdict "unknown" and no explanation."""
@@ -110,7 +124,8 @@ def attribute(
     beside it (``further_level``); it is reported if no part of it is sufficient. Each of several candidates must be
     significant beside the others, or the residual is that of something unknown; and several must be more probable than
     an unknown effect of the same prior S/N in an isotropic direction. Candidates of one identity compete by evidence
-    alone. A stochastic effect scatters the data: sets with a member whose scatter is known are tested with a null
+    alone. A gap that is faint has many explanations, no effect among them: see ``probability`` of the attribution.
+    A stochastic effect scatters the data: sets with a member whose scatter is known are tested with a null
     distribution to which it is added, and such a member alone has to be significant and probable like several. A
     template that is wrong by a fraction eps of its white norm leaves eps^2 s_c^2 in the residual, s_c the white norm of
     its fitted part (at most that of the whole fit); the sum over members makes both tests noncentral, in the least
@@ -125,7 +140,8 @@ def attribute(
     signal = null.hartlap_factor * delta_chi2[nearest] - groups.sizes[nearest]
     excess = max(null.hartlap_factor * float(y @ y) - null.dimension, signal, 1e-300)
     selection = _Selection(null, x, t, candidates, calibration, settings)
-    explanations = tuple(selection.explanations()) if found.pvalue <= settings.alpha else ()
+    accepted = selection.accepted() if found.pvalue <= settings.alpha else []
+    explanations = tuple(selection.explanations(accepted))
     return Attribution(
         verdict=_verdict(found.pvalue > settings.alpha, explanations),
         gap=found,
@@ -135,6 +151,7 @@ def attribute(
         singles=tuple(null.fit(x, t[:, list(candidate.columns)]) for candidate in candidates),
         correlation=cosines(groups),
         contrasts=tuple(selection.contrasts(explanations)),
+        probability=selection.probability(accepted) if accepted else 0.0,
     )
 
 
@@ -168,10 +185,10 @@ class _Selection:
     calibration: Calibration
     settings: DiagnosisSettings
 
-    def explanations(self) -> Iterator[Explanation]:
+    def explanations(self, accepted: Sequence[_Accepted]) -> Iterator[Explanation]:
         """Yield the most probable first; of those that differ only in settings the most probable one."""
         seen: set[frozenset[tuple[str, str | None]]] = set()
-        ranked = sorted(self._accepted(), reverse=True)
+        ranked = sorted(accepted, reverse=True)
         for found in ranked:
             identity = frozenset(self.candidates[member].identity for member in found.members)
             lost = ranked[0].evidence - found.evidence
@@ -192,7 +209,19 @@ class _Selection:
             order = np.argsort(-shares)
             yield Contrast(first, second, float(np.sqrt(squared)), tuple(order.tolist()), tuple(shares[order].tolist()))
 
-    def _accepted(self) -> list[_Accepted]:
+    def probability(self, accepted: Sequence[_Accepted]) -> float:
+        """Return the posterior probability of accepted sets; see :class:`Attribution`."""
+        searches = list(self._searches())
+        known = {found.members: found.evidence for found in accepted}
+        for search in searches:
+            for subsets in search.rows(1, ()):
+                members = [(int(one),) for one in subsets[:, 0]]
+                known = dict(zip(members, search.solve(subsets).evidence.tolist(), strict=True)) | known
+        nothing = float(self.null.log_likelihood(searches[0].total))
+        everything = special.logsumexp([nothing, searches[0].unknown, *known.values()])
+        return float(np.exp(special.logsumexp([found.evidence for found in accepted]) - everything))
+
+    def accepted(self) -> list[_Accepted]:
         """Return minimal sufficient sets that are possible and whose evidence is not below the best by the cut."""
         accepted: list[_Accepted] = []
         searches = list(self._searches())

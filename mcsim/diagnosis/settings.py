@@ -15,6 +15,7 @@ class DiagnosisSettings:
     residual_level: float = 0.02
     further_level: float = 0.005
     max_effects: int = 3  # that may act together
+    named_probability: float = 0.5  # posterior, below which the accepted sets of a faint gap are not named
     odds_cut: float = 100.0  # explanations that are less probable than the best by this factor are left out
     template_error: float = 0.01  # relative error of templates in white norm
     # Standard deviations of the amplitudes' prior, in units of their errors: flat in the logarithm.

@@ -27,6 +27,8 @@ def sentence(result: DiagnosisResult) -> str:
     if result.kind == "none":
         return f"The model describes the data ({p})."
     start = f"The model does not describe the data ({p})"
+    if result.faint:
+        return f"{start}, but the departure is too faint to name its cause."
     if result.kind == "unknown":
         partly = ""
         if len(result.partial) > 1 and result.partial_left is not None:
@@ -65,8 +67,13 @@ def status(result: DiagnosisResult) -> str:
             "Neither χ² nor any candidate departs from the simulations. An effect below its detectable amplitude can "
             "still be there."
         )
+    near = result.candidates[result.nearest]
+    if result.faint:
+        return (
+            f"Nearest is {near.label}. But all sets of effects that describe the data have together a probability of "
+            f"{100 * result.probability:.0f} %, against no effect, an unlisted one, and the rest of the library."
+        )
     if result.kind == "unknown":
-        near = result.candidates[result.nearest]
         return (
             f"The most similar candidate is {near.label}: cosine {result.cosine:.2f} with the departure, so that it "
             f"accounts for {100 * result.cosine**2:.0f} % of the excess χ². It is a hint and not the cause."

@@ -26,6 +26,7 @@ ORDER = (
     "ensemble",
     "beamfit",
     "plot",
+    "comparison",
     "diagnosis",
     "benchmark",
     "cli",

@@ -1,4 +1,4 @@
-"""Attribution on constructed geometries: verdicts, minimal sets, twins, model errors; evidence by brute force."""
+"""Attribution on constructed geometries: verdicts, minimal sets, degenerate effects, model errors."""
 
 import copy
 import time
@@ -32,7 +32,7 @@ def candidate(name: str, channel: str | None, columns: tuple[int, ...], settings
 
 
 class Bench:
-    """Candidates on evidence of 60 unit normals with a believed ensemble of 800 simulations."""
+    """Candidates on a data vector of 60 unit normals with a fiducial ensemble of 800 simulations."""
 
     def __init__(self, t: np.ndarray, candidates: list[Candidate]) -> None:
         self.null = SimulatedGaussian.from_simulations(np.random.default_rng(7).normal(size=(N, P)))
@@ -94,6 +94,38 @@ def test_mixtures_are_minimal(bench, members):
     # 95 % less three sigma.
     assert len(right) >= 20
     assert right[0].explanations[0].odds == 1.0
+
+
+def test_a_faint_departure_is_not_named_and_a_clear_one_is(bench):
+    settings = DiagnosisSettings()
+    explained = [one for one in verdicts(bench, 3.0 * bench.t[:, 4], 80) if one.explanations]
+    faint = [one.if_named(settings) for one in explained]
+    for before, after in zip(explained, faint, strict=True):
+        assert after.faint == (before.probability < 0.5)
+        assert after.verdict == ("unknown" if after.faint else before.verdict)
+        assert bool(after.explanations) != after.faint
+    assert any(one.faint for one in faint)
+    clear = [one.if_named(settings) for one in verdicts(bench, 9.0 * bench.t[:, 4], 20)]
+    assert all(one.probability > 0.99 for one in clear if one.explanations)
+    assert not any(one.faint for one in clear)
+
+
+def test_the_probability_of_a_name_is_the_rate_at_which_it_is_right(bench):
+    """Cases are drawn as it assumes: no effect as often as one of the library, with a strength from the prior."""
+    draw, settings = np.random.default_rng(11), DiagnosisSettings(alpha=1.0, prior_snr=(2.0, 4.0, 8.0))
+    said, right = [], []
+    for _ in range(400):
+        member = int(draw.integers(-12, 12))
+        size = draw.normal(scale=draw.choice(settings.prior_snr)) if member >= 0 else 0.0
+        x = draw.normal(size=P) + (size * bench.t[:, member] if member >= 0 else 0.0)
+        found = attribute(bench.null, x, bench.t, bench.candidates, bench.calibration, settings)
+        if found.explanations:
+            said.append(found.probability)
+            right.append(any(one.members == (member,) for one in found.explanations))
+    assert len(said) > 150
+    # Sets that need two members take part of the probability, and the unknown effect is never drawn: it is a bound.
+    error = np.sqrt(np.sum(np.multiply(said, 1.0 - np.array(said)))) / len(said)
+    assert np.mean(right) > np.mean(said) - 3.0 * error
 
 
 def test_what_is_not_in_the_library_is_unknown(bench):

@@ -37,6 +37,7 @@ NAMES = [
     "ScanModel",
     "__version__",
     "biposh",
+    "compare",
     "diagnose",
     "effects",
     "fit",

@@ -41,7 +41,7 @@ class ScanModel:
     name
         Name of the mission or survey.
     spin_period_s
-        Spin period, > 0.
+        Spin period; negative turns backwards.
     precession_period_s
         Precession period about the anti-Sun direction; negative turns backwards.
     precession_angle_deg
@@ -224,7 +224,7 @@ def _toml(value: str | float | tuple[str, ...]) -> str:
 _TABLES = {"schema", "line_of_sight", "lines_of_sight", "default_lines", "pairs", "source"}
 _TEXT = {"name", "description"}
 NUMBERS = {f.name for f in fields(ScanModel)} - _TEXT - _TABLES
-_POSITIVE = {"spin_period_s", "orbit_period_s", "sample_period_s", "duration_days"}
+_POSITIVE = {"orbit_period_s", "sample_period_s", "duration_days"}
 _OPTIONAL = {"spin_phase_deg", "precession_phase_deg", "orbit_phase_deg"}
 _LINE_NUMBERS = {"boresight_angle_deg", "azimuth_deg", "sample_period_s"}
 
@@ -324,6 +324,8 @@ def _check(model: ScanModel) -> None:
         )
     if model.duration_days > LONGEST_DAYS:
         raise InputError(f"{where}: duration_days is {model.duration_days:g}, more than a century; give days.")
+    if model.spin_period_s == 0.0:
+        raise InputError(f"{where}: spin_period_s is 0, but a survey spins; give seconds (negative: backwards).")
     if model.precession_period_s == 0.0:
         raise InputError(f"{where}: precession_period_s is 0; for no precession set precession_angle_deg = 0 instead.")
     if not 0.0 <= model.precession_angle_deg <= 90.0:

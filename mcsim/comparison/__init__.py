@@ -1,0 +1,1 @@
+"""Explain why two simulations of the same skies differ."""

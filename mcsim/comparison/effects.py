@@ -1,0 +1,109 @@
+"""Effects of the library as differences between two simulations: side B has one that side A lacks."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim import config
+from mcsim.comparison.differences import Difference, State
+from mcsim.comparison.pairs import ChannelPair, quiet
+from mcsim.comparison.scene import Maps
+from mcsim.errors import InputError
+from mcsim.simulation import sampled, simulate
+from mcsim.simulation.survey import survey
+from mcsim.systematics import Effect
+from mcsim.systematics.base import Pointing
+from mcsim.systematics.registry import basis_of, catalogue
+
+Vector = NDArray[np.float64]
+
+REDUNDANT = ("pixelization", "spectrum")
+"""pixel_centres says the same; and band powers change with the sky, which two sides have in common."""
+
+
+class EffectDifference(Difference):
+    """An effect of the library, linear in its coordinates."""
+
+    def __init__(self, kind: type[Effect], templates: Maps, run: config.RunConfig) -> None:
+        self.kind, self.templates, self.run = kind, templates, run
+
+    def starts(self, state: State) -> list[Vector]:
+        """Return the coordinates that fit best."""
+        return [state.fit(list(self.templates))]
+
+    def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
+        """Return the maps with the effect's response."""
+        return maps + np.tensordot(value, self.templates, 1)
+
+    def sampled(self, value: Vector, pair: ChannelPair, pointing: Pointing) -> Maps | None:
+        """Return the response of the time-ordered reference; None if the effect does not act on samples."""
+        assert pair.scene is not None
+        sky: Any = pair.scene.sky  # an array stands for a file
+        alone = replace(self.run, sky=replace(self.run.sky, spectrum=None, map=None, alm=sky))
+        sides = [alone, replace(alone, effects=(_table(self._effect(value), pair.name),))]
+        try:
+            bare, acting = (sampled.maps(survey(run, pair.scene.nthreads), 0, pair.scene.nthreads) for run in sides)
+        except InputError:
+            return None
+        return np.stack([more - less for (_, more), (_, less) in zip(acting, bare, strict=True)])
+
+    def _effect(self, value: Vector) -> Effect:
+        return self.kind(**self.kind.parametrization.nearest(value, np.eye(value.size)))
+
+    def amplitude(self, value: Vector) -> float:
+        """Return the effect's amplitude."""
+        return float(self._effect(value).amplitude)
+
+    def parameters(self, value: Vector) -> dict[str, float | str]:
+        """Return its other parameters."""
+        return {k: v for k, v in self._effect(value).parameters().items() if isinstance(v, float | str)}
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        """Of the effect."""
+        return self.kind.name
+
+    @property
+    def unit(self) -> str:  # type: ignore[override]
+        """Of its amplitude."""
+        return self.kind.unit
+
+    @property
+    def met(self) -> str:  # type: ignore[override]
+        """Its cause."""
+        return self.kind.cause
+
+
+def effects_of(pair: ChannelPair, run: config.RunConfig) -> Iterator[EffectDifference]:
+    """Yield the effects to which the noise-free maps of a channel respond, with their templates per coordinate."""
+    if pair.scene is None:
+        return
+    spec = next(channel for channel in run.channels if channel.name == pair.name)
+    alone = quiet(replace(run, channels=(spec,)))
+    sky, nthreads = pair.scene.sky, pair.scene.nthreads
+    bare = simulate.maps(survey(alone, nthreads), 0, nthreads, sky)
+    for name, kind in catalogue().items():
+        if kind.parametrization.stochastic or name in REDUNDANT:
+            continue
+        templates = []
+        try:
+            for effect in basis_of(kind):
+                acting = replace(alone, effects=(_table(effect, pair.name),))
+                made = simulate.maps(survey(acting, nthreads), 0, nthreads, sky)
+                scale = float(np.max(np.abs(kind.parametrization.coordinates(effect))))
+                templates.append(np.where(pair.seen, (made - bare) / scale, 0.0))
+        except InputError:  # it depends on what the model does not say: a frequency, a pointing, a differencing scan
+            continue
+        if any(t.any() for t in templates):
+            yield EffectDifference(kind, np.stack(templates), alone)
+
+
+def _table(effect: Effect, channel: str) -> config.Effect:
+    """Return an effect as a run names it."""
+    parameters = {"amplitude": effect.amplitude, **effect.parameters()}
+    return config.Effect(
+        name=effect.name, channel=channel if effect.scope == "channel" else None, parameters=parameters
+    )

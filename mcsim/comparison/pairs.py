@@ -1,0 +1,219 @@
+"""Two sets of maps of the same skies, read and brought into pairs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import healpy
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim import config
+from mcsim.comparison.scene import Maps, Scene, scene_of, sky_in
+from mcsim.ensemble.maps import file_names
+from mcsim.errors import InputError
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import Channel, Survey, survey
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import header, healpix
+
+EXTRA_ORDERS = 3
+"""Moments beyond the beam's orders: a displaced beam has them."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelPair:
+    """The maps of one channel on both sides.
+
+    Attributes
+    ----------
+    name, splits
+        Of the channel and of its maps.
+    a, b
+        Maps, uK, shape (split, npix).
+    seen
+        What both sides observed, shape (split, npix).
+    scene
+        What the model says of side A; None without a model.
+    channel
+        The same with everything that effects need; None without a model.
+    sky_of_maps
+        True if the scene's sky was taken from side A, and not from the model.
+    """
+
+    name: str
+    splits: tuple[str, ...]
+    a: Maps
+    b: Maps
+    seen: NDArray[np.bool_]
+    scene: Scene | None = None
+    channel: Channel | None = None
+    sky_of_maps: bool = False
+
+    @property
+    def nside(self) -> int:
+        """Of the maps."""
+        return healpy.npix2nside(self.a.shape[1])
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """All channels of two sides, and the run that describes side A, if one does."""
+
+    pairs: tuple[ChannelPair, ...]
+    run: config.RunConfig | None
+    frame: str
+
+
+def read(
+    a: str | Path, b: str | Path, model: str | Path | config.RunConfig | None = None, nthreads: int = 1
+) -> Comparison:
+    """Read two sides: folders of FITS maps or configurations, with the run that describes side A.
+
+    Raises
+    ------
+    InputError
+        If a side cannot be read, or the sides have no map in common.
+    """
+    run = _model(a, b, model)
+    whole = None if run is None else survey(quiet(run), nthreads, orders=_orders(run))
+    sides = [_side(side, run, nthreads) for side in (a, b)]
+    if run is None:
+        names = [name for name in sides[0] if name in sides[1]]
+        groups = {name: [name] for name in names}
+    else:
+        groups = {
+            channel.name: [n for n in config.map_names(run) if n.partition(":")[0] == channel.name]
+            for channel in run.channels
+        }
+        groups = {c: names for c, names in groups.items() if all(n in side for n in names for side in sides)}
+    if not groups:
+        raise InputError(
+            f"{a} and {b} have no channel in common; give both maps of the same names, CHANNEL.fits or "
+            "CHANNEL_SPLIT.fits."
+        )
+    pairs = [_pair(name, maps, sides, whole, nthreads) for name, maps in groups.items()]
+    return Comparison(tuple(pairs), run, "ecliptic" if run is None else run.map.frame)
+
+
+def given(
+    a: Sequence[NDArray[np.float64]],
+    b: Sequence[NDArray[np.float64]],
+    run: config.RunConfig,
+    nthreads: int = 1,
+) -> Comparison:
+    """Compare maps given as arrays, in the order of the run's, uK."""
+    names = config.map_names(run)
+    for side in (a, b):
+        if len(side) != len(names):
+            raise InputError(f"{len(side)} maps were given, the model has {len(names)}; give one for each.")
+    whole = survey(quiet(run), nthreads, orders=_orders(run))
+    sides = [dict(zip(names, (np.asarray(m, dtype=np.float64) for m in side), strict=True)) for side in (a, b)]
+    pairs = [
+        _pair(c.name, [n for n in names if n.partition(":")[0] == c.name], sides, whole, nthreads) for c in run.channels
+    ]
+    return Comparison(tuple(pairs), run, run.map.frame)
+
+
+def _orders(run: config.RunConfig) -> int:
+    return max((getattr(c.beam, "m_max", None) or 2) for c in run.channels) + EXTRA_ORDERS
+
+
+def quiet(run: config.RunConfig) -> config.RunConfig:
+    """Return the run without noise and effects, and with nothing to estimate; InputError if it prepares its maps."""
+    _check_steps(run)
+    channels = tuple(replace(channel, noise=config.Noise()) for channel in run.channels)
+    biposh = replace(run.biposh, L_max=0, pairs="auto")
+    return replace(run, channels=channels, effects=(), biposh=biposh)
+
+
+def _check_steps(run: config.RunConfig) -> None:
+    if run.preparation:
+        raise InputError(
+            f"{run.name} has [[preparation]], but maps are compared as they were made; remove it, and give maps that "
+            "are not prepared."
+        )
+
+
+def _model(a: str | Path, b: str | Path, model: str | Path | config.RunConfig | None) -> config.RunConfig | None:
+    if isinstance(model, config.RunConfig):
+        return model
+    found: str | Path | None = model
+    if found is None:
+        beside = [Path(side) / "model.toml" for side in (a, b)] + [Path(a).absolute().parent / "model.toml"]
+        found = next((path for path in beside if path.is_file()), None)
+    if found is None:
+        found = next((side for side in (a, b) if not Path(side).is_dir()), None)
+    if found is None:
+        return None
+    run = config.load(found)
+    if run.map.grid != "healpix":
+        raise InputError(f'{run.name} has map.grid = "{run.map.grid}" and so no pixels; set map.grid = "healpix".')
+    return run
+
+
+def _side(side: str | Path, run: config.RunConfig | None, nthreads: int) -> dict[str, NDArray[np.float64]]:
+    """Return the maps of a side by name, uK."""
+    path = Path(side)
+    if path.is_dir():
+        return _folder(path, run)
+    own = config.load(side)
+    _check_steps(own)
+    shared = survey(own, nthreads)
+    if run is not None and own.map.frame != run.map.frame:
+        raise InputError(f"{side} makes maps in {own.map.frame} coordinates, the model in {run.map.frame}; choose one.")
+    return dict(zip(shared.map_names, simulate.maps(shared, 0, nthreads), strict=True))
+
+
+def _folder(folder: Path, run: config.RunConfig | None) -> dict[str, NDArray[np.float64]]:
+    names = {path.stem: path for path in sorted(folder.glob("*.fits"))}
+    frequencies: dict[str, float | None] = {}
+    if run is not None:
+        own = file_names(run)
+        names = {name: folder / file for name, file in own.items() if (folder / file).is_file()}
+        frequencies = {n: c.frequency_ghz for n in own for c in run.channels if n.partition(":")[0] == c.name}
+    if not names:
+        expected = "any FITS map" if run is None else ", ".join(file_names(run).values())
+        raise InputError(f"{folder} holds no map to compare; give {expected}.")
+    found = {}
+    for name, path in names.items():
+        map_, frame, unit = healpix.read_map(path)
+        if run is not None and frame not in (None, run.map.frame):
+            raise InputError(f"{path} is in {frame} coordinates, the model in {run.map.frame}; rotate the model.")
+        factor = header.to_uk(unit, path, frequencies.get(name))
+        found[name] = np.where(map_ == healpy.UNSEEN, map_, factor * map_)
+    return found
+
+
+def _pair(
+    name: str, maps: Sequence[str], sides: Sequence[dict[str, NDArray[np.float64]]], whole: Survey | None, nthreads: int
+) -> ChannelPair:
+    sizes = {side[m].size for side in sides for m in maps}
+    if len(sizes) > 1:
+        nsides = " and ".join(str(healpy.npix2nside(size)) for size in sorted(sizes))
+        raise InputError(f"the maps of {name} have nside {nsides}; bring them to the same.")
+    a, b = (np.stack([side[m] for m in maps]) for side in sides)
+    seen = np.isfinite(a) & np.isfinite(b) & (a != healpy.UNSEEN) & (b != healpy.UNSEEN)
+    if whole is None:
+        return ChannelPair(name, tuple(maps), a, b, seen)
+    channel = next(c for c in whole.channels if c.name == name)
+    if channel.side_b is not None:
+        raise InputError(f"channel {name} has a differencing scan, which a comparison cannot describe; leave it out.")
+    if a.shape[1] != channel.maps[0].moments.npix:
+        raise InputError(
+            f"the maps of {name} have nside {healpy.npix2nside(a.shape[1])}, the model {whole.config.map.resolution}; "
+            "set map.nside to that of the maps."
+        )
+    for index, m in enumerate(channel.maps):
+        seen[index] &= m.moments.hits > 0
+        if m.weight is not None:
+            seen[index] &= m.weight > 0
+    if not seen.any(axis=1).all():
+        raise InputError(f"the maps of {name} have no pixel in common with each other and the model; check the scan.")
+    sky = whole.config.sky
+    if sky.alm is not None or sky.map is not None:
+        truth = simulate.draw_sky(whole, 0)
+        return ChannelPair(name, tuple(maps), a, b, seen, scene_of(channel, truth, nthreads), channel)
+    empty = scene_of(channel, np.zeros(alm_.size(sky.lmax), complex), nthreads)
+    shown = replace(empty, sky=sky_in(np.where(seen, a, 0.0), seen, empty))
+    return ChannelPair(name, tuple(maps), a, b, seen, shown, channel, sky_of_maps=True)

@@ -1,0 +1,125 @@
+"""One self-contained page about a comparison: what differs, in maps, by degree and by hits."""
+
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import healpy
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
+from numpy.typing import NDArray
+
+from mcsim.comparison.result import ChannelResult, ComparisonResult
+from mcsim.sphere import healpix
+from mcsim.support import page as page_
+from mcsim.support.numbers import number
+
+DOTS_PER_INCH = 110
+SHOWN = 64
+"""nside of the maps in pictures."""
+
+
+def page(result: ComparisonResult) -> str:
+    """Return the page as text."""
+    pictures = [(channel, page_.embedded(page_.png(figure(channel), DOTS_PER_INCH))) for channel in result.channels]
+    return page_.render(
+        Path(__file__).with_name("report.html.j2"),
+        {"number": number},
+        result=result,
+        pictures=pictures,
+        version=version("mcsim"),
+    )
+
+
+def figure(channel: ChannelResult) -> Figure:
+    """Draw the first map of a channel on both sides, their difference and its parts, their spectra, and hits."""
+    made = Figure(figsize=(12.0, 7.4), layout="constrained")
+    axes = made.subplot_mosaic("aabbcc;ddeeff;ggghhh", height_ratios=(1.0, 1.0, 1.15))
+    a, b, explained, seen = (one[0] for one in (channel.a, channel.b, channel.explained, channel.seen))
+    difference = b - a
+    for key, title, values in (
+        ("a", f"A: {channel.splits[0]}", a),
+        ("b", "B", b),
+        ("c", "B − A", difference),
+        ("d", "explained", explained),
+        ("e", "left", difference - explained),
+    ):
+        _draw_map(axes[key], np.where(seen, values, np.nan), title)
+    _draw_words(axes["f"], channel)
+    _draw_spectra(axes["g"], channel)
+    _draw_depth(axes["h"], channel)
+    return made
+
+
+def _draw_map(axes: Axes, values: NDArray[np.float64], title: str) -> None:
+    """Draw a Mollweide view, its colours up to the 99.5th percentile of |value|."""
+    nside = min(SHOWN, healpy.npix2nside(values.size))
+    coarse = healpy.ud_grade(np.where(np.isfinite(values), values, healpy.UNSEEN), nside)
+    projector: Any = healpy.projector.MollweideProj(xsize=500)
+    image = projector.projmap(coarse, lambda x, y, z: healpy.vec2pix(nside, x, y, z))
+    image = np.ma.masked_invalid(np.where(np.isneginf(image) | (image == healpy.UNSEEN), np.nan, image))
+    middle = float(np.nanmean(values))
+    largest = float(np.nanquantile(np.abs(values - middle), 0.995)) or 1.0
+    shown = axes.imshow(
+        image,
+        origin="lower",
+        extent=projector.get_extent(),
+        cmap="RdBu_r",
+        vmin=middle - largest,
+        vmax=middle + largest,
+    )
+    axes.set_title(f"{title}: rms {number(float(np.nanstd(values)))} uK", fontsize=10)
+    axes.axis("off")
+    axes.figure.colorbar(shown, ax=axes, orientation="horizontal", shrink=0.7, aspect=30, pad=0.02).set_label("uK")
+
+
+def _draw_words(axes: Axes, channel: ChannelResult) -> None:
+    """Say in words what was found, beside the maps."""
+    lines = [f"{d.name}: {number(d.amplitude)} {d.unit}" for d in channel.differences]
+    lines += [f"  {key}: {value if isinstance(value, str) else number(value)}" for d in channel.differences
+              for key, value in d.parameters.items()]  # fmt: skip
+    axes.axis("off")
+    text = "\n".join([channel.verdict, *lines])
+    axes.text(0.05, 0.9, text, va="top", fontsize=11, linespacing=1.5, transform=axes.transAxes)
+
+
+def _draw_spectra(axes: Axes, channel: ChannelResult) -> None:
+    """Draw power by degree: side A, the difference, what is explained, and what is left."""
+    nside = healpy.npix2nside(channel.a.shape[1])
+    lmax = 2 * nside
+    ell = np.arange(2, lmax + 1)
+    difference = channel.b - channel.a
+    for label, values, colour, style in (
+        ("A", channel.a, "#444444", "-"),
+        ("B − A", difference, "#0072b2", "-"),
+        ("explained", channel.explained, "#d55e00", "--"),
+        ("left", difference - channel.explained, "#00785a", "-"),
+    ):
+        alm = healpix.analysis(np.where(channel.seen[0], values[0], 0.0), lmax)
+        power = healpy.alm2cl(alm)[2:]
+        if power.max() > 0.0:
+            axes.loglog(ell, ell * (ell + 1) / (2.0 * np.pi) * power, label=label, color=colour, ls=style, lw=1.2)
+    axes.set(xlabel="degree l", ylabel="l(l + 1) C_l / 2π  [uK²]", title="by degree")
+    axes.legend(frameon=False, fontsize=9)
+
+
+def _draw_depth(axes: Axes, channel: ChannelResult) -> None:
+    """Draw the rms of the difference, and of what is left, against the samples in a pixel."""
+    if channel.hits is None or np.ptp(channel.hits[channel.seen]) == 0.0:
+        axes.axis("off")
+        return
+    hits = channel.hits[channel.seen]
+    difference = (channel.b - channel.a)[channel.seen]
+    left = difference - channel.explained[channel.seen]
+    edges = np.unique(np.quantile(hits, np.linspace(0.0, 1.0, 13)))
+    bins = np.clip(np.searchsorted(edges, hits, side="right") - 1, 0, edges.size - 2)
+    count = np.maximum(np.bincount(bins, minlength=edges.size - 1), 1)
+    middle = np.bincount(bins, hits, edges.size - 1) / count
+    for label, values, colour in (("B − A", difference, "#0072b2"), ("left", left, "#00785a")):
+        rms = np.sqrt(np.bincount(bins, values**2, edges.size - 1) / count)
+        axes.loglog(middle, rms, "o-", ms=4, label=label, color=colour)
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set(xlabel="samples in a pixel", ylabel="rms  [uK]", title="by depth")
+    axes.legend(frameon=False, fontsize=9)

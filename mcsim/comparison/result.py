@@ -1,0 +1,168 @@
+"""What a comparison found, in types, in JSON and in words."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.support.numbers import number
+
+Verdict = Literal["identical", "difference", "mixture", "degenerate", "unknown"]
+Maps = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DifferenceResult:
+    """One difference: name, channel, amplitude with unit, share of the variance that it explains, what else is known.
+
+    ``explains`` is the share that the set loses without it.
+    """
+
+    name: str
+    channel: str
+    amplitude: float
+    unit: str
+    explains: float
+    parameters: dict[str, float | str]
+    met: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as in ``compare.json``."""
+        own = {key: getattr(self, key) for key in ("name", "channel", "amplitude", "unit", "explains")}
+        return own | ({"parameters": self.parameters} if self.parameters else {})
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelResult:
+    """The comparison of one channel.
+
+    Attributes
+    ----------
+    name, splits
+        Of the channel and of its maps.
+    verdict
+        "identical", "difference" (one), "mixture" (several), "degenerate" (several sets do), or "unknown".
+    differences, alternatives, nearest
+        The best set that is accepted, the other ones, and the best single difference whatever it explains.
+    rms_uk, sky_rms_uk, noncircular_rms_uk, noise_rms_uk, left_rms_uk
+        Of the difference; of the sky without monopole and dipole; of what the beam's shape adds; of the noise that the
+        model has; and of what is left. NaN where no model says it.
+    a, b, explained, seen
+        Maps, uK, shape (split, npix), ``explained`` the part of b - a that the set makes.
+    hits
+        Samples per pixel, of the model; None without one.
+    """
+
+    name: str
+    splits: tuple[str, ...]
+    verdict: Verdict
+    differences: tuple[DifferenceResult, ...]
+    alternatives: tuple[tuple[DifferenceResult, ...], ...]
+    nearest: DifferenceResult | None
+    rms_uk: float
+    sky_rms_uk: float
+    noncircular_rms_uk: float
+    noise_rms_uk: float
+    left_rms_uk: float
+    a: Maps
+    b: Maps
+    explained: Maps
+    seen: NDArray[np.bool_]
+    hits: Maps | None
+
+    @property
+    def accuracy(self) -> float:
+        """Rms of the difference over that of the sky."""
+        return self.rms_uk / self.sky_rms_uk
+
+    @property
+    def left(self) -> float:
+        """Share of the variance of the difference that is left."""
+        return (self.left_rms_uk / self.rms_uk) ** 2 if self.rms_uk > 0.0 else 0.0
+
+    def sentence(self) -> str:
+        """Say what was found in this channel."""
+        size = f"{number(self.rms_uk)} uK rms, {number(self.accuracy)} of the sky"
+        if self.verdict == "identical":
+            return f"{self.name}: identical to an accuracy of {number(self.accuracy)} ({number(self.rms_uk)} uK rms)."
+        if self.verdict == "unknown":
+            near = self.nearest
+            hint = (
+                ""
+                if near is None or near.explains < 0.01
+                else f"; nearest is {near.name}, which explains {100 * near.explains:.0f} %"
+            )
+            return f"{self.name}: different by {size}, in a way that no difference of the library explains{hint}."
+        named = " and ".join(f"{d.name} = {number(d.amplitude)} {d.unit}" for d in self.differences)
+        others = [" and ".join(d.name for d in one) for one in self.alternatives]
+        also = f"; {', '.join(others)} would do as well" if others else ""
+        return (
+            f"{self.name}: different by {size}, by {named}, which explains {100 * (1 - self.left):.2f} % and leaves "
+            f"{number(self.left_rms_uk)} uK{also}."
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ComparisonResult:
+    """The comparison of two sides; ``str`` of it says what was found.
+
+    Attributes
+    ----------
+    case
+        Name.
+    channels
+        One result for every channel.
+    """
+
+    case: str
+    channels: tuple[ChannelResult, ...]
+
+    @property
+    def verdict(self) -> Verdict:
+        """Of all channels together."""
+        kinds = {channel.verdict for channel in self.channels}
+        for kind in ("unknown", "mixture", "degenerate"):
+            if kind in kinds:
+                return kind
+        names = {d.name for channel in self.channels for d in channel.differences}
+        if not names:
+            return "identical"
+        return "mixture" if len(names) > 1 else "difference"
+
+    @property
+    def accuracy(self) -> float:
+        """Rms of the difference over that of the sky, of all maps together."""
+        return self._rms("rms_uk") / self._rms("sky_rms_uk")
+
+    def _rms(self, name: str) -> float:
+        sizes = [channel.seen.sum() for channel in self.channels]
+        return float(np.sqrt(np.average([getattr(c, name) ** 2 for c in self.channels], weights=sizes)))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of ``compare.json``, schema 1."""
+        rms, left = self._rms("rms_uk"), self._rms("left_rms_uk")
+        return {
+            "schema": 1,
+            "case": self.case,
+            "verdict": self.verdict,
+            "accuracy": self.accuracy,
+            "difference": {
+                "rms_uk": rms,
+                "of_sky": self.accuracy,
+                "of_noncircular": _ratio(rms, self._rms("noncircular_rms_uk")),
+                "of_noise": _ratio(rms, self._rms("noise_rms_uk")),
+            },
+            "differences": [d.to_dict() for c in self.channels for d in c.differences],
+            "alternatives": [[d.to_dict() for d in one] for c in self.channels for one in c.alternatives],
+            "nearest": [c.nearest.to_dict() for c in self.channels if c.verdict == "unknown" and c.nearest],
+            "left": {"rms_uk": left, "fraction": (left / rms) ** 2 if rms > 0.0 else 0.0},
+        }
+
+    def __str__(self) -> str:
+        """Say what was found, channel by channel."""
+        return "\n".join([f"{self.case}: {self.verdict}", *(channel.sentence() for channel in self.channels)])
+
+
+def _ratio(value: float, unit: float) -> float | None:
+    return value / unit if np.isfinite(unit) and unit > 0.0 else None

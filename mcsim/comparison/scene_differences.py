@@ -1,0 +1,310 @@
+"""Differences of beam, scan, sky and pixels: what side B simulates otherwise than side A."""
+
+from dataclasses import replace
+
+import ducc0
+import healpy
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
+
+from mcsim.comparison.differences import Difference, State, Vector
+from mcsim.comparison.pairs import ChannelPair
+from mcsim.comparison.scene import WEAKEST, Maps, Scene
+from mcsim.instrument.scan import Moments
+from mcsim.instrument.scan.geometry import MapGrid
+from mcsim.simulation import tod
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix
+from mcsim.sphere.rotation import euler_angles, rotation_matrix
+from mcsim.systematics.shape import displaced
+
+
+class PsiOffset(Difference):
+    """psi of side B is that of side A plus an angle."""
+
+    name, unit = "psi_offset", "deg"
+    met = "polarisation angle counted from another axis of the focal plane, or from the meridian instead of the scan"
+    smooth = True
+
+    def starts(self, state: State) -> list[Vector]:
+        assert state.scene is not None
+        if not state.scene.noncircular().any():
+            return []
+        return [np.array([float(angle)]) for angle in (90, 180, -90, 5, -5, 30, -30, 150, -150)]
+
+    def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
+        return scene.turned(float(np.deg2rad(value[0])))
+
+    def amplitude(self, value: Vector) -> float:
+        return 180.0 - (180.0 - float(value[0])) % 360.0
+
+    def equivalent(self, value: Vector) -> list[tuple[str, float, str]]:
+        return [("beam_turned", self.amplitude(value), "deg")]
+
+
+class PsiSign(Difference):
+    """psi of side B counts the other way round."""
+
+    name, unit = "psi_sign", "1 = reversed"
+    met = "COSMO and IAU conventions, or a reflected focal plane"
+
+    def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
+        return scene.reversed()
+
+
+class BeamConjugated(Difference):
+    """The beam of side B has b_lm of the opposite sign of m: it is a mirror image."""
+
+    name, unit = "beam_conjugated", "1 = opposite m"
+    met = "beam coefficients of e^(im phi) where e^(-im phi) was meant"
+
+    def starts(self, state: State) -> list[Vector]:
+        return [np.array([1.0]), np.array([-1.0])]
+
+    def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
+        signs = np.where(np.arange(scene.beam.mmax + 1) % 2 == 1, value[0], 1.0)
+        return replace(scene, beam=replace(scene.beam, blm=signs[:, None] * scene.beam.blm.conj()))
+
+    def amplitude(self, value: Vector) -> float:
+        return 1.0
+
+
+class FrameRotated(Difference):
+    """The sky of side B is that of side A, turned about a pole."""
+
+    name, unit = "frame_rotated", "deg"
+    met = "Galactic for ecliptic coordinates, or a longitude counted from another origin"
+    smooth = True
+
+    def __init__(self, frame: str) -> None:
+        self.frame = frame
+
+    def starts(self, state: State) -> list[Vector]:
+        """Return the best angle about each frame's pole, and the rotations from one frame to another."""
+        assert state.scene is not None
+        lmax = min(state.scene.lmax, 2 * state.scene.nside)
+        a, b = (_mean_alm(side, state, lmax) for side in (state.maps, state.pair.b))
+        found = []
+        for frame in ("ecliptic", "galactic", "equatorial"):
+            to_pole = rotation_matrix(self.frame, frame)
+            one, other = (_turned(alm, lmax, to_pole) for alm in (a, b))
+            angle = _best_angle(one, other, lmax)
+            pole = to_pole.T @ np.array([0.0, 0.0, 1.0])
+            if abs(angle) > 1e-7:
+                found.append(np.rad2deg(angle) * pole)
+        for start in ("ecliptic", "galactic", "equatorial"):
+            for end in ("ecliptic", "galactic", "equatorial"):
+                if start != end:
+                    found.append(np.rad2deg(Rotation.from_matrix(rotation_matrix(start, end)).as_rotvec()))
+        lost = [float(np.sum(np.abs(b - _turned(a, lmax, _matrix(value))) ** 2)) for value in found]
+        best = sorted(range(len(found)), key=lambda i: lost[i])[:1]
+        return [found[i] for i in best if lost[i] < float(np.sum(np.abs(b - a) ** 2))]
+
+    def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
+        return replace(scene, sky=_turned(scene.sky, scene.lmax, _matrix(value)))
+
+    def amplitude(self, value: Vector) -> float:
+        return float(np.linalg.norm(value))
+
+    def parameters(self, value: Vector) -> dict[str, float | str]:
+        lon, lat = healpy.vec2ang(value, lonlat=True)
+        return {"pole_lon_deg": float(lon[0]), "pole_lat_deg": float(lat[0]), "frame": self.frame}
+
+
+def _matrix(rotation_deg: Vector) -> Vector:
+    return np.asarray(Rotation.from_rotvec(np.deg2rad(rotation_deg)).as_matrix())
+
+
+def _turned(alm: NDArray[np.complex128], lmax: int, matrix: Vector) -> NDArray[np.complex128]:
+    alpha, beta, gamma = euler_angles(matrix)
+    return np.asarray(ducc0.sht.rotate_alm(alm, lmax, gamma, beta, alpha))
+
+
+def _mean_alm(maps: Maps, state: State, lmax: int) -> NDArray[np.complex128]:
+    seen = state.pair.seen
+    mean = np.where(seen, maps, 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
+    nthreads = 1 if state.scene is None else state.scene.nthreads
+    return healpix.analysis(mean, lmax, iterations=1, nthreads=nthreads)
+
+
+def _best_angle(a: NDArray[np.complex128], b: NDArray[np.complex128], lmax: int) -> float:
+    """Return the angle about the z axis that turns a into b best: a_lm becomes e^(-i m angle) a_lm."""
+    orders = alm_.orders(lmax)
+    power = np.zeros(lmax + 1, dtype=np.complex128)
+    np.add.at(power, orders, np.conj(a) * b)
+
+    def lost(angle: float) -> float:
+        return -float(np.sum(np.real(power * np.exp(1j * np.arange(lmax + 1) * angle))))
+
+    grid = np.linspace(-np.pi, np.pi, 16 * lmax, endpoint=False)
+    values = -np.real(np.exp(1j * np.outer(grid, np.arange(lmax + 1))) @ power)
+    start, step = grid[int(np.argmin(values))], grid[1] - grid[0]
+    return float(minimize_scalar(lost, bounds=(start - step, start + step), method="bounded").x)
+
+
+class TimeShift(Difference):
+    """The signal of side B is attributed to a pointing so many samples earlier than on side A."""
+
+    name, unit = "time_shift", "samples"
+    met = "time stamps at the end of an integration instead of its middle"
+
+    def starts(self, state: State) -> list[Vector]:
+        """Return the shift that fits best, if it is small beside the beam: farther on, the sky is another one."""
+        scene, pair = state.scene, state.pair
+        if scene is None or pair.channel is None or pair.channel.site.pointing is None:
+            return []
+        width = np.sqrt(-np.log(max(scene.beam.window[scene.lmax], 1e-12)) * 2.0) / scene.lmax
+        largest = 2.0 * width / _radians_per_sample(pair)
+        bare, value = scene.maps(), 0.05 * largest
+        for _ in range(3):
+            moved = self.scene(scene, np.array([value]), pair).maps() - bare
+            value = float(np.clip(value * state.fit([moved])[0], -largest, largest))
+            if abs(value) < 1e-6 * largest:
+                return []
+        return [np.array([value])]
+
+    def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
+        ahead = value[0] * _radians_per_sample(pair)
+        beam = displaced(scene.beam, 0.0 if ahead >= 0.0 else np.pi, abs(ahead))
+        return replace(scene, beam=beam.truncated(min(beam.mmax, scene.moments[0].smax)))
+
+
+def _radians_per_sample(pair: ChannelPair) -> float:
+    """Return the median distance between consecutive samples of a channel."""
+    assert pair.channel is not None
+    pointing = pair.channel.site.pointed("time_shift")
+    first = next(iter(tod.samples(pointing.model, pointing.line, MapGrid(pair.nside, pair.channel.site.frame))))
+    n = healpy.ang2vec(first.theta[:4096], first.phi[:4096])
+    return float(np.median(np.arccos(np.clip(np.sum(n[1:] * n[:-1], axis=1), -1.0, 1.0))))
+
+
+class ReversedMotion(Difference):
+    """A motion of the scan of side B turns the other way round."""
+
+    unit = "1 = reversed"
+    slow = True
+
+    def __init__(self, motion: str) -> None:
+        self.motion = motion
+
+    def starts(self, state: State) -> list[Vector]:
+        known = state.pair.channel is not None and state.pair.channel.site.pointing is not None
+        return [np.ones(1)] if known else []
+
+    def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
+        assert pair.channel is not None
+        pointing = pair.channel.site.pointed(self.name)
+        period = getattr(pointing.model, self.motion)
+        model = replace(pointing.model, **{self.motion: -period}).with_lines_of_sight(pointing.line.name)
+        count = len(scene.moments)
+        moments = tuple(
+            Moments.from_model(
+                model, scene.nside, scene.moments[0].smax, pair.channel.site.frame, (i / count, (i + 1) / count),
+                scene.nthreads,
+            )
+            for i in range(count)
+        )  # fmt: skip
+        return replace(scene, moments=moments, motion=model)
+
+
+class SpinSign(ReversedMotion):
+    """The spin of side B turns the other way round."""
+
+    name = "spin_sign"
+    met = "a left-handed spin in one of two scan generators"
+
+    def __init__(self) -> None:
+        super().__init__("spin_period_s")
+
+
+class PrecessionSign(ReversedMotion):
+    """The precession of side B turns the other way round."""
+
+    name = "precession_sign"
+    met = "precession rates of opposite sign in two scan generators"
+
+    def __init__(self) -> None:
+        super().__init__("precession_period_s")
+
+
+class PixelCentres(Difference):
+    """Samples of side B are moved to the centres of their pixels."""
+
+    name, unit = "pixel_centres", "1 = samples at the centres"
+    met = "pointing rounded to pixels before the sky is looked up"
+
+    def starts(self, state: State) -> list[Vector]:
+        known = state.scene is not None and state.scene.moments[0].dtheta is not None
+        return [np.ones(1)] if known else []
+
+    def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
+        moments = tuple(replace(m, dtheta=None, dphi=None) for m in scene.moments)
+        return replace(scene, moments=moments, window=np.ones_like(scene.window), centred=True)
+
+
+class PixelWindow(Difference):
+    """The pixel window is once more (+1) or once less (-1) in side B."""
+
+    name, unit = "pixel_window", "times too often"
+    met = "a window applied to the sky and again by the samples' spread, or forgotten for a map made at centres"
+
+    def starts(self, state: State) -> list[Vector]:
+        return [np.array([1.0]), np.array([-1.0])]
+
+    def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
+        own = healpix.pixel_window(scene.nside, scene.lmax)
+        return replace(scene, window=scene.window * own ** value[0])
+
+
+class BeamWindow(Difference):
+    """The circular part of the beam is once more (+1) or once less (-1) in side B."""
+
+    name, unit = "beam_window", "times too often"
+    met = "an input map that is smoothed already, or an unsmoothed one taken for smoothed"
+
+    def starts(self, state: State) -> list[Vector]:
+        return [np.array([1.0]), np.array([-1.0])]
+
+    def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
+        window = scene.beam.window[: scene.lmax + 1]
+        factor = np.where(window > WEAKEST, np.maximum(window, WEAKEST) ** value[0], 1.0 if value[0] < 0 else 0.0)
+        return replace(scene, sky=alm_.multiply(scene.sky, factor, scene.lmax))
+
+
+class LmaxCut(Difference):
+    """Sky or beam of side B end at a lower degree."""
+
+    name, unit = "lmax_cut", "highest l"
+    met = "b_lm of a lower lmax than the sky's, padded with zeros"
+
+    def starts(self, state: State) -> list[Vector]:
+        assert state.scene is not None
+        lmax = min(state.scene.lmax, 2 * state.scene.nside)
+        a, b = (_mean_alm(side, state, lmax) for side in (state.maps, state.pair.b))
+        degrees = alm_.degrees(lmax)
+        weight = np.where(alm_.orders(lmax) == 0, 1.0, 2.0)
+        kept, gone = (np.bincount(degrees, weight * np.abs(x) ** 2, lmax + 1) for x in (b - a, b))
+        lost = np.cumsum(kept) + gone.sum() - np.cumsum(gone)
+        best = int(np.argmin(lost))
+        return [np.array([float(best)])] if 2 <= best < lmax else []
+
+    def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
+        kept = np.arange(scene.lmax + 1) <= value[0]
+        return replace(scene, sky=alm_.multiply(scene.sky, kept.astype(float), scene.lmax))
+
+
+class MmaxCut(Difference):
+    """The beam of side B has lower azimuthal orders alone."""
+
+    name, unit = "mmax_cut", "highest m"
+    met = "an mmax of the convolution below that of the beam"
+
+    def starts(self, state: State) -> list[Vector]:
+        assert state.scene is not None
+        orders = [m for m in range(state.scene.beam.mmax + 1) if state.scene.beam.blm[m].any()]
+        return [np.array([float(m)]) for m in orders[:-1]]
+
+    def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
+        return replace(scene, beam=scene.beam.truncated(int(value[0])))
