@@ -10,6 +10,15 @@ from mcsim.config.values import STRICT, Frame, Fwhm, Label, Nside, PathText
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
+class _Masked:
+    """Keys of steps that may have a mask, and be of some channels only."""
+
+    mask: PathText | None = None
+    mask_frame: Frame | None = None
+    channels: tuple[Label, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Degrade:
     """Coarser pixels, with ``nside`` below that of the maps so far.
 
@@ -47,15 +56,12 @@ class Smooth:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class SubtractDipole:
+class SubtractDipole(_Masked):
     """Monopole and dipole, fitted by least squares with the weights of ``mask``, subtracted everywhere."""
 
     kind: Literal["subtract_dipole"] = "subtract_dipole"
     monopole: bool = True
     dipole: bool = True
-    mask: PathText | None = None
-    mask_frame: Frame | None = None
-    channels: tuple[Label, ...] = ()
 
     @model_validator(mode="after")
     def _something(self) -> Self:
@@ -65,7 +71,7 @@ class SubtractDipole:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class Templates:
+class Templates(_Masked):
     """Maps ``templates`` (uK), fitted by least squares with the weights of ``mask``, or times given ``coefficients``.
 
     ``monopole``, ``dipole``: fitted along, and subtracted too. With ``coefficients`` the data are taken to hold this
@@ -79,9 +85,6 @@ class Templates:
     simulated: bool = False
     monopole: bool = False
     dipole: bool = False
-    mask: PathText | None = None
-    mask_frame: Frame | None = None
-    channels: tuple[Label, ...] = ()
 
     @model_validator(mode="after")
     def _fitted_or_given(self) -> Self:
@@ -98,7 +101,7 @@ class Templates:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class Fill:
+class Fill(_Masked):
     """Values for pixels that were not observed or where ``mask`` is 0.
 
     ``method``: "diffuse" gives every such pixel the mean of its neighbours; "constant" gives it ``value_uk``.
@@ -107,9 +110,6 @@ class Fill:
     kind: Literal["fill"] = "fill"
     method: Literal["diffuse", "constant"] = "diffuse"
     value_uk: float = 0.0
-    mask: PathText | None = None
-    mask_frame: Frame | None = None
-    channels: tuple[Label, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

@@ -102,22 +102,10 @@ def _channel(run: config.RunConfig, name: str) -> tuple[config.Channel, str | No
 
 
 def prepare_files(source: Source, files: Sequence[str], folder: str | Path) -> list[Path]:
-    """Prepare FITS files and write them to a new folder, which :func:`mcsim.diagnose` can read.
+    """Prepare FITS files and write them to a new folder, complete or not at all, which :func:`mcsim.diagnose` can read.
 
-    Parameters
-    ----------
-    source
-        Configuration.
-    files
-        Paths ``.../{channel}.fits`` or ``{channel}_{split}.fits``, or NAME=PATH with any path. Unit and frame are those
-        of the header; without them uK and the frame of the run.
-    folder
-        New or empty; it appears complete or not at all.
-
-    Raises
-    ------
-    InputError
-        As of :func:`prepare`, and for files that cannot be used or written.
+    Files are ``.../{channel}.fits`` or ``{channel}_{split}.fits``, or NAME=PATH with any path. Unit and frame are those
+    of the header; without them uK and the frame of the run.
     """
     run = source if isinstance(source, config.RunConfig) else config.load(source)
     target, names = Path(folder), file_names(run)

@@ -36,28 +36,16 @@ REACH, HIGHEST = 24, 8192
 
 @dataclass(frozen=True)
 class Neglected:
-    """Power above ``sky.lmax`` that the pixels of a map see.
+    """Power above ``sky.lmax`` that the pixels of a map see."""
 
-    Attributes
-    ----------
-    name, nside
-        Map, and resolution of its pixels.
-    lmax, needed
-        The ``sky.lmax`` of the run, and the one that is enough.
-    spectrum, last
-        Where C_l are from, and the last degree there.
-    rms_uk, shift
-        Of the neglected power per pixel, and what it does to the variance of all pixels, in standard deviations.
-    """
-
-    name: str
-    nside: int
-    lmax: int
-    needed: int
-    spectrum: str
-    last: int
-    rms_uk: float
-    shift: float
+    name: str  # of the map
+    nside: int  # of its pixels
+    lmax: int  # sky.lmax of the run
+    needed: int  # the sky.lmax that is enough
+    spectrum: str  # where C_l are from
+    last: int  # its last degree
+    rms_uk: float  # of the neglected power per pixel
+    shift: float  # of the variance of all pixels, in standard deviations
 
     def __str__(self) -> str:
         """Say it in a sentence with the remedy."""

@@ -117,12 +117,8 @@ def preparation(
 ) -> Preparation | None:
     """Return the preparation of the maps of a channel and split; None if the run declares none.
 
-    ``observed``: of data, from which templates with given coefficients are subtracted.
-
-    Raises
-    ------
-    InputError
-        For files that cannot be used, and a target beam that is narrower than the map's own.
+    ``observed``: of data, from which templates with given coefficients are subtracted. InputError for files that cannot
+    be used, and a target beam that is narrower than the map's own.
     """
     if not run.preparation:
         return None

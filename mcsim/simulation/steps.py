@@ -88,23 +88,13 @@ class Average(Step):
 
 @dataclass(frozen=True, eq=False)
 class Filter(Step):
-    """Product with a window in harmonics, and synthesis at another nside where that is lower.
+    """Product with a window in harmonics, and synthesis at another nside where that is lower."""
 
-    Attributes
-    ----------
-    name
-        Of the step, for messages.
-    fine, coarse
-        nside before and after.
-    beam, pixels
-        Factors of B_l and of the pixel window, shape (lmax + 1,) each; nothing is kept above.
-    """
-
-    name: str
-    fine: int
-    coarse: int
-    beam: NDArray[np.float64]
-    pixels: NDArray[np.float64]
+    name: str  # of the step, for messages
+    fine: int  # nside before
+    coarse: int  # nside after
+    beam: NDArray[np.float64]  # factors of B_l, (lmax + 1,); nothing is kept above
+    pixels: NDArray[np.float64]  # factors of the pixel window, (lmax + 1,)
 
     transforms = 2 + 2 * ITERATIONS
 
@@ -232,16 +222,9 @@ class Rotated(Step):
 
     def orientations(self, w: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return the moments of psi from the meridians of the new frame."""
-        theta, phi = healpy.pix2ang(self.nside, np.arange(w.shape[1]))
-        matrix = rotation.rotation_matrix(self.before, self.after)
-        theta_old, phi_old = healpy.vec2ang((matrix.T @ np.stack(healpy.ang2vec(theta, phi).T)).T)
-        south = matrix @ np.stack(
-            [np.cos(theta_old) * np.cos(phi_old), np.cos(theta_old) * np.sin(phi_old), -np.sin(theta_old)]
-        )
-        down = np.stack([np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)])
-        east = np.stack([-np.sin(phi), np.cos(phi), np.zeros_like(phi)])
-        turn = np.arctan2((south * east).sum(axis=0), (south * down).sum(axis=0))
-        return np.stack([np.exp(-1j * s * turn) * self.local(row) for s, row in enumerate(w, start=1)])
+        back = healpy.Rotator(coord=[rotation.FRAMES[self.after], rotation.FRAMES[self.before]])
+        turn = back.angle_ref(*healpy.pix2ang(self.nside, np.arange(w.shape[1])))  # from the old meridian to the new
+        return np.stack([np.exp(1j * s * turn) * self.local(row) for s, row in enumerate(w, start=1)])
 
 
 def _complete(map_uk: Map, name: str) -> Map:

@@ -44,10 +44,7 @@ def of_average(fine: int, coarse: int, lmax: int) -> Window:
 def read_beam(path: Path, lmax: int) -> Window:
     """Read B_l from l = 0 to lmax: a text table (B_l, or ell and B_l), a FITS table or a .npy file.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, ends below lmax, or does not start at 1.
+    Raise InputError if the file cannot be read, ends below lmax, or does not start at 1.
     """
     if path.suffix in (".npy", ".fits", ".fit", ".gz"):
         return healpix.read_pixel_window(path, lmax)
