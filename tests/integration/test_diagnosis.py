@@ -258,10 +258,12 @@ def test_orders_are_proposed_where_a_run_leaves_some_out(small):
 
 
 def test_the_library_is_an_argument_that_workers_share(small):
+    level = systematics.get("noise_level")
+
     @dataclass(frozen=True, kw_only=True)
-    class Louder(systematics.get("noise_level")):
+    class Louder(level):
         name = "louder"
-        matched_filter = True
+        parametrization = replace(level.parametrization, matched_filter=True)
 
     analysis = analysis_of(small.run, library={"louder": Louder})
     assert {candidate.identity for candidate in analysis.candidates} == {("louder", "V1"), ("louder", "W1")}
