@@ -7,8 +7,8 @@ order.
 
 Ensembles: `run`, `merge`, `open_ensemble`, `open_summary`; configurations: `load_config`, `RunConfig`.
 Instrument: `Beam`, `ScanModel`, `Moments`, and what they make of one sky: `observe`.
-Statistics: `biposh` of maps at hand, `predict` of a run, `fit` of an effective beam, `diagnose` of maps with
-`DiagnosisSettings`, `compare` of two simulations.
+Statistics: `biposh` of maps at hand, `predict` of a run, `fit` of an effective beam, `prepare` and `diagnose` of maps
+with `DiagnosisSettings`, `compare` of two simulations.
 Systematic effects: `effects`, and `Effect` to write one. Bad input raises `InputError`.
 
 Names are loaded when they are first used, so that ``import mcsim`` costs little.
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from mcsim.ensemble.maps import write_maps
     from mcsim.ensemble.opening import open_ensemble, open_summary
     from mcsim.ensemble.prediction import predict
+    from mcsim.ensemble.prepare import prepare
     from mcsim.ensemble.runner import merge, run
     from mcsim.errors import InputError
     from mcsim.instrument.beams import Beam
@@ -57,6 +58,7 @@ __all__ = [
     "open_ensemble",
     "open_summary",
     "predict",
+    "prepare",
     "run",
     "write_maps",
 ]
@@ -80,6 +82,7 @@ _HOME = {
     "open_ensemble": "mcsim.ensemble.opening",
     "open_summary": "mcsim.ensemble.opening",
     "predict": "mcsim.ensemble.prediction",
+    "prepare": "mcsim.ensemble.prepare",
     "run": "mcsim.ensemble.runner",
     "write_maps": "mcsim.ensemble.maps",
 }

@@ -14,6 +14,7 @@ from mcsim.beamfit.likelihood import Comparison, Solution, compare, size, solve,
 from mcsim.beamfit.models import Model, model
 from mcsim.beamfit.table import check_frame, read_table
 from mcsim.beamfit.templates import ORDERS, Order, Polynomial, Templates, templates
+from mcsim.config.preparation import frame_of
 from mcsim.ensemble import store
 from mcsim.ensemble.expectation import Source, survey_of
 from mcsim.errors import InputError
@@ -240,10 +241,10 @@ def measurement(
     """
     if isinstance(data, Measurement):
         return data
-    path, frame = Path(data), survey_of(source).config.map.frame
+    path, frame = Path(data), survey_of(source).frame
     if path.is_dir():
         measured = from_store(path, selection)
-        check_frame(path, store.attributes(path)["configuration"]["map"]["frame"], frame)
+        check_frame(path, frame_of(store.attributes(path)["configuration"]), frame)
     else:
         measured = read_table(path, frame, selection)
     return measured if covariance is None else with_covariance_of(measured, covariance, selection.pair)

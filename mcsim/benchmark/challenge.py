@@ -93,7 +93,7 @@ def make_case(settings: Settings, folder: Path, truth: Truth) -> None:
         files.write_key(folder, truth)
     with appearing(folder / files.MAPS / case) as scratch:
         for name, map_uk in maps_of(run, truth, settings.out_of_library):
-            write_map(scratch / names[name], map_uk, run.map.frame)
+            write_map(scratch / names[name], map_uk, config.prepared_grid(run)[1])
         plain = {**config.to_dict(run), "name": case}
         (scratch / "model.toml").write_text(tomli_w.dumps(_without_none(plain)), encoding="utf-8")
         (scratch / "question.json").write_text(json.dumps({"without": list(truth.without)}) + "\n")

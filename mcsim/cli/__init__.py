@@ -51,7 +51,15 @@ def _options(version: Version = False) -> None:
     """Tell whether a measured isotropy violation is made by the instrument."""
 
 
-for _command in (ensembles.run, ensembles.merge, ensembles.info, ensembles.plot, ensembles.predict, ensembles.maps):
+for _command in (
+    ensembles.run,
+    ensembles.merge,
+    ensembles.info,
+    ensembles.plot,
+    ensembles.predict,
+    ensembles.maps,
+    ensembles.prepare,
+):
     app.command()(_command)
 
 
@@ -139,9 +147,11 @@ def diagnose(
     without: Annotated[list[str] | None, Option(metavar="EFFECT", help="Do not propose it; repeatable.")] = None,
     simulations: Simulations = None,
     workers: Processes = None,
+    dry_run: Annotated[bool, Option("--dry-run", help="Say simulations, memory and time; simulate none.")] = False,
 ) -> None:
     """Test maps against a model, and find the effect that the model lacks: where, how large, and if adding it helps."""
     from mcsim import config
+    from mcsim.diagnosis.api import describe
     from mcsim.diagnosis.api import diagnose as judge
     from mcsim.diagnosis.settings import DiagnosisSettings
     from mcsim.diagnosis.words import summary
@@ -150,6 +160,9 @@ def diagnose(
     run, settings = config.load(model), DiagnosisSettings(without=tuple(without or ()), simulations=simulations)
     if workers is not None:
         run = replace(run, compute=replace(run.compute, workers=workers))
+    if dry_run:
+        print(describe(run, settings))
+        return
     found = judge(run, data, output, case=case, settings=settings, quiet=False)
     print("\n".join(summary(found, output)))
 

@@ -149,6 +149,18 @@ def maps(
     print(f"wrote maps of {len(found)} realization{'' if len(found) == 1 else 's'} to {folder}")
 
 
+def prepare(
+    config: Config,
+    maps: Annotated[list[str], Argument(metavar="MAP...", help="CHANNEL.fits or CHANNEL_SPLIT.fits, or NAME=FILE.")],
+    folder: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Folder to fill; nothing is replaced.")],
+) -> None:
+    """Prepare observed maps as CONFIG prepares its simulated maps, by the steps of [[preparation]]."""
+    from mcsim.ensemble.prepare import prepare_files
+
+    for path in prepare_files(config, maps, folder):
+        print(f"wrote {path}")
+
+
 def _slice(text: str | None) -> slice | None:
     if text is None:
         return None

@@ -120,10 +120,19 @@ def _orders(run: config.RunConfig) -> int:
 
 
 def quiet(run: config.RunConfig) -> config.RunConfig:
-    """Return the run without noise and effects, and with nothing to estimate."""
+    """Return the run without noise and effects, and with nothing to estimate; InputError if it prepares its maps."""
+    _check_steps(run)
     channels = tuple(replace(channel, noise=config.Noise()) for channel in run.channels)
     biposh = replace(run.biposh, L_max=0, pairs="auto")
     return replace(run, channels=channels, effects=(), biposh=biposh)
+
+
+def _check_steps(run: config.RunConfig) -> None:
+    if run.preparation:
+        raise InputError(
+            f"{run.name} has [[preparation]], but maps are compared as they were made; remove it, and give maps that "
+            "are not prepared."
+        )
 
 
 def _model(a: str | Path, b: str | Path, model: str | Path | config.RunConfig | None) -> config.RunConfig | None:
@@ -149,6 +158,7 @@ def _side(side: str | Path, run: config.RunConfig | None, nthreads: int) -> dict
     if path.is_dir():
         return _folder(path, run)
     own = config.load(side)
+    _check_steps(own)
     shared = survey(own, nthreads)
     if run is not None and own.map.frame != run.map.frame:
         raise InputError(f"{side} makes maps in {own.map.frame} coordinates, the model in {run.map.frame}; choose one.")

@@ -1,7 +1,7 @@
 """Configuration of a run: schema 1, its checks, and the hash of what defines a result."""
 
 from mcsim.config.identity import differences, digest, science
-from mcsim.config.load import check_skies, from_json, json_schema, load, resolved, to_dict, to_json
+from mcsim.config.load import check_skies, from_json, json_schema, load, prepared_grid, resolved, to_dict, to_json
 from mcsim.config.paths import channel_path, sky_path
 from mcsim.config.schema import (
     Beam,
@@ -60,6 +60,7 @@ __all__ = [
     "load",
     "map_names",
     "pixel_window",
+    "prepared_grid",
     "resolved",
     "science",
     "sky_path",

@@ -36,6 +36,10 @@ RULES = {
     "scan.path": Rule(placeholders=("channel", "split")),
     "scan.model": Rule(packaged="scan_models", placeholders=("channel", "split")),
     "effect.template": Rule(),
+    "preparation.mask": Rule(placeholders=("channel", "split")),
+    "preparation.window": Rule(placeholders=("channel",)),
+    "preparation.own_window": Rule(placeholders=("channel",)),
+    "preparation.templates": Rule(placeholders=("channel",)),
 }
 
 _TEMPLATES = {path.split(".")[1] for path, rule in RULES.items() if rule.placeholders}
@@ -59,7 +63,7 @@ def in_files(value: Any, key: str = "") -> Any:
     if isinstance(value, Mapping):
         return {name: in_files(item, name) for name, item in value.items()}
     if isinstance(value, list | tuple):
-        return [in_files(item) for item in value]
+        return [in_files(item, key) for item in value]
     if isinstance(value, Tabled):
         table = table_of(value)
         return table.popitem()[1] if key in _FILES else table

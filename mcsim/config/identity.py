@@ -13,10 +13,10 @@ from mcsim.config.schema import RunConfig, analysis_lmax, pixel_window
 def science(config: RunConfig) -> dict[str, Any]:
     """Return the part of a run that defines its numbers, with file names replaced by hashes of contents.
 
-    It has sky, map, channels, effects, biposh, seed and pairing; not name, compute, the number of realizations,
-    keep_maps or the bins of the summary. A file is represented by the SHA-256 of its contents, a template by those of
-    its files. Skies given one file per realization are represented by the part of their template with the placeholder
-    and by the contents of realization 0; the others are not read.
+    It has sky, map, channels, effects, preparation, biposh, seed and pairing; not name, compute, the number of
+    realizations, keep_maps or the bins of the summary. A file is represented by the SHA-256 of its contents, a
+    template by those of its files. Skies given one file per realization are represented by the part of their template
+    with the placeholder and by the contents of realization 0; the others are not read.
     """
     plain = to_dict(config)
     for entry in paths.entries(plain):
@@ -34,7 +34,11 @@ def science(config: RunConfig) -> dict[str, Any]:
         table["pixel_window"] = pixel_window(config, channel) if window is None else window
     return {
         "schema": plain["schema"],
-        **{section: plain[section] for section in ("sky", "map", "channel", "effect", "biposh") if section in plain},
+        **{
+            section: plain[section]
+            for section in ("sky", "map", "channel", "effect", "preparation", "biposh")
+            if section in plain
+        },
         "ensemble": {key: plain["ensemble"][key] for key in ("seed", "paired")},
     }
 
@@ -53,7 +57,7 @@ def _leave_out_what_says_nothing(plain: dict[str, Any]) -> None:
 
     A run that does not use a key thus keeps its hash from before the key existed.
     """
-    _drop(plain, {"effect": []})
+    _drop(plain, {"effect": [], "preparation": []})
     _drop(plain["map"], _MAP)
     _drop(plain["sky"], {"dipole_uk": None})
     if (plain["sky"]["dipole_lon_deg"], plain["sky"]["dipole_lat_deg"]) == (264.0, 48.24):

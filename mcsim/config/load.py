@@ -12,6 +12,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from mcsim.config import arrays, paths
 from mcsim.config.messages import sentence, shown
+from mcsim.config.preparation import grid_after
 from mcsim.config.schema import RunConfig, analysis_lmax, pixel_window
 from mcsim.errors import InputError
 from mcsim.support import resources
@@ -104,6 +105,11 @@ def resolved(config: RunConfig) -> dict[str, Any]:
     windows = {pixel_window(config, channel) for channel in config.channels}
     plain["map"]["pixel_window"] = windows.pop() if len(windows) == 1 else None
     return plain
+
+
+def prepared_grid(config: RunConfig) -> tuple[int, str]:
+    """Return nside (0 without pixels) and frame of the maps after their preparation."""
+    return grid_after(config.preparation, config.map.resolution, config.map.frame)
 
 
 def to_json(config: RunConfig) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from mcsim.config import schema
+from mcsim.config import preparation, schema
 
 # Table -> its class. The kind of a beam or scan, which pydantic puts into the location, selects one of several.
 _TABLES: dict[tuple[str, ...], type] = {
@@ -21,6 +21,7 @@ _TABLES: dict[tuple[str, ...], type] = {
     ("biposh",): schema.Biposh,
     ("ensemble",): schema.Ensemble,
     ("compute",): schema.Compute,
+    **{("preparation", step.kind): step for step in preparation.STEPS},
     **{
         ("channel", key, kind): table
         for key, tables in (("beam", schema.BEAMS), ("beam_b", schema.BEAMS), ("scan", schema.SCANS))
@@ -28,7 +29,7 @@ _TABLES: dict[tuple[str, ...], type] = {
     },
 }
 _TOML_NAMES = {"schema_version": "schema", "channels": "channel", "effects": "effect"}
-_REPEATED = {"channel": "[[channel]]", "effect": "[[effect]]"}
+_REPEATED = {"channel": "[[channel]]", "effect": "[[effect]]", "preparation": "[[preparation]]"}
 
 _EXPECTED = {
     "int_type": "a whole number",

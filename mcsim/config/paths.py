@@ -24,8 +24,8 @@ class Entry(NamedTuple):
     """One key that names a file (or a family of files) in the plain dict of a run."""
 
     key: str  # as in messages: channel[W1].beam.path
-    holder: dict[str, Any]  # the table that contains it
-    field: str  # its name in that table
+    holder: Any  # the table, or list, that contains it
+    field: str | int  # its name or place there
     rule: Rule
     channels: tuple[str, ...]  # channels that it applies to
 
@@ -56,6 +56,10 @@ def entries(plain: dict[str, Any]) -> Iterator[Entry]:
         key = f"channel[{label(table, number)}]"
         sections += [(part, f"{key}.{part}", table.get(part), (every[number],)) for part in ("beam", "beam_b", "scan")]
     sections += [("effect", f"effect[{n}]", table, every) for n, table in enumerate(_tables(plain, "effect"))]
+    for number, table in enumerate(_tables(plain, "preparation")):
+        own = table.get("channels")
+        names = tuple(map(str, own)) if isinstance(own, list) and own else every
+        sections.append(("preparation", f"preparation[{number}]", table, names))
     for section, where, holder, speaks_of in sections:
         for path, rule in RULES.items():
             table_name, field = path.split(".")
@@ -63,6 +67,9 @@ def entries(plain: dict[str, Any]) -> Iterator[Entry]:
                 value = holder.get(field)
                 if isinstance(value, str) and value.strip() and value not in rule.words:
                     yield Entry(f"{where}.{field}", holder, field, rule, speaks_of)
+                for place, item in enumerate(value if isinstance(value, list) else []):
+                    if isinstance(item, str) and item.strip():
+                        yield Entry(f"{where}.{field}[{place}]", value, place, rule, speaks_of)
 
 
 def _tables(plain: dict[str, Any], key: str) -> list[dict[str, Any]]:

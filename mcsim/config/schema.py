@@ -6,17 +6,16 @@ Every key states the unit of its number. A failed check raises ValueError whose 
 
 from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import AfterValidator, ConfigDict, Field, GetCoreSchemaHandler, model_validator
+from pydantic import AfterValidator, Field, GetCoreSchemaHandler, model_validator
 from pydantic.dataclasses import dataclass
 from pydantic_core import core_schema
 
 from mcsim.config import arrays
-from mcsim.config.values import NSIDE_MAX, BeamOrder, Degree, Frame, Fwhm, Label, PathText, power_of_two, unique
+from mcsim.config.preparation import Step, check_steps
+from mcsim.config.values import STRICT, BeamOrder, Degree, Frame, Fwhm, Label, Nside, PathText, power_of_two, unique
 
-_STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, validate_by_name=True, validate_by_alias=True)
 
-
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Sky:
     """Isotropic Gaussian skies from ``spectrum``, or skies given as a_lm or map files (a template: {realization}).
 
@@ -42,7 +41,7 @@ class Sky:
         return self
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Map:
     """Pixels, frame, mask, splits and pixel window.
 
@@ -56,7 +55,7 @@ class Map:
     of its soft edge.
     """
 
-    nside: Annotated[int, Field(ge=1, le=NSIDE_MAX), AfterValidator(power_of_two)] | None = None
+    nside: Nside | None = None
     grid: Literal["healpix", "gl"] = "healpix"
     frame: Frame = "ecliptic"
     mask: PathText | None = None
@@ -83,7 +82,7 @@ class Map:
         return self
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class BeamGaussian:
     """Circular Gaussian."""
 
@@ -91,7 +90,7 @@ class BeamGaussian:
     fwhm_arcmin: Fwhm
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class BeamEllipticalGaussian:
     """Elliptical Gaussian; ``angle_deg`` is that of the major axis, from the beam's x axis towards y."""
 
@@ -111,7 +110,7 @@ class BeamEllipticalGaussian:
         return self
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class BeamMap:
     """Two-dimensional beam map in FITS.
 
@@ -130,7 +129,7 @@ class BeamMap:
     m_max: BeamOrder = None
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class BeamBlm:
     """File of b_lm; ``angle_deg`` rotates the beam about its axis, from x towards y."""
 
@@ -140,7 +139,7 @@ class BeamBlm:
     m_max: BeamOrder = None
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class ScanParallelTransport:
     """Parallel transport: one sample at every pixel centre, at the angle ``psi0_deg`` from e_theta."""
 
@@ -148,7 +147,7 @@ class ScanParallelTransport:
     psi0_deg: float = 0.0
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class ScanHitAveraged:
     """Orientation moments of a scan model: a packaged name or a TOML file."""
 
@@ -158,7 +157,7 @@ class ScanHitAveraged:
     line_of_sight: PathText | None = None
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class ScanMoments:
     """Orientation moments from a FITS file.
 
@@ -172,7 +171,7 @@ class ScanMoments:
     line_of_sight: PathText | None = None
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class ScanPointing:
     """Orientation moments from a file of pointings: theta, phi, psi[, time]."""
 
@@ -180,7 +179,7 @@ class ScanPointing:
     path: PathText
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class ScanDifferencing:
     """A differencing pair of a scan model; maps are made from (1+x) T_A - (1-x) T_B, x the transmission imbalance.
 
@@ -221,14 +220,14 @@ BEAMS: dict[str, Any] = {each.kind: each for each in get_args(AnyBeam)}
 SCANS: dict[str, Any] = {each.kind: each for each in get_args(AnyScan)}
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Noise:
     """White noise per sample; the variance of a pixel is sigma0_uk^2 / hits. Differencing: per difference."""
 
     sigma0_uk: Annotated[float, Field(ge=0.0)] = 0.0
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Channel:
     """One detector or band: a beam under a scan, with noise.
 
@@ -252,7 +251,7 @@ class Channel:
         return self
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Biposh:
     """Settings of the estimator; ``lmax``: by default the sky's; ``iterations``: Jacobi iterations of the analysis."""
 
@@ -264,7 +263,7 @@ class Biposh:
     pairs: Literal["all", "auto"] = "all"
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Ensemble:
     """Realizations 0 .. realizations - 1 of the seed; ``paired`` adds the circular-beam control of each."""
 
@@ -274,7 +273,7 @@ class Ensemble:
     keep_maps: bool = False
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Compute:
     """Settings of the computation; no result depends on them. ``chunk``: realizations per task (default: chosen)."""
 
@@ -282,7 +281,7 @@ class Compute:
     chunk: Annotated[int, Field(ge=1, le=2**20), AfterValidator(power_of_two)] | None = None
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Effect:
     """Named change of the simulation; in TOML its ``parameters`` are keys of the table ``[[effect]]``."""
 
@@ -291,7 +290,7 @@ class Effect:
     parameters: dict[str, float | str | tuple[float, ...]] = Field(default_factory=dict)
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class RunConfig:
     """Configuration of a run, from :func:`mcsim.load_config`; frozen: ``dataclasses.replace`` makes another one.
 
@@ -305,8 +304,9 @@ class RunConfig:
         The skies, and the pixels and frame of the maps.
     channels
         Beams under scans; in TOML the tables ``[[channel]]``.
-    effects
-        Changes of the simulation, such as :func:`mcsim.effects` lists; in TOML the tables ``[[effect]]``.
+    effects, preparation
+        Changes of the simulation, such as :func:`mcsim.effects` lists, and of its maps before the analysis; in TOML
+        the tables ``[[effect]]`` and ``[[preparation]]``.
     biposh, ensemble, compute
         Settings of the estimator, of the realizations and seed, and of the computation.
 
@@ -327,13 +327,15 @@ class RunConfig:
     map: Map
     channels: Annotated[tuple[Channel, ...], Field(alias="channel", min_length=1)]
     effects: Annotated[tuple[Effect, ...], Field(alias="effect")] = ()
+    preparation: tuple[Step, ...] = ()
     biposh: Biposh = Biposh()
     ensemble: Ensemble = Ensemble()
     compute: Compute = Compute()
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        limit = 3 * self.map.resolution - 1
+        names = tuple(channel.name for channel in self.channels)
+        limit, of = check_steps(self.preparation, self.map.resolution, self.map.frame, names)
         lmax = analysis_lmax(self)
         key = "biposh.lmax" if self.biposh.lmax is not None else "biposh.lmax (by default sky.lmax)"
         if lmax > self.sky.lmax:
@@ -342,12 +344,11 @@ class RunConfig:
             _check_rings(self)
         elif lmax > limit:
             raise ValueError(
-                f"{key} = {lmax} is above 3 nside - 1 = {limit} of map.nside = {self.map.nside}; "
+                f"{key} = {lmax} is above 3 nside - 1 = {limit} of {of}; "
                 f"set biposh.lmax to at most {limit} or raise nside"
             )
         if self.biposh.L_max > lmax:
             raise ValueError(f"biposh.L_max = {self.biposh.L_max} is above the lmax of the analysis, {lmax}; lower it")
-        names = tuple(channel.name for channel in self.channels)
         try:
             unique(names)
         except ValueError as error:
@@ -362,10 +363,8 @@ class RunConfig:
             for key in ("beam", "beam_b"):
                 m_max = getattr(getattr(channel, key), "m_max", None)
                 if m_max is not None and m_max > self.sky.lmax:
-                    raise ValueError(
-                        f"channel[{channel.name}].{key}.m_max = {m_max} is above sky.lmax = {self.sky.lmax}; "
-                        "lower m_max"
-                    )
+                    where = f"channel[{channel.name}].{key}.m_max = {m_max}"
+                    raise ValueError(f"{where} is above sky.lmax = {self.sky.lmax}; lower m_max")
         return self
 
 
@@ -391,6 +390,7 @@ def _check_rings(run: RunConfig) -> None:
             )
     for key, given in (
         ("ensemble.keep_maps = true", run.ensemble.keep_maps),
+        ("[[preparation]]", bool(run.preparation)),
         ('biposh.weighting = "hits"', run.biposh.weighting == "hits"),
         (f"biposh.iterations = {run.biposh.iterations}", run.biposh.iterations > 0),
     ):

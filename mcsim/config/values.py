@@ -6,12 +6,14 @@ sentence.
 
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationInfo
 
 from mcsim.config import arrays
 
 NSIDE_MAX = 8192
 LMAX_MAX = 32768
+
+STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, validate_by_name=True, validate_by_alias=True)
 
 
 def power_of_two(value: int) -> int:
@@ -53,6 +55,7 @@ def _in_file(value: Any, info: ValidationInfo) -> Any:
 
 Label = Annotated[str, AfterValidator(_label)]
 PathText = Annotated[str, BeforeValidator(_in_file), AfterValidator(_not_empty)]
+Nside = Annotated[int, Field(ge=1, le=NSIDE_MAX), AfterValidator(power_of_two)]
 Degree = Annotated[int, Field(ge=2, le=LMAX_MAX)]
 BeamOrder = Annotated[int, Field(ge=0, le=LMAX_MAX)] | None
 Fwhm = Annotated[float, Field(gt=0.0, le=10800.0)]

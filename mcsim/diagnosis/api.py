@@ -23,7 +23,9 @@ from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.observed_maps import ObservedMaps, checked, read_maps
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.ensemble.plan import cost
 from mcsim.errors import InputError
+from mcsim.simulation import power
 from mcsim.support import folders
 from mcsim.support.code import class_digest, package_digest
 
@@ -87,6 +89,9 @@ def diagnose(
         analysis = measured_spectra.analysis_of_spectra(run, table, settings.without, threads, settings, library)
     else:
         analysis = analysis_of(run, settings.without, threads, settings, library)
+    power.check(analysis.model.survey)
+    maps: Sequence[NDArray[np.float64]] = ()
+    if table is None:
         maps = read_maps(analysis.model, data) if isinstance(data, str | Path) else checked(analysis.model, data)
     with batch(run.compute.workers) as call:
         with asking(call, quiet, task, "simulations of the model and of each effect") as ask:
@@ -97,10 +102,28 @@ def diagnose(
                 ObservedMaps(known, maps, ask) if table is None else MeasuredSpectra(known, table, ask)
             )
             diagnosis = diagnose_data(found, case or run.name)
+    if table is None:
+        diagnosis = replace(diagnosis, warnings=_warnings(analysis))
     if output is not None:
         diagnosis.save(output)
         report.write(diagnosis, Path(output) / "report.html")
     return diagnosis
+
+
+def describe(run: config.RunConfig, settings: DiagnosisSettings) -> str:
+    """Return a text on the cost of a diagnosis of maps: simulations, memory, time, and that of preparing the maps."""
+    analysis = analysis_of(run, settings.without, os.cpu_count() or 1, settings)
+    power.check(analysis.model.survey)
+    number = sum(job.count for job in campaign.plan(analysis, settings.simulations).values())
+    size = len(analysis.elements)
+    head = f"{run.name}: at most {number} simulations before data, for a data vector of {size}"
+    return "\n".join([head, *cost(run).lines(number, run.compute.workers)])
+
+
+def _warnings(analysis: Analysis) -> tuple[str, ...]:
+    """Return a sentence on sky power that maps of a real sky hold and the simulations lack, if there is any."""
+    found = power.neglected(analysis.model.survey)
+    return () if found is None else (f"{found} Simulated data whose own sky ends there are not concerned.",)
 
 
 def prepared(run: config.RunConfig, analysis: Analysis, ask: campaign.Ask) -> DiagnosisContext:

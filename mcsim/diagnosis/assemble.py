@@ -69,7 +69,7 @@ def result_of(
         calibration=context.calibration.combined,
         residual_maps=residuals,
         residual_range=None if residuals is None else np.quantile(ensemble.residual_rms, [0.025, 0.975], axis=0).T,
-        frame=model.survey.config.map.frame,
+        frame=model.frame,
         notes=tuple(notes),
         settings=context.settings,
         provenance={

@@ -126,7 +126,7 @@ def read_spectra(path: str | Path, run: config.RunConfig) -> Spectra:
     if not found:
         raise InputError(f"{path} has no finite value; give the measured bins.")
     (rows, pairs), (value, error) = zip(*found, strict=True), np.array(list(found.values())).T
-    frame, count = _frame_and_skies(path, table.meta, run.map.frame, any(row.mode.L for row in rows))
+    frame, count = _frame_and_skies(path, table.meta, config.prepared_grid(run)[1], any(row.mode.L for row in rows))
     return Spectra(str(path), frame, rows, pairs, scaling, value, error, count)
 
 

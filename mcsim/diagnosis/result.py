@@ -154,8 +154,8 @@ class DiagnosisResult:
         nothing was observed, shape (map, npix); None without maps.
     residual_range
         Smallest and largest rms of such maps in 95 % of the simulations, shape (map, 2).
-    frame, notes
-        Of the maps; remarks.
+    frame, notes, warnings
+        Of the maps; remarks; what makes the verdict unreliable for maps of a real sky.
     settings, provenance
         Settings of the diagnosis; numbers of simulations, the seed and the data, by name.
     configuration
@@ -192,6 +192,7 @@ class DiagnosisResult:
     settings: DiagnosisSettings
     provenance: dict[str, Any]
     configuration: str
+    warnings: tuple[str, ...] = ()
     faint: bool = False
     probability: float = 1.0
 
@@ -257,6 +258,7 @@ class DiagnosisResult:
             "left": self.partial_left,
             "detectable": [_detectable_json(one) for one in self.candidates if one.detectable is not None],
             "notes": list(self.notes),
+            **({"warnings": list(self.warnings)} if self.warnings else {}),
         }
 
     def to_dataset(self) -> xr.Dataset:

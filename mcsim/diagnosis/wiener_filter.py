@@ -63,7 +63,7 @@ class Model:
     @property
     def frame(self) -> str:
         """Return the frame of the maps."""
-        return self.survey.config.map.frame
+        return self.survey.frame
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -125,7 +125,7 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
     gain = sum(response[part.channel] ** 2 / part.noise_power for part in parts)
     sky_power = cl * gain / (1.0 + cl * gain)
     dipole = dipole_alm(survey.channels[0].site.dipole_uk, lmax)
-    return Model(survey, lmax, run.map.resolution, cl, response, tuple(parts), dipole, sky_power, settings)
+    return Model(survey, lmax, survey.nside, cl, response, tuple(parts), dipole, sky_power, settings)
 
 
 def wiener_filter(model: Model, maps: Sequence[Map]) -> FilteredMaps:

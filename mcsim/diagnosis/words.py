@@ -146,7 +146,8 @@ def apart(result: DiagnosisResult, one: Contrast) -> str:
 
 def summary(result: DiagnosisResult, folder: Path) -> list[str]:
     """Return a summary for the command line, about ten lines."""
-    rows = [("case", result.case), ("tested", tested(result)), ("global test", chi2(result))]
+    rows = [("warning", warning) for warning in result.warnings]
+    rows += [("case", result.case), ("tested", tested(result)), ("global test", chi2(result))]
     rows.append(("verdict", f"{result.kind}. {status(result)}"))
     shown = result.sets[: SETS + 1]
     for one in shown:

@@ -91,7 +91,7 @@ def _orientations(
             harmonics = spin_functions(rings.s, L_max, rings.theta)[rings.s]
             result[rings.s, :, L_max] = rings.phase * (harmonics @ rings.weight)
         return result
-    if isinstance(scan, config.ScanParallelTransport) and m.weight is None:
+    if isinstance(scan, config.ScanParallelTransport) and m.weight is None and m.preparation is None:
         return parallel_transport_harmonics(smax, L_max, float(np.deg2rad(scan.psi0_deg)))
     w = np.asarray(m.moments.w[:smax])
     return orientation_harmonics(w if m.weight is None else w * m.weight**2, L_max, nthreads=nthreads)

@@ -102,7 +102,7 @@ def write_maps(
                 made = dict(zip(shared.map_names, simulate.maps(shared, r, threads), strict=True))
             with unwritable(target, "choose another folder with -o"), appearing(target) as scratch:
                 for name, map_uk in made.items():
-                    write_map(scratch / names[name], map_uk, run.map.frame, [*header, ("REALIZ", r)])
+                    write_map(scratch / names[name], map_uk, shared.frame, [*header, ("REALIZ", r)])
             report(number + 1.0)
     return list(targets.values())
 

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -12,11 +12,13 @@ import numpy as np
 from mcsim import config
 from mcsim.bipolar import Mode, estimate, estimator, modes
 from mcsim.bipolar.dataset import CONVENTION, NORMALISATION
+from mcsim.config.preparation import frame_of
 from mcsim.ensemble import opening, store
 from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError
 from mcsim.simulation import differencing
 from mcsim.simulation.channels import check_effects, load_beam
+from mcsim.simulation.preparation import preparation
 from mcsim.simulation.survey import Survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rng, spectra
@@ -76,8 +78,9 @@ def layout(survey: Survey) -> Layout:
 def _layout(run: config.RunConfig, pairs: tuple[str, ...], modes: tuple[Mode, ...]) -> Layout:
     """Return a layout of about 128 chunks, unless one would exceed 64 MiB; the tree of sums needs a power of two."""
     lmax, paired = config.analysis_lmax(run), run.ensemble.paired
-    kept_npix = 12 * run.map.resolution**2 if run.ensemble.keep_maps else None
-    more: dict[str, Any] = {"frame": run.map.frame, "bin_width": run.biposh.summary_bin}
+    nside, frame = config.prepared_grid(run)
+    kept_npix = 12 * nside**2 if run.ensemble.keep_maps else None
+    more: dict[str, Any] = {"frame": frame, "bin_width": run.biposh.summary_bin}
     bare = Layout(run.ensemble.realizations, 1, config.map_names(run), pairs, modes, lmax, paired, kept_npix, **more)
     chunk = run.compute.chunk or 1
     if run.compute.chunk is not None:
@@ -147,19 +150,50 @@ def stored(path: Path, realizations: int) -> Layout:
             found.sizes["ell"] - 1,
             "biposh_circular" in found,
             kept,
-            frame=attrs["map"]["frame"],
+            frame=frame_of(attrs),
             bin_width=attrs["biposh"]["summary_bin"],
         )
 
 
-def describe(source: str | Path, part: slice | None = None, workers: int | None = None) -> str:
-    """Return a text on the cost of a run: realizations, tasks, memory, disk, files and time.
+@dataclass(frozen=True)
+class Cost:
+    """Cost of a run: layout of its store, memory of a worker in bytes, processor time of a realization in seconds."""
 
-    It is estimated from the run's sizes, its beams, and one timed transform.
-    """
+    layout: Layout
+    memory: float
+    each_s: float
+    preparation: str  # what preparing the maps adds, in words
+
+    def lines(self, number: int, workers: int) -> list[str]:
+        """Return lines on memory, preparation and time for a number of realizations."""
+        hours = number * self.each_s / 3600.0
+        return [
+            f"  memory  {self.memory / 1e9:.2f} GB per worker, {workers} workers",
+            *([f"  prepare {self.preparation}"] if self.preparation else []),
+            f"  time    {self.each_s:.3g} s per realization and core, {hours:.3g} core-hours,"
+            f" {60.0 * hours / workers:.3g} minutes with {workers} workers on as many idle cores",
+        ]
+
+
+def describe(source: str | Path, part: slice | None = None, workers: int | None = None) -> str:
+    """Return a text on the cost of a run: realizations, tasks, memory, disk, files and time."""
     run = config.load(source)
     check_effects(run)
-    number = len(wanted(run, part))
+    number, found = len(wanted(run, part)), cost(run)
+    memory, *rest = found.lines(number, workers or run.compute.workers)
+    disk = float(found.layout.realization_bytes()) * number
+    return "\n".join(
+        [
+            f"{run.name}: {number} realizations in {-(-number // found.layout.chunk)} tasks",
+            memory,
+            f"  disk    {disk / 1e6:.1f} MB in about {found.layout.files()} files",
+            *rest,
+        ]
+    )
+
+
+def cost(run: config.RunConfig) -> Cost:
+    """Estimate the cost of a run from its sizes, its beams, and one timed transform."""
     if run.sky.spectrum is not None:
         spectra.load(run.sky.spectrum, run.sky.lmax)
     mmax = [load_beam(channel, run.sky.lmax).mmax for channel in run.channels]
@@ -175,21 +209,18 @@ def describe(source: str | Path, part: slice | None = None, workers: int | None 
     transforms = sum(1.0 + 2.0 * m + splits * (2.0 + 4.0 * run.biposh.iterations) for m in mmax)
     if run.map.grid == "gl":
         transforms = sum(2.0 * m for m in mmax)
-    estimates = pairs * (2 if run.ensemble.paired else 1)
-    each_s = transform * transforms + estimation * estimates + differencing.seconds(run)
     memory = 3e8 + 96.0 * nside**2 * (6 + 2 * max(mmax)) + 16.0 * alm_.size(run.sky.lmax) * (6 + len(names) * 2)
     memory += planned.chunk * planned.realization_bytes()
-    disk = float(planned.realization_bytes()) * number
-    count, hours = workers or run.compute.workers, number * each_s / 3600.0
-    return "\n".join(
-        [
-            f"{run.name}: {number} realizations in {-(-number // planned.chunk)} tasks",
-            f"  memory  {memory / 1e9:.2f} GB per worker, {count} workers",
-            f"  disk    {disk / 1e6:.1f} MB in about {planned.files()} files",
-            f"  time    {each_s:.3g} s per realization and core, {hours:.3g} core-hours,"
-            f" {60.0 * hours / count:.3g} minutes with {count} workers on as many idle cores",
-        ]
-    )
+    words = ""
+    if run.preparation:
+        steps = [preparation(run, channel, split) for channel in run.channels for split in run.map.splits or (None,)]
+        extra = (1 + run.ensemble.paired) * sum(each.transforms for each in steps if each is not None)
+        transforms, memory = transforms + extra, memory + 480.0 * nside**2
+        grid = f"nside {nside} to {config.prepared_grid(run)[0]}"
+        words = f"{extra:g} further transforms per realization and {480e-9 * nside**2:.2g} GB per worker, {grid}"
+    estimates = pairs * (2 if run.ensemble.paired else 1)
+    each_s = transform * transforms + estimation * estimates + differencing.seconds(run)
+    return Cost(planned, memory, each_s, words)
 
 
 def _timed(nside: int, lmax_sky: int, lmax: int, L_max: int) -> tuple[float, float]:

@@ -11,6 +11,7 @@ from mcsim import config
 from mcsim.bipolar import estimator
 from mcsim.ensemble import detectability, plan, summary
 from mcsim.ensemble.expectation import L_MOMENTS, Means, Source, means, scanned_beams, survey_of
+from mcsim.simulation import power
 from mcsim.simulation.survey import Survey
 from mcsim.stats.streaming import Sums
 
@@ -65,6 +66,7 @@ def predict(
     True
     """
     survey = survey_of(source, nthreads)
+    power.check(survey)
     beams = scanned_beams(survey, L_moments if exact else survey.config.biposh.L_max, nthreads)
     found = {pair: means(survey, beams, pair, exact, nthreads) for pair in survey.pairs}
     result = _dataset(survey, found)
@@ -123,7 +125,7 @@ def _attributes(survey: Survey, L_moments: int | None) -> dict[str, Any]:
     return {
         "name": run.name,
         "prediction": f"from b_lm of the beams, {order}",
-        "frame": run.map.frame,
+        "frame": survey.frame,
         "digest": config.digest(run),
         "f_sky": min(detectability.sky_fraction(survey, pair) for pair in survey.pairs),
         "mask": mask,

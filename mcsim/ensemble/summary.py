@@ -9,6 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from mcsim.bipolar import Mode, bennett_factor
+from mcsim.config.preparation import frame_of
 from mcsim.ensemble.layout import Layout
 from mcsim.stats import streaming
 from mcsim.stats.streaming import Sums
@@ -119,6 +120,6 @@ def dataset(layout: Layout, sums: Sums, attributes: Mapping[str, Any]) -> xr.Dat
     ):
         coordinates[name] = (dim, values, {"units": "1", "long_name": text})
     origin = {name: attributes[name] for name in ("digest", "conventions", "packages")}
-    run = {"name": attributes["configuration"]["name"], "frame": attributes["configuration"]["map"]["frame"]}
+    run = {"name": attributes["configuration"]["name"], "frame": frame_of(attributes["configuration"])}
     normalisation = "Hajian-Souradeep; binned: see bin_factor"
     return xr.Dataset(variables, coordinates, {**run, **origin, "normalisation": normalisation})

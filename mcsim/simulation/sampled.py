@@ -40,7 +40,7 @@ def maps(
     """
     run, sky = survey.config, simulate.draw_sky(survey, realization)
     found = []
-    for channel, spec in zip(survey.channels, run.channels, strict=True):
+    for channel, spec in zip(survey.making.channels, run.channels, strict=True):
         check(channel)
         site, acting = channel.site, channel.effects
         seen = systematics.looked_at(acting, sky, site, run.ensemble.seed, realization)
@@ -58,7 +58,8 @@ def maps(
                 draw = rng.generator(run.ensemble.seed, realization, f"noise/{m.name}")
                 stages.append(tod.white_noise(spec.noise.sigma0_uk, draw, _noise_factor(channel)))
             stream = tod.through(_seen(channel, grid, observe), stages)
-            found.append((m.name, tod.bin_samples(stream, site.nside)[0]))
+            map_uk = tod.bin_samples(stream, site.nside)[0]
+            found.append((m.name, map_uk if m.preparation is None else m.preparation.apply(map_uk)))
     return found
 
 

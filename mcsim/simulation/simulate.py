@@ -1,7 +1,7 @@
 """One realization: sky -> beams under the scan -> maps -> a_lm -> BipoSH and power spectra."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 
 import healpy
@@ -48,7 +48,8 @@ def realize(survey: Survey, realization: int, nthreads: int = 1) -> dict[str, ND
     ensemble = survey.config.ensemble
     sky = draw_sky(survey, realization)
     made = _circular_maps(survey, nthreads)
-    observed = [result for channel in survey.channels for result in _observe(survey, channel, sky, realization, made)]
+    observe = _observe if survey.source is None else _observe_prepared
+    observed = [result for channel in survey.channels for result in observe(survey, channel, sky, realization, made)]
     result = _spectra(survey, [o.alm for o in observed], "")
     if ensemble.paired:
         result |= _spectra(survey, [o.circular for o in observed if o.circular is not None], "_circular")
@@ -75,16 +76,24 @@ def draw_sky(survey: Survey, realization: int) -> Alm:
 def maps(survey: Survey, realization: int, nthreads: int = 1, sky: Alm | None = None) -> NDArray[np.float64]:
     """Return the maps of one realization with effects and noise, uK, shape (map, npix), ``healpy.UNSEEN`` without hits.
 
+    They are prepared where the run says how.
+
     ``sky``: coefficients up to the sky's lmax, in place of those that the realization would draw.
     """
     if sky is None:
         sky = draw_sky(survey, realization)
     found = []
     made = _circular_maps(survey, nthreads)
-    for channel in survey.channels:
-        for m, parts in _map_parts(survey, channel, sky, realization, made, smooth=True):
-            found.append(np.where(m.moments.hits > 0, parts.total, healpy.UNSEEN))
+    for channel in survey.making.channels:
+        for m, parts in _map_parts(survey.making, channel, sky, realization, made, smooth=True):
+            found.append(_finished(m, parts.total))
     return np.stack(found)
+
+
+def _finished(m: SurveyMap, map_uk: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a map that was made as it is handed out: without what was not observed, and prepared."""
+    observed = np.where(m.moments.hits > 0, map_uk, healpy.UNSEEN)
+    return observed if m.preparation is None else m.preparation.apply(observed)
 
 
 @dataclass(frozen=True)
@@ -144,6 +153,26 @@ def _observe(
             alm = control + _analyse(survey, channel, parts.difference, m.weight, made.nthreads)
         kept = np.where(m.moments.hits > 0, parts.total, healpy.UNSEEN) if ensemble.keep_maps else None
         results.append(Observed(alm, control if ensemble.paired else None, kept))
+    return results
+
+
+def _observe_prepared(
+    survey: Survey, channel: Channel, sky: Alm, realization: int, made: convolve.CircularMaps
+) -> list[Observed]:
+    """Return the analysed maps of a channel for one sky, prepared: the map and its control each by itself."""
+    ensemble, making = survey.config.ensemble, survey.making
+    source = next(one for one in making.channels if one.name == channel.name)
+    results = []
+    parts_of_maps = _map_parts(making, source, sky, realization, made, smooth=True)
+    for m, (own, parts) in zip(channel.maps, parts_of_maps, strict=True):
+        total, control = _finished(own, parts.total), None
+        alm = _analyse(survey, channel, total, m.left_to_apply, made.nthreads)
+        if ensemble.paired and parts.difference is not None:
+            circular = _finished(own, replace(parts, difference=None).total)
+            control = _analyse(survey, channel, circular, m.left_to_apply, made.nthreads)
+        elif ensemble.paired:
+            control = alm
+        results.append(Observed(alm, control, total if ensemble.keep_maps else None))
     return results
 
 

@@ -15,6 +15,7 @@ from mcsim.instrument import beams, scan
 from mcsim.instrument.scan import MapGrid
 from mcsim.simulation import convolve, mapmaking, tod
 from mcsim.simulation.channels import effects_on, refuse_pixel_effects, scan_model, site_b_of, site_of
+from mcsim.simulation.preparation import Preparation, preparation
 from mcsim.simulation.rings import Rings, limit_rings, parallel_transport_rings
 from mcsim.sphere import healpix, spectra
 from mcsim.sphere.mask import read_mask
@@ -39,6 +40,8 @@ class SurveyMap:
         Pairs of pixels of a differencing scan; ``None``: any other scan.
     gain
         Mean relative error of the gain over the samples of a pixel, shape (npix,); ``None``: no error.
+    preparation
+        What is done to the map after it is made; ``None``: nothing.
     """
 
     name: str
@@ -47,6 +50,15 @@ class SurveyMap:
     noise_uk: NDArray[np.float64] | None
     pairs: mapmaking.DifferencingScan | None = None
     gain: NDArray[np.float64] | None = None
+    preparation: Preparation | None = None
+
+    @property
+    def left_to_apply(self) -> NDArray[np.float64] | None:
+        """Return the part of the weight that the preparation has not multiplied the map with already."""
+        done = None if self.preparation is None else self.preparation.weight()
+        if self.weight is None or done is None:
+            return self.weight
+        return np.divide(self.weight, done, out=np.zeros(done.size), where=done > 0.0)
 
     @property
     def sky_fraction(self) -> float:
@@ -116,7 +128,9 @@ class Channel:
 class Survey:
     """Everything that all realizations of a run share.
 
-    ``pairs`` are indices into the maps in order, with 1 / <w_x w_y> of their weights in ``pair_norm``.
+    ``pairs`` are indices into the maps in order, with 1 / <w_x w_y> of their weights in ``pair_norm``. Where maps are
+    prepared, the channels describe the prepared maps (pixels, moments, noise, weights, beams and pixel windows), and
+    ``source`` the survey whose maps are made; None where the maps are analysed as they are made.
     """
 
     config: config.RunConfig
@@ -126,6 +140,22 @@ class Survey:
     estimator: Estimator
     pairs: tuple[tuple[int, int], ...]
     pair_norm: tuple[float, ...]
+    source: "Survey | None" = None
+
+    @property
+    def making(self) -> "Survey":
+        """The survey whose maps are made, before their preparation."""
+        return self if self.source is None else replace(self.source, config=self.config)
+
+    @property
+    def nside(self) -> int:
+        """Resolution of the maps that are analysed, 0 on a grid without pixels."""
+        return config.prepared_grid(self.config)[0]
+
+    @property
+    def frame(self) -> str:
+        """Frame of the maps that are analysed."""
+        return config.prepared_grid(self.config)[1]
 
     @property
     def map_names(self) -> tuple[str, ...]:
@@ -159,13 +189,17 @@ def survey(
     """
     lmax = config.analysis_lmax(run)
     cl = None if run.sky.spectrum is None else spectra.load(run.sky.spectrum, run.sky.lmax)
-    channels = tuple(_channel(run, channel, nthreads, progress, orders, library) for channel in run.channels)
+    made = tuple(_channel(run, channel, nthreads, progress, orders, library) for channel in run.channels)
+    channels = (
+        tuple(_prepared(run, *each) for each in zip(run.channels, made, strict=True)) if run.preparation else made
+    )
     maps = [m for channel in channels for m in channel.maps]
     both = run.biposh.pairs == "all"
     pairs = tuple((x, y) for x in range(len(maps)) for y in range(x, len(maps)) if both or x == y)
     norm = tuple(1.0 / _overlap(maps[x], maps[y]) for x, y in pairs)
     tables = estimator(run.biposh.L_max, lmax, both_orders=both and len(maps) > 1)
-    return Survey(run, cl, channels, lmax, tables, pairs, norm)
+    found = Survey(run, cl, made, lmax, tables, pairs, norm)
+    return replace(found, channels=channels, source=found) if run.preparation else found
 
 
 def _channel(
@@ -208,6 +242,31 @@ def _channel(
     response = convolve.response(beam, run.sky.lmax, seen_window)
     side_b = _side_b(spec, seen_window, site, acting)
     return Channel(spec.name, beam, response, window, tuple(maps), site, acting, side_b)
+
+
+def _prepared(run: config.RunConfig, spec: config.Channel, channel: Channel) -> Channel:
+    """Return what the analysis knows of a channel whose maps are prepared."""
+    maps = []
+    for split, m in zip(run.map.splits or (None,), channel.maps, strict=True):
+        steps = _steps_of(m)
+        moments = steps.moments(m.moments)
+        noise = None if m.noise_uk is None else steps.noise_uk(m.noise_uk, m.moments.hits)
+        weight = _weight(run, spec, split, m.name, moments, steps.weight())
+        maps.append(replace(m, moments=moments, noise_uk=noise, weight=weight, gain=None))
+    pixels, smoothing = steps.pixel_window(run.sky.lmax), steps.beam_window(run.sky.lmax)
+    return replace(
+        channel,
+        beam=steps.beam(channel.beam),
+        response=convolve.Response(np.asarray(channel.response.factors * (pixels * smoothing))),
+        window=channel.window * pixels,
+        maps=tuple(maps),
+        site=steps.site(channel.site),
+    )
+
+
+def _steps_of(m: SurveyMap) -> Preparation:
+    assert m.preparation is not None  # as of every map of a run that declares one
+    return m.preparation
 
 
 def _channel_on_rings(run: config.RunConfig, spec: config.Channel, site: Site, acting: tuple[Effect, ...]) -> Channel:
@@ -320,19 +379,35 @@ def _survey_map(
         raise InputError(
             f"The scan of map {name} hits no pixel of nside {moments.nside}; check the scan of the channel."
         )
-    weight = observed.astype(float)
+    noise = None
+    if spec.noise.sigma0_uk > 0 and pairs is None:
+        noise = np.divide(spec.noise.sigma0_uk, np.sqrt(moments.hits), out=np.zeros(observed.size), where=observed)
+    steps = preparation(run, spec, split)
+    weight = None if steps is not None else _weight(run, spec, split, name, moments)
+    return SurveyMap(name, moments, weight, noise, pairs, preparation=steps)
+
+
+def _weight(
+    run: config.RunConfig,
+    spec: config.Channel,
+    split: str | None,
+    name: str,
+    moments: scan.Moments,
+    done: NDArray[np.float64] | None = None,
+) -> NDArray[np.float64] | None:
+    """Return the weight of a map that is analysed; ``done``: by which its preparation multiplied it."""
+    weight = (moments.hits > 0).astype(float)
     if run.biposh.weighting == "hits":
         weight *= moments.hits
     if run.map.mask is not None:
         path = config.channel_path(run.map.mask, spec.name, split)
-        weight *= read_mask(path, moments.nside, run.map.frame, run.map.mask_frame, run.map.mask_apodisation_deg)
+        weight *= read_mask(path, moments.nside, moments.frame, run.map.mask_frame, run.map.mask_apodisation_deg)
+    if done is not None:
+        weight *= done
     if not weight.any():
         raise InputError(f"The mask of map {name} leaves no observed pixel; widen it or observe more of the sky.")
-    noise = None
-    if spec.noise.sigma0_uk > 0 and pairs is None:
-        noise = np.divide(spec.noise.sigma0_uk, np.sqrt(moments.hits), out=np.zeros(weight.size), where=observed)
     uniform = bool(np.all(weight == weight[0]))
-    return SurveyMap(name, moments, None if uniform else weight / np.sqrt(np.mean(weight**2)), noise, pairs)
+    return None if uniform else weight / np.sqrt(np.mean(weight**2))
 
 
 def _overlap(x: SurveyMap, y: SurveyMap) -> float:

@@ -101,22 +101,30 @@ def pixel_window(nside: int, lmax: int) -> NDArray[np.float64]:
     """
     check_nside(nside)
     check_whole(lmax, "lmax")
+    window = np.zeros(lmax + 1)
+    for pixels, share in _representatives(nside):
+        # The centres of n x n sub-pixels miss 1/n^2 of a pixel's extent: extrapolate from n = 4 and 8.
+        window += share * (4.0 * _mean_legendre(pixels, nside, 8, lmax) - _mean_legendre(pixels, nside, 4, lmax)) / 3.0
+    window = np.sqrt(np.abs(window))
+    window.setflags(write=False)
+    return window
+
+
+def mean_window(nside: int, split: int, lmax: int) -> NDArray[np.float64]:
+    """Return the window of the mean of split x split sub-pixel centres over pixels, shape (lmax + 1,)."""
+    found = [share * _mean_legendre(pixels, nside, split, lmax) for pixels, share in _representatives(nside)]
+    return np.asarray(np.sqrt(np.abs(np.sum(found, axis=0))))
+
+
+def _representatives(nside: int) -> list[tuple[NDArray[np.int64], float]]:
+    """Return NESTED pixels of one polar and one equatorial face that represent all, with the share of such faces."""
     lattice = min(nside, 32)
     step = (nside // lattice) ** 2
     cell = np.arange(lattice * lattice)
     # Pixels alternate just above and just below the middle of a cell: their mean is at the middle.
     above = (cell ^ (cell >> 1)) & 1 == 0
     pixels = cell * step + np.where(above, 3 * step // 4, max(step // 4 - 1, 0))
-    window = np.zeros(lmax + 1)
-    for face, share in ((0, 2.0 / 3.0), (4, 1.0 / 3.0)):
-        shifted = pixels + face * nside * nside
-        # The centres of n x n sub-pixels miss 1/n^2 of a pixel's extent: extrapolate from n = 4 and 8.
-        window += (
-            share * (4.0 * _mean_legendre(shifted, nside, 8, lmax) - _mean_legendre(shifted, nside, 4, lmax)) / 3.0
-        )
-    window = np.sqrt(np.abs(window))
-    window.setflags(write=False)
-    return window
+    return [(pixels + face * nside * nside, share) for face, share in ((0, 2.0 / 3.0), (4, 1.0 / 3.0))]
 
 
 def _mean_legendre(pixels: NDArray[np.int64], nside: int, split: int, lmax: int) -> NDArray[np.float64]:

@@ -73,13 +73,7 @@ def load(spec: str | Path, lmax: int) -> NDArray[np.float64]:
     states their parameters and accuracy.
     """
     check_whole(lmax, "lmax")
-    path = resources.spectrum(spec)
-    if path.suffix == ".npy":
-        cl, names, stated = read_npy(path, "iuf").astype(np.float64), "", False
-    elif path.name.removesuffix(".gz").endswith((".fits", ".fit")):
-        cl, names, stated = _read_fits(path)
-    else:
-        cl, names, stated = _read_text(path)
+    cl, names, stated = _read(spec)
     if len(cl) <= lmax:
         raise InputError(
             f"power spectrum {str(spec)!r} ends at l = {len(cl) - 1}, but lmax = {lmax} is wanted; "
@@ -97,6 +91,21 @@ def load(spec: str | Path, lmax: int) -> NDArray[np.float64]:
     _check_size(where, table, stated)
     _check_shape(where, table, _NAMES_OF_C_L.search(names) is not None)
     return cl
+
+
+def last(spec: str | Path) -> int:
+    """Return the last degree of a spectrum as :func:`load` reads it."""
+    return len(_read(spec)[0]) - 1
+
+
+def _read(spec: str | Path) -> tuple[NDArray[np.float64], str, bool]:
+    """Return all C_l, the names in the header, and True if it states the unit."""
+    path = resources.spectrum(spec)
+    if path.suffix == ".npy":
+        return read_npy(path, "iuf").astype(np.float64), "", False
+    if path.name.removesuffix(".gz").endswith((".fits", ".fit")):
+        return _read_fits(path)
+    return _read_text(path)
 
 
 def _check_size(where: str, cl: NDArray[np.float64], stated: bool) -> None:

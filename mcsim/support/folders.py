@@ -4,7 +4,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from mcsim.errors import InputError
@@ -48,11 +48,15 @@ def write_whole(path: Path, text: str) -> None:
 
 
 def writable(folder: Path) -> None:
-    """Make a folder; raise InputError if nothing can be written into it."""
+    """Raise InputError if a folder cannot be made or written into; a folder that is made for the test is removed."""
     with unwritable(folder, "choose another folder"):
+        made = [path for path in (folder, *folder.parents) if not path.exists()]
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
+    with suppress(OSError):  # another process may have begun to use it
+        for path in made:
+            path.rmdir()
 
 
 def default_cache_dir() -> Path:

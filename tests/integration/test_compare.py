@@ -19,6 +19,7 @@ from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.simulation import simulate, tod
 from mcsim.simulation.survey import survey
 from mcsim.sphere.rotation import rotate_alm
+from refusals import refused
 
 NSIDE, LMAX = 32, 64
 MODEL = {
@@ -231,3 +232,8 @@ def test_files_are_compared_from_the_command_line(tmp_path, simulator, side_a):
 def test_what_cannot_be_compared_is_refused(a, b, model):
     with pytest.raises(mcsim.InputError):
         mcsim.compare(a, b, model)
+
+
+def test_prepared_models_are_refused(side_a):
+    with refused("[[preparation]]"):
+        mcsim.compare(side_a, side_a, MODEL | {"preparation": [{"kind": "subtract_dipole"}]})

@@ -316,7 +316,8 @@ def test_what_cannot_be_done_is_said_before_anything_is_learned(small, folder):
         ({"settings": DiagnosisSettings(simulations=20)}, ("20 simulations", 165, 330)),
     ):
         with refused(*named):
-            mcsim.diagnose(**({"model": small.run, "data": folder} | changes))
+            mcsim.diagnose(**({"model": small.run, "data": folder, "output": folder / "new" / "verdict"} | changes))
+    assert not (folder / "new").exists()
 
 
 def test_exchanged_channels_are_noticed(small):

@@ -79,6 +79,7 @@ PUBLIC = {
         "load",
         "map_names",
         "pixel_window",
+        "prepared_grid",
         "resolved",
         "science",
         "sky_path",
@@ -87,7 +88,7 @@ PUBLIC = {
     ],
     "mcsim.errors": ["InputError", "RunError"],
     "mcsim.support.resources": ["names", "scan_model", "spectrum", "workflow"],
-    "mcsim.sphere.spectra": ["load"],
+    "mcsim.sphere.spectra": ["last", "load"],
 }
 
 

@@ -100,8 +100,7 @@ def bench(nearest_candidates: bool) -> SimpleNamespace:
     simulations = np.random.default_rng(10).normal(size=(N, P))
     model = SimulatedGaussian.from_simulations(simulations)
     spread = np.random.default_rng(12).normal(size=(5, 2))
-    survey = SimpleNamespace(config=SimpleNamespace(map=SimpleNamespace(frame="ecliptic")))
-    fiducial = SimpleNamespace(survey=survey, parts=[SimpleNamespace(name=name) for name in (EVIL, "V")])
+    fiducial = SimpleNamespace(frame="ecliptic", parts=[SimpleNamespace(name=name) for name in (EVIL, "V")])
     return SimpleNamespace(
         run=replace(config.load(resources.workflow("quickstart")), name=EVIL),
         analysis=SimpleNamespace(elements=tuple(elements()), model=fiducial),

@@ -48,6 +48,7 @@ NAMES = [
     "open_ensemble",
     "open_summary",
     "predict",
+    "prepare",
     "run",
     "write_maps",
 ]

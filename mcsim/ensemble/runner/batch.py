@@ -18,7 +18,7 @@ from mcsim.ensemble.lock import locked
 from mcsim.ensemble.runner.cluster import Roll, answers, death, local_client, remote_client
 from mcsim.ensemble.tasks import Failure, Job, packages, realize_chunk, summarise_node
 from mcsim.errors import InputError, RunError
-from mcsim.simulation import simulate
+from mcsim.simulation import power, simulate
 from mcsim.simulation.survey import Survey, survey
 from mcsim.stats import streaming
 from mcsim.stats.streaming import Sums
@@ -111,6 +111,7 @@ def run(
             workers = stack.enter_context(remote_client(workers))
         with reporting("orientation moments", 1.0, "", quiet) as report:
             shared = survey(loaded, nthreads=os.cpu_count() or 1, progress=report)
+        power.check(shared)
         simulate.draw_sky(shared, wanted.start)  # finds bad sky files before a store is made
         stack.enter_context(locked(target))
         stack.enter_context(_written_down(journal, loaded, wanted))

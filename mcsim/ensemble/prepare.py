@@ -1,0 +1,138 @@
+"""Prepare observed maps as the maps of a run are prepared, by the same code."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mcsim import config
+from mcsim.ensemble.maps import file_names, write_map
+from mcsim.errors import InputError
+from mcsim.simulation.preparation import preparation
+from mcsim.sphere import header, healpix
+from mcsim.sphere.checks import UNSEEN_BELOW, check_map
+from mcsim.support.folders import appearing, unwritable, writable
+
+Map = NDArray[np.float64]
+Source = str | Path | Mapping[str, Any] | config.RunConfig
+
+
+@overload
+def prepare(maps: Mapping[str, ArrayLike], source: Source) -> dict[str, Map]: ...
+@overload
+def prepare(maps: Sequence[ArrayLike], source: Source) -> list[Map]: ...
+def prepare(maps: Mapping[str, ArrayLike] | Sequence[ArrayLike], source: Source) -> dict[str, Map] | list[Map]:
+    """Prepare observed maps by the steps of ``[[preparation]]``, as a run prepares its simulated maps.
+
+    Parameters
+    ----------
+    maps
+        By name, "channel" or "channel:split"; or all maps of the run in their order, channel by channel. Each in uK,
+        RING order, shape (12 nside^2,) with ``map.nside`` of the run, in ``map.frame``, ``healpy.UNSEEN`` where nothing
+        was observed.
+    source
+        Configuration: a TOML file, the name of a packaged workflow, a dict, or a loaded one.
+
+    Returns
+    -------
+    dict or list
+        The prepared maps, uK, named or ordered as given, ``healpy.UNSEEN`` where nothing was observed.
+
+    Raises
+    ------
+    InputError
+        For a run without ``[[preparation]]``, maps that are not its, and steps that cannot be applied.
+
+    Notes
+    -----
+    Data may need more than simulations do: templates with given coefficients are subtracted from data only.
+
+    Examples
+    --------
+    >>> import healpy
+    >>> import numpy as np
+    >>> import mcsim
+    >>> model = {
+    ...     "name": "mine",
+    ...     "sky": {"spectrum": "wmap7", "lmax": 40},
+    ...     "map": {"nside": 32},
+    ...     "biposh": {"lmax": 20},
+    ...     "channel": [
+    ...         {
+    ...             "name": "W",
+    ...             "beam": {"kind": "gaussian", "fwhm_arcmin": 300.0},
+    ...             "scan": {"kind": "parallel_transport"},
+    ...         }
+    ...     ],
+    ...     "preparation": [{"kind": "degrade", "nside": 8}, {"kind": "subtract_dipole"}],
+    ... }
+    >>> x, y, z = healpy.pix2vec(32, np.arange(12 * 32**2))
+    >>> prepared = mcsim.prepare({"W": 100.0 + 5.0 * z}, model)
+    >>> prepared["W"].shape, bool(abs(prepared["W"]).max() < 0.1)
+    ((768,), True)
+    """
+    run = source if isinstance(source, config.RunConfig) else config.load(source)
+    if not run.preparation:
+        raise InputError(f"{run.name} has no [[preparation]], so there is nothing to do; declare its steps.")
+    names = config.map_names(run)
+    if isinstance(maps, Mapping):
+        return {name: _prepared(run, name, map_) for name, map_ in maps.items()}
+    if len(maps) != len(names):
+        raise InputError(f"{len(maps)} maps were given, {run.name} has {len(names)}; give all, or a dict by name.")
+    return [_prepared(run, name, map_) for name, map_ in zip(names, maps, strict=True)]
+
+
+def _prepared(run: config.RunConfig, name: str, map_: ArrayLike) -> Map:
+    spec, split = _channel(run, name)
+    given = np.asarray(map_, dtype=np.float64)
+    check_map(given, run.map.resolution, f"map {name}")
+    steps = preparation(run, spec, split, observed=True)
+    assert steps is not None  # the run has steps
+    return steps.apply(given)
+
+
+def _channel(run: config.RunConfig, name: str) -> tuple[config.Channel, str | None]:
+    names = config.map_names(run)
+    if name not in names:
+        raise InputError(f"map {name!r} is no map of {run.name}; use one of {', '.join(names)}.")
+    channel, _, split = name.partition(":")
+    return next(one for one in run.channels if one.name == channel), split or None
+
+
+def prepare_files(source: Source, files: Sequence[str], folder: str | Path) -> list[Path]:
+    """Prepare FITS files and write them to a new folder, complete or not at all, which :func:`mcsim.diagnose` can read.
+
+    Files are ``.../{channel}.fits`` or ``{channel}_{split}.fits``, or NAME=PATH with any path. Unit and frame are those
+    of the header; without them uK and the frame of the run.
+    """
+    run = source if isinstance(source, config.RunConfig) else config.load(source)
+    target, names = Path(folder), file_names(run)
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise InputError(f"{target} is not a new folder, and nothing is written over; choose another folder with -o.")
+    done = prepare(dict(_read(run, names, file) for file in files), run)
+    writable(target.absolute().parent)
+    keywords = [("RUN", run.name.encode("ascii", "backslashreplace").decode()), ("DIGEST", config.digest(run))]
+    with unwritable(target, "choose another folder with -o"), appearing(target) as scratch:
+        for name, map_uk in done.items():
+            write_map(scratch / names[name], map_uk, config.prepared_grid(run)[1], keywords)
+    return [target / names[name] for name in done]
+
+
+def _read(run: config.RunConfig, names: Mapping[str, str], file: str) -> tuple[str, Map]:
+    """Return the name of a map of the run, and the map of a file in uK."""
+    named, equals, path = file.partition("=")
+    if not equals:
+        path = file
+        named = next((name for name, own in names.items() if own == Path(file).name), "")
+    if named not in names:
+        known = ", ".join(names.values())
+        raise InputError(f"{file} is none of {known}; rename it, or say which map it is: NAME={file}.")
+    map_, frame, unit = healpix.read_map(Path(path))
+    if frame not in (None, run.map.frame):
+        raise InputError(
+            f"{path} is in {frame} coordinates, map.frame is {run.map.frame}; set map.frame to that of the data."
+        )
+    factor = header.to_uk(unit, Path(path), _channel(run, named)[0].frequency_ghz)
+    return named, np.where(map_ > UNSEEN_BELOW, factor * map_, map_)

@@ -1,0 +1,210 @@
+"""Preparation of maps, ``[[preparation]]``: one implementation for simulated maps and for data.
+
+Inside, a map is NaN where it was not observed. Each step changes a map and says what it makes of the sky's window,
+of white noise, and of what belongs to the samples of a pixel (hits, orientation moments).
+"""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import healpy
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim import config
+from mcsim.config import preparation as declared
+from mcsim.errors import InputError
+from mcsim.instrument.beams import Beam
+from mcsim.instrument.scan import Moments
+from mcsim.simulation import windows
+from mcsim.simulation.channels import load_beam
+from mcsim.simulation.steps import NEGLIGIBLE, Average, Filled, Filter, Regression, Rotated, Step, Weighted
+from mcsim.sphere import header, healpix, rotation
+from mcsim.sphere.checks import UNSEEN_BELOW, check_map
+from mcsim.sphere.mask import read_mask
+from mcsim.systematics import Site
+
+Map = NDArray[np.float64]
+
+LARGEST_GAIN = 10.0
+"""Of B_l by a change of the beam: a target that asks for more is narrower than the beam."""
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """All steps on the maps of one channel and split, and the nside and frame that they end in."""
+
+    steps: tuple[Step, ...]
+    nside: int
+    frame: str
+
+    @property
+    def transforms(self) -> int:
+        """Return the number of scalar transforms of one map."""
+        return sum(step.transforms for step in self.steps)
+
+    def apply(self, map_uk: Map) -> Map:
+        """Return the prepared map, uK, ``healpy.UNSEEN`` where nothing was observed, before as after."""
+        check_map(map_uk)
+        prepared = np.where(map_uk > UNSEEN_BELOW, map_uk, np.nan)
+        for step in self.steps:
+            prepared = step.apply(prepared)
+        return np.where(np.isfinite(prepared), prepared, healpy.UNSEEN)
+
+    def beam_window(self, lmax: int) -> NDArray[np.float64]:
+        """Return what the steps multiply B_l with, shape (lmax + 1,)."""
+        return np.asarray(np.prod([np.ones(lmax + 1), *(step.beam_window(lmax) for step in self.steps)], axis=0))
+
+    def pixel_window(self, lmax: int) -> NDArray[np.float64]:
+        """Return what the steps multiply the pixel window with, shape (lmax + 1,)."""
+        return np.asarray(np.prod([np.ones(lmax + 1), *(step.pixel_window(lmax) for step in self.steps)], axis=0))
+
+    def noise_uk(self, noise_uk: Map, hits: Map) -> Map:
+        """Return the standard deviation of white noise after the steps, uK, 0 without data.
+
+        Filters leave correlated noise; this is its standard deviation where the noise changes slowly over their kernel.
+        """
+        fine = healpy.npix2nside(hits.size)
+        power = np.where(hits > 0, noise_uk**2, np.nan) * healpy.nside2pixarea(fine)
+        for step in self.steps:
+            power = step.noise(power)
+        band = 1.0 / healpy.nside2pixarea(self.nside)
+        if self.transforms:
+            ell = np.arange(3 * fine)
+            window = self.beam_window(ell[-1]) * self.pixel_window(ell[-1])
+            band = float(np.sum((2 * ell + 1) / (4 * np.pi) * window**2))
+        return np.sqrt(np.nan_to_num(band * power))
+
+    def weight(self) -> Map | None:
+        """Return the product of the masks of the steps in the prepared pixels; None without one."""
+        weight: Map | None = None
+        for step in self.steps:
+            if isinstance(step, Weighted):
+                weight = step.mask if weight is None else weight * step.mask
+            elif weight is not None and not isinstance(step, Filled):
+                weight = step.local(weight)
+        return weight
+
+    def moments(self, moments: Moments) -> Moments:
+        """Return hits and orientation moments of the prepared pixels: plain means, as of the temperatures."""
+        seen = moments.hits > 0
+        hits = np.where(seen, moments.hits, np.nan)
+        w = np.where(seen, moments.w, np.nan)
+        for step in self.steps:
+            hits, w = step.local(hits), step.orientations(w)
+        hits = hits * (moments.nside / self.nside) ** 2
+        moved = self.nside != moments.nside or self.frame != moments.frame
+        found = Moments(self.nside, self.frame, np.nan_to_num(hits), np.nan_to_num(w))
+        return found if moved else replace(found, dtheta=moments.dtheta, dphi=moments.dphi)
+
+    def site(self, site: Site) -> Site:
+        """Return what effects may know of a channel whose maps are prepared."""
+        turn = rotation.rotation_matrix(site.frame, self.frame)
+        beam, dipole = self.beam(site.beam), turn @ site.dipole_uk
+        return replace(site, nside=self.nside, frame=self.frame, beam=beam, dipole_uk=dipole)
+
+    def beam(self, beam: Beam) -> Beam:
+        """Return a beam after the change of beams, the same for every order.
+
+        That is exact where orientations change slowly over the target beam.
+        """
+        return replace(beam, blm=beam.blm * self.beam_window(beam.lmax))
+
+
+def preparation(
+    run: config.RunConfig, spec: config.Channel, split: str | None, observed: bool = False
+) -> Preparation | None:
+    """Return the preparation of the maps of a channel and split; None if the run declares none.
+
+    ``observed``: of data, from which templates with given coefficients are subtracted. InputError for files that cannot
+    be used, and a target beam that is narrower than the map's own.
+    """
+    if not run.preparation:
+        return None
+    nside, frame = run.map.resolution, str(run.map.frame)
+    steps = []
+    for step in run.preparation:
+        of_data = isinstance(step, declared.Templates) and bool(step.coefficients) and not step.simulated
+        if spec.name in (getattr(step, "channels", ()) or (spec.name,)) and (observed or not of_data):
+            steps.append(_step(step, spec, split, nside, frame))
+        nside, frame = declared.grid_after([step], nside, frame)
+    return Preparation(tuple(steps), nside, frame)
+
+
+def _step(step: declared.Step, spec: config.Channel, split: str | None, nside: int, frame: str) -> Step:
+    def mask(path: str | None, mask_frame: str | None) -> Map:
+        if path is None:
+            return np.ones(12 * nside**2)
+        return _read_mask(config.channel_path(path, spec.name, split), nside, frame, mask_frame)
+
+    match step:
+        case declared.Degrade(method="average"):
+            return Average(nside, step.nside)
+        case declared.Degrade():
+            lmax = 3 * step.nside - 1
+            pixels = healpix.pixel_window(step.nside, lmax) / healpix.pixel_window(nside, lmax)
+            return Filter("degrade", nside, step.nside, np.ones(lmax + 1), pixels)
+        case declared.Smooth():
+            beam = _change_of_beam(step, spec, 3 * nside - 1)
+            return Filter("smooth", nside, nside, beam, np.ones(beam.size))
+        case declared.SubtractDipole():
+            return Regression(_harmonics(nside, step.monopole, step.dipole), mask(step.mask, step.mask_frame))
+        case declared.Templates():
+            read = [_template(config.channel_path(path, spec.name), nside, frame, spec) for path in step.templates]
+            columns = np.concatenate([np.stack(read), _harmonics(nside, step.monopole, step.dipole)])
+            given = None if step.coefficients is None else np.array(step.coefficients)
+            return Regression(columns, mask(step.mask, step.mask_frame), given)
+        case declared.Fill():
+            value = None if step.method == "diffuse" else step.value_uk
+            return Filled(mask(step.mask, step.mask_frame) == 0.0, value)
+        case declared.Mask():
+            return Weighted(mask(step.mask, step.mask_frame))
+        case declared.Rotate():
+            return Rotated(frame, step.frame, nside)
+
+
+def _change_of_beam(step: declared.Smooth, spec: config.Channel, lmax: int) -> NDArray[np.float64]:
+    """Return target B_l over own B_l up to where the target, or what is left of the beam, is negligible."""
+    if step.fwhm_arcmin is not None:
+        target = healpy.gauss_beam(np.deg2rad(step.fwhm_arcmin / 60.0), lmax)
+    else:
+        target = windows.read_beam(config.channel_path(str(step.window), spec.name), lmax)
+    if step.own_fwhm_arcmin is not None:
+        own = healpy.gauss_beam(np.deg2rad(step.own_fwhm_arcmin / 60.0), lmax)
+    elif step.own_window is not None:
+        own = windows.read_beam(config.channel_path(step.own_window, spec.name), lmax)
+    else:
+        own = load_beam(spec, lmax).window
+    end = int(np.argmin(np.append(np.minimum(np.abs(target), np.abs(own)) > NEGLIGIBLE, False)))
+    change: NDArray[np.float64] = target[:end] / own[:end]
+    if end == 0 or np.abs(change).max() > LARGEST_GAIN:
+        raise InputError(
+            f"a target beam of a preparation is narrower than the beam of the maps of {spec.name} and would amplify "
+            f"them more than {LARGEST_GAIN:g} times; choose a wider target."
+        )
+    return change
+
+
+def _harmonics(nside: int, monopole: bool, dipole: bool) -> NDArray[np.float64]:
+    """Return 1 and x, y, z at the pixels' centres, as wanted, shape (K, npix)."""
+    rows = np.stack([np.ones(12 * nside**2), *healpy.pix2vec(nside, np.arange(12 * nside**2))])
+    return rows[np.array([monopole, dipole, dipole, dipole])]
+
+
+def _template(path: Path, nside: int, frame: str, spec: config.Channel) -> Map:
+    """Read a template in uK, at the nside and in the frame of the maps that it is taken off."""
+    template, found, unit = healpix.read_map(path)
+    check_map(template, nside, f"template {path}")
+    if found not in (None, frame):
+        raise InputError(f"template {path} is in {found} coordinates, the maps are in {frame}; give it in {frame}.")
+    if not np.all(np.isfinite(template) & (template > UNSEEN_BELOW)):
+        raise InputError(f"template {path} has pixels that are not finite or unseen; give a complete map.")
+    return header.to_uk(unit, path, spec.frequency_ghz) * template
+
+
+@lru_cache(maxsize=32)
+def _read_mask(path: Path, nside: int, frame: str, mask_frame: str | None) -> Map:
+    mask = read_mask(path, nside, frame, mask_frame)
+    mask.setflags(write=False)
+    return mask

@@ -1,0 +1,148 @@
+"""Diagnosis of maps that were prepared: what the model declares is done to its simulations, and its limits are said."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import healpy
+import numpy as np
+import pytest
+
+import mcsim
+from mcsim import cli, config
+from mcsim.diagnosis import report, words
+from mcsim.diagnosis.api import describe
+from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.ensemble import plan
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import survey
+
+PROPOSED = ("beam_ellipticity", "noise_level", "dipole_modulation")
+SETTINGS = DiagnosisSettings(without=tuple(name for name in mcsim.effects() if name not in PROPOSED))
+FINE, COARSE = 64, 16
+MASK = (np.abs(healpy.pix2vec(COARSE, np.arange(12 * COARSE**2))[2]) > 0.25).astype(float)
+
+
+def model(lmax=150, steps=True):
+    channels = [
+        {
+            "name": name,
+            "frequency_ghz": frequency,
+            "beam": {"kind": "gaussian", "fwhm_arcmin": 150.0},
+            "noise": {"sigma0_uk": 600.0},
+            "scan": {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 30.0, "line_of_sight": line},
+        }
+        for name, frequency, line in (("V1", 61.0, "A"), ("W1", 94.0, "B"))
+    ]
+    run = {
+        "name": "prepared",
+        "sky": {"spectrum": "wmap7", "lmax": lmax},
+        "map": {"nside": FINE if steps else COARSE, "mask": MASK},
+        "biposh": {"L_max": 2, "lmax": 32},
+        "channel": channels,
+        "preparation": [
+            {"kind": "degrade", "nside": COARSE},
+            {"kind": "subtract_dipole", "mask": MASK},
+        ],
+    }
+    if not steps:
+        del run["preparation"]
+    return config.load(run)
+
+
+def data(run, *effects, seed=99):
+    """Return maps of another seed and of all the sky that the fine pixels hold, prepared by the public function."""
+    made = replace(
+        run,
+        preparation=(),
+        map=replace(run.map, mask=None),
+        sky=replace(run.sky, lmax=3 * FINE - 1),
+        ensemble=replace(run.ensemble, seed=seed),
+        effects=effects,
+    )
+    return mcsim.prepare(list(simulate.maps(survey(made), 0)), run)
+
+
+def diagnosed(run, maps, folder=None):
+    return mcsim.diagnose(run, maps, folder, settings=replace(SETTINGS, simulations=300))
+
+
+@pytest.mark.slow
+def test_prepared_maps_of_the_model_agree_with_it_and_an_effect_is_found(tmp_path):
+    run = model()
+    maps = data(run)
+    found = diagnosed(run, maps, tmp_path)
+    assert found.test.pvalue > 0.01
+    assert found.warnings == ()
+    assert "warnings" not in json.loads((tmp_path / "verdict.json").read_text())
+    noise = config.Effect(name="noise_level", channel="W1", parameters={"amplitude": 0.3})
+    louder = diagnosed(run, data(run, noise))
+    assert [(effect.name, effect.channel) for effect in louder.effects] == [("noise_level", "W1")]
+    assert abs(louder.effects[0].amplitude - 0.3) < 4.0 * louder.effects[0].sigma
+    # The same data against a model without the steps that lacks the power above l = 40.
+    bare = diagnosed(model(40, steps=False), maps, tmp_path / "bare")
+    assert len(bare.warnings) == 1
+    assert "set sky.lmax to" in bare.warnings[0]
+    assert json.loads((tmp_path / "bare" / "verdict.json").read_text())["warnings"] == list(bare.warnings)
+    assert words.summary(bare, tmp_path)[0].startswith("warning")
+    assert "Warning: sky.lmax = 40" in report.page(bare)
+    assert mcsim.diagnosis.result.DiagnosisResult.open(tmp_path / "bare").warnings == bare.warnings
+
+
+def test_the_cost_of_a_preparation_is_said():
+    run = model()
+    smooth = config.preparation.Smooth(fwhm_arcmin=300.0)
+    smoothed = replace(run, preparation=(smooth, *run.preparation))
+    assert "prepare 0 further transforms" in plan.describe(config.to_dict(run))
+    # Two channels, map and control, four transforms each.
+    assert "prepare 16 further transforms" in plan.describe(config.to_dict(smoothed))
+    text = describe(run, SETTINGS)
+    assert "nside 64 to 16" in text
+    assert "further transforms" not in plan.describe(config.to_dict(model(steps=False)))
+
+
+TOML = """
+schema = 1
+name = "cli"
+[sky]
+spectrum = "wmap7"
+lmax = {lmax}
+[map]
+nside = 32
+[[channel]]
+name = "V"
+beam = {{ kind = "gaussian", fwhm_arcmin = 240.0 }}
+noise = {{ sigma0_uk = 30.0 }}
+scan = {{ kind = "parallel_transport" }}
+[[preparation]]
+kind = "degrade"
+nside = 8
+[biposh]
+lmax = 16
+"""
+
+
+def test_commands_prepare_maps_and_refuse_too_little_sky(tmp_path, monkeypatch, capsys):
+    def mcsim_(*words):
+        monkeypatch.setattr("sys.argv", ["mcsim", *map(str, words)])
+        code = 0
+        try:
+            cli.main()
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        return code, capsys.readouterr()
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "enough.toml").write_text(TOML.format(lmax=60))
+    (tmp_path / "low.toml").write_text(TOML.format(lmax=18))
+    healpy.write_map("V.fits", np.arange(12.0 * 32**2), dtype=np.float64, column_units="uK")
+    code, said = mcsim_("prepare", "enough.toml", "V.fits", "-o", "out")
+    assert (code, said.out.strip()) == (0, f"wrote {Path('out/V.fits')}")
+    assert np.array_equal(healpy.read_map("out/V.fits"), healpy.ud_grade(healpy.read_map("V.fits"), 8))
+    assert mcsim_("predict", "enough.toml")[0] == 0
+    for command in (("predict", "low.toml"), ("run", "low.toml"), ("diagnose", "low.toml", "out", "-o", "verdict")):
+        code, said = mcsim_(*command)
+        assert code == 2
+        assert said.err.count("\n") == 1
+        assert "set sky.lmax to" in said.err
+    assert {path.name for path in tmp_path.iterdir()} == {"V.fits", "enough.toml", "low.toml", "out"}
