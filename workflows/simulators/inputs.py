@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 import mcsim
 from mcsim.ensemble.maps import write_map
 from mcsim.instrument.scan import LineOfSight
-from mcsim.instrument.scan.geometry import frame_matrix
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
+from mcsim.sphere.rotation import rotation_matrix
 
 Vector = NDArray[np.float64]
 Maps = dict[str, Vector]
@@ -81,7 +81,8 @@ def pointing(channel: Channel, samples: range, frame: str, late: float = 0.0) ->
     n = np.stack([np.sin(boresight) * np.cos(spin), np.sin(boresight) * np.sin(spin), np.cos(boresight) + zero])
     x = np.stack([-np.sin(spin), np.cos(spin), zero])  # (spin axis) x (line of sight): along the scan
     n, x = (_about_z(_about_y(_about_z(_about_y(v, tilt), precession), np.pi / 2), orbit) for v in (n, x))
-    n, x = frame_matrix(frame) @ n, frame_matrix(frame) @ x
+    turn = rotation_matrix("ecliptic", frame)
+    n, x = turn @ n, turn @ x
     theta, phi = healpy.vec2ang(n.T)
     south = np.stack([np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)])
     east = np.stack([-np.sin(phi), np.cos(phi), zero])
