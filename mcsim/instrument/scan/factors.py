@@ -9,7 +9,6 @@ import healpy
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import eval_jacobi
-from scipy.stats import binned_statistic
 
 from mcsim.errors import InputError
 from mcsim.instrument.scan.limit import limit_moments, limit_quadrature
@@ -57,6 +56,8 @@ def latitude_means(
     The latitude is that of the moments' frame, the edges are n + 1 in degrees. Unobserved pixels count for the hits
     alone; w is nan where a bin has no other.
     """
+    from scipy.stats import binned_statistic  # half a second, which no run should wait for
+
     seen = _seen(moments)
     latitude = np.abs(90.0 - np.degrees(healpy.pix2ang(moments.nside, np.arange(moments.npix))[0]))
     hits = binned_statistic(latitude, moments.hits, bins=edges_deg).statistic
