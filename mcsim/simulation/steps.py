@@ -1,5 +1,6 @@
 """Steps of the preparation of maps, each with what it makes of windows, noise, hits and orientation moments."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -26,15 +27,15 @@ FILL_TOLERANCE = 1e-10
 """Relative residual of the diffuse filling."""
 
 
-class Step:
+class Step(ABC):
     """One step on the maps of a channel; a step that does not change something inherits it unchanged."""
 
     transforms = 0
     """Number of scalar transforms."""
 
+    @abstractmethod
     def apply(self, map_uk: Map) -> Map:
         """Return the map after the step, uK, NaN where not observed."""
-        raise NotImplementedError
 
     def beam_window(self, lmax: int) -> NDArray[np.float64]:
         """Return what the step multiplies B_l with, shape (lmax + 1,)."""
