@@ -91,15 +91,14 @@ class BipolarScan:
         return found
 
     def _powers(self) -> Iterator[Element]:
-        """Yield the descriptions of the cross powers of residuals; only in the lowest bin is a split by itself."""
+        """Yield the descriptions of the cross powers of residuals; maps of two splits have no split in common."""
         model = self.model
         for one, two in combinations_with_replacement(model.parts, 2):
             channels = tuple(dict.fromkeys(model.channels[part.channel] for part in (one, two)))
-            alike = Element(f"cl/{one.name},{two.name}", "cl", channels, L=0, M=0, parity="even", kind="cross")
-            for place, (low, high) in enumerate(scales(model.lmax)):
-                split = one.split if place == 0 and one.split == two.split else None
-                name = f"{alike.name}/{low}-{high}"
-                yield replace(alike, name=name, split=split, ell=(low, high), frame=model.frame)
+            split = one.split if one.split == two.split else None
+            alike = Element(f"cl/{one.name},{two.name}", "cl", channels, split, L=0, M=0, parity="even", kind="cross")
+            for low, high in scales(model.lmax):
+                yield replace(alike, name=f"{alike.name}/{low}-{high}", ell=(low, high), frame=model.frame)
 
     def _sums(self, filtered: FilteredMaps) -> NDArray[np.complex128]:
         """Return the sums of coefficients over bins, shape (sources, frames, modes, bins)."""
