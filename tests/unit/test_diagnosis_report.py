@@ -361,17 +361,6 @@ def test_largest_picture_leaves_the_page_small(diagnoses):
     assert len(report._picture(figure, "").data) < 1_800_000
 
 
-@pytest.mark.parametrize("kind", VERDICTS)
-def test_first_screen_fits_its_picture(diagnoses, kind, tmp_path):
-    figure = plots.first_screen(diagnoses[kind])
-    figure.savefig(tmp_path / "first.png", dpi=60)
-    box, whole = figure.get_tightbbox(), figure.bbox_inches
-    assert box.x0 >= -0.01
-    assert box.y0 >= -0.01
-    assert box.x1 <= whole.x1 + 0.01
-    assert box.y1 <= whole.y1 + 0.01
-
-
 def test_simulations_held_out_against_refits():
     simulations = np.random.default_rng(2).normal(size=(60, 8)) @ np.random.default_rng(3).normal(size=(8, 8))
     found = held_out_pvalues(simulations, SimulatedGaussian.from_simulations(simulations))
