@@ -148,7 +148,22 @@ def in_uk2(path: str | Path, table: Table, name: str) -> NDArray[np.float64]:
         raise InputError(f"{path}: the column {name} has no unit; write uK2 (or mK2, K2) into its header.")
     try:
         factor = units.Unit(column.unit).to(units.uK**2)
-        values: NDArray[np.float64] = np.ma.filled(np.ma.asarray(column, dtype=float), np.nan)
     except (units.UnitConversionError, ValueError, TypeError):
         raise InputError(f"{path}: the column {name} has unit {column.unit}; convert it to uK2.") from None
+    try:
+        values: NDArray[np.float64] = np.ma.filled(np.ma.asarray(column, dtype=float), np.nan)
+    except (ValueError, TypeError):
+        wrong = next(row for row, text in enumerate(column) if not _is_number(text))
+        raise InputError(
+            f"{path}: the column {name} has {str(column[wrong])!r} in row {wrong + 1}, where a number in "
+            f"{column.unit} is expected; correct the row or leave it out."
+        ) from None
     return np.asarray(factor * values)
+
+
+def _is_number(text: Any) -> bool:
+    try:
+        float(text)
+    except (ValueError, TypeError):
+        return False
+    return True

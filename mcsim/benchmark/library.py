@@ -32,7 +32,7 @@ HELD_OUT = 0.25
 
 
 @dataclass(frozen=True, eq=False)
-class Library:
+class EffectsLibrary:
     """Candidates of a diagnosis, their templates, and the noise model that they are tested with.
 
     ``null`` describes the data vector, of p_raw elements, without any effect; the templates are its response per unit
@@ -85,7 +85,7 @@ class Library:
 
 
 @dataclass(frozen=True, eq=False)
-class LinearModel(Library):
+class LinearModel(EffectsLibrary):
     """A library whose responses are straight lines: simulated data vectors plus templates times coordinates.
 
     Its covariance does not know the simulations that serve as ``data`` without an effect, shape (n, p_raw). ``halves``
@@ -149,7 +149,7 @@ def reduced(
 
 
 @dataclass(frozen=True, eq=False)
-class LearnedModel(Library):
+class LearnedModel(EffectsLibrary):
     """A library with all that cases of a model are diagnosed with."""
 
     context: DiagnosisContext
