@@ -358,7 +358,7 @@ def test_largest_picture_leaves_the_page_small(diagnoses):
     assert len(titles) == plots.MAPS
     assert f"W 3: rms {np.sqrt(np.mean(sky[3] ** 2)):.2f} (simulations 0.97 to 1.03)" in titles
     # With 1 MB for all others of 42 candidates and 222 elements the page stays below 3 MB.
-    assert len(report._picture(figure, "").data) < 1_800_000
+    assert len(report._picture(figure, "")["data"]) < 1_800_000
 
 
 def test_simulations_held_out_against_refits():
