@@ -19,8 +19,9 @@ from mcsim.diagnosis.context import DiagnosisContext, context
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.subsets import Subsets
-from mcsim.diagnosis.validation import Halves, HeldOut
+from mcsim.diagnosis.validation import Halves
 from mcsim.errors import InputError, RunError
+from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit, SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration, calibrate
 

@@ -11,9 +11,9 @@ from mcsim.diagnosis.candidate import Candidate, parts_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.result import CandidateResult, DiagnosisResult, EffectResult, EffectSet
-from mcsim.diagnosis.validation import HeldOut, excess_of
 from mcsim.errors import InputError
 from mcsim.stats.detection import detectable, snr_needed, snr_to_separate
+from mcsim.stats.excess import HeldOut, excess_of
 from mcsim.stats.gaussian import Fit, SimulatedGaussian, residual_pvalue
 
 Vector = NDArray[np.float64]

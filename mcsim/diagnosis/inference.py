@@ -12,8 +12,9 @@ from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.refine import Refined, Refiner, with_scatter
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import Attribution
-from mcsim.diagnosis.validation import Halves, HeldOut
+from mcsim.diagnosis.validation import Halves
 from mcsim.errors import InputError
+from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit
 from mcsim.support.numbers import measured
 

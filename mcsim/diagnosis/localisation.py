@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 from mcsim import bipolar
 from mcsim.beamfit.data import parts
 from mcsim.diagnosis.summaries import Element, bins, scales
-from mcsim.diagnosis.wiener_filter import FilteredMaps, Map, Model, by_degree
+from mcsim.diagnosis.wiener_filter import FilteredMaps, Model, by_degree
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.rotation import FRAMES, rotate_biposh
 from mcsim.stats.look_elsewhere import scan_pvalues
-
-Vector = NDArray[np.float64]
+from mcsim.support.arrays import Map, Vector
 
 NSIDE = 16
 """Of residual maps, if the data are not coarser: finer pixels show noise and little else."""
@@ -46,7 +45,7 @@ class BipolarScan:
         """Return the description of each number, in the order of :meth:`values`."""
         return (*(element for element, _ in self._binned), *self._powers())
 
-    def values(self, filtered: FilteredMaps) -> NDArray[np.float64]:
+    def values(self, filtered: FilteredMaps) -> Vector:
         """Return all numbers of a set of maps, shape (numbers,)."""
         sums = self._sums(filtered)
         binned = np.stack([sums.real, sums.imag], axis=-1)[tuple(np.transpose([where for _, where in self._binned]))]

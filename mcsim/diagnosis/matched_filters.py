@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim import systematics
 from mcsim.diagnosis.wiener_filter import FilteredMaps, Model, by_degree
@@ -19,10 +18,10 @@ from mcsim.simulation.survey import mean_gain
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
 from mcsim.support import folders
+from mcsim.support.arrays import Map
 from mcsim.support.code import class_digest, package_digest
 from mcsim.systematics import Effect
 
-Map = NDArray[np.float64]
 MatchedFilter = Callable[[FilteredMaps], float]
 
 

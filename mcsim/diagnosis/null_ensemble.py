@@ -13,9 +13,7 @@ from pydantic import TypeAdapter
 from mcsim.diagnosis.candidate import Column, TemplateBank
 from mcsim.diagnosis.summaries import Element
 from mcsim.stats.gaussian import SimulatedGaussian
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
+from mcsim.support.arrays import Matrix, Vector
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import healpy
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.diagnosis.campaign import constrained_jobs
@@ -20,10 +19,7 @@ from mcsim.ensemble.maps import file_names
 from mcsim.errors import InputError
 from mcsim.sphere import header, healpix
 from mcsim.stats.look_elsewhere import global_test
-
-Map = NDArray[np.float64]
-Vector = NDArray[np.float64]
-Rows = NDArray[np.float64]
+from mcsim.support.arrays import Alm, Map, Matrix, Vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +44,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         return self._measured[0]
 
     @cached_property
-    def _sky(self) -> NDArray[np.complex128]:
+    def _sky(self) -> Alm:
         return shared_sky(self.context.analysis.model, self.data)
 
     @cached_property
@@ -56,7 +52,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         """Return data vectors of constrained skies without any effect, as many as were needed so far."""
         return []
 
-    def respond(self, found: Sequence[config.Effect], skies: int) -> Rows:
+    def respond(self, found: Sequence[config.Effect], skies: int) -> Matrix:
         """Return changes of the data vector in ``skies`` constrained skies, shape (rows, p).
 
         Effects with a mean response are simulated in typical skies instead: the observed sky has its power already.
@@ -69,16 +65,16 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         before, after = self._constrained(others, skies)
         return shift.mean(axis=0) + after - before
 
-    def pair(self, found: Sequence[config.Effect]) -> tuple[Rows, Rows]:
+    def pair(self, found: Sequence[config.Effect]) -> tuple[Matrix, Matrix]:
         """Return data vectors of the same skies without effects and with them, shape (rows, p) each."""
         if any(self._is_typical(effect) for effect in found):
             return self.context.ensemble.reference, self._simulated(found)
         return self._constrained(found, self.context.settings.constrained_skies)
 
-    def _constrained(self, found: Sequence[config.Effect], skies: int) -> tuple[Rows, Rows]:
+    def _constrained(self, found: Sequence[config.Effect], skies: int) -> tuple[Matrix, Matrix]:
         """Return data vectors of constrained skies without effects and with them, shape (skies, p) each."""
 
-        def simulated(found: Sequence[config.Effect], first: int) -> Rows:
+        def simulated(found: Sequence[config.Effect], first: int) -> Matrix:
             jobs = constrained_jobs(self.context.analysis, found, self._sky, range(first, skies))
             return np.concatenate(self.ask(jobs))
 
@@ -91,7 +87,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         kind = next(one.effect for one in self.context.candidates if one.name == effect.name)
         return kind.parametrization.mean_response and not kind.parametrization.stochastic
 
-    def templates(self) -> Rows:
+    def templates(self) -> Matrix:
         """Return the templates; those that depend on the very sky are measured on the observed one if it departs."""
         context, t, settings = self.context, self.context.templates.copy(), self.context.settings
         if global_test(context.null, self.x, context.groups, context.calibration).pvalue > settings.alpha:
@@ -126,7 +122,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
                 notes.append(f"The model fits (p = {p:.2g}) with maps exchanged: {pairs}.")
         return notes
 
-    def halves(self) -> tuple[Rows, str]:
+    def halves(self) -> tuple[Matrix, str]:
         """Return the identity, since the noise of the folds is independent, and the folds in words."""
         splits, words = self.context.run.map.splits, "odd degrees, alternate pixels"
         if len(splits) > 1:
@@ -143,7 +139,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         elements = (*analysis.bipolar_scan.elements, *(analysis.elements[i] for i in own))
         return places(np.concatenate([self._measured[1], shifted]), drawn, elements, self.context.settings.place_pvalue)
 
-    def residual_maps(self) -> Rows:
+    def residual_maps(self) -> Matrix:
         """Return the residual maps over the scatter of those of simulations, shape (map, npix)."""
         ensemble = self.context.ensemble
         drawn = len(ensemble.bipolar_scan)

@@ -4,16 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim.diagnosis.candidate import Candidate, columns_of, effects_at, parts_of, within_bounds
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import Fit, SimulatedGaussian, orthonormal
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
+from mcsim.support.arrays import Matrix, Vector
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,10 @@ from mcsim.diagnosis.localisation import Place
 from mcsim.diagnosis.selection import Contrast, Verdict
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Element
-from mcsim.diagnosis.validation import HeldOut, Measured, excess_of
 from mcsim.errors import InputError
+from mcsim.stats.excess import HeldOut, Measured, excess_of
 from mcsim.stats.look_elsewhere import GlobalTest
-
-Vector = NDArray[np.float64]
+from mcsim.support.arrays import Vector
 
 SCHEMA = 1
 STORE = "diagnosis.zarr"

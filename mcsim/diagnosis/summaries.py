@@ -6,15 +6,13 @@ from itertools import pairwise, product
 
 import healpy
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim.diagnosis.matched_filters import normalised_difference
-from mcsim.diagnosis.wiener_filter import FilteredMaps, Map, Model, by_degree
+from mcsim.diagnosis.wiener_filter import FilteredMaps, Model, by_degree
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotation_matrix
-
-Vector = NDArray[np.float64]
+from mcsim.support.arrays import Map, Vector
 
 
 @dataclass(frozen=True)

@@ -27,11 +27,7 @@ from mcsim.simulation.survey import Survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
-
-Map = NDArray[np.float64]
-Alm = NDArray[np.complex128]
-Cl = NDArray[np.float64]
-"""Shape (lmax + 1,)."""
+from mcsim.support.arrays import Alm, Cl, Map
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from mcsim.diagnosis.result import DiagnosisResult, EffectResult
 from mcsim.diagnosis.selection import Contrast
-from mcsim.diagnosis.validation import Measured
+from mcsim.stats.excess import Measured
 from mcsim.support.numbers import measured, number, p_equals
 
 AGREES, DISAGREES = 0.05, 0.005

@@ -14,8 +14,8 @@ from mcsim.diagnosis.inference import confirmed
 from mcsim.diagnosis.refine import PartialExplanation, Refiner
 from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.diagnosis.validation import HeldOut, Measured
 from mcsim.stats.detection import cosines, detectable, log_evidence, posterior, snr_needed, snr_to_separate
+from mcsim.stats.excess import HeldOut, Measured
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate
 from mcsim.systematics import Effect, Parametrization

@@ -24,8 +24,8 @@ from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import attribute
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Element
-from mcsim.diagnosis.validation import HeldOut, Measured
 from mcsim.stats.detection import confusion, snr_needed
+from mcsim.stats.excess import HeldOut, Measured
 from mcsim.stats.gaussian import SimulatedGaussian, residual_pvalue
 from mcsim.stats.look_elsewhere import calibrate
 from mcsim.support import resources
