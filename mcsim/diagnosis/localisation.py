@@ -125,7 +125,6 @@ class Place:
     element: Element  # the number of the group that departs most
     z: float  # normal deviate of the group
     p: float  # global p-value: that the largest departure of all groups is as large
-    peak: float  # normal deviate of that number alone
 
 
 def places(x: Vector, simulations: Vector, elements: Sequence[Element], level: float = 0.01) -> list[Place]:
@@ -159,7 +158,7 @@ def places(x: Vector, simulations: Vector, elements: Sequence[Element], level: f
     seen: set[tuple[object, ...]] = set()
     for group in np.argsort(-z):
         peak = max(rows[group], key=lambda number: abs(deviates[number]))
-        place = Place(elements[peak], float(z[group]), float(p[group]), float(deviates[peak]))
+        place = Place(elements[peak], float(z[group]), float(p[group]))
         kind = (place.element.frame, place.element.L, place.element.parity)
         new = kind not in seen and (place.p <= level or not seen)
         (firsts if new else rest).append(place)

@@ -9,7 +9,7 @@ from mcsim.diagnosis.candidate import Candidate, columns_of, effects_at, parts_o
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.errors import InputError
-from mcsim.stats.gaussian import Fit, SimulatedGaussian, orthonormal
+from mcsim.stats.gaussian import Fit
 from mcsim.support.arrays import Matrix, Vector
 
 
@@ -247,24 +247,3 @@ class Refiner:
             return False
         moved = now - before
         return float(moved @ np.linalg.pinv(covariance) @ moved) < self.context.settings.settled_sigma**2
-
-
-def with_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, before: Matrix, after: Matrix) -> Fit:
-    """Return a fit of templates, shape (p_raw, K), with the errors of its amplitudes with the effects in the data.
-
-    ``before`` and ``after`` are data vectors of the same skies without the effects and with them at their amplitudes,
-    shape (skies, p_raw).
-
-    Notes
-    -----
-    A strong effect changes the scatter of the data. The fit is linear, so that it is applied to every sky. The variance
-    of each amplitude grows by its excess among the skies with the effects over that without them: the same skies, whose
-    common scatter cancels. Correlations stay; errors are not made smaller.
-    """
-    basis, back = orthonormal(null.whiten_templates(t))
-    without, acting = (
-        np.var(back @ basis.T @ null.whiten_templates(rows.T), axis=1, ddof=1) for rows in (before, after)
-    )
-    own = np.diag(found.covariance)
-    factor = np.sqrt(1.0 + np.divide(np.maximum(acting - without, 0.0), own, out=np.zeros_like(own), where=own > 0.0))
-    return replace(found, covariance=factor[:, None] * found.covariance * factor)

@@ -265,9 +265,7 @@ def _sky_block(model: Model) -> Block:
 
 
 _FORMS = {"x": (1, 1), "y": (1, 1), "z": (1, 0), "zz": (2, 0), "xz": (2, 1), "yz": (2, 1), "xx": (2, 2), "xy": (2, 2)}
-"""L and M of real forms."""
-
-_FORM_WORDS = {"zz": "3z² − 1", "xx": "x² − y²"}
+"""L and M of real forms; "zz" is 3z² − 1 and "xx" is x² − y²."""
 
 
 def _isotropy_block(model: Model) -> Block:
@@ -284,7 +282,7 @@ def _isotropy_block(model: Model) -> Block:
         alike = Element("isotropy", "biposh", model.channels, None, fold, (low, high), frame=model.frame)
         for form, (L, M) in _FORMS.items():
             own = replace(alike, name=f"isotropy/{form}/{low}-{high}", L=L, M=M, parity="even")
-            elements.append(replace(own, kind="isotropy", component=_FORM_WORDS.get(form, form)))
+            elements.append(replace(own, kind="isotropy", component={"zz": "3z² − 1", "xx": "x² − y²"}.get(form, form)))
 
     def values(filtered: FilteredMaps) -> Vector:
         sky = healpix.synthesis(filtered.sky[None], nside, lmax)[0]
