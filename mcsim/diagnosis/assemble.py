@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.diagnosis.candidate import Candidate, parts_of
@@ -15,8 +14,7 @@ from mcsim.errors import InputError
 from mcsim.stats.detection import detectable, snr_needed, snr_to_separate
 from mcsim.stats.excess import HeldOut, excess_of
 from mcsim.stats.gaussian import Fit, held_out_pvalues
-
-Vector = NDArray[np.float64]
+from mcsim.support.arrays import Vector
 
 TELLING = 12
 """Elements that are named where two sets differ."""

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
 
-from mcsim.diagnosis.result import CandidateResult, DiagnosisResult
+from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import Contrast
 from mcsim.diagnosis.summaries import KINDS
 from mcsim.plot.sky import mollweide
@@ -61,7 +61,9 @@ def candidates_figure(result: DiagnosisResult) -> Figure:
     rows = result.ranked[:TOP]
     figure = Figure(figsize=(7.2, 1.0 + 0.27 * len(rows)), layout="constrained")
     axes = figure.subplots()
-    colours = [_colour(result, row) for row in rows]
+    accepted = [{result.candidates[k].label for k in one.candidates} for one in result.sets]
+    named, others = (accepted[0] if accepted else set()), set().union(*accepted[1:])
+    colours = [BLUE if row.label in named else AMBER if row.label in others else "#b5b5b5" for row in rows]
     axes.barh(range(len(rows)), [row.significance for row in rows], height=0.7, color=colours)
     axes.set_yticks(range(len(rows)), [_label(row.label, 46) for row in rows], fontsize=8)
     axes.set_ylim(len(rows) - 0.4, -0.6)
@@ -71,12 +73,6 @@ def candidates_figure(result: DiagnosisResult) -> Figure:
     axes.set_xlabel(r"fitted alone: $\sqrt{\Delta\chi^2}$" + (f"\n({key})" if key else ""), fontsize=9)
     _bare(axes)
     return figure
-
-
-def _colour(result: DiagnosisResult, row: CandidateResult) -> str:
-    index = result.candidates.index(row)
-    member = [index in one.candidates for one in result.sets]
-    return "#b5b5b5" if not any(member) else BLUE if member[0] else AMBER
 
 
 def blocks_figure(result: DiagnosisResult) -> Figure:
@@ -90,9 +86,7 @@ def blocks_figure(result: DiagnosisResult) -> Figure:
     at = np.array(
         [(kinds.index(e.family), names.index(column)) for e, column in zip(result.elements, columns, strict=True)]
     )
-    panels = (
-        {"before": result.z} if result.z_after is None else {"before": result.z, "after the best fit": result.z_after}
-    )
+    panels = {"before": result.z} | ({} if result.z_after is None else {"after the best fit": result.z_after})
     width = 3.4 + len(panels) * (0.62 * len(names) + 0.3)
     figure = Figure(figsize=(width, 2.6 + 0.27 * len(kinds)), layout="constrained")
     grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]

@@ -59,8 +59,8 @@ class BipolarScan:
     @cached_property
     def _sources(self) -> list[tuple[Element, int | None, float]]:
         """Return what is correlated with the sky: itself, and sum and (sign -1) difference of a channel's residuals."""
-        found: list[tuple[Element, int | None, float]] = []
-        found.append((Element("sky", "biposh", self.model.channels, kind="biposh"), None, 1.0))
+        sky = Element("sky", "biposh", self.model.channels, kind="biposh")
+        found: list[tuple[Element, int | None, float]] = [(sky, None, 1.0)]
         for channel, name in enumerate(self.model.channels):
             own = Element(name, "biposh", (name,), kind="biposh")
             found.append((own, channel, 1.0))
@@ -157,8 +157,8 @@ def places(x: Vector, simulations: Vector, elements: Sequence[Element], level: f
     rest: list[Place] = []
     seen: set[tuple[object, ...]] = set()
     for group in np.argsort(-z):
-        peak = max(rows[group], key=lambda number: abs(deviates[number]))
-        place = Place(elements[peak], float(z[group]), float(p[group]))
+        most = max(rows[group], key=lambda number: abs(deviates[number]))
+        place = Place(elements[most], float(z[group]), float(p[group]))
         kind = (place.element.frame, place.element.L, place.element.parity)
         new = kind not in seen and (place.p <= level or not seen)
         (firsts if new else rest).append(place)

@@ -126,8 +126,7 @@ def gain_of(effect: Effect, site: systematics.Site, share: tuple[float, float]) 
     def fill(folder: Path) -> None:
         np.save(folder / "gain.npy", np.asarray(mean_gain((effect,), site, share), dtype=np.float64))
 
-    found: Map = np.load(folders.cached(f"gain-{where[:32]}-{what[:32]}", fill) / "gain.npy")
-    return found
+    return np.asarray(np.load(folders.cached(f"gain-{where[:32]}-{what[:32]}", fill) / "gain.npy"))
 
 
 def normalised_difference(model: Model, filtered: FilteredMaps, parts: tuple[int, ...]) -> Map:

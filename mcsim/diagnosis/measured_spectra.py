@@ -71,10 +71,7 @@ class Spectra:
         return tuple(found)
 
     def __call__(self, job: Job) -> Vector:
-        """Return the same numbers of simulations, shape (count, p), by the function that runs an ensemble.
-
-        This is the task that a worker runs.
-        """
+        """Return the same numbers of simulations, shape (count, p), by the function that runs an ensemble."""
         shared = survey(config.from_json(job.simulated), library=dict(job.library))
         biposh = np.stack([simulate.realize(shared, job.first + r)["biposh"] for r in range(job.count)])
         columns = []

@@ -74,9 +74,8 @@ def save(path: Path, ensemble: NullEnsemble, bank: TemplateBank) -> None:
         "columns": json.dumps(bank.labels),
         "redundant": ensemble.redundant,
     }
-    dims = {name: tuple(f"{name}_{axis}" for axis in range(array.ndim)) for name, array in arrays.items()}
-    dataset = xr.Dataset({name: (dims[name], array) for name, array in arrays.items()}, attrs=attributes)
-    dataset.to_zarr(path, mode="w", consolidated=False)
+    variables = {name: ([f"{name}_{axis}" for axis in range(array.ndim)], array) for name, array in arrays.items()}
+    xr.Dataset(variables, attrs=attributes).to_zarr(path, mode="w", consolidated=False)
 
 
 def load(path: Path) -> tuple[NullEnsemble, TemplateBank]:

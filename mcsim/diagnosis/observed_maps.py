@@ -212,12 +212,11 @@ def _checked(model: Model, part: Part, map_: Map, name: str) -> Map:
 
 def exchanges(parts: Sequence[Part]) -> list[tuple[int, ...]]:
     """Return the orders of the maps in which two channels, or two splits of all channels, are exchanged."""
-    places = {(part.channel, part.split): place for place, part in enumerate(parts)}
+    keys: list[tuple[int | str | None, ...]] = [(part.channel, part.split) for part in parts]
     found = []
-    for one, other in combinations(dict.fromkeys(channel for channel, _ in places), 2):
-        channels = {one: other, other: one}
-        found.append(tuple(places[channels.get(channel, channel), split] for channel, split in places))
-    for first, second in combinations(dict.fromkeys(split for _, split in places), 2):
-        splits = {first: second, second: first}
-        found.append(tuple(places[channel, splits.get(split, split)] for channel, split in places))
+    for axis in (0, 1):
+        for one, other in combinations(dict.fromkeys(key[axis] for key in keys), 2):
+            swap = {one: other, other: one}
+            moved = [tuple(swap.get(k, k) if i == axis else k for i, k in enumerate(key)) for key in keys]
+            found.append(tuple(keys.index(key) for key in moved))
     return found

@@ -156,7 +156,7 @@ class Refiner:
         Strong effects change their own responses and each other's. None if one can have no such amplitude, or the
         amplitudes diverge round by round.
         """
-        columns = np.array(columns_of(candidates, members))
+        columns, share = np.array(columns_of(candidates, members)), self.context.settings.settled_share
         for _ in range(self.context.settings.joint_rounds):
             try:
                 effects = effects_at(candidates, members, fitted)
@@ -169,7 +169,7 @@ class Refiner:
             at = np.concatenate([effect.parametrization.coordinates(effect) for effect in effects])
             t[:, columns] += self._beyond(t[:, columns], at, response)
             before, fitted = fitted, self.context.null.fit(self.data.x, t[:, columns])
-            if self._has_converged(before.amplitudes, fitted):
+            if self._has_settled(before.amplitudes, fitted.amplitudes, fitted.covariance, share):
                 return t
         return None
 
@@ -236,14 +236,10 @@ class Refiner:
         size = float(np.linalg.norm(self.context.null.whiten_templates(shift[:, None])))
         return crossed * size > self.context.settings.nonlinear_sigma
 
-    def _has_converged(self, before: Vector, now: Fit) -> bool:
-        """Return True if amplitudes have hardly moved, by their errors, or by their size if the errors are tiny."""
-        precision, settings = np.linalg.pinv(now.covariance), self.context.settings
-        moved, size = (float(v @ precision @ v) for v in (now.amplitudes - before, now.amplitudes))
-        return moved < max(settings.settled_sigma**2, settings.settled_share**2 * size)
-
-    def _has_settled(self, before: Vector | None, now: Vector, covariance: Matrix) -> bool:
+    def _has_settled(self, before: Vector | None, now: Vector, covariance: Matrix, share: float = 0.0) -> bool:
+        """Return True if amplitudes have hardly moved, by their errors, or by a share of their size."""
         if before is None:
             return False
-        moved = now - before
-        return float(moved @ np.linalg.pinv(covariance) @ moved) < self.context.settings.settled_sigma**2
+        precision = np.linalg.pinv(covariance)
+        moved, size = (float(v @ precision @ v) for v in (now - before, now))
+        return moved < max(self.context.settings.settled_sigma**2, share**2 * size)

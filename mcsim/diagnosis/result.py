@@ -20,7 +20,6 @@ from mcsim.stats.excess import HeldOut, Measured, excess_of
 from mcsim.stats.look_elsewhere import GlobalTest
 from mcsim.support.arrays import Vector
 
-SCHEMA = 1
 STORE = "diagnosis.zarr"
 PLACES = 12
 """Groups in the localisation table of ``verdict.json`` and of the report."""
@@ -242,7 +241,7 @@ class DiagnosisResult:
         sets = [[_effect_json(effect) for effect in one.effects] for one in self.sets]
         faint = {"faint": True, "probability": self.probability} if self.faint else {}
         return {
-            "schema": SCHEMA,
+            "schema": 1,
             "case": self.case,
             "gap": {"p_value": self.test.pvalue, "statistic": self.test.chi2, "dof": self.test.dimension},
             "verdict": self.kind,
@@ -255,7 +254,12 @@ class DiagnosisResult:
             "nearest": {"name": near.name, "channel": near.channel, "cosine": self.cosine},
             "heard": [_effect_json(effect) for effect in self.partial],
             "left": self.partial_left,
-            "detectable": [_detectable_json(one) for one in self.candidates if one.detectable is not None],
+            "detectable": [
+                {key: getattr(one, key) for key in ("name", "channel", "unit", "settings")}
+                | {"amplitude_90": one.detectable}
+                for one in self.candidates
+                if one.detectable is not None
+            ],
             "notes": list(self.notes),
             **({"warnings": list(self.warnings)} if self.warnings else {}),
         }
@@ -338,11 +342,6 @@ def _place_json(place: Place) -> dict[str, Any]:
     found["statistic"] = {"score": "map", "noise": "cl"}.get(e.statistic, e.statistic)
     lists = {key: list(value) for key, value in found.items() if isinstance(value, tuple)}
     return found | lists | {"z": place.z, "p": place.p}
-
-
-def _detectable_json(one: CandidateResult) -> dict[str, Any]:
-    named = {key: getattr(one, key) for key in ("name", "channel", "unit", "settings")}
-    return named | {"amplitude_90": one.detectable}
 
 
 def _held_out_json(found: HeldOut) -> dict[str, Any]:

@@ -111,8 +111,7 @@ def _of_map(model: Model, part: int) -> Element:
 
 def _height(frame: str, to: str, nside: int) -> Map:
     """Return the sine of the latitude in another frame of every pixel, RING, shape (npix,)."""
-    height: Map = rotation_matrix(frame, to)[2] @ np.stack(healpy.pix2vec(nside, np.arange(12 * nside**2)))
-    return height
+    return np.asarray(rotation_matrix(frame, to)[2] @ np.stack(healpy.pix2vec(nside, np.arange(12 * nside**2))))
 
 
 def _beam_block(model: Model, part: int) -> Block:
@@ -235,8 +234,7 @@ def _contrast_blocks(model: Model) -> list[Block]:
         low = alm_.resize(total, model.lmax, top)
         low[: min(2, top + 1)] = 0.0
         low[top + 1] = 0.0
-        found: Map = healpix.synthesis(low[None], nside, top)[0]
-        return found
+        return np.asarray(healpix.synthesis(low[None], nside, top)[0])
 
     return [Block(elements, lambda filtered: np.asarray(bands @ (smoothed(filtered, 0) * smoothed(filtered, 1))))]
 
