@@ -53,6 +53,8 @@ class ChannelPair:
         True if the scene's sky was taken from side A, and not from the model.
     files
         Samples of the channel, if the model has them in files.
+    noisy
+        True if noise was filtered out of the sky that side A shows, and so what noise hides of the sky is missing.
     """
 
     name: str
@@ -67,6 +69,7 @@ class ChannelPair:
     sky_of_maps: bool = False
 
     files: PointingFiles | None = None
+    noisy: bool = False
 
     def pointing(self, longest: float = SAMPLES) -> Pointing | PointingFiles | None:
         """Return the pointing, if it is known and has no more samples than the longest that is wanted."""

@@ -19,7 +19,7 @@ from mcsim.systematics.base import Pointing
 Vector = NDArray[np.float64]
 
 EXPLAINED = 0.8
-"""Share of a difference map's variance that a set must explain to be named, with orientation moments."""
+"""Share of a difference map's variance that a set must explain to be named, with orientation moments or noisy maps."""
 
 EXPLAINED_BY_SAMPLES = 0.95
 """The same where single samples are simulated, or no simulation is needed."""
@@ -152,7 +152,7 @@ class Problem:
     @property
     def needed(self) -> float:
         """Share of the variance that a set must explain to be named."""
-        simple = self._pointing is not None or self.pair.scene is None
+        simple = self.pair.scene is None or (self._pointing is not None and not self.pair.noisy)
         return EXPLAINED_BY_SAMPLES if simple else EXPLAINED
 
     def suffices(self, found: Set) -> bool:
@@ -243,9 +243,8 @@ class Problem:
                 for one in self._extended(smaller.members, library)
                 if one.left < (1.0 - FURTHER) * smaller.left
             ]
-            found = sorted(
-                map(self.polished, sorted(larger, key=lambda one: one.left)[:KEPT]), key=lambda one: one.left
-            )
+            best = sorted(larger, key=lambda one: one.left)[:KEPT]
+            found = sorted((self.corrected(self.polished(one)) for one in best), key=lambda one: one.left)
             if not found or found[0].left > (1.0 - self.further(chosen[0])) * chosen[0].left:
                 break
             chosen = found
@@ -382,7 +381,7 @@ def without_noise(pair: ChannelPair) -> ChannelPair:
     near = np.ones(NEAR) / NEAR
     share = np.convolve(noise, near, "same") / np.maximum(np.convolve(both, near, "same"), 1e-300)
     kept = np.pad(np.clip(1.0 - share, 0.0, 1.0), (0, scene.lmax - lmax))
-    return replace(pair, scene=replace(scene, sky=alm_.multiply(scene.sky, kept, scene.lmax)))
+    return replace(pair, scene=replace(scene, sky=alm_.multiply(scene.sky, kept, scene.lmax)), noisy=True)
 
 
 def alternatives(sets: Sequence[Set], problem: Problem) -> list[Set]:
