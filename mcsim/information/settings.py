@@ -1,0 +1,62 @@
+"""What the limit of a model is computed of, and how."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from mcsim.systematics import Library
+
+
+@dataclass(frozen=True)
+class LimitSettings:
+    """Set effects, nuisances, levels and random probes of :func:`mcsim.limit`.
+
+    Attributes
+    ----------
+    only
+        Names of the effects to compute; empty: all that apply. The look-elsewhere correction is for all in any case.
+    without
+        Names of effects that are left out, of the look-elsewhere correction too.
+    library
+        Effects by name, as :func:`mcsim.effects` returns them; None: all of these.
+    nuisances
+        Width of the Gaussian prior, in the effect's unit, of every coordinate of effects that are unknown but not
+        looked for: ``{"beam_width": 0.01}`` in every channel, ``{"beam_width:W1": 0.01}`` in one. The limits of the
+        others are marginalised over them.
+    alpha, power
+        Global level of the test, and its power at the amplitudes that are called detected.
+    separation
+        Probability that the right one of two effects is chosen at the amplitude at which they are told apart.
+    orders
+        Highest azimuthal order of the fiducial beams in the inverse covariance, the centroids of the samples included;
+        0: circular beams at pixel centres. What an effect changes has all orders in any case.
+    pairs
+        Random probes that are paired with each other; the error of sigma falls about as 1/pairs.
+    filtered_modes
+        Modes of the sky times random probes whose responses are filtered; there are four such probes at least.
+    dense
+        Compute whole matrices, without random probes: the reference for small maps.
+    tolerance
+        Relative residual at which the conjugate gradients end.
+    seed
+        Of the random probes.
+
+    Examples
+    --------
+    >>> import mcsim
+    >>> mcsim.LimitSettings(only=("beam_width",), nuisances={"gain_drift": 1e-4}).pairs
+    64
+    """
+
+    only: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
+    library: Library | None = None
+    nuisances: Mapping[str, float] = field(default_factory=dict)
+    alpha: float = 0.05
+    power: float = 0.9
+    separation: float = 0.95
+    orders: int = 0
+    pairs: int = 64
+    filtered_modes: int = 1 << 14
+    dense: bool = False
+    tolerance: float = 1e-6
+    seed: int = 0
