@@ -33,6 +33,9 @@ Maps = NDArray[np.float64]
 ITERATIONS = 2000
 """After so many the conjugate gradients are given up."""
 
+BRIGHT, BLOCK = 100.0, 32
+"""Power of the sky over that of the noise above which degrees, up to the second, are preconditioned as a block."""
+
 
 @dataclass(frozen=True, eq=False)
 class ObservedMap:
@@ -81,8 +84,11 @@ class InverseCovariance:
     Notes
     -----
     The preconditioner is diagonal in harmonics: 1/(1 + C_l sum_k (B_kl w_kl)^2 / N_k), with 1/N_k the mean precision of
-    the map's pixels over the whole sky, per sr. Equal to a dense solve to 1e-6 with a mask, uneven noise, the orders of
-    the beam and centroids (tests/unit/test_inverse_covariance.py).
+    the map's pixels over the whole sky, per sr; and where pixels are missing, whole for the degrees at which the sky is
+    far above the noise (Eriksen et al. 2004). At nside 128, lmax 384 and S/N = 440 at l = 2, three channels of two halves
+    take 16 iterations for 1e-6 on the full sky, and 166 outside 15 degrees of the equator (586 without the block).
+    Equal to a dense solve to 1e-6 with a mask, uneven noise, the orders of the beam and centroids
+    (tests/unit/test_inverse_covariance.py).
     """
 
     def __init__(
@@ -101,9 +107,10 @@ class InverseCovariance:
             raise InputError("no map has an observed pixel; give a precision above 0 somewhere.")
         self.npix = sizes.pop()
         self.nside = int(np.sqrt(self.npix // 12))
-        self._groups: dict[bytes, list[int]] = {}
+        groups: dict[bytes, list[int]] = {}
         for i, m in enumerate(self.maps):
-            self._groups.setdefault(m.response.factors.tobytes(), []).append(i)
+            groups.setdefault(m.response.factors.tobytes(), []).append(i)
+        self._members = list(groups.values())  # maps of equal responses
         self._root = np.sqrt(cl)
 
     @property
@@ -123,7 +130,7 @@ class InverseCovariance:
     def observe(self, sky: Alm) -> Maps:
         """Return P s, the maps of a sky without noise, uK."""
         found = np.empty((len(self.maps), self.npix))
-        for members in self._groups.values():
+        for members in self._members:
             shared = [self.maps[i] for i in members]
             response = shared[0].response
             circular = convolve.circular_alm(sky, response)
@@ -131,8 +138,8 @@ class InverseCovariance:
             moved = self._moved(members)
             if moved:
                 gradient = healpix.gradient(circular, self.nside, self.lmax, self.nthreads)
-                for i, moments in moved.items():
-                    found[i] += convolve.centroid_map(gradient, moments)
+                for i, own in moved.items():
+                    found[i] += convolve.centroid_map(gradient, own)
             wanted = {s for m in shared for s in m.spins}
             for s in sorted(wanted):
                 only = convolve.Response(np.where(np.arange(s + 1)[:, None] == s, response.factors[: s + 1], 0.0))
@@ -150,7 +157,7 @@ class InverseCovariance:
         """
         total = np.zeros(alm_.size(self.lmax), dtype=np.complex128)
         at = {i: row for row, i in enumerate(range(len(self.maps)) if only is None else only)}
-        for everyone in self._groups.values():
+        for everyone in self._members:
             members = [i for i in everyone if i in at]
             if not members:
                 continue
@@ -196,8 +203,7 @@ class InverseCovariance:
 
         shape = (known.size, known.size)
         matrix = LinearOperator(shape, matvec=apply, dtype=np.float64)
-        diagonal = self._preconditioner
-        near = LinearOperator(shape, matvec=lambda vector: diagonal * vector, dtype=np.float64)
+        near = LinearOperator(shape, matvec=self._precondition, dtype=np.float64)
         found, failed = cg(matrix, known, rtol=self.tolerance, maxiter=ITERATIONS, M=near)
         if failed:
             raise InputError(
@@ -224,9 +230,38 @@ class InverseCovariance:
         return found
 
     @cached_property
-    def _preconditioner(self) -> NDArray[np.float64]:
+    def _gain(self) -> NDArray[np.float64]:
+        """Power of the sky over that of the noise in one mode, if all pixels of a map counted alike; (lmax + 1,)."""
         gain = sum(m.response.factors[0].real ** 2 * m.precision.sum() for m in self.maps) / (4.0 * np.pi)
-        return _spread(1.0 / (1.0 + self.cl * gain), self.lmax)
+        return np.asarray(self.cl * gain)
+
+    @cached_property
+    def _diagonal(self) -> NDArray[np.float64]:
+        return _spread(1.0 / (1.0 + self._gain), self.lmax)
+
+    @cached_property
+    def _largest_scales(self) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+        """Places of low degrees in a packed vector, and the inverse of their part of the matrix; None: not needed."""
+        bright = np.flatnonzero(self._gain > BRIGHT)
+        if bright.size == 0 or all(m.precision.all() for m in self.maps):
+            return None
+        top = min(int(bright[-1]), BLOCK)
+        together = [(self.maps[members[0]].response, self.precision[members].sum(axis=0)) for members in self._members]
+        short = [ObservedMap(convolve.Response(r.factors[:1, : top + 1]), precision) for r, precision in together]
+        low = InverseCovariance(self.cl[: top + 1], short, nthreads=self.nthreads)
+        scale = _spread(low._root, top)
+        columns = [_packed(low.adjoint(low.precision * low.observe(sky)), top) for _, sky in unit_skies(top)]
+        matrix = np.eye(scale.size) + scale[:, None] * np.stack(columns, axis=1) * scale
+        # Both orders of packing are by m, so that degrees up to top keep their order.
+        places = np.flatnonzero(_spread(np.arange(self.lmax + 1), self.lmax) <= top)
+        return places, np.linalg.inv((matrix + matrix.T) / 2.0)
+
+    def _precondition(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
+        found = self._diagonal * vector
+        if self._largest_scales is not None:
+            places, inverse = self._largest_scales
+            found[places] = inverse @ vector[places]
+        return found
 
 
 def unit_skies(lmax: int) -> Iterator[tuple[int, Alm]]:

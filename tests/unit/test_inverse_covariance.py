@@ -44,9 +44,9 @@ def maps_with_everything(rng: np.random.Generator) -> list[ObservedMap]:
     other = replace(moments, w=w.conj(), dtheta=None, dphi=None)
     weights = [rng.uniform(0.2, 5.0, npix) * mask, rng.uniform(0.2, 5.0, npix), rng.uniform(0.1, 2.0, npix) * mask]
     return [
-        ObservedMap(elliptical, weights[0] / 40.0**2, moments),
-        ObservedMap(elliptical, weights[1] / 40.0**2, other),
-        ObservedMap(round_beam, weights[2] / 40.0**2, replace(moments, w=moments.w[:1])),
+        ObservedMap(elliptical, weights[0] / 10.0**2, moments),
+        ObservedMap(elliptical, weights[1] / 10.0**2, other),
+        ObservedMap(round_beam, weights[2] / 10.0**2, replace(moments, w=moments.w[:1])),
     ]
 
 
