@@ -11,16 +11,14 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from mcsim.errors import InputError
 from mcsim.information.derivatives import Derivative
 from mcsim.information.fisher import Information
 from mcsim.simulation.inverse_covariance import InverseCovariance, unit_skies
+from mcsim.support.arrays import Vector
 from mcsim.support.progress import Reporter
-
-Matrix = NDArray[np.float64]
 
 BYTES = 4 << 30
 """Largest memory of the matrices."""
@@ -62,7 +60,7 @@ def dense(filtered: InverseCovariance, derivatives: Sequence[Derivative], report
     changes, solved, noises, means = [], [], [], []
     for number, derivative in enumerate(derivatives):
 
-        def whole(maps: NDArray[np.float64], part: slice = derivative.maps) -> NDArray[np.float64]:
+        def whole(maps: Vector, part: slice = derivative.maps) -> Vector:
             full = np.zeros_like(filtered.precision)
             full[part] = maps
             return full.ravel()[seen]

@@ -15,9 +15,9 @@ from mcsim.simulation import convolve, simulate
 from mcsim.simulation.survey import Channel, Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.sky import dipole_alm
+from mcsim.support.arrays import Alm, Vector
 from mcsim.systematics import Effect
 
-Alm = NDArray[np.complex128]
 Maps = NDArray[np.float64]
 
 DRAWS = 64
@@ -58,7 +58,7 @@ class Derivative:
     plus: Survey
     minus: Survey | None
     width: float
-    factor: NDArray[np.float64] | None
+    factor: Vector | None
     dipole: Alm
     noise: Maps | None
     stochastic: bool

@@ -1,18 +1,19 @@
 r"""Fisher information of maps that share an unknown Gaussian sky, from random probes.
 
-With d = P s + n, C = P S P^t + N, and an effect that changes P by dP, the variance of the noise by dN and the mean by
-dmu, the covariance changes by dC = B C^-1-weighted as follows: for x = C^-1 d and s^ = S P^t x let
+With d = P s + n and C = P S P^t + N, let an effect change P by dP, the variance of the noise by dN and the mean by dmu.
+For x = C^-1 d and s^ = S P^t x let
 
     b_i = dP_i s^ + dN_i x / 2,     so that     d' C^-1 dC_i C^-1 d / 2 = x' b_i.
 
-b_i = B_i x is linear in x and dC_i = B_i + B_i^t, so that with x drawn from data of the model, of covariance C^-1,
+b_i = B_i x is linear in x, and dC_i = B_i + B_i^t. If x and y are made of independent data of the model, their
+covariance is C^-1, and
 
     F_ij = 1/2 Tr[C^-1 dC_i C^-1 dC_j] + dmu_i' C^-1 dmu_j
-         = E[(x'b_i(y)) (y'b_j(x))] + E[b_i(x)' C^-1 b_j(x)] + dmu_i' C^-1 dmu_j
+         = E[(x'b_i(y)) (y'b_j(x))] + E[b_i(x)' C^-1 b_j(x)] + dmu_i' C^-1 dmu_j.
 
-for independent probes x and y. The first mean, over pairs of probes, takes one solution of C^-1 each. The second takes
-one for each effect as well, but is a trace of many modes: few probes are enough. No adjoint of dP is needed, so that
-the simulator itself is the operator.
+The first mean, over pairs of probes, takes one solution of C^-1 for each probe. The second takes one for each effect as
+well, but is a trace of many modes: few probes are enough. No adjoint of dP is needed, so that the simulator itself is
+the operator.
 """
 
 from collections.abc import Sequence
@@ -25,10 +26,10 @@ from mcsim.information.derivatives import Derivative
 from mcsim.simulation.inverse_covariance import InverseCovariance, product
 from mcsim.sphere import rng
 from mcsim.sphere.sky import gaussian_alm
+from mcsim.support.arrays import Alm, Matrix
 from mcsim.support.progress import Reporter
 
 Maps = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 
 PAIRED_BYTES = 1 << 30
 """Memory for probes that are paired with each other; more probes are done in groups."""
@@ -104,7 +105,7 @@ def stochastic(
     return Information(total, np.divide(np.sqrt(variance), size, out=np.zeros(K), where=size > 0.0))
 
 
-def _draw(filtered: InverseCovariance, seed: int, number: int) -> tuple[Maps, NDArray[np.complex128]]:
+def _draw(filtered: InverseCovariance, seed: int, number: int) -> tuple[Maps, Alm]:
     """Return x = C^-1 d and s^ of data that the model makes."""
     sky = gaussian_alm(filtered.cl, rng.generator(seed, number, "information/sky"))
     noise = rng.generator(seed, number, "information/noise").standard_normal(filtered.precision.shape)
@@ -115,7 +116,7 @@ def _draw(filtered: InverseCovariance, seed: int, number: int) -> tuple[Maps, ND
     return filtered.apply(data, found), found
 
 
-def _response(derivative: Derivative, x: Maps, sky: NDArray[np.complex128]) -> Maps:
+def _response(derivative: Derivative, x: Maps, sky: Alm) -> Maps:
     """Return b = dP s^ + dN x / 2 of the derivative's own maps."""
     if derivative.noise is None:
         return derivative.of_sky(sky)

@@ -8,16 +8,14 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from mcsim.diagnosis.candidate import Candidate, columns_of, numbered
 from mcsim.information.fisher import Information
 from mcsim.information.settings import LimitSettings
 from mcsim.stats.detection import snr_needed, snr_to_separate
+from mcsim.support.arrays import Matrix
 from mcsim.support.folders import unwritable, write_whole
 from mcsim.support.numbers import number
-
-Matrix = NDArray[np.float64]
 
 TABLE, STORE = "limit.json", "limit.zarr"
 

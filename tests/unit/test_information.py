@@ -1,5 +1,6 @@
 """Fisher information of maps: against the likelihood itself, closed forms, and random probes against whole matrices."""
 
+import json
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -7,15 +8,18 @@ from typing import Any
 import healpy
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.linalg import cho_factor, cho_solve
+from typer.testing import CliRunner
 
 import mcsim
 from mcsim import config
 from mcsim.bipolar import estimate, estimator
 from mcsim.bipolar.theory import fisher_information
+from mcsim.cli import app
 from mcsim.diagnosis.campaign import with_effects
-from mcsim.information.api import describe
-from mcsim.information.result import canonical_correlations, marginalised
+from mcsim.information.api import describe, widths
+from mcsim.information.result import Limits, canonical_correlations, marginalised
 from mcsim.simulation import simulate
 from mcsim.simulation.inverse_covariance import unit_skies
 from mcsim.simulation.survey import survey
@@ -69,7 +73,7 @@ COMPARED = ("beam_ellipticity", "dipole_modulation", "dipole_residual", "gain_dr
 
 
 @cache
-def limits(dense: bool) -> mcsim.limit:
+def limits(dense: bool) -> Limits:
     return mcsim.limit(model(), settings=mcsim.LimitSettings(only=COMPARED, dense=dense, orders=2, filtered_modes=600))
 
 
@@ -139,6 +143,7 @@ def test_dense_matrix_is_the_curvature_of_the_likelihood() -> None:
         assert (curvature(a, b) - 2.0) / 2.0 == pytest.approx(rho, abs=4e-3), (a, b)
 
 
+@pytest.mark.slow
 def test_random_probes_agree_with_whole_matrices() -> None:
     exact, drawn = limits(dense=True), limits(dense=False)
     assert exact.components == drawn.components
@@ -220,7 +225,7 @@ def test_power_of_random_sources_is_that_of_their_spectrum() -> None:
 
 
 def test_orders_of_the_fiducial_beams_change_little() -> None:
-    """The inverse covariance of circular beams in place of the elliptical ones: sigma within 1 %."""
+    """The inverse covariance of circular beams in place of the elliptical ones: sigma within 2 %."""
     exact = limits(dense=True)
     settings = mcsim.LimitSettings(only=COMPARED, dense=True)
     circular = mcsim.limit(model(), settings=settings)
@@ -258,11 +263,7 @@ def test_nuisance_widens_what_it_resembles_and_conventions_are_textbook() -> Non
     assert noise.amplitude_90 / noise.sigma > 4.2
 
 
-def test_limits_are_written_and_say_what_they_are(tmp_path, monkeypatch) -> None:
-    import json
-
-    import xarray as xr
-
+def test_limits_are_written_and_say_what_they_are(tmp_path) -> None:
     found = mcsim.limit(model(), tmp_path / "out", settings=mcsim.LimitSettings(only=("noise_level",), dense=True))
     written = json.loads((tmp_path / "out" / "limit.json").read_text())
     assert written["effects"][0]["sigma"] == found.effects[0].sigma
@@ -274,7 +275,16 @@ def test_limits_are_written_and_say_what_they_are(tmp_path, monkeypatch) -> None
     assert "noise_level" not in describe(model(), mcsim.LimitSettings())
 
 
-def test_bad_input_is_refused(tmp_path) -> None:
+def test_command_says_what_it_would_cost_and_reads_nuisances() -> None:
+    said = CliRunner().invoke(app, ["limit", "demo-model", "--dry-run", "--dense", "--only", "noise_level"])
+    assert said.exit_code == 0
+    assert said.output.startswith("demo-model: 2 effects of 2 components, 4 maps")
+    assert widths(["beam_width=0.01", "gain_drift:W1=1e-4"]) == {"beam_width": 0.01, "gain_drift:W1": 1e-4}
+    with refused("beam_width"):
+        widths(["beam_width"])
+
+
+def test_bad_input_is_refused() -> None:
     quiet = model(channel=[{**channel("V1", "A", (1150.0, 900.0), 0.0)}])
     with refused("V1:half1", "noise.sigma0_uk"):
         mcsim.limit(quiet)

@@ -36,18 +36,17 @@ def main() -> None:
     print(f"{null.dimension} independent elements, {null.n_sims} simulations; {limits.tests} effects")
     print("| effect | sigma of the maps | error | sigma of the data vector | ratio | amplitude_90 ratio |")
     print("|---|---|---|---|---|---|")
+    rng = np.random.default_rng(0)
     for candidate, limit in zip(known.candidates, limits.effects, strict=True):
         assert candidate.label == limit.label
         columns = list(candidate.columns)
-        white = null.whiten_templates(model.templates[:, columns])
-        noise = null.whitening @ (known.bank.error[:, columns] * np.random.default_rng(0).standard_normal((len(model.templates), len(columns))))
-        size = null.hartlap_factor * (np.sum(white**2) - np.sum(noise**2)) / len(columns)
+        t, error = model.templates[:, columns], known.bank.error[:, columns]
+        noise = null.whitening @ (error * rng.standard_normal(error.shape))
+        size = null.hartlap_factor * (np.sum(null.whiten_templates(t) ** 2) - np.sum(noise**2)) / len(columns)
         sigma = 1.0 / np.sqrt(size) if size > 0.0 else np.inf
-        found = detectable(null, model.templates[:, columns], len(known.candidates))
-        print(
-            f"| {limit.label} | {limit.sigma:.3g} | {100 * limit.error:.1f} % | {sigma:.3g} | {limit.sigma / sigma:.2f} "
-            f"| {limit.amplitude_90 / found:.2f} |"
-        )
+        found = detectable(null, t, len(known.candidates))
+        ratios = f"{limit.sigma / sigma:.2f} | {limit.amplitude_90 / found:.2f}"
+        print(f"| {limit.label} | {limit.sigma:.3g} | {100 * limit.error:.1f} % | {sigma:.3g} | {ratios} |")
 
 
 if __name__ == "__main__":
