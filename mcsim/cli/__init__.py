@@ -178,6 +178,7 @@ def limit(
     nuisance: Annotated[
         list[str] | None, Option(metavar="EFFECT[:CHANNEL]=WIDTH", help="Unknown within this prior; repeatable.")
     ] = None,
+    unknown_dipole_uk: Annotated[float, Option(help="Rms of a monopole and dipole of which nothing is known.")] = 0.0,
     pairs: Annotated[int, Option(min=2, help="Random probes.")] = 64,
     orders: Annotated[int, Option(min=0, help="Orders of the fiducial beams in the inverse covariance.")] = 0,
     dense: Annotated[bool, Option("--dense", help="Whole matrices, for small maps.")] = False,
@@ -194,6 +195,7 @@ def limit(
         only=tuple(only or ()),
         without=tuple(without or ()),
         nuisances=widths(nuisance or ()),
+        unknown_dipole_uk=unknown_dipole_uk,
         pairs=pairs,
         orders=orders,
         dense=dense,

@@ -103,6 +103,8 @@ def limit(
     analysis, candidates = _candidates(run, settings, nthreads)
     filtered = inverse_covariance(analysis, settings, nthreads)
     total = sum(len(candidate.columns) for candidate in candidates)
+    cl = analysis.model.survey.cl
+    assert cl is not None  # a model of the analysis has one
     with reporting("derivatives of the maps", total, "components", quiet) as report:
         changes = []
         for number, derivative in enumerate(derivatives(analysis, candidates, nthreads), 1):
@@ -110,13 +112,13 @@ def limit(
             report(number)
     if settings.dense:
         with reporting("whole matrices", total, "components", quiet) as report:
-            information: Information = dense(filtered, changes, report)
+            information: Information = dense(filtered, changes, cl, report)
         method = "From whole matrices"
     else:
         probes = probes_for(settings, filtered.lmax)
         steps = (probes.pairs + min(probes.pairs, probes.filtered)) * total
         with reporting("random probes", steps, "responses", quiet) as report:
-            information = stochastic(filtered, changes, probes, report)
+            information = stochastic(filtered, changes, cl, probes, report)
         method = f"From {probes.pairs} random probes, {min(probes.pairs, probes.filtered)} of them filtered"
     tests = sum(not _is_nuisance(candidate, settings) for candidate in analysis.candidates)
     found = limits_of(candidates, information, tests, method, run.name, settings)
@@ -192,7 +194,9 @@ def inverse_covariance(analysis: Analysis, settings: LimitSettings, nthreads: in
             precision = np.divide(1.0, m.noise_uk**2, out=np.zeros(seen.size), where=seen)
             maps.append(ObservedMap(response, precision, m.moments if settings.orders else None))
     assert shared.cl is not None  # a model of the analysis has one
-    return InverseCovariance(shared.cl, maps, settings.tolerance, nthreads)
+    cl = shared.cl.copy()
+    cl[:2] += 4.0 * np.pi * settings.unknown_dipole_uk**2 / np.array([1.0, 3.0])
+    return InverseCovariance(cl, maps, settings.tolerance, nthreads)
 
 
 def _candidates(
@@ -205,6 +209,8 @@ def _candidates(
         )
     if settings.pairs < 2:
         raise InputError(f"pairs = {settings.pairs} makes no pair of random probes; give 2 or more.")
+    if not 0.0 <= settings.unknown_dipole_uk < np.inf:
+        raise InputError(f"unknown_dipole_uk = {settings.unknown_dipole_uk:g} is no rms; give 0 or more.")
     if settings.orders < 0:
         raise InputError(f"orders = {settings.orders} is no azimuthal order; give 0 or more.")
     library = systematics.catalogue() if settings.library is None else systematics.checked(settings.library)

@@ -17,7 +17,7 @@ from mcsim.errors import InputError
 from mcsim.information.derivatives import Derivative
 from mcsim.information.fisher import Information
 from mcsim.simulation.inverse_covariance import InverseCovariance, unit_skies
-from mcsim.support.arrays import Vector
+from mcsim.support.arrays import Cl, Vector
 from mcsim.support.progress import Reporter
 
 BYTES = 4 << 30
@@ -38,10 +38,11 @@ def size_of(filtered: InverseCovariance, columns: int) -> Size:
     return Size(pixels, modes, 8 * (3 * pixels**2 + (2 * columns + 2) * pixels * modes))
 
 
-def dense(filtered: InverseCovariance, derivatives: Sequence[Derivative], report: Reporter) -> Information:
+def dense(filtered: InverseCovariance, derivatives: Sequence[Derivative], cl: Cl, report: Reporter) -> Information:
     """Return the Fisher information; raise InputError if the matrices do not fit :data:`BYTES`.
 
-    ``report`` counts the derivatives.
+    ``cl`` is the spectrum of the sky that effects act on, uK^2, shape (lmax + 1,), at most that of the inverse
+    covariance; ``report`` counts the derivatives.
     """
     size = size_of(filtered, len(derivatives))
     if size.bytes > BYTES:
@@ -50,9 +51,11 @@ def dense(filtered: InverseCovariance, derivatives: Sequence[Derivative], report
             f"take {size.bytes / 1e9:.3g} GB, more than {BYTES / 1e9:.3g} GB; take fewer effects, or random probes."
         )
     seen = filtered.precision.ravel() > 0.0
-    skies = [np.sqrt(filtered.cl[ell]) * sky for ell, sky in unit_skies(filtered.lmax)]
-    V0 = np.stack([filtered.observe(sky).ravel()[seen] for sky in skies], axis=1)
-    covariance = V0 @ V0.T
+    degrees, units = zip(*unit_skies(filtered.lmax), strict=True)
+    skies = [np.sqrt(cl[ell]) * sky for ell, sky in zip(degrees, units, strict=True)]
+    response = np.stack([filtered.observe(sky).ravel()[seen] for sky in units], axis=1)
+    V0 = response * np.sqrt(cl[list(degrees)])
+    covariance = (response * filtered.cl[list(degrees)]) @ response.T
     covariance[np.diag_indices_from(covariance)] += 1.0 / filtered.precision.ravel()[seen]
     factor = cho_factor(covariance, lower=True)
     Z0 = cho_solve(factor, V0)

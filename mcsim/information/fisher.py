@@ -24,9 +24,10 @@ from numpy.typing import NDArray
 
 from mcsim.information.derivatives import Derivative
 from mcsim.simulation.inverse_covariance import InverseCovariance, product
+from mcsim.sphere import alm as alm_
 from mcsim.sphere import rng
 from mcsim.sphere.sky import gaussian_alm
-from mcsim.support.arrays import Alm, Matrix
+from mcsim.support.arrays import Alm, Cl, Matrix
 from mcsim.support.progress import Reporter
 
 Maps = NDArray[np.float64]
@@ -58,9 +59,12 @@ def group_of(probes: Probes, filtered: InverseCovariance) -> int:
 
 
 def stochastic(
-    filtered: InverseCovariance, derivatives: Sequence[Derivative], probes: Probes, report: Reporter
+    filtered: InverseCovariance, derivatives: Sequence[Derivative], cl: Cl, probes: Probes, report: Reporter
 ) -> Information:
     """Estimate the Fisher information by random probes; ``report`` counts the applications of a derivative or of C^-1.
+
+    ``cl`` is the spectrum of the sky that effects act on, uK^2, shape (lmax + 1,), at most that of the inverse
+    covariance.
 
     Notes
     -----
@@ -73,7 +77,7 @@ def stochastic(
         members = range(first, min(first + group, probes.pairs))
         if len(members) < 2:
             break
-        drawn = [_draw(filtered, probes.seed, number) for number in members]
+        drawn = [_draw(filtered, cl, probes.seed, number) for number in members]
         table = np.zeros((K, len(members), len(members)))  # x_k . b_i(x_l)
         for column, (x, sky) in enumerate(drawn):
             number = members[column]
@@ -105,15 +109,16 @@ def stochastic(
     return Information(total, np.divide(np.sqrt(variance), size, out=np.zeros(K), where=size > 0.0))
 
 
-def _draw(filtered: InverseCovariance, seed: int, number: int) -> tuple[Maps, Alm]:
-    """Return x = C^-1 d and s^ of data that the model makes."""
+def _draw(filtered: InverseCovariance, cl: Cl, seed: int, number: int) -> tuple[Maps, Alm]:
+    """Return x = C^-1 d of data that the model makes, and s^ of the sky of spectrum ``cl``."""
     sky = gaussian_alm(filtered.cl, rng.generator(seed, number, "information/sky"))
     noise = rng.generator(seed, number, "information/noise").standard_normal(filtered.precision.shape)
     seen = filtered.precision > 0.0
     scale = np.divide(1.0, np.sqrt(filtered.precision), out=np.zeros_like(noise), where=seen)
     data = np.where(seen, filtered.observe(sky) + scale * noise, 0.0)
     found = filtered.wiener(data)
-    return filtered.apply(data, found), found
+    share = np.divide(cl, filtered.cl, out=np.zeros_like(cl), where=filtered.cl > 0.0)
+    return filtered.apply(data, found), alm_.multiply(found, share, filtered.lmax)
 
 
 def _response(derivative: Derivative, x: Maps, sky: Alm) -> Maps:

@@ -22,6 +22,10 @@ class LimitSettings:
         Width of the Gaussian prior, in the effect's unit, of every coordinate of effects that are unknown but not
         looked for: ``{"beam_width": 0.01}`` in every channel, ``{"beam_width:W1": 0.01}`` in one. The limits of the
         others are marginalised over them.
+    unknown_dipole_uk
+        Rms over the sky, in uK, of a monopole and of a dipole that all maps share and of which nothing is known; 0: the
+        model's spectrum says all of the sky. A model without power there knows them, but for noise, and so knows what
+        modulations make of a quadrupole.
     alpha, power
         Global level of the test, and its power at the amplitudes that are called detected.
     separation
@@ -36,7 +40,8 @@ class LimitSettings:
     dense
         Compute whole matrices, without random probes: the reference for small maps.
     tolerance
-        Relative residual at which the conjugate gradients end; 1e-4 moves sigma by 1e-4 of itself.
+        Relative residual at which the conjugate gradients end. What the sky is above the noise, squared, multiplies it
+        in the largest scales, so that 1e-4 is too much there.
     seed
         Of the random probes.
 
@@ -51,6 +56,7 @@ class LimitSettings:
     without: tuple[str, ...] = ()
     library: Library | None = None
     nuisances: Mapping[str, float] = field(default_factory=dict)
+    unknown_dipole_uk: float = 0.0
     alpha: float = 0.05
     power: float = 0.9
     separation: float = 0.95
@@ -58,5 +64,5 @@ class LimitSettings:
     pairs: int = 64
     filtered_modes: int = 1 << 14
     dense: bool = False
-    tolerance: float = 1e-4
+    tolerance: float = 1e-8
     seed: int = 0

@@ -212,6 +212,19 @@ def test_additive_effect_has_its_signal_to_noise() -> None:
     assert found.effects[0].sigma == pytest.approx(1.0 / np.sqrt(found.fisher[2, 2]), rel=1e-3)
 
 
+@pytest.mark.parametrize("dense", [True, False])
+def test_unknown_dipole_hides_one_that_all_maps_share(dense) -> None:
+    """The variance of a residual dipole is that of the noise and that of the sky's: d.n of rms d has it d^2."""
+    run = one_map()
+    settings = mcsim.LimitSettings(only=("dipole_residual",), dense=dense, pairs=4)
+    known = mcsim.limit(run, settings=settings)
+    found = mcsim.limit(run, settings=replace(settings, unknown_dipole_uk=5.0))
+    assert found.effects[0].sigma ** 2 == pytest.approx(known.effects[0].sigma ** 2 + 25.0, rel=1e-3)
+    modulated = replace(settings, only=("dipole_modulation",), dense=True)
+    known, found = (mcsim.limit(run, settings=replace(modulated, unknown_dipole_uk=rms)) for rms in (0.0, 1e3))
+    assert found.effects[0].sigma > 1.1 * known.effects[0].sigma
+
+
 def test_power_of_random_sources_is_that_of_their_spectrum() -> None:
     """F = sum (2l + 1)/2 (B_l^2 / C_l)^2 over l >= 2 for a flat spectrum, by draws that are 64 for each mode."""
     run = one_map()

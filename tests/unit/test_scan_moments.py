@@ -193,6 +193,7 @@ def test_fits_round_trip(tmp_path):
     for name in ("hits", "w", "dtheta", "dphi"):
         np.testing.assert_array_equal(getattr(back, name), getattr(moments, name))
     assert read_moments(path, smax=2).smax == 2
+    assert read_moments(path, smax=0).w.shape == (0, 12 * NSIDE**2)  # a circular beam needs none
 
 
 def test_fits_as_healpy_writes_it(tmp_path):

@@ -25,9 +25,11 @@ def main() -> None:
     parser.add_argument("model")
     parser.add_argument("-o", "--output", type=Path, default=None, help="folder for limit.json and its picture")
     parser.add_argument("--pairs", type=int, default=128)
+    parser.add_argument("--unknown-dipole-uk", type=float, default=0.0)
     arguments = parser.parse_args()
     run = config.load(arguments.model)
-    limits = mcsim.limit(run, arguments.output, settings=mcsim.LimitSettings(pairs=arguments.pairs), quiet=False)
+    chosen = mcsim.LimitSettings(pairs=arguments.pairs, unknown_dipole_uk=arguments.unknown_dipole_uk)
+    limits = mcsim.limit(run, arguments.output, settings=chosen, quiet=False)
     settings = Settings(run)
     with workers_of(settings, None, quiet=False):
         pass
