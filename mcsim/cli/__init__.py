@@ -179,7 +179,7 @@ def limit(
         list[str] | None, Option(metavar="EFFECT[:CHANNEL]=WIDTH", help="Unknown within this prior; repeatable.")
     ] = None,
     unknown_dipole_uk: Annotated[float, Option(help="Rms of a monopole and dipole of which nothing is known.")] = 0.0,
-    pairs: Annotated[int, Option(min=2, help="Random probes.")] = 64,
+    probes: Annotated[int, Option(min=3, help="Random probes.")] = 64,
     orders: Annotated[int, Option(min=0, help="Orders of the fiducial beams in the inverse covariance.")] = 0,
     dense: Annotated[bool, Option("--dense", help="Whole matrices, for small maps.")] = False,
     dry_run: Annotated[bool, Option("--dry-run", help="Say memory and time; compute nothing.")] = False,
@@ -196,7 +196,7 @@ def limit(
         without=tuple(without or ()),
         nuisances=widths(nuisance or ()),
         unknown_dipole_uk=unknown_dipole_uk,
-        pairs=pairs,
+        probes=probes,
         orders=orders,
         dense=dense,
     )

@@ -25,9 +25,6 @@ from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap
 from mcsim.support import folders
 from mcsim.support.progress import reporting
 
-FEWEST = 4
-"""Probes whose responses are filtered, at least."""
-
 PICTURE = "limit.png"
 
 RESPONSE = 3.0
@@ -107,7 +104,7 @@ def limit(
     assert cl is not None  # a model of the analysis has one
     with reporting("derivatives of the maps", total, "components", quiet) as report:
         changes = []
-        for number, derivative in enumerate(derivatives(analysis, candidates, nthreads), 1):
+        for number, derivative in enumerate(derivatives(analysis, candidates, filtered.observe, nthreads), 1):
             changes.append(derivative)
             report(number)
     if settings.dense:
@@ -115,11 +112,10 @@ def limit(
             information: Information = dense(filtered, changes, cl, report)
         method = "From whole matrices"
     else:
-        probes = probes_for(settings, filtered.lmax)
-        steps = (probes.pairs + min(probes.pairs, probes.filtered)) * total
+        steps = settings.probes * total
         with reporting("random probes", steps, "responses", quiet) as report:
-            information = stochastic(filtered, changes, cl, probes, report)
-        method = f"From {probes.pairs} random probes, {min(probes.pairs, probes.filtered)} of them filtered"
+            information = stochastic(filtered, changes, cl, Probes(settings.probes, settings.seed), report)
+        method = f"From {settings.probes} random probes"
     tests = sum(not _is_nuisance(candidate, settings) for candidate in analysis.candidates)
     found = limits_of(candidates, information, tests, method, run.name, settings)
     if output is not None:
@@ -137,21 +133,21 @@ def describe(run: config.RunConfig, settings: LimitSettings) -> str:
     if settings.dense:
         size = size_of(filtered, columns)
         return f"{head}\n  memory  {size.bytes / 1e9:.3g} GB for {size.pixels} pixels and {size.modes} modes of the sky"
-    probes = probes_for(settings, filtered.lmax)
-    memory = 8.0 * filtered.precision.size * (group_of(probes, filtered) + 2 * columns)
+    probes = Probes(settings.probes)
+    memory = 8.0 * filtered.precision.size * (group_of(probes, filtered) + 4 * columns)
     start = time.perf_counter()
     filtered.wiener(filtered.observe(np.ones(filtered.size, dtype=complex)))
     solved_s = time.perf_counter() - start
     start = time.perf_counter()
     filtered.observe(np.ones(filtered.size, dtype=complex))
     made_s = time.perf_counter() - start
-    solutions = probes.pairs + (probes.filtered + 1) * columns
-    total_s = solutions * solved_s + RESPONSE * made_s * columns * probes.pairs
+    solutions = probes.number + columns
+    total_s = solutions * solved_s + RESPONSE * made_s * columns * probes.number
     return "\n".join(
         [
             head,
-            f"  probes  {probes.pairs}, {probes.filtered} of them filtered: {columns * probes.pairs} responses, "
-            f"{solutions} solutions of the inverse covariance of {solved_s:.3g} s each",
+            f"  probes  {probes.number}: {columns * probes.number} responses, {solutions} solutions of the inverse "
+            f"covariance of {solved_s:.3g} s each",
             f"  memory  {memory / 1e9:.2f} GB",
             f"  time    about {total_s / 60.0:.3g} minutes with {nthreads} threads",
         ]
@@ -168,12 +164,6 @@ def widths(given: Iterable[str]) -> dict[str, float]:
         except ValueError:
             raise InputError(f"nuisance {text!r} says no width; give EFFECT=WIDTH, as in beam_width=0.01.") from None
     return found
-
-
-def probes_for(settings: LimitSettings, lmax: int) -> Probes:
-    """Return the numbers of random probes."""
-    filtered = max(FEWEST, -(-settings.filtered_modes // (lmax + 1) ** 2))
-    return Probes(settings.pairs, min(filtered, settings.pairs), settings.seed)
 
 
 def inverse_covariance(analysis: Analysis, settings: LimitSettings, nthreads: int = 1) -> InverseCovariance:
@@ -207,8 +197,8 @@ def _candidates(
         raise InputError(
             "the limit is that of maps as they are made, but the run prepares its maps; leave [[preparation]] out."
         )
-    if settings.pairs < 2:
-        raise InputError(f"pairs = {settings.pairs} makes no pair of random probes; give 2 or more.")
+    if settings.probes < 3:
+        raise InputError(f"probes = {settings.probes} are too few to tell an error; give 3 or more.")
     if not 0.0 <= settings.unknown_dipole_uk < np.inf:
         raise InputError(f"unknown_dipole_uk = {settings.unknown_dipole_uk:g} is no rms; give 0 or more.")
     if settings.orders < 0:

@@ -1,6 +1,6 @@
 """Derivatives of a survey's maps with respect to effects: of the response to the sky, of the mean, of the noise."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -19,6 +19,8 @@ from mcsim.support.arrays import Alm, Vector
 from mcsim.systematics import Effect
 
 Maps = NDArray[np.float64]
+Observe = Callable[[Alm], Maps]
+"""Return the maps of all channels, shape (map, npix), of a sky."""
 
 DRAWS = 64
 """Realizations that the mean of an effect of random shape is estimated from, in two halves."""
@@ -29,8 +31,7 @@ STEP = 0.1
 NEGLIGIBLE = 1e-12
 """Orders whose derivative is below this share of the largest are rounding."""
 
-_BEYOND_RESPONSE = ("sky", "gain", "noise", "spread", "orientations", "differencing")
-"""Hooks that change more than the response to the sky."""
+_HOOKS = ("sky", "beam", "pointing", "gain", "noise", "spread", "orientations", "differencing")
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +45,9 @@ class Derivative:
     plus, minus, width
         Surveys of these maps alone, without noise, and the difference of the coordinate between them;
         ``minus`` None: ``plus`` is linear in the sky and is the derivative itself.
+    observe
+        Maps of all channels from a sky, for an effect on the sky alone: the response of the inverse covariance, of
+        which what such an effect changes must be no more and no less; None: the simulator's.
     factor
         What the sky is multiplied with at first, shape (lmax + 1,); None: nothing.
     dipole
@@ -58,6 +62,7 @@ class Derivative:
     plus: Survey
     minus: Survey | None
     width: float
+    observe: Observe | None
     factor: Vector | None
     dipole: Alm
     noise: Maps | None
@@ -88,10 +93,32 @@ class Derivative:
     def _changes(self, sky: Alm, realization: int = 0, with_dipole: bool = False) -> Maps:
         lmax = self.plus.config.sky.lmax
         seen = sky if self.factor is None else alm_.multiply(sky, self.factor, lmax)
+        if self.observe is not None:
+            return self._through(self.observe, seen, realization)
         found = _maps(self.plus, seen, realization, with_dipole)
         if self.minus is None:
             return found
         return np.asarray((found - _maps(self.minus, seen, realization, with_dipole)) / self.width)
+
+    def _through(self, observe: Observe, sky: Alm, realization: int) -> Maps:
+        """Return what changes in the maps if the sky alone does; channels that see the same share the transforms."""
+        found: list[Maps] = []
+        last, maps, first = None, np.zeros((0, 0)), self.maps.start
+        for number, channel in enumerate(self.plus.channels):
+            change = sky
+            if self.minus is not None:
+                other = self.minus.channels[number]
+                upper, lower = (_looked_at(one, sky, realization) for one in (channel, other))
+                change = (upper - lower) / self.width
+            if last is None or not np.array_equal(change, last):
+                last, maps = change, observe(change)
+            found.append(maps[first : first + len(channel.maps)])
+            first += len(channel.maps)
+        return np.concatenate(found)
+
+
+def _looked_at(channel: Channel, sky: Alm, realization: int) -> Alm:
+    return systematics.looked_at(channel.effects, sky, channel.site, 0, realization)
 
 
 def _maps(shared: Survey, sky: Alm, realization: int, with_dipole: bool) -> Maps:
@@ -104,18 +131,21 @@ def _without_dipole(channel: Channel) -> Channel:
     return replace(channel, site=replace(channel.site, dipole_uk=np.zeros(3)))
 
 
-def derivatives(analysis: Analysis, candidates: Sequence[Candidate], nthreads: int = 1) -> Iterator[Derivative]:
+def derivatives(
+    analysis: Analysis, candidates: Sequence[Candidate], observe: Observe, nthreads: int = 1
+) -> Iterator[Derivative]:
     """Yield the derivative with respect to every coordinate of candidates, in the order of their columns.
 
-    The effects are those of the simulator, what a run with ``[[effect]]`` makes at plus and minus a small amplitude.
+    ``observe`` is the response of the inverse covariance. The effects are those of the simulator, what a run with
+    ``[[effect]]`` makes at plus and minus a small amplitude.
     """
-    fiducial = analysis.model.survey
     for candidate in candidates:
         for basis in candidate.basis:
-            yield _derivative(analysis, fiducial, candidate, basis.scaled(STEP), nthreads)
+            yield _derivative(analysis, candidate, basis.scaled(STEP), observe, nthreads)
 
 
-def _derivative(analysis: Analysis, fiducial: Survey, candidate: Candidate, basis: Effect, nthreads: int) -> Derivative:
+def _derivative(analysis: Analysis, candidate: Candidate, basis: Effect, observe: Observe, nthreads: int) -> Derivative:
+    fiducial = analysis.model.survey
     run, kind = fiducial.config, type(basis)
     own, first = [], 0
     for channel in fiducial.channels:
@@ -143,11 +173,13 @@ def _derivative(analysis: Analysis, fiducial: Survey, candidate: Candidate, basi
         # What is drawn is a Gaussian sky of its own with a power proportional to the amplitude.
         factor = _power_factor(fiducial, replace(basis, amplitude=abs(basis.amplitude)), fit.coordinates(basis))
         own_survey = _quiet(survey(only, nthreads=nthreads, library=known))
-        return Derivative(maps, own_survey, None, 1.0, factor, np.zeros_like(dipole), noise, True)
-    if not run.effects and all(getattr(kind, name) is getattr(Effect, name) for name in _BEYOND_RESPONSE):
+        return Derivative(maps, own_survey, None, 1.0, observe, factor, np.zeros_like(dipole), noise, True)
+    changed = [name for name in _HOOKS if getattr(kind, name) is not getattr(Effect, name)]
+    if not run.effects and not set(changed) - {"beam", "pointing"}:
         channels = tuple(_difference(a, b, width) for a, b in zip(plus.channels, minus.channels, strict=True))
-        return Derivative(maps, replace(plus, channels=channels), None, 1.0, None, dipole, noise, False)
-    return Derivative(maps, plus, minus, width, None, dipole, noise, fit.stochastic)
+        return Derivative(maps, replace(plus, channels=channels), None, 1.0, None, None, dipole, noise, False)
+    through = observe if changed == ["sky"] and not fit.stochastic else None
+    return Derivative(maps, plus, minus, width, through, None, dipole, noise, fit.stochastic)
 
 
 def _quiet(shared: Survey) -> Survey:

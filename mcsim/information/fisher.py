@@ -8,12 +8,11 @@ For x = C^-1 d and s^ = S P^t x let
 b_i = B_i x is linear in x, and dC_i = B_i + B_i^t. If x and y are made of independent data of the model, their
 covariance is C^-1, and
 
-    F_ij = 1/2 Tr[C^-1 dC_i C^-1 dC_j] + dmu_i' C^-1 dmu_j
-         = E[(x'b_i(y)) (y'b_j(x))] + E[b_i(x)' C^-1 b_j(x)] + dmu_i' C^-1 dmu_j.
+    1/2 Tr[C^-1 dC_i C^-1 dC_j] = 1/2 E[(x'b_i(y) + y'b_i(x)) (x'b_j(y) + y'b_j(x))],
 
-The first mean, over pairs of probes, takes one solution of C^-1 for each probe. The second takes one for each effect as
-well, but is a trace of many modes: few probes are enough. No adjoint of dP is needed, so that the simulator itself is
-the operator.
+for x'b_i(y) + y'b_i(x) = x' dC_i y. All pairs of a set of probes are averaged: one solution of C^-1 for each, and the
+error falls as one over their number. No adjoint of dP is needed, so that the simulator itself is the operator. To this
+dmu_i' C^-1 dmu_j is added, without probes.
 """
 
 from collections.abc import Sequence
@@ -46,67 +45,53 @@ class Information:
 
 @dataclass(frozen=True)
 class Probes:
-    """Say how many random probes are drawn: of pairs, and of those whose responses are filtered as well; and a seed."""
+    """Say how many random probes are drawn, and with which seed."""
 
-    pairs: int
-    filtered: int
+    number: int
     seed: int = 0
 
 
 def group_of(probes: Probes, filtered: InverseCovariance) -> int:
     """Return how many probes are paired with each other at once."""
-    return max(2, min(probes.pairs, PAIRED_BYTES // (8 * filtered.precision.size)))
+    return max(3, min(probes.number, PAIRED_BYTES // (8 * filtered.precision.size)))
 
 
 def stochastic(
     filtered: InverseCovariance, derivatives: Sequence[Derivative], cl: Cl, probes: Probes, report: Reporter
 ) -> Information:
-    """Estimate the Fisher information by random probes; ``report`` counts the applications of a derivative or of C^-1.
+    """Estimate the Fisher information by random probes; ``report`` counts the applications of a derivative.
 
     ``cl`` is the spectrum of the sky that effects act on, uK^2, shape (lmax + 1,), at most that of the inverse
     covariance.
 
     Notes
     -----
-    The relative error of the diagonal is that of both means together, by jackknife over the probes: about 1/pairs for a
-    single mode of each, whatever the size of the maps.
+    The relative error of the diagonal is by jackknife over the probes; it is about 2/number.
     """
     K, group, done = len(derivatives), group_of(probes, filtered), 0.0
-    crossed, jackknife, each = [], [], []
-    for first in range(0, probes.pairs, group):
-        members = range(first, min(first + group, probes.pairs))
-        if len(members) < 2:
+    found: list[Matrix] = []
+    variance = []
+    for first in range(0, probes.number, group):
+        members = range(first, min(first + group, probes.number))
+        if len(members) < 3 and found:
             break
         drawn = [_draw(filtered, cl, probes.seed, number) for number in members]
         table = np.zeros((K, len(members), len(members)))  # x_k . b_i(x_l)
         for column, (x, sky) in enumerate(drawn):
-            number = members[column]
-            responses = []
             for row, derivative in enumerate(derivatives):
-                found = _response(derivative, x, sky)
-                table[row, :, column] = [np.vdot(other[derivative.maps], found) for other, _ in drawn]
-                if number < probes.filtered:
-                    responses.append(found)
+                response = _response(derivative, x, sky)
+                table[row, :, column] = [np.vdot(other[derivative.maps], response) for other, _ in drawn]
                 done += 1.0
                 report(done)
-            if responses:
-                each.append(_filtered_products(filtered, derivatives, responses, responses))
-                done += K
-                report(done)
-        pairs = len(members) * (len(members) - 1)
-        inside = np.einsum("ikk->ik", table)
-        swapped = np.swapaxes(table, 1, 2)
-        crossed.append((np.einsum("ikl,jkl->ij", table, swapped) - inside @ inside.T) / pairs)
-        jackknife.append(_left_out(table * swapped))
-    T1, T2 = np.mean(crossed, axis=0), np.mean(each, axis=0)
+        both = (table + np.swapaxes(table, 1, 2)) * (1.0 - np.eye(len(members)))
+        flat = both.reshape(K, -1)
+        found.append(0.5 * flat @ flat.T / (len(members) * (len(members) - 1)))
+        variance.append(_left_out(0.5 * both**2))
     first_half, second_half = zip(*(derivative.mean for derivative in derivatives), strict=True)
-    total = T1 + T2 + _filtered_products(filtered, derivatives, first_half, second_half)
-    total = (total + total.T) / 2.0
-    diagonal = np.einsum("nii->ni", np.array(each))
-    variance = np.mean(jackknife, axis=0) / len(jackknife)
-    variance = variance + diagonal.var(axis=0, ddof=1) / len(diagonal)
+    total = np.mean(found, axis=0) + _filtered_products(filtered, derivatives, first_half, second_half)
     size = np.diag(total)
-    return Information(total, np.divide(np.sqrt(variance), size, out=np.zeros(K), where=size > 0.0))
+    error = np.sqrt(np.mean(variance, axis=0) / len(variance))
+    return Information((total + total.T) / 2.0, np.divide(error, size, out=np.zeros(K), where=size > 0.0))
 
 
 def _draw(filtered: InverseCovariance, cl: Cl, seed: int, number: int) -> tuple[Maps, Alm]:
@@ -133,10 +118,9 @@ def _filtered_products(
 ) -> Matrix:
     """Return a_i' C^-1 b_j = a_i' N^-1 b_j - (P^t N^-1 a_i)' (S^-1 + P^t N^-1 P)^-1 (P^t N^-1 b_j)."""
     own = [derivative.maps for derivative in derivatives]
-    same = left is right
     found = np.zeros((len(own), len(own)))
     seen = [filtered.of_own(maps, part) for maps, part in zip(left, own, strict=True)]
-    others = seen if same else [filtered.of_own(maps, part) for maps, part in zip(right, own, strict=True)]
+    others = [filtered.of_own(maps, part) for maps, part in zip(right, own, strict=True)]
     for j, (maps, part) in enumerate(zip(right, own, strict=True)):
         if not maps.any():
             continue
@@ -152,12 +136,8 @@ def _filtered_products(
 
 
 def _left_out(products: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the jackknife variance of the mean over pairs of different probes, (K, n, n) to (K,)."""
+    """Return the jackknife variance of the mean over pairs of different probes, symmetric (K, n, n) to (K,)."""
     n = products.shape[1]
-    if n < 3:
-        return np.zeros(len(products))
-    inside = np.einsum("ikk->ik", products)
-    total = products.sum(axis=(1, 2)) - inside.sum(axis=1)
-    each = products.sum(axis=2) + products.sum(axis=1) - 2.0 * inside
-    without = (total[:, None] - each) / ((n - 1) * (n - 2))
+    each = products.sum(axis=2)
+    without = (each.sum(axis=1)[:, None] - 2.0 * each) / ((n - 1) * (n - 2))
     return np.asarray((n - 1) * without.var(axis=1))

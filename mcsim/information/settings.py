@@ -33,10 +33,8 @@ class LimitSettings:
     orders
         Highest azimuthal order of the fiducial beams in the inverse covariance, the centroids of the samples included;
         0: circular beams at pixel centres. What an effect changes has all orders in any case.
-    pairs
-        Random probes that are paired with each other; the error of sigma falls about as 1/pairs.
-    filtered_modes
-        Modes of the sky times random probes whose responses are filtered; there are four such probes at least.
+    probes
+        Number of random probes, 3 or more; the relative error of sigma is about 1/probes.
     dense
         Compute whole matrices, without random probes: the reference for small maps.
     tolerance
@@ -48,7 +46,7 @@ class LimitSettings:
     Examples
     --------
     >>> import mcsim
-    >>> mcsim.LimitSettings(only=("beam_width",), nuisances={"gain_drift": 1e-4}).pairs
+    >>> mcsim.LimitSettings(only=("beam_width",), nuisances={"gain_drift": 1e-4}).probes
     64
     """
 
@@ -61,8 +59,7 @@ class LimitSettings:
     power: float = 0.9
     separation: float = 0.95
     orders: int = 0
-    pairs: int = 64
-    filtered_modes: int = 1 << 14
+    probes: int = 64
     dense: bool = False
     tolerance: float = 1e-8
     seed: int = 0

@@ -69,12 +69,20 @@ def one_map(nside: int = 16, sigma0_uk: float = 300.0) -> config.RunConfig:
     )
 
 
-COMPARED = ("beam_ellipticity", "dipole_modulation", "dipole_residual", "gain_drift", "noise_level", "pixelization")
+COMPARED = (
+    "beam_ellipticity",
+    "dipole_modulation",
+    "dipole_residual",
+    "gain_drift",
+    "noise_level",
+    "pixelization",
+    "boost",
+)
 
 
 @cache
 def limits(dense: bool) -> Limits:
-    return mcsim.limit(model(), settings=mcsim.LimitSettings(only=COMPARED, dense=dense, orders=2, filtered_modes=600))
+    return mcsim.limit(model(), settings=mcsim.LimitSettings(only=COMPARED, dense=dense, orders=2))
 
 
 def expected_log_likelihood(run: config.RunConfig, of: np.ndarray, at: tuple[np.ndarray, np.ndarray]) -> float:
@@ -152,6 +160,7 @@ def test_random_probes_agree_with_whole_matrices() -> None:
         assert 0.0 <= other.error < 0.2
         assert other.sigma == pytest.approx(one.sigma, rel=max(4.0 * other.error, 1e-4)), one.label
     assert sum(other.error > 0.005 for other in drawn.effects) >= 5
+    assert np.linalg.eigvalsh(drawn.fisher / np.outer(size := np.sqrt(np.diag(drawn.fisher)), size))[0] > 0.0
     size = np.sqrt(np.diag(exact.fisher))
     departure = (drawn.fisher - exact.fisher) / np.outer(size, size)
     # The error of sigma is half of that of the information, and of an effect's components together.
@@ -163,7 +172,7 @@ def test_random_probes_agree_with_whole_matrices() -> None:
 def test_one_map_has_the_information_of_its_bipolar_coefficients() -> None:
     """F = sum (2 - delta_M0) |dA|^2 / ((1 + delta_l1l2) C_l1 C_l2) over l1 <= l2, L, M; these effects end at L = 2."""
     run = one_map()
-    names = ("quadrupole_modulation", "dipole_modulation", "beam_width")
+    names = ("quadrupole_modulation", "dipole_modulation", "beam_width", "boost")
     found = mcsim.limit(run, settings=mcsim.LimitSettings(only=names, dense=True))
     lmax, shared = run.sky.lmax, survey(run)
     window = shared.channels[0].response.factors[0].real
@@ -173,6 +182,7 @@ def test_one_map_has_the_information_of_its_bipolar_coefficients() -> None:
     wanted = [mode for mode in tables.modes if mode.d >= 0]
     at = [tables.modes.index(mode) for mode in wanted]
     steps = {
+        "boost (all)/2": effect("boost", None, 1e-3, lat_deg=90.0),
         "beam_width (W1)/0": effect("beam_width", "W1", 0.005),
         "dipole_modulation (all)/0": effect("dipole_modulation", None, 0.01),
         "quadrupole_modulation (all)/1": effect(
@@ -216,7 +226,7 @@ def test_additive_effect_has_its_signal_to_noise() -> None:
 def test_unknown_dipole_hides_one_that_all_maps_share(dense) -> None:
     """The variance of a residual dipole is that of the noise and that of the sky's: d.n of rms d has it d^2."""
     run = one_map()
-    settings = mcsim.LimitSettings(only=("dipole_residual",), dense=dense, pairs=4)
+    settings = mcsim.LimitSettings(only=("dipole_residual",), dense=dense, probes=4)
     known = mcsim.limit(run, settings=settings)
     found = mcsim.limit(run, settings=replace(settings, unknown_dipole_uk=5.0))
     assert found.effects[0].sigma ** 2 == pytest.approx(known.effects[0].sigma ** 2 + 25.0, rel=1e-3)
@@ -307,5 +317,5 @@ def test_bad_input_is_refused() -> None:
         mcsim.limit(model(), settings=mcsim.LimitSettings(nuisances={"beam_width:X": 0.1}))
     with refused("beam_width", 0):
         mcsim.limit(model(), settings=mcsim.LimitSettings(nuisances={"beam_width": 0.0}))
-    with refused("pairs", 1):
-        mcsim.limit(model(), settings=mcsim.LimitSettings(pairs=1))
+    with refused("probes", 2):
+        mcsim.limit(model(), settings=mcsim.LimitSettings(probes=2))

@@ -24,11 +24,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("model")
     parser.add_argument("-o", "--output", type=Path, default=None, help="folder for limit.json and its picture")
-    parser.add_argument("--pairs", type=int, default=128)
+    parser.add_argument("--probes", type=int, default=128)
     parser.add_argument("--unknown-dipole-uk", type=float, default=0.0)
     arguments = parser.parse_args()
     run = config.load(arguments.model)
-    chosen = mcsim.LimitSettings(pairs=arguments.pairs, unknown_dipole_uk=arguments.unknown_dipole_uk)
+    chosen = mcsim.LimitSettings(probes=arguments.probes, unknown_dipole_uk=arguments.unknown_dipole_uk)
     limits = mcsim.limit(run, arguments.output, settings=chosen, quiet=False)
     settings = Settings(run)
     with workers_of(settings, None, quiet=False):
@@ -38,13 +38,12 @@ def main() -> None:
     print(f"{null.dimension} independent elements, {null.n_sims} simulations; {limits.tests} effects")
     print("| effect | sigma of the maps | error | sigma of the data vector | ratio | amplitude_90 ratio |")
     print("|---|---|---|---|---|---|")
-    rng = np.random.default_rng(0)
     for candidate, limit in zip(known.candidates, limits.effects, strict=True):
         assert candidate.label == limit.label
         columns = list(candidate.columns)
         t, error = model.templates[:, columns], known.bank.error[:, columns]
-        noise = null.whitening @ (error * rng.standard_normal(error.shape))
-        size = null.hartlap_factor * (np.sum(null.whiten_templates(t) ** 2) - np.sum(noise**2)) / len(columns)
+        noise = np.sum(null.whitening**2 @ error**2)
+        size = null.hartlap_factor * (np.sum(null.whiten_templates(t) ** 2) - noise) / len(columns)
         sigma = 1.0 / np.sqrt(size) if size > 0.0 else np.inf
         found = detectable(null, t, len(known.candidates))
         ratios = f"{limit.sigma / sigma:.2f} | {limit.amplitude_90 / found:.2f}"
