@@ -145,6 +145,9 @@ def diagnose(
     output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Folder for verdict and report.")],
     case: Annotated[str | None, Option(help="Name of the case; default: that of the model.")] = None,
     without: Annotated[list[str] | None, Option(metavar="EFFECT", help="Do not propose it; repeatable.")] = None,
+    including: Annotated[
+        list[str] | None, Option("--with", metavar="EFFECT", help="Propose it too, if it is on request; repeatable.")
+    ] = None,
     simulations: Simulations = None,
     workers: Processes = None,
     dry_run: Annotated[bool, Option("--dry-run", help="Say simulations, memory and time; simulate none.")] = False,
@@ -157,7 +160,10 @@ def diagnose(
     from mcsim.diagnosis.words import summary
 
     interrupt_once()
-    run, settings = config.load(model), DiagnosisSettings(without=tuple(without or ()), simulations=simulations)
+    run = config.load(model)
+    settings = DiagnosisSettings(
+        without=tuple(without or ()), including=tuple(including or ()), simulations=simulations
+    )
     if workers is not None:
         run = replace(run, compute=replace(run.compute, workers=workers))
     if dry_run:
@@ -264,6 +270,8 @@ def effects(name: Annotated[str | None, Argument(metavar="EFFECT", help="Only th
         parameters = ", ".join(f"{field.name} = {field.default!r}" for field in fields(kind))
         typer.secho(f"{kind.name} ({kind.scope}; amplitude in {kind.unit})", bold=True)
         print(f"  parameters  {parameters}")
+        if not kind.proposed:
+            print(f"  proposed    on request: mcsim diagnose --with {kind.name}")
         for key in ("cause", "signature", "source"):
             print(f"  {key:<11} {getattr(kind, key)}")
 

@@ -83,7 +83,8 @@ def analysis_of(
     """Define the analysis of data that ``run``, with the effects that are modelled already, claims to describe.
 
     Effects of the library (default: built-in and registered ones), which the run may name as well, are candidates
-    where they apply, but those called in ``without``. ``nthreads`` compute what is computed once.
+    where they apply, but those called in ``without``, and those that are proposed on request alone and not called in
+    ``settings.including``. ``nthreads`` compute what is computed once.
     """
     settings = settings or DiagnosisSettings()
     known = kinds_of(library)
@@ -92,7 +93,7 @@ def analysis_of(
         [
             Candidate(effect, channel, tuple(range(len(effect.parametrization.basis()))), dict(fixed))
             for name, effect in known
-            if name not in without
+            if name not in without and (effect.proposed or name in settings.including)
             for channel in ((None,) if effect.scope == "common" else model.channels)
             for fixed in effect.variants
             if _applies(model, effect, channel, fixed)
@@ -129,6 +130,7 @@ def _applies(model: Model, kind: type[Effect], channel: str | None, settings: Ma
             effect.noise(owner.site)
             systematics.seen_through((effect,), owner.site)
             systematics.looked_at((effect,), np.zeros_like(model.dipole), replace(owner.site, lmax=model.lmax), 0, 0)
+            systematics.check_added((effect,), owner.site)
             effect.orientations(owner.maps[0].moments, owner.site)
     except InputError:
         return False

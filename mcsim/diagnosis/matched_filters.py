@@ -8,6 +8,7 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from mcsim import systematics
 from mcsim.diagnosis.wiener_filter import FilteredMaps, Model, by_degree
 from mcsim.instrument.scan import MapGrid, scan_key
-from mcsim.simulation.survey import mean_gain
+from mcsim.simulation.pixel_means import mean_gain, mean_signal
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
 from mcsim.support import folders
@@ -40,6 +41,8 @@ def matched_filter(model: Model, effect: Effect, channel: int | None) -> Matched
         return None
     if kind.beam is not Effect.beam or kind.pointing is not Effect.pointing or kind.spread is not Effect.spread:
         return _beam_filter(model, effect, channel)
+    if kind.signal is not Effect.signal:
+        return _signal_filter(model, effect, channel)
     factor = effect.noise(owner.site)
     if factor is not None:
         change, parts = np.asarray(factor) - 1.0, model.of(channel)
@@ -93,9 +96,8 @@ def _beam_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter | 
 
 def _gain_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter:
     """Correlate residuals with sky and dipole times the mean gain error of every pixel."""
-    site, parts = model.survey.channels[channel].site, model.of(channel)
-    splits, lmax = len(parts), max(model.lmax, 1)
-    errors = [gain_of(effect, site, (n / splits, (n + 1) / splits)) for n in range(splits)]
+    site, parts, lmax = model.survey.channels[channel].site, model.of(channel), max(model.lmax, 1)
+    errors = [gain_of(effect, site, share) for share in _shares(len(parts))]
     dipole = healpix.synthesis(dipole_alm(site.dipole_uk, lmax)[None], model.nside, lmax)[0]
 
     def value(filtered: FilteredMaps) -> float:
@@ -105,29 +107,65 @@ def _gain_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter:
     return value
 
 
+def _signal_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter:
+    """Correlate residuals with the mean of what is added to the samples of every pixel."""
+    site, parts = model.survey.channels[channel].site, model.of(channel)
+    signals = [signal_of(effect, site, share) for share in _shares(len(parts))]
+
+    def value(filtered: FilteredMaps) -> float:
+        return float(sum(np.dot(filtered.residual[i], signal) for i, signal in zip(parts, signals, strict=True)))
+
+    return value
+
+
+def _shares(splits: int) -> list[tuple[float, float]]:
+    return [(n / splits, (n + 1) / splits) for n in range(splits)]
+
+
 _TIMES = 4096
-"""At which a gain is evaluated for the key."""
+"""At which a gain or a signal is evaluated for the key."""
 
 
 def gain_of(effect: Effect, site: systematics.Site, share: tuple[float, float]) -> Map:
-    """Return the mean error of the gain in every pixel, kept on disk: each process of each diagnosis needs it.
+    """Return the mean error of the gain in every pixel, kept on disk: each process of each diagnosis needs it."""
+    times = _times(effect, site, share)
+    return _kept("gain", (effect, site, share), np.asarray(effect.gain(times, site)), mean_gain)
 
-    The key has the effect, its code, and its gain at a few thousand times: what an effect takes from elsewhere shows
-    in these.
-    """
+
+def signal_of(effect: Effect, site: systematics.Site, share: tuple[float, float]) -> Map:
+    """Return the mean of what an effect adds to the samples of every pixel, uK, kept on disk too."""
+    times, turns = _times(effect, site, share), np.linspace(0.0, 1.0, _TIMES)
+    angles = np.pi * turns, 2.0 * np.pi * (7.0 * turns % 1.0), 2.0 * np.pi * (31.0 * turns % 1.0)
+    return _kept("signal", (effect, site, share), effect.signal(times, *angles, site), mean_signal)
+
+
+def _times(effect: Effect, site: systematics.Site, share: tuple[float, float]) -> Map:
     pointing = site.pointed(effect.name)
     grid = MapGrid(site.nside, site.frame, share)
-    where = scan_key(pointing.model.with_lines_of_sight(pointing.line.name), grid)
     period = pointing.model.period_of_samples(pointing.line)
-    times = period * np.linspace(*grid.sample_range(pointing.model, pointing.line), _TIMES)
+    return np.asarray(period * np.linspace(*grid.sample_range(pointing.model, pointing.line), _TIMES))
+
+
+def _kept(
+    what: str, where: tuple[Effect, systematics.Site, tuple[float, float]], values: Map, mean: Callable[..., Any]
+) -> Map:
+    """Return a mean over the samples of pixels, from the disk if it is there.
+
+    The key has the effect, its code, and its values at a few thousand times: what an effect takes from elsewhere shows
+    in these.
+    """
+    effect, site, share = where
+    pointing = site.pointed(effect.name)
+    grid = MapGrid(site.nside, site.frame, share)
+    scan = scan_key(pointing.model.with_lines_of_sight(pointing.line.name), grid)
     code = class_digest(type(effect)) + package_digest(["mcsim.systematics", "mcsim.simulation"])
     text = f"{effect!r} {pointing.line!r} {code}".encode()
-    what = hashlib.sha256(text + np.asarray(effect.gain(times, site)).tobytes()).hexdigest()
+    own = hashlib.sha256(text + values.tobytes()).hexdigest()
 
     def fill(folder: Path) -> None:
-        np.save(folder / "gain.npy", np.asarray(mean_gain((effect,), site, share), dtype=np.float64))
+        np.save(folder / f"{what}.npy", np.asarray(mean((effect,), site, share), dtype=np.float64))
 
-    found: Map = np.load(folders.cached(f"gain-{where[:32]}-{what[:32]}", fill) / "gain.npy")
+    found: Map = np.load(folders.cached(f"{what}-{scan[:32]}-{own[:32]}", fill) / f"{what}.npy")
     return found
 
 

@@ -100,12 +100,13 @@ def check_effects(run: config.RunConfig) -> None:
         systematics.looked_at(acting, np.zeros(alm_.size(site.lmax), complex), site, run.ensemble.seed, 0)
         for effect in acting:
             effect.gain(np.zeros(1), site)
+        systematics.check_added(acting, site)
 
 
 def refuse_pixel_effects(channel: str, acting: tuple[systematics.Effect, ...]) -> None:
     """Refuse effects that act on pixels, for a grid of rings."""
     for effect in acting:
-        for hook in ("gain", "noise", "spread", "orientations"):
+        for hook in ("gain", "signal", "noise", "spread", "orientations"):
             if getattr(type(effect), hook) is not getattr(systematics.Effect, hook):
                 raise InputError(
                     f'effect {effect.name} on channel {channel} acts on pixels, but grid = "gl" has none; remove it '

@@ -107,7 +107,7 @@ class MapParts:
     smooth
         The sky through the circular part of the beam at the pixels' centres; None where its a_lm stand for it.
     extra
-        The rest of the circular-beam control: centroids, noise, gain. None: nothing.
+        The rest of the circular-beam control: centroids, noise, gain, what effects add to samples. None: nothing.
     difference
         What the rest of the beam adds. None: nothing.
     """
@@ -208,6 +208,8 @@ def _map_parts(
             extra.append(m.noise_uk * draw.standard_normal(m.noise_uk.size))
         if m.gain is not None and whole is not None:
             extra.append(m.gain * whole)
+        if m.signal_uk is not None:
+            extra.append(m.signal_uk)
         difference = convolve.noncircular_map(spins, m.moments) if spins else None
         yield m, MapParts(flat, sum(extra[1:], start=extra[0]) if extra else None, difference)
 

@@ -70,6 +70,13 @@ RESPONSES = {
     "dipole_residual": {"amplitude": 10.0, "lon_deg": 20.0, "lat_deg": 30.0},
     "boost": {"amplitude": 0.001, "lon_deg": 20.0, "lat_deg": 30.0},
     "foreground_residual": {"amplitude": 5.0},
+    "gain_spin": {"amplitude": 0.01, "phase_deg": 30.0},
+    "bandpass_mismatch": {"amplitude": 5.0},
+    "sidelobe_pickup": {"amplitude": 0.002, "width_deg": 20.0},
+    "nonlinearity": {"amplitude": 0.002},
+    "orbital_dipole": {"amplitude": 0.02, "phase_deg": 40.0},
+    "spin_synchronous_offset": {"amplitude": 2.0, "phase_deg": 30.0},
+    "pointing_jitter": {"amplitude": 400.0},
 }
 
 

@@ -9,7 +9,7 @@ from mcsim import systematics
 from mcsim.diagnosis import matched_filters
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import ScanModel
-from mcsim.simulation.survey import mean_gain
+from mcsim.simulation.pixel_means import mean_gain
 
 HALVES = ((0.0, 0.5), (0.5, 1.0))
 
