@@ -77,6 +77,7 @@ RESPONSES = {
     "orbital_dipole": {"amplitude": 0.02, "phase_deg": 40.0},
     "spin_synchronous_offset": {"amplitude": 2.0, "phase_deg": 30.0},
     "pointing_jitter": {"amplitude": 400.0},
+    "lensing": {"amplitude": 4.0},
 }
 
 

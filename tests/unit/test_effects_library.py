@@ -24,6 +24,7 @@ ON_REQUEST = {
     "orbital_dipole",
     "spin_synchronous_offset",
     "pointing_jitter",
+    "lensing",
 }
 NAMES = {
     "beam_ellipticity",

@@ -57,6 +57,7 @@ PARAMETERS: dict[str, dict[str, Any]] = {
     "orbital_dipole": {"amplitude": 0.01, "phase_deg": 30.0},
     "spin_synchronous_offset": {"amplitude": 1.0, "phase_deg": 30.0},
     "pointing_jitter": {"amplitude": 25.0},
+    "lensing": {"amplitude": 1.0},
 }
 NOISE = ("noise_anisotropy", "noise_level")
 DIFFERENCING = ("transmission_imbalance", "mapmaking_convergence")
@@ -178,7 +179,7 @@ def draw(found: dict[str, Map], path: Path, title: str) -> None:
     figure = plt.figure(figsize=(23 / wide, 12 / high))
     for place, (name, maps) in enumerate(found.items()):
         column, row = place % columns, place // columns
-        left, bottom = (0.03 + column * 0.139) * wide, 1.0 - (0.337 + row * 0.309) * high
+        left, bottom = 0.03 + column * 0.139 * wide, 1.0 - (0.337 + row * 0.309) * high
         shown = healpy.smoothing(maps[0], fwhm=np.deg2rad(1.5)) if len(maps) == 4 else maps[0]
         reach = np.percentile(np.abs(shown - (0.0 if name in NOISE else shown.mean())), 99.0)
         colours = {"cmap": "RdBu_r", "min": -reach, "max": reach}
