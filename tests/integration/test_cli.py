@@ -90,6 +90,28 @@ def test_plot_chooses_modes(mcsim: Command, small_store: Path, tmp_path: Path) -
     assert_refused(mcsim("plot", small_store, "--L", 9), "L = 9")
 
 
+def test_effects_on_request_are_marked_and_proposed_when_asked_for(mcsim: Command, tmp_path: Path) -> None:
+    asked = "--with orbital_dipole"
+    assert asked in mcsim("effects", "orbital_dipole")[1]
+    assert "--with" not in mcsim("effects", "gain_drift")[1]
+    model = """
+schema = 1
+name = "small"
+sky = { spectrum = "wmap7", lmax = 40 }
+map = { nside = 16 }
+[[channel]]
+name = "W1"
+beam = { kind = "gaussian", fwhm_arcmin = 350.0 }
+noise = { sigma0_uk = 30.0 }
+scan = { kind = "hit_averaged", model = "wmap", sample_period_s = 157.8, line_of_sight = "A" }
+"""
+    (tmp_path / "small.toml").write_text(model)
+    command = ("diagnose", "small.toml", "data", "-o", "out", "--dry-run", "--simulations", 400)
+    sizes = [int(mcsim(*command, *more)[1].splitlines()[0].split()[-1]) for more in ((), asked.split())]
+    assert sizes[1] == sizes[0] + 2  # cosine and sine have a matched filter each
+    assert_refused(mcsim(*command, "--with", "orbital_dipol"), "orbital_dipol", "orbital_dipole")
+
+
 def test_dry_run_says_the_cost_and_computes_nothing(mcsim: Command, tmp_path: Path) -> None:
     code, out, _ = mcsim("run", "quickstart", "--dry-run")
     assert code == 0

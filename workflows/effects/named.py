@@ -96,10 +96,10 @@ def diagnose(known: DiagnosisContext, case: int, drawn: Drawn) -> None:
     named = [" + ".join(f"{one['name']} ({one['channel']})" for one in members) for members in sets]
     truth = f"{member.name} ({member.channel})"
     first = verdict["effects"][0] if verdict["effects"] else {"amplitude": np.nan, "sigma": np.nan}
+    answer = "right" if named[0] == truth else "in the set" if truth in named else "not named"
     print(
-        f"{truth} of S/N {member.strength:.1f}: {'right' if named[0] == truth else 'in the set' if truth in named else 'NO'}"
-        f"; {verdict['verdict']}: {' or '.join(named)}; amplitude {member.parameters['amplitude']:.3g}, fitted "
-        f"{first['amplitude']:.3g} +- {first['sigma']:.2g}",
+        f"{truth} of S/N {member.strength:.1f}: {answer}; {verdict['verdict']}: {' or '.join(named)}; "
+        f"amplitude {member.parameters['amplitude']:.3g}, fitted {first['amplitude']:.3g} +- {first['sigma']:.2g}",
         flush=True,
     )
 
