@@ -283,6 +283,7 @@ SIGNATURES = {
     "orbital_dipole": Signature("ecliptic", (0, 1)),
     "spin_synchronous_offset": Signature("ecliptic"),
     "pointing_jitter": Signature("", (0,), "even"),
+    "excess_noise": Signature("", (0,), "even"),
     "lensing": Signature("", (0,), "even"),
 }
 

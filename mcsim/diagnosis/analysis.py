@@ -135,7 +135,7 @@ def _applies(model: Model, kind: type[Effect], channel: str | None, settings: Ma
     except InputError:
         return False
     quiet = all(m.noise_uk is None for owner in owners for m in owner.maps)
-    return not (quiet and kind.noise is not Effect.noise)
+    return not (quiet and (kind.noise is not Effect.noise or kind.excess is not Effect.excess))
 
 
 def _matched_blocks(model: Model, candidates: Sequence[Candidate]) -> Iterator[Block]:

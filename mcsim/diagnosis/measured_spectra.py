@@ -27,8 +27,9 @@ from mcsim.systematics import Effect, Library
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
-_SPECTRAL_HOOKS = ("sky", "beam", "pointing", "spread", "orientations", "noise")
-"""Hooks that change spectra of a map. A drift of the gain does so in the lowest degrees only and is no candidate."""
+_SPECTRAL_HOOKS = ("sky", "beam", "pointing", "spread", "orientations", "noise", "excess")
+"""Hooks that change spectra of a map. Gains and signals of samples do so in the lowest degrees only, and are no
+candidates."""
 
 
 class Pair(NamedTuple):

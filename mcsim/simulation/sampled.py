@@ -58,6 +58,9 @@ def maps(
             if spec.noise.sigma0_uk > 0.0:
                 draw = rng.generator(run.ensemble.seed, realization, f"noise/{m.name}")
                 stages.append(tod.white_noise(spec.noise.sigma0_uk, draw, _noise_factor(channel)))
+            for effect in systematics.disturbing(acting):
+                draw = rng.generator(run.ensemble.seed, realization, f"effect/{effect.name}/noise/{m.name}")
+                stages.append(_disturbed(effect, draw))
             stream = tod.through(_seen(channel, grid, observe), stages)
             map_uk = tod.bin_samples(stream, site.nside)[0]
             found.append((m.name, map_uk if m.preparation is None else m.preparation.apply(map_uk)))
@@ -168,6 +171,16 @@ def _added(channel: Channel) -> tod.Stage:
         for chunk in stream:
             signals = (effect.signal(chunk.time_s, chunk.theta, chunk.phi, chunk.psi, site) for effect in acting)
             yield replace(chunk, signal_uk=sum(signals, start=chunk.signal_uk))
+
+    return stage
+
+
+def _disturbed(effect: systematics.Effect, draw: np.random.Generator) -> tod.Stage:
+    """Return a stage that adds an effect's noise to every sample."""
+
+    def stage(stream: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
+        for chunk in stream:
+            yield replace(chunk, signal_uk=chunk.signal_uk + effect.excess(np.ones(chunk.time_s.size), draw))
 
     return stage
 

@@ -206,6 +206,10 @@ def _map_parts(
         if m.noise_uk is not None:
             draw = rng.generator(seed, realization, f"noise/{m.name}")
             extra.append(m.noise_uk * draw.standard_normal(m.noise_uk.size))
+        for effect in systematics.disturbing(channel.effects):
+            draw = rng.generator(seed, realization, f"effect/{effect.name}/noise/{m.name}")
+            hits = m.moments.hits
+            extra.append(np.divide(effect.excess(hits, draw), hits, out=np.zeros_like(hits), where=hits > 0.0))
         if m.gain is not None and whole is not None:
             extra.append(m.gain * whole)
         if m.signal_uk is not None:

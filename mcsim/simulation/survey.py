@@ -14,7 +14,7 @@ from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
 from mcsim.instrument.scan import MapGrid
 from mcsim.simulation import convolve, mapmaking
-from mcsim.simulation.channels import effects_on, refuse_pixel_effects, scan_model, site_b_of, site_of
+from mcsim.simulation.channels import effects_on, refuse_excess, refuse_pixel_effects, scan_model, site_b_of, site_of
 from mcsim.simulation.pixel_means import mean_gain, mean_signal
 from mcsim.simulation.preparation import Preparation, preparation
 from mcsim.simulation.rings import Rings, limit_rings, parallel_transport_rings
@@ -227,6 +227,7 @@ def _channel(
         pairs = None
         if isinstance(spec.scan, config.ScanDifferencing):
             model = scan_model(spec, spec.scan, split)
+            refuse_excess(spec.name, acting)
             pairs = mapmaking.prepare(model, spec.scan.pair, grid, nthreads=nthreads, progress=progress)
             moments = _hits_alone(pairs, max(beam.mmax, 1))
         else:

@@ -119,7 +119,8 @@ class Effect:
     """Derive an effect from this class, whose hooks change nothing.
 
     A subclass is a frozen dataclass whose fields are its parameters, ``amplitude`` first. Zero amplitude is no effect:
-    ``sky``, ``beam``, ``pointing`` and ``signal`` are not called then, and what the other hooks return changes nothing.
+    ``sky``, ``beam``, ``pointing``, ``signal`` and ``excess`` are not called then; what the others return changes
+    nothing.
 
     Attributes
     ----------
@@ -215,6 +216,10 @@ class Effect:
     def noise(self, site: Site) -> Map | None:
         """Return the factor of the variance of every pixel's samples, shape (npix,); None: one."""
         return None
+
+    def excess(self, count: Vector, rng: np.random.Generator) -> Vector:
+        """Return the sums, uK, shape (n,), of what is added at random to each of ``count`` samples, shape (n,)."""
+        return np.zeros_like(count)
 
     def spread(self) -> float:
         """Return the factor by which samples move towards the centre of their pixel."""
@@ -332,6 +337,11 @@ def spread_of(acting: Iterable[Effect]) -> float:
 def adding(acting: Iterable[Effect]) -> list[Effect]:
     """Return the effects that add a signal to samples."""
     return [one for one in acting if one.amplitude != 0.0 and type(one).signal is not Effect.signal]
+
+
+def disturbing(acting: Iterable[Effect]) -> list[Effect]:
+    """Return the effects that add noise of their own to samples."""
+    return [one for one in acting if one.amplitude != 0.0 and type(one).excess is not Effect.excess]
 
 
 def check_added(acting: Iterable[Effect], site: Site) -> None:

@@ -25,6 +25,7 @@ ON_REQUEST = {
     "spin_synchronous_offset",
     "pointing_jitter",
     "lensing",
+    "excess_noise",
 }
 NAMES = {
     "beam_ellipticity",
@@ -89,6 +90,7 @@ def test_zero_amplitude_changes_nothing(name, site):
     assert systematics.seen_through([effect], site) is site.beam
     assert effect.gain(np.arange(3.0), site) is None
     assert not systematics.adding([effect])
+    assert not systematics.disturbing([effect])
     assert effect.noise(site) is None
     assert effect.spread() == 1.0
     assert effect.differencing(0.01, 2) == (0.01, 2)

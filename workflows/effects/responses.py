@@ -58,6 +58,7 @@ PARAMETERS: dict[str, dict[str, Any]] = {
     "spin_synchronous_offset": {"amplitude": 1.0, "phase_deg": 30.0},
     "pointing_jitter": {"amplitude": 25.0},
     "lensing": {"amplitude": 1.0},
+    "excess_noise": {"amplitude": 0.001},
 }
 NOISE = ("noise_anisotropy", "noise_level")
 DIFFERENCING = ("transmission_imbalance", "mapmaking_convergence")
@@ -94,7 +95,7 @@ def response(name: str, arguments: argparse.Namespace, plain: dict[str | None, t
         effect = systematics.build(name, PARAMETERS[name])
         factor = effect.noise(prepared(name, arguments).channels[0].site)
         return np.array([factor - 1.0])
-    if name in DIFFERENCING or name == "orientation_averaging":
+    if name in DIFFERENCING or name in ("orientation_averaging", "excess_noise"):
         return simulate.maps(prepared(name, arguments), 0)[:1] - simulate.maps(prepared(None, arguments, name), 0)[:1]
     like = name if name == "beam_noncircularity" else None
     if like not in plain:
@@ -174,12 +175,12 @@ def report(name: str, maps: Map) -> None:
 
 def draw(found: dict[str, Map], path: Path, title: str) -> None:
     """A map of the response of the first half and the spectra of both routes, for every effect."""
-    columns, rows = (7, 3) if len(found) > 8 else (4, 2)
+    columns, rows = (7, 3) if len(found) > 10 else (5, 2)
     wide, high = 7 / columns, 3 / rows
     figure = plt.figure(figsize=(23 / wide, 12 / high))
     for place, (name, maps) in enumerate(found.items()):
         column, row = place % columns, place // columns
-        left, bottom = 0.03 + column * 0.139 * wide, 1.0 - (0.337 + row * 0.309) * high
+        left, bottom = 0.03 + column * 0.139 * wide, 1.0 - (0.33 + row * 0.304) * high
         shown = healpy.smoothing(maps[0], fwhm=np.deg2rad(1.5)) if len(maps) == 4 else maps[0]
         reach = np.percentile(np.abs(shown - (0.0 if name in NOISE else shown.mean())), 99.0)
         colours = {"cmap": "RdBu_r", "min": -reach, "max": reach}
