@@ -4,26 +4,19 @@ The formula follows from the hooks that an effect defines, so that a user's effe
 stochastic effect has no matched filter: it shows in the spectra.
 """
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim import systematics
 from mcsim.diagnosis.wiener_filter import FilteredMaps, Model, by_degree
-from mcsim.instrument.scan import MapGrid, scan_key
-from mcsim.simulation.pixel_means import mean_gain, mean_signal
+from mcsim.simulation.pixel_means import gain_of, signal_of
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
-from mcsim.support import folders
-from mcsim.support.code import class_digest, package_digest
+from mcsim.support.arrays import Map
 from mcsim.systematics import Effect
 
-Map = NDArray[np.float64]
 MatchedFilter = Callable[[FilteredMaps], float]
 
 
@@ -120,53 +113,6 @@ def _signal_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter:
 
 def _shares(splits: int) -> list[tuple[float, float]]:
     return [(n / splits, (n + 1) / splits) for n in range(splits)]
-
-
-_TIMES = 4096
-"""At which a gain or a signal is evaluated for the key."""
-
-
-def gain_of(effect: Effect, site: systematics.Site, share: tuple[float, float]) -> Map:
-    """Return the mean error of the gain in every pixel, kept on disk: each process of each diagnosis needs it."""
-    times = _times(effect, site, share)
-    return _kept("gain", (effect, site, share), np.asarray(effect.gain(times, site)), mean_gain)
-
-
-def signal_of(effect: Effect, site: systematics.Site, share: tuple[float, float]) -> Map:
-    """Return the mean of what an effect adds to the samples of every pixel, uK, kept on disk too."""
-    times, turns = _times(effect, site, share), np.linspace(0.0, 1.0, _TIMES)
-    angles = np.pi * turns, 2.0 * np.pi * (7.0 * turns % 1.0), 2.0 * np.pi * (31.0 * turns % 1.0)
-    return _kept("signal", (effect, site, share), effect.signal(times, *angles, site), mean_signal)
-
-
-def _times(effect: Effect, site: systematics.Site, share: tuple[float, float]) -> Map:
-    pointing = site.pointed(effect.name)
-    grid = MapGrid(site.nside, site.frame, share)
-    period = pointing.model.period_of_samples(pointing.line)
-    return np.asarray(period * np.linspace(*grid.sample_range(pointing.model, pointing.line), _TIMES))
-
-
-def _kept(
-    what: str, where: tuple[Effect, systematics.Site, tuple[float, float]], values: Map, mean: Callable[..., Any]
-) -> Map:
-    """Return a mean over the samples of pixels, from the disk if it is there.
-
-    The key has the effect, its code, and its values at a few thousand times: what an effect takes from elsewhere shows
-    in these.
-    """
-    effect, site, share = where
-    pointing = site.pointed(effect.name)
-    grid = MapGrid(site.nside, site.frame, share)
-    scan = scan_key(pointing.model.with_lines_of_sight(pointing.line.name), grid)
-    code = class_digest(type(effect)) + package_digest(["mcsim.systematics", "mcsim.simulation"])
-    text = f"{effect!r} {pointing.line!r} {code}".encode()
-    own = hashlib.sha256(text + values.tobytes()).hexdigest()
-
-    def fill(folder: Path) -> None:
-        np.save(folder / f"{what}.npy", np.asarray(mean((effect,), site, share), dtype=np.float64))
-
-    found: Map = np.load(folders.cached(f"{what}-{scan[:32]}-{own[:32]}", fill) / f"{what}.npy")
-    return found
 
 
 def normalised_difference(model: Model, filtered: FilteredMaps, parts: tuple[int, ...]) -> Map:

@@ -1,5 +1,6 @@
 """The command line as a user meets it: outputs, exit codes, one sentence for bad input, nothing left behind."""
 
+import io
 import json
 import shutil
 import subprocess
@@ -17,6 +18,7 @@ from astropy.table import Table
 from mcsim import cli, config, open_summary
 from mcsim.ensemble import tables
 from mcsim.ensemble.prediction import predict
+from mcsim.plot.spectra import ensemble_figure
 from refusals import unnamed
 
 from .conftest import table
@@ -110,6 +112,15 @@ scan = { kind = "hit_averaged", model = "wmap", sample_period_s = 157.8, line_of
     sizes = [int(mcsim(*command, *more)[1].splitlines()[0].split()[-1]) for more in ((), asked.split())]
     assert sizes[1] == sizes[0] + 2  # cosine and sine have a matched filter each
     assert_refused(mcsim(*command, "--with", "orbital_dipol"), "orbital_dipol", "orbital_dipole")
+
+
+@pytest.mark.parametrize("chosen", [{}, {"L": 2, "M": 0}])
+def test_notes_of_a_wide_and_a_narrow_figure_are_whole(small_store: Path, chosen: dict[str, int]) -> None:
+    figure = ensemble_figure(small_store, prediction=predict(table()), **chosen)
+    figure.savefig(io.BytesIO(), dpi=figure.dpi)
+    box, whole = figure.get_tightbbox(), figure.bbox_inches
+    assert box.x0 >= 0.0
+    assert box.x1 <= whole.x1
 
 
 def test_dry_run_says_the_cost_and_computes_nothing(mcsim: Command, tmp_path: Path) -> None:
