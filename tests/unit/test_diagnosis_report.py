@@ -318,7 +318,9 @@ def test_settings_are_stored_and_printed(diagnoses, pages, tmp_path):
     assert "level 0.05" in text
 
 
-@pytest.mark.parametrize("kind", VERDICTS)
+@pytest.mark.parametrize(
+    "kind", [kind if kind == "mixture" else pytest.param(kind, marks=pytest.mark.slow) for kind in VERDICTS]
+)
 def test_result_comes_back_from_disk_as_it_was(diagnoses, pages, tmp_path, kind):
     one = diagnoses[kind]
     one.save(tmp_path)
