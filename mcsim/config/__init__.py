@@ -2,6 +2,7 @@
 
 from mcsim.config.identity import differences, digest, science
 from mcsim.config.load import check_skies, from_json, json_schema, load, prepared_grid, resolved, to_dict, to_json
+from mcsim.config.noise import Noise
 from mcsim.config.paths import channel_path, sky_path
 from mcsim.config.schema import (
     Beam,
@@ -9,13 +10,13 @@ from mcsim.config.schema import (
     BeamEllipticalGaussian,
     BeamGaussian,
     BeamMap,
+    BeamWindow,
     Biposh,
     Channel,
     Compute,
     Effect,
     Ensemble,
     Map,
-    Noise,
     RunConfig,
     Scan,
     ScanDifferencing,
@@ -35,6 +36,7 @@ __all__ = [
     "BeamEllipticalGaussian",
     "BeamGaussian",
     "BeamMap",
+    "BeamWindow",
     "Biposh",
     "Channel",
     "Compute",

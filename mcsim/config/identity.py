@@ -48,8 +48,9 @@ _OF_KIND: dict[str, dict[str, Any]] = {
     "moments": {"model": None, "line_of_sight": None},
     "map": {"angle_deg": 0.0},
     "blm": {"angle_deg": 0.0},
+    "white": {"kind": "white", "hits": None},
 }
-"""Defaults of the keys of a scan or beam that are younger than its kind."""
+"""Defaults of the keys of a scan, beam or noise that are younger than its kind."""
 
 
 def _leave_out_what_says_nothing(plain: dict[str, Any]) -> None:
@@ -65,7 +66,7 @@ def _leave_out_what_says_nothing(plain: dict[str, Any]) -> None:
     for channel in plain["channel"]:
         channel["scan"].pop("max_iterations", None)
         _drop(channel, {"beam_b": None})
-        for table in (channel["scan"], channel["beam"], channel.get("beam_b", {"kind": "none"})):
+        for table in (channel["scan"], channel["beam"], channel["noise"], channel.get("beam_b", {"kind": "none"})):
             _drop(table, _OF_KIND.get(table["kind"], {}))
 
 

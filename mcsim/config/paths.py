@@ -54,7 +54,8 @@ def entries(plain: dict[str, Any]) -> Iterator[Entry]:
     ]
     for number, table in enumerate(channels):
         key = f"channel[{label(table, number)}]"
-        sections += [(part, f"{key}.{part}", table.get(part), (every[number],)) for part in ("beam", "beam_b", "scan")]
+        parts = ("beam", "beam_b", "scan", "noise")
+        sections += [(part, f"{key}.{part}", table.get(part), (every[number],)) for part in parts]
     sections += [("effect", f"effect[{n}]", table, every) for n, table in enumerate(_tables(plain, "effect"))]
     for number, table in enumerate(_tables(plain, "preparation")):
         own = table.get("channels")

@@ -11,6 +11,7 @@ from pydantic.dataclasses import dataclass
 from pydantic_core import core_schema
 
 from mcsim.config import arrays
+from mcsim.config.noise import AnyNoise, Noise, in_words, is_noise_free
 from mcsim.config.preparation import Step, check_steps
 from mcsim.config.values import STRICT, BeamOrder, Degree, Frame, Fwhm, Label, Nside, PathText, power_of_two, unique
 
@@ -140,6 +141,16 @@ class BeamBlm:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
+class BeamWindow:
+    """Circular beam from a table of B_l: text, .npy or FITS (``extension`` and ``column`` if it leaves a choice)."""
+
+    kind: Literal["window"] = "window"
+    path: PathText
+    extension: str | None = None
+    column: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class ScanParallelTransport:
     """Parallel transport: one sample at every pixel centre, at the angle ``psi0_deg`` from e_theta."""
 
@@ -212,19 +223,12 @@ class _OrObject:
         return (BEAMS | SCANS)[table["kind"]](**table)
 
 
-AnyBeam = BeamGaussian | BeamEllipticalGaussian | BeamMap | BeamBlm
+AnyBeam = BeamGaussian | BeamEllipticalGaussian | BeamMap | BeamBlm | BeamWindow
 AnyScan = ScanParallelTransport | ScanHitAveraged | ScanMoments | ScanPointing | ScanDifferencing
 Beam = Annotated[AnyBeam, Field(discriminator="kind"), _OrObject()]
 Scan = Annotated[AnyScan, Field(discriminator="kind"), _OrObject()]
 BEAMS: dict[str, Any] = {each.kind: each for each in get_args(AnyBeam)}
 SCANS: dict[str, Any] = {each.kind: each for each in get_args(AnyScan)}
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class Noise:
-    """White noise per sample; the variance of a pixel is sigma0_uk^2 / hits. Differencing: per difference."""
-
-    sigma0_uk: Annotated[float, Field(ge=0.0)] = 0.0
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -239,7 +243,7 @@ class Channel:
     scan: Scan
     beam_b: Beam | None = None
     frequency_ghz: Annotated[float, Field(gt=0.0)] | None = None
-    noise: Noise = Noise()
+    noise: AnyNoise = Noise()
 
     @model_validator(mode="after")
     def _one_or_two_beams(self) -> Self:
@@ -247,6 +251,14 @@ class Channel:
             raise ValueError(
                 f'beam_b is given, but a scan of kind "{self.scan.kind}" has one beam; remove beam_b or choose '
                 'kind = "differencing"'
+            )
+        if isinstance(self.scan, ScanDifferencing) and (
+            not isinstance(self.noise, Noise) or self.noise.hits is not None
+        ):
+            key = "noise.hits" if isinstance(self.noise, Noise) else in_words(self.noise)
+            raise ValueError(
+                f"{key} describes pixels, but the maps of a differencing scan are made from differences; give their "
+                "noise as noise.sigma0_uk alone"
             )
         return self
 
@@ -383,10 +395,10 @@ def _check_rings(run: RunConfig) -> None:
                 f'map.frame = "{run.map.frame}", but with grid = "gl" the limit of a scan depends on '
                 f'ecliptic colatitude alone; set frame = "ecliptic" {remedy}'
             )
-        if channel.noise.sigma0_uk > 0.0:
+        if not is_noise_free(channel.noise):
             raise ValueError(
-                f'channel[{channel.name}].noise.sigma0_uk = {channel.noise.sigma0_uk:g}, but grid = "gl" has no pixels '
-                f"to draw noise in; remove the noise {remedy}"
+                f'channel[{channel.name}].{in_words(channel.noise)}, but grid = "gl" has no pixels to draw noise in; '
+                f"remove the noise {remedy}"
             )
     for key, given in (
         ("ensemble.keep_maps = true", run.ensemble.keep_maps),

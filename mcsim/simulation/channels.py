@@ -14,6 +14,9 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import rotation
 from mcsim.support import resources
 
+CIRCULAR = (config.BeamGaussian, config.BeamWindow)
+"""Beams that have no m_max."""
+
 WHOLE = 4
 """Orders that a beam has at least without its m_max, where its source has them."""
 
@@ -43,6 +46,9 @@ def _beam(channel: str, spec: config.Beam, lmax: int) -> beams.Beam:
         case config.BeamBlm():
             file = config.channel_path(spec.path, channel)
             return beams.Beam.from_blm(file, lmax, mmax=spec.m_max).rotated(np.deg2rad(spec.angle_deg))
+        case config.BeamWindow():
+            file = config.channel_path(spec.path, channel)
+            return beams.Beam.from_window(file, lmax, extension=spec.extension, column=spec.column)
 
 
 def load_beam_map(channel: str, spec: config.BeamMap) -> beams.BeamMap:
@@ -138,7 +144,7 @@ def site_b_of(site: systematics.Site, spec: config.Channel) -> systematics.Site:
 
 
 def _is_cut(spec: config.Beam) -> bool:
-    return not isinstance(spec, config.BeamGaussian) and spec.m_max is not None
+    return not isinstance(spec, CIRCULAR) and spec.m_max is not None
 
 
 def _whole(load: Callable[[config.Channel, int], beams.Beam], spec: config.Channel, lmax: int) -> beams.Beam:
@@ -155,7 +161,7 @@ def _whole(load: Callable[[config.Channel, int], beams.Beam], spec: config.Chann
 def _with_m_max(spec: config.Channel, m_max: int | None) -> config.Channel:
     """Return a channel whose beams have another m_max."""
     beam, beam_b = (
-        each if each is None or isinstance(each, config.BeamGaussian) else replace(each, m_max=m_max)
+        each if each is None or isinstance(each, CIRCULAR) else replace(each, m_max=m_max)
         for each in (spec.beam, spec.beam_b)
     )
     return replace(spec, beam=beam or spec.beam, beam_b=beam_b)

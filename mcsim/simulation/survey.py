@@ -15,6 +15,7 @@ from mcsim.instrument import beams, scan
 from mcsim.instrument.scan import MapGrid
 from mcsim.simulation import convolve, mapmaking, tod
 from mcsim.simulation.channels import effects_on, refuse_pixel_effects, scan_model, site_b_of, site_of
+from mcsim.simulation.noise import in_pixels
 from mcsim.simulation.preparation import Preparation, preparation
 from mcsim.simulation.rings import Rings, limit_rings, parallel_transport_rings
 from mcsim.sphere import healpix, spectra
@@ -296,6 +297,7 @@ def _side_b(spec: config.Channel, window: NDArray[np.float64], site: Site, actin
     imbalance, short = spec.scan.transmission_imbalance, 0
     for effect in acting:
         imbalance, short = effect.differencing(imbalance, short)
+    assert isinstance(spec.noise, config.Noise)  # the configuration refuses other noise of differences
     return SideB(beam, response, other.beam, spec.scan, spec.noise.sigma0_uk, imbalance, short)
 
 
@@ -374,14 +376,11 @@ def _survey_map(
 ) -> SurveyMap:
     """Return a map without effects: moments, weights of its pixels, and noise."""
     name = spec.name if split is None else f"{spec.name}:{split}"
-    observed = moments.hits > 0
-    if not observed.any():
+    if not np.any(moments.hits > 0):
         raise InputError(
             f"The scan of map {name} hits no pixel of nside {moments.nside}; check the scan of the channel."
         )
-    noise = None
-    if spec.noise.sigma0_uk > 0 and pairs is None:
-        noise = np.divide(spec.noise.sigma0_uk, np.sqrt(moments.hits), out=np.zeros(observed.size), where=observed)
+    moments, noise = (moments, None) if pairs is not None else in_pixels(spec, split, moments)
     steps = preparation(run, spec, split)
     weight = None if steps is not None else _weight(run, spec, split, name, moments)
     return SurveyMap(name, moments, weight, noise, pairs, preparation=steps)
