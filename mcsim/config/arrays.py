@@ -35,6 +35,7 @@ RULES = {
     "beam_b.path": Rule(placeholders=("channel",)),
     "scan.path": Rule(placeholders=("channel", "split")),
     "scan.model": Rule(packaged="scan_models", placeholders=("channel", "split")),
+    "channel.mask": Rule(placeholders=("channel", "split")),
     "noise.hits": Rule(placeholders=("channel", "split")),
     "noise.variance": Rule(placeholders=("channel", "split")),
     "effect.template": Rule(),

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from mcsim.config import noise, preparation, schema
+from mcsim.config import beams, noise, preparation, schema
 
 # Table -> its class. The kind of a beam or scan, which pydantic puts into the location, selects one of several.
 _TABLES: dict[tuple[str, ...], type] = {
@@ -24,8 +24,8 @@ _TABLES: dict[tuple[str, ...], type] = {
     **{
         ("channel", key, kind): table
         for key, tables in (
-            ("beam", schema.BEAMS),
-            ("beam_b", schema.BEAMS),
+            ("beam", beams.BEAMS),
+            ("beam_b", beams.BEAMS),
             ("scan", schema.SCANS),
             ("noise", noise.NOISES),
         )
@@ -141,4 +141,5 @@ def _locate(loc: tuple[int | str, ...], plain: Any) -> tuple[str, tuple[str, ...
         readable = part if part.isprintable() else shown(part)
         key = f"{key}.{readable}" if key else readable
         here = here.get(part) if isinstance(here, dict) else None
-    return key, tuple(str(part) for part in loc[:-1] if not isinstance(part, int))
+    tables = tuple(str(part) for part in loc[:-1] if not isinstance(part, int))
+    return key, ("channel", "noise", *tables[3:]) if tables[:2] == ("channel", "split_noise") else tables

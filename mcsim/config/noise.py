@@ -62,3 +62,30 @@ def in_words(noise: Any) -> str:
     if isinstance(noise, Noise):
         return f"noise.sigma0_uk = {noise.sigma0_uk:g}"
     return f'noise.kind = "{noise.kind}"'
+
+
+def check_differences(noise: Any, split_noise: dict[str, Any]) -> None:
+    """Raise ValueError unless noise is of the samples of a differencing scan, the same for all splits."""
+    if isinstance(noise, Noise) and noise.hits is None and not split_noise:
+        return
+    key = "split_noise" if split_noise else "noise.hits" if isinstance(noise, Noise) else in_words(noise)
+    raise ValueError(
+        f"{key} is given, but the maps of a differencing scan are made from differences; give their noise as "
+        "noise.sigma0_uk alone"
+    )
+
+
+def check_splits(channel: Any, splits: tuple[str, ...], split_by: str) -> None:
+    """Raise ValueError for splits that the scan or the noise of a channel does not have."""
+    key = f"channel[{channel.name}]"
+    known = f"use one of {', '.join(splits)}" if splits else "name the splits in map.splits"
+    for name in channel.split_noise:
+        if name not in splits:
+            raise ValueError(f"{key}.split_noise.{name} is no split of the run; {known}")
+    if split_by == "rings" and channel.scan.kind == "differencing":
+        raise ValueError(
+            f'map.split_by = "rings" needs rings of one beam, but {key}.scan is of kind "differencing"; split by "time"'
+        )
+    line = getattr(channel.scan, "line_of_sight", None) or ""
+    if "{split}" in line and not splits:
+        raise ValueError(f"{key}.scan.line_of_sight = {line!r} contains {{split}}, but map.splits is empty; {known}")

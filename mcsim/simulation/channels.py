@@ -69,7 +69,7 @@ def scan_model(
     """Return the scan model of a channel, at the sampling and with the line of sight that the channel asks for."""
     model = scan.ScanModel.load(str(config.channel_path(chosen.model, spec.name, split)))
     if isinstance(chosen, config.ScanHitAveraged) and chosen.line_of_sight is not None:
-        model = model.with_lines_of_sight(chosen.line_of_sight)
+        model = model.with_lines_of_sight(chosen.line_of_sight.replace("{split}", str(split)))
     return model if chosen.sample_period_s is None else model.with_sampling(chosen.sample_period_s)
 
 
@@ -177,6 +177,8 @@ def _described(spec: config.Channel) -> tuple[systematics.Pointing | None, float
             if spec.scan.line_of_sight is None and name not in [line.name for line in model.lines_of_sight]:
                 return None, dipole_uk
             return systematics.Pointing(model, model.line_of_sight(name)), dipole_uk
+        case config.ScanHitAveraged() if "{split}" in f"{spec.scan.model}{spec.scan.line_of_sight}":
+            return None, None  # splits were pointed in different ways
         case config.ScanHitAveraged():
             model = scan_model(spec, spec.scan, None)
             lines = model.select()

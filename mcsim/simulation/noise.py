@@ -23,7 +23,7 @@ def in_pixels(spec: config.Channel, split: str | None, moments: Moments) -> tupl
     A map of hits takes the place of the scan's. What is not observed in a map of hits or variances is not observed.
     InputError if a file of the run cannot be used; its pixels and frame must be those of the maps that are made.
     """
-    noise = spec.noise
+    noise = spec.noise_of(split)
     if isinstance(noise, declared.Noise) and noise.hits is not None:
         path = config.channel_path(noise.hits, spec.name, split)
         hits, _ = _read(path, moments, healpix.HITS, "hits")

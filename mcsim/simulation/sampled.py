@@ -1,7 +1,7 @@
 """The whole survey sample by sample, effects and all: the time-ordered reference of each realization."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import reduce
 
 import healpy
@@ -52,12 +52,15 @@ def maps(
         beam = systematics.seen_through(acting, site, [effect for effect in acting if not _moves(effect)])
         observe = tod.sky_signal(seen, site.lmax, beam, epsilon, nthreads)
         for index, m in enumerate(channel.maps):
-            grid = MapGrid(site.nside, site.frame, (index / len(channel.maps), (index + 1) / len(channel.maps)))
+            grid = MapGrid(site.nside, site.frame, run.map.span(index))
             stages = list(after)
+            if run.map.split_by == "rings":
+                stages.append(_every(site.pointed("of rings").model.spin_period_s, len(channel.maps), index))
             draw = rng.generator(run.ensemble.seed, realization, f"noise/{m.name}")
-            of_samples = isinstance(spec.noise, config.Noise) and spec.noise.hits is None
-            if isinstance(spec.noise, config.Noise) and of_samples and spec.noise.sigma0_uk > 0.0:
-                stages.append(tod.white_noise(spec.noise.sigma0_uk, draw, _noise_factor(channel)))
+            given = spec.noise_of(run.map.splits[index] if run.map.splits else None)
+            of_samples = isinstance(given, config.Noise) and given.hits is None
+            if isinstance(given, config.Noise) and of_samples and given.sigma0_uk > 0.0:
+                stages.append(tod.white_noise(given.sigma0_uk, draw, _noise_factor(channel)))
             stream = tod.through(_seen(channel, grid, observe), stages)
             map_uk = tod.bin_samples(stream, site.nside)[0]
             if not of_samples:
@@ -159,6 +162,17 @@ def _gained(channel: Channel) -> tod.Stage:
                 if error is not None:
                     gain = gain + error
             yield replace(chunk, signal_uk=gain * chunk.signal_uk)
+
+    return stage
+
+
+def _every(spin_period_s: float, number: int, index: int) -> tod.Stage:
+    """Return a stage that keeps the samples of every ``number``-th ring, one turn of the spin each."""
+
+    def stage(stream: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
+        for chunk in stream:
+            own = np.floor(chunk.time_s / spin_period_s).astype(np.int64) % number == index
+            yield tod.Samples(**{each.name: getattr(chunk, each.name)[own] for each in fields(chunk)})
 
     return stage
 

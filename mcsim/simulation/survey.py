@@ -220,7 +220,7 @@ def _channel(
     splits = run.map.splits or (None,)
     maps = []
     for index, split in enumerate(splits):
-        grid = MapGrid(run.map.resolution, run.map.frame, (index / len(splits), (index + 1) / len(splits)))
+        grid = MapGrid(run.map.resolution, run.map.frame, run.map.span(index))
         pairs = None
         if isinstance(spec.scan, config.ScanDifferencing):
             model = scan_model(spec, spec.scan, split)
@@ -234,6 +234,8 @@ def _channel(
                 moments = _moments_of_file(path, grid.nside, wanted, grid.frame)
             else:
                 moments = _moments(spec, split, grid, max(smax, 1), nthreads, progress)
+                if run.map.split_by == "rings" and isinstance(spec.scan, config.ScanHitAveraged):
+                    moments = replace(moments, hits=moments.hits / len(splits))
             # An effect may give the beam higher orders than a file of moments has: they are left out.
             beam = beam.truncated(moments.smax) if acting and moments.smax < beam.mmax else beam
         maps.append(_with_effects(_survey_map(run, spec, split, moments, pairs), acting, site, grid.time_range))
@@ -398,8 +400,9 @@ def _weight(
     weight = (moments.hits > 0).astype(float)
     if run.biposh.weighting == "hits":
         weight *= moments.hits
-    if run.map.mask is not None:
-        path = config.channel_path(run.map.mask, spec.name, split)
+    mask = spec.mask or run.map.mask
+    if mask is not None:
+        path = config.channel_path(mask, spec.name, split)
         weight *= read_mask(path, moments.nside, moments.frame, run.map.mask_frame, run.map.mask_apodisation_deg)
     if done is not None:
         weight *= done
