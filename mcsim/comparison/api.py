@@ -26,7 +26,7 @@ from mcsim.comparison.search import (
     with_sharper_sky,
 )
 from mcsim.errors import InputError
-from mcsim.simulation.noise import in_pixels
+from mcsim.simulation.noise import of_map
 from mcsim.support import folders
 from mcsim.support.progress import reporting
 
@@ -195,7 +195,7 @@ def _noise_rms(run: config.RunConfig, pair: ChannelPair) -> float:
     assert pair.scene is not None  # the caller looked
     spec = next(c for c in run.channels if c.name == pair.name)
     found = [
-        in_pixels(spec, split, m)[1] for split, m in zip(run.map.splits or (None,), pair.scene.moments, strict=True)
+        of_map(run, spec, split, m)[1] for split, m in zip(run.map.splits or (None,), pair.scene.moments, strict=True)
     ]
     levels = np.stack(
         [np.zeros(m.npix) if own is None else own for own, m in zip(found, pair.scene.moments, strict=True)]

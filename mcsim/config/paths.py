@@ -139,8 +139,15 @@ def check_files(config: RunConfig, plain: dict[str, Any], where: str, realizatio
     for entry in entries(plain):
         files(entry, config.map.splits, where)
         if "realization" in _placeholders(entry, where):
-            for realization in range(config.ensemble.realizations) if realizations is None else realizations:
-                files(entry, (), where, realization)
+            wanted = range(config.ensemble.realizations) if realizations is None else realizations
+            for realization in wanted:
+                try:
+                    files(entry, config.map.splits, where, realization)
+                except InputError as error:
+                    raise InputError(
+                        f"{str(error).rstrip('.')}; realizations {wanted.start} to {wanted.stop - 1} need a file each, "
+                        f"{len(wanted)} in all."
+                    ) from None
 
 
 def template_tail(template: str) -> str:

@@ -1,7 +1,7 @@
 """The whole survey sample by sample, effects and all: the time-ordered reference of each realization."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import reduce
 
 import healpy
@@ -55,7 +55,7 @@ def maps(
             grid = MapGrid(site.nside, site.frame, run.map.span(index))
             stages = list(after)
             if run.map.split_by == "rings":
-                stages.append(_every(site.pointed("of rings").model.spin_period_s, len(channel.maps), index))
+                stages.append(tod.every_ring(site.pointed("of rings").model.spin_period_s, len(channel.maps), index))
             draw = rng.generator(run.ensemble.seed, realization, f"noise/{m.name}")
             given = spec.noise_of(run.map.splits[index] if run.map.splits else None)
             of_samples = isinstance(given, config.Noise) and given.hits is None
@@ -64,7 +64,7 @@ def maps(
             stream = tod.through(_seen(channel, grid, observe), stages)
             map_uk = tod.bin_samples(stream, site.nside)[0]
             if not of_samples:
-                noise = 0.0 if m.noise_uk is None else m.noise_uk * draw.standard_normal(map_uk.size)
+                noise = 0.0 if m.noise_uk is None else m.noise(run.ensemble.seed, realization)
                 map_uk = np.where(m.moments.hits > 0, map_uk + noise, healpy.UNSEEN)
             found.append((m.name, map_uk if m.preparation is None else m.preparation.apply(map_uk)))
     return found
@@ -162,17 +162,6 @@ def _gained(channel: Channel) -> tod.Stage:
                 if error is not None:
                     gain = gain + error
             yield replace(chunk, signal_uk=gain * chunk.signal_uk)
-
-    return stage
-
-
-def _every(spin_period_s: float, number: int, index: int) -> tod.Stage:
-    """Return a stage that keeps the samples of every ``number``-th ring, one turn of the spin each."""
-
-    def stage(stream: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
-        for chunk in stream:
-            own = np.floor(chunk.time_s / spin_period_s).astype(np.int64) % number == index
-            yield tod.Samples(**{each.name: getattr(chunk, each.name)[own] for each in fields(chunk)})
 
     return stage
 

@@ -15,10 +15,10 @@ from mcsim.instrument import beams, scan
 from mcsim.instrument.scan import MapGrid
 from mcsim.simulation import convolve, mapmaking, tod
 from mcsim.simulation.channels import effects_on, refuse_pixel_effects, scan_model, site_b_of, site_of
-from mcsim.simulation.noise import in_pixels
+from mcsim.simulation.noise import DrawnNoise, of_map
 from mcsim.simulation.preparation import Preparation, preparation
 from mcsim.simulation.rings import Rings, limit_rings, parallel_transport_rings
-from mcsim.sphere import healpix, spectra
+from mcsim.sphere import healpix, rng, spectra
 from mcsim.sphere.mask import read_mask
 from mcsim.systematics import Effect, Library, Site, seen_through, spread_of
 
@@ -43,6 +43,9 @@ class SurveyMap:
         Mean relative error of the gain over the samples of a pixel, shape (npix,); ``None``: no error.
     preparation
         What is done to the map after it is made; ``None``: nothing.
+    drawn
+        How noise that is not white comes into the map, whose standard deviation noise_uk then describes; ``None``:
+        white.
     """
 
     name: str
@@ -52,6 +55,17 @@ class SurveyMap:
     pairs: mapmaking.DifferencingScan | None = None
     gain: NDArray[np.float64] | None = None
     preparation: Preparation | None = None
+    drawn: DrawnNoise | None = None
+
+    def noise(self, seed: int, realization: int) -> NDArray[np.float64]:
+        """Return the noise of a realization before any preparation, uK, shape (npix,); the map must have some."""
+        assert self.noise_uk is not None  # the caller looked
+        if self.drawn is None:
+            draw = rng.generator(seed, realization, f"noise/{self.name}")
+            return self.noise_uk * draw.standard_normal(self.noise_uk.size)
+        level = self.drawn.level_uk
+        changed = np.divide(self.noise_uk, level, out=np.zeros(level.size), where=level > 0.0)
+        return np.asarray(changed * self.drawn.draw(seed, realization))
 
     @property
     def left_to_apply(self) -> NDArray[np.float64] | None:
@@ -382,10 +396,10 @@ def _survey_map(
         raise InputError(
             f"The scan of map {name} hits no pixel of nside {moments.nside}; check the scan of the channel."
         )
-    moments, noise = (moments, None) if pairs is not None else in_pixels(spec, split, moments)
+    moments, noise, drawn = (moments, None, None) if pairs is not None else of_map(run, spec, split, moments)
     steps = preparation(run, spec, split)
     weight = None if steps is not None else _weight(run, spec, split, name, moments)
-    return SurveyMap(name, moments, weight, noise, pairs, preparation=steps)
+    return SurveyMap(name, moments, weight, noise, pairs, preparation=steps, drawn=drawn)
 
 
 def _weight(
