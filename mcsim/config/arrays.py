@@ -39,7 +39,7 @@ RULES = {
     "noise.hits": Rule(placeholders=("channel", "split")),
     "noise.variance": Rule(placeholders=("channel", "split")),
     "noise.maps": Rule(placeholders=("channel",)),
-    "noise.mask": Rule(placeholders=("channel", "split")),
+    "noise.mask": Rule(placeholders=("channel",)),
     "noise.files": Rule(placeholders=("channel", "split", "realization")),
     "effect.template": Rule(),
     "preparation.mask": Rule(placeholders=("channel", "split")),

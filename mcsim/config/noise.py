@@ -56,6 +56,8 @@ class NoiseDifference:
     def _as_many_hits(self) -> Self:
         if len(self.maps) < 2:
             raise ValueError(f"maps names {len(self.maps)} split, but a difference is of 2 or more; give their maps")
+        if any("{split}" in path for path in self.hits):
+            raise ValueError("hits contains {split}, but it lists the maps of all splits; name each")
         if self.hits and self.isotropic:
             raise ValueError("hits are given, but isotropic noise does not depend on them; remove one of them")
         if self.hits and len(self.hits) != len(self.maps):

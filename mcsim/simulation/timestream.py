@@ -15,7 +15,7 @@ from pathlib import Path
 import ducc0
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import LinearOperator, cg
 
 from mcsim.config.noise import NoiseCorrelated
@@ -35,7 +35,7 @@ TOLERANCE, ITERATIONS = 1e-10, 2000
 """Of the offsets: relative residual of the conjugate gradients."""
 
 LARGEST = 150_000_000
-"""Pairs of baseline and pixel: 12 bytes each."""
+"""Pairs of baseline and pixel: 12 bytes each on disk, which all workers share, and 24 while they are found."""
 
 LEVEL_DRAWS = 4
 """Realizations from which the standard deviation of the noise of pixels is estimated."""
@@ -162,14 +162,17 @@ def correlated_noise(
 def _fill(folder: Path, empty: CorrelatedNoise) -> None:
     """Write what :func:`correlated_noise` keeps."""
     hits = np.zeros(empty.grid.npix)
-    pieces, first = [], 0
-    size = 0
+    pieces: list[tuple[NDArray[np.int32], Map]] = []
+    total = sum(_number(empty, line) for line in empty.model.select())
+    filled, first, size = np.zeros(total, dtype=np.int64), 0, 0
     for line in empty.model.select():
         for chunk, baseline in _timed(empty, line):
             hits += np.bincount(chunk.pixel, minlength=hits.size)
             if empty.noise.map_making == "destriped":
                 where, count = np.unique((first + baseline) * hits.size + chunk.pixel, return_counts=True)
-                pieces.append((where, count))
+                # Baselines come in the order of time, so these are rows of a matrix, in which pairs may be repeated.
+                pieces.append(((where % hits.size).astype(np.int32), count.astype(np.float64)))
+                filled += np.bincount(where // hits.size, minlength=total)
                 size += where.size
                 if size > LARGEST:
                     raise InputError(
@@ -180,9 +183,9 @@ def _fill(folder: Path, empty: CorrelatedNoise) -> None:
         first += _number(empty, line)
     made = replace(empty, hits=hits)
     if pieces:
-        where, count = (np.concatenate(each) for each in zip(*pieces, strict=True))
-        at = (where // hits.size, where % hits.size)
-        made = replace(made, pairs=coo_matrix((count.astype(np.float64), at), shape=(first, hits.size)).tocsr())
+        pixel, count = (np.concatenate(each) for each in zip(*pieces, strict=True))
+        begin = np.concatenate([[0], np.cumsum(filled)]).astype(np.int32)  # at most LARGEST
+        made = replace(made, pairs=csr_matrix((count, pixel, begin), shape=(total, hits.size)))
         for name in ("data", "indices", "indptr"):
             np.save(folder / f"{name}.npy", getattr(made.pairs, name))
     drawn = [made._drawn(0, r, f"level of {empty.streams}") for r in range(LEVEL_DRAWS)]

@@ -101,6 +101,7 @@ def test_hits_stand_beside_the_temperature_and_the_plan_says_the_level(observed,
     [
         ({"hits": [HITS[0]]}, (), ("hits", 1, 2)),
         ({"isotropic": True}, (), ("hits", "isotropic")),
+        ({"hits": ["{split}.npy", "b.npy"]}, (), ("hits", "{split}")),
         ({}, ("a", "b", "c"), ("channel[W].noise.maps", 2, 3)),
         ({"maps": [HITS[0]]}, (), ("channel[W].noise", "maps", 1, 2)),
         ({"maps": [HITS[0], "none.fits"]}, (), ("channel[W].noise.maps[1]", "none.fits")),
@@ -110,6 +111,12 @@ def test_splits_that_do_not_fit_are_refused(observed, changes, splits, named):
     noise = {"kind": "difference", "maps": list(observed[:2]), "hits": list(HITS[:2])} | changes
     with refused(*named):
         run_with(noise, splits)
+
+
+def test_the_hash_is_over_the_contents_of_all_maps(observed):
+    noise = {"kind": "difference", "maps": list(observed[:2]), "hits": list(HITS[:2])}
+    other = noise | {"maps": [observed[0], observed[2]]}
+    assert config.digest(run_with(noise)) == config.digest(run_with(noise)) != config.digest(run_with(other))
 
 
 def test_equal_maps_have_no_noise(observed):
@@ -140,6 +147,18 @@ def test_realizations_are_those_of_the_files(files):
         assert drawn == pytest.approx(stored, abs=1e-9)
     level = shared.channels[0].maps[0].noise_uk
     assert level == pytest.approx(np.full(NPIX, np.std(1e6 * healpy.read_map(files.format(realization=0)))), rel=0.01)
+
+
+def test_the_hash_is_over_the_first_file_and_the_name(files, tmp_path):
+    def digest(name):
+        return config.digest(run_with({"kind": "realizations", "files": str(tmp_path / name)}))
+
+    before = digest("n_{realization:03d}.fits")
+    for number in range(2):
+        (tmp_path / f"other_{number:03d}.fits").write_bytes((tmp_path / f"n_{number:03d}.fits").read_bytes())
+    assert digest("other_{realization:03d}.fits") != before
+    (tmp_path / "n_000.fits").write_bytes((tmp_path / "n_001.fits").read_bytes())
+    assert digest("n_{realization:03d}.fits") != before
 
 
 def test_effects_scale_drawn_noise(files):
