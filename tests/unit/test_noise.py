@@ -8,6 +8,9 @@ import pytest
 
 from layouts import table
 from mcsim import config
+from mcsim.diagnosis.observed_maps import read_maps
+from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.diagnosis.wiener_filter import model_of
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere import header, healpix
@@ -83,6 +86,25 @@ def test_part_of_the_sky_is_read_by_its_pixels(tmp_path):
         assert np.array_equal(np.flatnonzero(map_ != healpy.UNSEEN), np.sort(seen))
         assert np.array_equal(map_[seen], expected[seen])
         assert unit == expected_unit
+
+
+def test_a_diagnosis_reads_published_maps_as_they_are(tmp_path):
+    """In mK, NESTED, Galactic, with the hits beside, which are the model's too."""
+    path = tmp_path / "W.fits"
+    np.save(tmp_path / "hits.npy", HITS)
+    model = model_of(survey(run_with({"sigma0_uk": 50.0, "hits": str(tmp_path / "hits.npy")})), DiagnosisSettings())
+    made = simulate.maps(model.survey, 1)[0]
+    units = {"TEMPERATURE": "mK", "N_OBS": "counts"}
+    table(path, {"TEMPERATURE": made / 1e3, "N_OBS": HITS}, units, ORDERING="NESTED", COORDSYS="G")
+    assert read_maps(model, tmp_path)[0] == pytest.approx(made, rel=1e-12)
+    path.unlink()
+    table(path, {"TEMPERATURE": made / 1e3}, units, COORDSYS="C")
+    with refused(path, "equatorial", "galactic", "map.frame"):
+        read_maps(model, tmp_path)
+    path.unlink()
+    table(path, {"TEMPERATURE": made / 1e3}, COORDSYS="G")  # no unit: uK
+    with refused(path, "TUNIT1"):
+        read_maps(model, tmp_path)
 
 
 @pytest.mark.parametrize(

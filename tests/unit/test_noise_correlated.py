@@ -9,7 +9,7 @@ from scipy.linalg import toeplitz
 from mcsim import config
 from mcsim.config.noise import NoiseCorrelated
 from mcsim.ensemble import plan
-from mcsim.instrument.scan import MapGrid
+from mcsim.instrument.scan import MapGrid, ScanModel
 from mcsim.simulation import sampled, simulate, timestream, tod
 from mcsim.simulation.channels import scan_model
 from mcsim.simulation.survey import survey
@@ -168,6 +168,16 @@ def test_maps_of_a_run_have_the_noise_of_their_realization():
         assert np.array_equal(m.moments.hits, other.moments.hits)
         assert own[seen] == pytest.approx(m.noise(3, 1)[seen], abs=1e-9)
     assert abs(np.corrcoef(noisy[0], noisy[1])[0, 1]) < 0.5
+
+
+def test_lines_of_sight_have_noise_of_their_own():
+    """Nearly white noise of both sides of the model: the variance is that of all samples."""
+    noise = NoiseCorrelated(sigma0_uk=2.0, f_knee_hz=2e-5, f_min_hz=1e-5)
+    model = ScanModel.load("wmap").with_lines_of_sight("A", "B").with_sampling(PERIOD_S)
+    made = timestream.correlated_noise(noise, model, MapGrid(NSIDE), "noise/W")
+    assert made.hits.sum() == 2.0 * model.samples(model.select()[0])
+    drawn = made.hits * made.draw(1, 0) ** 2
+    assert np.mean(drawn) == pytest.approx(4.0, rel=4.0 * np.sqrt(2.0 / drawn.size) + 0.06)
 
 
 def test_samples_have_the_noise_of_the_default_route():
