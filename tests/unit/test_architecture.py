@@ -55,6 +55,7 @@ PUBLIC = {
         "BeamEllipticalGaussian",
         "BeamGaussian",
         "BeamMap",
+        "BeamWindow",
         "Biposh",
         "Channel",
         "Compute",
