@@ -89,8 +89,8 @@ def limit(
     ...     ],
     ... }
     >>> found = mcsim.limit(run, settings=mcsim.LimitSettings(only=("noise_level",), dense=True))
-    >>> found.effects[0].name, round(found.effects[0].sigma, 2)
-    ('noise_level', 0.06)
+    >>> found.effects[0].name, round(float(found.effects[0].sigma), 2)
+    ('noise_level', 0.07)
     """
     run = model if isinstance(model, config.RunConfig) else config.load(model)
     settings = settings or LimitSettings()
@@ -206,7 +206,9 @@ def _candidates(
     library = systematics.catalogue() if settings.library is None else systematics.checked(settings.library)
     for name in (*settings.only, *settings.without):
         systematics.get(name, library)
-    fits = DiagnosisSettings(beam_orders=max(DiagnosisSettings().beam_orders, settings.orders))
+    named = dict.fromkeys((*settings.only, *(name.partition(":")[0] for name in settings.nuisances)))
+    orders = max(DiagnosisSettings().beam_orders, settings.orders)
+    fits = DiagnosisSettings(beam_orders=orders, including=tuple(name for name in named if name in library))
     analysis = analysis_of(run, settings.without, nthreads, fits, library)
     known = {one for c in analysis.candidates for one in (c.name, f"{c.name}:{c.channel}")}
     for name, width in settings.nuisances.items():
