@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from mcsim.diagnosis.assemble import effects_of, held_out_pvalues
 from mcsim.diagnosis.campaign import Rows, Task
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.result import Agreement
-from mcsim.ensemble.external import SEEDS, source_of
+from mcsim.ensemble.external import SEEDS, named_source, source_of
 from mcsim.ensemble.external_maps import Source
 from mcsim.errors import InputError
 from mcsim.stats.look_elsewhere import global_test
@@ -71,8 +71,7 @@ def loaded(
     external = isinstance(model, ExternalModel)
     given = model.description if isinstance(model, ExternalModel) else model
     run = given if isinstance(given, config.RunConfig) else config.load(given)
-    named = run.simulator or run.ensemble.maps
-    bare = replace(run, simulator=None, ensemble=replace(run.ensemble, maps=None))
+    bare, named = named_source(run)
     if external and named is not None:
         raise InputError(f"{run.name} names the simulator {named!r} already; give the run or the simulator alone.")
     if isinstance(model, ExternalModel):

@@ -5,7 +5,7 @@ import inspect
 import os
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
@@ -59,6 +59,12 @@ class Code(Source):
             raise RunError(
                 f"{self.words(seed, realization)} fails ({type(error).__name__}: {reason}); mend it."
             ) from error
+
+
+def named_source(run: config.RunConfig) -> tuple[config.RunConfig, str | None]:
+    """Return a run without the simulator or stored maps that it names, and these; None: mcsim simulates."""
+    bare = replace(run, simulator=None, ensemble=replace(run.ensemble, maps=None))
+    return bare, run.simulator or run.ensemble.maps
 
 
 def source_of(run: config.RunConfig, given: Any) -> Source:

@@ -1,6 +1,9 @@
 """Simulators that are not mcsim's as the model of a diagnosis: functions, classes, stored maps; and their refusals."""
 
+import json
+import sys
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import healpy
 import numpy as np
@@ -9,7 +12,7 @@ import xarray as xr
 from scipy.stats import kstest
 
 import mcsim
-from mcsim import config
+from mcsim import cli, config
 from mcsim.diagnosis import api, campaign
 from mcsim.diagnosis.external import Kept
 from mcsim.ensemble.external import seed_of, source_of
@@ -331,6 +334,61 @@ def test_only_a_diagnosis_takes_a_simulator(tmp_path):
         config.load(dict(MODEL, simulator="math:pi", ensemble={"maps": "x.zarr"}))
     assert "simulator" not in config.to_dict(config.load(MODEL))
     assert "maps" not in config.to_dict(config.load(MODEL))["ensemble"]
+
+
+@pytest.mark.slow
+def test_the_example_of_the_documentation_runs_from_the_command_line(tmp_path, monkeypatch, capsys):
+    """On workers, with its own effect in the data."""
+    monkeypatch.undo()
+    monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / "cache"))
+    example = Path(__file__).parents[2] / "docs" / "howto" / "own_simulator.toml"
+    run = config.load(example)
+    maps = source_of(replace(run, simulator=None), run.simulator).maps(0, 0, [effect("beam_width", -0.4)])
+    (tmp_path / "data").mkdir()
+    for name, map_uk in zip(("V_a.fits", "V_b.fits"), maps, strict=True):
+        write_map(tmp_path / "data" / name, map_uk, "ecliptic")
+    others = [name for name in mcsim.effects() if name not in ("beam_width", "noise_level")]
+    words = ["mcsim", "diagnose", str(example), str(tmp_path / "data"), "-o", str(tmp_path / "out"), "--workers", "2"]
+    words += ["--simulations", "200", *(word for name in others for word in ("--without", name))]
+    monkeypatch.setattr(sys, "argv", [*words, "--dry-run"])
+    cli.main()
+    assert "own_simulator.py:HealpySurvey" in capsys.readouterr().out
+    monkeypatch.setattr(sys, "argv", words)
+    cli.main()
+    assert "own_simulator.py:HealpySurvey" in capsys.readouterr().out
+    verdict = json.loads((tmp_path / "out" / "verdict.json").read_text())
+    assert verdict["gap"]["p_value"] < 1e-3
+    assert verdict["nearest"]["name"] == "beam_width"
+    assert verdict["simulator"]["effects"] == ["beam_width"]
+    assert verdict["simulator"]["agrees"]
+
+
+SMOOTHED = """
+import healpy
+import numpy as np
+
+def simulate(seed, effects=(), sky=None):
+    window = healpy.gauss_beam(np.deg2rad(500.0 / 60.0), lmax=24)
+    return {"V": 1.02 * healpy.alm2map(healpy.almxfl(sky, window), 16)}
+"""
+
+
+def test_a_comparison_takes_the_same_simulators(tmp_path):
+    """On the sky of mcsim's own side; its calibration is 2 % off."""
+    (tmp_path / "smoothed.py").write_text(SMOOTHED)
+    description = (Path(__file__).parents[2] / "docs" / "howto" / "own_simulator.toml").read_text()
+    plain = description.replace('splits = ["a", "b"]', "").replace('"own_simulator_cl.txt"', '"wmap7"')
+    plain = plain.replace("sigma0_uk = 30.0", "sigma0_uk = 0.0")
+    (tmp_path / "a.toml").write_text(plain.replace('simulator = "own_simulator.py:HealpySurvey"', ""))
+    (tmp_path / "b.toml").write_text(plain.replace("own_simulator.py:HealpySurvey", "smoothed.py:simulate"))
+    found = mcsim.compare(tmp_path / "a.toml", tmp_path / "b.toml", tmp_path / "a.toml")
+    [only] = found.channels
+    assert only.differences[0].name == "calibration"
+    assert only.differences[0].amplitude == pytest.approx(0.02, rel=1e-3)
+    (tmp_path / "smoothed.py").with_name("other.py").write_text("def simulate(seed): ...")
+    (tmp_path / "c.toml").write_text(plain.replace("own_simulator.py:HealpySurvey", "other.py:simulate"))
+    with refused("other.py:simulate", "sky"):
+        mcsim.compare(tmp_path / "a.toml", tmp_path / "c.toml", tmp_path / "a.toml")
 
 
 def test_names_and_units_of_maps(tmp_path):
