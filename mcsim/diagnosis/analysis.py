@@ -199,7 +199,7 @@ def data_vectors(job: Job, library: Library | None = None) -> Vector:
         else:
             sky = None
             if job.observed is not None:
-                seed = config.from_json(job.simulated).ensemble.seed
+                seed, _ = _seed_and_added(job.simulated, job.fiducial)
                 sky = _constrained_sky(job.definition, job.observed.tobytes(), seed, realization)
             if job.source is not None:
                 maps = external_maps(job, realization, sky)
@@ -213,12 +213,18 @@ def data_vectors(job: Job, library: Library | None = None) -> Vector:
 def external_maps(job: Job, realization: int, sky: NDArray[np.complex128] | None = None) -> list[Map]:
     """Return the maps of one realization that an external simulator makes; InputError if no such survey makes them."""
     assert job.source is not None
-    run, fiducial = config.from_json(job.simulated), config.from_json(job.fiducial)
-    seed, added = run.ensemble.seed, run.effects[len(fiducial.effects) :]
+    seed, added = _seed_and_added(job.simulated, job.fiducial)
     model, where = _analysis(*job.definition).model, job.source.words(seed, realization)
     maps = job.source.maps(seed, realization, added, sky)
     named = zip(model.parts, maps, strict=True)
     return [checked_map(model, part, map_uk, f"the map {part.name} of {where}") for part, map_uk in named]
+
+
+@lru_cache(maxsize=2)
+def _seed_and_added(simulated: str, fiducial: str) -> tuple[int, tuple[config.Effect, ...]]:
+    """Return the seed of a run, and its effects beyond those of the fiducial one."""
+    run = config.from_json(simulated)
+    return run.ensemble.seed, run.effects[len(config.from_json(fiducial).effects) :]
 
 
 @lru_cache(maxsize=32)

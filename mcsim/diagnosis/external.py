@@ -90,7 +90,8 @@ class Kept:
         """Return the data vectors of a job, simulated or kept."""
         if job.source is None:
             return self.task(job)
-        text = json.dumps([job.simulated, job.first, job.count, job.bipolar_scan])
+        run = json.loads(job.simulated)
+        text = json.dumps([run["effect"], run["ensemble"]["seed"], job.first, job.count, job.bipolar_scan])
 
         def fill(scratch: Path) -> None:
             if job.first == 0 and job.source is not None and job.source.count is None:

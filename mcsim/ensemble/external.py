@@ -17,6 +17,7 @@ import numpy as np
 import xarray as xr
 
 from mcsim import config
+from mcsim.config import arrays
 from mcsim.ensemble.external_maps import Alm, Part, Source, StoredMaps, fits_maps, hash_of, parts_of, stacked
 from mcsim.errors import InputError, RunError
 from mcsim.support.code import class_digest
@@ -24,15 +25,19 @@ from mcsim.support.code import class_digest
 SEEDS = 1 << 20
 """Realizations of a stream of seeds."""
 
+LARGEST = 1 << 16
+"""Bytes of a pickled simulator up to which it goes with every task; a larger one is a file in the cache."""
+
 _GOLDEN = 2654435769
 """2^32 over the golden ratio, odd: multiples modulo 2^32 are all different, and far apart."""
 
 
 @dataclass(frozen=True)
 class Code(Source):
-    """A function or class; ``made`` is the pickle of a function without arguments that returns it."""
+    """A function or class; ``made`` is the pickle of a function that returns it, ``held`` a hash of what it holds."""
 
     made: bytes = b""
+    held: str = ""
 
     def words(self, seed: int, realization: int) -> str:
         """Return which maps these are, for messages."""
@@ -41,10 +46,9 @@ class Code(Source):
     def identity(self) -> str:
         """Return a hash of the source code and of ``state``, or without one of everything that the object holds."""
         simulator = _loaded(self.made)
-        own = _definition(simulator)
         state = getattr(simulator, "state", None)
-        held = self.made if state is None else repr(state).encode()
-        return hash_of(class_digest(own), hashlib.sha256(held).hexdigest(), self.effects, self.takes_sky)
+        held = self.held if state is None else repr(state)
+        return hash_of(class_digest(_definition(simulator)), held, self.effects, self.takes_sky)
 
     def _given(self, seed: int, realization: int, effects: Sequence[config.Effect], sky: Alm | None) -> Any:
         own: dict[str, Any] = {"effects": tuple(effects)} if effects else {}
@@ -92,17 +96,22 @@ def source_of(run: config.RunConfig, given: Any) -> Source:
         text = str(given)
         if "{" in text.replace("{{", ""):
             return fits_maps(parts, text)
-        if text.endswith(".npy") or os.path.isdir(text):
+        if ":" not in os.path.basename(text):
             if not os.path.exists(text):
-                raise InputError(f"{text} does not exist; give stored maps, or a simulator as module:name.")
+                raise InputError(f"{text} does not exist; give stored maps, or a simulator as package.module:name.")
             return StoredMaps(parts, Path(text).name, path=os.path.abspath(text))
-        made = cloudpickle.dumps(partial(_resolved, text, config.to_json(run)))
-        return _code(parts, text.replace(os.path.dirname(text.partition(":")[0]) + os.sep, ""), made)
+        made = cloudpickle.dumps(partial(_resolved, text, config.to_json(run), _written(text.rpartition(":")[0])))
+        # The run is a part of what tells diagnoses apart already.
+        return _code(parts, os.path.basename(text), made, os.path.basename(text))
     try:
         made = cloudpickle.dumps(partial(_same, given))
     except Exception as error:  # of any type, from what the object holds
         raise InputError(f"the simulator {given!r} cannot be sent to workers ({error}); hold no open files.") from error
-    return _code(parts, getattr(given, "__name__", type(_whole(given)).__name__), made)
+    held = hashlib.sha256(made).hexdigest()
+    if len(made) > LARGEST:
+        kept = arrays.kept(lambda folder: (folder / "simulator").write_bytes(made), "simulator") / "simulator"
+        made = cloudpickle.dumps(partial(_read, str(kept)))
+    return _code(parts, getattr(given, "__name__", type(_whole(given)).__name__), made, held)
 
 
 def seed_of(seed: int, realization: int) -> int:
@@ -115,7 +124,7 @@ def seed_of(seed: int, realization: int) -> int:
     return (seed * SEEDS + realization) * _GOLDEN % (1 << 32)
 
 
-def _code(parts: tuple[Part, ...], label: str, made: bytes) -> Code:
+def _code(parts: tuple[Part, ...], label: str, made: bytes, held: str) -> Code:
     """Return the source of a simulator, from what it says of itself."""
     simulator = _loaded(made)
     method, effects = _method(simulator), getattr(simulator, "effects", ())
@@ -125,17 +134,24 @@ def _code(parts: tuple[Part, ...], label: str, made: bytes) -> Code:
     if not takes or (effects and "effects" not in takes):
         missing = "effects" if takes else "seed"
         raise InputError(f"simulate of {label} has no argument {missing}; define simulate(seed, effects=()).")
-    return Code(parts, label, tuple(effects), "sky" in takes, made)
+    return Code(parts, label, tuple(effects), "sky" in takes, made, held)
 
 
 def _same(given: Any) -> Any:
     return given
 
 
+def _read(path: str) -> Any:
+    return cloudpickle.loads(Path(path).read_bytes())()
+
+
 @lru_cache(maxsize=2)
 def _loaded(made: bytes) -> Any:
     """Make a simulator once per process: what it keeps serves all its realizations."""
-    return cloudpickle.loads(made)()
+    try:
+        return cloudpickle.loads(made)()
+    except ImportError as error:  # of an object from a module that this process does not find
+        raise InputError(f"a worker cannot load the simulator ({error}); install its module.") from error
 
 
 def _method(simulator: Any) -> Callable[..., Any]:
@@ -162,13 +178,11 @@ def _definition(simulator: Any) -> Any:
     return found if inspect.isfunction(found) or isinstance(found, type) else type(found)
 
 
-def _resolved(text: str, run: str) -> Any:
+def _resolved(text: str, run: str, written: str) -> Any:
     """Import a simulator; a class is made, with the description if it takes an argument."""
     module, _, name = text.rpartition(":")
-    if not module or not name:
-        raise InputError(f"simulator = {text!r} names no simulator; give package.module:name or file.py:name.")
     try:
-        found: Any = _of_path(module) if module.endswith(".py") else import_module(module)
+        found: Any = _of_path(module, written) if module.endswith(".py") else import_module(module)
         for part in name.split("."):
             found = getattr(found, part)
         if isinstance(found, type):
@@ -183,12 +197,19 @@ def _resolved(text: str, run: str) -> Any:
     return found
 
 
-def _of_path(path: str) -> Any:
+def _written(path: str) -> str:
+    """Return a hash of a file, so that one that is changed is loaded again; "" for a module."""
+    if not path.endswith(".py"):
+        return ""
+    if not os.path.isfile(path):
+        raise InputError(f"{path} does not exist; give the file of the simulator.")
+    return arrays.sha256_of(Path(path))
+
+
+def _of_path(path: str, written: str) -> Any:
     """Import a file as ``python file.py`` would: what stands beside it can be imported."""
-    name = f"{Path(path).stem}_{hashlib.sha256(path.encode()).hexdigest()[:8]}"
+    name = f"{Path(path).stem}_{hash_of(path, written)[:8]}"
     if name not in sys.modules:
-        if not os.path.isfile(path):
-            raise InputError(f"{path} does not exist; give the file of the simulator.")
         if os.path.dirname(path) not in sys.path:
             sys.path.insert(0, os.path.dirname(path))
         spec = spec_from_file_location(name, path)

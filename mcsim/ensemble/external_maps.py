@@ -156,6 +156,10 @@ class FitsMaps(Source):
         """Return the number of realizations."""
         return len(self.realizations)
 
+    def words(self, seed: int, realization: int) -> str:
+        """Return which maps these are, for messages."""
+        return f"realization {self.realizations[realization]} of {self.label}"
+
     def identity(self) -> str:
         """Return a hash of names, sizes and contents of the files."""
         files = [self._path(part, r) for r in self.realizations for part in self.parts]
@@ -227,6 +231,8 @@ def fits_maps(parts: tuple[Part, ...], template: str) -> FitsMaps:
         ) from None
     if not numbers:
         raise InputError(f"no file fits {template}; write {{realization}} where its number stands, once.")
+    if len({found._path(part, numbers[0]) for part in parts}) < len(parts):
+        raise InputError(f"{template} has one file for several maps; write {{channel}} and {{split}} into it.")
     for r in numbers:
         for part in parts:
             if not os.path.isfile(found._path(part, r)):

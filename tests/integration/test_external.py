@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import healpy
@@ -99,7 +100,7 @@ def native(seed, realizations):
 
 
 def test_the_same_maps_stored_elsewhere_give_the_verdict_of_the_run(tmp_path):
-    """mcsim's own null simulations, as FITS files, a Zarr store and an xarray object, make the same numbers as the run."""
+    """mcsim's own null simulations, as FITS files, Zarr store and xarray object, make the numbers of the run."""
     data = list(native(5, 1)[0])
     expected = mcsim.diagnose(MODEL, data, settings=FEW)
     stack = native(campaign._COVARIANCE, expected.simulations)
@@ -263,7 +264,7 @@ def test_a_batch_that_was_interrupted_goes_on_with_the_same_maps(tmp_path):
         mcsim.diagnose(run, data, settings=SETTINGS)
     first = (tmp_path / "calls").read_text().split()
     (tmp_path / "stop").unlink()
-    found = mcsim.diagnose(run, data, settings=SETTINGS)
+    found = mcsim.diagnose(replace(run, compute=replace(run.compute, workers=7)), data, settings=SETTINGS)
     calls = (tmp_path / "calls").read_text().split()
     again = set(first) & set(calls[len(first) :])
     assert len(again) <= 10  # those of the task that was interrupted
@@ -271,6 +272,20 @@ def test_a_batch_that_was_interrupted_goes_on_with_the_same_maps(tmp_path):
     assert mcsim.diagnose(run, data, settings=SETTINGS).test.pvalue == found.test.pvalue
     assert (tmp_path / "calls").read_text().split() == calls
     assert not list((tmp_path / "cache").glob("diagnose/*.parts"))
+    (tmp_path / "sim.py").write_text(SIMULATOR.replace("scale=300.0", "scale=320.0"))
+    other = mcsim.diagnose(run, data, settings=SETTINGS)
+    assert len((tmp_path / "calls").read_text().split()) == len(calls) + other.simulations + 3
+    assert other.test.pvalue != found.test.pvalue
+
+
+def test_a_large_simulator_is_a_file_of_the_cache():
+    """Its content is a part of its identity; what it holds is loaded once per process."""
+    run = config.load(MODEL)
+    held = [np.zeros(20000), np.ones(20000)]
+    sources = [source_of(run, partial(Plain.simulate, Plain(), sky=one)) for one in (*held, held[0])]
+    assert all(len(source.made) < 1000 for source in sources)
+    assert sources[0].identity() != sources[1].identity()
+    assert sources[0].held == sources[2].held
 
 
 def test_seeds_are_unique_and_far_apart():
@@ -317,6 +332,8 @@ def test_what_cannot_be_a_simulator(tmp_path, monkeypatch):
     run = config.load(MODEL)
     no_seed, cannot = (lambda: None), (lambda seed: None)
     cannot.effects = ("beam_width",)
+    for name in ("one1.fits", "a1.fits"):
+        (tmp_path / name).touch()
     for given, words in (
         ("no_such_module:thing", ("no_such_module", "ModuleNotFoundError")),
         (str(tmp_path / "none.py") + ":Thing", (str(tmp_path / "none.py"),)),
@@ -324,6 +341,9 @@ def test_what_cannot_be_a_simulator(tmp_path, monkeypatch):
         ("only_a_name", ("package.module:name", "only_a_name")),
         (str(tmp_path / "{realization}.fits"), ("{realization}", tmp_path)),
         (str(tmp_path / "{realisation}.fits"), ("{realisation}", "{realization}")),
+        (str(tmp_path / "one{realization}.fits"), ("{channel}", "{split}")),
+        (str(tmp_path / "{split}{realization}.fits"), (str(tmp_path / "b1.fits"), "V:b", "1")),
+        (str(tmp_path / "none.zarr"), (str(tmp_path / "none.zarr"),)),
         (no_seed, ("seed",)),
         (cannot, ("effects",)),
         (np.zeros((3, 5, 3072)), ("5", "V:a, V:b")),
