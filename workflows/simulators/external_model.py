@@ -180,9 +180,8 @@ def main() -> None:
         p.append(global_test(known.null, x, groups, known.calibration).pvalue)
     ks = kstest(p, "uniform").pvalue
     print(f"null cases: {np.sum(np.array(p) < 0.05)} of {len(p)} below 0.05, KS p = {ks:.2g}\n", flush=True)
-    print(
-        "| systematic of litebird_sim in W1 | p | litebird_sim as the model | p | mcsim as the model |\n|---|---|---|---|---|"
-    )
+    print("| systematic of litebird_sim in W1 | p | litebird_sim as the model | p | mcsim as the model |")
+    print("|---|---|---|---|---|")
     for flaw in (
         {},
         {"ellipticity": 0.1},
