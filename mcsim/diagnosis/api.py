@@ -77,6 +77,8 @@ def diagnose(
     ------
     InputError
         If a run, data or settings cannot be used.
+    RunError
+        If a simulator of another program fails; the same call goes on where it ended.
     """
     run, source = loaded(model)
     settings = settings or DiagnosisSettings()

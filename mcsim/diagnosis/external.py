@@ -38,7 +38,8 @@ class ExternalModel:
         Sky, beams, scans and noise of the instrument: a run. With it maps are filtered, and the responses to effects
         that the other program cannot add are simulated.
     simulator
-        Where the maps come from. A function ``simulate(seed, effects=())``, or an object with such a method: it returns
+        Where the maps come from. A function ``simulate(seed, effects=())``, or an object with such a method, or its
+        class (made with the description if it takes an argument), or ``"package.module:name"`` of these: it returns
         maps, uK, RING order, in the description's frame and after its preparation, as a dict or xarray object by
         channel, or by channel and split. Or stored maps: the template of FITS files with {realization}, {channel} and
         {split}; a Zarr store; an xarray object or array with the dimension ``realization``.

@@ -79,8 +79,8 @@ def source_of(run: config.RunConfig, given: Any) -> Source:
     run
         Description of sky, beams, scans and noise.
     given
-        A function ``simulate(seed, effects=())``, or an object with such a method; the same as text,
-        ``package.module:name`` or ``file.py:name``, where a class is made with the run if it takes an argument. Or
+        A function ``simulate(seed, effects=())``, or an object with such a method, or its class, which is made with the
+        run if it takes an argument; the same as text, ``package.module:name`` or ``file.py:name``. Or
         stored maps: a template of FITS files with {realization}, {channel} and {split}; a Zarr store or .npy file; an
         xarray object or array with the dimension ``realization`` first.
 
@@ -103,6 +103,9 @@ def source_of(run: config.RunConfig, given: Any) -> Source:
         made = cloudpickle.dumps(partial(_resolved, text, config.to_json(run), _written(text.rpartition(":")[0])))
         # The run is a part of what tells diagnoses apart already.
         return _code(parts, os.path.basename(text), made, os.path.basename(text))
+    label = getattr(given, "__name__", type(_whole(given)).__name__)
+    if isinstance(given, type):
+        return _code(parts, label, cloudpickle.dumps(partial(_instance, given, config.to_json(run))), label)
     try:
         made = cloudpickle.dumps(partial(_same, given))
     except Exception as error:  # of any type, from what the object holds
@@ -111,7 +114,7 @@ def source_of(run: config.RunConfig, given: Any) -> Source:
     if len(made) > LARGEST:
         kept = arrays.kept(lambda folder: (folder / "simulator").write_bytes(made), "simulator") / "simulator"
         made = cloudpickle.dumps(partial(_read, str(kept)))
-    return _code(parts, getattr(given, "__name__", type(_whole(given)).__name__), made, held)
+    return _code(parts, label, made, held)
 
 
 def seed_of(seed: int, realization: int) -> int:
@@ -185,8 +188,7 @@ def _resolved(text: str, run: str, written: str) -> Any:
         found: Any = _of_path(module, written) if module.endswith(".py") else import_module(module)
         for part in name.split("."):
             found = getattr(found, part)
-        if isinstance(found, type):
-            found = found(config.from_json(run)) if inspect.signature(found).parameters else found()
+        return _instance(found, run)
     except InputError:
         raise
     except Exception as error:  # whatever a foreign module does when it is imported
@@ -194,7 +196,13 @@ def _resolved(text: str, run: str, written: str) -> Any:
         raise InputError(
             f"simulator = {text!r} cannot be loaded ({type(error).__name__}: {reason}); mend or install it."
         ) from error
-    return found
+
+
+def _instance(found: Any, run: str) -> Any:
+    """Make a class, with the description if it takes an argument; another object stays as it is."""
+    if not isinstance(found, type):
+        return found
+    return found(config.from_json(run)) if inspect.signature(found).parameters else found()
 
 
 def _written(path: str) -> str:

@@ -1,5 +1,6 @@
 """Simulators that are not mcsim's as the model of a diagnosis: functions, classes, stored maps; and their refusals."""
 
+import json
 import sys
 from dataclasses import dataclass, replace
 from functools import partial
@@ -41,6 +42,7 @@ MODEL = {
         }
     ],
 }
+EXAMPLE = Path(__file__).parents[2] / "docs" / "howto" / "own_simulator.toml"
 LIBRARY = {name: kind for name, kind in mcsim.effects().items() if name in ("beam_width", "noise_level")}
 SMALL = {"beam_orders": 1, "split_beam_orders": 1, "sky_bins": 4, "scan_L_max": 1, "scan_bins": 1, "scan_sims": 20}
 SETTINGS = mcsim.DiagnosisSettings(library=LIBRARY, sims_per_element=5, **SMALL)
@@ -288,6 +290,23 @@ def test_a_large_simulator_is_a_file_of_the_cache():
     assert sources[0].held == sources[2].held
 
 
+class Told:
+    """A simulator that is made with the description."""
+
+    def __init__(self, run):
+        self.sigma = run.channels[0].noise.sigma0_uk
+
+    def simulate(self, seed):
+        return {"V": {split: np.full(3072, self.sigma) for split in "ab"}}
+
+
+def test_a_class_is_made_with_the_description():
+    source = source_of(config.load(MODEL), Told)
+    assert [maps[0] for maps in source.maps(0, 0)] == [SIGMA, SIGMA]
+    busier = replace(config.load(MODEL), compute=config.Compute(workers=5))
+    assert source_of(busier, Told).held == source.held
+
+
 def test_seeds_are_unique_and_far_apart():
     seeds = np.sort([seed_of(stream, r) for stream in (campaign._COVARIANCE, campaign._RESPONSE) for r in range(5000)])
     assert seeds[0] >= 0
@@ -364,6 +383,14 @@ def test_small_ensembles_are_refused_with_the_number_that_is_needed(tmp_path):
         mcsim.diagnose(mcsim.ExternalModel(MODEL, stack), list(stack[0]), settings=few)
 
 
+def test_a_configuration_with_a_simulator_is_printed(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["mcsim", "config", str(EXAMPLE)])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert stop.value.code == 0
+    assert json.loads(capsys.readouterr().out)["simulator"] == f"{EXAMPLE.with_name('own_simulator.py')}:HealpySurvey"
+
+
 def test_only_a_diagnosis_takes_a_simulator(tmp_path):
     told = config.load(dict(MODEL, simulator="math:pi"))
     with refused("simulator", "math:pi"):
@@ -374,9 +401,6 @@ def test_only_a_diagnosis_takes_a_simulator(tmp_path):
     assert "maps" not in config.to_dict(config.load(MODEL))["ensemble"]
 
 
-EXAMPLE = Path(__file__).parents[2] / "docs" / "howto" / "own_simulator.toml"
-
-
 def test_the_command_line_says_what_a_simulator_is_asked_for(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["mcsim", "diagnose", str(EXAMPLE), "data", "-o", "out", "--dry-run"])
     with pytest.raises(SystemExit) as stop:
@@ -385,7 +409,6 @@ def test_the_command_line_says_what_a_simulator_is_asked_for(monkeypatch, capsys
     assert "own_simulator.py:HealpySurvey" in capsys.readouterr().out
 
 
-@pytest.mark.slow
 def test_the_example_of_the_documentation_runs_on_workers(tmp_path, monkeypatch):
     """With its own effect in the data."""
     monkeypatch.undo()
