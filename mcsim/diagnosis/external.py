@@ -127,9 +127,9 @@ def agreement(known: DiagnosisContext) -> Agreement:
     -----
     The skies in which responses are measured are diagnosed with the external ensemble as the model: their mean with all
     candidates, as the data of a table are (:meth:`NullEnsemble.of_mean`), and the scatter of their chi^2 against those
-    of the external simulations (each against the others, Kolmogorov-Smirnov); Bonferroni over both. Where the pointing
-    is known, mcsim's skies are those of the default route or of the time-ordered reference, whichever agrees better: an
-    external simulator may be either.
+    of the external simulations (each against the others, Kolmogorov-Smirnov). The smaller of both p-values counts,
+    corrected by Šidák. Where the pointing is known, mcsim's skies are those of the default route or of the time-ordered
+    reference, whichever agrees better: an external simulator may be either.
     """
     ensemble, source = known.ensemble, known.analysis.source
     assert source is not None
@@ -142,7 +142,8 @@ def agreement(known: DiagnosisContext) -> Agreement:
         mean = own.mean(axis=0)
         test = global_test(null, mean, groups, known.calibration)
         scatter = float(ks_2samp([known.null.pvalue(x) for x in own], others).pvalue)
-        found.append((min(1.0, 2.0 * min(test.pvalue, scatter)), test.best, mean))
+        least = min(test.pvalue, scatter, 1.0 - 1e-12)
+        found.append((float(-np.expm1(2.0 * np.log1p(-least))), test.best, mean))
     pvalue, best, mean = max(found, key=lambda one: one[0])
     nearest = None
     if known.candidates:
