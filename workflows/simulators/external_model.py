@@ -49,6 +49,7 @@ MODEL = {
         for name, frequency, line in (("V1", 61.0, "A"), ("W1", 94.0, "B"))
     ],
 }
+NONE = {"amplitude": 0.0}
 CALLS = 20
 PROPOSED = ("beam_ellipticity", "beam_width", "gain_drift", "noise_level", "pointing_offset")
 
@@ -61,7 +62,7 @@ class Litebird:
     (apply_gaindrift), ``quadratic`` response in 1/K (apply_quadratic_nonlin).
     """
 
-    effects = ("beam_width", "noise_level")
+    effects = ("beam_ellipticity", "beam_width", "noise_level")
 
     def __init__(self, run: mcsim.RunConfig, **flaws: float) -> None:
         self.inputs, self.flaws = of(run), flaws
@@ -98,19 +99,19 @@ class Litebird:
         draw, lmax = np.random.default_rng(seed), self.inputs.lmax
         drawn = self._sky(draw)
         alm = lbs.SphericalHarmonics((drawn if sky is None else sky)[None], lmax, lmax, coordinates=_ECLIPTIC)
-        size = {(e.name, e.channel): e.parameters["amplitude"] for e in effects}
+        added = {(e.name, e.channel): e.parameters for e in effects}
         maps = {}
-        for channel, name, angles, pixels in self.scans:
-            ellipticity = 1.0 + (self.flaws.get("ellipticity", 0.0) if channel == "W1" else 0.0)
-            beam, order = self._beam(self.fwhm[channel] * (1.0 + size.get(("beam_width", channel), 0.0)), ellipticity)
+        for channel, part, angles, pixels in self.scans:
+            own = {name: given for (name, of_channel), given in added.items() if of_channel == channel}
+            beam, order = self._beam(channel, own)
             tod = np.zeros(len(pixels))
             how = lbs.BeamConvolutionParameters(lmax, order, False, 1e-6)
             lbs.add_convolved_sky_to_one_detector(tod, alm, beam, angles, None, None, how, 1)
             if channel == "W1":
                 self._respond(tod)
-            noise = np.sqrt(1.0 + size.get(("noise_level", channel), 0.0))
-            lbs.add_white_noise(tod, noise * self.sigma[channel], draw)
-            maps[name] = binned(self.inputs.nside, iter([(pixels, tod)]))
+            noise = np.sqrt(1.0 + own.get("noise_level", NONE)["amplitude"]) * self.sigma[channel]
+            lbs.add_white_noise(tod, noise, draw)
+            maps[part] = binned(self.inputs.nside, iter([(pixels, tod)]))
         return maps
 
     def _respond(self, tod):  # type: ignore[no-untyped-def]
@@ -133,10 +134,17 @@ class Litebird:
         real, imaginary = draw.normal(size=(2, ell.size))
         return np.sqrt(self.cl[ell]) * np.where(m > 0, (real + 1j * imaginary) / np.sqrt(2.0), real)
 
-    def _beam(self, fwhm, ellipticity):  # type: ignore[no-untyped-def]
-        lmax, order = self.inputs.lmax, 0 if ellipticity == 1.0 else 4
-        own = lbs.gauss_beam_to_alm(lmax, order, fwhm, ellipticity, 0.0, None)
-        return own, order
+    def _beam(self, channel, own):  # type: ignore[no-untyped-def]
+        """Return the beam of a channel with effects, and its highest order."""
+        ellipse = own.get("beam_ellipticity", NONE)
+        if channel == "W1" and "ellipticity" in self.flaws:
+            ellipse = {"amplitude": self.flaws["ellipticity"]}
+        order = 4 if ellipse["amplitude"] else 0
+        fwhm = self.fwhm[channel] * (1.0 + own.get("beam_width", NONE)["amplitude"])
+        ratio, angle = 1.0 + abs(ellipse["amplitude"]), np.deg2rad(ellipse.get("angle_deg", 0.0))
+        if ellipse["amplitude"] < 0.0:
+            angle += np.pi / 2.0
+        return lbs.gauss_beam_to_alm(self.inputs.lmax, order, fwhm, ratio, angle, None), order
 
 
 def ask(jobs):  # type: ignore[no-untyped-def]
