@@ -6,7 +6,6 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim import config, systematics
 from mcsim.diagnosis.candidate import Candidate, numbered
@@ -15,15 +14,15 @@ from mcsim.diagnosis.map_checks import checked_map
 from mcsim.diagnosis.matched_filters import matched_filter
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Block, Element, blocks_of
-from mcsim.diagnosis.wiener_filter import Map, Model, model_of, shared_sky, wiener_filter
+from mcsim.diagnosis.wiener_filter import Model, model_of, shared_sky, wiener_filter
 from mcsim.ensemble.external_maps import Source
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import Survey, survey
 from mcsim.sphere import alm as alm_
+from mcsim.support.arrays import Alm, Map, Vector
 from mcsim.systematics import Effect, Library
 
-Vector = NDArray[np.float64]
 Kinds = tuple[tuple[str, type[Effect]], ...]
 """Effects of a library by name, as they are sent to workers."""
 
@@ -174,7 +173,7 @@ class Job:
     sample_by_sample: bool = False  # simulate with the time-ordered reference, not with the default route
     without: tuple[str, ...] = ()  # effects that are no candidates
     bipolar_scan: bool = False  # measure the bipolar scan and the coarse residual maps as well
-    observed: NDArray[np.complex128] | None = None  # filtered sky of the data, which then constrains the skies
+    observed: Alm | None = None  # filtered sky of the data, which then constrains the skies
     settings: DiagnosisSettings = field(default_factory=DiagnosisSettings)
     library: Kinds = field(default_factory=lambda: kinds_of(None))
     source: Source | None = None  # simulates in place of mcsim
@@ -210,7 +209,7 @@ def data_vectors(job: Job, library: Library | None = None) -> Vector:
     return np.stack(rows)
 
 
-def external_maps(job: Job, realization: int, sky: NDArray[np.complex128] | None = None) -> list[Map]:
+def external_maps(job: Job, realization: int, sky: Alm | None = None) -> list[Map]:
     """Return the maps of one realization that an external simulator makes; InputError if no such survey makes them."""
     assert job.source is not None
     seed, added = _seed_and_added(job.simulated, job.fiducial)
@@ -228,9 +227,7 @@ def _seed_and_added(simulated: str, fiducial: str) -> tuple[int, tuple[config.Ef
 
 
 @lru_cache(maxsize=32)
-def _constrained_sky(
-    definition: tuple[Any, ...], observed: bytes, seed: int, realization: int
-) -> NDArray[np.complex128]:
+def _constrained_sky(definition: tuple[Any, ...], observed: bytes, seed: int, realization: int) -> Alm:
     """Return a constrained realization: a sky s + (s^_data - s^_drawn), with s^_drawn filtered from maps of s.
 
     Notes

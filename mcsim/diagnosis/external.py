@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import ks_2samp
 
 from mcsim import config
 from mcsim.diagnosis.analysis import Job, external_maps
 from mcsim.diagnosis.assemble import effects_of, held_out_pvalues
-from mcsim.diagnosis.campaign import Rows, Task
+from mcsim.diagnosis.campaign import Task
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.result import Agreement
 from mcsim.ensemble.external import SEEDS, named_source, source_of
@@ -22,6 +21,7 @@ from mcsim.ensemble.external_maps import Source
 from mcsim.errors import InputError
 from mcsim.stats.look_elsewhere import global_test
 from mcsim.support import folders
+from mcsim.support.arrays import Map, Matrix
 
 FILE = "vectors.npy"
 REPEATS = 1e-6
@@ -87,7 +87,7 @@ class Kept:
     task: Task
     folder: str  # in the cache
 
-    def __call__(self, job: Job) -> Rows:
+    def __call__(self, job: Job) -> Matrix:
         """Return the data vectors of a job, simulated or kept."""
         if job.source is None:
             return self.task(job)
@@ -99,7 +99,9 @@ class Kept:
                 _check_seeds(job)
             np.save(scratch / FILE, self.task(job))
 
-        found: Rows = np.load(folders.cached(f"{self.folder}/{hashlib.sha256(text.encode()).hexdigest()}", fill) / FILE)
+        found: Matrix = np.load(
+            folders.cached(f"{self.folder}/{hashlib.sha256(text.encode()).hexdigest()}", fill) / FILE
+        )
         return found
 
 
@@ -116,7 +118,7 @@ def _check_seeds(job: Job) -> None:
         raise InputError(f"{job.source.label} gives the same maps for every seed; draw sky and noise from the seed.")
 
 
-def _same(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+def _same(one: Map, other: Map) -> bool:
     return bool(np.linalg.norm(one - other) <= REPEATS * np.linalg.norm(one))
 
 

@@ -3,8 +3,9 @@
 import healpy
 import numpy as np
 
-from mcsim.diagnosis.wiener_filter import Map, Model, Part
+from mcsim.diagnosis.wiener_filter import Model, Part, sky_variance
 from mcsim.errors import InputError
+from mcsim.support.arrays import Map
 
 
 def checked_map(model: Model, part: Part, map_: Map, name: str) -> Map:
@@ -28,18 +29,11 @@ def checked_map(model: Model, part: Part, map_: Map, name: str) -> Map:
     rms = float(np.std(seen))
     if rms == 0.0:
         raise InputError(f"{name} is constant; give an observed map.")
-    ratio = rms / expected_rms(model, part)
+    sky, noise = sky_variance(model.cl, model.response[part.channel]), np.mean(1.0 / part.precision[fiducial])
+    ratio = rms / float(np.sqrt(sky + noise))
     if not 1.0 / limits.rms_ratio < ratio < limits.rms_ratio:
         raise InputError(
             f"{name} has an rms of {rms:.3g} uK where the model expects {rms / ratio:.3g} uK; is it in another "
             "unit, or is the dipole still in it? Say the unit in its header (TUNIT1), or give it in uK."
         )
     return map_
-
-
-def expected_rms(model: Model, part: Part) -> float:
-    """Return the rms over the sky that the model expects in a map, sky and noise, uK."""
-    cl, response = model.survey.cl, model.survey.channels[part.channel].response.factors[0].real
-    assert cl is not None  # a model of a diagnosis has a spectrum
-    sky = float(np.sum((2 * np.arange(cl.size) + 1) / (4 * np.pi) * cl * response**2))
-    return float(np.sqrt(sky + np.mean(1.0 / part.precision[part.precision > 0])))

@@ -18,8 +18,9 @@ import xarray as xr
 
 from mcsim import config
 from mcsim.config import arrays
-from mcsim.ensemble.external_maps import Alm, Part, Source, StoredMaps, fits_maps, hash_of, parts_of, stacked
+from mcsim.ensemble.external_maps import Part, Source, StoredMaps, fits_maps, hash_of, parts_of, stacked
 from mcsim.errors import InputError, RunError
+from mcsim.support.arrays import Alm
 from mcsim.support.code import class_digest
 
 SEEDS = 1 << 20

@@ -15,16 +15,13 @@ from typing import Any, NamedTuple
 import healpy
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.config import arrays
 from mcsim.ensemble.maps import read_uk
 from mcsim.errors import InputError
 from mcsim.sphere import header
-
-Map = NDArray[np.float64]
-Alm = NDArray[np.complex128]
+from mcsim.support.arrays import Alm, Map
 
 
 class Part(NamedTuple):
