@@ -121,6 +121,7 @@ def test_finished_store_says_so(mcsim: Command, small_store: Path, tmp_path: Pat
     assert stamps(small_store) == before
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_other_bins_of_a_finished_store_need_no_realization(mcsim: Command, small_store: Path, tmp_path: Path) -> None:
     shutil.copytree(small_store, tmp_path / "small.zarr")
     (tmp_path / "small.toml").write_text(SMALL.replace("summary_bin = 10", "summary_bin = 16"))

@@ -24,6 +24,7 @@ from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
 from mcsim.stats.look_elsewhere import global_test
 from mcsim.systematics import Parametrization
+from pictures import quick_pictures
 from refusals import refused
 
 PROPOSED = ("beam_ellipticity", "pointing_offset", "noise_level", "dipole_modulation")
@@ -285,7 +286,8 @@ def test_a_diagnosis_knows_the_library_that_it_is_given(small, tmp_path, monkeyp
     seeded = replace(run, ensemble=replace(run.ensemble, seed=77))
     maps = list(simulate.maps(survey(with_effects(seeded, [louder]), library={"louder": Louder}), 0))
     settings = DiagnosisSettings(library={"louder": Louder}, simulations=320)
-    found = mcsim.diagnose(run, maps, tmp_path / "out", settings=settings)
+    with quick_pictures():
+        found = mcsim.diagnose(run, maps, tmp_path / "out", settings=settings)
     assert {(one.name, one.channel) for one in found.candidates} == {("louder", "V1"), ("louder", "W1")}
     assert found.to_json()["verdict"] == "effect"
     assert [(one["name"], one["channel"]) for one in found.to_json()["effects"]] == [("louder", "W1")]
