@@ -23,6 +23,7 @@ from mcsim.errors import RunError
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere import spectra
+from pictures import quick_pictures
 from refusals import refused
 
 NSIDE, LMAX, FWHM, SIGMA = 16, 24, 500.0, 30.0
@@ -215,7 +216,8 @@ def test_agreement_of_a_right_description_is_no_rare_event(learned):
 
 def test_a_description_of_another_beam_is_said_first(tmp_path):
     data = arrays_of(Plain(wider=0.1).simulate(3))
-    found = mcsim.diagnose(mcsim.ExternalModel(MODEL, Plain(wider=0.1)), data, tmp_path / "out", settings=FEW)
+    with quick_pictures():
+        found = mcsim.diagnose(mcsim.ExternalModel(MODEL, Plain(wider=0.1)), data, tmp_path / "out", settings=FEW)
     assert found.agreement.pvalue < 1e-4
     assert not found.agreement.agrees
     assert "beam" in found.agreement.nearest
