@@ -12,13 +12,14 @@ from scipy.stats import ks_2samp
 
 from mcsim import config
 from mcsim.diagnosis.analysis import Job, external_maps
-from mcsim.diagnosis.assemble import effects_of, held_out_pvalues
+from mcsim.diagnosis.assemble import effects_of
 from mcsim.diagnosis.campaign import Task
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.result import Agreement
 from mcsim.ensemble.external import SEEDS, named_source, source_of
 from mcsim.ensemble.external_maps import Source
 from mcsim.errors import InputError
+from mcsim.stats.gaussian import held_out_pvalues
 from mcsim.stats.look_elsewhere import global_test
 from mcsim.support import folders
 from mcsim.support.arrays import Map, Matrix
