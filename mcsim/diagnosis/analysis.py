@@ -93,8 +93,9 @@ def analysis_of(
     """Define the analysis of data that ``run``, with the effects that are modelled already, claims to describe.
 
     Effects of the library (default: built-in and registered ones), which the run may name as well, are candidates
-    where they apply, but those called in ``without``. ``nthreads`` compute what is computed once. ``source``: simulates
-    in place of mcsim.
+    where they apply, but those called in ``without``, and those that are proposed on request alone and not called in
+    ``settings.including``. ``nthreads`` compute what is computed once. ``source``:
+    simulates in place of mcsim.
     """
     settings = settings or DiagnosisSettings()
     known = kinds_of(library)
@@ -103,7 +104,7 @@ def analysis_of(
         [
             Candidate(effect, channel, tuple(range(len(effect.parametrization.basis()))), dict(fixed))
             for name, effect in known
-            if name not in without
+            if name not in without and (effect.proposed or name in settings.including)
             for channel in ((None,) if effect.scope == "common" else model.channels)
             for fixed in effect.variants
             if _applies(model, effect, channel, fixed)
@@ -142,11 +143,12 @@ def _applies(model: Model, kind: type[Effect], channel: str | None, settings: Ma
             effect.noise(owner.site)
             systematics.seen_through((effect,), owner.site)
             systematics.looked_at((effect,), np.zeros_like(model.dipole), replace(owner.site, lmax=model.lmax), 0, 0)
+            systematics.check_added((effect,), owner.site)
             effect.orientations(owner.maps[0].moments, owner.site)
     except InputError:
         return False
     quiet = all(m.noise_uk is None for owner in owners for m in owner.maps)
-    return not (quiet and kind.noise is not Effect.noise)
+    return not (quiet and (kind.noise is not Effect.noise or kind.excess is not Effect.excess))
 
 
 def _matched_blocks(model: Model, candidates: Sequence[Candidate]) -> Iterator[Block]:

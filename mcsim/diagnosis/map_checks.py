@@ -13,7 +13,10 @@ def checked_map(model: Model, part: Part, map_: Map, name: str) -> Map:
     if map_.shape != (12 * model.nside**2,):
         size = healpy.npix2nside(map_.size) if map_.ndim == 1 and healpy.isnpixok(map_.size) else None
         found = f"the shape {map_.shape}" if size is None else f"nside {size}"
-        raise InputError(f"{name} has {found}, the model {model.nside}; bring them to the same.")
+        raise InputError(
+            f"{name} has {found}, the model {model.nside}; set map.nside of the model to that of the data, or say in "
+            "[[preparation]] how they were degraded."
+        )
     broken = int(np.sum(~np.isfinite(map_)))
     if broken:
         raise InputError(f"{name} has {broken} pixels that are not finite; mark what was not observed as UNSEEN.")

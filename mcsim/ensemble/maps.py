@@ -121,7 +121,10 @@ def read_uk(path: Path, frame: str, frequency_ghz: float | None) -> NDArray[np.f
     """Read a map in RING order, uK; InputError if its header names another frame, or a unit that is none."""
     map_, found, unit = healpix.read_map(path)
     if found not in (None, frame):
-        raise InputError(f"{path} is in {found} coordinates, the model in {frame}; rotate the map.")
+        raise InputError(
+            f'{path} is in {found} coordinates, the model in {frame}; set map.frame = "{found}" in the model, so '
+            "that its scan and noise are computed there."
+        )
     factor = header_.to_uk(unit, path, frequency_ghz)
     return np.where(map_ == healpy.UNSEEN, map_, factor * map_)
 
