@@ -20,6 +20,8 @@ def science(config: RunConfig) -> dict[str, Any]:
     """
     plain = to_dict(config)
     for entry in paths.entries(plain):
+        if not entry.rule.checked:
+            continue
         named = paths.files(entry, config.map.splits, config.name)
         found = {label: f"sha256:{sha256_of(path)}" for label, path in named.items()}
         contents: Any = found[""] if list(found) == [""] else found

@@ -51,7 +51,7 @@ def entries(plain: dict[str, Any]) -> Iterator[Entry]:
     channels = _tables(plain, "channel")
     every = tuple(str(table.get("name")) for table in channels)
     sections: list[tuple[str, str, Any, tuple[str, ...], str | None]] = [
-        (name, name, plain.get(name), every, None) for name in ("sky", "map")
+        (name, name, plain.get(name), every, None) for name in ("sky", "map", "ensemble")
     ]
     for number, table in enumerate(channels):
         key = f"channel[{label(table, number)}]"
@@ -77,6 +77,8 @@ def entries(plain: dict[str, Any]) -> Iterator[Entry]:
                 for place, item in enumerate(value if isinstance(value, list) else []):
                     if isinstance(item, str) and item.strip():
                         yield Entry(f"{where}.{field}[{place}]", value, place, rule, speaks_of, split)
+    if ".py:" in str(plain.get("simulator")):
+        yield Entry("simulator", plain, "simulator", Rule(checked=False), every)
 
 
 def _tables(plain: dict[str, Any], key: str) -> list[dict[str, Any]]:
@@ -137,8 +139,11 @@ def files(entry: Entry, splits: Sequence[str], where: str, realization: int = 0)
 def check_files(config: RunConfig, plain: dict[str, Any], where: str, realizations: range | None = None) -> None:
     """Raise InputError unless all files of a run exist, with the skies of all these realizations."""
     for entry in entries(plain):
+        placeholders = _placeholders(entry, where)
+        if not entry.rule.checked:
+            continue
         files(entry, config.map.splits, where)
-        if "realization" in _placeholders(entry, where):
+        if "realization" in placeholders:
             wanted = range(config.ensemble.realizations) if realizations is None else realizations
             for realization in wanted:
                 try:

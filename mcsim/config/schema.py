@@ -222,12 +222,17 @@ class Biposh:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Ensemble:
-    """Realizations 0 .. realizations - 1 of the seed; ``paired`` adds the circular-beam control of each."""
+    """Realizations 0 .. realizations - 1 of the seed; ``paired`` adds the circular-beam control of each.
+
+    ``maps``: stored maps of another simulator, with which a diagnosis compares data: a template of FITS files with
+    {realization}, {channel} and {split}, or a Zarr store.
+    """
 
     realizations: Annotated[int, Field(ge=1, le=10_000_000)] = 100
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0
     paired: bool = True
     keep_maps: bool = False
+    maps: PathText | None = None
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -264,6 +269,8 @@ class RunConfig:
     effects, preparation
         Changes of the simulation, such as :func:`mcsim.effects` lists, and of its maps before the analysis; in TOML
         the tables ``[[effect]]`` and ``[[preparation]]``.
+    simulator
+        Simulator of another program, ``package.module:name`` or ``file.py:name``, whose maps a diagnosis takes.
     biposh, ensemble, compute
         Settings of the estimator, of the realizations and seed, and of the computation.
 
@@ -285,6 +292,7 @@ class RunConfig:
     channels: Annotated[tuple[Channel, ...], Field(alias="channel", min_length=1)]
     effects: Annotated[tuple[Effect, ...], Field(alias="effect")] = ()
     preparation: tuple[Step, ...] = ()
+    simulator: PathText | None = None
     biposh: Biposh = Biposh()
     ensemble: Ensemble = Ensemble()
     compute: Compute = Compute()
@@ -304,6 +312,8 @@ class RunConfig:
                 f"{key} = {lmax} is above 3 nside - 1 = {limit} of {of}; "
                 f"set biposh.lmax to at most {limit} or raise nside"
             )
+        if self.simulator is not None and self.ensemble.maps is not None:
+            raise ValueError("both simulator and ensemble.maps are given; keep one of them")
         if self.biposh.L_max > lmax:
             raise ValueError(f"biposh.L_max = {self.biposh.L_max} is above the lmax of the analysis, {lmax}; lower it")
         try:

@@ -10,10 +10,12 @@ import numpy as np
 from mcsim import config, systematics
 from mcsim.diagnosis.candidate import Candidate, numbered
 from mcsim.diagnosis.localisation import BipolarScan, coarse_residuals
+from mcsim.diagnosis.map_checks import checked_map
 from mcsim.diagnosis.matched_filters import matched_filter
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Block, Element, blocks_of
 from mcsim.diagnosis.wiener_filter import Model, model_of, shared_sky, wiener_filter
+from mcsim.ensemble.external_maps import Source
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import Survey, survey
@@ -37,6 +39,7 @@ class Analysis:
     without: tuple[str, ...] = ()  # effects of the library that are left out
     library: Kinds = field(default_factory=lambda: kinds_of(None))  # effects that are known
     of_maps: bool = True  # False: the data vector is a table of spectra
+    source: Source | None = None  # external simulations in place of those of the run
 
     @property
     def run(self) -> config.RunConfig:
@@ -66,6 +69,13 @@ class Analysis:
             found += [self.bipolar_scan.values(filtered), coarse_residuals(self.model, filtered).ravel()]
         return np.concatenate(found)
 
+    def source_of(self, found: Sequence[config.Effect], given_sky: bool = False) -> Source | None:
+        """Return the external simulator if it can add these effects, to a given sky on request; else None."""
+        source = self.source
+        if source is None or not source.effects or not {effect.name for effect in found} <= set(source.effects):
+            return None
+        return source if source.takes_sky or not given_sky else None
+
     def job(self, simulated: config.RunConfig) -> "Job":
         """Return a job of no realization yet that simulates a run and analyses it."""
         fiducial, own = config.to_json(self.run), config.to_json(simulated)
@@ -78,12 +88,14 @@ def analysis_of(
     nthreads: int = 1,
     settings: DiagnosisSettings | None = None,
     library: Library | None = None,
+    source: Source | None = None,
 ) -> Analysis:
     """Define the analysis of data that ``run``, with the effects that are modelled already, claims to describe.
 
     Effects of the library (default: built-in and registered ones), which the run may name as well, are candidates
     where they apply, but those called in ``without``, and those that are proposed on request alone and not called in
-    ``settings.including``. ``nthreads`` compute what is computed once.
+    ``settings.including``. ``nthreads`` compute what is computed once. ``source``:
+    simulates in place of mcsim.
     """
     settings = settings or DiagnosisSettings()
     known = kinds_of(library)
@@ -99,7 +111,9 @@ def analysis_of(
         ]
     )
     blocks = (*blocks_of(model), *_matched_blocks(model, candidates))
-    return Analysis(model, candidates, blocks, tuple(without), known)
+    for name in () if source is None else source.effects:
+        systematics.get(name, dict(known))
+    return Analysis(model, candidates, blocks, tuple(without), known, source=source)
 
 
 def kinds_of(library: Library | None) -> Kinds:
@@ -164,6 +178,7 @@ class Job:
     observed: Alm | None = None  # filtered sky of the data, which then constrains the skies
     settings: DiagnosisSettings = field(default_factory=DiagnosisSettings)
     library: Kinds = field(default_factory=lambda: kinds_of(None))
+    source: Source | None = None  # simulates in place of mcsim
 
     @property
     def definition(self) -> tuple[str, tuple[str, ...], DiagnosisSettings, Kinds]:
@@ -177,19 +192,40 @@ def data_vectors(job: Job, library: Library | None = None) -> Vector:
     This is the task that a worker runs. ``library``: effects that the simulated run may name; default: the job's.
     """
     analysis = _analysis(*job.definition)
-    shared = _survey(job.simulated, job.library if library is None else kinds_of(library))
     rows = []
     for realization in range(job.first, job.first + job.count):
         if job.sample_by_sample:
+            shared = _survey(job.simulated, job.library if library is None else kinds_of(library))
             maps = [map_uk for _, map_uk in sampled.maps(shared, realization)]
         else:
             sky = None
             if job.observed is not None:
-                seed = shared.config.ensemble.seed
+                seed, _ = _seed_and_added(job.simulated, job.fiducial)
                 sky = _constrained_sky(job.definition, job.observed.tobytes(), seed, realization)
-            maps = list(simulate.maps(shared, realization, sky=sky))
+            if job.source is not None:
+                maps = external_maps(job, realization, sky)
+            else:
+                shared = _survey(job.simulated, job.library if library is None else kinds_of(library))
+                maps = list(simulate.maps(shared, realization, sky=sky))
         rows.append(analysis.data_vector(maps, bipolar_scan=job.bipolar_scan))
     return np.stack(rows)
+
+
+def external_maps(job: Job, realization: int, sky: Alm | None = None) -> list[Map]:
+    """Return the maps of one realization that an external simulator makes; InputError if no such survey makes them."""
+    assert job.source is not None
+    seed, added = _seed_and_added(job.simulated, job.fiducial)
+    model, where = _analysis(*job.definition).model, job.source.words(seed, realization)
+    maps = job.source.maps(seed, realization, added, sky)
+    named = zip(model.parts, maps, strict=True)
+    return [checked_map(model, part, map_uk, f"the map {part.name} of {where}") for part, map_uk in named]
+
+
+@lru_cache(maxsize=2)
+def _seed_and_added(simulated: str, fiducial: str) -> tuple[int, tuple[config.Effect, ...]]:
+    """Return the seed of a run, and its effects beyond those of the fiducial one."""
+    run = config.from_json(simulated)
+    return run.ensemble.seed, run.effects[len(config.from_json(fiducial).effects) :]
 
 
 @lru_cache(maxsize=32)

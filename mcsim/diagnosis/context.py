@@ -48,6 +48,13 @@ class DiagnosisContext:
         """Return the settings of the analysis."""
         return self.analysis.settings
 
+    def reference(self, found: Sequence[config.Effect]) -> Matrix:
+        """Return the data vectors of the skies in which responses to effects are measured, shape (skies, p)."""
+        if self.analysis.source_of(found) is None:
+            return self.ensemble.reference
+        assert self.ensemble.external_reference is not None  # simulated where the source can add effects
+        return self.ensemble.external_reference
+
 
 def context(analysis: Analysis, ensemble: NullEnsemble, bank: TemplateBank) -> DiagnosisContext:
     """Prepare the tests of data sets of a model."""
@@ -95,7 +102,7 @@ class DataSet(ABC, Generic[Data]):
 
         By default they are those of the reference, whatever ``skies`` is.
         """
-        return self._simulated(found) - self.context.ensemble.reference
+        return self._simulated(found) - self.context.reference(found)
 
     def _simulated(self, found: Sequence[config.Effect]) -> Matrix:
         """Return the data vectors of the skies of the reference with effects, shape (rows, p)."""

@@ -29,6 +29,9 @@ class NullEnsemble:
     residual_scatter: Matrix  # standard deviation of the same
     residual_rms: Matrix  # rms of each over this scatter, (n, map)
     redundant: float = 1e-4  # directions with less than this fraction of the largest variance are left out
+    # Of an external model: the reference of its simulator if that can add effects, and the offset of mcsim's routes.
+    external_reference: Matrix | None = None
+    own_offset: Vector | None = None
 
     @cached_property
     def spread(self) -> Vector:

@@ -117,6 +117,31 @@ class CandidateResult:
         return float(np.sqrt(max(self.delta_chi2, 0.0)))
 
 
+@dataclass(frozen=True)
+class Agreement:
+    """Say which simulator an external model is, and if mcsim's own simulation of its description agrees with it.
+
+    Attributes
+    ----------
+    simulator
+        In words.
+    pvalue, agrees, skies
+        Of the test with so many of mcsim's skies.
+    nearest
+        What the external simulations look like, seen from mcsim's: the effect, with its amplitude, nearest to the
+        difference.
+    effects
+        Names of the effects whose responses the external simulator makes; those of all others are mcsim's.
+    """
+
+    simulator: str
+    pvalue: float
+    agrees: bool
+    skies: int
+    nearest: str | None
+    effects: tuple[str, ...]
+
+
 @dataclass(frozen=True, eq=False)
 class DiagnosisResult:
     """All that a diagnosis says: the verdict, and what it rests on.
@@ -158,6 +183,8 @@ class DiagnosisResult:
         Settings of the diagnosis; numbers of simulations, the seed and the data, by name.
     configuration
         The run that is the model, as JSON.
+    agreement
+        Of an external model; None where mcsim simulates.
     faint, probability
         True if sets describe the data, but are less probable than all else together; their posterior probability.
     """
@@ -193,6 +220,7 @@ class DiagnosisResult:
     warnings: tuple[str, ...] = ()
     faint: bool = False
     probability: float = 1.0
+    agreement: Agreement | None = None
 
     @property
     def verdict(self) -> dict[str, Any]:
@@ -262,6 +290,7 @@ class DiagnosisResult:
             ],
             "notes": list(self.notes),
             **({"warnings": list(self.warnings)} if self.warnings else {}),
+            **({"simulator": asdict(self.agreement)} if self.agreement else {}),
         }
 
     def to_dataset(self) -> xr.Dataset:

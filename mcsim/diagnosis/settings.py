@@ -99,6 +99,8 @@ class DiagnosisSettings:
     rms_ratio, cl_ratio, biposh_ratio
         Largest ratio to the model, either way, of the rms of a map and of C_l, and of BipoSH to their standard
         deviation: beyond it the unit is wrong.
+    agreement_level
+        p-value up to which mcsim's own simulation does not agree with that of an external model.
     small_chi2_pvalue
         Probability of a smaller chi^2 below which a table of spectra is refused.
     correlated_sigma
@@ -181,5 +183,6 @@ class DiagnosisSettings:
     rms_ratio: float = 20.0
     cl_ratio: float = 25.0
     biposh_ratio: float = 1000.0
+    agreement_level: float = 0.01
     small_chi2_pvalue: float = 1e-6
     correlated_sigma: float = 5.0

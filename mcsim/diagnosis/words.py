@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from mcsim.diagnosis.result import DiagnosisResult, EffectResult
+from mcsim.diagnosis.result import Agreement, DiagnosisResult, EffectResult
 from mcsim.diagnosis.selection import Contrast
 from mcsim.stats.excess import Measured
 from mcsim.support.numbers import measured, number, p_equals
@@ -54,10 +54,11 @@ def tested(result: DiagnosisResult) -> str:
     source = f"{len(result.maps)} maps" + (f" ({splits} splits)" if splits > 1 else "")
     if result.residual_maps is None:
         source = "a table of spectra"
+    by = "" if result.agreement is None else f" by {result.agreement.simulator}"
     return (
         f"{len(result.elements)} elements of the data vector, {result.test.dimension} of them independent, measured "
-        f"from {source}; {result.simulations} simulations of the model; {len(result.candidates)} candidate effects, "
-        f"alone and up to {result.settings.max_effects} together"
+        f"from {source}; {result.simulations} simulations of the model{by}; "
+        f"{len(result.candidates)} candidate effects, alone and up to {result.settings.max_effects} together"
     )
 
 
@@ -98,6 +99,19 @@ def status(result: DiagnosisResult) -> str:
         f"{start}: the residual of the fit {residual(best.pvalue)}, and {beside} beside {'them' if many else 'it'} "
         f"({p_equals(best.further)}, look-elsewhere effect included)."
     )
+
+
+def agreement(found: Agreement) -> str:
+    """Return if mcsim's own simulation agrees with an external model, and where the responses come from."""
+    how = "agrees" if found.agrees else "does not agree"
+    text = f"mcsim's own simulation of the description {how} with {found.simulator} "
+    text += f"({p_equals(found.pvalue)}, {found.skies} skies)"
+    if not found.agrees and found.nearest is not None:
+        text += f"; nearest to what {found.simulator} has beside it is {found.nearest}"
+    whose = f"those of {', '.join(found.effects)} are {found.simulator}'s" if found.effects else ""
+    if found.agrees:
+        return f"{text}. Responses to effects are mcsim's{f', but {whose}' if whose else ''}."
+    return f"{text}. Responses to effects are mcsim's and approximate{f', but {whose}' if whose else ''}."
 
 
 def chi2(result: DiagnosisResult) -> str:

@@ -17,7 +17,7 @@ from mcsim.ensemble import opening, store
 from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError
 from mcsim.simulation import differencing, noise
-from mcsim.simulation.channels import check_effects, load_beam
+from mcsim.simulation.channels import check_effects, load_beam, refuse_external
 from mcsim.simulation.preparation import preparation
 from mcsim.simulation.survey import Survey
 from mcsim.sphere import alm as alm_
@@ -180,6 +180,7 @@ class Cost:
 def describe(source: str | Path, part: slice | None = None, workers: int | None = None) -> str:
     """Return a text on the cost of a run: realizations, tasks, memory, disk, files and time."""
     run = config.load(source)
+    refuse_external(run)
     check_effects(run)
     number, found = len(wanted(run, part)), cost(run)
     memory, *rest = found.lines(number, workers or run.compute.workers)

@@ -93,6 +93,16 @@ def effects_on(
     return tuple(acting)
 
 
+def refuse_external(run: config.RunConfig) -> None:
+    """Raise InputError for a run whose maps another simulator makes."""
+    if run.simulator is not None or run.ensemble.maps is not None:
+        key = "ensemble.maps" if run.simulator is None else "simulator"
+        given = run.simulator or run.ensemble.maps
+        raise InputError(
+            f"{run.name} has {key} = {given!r}, which only a diagnosis of maps takes; remove it to simulate with mcsim."
+        )
+
+
 def check_effects(run: config.RunConfig) -> None:
     """Refuse a run with an effect that is not known, or cannot act where it is put, as the run would; make no map."""
     for spec in run.channels:

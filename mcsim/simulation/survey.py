@@ -14,7 +14,15 @@ from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
 from mcsim.instrument.scan import MapGrid
 from mcsim.simulation import convolve, mapmaking
-from mcsim.simulation.channels import effects_on, refuse_excess, refuse_pixel_effects, scan_model, site_b_of, site_of
+from mcsim.simulation.channels import (
+    effects_on,
+    refuse_excess,
+    refuse_external,
+    refuse_pixel_effects,
+    scan_model,
+    site_b_of,
+    site_of,
+)
 from mcsim.simulation.noise import DrawnNoise, of_map
 from mcsim.simulation.pixel_means import mean_gain, mean_signal
 from mcsim.simulation.preparation import Preparation, preparation
@@ -206,6 +214,7 @@ def survey(
     memory-mapped, so that workers share them. ``orders``: moments up to this order even where the beam needs fewer (of
     a file of moments, all that it has). ``library``: the effects that the run may name; default: the catalogue.
     """
+    refuse_external(run)
     lmax = config.analysis_lmax(run)
     cl = None if run.sky.spectrum is None else spectra.load(run.sky.spectrum, run.sky.lmax)
     made = tuple(_channel(run, channel, nthreads, progress, orders, library) for channel in run.channels)

@@ -32,6 +32,7 @@ NAMES = [
     "Beam",
     "DiagnosisSettings",
     "Effect",
+    "ExternalModel",
     "InputError",
     "LimitSettings",
     "Moments",
