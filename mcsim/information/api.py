@@ -199,8 +199,8 @@ def _candidates(
         )
     if run.simulator is not None:
         raise InputError(
-            f"the limit needs derivatives of mcsim's own maps, but simulator = {str(run.simulator)!r} makes those of the "
-            "run; leave it out."
+            f"the limit needs derivatives of mcsim's own maps, but simulator = {str(run.simulator)!r} makes those of "
+            "the run; leave it out."
         )
     if settings.probes < 3:
         raise InputError(f"probes = {settings.probes} are too few to tell an error; give 3 or more.")
