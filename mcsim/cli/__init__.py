@@ -172,6 +172,48 @@ def diagnose(
 
 
 @app.command()
+def limit(
+    model: Config,
+    output: Annotated[
+        Path | None, Option("-o", "--output", metavar="DIR", help="Folder for limit.json, limit.zarr and limit.png.")
+    ] = None,
+    only: Annotated[list[str] | None, Option(metavar="EFFECT", help="Compute only this one; repeatable.")] = None,
+    without: Annotated[list[str] | None, Option(metavar="EFFECT", help="Leave it out; repeatable.")] = None,
+    nuisance: Annotated[
+        list[str] | None, Option(metavar="EFFECT[:CHANNEL]=WIDTH", help="Unknown within this prior; repeatable.")
+    ] = None,
+    unknown_dipole_uk: Annotated[float, Option(help="Rms of a monopole and dipole of which nothing is known.")] = 0.0,
+    probes: Annotated[int, Option(min=3, help="Random probes.")] = 64,
+    orders: Annotated[int, Option(min=0, help="Orders of the fiducial beams in the inverse covariance.")] = 0,
+    dense: Annotated[bool, Option("--dense", help="Whole matrices, for small maps.")] = False,
+    dry_run: Annotated[bool, Option("--dry-run", help="Say memory and time; compute nothing.")] = False,
+) -> None:
+    """Say how small an effect these maps could tell at best, before any data, and which effects look alike."""
+    from mcsim import config
+    from mcsim.information.api import describe, widths
+    from mcsim.information.api import limit as compute
+    from mcsim.information.settings import LimitSettings
+
+    interrupt_once()
+    settings = LimitSettings(
+        only=tuple(only or ()),
+        without=tuple(without or ()),
+        nuisances=widths(nuisance or ()),
+        unknown_dipole_uk=unknown_dipole_uk,
+        probes=probes,
+        orders=orders,
+        dense=dense,
+    )
+    if dry_run:
+        print(describe(config.load(model), settings))
+        return
+    found = compute(model, output, settings=settings, quiet=False)
+    print("\n".join(found.lines()))
+    if output is not None:
+        print(f"written: {output / 'limit.json'}, {output / 'limit.zarr'}, {output / 'limit.png'}")
+
+
+@app.command()
 def compare(
     a: Annotated[Path, typer.Argument(metavar="A", help="Folder of maps, or a configuration.")],
     b: Annotated[Path, typer.Argument(metavar="B", help="The same skies from another simulation.")],
