@@ -97,6 +97,15 @@ class DataSet(ABC, Generic[Data]):
         """
         return self._simulated(found) - self.context.ensemble.reference
 
+    @property
+    def extended(self) -> Vector:
+        """Return the data vector with the numbers beside it behind it, if there are any."""
+        return self.x
+
+    def respond_extended(self, found: Sequence[config.Effect], skies: int) -> Matrix:
+        """Return the changes of :meth:`respond` for :attr:`extended`."""
+        return self.respond(found, skies)
+
     def _simulated(self, found: Sequence[config.Effect]) -> Matrix:
         """Return the data vectors of the skies of the reference with effects, shape (rows, p)."""
         return np.concatenate(self.ask(after_jobs(self.context.analysis, found)))
