@@ -120,6 +120,7 @@ def _described(kind: Any) -> str:
         ("Scope", kind.scope),
         ("Amplitude", kind.unit),
         ("Other parameters", ", ".join(settings)),
+        *(("Possible", f"`{one.parameter}` from {one.low:g} to {one.high:g}: {one.source}") for one in kind.bounds),
         ("Cause", kind.cause),
         ("Shows as", kind.signature),
         ("Source", kind.source),

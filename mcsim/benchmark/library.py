@@ -157,7 +157,12 @@ class LearnedModel(EffectsLibrary):
 
     def simulate(self, jobs: Sequence[Job]) -> list[Vector]:
         """Return the data vectors of simulations that are made in this process."""
-        return [data_vectors(replace(job, without=()))[:, self.rows] for job in jobs]
+        beside = len(self.context.analysis.slices)
+        found = [data_vectors(replace(job, without=())) for job in jobs]
+        return [
+            row[:, [*self.rows, *range(row.shape[1] - beside, row.shape[1])] if job.slices else self.rows]
+            for job, row in zip(jobs, found, strict=True)
+        ]
 
     def expected_snr(self, effect: config.Effect) -> float:
         """Return the expected S/N of the mean response, from two halves of the skies: noise is no part of it."""

@@ -318,6 +318,8 @@ def effects(name: Annotated[str | None, Argument(metavar="EFFECT", help="Only th
         parameters = ", ".join(f"{field.name} = {field.default!r}" for field in fields(kind))
         typer.secho(f"{kind.name} ({kind.scope}; amplitude in {kind.unit})", bold=True)
         print(f"  parameters  {parameters}")
+        for bound in kind.bounds:
+            print(f"  possible    {bound.parameter} from {bound.low:g} to {bound.high:g}: {bound.source}")
         if not kind.proposed:
             print(f"  proposed    on request: mcsim diagnose --with {kind.name}")
         for key in ("cause", "signature", "source"):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from mcsim import config, systematics
+from mcsim.diagnosis import slices as slices_
 from mcsim.diagnosis.candidate import Candidate, numbered
 from mcsim.diagnosis.localisation import BipolarScan, coarse_residuals
 from mcsim.diagnosis.map_checks import checked_map
@@ -56,15 +57,25 @@ class Analysis:
         """Return the descriptions of the elements of the data vector."""
         return tuple(element for block in self.blocks for element in block.elements)
 
+    @property
+    def slices(self) -> tuple[Element, ...]:
+        """Return the descriptions of the numbers beside the data vector; none for measured spectra."""
+        return slices_.elements_of(self.model) if self.of_maps else ()
+
     @cached_property
     def bipolar_scan(self) -> BipolarScan:
         """Return the scan that localises a departure from the model."""
         return BipolarScan(self.model)
 
-    def data_vector(self, maps: Sequence[Map], bipolar_scan: bool = False) -> Vector:
-        """Return the data vector, shape (p,), and on request the bipolar scan and coarse residuals behind it."""
+    def data_vector(self, maps: Sequence[Map], bipolar_scan: bool = False, slices: bool = False) -> Vector:
+        """Return the data vector, shape (p,), and on request what follows it.
+
+        These are the numbers beside it, and bipolar scan and coarse residuals, in this order.
+        """
         filtered = wiener_filter(self.model, maps)
         found = [np.atleast_1d(block.values(filtered)) for block in self.blocks]
+        if slices:
+            found.append(slices_.values_of(self.model, filtered))
         if bipolar_scan:
             found += [self.bipolar_scan.values(filtered), coarse_residuals(self.model, filtered).ravel()]
         return np.concatenate(found)
@@ -175,6 +186,7 @@ class Job:
     sample_by_sample: bool = False  # simulate with the time-ordered reference, not with the default route
     without: tuple[str, ...] = ()  # effects that are no candidates
     bipolar_scan: bool = False  # measure the bipolar scan and the coarse residual maps as well
+    slices: bool = False  # measure the numbers beside the data vector as well
     observed: Alm | None = None  # filtered sky of the data, which then constrains the skies
     settings: DiagnosisSettings = field(default_factory=DiagnosisSettings)
     library: Kinds = field(default_factory=lambda: kinds_of(None))
@@ -187,7 +199,7 @@ class Job:
 
 
 def data_vectors(job: Job, library: Library | None = None) -> Vector:
-    """Return the data vectors of simulations, shape (count, p), with bipolar scan and coarse residuals if asked for.
+    """Return the data vectors of simulations, shape (count, p), and behind them what else the job asks for.
 
     This is the task that a worker runs. ``library``: effects that the simulated run may name; default: the job's.
     """
@@ -207,7 +219,7 @@ def data_vectors(job: Job, library: Library | None = None) -> Vector:
             else:
                 shared = _survey(job.simulated, job.library if library is None else kinds_of(library))
                 maps = list(simulate.maps(shared, realization, sky=sky))
-        rows.append(analysis.data_vector(maps, bipolar_scan=job.bipolar_scan))
+        rows.append(analysis.data_vector(maps, job.bipolar_scan, job.slices))
     return np.stack(rows)
 
 

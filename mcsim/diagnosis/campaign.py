@@ -112,7 +112,7 @@ def plan(analysis: Analysis, simulations: int | None = None, time_ordered: bool 
         table = candidate.table(effect)
         acting = replace(analysis.job(with_effects(base, [table])), source=analysis.source_of([table]))
         jobs[Purpose("response", column, sign)] = replace(acting, count=skies(analysis, candidate))
-    return jobs
+    return {purpose: replace(job, slices=analysis.of_maps) for purpose, job in jobs.items()}
 
 
 def _split(job: Job, realizations: range, size: int = _PER_TASK) -> list[Job]:
@@ -153,15 +153,16 @@ def learned(
     many are independent, and so how many simulations are needed.
     """
     size, jobs = len(analysis.elements), plan(analysis, simulations, time_ordered)
+    whole = size + len(analysis.slices)
     results = _results(analysis, jobs, ask, simulations is None)
 
     def stacked(kind: str) -> Rows:
-        rows = [result[:, :size] for purpose, result in results.items() if purpose.kind == kind]
-        return np.concatenate(rows) if rows else np.zeros((0, size))
+        rows = [result[:, :whole] for purpose, result in results.items() if purpose.kind == kind]
+        return np.concatenate(rows) if rows else np.zeros((0, whole))
 
     references = {False: stacked("reference"), True: stacked("external reference")}
     labels = tuple(label for candidate in analysis.candidates for label in candidate.labels)
-    matrix, curvature, error = np.zeros((3, size, len(labels)))
+    matrix, curvature, error = np.zeros((3, whole, len(labels)))
     for candidate, column, sign, effect in _steps(analysis):
         other = results.get(Purpose("response", column, -sign))
         if sign < 0 and other is not None:
@@ -176,21 +177,32 @@ def learned(
             curvature[:, column] = np.mean(here + other - 2.0 * same, axis=0) / (2.0 * step**2)
         matrix[:, column] = each.mean(axis=0)
         error[:, column] = each.std(axis=0, ddof=1) / np.sqrt(len(each))
-    offset = np.zeros(size)
+    offset = np.zeros(whole)
     if analysis.of_maps and len(default := stacked("default")):
         offset = np.mean(stacked("time-ordered") - default, axis=0)
-    # Behind the data vector come bipolar scan and coarse residuals; measured spectra have neither.
-    rest = np.concatenate([results[purpose][:, size:] for purpose in results if jobs[purpose].bipolar_scan])
+    # Behind all these come bipolar scan and coarse residuals; measured spectra have neither.
+    rest = np.concatenate([results[purpose][:, whole:] for purpose in results if jobs[purpose].bipolar_scan])
     numbers = len(analysis.bipolar_scan.elements) if analysis.of_maps else 0
     coarse = rest[:, numbers:].reshape(len(rest), len(analysis.model.parts), -1)
-    vectors = stacked("null"), offset, analysis.elements, references[False]
-    residuals = coarse.mean(axis=0), coarse.std(axis=0, ddof=1), rms(coarse)
-    ensemble = NullEnsemble(*vectors, rest[:, :numbers], *residuals, analysis.settings.redundant)
+    null, reference, own_offset = stacked("null"), references[False], None
     if analysis.source is not None:
         # The mean is that of the external simulations, whatever mcsim's routes differ by.
-        no_offset = np.zeros(size)
-        ensemble = replace(ensemble, offset=no_offset, own_offset=offset, external_reference=references[True])
-    return ensemble, TemplateBank(matrix, error, curvature, labels)
+        own_offset, offset = offset[:size], np.zeros(whole)
+    vectors = null[:, :size], offset[:size], analysis.elements, reference[:, :size]
+    residuals = coarse.mean(axis=0), coarse.std(axis=0, ddof=1), rms(coarse)
+    ensemble = NullEnsemble(
+        *vectors,
+        rest[:, :numbers],
+        *residuals,
+        redundant=analysis.settings.redundant,
+        external_reference=None if analysis.source is None else references[True],
+        own_offset=own_offset,
+        slices=null[:, size:],
+        slice_offset=offset[size:],
+        slice_reference=reference[:, size:],
+        slice_elements=analysis.slices,
+    )
+    return ensemble, TemplateBank(matrix[:size], error[:size], curvature[:size], labels, matrix[size:])
 
 
 def _results(analysis: Analysis, jobs: dict[Purpose, Job], ask: Ask, pilot: bool) -> dict[Purpose, Rows]:

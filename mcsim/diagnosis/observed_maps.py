@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mcsim import config
-from mcsim.diagnosis.campaign import constrained_jobs
+from mcsim.diagnosis.campaign import after_jobs, constrained_jobs
 from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.localisation import Place, places, standardised
 from mcsim.diagnosis.map_checks import checked_map
@@ -29,18 +29,23 @@ class ObservedMaps(DataSet[Sequence[Map]]):
     """
 
     @cached_property
-    def _measured(self) -> tuple[Vector, Vector, Map]:
-        """Return data vector, bipolar scan and coarse residuals, shape (map, npix)."""
+    def _measured(self) -> tuple[Vector, Vector, Map, Vector]:
+        """Return data vector, bipolar scan, coarse residuals, shape (map, npix), and the numbers beside them."""
         analysis, ensemble = self.context.analysis, self.context.ensemble
-        size = len(analysis.elements)
-        found = analysis.data_vector(self.data, bipolar_scan=True)
-        x, scan, coarse = np.split(found, [size, size + ensemble.bipolar_scan.shape[1]])
-        return x, scan, coarse.reshape(ensemble.residual_mean.shape)
+        sizes = [len(analysis.elements), len(analysis.slices), ensemble.bipolar_scan.shape[1]]
+        found = analysis.data_vector(self.data, bipolar_scan=True, slices=True)
+        x, beside, scan, coarse = np.split(found, np.cumsum(sizes))
+        return x, scan, coarse.reshape(ensemble.residual_mean.shape), beside
 
     @property
     def x(self) -> Vector:
         """Return the data vector, shape (p,)."""
         return self._measured[0]
+
+    @property
+    def extended(self) -> Vector:
+        """Return the data vector with the numbers beside it behind it, shape (p + E,)."""
+        return np.concatenate([self.x, self._measured[3]])
 
     @cached_property
     def _sky(self) -> Alm:
@@ -59,9 +64,15 @@ class ObservedMaps(DataSet[Sequence[Map]]):
 
         Effects with a mean response are simulated in typical skies instead: the observed sky has its power already.
         """
+        return self.respond_extended(found, skies)[:, : len(self.x)]
+
+    def respond_extended(self, found: Sequence[config.Effect], skies: int) -> Matrix:
+        """Return the changes of :meth:`respond` with those of the numbers beside the data vector, (rows, p + E)."""
         typical = [effect for effect in found if self._is_typical(effect)]
         others = [effect for effect in found if not self._is_typical(effect)]
-        shift = super().respond(typical, skies) if typical else np.zeros((1, len(self.x)))
+        shift = np.zeros((1, len(self.extended)))
+        if typical:
+            shift = self._simulated(typical) - self.context.extended_reference(typical)
         if not others:
             return shift
         before, after = self._constrained(others, skies)
@@ -69,17 +80,24 @@ class ObservedMaps(DataSet[Sequence[Map]]):
 
     def pair(self, found: Sequence[config.Effect]) -> tuple[Matrix, Matrix]:
         """Return data vectors of the same skies without effects and with them, shape (rows, p) each."""
+        size = len(self.x)
         if any(self._is_typical(effect) for effect in found):
-            return self.context.reference(found), self._simulated(found)
-        return self._constrained(found, self.context.settings.constrained_skies)
+            return self.context.reference(found), self._simulated(found)[:, :size]
+        before, after = self._constrained(found, self.context.settings.constrained_skies)
+        return before[:, :size], after[:, :size]
+
+    def _simulated(self, found: Sequence[config.Effect]) -> Matrix:
+        """Return extended data vectors of the skies of the reference with effects, shape (rows, p + E)."""
+        jobs = after_jobs(self.context.analysis, found)
+        return np.concatenate(self.ask([replace(job, slices=True) for job in jobs]))
 
     def _constrained(self, found: Sequence[config.Effect], skies: int) -> tuple[Matrix, Matrix]:
-        """Return data vectors of constrained skies without effects and with them, shape (skies, p) each."""
+        """Return extended data vectors of constrained skies without effects and with them, (skies, p + E) each."""
         source = self.context.analysis.source_of(found, given_sky=True)
 
         def simulated(found: Sequence[config.Effect], first: int) -> Matrix:
             jobs = constrained_jobs(self.context.analysis, found, self._sky, range(first, skies))
-            return np.concatenate(self.ask([replace(job, source=source) for job in jobs]))
+            return np.concatenate(self.ask([replace(job, slices=True, source=source) for job in jobs]))
 
         after, before = simulated(found, 0), self._before[source is not None]
         if len(before) < skies:

@@ -11,6 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
+from mcsim.diagnosis.consistency import Comparison, MapCheck
 from mcsim.diagnosis.localisation import Place
 from mcsim.diagnosis.selection import Contrast, Verdict
 from mcsim.diagnosis.settings import DiagnosisSettings
@@ -27,7 +28,10 @@ PLACES = 12
 
 @dataclass(frozen=True)
 class EffectResult:
-    """One fitted effect: amplitude, standard error and parameters; ``label`` and ``words`` as people read them."""
+    """One fitted effect: amplitude, standard error and parameters; ``label`` and ``words`` as people read them.
+
+    ``consistency`` are its amplitudes in parts of the data, over the fitted one, and ``parts`` the same in words.
+    """
 
     name: str
     channel: str | None
@@ -37,6 +41,8 @@ class EffectResult:
     parameters: dict[str, Any]
     label: str
     words: str
+    consistency: tuple[Comparison, ...] = ()
+    parts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -55,6 +61,8 @@ class EffectSet:
         Of the residual that the fit leaves: p-value, and excess chi^2.
     further
         p-value of the most significant further candidate, with the look-elsewhere effect.
+    maps
+        Largest scales of the maps before and after the effects are taken out.
     """
 
     effects: tuple[EffectResult, ...]
@@ -65,6 +73,7 @@ class EffectSet:
     pvalue: float
     further: float
     excess: Measured
+    maps: tuple[MapCheck, ...] = ()
 
     @property
     def label(self) -> str:
@@ -187,6 +196,8 @@ class DiagnosisResult:
         Of an external model; None where mcsim simulates.
     faint, probability
         True if sets describe the data, but are less probable than all else together; their posterior probability.
+    contradicted
+        Sets that describe the data vector and are not named, because parts of the data do not bear them out.
     """
 
     case: str
@@ -221,6 +232,7 @@ class DiagnosisResult:
     faint: bool = False
     probability: float = 1.0
     agreement: Agreement | None = None
+    contradicted: tuple[EffectSet, ...] = ()
 
     @property
     def verdict(self) -> dict[str, Any]:
@@ -276,6 +288,8 @@ class DiagnosisResult:
             **faint,
             "effects": sets[0] if sets else [],
             "alternatives": sets[1:],
+            "maps": [] if not self.sets else [asdict(one) for one in self.sets[0].maps],
+            **({"contradicted": [_set_json(one) for one in self.contradicted]} if self.contradicted else {}),
             "odds": [one.odds for one in self.sets],
             "where": [_place_json(place) for place in self.places[:PLACES]],
             "shrink": None if self.held_out is None else _held_out_json(self.held_out),
@@ -362,7 +376,22 @@ _OF_CANDIDATES = {"amplitude": "fitted alone", "sigma": "standard error", "delta
 
 
 def _effect_json(effect: EffectResult) -> dict[str, Any]:
-    return {name: value for name, value in vars(effect).items() if name not in ("label", "words")}
+    plain = {name: value for name, value in vars(effect).items() if name not in _NOT_IN_JSON}
+    return plain | {"consistency": [_comparison_json(effect, one) for one in effect.consistency]}
+
+
+_NOT_IN_JSON = ("label", "words", "consistency", "parts")
+
+
+def _comparison_json(effect: EffectResult, one: Comparison) -> dict[str, Any]:
+    """Return the amplitudes of parts of the data in the unit of the effect."""
+    amplitudes = [effect.amplitude * value for value in one.amplitudes]
+    errors = [abs(effect.amplitude) * value for value in one.errors]
+    return {"by": one.kind, "slices": list(one.slices), "amplitude": amplitudes, "sigma": errors, "p": one.pvalue}
+
+
+def _set_json(one: EffectSet) -> dict[str, Any]:
+    return {"effects": [_effect_json(effect) for effect in one.effects], "maps": [asdict(own) for own in one.maps]}
 
 
 def _place_json(place: Place) -> dict[str, Any]:

@@ -44,6 +44,17 @@ class DiagnosisSettings:
         Standard deviations by which a fractional reduction on held-out data may miss its prediction, or zero.
     half_snr_share
         Share of an effect's expected S/N that each half needs for a reduction to be measured.
+    consistency_level
+        Global p-value of the comparisons of an effect's amplitude in independent parts of the data, and of what it
+        leaves in them, up to which it is not named.
+    absence_odds
+        Odds of no effect against it, in the data without the part that supports it most, from which on it is not named.
+    consistency_error
+        Relative error of an effect's response in these parts that is tolerated.
+    compared_sets
+        Sets of effects that are simulated for it, the most probable ones.
+    slice_snr
+        Expected S/N of an effect in a part of the data from which on the part counts.
     place_pvalue
         P-value up to which a group of numbers is listed before others of a kind listed already.
     sims_per_element, pilot_sims_per_element
@@ -140,6 +151,11 @@ class DiagnosisSettings:
     exchanged_pvalue: float = 0.01
     reduction_sigma: float = 3.0
     half_snr_share: float = 0.2
+    consistency_level: float = 0.01
+    absence_odds: float = 20.0
+    consistency_error: float = 0.05
+    compared_sets: int = 4
+    slice_snr: float = 2.0
     place_pvalue: float = 0.01
 
     sims_per_element: int = 10

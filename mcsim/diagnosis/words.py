@@ -34,6 +34,9 @@ def sentence(result: DiagnosisResult) -> str:
         if len(result.partial) > 1 and result.partial_left is not None:
             left = f"{100 * result.partial_left:.0f} % of the excess χ²"
             partly = f" Detected are {_effects(result.partial)}; they leave {left}."
+        if result.contradicted:
+            sets = "; and ".join(_effects(one.effects) for one in result.contradicted[: SETS + 1])
+            return f"{start}. Parts of the data do not bear out what fits the data vector: {sets}."
         chance = ", which may be chance" if result.test.pvalue > DISAGREES else ""
         return f"{start}{chance}, and no effect of the library explains why.{partly}"
     if result.kind == "degenerate":
@@ -143,6 +146,22 @@ def held_out(result: DiagnosisResult) -> str:
     )
 
 
+def compared_parts(result: DiagnosisResult) -> list[str]:
+    """Return the amplitudes of each named effect in parts of the data, and what it removes from the maps."""
+    found = [
+        f"{effect.label}: {text} ({p_equals(one.pvalue)})"
+        for effect in result.effects
+        for one, text in zip(effect.consistency, effect.parts, strict=True)
+    ]
+    for one in result.sets[0].maps if result.sets else ():
+        fall, forecast = number(one.before - one.after), number(one.forecast)
+        maps = " and ".join(one.maps)
+        found.append(
+            f"Largest scales of {maps}: χ² falls by {fall}, {forecast} forecast; {p_equals(one.pvalue)} of the rest"
+        )
+    return found
+
+
 def percent(fraction: Measured) -> str:
     """Return a fraction with its error in per cent."""
     return measured(100.0 * fraction.value, 100.0 * fraction.sigma, " %")
@@ -172,6 +191,10 @@ def summary(result: DiagnosisResult, folder: Path) -> list[str]:
     if result.partial:
         rows += [("detected", _numbered(result.partial))]
     if result.sets:
+        tests = [one for effect in result.effects for one in effect.consistency]
+        least = min((one.pvalue for one in tests), default=1.0)
+        if tests:
+            rows.append(("parts agree", f"{len(tests)} comparisons of amplitudes, the least likely {p_equals(least)}"))
         rows.append(("held-out data", held_out(result)))
     if result.kind != "none":
         first = result.places[0]

@@ -2,6 +2,7 @@
 
 from mcsim.systematics.base import (
     Alm,
+    Bound,
     Draw,
     Effect,
     Map,
@@ -20,6 +21,7 @@ from mcsim.systematics.registry import Library, basis_of, build, catalogue, chec
 
 __all__ = [
     "Alm",
+    "Bound",
     "Draw",
     "Effect",
     "Library",

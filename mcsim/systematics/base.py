@@ -114,6 +114,19 @@ class Wording:
     negative: str | None = None
 
 
+@dataclass(frozen=True)
+class Bound:
+    """Bound a parameter of an effect by what is possible: a diagnosis names no effect beyond it.
+
+    ``source`` says where the range, both ends included, is from.
+    """
+
+    parameter: str
+    low: float
+    high: float
+    source: str
+
+
 @dataclass(frozen=True, kw_only=True)
 class Effect:
     """Derive an effect from this class, whose hooks change nothing.
@@ -138,6 +151,8 @@ class Effect:
         Amplitude at which responses are measured: small enough to be linear.
     variants
         Fixed parameters with which the effect is a candidate, one candidate for each.
+    bounds
+        Ranges of the parameters that are possible; angles and directions have none.
     parametrization
         How a diagnosis fits it; left out: the amplitude alone, of either sign.
     proposed
@@ -176,6 +191,7 @@ class Effect:
     source: ClassVar[str] = ""
     step: ClassVar[float]
     variants: ClassVar[tuple[Mapping[str, Any], ...]] = ({},)
+    bounds: ClassVar[tuple[Bound, ...]] = ()
     parametrization: ClassVar[Parametrization] = Parametrization()
     proposed: ClassVar[bool] = True
 
@@ -268,6 +284,12 @@ class Effect:
         if amplitude < 0.0 and how.negative is not None:
             return how.negative.format(measured(-how.scale * amplitude, how.scale * sigma, how.symbol))
         return how.text.format(measured(how.scale * amplitude + how.offset, how.scale * sigma, how.symbol))
+
+    def within_bounds(self) -> Self:
+        """Return the effect with each parameter moved to the nearest value within its bounds."""
+        values = {one.parameter: getattr(self, one.parameter) for one in self.bounds}
+        moved = {one.parameter: min(max(values[one.parameter], one.low), one.high) for one in self.bounds}
+        return self if moved == values else replace(self, **moved)
 
     def direction(self) -> str:
         """Return where the amplitude points, in words; empty for an effect without a direction."""

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from mcsim.systematics.base import Alm, Draw, Effect, Site, Wording
+from mcsim.systematics.base import Alm, Bound, Draw, Effect, Site, Wording
 from mcsim.systematics.galaxy import morphology
 from mcsim.systematics.parametrization import Parametrization
 
@@ -40,6 +40,10 @@ class ForegroundResidual(Effect):
     )
     source = "Bennett et al. 2013, ApJS 208, 20, Sec. 5 (residuals of cleaned bands); the morphology is a model"
     step = 5.0
+    bounds = (
+        Bound("amplitude", -500.0, 500.0, "a prior of this library: less than the foreground itself"),
+        Bound("spectral_index", -4.0, 4.0, "from synchrotron to dust; fixed in a fit"),
+    )
     parametrization = Parametrization(stochastic=True, matched_filter=False)
 
     spectral_index: float = 2.0

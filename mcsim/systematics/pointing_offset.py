@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mcsim.instrument.beams import Beam
-from mcsim.systematics.base import Effect, Site, Wording, scan_direction
+from mcsim.systematics.base import Bound, Effect, Site, Wording, scan_direction
 from mcsim.systematics.parametrization import Angle, Vector
 from mcsim.systematics.shape import displaced
 from mcsim.systematics.spacecraft import axes
@@ -35,6 +35,9 @@ class PointingOffset(Effect):
     signature = "The gradient of the sky along or across the scan, through w_1; acts on the dipole too."
     source = "Jarosik et al. 2007, ApJS 170, 263 (boresights); Mitra et al. 2011, ApJS 193, 5"
     step = 0.2
+    bounds = (
+        Bound("amplitude", 0.0, 120.0, "a prior of this library: reconstructed pointing is never wrong by two degrees"),
+    )
     parametrization = Angle()
 
     angle_deg: float = 0.0

@@ -17,6 +17,7 @@ from mcsim.diagnosis.campaign import with_effects
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps, read_maps
+from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.wiener_filter import shared_sky, wiener_filter
 from mcsim.errors import InputError
@@ -96,7 +97,7 @@ def test_no_gap_where_there_is_none(small):
     assert found.verdict["effects"] == []
 
 
-def test_ellipticity_seen_sample_by_sample_is_named_and_shrinks(small):
+def test_ellipticity_seen_sample_by_sample_is_named_and_shrinks(small, tmp_path):
     truth = 0.25
     shared = data_of(small.run, "beam_ellipticity", "W1", amplitude=truth, angle_deg=20.0)
     maps = [map_uk for _, map_uk in sampled.maps(shared, 0)]
@@ -109,6 +110,15 @@ def test_ellipticity_seen_sample_by_sample_is_named_and_shrinks(small):
     assert abs(best["amplitude"] - truth) < 3 * best["sigma"]
     assert verdict["shrink"]["achieved"] > 0.5
     assert abs(verdict["shrink"]["achieved"] - verdict["shrink"]["predicted"]) < 4 * verdict["shrink"]["sigma"]
+    # It is the same in both halves, which measure it independently.
+    halves = next(one for one in best["consistency"] if one["by"] == "halves")
+    assert halves["slices"] == ["half1", "half2"]
+    assert all(
+        abs(a - best["amplitude"]) < 4 * sigma for a, sigma in zip(halves["amplitude"], halves["sigma"], strict=True)
+    )
+    assert "contradicted" not in verdict
+    found.save(tmp_path)
+    assert DiagnosisResult.open(tmp_path).effects == found.effects
 
 
 def mean_squares(learned, name=None, channel=None, skies=20, **parameters):
