@@ -56,6 +56,8 @@ def entries(plain: dict[str, Any]) -> Iterator[Entry]:
         key = f"channel[{label(table, number)}]"
         sections += [(part, f"{key}.{part}", table.get(part), (every[number],)) for part in ("beam", "beam_b", "scan")]
     sections += [("effect", f"effect[{n}]", table, every) for n, table in enumerate(_tables(plain, "effect"))]
+    given = enumerate(_tables(plain, "nuisance"))
+    sections += [("effect", f"nuisance[{n}].parameters", table.get("parameters"), every) for n, table in given]
     for number, table in enumerate(_tables(plain, "preparation")):
         own = table.get("channels")
         names = tuple(map(str, own)) if isinstance(own, list) and own else every

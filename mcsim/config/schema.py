@@ -6,7 +6,7 @@ Every key states the unit of its number. A failed check raises ValueError whose 
 
 from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import AfterValidator, Field, GetCoreSchemaHandler, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, GetCoreSchemaHandler, model_validator
 from pydantic.dataclasses import dataclass
 from pydantic_core import core_schema
 
@@ -290,6 +290,31 @@ class Effect:
     parameters: dict[str, float | str | tuple[float, ...]] = Field(default_factory=dict)
 
 
+Width = Annotated[float, Field(gt=0.0)]
+"""Prior standard deviation."""
+
+
+def _listed(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list | tuple) else (value,)
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Nuisance:
+    """Effect of unknown size that a diagnosis marginalises: normal about zero, with a prior width in its unit.
+
+    ``width``: that of the amplitude or, of an effect with several linear components, of each of them. ``parameters``
+    are the others, ``parameter_widths`` prior widths of those among them that are not known either.
+    """
+
+    effect: PathText
+    width: Annotated[
+        tuple[Width, ...], Field(min_length=1), BeforeValidator(_listed, json_schema_input_type=float | list[float])
+    ]
+    channel: Label | None = None
+    parameters: dict[str, float | str | tuple[float, ...]] = Field(default_factory=dict)
+    parameter_widths: dict[str, Width] = Field(default_factory=dict)
+
+
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class RunConfig:
     """Configuration of a run, from :func:`mcsim.load_config`; frozen: ``dataclasses.replace`` makes another one.
@@ -307,6 +332,8 @@ class RunConfig:
     effects, preparation
         Changes of the simulation, such as :func:`mcsim.effects` lists, and of its maps before the analysis; in TOML
         the tables ``[[effect]]`` and ``[[preparation]]``.
+    nuisances
+        Effects that a diagnosis marginalises; in TOML the tables ``[[nuisance]]``.
     biposh, ensemble, compute
         Settings of the estimator, of the realizations and seed, and of the computation.
 
@@ -328,6 +355,7 @@ class RunConfig:
     channels: Annotated[tuple[Channel, ...], Field(alias="channel", min_length=1)]
     effects: Annotated[tuple[Effect, ...], Field(alias="effect")] = ()
     preparation: tuple[Step, ...] = ()
+    nuisances: Annotated[tuple[Nuisance, ...], Field(alias="nuisance")] = ()
     biposh: Biposh = Biposh()
     ensemble: Ensemble = Ensemble()
     compute: Compute = Compute()
@@ -353,12 +381,11 @@ class RunConfig:
             unique(names)
         except ValueError as error:
             raise ValueError(f"channel {error}") from None
-        for effect in self.effects:
-            if effect.channel is not None and effect.channel not in names:
-                raise ValueError(
-                    f"effect {effect.name}: channel = {effect.channel!r} is no channel of the run; use one of "
-                    f"{', '.join(names)}"
-                )
+        acting = [(f"effect {one.name}", one.channel) for one in self.effects]
+        acting += [(f"nuisance {one.effect}", one.channel) for one in self.nuisances]
+        for what, where in acting:
+            if where is not None and where not in names:
+                raise ValueError(f"{what}: channel = {where!r} is no channel of the run; use one of {', '.join(names)}")
         for channel in self.channels:
             for key in ("beam", "beam_b"):
                 m_max = getattr(getattr(channel, key), "m_max", None)

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from mcsim import config, systematics
 from mcsim.diagnosis.candidate import Candidate, numbered
 from mcsim.diagnosis.localisation import BipolarScan, coarse_residuals
-from mcsim.diagnosis.matched_filters import matched_filter
+from mcsim.diagnosis.matched_filters import gain_of, matched_filter
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Block, Element, blocks_of
 from mcsim.diagnosis.wiener_filter import Map, Model, model_of, shared_sky, wiener_filter
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
+from mcsim.simulation.nuisance import DisturbedSurvey, Nuisance, check_nuisances, nuisances_of
 from mcsim.simulation.survey import Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.systematics import Effect, Library
@@ -55,6 +56,11 @@ class Analysis:
         return tuple(element for block in self.blocks for element in block.elements)
 
     @cached_property
+    def nuisances(self) -> tuple[Nuisance, ...]:
+        """Return the nuisances of the run."""
+        return nuisances_of(self.run, dict(self.library))
+
+    @cached_property
     def bipolar_scan(self) -> BipolarScan:
         """Return the scan that localises a departure from the model."""
         return BipolarScan(self.model)
@@ -87,6 +93,7 @@ def analysis_of(
     """
     settings = settings or DiagnosisSettings()
     known = kinds_of(library)
+    check_nuisances(run, dict(known))
     model = model_of(survey(run, nthreads=nthreads, orders=settings.beam_orders, library=dict(known)), settings)
     candidates = numbered(
         [
@@ -163,6 +170,7 @@ class Job:
     observed: NDArray[np.complex128] | None = None  # filtered sky of the data, which then constrains the skies
     settings: DiagnosisSettings = field(default_factory=DiagnosisSettings)
     library: Kinds = field(default_factory=lambda: kinds_of(None))
+    nuisances: bool = False  # draw those of the run
 
     @property
     def definition(self) -> tuple[str, tuple[str, ...], DiagnosisSettings, Kinds]:
@@ -176,9 +184,8 @@ def data_vectors(job: Job, library: Library | None = None) -> Vector:
     This is the task that a worker runs. ``library``: effects that the simulated run may name; default: the job's.
     """
     analysis = _analysis(*job.definition)
-    shared = _survey(job.simulated, job.library if library is None else kinds_of(library))
     rows = []
-    for realization in range(job.first, job.first + job.count):
+    for realization, shared in surveys(job, library):
         if job.sample_by_sample:
             maps = [map_uk for _, map_uk in sampled.maps(shared, realization)]
         else:
@@ -189,6 +196,19 @@ def data_vectors(job: Job, library: Library | None = None) -> Vector:
             maps = list(simulate.maps(shared, realization, sky=sky))
         rows.append(analysis.data_vector(maps, bipolar_scan=job.bipolar_scan))
     return np.stack(rows)
+
+
+def surveys(job: Job, library: Library | None = None) -> Iterator[tuple[int, Survey]]:
+    """Yield every realization of a job with its survey: the same for all, but for the nuisances that each draws."""
+    kinds = job.library if library is None else kinds_of(library)
+    disturbed = _disturbed(job.simulated, kinds) if job.nuisances else None
+    for realization in range(job.first, job.first + job.count):
+        yield realization, _survey(job.simulated, kinds) if disturbed is None else disturbed.at(realization)
+
+
+@lru_cache(maxsize=1)
+def _disturbed(simulated: str, kinds: Kinds) -> DisturbedSurvey:
+    return DisturbedSurvey.of(config.from_json(simulated), dict(kinds), gain_of)
 
 
 @lru_cache(maxsize=32)

@@ -117,7 +117,8 @@ def describe(run: config.RunConfig, settings: DiagnosisSettings) -> str:
     number = sum(job.count for job in campaign.plan(analysis, settings.simulations).values())
     size = len(analysis.elements)
     head = f"{run.name}: at most {number} simulations before data, for a data vector of {size}"
-    return "\n".join([head, *cost(run).lines(number, run.compute.workers)])
+    priors = [f"nuisance: {line}" for one in analysis.nuisances for line in one.lines]
+    return "\n".join([head, *priors, *cost(run).lines(number, run.compute.workers)])
 
 
 def _warnings(analysis: Analysis) -> tuple[str, ...]:
@@ -154,10 +155,11 @@ def _key(run: config.RunConfig, analysis: Analysis) -> str:
 
     Its name, its seed and its number of realizations do not count.
     """
-    science = config.science(run)
+    science = config.science(run, *(("nuisance",) if run.nuisances else ()))
     science["ensemble"] = {}
     effects = {candidate.effect for candidate in analysis.candidates}
-    effects |= {systematics.get(effect.name, dict(analysis.library)) for effect in run.effects}
+    named = [*(one.name for one in run.effects), *(one.effect for one in run.nuisances)]
+    effects |= {systematics.get(name, dict(analysis.library)) for name in named}
     rest = [
         [[candidate.label, [repr(basis) for basis in candidate.basis]] for candidate in analysis.candidates],
         asdict(analysis.settings),

@@ -14,8 +14,9 @@ from mcsim import config
 from mcsim.diagnosis.analysis import Analysis, Job, data_vectors
 from mcsim.diagnosis.candidate import Candidate, TemplateBank
 from mcsim.diagnosis.localisation import rms
-from mcsim.diagnosis.null_ensemble import NullEnsemble
+from mcsim.diagnosis.null_ensemble import NullEnsemble, without_nuisances
 from mcsim.ensemble import runner
+from mcsim.simulation.nuisance import draws
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.progress import reporting
 from mcsim.systematics import Effect
@@ -97,7 +98,8 @@ def plan(analysis: Analysis, simulations: int | None = None, time_ordered: bool 
             jobs[Purpose("time-ordered", job.first)] = replace(job, sample_by_sample=True)
             jobs[Purpose("default", job.first)] = job
     for job in _split(analysis.job(seeded(run, _COVARIANCE)), range(wanted)):
-        jobs[Purpose("null", job.first)] = replace(job, bipolar_scan=job.first < settings.scan_sims)
+        drawn = replace(job, nuisances=bool(run.nuisances))
+        jobs[Purpose("null", job.first)] = replace(drawn, bipolar_scan=job.first < settings.scan_sims)
     for job in _split(analysis.job(base), range(settings.noisy_skies)):
         jobs[Purpose("reference", job.first)] = job
     for candidate, column, sign, effect in _steps(analysis):
@@ -150,7 +152,7 @@ def learned(
         rows = [result[:, :size] for purpose, result in results.items() if purpose.kind == kind]
         return np.concatenate(rows) if rows else np.zeros((0, size))
 
-    reference = stacked("reference")
+    null, reference = stacked("null"), stacked("reference")
     labels = tuple(label for candidate in analysis.candidates for label in candidate.labels)
     matrix, curvature, error = np.zeros((3, size, len(labels)))
     for candidate, column, sign, effect in _steps(analysis):
@@ -174,9 +176,10 @@ def learned(
     rest = np.concatenate([results[purpose][:, size:] for purpose in results if jobs[purpose].bipolar_scan])
     numbers = len(analysis.bipolar_scan.elements) if analysis.of_maps else 0
     coarse = rest[:, numbers:].reshape(len(rest), len(analysis.model.parts), -1)
-    vectors = stacked("null"), offset, analysis.elements, reference
+    vectors = null, offset, analysis.elements, reference
     residuals = coarse.mean(axis=0), coarse.std(axis=0, ddof=1), rms(coarse)
-    ensemble = NullEnsemble(*vectors, rest[:, :numbers], *residuals, analysis.settings.redundant)
+    nuisances = _nuisances(analysis, len(null))
+    ensemble = NullEnsemble(*vectors, rest[:, :numbers], *residuals, analysis.settings.redundant, nuisances)
     return ensemble, TemplateBank(matrix, error, curvature, labels)
 
 
@@ -192,10 +195,18 @@ def _results(analysis: Analysis, jobs: dict[Purpose, Job], ask: Ask, pilot: bool
     few = settings.pilot_sims_per_element * size
     first = run([one for one in jobs if one.kind == "null" and one.number < few])
     drawn = np.concatenate([result[:, :size] for result in first.values()])
-    independent = SimulatedGaussian.from_simulations(drawn, floor=settings.redundant).dimension
+    quiet = without_nuisances(drawn, _nuisances(analysis, len(drawn)))
+    independent = SimulatedGaussian.from_simulations(quiet, floor=settings.redundant).dimension
     enough = settings.sims_per_element * independent
     found = first | run([one for one in jobs if one not in first and (one.kind != "null" or one.number < enough)])
     return {purpose: found[purpose] for purpose in jobs if purpose in found}
+
+
+def _nuisances(analysis: Analysis, count: int) -> Rows | None:
+    """Return the coordinates of the nuisances that the first simulations of the model draw, shape (count, k)."""
+    if not analysis.nuisances:
+        return None
+    return np.stack([draws(analysis.nuisances, _COVARIANCE, realization)[0] for realization in range(count)])
 
 
 def after_jobs(analysis: Analysis, found: Sequence[config.Effect], skies: int | None = None) -> list[Job]:

@@ -12,6 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from mcsim.diagnosis.localisation import Place
+from mcsim.diagnosis.nuisance import NuisanceResult
 from mcsim.diagnosis.selection import Contrast, Verdict
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Element
@@ -160,6 +161,8 @@ class DiagnosisResult:
         Settings of the diagnosis; numbers of simulations, the seed and the data, by name.
     configuration
         The run that is the model, as JSON.
+    nuisances
+        What the data say of each component of the declared nuisances, against its prior.
     faint, probability
         True if sets describe the data, but are less probable than all else together; their posterior probability.
     """
@@ -193,6 +196,7 @@ class DiagnosisResult:
     provenance: dict[str, Any]
     configuration: str
     warnings: tuple[str, ...] = ()
+    nuisances: tuple[NuisanceResult, ...] = ()
     faint: bool = False
     probability: float = 1.0
 
@@ -258,6 +262,7 @@ class DiagnosisResult:
             "left": self.partial_left,
             "detectable": [_detectable_json(one) for one in self.candidates if one.detectable is not None],
             "notes": list(self.notes),
+            **({"nuisances": [_nuisance_json(one) for one in self.nuisances]} if self.nuisances else {}),
             **({"warnings": list(self.warnings)} if self.warnings else {}),
         }
 
@@ -331,6 +336,10 @@ _OF_CANDIDATES = {"amplitude": "fitted alone", "sigma": "standard error", "delta
 
 def _effect_json(effect: EffectResult) -> dict[str, Any]:
     return {f.name: getattr(effect, f.name) for f in fields(effect) if f.name not in ("label", "words")}
+
+
+def _nuisance_json(found: NuisanceResult) -> dict[str, Any]:
+    return {f.name: getattr(found, f.name) for f in fields(found) if f.name not in ("label", "words")}
 
 
 def _place_json(place: Place) -> dict[str, Any]:

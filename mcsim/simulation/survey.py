@@ -235,7 +235,8 @@ def _channel(
                 moments = _moments(spec, split, grid, max(smax, 1), nthreads, progress)
             # An effect may give the beam higher orders than a file of moments has: they are left out.
             beam = beam.truncated(moments.smax) if acting and moments.smax < beam.mmax else beam
-        maps.append(_with_effects(_survey_map(run, spec, split, moments, pairs), acting, site, grid.time_range))
+        m = with_effects(_survey_map(run, spec, split, moments, pairs), acting, site)
+        maps.append(replace(m, gain=mean_gain(acting, site, grid.time_range)))
     # A pixel whose samples keep closer to its centre blurs less; the window is a Gaussian in all but name.
     spread = spread_of(acting)
     seen_window = window ** (spread * spread)
@@ -299,8 +300,8 @@ def _side_b(spec: config.Channel, window: NDArray[np.float64], site: Site, actin
     return SideB(beam, response, other.beam, spec.scan, spec.noise.sigma0_uk, imbalance, short)
 
 
-def _with_effects(m: SurveyMap, acting: tuple[Effect, ...], site: Site, share: tuple[float, float]) -> SurveyMap:
-    """Return the map with what effects make of its moments, noise and gain."""
+def with_effects(m: SurveyMap, acting: tuple[Effect, ...], site: Site) -> SurveyMap:
+    """Return the map with what effects make of its moments and noise."""
     moments, noise, spread = m.moments, m.noise_uk, spread_of(acting)
     for effect in acting:
         moments = effect.orientations(moments, site)
@@ -309,7 +310,7 @@ def _with_effects(m: SurveyMap, acting: tuple[Effect, ...], site: Site, share: t
             noise = noise * np.sqrt(np.clip(factor, 0.0, None))
     if spread != 1.0 and moments.dtheta is not None and moments.dphi is not None:
         moments = replace(moments, dtheta=spread * moments.dtheta, dphi=spread * moments.dphi)
-    return replace(m, moments=moments, noise_uk=noise, gain=mean_gain(acting, site, share))
+    return replace(m, moments=moments, noise_uk=noise)
 
 
 def mean_gain(acting: tuple[Effect, ...], site: Site, share: tuple[float, float]) -> NDArray[np.float64] | None:
