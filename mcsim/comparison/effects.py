@@ -20,8 +20,8 @@ from mcsim.systematics.registry import basis_of, catalogue
 
 Vector = NDArray[np.float64]
 
-REDUNDANT = ("pixelization", "spectrum")
-"""pixel_centres says the same; and band powers change with the sky, which two sides have in common."""
+REDUNDANT = ("calibration", "pixelization", "spectrum")
+"""calibration and pixel_centres are differences of their own; band powers change with the sky, common to two sides."""
 
 
 class EffectDifference(Difference):

@@ -101,6 +101,8 @@ def _nuisances(data: DataSet, refined: Refined) -> Iterator[NuisanceResult]:
 def _left_out(context: DiagnosisContext) -> Iterator[str]:
     """Yield a sentence on elements that are not tested, if there are any."""
     ensemble = context.ensemble
+    if ensemble.nuisances is None:
+        return
     if names := [element.words for element, kept in zip(ensemble.elements, ensemble.tested, strict=True) if not kept]:
         yield (
             f"{len(names)} of {len(ensemble.elements)} elements are not tested, because they follow the square of a "

@@ -13,6 +13,7 @@ from mcsim.diagnosis.analysis import Analysis
 from mcsim.diagnosis.campaign import Ask, after_jobs, skies
 from mcsim.diagnosis.candidate import Candidate, TemplateBank
 from mcsim.diagnosis.localisation import Place
+from mcsim.diagnosis.nuisance import with_nuisances
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.selection import Attribution
 from mcsim.diagnosis.settings import DiagnosisSettings
@@ -59,6 +60,7 @@ def context(analysis: Analysis, ensemble: NullEnsemble, bank: TemplateBank) -> D
         for candidate, own in zip(analysis.candidates, scatter, strict=True)
     )
     templates = bank.significant(ensemble.spread, analysis.settings)
+    candidates, templates = with_nuisances(ensemble, null, analysis.nuisances, candidates, templates)
     groups = null.whiten_groups(templates, [candidate.columns for candidate in candidates])
     calibration = calibration_of(ensemble, null, groups)
     return DiagnosisContext(analysis, ensemble, bank, null, candidates, calibration, scatter, templates, groups)

@@ -5,17 +5,21 @@ them. The drawn coordinates are known: their regression on the data vectors is t
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mcsim.diagnosis.candidate import Candidate
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.simulation.nuisance import Nuisance
 from mcsim.stats.gaussian import SimulatedGaussian, orthonormal
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
+
+MEASURED = 0.04
+"""Share of the prior variance that the data leave at most of a nuisance whose response is that of the regression."""
 
 LEAST = 0.1
 """Share of the prior variance that the data have to remove for a pull to be given."""
@@ -103,6 +107,36 @@ class Regression:
         scale = 1.0 + 1.0 / null.n_sims + self.shrinkage * float(white @ white) / null.dof
         shift = self.shrinkage * (self.slopes @ white + self.chance - prior_mean)
         return prior_mean + shift, np.sqrt(self.left * scale * degrees / (degrees - 2))
+
+
+def with_nuisances(
+    ensemble: NullEnsemble,
+    null: SimulatedGaussian,
+    nuisances: Sequence[Nuisance],
+    candidates: tuple[Candidate, ...],
+    templates: Matrix,
+) -> tuple[tuple[Candidate, ...], Matrix]:
+    """Return candidates and templates, shape (p_raw, K), those of effects that are nuisances as well regressed.
+
+    Such a candidate departs from the model only beyond its prior. Its template must therefore be the very direction in
+    which the nuisance scatters the simulations; of a nuisance that the data hardly measure the regression is noise, and
+    its scatter small beside that of the data.
+    """
+    if ensemble.nuisances is None:
+        return candidates, templates
+    drawn = ensemble.nuisances - ensemble.nuisances.mean(axis=0)
+    response = np.linalg.lstsq(drawn, ensemble.simulations, rcond=None)[0]
+    clear = Regression.of(ensemble, null).left < MEASURED * np.mean(drawn**2, axis=0)
+    found, t, start = list(candidates), templates.copy(), 0
+    for one in nuisances:
+        own = slice(start, start + len(one.widths))
+        start = own.stop
+        for place, candidate in enumerate(candidates):
+            same = candidate.identity == (one.effect.name, one.channel) and not one.parameter_widths
+            if same and clear[own].all() and candidate.effect(**candidate.settings) == one.effect(**one.settings):
+                t[:, list(candidate.columns)] = response[own].T
+                found[place] = replace(candidate, nuisance=True)
+    return tuple(found), t
 
 
 def half_given_other(ensemble: NullEnsemble) -> Matrix:

@@ -101,6 +101,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
             if (
                 scatter < settings.sky_scatter
                 or candidate.random_response
+                or candidate.nuisance
                 or candidate.effect.parametrization.mean_response
             ):
                 continue

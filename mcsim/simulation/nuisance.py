@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from mcsim.simulation.channels import site_of
 from mcsim.simulation.survey import Channel, Survey, mean_gain, survey, with_effects
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import rng
-from mcsim.systematics import Effect, Library, Site, basis_of, seen_through, spread_of
+from mcsim.systematics import Effect, Library, Site, basis_of, looked_at, seen_through, spread_of
 
 Vector = NDArray[np.float64]
 Map = NDArray[np.float64]
@@ -90,7 +91,10 @@ class Nuisance:
         """Yield the effect at its largest draws, component by component, and with each parameter at either end."""
         for row, sign in ((row, sign) for row in REACH * np.diag(self.widths) for sign in (1.0, -1.0)):
             if sign > 0.0 or not self._one_sided:
-                yield self.at(sign * row)
+                effect = self.at(sign * row)
+                if not np.allclose(self.effect.parametrization.coordinates(effect), sign * row):
+                    raise InputError(f"effect {effect.name} can have no component of {sign * row.max():g}.")
+                yield effect
         for name, width in self.parameter_widths.items():
             for sign in (REACH, -REACH):
                 yield self.at(np.array(self.widths), **{name: self._centre(name) + sign * width})
@@ -144,21 +148,25 @@ def check_nuisances(run: config.RunConfig, library: Library | None = None) -> in
     """
     orders = 0
     for one in nuisances_of(run, library):
-        for site in (site_of(run, spec) for spec in run.channels if one.channel in (None, spec.name)):
-            for effect in one.extremes():
-                try:
-                    orders = max(orders, seen_through((effect,), site).mmax)
-                    sky = np.zeros(alm_.size(site.lmax), dtype=np.complex128)
-                    systematics.looked_at((effect,), sky, site, run.ensemble.seed, 0)
-                    effect.gain(np.zeros(1), site)
-                    effect.noise(site)
-                except InputError as error:
-                    text = str(error).rstrip(".")
-                    raise InputError(
-                        f"nuisance {one.title}: {REACH:g} prior widths are drawn, and there: {text}; lower the width "
-                        "or remove the nuisance."
-                    ) from None
+        try:
+            for effect, spec in product(one.extremes(), run.channels):
+                if one.channel in (None, spec.name):
+                    orders = max(orders, _try(effect, site_of(run, spec)))
+        except InputError as error:
+            text = str(error).rstrip(".")
+            raise InputError(
+                f"nuisance {one.effect.name}: draws reach {REACH:g} prior widths, and there {text}; lower the width or "
+                "remove the nuisance."
+            ) from None
     return orders
+
+
+def _try(effect: Effect, site: Site) -> int:
+    """Return the highest order of the beam with an effect; raise InputError if it cannot act."""
+    looked_at((effect,), np.zeros(alm_.size(site.lmax), dtype=np.complex128), site, 0, 0)
+    effect.gain(np.zeros(1), site)
+    effect.noise(site)
+    return seen_through((effect,), site).mmax
 
 
 def draws(nuisances: Sequence[Nuisance], seed: int, realization: int) -> tuple[Vector, Drawn]:

@@ -64,6 +64,7 @@ RESPONSES = {
     "beam_coma": {"amplitude": 0.02, "angle_deg": 20.0},
     "beam_sidelobe": {"amplitude": 0.002, "quadrupole": 0.5, "calibrated": "dipole"},
     "beam_width": {"amplitude": 0.02},
+    "calibration": {"amplitude": 0.003},
     "pointing_offset": {"amplitude": 5.0, "angle_deg": 70.0},
     "time_constant": {"amplitude": 0.05},
     "gain_drift": {"amplitude": 0.01, "phase_deg": 30.0},

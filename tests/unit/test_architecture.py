@@ -61,6 +61,7 @@ PUBLIC = {
         "Ensemble",
         "Map",
         "Noise",
+        "Nuisance",
         "RunConfig",
         "Scan",
         "ScanDifferencing",

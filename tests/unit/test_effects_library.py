@@ -21,6 +21,7 @@ NAMES = {
     "beam_coma",
     "beam_sidelobe",
     "beam_width",
+    "calibration",
     "beam_noncircularity",
     "pointing_offset",
     "time_constant",

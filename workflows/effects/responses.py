@@ -32,6 +32,7 @@ PARAMETERS: dict[str, dict[str, Any]] = {
     "beam_coma": {"amplitude": 0.02, "angle_deg": 20.0},
     "beam_sidelobe": {"amplitude": 0.001, "quadrupole": 0.5},
     "beam_width": {"amplitude": 0.02},
+    "calibration": {"amplitude": 0.003},
     "beam_noncircularity": {"amplitude": 1.0},
     "pointing_offset": {"amplitude": 2.0, "angle_deg": 70.0},
     "time_constant": {"amplitude": 0.02},

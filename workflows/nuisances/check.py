@@ -128,7 +128,7 @@ def compressed(known: dict[str, DiagnosisContext], ask: Ask, draws: int, seed: i
     return {
         **{name: summary([pvalue(one, x) for x in rows]) for name, one in known.items()},
         "posterior": {
-            one.title: {
+            one.effect.label(one.channel): {
                 "sigma_over_width": float(np.mean(sigma[:, k]) / one.widths[0]),
                 "pull_mean": float(np.mean(pulls[:, k])),
                 "pull_width": float(np.std(pulls[:, k])),
@@ -138,7 +138,9 @@ def compressed(known: dict[str, DiagnosisContext], ask: Ask, draws: int, seed: i
     }
 
 
-def cases(known: DiagnosisContext, count: int, strength: float, seed: int) -> Iterator[tuple[str, Any, float, list]]:
+def cases(
+    known: DiagnosisContext, count: int, strength: float, seed: int
+) -> Iterator[tuple[str, Any, float, list[Any]]]:
     """Yield truth (name of effect and channel, None: no effect), amplitude and maps."""
     for number in range(count):
         run = seeded(replace(known.run, nuisances=()), seed + number)
@@ -185,7 +187,7 @@ def score(outcomes: list[dict[str, Any]], company: set[tuple[str, str | None]]) 
     }
     shrinks = [(o["achieved"], o["predicted"]) for o in outcomes if o.get("achieved") is not None]
     if shrinks:
-        found["mean reduction on held-out data, achieved and predicted"] = np.mean(shrinks, axis=0).tolist()
+        found["median reduction on held-out data, achieved and predicted"] = np.median(shrinks, axis=0).tolist()
     return found
 
 
