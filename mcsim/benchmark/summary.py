@@ -265,6 +265,7 @@ SIGNATURES = {
     "time_constant": Signature("ecliptic", (1, 2)),
     "gain_drift": Signature("ecliptic", (0, 1, 2)),
     "dipole_residual": Signature("", (1,)),
+    "monopole_residual": Signature("", (0, 1), "even"),
     "transmission_imbalance": Signature("ecliptic"),
     "noise_anisotropy": Signature("ecliptic", (0, 2), "even"),
     "noise_level": Signature("", (0,), "even"),

@@ -69,6 +69,7 @@ RESPONSES = {
     "time_constant": {"amplitude": 0.05},
     "gain_drift": {"amplitude": 0.01, "phase_deg": 30.0},
     "dipole_residual": {"amplitude": 10.0, "lon_deg": 20.0, "lat_deg": 30.0},
+    "monopole_residual": {"amplitude": 10.0},
     "boost": {"amplitude": 0.001, "lon_deg": 20.0, "lat_deg": 30.0},
     "foreground_residual": {"amplitude": 5.0},
 }

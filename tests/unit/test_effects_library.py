@@ -27,6 +27,7 @@ NAMES = {
     "time_constant",
     "gain_drift",
     "dipole_residual",
+    "monopole_residual",
     "transmission_imbalance",
     "noise_anisotropy",
     "noise_level",

@@ -61,6 +61,7 @@ MANY = (
     {"effect": "noise_level", "channel": "W1", "width": 0.05},
     {"effect": "gain_drift", "channel": "W1", "width": [0.001, 0.002]},
     {"effect": "dipole_residual", "channel": "V1", "width": 5.0},
+    {"effect": "monopole_residual", "channel": "V1", "width": 5.0},
     {"effect": "spectrum", "width": 0.05},
     {
         "effect": "foreground_residual",
@@ -114,7 +115,7 @@ def test_draws_have_the_widths_and_do_not_depend_on_each_other():
     known = nuisances_of(run)
     rows = np.stack([draws(known, 3, r)[0] for r in range(4000)])
     mean, sigma = (np.concatenate([getattr(one, key) for one in known]) for key in ("mean", "sigma"))
-    assert rows.shape[1] == len(mean) == 1 + 1 + 2 + 1 + 1 + 2 + 3 + 6 + 1 + 1
+    assert rows.shape[1] == len(mean) == 1 + 1 + 2 + 1 + 1 + 2 + 3 + 1 + 6 + 1 + 1
     assert np.all(np.abs(rows.mean(axis=0) - mean) < 4.0 * sigma / np.sqrt(4000))
     assert np.all(np.abs(rows.std(axis=0) / sigma - 1.0) < 4.0 * np.sqrt(0.75 / 4000))
     assert np.abs(np.corrcoef(rows.T) - np.eye(len(mean))).max() < 4.5 / np.sqrt(4000)

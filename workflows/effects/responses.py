@@ -38,6 +38,7 @@ PARAMETERS: dict[str, dict[str, Any]] = {
     "time_constant": {"amplitude": 0.02},
     "gain_drift": {"amplitude": 0.001, "phase_deg": 30.0},
     "dipole_residual": {"amplitude": 3.0, "lon_deg": 20.0, "lat_deg": 30.0},
+    "monopole_residual": {"amplitude": 3.0},
     "dipole_modulation": {"amplitude": 0.07, "lon_deg": 20.0, "lat_deg": 30.0},
     "quadrupole_modulation": {"amplitude": 0.05, "components": [1.0, 0.2, 0.3, 0.4, 0.5]},
     "boost": {"amplitude": 0.00123, "lon_deg": 264.0, "lat_deg": 48.0},
