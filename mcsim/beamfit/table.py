@@ -10,6 +10,7 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from mcsim.beamfit.data import EVERYTHING, SUMMARY, Measurement, Row, Scaling, Selection, parts
+from mcsim.bipolar import Mode
 from mcsim.errors import InputError
 
 COLUMNS = ("L", "M", "d", "ell_min", "ell_max")
@@ -30,9 +31,6 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING) 
         For a table that cannot be read, or does not define its numbers.
     """
     table = read_ecsv(path)
-    missing = [name for name in COLUMNS if name not in table.colnames]
-    if missing:
-        raise InputError(f"{path} has no column {missing[0]}; give {', '.join(COLUMNS)}, value and error.")
     suffix, chosen = _kind(path, table, selection.kind)
     scaling = scaling_of(path, table.meta)
     check_frame(path, str(table.meta.get("frame", frame)).lower(), frame)
@@ -43,7 +41,7 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING) 
         if label not in labels:
             raise InputError(f"There is no pair {label} in {path}; choose among {'; '.join(dict.fromkeys(labels))}.")
         table = table[[name == label for name in labels]]
-    L, M, d, low, high = (_integers(path, table, name) for name in COLUMNS)
+    L, M, d, low, high = identified(path, table)
     wrong = np.flatnonzero((low < 0) | (low > high))
     if len(wrong):
         a, b = low[wrong[0]], high[wrong[0]]
@@ -54,10 +52,7 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING) 
     values: list[NDArray[np.float64]] = []
     errors: list[NDArray[np.float64]] = []
     for mode in selection.parsed:
-        if mode.parity == "odd" and not scaling.summary and scaling.bennett:
-            raise InputError(
-                f"{path}: {mode.name} has odd parity, which the Bennett normalisation does not have; leave it out."
-            )
+        check_parity(path, mode, scaling)
         same = np.flatnonzero((L == mode.L) & (M == mode.M) & (d == mode.d) & (low >= first) & (high <= last))
         for imaginary in parts(mode):
             part = in_uk2(path, table, f"value_imag{suffix}") if imaginary else real
@@ -85,28 +80,44 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING) 
 def check_frame(path: str | Path, found: str, wanted: str) -> None:
     """Raise InputError if data are in another frame than the configuration."""
     if found != wanted:
-        raise InputError(f"{path} is in the {found} frame, the configuration in the {wanted} one; rotate one of them.")
+        raise InputError(
+            f"{path} is in the {found} frame, the configuration in the {wanted} one; rotate the data or set map.frame."
+        )
 
 
-def _integers(path: str | Path, table: Table, name: str) -> NDArray[np.int64]:
-    """Return a column of integers; raise InputError for anything else."""
-    try:
-        values: NDArray[np.float64] = np.ma.filled(np.ma.asarray(table[name], dtype=float), np.nan)
-    except (ValueError, TypeError):
-        values = np.array([np.nan])
-    if not np.all(np.abs(values - np.round(values)) == 0.0):
-        raise InputError(f"{path}: the column {name} holds values that are no integers; correct them.")
-    return values.astype(np.int64)
+def check_parity(path: str | Path, mode: Mode, scaling: Scaling) -> None:
+    """Raise InputError for a mode that the normalisation does not have."""
+    if mode.parity == "odd" and scaling.bennett and not scaling.summary:
+        raise InputError(
+            f"{path}: {mode.name} has odd parity, which the Bennett normalisation does not have; leave it out."
+        )
+
+
+def identified(path: str | Path, table: Table) -> NDArray[np.int64]:
+    """Return :data:`COLUMNS`, shape (5, rows); raise InputError if one holds anything but integers."""
+    found = []
+    for name in COLUMNS:
+        try:
+            values: NDArray[np.float64] = np.ma.filled(np.ma.asarray(table[name], dtype=float), np.nan)
+        except (ValueError, TypeError):
+            values = np.array([np.nan])
+        if not np.all(np.abs(values - np.round(values)) == 0.0):
+            raise InputError(f"{path}: the column {name} holds values that are no integers; correct them.")
+        found.append(values.astype(np.int64))
+    return np.stack(found)
 
 
 def read_ecsv(path: str | Path) -> Table:
-    """Read an ECSV table with rows; raise InputError for anything else."""
+    """Read an ECSV table with rows and :data:`COLUMNS`; raise InputError for anything else."""
     try:
         table = Table.read(path, format="ascii.ecsv")
     except Exception as error:  # libraries raise errors of any type for a broken file
         raise InputError(f"{path} cannot be read as an ECSV table ({error}); give a store or such a table.") from None
     if len(table) == 0:
         raise InputError(f"{path} has no rows; give the measured bins.")
+    missing = [name for name in COLUMNS if name not in table.colnames]
+    if missing:
+        raise InputError(f"{path} has no column {missing[0]}; give {', '.join(COLUMNS)}, value and error.")
     return table
 
 
@@ -148,7 +159,22 @@ def in_uk2(path: str | Path, table: Table, name: str) -> NDArray[np.float64]:
         raise InputError(f"{path}: the column {name} has no unit; write uK2 (or mK2, K2) into its header.")
     try:
         factor = units.Unit(column.unit).to(units.uK**2)
-        values: NDArray[np.float64] = np.ma.filled(np.ma.asarray(column, dtype=float), np.nan)
     except (units.UnitConversionError, ValueError, TypeError):
         raise InputError(f"{path}: the column {name} has unit {column.unit}; convert it to uK2.") from None
+    try:
+        values: NDArray[np.float64] = np.ma.filled(np.ma.asarray(column, dtype=float), np.nan)
+    except (ValueError, TypeError):
+        wrong = next(row for row, text in enumerate(column) if not _is_number(text))
+        raise InputError(
+            f"{path}: the column {name} has {str(column[wrong])!r} in row {wrong + 1}, where a number in "
+            f"{column.unit} is expected; correct the row or leave it out."
+        ) from None
     return np.asarray(factor * values)
+
+
+def _is_number(text: Any) -> bool:
+    try:
+        float(text)
+    except (ValueError, TypeError):
+        return False
+    return True

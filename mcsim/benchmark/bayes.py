@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mcsim.benchmark.case import Answer, Drawn, Vector
-from mcsim.benchmark.library import Library
+from mcsim.benchmark.library import EffectsLibrary
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.sphere import rng
 from mcsim.stats.detection import pair_log_marginals, posterior
@@ -29,7 +29,7 @@ class BayesClassifier:
 
     def probabilities(self, x: Vector) -> dict[Answer, float]:
         """Return the posterior of sets of effects, shape (p_raw,) to a dict without those below 1e-13 of the best."""
-        library, prior = self.sampler.library, self.sampler.prior
+        library, prior = self.sampler.effects_library, self.sampler.prior
         y = library.null.whiten(x)
         none = float(library.null.log_likelihood(float(y @ y)))
         with np.errstate(divide="ignore"):  # what the prior excludes has a logarithm of minus infinity
@@ -52,12 +52,12 @@ class BayesClassifier:
     @property
     def _norms(self) -> tuple[float, float]:
         """Return the smallest and largest whitened norm of an effect."""
-        scale = float(np.sqrt(self.sampler.library.null.hartlap_factor))
+        scale = float(np.sqrt(self.sampler.effects_library.null.hartlap_factor))
         return self.sampler.prior.weakest / scale, self.sampler.prior.strongest / scale
 
     def _singles(self, x: Vector, y: Vector) -> Vector:
         """Return the log marginal likelihood of each candidate relative to no effect, prior weight included."""
-        null, groups = self.sampler.library.null, self.sampler.library.groups
+        null, groups = self.sampler.effects_library.null, self.sampler.effects_library.groups
         # Where an effect is strong, the probability of none would underflow: its scale is free.
         boost = min(0.5 * float(np.max(groups.delta_chi2(y), initial=0.0)), 600.0)
         edges = np.geomspace(*self._norms, 61)
@@ -69,7 +69,7 @@ class BayesClassifier:
     @cached_property
     def _pairs(self) -> dict[tuple[int, int], float]:
         """Pairs of candidates that can be drawn together, and their probabilities."""
-        identities, weights = self.sampler.library.identities, self.sampler.weights
+        identities, weights = self.sampler.effects_library.identities, self.sampler.weights
         pairs = combinations(np.flatnonzero(weights).tolist(), 2)
         found = {(i, j): float(weights[i] * weights[j]) for i, j in pairs if identities[i] != identities[j]}
         total = sum(found.values())
@@ -78,12 +78,12 @@ class BayesClassifier:
     @cached_property
     def _normals(self) -> Vector:
         """Antithetic standard normals, shape (256, columns)."""
-        columns = 2 * int(self.sampler.library.groups.sizes.max())
+        columns = 2 * int(self.sampler.effects_library.groups.sizes.max())
         half = rng.generator(0, 0, "challenge/bayes").standard_normal((128, columns))
         return np.concatenate([half, -half])
 
 
-def facts(drawn: Drawn, x: Vector, response: Vector, library: Library, bayes: BayesClassifier) -> dict[str, Any]:
+def facts(drawn: Drawn, x: Vector, response: Vector, library: EffectsLibrary, bayes: BayesClassifier) -> dict[str, Any]:
     """Return what a record says of the truth, and of the best possible answer.
 
     Data vector and response of the effects are those of the case's library, shape (p_raw,).

@@ -19,8 +19,9 @@ from mcsim.diagnosis.context import DiagnosisContext, calibration_of, context
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.subsets import Subsets
-from mcsim.diagnosis.validation import Halves, HeldOut
+from mcsim.diagnosis.validation import Halves
 from mcsim.errors import InputError, RunError
+from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit, SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration
 
@@ -32,7 +33,7 @@ HELD_OUT = 0.25
 
 
 @dataclass(frozen=True, eq=False)
-class Library:
+class EffectsLibrary:
     """Candidates of a diagnosis, their templates, and the noise model that they are tested with.
 
     ``null`` describes the data vector, of p_raw elements, without any effect; the templates are its response per unit
@@ -85,7 +86,7 @@ class Library:
 
 
 @dataclass(frozen=True, eq=False)
-class LinearModel(Library):
+class LinearModel(EffectsLibrary):
     """A library whose responses are straight lines: simulated data vectors plus templates times coordinates.
 
     Its covariance does not know the simulations that serve as ``data`` without an effect, shape (n, p_raw). ``halves``
@@ -149,7 +150,7 @@ def reduced(
 
 
 @dataclass(frozen=True, eq=False)
-class LearnedModel(Library):
+class LearnedModel(EffectsLibrary):
     """A library with all that cases of a model are diagnosed with."""
 
     context: DiagnosisContext

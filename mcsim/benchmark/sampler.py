@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from mcsim.benchmark.case import KINDS, Drawn, Kind, Member, Prior, Vector
-from mcsim.benchmark.library import Library
+from mcsim.benchmark.library import EffectsLibrary
 from mcsim.benchmark.out_of_library import OutOfLibrary
 from mcsim.sphere import rng
 
@@ -17,7 +17,7 @@ class CaseSampler:
     """Draw cases from a prior: effects of a library, and effects that no library has, by name, channel by channel."""
 
     prior: Prior
-    library: Library
+    effects_library: EffectsLibrary
     out_of_library: Mapping[str, Sequence[OutOfLibrary]] = field(default_factory=dict)
 
     def draw(self, kinds: Sequence[Kind], seed: int, case: int) -> Drawn:
@@ -52,7 +52,7 @@ class CaseSampler:
     @cached_property
     def weights(self) -> Vector:
         """Prior probability of each candidate as the only effect, shape (candidates,)."""
-        total = np.zeros(len(self.library.candidates))
+        total = np.zeros(len(self.effects_library.candidates))
         for channels in self._groups.values():
             for group in channels:
                 total[group] = 1.0 / len(self._groups) / len(channels) / len(group)
@@ -62,7 +62,7 @@ class CaseSampler:
     def _groups(self) -> dict[str, list[list[int]]]:
         """Candidates that can be drawn: name by name, channel by channel."""
         found: dict[str, dict[str | None, list[int]]] = {}
-        for index, candidate in enumerate(self.library.candidates):
+        for index, candidate in enumerate(self.effects_library.candidates):
             largest = float(np.max(np.linalg.norm(self._white(index), axis=0)))
             # Of an effect without response and without a limit the product is NaN, which is not larger.
             if candidate.effect.parametrization.max_amplitude * largest >= self.prior.weakest:
@@ -71,8 +71,8 @@ class CaseSampler:
 
     def _white(self, index: int) -> Vector:
         """Return the templates of a candidate in units of their standard deviations, shape (p, k)."""
-        null = self.library.null
-        t = self.library.templates[:, list(self.library.candidates[index].columns)]
+        null = self.effects_library.null
+        t = self.effects_library.templates[:, list(self.effects_library.candidates[index].columns)]
         return np.sqrt(null.hartlap_factor) * null.whiten_templates(t)
 
     def _member(self, draw: np.random.Generator, name: str) -> Member:
@@ -80,7 +80,11 @@ class CaseSampler:
         channels = self._groups[name]
         group = channels[int(draw.integers(len(channels)))]
         index = group[int(draw.integers(len(group)))]
-        candidate, white, strength = self.library.candidates[index], self._white(index), self.prior.strength(draw)
+        candidate, white, strength = (
+            self.effects_library.candidates[index],
+            self._white(index),
+            self.prior.strength(draw),
+        )
         gram, fit = white.T @ white, candidate.effect.parametrization
         values, vectors = np.linalg.eigh(gram)
         constrained = values > 1e-9 * values[-1]
@@ -104,7 +108,7 @@ class CaseSampler:
         group = self.out_of_library[name]
         one = group[int(draw.integers(len(group)))]
         strength = self.prior.strength(draw)
-        amplitude = strength / self.library.null.expected_snr(one.response)
+        amplitude = strength / self.effects_library.null.expected_snr(one.response)
         effect = one.kind(amplitude=amplitude)
         parameters = {"amplitude": effect.amplitude, **effect.parameters()}
         response = tuple(map(float, amplitude * one.response))

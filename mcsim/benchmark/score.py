@@ -11,7 +11,7 @@ from mcsim.benchmark import report
 from mcsim.benchmark.bayes import BayesClassifier, facts
 from mcsim.benchmark.case import Drawn, Prior, Record, Truth, Vector, pulls
 from mcsim.benchmark.folder import VERDICTS, Settings, finished_cases, open_key, read_json
-from mcsim.benchmark.library import Library, LinearModel, learned_model, linear_model, workers_of
+from mcsim.benchmark.library import EffectsLibrary, LinearModel, learned_model, linear_model, workers_of
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.benchmark.summary import ALPHA, Power, Score
 from mcsim.diagnosis.campaign import Batch
@@ -83,7 +83,7 @@ def score_draws(
 
 def _record(settings: Settings, truth: Truth, folder: Path, bayes: BayesClassifier) -> Record:
     """Compare the key of a case with the verdict in a folder."""
-    model, full = learned_model(settings, truth.without), bayes.sampler.library
+    model, full = learned_model(settings, truth.without), bayes.sampler.effects_library
     remedy = f"delete {folder} and run mcsim challenge run again"
     verdict, answer = (read_json(folder / name, remedy) for name in ("verdict.json", "answer.json"))
     try:
@@ -100,7 +100,9 @@ def _record(settings: Settings, truth: Truth, folder: Path, bayes: BayesClassifi
     )
 
 
-def _said(truth: Truth, verdict: Mapping[str, Any], answer: Mapping[str, Any], library: Library) -> dict[str, Any]:
+def _said(
+    truth: Truth, verdict: Mapping[str, Any], answer: Mapping[str, Any], library: EffectsLibrary
+) -> dict[str, Any]:
     """Return what a record says of the verdict."""
     sets = [verdict["effects"], *verdict["alternatives"]] if verdict["effects"] else []
     reduction = verdict["shrink"] or {}
@@ -116,7 +118,9 @@ def _said(truth: Truth, verdict: Mapping[str, Any], answer: Mapping[str, Any], l
     }
 
 
-def _pulls(truth: Truth, verdict: Mapping[str, Any], answer: Mapping[str, Any], library: Library) -> tuple[float, ...]:
+def _pulls(
+    truth: Truth, verdict: Mapping[str, Any], answer: Mapping[str, Any], library: EffectsLibrary
+) -> tuple[float, ...]:
     """Return fitted less true components over their errors, where the only effect is named first."""
     if truth.kind != "one" or not answer["explanations"]:
         return ()

@@ -6,7 +6,6 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim import config, systematics
 from mcsim.diagnosis.candidate import Candidate, numbered
@@ -14,15 +13,15 @@ from mcsim.diagnosis.localisation import BipolarScan, coarse_residuals
 from mcsim.diagnosis.matched_filters import gain_of, matched_filter
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Block, Element, blocks_of
-from mcsim.diagnosis.wiener_filter import Map, Model, model_of, shared_sky, wiener_filter
+from mcsim.diagnosis.wiener_filter import Model, model_of, shared_sky, wiener_filter
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.nuisance import DisturbedSurvey, Nuisance, check_nuisances, nuisances_of
 from mcsim.simulation.survey import Survey, survey
 from mcsim.sphere import alm as alm_
+from mcsim.support.arrays import Alm, Map, Vector
 from mcsim.systematics import Effect, Library
 
-Vector = NDArray[np.float64]
 Kinds = tuple[tuple[str, type[Effect]], ...]
 """Effects of a library by name, as they are sent to workers."""
 
@@ -167,7 +166,7 @@ class Job:
     sample_by_sample: bool = False  # simulate with the time-ordered reference, not with the default route
     without: tuple[str, ...] = ()  # effects that are no candidates
     bipolar_scan: bool = False  # measure the bipolar scan and the coarse residual maps as well
-    observed: NDArray[np.complex128] | None = None  # filtered sky of the data, which then constrains the skies
+    observed: Alm | None = None  # filtered sky of the data, which then constrains the skies
     settings: DiagnosisSettings = field(default_factory=DiagnosisSettings)
     library: Kinds = field(default_factory=lambda: kinds_of(None))
     nuisances: bool = False  # draw those of the run
@@ -212,9 +211,7 @@ def _disturbed(simulated: str, kinds: Kinds) -> DisturbedSurvey:
 
 
 @lru_cache(maxsize=32)
-def _constrained_sky(
-    definition: tuple[Any, ...], observed: bytes, seed: int, realization: int
-) -> NDArray[np.complex128]:
+def _constrained_sky(definition: tuple[Any, ...], observed: bytes, seed: int, realization: int) -> Alm:
     """Return a constrained realization: a sky s + (s^_data - s^_drawn), with s^_drawn filtered from maps of s.
 
     Notes

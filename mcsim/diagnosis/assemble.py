@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.diagnosis.candidate import Candidate, columns_of, parts_of
@@ -12,12 +11,11 @@ from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.nuisance import NuisanceResult, Regression, results
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.result import CandidateResult, DiagnosisResult, EffectResult, EffectSet
-from mcsim.diagnosis.validation import HeldOut, excess_of
 from mcsim.errors import InputError
 from mcsim.stats.detection import detectable, snr_needed, snr_to_separate
-from mcsim.stats.gaussian import Fit, SimulatedGaussian, residual_pvalue
-
-Vector = NDArray[np.float64]
+from mcsim.stats.excess import HeldOut, excess_of
+from mcsim.stats.gaussian import Fit, held_out_pvalues
+from mcsim.support.arrays import Vector
 
 TELLING = 12
 """Elements that are named where two sets differ."""
@@ -192,20 +190,3 @@ def _candidates(context: DiagnosisContext, refined: Refined) -> Iterator[Candida
             separable=separable,
             separable_words=candidate.effect.format_amplitude(separable) if np.isfinite(separable) else "–",
         )
-
-
-def held_out_pvalues(simulations: Vector, null: SimulatedGaussian) -> Vector:
-    """Return the p-value of every simulation against all others, shape (N,): uniform for Gaussian data vectors.
-
-    Notes
-    -----
-    With c = x_i - mean, S the scatter of all N and a = N/(N - 1) c'S^-1 c, the scatter of the others is
-    S - N/(N - 1) c c', and x_i less their mean is N/(N - 1) c: its square in their scatter, over 1 + 1/(N - 1), is
-    a/(1 - a) (Sherman & Morrison, Ann. Math. Stat. 21, 124, 1950).
-    Against explicit refits: tests/unit/test_diagnosis_report.py.
-    """
-    count = len(simulations)
-    white = (simulations - simulations.mean(axis=0)) @ null.whitening.T
-    a = np.sum(white**2, axis=1) / null.dof * count / (count - 1)
-    square = (null.dof - 1) * a / np.maximum(1.0 - a, 1e-12)
-    return residual_pvalue(square, null.dimension, null.dof - 1)

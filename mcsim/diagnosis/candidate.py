@@ -1,6 +1,6 @@
 """Candidates: effects that may be in the data, the response of the data vector to each, and what a fit says of them."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -15,8 +15,6 @@ from mcsim.systematics import Effect, basis_of
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
-Respond = Callable[[Sequence[config.Effect], int], Matrix]
-"""Return the changes of the data vector by effects in a number of simulated skies, shape (skies, p)."""
 
 
 class Column(NamedTuple):

@@ -1,6 +1,5 @@
 """Pictures of a diagnosis: excess chi^2, candidates, elements, residual maps, correlations and calibration."""
 
-import textwrap
 from typing import Any
 
 import numpy as np
@@ -10,17 +9,15 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
 
-from mcsim.diagnosis.result import CandidateResult, DiagnosisResult
+from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import Contrast
 from mcsim.diagnosis.summaries import KINDS
-from mcsim.diagnosis.words import sentence
 from mcsim.plot.sky import mollweide
 from mcsim.stats.detection import snr_to_separate
 from mcsim.support.numbers import measured, p_equals
 
 # Okabe and Ito's palette: told apart with any colour vision.
-BLUE, RED, GREEN, AMBER = "#0072b2", "#d55e00", "#00785a", "#e69f00"
-_VERDICTS = {"none": GREEN, "effect": BLUE, "mixture": BLUE, "degenerate": "#8a5c00", "unknown": "#b04a00"}
+BLUE, RED, AMBER = "#0072b2", "#d55e00", "#e69f00"
 
 TOP, MAPS = 15, 12
 """Candidates in the picture of those fitted alone, of which the table has all; and residual maps in theirs."""
@@ -29,33 +26,10 @@ LIMIT = 8.0
 """Deviation at which the colours of the table of blocks end."""
 
 
-def first_screen(result: DiagnosisResult) -> Figure:
-    """Draw the verdict in one picture: sentence, excess before and after, and the candidates that matter most."""
-    lines = textwrap.wrap(sentence(result).replace("$", r"\$"), 110)
-    top = 0.8 + 0.24 * len(lines)
-    height = 2.6 + top
-    figure = Figure(figsize=(9.6, height))
-    figure.set_layout_engine("constrained", rect=(0.0, 0.0, 1.0, 1.0 - top / height), w_pad=0.15)
-    name = f" {_label(result.case, 60)}: {result.kind} "
-    head = figure.text(0.02, 1.0 - 0.3 / height, name, va="center", fontsize=13)
-    head.set(color="white", fontweight="bold", in_layout=False)
-    head.set_bbox({"facecolor": _VERDICTS[result.kind], "edgecolor": "none", "boxstyle": "round,pad=0.3"})
-    style: dict[str, Any] = {"fontsize": 10.5, "va": "top", "linespacing": 1.35, "in_layout": False}
-    figure.text(0.02, 1.0 - 0.6 / height, "\n".join(lines), **style)
-    left, right = figure.subplots(1, 2)
-    _draw_excess(left, result)
-    _draw_candidates(right, result, 6)
-    return figure
-
-
 def excess_figure(result: DiagnosisResult) -> Figure:
     """Draw the excess chi^2 before and after, on held-out data where they are measured."""
     figure = Figure(figsize=(6.4, 2.2), layout="constrained")
-    _draw_excess(figure.subplots(), result)
-    return figure
-
-
-def _draw_excess(axes: Axes, result: DiagnosisResult) -> None:
+    axes = figure.subplots()
     found, expected = result.held_out, 0.0
     rows, of = [("model", result.excess, RED)], "all data"
     if found is not None:
@@ -79,19 +53,17 @@ def _draw_excess(axes: Axes, result: DiagnosisResult) -> None:
     axes.spines["left"].set_visible(False)
     axes.set_xlabel(f"excess $\\chi^2$ (0: the model is right)\n{_label(of, 60)}", fontsize=9)
     _bare(axes)
+    return figure
 
 
 def candidates_figure(result: DiagnosisResult) -> Figure:
     """Draw the candidates fitted alone, ranked."""
-    count = min(TOP, len(result.candidates))
-    figure = Figure(figsize=(7.2, 1.0 + 0.27 * count), layout="constrained")
-    _draw_candidates(figure.subplots(), result, TOP)
-    return figure
-
-
-def _draw_candidates(axes: Axes, result: DiagnosisResult, count: int) -> None:
-    rows = result.ranked[:count]
-    colours = [_colour(result, row) for row in rows]
+    rows = result.ranked[:TOP]
+    figure = Figure(figsize=(7.2, 1.0 + 0.27 * len(rows)), layout="constrained")
+    axes = figure.subplots()
+    accepted = [{result.candidates[k].label for k in one.candidates} for one in result.sets]
+    named, others = (accepted[0] if accepted else set()), set().union(*accepted[1:])
+    colours = [BLUE if row.label in named else AMBER if row.label in others else "#b5b5b5" for row in rows]
     axes.barh(range(len(rows)), [row.significance for row in rows], height=0.7, color=colours)
     axes.set_yticks(range(len(rows)), [_label(row.label, 46) for row in rows], fontsize=8)
     axes.set_ylim(len(rows) - 0.4, -0.6)
@@ -100,12 +72,7 @@ def _draw_candidates(axes: Axes, result: DiagnosisResult, count: int) -> None:
     key = ", ".join(word for word, colour in shown if colour in colours)
     axes.set_xlabel(r"fitted alone: $\sqrt{\Delta\chi^2}$" + (f"\n({key})" if key else ""), fontsize=9)
     _bare(axes)
-
-
-def _colour(result: DiagnosisResult, row: CandidateResult) -> str:
-    index = result.candidates.index(row)
-    member = [index in one.candidates for one in result.sets]
-    return "#b5b5b5" if not any(member) else BLUE if member[0] else AMBER
+    return figure
 
 
 def blocks_figure(result: DiagnosisResult) -> Figure:
@@ -119,9 +86,7 @@ def blocks_figure(result: DiagnosisResult) -> Figure:
     at = np.array(
         [(kinds.index(e.family), names.index(column)) for e, column in zip(result.elements, columns, strict=True)]
     )
-    panels = (
-        {"before": result.z} if result.z_after is None else {"before": result.z, "after the best fit": result.z_after}
-    )
+    panels = {"before": result.z} | ({} if result.z_after is None else {"after the best fit": result.z_after})
     width = 3.4 + len(panels) * (0.62 * len(names) + 0.3)
     figure = Figure(figsize=(width, 2.6 + 0.27 * len(kinds)), layout="constrained")
     grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]

@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 from mcsim.diagnosis.assemble import result_of
 from mcsim.diagnosis.candidate import columns_of, tables_at
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
-from mcsim.diagnosis.refine import Refined, Refiner, with_scatter
+from mcsim.diagnosis.refine import Refined, Refiner
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import Attribution
-from mcsim.diagnosis.validation import Halves, HeldOut
+from mcsim.diagnosis.validation import Halves
 from mcsim.errors import InputError
-from mcsim.stats.gaussian import Fit
+from mcsim.stats.excess import HeldOut
+from mcsim.stats.gaussian import Fit, with_scatter
 from mcsim.support.numbers import measured
 
 Vector = NDArray[np.float64]

@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 from mcsim import bipolar
 from mcsim.beamfit.data import parts
 from mcsim.diagnosis.summaries import Element, bins, scales
-from mcsim.diagnosis.wiener_filter import FilteredMaps, Map, Model, by_degree
+from mcsim.diagnosis.wiener_filter import FilteredMaps, Model, by_degree
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.rotation import FRAMES, rotate_biposh
 from mcsim.stats.look_elsewhere import scan_pvalues
-
-Vector = NDArray[np.float64]
+from mcsim.support.arrays import Map, Vector
 
 NSIDE = 16
 """Of residual maps, if the data are not coarser: finer pixels show noise and little else."""
@@ -46,7 +45,7 @@ class BipolarScan:
         """Return the description of each number, in the order of :meth:`values`."""
         return (*(element for element, _ in self._binned), *self._powers())
 
-    def values(self, filtered: FilteredMaps) -> NDArray[np.float64]:
+    def values(self, filtered: FilteredMaps) -> Vector:
         """Return all numbers of a set of maps, shape (numbers,)."""
         sums = self._sums(filtered)
         binned = np.stack([sums.real, sums.imag], axis=-1)[tuple(np.transpose([where for _, where in self._binned]))]
@@ -60,8 +59,8 @@ class BipolarScan:
     @cached_property
     def _sources(self) -> list[tuple[Element, int | None, float]]:
         """Return what is correlated with the sky: itself, and sum and (sign -1) difference of a channel's residuals."""
-        found: list[tuple[Element, int | None, float]] = []
-        found.append((Element("sky", "biposh", self.model.channels, kind="biposh"), None, 1.0))
+        sky = Element("sky", "biposh", self.model.channels, kind="biposh")
+        found: list[tuple[Element, int | None, float]] = [(sky, None, 1.0)]
         for channel, name in enumerate(self.model.channels):
             own = Element(name, "biposh", (name,), kind="biposh")
             found.append((own, channel, 1.0))
@@ -91,15 +90,14 @@ class BipolarScan:
         return found
 
     def _powers(self) -> Iterator[Element]:
-        """Yield the descriptions of the cross powers of residuals; only in the lowest bin is a split by itself."""
+        """Yield the descriptions of the cross powers of residuals; maps of two splits have no split in common."""
         model = self.model
         for one, two in combinations_with_replacement(model.parts, 2):
             channels = tuple(dict.fromkeys(model.channels[part.channel] for part in (one, two)))
-            alike = Element(f"cl/{one.name},{two.name}", "cl", channels, L=0, M=0, parity="even", kind="cross")
-            for place, (low, high) in enumerate(scales(model.lmax)):
-                split = one.split if place == 0 and one.split == two.split else None
-                name = f"{alike.name}/{low}-{high}"
-                yield replace(alike, name=name, split=split, ell=(low, high), frame=model.frame)
+            split = one.split if one.split == two.split else None
+            alike = Element(f"cl/{one.name},{two.name}", "cl", channels, split, L=0, M=0, parity="even", kind="cross")
+            for low, high in scales(model.lmax):
+                yield replace(alike, name=f"{alike.name}/{low}-{high}", ell=(low, high), frame=model.frame)
 
     def _sums(self, filtered: FilteredMaps) -> NDArray[np.complex128]:
         """Return the sums of coefficients over bins, shape (sources, frames, modes, bins)."""
@@ -127,7 +125,6 @@ class Place:
     element: Element  # the number of the group that departs most
     z: float  # normal deviate of the group
     p: float  # global p-value: that the largest departure of all groups is as large
-    peak: float  # normal deviate of that number alone
 
 
 def places(x: Vector, simulations: Vector, elements: Sequence[Element], level: float = 0.01) -> list[Place]:
@@ -160,8 +157,8 @@ def places(x: Vector, simulations: Vector, elements: Sequence[Element], level: f
     rest: list[Place] = []
     seen: set[tuple[object, ...]] = set()
     for group in np.argsort(-z):
-        peak = max(rows[group], key=lambda number: abs(deviates[number]))
-        place = Place(elements[peak], float(z[group]), float(p[group]), float(deviates[peak]))
+        most = max(rows[group], key=lambda number: abs(deviates[number]))
+        place = Place(elements[most], float(z[group]), float(p[group]))
         kind = (place.element.frame, place.element.L, place.element.parity)
         new = kind not in seen and (place.p <= level or not seen)
         (firsts if new else rest).append(place)

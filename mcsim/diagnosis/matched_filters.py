@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim import systematics
 from mcsim.diagnosis.wiener_filter import FilteredMaps, Model, by_degree
@@ -19,10 +18,10 @@ from mcsim.simulation.survey import mean_gain
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
 from mcsim.support import folders
+from mcsim.support.arrays import Map
 from mcsim.support.code import class_digest, package_digest
 from mcsim.systematics import Effect
 
-Map = NDArray[np.float64]
 MatchedFilter = Callable[[FilteredMaps], float]
 
 
@@ -127,8 +126,7 @@ def gain_of(effect: Effect, site: systematics.Site, share: tuple[float, float]) 
     def fill(folder: Path) -> None:
         np.save(folder / "gain.npy", np.asarray(mean_gain((effect,), site, share), dtype=np.float64))
 
-    found: Map = np.load(folders.cached(f"gain-{where[:32]}-{what[:32]}", fill) / "gain.npy")
-    return found
+    return np.asarray(np.load(folders.cached(f"gain-{where[:32]}-{what[:32]}", fill) / "gain.npy"))
 
 
 def normalised_difference(model: Model, filtered: FilteredMaps, parts: tuple[int, ...]) -> Map:

@@ -4,14 +4,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement, product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.beamfit.data import Row, Scaling, parts, project
-from mcsim.beamfit.table import COLUMNS, in_uk2, read_ecsv, scaling_of
+from mcsim.beamfit.table import check_frame, check_parity, identified, in_uk2, read_ecsv, scaling_of
 from mcsim.bipolar import Mode
 from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, kinds_of, surveys
 from mcsim.diagnosis.context import DataSet
@@ -21,10 +20,8 @@ from mcsim.diagnosis.summaries import Block, Element
 from mcsim.errors import InputError
 from mcsim.simulation import simulate
 from mcsim.sphere.rotation import FRAMES, rotate_biposh
+from mcsim.support.arrays import Matrix, Vector
 from mcsim.systematics import Effect, Library
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 
 _SPECTRAL_HOOKS = ("sky", "beam", "pointing", "spread", "orientations", "noise")
 """Hooks that change spectra of a map. A drift of the gain does so in the lowest degrees only and is no candidate."""
@@ -73,10 +70,7 @@ class Spectra:
         return tuple(found)
 
     def __call__(self, job: Job) -> Vector:
-        """Return the same numbers of simulations, shape (count, p), by the function that runs an ensemble.
-
-        This is the task that a worker runs.
-        """
+        """Return the same numbers of simulations, shape (count, p), by the function that runs an ensemble."""
         realized = [(shared, simulate.realize(shared, realization)) for realization, shared in surveys(job)]
         shared, biposh = realized[0][0], np.stack([spectra["biposh"] for _, spectra in realized])
         columns = []
@@ -96,22 +90,18 @@ def read_spectra(path: str | Path, run: config.RunConfig) -> Spectra:
     many skies the values are the mean (default: 1).
     """
     table = read_ecsv(path)
-    missing = [name for name in (*COLUMNS, "value") if name not in table.colnames]
-    if missing:
-        raise InputError(f"{path} has no column {missing[0]}; give {', '.join(COLUMNS)} and value.")
     scaling, known, lmax = scaling_of(path, table.meta), _pairs(run), config.analysis_lmax(run)
-    real, imag, stated = (
-        in_uk2(path, table, name) if name in table.colnames else np.full(len(table), np.nan)
-        for name in ("value", "value_imag", "error")
-    )
+    absent = np.full(len(table), np.nan)
+    real = in_uk2(path, table, "value")
+    imag, stated = (in_uk2(path, table, name) if name in table.colnames else absent for name in ("value_imag", "error"))
     found: dict[tuple[Row, Pair], tuple[float, float]] = {}
-    for number, line in enumerate(table):
-        label = str(line["pair"]) if "pair" in table.colnames else next(iter(known))
+    for number, (L, M, d, low, high) in enumerate(identified(path, table).T.tolist()):
+        label = str(table["pair"][number]) if "pair" in table.colnames else next(iter(known))
         if label not in known:
             raise InputError(f"{path}: {label} is no pair of the model's maps; use one of {'; '.join(known)}.")
-        L, M, d, low, high = (int(line[name]) for name in COLUMNS)
         mode, pair = Mode(L, M, d), known[label]
-        _check_row(path, Row(mode, low, high, False), pair, scaling, lmax)
+        check_parity(path, mode, scaling)
+        _check_row(path, Row(mode, low, high, False), pair, lmax)
         for imaginary in parts(mode):
             key, value = (Row(mode, low, high, imaginary), pair), float((imag if imaginary else real)[number])
             if imaginary and not np.isfinite(value):
@@ -125,7 +115,13 @@ def read_spectra(path: str | Path, run: config.RunConfig) -> Spectra:
     if not found:
         raise InputError(f"{path} has no finite value; give the measured bins.")
     (rows, pairs), (value, error) = zip(*found, strict=True), np.array(list(found.values())).T
-    frame, count = _frame_and_skies(path, table.meta, config.prepared_grid(run)[1], any(row.mode.L for row in rows))
+    frame, said = config.prepared_grid(run)[1], str(table.meta.get("frame", "")).lower()
+    if not said and any(row.mode.L for row in rows):
+        raise InputError(f'{path} does not say its frame; add frame: "{frame}" to its meta, if that is the one.')
+    check_frame(path, said or frame, frame)
+    count = table.meta.get("realizations", 1)
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+        raise InputError(f"{path} is the mean of {count!r} realizations; give a whole number from 1 in its meta.")
     return Spectra(str(path), frame, rows, pairs, scaling, value, error, count)
 
 
@@ -137,15 +133,11 @@ def _pairs(run: config.RunConfig) -> dict[str, Pair]:
     return {f"{x},{y}": Pair(f"{x},{y}", (one[0], two[0]), (one[1], two[1])) for (x, one), (y, two) in pairs}
 
 
-def _check_row(path: str | Path, row: Row, pair: Pair, scaling: Scaling, lmax: int) -> None:
+def _check_row(path: str | Path, row: Row, pair: Pair, lmax: int) -> None:
     """Raise InputError for a mode or a bin that the pair does not have."""
     mode, low, high, _ = row
     if not (0 <= mode.M <= mode.L and abs(mode.d) <= mode.L):
         raise InputError(f"{path}: the mode {mode.name} does not exist; it needs 0 <= M <= L and |d| <= L.")
-    if mode.parity == "odd" and scaling.bennett and not scaling.summary:
-        raise InputError(
-            f"{path}: {mode.name} has odd parity, which the Bennett normalisation does not have; leave it out."
-        )
     if not 0 <= low <= high <= lmax:
         raise InputError(
             f"{path}: the bin ell = {low} ... {high} is not within 0 ... {lmax}, the model's analysis; leave the "
@@ -159,19 +151,6 @@ def _check_row(path: str | Path, row: Row, pair: Pair, scaling: Scaling, lmax: i
             f"{path}: there is no {mode.name} of {pair.label} at l2 = {low} ... {high}, or it repeats another; leave "
             "the row out."
         )
-
-
-def _frame_and_skies(path: str | Path, meta: Any, frame: str, needed: bool) -> tuple[str, int]:
-    """Return the frame of a table, which is that of the model and said if ``needed``, and the skies of its mean."""
-    found = str(meta.get("frame", "" if needed else frame)).lower()
-    if not found:
-        raise InputError(f'{path} does not say its frame; add frame: "{frame}" to its meta, if that is the one.')
-    if found != frame:
-        raise InputError(f"{path} is in the {found} frame, the model in the {frame} one; set map.frame to {found}.")
-    count = meta.get("realizations", 1)
-    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise InputError(f"{path} is the mean of {count!r} realizations; give a whole number from 1 in its meta.")
-    return found, count
 
 
 def estimator_for(run: config.RunConfig, measured: Spectra) -> config.RunConfig:

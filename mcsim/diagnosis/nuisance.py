@@ -8,15 +8,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim.diagnosis.candidate import Candidate
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.simulation.nuisance import Nuisance
 from mcsim.stats.gaussian import SimulatedGaussian, orthonormal
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
+from mcsim.support.arrays import Matrix, Vector
 
 MEASURED = 0.04
 """Share of the prior variance that the data leave at most of a nuisance whose response is that of the regression."""

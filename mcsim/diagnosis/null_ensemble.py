@@ -1,22 +1,19 @@
 """Simulations of the model: the null distribution of the data vector."""
 
 import json
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from mcsim.diagnosis.candidate import Column, TemplateBank
 from mcsim.diagnosis.summaries import Element
 from mcsim.stats.gaussian import SimulatedGaussian
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
+from mcsim.support.arrays import Matrix, Vector
 
 QUADRATIC = 0.05
 """Share of an element's variance that may come from squares and products of nuisances."""
@@ -135,22 +132,16 @@ def save(path: Path, ensemble: NullEnsemble, bank: TemplateBank) -> None:
         "columns": json.dumps(bank.labels),
         "redundant": ensemble.redundant,
     }
-    dims = {name: tuple(f"{name}_{axis}" for axis in range(array.ndim)) for name, array in arrays.items()}
-    dataset = xr.Dataset({name: (dims[name], array) for name, array in arrays.items()}, attrs=attributes)
-    dataset.to_zarr(path, mode="w", consolidated=False)
+    variables = {name: ([f"{name}_{axis}" for axis in range(array.ndim)], array) for name, array in arrays.items()}
+    xr.Dataset(variables, attrs=attributes).to_zarr(path, mode="w", consolidated=False)
 
 
 def load(path: Path) -> tuple[NullEnsemble, TemplateBank]:
     """Read what :func:`save` wrote."""
     with xr.open_zarr(path, consolidated=False) as dataset:
         arrays = {str(name): np.asarray(values) for name, values in dataset.data_vars.items()}
-        elements = tuple(_element(row) for row in json.loads(dataset.attrs["elements"]))
-        columns = tuple(Column(e, c, tuple(map(tuple, s)), k) for e, c, s, k in json.loads(dataset.attrs["columns"]))
+        elements = TypeAdapter(tuple[Element, ...]).validate_json(dataset.attrs["elements"])
+        columns = TypeAdapter(tuple[Column, ...]).validate_json(dataset.attrs["columns"])
         redundant = float(dataset.attrs["redundant"])
     bank = TemplateBank(arrays.pop("matrix"), arrays.pop("error"), arrays.pop("curvature"), columns)
     return NullEnsemble(**arrays, elements=elements, redundant=redundant), bank
-
-
-def _element(row: Mapping[str, Any]) -> Element:
-    ell = row["ell"]
-    return Element(**{**row, "channels": tuple(row["channels"]), "ell": None if ell is None else tuple(ell)})

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import healpy
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.diagnosis.campaign import constrained_jobs
@@ -16,15 +15,12 @@ from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.localisation import Place, places, standardised
 from mcsim.diagnosis.nuisance import half_given_other
 from mcsim.diagnosis.selection import Attribution
-from mcsim.diagnosis.wiener_filter import Model, Part, shared_sky
+from mcsim.diagnosis.wiener_filter import Model, Part, shared_sky, sky_variance
 from mcsim.ensemble.maps import file_names
 from mcsim.errors import InputError
 from mcsim.sphere import header, healpix
 from mcsim.stats.look_elsewhere import global_test
-
-Map = NDArray[np.float64]
-Vector = NDArray[np.float64]
-Rows = NDArray[np.float64]
+from mcsim.support.arrays import Alm, Map, Matrix, Vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +45,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         return self._measured[0]
 
     @cached_property
-    def _sky(self) -> NDArray[np.complex128]:
+    def _sky(self) -> Alm:
         return shared_sky(self.context.analysis.model, self.data)
 
     @cached_property
@@ -57,7 +53,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         """Return data vectors of constrained skies without any effect, as many as were needed so far."""
         return []
 
-    def respond(self, found: Sequence[config.Effect], skies: int) -> Rows:
+    def respond(self, found: Sequence[config.Effect], skies: int) -> Matrix:
         """Return changes of the data vector in ``skies`` constrained skies, shape (rows, p).
 
         Effects with a mean response are simulated in typical skies instead: the observed sky has its power already.
@@ -70,16 +66,16 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         before, after = self._constrained(others, skies)
         return shift.mean(axis=0) + after - before
 
-    def pair(self, found: Sequence[config.Effect]) -> tuple[Rows, Rows]:
+    def pair(self, found: Sequence[config.Effect]) -> tuple[Matrix, Matrix]:
         """Return data vectors of the same skies without effects and with them, shape (rows, p) each."""
         if any(self._is_typical(effect) for effect in found):
             return self.context.ensemble.reference, self._simulated(found)
         return self._constrained(found, self.context.settings.constrained_skies)
 
-    def _constrained(self, found: Sequence[config.Effect], skies: int) -> tuple[Rows, Rows]:
+    def _constrained(self, found: Sequence[config.Effect], skies: int) -> tuple[Matrix, Matrix]:
         """Return data vectors of constrained skies without effects and with them, shape (skies, p) each."""
 
-        def simulated(found: Sequence[config.Effect], first: int) -> Rows:
+        def simulated(found: Sequence[config.Effect], first: int) -> Matrix:
             jobs = constrained_jobs(self.context.analysis, found, self._sky, range(first, skies))
             return np.concatenate(self.ask(jobs))
 
@@ -92,7 +88,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         kind = next(one.effect for one in self.context.candidates if one.name == effect.name)
         return kind.parametrization.mean_response and not kind.parametrization.stochastic
 
-    def templates(self) -> Rows:
+    def templates(self) -> Matrix:
         """Return the templates; those that depend on the very sky are measured on the observed one if it departs."""
         context, t, settings = self.context, self.context.templates.copy(), self.context.settings
         if global_test(context.null, self.x, context.groups, context.calibration).pvalue > settings.alpha:
@@ -128,7 +124,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
                 notes.append(f"The model fits (p = {p:.2g}) with maps exchanged: {pairs}.")
         return notes
 
-    def halves(self) -> tuple[Rows, str]:
+    def halves(self) -> tuple[Matrix, str]:
         """Return the identity, since only nuisances make the folds depend on each other, and the folds in words."""
         splits, words = self.context.run.map.splits, "odd degrees, alternate pixels"
         if len(splits) > 1:
@@ -145,7 +141,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         elements = (*analysis.bipolar_scan.elements, *(analysis.elements[i] for i in own))
         return places(np.concatenate([self._measured[1], shifted]), drawn, elements, self.context.settings.place_pvalue)
 
-    def residual_maps(self) -> Rows:
+    def residual_maps(self) -> Matrix:
         """Return the residual maps over the scatter of those of simulations, shape (map, npix)."""
         ensemble = self.context.ensemble
         drawn = len(ensemble.bipolar_scan)
@@ -206,7 +202,8 @@ def _checked(model: Model, part: Part, map_: Map, name: str) -> Map:
     rms = float(np.std(seen))
     if rms == 0.0:
         raise InputError(f"{name} is constant; give an observed map.")
-    ratio = rms / expected_rms(model, part)
+    sky, noise = sky_variance(model.cl, model.response[part.channel]), np.mean(1.0 / part.precision[fiducial])
+    ratio = rms / float(np.sqrt(sky + noise))
     if not 1.0 / limits.rms_ratio < ratio < limits.rms_ratio:
         raise InputError(
             f"{name} has an rms of {rms:.3g} uK where the model expects {rms / ratio:.3g} uK; is it in another "
@@ -215,22 +212,13 @@ def _checked(model: Model, part: Part, map_: Map, name: str) -> Map:
     return map_
 
 
-def expected_rms(model: Model, part: Part) -> float:
-    """Return the rms over the sky that the model expects in a map, sky and noise, uK."""
-    cl, response = model.survey.cl, model.survey.channels[part.channel].response.factors[0].real
-    assert cl is not None  # a model of a diagnosis has a spectrum
-    sky = float(np.sum((2 * np.arange(cl.size) + 1) / (4 * np.pi) * cl * response**2))
-    return float(np.sqrt(sky + np.mean(1.0 / part.precision[part.precision > 0])))
-
-
 def exchanges(parts: Sequence[Part]) -> list[tuple[int, ...]]:
     """Return the orders of the maps in which two channels, or two splits of all channels, are exchanged."""
-    places = {(part.channel, part.split): place for place, part in enumerate(parts)}
+    keys: list[tuple[int | str | None, ...]] = [(part.channel, part.split) for part in parts]
     found = []
-    for one, other in combinations(dict.fromkeys(channel for channel, _ in places), 2):
-        channels = {one: other, other: one}
-        found.append(tuple(places[channels.get(channel, channel), split] for channel, split in places))
-    for first, second in combinations(dict.fromkeys(split for _, split in places), 2):
-        splits = {first: second, second: first}
-        found.append(tuple(places[channel, splits.get(split, split)] for channel, split in places))
+    for axis in (0, 1):
+        for one, other in combinations(dict.fromkeys(key[axis] for key in keys), 2):
+            swap = {one: other, other: one}
+            moved = [tuple(swap.get(k, k) if i == axis else k for i, k in enumerate(key)) for key in keys]
+            found.append(tuple(keys.index(key) for key in moved))
     return found

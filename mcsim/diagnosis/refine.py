@@ -2,20 +2,30 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mcsim.diagnosis.candidate import Candidate, columns_of, effects_at, parts_of
+from mcsim.diagnosis.candidate import Candidate, columns_of, effects_at, parts_of, within_bounds
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
-from mcsim.diagnosis.partial_explanation import Detection, PartialExplanation
 from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.errors import InputError
-from mcsim.stats.gaussian import Fit, SimulatedGaussian, orthonormal
+from mcsim.stats.gaussian import Fit
+from mcsim.support.arrays import Matrix, Vector
 
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
+
+@dataclass(frozen=True)
+class PartialExplanation:
+    """Hold effects that are detected without explaining all of the excess chi^2.
+
+    ``members`` are the indices of the candidates, in the order in which they were detected, and ``fit`` the amplitudes
+    of their columns; ``left`` is the share of the excess chi^2 that they leave. The ``templates``, shape (p, K), hold
+    for the members together.
+    """
+
+    members: tuple[int, ...]
+    fit: Fit
+    left: float
+    templates: Matrix
 
 
 @dataclass(frozen=True)
@@ -93,9 +103,48 @@ class Refiner:
         return Refined(found, t, tuple(tried), detected)
 
     def detected_in(self, t: Matrix, candidates: Sequence[Candidate]) -> PartialExplanation | None:
-        """Return the effects that are detected, each set simulated together at its amplitudes."""
-        known, exact = self.context, partial(self._together, candidates)
-        return Detection(known.null, self.data.x, candidates, known.calibration, exact, known.settings).run(t)
+        """Add the most significant candidate beside those that are detected already, until none is significant.
+
+        None if nothing is. Each is significant beside those before it, before and after it is simulated together with
+        them at its amplitude; of two similar effects the one that is not there may be the first.
+        """
+        null, settings = self.context.null, self.context.settings
+        members: tuple[int, ...] = ()
+        refused: set[int] = set()
+        before = self._fit(t, candidates, members)
+        total = before.chi2
+        while len(members) < settings.partial_effects and len(refused) < settings.partial_refusals:
+            taken = {candidates[member].identity for member in members}
+            free = [i for i, one in enumerate(candidates) if one.identity not in taken and i not in refused]
+            fits = {i: self._fit(t, candidates, (*members, i)) for i in free}
+            possible = [i for i, fit in fits.items() if within_bounds(candidates, (*members, i), fit)]
+            best = min(possible, key=lambda i: self._pvalue(before, fits[i]), default=None)
+            if best is None or not self._is_significant(before, fits[best]):
+                break
+            together = (*members, best)
+            exact = self._together(candidates, t, together, fits[best])
+            if exact is not None:
+                after = self._fit(exact, candidates, together)
+                if within_bounds(candidates, together, after) and self._is_significant(before, after):
+                    members, t, before = together, exact, after
+                    continue
+            refused.add(best)
+        if not members:
+            return None
+        excess = null.hartlap_factor * total - null.dimension
+        left = null.hartlap_factor * before.chi2 - before.dimension
+        return PartialExplanation(members, before, min(max(left / excess, 0.0), 1.0) if excess > 0.0 else 1.0, t)
+
+    def _fit(self, t: Matrix, candidates: Sequence[Candidate], members: tuple[int, ...]) -> Fit:
+        return self.context.null.fit(self.data.x, t[:, columns_of(candidates, members)])
+
+    def _pvalue(self, before: Fit, after: Fit) -> float:
+        columns, fitted = before.dimension - after.dimension, self.context.null.dimension - before.dimension
+        return float(self.context.null.nested_test(before.chi2 - after.chi2, before.chi2, columns, fitted))
+
+    def _is_significant(self, before: Fit, after: Fit) -> bool:
+        pvalue = float(self.context.calibration.global_pvalue(self._pvalue(before, after)))
+        return pvalue <= self.context.settings.partial_level
 
     def _attribute(self, t: Matrix, candidates: Sequence[Candidate]) -> Attribution:
         known = self.context
@@ -109,7 +158,7 @@ class Refiner:
         Strong effects change their own responses and each other's. None if one can have no such amplitude, or the
         amplitudes diverge round by round.
         """
-        columns = np.array(columns_of(candidates, members))
+        columns, share = np.array(columns_of(candidates, members)), self.context.settings.settled_share
         for _ in range(self.context.settings.joint_rounds):
             try:
                 effects = effects_at(candidates, members, fitted)
@@ -122,7 +171,7 @@ class Refiner:
             at = np.concatenate([effect.parametrization.coordinates(effect) for effect in effects])
             t[:, columns] += self._beyond(t[:, columns], at, response)
             before, fitted = fitted, self.context.null.fit(self.data.x, t[:, columns])
-            if self._has_converged(before.amplitudes, fitted):
+            if self._has_settled(before.amplitudes, fitted.amplitudes, fitted.covariance, share):
                 return t
         return None
 
@@ -189,35 +238,10 @@ class Refiner:
         size = float(np.linalg.norm(self.context.null.whiten_templates(shift[:, None])))
         return crossed * size > self.context.settings.nonlinear_sigma
 
-    def _has_converged(self, before: Vector, now: Fit) -> bool:
-        """Return True if amplitudes have hardly moved, by their errors, or by their size if the errors are tiny."""
-        precision, settings = np.linalg.pinv(now.covariance), self.context.settings
-        moved, size = (float(v @ precision @ v) for v in (now.amplitudes - before, now.amplitudes))
-        return moved < max(settings.settled_sigma**2, settings.settled_share**2 * size)
-
-    def _has_settled(self, before: Vector | None, now: Vector, covariance: Matrix) -> bool:
+    def _has_settled(self, before: Vector | None, now: Vector, covariance: Matrix, share: float = 0.0) -> bool:
+        """Return True if amplitudes have hardly moved, by their errors, or by a share of their size."""
         if before is None:
             return False
-        moved = now - before
-        return float(moved @ np.linalg.pinv(covariance) @ moved) < self.context.settings.settled_sigma**2
-
-
-def with_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, before: Matrix, after: Matrix) -> Fit:
-    """Return a fit of templates, shape (p_raw, K), with the errors of its amplitudes with the effects in the data.
-
-    ``before`` and ``after`` are data vectors of the same skies without the effects and with them at their amplitudes,
-    shape (skies, p_raw).
-
-    Notes
-    -----
-    A strong effect changes the scatter of the data. The fit is linear, so that it is applied to every sky. The variance
-    of each amplitude grows by its excess among the skies with the effects over that without them: the same skies, whose
-    common scatter cancels. Correlations stay; errors are not made smaller.
-    """
-    basis, back = orthonormal(null.whiten_templates(t))
-    without, acting = (
-        np.var(back @ basis.T @ null.whiten_templates(rows.T), axis=1, ddof=1) for rows in (before, after)
-    )
-    own = np.diag(found.covariance)
-    factor = np.sqrt(1.0 + np.divide(np.maximum(acting - without, 0.0), own, out=np.zeros_like(own), where=own > 0.0))
-    return replace(found, covariance=factor[:, None] * found.covariance * factor)
+        precision = np.linalg.pinv(covariance)
+        moved, size = (float(v @ precision @ v) for v in (now - before, now))
+        return moved < max(self.context.settings.settled_sigma**2, share**2 * size)

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,15 +15,6 @@ from mcsim.support import page as page_
 from mcsim.support.numbers import measured, number, p_equals, probability
 
 DOTS_PER_INCH = 120
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A picture inside the page: PNG as base64, what it shows for those who cannot see it, its width in CSS pixels."""
-
-    data: str
-    words: str
-    width: int
 
 
 def write(result: DiagnosisResult, path: str | Path) -> None:
@@ -57,7 +48,7 @@ def _value(value: Any) -> str:
     return number(value) if isinstance(value, float) else str(value)
 
 
-def _pictures(result: DiagnosisResult) -> dict[str, Picture]:
+def _pictures(result: DiagnosisResult) -> dict[str, dict[str, Any]]:
     z, element = max(zip(abs(result.z), result.elements, strict=True), key=lambda pair: pair[0])
     first, largest = f"the first is {result.ranked[0].label}", f"the largest is {z:.1f}, {element.words}"
     drawn = {
@@ -77,5 +68,7 @@ def _pictures(result: DiagnosisResult) -> dict[str, Picture]:
     return {name: _picture(figure, text) for name, (figure, text) in drawn.items() if figure is not None}
 
 
-def _picture(figure: Figure, text: str) -> Picture:
-    return Picture(page_.embedded(page_.png(figure, DOTS_PER_INCH)), text, round(72 * figure.get_figwidth()))
+def _picture(figure: Figure, words: str) -> dict[str, Any]:
+    """Return PNG as base64, what it shows for those who cannot see it, and its width in CSS pixels."""
+    data = page_.embedded(page_.png(figure, DOTS_PER_INCH))
+    return {"data": data, "words": words, "width": round(72 * figure.get_figwidth())}

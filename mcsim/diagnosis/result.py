@@ -1,28 +1,26 @@
 """The result of a diagnosis: one typed object that the report, the figures and the command line read."""
 
 import json
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from mcsim.diagnosis.localisation import Place
 from mcsim.diagnosis.nuisance import NuisanceResult
 from mcsim.diagnosis.selection import Contrast, Verdict
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Element
-from mcsim.diagnosis.validation import HeldOut, Measured, excess_of
 from mcsim.errors import InputError
+from mcsim.stats.excess import HeldOut, Measured, excess_of
 from mcsim.stats.look_elsewhere import GlobalTest
+from mcsim.support.arrays import Vector
 
-Vector = NDArray[np.float64]
-
-SCHEMA = 1
 STORE = "diagnosis.zarr"
 PLACES = 12
 """Groups in the localisation table of ``verdict.json`` and of the report."""
@@ -247,7 +245,7 @@ class DiagnosisResult:
         sets = [[_effect_json(effect) for effect in one.effects] for one in self.sets]
         faint = {"faint": True, "probability": self.probability} if self.faint else {}
         return {
-            "schema": SCHEMA,
+            "schema": 1,
             "case": self.case,
             "gap": {"p_value": self.test.pvalue, "statistic": self.test.chi2, "dof": self.test.dimension},
             "verdict": self.kind,
@@ -260,7 +258,12 @@ class DiagnosisResult:
             "nearest": {"name": near.name, "channel": near.channel, "cosine": self.cosine},
             "heard": [_effect_json(effect) for effect in self.partial],
             "left": self.partial_left,
-            "detectable": [_detectable_json(one) for one in self.candidates if one.detectable is not None],
+            "detectable": [
+                {key: getattr(one, key) for key in ("name", "channel", "unit", "settings")}
+                | {"amplitude_90": one.detectable}
+                for one in self.candidates
+                if one.detectable is not None
+            ],
             "notes": list(self.notes),
             **({"nuisances": [_nuisance_json(one) for one in self.nuisances]} if self.nuisances else {}),
             **({"warnings": list(self.warnings)} if self.warnings else {}),
@@ -317,7 +320,7 @@ class DiagnosisResult:
             arrays: dict[str, Any] = {name: np.asarray(stored[name]) if name in stored else None for name in _ARRAYS}
             rest = json.loads(stored.attrs["result"])
         hints = get_type_hints(cls)
-        return cls(**arrays, **{key: _typed(hints[key], value) for key, value in rest.items()})
+        return cls(**arrays, **{key: TypeAdapter(hints[key]).validate_python(value) for key, value in rest.items()})
 
 
 _ARRAYS = {
@@ -335,7 +338,7 @@ _OF_CANDIDATES = {"amplitude": "fitted alone", "sigma": "standard error", "delta
 
 
 def _effect_json(effect: EffectResult) -> dict[str, Any]:
-    return {f.name: getattr(effect, f.name) for f in fields(effect) if f.name not in ("label", "words")}
+    return {name: value for name, value in vars(effect).items() if name not in ("label", "words")}
 
 
 def _nuisance_json(found: NuisanceResult) -> dict[str, Any]:
@@ -344,20 +347,10 @@ def _nuisance_json(found: NuisanceResult) -> dict[str, Any]:
 
 def _place_json(place: Place) -> dict[str, Any]:
     e = place.element
-    return {
-        "statistic": {"score": "map", "noise": "cl"}.get(e.statistic, e.statistic),
-        "channels": list(e.channels),
-        **{key: getattr(e, key) for key in ("split", "L", "M", "parity")},
-        "ell": None if e.ell is None else list(e.ell),
-        "frame": e.frame,
-        "z": place.z,
-        "p": place.p,
-    }
-
-
-def _detectable_json(one: CandidateResult) -> dict[str, Any]:
-    named = {key: getattr(one, key) for key in ("name", "channel", "unit", "settings")}
-    return named | {"amplitude_90": one.detectable}
+    found = {key: getattr(e, key) for key in ("statistic", "channels", "split", "L", "M", "parity", "ell", "frame")}
+    found["statistic"] = {"score": "map", "noise": "cl"}.get(e.statistic, e.statistic)
+    lists = {key: list(value) for key, value in found.items() if isinstance(value, tuple)}
+    return found | lists | {"z": place.z, "p": place.p}
 
 
 def _held_out_json(found: HeldOut) -> dict[str, Any]:
@@ -378,16 +371,3 @@ def _held_out_json(found: HeldOut) -> dict[str, Any]:
 def _texts(words: Any) -> NDArray[np.object_]:
     """Return texts as objects: Zarr 3 has no stable form for numpy's texts of fixed length."""
     return np.array(list(words), dtype=object)
-
-
-def _typed(kind: Any, value: Any) -> Any:
-    """Return a value from JSON as the type that a field declares: dataclasses, tuples, optional ones."""
-    if isinstance(kind, UnionType):
-        return None if value is None else _typed(next(k for k in get_args(kind) if k is not NoneType), value)
-    if get_origin(kind) is tuple:
-        inner = get_args(kind)
-        return tuple(_typed(inner[0] if inner[-1] is Ellipsis else inner[i], item) for i, item in enumerate(value))
-    if isinstance(kind, type) and is_dataclass(kind):
-        hints = get_type_hints(kind)
-        return kind(**{key: _typed(hints[key], item) for key, item in value.items()})
-    return value

@@ -81,10 +81,8 @@ class DiagnosisSettings:
         Least noise per pixel over the rms of the sky.
     hole_iterations
         Iterations of filling unobserved pixels with the filtered sky.
-    sky_bins
-        Bins in l of the spectrum of the sky, for each parity of l.
-    beam_bins
-        Bins in l of each azimuthal order of a beam, from m = 0.
+    sky_bins, beam_bins
+        Bins in l of the spectrum of the sky, for each parity of l; of each azimuthal order of a beam, from m = 0.
     latitude_edges
         Edges of bands of the sky, in abs(sin(latitude)).
     plane_width

@@ -14,8 +14,7 @@ from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.stats.detection import log_evidence
 from mcsim.stats.gaussian import COLLINEAR, SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration
-
-Vector = NDArray[np.float64]
+from mcsim.support.arrays import Vector
 
 # Relative to columns of norm one: keeps the normal equations of degenerate effects solvable, far below any noise.
 RIDGE = 1e-9

@@ -6,15 +6,13 @@ from itertools import pairwise, product
 
 import healpy
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim.diagnosis.matched_filters import normalised_difference
-from mcsim.diagnosis.wiener_filter import FilteredMaps, Map, Model, by_degree
+from mcsim.diagnosis.wiener_filter import FilteredMaps, Model, by_degree
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotation_matrix
-
-Vector = NDArray[np.float64]
+from mcsim.support.arrays import Map, Vector
 
 
 @dataclass(frozen=True)
@@ -113,8 +111,7 @@ def _of_map(model: Model, part: int) -> Element:
 
 def _height(frame: str, to: str, nside: int) -> Map:
     """Return the sine of the latitude in another frame of every pixel, RING, shape (npix,)."""
-    height: Map = rotation_matrix(frame, to)[2] @ np.stack(healpy.pix2vec(nside, np.arange(12 * nside**2)))
-    return height
+    return np.asarray(rotation_matrix(frame, to)[2] @ np.stack(healpy.pix2vec(nside, np.arange(12 * nside**2))))
 
 
 def _beam_block(model: Model, part: int) -> Block:
@@ -237,8 +234,7 @@ def _contrast_blocks(model: Model) -> list[Block]:
         low = alm_.resize(total, model.lmax, top)
         low[: min(2, top + 1)] = 0.0
         low[top + 1] = 0.0
-        found: Map = healpix.synthesis(low[None], nside, top)[0]
-        return found
+        return np.asarray(healpix.synthesis(low[None], nside, top)[0])
 
     return [Block(elements, lambda filtered: np.asarray(bands @ (smoothed(filtered, 0) * smoothed(filtered, 1))))]
 
@@ -267,9 +263,7 @@ def _sky_block(model: Model) -> Block:
 
 
 _FORMS = {"x": (1, 1), "y": (1, 1), "z": (1, 0), "zz": (2, 0), "xz": (2, 1), "yz": (2, 1), "xx": (2, 2), "xy": (2, 2)}
-"""L and M of real forms."""
-
-_FORM_WORDS = {"zz": "3z² − 1", "xx": "x² − y²"}
+"""L and M of real forms; "zz" is 3z² − 1 and "xx" is x² − y²."""
 
 
 def _isotropy_block(model: Model) -> Block:
@@ -286,7 +280,7 @@ def _isotropy_block(model: Model) -> Block:
         alike = Element("isotropy", "biposh", model.channels, None, fold, (low, high), frame=model.frame)
         for form, (L, M) in _FORMS.items():
             own = replace(alike, name=f"isotropy/{form}/{low}-{high}", L=L, M=M, parity="even")
-            elements.append(replace(own, kind="isotropy", component=_FORM_WORDS.get(form, form)))
+            elements.append(replace(own, kind="isotropy", component={"zz": "3z² − 1", "xx": "x² − y²"}.get(form, form)))
 
     def values(filtered: FilteredMaps) -> Vector:
         sky = healpix.synthesis(filtered.sky[None], nside, lmax)[0]

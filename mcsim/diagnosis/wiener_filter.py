@@ -27,11 +27,7 @@ from mcsim.simulation.survey import Survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
-
-Map = NDArray[np.float64]
-Alm = NDArray[np.complex128]
-Cl = NDArray[np.float64]
-"""Shape (lmax + 1,)."""
+from mcsim.support.arrays import Alm, Cl, Map
 
 
 @dataclass(frozen=True)
@@ -112,8 +108,7 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
                 f"channel {channel.name} reads differences of two beams, which a diagnosis cannot take yet; describe "
                 'the map by a scan of kind "hit_averaged" or "moments".'
             )
-        power = np.sum((2 * np.arange(lmax + 1) + 1) / (4 * np.pi) * cl * response[index] ** 2)
-        floor = settings.noise_floor * float(np.sqrt(power))
+        floor = settings.noise_floor * float(np.sqrt(sky_variance(cl, response[index])))
         for m, split in zip(channel.maps, run.map.splits or (None,), strict=True):
             seen = m.moments.hits > 0
             if m.weight is not None:
@@ -126,6 +121,11 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
     sky_power = cl * gain / (1.0 + cl * gain)
     dipole = dipole_alm(survey.channels[0].site.dipole_uk, lmax)
     return Model(survey, lmax, survey.nside, cl, response, tuple(parts), dipole, sky_power, settings)
+
+
+def sky_variance(cl: Cl, response: Cl) -> float:
+    """Return the variance over the sky of a spectrum seen through B_l, in its unit."""
+    return float(np.sum((2 * np.arange(cl.size) + 1) / (4 * np.pi) * cl * response**2))
 
 
 def wiener_filter(model: Model, maps: Sequence[Map]) -> FilteredMaps:

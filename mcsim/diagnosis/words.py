@@ -6,11 +6,11 @@ from pathlib import Path
 from mcsim.diagnosis.nuisance import NuisanceResult
 from mcsim.diagnosis.result import DiagnosisResult, EffectResult
 from mcsim.diagnosis.selection import Contrast
-from mcsim.diagnosis.validation import Measured
+from mcsim.stats.excess import Measured
 from mcsim.support.numbers import measured, number, p_equals
 
 AGREES, DISAGREES = 0.05, 0.005
-"""p-value above which a residual agrees with the simulations, and below which it does not; marginal between."""
+"""p-value above which data or a residual agree with the simulations, and below which they do not; marginal between."""
 
 SEPARATION = 3.29
 """Distance in standard deviations at which the nearer of two predictions is the right one in 95 cases of 100."""
@@ -35,7 +35,8 @@ def sentence(result: DiagnosisResult) -> str:
         if len(result.partial) > 1 and result.partial_left is not None:
             left = f"{100 * result.partial_left:.0f} % of the excess χ²"
             partly = f" Detected are {_effects(result.partial)}; they leave {left}."
-        return f"{start}, and no effect of the library explains why.{partly}"
+        chance = ", which may be chance" if result.test.pvalue > DISAGREES else ""
+        return f"{start}{chance}, and no effect of the library explains why.{partly}"
     if result.kind == "degenerate":
         shown = [_effects(one.effects) for one in result.sets[: SETS + 1]]
         more = len(result.sets) - len(shown)
@@ -75,9 +76,11 @@ def status(result: DiagnosisResult) -> str:
             f"{100 * result.probability:.0f} %, against no effect, an unlisted one, and the rest of the library."
         )
     if result.kind == "unknown":
+        p = result.test.pvalue
+        chance = f" Data of the model depart as far in {100 * p:.2g} % of cases." if p > DISAGREES else ""
         return (
             f"The most similar candidate is {near.label}: cosine {result.cosine:.2f} with the departure, so that it "
-            f"accounts for {100 * result.cosine**2:.0f} % of the excess χ². It is a hint and not the cause."
+            f"accounts for {100 * result.cosine**2:.0f} % of the excess χ². It is a hint and not the cause.{chance}"
         )
     best = result.sets[0]
     if result.kind == "degenerate":

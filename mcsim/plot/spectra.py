@@ -1,5 +1,6 @@
 """Figure of the binned BipoSH spectra of an ensemble with error bars."""
 
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -58,7 +59,7 @@ def ensemble_figure(
         asked = ", ".join(f"{name} = {value}" for name, value in wanted.items())
         raise InputError(f"{path} has no mode with {asked or 'finite values'}; mcsim info names what it holds.")
     expected = None if prediction is None else _matching(prediction, label, modes)
-    return _draw(modes, f"{path}: {label}, {int(modes['count'])} realizations", expected)
+    return _draw(modes, f"{Path(path).name}: {label}, {int(modes['count'])} realizations", expected)
 
 
 def _matching(prediction: xr.Dataset, pair: str, modes: xr.Dataset) -> xr.Dataset:
@@ -96,8 +97,8 @@ def _draw(modes: xr.Dataset, title: str, expected: xr.Dataset | None) -> Figure:
         notes += ["points: non-circular minus circular-beam control", "band (M = 0): plain mean and its standard error"]
     if expected is not None:
         notes.append(f"dashed: prediction, {expected.attrs['prediction']}")
-    # A narrow figure takes one line for each; a single line would be cut off.
-    figure.supxlabel((";  " if figure.get_figwidth() > 10.0 else "\n").join(notes), fontsize=9)
+    # Some 15 letters of this size fill an inch: longer lines would be cut off at both ends.
+    figure.supxlabel(textwrap.fill(";  ".join(notes), round(14 * figure.get_figwidth())), fontsize=9)
     return figure
 
 

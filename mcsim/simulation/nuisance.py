@@ -7,7 +7,6 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim import config, systematics
 from mcsim.errors import InputError
@@ -16,10 +15,9 @@ from mcsim.simulation.channels import site_of
 from mcsim.simulation.survey import Channel, Survey, mean_gain, survey, with_effects
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import rng
+from mcsim.support.arrays import Map, Vector
 from mcsim.systematics import Effect, Library, Site, basis_of, looked_at, seen_through, spread_of
 
-Vector = NDArray[np.float64]
-Map = NDArray[np.float64]
 MeanGain = Callable[[Effect, Site, tuple[float, float]], Map]
 """Return the mean error of the gain in every pixel, shape (npix,), from effect, site and share of the survey."""
 

@@ -1,1 +1,1 @@
-"""Statistics: small-sample Gaussian tests, look-elsewhere corrections, detection power, intervals, sums of streams."""
+"""Statistics: small-sample Gaussian tests, look-elsewhere, detection power, excess chi^2, intervals, streaming sums."""

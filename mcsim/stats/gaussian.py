@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 from mcsim.errors import InputError
+from mcsim.support.arrays import Matrix, Vector
 
 # A direction is empty if its variance, or its part outside a span, is below this fraction of its size.
 COLLINEAR = 1e-6
@@ -267,6 +268,44 @@ class SimulatedGaussian:
             volume = wide.log_jacobian - 0.5 * float(np.sum(np.log(values)))
             wide = replace(wide, whitening=turn @ wide.whitening, log_jacobian=volume)
         return wide
+
+
+def with_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, before: Matrix, after: Matrix) -> Fit:
+    """Return a fit of templates, shape (p_raw, K), with the errors of its amplitudes with the effects in the data.
+
+    ``before`` and ``after`` are data vectors of the same skies without the effects and with them at their amplitudes,
+    shape (skies, p_raw).
+
+    Notes
+    -----
+    A strong effect changes the scatter of the data. The fit is linear, so that it is applied to every sky. The variance
+    of each amplitude grows by its excess among the skies with the effects over that without them: the same skies, whose
+    common scatter cancels. Correlations stay; errors are not made smaller.
+    """
+    basis, back = orthonormal(null.whiten_templates(t))
+    without, acting = (
+        np.var(back @ basis.T @ null.whiten_templates(rows.T), axis=1, ddof=1) for rows in (before, after)
+    )
+    own = np.diag(found.covariance)
+    factor = np.sqrt(1.0 + np.divide(np.maximum(acting - without, 0.0), own, out=np.zeros_like(own), where=own > 0.0))
+    return replace(found, covariance=factor[:, None] * found.covariance * factor)
+
+
+def held_out_pvalues(simulations: Matrix, null: SimulatedGaussian) -> Vector:
+    """Return the p-value of every simulation against all others, shape (N,): uniform for Gaussian data vectors.
+
+    Notes
+    -----
+    With c = x_i - mean, S the scatter of all N and a = N/(N - 1) c'S^-1 c, the scatter of the others is
+    S - N/(N - 1) c c', and x_i less their mean is N/(N - 1) c: its square in their scatter, over 1 + 1/(N - 1), is
+    a/(1 - a) (Sherman & Morrison, Ann. Math. Stat. 21, 124, 1950).
+    Against explicit refits: tests/unit/test_diagnosis_report.py.
+    """
+    count = len(simulations)
+    white = (simulations - simulations.mean(axis=0)) @ null.whitening.T
+    a = np.sum(white**2, axis=1) / null.dof * count / (count - 1)
+    square = (null.dof - 1) * a / np.maximum(1.0 - a, 1e-12)
+    return residual_pvalue(square, null.dimension, null.dof - 1)
 
 
 def ledoit_wolf(white: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,5 +1,6 @@
 """The command line as a user meets it: outputs, exit codes, one sentence for bad input, nothing left behind."""
 
+import io
 import json
 import shutil
 import subprocess
@@ -17,6 +18,7 @@ from astropy.table import Table
 from mcsim import cli, config, open_summary
 from mcsim.ensemble import tables
 from mcsim.ensemble.prediction import predict
+from mcsim.plot.spectra import ensemble_figure
 from refusals import unnamed
 
 from .conftest import table
@@ -88,6 +90,15 @@ def test_plot_chooses_modes(mcsim: Command, small_store: Path, tmp_path: Path) -
     assert mcsim("plot", small_store, "--L", 2, "--M", 0, "-o", "a20.png")[0] == 0
     assert (tmp_path / "a20.png").stat().st_size > 10_000
     assert_refused(mcsim("plot", small_store, "--L", 9), "L = 9")
+
+
+@pytest.mark.parametrize("chosen", [{}, {"L": 2, "M": 0}])
+def test_notes_of_a_wide_and_a_narrow_figure_are_whole(small_store: Path, chosen: dict[str, int]) -> None:
+    figure = ensemble_figure(small_store, prediction=predict(table()), **chosen)
+    figure.savefig(io.BytesIO(), dpi=figure.dpi)
+    box, whole = figure.get_tightbbox(), figure.bbox_inches
+    assert box.x0 >= 0.0
+    assert box.x1 <= whole.x1
 
 
 def test_dry_run_says_the_cost_and_computes_nothing(mcsim: Command, tmp_path: Path) -> None:

@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 from scipy.linalg import solve_triangular
 
-from mcsim.diagnosis.validation import excess, expected_fall, expected_fall_of_draw, held_out
 from mcsim.stats.detection import confusion, detectable, posterior, power, snr_needed, snr_to_separate
+from mcsim.stats.excess import excess, expected_fall, expected_fall_of_draw, held_out
 from mcsim.stats.gaussian import SimulatedGaussian, nested_pvalue, residual_pvalue
 from mcsim.stats.look_elsewhere import calibrate, global_test, scan_pvalues
 

@@ -37,7 +37,7 @@ RESERVED = {
     "zarr": {"mcsim.ensemble.store"},
     "dask": {"mcsim.ensemble.runner"},
     "distributed": {"mcsim.ensemble.runner"},
-    "pydantic": {"mcsim.config"},
+    "pydantic": {"mcsim.config", "mcsim.diagnosis"},
     "typer": {"mcsim.cli"},
     "camb": set(),
 }

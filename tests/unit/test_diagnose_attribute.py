@@ -11,11 +11,11 @@ from scipy import special, stats
 
 from mcsim.diagnosis.candidate import Candidate
 from mcsim.diagnosis.inference import confirmed
-from mcsim.diagnosis.partial_explanation import Detection, Exact, PartialExplanation
+from mcsim.diagnosis.refine import PartialExplanation, Refiner
 from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.diagnosis.validation import HeldOut, Measured
 from mcsim.stats.detection import cosines, detectable, log_evidence, posterior, snr_needed, snr_to_separate
+from mcsim.stats.excess import HeldOut, Measured
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate
 from mcsim.systematics import Effect, Parametrization
@@ -370,9 +370,15 @@ def test_four_effects_are_heard_where_no_set_of_three_suffices(bench):
     """The four, the strongest first, and what is left is noise; without a gap there is nothing."""
     weights = np.array([30.0, 20.0, 14.0, 10.0])
 
-    def filtered(x: np.ndarray, exact: Exact = lambda t, members, fitted: t) -> PartialExplanation | None:
+    def filtered(x: np.ndarray, exact=lambda t, members: t) -> PartialExplanation | None:
         settings = DiagnosisSettings()
-        return Detection(bench.null, x, bench.candidates, bench.calibration, exact, settings).run(bench.t)
+        context = SimpleNamespace(null=bench.null, calibration=bench.calibration, settings=settings)
+
+        class Straight(Refiner):
+            def _together(self, candidates, t, members, fitted):
+                return exact(t, members)
+
+        return Straight(SimpleNamespace(context=context, x=x)).detected_in(bench.t, bench.candidates)
 
     signal = bench.t[:, :4] @ weights
     found = [filtered(signal + np.random.default_rng(seed).normal(size=P)) for seed in range(10)]
@@ -384,10 +390,10 @@ def test_four_effects_are_heard_where_no_set_of_three_suffices(bench):
     assert max(one.left for one in found) < 4.0 * np.sqrt(2.0 * 56) / 1596
     assert filtered(bench.null.mean) is None
     # What cannot have its amplitude, or says something else there, is passed over.
-    assert 0 not in filtered(signal, lambda t, members, fitted: None if 0 in members else t).members
+    assert 0 not in filtered(signal, lambda t, members: None if 0 in members else t).members
     other = bench.t.copy()
     other[:, 0] -= signal * (signal @ other[:, 0]) / (signal @ signal)
-    assert 0 not in filtered(signal, lambda t, members, fitted: other if 0 in members else t).members
+    assert 0 not in filtered(signal, lambda t, members: other if 0 in members else t).members
 
 
 UNSURE = Measured(0.0, 100.0)

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from mcsim.diagnosis.refine import with_scatter
-from mcsim.stats.gaussian import SimulatedGaussian
+from mcsim.stats.gaussian import SimulatedGaussian, with_scatter
 
 P, SKIES = 12, 4000
 

@@ -166,12 +166,16 @@ def test_headers_that_do_not_fit_are_refused(tmp_path, change, named):
         ("M", 3, ("L0M3d0",)),
         ("ell_min", 11, ("twice",)),
         ("value", np.nan, ("L0M0d0", "nan")),
+        ("ell_min", 2.5, ("ell_min", "integers")),
+        ("value", "none", ("value", "'none'", "row 1", "uK2")),
     ],
 )
 def test_rows_that_do_not_fit_are_refused(tmp_path, column, value, named):
     table = measured(RUN)
-    table[column][0] = value
-    if column == "ell_min":
+    unit = table[column].unit
+    table[column] = [value, *table[column][1:]]
+    table[column].unit = unit
+    if value == 11:
         table["ell_max"][0] = 16
     with refused(*named):
         read(tmp_path, table)

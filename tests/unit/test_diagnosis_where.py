@@ -1,8 +1,12 @@
 """The ranked list of places: what departs most first, and of each kind one before the others."""
 
-import numpy as np
+from types import SimpleNamespace
+from typing import Any
 
-from mcsim.diagnosis.localisation import places
+import numpy as np
+import pytest
+
+from mcsim.diagnosis.localisation import BipolarScan, places
 from mcsim.diagnosis.summaries import Element
 
 KINDS = [("V1", "ecliptic", 2), ("W1", "ecliptic", 2), ("W2", "ecliptic", 2), ("V1", "galactic", 1), ("W1", None, 0)]
@@ -26,3 +30,22 @@ def test_each_kind_comes_before_more_of_the_same():
 
 def test_what_is_not_significant_is_brought_before_nothing():
     assert ranked([9.0, 12.0, 10.0, 1.0, 0.1])[:3] == [("W1", 2), ("W2", 2), ("V1", 2)]
+
+
+@pytest.mark.parametrize("split", ["half1", "half2"])
+def test_power_at_high_degrees_keeps_its_split(split):
+    """Power of one map above its lowest bin is no power that the splits have in common."""
+    parts = [
+        SimpleNamespace(channel=c, name=f"{name}:{half}", split=half)
+        for c, name in enumerate(("V1", "W1"))
+        for half in ("half1", "half2")
+    ]
+    model: Any = SimpleNamespace(parts=parts, channels=("V1", "W1"), lmax=60, frame="ecliptic")
+    powers = list(BipolarScan(model)._powers())
+    here = [one.name.startswith(f"cl/W1:{split},W1:{split}/") and one.ell != (2, 12) for one in powers]
+    assert sum(here) == 2
+    simulations = np.random.default_rng(2).normal(size=(400, len(powers)))
+    first = places(20.0 * np.array(here), simulations, powers)[0].element
+    assert (first.channels, first.split) == (("W1",), split)
+    across = {one.split for one in powers if one.name.startswith("cl/W1:half1,W1:half2/")}
+    assert across == {None}

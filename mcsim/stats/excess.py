@@ -1,0 +1,121 @@
+"""Excess chi^2 of data over what the simulations expect, and its reduction once an effect is in the simulator."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mcsim.stats.gaussian import SimulatedGaussian
+from mcsim.support.arrays import Matrix, Vector
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Hold a number with its standard deviation."""
+
+    value: float
+    sigma: float
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Hold the excess chi^2 of data that were not fitted, before and after the effects are added to the simulator.
+
+    ``predicted`` and ``achieved`` are fractional reductions; ``pvalue_after`` is that of what remains; ``data`` names
+    the held-out data.
+    """
+
+    predicted: Measured
+    achieved: Measured
+    before: Measured
+    after: Measured
+    pvalue_after: float
+    data: str
+
+
+def excess(null: SimulatedGaussian, x: Vector) -> Measured:
+    """Return the excess chi^2 of data, shape (p_raw,); see :func:`excess_of`."""
+    return excess_of(null.chi2(x), null.dimension, null.dof)
+
+
+def excess_of(chi2: float, p: int, n: int) -> Measured:
+    """Return the excess G of chi^2 in p dimensions over its expectation, for n degrees of freedom of the covariance.
+
+    Notes
+    -----
+    G = (n - p - 1)/n chi^2 - p has as its mean the squared signal-to-noise ratio lambda of the departure, and the
+    variance of a noncentral F, 2 ((p + lambda)^2 + (p + 2 lambda)(d - 2))/(d - 4), d = n - p + 1 (Johnson, Kotz &
+    Balakrishnan, Continuous Univariate Distributions 2, ch. 30). sigma takes G for lambda.
+    """
+    value = (n - p - 1) / n * chi2 - p
+    length, d = max(value, 0.0), n - p + 1
+    return Measured(value, float(np.sqrt(2.0 * ((p + length) ** 2 + (p + 2.0 * length) * (d - 2)) / (d - 4))))
+
+
+def expected_fall(test: SimulatedGaussian, t: Matrix, amplitudes: Vector, covariance: Matrix) -> Measured:
+    """Return the fall of chi^2 to expect on data that were not fitted, with null ``test`` and templates (p_test, K).
+
+    ``amplitudes``, shape (K,), are frozen; ``covariance`` is that of their fit to other data.
+
+    Notes
+    -----
+    Frozen at theta^ = theta + e, chi^2 of fresh data falls by 2 theta'F theta^ - theta^'F theta^ on average, whose
+    unbiased estimate from the fit is theta^'F theta^ - 2 tr(F V); tr(F V) = K if both data are equally good. sigma is
+    the error of this estimate: 2 sqrt(theta^'F V F theta^ + tr(F V F V)).
+    """
+    white = test.whiten_templates(t)
+    fisher = test.hartlap_factor * white.T @ white
+    product = fisher @ covariance
+    delta_chi2 = float(amplitudes @ fisher @ amplitudes) - 2.0 * float(np.trace(product))
+    variance = 4.0 * float(amplitudes @ product @ fisher @ amplitudes) + 4.0 * float(np.trace(product @ product))
+    return Measured(delta_chi2, float(np.sqrt(variance)))
+
+
+def expected_fall_of_draw(
+    wide: SimulatedGaussian, t: Matrix, covariance: Matrix, seen: Measured, here: Vector, there: Vector
+) -> Measured:
+    """Return the fall of chi^2 to expect for a stochastic effect: all data see the same draw.
+
+    ``wide`` is the null distribution of the data that judge, with the scatter of the effect, and ``t`` are its
+    templates, shape (p_test, K); ``covariance`` is that of the frozen amplitudes from noise alone, and ``seen`` the
+    excess chi^2 of the data that were fitted. ``here`` and ``there``, shape (draws,), are squared signal-to-noise
+    ratios of draws of the response in the data that judge, and in those that were fitted.
+
+    Notes
+    -----
+    The fall is the excess of the fitted data times the ratio of the mean squares, less tr(F V) for the error of the
+    frozen amplitudes, F of the wide distribution. How closely the squares of a draw keep to that ratio is part of its
+    error.
+    """
+    share = float(np.mean(here) / np.mean(there))
+    white = wide.whiten_templates(t)
+    lost = wide.hartlap_factor * float(np.trace(white.T @ white @ covariance))
+    sigma = float(np.hypot(share * seen.sigma, np.std(here - share * there, ddof=1)))
+    return Measured(share * seen.value - lost, sigma)
+
+
+def held_out(before: SimulatedGaussian, after: SimulatedGaussian, x: Vector, expected: Measured, data: str) -> HeldOut:
+    """Return the reduction of the excess chi^2 of data, shape (p_raw,), from one null distribution to another.
+
+    ``expected`` is the fall of chi^2 that the fit to other data predicts.
+
+    Notes
+    -----
+    A = 1 - G1/G0. Both excesses have the same noise e of the data: with d = true mean - mean before and D = mean after
+    - mean before, dA = (2 (D - A d).e - A (e'e - p))/G0, hence var A = (4 |D - A d|^2 + 2 p A^2)/G0^2, to which the
+    errors of the covariances add 2 ((p + G1)^2 + (1 - A)^2 (p + G0)^2)/(d2 - 4)/G0^2. Pulls: tests/statistical.
+    """
+    first, last = excess(before, x), excess(after, x)
+    share = expected.value / first.value
+    forecast = Measured(share, float(np.hypot(expected.sigma, share * first.sigma)) / abs(first.value))
+    fraction = 1.0 - last.value / first.value
+    p, d2 = before.dimension, before.dof - before.dimension + 1
+    shift = before.whiten_templates((after.mean - before.mean)[:, None])[:, 0]
+    distance, length = max(first.value, 0.0), max(last.value, 0.0)
+    # The error of the two means adds to the square of their difference.
+    moved = max(before.hartlap_factor * float(shift @ shift) - p * (1.0 / before.n_sims + 1.0 / after.n_sims), 0.0)
+    along = before.hartlap_factor * float(shift @ before.whiten(x))
+    mismatch = max(moved - 2.0 * fraction * along + fraction**2 * distance, 0.0)
+    noise = (4.0 * mismatch + 2.0 * p * fraction**2) * (d2 - 2) / (d2 - 4)
+    scatter = 2.0 * ((p + length) ** 2 + (1.0 - fraction) ** 2 * (p + distance) ** 2) / (d2 - 4)
+    sigma = float(np.sqrt(noise + scatter)) / abs(first.value)
+    return HeldOut(forecast, Measured(fraction, sigma), first, last, after.pvalue(x), data)
