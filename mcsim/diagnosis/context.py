@@ -60,7 +60,8 @@ def context(analysis: Analysis, ensemble: NullEnsemble, bank: TemplateBank) -> D
         for candidate, own in zip(analysis.candidates, scatter, strict=True)
     )
     templates = bank.significant(ensemble.spread, analysis.settings)
-    candidates, templates = with_nuisances(ensemble, null, analysis.nuisances, candidates, templates)
+    if ensemble.nuisances is not None:
+        candidates, templates = with_nuisances(ensemble, null, analysis.nuisances, candidates, templates)
     groups = null.whiten_groups(templates, [candidate.columns for candidate in candidates])
     calibration = calibration_of(ensemble, null, groups)
     return DiagnosisContext(analysis, ensemble, bank, null, candidates, calibration, scatter, templates, groups)

@@ -119,8 +119,7 @@ def with_nuisances(
     which the nuisance scatters the simulations; of a nuisance that the data hardly measure the regression is noise, and
     its scatter small beside that of the data.
     """
-    if ensemble.nuisances is None:
-        return candidates, templates
+    assert ensemble.nuisances is not None  # the caller has asked
     drawn = ensemble.nuisances - ensemble.nuisances.mean(axis=0)
     response = np.linalg.lstsq(drawn, ensemble.simulations, rcond=None)[0]
     clear = Regression.of(ensemble, null).left < MEASURED * np.mean(drawn**2, axis=0)

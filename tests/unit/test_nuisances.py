@@ -10,7 +10,8 @@ from scipy import stats
 from mcsim import config, systematics
 from mcsim.diagnosis.analysis import analysis_of
 from mcsim.diagnosis.api import _key, describe
-from mcsim.diagnosis.nuisance import Regression, half_given_other, results
+from mcsim.diagnosis.candidate import Candidate, numbered
+from mcsim.diagnosis.nuisance import Regression, half_given_other, results, with_nuisances
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Element
@@ -373,3 +374,24 @@ def test_results_say_prior_posterior_and_pull():
     assert "prior 0 % ± 10 % of the gain" in one.words
     assert (two.pull, two.parameters) == (None, {"spectral_index_width": 0.3})
     assert two.sigma == pytest.approx(2.0, rel=0.1)
+
+
+def test_a_candidate_that_is_a_nuisance_departs_beyond_its_prior_alone():
+    """Its template is the direction of the scatter, so that its error has the whole prior; others keep theirs."""
+    rng = np.random.default_rng(10)
+    t = rng.normal(size=(6, 2)) * [500.0, 0.001]
+    _, drawn, simulations = linear(rng, 6, 3000, t, np.array([0.1, 2.0]))
+    known = ensemble_of(simulations, drawn)
+    kind, foreground = systematics.get("calibration"), systematics.get("foreground_residual")
+    priors = [Nuisance(kind, "W1", (0.1,)), Nuisance(foreground, None, (2.0,))]
+    candidates = numbered([Candidate(kind, "V1", (0,)), Candidate(kind, "W1", (0,)), Candidate(foreground, None, (0,))])
+    bank = np.stack([t[:, 0], t[:, 0] + rng.normal(size=6) * 10.0, t[:, 1]], axis=1)
+    found, templates = with_nuisances(known, known.gaussian, priors, candidates, bank)
+    assert [one.nuisance for one in found] == [False, True, False]
+    np.testing.assert_array_equal(templates[:, [0, 2]], bank[:, [0, 2]])
+    np.testing.assert_allclose(templates[:, 1], t[:, 0], atol=5.0 * np.linalg.norm(simulations - drawn @ t.T) / 2000)
+    x = simulations.mean(axis=0) + 1.0 * t[:, 0]
+    wrong, right = (known.gaussian.fit(x, one[:, 1:2]) for one in (bank, templates))
+    assert right.amplitudes[0] == pytest.approx(1.0, rel=0.02)
+    assert right.errors[0] > 0.1 > 2.0 * wrong.errors[0]
+    assert with_nuisances(known, known.gaussian, priors[:1], candidates[:1], bank)[0][0].nuisance is False
