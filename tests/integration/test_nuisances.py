@@ -7,7 +7,7 @@ import healpy
 import numpy as np
 import pytest
 import tomli_w
-from scipy.stats import kstest
+from scipy.stats import ks_2samp
 
 import mcsim
 from mcsim import cli, config, systematics
@@ -94,7 +94,8 @@ def test_p_is_uniform_over_the_prior_and_not_without_the_nuisances(declared, und
     p = {}
     for name, known in (("declared", declared), ("undeclared", undeclared)):
         p[name] = [global_test(known.null, x, known.groups, known.calibration).pvalue for x in rows]
-    assert kstest(p["declared"], "uniform").pvalue > 1e-3
+    # P-values are ranks among those of the simulations, a sample like that of the data.
+    assert ks_2samp(p["declared"], np.arange(1.0, SIMULATIONS + 1.0) / (SIMULATIONS + 1.0)).pvalue > 1e-3
     alarms = np.mean(np.array(p["declared"]) <= 0.05)
     # Binomial, of the data and of the ranks of the simulations.
     assert abs(alarms - 0.05) < 4.0 * np.sqrt(0.05 * 0.95 * (1.0 / 500 + 1.0 / SIMULATIONS))
@@ -106,7 +107,7 @@ def test_p_is_uniform_over_the_prior_and_not_without_the_nuisances(declared, und
     pulls = (mean - true) / sigma
     assert np.all(np.abs(pulls.mean(axis=0)) < 4.0 * np.sqrt(1.0 / 500 + (1.0 + declared.null.dimension) / SIMULATIONS))
     assert np.all(np.abs(pulls.std(axis=0) - 1.0) < 0.15)
-    assert np.all(sigma.mean(axis=0) < 0.5 * np.array([WIDTH, NOISE] * 2))
+    assert np.all(sigma.mean(axis=0) < 0.6 * np.array([WIDTH, NOISE] * 2))
 
 
 def test_an_effect_is_named_beside_nuisances_that_are_far_from_zero(run, declared, undeclared):
@@ -118,7 +119,7 @@ def test_an_effect_is_named_beside_nuisances_that_are_far_from_zero(run, declare
     for one, truth in zip(found.nuisances, drawn, strict=True):
         assert (one.name, one.channel) == (truth.name, truth.channel)
         assert abs(one.amplitude - truth.parameters["amplitude"]) < 4.0 * one.sigma
-        assert one.sigma < 0.5 * one.prior_width
+        assert one.sigma < 0.6 * one.prior_width
         assert abs(one.pull) < 4.0
     assert found.held_out.pvalue_after > 1e-3
     assert abs(found.held_out.achieved.value - found.held_out.predicted.value) < 4.0 * np.hypot(
@@ -136,8 +137,8 @@ def test_a_calibration_far_beyond_its_prior_is_named(run, declared):
     beyond = diagnose_data(ObservedMaps(declared, maps_of(run, calibration(10.0 * WIDTH)), ask), "beyond")
     best = beyond.effects[0]
     assert [(one.name, one.channel) for one in beyond.effects] == [("calibration", "W1")]
-    # Its error has the prior, which is part of the model.
-    assert best.sigma > 0.9 * WIDTH
+    # Its error has the prior, which is part of the model, but for what 500 standard deviations change in the response.
+    assert best.sigma > 0.5 * WIDTH
     assert best.amplitude == pytest.approx(10.0 * WIDTH, abs=4.0 * best.sigma)
 
 
@@ -145,7 +146,8 @@ def test_the_command_lists_and_writes_nuisances(run, tmp_path, monkeypatch, caps
     monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(api, "batch", lambda workers: campaign.batch(0))  # in this process
     monkeypatch.chdir(tmp_path)
-    channels = [MODEL["channel"][1]]
+    channel = MODEL["channel"][1]
+    channels = [channel | {"scan": channel["scan"] | {"sample_period_s": 610.0}}]
     table = MODEL | {"map": {"nside": 8, "splits": ["a", "b"]}, "sky": MODEL["sky"] | {"lmax": 20}, "channel": channels}
     table["nuisance"] = MODEL["nuisance"][2:]
     (tmp_path / "model.toml").write_text(tomli_w.dumps(table))
