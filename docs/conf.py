@@ -123,6 +123,7 @@ def _described(kind: Any) -> str:
         ("Cause", kind.cause),
         ("Shows as", kind.signature),
         ("Source", kind.source),
+        ("Proposed", "" if kind.proposed else "on request"),
     ]
     lines = "\n".join(f"- **{name}**: {text}" for name, text in rows if text)
     summary = str(kind.__doc__).split("\n\n")[0].replace("\n", " ")

@@ -177,18 +177,22 @@ class LearnedModel(EffectsLibrary):
 
 def learned_model(settings: Settings, without: tuple[str, ...] = ()) -> LearnedModel:
     """Return a model that was learned before, without some effects; RunError if it is not in the cache."""
-    return _learned(config.to_json(settings.model), settings.simulations, without)
+    return _learned(config.to_json(settings.model), _proposing(settings), without)
+
+
+def _proposing(settings: Settings) -> DiagnosisSettings:
+    return DiagnosisSettings(simulations=settings.simulations, including=settings.including)
 
 
 @lru_cache(maxsize=3)
-def _learned(model: str, simulations: int | None, without: tuple[str, ...]) -> LearnedModel:
+def _learned(model: str, settings: DiagnosisSettings, without: tuple[str, ...]) -> LearnedModel:
     if without:
-        full = _learned(model, simulations, ()).context
+        full = _learned(model, settings, ()).context
         analysis, ensemble, bank, rows = reduced(full, without)
         known = context(analysis, ensemble, bank)
     else:
         run = config.from_json(model)
-        known = prepared(run, analysis_of(run, settings=DiagnosisSettings(simulations=simulations)), _refuse)
+        known = prepared(run, analysis_of(run, settings=settings), _refuse)
         rows = np.arange(len(known.analysis.elements))
     return LearnedModel(known.null, known.templates, known.candidates, known.calibration, rows, known)
 
@@ -206,5 +210,5 @@ def workers_of(settings: Settings, workers: int | None, quiet: bool) -> Iterator
     run = settings.model
     with batch(run.compute.workers if workers is None else workers) as call:
         with asking(call, quiet) as ask:
-            prepared(run, analysis_of(run, settings=DiagnosisSettings(simulations=settings.simulations)), ask)
+            prepared(run, analysis_of(run, settings=_proposing(settings)), ask)
         yield call

@@ -14,7 +14,7 @@ import typer
 from typer import Argument, Option
 
 from mcsim.cli import ensembles
-from mcsim.cli.common import Config, Png, Processes, Simulations, Workers, interrupt_once, save
+from mcsim.cli.common import Config, Including, Png, Processes, Simulations, Workers, interrupt_once, save
 from mcsim.errors import InputError, RunError
 
 app = typer.Typer(
@@ -145,6 +145,7 @@ def diagnose(
     output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Folder for verdict and report.")],
     case: Annotated[str | None, Option(help="Name of the case; default: that of the model.")] = None,
     without: Annotated[list[str] | None, Option(metavar="EFFECT", help="Do not propose it; repeatable.")] = None,
+    including: Including = None,
     simulations: Simulations = None,
     workers: Processes = None,
     dry_run: Annotated[bool, Option("--dry-run", help="Say simulations, memory and time; simulate none.")] = False,
@@ -157,7 +158,10 @@ def diagnose(
     from mcsim.diagnosis.words import summary
 
     interrupt_once()
-    run, settings = config.load(model), DiagnosisSettings(without=tuple(without or ()), simulations=simulations)
+    run = config.load(model)
+    settings = DiagnosisSettings(
+        without=tuple(without or ()), including=tuple(including or ()), simulations=simulations
+    )
     if workers is not None:
         run = replace(run, compute=replace(run.compute, workers=workers))
     if dry_run:
@@ -205,6 +209,7 @@ def challenge_make(
     seed: Annotated[int, Option(min=0, help="Of the draws; keep it as secret as the keys.")] = 0,
     sampled_share: Annotated[float, Option(min=0.0, max=1.0, help="Share of maps made sample by sample.")] = 0.5,
     inventions: Annotated[Path | None, Option(metavar="FILE", help="Python file of effects in no library.")] = None,
+    including: Including = None,
     simulations: Simulations = None,
     workers: Workers = None,
 ) -> None:
@@ -215,7 +220,13 @@ def challenge_make(
 
     interrupt_once()
     file = None if inventions is None else str(inventions)
-    shared = Settings(config.load(model), sampled_share=sampled_share, out_of_library=file, simulations=simulations)
+    shared = Settings(
+        config.load(model),
+        sampled_share=sampled_share,
+        out_of_library=file,
+        simulations=simulations,
+        including=tuple(including or ()),
+    )
     make(shared, output, cases, seed, workers=workers, quiet=False)
 
 
@@ -242,6 +253,7 @@ def challenge_draws(
     output: Target,
     number: Annotated[int, Option(min=1, help="Number of draws.")] = 1000,
     seed: Annotated[int, Option(min=0, help="Of the draws.")] = 0,
+    including: Including = None,
     simulations: Simulations = None,
     workers: Workers = None,
 ) -> None:
@@ -250,7 +262,7 @@ def challenge_draws(
     from mcsim.benchmark import report, score
     from mcsim.benchmark.folder import Settings
 
-    shared = Settings(config.load(model), simulations=simulations)
+    shared = Settings(config.load(model), simulations=simulations, including=tuple(including or ()))
     found = score.score_draws(shared, output, number, seed, workers=workers, quiet=False)
     print("\n".join(report.lines(found)))
 
@@ -264,6 +276,8 @@ def effects(name: Annotated[str | None, Argument(metavar="EFFECT", help="Only th
         parameters = ", ".join(f"{field.name} = {field.default!r}" for field in fields(kind))
         typer.secho(f"{kind.name} ({kind.scope}; amplitude in {kind.unit})", bold=True)
         print(f"  parameters  {parameters}")
+        if not kind.proposed:
+            print(f"  proposed    on request: mcsim diagnose --with {kind.name}")
         for key in ("cause", "signature", "source"):
             print(f"  {key:<11} {getattr(kind, key)}")
 

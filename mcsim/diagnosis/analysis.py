@@ -10,7 +10,7 @@ import numpy as np
 from mcsim import config, systematics
 from mcsim.diagnosis.candidate import Candidate, numbered
 from mcsim.diagnosis.localisation import BipolarScan, coarse_residuals
-from mcsim.diagnosis.matched_filters import gain_of, matched_filter
+from mcsim.diagnosis.matched_filters import matched_filter
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Block, Element, blocks_of
 from mcsim.diagnosis.wiener_filter import Model, model_of, shared_sky, wiener_filter
@@ -88,17 +88,19 @@ def analysis_of(
     """Define the analysis of data that ``run``, with the effects that are modelled already, claims to describe.
 
     Effects of the library (default: built-in and registered ones), which the run may name as well, are candidates
-    where they apply, but those called in ``without``. ``nthreads`` compute what is computed once.
+    where they apply, but those called in ``without``, and those that are proposed on request alone and neither called
+    in ``settings.including`` nor nuisances of the run. ``nthreads`` compute what is computed once.
     """
     settings = settings or DiagnosisSettings()
     known = kinds_of(library)
     check_nuisances(run, dict(known))
+    declared = [one.effect for one in run.nuisances]
     model = model_of(survey(run, nthreads=nthreads, orders=settings.beam_orders, library=dict(known)), settings)
     candidates = numbered(
         [
             Candidate(effect, channel, tuple(range(len(effect.parametrization.basis()))), dict(fixed))
             for name, effect in known
-            if name not in without
+            if name not in without and (effect.proposed or name in (*settings.including, *declared))
             for channel in ((None,) if effect.scope == "common" else model.channels)
             for fixed in effect.variants
             if _applies(model, effect, channel, fixed)
@@ -135,11 +137,12 @@ def _applies(model: Model, kind: type[Effect], channel: str | None, settings: Ma
             effect.noise(owner.site)
             systematics.seen_through((effect,), owner.site)
             systematics.looked_at((effect,), np.zeros_like(model.dipole), replace(owner.site, lmax=model.lmax), 0, 0)
+            systematics.check_added((effect,), owner.site)
             effect.orientations(owner.maps[0].moments, owner.site)
     except InputError:
         return False
     quiet = all(m.noise_uk is None for owner in owners for m in owner.maps)
-    return not (quiet and kind.noise is not Effect.noise)
+    return not (quiet and (kind.noise is not Effect.noise or kind.excess is not Effect.excess))
 
 
 def _matched_blocks(model: Model, candidates: Sequence[Candidate]) -> Iterator[Block]:
@@ -207,7 +210,7 @@ def surveys(job: Job, library: Library | None = None) -> Iterator[tuple[int, Sur
 
 @lru_cache(maxsize=1)
 def _disturbed(simulated: str, kinds: Kinds) -> DisturbedSurvey:
-    return DisturbedSurvey.of(config.from_json(simulated), dict(kinds), gain_of)
+    return DisturbedSurvey.of(config.from_json(simulated), dict(kinds))
 
 
 @lru_cache(maxsize=32)

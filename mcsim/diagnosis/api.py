@@ -75,10 +75,7 @@ def diagnose(
     """
     run = model if isinstance(model, config.RunConfig) else config.load(model)
     settings = settings or DiagnosisSettings()
-    library = systematics.catalogue() if settings.library is None else systematics.checked(settings.library)
-    settings = replace(settings, without=tuple(settings.without), library=None)
-    for effect in settings.without:
-        systematics.get(effect, library)
+    settings, library = _with_library(settings)
     if output is not None:
         folders.writable(Path(output))
     threads = os.cpu_count() or 1
@@ -110,9 +107,20 @@ def diagnose(
     return diagnosis
 
 
+def _with_library(settings: DiagnosisSettings) -> tuple[DiagnosisSettings, systematics.Library]:
+    """Return settings that name effects of a library, and that library; refuse other names."""
+    known = systematics.catalogue() if settings.library is None else systematics.checked(settings.library)
+    asked = tuple(settings.including) if settings.library is None else (*settings.including, *known)
+    for effect in (*settings.without, *settings.including):
+        systematics.get(effect, known)
+    including = tuple(sorted({name for name in asked if not known[name].proposed}))
+    return replace(settings, without=tuple(settings.without), including=including, library=None), known
+
+
 def describe(run: config.RunConfig, settings: DiagnosisSettings) -> str:
     """Return a text on the cost of a diagnosis of maps: simulations, memory, time, and that of preparing the maps."""
-    analysis = analysis_of(run, settings.without, os.cpu_count() or 1, settings)
+    settings, library = _with_library(settings)
+    analysis = analysis_of(run, settings.without, os.cpu_count() or 1, settings, library)
     power.check(analysis.model.survey)
     number = sum(job.count for job in campaign.plan(analysis, settings.simulations).values())
     size = len(analysis.elements)

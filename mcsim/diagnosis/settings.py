@@ -14,7 +14,10 @@ class DiagnosisSettings:
     without
         Names of effects that are no candidates.
     library
-        Effects by name, as :func:`mcsim.effects` returns them; None: all of these.
+        Effects by name, as :func:`mcsim.effects` returns them; None: those of them that are proposed without a request.
+    including
+        Names of effects that are candidates although they are proposed on request alone; those of a ``library`` that is
+        given always are.
     simulations
         Simulations for the covariance of the data vector; None: ``sims_per_element`` for each of its elements.
     alpha
@@ -119,6 +122,7 @@ class DiagnosisSettings:
 
     without: tuple[str, ...] = ()
     library: Library | None = None
+    including: tuple[str, ...] = ()
     simulations: int | None = None
     alpha: float = 0.05
     residual_level: float = 0.02

@@ -95,17 +95,29 @@ def check_effects(run: config.RunConfig) -> None:
             continue
         if run.map.grid == "gl":
             refuse_pixel_effects(spec.name, acting)
+        if isinstance(spec.scan, config.ScanDifferencing):
+            refuse_excess(spec.name, acting)
         site = site_of(run, spec)
         systematics.seen_through(acting, site)
         systematics.looked_at(acting, np.zeros(alm_.size(site.lmax), complex), site, run.ensemble.seed, 0)
         for effect in acting:
             effect.gain(np.zeros(1), site)
+        systematics.check_added(acting, site)
+
+
+def refuse_excess(channel: str, acting: tuple[systematics.Effect, ...]) -> None:
+    """Refuse noise of effects in a differencing scan, whose samples are differences."""
+    for effect in systematics.disturbing(acting):
+        raise InputError(
+            f"effect {effect.name} on channel {channel} adds noise to samples of one beam, but the scan takes "
+            "differences; remove it, or use noise.sigma0_uk."
+        )
 
 
 def refuse_pixel_effects(channel: str, acting: tuple[systematics.Effect, ...]) -> None:
     """Refuse effects that act on pixels, for a grid of rings."""
     for effect in acting:
-        for hook in ("gain", "noise", "spread", "orientations"):
+        for hook in ("gain", "signal", "noise", "excess", "spread", "orientations"):
             if getattr(type(effect), hook) is not getattr(systematics.Effect, hook):
                 raise InputError(
                     f'effect {effect.name} on channel {channel} acts on pixels, but grid = "gl" has none; remove it '

@@ -1,6 +1,6 @@
 """Nuisances: effects of unknown size with a prior, which every simulation of a model draws anew."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import product
@@ -12,14 +12,12 @@ from mcsim import config, systematics
 from mcsim.errors import InputError
 from mcsim.simulation import convolve
 from mcsim.simulation.channels import site_of
-from mcsim.simulation.survey import Channel, Survey, mean_gain, survey, with_effects
+from mcsim.simulation.pixel_means import gain_of, signal_of
+from mcsim.simulation.survey import Channel, Survey, survey, with_effects
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import rng
 from mcsim.support.arrays import Map, Vector
 from mcsim.systematics import Effect, Library, Site, basis_of, looked_at, seen_through, spread_of
-
-MeanGain = Callable[[Effect, Site, tuple[float, float]], Map]
-"""Return the mean error of the gain in every pixel, shape (npix,), from effect, site and share of the survey."""
 
 _OF_BEAMS = ("beam", "pointing", "spread")
 
@@ -189,10 +187,6 @@ def tables(run: config.RunConfig, seed: int, realization: int, library: Library 
     ]
 
 
-def _plain_mean_gain(effect: Effect, site: Site, share: tuple[float, float]) -> Map:
-    return np.asarray(mean_gain((effect,), site, share))
-
-
 @dataclass(frozen=True, eq=False)
 class DisturbedSurvey:
     """Make the survey of every realization, with the nuisances that it draws; what they leave alone is shared."""
@@ -200,15 +194,12 @@ class DisturbedSurvey:
     survey: Survey
     nuisances: tuple[Nuisance, ...]
     library: Library | None = None
-    mean_gain: MeanGain = _plain_mean_gain
 
     @classmethod
-    def of(
-        cls, run: config.RunConfig, library: Library | None = None, mean_gain: MeanGain = _plain_mean_gain
-    ) -> "DisturbedSurvey":
+    def of(cls, run: config.RunConfig, library: Library | None = None) -> "DisturbedSurvey":
         """Prepare a run; InputError as of :func:`check_nuisances`."""
         orders = check_nuisances(run, library)
-        return cls(survey(run, orders=orders, library=library), nuisances_of(run, library), library, mean_gain)
+        return cls(survey(run, orders=orders, library=library), nuisances_of(run, library), library)
 
     def at(self, realization: int) -> Survey:
         """Return the survey of one realization."""
@@ -225,8 +216,8 @@ class DisturbedSurvey:
 
     def _disturbed(self, channel: Channel, drawn: Drawn) -> Channel:
         """Return a channel with the effects that are drawn for it after its own."""
-        own = [(number, effect) for number, (one, effect) in enumerate(drawn) if one.channel in (None, channel.name)]
-        more, site = tuple(effect for _, effect in own), channel.site
+        more = tuple(effect for one, effect in drawn if one.channel in (None, channel.name))
+        site = channel.site
         acting = (*channel.effects, *more)
         beam, response = channel.beam, channel.response
         if any(getattr(type(effect), hook) is not getattr(Effect, hook) for effect in more for hook in _OF_BEAMS):
@@ -235,35 +226,31 @@ class DisturbedSurvey:
             response = convolve.response(beam, site.lmax, channel.window ** (spread_of(acting) ** 2))
         maps = []
         for place, m in enumerate(channel.maps):
-            gains = [
-                effect.parametrization.coordinates(effect) @ basis[place] for effect, basis in self._gains(channel, own)
-            ]
-            if m.gain is not None:
-                gains.append(m.gain)
-            maps.append(replace(with_effects(m, more, site), gain=sum(gains[1:], start=gains[0]) if gains else None))
+            means: dict[str, Map | None] = {"gain": m.gain, "signal_uk": m.signal_uk}
+            for (number, name, key), basis in self._means.items():
+                if name == channel.name:
+                    effect = drawn[number][1]
+                    added, before = effect.parametrization.coordinates(effect) @ basis[place], means[key]
+                    means[key] = added if before is None else before + added
+            own = with_effects(m, more, site)
+            maps.append(replace(own, gain=means["gain"], signal_uk=means["signal_uk"]))
         return replace(channel, beam=beam, response=response, maps=tuple(maps), effects=acting)
 
-    def _gains(self, channel: Channel, own: Sequence[tuple[int, Effect]]) -> Iterator[tuple[Effect, list[Map]]]:
-        """Yield each effect on the gain, and the mean errors of the gain per coordinate, of each map, (k, npix)."""
-        for number, effect in own:
-            if (number, channel.name) in self._basis_gains:
-                yield effect, self._basis_gains[number, channel.name]
-
     @cached_property
-    def _basis_gains(self) -> dict[tuple[int, str], list[Map]]:
-        """Return the mean errors of the gain per coordinate; they are linear in the coordinates, and take a pass each.
+    def _means(self) -> dict[tuple[int, str, str], list[Map]]:
+        """Return the mean errors of the gain, and signals, per coordinate: linear in these, they take a pass each.
 
-        By nuisance and channel, one array of shape (k, npix) for each of its maps.
+        By nuisance, channel, and name in a map: one array of shape (k, npix) for each map of the channel.
         """
         found = {}
-        for number, one in enumerate(self.nuisances):
-            for channel in self.survey.making.channels:
-                if one.effect.gain is Effect.gain or one.channel not in (None, channel.name):
+        for (number, one), channel in product(enumerate(self.nuisances), self.survey.making.channels):
+            for key, hook, mean in (("gain", "gain", gain_of), ("signal_uk", "signal", signal_of)):
+                if getattr(one.effect, hook) is getattr(Effect, hook) or one.channel not in (None, channel.name):
                     continue
                 basis, splits = basis_of(one.effect, one.settings), len(channel.maps)
                 shares = [(n / splits, (n + 1) / splits) for n in range(splits)]
-                found[number, channel.name] = [
-                    np.stack([self.mean_gain(effect, channel.site, share) / effect.amplitude for effect in basis])
+                found[number, channel.name, key] = [
+                    np.stack([mean(effect, channel.site, share) / effect.amplitude for effect in basis])
                     for share in shares
                 ]
         return found

@@ -35,7 +35,8 @@ def maps(
     Notes
     -----
     For every sample: its true pointing (moved, or earlier), the sky and the dipole through the true beam there, times
-    one plus the error of the gain, less the dipole through the fiducial beam at the fiducial pointing, plus noise.
+    one plus the error of the gain, less the dipole through the fiducial beam at the fiducial pointing, plus what
+    effects add to samples, plus noise.
     An effect acts by its ``moved`` and ``lags`` where it has them, else by the beam that its ``pointing`` gives.
     """
     run, sky = survey.config, simulate.draw_sky(survey, realization)
@@ -53,10 +54,13 @@ def maps(
         observe = tod.sky_signal(seen, site.lmax, beam, epsilon, nthreads)
         for index, m in enumerate(channel.maps):
             grid = MapGrid(site.nside, site.frame, (index / len(channel.maps), (index + 1) / len(channel.maps)))
-            stages = list(after)
+            stages = [*after, _added(channel)]
             if spec.noise.sigma0_uk > 0.0:
                 draw = rng.generator(run.ensemble.seed, realization, f"noise/{m.name}")
                 stages.append(tod.white_noise(spec.noise.sigma0_uk, draw, _noise_factor(channel)))
+            for effect in systematics.disturbing(acting):
+                draw = rng.generator(run.ensemble.seed, realization, f"effect/{effect.name}/noise/{m.name}")
+                stages.append(_disturbed(effect, draw))
             stream = tod.through(_seen(channel, grid, observe), stages)
             map_uk = tod.bin_samples(stream, site.nside)[0]
             found.append((m.name, map_uk if m.preparation is None else m.preparation.apply(map_uk)))
@@ -155,6 +159,28 @@ def _gained(channel: Channel) -> tod.Stage:
                 if error is not None:
                     gain = gain + error
             yield replace(chunk, signal_uk=gain * chunk.signal_uk)
+
+    return stage
+
+
+def _added(channel: Channel) -> tod.Stage:
+    """Return a stage that adds the signals of effects."""
+    acting, site = systematics.adding(channel.effects), channel.site
+
+    def stage(stream: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
+        for chunk in stream:
+            signals = (effect.signal(chunk.time_s, chunk.theta, chunk.phi, chunk.psi, site) for effect in acting)
+            yield replace(chunk, signal_uk=sum(signals, start=chunk.signal_uk))
+
+    return stage
+
+
+def _disturbed(effect: systematics.Effect, draw: np.random.Generator) -> tod.Stage:
+    """Return a stage that adds an effect's noise to every sample."""
+
+    def stage(stream: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
+        for chunk in stream:
+            yield replace(chunk, signal_uk=chunk.signal_uk + effect.excess(np.ones(chunk.time_s.size), draw))
 
     return stage
 

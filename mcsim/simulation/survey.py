@@ -1,6 +1,6 @@
 """From a configuration to what a realization needs: spectrum, beam responses, moments, weights, estimator tables."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -13,8 +13,9 @@ from mcsim.bipolar import Estimator, estimator
 from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
 from mcsim.instrument.scan import MapGrid
-from mcsim.simulation import convolve, mapmaking, tod
-from mcsim.simulation.channels import effects_on, refuse_pixel_effects, scan_model, site_b_of, site_of
+from mcsim.simulation import convolve, mapmaking
+from mcsim.simulation.channels import effects_on, refuse_excess, refuse_pixel_effects, scan_model, site_b_of, site_of
+from mcsim.simulation.pixel_means import mean_gain, mean_signal
 from mcsim.simulation.preparation import Preparation, preparation
 from mcsim.simulation.rings import Rings, limit_rings, parallel_transport_rings
 from mcsim.sphere import healpix, spectra
@@ -40,6 +41,8 @@ class SurveyMap:
         Pairs of pixels of a differencing scan; ``None``: any other scan.
     gain
         Mean relative error of the gain over the samples of a pixel, shape (npix,); ``None``: no error.
+    signal_uk
+        Mean of what effects add to the samples of a pixel, shape (npix,); ``None``: nothing.
     preparation
         What is done to the map after it is made; ``None``: nothing.
     """
@@ -50,6 +53,7 @@ class SurveyMap:
     noise_uk: NDArray[np.float64] | None
     pairs: mapmaking.DifferencingScan | None = None
     gain: NDArray[np.float64] | None = None
+    signal_uk: NDArray[np.float64] | None = None
     preparation: Preparation | None = None
 
     @property
@@ -223,6 +227,7 @@ def _channel(
         pairs = None
         if isinstance(spec.scan, config.ScanDifferencing):
             model = scan_model(spec, spec.scan, split)
+            refuse_excess(spec.name, acting)
             pairs = mapmaking.prepare(model, spec.scan.pair, grid, nthreads=nthreads, progress=progress)
             moments = _hits_alone(pairs, max(beam.mmax, 1))
         else:
@@ -236,7 +241,8 @@ def _channel(
             # An effect may give the beam higher orders than a file of moments has: they are left out.
             beam = beam.truncated(moments.smax) if acting and moments.smax < beam.mmax else beam
         m = with_effects(_survey_map(run, spec, split, moments, pairs), acting, site)
-        maps.append(replace(m, gain=mean_gain(acting, site, grid.time_range)))
+        gain, signal = (mean(acting, site, grid.time_range) for mean in (mean_gain, mean_signal))
+        maps.append(replace(m, gain=gain, signal_uk=signal))
     # A pixel whose samples keep closer to its centre blurs less; the window is a Gaussian in all but name.
     spread = spread_of(acting)
     seen_window = window ** (spread * spread)
@@ -253,7 +259,7 @@ def _prepared(run: config.RunConfig, spec: config.Channel, channel: Channel) -> 
         moments = steps.moments(m.moments)
         noise = None if m.noise_uk is None else steps.noise_uk(m.noise_uk, m.moments.hits)
         weight = _weight(run, spec, split, m.name, moments, steps.weight())
-        maps.append(replace(m, moments=moments, noise_uk=noise, weight=weight, gain=None))
+        maps.append(replace(m, moments=moments, noise_uk=noise, weight=weight, gain=None, signal_uk=None))
     pixels, smoothing = steps.pixel_window(run.sky.lmax), steps.beam_window(run.sky.lmax)
     return replace(
         channel,
@@ -311,22 +317,6 @@ def with_effects(m: SurveyMap, acting: tuple[Effect, ...], site: Site) -> Survey
     if spread != 1.0 and moments.dtheta is not None and moments.dphi is not None:
         moments = replace(moments, dtheta=spread * moments.dtheta, dphi=spread * moments.dphi)
     return replace(m, moments=moments, noise_uk=noise)
-
-
-def mean_gain(acting: tuple[Effect, ...], site: Site, share: tuple[float, float]) -> NDArray[np.float64] | None:
-    """Return the mean relative error of the gain in every pixel, by a pass over the pointing of part of the survey."""
-    drifting = [effect for effect in acting if effect.gain(np.zeros(1), site) is not None]
-    if not drifting:
-        return None
-    pointing = site.pointed(drifting[0].name)
-
-    def errors() -> Iterator[tod.Samples]:
-        for chunk in tod.samples(pointing.model, pointing.line, MapGrid(site.nside, site.frame, share)):
-            gains = [effect.gain(chunk.time_s, site) for effect in drifting]
-            yield replace(chunk, signal_uk=sum((g for g in gains if g is not None), start=chunk.signal_uk))
-
-    mean, hits = tod.bin_samples(errors(), site.nside)
-    return np.where(hits > 0, mean, 0.0)
 
 
 def _window(run: config.RunConfig, spec: config.Channel) -> NDArray[np.float64]:

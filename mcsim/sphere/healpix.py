@@ -102,9 +102,9 @@ def pixel_window(nside: int, lmax: int) -> NDArray[np.float64]:
     check_nside(nside)
     check_whole(lmax, "lmax")
     window = np.zeros(lmax + 1)
-    for pixels, share in _representatives(nside):
+    for face, share in _FACES:
         # The centres of n x n sub-pixels miss 1/n^2 of a pixel's extent: extrapolate from n = 4 and 8.
-        window += share * (4.0 * _mean_legendre(pixels, nside, 8, lmax) - _mean_legendre(pixels, nside, 4, lmax)) / 3.0
+        window += share * (4.0 * _mean_legendre(face, nside, 8, lmax) - _mean_legendre(face, nside, 4, lmax)) / 3.0
     window = np.sqrt(np.abs(window))
     window.setflags(write=False)
     return window
@@ -112,24 +112,32 @@ def pixel_window(nside: int, lmax: int) -> NDArray[np.float64]:
 
 def mean_window(nside: int, split: int, lmax: int) -> NDArray[np.float64]:
     """Return the window of the mean of split x split sub-pixel centres over pixels, shape (lmax + 1,)."""
-    found = [share * _mean_legendre(pixels, nside, split, lmax) for pixels, share in _representatives(nside)]
+    found = [share * _mean_legendre(face, nside, split, lmax) for face, share in _FACES]
     return np.asarray(np.sqrt(np.abs(np.sum(found, axis=0))))
 
 
-def _representatives(nside: int) -> list[tuple[NDArray[np.int64], float]]:
-    """Return NESTED pixels of one polar and one equatorial face that represent all, with the share of such faces."""
+_FACES = ((0, 2.0 / 3.0), (4, 1.0 / 3.0))
+"""One polar and one equatorial face that represent all, with the share of such faces."""
+
+
+def _representatives(face: int, nside: int) -> NDArray[np.int64]:
+    """Return NESTED pixels of a face that represent all of it."""
     lattice = min(nside, 32)
     step = (nside // lattice) ** 2
     cell = np.arange(lattice * lattice)
     # Pixels alternate just above and just below the middle of a cell: their mean is at the middle.
     above = (cell ^ (cell >> 1)) & 1 == 0
     pixels = cell * step + np.where(above, 3 * step // 4, max(step // 4 - 1, 0))
-    return [(pixels + face * nside * nside, share) for face, share in ((0, 2.0 / 3.0), (4, 1.0 / 3.0))]
+    return pixels + face * nside * nside
 
 
-def _mean_legendre(pixels: NDArray[np.int64], nside: int, split: int, lmax: int) -> NDArray[np.float64]:
-    """Return <P_l(x . y)> over pairs of the split x split sub-pixel centres of NESTED pixels, by a histogram."""
-    inside = pixels[:, None] * split**2 + np.arange(split**2)
+@lru_cache(maxsize=32)
+def _distances(face: int, nside: int, split: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the cosines between split x split sub-pixel centres of a face's pixels, by a histogram, and their shares.
+
+    They serve windows up to any lmax.
+    """
+    inside = _representatives(face, nside)[:, None] * split**2 + np.arange(split**2)
     centres = np.stack(healpy.pix2vec(split * nside, inside, nest=True), axis=-1)
     difference = centres[:, :, None, :] - centres[:, None, :, :]
     chord = np.sqrt(np.einsum("pijk,pijk->pij", difference, difference)).ravel()
@@ -138,6 +146,14 @@ def _mean_legendre(pixels: NDArray[np.int64], nside: int, split: int, lmax: int)
     filled = count > 0
     cosine = 1.0 - (total[filled] / count[filled]) ** 2 / 2.0
     weight = count[filled] / count.sum()
+    cosine.setflags(write=False)
+    weight.setflags(write=False)
+    return cosine, weight
+
+
+def _mean_legendre(face: int, nside: int, split: int, lmax: int) -> NDArray[np.float64]:
+    """Return <P_l(x . y)> over pairs of the split x split sub-pixel centres of a face's pixels, shape (lmax + 1,)."""
+    cosine, weight = _distances(face, nside, split)
     before, legendre = np.ones_like(cosine), cosine
     mean = np.ones(lmax + 1)
     for ell in range(1, lmax + 1):

@@ -8,6 +8,7 @@ from mcsim.instrument.beams import Beam
 from mcsim.systematics.base import Effect, Site, Wording, scan_direction
 from mcsim.systematics.parametrization import Angle, Vector
 from mcsim.systematics.shape import displaced
+from mcsim.systematics.spacecraft import axes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,10 +48,7 @@ class PointingOffset(Effect):
         if self.amplitude == 0.0:
             return theta, phi, psi
         distance, angle = np.deg2rad(self.amplitude / 60.0), np.deg2rad(self.angle_deg)
-        sin_t, cos_t, sin_p, cos_p = np.sin(theta), np.cos(theta), np.sin(phi), np.cos(phi)
-        outward = np.stack([sin_t * cos_p, sin_t * sin_p, cos_t])
-        south = np.stack([cos_t * cos_p, cos_t * sin_p, -sin_t])
-        east = np.stack([-sin_p, cos_p, np.zeros_like(phi)])
+        outward, south, east = axes(theta, phi)
         # Along the displacement and to its left; the first turns down, the second stays.
         forward = np.cos(psi + angle) * south + np.sin(psi + angle) * east
         left = np.cos(psi + angle) * east - np.sin(psi + angle) * south

@@ -58,7 +58,7 @@ def ask(jobs):
 
 
 def learned(run):
-    analysis = analysis_of(run, without=WITHOUT)
+    analysis = analysis_of(run, without=WITHOUT, settings=DiagnosisSettings(including=PROPOSED))
     return context(analysis, *campaign.learned(analysis, ask, SIMULATIONS, time_ordered=False))
 
 
@@ -198,4 +198,3 @@ def test_settings_without_nuisances_keep_the_verdict(run, undeclared):
     assert undeclared.calibration.held_out_combined is None
     found = diagnose_data(ObservedMaps(undeclared, maps_of(run), ask), "plain")
     assert "nuisances" not in found.to_json()
-    assert DiagnosisSettings() == undeclared.settings

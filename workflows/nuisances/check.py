@@ -31,6 +31,7 @@ from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.nuisance import Regression
 from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.simulation import nuisance, simulate
 from mcsim.simulation.survey import survey
 from mcsim.stats.look_elsewhere import global_test
@@ -97,7 +98,8 @@ def model(template: Path) -> mcsim.RunConfig:
 
 def learned(run: mcsim.RunConfig, ask: Ask) -> DiagnosisContext:
     """Return what data of a model are tested with."""
-    return prepared(run, analysis_of(run, [name for name in mcsim.effects() if name not in PROPOSED]), ask)
+    without = [name for name in mcsim.effects() if name not in PROPOSED]
+    return prepared(run, analysis_of(run, without, settings=DiagnosisSettings(including=PROPOSED)), ask)
 
 
 def pvalue(known: DiagnosisContext, x: np.ndarray) -> float:
