@@ -103,7 +103,7 @@ def fit(
 
 @app.command()
 def beam(
-    source: Annotated[str, Argument(metavar="BEAM", help="Beam map or b_lm (FITS), or a CONFIG.")],
+    source: Annotated[str, Argument(metavar="BEAM", help="Beam map or b_lm (FITS), B_l (text), or a CONFIG.")],
     lmax: Annotated[int, Option(min=2, max=8192, help="Degree of the coefficients.")] = 2048,
     m_max: Annotated[int | None, Option(min=0, help="Order; default: chosen from the beam.")] = None,
     pixel_deg: Annotated[float | None, Option(help="Side of a pixel of a beam map; default: its header's.")] = None,

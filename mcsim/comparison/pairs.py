@@ -122,7 +122,7 @@ def _orders(run: config.RunConfig) -> int:
 def quiet(run: config.RunConfig) -> config.RunConfig:
     """Return the run without noise and effects, and with nothing to estimate; InputError if it prepares its maps."""
     _check_steps(run)
-    channels = tuple(replace(channel, noise=config.Noise()) for channel in run.channels)
+    channels = tuple(channel.without_noise() for channel in run.channels)
     biposh = replace(run.biposh, L_max=0, pairs="auto")
     return replace(run, channels=channels, effects=(), biposh=biposh)
 
@@ -132,6 +132,11 @@ def _check_steps(run: config.RunConfig) -> None:
         raise InputError(
             f"{run.name} has [[preparation]], but maps are compared as they were made; remove it, and give maps that "
             "are not prepared."
+        )
+    if run.map.split_by != "time":
+        raise InputError(
+            f'{run.name} has map.split_by = "{run.map.split_by}", but the samples of maps that are compared are found '
+            'by their time; use splits by "time", or none.'
         )
 
 

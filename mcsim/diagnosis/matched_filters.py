@@ -90,7 +90,7 @@ def _beam_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter | 
 def _gain_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter:
     """Correlate residuals with sky and dipole times the mean gain error of every pixel."""
     site, parts, lmax = model.survey.channels[channel].site, model.of(channel), max(model.lmax, 1)
-    errors = [gain_of(effect, site, share) for share in _shares(len(parts))]
+    errors = [gain_of(effect, site, model.survey.config.map.span(n)) for n in range(len(parts))]
     dipole = healpix.synthesis(dipole_alm(site.dipole_uk, lmax)[None], model.nside, lmax)[0]
 
     def value(filtered: FilteredMaps) -> float:
@@ -103,16 +103,12 @@ def _gain_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter:
 def _signal_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter:
     """Correlate residuals with the mean of what is added to the samples of every pixel."""
     site, parts = model.survey.channels[channel].site, model.of(channel)
-    signals = [signal_of(effect, site, share) for share in _shares(len(parts))]
+    signals = [signal_of(effect, site, model.survey.config.map.span(n)) for n in range(len(parts))]
 
     def value(filtered: FilteredMaps) -> float:
         return float(sum(np.dot(filtered.residual[i], signal) for i, signal in zip(parts, signals, strict=True)))
 
     return value
-
-
-def _shares(splits: int) -> list[tuple[float, float]]:
-    return [(n / splits, (n + 1) / splits) for n in range(splits)]
 
 
 def normalised_difference(model: Model, filtered: FilteredMaps, parts: tuple[int, ...]) -> Map:

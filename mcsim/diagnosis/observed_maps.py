@@ -176,7 +176,10 @@ def _read(model: Model, part: Part, path: Path) -> Map:
         raise InputError(f"{path} does not exist; the model has a map {part.name}, give it under that name.")
     map_, frame, unit = healpix.read_map(path)
     if frame not in (None, model.frame):
-        raise InputError(f"{path} is in {frame} coordinates, the model in {model.frame}; rotate the map.")
+        raise InputError(
+            f'{path} is in {frame} coordinates, the model in {model.frame}; set map.frame = "{frame}" in the model, so '
+            "that its scan and noise are computed there."
+        )
     factor = header.to_uk(unit, path, model.survey.channels[part.channel].site.frequency_ghz)
     return _checked(model, part, np.where(map_ == healpy.UNSEEN, map_, factor * map_), str(path))
 
@@ -186,7 +189,10 @@ def _checked(model: Model, part: Part, map_: Map, name: str) -> Map:
     if map_.shape != (12 * model.nside**2,):
         size = healpy.npix2nside(map_.size) if map_.ndim == 1 and healpy.isnpixok(map_.size) else None
         found = f"the shape {map_.shape}" if size is None else f"nside {size}"
-        raise InputError(f"{name} has {found}, the model {model.nside}; bring them to the same.")
+        raise InputError(
+            f"{name} has {found}, the model {model.nside}; set map.nside of the model to that of the data, or say in "
+            "[[preparation]] how they were degraded."
+        )
     broken = int(np.sum(~np.isfinite(map_)))
     if broken:
         raise InputError(f"{name} has {broken} pixels that are not finite; mark what was not observed as UNSEEN.")

@@ -14,6 +14,9 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import rotation
 from mcsim.support import resources
 
+CIRCULAR = (config.BeamGaussian, config.BeamWindow)
+"""Beams that have no m_max."""
+
 WHOLE = 4
 """Orders that a beam has at least without its m_max, where its source has them."""
 
@@ -43,6 +46,9 @@ def _beam(channel: str, spec: config.Beam, lmax: int) -> beams.Beam:
         case config.BeamBlm():
             file = config.channel_path(spec.path, channel)
             return beams.Beam.from_blm(file, lmax, mmax=spec.m_max).rotated(np.deg2rad(spec.angle_deg))
+        case config.BeamWindow():
+            file = config.channel_path(spec.path, channel)
+            return beams.Beam.from_window(file, lmax, extension=spec.extension, column=spec.column)
 
 
 def load_beam_map(channel: str, spec: config.BeamMap) -> beams.BeamMap:
@@ -63,7 +69,7 @@ def scan_model(
     """Return the scan model of a channel, at the sampling and with the line of sight that the channel asks for."""
     model = scan.ScanModel.load(str(config.channel_path(chosen.model, spec.name, split)))
     if isinstance(chosen, config.ScanHitAveraged) and chosen.line_of_sight is not None:
-        model = model.with_lines_of_sight(chosen.line_of_sight)
+        model = model.with_lines_of_sight(chosen.line_of_sight.replace("{split}", str(split)))
     return model if chosen.sample_period_s is None else model.with_sampling(chosen.sample_period_s)
 
 
@@ -150,7 +156,7 @@ def site_b_of(site: systematics.Site, spec: config.Channel) -> systematics.Site:
 
 
 def _is_cut(spec: config.Beam) -> bool:
-    return not isinstance(spec, config.BeamGaussian) and spec.m_max is not None
+    return not isinstance(spec, CIRCULAR) and spec.m_max is not None
 
 
 def _whole(load: Callable[[config.Channel, int], beams.Beam], spec: config.Channel, lmax: int) -> beams.Beam:
@@ -167,7 +173,7 @@ def _whole(load: Callable[[config.Channel, int], beams.Beam], spec: config.Chann
 def _with_m_max(spec: config.Channel, m_max: int | None) -> config.Channel:
     """Return a channel whose beams have another m_max."""
     beam, beam_b = (
-        each if each is None or isinstance(each, config.BeamGaussian) else replace(each, m_max=m_max)
+        each if each is None or isinstance(each, CIRCULAR) else replace(each, m_max=m_max)
         for each in (spec.beam, spec.beam_b)
     )
     return replace(spec, beam=beam or spec.beam, beam_b=beam_b)
@@ -183,6 +189,8 @@ def _described(spec: config.Channel) -> tuple[systematics.Pointing | None, float
             if spec.scan.line_of_sight is None and name not in [line.name for line in model.lines_of_sight]:
                 return None, dipole_uk
             return systematics.Pointing(model, model.line_of_sight(name)), dipole_uk
+        case config.ScanHitAveraged() if "{split}" in f"{spec.scan.model}{spec.scan.line_of_sight}":
+            return None, None  # splits were pointed in different ways
         case config.ScanHitAveraged():
             model = scan_model(spec, spec.scan, None)
             lines = model.select()

@@ -8,7 +8,7 @@ import healpy
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim import systematics
+from mcsim import config, systematics
 from mcsim.errors import InputError
 from mcsim.instrument.scan import MapGrid
 from mcsim.simulation import simulate, tod
@@ -28,9 +28,9 @@ def maps(
     """Return names and maps of one realization, each the plain mean of its samples, in the order of the survey's.
 
     The maps are in uK, shape (npix,), ``healpy.UNSEEN`` where nothing was observed. The sky and what effects draw are
-    those of :func:`mcsim.simulation.simulate.maps`, the noise is a draw of its own. The threads of the interpolation do
-    not change the result; its accuracy ``epsilon`` is relative to the dipole where there is one. InputError as of
-    :func:`check`.
+    those of :func:`mcsim.simulation.simulate.maps`, the noise is a draw of its own, of samples or, where the run gives
+    it for pixels, of the map. The threads of the interpolation do not change the result; its accuracy ``epsilon`` is
+    relative to the dipole where there is one. InputError as of :func:`check`.
 
     Notes
     -----
@@ -53,16 +53,23 @@ def maps(
         beam = systematics.seen_through(acting, site, [effect for effect in acting if not _moves(effect)])
         observe = tod.sky_signal(seen, site.lmax, beam, epsilon, nthreads)
         for index, m in enumerate(channel.maps):
-            grid = MapGrid(site.nside, site.frame, (index / len(channel.maps), (index + 1) / len(channel.maps)))
+            grid = MapGrid(site.nside, site.frame, run.map.span(index))
             stages = [*after, _added(channel)]
-            if spec.noise.sigma0_uk > 0.0:
-                draw = rng.generator(run.ensemble.seed, realization, f"noise/{m.name}")
-                stages.append(tod.white_noise(spec.noise.sigma0_uk, draw, _noise_factor(channel)))
+            if run.map.split_by == "rings":
+                stages.append(tod.every_ring(site.pointed("of rings").model.spin_period_s, len(channel.maps), index))
+            draw = rng.generator(run.ensemble.seed, realization, f"noise/{m.name}")
+            given = spec.noise_of(run.map.splits[index] if run.map.splits else None)
+            of_samples = isinstance(given, config.Noise) and given.hits is None
+            if isinstance(given, config.Noise) and of_samples and given.sigma0_uk > 0.0:
+                stages.append(tod.white_noise(given.sigma0_uk, draw, _noise_factor(channel)))
             for effect in systematics.disturbing(acting):
                 draw = rng.generator(run.ensemble.seed, realization, f"effect/{effect.name}/noise/{m.name}")
                 stages.append(_disturbed(effect, draw))
             stream = tod.through(_seen(channel, grid, observe), stages)
             map_uk = tod.bin_samples(stream, site.nside)[0]
+            if not of_samples:
+                noise = 0.0 if m.noise_uk is None else m.noise(run.ensemble.seed, realization)
+                map_uk = np.where(m.moments.hits > 0, map_uk + noise, healpy.UNSEEN)
             found.append((m.name, map_uk if m.preparation is None else m.preparation.apply(map_uk)))
     return found
 

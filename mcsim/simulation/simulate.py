@@ -204,8 +204,7 @@ def _map_parts(
         if m.moments.dtheta is not None and gradient is not None:
             extra.append(convolve.centroid_map(gradient, m.moments))
         if m.noise_uk is not None:
-            draw = rng.generator(seed, realization, f"noise/{m.name}")
-            extra.append(m.noise_uk * draw.standard_normal(m.noise_uk.size))
+            extra.append(m.noise(seed, realization))
         for effect in systematics.disturbing(channel.effects):
             draw = rng.generator(seed, realization, f"effect/{effect.name}/noise/{m.name}")
             hits = m.moments.hits

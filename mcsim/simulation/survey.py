@@ -15,10 +15,11 @@ from mcsim.instrument import beams, scan
 from mcsim.instrument.scan import MapGrid
 from mcsim.simulation import convolve, mapmaking
 from mcsim.simulation.channels import effects_on, refuse_excess, refuse_pixel_effects, scan_model, site_b_of, site_of
+from mcsim.simulation.noise import DrawnNoise, of_map
 from mcsim.simulation.pixel_means import mean_gain, mean_signal
 from mcsim.simulation.preparation import Preparation, preparation
 from mcsim.simulation.rings import Rings, limit_rings, parallel_transport_rings
-from mcsim.sphere import healpix, spectra
+from mcsim.sphere import healpix, rng, spectra
 from mcsim.sphere.mask import read_mask
 from mcsim.systematics import Effect, Library, Site, seen_through, spread_of
 
@@ -45,6 +46,9 @@ class SurveyMap:
         Mean of what effects add to the samples of a pixel, shape (npix,); ``None``: nothing.
     preparation
         What is done to the map after it is made; ``None``: nothing.
+    drawn
+        How noise that is not white comes into the map, whose standard deviation noise_uk then describes; ``None``:
+        white.
     """
 
     name: str
@@ -55,6 +59,17 @@ class SurveyMap:
     gain: NDArray[np.float64] | None = None
     signal_uk: NDArray[np.float64] | None = None
     preparation: Preparation | None = None
+    drawn: DrawnNoise | None = None
+
+    def noise(self, seed: int, realization: int) -> NDArray[np.float64]:
+        """Return the noise of a realization before any preparation, uK, shape (npix,); the map must have some."""
+        assert self.noise_uk is not None  # the caller looked
+        if self.drawn is None:
+            draw = rng.generator(seed, realization, f"noise/{self.name}")
+            return self.noise_uk * draw.standard_normal(self.noise_uk.size)
+        level = self.drawn.level_uk
+        changed = np.divide(self.noise_uk, level, out=np.zeros(level.size), where=level > 0.0)
+        return np.asarray(changed * self.drawn.draw(seed, realization))
 
     @property
     def left_to_apply(self) -> NDArray[np.float64] | None:
@@ -223,7 +238,7 @@ def _channel(
     splits = run.map.splits or (None,)
     maps = []
     for index, split in enumerate(splits):
-        grid = MapGrid(run.map.resolution, run.map.frame, (index / len(splits), (index + 1) / len(splits)))
+        grid = MapGrid(run.map.resolution, run.map.frame, run.map.span(index))
         pairs = None
         if isinstance(spec.scan, config.ScanDifferencing):
             model = scan_model(spec, spec.scan, split)
@@ -238,6 +253,8 @@ def _channel(
                 moments = _moments_of_file(path, grid.nside, wanted, grid.frame)
             else:
                 moments = _moments(spec, split, grid, max(smax, 1), nthreads, progress)
+                if run.map.split_by == "rings" and isinstance(spec.scan, config.ScanHitAveraged):
+                    moments = replace(moments, hits=moments.hits / len(splits))
             # An effect may give the beam higher orders than a file of moments has: they are left out.
             beam = beam.truncated(moments.smax) if acting and moments.smax < beam.mmax else beam
         m = with_effects(_survey_map(run, spec, split, moments, pairs), acting, site)
@@ -303,6 +320,7 @@ def _side_b(spec: config.Channel, window: NDArray[np.float64], site: Site, actin
     imbalance, short = spec.scan.transmission_imbalance, 0
     for effect in acting:
         imbalance, short = effect.differencing(imbalance, short)
+    assert isinstance(spec.noise, config.Noise)  # the configuration refuses other noise of differences
     return SideB(beam, response, other.beam, spec.scan, spec.noise.sigma0_uk, imbalance, short)
 
 
@@ -365,17 +383,14 @@ def _survey_map(
 ) -> SurveyMap:
     """Return a map without effects: moments, weights of its pixels, and noise."""
     name = spec.name if split is None else f"{spec.name}:{split}"
-    observed = moments.hits > 0
-    if not observed.any():
+    if not np.any(moments.hits > 0):
         raise InputError(
             f"The scan of map {name} hits no pixel of nside {moments.nside}; check the scan of the channel."
         )
-    noise = None
-    if spec.noise.sigma0_uk > 0 and pairs is None:
-        noise = np.divide(spec.noise.sigma0_uk, np.sqrt(moments.hits), out=np.zeros(observed.size), where=observed)
+    moments, noise, drawn = (moments, None, None) if pairs is not None else of_map(run, spec, split, moments)
     steps = preparation(run, spec, split)
     weight = None if steps is not None else _weight(run, spec, split, name, moments)
-    return SurveyMap(name, moments, weight, noise, pairs, preparation=steps)
+    return SurveyMap(name, moments, weight, noise, pairs, preparation=steps, drawn=drawn)
 
 
 def _weight(
@@ -390,8 +405,9 @@ def _weight(
     weight = (moments.hits > 0).astype(float)
     if run.biposh.weighting == "hits":
         weight *= moments.hits
-    if run.map.mask is not None:
-        path = config.channel_path(run.map.mask, spec.name, split)
+    mask = spec.mask or run.map.mask
+    if mask is not None:
+        path = config.channel_path(mask, spec.name, split)
         weight *= read_mask(path, moments.nside, moments.frame, run.map.mask_frame, run.map.mask_apodisation_deg)
     if done is not None:
         weight *= done

@@ -54,6 +54,7 @@ PUBLIC = {
         "BeamEllipticalGaussian",
         "BeamGaussian",
         "BeamMap",
+        "BeamWindow",
         "Biposh",
         "Channel",
         "Compute",
