@@ -13,6 +13,7 @@ from pydantic import TypeAdapter
 
 from mcsim.diagnosis.consistency import Comparison, MapCheck
 from mcsim.diagnosis.localisation import Place
+from mcsim.diagnosis.nuisance import NuisanceResult
 from mcsim.diagnosis.selection import Contrast, Verdict
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Element
@@ -194,6 +195,8 @@ class DiagnosisResult:
         The run that is the model, as JSON.
     agreement
         Of an external model; None where mcsim simulates.
+    nuisances
+        What the data say of each component of the declared nuisances, against its prior.
     faint, probability
         True if sets describe the data, but are less probable than all else together; their posterior probability.
     contradicted
@@ -229,6 +232,7 @@ class DiagnosisResult:
     provenance: dict[str, Any]
     configuration: str
     warnings: tuple[str, ...] = ()
+    nuisances: tuple[NuisanceResult, ...] = ()
     faint: bool = False
     probability: float = 1.0
     agreement: Agreement | None = None
@@ -303,6 +307,7 @@ class DiagnosisResult:
                 if one.detectable is not None
             ],
             "notes": list(self.notes),
+            **({"nuisances": [_nuisance_json(one) for one in self.nuisances]} if self.nuisances else {}),
             **({"warnings": list(self.warnings)} if self.warnings else {}),
             **({"simulator": asdict(self.agreement)} if self.agreement else {}),
         }
@@ -392,6 +397,10 @@ def _comparison_json(effect: EffectResult, one: Comparison) -> dict[str, Any]:
 
 def _set_json(one: EffectSet) -> dict[str, Any]:
     return {"effects": [_effect_json(effect) for effect in one.effects], "maps": [asdict(own) for own in one.maps]}
+
+
+def _nuisance_json(found: NuisanceResult) -> dict[str, Any]:
+    return {f.name: getattr(found, f.name) for f in fields(found) if f.name not in ("label", "words")}
 
 
 def _place_json(place: Place) -> dict[str, Any]:
