@@ -53,8 +53,13 @@ def rhs_from_samples() -> Callable[..., np.ndarray]:
 SLOW = {"integration", "statistical"}
 
 
+FIRST = {"test_prepared_diagnosis", "test_diagnosis", "test_challenge", "test_compare", "test_faults", "test_script"}
+"""Files of the longest tests and fixtures: no other process takes them over at the end, and all end together."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Call what runs whole ensembles, or draws thousands of them, slow; single tests bear the mark themselves."""
+    items.sort(key=lambda item: item.path.stem not in FIRST)
     root = Path(__file__).parent
     for item in items:
         if item.path.relative_to(root).parts[0] in SLOW:

@@ -15,7 +15,7 @@ from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, data_vectors
 from mcsim.diagnosis.api import prepared
 from mcsim.diagnosis.campaign import Batch, after_jobs, asking, batch, seeded, with_effects
 from mcsim.diagnosis.candidate import Candidate, TemplateBank, columns_of, effects_at, numbered
-from mcsim.diagnosis.context import DiagnosisContext, context
+from mcsim.diagnosis.context import DiagnosisContext, calibration_of, context
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.subsets import Subsets
@@ -23,7 +23,7 @@ from mcsim.diagnosis.validation import Halves
 from mcsim.errors import InputError, RunError
 from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit, SimulatedGaussian, WhitenedTemplates
-from mcsim.stats.look_elsewhere import Calibration, calibrate
+from mcsim.stats.look_elsewhere import Calibration
 
 SKIES = 6
 """Skies that an expected S/N is the mean of."""
@@ -122,12 +122,12 @@ def linear_model(known: DiagnosisContext, without: Sequence[str] = ()) -> Linear
     """
     analysis, ensemble, bank, rows = reduced(known, without)
     kept = len(ensemble.simulations) - int(HELD_OUT * len(ensemble.simulations))
-    seen = replace(ensemble, simulations=ensemble.simulations[:kept])
+    seen = ensemble.first(kept)
     candidates = tuple(replace(candidate, shape_error=None) for candidate in analysis.candidates)
     null, templates = seen.gaussian, bank.significant(ensemble.spread, known.settings)
     groups = null.whiten_groups(templates, [candidate.columns for candidate in candidates])
     halves, data = Halves.of(seen, np.zeros(len(templates))), ensemble.simulations[kept:] + ensemble.offset
-    return LinearModel(null, templates, candidates, calibrate(null, groups), rows, halves, data)
+    return LinearModel(null, templates, candidates, calibration_of(seen, null, groups), rows, halves, data)
 
 
 def reduced(
@@ -157,7 +157,12 @@ class LearnedModel(EffectsLibrary):
 
     def simulate(self, jobs: Sequence[Job]) -> list[Vector]:
         """Return the data vectors of simulations that are made in this process."""
-        return [data_vectors(replace(job, without=()))[:, self.rows] for job in jobs]
+        beside = len(self.context.analysis.slices)
+        found = [data_vectors(replace(job, without=())) for job in jobs]
+        return [
+            row[:, [*self.rows, *range(row.shape[1] - beside, row.shape[1])] if job.slices else self.rows]
+            for job, row in zip(jobs, found, strict=True)
+        ]
 
     def expected_snr(self, effect: config.Effect) -> float:
         """Return the expected S/N of the mean response, from two halves of the skies: noise is no part of it."""
@@ -177,18 +182,22 @@ class LearnedModel(EffectsLibrary):
 
 def learned_model(settings: Settings, without: tuple[str, ...] = ()) -> LearnedModel:
     """Return a model that was learned before, without some effects; RunError if it is not in the cache."""
-    return _learned(config.to_json(settings.model), settings.simulations, without)
+    return _learned(config.to_json(settings.model), _proposing(settings), without)
+
+
+def _proposing(settings: Settings) -> DiagnosisSettings:
+    return DiagnosisSettings(simulations=settings.simulations, including=settings.including)
 
 
 @lru_cache(maxsize=3)
-def _learned(model: str, simulations: int | None, without: tuple[str, ...]) -> LearnedModel:
+def _learned(model: str, settings: DiagnosisSettings, without: tuple[str, ...]) -> LearnedModel:
     if without:
-        full = _learned(model, simulations, ()).context
+        full = _learned(model, settings, ()).context
         analysis, ensemble, bank, rows = reduced(full, without)
         known = context(analysis, ensemble, bank)
     else:
         run = config.from_json(model)
-        known = prepared(run, analysis_of(run, settings=DiagnosisSettings(simulations=simulations)), _refuse)
+        known = prepared(run, analysis_of(run, settings=settings), _refuse)
         rows = np.arange(len(known.analysis.elements))
     return LearnedModel(known.null, known.templates, known.candidates, known.calibration, rows, known)
 
@@ -206,5 +215,5 @@ def workers_of(settings: Settings, workers: int | None, quiet: bool) -> Iterator
     run = settings.model
     with batch(run.compute.workers if workers is None else workers) as call:
         with asking(call, quiet) as ask:
-            prepared(run, analysis_of(run, settings=DiagnosisSettings(simulations=settings.simulations)), ask)
+            prepared(run, analysis_of(run, settings=_proposing(settings)), ask)
         yield call

@@ -14,7 +14,7 @@ import typer
 from typer import Argument, Option
 
 from mcsim.cli import ensembles
-from mcsim.cli.common import Config, Png, Processes, Simulations, Workers, interrupt_once, save
+from mcsim.cli.common import Config, Including, Png, Processes, Simulations, Workers, interrupt_once, save
 from mcsim.errors import InputError, RunError
 
 app = typer.Typer(
@@ -103,7 +103,7 @@ def fit(
 
 @app.command()
 def beam(
-    source: Annotated[str, Argument(metavar="BEAM", help="Beam map or b_lm (FITS), or a CONFIG.")],
+    source: Annotated[str, Argument(metavar="BEAM", help="Beam map or b_lm (FITS), B_l (text), or a CONFIG.")],
     lmax: Annotated[int, Option(min=2, max=8192, help="Degree of the coefficients.")] = 2048,
     m_max: Annotated[int | None, Option(min=0, help="Order; default: chosen from the beam.")] = None,
     pixel_deg: Annotated[float | None, Option(help="Side of a pixel of a beam map; default: its header's.")] = None,
@@ -145,6 +145,7 @@ def diagnose(
     output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Folder for verdict and report.")],
     case: Annotated[str | None, Option(help="Name of the case; default: that of the model.")] = None,
     without: Annotated[list[str] | None, Option(metavar="EFFECT", help="Do not propose it; repeatable.")] = None,
+    including: Including = None,
     simulations: Simulations = None,
     workers: Processes = None,
     dry_run: Annotated[bool, Option("--dry-run", help="Say simulations, memory and time; simulate none.")] = False,
@@ -157,7 +158,10 @@ def diagnose(
     from mcsim.diagnosis.words import summary
 
     interrupt_once()
-    run, settings = config.load(model), DiagnosisSettings(without=tuple(without or ()), simulations=simulations)
+    run = config.load(model)
+    settings = DiagnosisSettings(
+        without=tuple(without or ()), including=tuple(including or ()), simulations=simulations
+    )
     if workers is not None:
         run = replace(run, compute=replace(run.compute, workers=workers))
     if dry_run:
@@ -165,6 +169,48 @@ def diagnose(
         return
     found = judge(run, data, output, case=case, settings=settings, quiet=False)
     print("\n".join(summary(found, output)))
+
+
+@app.command()
+def limit(
+    model: Config,
+    output: Annotated[
+        Path | None, Option("-o", "--output", metavar="DIR", help="Folder for limit.json, limit.zarr and limit.png.")
+    ] = None,
+    only: Annotated[list[str] | None, Option(metavar="EFFECT", help="Compute only this one; repeatable.")] = None,
+    without: Annotated[list[str] | None, Option(metavar="EFFECT", help="Leave it out; repeatable.")] = None,
+    nuisance: Annotated[
+        list[str] | None, Option(metavar="EFFECT[:CHANNEL]=WIDTH", help="Unknown within this prior; repeatable.")
+    ] = None,
+    unknown_dipole_uk: Annotated[float, Option(help="Rms of a monopole and dipole of which nothing is known.")] = 0.0,
+    probes: Annotated[int, Option(min=3, help="Random probes.")] = 64,
+    orders: Annotated[int, Option(min=0, help="Orders of the fiducial beams in the inverse covariance.")] = 0,
+    dense: Annotated[bool, Option("--dense", help="Whole matrices, for small maps.")] = False,
+    dry_run: Annotated[bool, Option("--dry-run", help="Say memory and time; compute nothing.")] = False,
+) -> None:
+    """Say how small an effect these maps could tell at best, before any data, and which effects look alike."""
+    from mcsim import config
+    from mcsim.information.api import describe, widths
+    from mcsim.information.api import limit as compute
+    from mcsim.information.settings import LimitSettings
+
+    interrupt_once()
+    settings = LimitSettings(
+        only=tuple(only or ()),
+        without=tuple(without or ()),
+        nuisances=widths(nuisance or ()),
+        unknown_dipole_uk=unknown_dipole_uk,
+        probes=probes,
+        orders=orders,
+        dense=dense,
+    )
+    if dry_run:
+        print(describe(config.load(model), settings))
+        return
+    found = compute(model, output, settings=settings, quiet=False)
+    print("\n".join(found.lines()))
+    if output is not None:
+        print(f"written: {output / 'limit.json'}, {output / 'limit.zarr'}, {output / 'limit.png'}")
 
 
 @app.command()
@@ -205,6 +251,7 @@ def challenge_make(
     seed: Annotated[int, Option(min=0, help="Of the draws; keep it as secret as the keys.")] = 0,
     sampled_share: Annotated[float, Option(min=0.0, max=1.0, help="Share of maps made sample by sample.")] = 0.5,
     inventions: Annotated[Path | None, Option(metavar="FILE", help="Python file of effects in no library.")] = None,
+    including: Including = None,
     simulations: Simulations = None,
     workers: Workers = None,
 ) -> None:
@@ -215,7 +262,13 @@ def challenge_make(
 
     interrupt_once()
     file = None if inventions is None else str(inventions)
-    shared = Settings(config.load(model), sampled_share=sampled_share, out_of_library=file, simulations=simulations)
+    shared = Settings(
+        config.load(model),
+        sampled_share=sampled_share,
+        out_of_library=file,
+        simulations=simulations,
+        including=tuple(including or ()),
+    )
     make(shared, output, cases, seed, workers=workers, quiet=False)
 
 
@@ -242,6 +295,7 @@ def challenge_draws(
     output: Target,
     number: Annotated[int, Option(min=1, help="Number of draws.")] = 1000,
     seed: Annotated[int, Option(min=0, help="Of the draws.")] = 0,
+    including: Including = None,
     simulations: Simulations = None,
     workers: Workers = None,
 ) -> None:
@@ -250,7 +304,7 @@ def challenge_draws(
     from mcsim.benchmark import report, score
     from mcsim.benchmark.folder import Settings
 
-    shared = Settings(config.load(model), simulations=simulations)
+    shared = Settings(config.load(model), simulations=simulations, including=tuple(including or ()))
     found = score.score_draws(shared, output, number, seed, workers=workers, quiet=False)
     print("\n".join(report.lines(found)))
 
@@ -264,6 +318,10 @@ def effects(name: Annotated[str | None, Argument(metavar="EFFECT", help="Only th
         parameters = ", ".join(f"{field.name} = {field.default!r}" for field in fields(kind))
         typer.secho(f"{kind.name} ({kind.scope}; amplitude in {kind.unit})", bold=True)
         print(f"  parameters  {parameters}")
+        for bound in kind.bounds:
+            print(f"  possible    {bound.parameter} from {bound.low:g} to {bound.high:g}: {bound.source}")
+        if not kind.proposed:
+            print(f"  proposed    on request: mcsim diagnose --with {kind.name}")
         for key in ("cause", "signature", "source"):
             print(f"  {key:<11} {getattr(kind, key)}")
 
@@ -293,9 +351,11 @@ def config(
         print(json.dumps(config_.json_schema(), indent=2))
     elif name is not None:
         from mcsim.simulation.channels import check_effects
+        from mcsim.simulation.nuisance import check_nuisances
 
         loaded = config_.load(name)
         check_effects(loaded)
+        check_nuisances(loaded)
         print(json.dumps({"digest": config_.digest(loaded), **config_.resolved(loaded)}, indent=2))
     else:
         raise InputError("Nothing was asked for; give a configuration to check, or --schema.")

@@ -117,6 +117,8 @@ def predict(
     """Predict the summary of a run without Monte Carlo."""
     from mcsim.ensemble import describe, prediction, tables
 
+    if output is not None:
+        tables.check_ending(output)
     expected = prediction.predict(config, exact=exact, snr=snr, nthreads=os.cpu_count() or 1)
     print(describe.describe_prediction(expected))
     if output is not None:

@@ -28,6 +28,7 @@ from mcsim.comparison.search import (
     without_noise,
 )
 from mcsim.errors import InputError
+from mcsim.simulation.noise import of_map
 from mcsim.support import folders
 from mcsim.support.progress import reporting
 
@@ -174,9 +175,8 @@ def _result(
     same = [other for one, own in zip(chosen, described, strict=False) for other in _equivalent(one, own)]
     nearest = _described(sets[0], pair.name, problem)[0] if sets and problem is not None else None
     scene, noise = pair.scene, np.nan
-    if sides.run is not None and pair.hits is not None:
-        sigma0 = next(c.noise.sigma0_uk for c in sides.run.channels if c.name == pair.name)
-        noise = sigma0 * float(np.sqrt(np.mean(1.0 / pair.hits[seen])))
+    if sides.run is not None and scene is not None:
+        noise = _noise_rms(sides.run, pair)
     return ChannelResult(
         name=pair.name,
         splits=pair.splits,
@@ -205,6 +205,23 @@ def _looks(pair: ChannelPair, explained: NDArray[np.float64]) -> tuple[str, ...]
     left = np.where(pair.seen, pair.b - pair.a - explained, 0.0)
     most = int(np.argmax(np.sum(left**2, axis=1)))
     return look(left[most], pair.a[most], pair.seen[most], None if pair.hits is None else pair.hits[most])
+
+
+def _noise_rms(run: config.RunConfig, pair: ChannelPair) -> float:
+    """Return the rms of the noise that a run describes over the pixels of a channel that are seen, uK."""
+    assert pair.scene is not None  # the caller looked
+    spec = next(c for c in run.channels if c.name == pair.name)
+    found = [
+        of_map(run, spec, split, m)[1] for split, m in zip(run.map.splits or (None,), pair.scene.moments, strict=True)
+    ]
+    levels = np.stack(
+        [np.zeros(m.npix) if own is None else own for own, m in zip(found, pair.scene.moments, strict=True)]
+    )
+    steps = pair.scene.preparations
+    if steps:
+        hits = [m.hits for m in pair.scene.moments]
+        levels = np.stack([step.noise_uk(own, h) for step, own, h in zip(steps, levels, hits, strict=True)])
+    return _rms(levels[pair.seen])
 
 
 def _described(found: Set, channel: str, problem: Problem | None) -> tuple[DifferenceResult, ...]:

@@ -20,8 +20,8 @@ from mcsim.systematics.registry import basis_of, catalogue
 
 Vector = NDArray[np.float64]
 
-REDUNDANT = ("pixelization", "spectrum")
-"""pixel_centres says the same; and band powers change with the sky, which two sides have in common."""
+REDUNDANT = ("calibration", "monopole_residual", "pixelization", "spectrum")
+"""calibration, monopole and pixel_centres are differences already; two sides have a sky, and its power, in common."""
 
 
 class EffectDifference(Difference):
@@ -86,7 +86,7 @@ def effects_of(pair: ChannelPair, run: config.RunConfig) -> Iterator[EffectDiffe
     sky, nthreads = pair.scene.sky, pair.scene.nthreads
     bare = simulate.maps(survey(alone, nthreads), 0, nthreads, sky)
     for name, kind in catalogue().items():
-        if kind.parametrization.stochastic or name in REDUNDANT:
+        if kind.parametrization.stochastic or name in REDUNDANT or not kind.proposed:
             continue
         templates = []
         try:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.comparison.scene import Maps, PointingFiles, Scene, scene_of, sky_in
+from mcsim.ensemble.external import named_source, source_of
 from mcsim.ensemble.maps import file_names
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
@@ -158,10 +159,20 @@ def _orders(run: config.RunConfig) -> int:
 
 
 def quiet(run: config.RunConfig) -> config.RunConfig:
-    """Return the run without noise and effects, and with nothing to estimate."""
-    channels = tuple(replace(channel, noise=config.Noise()) for channel in run.channels)
+    """Return the run without noise and effects, and with nothing to estimate; InputError without times of splits."""
+    _check_splits(run)
+    run = named_source(run)[0]
+    channels = tuple(channel.without_noise() for channel in run.channels)
     biposh = replace(run.biposh, L_max=0, pairs="auto")
     return replace(run, channels=channels, effects=(), biposh=biposh)
+
+
+def _check_splits(run: config.RunConfig) -> None:
+    if run.map.split_by != "time":
+        raise InputError(
+            f'{run.name} has map.split_by = "{run.map.split_by}", but the samples of maps that are compared are found '
+            'by their time; use splits by "time", or none.'
+        )
 
 
 def _model(a: str | Path, b: str | Path, model: str | Path | config.RunConfig | None) -> config.RunConfig | None:
@@ -186,14 +197,30 @@ def _side(side: str | Path, run: config.RunConfig | None, nthreads: int) -> dict
     path = Path(side)
     if path.is_dir():
         return _folder(path, run)
-    own = config.load(side)
-    shared = survey(own, nthreads)
+    own, external = named_source(config.load(side))
+    _check_splits(own)
     wanted = own_frame = config.prepared_grid(own)[1]
     if run is not None:
         wanted = config.prepared_grid(run)[1]
     if own_frame != wanted:
         raise InputError(f"{side} makes maps in {own_frame} coordinates, the model in {wanted}; choose one.")
+    if external is not None:
+        return _external(quiet(own), external, nthreads)
+    shared = survey(own, nthreads)
     return dict(zip(shared.map_names, simulate.maps(shared, 0, nthreads), strict=True))
+
+
+def _external(own: config.RunConfig, given: str, nthreads: int) -> dict[str, NDArray[np.float64]]:
+    """Return the first stored maps of another program, or those that its simulator makes of the run's sky."""
+    source, sky = source_of(own, given), None
+    if source.count is None:
+        if not source.takes_sky:
+            raise InputError(
+                f"{source.label} draws a sky of its own, so that no other side has the same; give its simulate an "
+                "argument sky."
+            )
+        sky = simulate.draw_sky(survey(own, nthreads), 0)
+    return dict(zip(config.map_names(own), source.maps(own.ensemble.seed, 0, sky=sky), strict=True))
 
 
 def _closer(
@@ -203,6 +230,9 @@ def _closer(
 
     Orientation moments spread samples over their pixels otherwise than another simulator does.
     """
+    run, external = named_source(run)
+    if external is not None:
+        return made
     whole = survey(run, nthreads)
     pointings = [channel.site.pointing for channel in whole.making.channels]
     if any(p is None or p.model.samples(p.line) > SAMPLES for p in pointings):

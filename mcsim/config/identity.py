@@ -10,16 +10,19 @@ from mcsim.config.load import to_dict
 from mcsim.config.schema import RunConfig, analysis_lmax, pixel_window
 
 
-def science(config: RunConfig) -> dict[str, Any]:
+def science(config: RunConfig, *others: str) -> dict[str, Any]:
     """Return the part of a run that defines its numbers, with file names replaced by hashes of contents.
 
     It has sky, map, channels, effects, preparation, biposh, seed and pairing; not name, compute, the number of
-    realizations, keep_maps or the bins of the summary. A file is represented by the SHA-256 of its contents, a
-    template by those of its files. Skies given one file per realization are represented by the part of their template
-    with the placeholder and by the contents of realization 0; the others are not read.
+    realizations, keep_maps or the bins of the summary, nor sections such as "nuisance" that are not named in
+    ``others``. A file is represented by the SHA-256 of its contents, a template by those of its files. Skies given one
+    file per realization are represented by the part of their template with the placeholder and by the contents of
+    realization 0; the others are not read.
     """
     plain = to_dict(config)
     for entry in paths.entries(plain):
+        if not entry.rule.checked:
+            continue
         named = paths.files(entry, config.map.splits, config.name)
         found = {label: f"sha256:{sha256_of(path)}" for label, path in named.items()}
         contents: Any = found[""] if list(found) == [""] else found
@@ -36,20 +39,21 @@ def science(config: RunConfig) -> dict[str, Any]:
         "schema": plain["schema"],
         **{
             section: plain[section]
-            for section in ("sky", "map", "channel", "effect", "preparation", "biposh")
+            for section in ("sky", "map", "channel", "effect", "preparation", "biposh", *others)
             if section in plain
         },
         "ensemble": {key: plain["ensemble"][key] for key in ("seed", "paired")},
     }
 
 
-_MAP = {"grid": "healpix", "nside": None, "mask_frame": None, "mask_apodisation_deg": 0.0}
+_MAP = {"grid": "healpix", "nside": None, "mask_frame": None, "mask_apodisation_deg": 0.0, "split_by": "time"}
 _OF_KIND: dict[str, dict[str, Any]] = {
     "moments": {"model": None, "line_of_sight": None},
     "map": {"angle_deg": 0.0},
     "blm": {"angle_deg": 0.0},
+    "white": {"kind": "white", "hits": None},
 }
-"""Defaults of the keys of a scan or beam that are younger than its kind."""
+"""Defaults of the keys of a scan, beam or noise that are younger than its kind."""
 
 
 def _leave_out_what_says_nothing(plain: dict[str, Any]) -> None:
@@ -64,8 +68,9 @@ def _leave_out_what_says_nothing(plain: dict[str, Any]) -> None:
         del plain["sky"]["dipole_lon_deg"], plain["sky"]["dipole_lat_deg"]
     for channel in plain["channel"]:
         channel["scan"].pop("max_iterations", None)
-        _drop(channel, {"beam_b": None})
-        for table in (channel["scan"], channel["beam"], channel.get("beam_b", {"kind": "none"})):
+        noises = (channel["noise"], *channel["split_noise"].values())
+        _drop(channel, {"beam_b": None, "split_noise": {}, "mask": None})
+        for table in (channel["scan"], channel["beam"], channel.get("beam_b", {"kind": "none"}), *noises):
             _drop(table, _OF_KIND.get(table["kind"], {}))
 
 

@@ -6,10 +6,13 @@ from dataclasses import replace
 import numpy as np
 
 from mcsim import config
-from mcsim.diagnosis.candidate import Candidate, parts_of
+from mcsim.diagnosis.candidate import Candidate, columns_of, parts_of
+from mcsim.diagnosis.consistency import amplitudes
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
+from mcsim.diagnosis.nuisance import NuisanceResult, Regression, results
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.result import CandidateResult, DiagnosisResult, EffectResult, EffectSet
+from mcsim.diagnosis.selection import Explanation
 from mcsim.errors import InputError
 from mcsim.stats.detection import detectable, snr_needed, snr_to_separate
 from mcsim.stats.excess import HeldOut, excess_of
@@ -31,19 +34,8 @@ def result_of(
         case=case,
         kind=found.verdict,
         test=found.gap,
-        sets=tuple(
-            EffectSet(
-                effects=tuple(effects_of(candidates, one.members, one.fit)),
-                candidates=tuple(one.members),
-                coordinates=tuple(one.fit.amplitudes.tolist()),
-                errors=tuple(one.fit.errors.tolist()),
-                odds=one.odds,
-                pvalue=one.pvalue,
-                further=one.further,
-                excess=excess_of(one.fit.chi2, one.fit.dimension, null.dof),
-            )
-            for one in found.explanations
-        ),
+        sets=tuple(_set_of(context, one) for one in found.explanations),
+        contradicted=tuple(_set_of(context, one) for one in found.contradicted),
         contrasts=tuple(
             replace(one, elements=one.elements[:TELLING], shares=one.shares[:TELLING]) for one in found.contrasts
         ),
@@ -54,6 +46,7 @@ def result_of(
         partial=() if partial is None else tuple(effects_of(candidates, partial.members, partial.fit)),
         partial_left=None if partial is None else partial.left,
         held_out=reduction,
+        nuisances=tuple(_nuisances(data, refined)),
         places=tuple(data.places()),
         candidates=tuple(_candidates(context, refined)),
         elements=context.analysis.elements,
@@ -68,7 +61,7 @@ def result_of(
         residual_maps=residuals,
         residual_range=None if residuals is None else np.quantile(ensemble.residual_rms, [0.025, 0.975], axis=0).T,
         frame=model.frame,
-        notes=tuple(notes),
+        notes=(*notes, *_left_out(context)),
         settings=context.settings,
         provenance={
             "simulations of the model": len(ensemble.simulations),
@@ -78,6 +71,52 @@ def result_of(
         },
         configuration=config.to_json(context.run),
     )
+
+
+def _set_of(context: DiagnosisContext, one: Explanation) -> EffectSet:
+    """Return a set of effects with its amplitudes in parts of the data."""
+    effects = list(effects_of(context.candidates, one.members, one.fit))
+    fitted = [context.candidates[m].fitted(*part) for m, *part in parts_of(context.candidates, one.members, one.fit)]
+    for place, own in enumerate(one.findings.comparisons):
+        words = tuple(amplitudes(comparison, fitted[place]) for comparison in own)
+        effects[place] = replace(effects[place], consistency=own, parts=words)
+    return EffectSet(
+        effects=tuple(effects),
+        candidates=tuple(one.members),
+        coordinates=tuple(one.fit.amplitudes.tolist()),
+        errors=tuple(one.fit.errors.tolist()),
+        odds=one.odds,
+        pvalue=one.pvalue,
+        further=one.further,
+        excess=excess_of(one.fit.chi2, one.fit.dimension, context.null.dof),
+        maps=one.findings.maps,
+    )
+
+
+def _nuisances(data: DataSet, refined: Refined) -> Iterator[NuisanceResult]:
+    """Yield what the data say of the nuisances beside the effects that are named, or else detected, of any size."""
+    context, found, partial = data.context, refined.attribution, refined.partial
+    if context.ensemble.nuisances is None:
+        return
+    members, t = found.explanations[0].members if found.explanations else (), refined.templates
+    if partial is not None and not members:
+        members, t = partial.members, partial.templates
+    scatters = [one for one in (refined.candidates[member].scatter for member in members) if one is not None]
+    null = context.null.with_extra_covariance(*scatters)
+    found_of = Regression.of(context.ensemble, null, t[:, columns_of(refined.candidates, members)])
+    yield from results(context.analysis.nuisances, found_of, data.x)
+
+
+def _left_out(context: DiagnosisContext) -> Iterator[str]:
+    """Yield a sentence on elements that are not tested, if there are any."""
+    ensemble = context.ensemble
+    if ensemble.nuisances is None:
+        return
+    if names := [element.words for element, kept in zip(ensemble.elements, ensemble.tested, strict=True) if not kept]:
+        yield (
+            f"{len(names)} of {len(ensemble.elements)} elements are not tested, because they follow the square of a "
+            f"nuisance as wide as its prior: {'; '.join(names)}."
+        )
 
 
 def effects_of(candidates: Sequence[Candidate], members: Sequence[int], fit: Fit) -> Iterator[EffectResult]:

@@ -13,11 +13,12 @@ from mcsim.diagnosis.analysis import Analysis
 from mcsim.diagnosis.campaign import Ask, after_jobs, skies
 from mcsim.diagnosis.candidate import Candidate, TemplateBank
 from mcsim.diagnosis.localisation import Place
+from mcsim.diagnosis.nuisance import with_nuisances
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.selection import Attribution
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates
-from mcsim.stats.look_elsewhere import Calibration, calibrate
+from mcsim.stats.look_elsewhere import Calibration, calibrate, calibrate_on
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -48,6 +49,17 @@ class DiagnosisContext:
         """Return the settings of the analysis."""
         return self.analysis.settings
 
+    def reference(self, found: Sequence[config.Effect]) -> Matrix:
+        """Return the data vectors of the skies in which responses to effects are measured, shape (skies, p)."""
+        return self.extended_reference(found)[:, : len(self.ensemble.elements)]
+
+    def extended_reference(self, found: Sequence[config.Effect]) -> Matrix:
+        """Return those of :meth:`reference` with the numbers beside the data vector behind it, (skies, p + E)."""
+        if self.analysis.source_of(found) is None:
+            return self.ensemble.extended.reference
+        assert self.ensemble.external_reference is not None  # simulated where the source can add effects
+        return self.ensemble.external_reference
+
 
 def context(analysis: Analysis, ensemble: NullEnsemble, bank: TemplateBank) -> DiagnosisContext:
     """Prepare the tests of data sets of a model."""
@@ -59,9 +71,17 @@ def context(analysis: Analysis, ensemble: NullEnsemble, bank: TemplateBank) -> D
         for candidate, own in zip(analysis.candidates, scatter, strict=True)
     )
     templates = bank.significant(ensemble.spread, analysis.settings)
+    if ensemble.nuisances is not None:
+        candidates, templates = with_nuisances(ensemble, null, analysis.nuisances, candidates, templates)
     groups = null.whiten_groups(templates, [candidate.columns for candidate in candidates])
-    calibration = calibrate(null, groups)
+    calibration = calibration_of(ensemble, null, groups)
     return DiagnosisContext(analysis, ensemble, bank, null, candidates, calibration, scatter, templates, groups)
+
+
+def calibration_of(ensemble: NullEnsemble, null: SimulatedGaussian, groups: WhitenedTemplates) -> Calibration:
+    """Return the null distribution of the tests; with nuisances, which make data less Gaussian, from held-out ones."""
+    found = calibrate(null, groups)
+    return found if ensemble.nuisances is None else calibrate_on(found, null, groups, ensemble.simulations)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +115,16 @@ class DataSet(ABC, Generic[Data]):
 
         By default they are those of the reference, whatever ``skies`` is.
         """
-        return self._simulated(found) - self.context.ensemble.reference
+        return self._simulated(found) - self.context.reference(found)
+
+    @property
+    def extended(self) -> Vector:
+        """Return the data vector with the numbers beside it behind it, if there are any."""
+        return self.x
+
+    def respond_extended(self, found: Sequence[config.Effect], skies: int) -> Matrix:
+        """Return the changes of :meth:`respond` for :attr:`extended`."""
+        return self.respond(found, skies)
 
     def _simulated(self, found: Sequence[config.Effect]) -> Matrix:
         """Return the data vectors of the skies of the reference with effects, shape (rows, p)."""

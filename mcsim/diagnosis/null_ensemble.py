@@ -1,7 +1,7 @@
 """Simulations of the model: the null distribution of the data vector."""
 
 import json
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -14,6 +14,12 @@ from mcsim.diagnosis.candidate import Column, TemplateBank
 from mcsim.diagnosis.summaries import Element
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector
+
+QUADRATIC = 0.05
+"""Share of an element's variance that may come from squares and products of nuisances."""
+
+ROUND_OFF = 1e-20
+"""Variance, relative to the largest, of a direction that is there only by round-off."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +35,16 @@ class NullEnsemble:
     residual_scatter: Matrix  # standard deviation of the same
     residual_rms: Matrix  # rms of each over this scatter, (n, map)
     redundant: float = 1e-4  # directions with less than this fraction of the largest variance are left out
+    # Of an external model: the reference of its simulator if that can add effects, of the extended data vector,
+    # and the offset of mcsim's routes.
+    external_reference: Matrix | None = None
+    own_offset: Vector | None = None
+    # Numbers beside the data vector, which no test of the gap sees: of the same simulations, (N, E), and all else.
+    slices: Matrix = field(default_factory=lambda: np.zeros((0, 0)))
+    slice_offset: Vector = field(default_factory=lambda: np.zeros(0))
+    slice_reference: Matrix = field(default_factory=lambda: np.zeros((0, 0)))
+    slice_elements: tuple[Element, ...] = ()
+    nuisances: Matrix | None = None  # coordinates that every simulation drew, (N, k); None: there are none
 
     @cached_property
     def spread(self) -> Vector:
@@ -37,8 +53,57 @@ class NullEnsemble:
 
     @cached_property
     def gaussian(self) -> SimulatedGaussian:
-        """Return the Gaussian with mean and covariance of the simulations, the mean moved by the offset."""
-        return SimulatedGaussian.from_simulations(self.simulations, self.offset, self.redundant)
+        """Return the Gaussian with mean and covariance of the simulations, the mean moved by the offset.
+
+        Which directions are redundant is decided without the nuisances: beside a wide prior all others look small.
+        """
+        if self.nuisances is None:
+            return SimulatedGaussian.from_simulations(self.simulations, self.offset, self.redundant)
+        tested = self.tested
+        kept = SimulatedGaussian.from_simulations(self.quiet[:, tested], floor=self.redundant).whitening
+        wide = SimulatedGaussian.from_simulations(self.simulations[:, tested] @ kept.T, floor=ROUND_OFF)
+        whitening = np.zeros((wide.dimension, len(tested)))
+        whitening[:, tested] = wide.whitening @ kept
+        return replace(wide, mean=self.simulations.mean(axis=0) + self.offset, whitening=whitening)
+
+    @cached_property
+    def tested(self) -> NDArray[np.bool_]:
+        """Return True for elements that are about as Gaussian as the tests take them to be, shape (p,).
+
+        Powers follow the square of a nuisance that is larger than the noise: the share of their variance beside what is
+        linear that products of two nuisances explain may be QUADRATIC, and four standard errors of such a share.
+        """
+        if self.nuisances is None:
+            return np.ones(len(self.elements), dtype=np.bool_)
+        z = _standardised(self.nuisances)
+        one, two = np.triu_indices(z.shape[1])
+        squares = (_standardised(z[:, one] * z[:, two]).T @ _standardised(self.quiet) / len(z)) ** 2
+        share = np.sum(squares - 1.0 / len(z), axis=0)
+        return np.asarray(share < QUADRATIC + 4.0 * np.sqrt(2.0 * len(one)) / len(z))
+
+    @cached_property
+    def quiet(self) -> Matrix:
+        """Return the simulations without what is linear in their nuisances, shape (N, p)."""
+        return without_nuisances(self.simulations, self.nuisances)
+
+    def first(self, count: int) -> "NullEnsemble":
+        """Return the ensemble of the first simulations."""
+        nuisances = None if self.nuisances is None else self.nuisances[:count]
+        return replace(self, simulations=self.simulations[:count], nuisances=nuisances, slices=self.slices[:count])
+
+    @cached_property
+    def extended(self) -> "NullEnsemble":
+        """Return the ensemble of the data vector with the numbers beside it behind it, (p + E) elements."""
+        if not self.slice_elements:
+            return self
+        return replace(
+            self,
+            simulations=np.concatenate([self.simulations, self.slices], axis=1),
+            offset=np.concatenate([self.offset, self.slice_offset]),
+            reference=np.concatenate([self.reference, self.slice_reference], axis=1),
+            elements=(*self.elements, *self.slice_elements),
+            slice_elements=(),
+        )
 
     def restrict(self, rows: NDArray[np.int64]) -> "NullEnsemble":
         """Return the ensemble of some elements."""
@@ -58,11 +123,27 @@ class NullEnsemble:
         -----
         A mean of R skies less that of N simulations has the covariance C (1/R + 1/N); the tests take it to be 1 + 1/N
         times that of the simulations. These are contracted about their mean until it is: the tests stay exact.
+        Nuisances are the same in all skies, and what is linear in them is not contracted.
         """
         count = len(self.simulations)
         scale = np.sqrt((count + realizations) / (realizations * (count + 1.0)))
         mean = self.simulations.mean(axis=0)
-        return replace(self, simulations=mean + scale * (self.simulations - mean))
+        common = self.simulations - self.quiet
+        return replace(self, simulations=mean + scale * (self.quiet - mean) + common)
+
+
+def _standardised(rows: Matrix) -> Matrix:
+    centred = rows - rows.mean(axis=0)
+    spread = np.std(rows, axis=0)
+    return np.asarray(np.divide(centred, spread, out=np.zeros_like(centred), where=spread > 0.0))
+
+
+def without_nuisances(simulations: Matrix, nuisances: Matrix | None) -> Matrix:
+    """Return simulations, shape (N, p), less their regression on the nuisances that they drew, shape (N, k)."""
+    if nuisances is None:
+        return simulations
+    centred = nuisances - nuisances.mean(axis=0)
+    return np.asarray(simulations - centred @ np.linalg.lstsq(centred, simulations, rcond=None)[0])
 
 
 def save(path: Path, ensemble: NullEnsemble, bank: TemplateBank) -> None:
@@ -71,6 +152,7 @@ def save(path: Path, ensemble: NullEnsemble, bank: TemplateBank) -> None:
     arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
     attributes = {
         "elements": json.dumps([asdict(element) for element in ensemble.elements]),
+        "slice_elements": json.dumps([asdict(element) for element in ensemble.slice_elements]),
         "columns": json.dumps(bank.labels),
         "redundant": ensemble.redundant,
     }
@@ -82,8 +164,11 @@ def load(path: Path) -> tuple[NullEnsemble, TemplateBank]:
     """Read what :func:`save` wrote."""
     with xr.open_zarr(path, consolidated=False) as dataset:
         arrays = {str(name): np.asarray(values) for name, values in dataset.data_vars.items()}
-        elements = TypeAdapter(tuple[Element, ...]).validate_json(dataset.attrs["elements"])
+        elements, beside = (
+            TypeAdapter(tuple[Element, ...]).validate_json(dataset.attrs[key]) for key in ("elements", "slice_elements")
+        )
         columns = TypeAdapter(tuple[Column, ...]).validate_json(dataset.attrs["columns"])
         redundant = float(dataset.attrs["redundant"])
-    bank = TemplateBank(arrays.pop("matrix"), arrays.pop("error"), arrays.pop("curvature"), columns)
-    return NullEnsemble(**arrays, elements=elements, redundant=redundant), bank
+    matrix, error, curvature, beside_matrix = map(arrays.pop, ("matrix", "error", "curvature", "slice_matrix"))
+    bank = TemplateBank(matrix, error, curvature, columns, beside_matrix)
+    return NullEnsemble(**arrays, elements=elements, redundant=redundant, slice_elements=beside), bank

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mcsim.diagnosis.candidate import Candidate, columns_of, effects_at, parts_of, within_bounds
+from mcsim.diagnosis.candidate import Candidate, beyond, columns_of, effects_at, parts_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.errors import InputError
@@ -68,6 +68,8 @@ class Refiner:
         for _ in range(self.context.settings.refine_rounds):
             changed = False
             for index, coordinates, covariance in self._to_try(found, tried):
+                if candidates[index].nuisance:
+                    continue
                 columns, how = list(candidates[index].columns), candidates[index].effect.parametrization
                 nonlinear = self._is_nonlinear(columns, coordinates)
                 stochastic = how.stochastic and (how.sign == 0 or coordinates[0] > 0.0)
@@ -115,7 +117,7 @@ class Refiner:
             taken = {candidates[member].identity for member in members}
             free = [i for i, one in enumerate(candidates) if one.identity not in taken and i not in refused]
             fits = {i: self._fit(t, candidates, (*members, i)) for i in free}
-            possible = [i for i, fit in fits.items() if within_bounds(candidates, (*members, i), fit)]
+            possible = [i for i, fit in fits.items() if np.isfinite(beyond(candidates, (*members, i), fit))]
             best = min(possible, key=lambda i: self._pvalue(before, fits[i]), default=None)
             if best is None or not self._is_significant(before, fits[best]):
                 break
@@ -123,7 +125,7 @@ class Refiner:
             exact = self._together(candidates, t, together, fits[best])
             if exact is not None:
                 after = self._fit(exact, candidates, together)
-                if within_bounds(candidates, together, after) and self._is_significant(before, after):
+                if np.isfinite(beyond(candidates, together, after)) and self._is_significant(before, after):
                     members, t, before = together, exact, after
                     continue
             refused.add(best)

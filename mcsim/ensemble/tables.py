@@ -62,8 +62,18 @@ def table(summary: xr.Dataset) -> Table:
     return result
 
 
+def check_ending(output: str | Path) -> None:
+    """Raise InputError unless :func:`write` knows the kind of file that the name asks for."""
+    ending = Path(output).suffix
+    if ending not in (".zarr", ".nc", ".ecsv"):
+        raise InputError(
+            f"{output} ends in {ending or 'nothing'}; choose .zarr, .nc (NetCDF) or .ecsv (table of bins)."
+        )
+
+
 def write(summary: xr.Dataset, output: str | Path) -> None:
     """Write a summary or a prediction as Zarr (``.zarr``) or NetCDF (``.nc``), or its binned spectra (``.ecsv``)."""
+    check_ending(output)
     target = Path(output)
     with unwritable(target, "choose another file"):
         if target.suffix == ".zarr":
@@ -75,11 +85,8 @@ def write(summary: xr.Dataset, output: str | Path) -> None:
                 summary.to_zarr(target, zarr_format=3, consolidated=True)
         elif target.suffix == ".nc":
             _for_netcdf(summary).to_netcdf(target, engine="scipy")
-        elif target.suffix == ".ecsv":
-            table(summary).write(target, format="ascii.ecsv", overwrite=True)
         else:
-            ending = target.suffix or "nothing"
-            raise InputError(f"{target} ends in {ending}; choose .zarr, .nc (NetCDF) or .ecsv (table of bins).")
+            table(summary).write(target, format="ascii.ecsv", overwrite=True)
 
 
 def _for_netcdf(summary: xr.Dataset) -> xr.Dataset:

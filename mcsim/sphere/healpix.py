@@ -102,9 +102,9 @@ def pixel_window(nside: int, lmax: int) -> NDArray[np.float64]:
     check_nside(nside)
     check_whole(lmax, "lmax")
     window = np.zeros(lmax + 1)
-    for pixels, share in _representatives(nside):
+    for face, share in _FACES:
         # The centres of n x n sub-pixels miss 1/n^2 of a pixel's extent: extrapolate from n = 4 and 8.
-        window += share * (4.0 * _mean_legendre(pixels, nside, 8, lmax) - _mean_legendre(pixels, nside, 4, lmax)) / 3.0
+        window += share * (4.0 * _mean_legendre(face, nside, 8, lmax) - _mean_legendre(face, nside, 4, lmax)) / 3.0
     window = np.sqrt(np.abs(window))
     window.setflags(write=False)
     return window
@@ -112,24 +112,32 @@ def pixel_window(nside: int, lmax: int) -> NDArray[np.float64]:
 
 def mean_window(nside: int, split: int, lmax: int) -> NDArray[np.float64]:
     """Return the window of the mean of split x split sub-pixel centres over pixels, shape (lmax + 1,)."""
-    found = [share * _mean_legendre(pixels, nside, split, lmax) for pixels, share in _representatives(nside)]
+    found = [share * _mean_legendre(face, nside, split, lmax) for face, share in _FACES]
     return np.asarray(np.sqrt(np.abs(np.sum(found, axis=0))))
 
 
-def _representatives(nside: int) -> list[tuple[NDArray[np.int64], float]]:
-    """Return NESTED pixels of one polar and one equatorial face that represent all, with the share of such faces."""
+_FACES = ((0, 2.0 / 3.0), (4, 1.0 / 3.0))
+"""One polar and one equatorial face that represent all, with the share of such faces."""
+
+
+def _representatives(face: int, nside: int) -> NDArray[np.int64]:
+    """Return NESTED pixels of a face that represent all of it."""
     lattice = min(nside, 32)
     step = (nside // lattice) ** 2
     cell = np.arange(lattice * lattice)
     # Pixels alternate just above and just below the middle of a cell: their mean is at the middle.
     above = (cell ^ (cell >> 1)) & 1 == 0
     pixels = cell * step + np.where(above, 3 * step // 4, max(step // 4 - 1, 0))
-    return [(pixels + face * nside * nside, share) for face, share in ((0, 2.0 / 3.0), (4, 1.0 / 3.0))]
+    return pixels + face * nside * nside
 
 
-def _mean_legendre(pixels: NDArray[np.int64], nside: int, split: int, lmax: int) -> NDArray[np.float64]:
-    """Return <P_l(x . y)> over pairs of the split x split sub-pixel centres of NESTED pixels, by a histogram."""
-    inside = pixels[:, None] * split**2 + np.arange(split**2)
+@lru_cache(maxsize=32)
+def _distances(face: int, nside: int, split: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the cosines between split x split sub-pixel centres of a face's pixels, by a histogram, and their shares.
+
+    They serve windows up to any lmax.
+    """
+    inside = _representatives(face, nside)[:, None] * split**2 + np.arange(split**2)
     centres = np.stack(healpy.pix2vec(split * nside, inside, nest=True), axis=-1)
     difference = centres[:, :, None, :] - centres[:, None, :, :]
     chord = np.sqrt(np.einsum("pijk,pijk->pij", difference, difference)).ravel()
@@ -138,6 +146,14 @@ def _mean_legendre(pixels: NDArray[np.int64], nside: int, split: int, lmax: int)
     filled = count > 0
     cosine = 1.0 - (total[filled] / count[filled]) ** 2 / 2.0
     weight = count[filled] / count.sum()
+    cosine.setflags(write=False)
+    weight.setflags(write=False)
+    return cosine, weight
+
+
+def _mean_legendre(face: int, nside: int, split: int, lmax: int) -> NDArray[np.float64]:
+    """Return <P_l(x . y)> over pairs of the split x split sub-pixel centres of a face's pixels, shape (lmax + 1,)."""
+    cosine, weight = _distances(face, nside, split)
     before, legendre = np.ones_like(cosine), cosine
     mean = np.ones(lmax + 1)
     for ell in range(1, lmax + 1):
@@ -146,11 +162,23 @@ def _mean_legendre(pixels: NDArray[np.int64], nside: int, split: int, lmax: int)
     return mean
 
 
-def read_map(path: Path) -> tuple[Map, str | None, str | None]:
-    """Read the first map of a HEALPix FITS file in RING order, and its frame and unit if the header has them.
+TEMPERATURE = ("TEMPERATURE", "I_STOKES", "TEMP", "INTENSITY", "I")
+"""Names of columns with the temperature, in the maps of WMAP, Planck and others."""
 
-    A .npy file holds an array of shape (npix,) in RING order; its frame and unit are None. Raise InputError if the file
-    cannot be read as a HEALPix map, does not say whether it is RING or NESTED, or names an unknown frame.
+HITS = ("N_OBS", "HITS", "NOBS", "HIT", "NHITS")
+"""Names of columns with the number of observations, in the maps of WMAP, Planck and others."""
+
+VARIANCE = ("II_COV", "VARIANCE", "I_VAR", "COV_II", "VAR_I", "VAR")
+"""Names of columns with the variance of the temperature."""
+
+
+def read_map(path: Path, names: tuple[str, ...] = ()) -> tuple[Map, str | None, str | None]:
+    """Read a map of a HEALPix FITS file in RING order, and its frame and unit if the header has them.
+
+    It is the column that is called one of ``names``; without names the temperature, or else the first column. A file
+    with a single column need not name it. A .npy file holds an array of shape (npix,) in RING order; its frame and unit
+    are None. Raise InputError if the file cannot be read as a HEALPix map, does not say whether it is RING or NESTED,
+    or names an unknown frame.
     """
     if path.suffix == ".npy":
         array = read_npy(path, "biuf").astype(np.float64)
@@ -160,18 +188,35 @@ def read_map(path: Path) -> tuple[Map, str | None, str | None]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", category=AstropyUserWarning)
-            map_, header = healpy.read_map(path, dtype=float, h=True)
+            field = _column_called(path, names)
+            map_, header = healpy.read_map(path, dtype=float, h=True, field=field)
+    except InputError:
+        raise
     except Exception as error:  # libraries raise errors of any type for a broken file
         raise InputError(f"{path} cannot be read as a HEALPix map ({error}); give a complete FITS map.") from error
     keywords = dict(header)
     if str(keywords.get("ORDERING", "")).strip().upper() not in ("RING", "NESTED"):
         raise InputError(f"{path} does not say how its pixels are ordered; write ORDERING = RING or NESTED there.")
     # A map with explicit pixel indices has them in its first column and the values in its second.
-    column = 2 if str(keywords.get("INDXSCHM", "")).strip().upper() == "EXPLICIT" else 1
+    column = (2 if str(keywords.get("INDXSCHM", "")).strip().upper() == "EXPLICIT" else 1) + field
     unit = str(keywords.get(f"TUNIT{column}", "")).strip() or None
     if str(keywords.get("TEMPTYPE", "")).strip().upper().startswith("ANT"):
         unit = f"{unit or 'K'} antenna"
     return np.asarray(map_), frame_named(keywords.get("COORDSYS"), str(path)), unit
+
+
+def _column_called(path: Path, names: tuple[str, ...]) -> int:
+    """Return the number of the map called one of ``names`` (none: of temperature), not counting pixel indices."""
+    with opened(path) as hdus:
+        columns = [name.upper() for name in hdus[1].columns.names]
+        explicit = str(hdus[1].header.get("INDXSCHM", "")).strip().upper() == "EXPLICIT"
+    columns = columns[1:] if explicit else columns
+    for name in names or TEMPERATURE:
+        if name in columns:
+            return columns.index(name)
+    if len(columns) == 1 or not names:
+        return 0
+    raise InputError(f"{path} has the columns {', '.join(columns)} and none called {' or '.join(names)}; name it so.")
 
 
 def read_pixel_window(path: Path, lmax: int, nside: int | None = None) -> NDArray[np.float64]:

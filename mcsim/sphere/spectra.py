@@ -4,6 +4,7 @@ import gzip
 import re
 import warnings
 import zlib
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -80,7 +81,7 @@ def load(spec: str | Path, lmax: int) -> NDArray[np.float64]:
             "lower lmax or give a longer table."
         )
     table = np.where(np.isfinite(cl), cl, 0.0)
-    cl = cl[: lmax + 1]
+    cl = cl[: lmax + 1].copy()
     for bad, what in ((~np.isfinite(cl), "not finite"), (cl < 0.0, "negative")):
         if bad.any():
             ell = int(np.argmax(bad))
@@ -100,12 +101,22 @@ def last(spec: str | Path) -> int:
 
 def _read(spec: str | Path) -> tuple[NDArray[np.float64], str, bool]:
     """Return all C_l, the names in the header, and True if it states the unit."""
+    if str(spec) in resources.names("data"):
+        return _packaged(str(spec))
     path = resources.spectrum(spec)
     if path.suffix == ".npy":
         return read_npy(path, "iuf").astype(np.float64), "", False
     if path.name.removesuffix(".gz").endswith((".fits", ".fit")):
         return _read_fits(path)
     return _read_text(path)
+
+
+@lru_cache(maxsize=4)
+def _packaged(name: str) -> tuple[NDArray[np.float64], str, bool]:
+    """Read a packaged table, which does not change under a process as a user's file may."""
+    cl, names, stated = _read_text(resources.spectrum(name))
+    cl.setflags(write=False)
+    return cl, names, stated
 
 
 def _check_size(where: str, cl: NDArray[np.float64], stated: bool) -> None:

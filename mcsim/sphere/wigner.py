@@ -4,6 +4,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+# Loops stand where numpy's operations on slices would be shorter: numba compiles each of those with its messages about
+# shapes, which takes seconds.
+
 # Values that grow through a forbidden region are rescaled at this size, so that their squares stay finite.
 _HUGE = 1e100
 
@@ -32,7 +35,8 @@ def _minimal_at_both_ends(
         below = lower[i] * out[i - 1] if i > 0 else 0.0
         out[i + 1] = -(diagonal[i] * out[i] + below) / upper[i]
         if abs(out[i + 1]) > _HUGE:
-            out[: i + 2] /= _HUGE
+            for k in range(i + 2):
+                out[k] /= _HUGE
         if i >= 1 and abs(out[i + 1]) <= abs(out[i]):
             join = i + 1
             break
@@ -45,23 +49,27 @@ def _minimal_at_both_ends(
         above = upper[i] * out[i + 1] if i < n - 1 else 0.0
         out[i - 1] = -(diagonal[i] * out[i] + above) / lower[i]
         if abs(out[i - 1]) > _HUGE:
-            out[i - 1 : n] /= _HUGE
+            for k in range(i - 1, n):
+                out[k] /= _HUGE
     overlap = forward0 * out[start] + forward1 * out[start + 1] + forward2 * out[start + 2]
     ratio = overlap / (forward0**2 + forward1**2 + forward2**2)
-    out[:start] *= ratio
+    for k in range(start):
+        out[k] *= ratio
 
 
 @njit(cache=True, nogil=True)
 def _normalise(jmin: int, n: int, factor: float, top_sign: float, out: NDArray[np.float64]) -> None:
     """Scale to factor sum_j (2j+1) f_j^2 = 1 with the given sign at the top."""
-    largest = np.abs(out[:n]).max()
-    norm = 0.0
+    largest, norm = 0.0, 0.0
+    for i in range(n):
+        largest = max(largest, abs(out[i]))
     for i in range(n):
         norm += (2.0 * (jmin + i) + 1.0) * (out[i] / largest) ** 2
     scale = 1.0 / (largest * np.sqrt(norm * factor))
     if out[n - 1] * top_sign < 0.0:
         scale = -scale
-    out[:n] *= scale
+    for i in range(n):
+        out[i] *= scale
 
 
 @njit(cache=True, nogil=True)

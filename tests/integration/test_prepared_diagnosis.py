@@ -10,12 +10,13 @@ import pytest
 
 import mcsim
 from mcsim import cli, config
-from mcsim.diagnosis import report, words
+from mcsim.diagnosis import api, campaign, report, words
 from mcsim.diagnosis.api import describe
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.ensemble import plan
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
+from pictures import quick_pictures
 
 PROPOSED = ("beam_ellipticity", "noise_level", "dipole_modulation")
 SETTINGS = DiagnosisSettings(without=tuple(name for name in mcsim.effects() if name not in PROPOSED))
@@ -63,14 +64,21 @@ def data(run, *effects, seed=99):
     return mcsim.prepare(list(simulate.maps(survey(made), 0)), run)
 
 
-def diagnosed(run, maps, folder=None):
-    return mcsim.diagnose(run, maps, folder, settings=replace(SETTINGS, simulations=300))
+def diagnosed(run, maps, folder=None, simulations=300):
+    with quick_pictures():
+        return mcsim.diagnose(run, maps, folder, settings=replace(SETTINGS, simulations=simulations))
+
+
+@pytest.fixture(scope="module")
+def maps():
+    """Prepared maps without an effect."""
+    return data(model())
 
 
 @pytest.mark.slow
-def test_prepared_maps_of_the_model_agree_with_it_and_an_effect_is_found(tmp_path):
+def test_prepared_maps_of_the_model_agree_with_it_and_an_effect_is_found(maps, tmp_path, monkeypatch):
+    monkeypatch.setattr(api, "batch", lambda workers: campaign.batch(0))  # in this process
     run = model()
-    maps = data(run)
     found = diagnosed(run, maps, tmp_path)
     assert found.test.pvalue > 0.01
     assert found.warnings == ()
@@ -79,14 +87,20 @@ def test_prepared_maps_of_the_model_agree_with_it_and_an_effect_is_found(tmp_pat
     louder = diagnosed(run, data(run, noise))
     assert [(effect.name, effect.channel) for effect in louder.effects] == [("noise_level", "W1")]
     assert abs(louder.effects[0].amplitude - 0.3) < 4.0 * louder.effects[0].sigma
-    # The same data against a model without the steps that lacks the power above l = 40.
-    bare = diagnosed(model(40, steps=False), maps, tmp_path / "bare")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("forked_workers")
+def test_a_model_that_lacks_power_of_the_sky_is_told_so(maps, tmp_path):
+    """Without the steps and the power above l = 40. Nothing of the verdict is asked, so few simulations will do."""
+    bare = diagnosed(model(40, steps=False), maps, tmp_path, 200)
     assert len(bare.warnings) == 1
     assert "set sky.lmax to" in bare.warnings[0]
-    assert json.loads((tmp_path / "bare" / "verdict.json").read_text())["warnings"] == list(bare.warnings)
+    assert json.loads((tmp_path / "verdict.json").read_text())["warnings"] == list(bare.warnings)
     assert words.summary(bare, tmp_path)[0].startswith("warning")
-    assert "Warning: sky.lmax = 40" in report.page(bare)
-    assert mcsim.diagnosis.result.DiagnosisResult.open(tmp_path / "bare").warnings == bare.warnings
+    with quick_pictures():
+        assert "Warning: sky.lmax = 40" in report.page(bare)
+    assert mcsim.diagnosis.result.DiagnosisResult.open(tmp_path).warnings == bare.warnings
 
 
 def test_the_cost_of_a_preparation_is_said():

@@ -20,10 +20,11 @@ from .conftest import ensemble, table
 
 def assert_same(a: Path, b: Path, attributes: bool = True) -> None:
     """Same arrays, summary and scientific attributes, bit for bit."""
-    xr.testing.assert_identical(open_ensemble(a).drop_attrs(), open_ensemble(b).drop_attrs())
-    xr.testing.assert_identical(opening.open_summary(a), opening.open_summary(b))
-    for path in (a, b):
-        assert open_ensemble(path).done.all()
+    one, other = (open_ensemble(path).load() for path in (a, b))
+    xr.testing.assert_identical(one.drop_attrs(), other.drop_attrs())
+    xr.testing.assert_identical(*(opening.open_summary(path).load() for path in (a, b)))
+    assert one.done.all()
+    assert other.done.all()
     if attributes:
         for key in ("science", "digest", "conventions", "packages"):
             assert store.attributes(a)[key] == store.attributes(b)[key]

@@ -38,8 +38,8 @@ def test_a_rotation_only_mixes_orders(one, other, psi, theta, phi):
     a, b = field(one), field(other)
     turned = [ducc0.sht.rotate_alm(x, LMAX, psi, theta, phi) for x in (a, b)]
     before, after = strengths(estimate(TABLES, a, b)), strengths(estimate(TABLES, *turned))
-    for key, value in before.items():
-        np.testing.assert_allclose(after[key], value, rtol=1e-9, atol=1e-9)
+    assert after.keys() == before.keys()
+    np.testing.assert_allclose([after[key] for key in before], list(before.values()), rtol=1e-9, atol=1e-9)
 
 
 @given(seeds, seeds, angles)
@@ -48,8 +48,8 @@ def test_a_turn_about_the_pole_is_a_phase(one, other, alpha):
     a, b = field(one), field(other)
     phase = np.exp(-1j * alpha * np.concatenate([np.full(LMAX + 1 - m, m) for m in range(LMAX + 1)]))
     before, after = estimate(TABLES, a, b), estimate(TABLES, phase * a, phase * b)
-    for (_, M, _), row in ROW.items():
-        np.testing.assert_allclose(after[row], np.exp(-1j * M * alpha) * before[row], atol=1e-10)
+    orders = np.array([mode.M for mode in TABLES.modes])
+    np.testing.assert_allclose(after, np.exp(-1j * orders * alpha)[:, None] * before, atol=1e-10)
 
 
 @given(seeds, seeds)
@@ -58,10 +58,10 @@ def test_exchanged_fields_have_the_sign_of_the_parity(one, other):
     a, b = field(one), field(other)
     forward, backward = estimate(TABLES, a, b), estimate(TABLES, b, a)
     for (L, M, d), row in ROW.items():
-        for l2 in range(max(0, d), min(LMAX, LMAX + d) + 1):
-            here, there = forward[row, l2], backward[ROW[L, M, -d], l2 - d]
-            assert np.isnan(here) == np.isnan(there)
-            np.testing.assert_allclose(there, (-1.0) ** (d + L) * here, atol=1e-10)
+        l2 = np.arange(max(0, d), min(LMAX, LMAX + d) + 1)
+        here, there = forward[row, l2], backward[ROW[L, M, -d], l2 - d]
+        # NaN where the coefficient does not exist, on both sides.
+        np.testing.assert_allclose(there, (-1.0) ** (d + L) * here, atol=1e-10)
 
 
 @given(seeds, seeds, st.floats(-1e3, 1e3), st.floats(-1e3, 1e3))

@@ -110,6 +110,7 @@ def test_a_faint_departure_is_not_named_and_a_clear_one_is(bench):
     assert not any(one.faint for one in clear)
 
 
+@pytest.mark.slow
 def test_the_probability_of_a_name_is_the_rate_at_which_it_is_right(bench):
     """Cases are drawn as it assumes: no effect as often as one of the library, with a strength from the prior."""
     draw, settings = np.random.default_rng(11), DiagnosisSettings(alpha=1.0, prior_snr=(2.0, 4.0, 8.0))

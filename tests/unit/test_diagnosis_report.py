@@ -2,7 +2,6 @@
 
 import json
 import re
-from collections.abc import Iterator
 from dataclasses import fields, replace
 from functools import lru_cache
 from html.parser import HTMLParser
@@ -30,7 +29,7 @@ from mcsim.stats.gaussian import SimulatedGaussian, held_out_pvalues, residual_p
 from mcsim.stats.look_elsewhere import calibrate
 from mcsim.support import resources
 from mcsim.support.numbers import measured, number, p_equals, probability
-from mcsim.support.page import png
+from pictures import quick_pictures
 from refusals import refused
 
 EVIL = "<script>alert('$x_')<img src=x onerror=alert(1)>"
@@ -105,7 +104,7 @@ def bench(nearest_candidates: bool) -> SimpleNamespace:
         run=replace(config.load(resources.workflow("quickstart")), name=EVIL),
         analysis=SimpleNamespace(elements=tuple(elements()), model=fiducial),
         settings=DiagnosisSettings(beam_bins=(5, 2, 2, 1, 1), place_pvalue=0.0123),
-        ensemble=SimpleNamespace(simulations=simulations, residual_rms=1.0 + 0.1 * spread),
+        ensemble=SimpleNamespace(simulations=simulations, residual_rms=1.0 + 0.1 * spread, nuisances=None),
         null=model,
         candidates=candidates,
         calibration=calibrate(
@@ -176,19 +175,14 @@ class Pages(dict[str, str]):
         self.diagnoses = diagnoses
 
     def __missing__(self, kind: str) -> str:
-        self[kind] = report.page(self.diagnoses[kind])
+        with quick_pictures():
+            self[kind] = report.page(self.diagnoses[kind])
         return self[kind]
 
 
 @pytest.fixture(scope="module")
-def pages(diagnoses) -> Iterator[Pages]:
-    def quick(figure, dpi: int) -> bytes:
-        figure.set_layout_engine("none")  # which draws a figure twice
-        return png(figure, 30)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report.page_, "png", quick)
-        yield Pages(diagnoses)
+def pages(diagnoses) -> Pages:
+    return Pages(diagnoses)
 
 
 @pytest.mark.parametrize("kind", VERDICTS)
@@ -332,7 +326,9 @@ def test_settings_are_stored_and_printed(diagnoses, pages, tmp_path):
     assert "level 0.05" in text
 
 
-@pytest.mark.parametrize("kind", VERDICTS)
+@pytest.mark.parametrize(
+    "kind", [kind if kind == "mixture" else pytest.param(kind, marks=pytest.mark.slow) for kind in VERDICTS]
+)
 def test_result_comes_back_from_disk_as_it_was(diagnoses, pages, tmp_path, kind):
     one = diagnoses[kind]
     one.save(tmp_path)
@@ -342,7 +338,8 @@ def test_result_comes_back_from_disk_as_it_was(diagnoses, pages, tmp_path, kind)
     for field in fields(one):
         if field.name not in ("candidates", "residual_maps"):  # with NaN
             np.testing.assert_equal(getattr(again, field.name), getattr(one, field.name))
-    assert report.page(again) == pages[kind]
+    with quick_pictures():
+        assert report.page(again) == pages[kind]
 
 
 def test_a_folder_without_a_diagnosis_is_named(tmp_path):
@@ -352,7 +349,8 @@ def test_a_folder_without_a_diagnosis_is_named(tmp_path):
 
 def test_tables_of_spectra_have_no_map_pictures(diagnoses, tmp_path):
     one = replace(diagnoses["effect"], residual_maps=None, residual_range=None)
-    assert "longitude" not in Page(report.page(one)).text
+    with quick_pictures():
+        assert "longitude" not in Page(report.page(one)).text
     one.save(tmp_path)
     assert DiagnosisResult.open(tmp_path).residual_maps is None
 

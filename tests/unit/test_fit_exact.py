@@ -8,7 +8,7 @@ from mcsim import config
 from mcsim.beamfit import Measurement, Selection, fit, fit_models, report
 from mcsim.beamfit.data import SUMMARY, Row, parts, project
 from mcsim.beamfit.models import model
-from mcsim.beamfit.templates import templates
+from mcsim.beamfit.templates import Templates, templates
 from mcsim.bipolar import parse_mode
 from mcsim.bipolar.theory import ScannedBeam, cmb_biposh_exact
 from mcsim.ensemble import expectation
@@ -63,11 +63,16 @@ def measured(value: np.ndarray, error: float, rows: tuple[Row, ...] = ROWS) -> M
     return Measurement("synthetic", None, "difference", rows, SUMMARY, value, covariance, None)
 
 
+@pytest.fixture(scope="module")
+def made(shared: Survey) -> Templates:
+    """What nested models share is computed once."""
+    return templates(shared, measured(np.zeros(len(ROWS)), 1.0))
+
+
 @pytest.mark.parametrize(
     ("name", "theta"), [("constant", [0.6]), ("linear", [1.4, -0.01]), ("orientation", [0.7, 0.4])]
 )
-def test_the_exact_data_are_a_polynomial_of_second_degree(shared, name, theta):
-    made = templates(shared, measured(np.zeros(len(ROWS)), 1.0))
+def test_the_exact_data_are_a_polynomial_of_second_degree(shared, made, name, theta):
     chosen = model(name, (8, 63))
     polynomial, expected = made.exact(chosen), predicted(shared, np.array(theta) @ chosen.functions(ELL))
     np.testing.assert_allclose(polynomial.at(np.array(theta)), expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())

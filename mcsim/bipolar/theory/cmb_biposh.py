@@ -203,10 +203,12 @@ def _moment_couplings(
     """Yield (L1, L2, X), X[M, s, s'] = sum_{M1 M2} C^{LM}_{L1 M1 L2 M2} w^X_{s,L1 M1} w^Y_{s',L2 M2}."""
     w_x, w_y = x.orientations(), y.orientations()
     for L1 in range(x.L_max + 1):
+        of_x = np.ascontiguousarray(w_x[:, L1])  # of one layout whatever the shape: numba compiles for each
         for L2 in range(abs(L - L1), min(L + L1, y.L_max) + 1):
+            of_y = np.ascontiguousarray(w_y[:, L2])
             coupling = np.zeros((len(orders), len(w_x), len(w_y)), dtype=np.complex128)
             for row, M in zip(coupling, orders, strict=True):
-                _couple((L, M), w_x[:, L1], w_y[:, L2], (L1, L2), row)
+                _couple((L, M), of_x, of_y, (L1, L2), row)
             yield L1, L2, coupling
 
 
@@ -241,8 +243,9 @@ def _spin_table(low: int, high: int, smax: int, L_max: int, response: NDArray[np
     family = np.zeros(2 * L_max + 1)
     for l1 in range(low, high):
         for L1 in range(L_max + 1):
+            zero = 0 * L1  # a literal 0 is a type of its own to numba, compiled anew
             for s in range(min(smax, L1) + 1):
-                bottom, n = threej_family(l1, L1, 0, s, family)
+                bottom, n = threej_family(l1, L1, zero, s, family)
                 for ell in range(bottom, min(bottom + n, lsky + 1)):
                     symbol = family[ell - bottom]
                     mirrored = symbol if (l1 + L1 + ell) % 2 == 0 else -symbol

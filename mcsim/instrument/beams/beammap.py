@@ -10,7 +10,6 @@ import ducc0
 import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from mcsim.errors import InputError
 from mcsim.instrument.beams.coefficients import check_lmax, check_mmax, unpacked
@@ -78,6 +77,8 @@ class BeamMap:
 
     def values(self, theta: NDArray[np.float64], phi: NDArray[np.float64]) -> NDArray[np.float64]:
         """Interpolate the response (cubic) at angles from the centre and azimuths from x towards y; 0 outside."""
+        from scipy.ndimage import map_coordinates  # here: it loads slowly, in every process, and few beams are maps
+
         radius = _PROJECTIONS[self.projection][0](theta) / self.pixel_rad
         column, row = self.centre
         position = [row + radius * np.sin(phi), column + radius * np.cos(phi)]

@@ -46,7 +46,9 @@ class PointingStream:
         self._turns = [step / Fraction(period) for period in periods]
         offsets_deg = (model.spin_phase_deg + line.azimuth_deg, model.precession_phase_deg, model.orbit_phase_deg)
         self._offsets = [Fraction(offset) / 360 for offset in offsets_deg]
-        angles = _TWO_PI * np.array([[float(k * turn % 1) for k in range(BLOCK)] for turn in self._turns])
+        # k x turn modulo 1, exact, then rounded once.
+        parts = [(turn.numerator, turn.denominator) for turn in self._turns]
+        angles = _TWO_PI * np.array([[k * above % below / below for k in range(BLOCK)] for above, below in parts])
         boresight, precession = math.radians(line.boresight_angle_deg), math.radians(model.precession_angle_deg)
         self._constant = (
             np.array([float(BLOCK * turn % 1) for turn in self._turns]),

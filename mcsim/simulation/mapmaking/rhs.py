@@ -136,7 +136,9 @@ def _add_chunk(side_of_a, side_of_b, nside, gains, noise, rhs):  # type: ignore[
     difference = np.empty((rhs.shape[1], BLOCK))
     for first in range(0, noise.size, BLOCK):
         size = min(BLOCK, noise.size - first)
-        difference[:, :size] = noise[first : first + size]
+        for sky in range(rhs.shape[1]):  # a loop: numba takes seconds to compile the assignment of a slice
+            for k in range(size):
+                difference[sky, k] = noise[first + k]
         _add_side(side_of_a, first, nside, gains[0], pixel_a[:size], difference)
         _add_side(side_of_b, first, nside, gains[1], pixel_b[:size], difference)
         for sky in range(rhs.shape[1]):
