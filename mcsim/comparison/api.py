@@ -18,6 +18,7 @@ from mcsim.comparison.looks import look
 from mcsim.comparison.pairs import ChannelPair, Comparison, given, read
 from mcsim.comparison.result import ChannelResult, ComparisonResult, DifferenceResult, Verdict
 from mcsim.comparison.search import (
+    DOUBTFUL,
     EXPLAINED_BY_SAMPLES,
     INTERPOLATING,
     PRECISION,
@@ -136,7 +137,7 @@ def _channel(pair: ChannelPair, sides: Comparison, accuracy: float) -> ChannelRe
     if sides.run is not None and (not sets or sets[0].left > problem.enough or problem.needed < EXPLAINED_BY_SAMPLES):
         problem = replace(problem, library=(*problem.library, *effects_of(pair, sides.run)))
         sets = problem.best()
-    if not sets or not problem.suffices(sets[0]):
+    if not sets or not problem.suffices(sets[0]) or sets[0].left > DOUBTFUL:
         sets = sorted([*sets, *problem.best(slow=True)], key=lambda one: one.left)
     exchanged = bool(sets) and any(difference.exchanges for difference, _ in sets[0].members)
     if rms > accuracy * sky and (

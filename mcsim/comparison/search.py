@@ -27,7 +27,7 @@ EXPLAINED_BY_SAMPLES = 0.95
 FURTHER = 0.7
 """Share of what is left that a further difference must explain to be added."""
 
-FURTHER_BEYOND = 0.95
+FURTHER_BEYOND = 0.85
 """The same where what there is explains enough to be named."""
 
 SLIGHT = 0.1
@@ -35,6 +35,9 @@ SLIGHT = 0.1
 
 LARGEST = 3
 """Differences that act together."""
+
+DOUBTFUL = 0.01
+"""Share of what a set that is named may leave, beyond which slow differences are tried all the same."""
 
 MEASURED = 4
 """Sets of every size that are simulated sample by sample."""
