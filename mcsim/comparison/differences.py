@@ -62,6 +62,8 @@ class Difference:
         True if it is tried only where nothing else explains the maps.
     enough
         Share of the variance that a set with it must explain at most to be named; 1: as all sets.
+    linear
+        True if the response is the template of a small amplitude, and so no better than about a per mille.
     exchanges
         True if it exchanges pixels or files, which can be taken back before the rest is looked for.
     """
@@ -73,6 +75,7 @@ class Difference:
     smooth: ClassVar[bool] = False
     slow: ClassVar[bool] = False
     enough: ClassVar[float] = 1.0
+    linear: ClassVar[bool] = False
     exchanges: ClassVar[bool] = False
 
     def starts(self, state: State) -> list[Vector]:

@@ -27,6 +27,8 @@ REDUNDANT = ("calibration", "monopole_residual", "pixelization", "spectrum")
 class EffectDifference(Difference):
     """An effect of the library, linear in its coordinates."""
 
+    linear = True
+
     def __init__(self, kind: type[Effect], templates: Maps, run: config.RunConfig) -> None:
         self.kind, self.templates, self.run = kind, templates, run
 

@@ -181,11 +181,13 @@ class NoiseShared(Difference):
         Noise of the same samples, or of the same deviates and other hits; from maps, or less the sky simulated.
         """
         count = len(state.maps)
-        pairs = [(j, i) for j in range(count) for i in range(count) if i != j]
-        pairs += [(-1, k) for k, other in enumerate(state.others) if other.a.shape == state.maps.shape]
-        manners = [(0, 0)] if state.pair.scene is None else [(0, 0), (0, 1), (1, 0), (1, 1)]
-        ways = [np.array([0.0, *pair, *manner]) for pair in pairs for manner in manners]
-        return [way + np.eye(5)[0] * state.fit([self._exchanged(way, state)]) for way in ways]
+        splits = [(j, i) for j in range(count) for i in range(count) if i != j]
+        channels = [(-1, k) for k, other in enumerate(state.others) if other.a.shape == state.maps.shape]
+        simulated = [] if state.pair.scene is None else [(1, 0), (1, 1)]
+        ways = [(*pair, *manner) for pair in splits for manner in [(0, 0), (0, 1), *simulated]]
+        ways += [(*pair, *manner) for pair in channels for manner in simulated]  # as they are, they are exchanged
+        values = [np.array([0.0, *way]) for way in ways]
+        return [value + np.eye(5)[0] * state.fit([self._exchanged(value, state)]) for value in values]
 
     def _exchanged(self, way: Vector, state: State) -> Maps:
         """Return other noise less a map's own: the difference of the maps, less that of the sky in them."""

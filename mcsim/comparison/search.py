@@ -162,6 +162,11 @@ class Problem:
         """Return True if a set explains enough to be named."""
         return found.explains >= min([self.needed, *(difference.enough for difference, _ in found.members)])
 
+    def complete(self, found: Set) -> bool:
+        """Return True if what a set leaves is too little to look for anything in it."""
+        linear = any(difference.linear for difference, _ in found.members)
+        return found.left < (ENOUGH if linear else self.enough)
+
     def further(self, found: Set) -> float:
         """Return the share of what a set leaves that a further difference must explain."""
         return FURTHER_BEYOND if self.suffices(found) else FURTHER
@@ -236,7 +241,7 @@ class Problem:
         found = self._sorted(self._extended((), library))
         chosen = found
         for _ in range(LARGEST - 1):
-            if not found or found[0].left < self.enough:
+            if not found or self.complete(found[0]):
                 break
             bases = [one for one in found[:KEPT] if one.explains > SLIGHT]
             bases += [one for one in found[KEPT:] if len(one.members) == 1 and one.members[0][0].exchanges]

@@ -72,7 +72,7 @@ def changes(given: inputs.Inputs, scan: str) -> dict[str, tuple[dict[str, Any], 
             {"sky": lambda sky: turned(sky, 0.1)},
         ),
         "calibration": (filtered(np.full(LMAX + 1, 1.02)), filtered(np.full(LMAX + 1, 0.9996))),
-        "unit": (filtered(np.full(LMAX + 1, 1e-6)), filtered(np.full(LMAX + 1, 1.0 / 1.2505))),
+        "unit": (mapped(lambda m: 1e-6 * m), mapped(lambda m: m / 1.2505)),
         "monopole": (mapped(lambda m: m + 5.0), mapped(lambda m: m - 0.3)),
         "dipole": (mapped(lambda m: m + 3300.0 * x[0]), mapped(lambda m: m + 0.6 * x[1] - 0.3 * x[2])),
         "ordering": tuple({"after": lambda m, to=to: healpy.reorder(m, **{to: True})} for to in ("r2n", "n2r")),
@@ -94,7 +94,7 @@ def changes(given: inputs.Inputs, scan: str) -> dict[str, tuple[dict[str, Any], 
     }  # fmt: skip
 
 
-TIMED = frozenset({"time_shift", "spin_sign", "precession_sign", "gain_drift", "pointing_offset"})
+TIMED = frozenset({"time_shift", "spin_sign", "precession_sign", "gain_drift", "pointing_offset", "map_making"})
 """What needs more than samples without their time."""
 
 
