@@ -20,6 +20,7 @@ from mcsim.diagnosis.campaign import Batch, seeded, with_effects
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps, read_maps
 from mcsim.ensemble.maps import file_names, write_map
+from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
@@ -39,7 +40,7 @@ STRONGER = 1.5
 
 
 def make(
-    settings: Settings, folder: str | Path, cases: int, seed: int, *, workers: int | None = None, quiet: bool = True
+    settings: Settings, folder: str | Path, cases: int, seed: int, *, workers: Workers | None = None, quiet: bool = True
 ) -> Path:
     """Make those of a number of cases of a challenge that are not there yet; return the folder.
 
@@ -142,7 +143,7 @@ def _without_none(value: Any) -> Any:
     return [_without_none(one) for one in value] if isinstance(value, list) else value
 
 
-def run(folder: str | Path, *, workers: int | None = None, quiet: bool = True) -> int:
+def run(folder: str | Path, *, workers: Workers | None = None, quiet: bool = True) -> int:
     """Diagnose the cases of a challenge that have no verdict yet, without looking at the keys; return their number.
 
     The folder, filled by :func:`make`, gets ``verdicts/case-NNN`` with ``verdict.json`` and ``answer.json`` (the data

@@ -19,6 +19,7 @@ from mcsim.diagnosis.candidate import Candidate
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError
 from mcsim.sphere import rng
 from mcsim.stats.detection import power
@@ -36,7 +37,7 @@ STRONG = 8.0
 """Expected S/N from which on an effect that does not act is added as well."""
 
 
-def score(folder: str | Path, *, workers: int | None = None, quiet: bool = True) -> Score:
+def score(folder: str | Path, *, workers: Workers | None = None, quiet: bool = True) -> Score:
     """Check the seals of a challenge, open the keys, and compare them with the verdicts.
 
     The folder gets ``score/score.json``, ``score/report.html`` and ``score/score.png``. ``workers`` are the processes
@@ -62,7 +63,13 @@ def score(folder: str | Path, *, workers: int | None = None, quiet: bool = True)
 
 
 def score_draws(
-    settings: Settings, folder: str | Path, number: int, seed: int, *, workers: int | None = None, quiet: bool = True
+    settings: Settings,
+    folder: str | Path,
+    number: int,
+    seed: int,
+    *,
+    workers: Workers | None = None,
+    quiet: bool = True,
 ) -> Score:
     """Score draws of a model's data vector (:func:`draws`), and write the score into a folder.
 

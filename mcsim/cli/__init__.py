@@ -14,7 +14,7 @@ import typer
 from typer import Argument, Option
 
 from mcsim.cli import ensembles
-from mcsim.cli.common import Config, Png, Processes, Simulations, Workers, interrupt_once, save
+from mcsim.cli.common import Config, Png, Processes, Scheduler, Simulations, Workers, chosen, interrupt_once, save
 from mcsim.errors import InputError, RunError
 
 app = typer.Typer(
@@ -146,7 +146,9 @@ def diagnose(
     case: Annotated[str | None, Option(help="Name of the case; default: that of the model.")] = None,
     without: Annotated[list[str] | None, Option(metavar="EFFECT", help="Do not propose it; repeatable.")] = None,
     simulations: Simulations = None,
+    controls: Annotated[int, Option(min=0, help="Perfect data sets, drawn at higher fidelity and diagnosed too.")] = 0,
     workers: Processes = None,
+    scheduler: Scheduler = None,
     dry_run: Annotated[bool, Option("--dry-run", help="Say simulations, memory and time; simulate none.")] = False,
 ) -> None:
     """Test maps against a model, and find the effect that the model lacks: where, how large, and if adding it helps."""
@@ -157,13 +159,14 @@ def diagnose(
     from mcsim.diagnosis.words import summary
 
     interrupt_once()
-    run, settings = config.load(model), DiagnosisSettings(without=tuple(without or ()), simulations=simulations)
+    where, run = chosen(workers, scheduler), config.load(model)
+    settings = DiagnosisSettings(without=tuple(without or ()), simulations=simulations, controls=controls)
     if workers is not None:
         run = replace(run, compute=replace(run.compute, workers=workers))
     if dry_run:
         print(describe(run, settings))
         return
-    found = judge(run, data, output, case=case, settings=settings, quiet=False)
+    found = judge(run, data, output, case=case, settings=settings, quiet=False, workers=where)
     print("\n".join(summary(found, output)))
 
 
@@ -207,6 +210,7 @@ def challenge_make(
     inventions: Annotated[Path | None, Option(metavar="FILE", help="Python file of effects in no library.")] = None,
     simulations: Simulations = None,
     workers: Workers = None,
+    scheduler: Scheduler = None,
 ) -> None:
     """Draw effects, make the maps of the cases, seal the keys."""
     from mcsim import config
@@ -216,24 +220,24 @@ def challenge_make(
     interrupt_once()
     file = None if inventions is None else str(inventions)
     shared = Settings(config.load(model), sampled_share=sampled_share, out_of_library=file, simulations=simulations)
-    make(shared, output, cases, seed, workers=workers, quiet=False)
+    make(shared, output, cases, seed, workers=chosen(workers, scheduler), quiet=False)
 
 
 @challenge.command("run")
-def challenge_run(folder: Folder, workers: Workers = None) -> None:
+def challenge_run(folder: Folder, workers: Workers = None, scheduler: Scheduler = None) -> None:
     """Diagnose all cases that have no verdict."""
     from mcsim.benchmark.challenge import run as diagnose_all
 
     interrupt_once()
-    print(f"{diagnose_all(folder, workers=workers, quiet=False)} cases diagnosed")
+    print(f"{diagnose_all(folder, workers=chosen(workers, scheduler), quiet=False)} cases diagnosed")
 
 
 @challenge.command("score")
-def challenge_score(folder: Folder, workers: Workers = None) -> None:
+def challenge_score(folder: Folder, workers: Workers = None, scheduler: Scheduler = None) -> None:
     """Open the keys and score the verdicts."""
     from mcsim.benchmark import report, score
 
-    print("\n".join(report.lines(score.score(folder, workers=workers, quiet=False))))
+    print("\n".join(report.lines(score.score(folder, workers=chosen(workers, scheduler), quiet=False))))
 
 
 @challenge.command("draws")
@@ -244,6 +248,7 @@ def challenge_draws(
     seed: Annotated[int, Option(min=0, help="Of the draws.")] = 0,
     simulations: Simulations = None,
     workers: Workers = None,
+    scheduler: Scheduler = None,
 ) -> None:
     """Draw and score compressed data vectors, without maps."""
     from mcsim import config
@@ -251,7 +256,7 @@ def challenge_draws(
     from mcsim.benchmark.folder import Settings
 
     shared = Settings(config.load(model), simulations=simulations)
-    found = score.score_draws(shared, output, number, seed, workers=workers, quiet=False)
+    found = score.score_draws(shared, output, number, seed, workers=chosen(workers, scheduler), quiet=False)
     print("\n".join(report.lines(found)))
 
 

@@ -6,13 +6,13 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config, systematics
-from mcsim.diagnosis import campaign, measured_spectra, null_ensemble, report
+from mcsim.diagnosis import campaign, controls, measured_spectra, null_ensemble, report
 from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, data_vectors
 from mcsim.diagnosis.campaign import asking, batch
 from mcsim.diagnosis.candidate import TemplateBank
@@ -24,6 +24,7 @@ from mcsim.diagnosis.observed_maps import ObservedMaps, checked, read_maps
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.ensemble.plan import cost
+from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError
 from mcsim.simulation import power
 from mcsim.support import folders
@@ -34,6 +35,13 @@ LIBRARIES = ("ducc0", "healpy", "numpy", "scipy")
 """What the simulations of a model and their data vectors are computed with."""
 
 
+class Computing(TypedDict, total=False):
+    """Keywords of :func:`diagnose` on which no result depends."""
+
+    quiet: bool
+    workers: Workers | None
+
+
 def diagnose(
     model: str | Path | Mapping[str, Any] | config.RunConfig,
     data: str | Path | Sequence[NDArray[np.float64]],
@@ -41,14 +49,14 @@ def diagnose(
     *,
     case: str | None = None,
     settings: DiagnosisSettings | None = None,
-    quiet: bool = True,
+    **computing: Unpack[Computing],
 ) -> DiagnosisResult:
     """Diagnose the gap between a simulation and data.
 
     Parameters
     ----------
     model
-        Fiducial model of sky, beams, scan and noise: a run. Its ``compute.workers`` processes simulate.
+        Fiducial model of sky, beams, scan and noise: a run.
     data
         Folder with ``{channel}.fits`` or ``{channel}_{split}.fits``, uK; or the maps themselves, shape (npix,) each, in
         the order channel by channel, split by split; or a table of measured spectra
@@ -58,10 +66,12 @@ def diagnose(
     case
         Name; default: that of the run.
     settings
-        Library of effects, those that are no candidates, levels, cuts, bins and numbers of simulations; default:
-        those of :class:`~mcsim.diagnosis.settings.DiagnosisSettings`.
-    quiet
-        Report no progress.
+        Library of effects, those that are no candidates, levels, cuts, bins, numbers of simulations and of controls;
+        default: those of :class:`~mcsim.diagnosis.settings.DiagnosisSettings`.
+    **computing
+        ``quiet`` (default True): report no progress. ``workers``: number of processes that simulate, 0 for this one
+        (default: the ``compute.workers`` of the run); or the address of a running Dask scheduler, or a
+        ``distributed.Client``, whose workers share the file system.
 
     Returns
     -------
@@ -73,10 +83,11 @@ def diagnose(
     InputError
         If a run, data or settings cannot be used.
     """
+    quiet, workers = _computing(**computing)
     run = model if isinstance(model, config.RunConfig) else config.load(model)
     settings = settings or DiagnosisSettings()
     library = systematics.catalogue() if settings.library is None else systematics.checked(settings.library)
-    settings = replace(settings, without=tuple(settings.without), library=None)
+    wanted, settings = settings, replace(settings, without=tuple(settings.without), library=None, controls=0)
     for effect in settings.without:
         systematics.get(effect, library)
     if output is not None:
@@ -84,6 +95,7 @@ def diagnose(
     threads = os.cpu_count() or 1
     task: Callable[[Job], NDArray[np.float64]] = data_vectors
     table = read_spectra(data, run) if isinstance(data, str | Path) and Path(data).is_file() else None
+    controls.check(wanted.controls, table is None)
     if table is not None:
         run, task = measured_spectra.estimator_for(run, table), table
         analysis = measured_spectra.analysis_of_spectra(run, table, settings.without, threads, settings, library)
@@ -93,17 +105,24 @@ def diagnose(
     maps: Sequence[NDArray[np.float64]] = ()
     if table is None:
         maps = read_maps(analysis.model, data) if isinstance(data, str | Path) else checked(analysis.model, data)
-    with batch(run.compute.workers) as call:
+    with batch(run.compute.workers if workers is None else workers) as call:
         with asking(call, quiet, task, "simulations of the model and of each effect") as ask:
             ensemble, bank = _learned(run, analysis, ask)
+        known = context(analysis, ensemble if table is None else ensemble.of_mean(table.realizations), bank)
+        drawn = None
+        if wanted.controls:
+            drawn = controls.diagnose_controls(known, _key(run, analysis), wanted.controls, call, quiet)
         with asking(call, quiet, task, "simulations of fitted effects") as ask:
-            known = context(analysis, ensemble if table is None else ensemble.of_mean(table.realizations), bank)
             found: DataSet[Any] = (
                 ObservedMaps(known, maps, ask) if table is None else MeasuredSpectra(known, table, ask)
             )
             diagnosis = diagnose_data(found, case or run.name)
     if table is None:
         diagnosis = replace(diagnosis, warnings=_warnings(analysis))
+    if drawn is not None:
+        first = (*drawn.warnings, *diagnosis.warnings)
+        done = replace(diagnosis.settings, controls=wanted.controls)
+        diagnosis = replace(diagnosis, controls=drawn, warnings=first, settings=done)
     if output is not None:
         diagnosis.save(output)
         report.write(diagnosis, Path(output) / "report.html")
@@ -112,12 +131,19 @@ def diagnose(
 
 def describe(run: config.RunConfig, settings: DiagnosisSettings) -> str:
     """Return a text on the cost of a diagnosis of maps: simulations, memory, time, and that of preparing the maps."""
-    analysis = analysis_of(run, settings.without, os.cpu_count() or 1, settings)
+    analysis = analysis_of(run, settings.without, os.cpu_count() or 1, replace(settings, controls=0))
     power.check(analysis.model.survey)
     number = sum(job.count for job in campaign.plan(analysis, settings.simulations).values())
     size = len(analysis.elements)
     head = f"{run.name}: at most {number} simulations before data, for a data vector of {size}"
-    return "\n".join([head, *cost(run).lines(number, run.compute.workers)])
+    lines = [head, *cost(run).lines(number, run.compute.workers)]
+    if settings.controls:
+        lines += controls.describe(analysis, settings.controls, run.compute.workers)
+    return "\n".join(lines)
+
+
+def _computing(quiet: bool = True, workers: Workers | None = None) -> tuple[bool, Workers | None]:
+    return quiet, workers
 
 
 def _warnings(analysis: Analysis) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
+from mcsim.diagnosis.control_result import Controls
 from mcsim.diagnosis.localisation import Place
 from mcsim.diagnosis.selection import Contrast, Verdict
 from mcsim.diagnosis.settings import DiagnosisSettings
@@ -158,6 +159,8 @@ class DiagnosisResult:
         Settings of the diagnosis; numbers of simulations, the seed and the data, by name.
     configuration
         The run that is the model, as JSON.
+    controls
+        Diagnoses of data drawn from the model at higher fidelity; None: none were asked for.
     faint, probability
         True if sets describe the data, but are less probable than all else together; their posterior probability.
     """
@@ -191,6 +194,7 @@ class DiagnosisResult:
     provenance: dict[str, Any]
     configuration: str
     warnings: tuple[str, ...] = ()
+    controls: Controls | None = None
     faint: bool = False
     probability: float = 1.0
 
@@ -262,6 +266,7 @@ class DiagnosisResult:
             ],
             "notes": list(self.notes),
             **({"warnings": list(self.warnings)} if self.warnings else {}),
+            **({"controls": self.controls.to_json()} if self.controls is not None else {}),
         }
 
     def to_dataset(self) -> xr.Dataset:

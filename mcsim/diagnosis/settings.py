@@ -17,6 +17,9 @@ class DiagnosisSettings:
         Effects by name, as :func:`mcsim.effects` returns them; None: all of these.
     simulations
         Simulations for the covariance of the data vector; None: ``sims_per_element`` for each of its elements.
+    controls
+        Data sets that are drawn from the model at higher fidelity and diagnosed too: what they say tells if the verdict
+        on the data can be trusted (:mod:`mcsim.diagnosis.controls`).
     alpha
         Global p-value up to which the model does not describe the data.
     residual_level, further_level
@@ -103,7 +106,7 @@ class DiagnosisSettings:
 
     Notes
     -----
-    Each setting has a part in the key of the cache: another value simulates the model anew.
+    Each setting but ``controls`` has a part in the key of the cache: another value simulates the model anew.
 
     Examples
     --------
@@ -120,6 +123,7 @@ class DiagnosisSettings:
     without: tuple[str, ...] = ()
     library: Library | None = None
     simulations: int | None = None
+    controls: int = 0
     alpha: float = 0.05
     residual_level: float = 0.02
     further_level: float = 0.005

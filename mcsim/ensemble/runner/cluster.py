@@ -26,6 +26,9 @@ signal.signal(signal.SIGINT, signal.SIG_IGN)
 logging.getLogger("distributed").setLevel(logging.CRITICAL)
 """
 
+Workers = int | str | Client
+"""Number of local processes, the address of a running scheduler, or a client, which is left open."""
+
 TURN_S = 30.0
 ALONE_S = 300.0
 """Time that a run waits for a worker if all are lost."""
@@ -87,6 +90,17 @@ def local_client(workers: int) -> Iterator[Client]:
                 f"The worker processes did not start ({type(error).__name__}: {error}); run the same command again "
                 "when the machine is less busy or has more memory."
             ) from error
+        yield client
+
+
+@contextmanager
+def connected(workers: Workers) -> Iterator[Client]:
+    """Yield the client of so many local processes or of the scheduler at an address; or the given one, left open."""
+    if isinstance(workers, Client):
+        _check_workers(workers)
+        yield workers
+        return
+    with remote_client(workers) if isinstance(workers, str) else local_client(workers) as client:
         yield client
 
 
@@ -229,7 +243,8 @@ def _first_of(roll: Roll, flying: list[Future]) -> set[Future]:
     missed = 0
     while True:
         try:
-            return set(wait(flying, timeout=TURN_S, return_when="FIRST_COMPLETED")[0])
+            with roll.client.as_current():  # distributed waits with the default client, which may be another, or none
+                return set(wait(flying, timeout=TURN_S, return_when="FIRST_COMPLETED")[0])
         except TimeoutError:
             missed = 0 if roll.call() else missed + 1
         if missed * TURN_S >= ALONE_S:
