@@ -120,9 +120,11 @@ def _described(kind: Any) -> str:
         ("Scope", kind.scope),
         ("Amplitude", kind.unit),
         ("Other parameters", ", ".join(settings)),
+        *(("Possible", f"`{one.parameter}` from {one.low:g} to {one.high:g}: {one.source}") for one in kind.bounds),
         ("Cause", kind.cause),
         ("Shows as", kind.signature),
         ("Source", kind.source),
+        ("Proposed", "" if kind.proposed else "on request"),
     ]
     lines = "\n".join(f"- **{name}**: {text}" for name, text in rows if text)
     summary = str(kind.__doc__).split("\n\n")[0].replace("\n", " ")

@@ -8,7 +8,8 @@ order.
 Ensembles: `run`, `merge`, `open_ensemble`, `open_summary`; configurations: `load_config`, `RunConfig`.
 Instrument: `Beam`, `ScanModel`, `Moments`, and what they make of one sky: `observe`.
 Statistics: `biposh` of maps at hand, `predict` of a run, `fit` of an effective beam, `prepare` and `diagnose` of maps
-with `DiagnosisSettings`, `compare` of two simulations.
+with `DiagnosisSettings`, also by the simulator of another program, an `ExternalModel`; `limit` of what maps can tell
+with `LimitSettings`, `compare` of two simulations.
 Systematic effects: `effects`, and `Effect` to write one. Bad input raises `InputError`.
 
 Names are loaded when they are first used, so that ``import mcsim`` costs little.
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from mcsim.config import RunConfig
     from mcsim.config import load as load_config
     from mcsim.diagnosis.api import diagnose
+    from mcsim.diagnosis.external import ExternalModel
     from mcsim.diagnosis.settings import DiagnosisSettings
     from mcsim.ensemble.maps import write_maps
     from mcsim.ensemble.opening import open_ensemble, open_summary
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
     from mcsim.ensemble.prepare import prepare
     from mcsim.ensemble.runner import merge, run
     from mcsim.errors import InputError
+    from mcsim.information.api import limit
+    from mcsim.information.settings import LimitSettings
     from mcsim.instrument.beams import Beam
     from mcsim.instrument.scan import Moments, ScanModel
     from mcsim.simulation.observe import observe
@@ -42,7 +46,9 @@ __all__ = [
     "Beam",
     "DiagnosisSettings",
     "Effect",
+    "ExternalModel",
     "InputError",
+    "LimitSettings",
     "Moments",
     "RunConfig",
     "ScanModel",
@@ -52,6 +58,7 @@ __all__ = [
     "diagnose",
     "effects",
     "fit",
+    "limit",
     "load_config",
     "merge",
     "observe",
@@ -67,7 +74,9 @@ _HOME = {
     "Beam": "mcsim.instrument.beams",
     "DiagnosisSettings": "mcsim.diagnosis.settings",
     "Effect": "mcsim.systematics",
+    "ExternalModel": "mcsim.diagnosis.external",
     "InputError": "mcsim.errors",
+    "LimitSettings": "mcsim.information.settings",
     "Moments": "mcsim.instrument.scan",
     "RunConfig": "mcsim.config",
     "ScanModel": "mcsim.instrument.scan",
@@ -76,6 +85,7 @@ _HOME = {
     "diagnose": "mcsim.diagnosis.api",
     "effects": "mcsim.systematics",
     "fit": "mcsim.beamfit.api",
+    "limit": "mcsim.information.api",
     "load_config": "mcsim.config:load",
     "merge": "mcsim.ensemble.runner",
     "observe": "mcsim.simulation.observe",

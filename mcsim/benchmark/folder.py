@@ -11,6 +11,7 @@ from mcsim.benchmark.case import Member, Prior, Truth
 from mcsim.benchmark.out_of_library import load
 from mcsim.errors import InputError
 from mcsim.support.folders import write_whole
+from mcsim.systematics import get
 
 SETTINGS, MAPS, KEYS, SEAL, VERDICTS = "challenge.json", "cases", "keys", "SEAL", "verdicts"
 
@@ -23,7 +24,7 @@ class Settings:
     with out-of-library effects, are made sample by sample, by another route than that which the diagnosis simulates
     with. ``out_of_library`` is a Python file with classes of effects that no library has; None: there are none, or they
     are not known because the challenge was read from its folder. ``simulations`` is the number for the covariance of
-    the data vector; default: ten for each element.
+    the data vector; default: ten for each element. ``including`` names effects that are proposed on request alone.
     """
 
     model: config.RunConfig
@@ -31,9 +32,12 @@ class Settings:
     sampled_share: float = 0.5
     out_of_library: str | None = None
     simulations: int | None = None
+    including: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Raise InputError for a share outside 0 to 1."""
+        """Raise InputError for a share outside 0 to 1, or an effect that there is not."""
+        for name in self.including:
+            get(name)
         if not 0.0 <= self.sampled_share <= 1.0:
             raise InputError(f"a share of {self.sampled_share:g} made sample by sample is none; give 0 to 1.")
 
@@ -47,6 +51,7 @@ class Settings:
             "inventions": None if self.out_of_library is None else sorted(load(self.out_of_library)),
             "simulations": self.simulations,
         }
+        plain |= {"including": list(self.including)} if self.including else {}
         for path, content in ((folder / SETTINGS, plain), (folder / KEYS / SETTINGS, {"seed": seed})):
             text = json.dumps(content, indent=1, sort_keys=True) + "\n"
             if not path.is_file():
@@ -60,7 +65,8 @@ class Settings:
         plain = read_json(folder / SETTINGS, "make the challenge with mcsim challenge make")
         try:
             prior, share = Prior(**plain["prior"]), plain["sampled_share"]
-            return cls(config.load(plain["model"]), prior, share, None, plain["simulations"])
+            including = tuple(plain.get("including", ()))
+            return cls(config.load(plain["model"]), prior, share, None, plain["simulations"], including)
         except (KeyError, TypeError) as error:
             raise InputError(f"{folder / SETTINGS} lacks what a challenge needs ({error}); make it again.") from error
 

@@ -158,7 +158,12 @@ class LearnedModel(EffectsLibrary):
 
     def simulate(self, jobs: Sequence[Job]) -> list[Vector]:
         """Return the data vectors of simulations that are made in this process."""
-        return [data_vectors(replace(job, without=()))[:, self.rows] for job in jobs]
+        beside = len(self.context.analysis.slices)
+        found = [data_vectors(replace(job, without=())) for job in jobs]
+        return [
+            row[:, [*self.rows, *range(row.shape[1] - beside, row.shape[1])] if job.slices else self.rows]
+            for job, row in zip(jobs, found, strict=True)
+        ]
 
     def expected_snr(self, effect: config.Effect) -> float:
         """Return the expected S/N of the mean response, from two halves of the skies: noise is no part of it."""
@@ -178,18 +183,22 @@ class LearnedModel(EffectsLibrary):
 
 def learned_model(settings: Settings, without: tuple[str, ...] = ()) -> LearnedModel:
     """Return a model that was learned before, without some effects; RunError if it is not in the cache."""
-    return _learned(config.to_json(settings.model), settings.simulations, without)
+    return _learned(config.to_json(settings.model), _proposing(settings), without)
+
+
+def _proposing(settings: Settings) -> DiagnosisSettings:
+    return DiagnosisSettings(simulations=settings.simulations, including=settings.including)
 
 
 @lru_cache(maxsize=3)
-def _learned(model: str, simulations: int | None, without: tuple[str, ...]) -> LearnedModel:
+def _learned(model: str, settings: DiagnosisSettings, without: tuple[str, ...]) -> LearnedModel:
     if without:
-        full = _learned(model, simulations, ()).context
+        full = _learned(model, settings, ()).context
         analysis, ensemble, bank, rows = reduced(full, without)
         known = context(analysis, ensemble, bank)
     else:
         run = config.from_json(model)
-        known = prepared(run, analysis_of(run, settings=DiagnosisSettings(simulations=simulations)), _refuse)
+        known = prepared(run, analysis_of(run, settings=settings), _refuse)
         rows = np.arange(len(known.analysis.elements))
     return LearnedModel(known.null, known.templates, known.candidates, known.calibration, rows, known)
 
@@ -207,5 +216,5 @@ def workers_of(settings: Settings, workers: Workers | None, quiet: bool) -> Iter
     run = settings.model
     with batch(run.compute.workers if workers is None else workers) as call:
         with asking(call, quiet) as ask:
-            prepared(run, analysis_of(run, settings=DiagnosisSettings(simulations=settings.simulations)), ask)
+            prepared(run, analysis_of(run, settings=_proposing(settings)), ask)
         yield call

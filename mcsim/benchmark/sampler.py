@@ -65,7 +65,9 @@ class CaseSampler:
         for index, candidate in enumerate(self.effects_library.candidates):
             largest = float(np.max(np.linalg.norm(self._white(index), axis=0)))
             # Of an effect without response and without a limit the product is NaN, which is not larger.
-            if candidate.effect.parametrization.max_amplitude * largest >= self.prior.weakest:
+            amplitudes = [one.high for one in candidate.effect.bounds if one.parameter == "amplitude"]
+            limit = min([candidate.effect.parametrization.max_amplitude, *amplitudes])
+            if limit * largest >= self.prior.weakest:
                 found.setdefault(candidate.name, {}).setdefault(candidate.channel, []).append(index)
         return {name: list(channels.values()) for name, channels in found.items()}
 

@@ -276,6 +276,15 @@ SIGNATURES = {
     "mapmaking_convergence": Signature("ecliptic"),
     "orientation_averaging": Signature("ecliptic", (2,)),
     "spectrum": Signature("", (0,), "even"),
+    "sidelobe_pickup": Signature("ecliptic"),
+    "nonlinearity": Signature("", (0, 1, 2)),
+    "gain_spin": Signature("ecliptic", (0, 1, 2)),
+    "bandpass_mismatch": Signature("galactic"),
+    "orbital_dipole": Signature("ecliptic", (0, 1)),
+    "spin_synchronous_offset": Signature("ecliptic"),
+    "pointing_jitter": Signature("", (0,), "even"),
+    "excess_noise": Signature("", (0,), "even"),
+    "lensing": Signature("", (0,), "even"),
 }
 
 

@@ -14,7 +14,18 @@ import typer
 from typer import Argument, Option
 
 from mcsim.cli import ensembles
-from mcsim.cli.common import Config, Png, Processes, Scheduler, Simulations, Workers, chosen, interrupt_once, save
+from mcsim.cli.common import (
+    Config,
+    Including,
+    Png,
+    Processes,
+    Scheduler,
+    Simulations,
+    Workers,
+    chosen,
+    interrupt_once,
+    save,
+)
 from mcsim.errors import InputError, RunError
 
 app = typer.Typer(
@@ -103,7 +114,7 @@ def fit(
 
 @app.command()
 def beam(
-    source: Annotated[str, Argument(metavar="BEAM", help="Beam map or b_lm (FITS), or a CONFIG.")],
+    source: Annotated[str, Argument(metavar="BEAM", help="Beam map or b_lm (FITS), B_l (text), or a CONFIG.")],
     lmax: Annotated[int, Option(min=2, max=8192, help="Degree of the coefficients.")] = 2048,
     m_max: Annotated[int | None, Option(min=0, help="Order; default: chosen from the beam.")] = None,
     pixel_deg: Annotated[float | None, Option(help="Side of a pixel of a beam map; default: its header's.")] = None,
@@ -145,6 +156,7 @@ def diagnose(
     output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Folder for verdict and report.")],
     case: Annotated[str | None, Option(help="Name of the case; default: that of the model.")] = None,
     without: Annotated[list[str] | None, Option(metavar="EFFECT", help="Do not propose it; repeatable.")] = None,
+    including: Including = None,
     simulations: Simulations = None,
     controls: Annotated[int, Option(min=0, help="Perfect data sets, drawn at higher fidelity and diagnosed too.")] = 0,
     workers: Processes = None,
@@ -160,7 +172,9 @@ def diagnose(
 
     interrupt_once()
     where, run = chosen(workers, scheduler), config.load(model)
-    settings = DiagnosisSettings(without=tuple(without or ()), simulations=simulations, controls=controls)
+    settings = DiagnosisSettings(
+        without=tuple(without or ()), including=tuple(including or ()), simulations=simulations, controls=controls
+    )
     if workers is not None:
         run = replace(run, compute=replace(run.compute, workers=workers))
     if dry_run:
@@ -168,6 +182,48 @@ def diagnose(
         return
     found = judge(run, data, output, case=case, settings=settings, quiet=False, workers=where)
     print("\n".join(summary(found, output)))
+
+
+@app.command()
+def limit(
+    model: Config,
+    output: Annotated[
+        Path | None, Option("-o", "--output", metavar="DIR", help="Folder for limit.json, limit.zarr and limit.png.")
+    ] = None,
+    only: Annotated[list[str] | None, Option(metavar="EFFECT", help="Compute only this one; repeatable.")] = None,
+    without: Annotated[list[str] | None, Option(metavar="EFFECT", help="Leave it out; repeatable.")] = None,
+    nuisance: Annotated[
+        list[str] | None, Option(metavar="EFFECT[:CHANNEL]=WIDTH", help="Unknown within this prior; repeatable.")
+    ] = None,
+    unknown_dipole_uk: Annotated[float, Option(help="Rms of a monopole and dipole of which nothing is known.")] = 0.0,
+    probes: Annotated[int, Option(min=3, help="Random probes.")] = 64,
+    orders: Annotated[int, Option(min=0, help="Orders of the fiducial beams in the inverse covariance.")] = 0,
+    dense: Annotated[bool, Option("--dense", help="Whole matrices, for small maps.")] = False,
+    dry_run: Annotated[bool, Option("--dry-run", help="Say memory and time; compute nothing.")] = False,
+) -> None:
+    """Say how small an effect these maps could tell at best, before any data, and which effects look alike."""
+    from mcsim import config
+    from mcsim.information.api import describe, widths
+    from mcsim.information.api import limit as compute
+    from mcsim.information.settings import LimitSettings
+
+    interrupt_once()
+    settings = LimitSettings(
+        only=tuple(only or ()),
+        without=tuple(without or ()),
+        nuisances=widths(nuisance or ()),
+        unknown_dipole_uk=unknown_dipole_uk,
+        probes=probes,
+        orders=orders,
+        dense=dense,
+    )
+    if dry_run:
+        print(describe(config.load(model), settings))
+        return
+    found = compute(model, output, settings=settings, quiet=False)
+    print("\n".join(found.lines()))
+    if output is not None:
+        print(f"written: {output / 'limit.json'}, {output / 'limit.zarr'}, {output / 'limit.png'}")
 
 
 @app.command()
@@ -208,6 +264,7 @@ def challenge_make(
     seed: Annotated[int, Option(min=0, help="Of the draws; keep it as secret as the keys.")] = 0,
     sampled_share: Annotated[float, Option(min=0.0, max=1.0, help="Share of maps made sample by sample.")] = 0.5,
     inventions: Annotated[Path | None, Option(metavar="FILE", help="Python file of effects in no library.")] = None,
+    including: Including = None,
     simulations: Simulations = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
@@ -219,7 +276,13 @@ def challenge_make(
 
     interrupt_once()
     file = None if inventions is None else str(inventions)
-    shared = Settings(config.load(model), sampled_share=sampled_share, out_of_library=file, simulations=simulations)
+    shared = Settings(
+        config.load(model),
+        sampled_share=sampled_share,
+        out_of_library=file,
+        simulations=simulations,
+        including=tuple(including or ()),
+    )
     make(shared, output, cases, seed, workers=chosen(workers, scheduler), quiet=False)
 
 
@@ -246,6 +309,7 @@ def challenge_draws(
     output: Target,
     number: Annotated[int, Option(min=1, help="Number of draws.")] = 1000,
     seed: Annotated[int, Option(min=0, help="Of the draws.")] = 0,
+    including: Including = None,
     simulations: Simulations = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
@@ -255,7 +319,7 @@ def challenge_draws(
     from mcsim.benchmark import report, score
     from mcsim.benchmark.folder import Settings
 
-    shared = Settings(config.load(model), simulations=simulations)
+    shared = Settings(config.load(model), simulations=simulations, including=tuple(including or ()))
     found = score.score_draws(shared, output, number, seed, workers=chosen(workers, scheduler), quiet=False)
     print("\n".join(report.lines(found)))
 
@@ -269,6 +333,10 @@ def effects(name: Annotated[str | None, Argument(metavar="EFFECT", help="Only th
         parameters = ", ".join(f"{field.name} = {field.default!r}" for field in fields(kind))
         typer.secho(f"{kind.name} ({kind.scope}; amplitude in {kind.unit})", bold=True)
         print(f"  parameters  {parameters}")
+        for bound in kind.bounds:
+            print(f"  possible    {bound.parameter} from {bound.low:g} to {bound.high:g}: {bound.source}")
+        if not kind.proposed:
+            print(f"  proposed    on request: mcsim diagnose --with {kind.name}")
         for key in ("cause", "signature", "source"):
             print(f"  {key:<11} {getattr(kind, key)}")
 

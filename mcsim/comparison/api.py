@@ -26,6 +26,7 @@ from mcsim.comparison.search import (
     with_sharper_sky,
 )
 from mcsim.errors import InputError
+from mcsim.simulation.noise import of_map
 from mcsim.support import folders
 from mcsim.support.progress import reporting
 
@@ -167,9 +168,7 @@ def _result(
     nearest = _described(sets[0], pair.name, problem)[0] if sets and problem is not None else None
     scene, noise = pair.scene, np.nan
     if sides.run is not None and scene is not None:
-        sigma0 = next(c.noise.sigma0_uk for c in sides.run.channels if c.name == pair.name)
-        hits = np.stack([m.hits for m in scene.moments])[seen]
-        noise = sigma0 * float(np.sqrt(np.mean(1.0 / hits)))
+        noise = _noise_rms(sides.run, pair)
     return ChannelResult(
         name=pair.name,
         splits=pair.splits,
@@ -189,6 +188,19 @@ def _result(
         seen=seen,
         hits=None if scene is None else np.stack([m.hits for m in scene.moments]),
     )
+
+
+def _noise_rms(run: config.RunConfig, pair: ChannelPair) -> float:
+    """Return the rms of the noise that a run describes over the pixels of a channel that are seen, uK."""
+    assert pair.scene is not None  # the caller looked
+    spec = next(c for c in run.channels if c.name == pair.name)
+    found = [
+        of_map(run, spec, split, m)[1] for split, m in zip(run.map.splits or (None,), pair.scene.moments, strict=True)
+    ]
+    levels = np.stack(
+        [np.zeros(m.npix) if own is None else own for own, m in zip(found, pair.scene.moments, strict=True)]
+    )
+    return _rms(levels[pair.seen])
 
 
 def _described(found: Set, channel: str, problem: Problem | None) -> tuple[DifferenceResult, ...]:

@@ -86,7 +86,7 @@ def effects_of(pair: ChannelPair, run: config.RunConfig) -> Iterator[EffectDiffe
     sky, nthreads = pair.scene.sky, pair.scene.nthreads
     bare = simulate.maps(survey(alone, nthreads), 0, nthreads, sky)
     for name, kind in catalogue().items():
-        if kind.parametrization.stochastic or name in REDUNDANT:
+        if kind.parametrization.stochastic or name in REDUNDANT or not kind.proposed:
             continue
         templates = []
         try:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.comparison.scene import Maps, Scene, scene_of, sky_in
+from mcsim.ensemble.external import named_source, source_of
 from mcsim.ensemble.maps import file_names
 from mcsim.errors import InputError
 from mcsim.simulation import simulate
@@ -122,7 +123,8 @@ def _orders(run: config.RunConfig) -> int:
 def quiet(run: config.RunConfig) -> config.RunConfig:
     """Return the run without noise and effects, and with nothing to estimate; InputError if it prepares its maps."""
     _check_steps(run)
-    channels = tuple(replace(channel, noise=config.Noise()) for channel in run.channels)
+    run = named_source(run)[0]
+    channels = tuple(channel.without_noise() for channel in run.channels)
     biposh = replace(run.biposh, L_max=0, pairs="auto")
     return replace(run, channels=channels, effects=(), biposh=biposh)
 
@@ -132,6 +134,11 @@ def _check_steps(run: config.RunConfig) -> None:
         raise InputError(
             f"{run.name} has [[preparation]], but maps are compared as they were made; remove it, and give maps that "
             "are not prepared."
+        )
+    if run.map.split_by != "time":
+        raise InputError(
+            f'{run.name} has map.split_by = "{run.map.split_by}", but the samples of maps that are compared are found '
+            'by their time; use splits by "time", or none.'
         )
 
 
@@ -157,12 +164,27 @@ def _side(side: str | Path, run: config.RunConfig | None, nthreads: int) -> dict
     path = Path(side)
     if path.is_dir():
         return _folder(path, run)
-    own = config.load(side)
+    own, external = named_source(config.load(side))
     _check_steps(own)
-    shared = survey(own, nthreads)
     if run is not None and own.map.frame != run.map.frame:
         raise InputError(f"{side} makes maps in {own.map.frame} coordinates, the model in {run.map.frame}; choose one.")
+    if external is not None:
+        return _external(quiet(own), external, nthreads)
+    shared = survey(own, nthreads)
     return dict(zip(shared.map_names, simulate.maps(shared, 0, nthreads), strict=True))
+
+
+def _external(own: config.RunConfig, given: str, nthreads: int) -> dict[str, NDArray[np.float64]]:
+    """Return the first stored maps of another program, or those that its simulator makes of the run's sky."""
+    source, sky = source_of(own, given), None
+    if source.count is None:
+        if not source.takes_sky:
+            raise InputError(
+                f"{source.label} draws a sky of its own, so that no other side has the same; give its simulate an "
+                "argument sky."
+            )
+        sky = simulate.draw_sky(survey(own, nthreads), 0)
+    return dict(zip(config.map_names(own), source.maps(own.ensemble.seed, 0, sky=sky), strict=True))
 
 
 def _folder(folder: Path, run: config.RunConfig | None) -> dict[str, NDArray[np.float64]]:

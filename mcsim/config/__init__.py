@@ -1,21 +1,18 @@
 """Configuration of a run: schema 1, its checks, and the hash of what defines a result."""
 
+from mcsim.config.beams import BeamBlm, BeamEllipticalGaussian, BeamGaussian, BeamMap, BeamWindow
 from mcsim.config.identity import differences, digest, science
 from mcsim.config.load import check_skies, from_json, json_schema, load, prepared_grid, resolved, to_dict, to_json
+from mcsim.config.noise import Noise
 from mcsim.config.paths import channel_path, sky_path
 from mcsim.config.schema import (
     Beam,
-    BeamBlm,
-    BeamEllipticalGaussian,
-    BeamGaussian,
-    BeamMap,
     Biposh,
     Channel,
     Compute,
     Effect,
     Ensemble,
     Map,
-    Noise,
     RunConfig,
     Scan,
     ScanDifferencing,
@@ -35,6 +32,7 @@ __all__ = [
     "BeamEllipticalGaussian",
     "BeamGaussian",
     "BeamMap",
+    "BeamWindow",
     "Biposh",
     "Channel",
     "Compute",

@@ -18,11 +18,15 @@ from mcsim.support import folders
 
 
 class Rule(NamedTuple):
-    """Rules of a key that names files: the kind of packaged name, the words and the placeholders that it may hold."""
+    """Rules of a key that names files: the kind of packaged name, the words and the placeholders that it may hold.
+
+    What is not ``checked`` is no file that must exist, and no part of the run's hash.
+    """
 
     packaged: str | None = None
     words: tuple[str, ...] = ()
     placeholders: tuple[str, ...] = ()
+    checked: bool = True
 
 
 RULES = {
@@ -35,7 +39,14 @@ RULES = {
     "beam_b.path": Rule(placeholders=("channel",)),
     "scan.path": Rule(placeholders=("channel", "split")),
     "scan.model": Rule(packaged="scan_models", placeholders=("channel", "split")),
+    "channel.mask": Rule(placeholders=("channel", "split")),
+    "noise.hits": Rule(placeholders=("channel", "split")),
+    "noise.variance": Rule(placeholders=("channel", "split")),
+    "noise.maps": Rule(placeholders=("channel",)),
+    "noise.mask": Rule(placeholders=("channel",)),
+    "noise.files": Rule(placeholders=("channel", "split", "realization")),
     "effect.template": Rule(),
+    "ensemble.maps": Rule(placeholders=("realization", "channel", "split"), checked=False),
     "preparation.mask": Rule(placeholders=("channel", "split")),
     "preparation.window": Rule(placeholders=("channel",)),
     "preparation.own_window": Rule(placeholders=("channel",)),
@@ -75,7 +86,7 @@ def in_files(value: Any, key: str = "") -> Any:
 def table_of(given: Tabled) -> dict[str, str]:
     """Write an object to the cache; return the table that represents it in a run, the path last."""
     table: dict[str, str] = {}
-    folder = _kept(lambda scratch: table.update(given.as_table(scratch)), type(given).__name__)
+    folder = kept(lambda scratch: table.update(given.as_table(scratch)), type(given).__name__)
     key, name = table.popitem()
     return {**table, key: _path(folder / name, key)}
 
@@ -88,11 +99,11 @@ def _file_of(given: Any, key: str) -> str:
     array = np.asarray(given)
     if array.dtype.kind not in "biufc":
         raise InputError(f"the array {key} is of type {array.dtype}; give numbers.")
-    folder = _kept(lambda scratch: np.save(scratch / f"{key}.npy", array), key)
+    folder = kept(lambda scratch: np.save(scratch / f"{key}.npy", array), key)
     return _path(folder / f"{key}.npy", key)
 
 
-def _kept(write: Callable[[Path], Any], what: str) -> Path:
+def kept(write: Callable[[Path], Any], what: str) -> Path:
     """Return the cache folder with the output of ``write``, named by the hash of that output."""
     root = folders.default_cache_dir()
     try:

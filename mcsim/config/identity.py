@@ -20,6 +20,8 @@ def science(config: RunConfig) -> dict[str, Any]:
     """
     plain = to_dict(config)
     for entry in paths.entries(plain):
+        if not entry.rule.checked:
+            continue
         named = paths.files(entry, config.map.splits, config.name)
         found = {label: f"sha256:{sha256_of(path)}" for label, path in named.items()}
         contents: Any = found[""] if list(found) == [""] else found
@@ -43,13 +45,14 @@ def science(config: RunConfig) -> dict[str, Any]:
     }
 
 
-_MAP = {"grid": "healpix", "nside": None, "mask_frame": None, "mask_apodisation_deg": 0.0}
+_MAP = {"grid": "healpix", "nside": None, "mask_frame": None, "mask_apodisation_deg": 0.0, "split_by": "time"}
 _OF_KIND: dict[str, dict[str, Any]] = {
     "moments": {"model": None, "line_of_sight": None},
     "map": {"angle_deg": 0.0},
     "blm": {"angle_deg": 0.0},
+    "white": {"kind": "white", "hits": None},
 }
-"""Defaults of the keys of a scan or beam that are younger than its kind."""
+"""Defaults of the keys of a scan, beam or noise that are younger than its kind."""
 
 
 def _leave_out_what_says_nothing(plain: dict[str, Any]) -> None:
@@ -64,8 +67,9 @@ def _leave_out_what_says_nothing(plain: dict[str, Any]) -> None:
         del plain["sky"]["dipole_lon_deg"], plain["sky"]["dipole_lat_deg"]
     for channel in plain["channel"]:
         channel["scan"].pop("max_iterations", None)
-        _drop(channel, {"beam_b": None})
-        for table in (channel["scan"], channel["beam"], channel.get("beam_b", {"kind": "none"})):
+        noises = (channel["noise"], *channel["split_noise"].values())
+        _drop(channel, {"beam_b": None, "split_noise": {}, "mask": None})
+        for table in (channel["scan"], channel["beam"], channel.get("beam_b", {"kind": "none"}), *noises):
             _drop(table, _OF_KIND.get(table["kind"], {}))
 
 

@@ -28,7 +28,7 @@ def load(source: str | Path | Mapping[str, Any], base: str | Path | None = None)
     source
         Path of a TOML file of schema 1; or the name of a packaged workflow (``"quickstart"``), used where no such
         file exists; or a dict of the same structure. In a dict an array may stand in place of a file (``sky.spectrum``,
-        ``sky.alm``, ``sky.map``, ``map.mask``, ``map.pixel_window``, the ``path`` of a beam), a
+        ``sky.alm``, ``sky.map``, masks, ``map.pixel_window``, the ``path`` of a beam, the maps of ``noise``), a
         :class:`mcsim.Beam` in place of a beam, and :class:`mcsim.Moments` or a :class:`mcsim.ScanModel` in place of a
         scan.
     base
@@ -92,6 +92,9 @@ def to_dict(config: RunConfig) -> dict[str, Any]:
     plain: dict[str, Any] = _ADAPTER.dump_python(config, mode="json", by_alias=True)
     for effect in plain["effect"]:
         effect |= effect.pop("parameters")
+    for table, key in ((plain, "simulator"), (plain["ensemble"], "maps")):
+        if table[key] is None:  # as in stores of runs without it
+            del table[key]
     return plain
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from mcsim.config import preparation, schema
+from mcsim.config import beams, noise, preparation, schema
 
 # Table -> its class. The kind of a beam or scan, which pydantic puts into the location, selects one of several.
 _TABLES: dict[tuple[str, ...], type] = {
@@ -17,14 +17,18 @@ _TABLES: dict[tuple[str, ...], type] = {
     ("sky",): schema.Sky,
     ("map",): schema.Map,
     ("channel",): schema.Channel,
-    ("channel", "noise"): schema.Noise,
     ("biposh",): schema.Biposh,
     ("ensemble",): schema.Ensemble,
     ("compute",): schema.Compute,
     **{("preparation", step.kind): step for step in preparation.STEPS},
     **{
         ("channel", key, kind): table
-        for key, tables in (("beam", schema.BEAMS), ("beam_b", schema.BEAMS), ("scan", schema.SCANS))
+        for key, tables in (
+            ("beam", beams.BEAMS),
+            ("beam_b", beams.BEAMS),
+            ("scan", schema.SCANS),
+            ("noise", noise.NOISES),
+        )
         for kind, table in tables.items()
     },
 }
@@ -130,10 +134,12 @@ def _locate(loc: tuple[int | str, ...], plain: Any) -> tuple[str, tuple[str, ...
             here = here[part] if isinstance(here, list) and part < len(here) else None
             key += f"[{label(here, part)}]"
             continue
-        if isinstance(here, dict) and here.get("kind") == part and not tag_passed:
+        # A table of noise may leave out that it is white.
+        if isinstance(here, dict) and here.get("kind", "white") == part and not tag_passed:
             tag_passed = True
             continue
         readable = part if part.isprintable() else shown(part)
         key = f"{key}.{readable}" if key else readable
         here = here.get(part) if isinstance(here, dict) else None
-    return key, tuple(str(part) for part in loc[:-1] if not isinstance(part, int))
+    tables = tuple(str(part) for part in loc[:-1] if not isinstance(part, int))
+    return key, ("channel", "noise", *tables[3:]) if tables[:2] == ("channel", "split_noise") else tables

@@ -28,6 +28,7 @@ class Entry(NamedTuple):
     field: str | int  # its name or place there
     rule: Rule
     channels: tuple[str, ...]  # channels that it applies to
+    split: str | None = None  # split that it applies to; None: all
 
     @property
     def template(self) -> str:
@@ -49,27 +50,35 @@ def entries(plain: dict[str, Any]) -> Iterator[Entry]:
     """Yield every key of the plain dict (as in TOML) that names files; the schema checks the types."""
     channels = _tables(plain, "channel")
     every = tuple(str(table.get("name")) for table in channels)
-    sections: list[tuple[str, str, Any, tuple[str, ...]]] = [
-        (name, name, plain.get(name), every) for name in ("sky", "map")
+    sections: list[tuple[str, str, Any, tuple[str, ...], str | None]] = [
+        (name, name, plain.get(name), every, None) for name in ("sky", "map", "ensemble")
     ]
     for number, table in enumerate(channels):
         key = f"channel[{label(table, number)}]"
-        sections += [(part, f"{key}.{part}", table.get(part), (every[number],)) for part in ("beam", "beam_b", "scan")]
-    sections += [("effect", f"effect[{n}]", table, every) for n, table in enumerate(_tables(plain, "effect"))]
+        parts = ("beam", "beam_b", "scan", "noise")
+        one = (every[number],)
+        sections.append(("channel", key, table, one, None))
+        sections += [(part, f"{key}.{part}", table.get(part), one, None) for part in parts]
+        of_splits = table.get("split_noise")
+        for split, own in of_splits.items() if isinstance(of_splits, dict) else ():
+            sections.append(("noise", f"{key}.split_noise.{split}", own, one, split))
+    sections += [("effect", f"effect[{n}]", table, every, None) for n, table in enumerate(_tables(plain, "effect"))]
     for number, table in enumerate(_tables(plain, "preparation")):
         own = table.get("channels")
         names = tuple(map(str, own)) if isinstance(own, list) and own else every
-        sections.append(("preparation", f"preparation[{number}]", table, names))
-    for section, where, holder, speaks_of in sections:
+        sections.append(("preparation", f"preparation[{number}]", table, names, None))
+    for section, where, holder, speaks_of, split in sections:
         for path, rule in RULES.items():
             table_name, field = path.split(".")
             if table_name == section and isinstance(holder, dict):
                 value = holder.get(field)
                 if isinstance(value, str) and value.strip() and value not in rule.words:
-                    yield Entry(f"{where}.{field}", holder, field, rule, speaks_of)
+                    yield Entry(f"{where}.{field}", holder, field, rule, speaks_of, split)
                 for place, item in enumerate(value if isinstance(value, list) else []):
                     if isinstance(item, str) and item.strip():
-                        yield Entry(f"{where}.{field}[{place}]", value, place, rule, speaks_of)
+                        yield Entry(f"{where}.{field}[{place}]", value, place, rule, speaks_of, split)
+    if ".py:" in str(plain.get("simulator")):
+        yield Entry("simulator", plain, "simulator", Rule(checked=False), every)
 
 
 def _tables(plain: dict[str, Any], key: str) -> list[dict[str, Any]]:
@@ -120,7 +129,8 @@ def files(entry: Entry, splits: Sequence[str], where: str, realization: int = 0)
         )
     found = {}
     for channel in entry.channels if "channel" in used else [""]:
-        for split in splits if "split" in used else [""]:
+        of = splits if entry.split is None else [entry.split]
+        for split in of if "split" in used else [""]:
             values = {"channel": channel, "split": split, "realization": realization}
             found[",".join(value for value in (channel, split) if value)] = _existing(entry, values, where)
     return found
@@ -129,10 +139,20 @@ def files(entry: Entry, splits: Sequence[str], where: str, realization: int = 0)
 def check_files(config: RunConfig, plain: dict[str, Any], where: str, realizations: range | None = None) -> None:
     """Raise InputError unless all files of a run exist, with the skies of all these realizations."""
     for entry in entries(plain):
+        placeholders = _placeholders(entry, where)
+        if not entry.rule.checked:
+            continue
         files(entry, config.map.splits, where)
-        if "realization" in _placeholders(entry, where):
-            for realization in range(config.ensemble.realizations) if realizations is None else realizations:
-                files(entry, (), where, realization)
+        if "realization" in placeholders:
+            wanted = range(config.ensemble.realizations) if realizations is None else realizations
+            for realization in wanted:
+                try:
+                    files(entry, config.map.splits, where, realization)
+                except InputError as error:
+                    raise InputError(
+                        f"{str(error).rstrip('.')}; realizations {wanted.start} to {wanted.stop - 1} need a file each, "
+                        f"{len(wanted)} in all."
+                    ) from None
 
 
 def template_tail(template: str) -> str:

@@ -4,6 +4,7 @@ Every key states the unit of its number. A failed check raises ValueError whose 
 :mod:`mcsim.config.messages` completes the sentence.
 """
 
+from dataclasses import replace
 from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import AfterValidator, Field, GetCoreSchemaHandler, model_validator
@@ -11,8 +12,10 @@ from pydantic.dataclasses import dataclass
 from pydantic_core import core_schema
 
 from mcsim.config import arrays
+from mcsim.config.beams import BEAMS, AnyBeam
+from mcsim.config.noise import AnyNoise, Noise, check_differences, check_splits, in_words, is_noise_free
 from mcsim.config.preparation import Step, check_steps
-from mcsim.config.values import STRICT, BeamOrder, Degree, Frame, Fwhm, Label, Nside, PathText, power_of_two, unique
+from mcsim.config.values import STRICT, Degree, Frame, Label, Nside, PathText, power_of_two, unique
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -53,6 +56,8 @@ class Map:
     pixels, "none" for parallel transport, whose samples are at the centres.
     ``mask_frame``: frame of the mask; default: that of its file, or that of the maps. ``mask_apodisation_deg``: width
     of its soft edge.
+    ``split_by``: "time": equal spans, one after the other; "rings": every n-th ring, in turn; "sets": each from the
+    whole of its scan.
     """
 
     nside: Nside | None = None
@@ -62,12 +67,18 @@ class Map:
     mask_frame: Frame | None = None
     mask_apodisation_deg: Annotated[float, Field(ge=0.0, le=90.0)] = 0.0
     splits: Annotated[tuple[Label, ...], AfterValidator(unique)] = ()
+    split_by: Literal["time", "rings", "sets"] = "time"
     pixel_window: PathText | None = None
 
     @property
     def resolution(self) -> int:
         """Value of nside, 0 on a grid without pixels."""
         return self.nside or 0
+
+    def span(self, index: int) -> tuple[float, float]:
+        """Return the share of the survey's time that a split covers, within 0 and 1."""
+        count = len(self.splits) if self.split_by == "time" and self.splits else 1
+        return index % count / count, (index % count + 1) / count
 
     @model_validator(mode="after")
     def _pixels_and_mask(self) -> Self:
@@ -76,67 +87,9 @@ class Map:
         for key in ("nside", "mask", "splits", "pixel_window") if self.grid == "gl" else ():
             if getattr(self, key) not in (None, (), "none"):
                 raise ValueError(f'{key} is given, but grid = "gl" has no pixels; remove {key} or set grid = "healpix"')
-        if self.mask is None and (self.mask_frame is not None or self.mask_apodisation_deg > 0.0):
-            key = "mask_frame" if self.mask_frame is not None else "mask_apodisation_deg"
-            raise ValueError(f"{key} is given without a mask; add mask or remove {key}")
+        if self.split_by != "time" and not self.splits:
+            raise ValueError(f'split_by = "{self.split_by}" is given without splits; name them, or remove split_by')
         return self
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class BeamGaussian:
-    """Circular Gaussian."""
-
-    kind: Literal["gaussian"] = "gaussian"
-    fwhm_arcmin: Fwhm
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class BeamEllipticalGaussian:
-    """Elliptical Gaussian; ``angle_deg`` is that of the major axis, from the beam's x axis towards y."""
-
-    kind: Literal["elliptical_gaussian"] = "elliptical_gaussian"
-    fwhm_major_arcmin: Fwhm
-    fwhm_minor_arcmin: Fwhm
-    angle_deg: float = 0.0
-    m_max: BeamOrder = None
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if self.fwhm_major_arcmin < self.fwhm_minor_arcmin:
-            raise ValueError(
-                f"fwhm_major_arcmin = {self.fwhm_major_arcmin:g} is smaller than "
-                f"fwhm_minor_arcmin = {self.fwhm_minor_arcmin:g}; exchange them and add 90 to angle_deg"
-            )
-        return self
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class BeamMap:
-    """Two-dimensional beam map in FITS.
-
-    ``pixel_deg``: by default from the file. ``centre_pixel`` (column, row): by default the intensity centroid.
-    ``plane``: one image of a cube. ``angle_deg``: rotation of the beam about its axis, from x towards y.
-    """
-
-    kind: Literal["map"] = "map"
-    path: PathText
-    pixel_deg: Annotated[float, Field(gt=0.0, le=10.0)] | None = None
-    cut_deg: Annotated[float, Field(gt=0.0, le=90.0)] = 3.5
-    centre_pixel: tuple[float, float] | None = None
-    plane: Annotated[int, Field(ge=0)] = 0
-    projection: Literal["equidistant", "orthographic", "equal_area"] = "equidistant"
-    angle_deg: float = 0.0
-    m_max: BeamOrder = None
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class BeamBlm:
-    """File of b_lm; ``angle_deg`` rotates the beam about its axis, from x towards y."""
-
-    kind: Literal["blm"] = "blm"
-    path: PathText
-    angle_deg: float = 0.0
-    m_max: BeamOrder = None
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -212,26 +165,18 @@ class _OrObject:
         return (BEAMS | SCANS)[table["kind"]](**table)
 
 
-AnyBeam = BeamGaussian | BeamEllipticalGaussian | BeamMap | BeamBlm
 AnyScan = ScanParallelTransport | ScanHitAveraged | ScanMoments | ScanPointing | ScanDifferencing
 Beam = Annotated[AnyBeam, Field(discriminator="kind"), _OrObject()]
 Scan = Annotated[AnyScan, Field(discriminator="kind"), _OrObject()]
-BEAMS: dict[str, Any] = {each.kind: each for each in get_args(AnyBeam)}
 SCANS: dict[str, Any] = {each.kind: each for each in get_args(AnyScan)}
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class Noise:
-    """White noise per sample; the variance of a pixel is sigma0_uk^2 / hits. Differencing: per difference."""
-
-    sigma0_uk: Annotated[float, Field(ge=0.0)] = 0.0
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Channel:
     """One detector or band: a beam under a scan, with noise.
 
-    ``beam_b``: beam of side B of a differencing scan; default: ``beam`` mirrored.
+    ``beam_b``: beam of side B of a differencing scan; default: ``beam`` mirrored. ``split_noise``: noise of splits that
+    have their own, by name. ``mask``: in place of the run's.
     """
 
     name: Label
@@ -239,7 +184,9 @@ class Channel:
     scan: Scan
     beam_b: Beam | None = None
     frequency_ghz: Annotated[float, Field(gt=0.0)] | None = None
-    noise: Noise = Noise()
+    noise: AnyNoise = Noise()
+    split_noise: dict[Label, AnyNoise] = Field(default_factory=dict)
+    mask: PathText | None = None
 
     @model_validator(mode="after")
     def _one_or_two_beams(self) -> Self:
@@ -248,7 +195,17 @@ class Channel:
                 f'beam_b is given, but a scan of kind "{self.scan.kind}" has one beam; remove beam_b or choose '
                 'kind = "differencing"'
             )
+        if isinstance(self.scan, ScanDifferencing):
+            check_differences(self.noise, self.split_noise)
         return self
+
+    def noise_of(self, split: str | None) -> AnyNoise:
+        """Return the noise of the map of a split, None: of the only map."""
+        return self.noise if split is None else self.split_noise.get(split, self.noise)
+
+    def without_noise(self) -> Self:
+        """Return the channel without any noise."""
+        return replace(self, noise=Noise(), split_noise={})
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -265,12 +222,17 @@ class Biposh:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Ensemble:
-    """Realizations 0 .. realizations - 1 of the seed; ``paired`` adds the circular-beam control of each."""
+    """Realizations 0 .. realizations - 1 of the seed; ``paired`` adds the circular-beam control of each.
+
+    ``maps``: stored maps of another simulator, with which a diagnosis compares data: a template of FITS files with
+    {realization}, {channel} and {split}, or a Zarr store.
+    """
 
     realizations: Annotated[int, Field(ge=1, le=10_000_000)] = 100
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0
     paired: bool = True
     keep_maps: bool = False
+    maps: PathText | None = None
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -307,6 +269,8 @@ class RunConfig:
     effects, preparation
         Changes of the simulation, such as :func:`mcsim.effects` lists, and of its maps before the analysis; in TOML
         the tables ``[[effect]]`` and ``[[preparation]]``.
+    simulator
+        Simulator of another program, ``package.module:name`` or ``file.py:name``, whose maps a diagnosis takes.
     biposh, ensemble, compute
         Settings of the estimator, of the realizations and seed, and of the computation.
 
@@ -328,6 +292,7 @@ class RunConfig:
     channels: Annotated[tuple[Channel, ...], Field(alias="channel", min_length=1)]
     effects: Annotated[tuple[Effect, ...], Field(alias="effect")] = ()
     preparation: tuple[Step, ...] = ()
+    simulator: PathText | None = None
     biposh: Biposh = Biposh()
     ensemble: Ensemble = Ensemble()
     compute: Compute = Compute()
@@ -347,6 +312,8 @@ class RunConfig:
                 f"{key} = {lmax} is above 3 nside - 1 = {limit} of {of}; "
                 f"set biposh.lmax to at most {limit} or raise nside"
             )
+        if self.simulator is not None and self.ensemble.maps is not None:
+            raise ValueError("both simulator and ensemble.maps are given; keep one of them")
         if self.biposh.L_max > lmax:
             raise ValueError(f"biposh.L_max = {self.biposh.L_max} is above the lmax of the analysis, {lmax}; lower it")
         try:
@@ -359,7 +326,12 @@ class RunConfig:
                     f"effect {effect.name}: channel = {effect.channel!r} is no channel of the run; use one of "
                     f"{', '.join(names)}"
                 )
+        masked = self.map.mask is not None or any(channel.mask is not None for channel in self.channels)
+        if not masked and (self.map.mask_frame is not None or self.map.mask_apodisation_deg > 0.0):
+            key = "mask_frame" if self.map.mask_frame is not None else "mask_apodisation_deg"
+            raise ValueError(f"map: {key} is given without a mask; add mask or remove {key}")
         for channel in self.channels:
+            check_splits(channel, self.map.splits, self.map.split_by)
             for key in ("beam", "beam_b"):
                 m_max = getattr(getattr(channel, key), "m_max", None)
                 if m_max is not None and m_max > self.sky.lmax:
@@ -383,12 +355,13 @@ def _check_rings(run: RunConfig) -> None:
                 f'map.frame = "{run.map.frame}", but with grid = "gl" the limit of a scan depends on '
                 f'ecliptic colatitude alone; set frame = "ecliptic" {remedy}'
             )
-        if channel.noise.sigma0_uk > 0.0:
+        if not is_noise_free(channel.noise):
             raise ValueError(
-                f'channel[{channel.name}].noise.sigma0_uk = {channel.noise.sigma0_uk:g}, but grid = "gl" has no pixels '
-                f"to draw noise in; remove the noise {remedy}"
+                f'channel[{channel.name}].{in_words(channel.noise)}, but grid = "gl" has no pixels to draw noise in; '
+                f"remove the noise {remedy}"
             )
     for key, given in (
+        ("mask of a channel", any(channel.mask is not None for channel in run.channels)),
         ("ensemble.keep_maps = true", run.ensemble.keep_maps),
         ("[[preparation]]", bool(run.preparation)),
         ('biposh.weighting = "hits"', run.biposh.weighting == "hits"),

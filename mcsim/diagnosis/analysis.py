@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 
 from mcsim import config, systematics
+from mcsim.diagnosis import slices as slices_
 from mcsim.diagnosis.candidate import Candidate, numbered
 from mcsim.diagnosis.localisation import BipolarScan, coarse_residuals
+from mcsim.diagnosis.map_checks import checked_map
 from mcsim.diagnosis.matched_filters import matched_filter
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Block, Element, blocks_of
 from mcsim.diagnosis.wiener_filter import Model, model_of, shared_sky, wiener_filter
+from mcsim.ensemble.external_maps import Source
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import Survey, survey
@@ -37,6 +40,7 @@ class Analysis:
     without: tuple[str, ...] = ()  # effects of the library that are left out
     library: Kinds = field(default_factory=lambda: kinds_of(None))  # effects that are known
     of_maps: bool = True  # False: the data vector is a table of spectra
+    source: Source | None = None  # external simulations in place of those of the run
 
     @property
     def run(self) -> config.RunConfig:
@@ -53,18 +57,35 @@ class Analysis:
         """Return the descriptions of the elements of the data vector."""
         return tuple(element for block in self.blocks for element in block.elements)
 
+    @property
+    def slices(self) -> tuple[Element, ...]:
+        """Return the descriptions of the numbers beside the data vector; none for measured spectra."""
+        return slices_.elements_of(self.model) if self.of_maps else ()
+
     @cached_property
     def bipolar_scan(self) -> BipolarScan:
         """Return the scan that localises a departure from the model."""
         return BipolarScan(self.model)
 
-    def data_vector(self, maps: Sequence[Map], bipolar_scan: bool = False) -> Vector:
-        """Return the data vector, shape (p,), and on request the bipolar scan and coarse residuals behind it."""
+    def data_vector(self, maps: Sequence[Map], bipolar_scan: bool = False, slices: bool = False) -> Vector:
+        """Return the data vector, shape (p,), and on request what follows it.
+
+        These are the numbers beside it, and bipolar scan and coarse residuals, in this order.
+        """
         filtered = wiener_filter(self.model, maps)
         found = [np.atleast_1d(block.values(filtered)) for block in self.blocks]
+        if slices:
+            found.append(slices_.values_of(self.model, filtered))
         if bipolar_scan:
             found += [self.bipolar_scan.values(filtered), coarse_residuals(self.model, filtered).ravel()]
         return np.concatenate(found)
+
+    def source_of(self, found: Sequence[config.Effect], given_sky: bool = False) -> Source | None:
+        """Return the external simulator if it can add these effects, to a given sky on request; else None."""
+        source = self.source
+        if source is None or not source.effects or not {effect.name for effect in found} <= set(source.effects):
+            return None
+        return source if source.takes_sky or not given_sky else None
 
     def job(self, simulated: config.RunConfig) -> "Job":
         """Return a job of no realization yet that simulates a run and analyses it."""
@@ -78,11 +99,14 @@ def analysis_of(
     nthreads: int = 1,
     settings: DiagnosisSettings | None = None,
     library: Library | None = None,
+    source: Source | None = None,
 ) -> Analysis:
     """Define the analysis of data that ``run``, with the effects that are modelled already, claims to describe.
 
     Effects of the library (default: built-in and registered ones), which the run may name as well, are candidates
-    where they apply, but those called in ``without``. ``nthreads`` compute what is computed once.
+    where they apply, but those called in ``without``, and those that are proposed on request alone and not called in
+    ``settings.including``. ``nthreads`` compute what is computed once. ``source``:
+    simulates in place of mcsim.
     """
     settings = settings or DiagnosisSettings()
     known = kinds_of(library)
@@ -91,14 +115,16 @@ def analysis_of(
         [
             Candidate(effect, channel, tuple(range(len(effect.parametrization.basis()))), dict(fixed))
             for name, effect in known
-            if name not in without
+            if name not in without and (effect.proposed or name in settings.including)
             for channel in ((None,) if effect.scope == "common" else model.channels)
             for fixed in effect.variants
             if _applies(model, effect, channel, fixed)
         ]
     )
     blocks = (*blocks_of(model), *_matched_blocks(model, candidates))
-    return Analysis(model, candidates, blocks, tuple(without), known)
+    for name in () if source is None else source.effects:
+        systematics.get(name, dict(known))
+    return Analysis(model, candidates, blocks, tuple(without), known, source=source)
 
 
 def kinds_of(library: Library | None) -> Kinds:
@@ -128,11 +154,12 @@ def _applies(model: Model, kind: type[Effect], channel: str | None, settings: Ma
             effect.noise(owner.site)
             systematics.seen_through((effect,), owner.site)
             systematics.looked_at((effect,), np.zeros_like(model.dipole), replace(owner.site, lmax=model.lmax), 0, 0)
+            systematics.check_added((effect,), owner.site)
             effect.orientations(owner.maps[0].moments, owner.site)
     except InputError:
         return False
     quiet = all(m.noise_uk is None for owner in owners for m in owner.maps)
-    return not (quiet and kind.noise is not Effect.noise)
+    return not (quiet and (kind.noise is not Effect.noise or kind.excess is not Effect.excess))
 
 
 def _matched_blocks(model: Model, candidates: Sequence[Candidate]) -> Iterator[Block]:
@@ -159,9 +186,11 @@ class Job:
     sample_by_sample: bool = False  # simulate with the time-ordered reference, not with the default route
     without: tuple[str, ...] = ()  # effects that are no candidates
     bipolar_scan: bool = False  # measure the bipolar scan and the coarse residual maps as well
+    slices: bool = False  # measure the numbers beside the data vector as well
     observed: Alm | None = None  # filtered sky of the data, which then constrains the skies
     settings: DiagnosisSettings = field(default_factory=DiagnosisSettings)
     library: Kinds = field(default_factory=lambda: kinds_of(None))
+    source: Source | None = None  # simulates in place of mcsim
 
     @property
     def definition(self) -> tuple[str, tuple[str, ...], DiagnosisSettings, Kinds]:
@@ -170,24 +199,45 @@ class Job:
 
 
 def data_vectors(job: Job, library: Library | None = None) -> Vector:
-    """Return the data vectors of simulations, shape (count, p), with bipolar scan and coarse residuals if asked for.
+    """Return the data vectors of simulations, shape (count, p), and behind them what else the job asks for.
 
     This is the task that a worker runs. ``library``: effects that the simulated run may name; default: the job's.
     """
     analysis = _analysis(*job.definition)
-    shared = _survey(job.simulated, job.library if library is None else kinds_of(library))
     rows = []
     for realization in range(job.first, job.first + job.count):
         if job.sample_by_sample:
+            shared = _survey(job.simulated, job.library if library is None else kinds_of(library))
             maps = [map_uk for _, map_uk in sampled.maps(shared, realization)]
         else:
             sky = None
             if job.observed is not None:
-                seed = shared.config.ensemble.seed
+                seed, _ = _seed_and_added(job.simulated, job.fiducial)
                 sky = _constrained_sky(job.definition, job.observed.tobytes(), seed, realization)
-            maps = list(simulate.maps(shared, realization, sky=sky))
-        rows.append(analysis.data_vector(maps, bipolar_scan=job.bipolar_scan))
+            if job.source is not None:
+                maps = external_maps(job, realization, sky)
+            else:
+                shared = _survey(job.simulated, job.library if library is None else kinds_of(library))
+                maps = list(simulate.maps(shared, realization, sky=sky))
+        rows.append(analysis.data_vector(maps, job.bipolar_scan, job.slices))
     return np.stack(rows)
+
+
+def external_maps(job: Job, realization: int, sky: Alm | None = None) -> list[Map]:
+    """Return the maps of one realization that an external simulator makes; InputError if no such survey makes them."""
+    assert job.source is not None
+    seed, added = _seed_and_added(job.simulated, job.fiducial)
+    model, where = _analysis(*job.definition).model, job.source.words(seed, realization)
+    maps = job.source.maps(seed, realization, added, sky)
+    named = zip(model.parts, maps, strict=True)
+    return [checked_map(model, part, map_uk, f"the map {part.name} of {where}") for part, map_uk in named]
+
+
+@lru_cache(maxsize=2)
+def _seed_and_added(simulated: str, fiducial: str) -> tuple[int, tuple[config.Effect, ...]]:
+    """Return the seed of a run, and its effects beyond those of the fiducial one."""
+    run = config.from_json(simulated)
+    return run.ensemble.seed, run.effects[len(config.from_json(fiducial).effects) :]
 
 
 @lru_cache(maxsize=32)

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -12,16 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config, systematics
-from mcsim.diagnosis import campaign, controls, measured_spectra, null_ensemble, report
+from mcsim.diagnosis import campaign, controls, measured_spectra, null_ensemble, report, words
 from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, data_vectors
 from mcsim.diagnosis.campaign import asking, batch
 from mcsim.diagnosis.candidate import TemplateBank
 from mcsim.diagnosis.context import DataSet, DiagnosisContext, context
+from mcsim.diagnosis.external import ExternalModel, Kept, agreement, loaded
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.measured_spectra import MeasuredSpectra, read_spectra
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.observed_maps import ObservedMaps, checked, read_maps
-from mcsim.diagnosis.result import DiagnosisResult
+from mcsim.diagnosis.result import Agreement, DiagnosisResult
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.ensemble.plan import cost
 from mcsim.ensemble.runner import Workers
@@ -31,6 +33,7 @@ from mcsim.support import folders
 from mcsim.support.code import class_digest, package_digest
 
 CODE = ("config", "sphere", "stats", "instrument", "systematics", "bipolar", "simulation", "beamfit", "diagnosis")
+EXTERNAL = ("external", "external_maps")
 LIBRARIES = ("ducc0", "healpy", "numpy", "scipy")
 """What the simulations of a model and their data vectors are computed with."""
 
@@ -43,7 +46,7 @@ class Computing(TypedDict, total=False):
 
 
 def diagnose(
-    model: str | Path | Mapping[str, Any] | config.RunConfig,
+    model: str | Path | Mapping[str, Any] | config.RunConfig | ExternalModel,
     data: str | Path | Sequence[NDArray[np.float64]],
     output: str | Path | None = None,
     *,
@@ -56,7 +59,8 @@ def diagnose(
     Parameters
     ----------
     model
-        Fiducial model of sky, beams, scan and noise: a run.
+        Fiducial model of sky, beams, scan and noise: a run. With a simulator of another program, or its stored maps, in
+        place of mcsim's: an :class:`mcsim.ExternalModel`, or a run with ``simulator`` or ``ensemble.maps``.
     data
         Folder with ``{channel}.fits`` or ``{channel}_{split}.fits``, uK; or the maps themselves, shape (npix,) each, in
         the order channel by channel, split by split; or a table of measured spectra
@@ -82,46 +86,49 @@ def diagnose(
     ------
     InputError
         If a run, data or settings cannot be used.
+    RunError
+        If a simulator of another program fails; the same call goes on where it ended.
     """
     quiet, workers = _computing(**computing)
-    run = model if isinstance(model, config.RunConfig) else config.load(model)
+    run, source = loaded(model)
     settings = settings or DiagnosisSettings()
-    library = systematics.catalogue() if settings.library is None else systematics.checked(settings.library)
-    wanted, settings = settings, replace(settings, without=tuple(settings.without), library=None, controls=0)
-    for effect in settings.without:
-        systematics.get(effect, library)
+    wanted, (settings, library) = settings.controls, _with_library(settings)
     if output is not None:
         folders.writable(Path(output))
     threads = os.cpu_count() or 1
     task: Callable[[Job], NDArray[np.float64]] = data_vectors
     table = read_spectra(data, run) if isinstance(data, str | Path) and Path(data).is_file() else None
-    controls.check(wanted.controls, table is None)
+    controls.check(wanted, of_maps=table is None, external=source is not None)
     if table is not None:
+        if source is not None:
+            raise InputError(f"{data} is a table, but {source.label} makes maps; give maps, or a run of mcsim.")
         run, task = measured_spectra.estimator_for(run, table), table
         analysis = measured_spectra.analysis_of_spectra(run, table, settings.without, threads, settings, library)
     else:
-        analysis = analysis_of(run, settings.without, threads, settings, library)
+        analysis = analysis_of(run, settings.without, threads, settings, library, source)
     power.check(analysis.model.survey)
     maps: Sequence[NDArray[np.float64]] = ()
     if table is None:
         maps = read_maps(analysis.model, data) if isinstance(data, str | Path) else checked(analysis.model, data)
+    key = _key(run, analysis)
     with batch(run.compute.workers if workers is None else workers) as call:
-        with asking(call, quiet, task, "simulations of the model and of each effect") as ask:
-            ensemble, bank = _learned(run, analysis, ask)
+        whole = task if source is None else Kept(task, f"diagnose/{key}.parts")
+        with asking(call, quiet, whole, "simulations of the model and of each effect") as ask:
+            ensemble, bank = _learned(key, analysis, ask)
         known = context(analysis, ensemble if table is None else ensemble.of_mean(table.realizations), bank)
-        drawn = None
-        if wanted.controls:
-            drawn = controls.diagnose_controls(known, _key(run, analysis), wanted.controls, call, quiet)
+        drawn = controls.diagnose_controls(known, key, wanted, call, quiet) if wanted else None
         with asking(call, quiet, task, "simulations of fitted effects") as ask:
             found: DataSet[Any] = (
                 ObservedMaps(known, maps, ask) if table is None else MeasuredSpectra(known, table, ask)
             )
             diagnosis = diagnose_data(found, case or run.name)
-    if table is None:
+    if source is not None:
+        diagnosis = _with_agreement(diagnosis, agreement(known))
+    elif table is None:
         diagnosis = replace(diagnosis, warnings=_warnings(analysis))
     if drawn is not None:
         first = (*drawn.warnings, *diagnosis.warnings)
-        done = replace(diagnosis.settings, controls=wanted.controls)
+        done = replace(diagnosis.settings, controls=wanted)
         diagnosis = replace(diagnosis, controls=drawn, warnings=first, settings=done)
     if output is not None:
         diagnosis.save(output)
@@ -129,21 +136,47 @@ def diagnose(
     return diagnosis
 
 
-def describe(run: config.RunConfig, settings: DiagnosisSettings) -> str:
+def _with_library(settings: DiagnosisSettings) -> tuple[DiagnosisSettings, systematics.Library]:
+    """Return settings that name effects of a library, and that library; refuse other names."""
+    known = systematics.catalogue() if settings.library is None else systematics.checked(settings.library)
+    asked = tuple(settings.including) if settings.library is None else (*settings.including, *known)
+    for effect in (*settings.without, *settings.including):
+        systematics.get(effect, known)
+    including = tuple(sorted({name for name in asked if not known[name].proposed}))
+    return replace(settings, without=tuple(settings.without), including=including, library=None, controls=0), known
+
+
+def describe(model: str | Path | config.RunConfig | ExternalModel, settings: DiagnosisSettings) -> str:
     """Return a text on the cost of a diagnosis of maps: simulations, memory, time, and that of preparing the maps."""
-    analysis = analysis_of(run, settings.without, os.cpu_count() or 1, replace(settings, controls=0))
+    run, source = loaded(model)
+    count, (settings, library) = settings.controls, _with_library(settings)
+    controls.check(count, of_maps=True, external=source is not None)
+    analysis = analysis_of(run, settings.without, os.cpu_count() or 1, settings, library, source)
     power.check(analysis.model.survey)
-    number = sum(job.count for job in campaign.plan(analysis, settings.simulations).values())
-    size = len(analysis.elements)
+    jobs, size = campaign.plan(analysis, settings.simulations).values(), len(analysis.elements)
+    number = sum(job.count for job in jobs if job.source is None)
     head = f"{run.name}: at most {number} simulations before data, for a data vector of {size}"
+    if source is not None:
+        given = sum(job.count for job in jobs if job.source is not None)
+        stored = "" if source.count is None else f", of {source.count} that are stored"
+        head += f"; and at most {given} of {source.label}{stored}, whose own cost is not in what follows"
     lines = [head, *cost(run).lines(number, run.compute.workers)]
-    if settings.controls:
-        lines += controls.describe(analysis, settings.controls, run.compute.workers)
+    if count:
+        lines += controls.describe(analysis, count, run.compute.workers)
     return "\n".join(lines)
 
 
 def _computing(quiet: bool = True, workers: Workers | None = None) -> tuple[bool, Workers | None]:
     return quiet, workers
+
+
+def _with_agreement(diagnosis: DiagnosisResult, found: Agreement) -> DiagnosisResult:
+    """Return a result that says if mcsim's own simulation agrees with the external one, first if it does not."""
+    sentence = words.agreement(found)
+    kept = replace(diagnosis, agreement=found)
+    if not found.agrees:
+        return replace(kept, warnings=(sentence,))
+    return replace(kept, notes=(sentence, *kept.notes))
 
 
 def _warnings(analysis: Analysis) -> tuple[str, ...]:
@@ -154,11 +187,11 @@ def _warnings(analysis: Analysis) -> tuple[str, ...]:
 
 def prepared(run: config.RunConfig, analysis: Analysis, ask: campaign.Ask) -> DiagnosisContext:
     """Return what every set of maps is tested with, simulated or from the cache."""
-    return context(analysis, *_learned(run, analysis, ask))
+    return context(analysis, *_learned(_key(run, analysis), analysis, ask))
 
 
 def _learned(
-    run: config.RunConfig,
+    key: str,
     analysis: Analysis,
     ask: campaign.Ask,
 ) -> tuple[NullEnsemble, TemplateBank]:
@@ -168,11 +201,17 @@ def _learned(
             f"{simulations} simulations are too few for the {size} elements of the data vector; give at least "
             f"{2 * size}, better {analysis.settings.sims_per_element * size}."
         )
+    stored = None if analysis.source is None else analysis.source.count
+    if stored is not None and simulations is not None and stored < simulations:
+        raise InputError(f"{simulations} simulations are asked for, but {stored} are stored; ask for as many at most.")
+    name = f"diagnose/{key}.zarr"
 
     def fill(scratch: Path) -> None:
         null_ensemble.save(scratch, *campaign.learned(analysis, ask, simulations))
 
-    return null_ensemble.load(folders.cached(f"diagnose/{_key(run, analysis)}.zarr", fill))
+    found = null_ensemble.load(folders.cached(name, fill))
+    shutil.rmtree(folders.default_cache_dir() / f"diagnose/{key}.parts", ignore_errors=True)
+    return found
 
 
 def _key(run: config.RunConfig, analysis: Analysis) -> str:
@@ -191,4 +230,9 @@ def _key(run: config.RunConfig, analysis: Analysis) -> str:
         sorted(class_digest(kind) for kind in effects),
         package_digest((f"mcsim.{name}" for name in CODE), LIBRARIES),
     ]
+    if analysis.source is not None:
+        rest += [
+            analysis.source.identity(),
+            package_digest(f"mcsim.ensemble.{name}" for name in EXTERNAL),
+        ]
     return hashlib.sha256(json.dumps([science, rest], sort_keys=True).encode()).hexdigest()[:32]

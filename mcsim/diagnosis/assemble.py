@@ -7,9 +7,11 @@ import numpy as np
 
 from mcsim import config
 from mcsim.diagnosis.candidate import Candidate, parts_of
+from mcsim.diagnosis.consistency import amplitudes
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.result import CandidateResult, DiagnosisResult, EffectResult, EffectSet
+from mcsim.diagnosis.selection import Explanation
 from mcsim.errors import InputError
 from mcsim.stats.detection import detectable, snr_needed, snr_to_separate
 from mcsim.stats.excess import HeldOut, excess_of
@@ -31,19 +33,8 @@ def result_of(
         case=case,
         kind=found.verdict,
         test=found.gap,
-        sets=tuple(
-            EffectSet(
-                effects=tuple(effects_of(candidates, one.members, one.fit)),
-                candidates=tuple(one.members),
-                coordinates=tuple(one.fit.amplitudes.tolist()),
-                errors=tuple(one.fit.errors.tolist()),
-                odds=one.odds,
-                pvalue=one.pvalue,
-                further=one.further,
-                excess=excess_of(one.fit.chi2, one.fit.dimension, null.dof),
-            )
-            for one in found.explanations
-        ),
+        sets=tuple(_set_of(context, one) for one in found.explanations),
+        contradicted=tuple(_set_of(context, one) for one in found.contradicted),
         contrasts=tuple(
             replace(one, elements=one.elements[:TELLING], shares=one.shares[:TELLING]) for one in found.contrasts
         ),
@@ -77,6 +68,26 @@ def result_of(
             **data.provenance(),
         },
         configuration=config.to_json(context.run),
+    )
+
+
+def _set_of(context: DiagnosisContext, one: Explanation) -> EffectSet:
+    """Return a set of effects with its amplitudes in parts of the data."""
+    effects = list(effects_of(context.candidates, one.members, one.fit))
+    fitted = [context.candidates[m].fitted(*part) for m, *part in parts_of(context.candidates, one.members, one.fit)]
+    for place, own in enumerate(one.findings.comparisons):
+        words = tuple(amplitudes(comparison, fitted[place]) for comparison in own)
+        effects[place] = replace(effects[place], consistency=own, parts=words)
+    return EffectSet(
+        effects=tuple(effects),
+        candidates=tuple(one.members),
+        coordinates=tuple(one.fit.amplitudes.tolist()),
+        errors=tuple(one.fit.errors.tolist()),
+        odds=one.odds,
+        pvalue=one.pvalue,
+        further=one.further,
+        excess=excess_of(one.fit.chi2, one.fit.dimension, context.null.dof),
+        maps=one.findings.maps,
     )
 
 

@@ -16,6 +16,8 @@ from mcsim.diagnosis.candidate import Candidate, TemplateBank
 from mcsim.diagnosis.localisation import rms
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.ensemble import runner
+from mcsim.ensemble.external_maps import Source
+from mcsim.errors import InputError
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.progress import reporting
 from mcsim.systematics import Effect
@@ -79,7 +81,7 @@ def asking(call: Batch, quiet: bool, task: Task = data_vectors, stage: str = "si
 class Purpose(NamedTuple):
     """Say what a job is for; ``number`` is its first realization, or the column of a response of this sign."""
 
-    kind: Literal["time-ordered", "default", "null", "reference", "response"]
+    kind: Literal["time-ordered", "default", "null", "reference", "external reference", "response"]
     number: int
     sign: int = 0
 
@@ -88,27 +90,34 @@ def plan(analysis: Analysis, simulations: int | None = None, time_ordered: bool 
     """Return all jobs from which :func:`learned` estimates null ensemble and templates.
 
     ``simulations`` for the covariance are by default ``settings.sims_per_element`` for every element of the data
-    vector. The default route is compared with the time-ordered reference if that is wanted, and every channel's
-    pointing is known.
+    vector, or what is stored of an external ensemble. The default route is compared with the time-ordered reference if
+    that is wanted, and every channel's pointing is known.
     """
     settings, run = analysis.settings, analysis.run
     wanted = settings.sims_per_element * len(analysis.elements) if simulations is None else simulations
+    if analysis.source is not None and analysis.source.count is not None:
+        wanted = min(wanted, analysis.source.count)
     base = seeded(run, _RESPONSE)
     jobs: dict[Purpose, Job] = {}
     known = all(channel.site.pointing is not None for channel in analysis.model.survey.channels)
     if time_ordered and analysis.of_maps and known:
-        quiet = replace(base, channels=tuple(replace(c, noise=config.Noise()) for c in base.channels))
+        quiet = replace(base, channels=tuple(c.without_noise() for c in base.channels))
         for job in _split(analysis.job(quiet), range(settings.time_ordered_skies), 1):
             jobs[Purpose("time-ordered", job.first)] = replace(job, sample_by_sample=True)
             jobs[Purpose("default", job.first)] = job
     for job in _split(analysis.job(seeded(run, _COVARIANCE)), range(wanted)):
-        jobs[Purpose("null", job.first)] = replace(job, bipolar_scan=job.first < settings.scan_sims)
+        scanned = job.first < settings.scan_sims
+        jobs[Purpose("null", job.first)] = replace(job, bipolar_scan=scanned, source=analysis.source)
+    own = analysis.source_of(())
     for job in _split(analysis.job(base), range(settings.noisy_skies)):
         jobs[Purpose("reference", job.first)] = job
+        if own is not None:
+            jobs[Purpose("external reference", job.first)] = replace(job, source=own)
     for candidate, column, sign, effect in _steps(analysis):
-        acting = analysis.job(with_effects(base, [candidate.table(effect)]))
+        table = candidate.table(effect)
+        acting = replace(analysis.job(with_effects(base, [table])), source=analysis.source_of([table]))
         jobs[Purpose("response", column, sign)] = replace(acting, count=skies(analysis, candidate))
-    return jobs
+    return {purpose: replace(job, slices=analysis.of_maps) for purpose, job in jobs.items()}
 
 
 def _split(job: Job, realizations: range, size: int = _PER_TASK) -> list[Job]:
@@ -149,22 +158,23 @@ def learned(
     many are independent, and so how many simulations are needed.
     """
     size, jobs = len(analysis.elements), plan(analysis, simulations, time_ordered)
+    whole = size + len(analysis.slices)
     results = _results(analysis, jobs, ask, simulations is None)
 
     def stacked(kind: str) -> Rows:
-        rows = [result[:, :size] for purpose, result in results.items() if purpose.kind == kind]
-        return np.concatenate(rows) if rows else np.zeros((0, size))
+        rows = [result[:, :whole] for purpose, result in results.items() if purpose.kind == kind]
+        return np.concatenate(rows) if rows else np.zeros((0, whole))
 
-    reference = stacked("reference")
+    references = {False: stacked("reference"), True: stacked("external reference")}
     labels = tuple(label for candidate in analysis.candidates for label in candidate.labels)
-    matrix, curvature, error = np.zeros((3, size, len(labels)))
+    matrix, curvature, error = np.zeros((3, whole, len(labels)))
     for candidate, column, sign, effect in _steps(analysis):
         other = results.get(Purpose("response", column, -sign))
         if sign < 0 and other is not None:
             continue  # done with the other sign
         here = results[Purpose("response", column, sign)]
         step = effect.parametrization.coordinates(effect)[candidate.columns.index(column)]
-        same = reference[: len(here)]
+        same = references[jobs[Purpose("response", column, sign)].source is not None][: len(here)]
         if other is None:
             each = (here - same) / step
         else:
@@ -172,17 +182,32 @@ def learned(
             curvature[:, column] = np.mean(here + other - 2.0 * same, axis=0) / (2.0 * step**2)
         matrix[:, column] = each.mean(axis=0)
         error[:, column] = each.std(axis=0, ddof=1) / np.sqrt(len(each))
-    offset = np.zeros(size)
+    offset = np.zeros(whole)
     if analysis.of_maps and len(default := stacked("default")):
         offset = np.mean(stacked("time-ordered") - default, axis=0)
-    # Behind the data vector come bipolar scan and coarse residuals; measured spectra have neither.
-    rest = np.concatenate([results[purpose][:, size:] for purpose in results if jobs[purpose].bipolar_scan])
+    # Behind all these come bipolar scan and coarse residuals; measured spectra have neither.
+    rest = np.concatenate([results[purpose][:, whole:] for purpose in results if jobs[purpose].bipolar_scan])
     numbers = len(analysis.bipolar_scan.elements) if analysis.of_maps else 0
     coarse = rest[:, numbers:].reshape(len(rest), len(analysis.model.parts), -1)
-    vectors = stacked("null"), offset, analysis.elements, reference
+    null, reference, own_offset = stacked("null"), references[False], None
+    if analysis.source is not None:
+        # The mean is that of the external simulations, whatever mcsim's routes differ by.
+        own_offset, offset = offset[:size], np.zeros(whole)
+    vectors = null[:, :size], offset[:size], analysis.elements, reference[:, :size]
     residuals = coarse.mean(axis=0), coarse.std(axis=0, ddof=1), rms(coarse)
-    ensemble = NullEnsemble(*vectors, rest[:, :numbers], *residuals, analysis.settings.redundant)
-    return ensemble, TemplateBank(matrix, error, curvature, labels)
+    ensemble = NullEnsemble(
+        *vectors,
+        rest[:, :numbers],
+        *residuals,
+        redundant=analysis.settings.redundant,
+        external_reference=None if analysis.source is None else references[True],
+        own_offset=own_offset,
+        slices=null[:, size:],
+        slice_offset=offset[size:],
+        slice_reference=reference[:, size:],
+        slice_elements=analysis.slices,
+    )
+    return ensemble, TemplateBank(matrix[:size], error[:size], curvature[:size], labels, matrix[size:])
 
 
 def _results(analysis: Analysis, jobs: dict[Purpose, Job], ask: Ask, pilot: bool) -> dict[Purpose, Rows]:
@@ -194,19 +219,31 @@ def _results(analysis: Analysis, jobs: dict[Purpose, Job], ask: Ask, pilot: bool
     if not pilot:
         return run(list(jobs))
     size, settings = len(analysis.elements), analysis.settings
-    few = settings.pilot_sims_per_element * size
+    few, source = settings.pilot_sims_per_element * size, analysis.source
+    if source is not None and source.count is not None and source.count <= size:
+        raise _too_few(source, size, settings.sims_per_element)
     first = run([one for one in jobs if one.kind == "null" and one.number < few])
     drawn = np.concatenate([result[:, :size] for result in first.values()])
     independent = SimulatedGaussian.from_simulations(drawn, floor=settings.redundant).dimension
     enough = settings.sims_per_element * independent
+    if source is not None and source.count is not None and source.count < enough:
+        raise _too_few(source, independent, settings.sims_per_element)
     found = first | run([one for one in jobs if one not in first and (one.kind != "null" or one.number < enough)])
     return {purpose: found[purpose] for purpose in jobs if purpose in found}
+
+
+def _too_few(source: Source, independent: int, each: int) -> InputError:
+    return InputError(
+        f"{source.count} realizations of {source.label} are too few for a data vector of {independent} independent "
+        f"elements; give {each * independent}, {each} for each, or leave effects out (--without)."
+    )
 
 
 def after_jobs(analysis: Analysis, found: Sequence[config.Effect], skies: int | None = None) -> list[Job]:
     """List two jobs that simulate the model with effects, over the skies with which responses are measured."""
     total = analysis.settings.noisy_skies if skies is None else skies
-    return _split(_with(analysis, found), range(total), -(-total // 2))
+    job = replace(_with(analysis, found), source=analysis.source_of(found))
+    return _split(job, range(total), -(-total // 2))
 
 
 def constrained_jobs(

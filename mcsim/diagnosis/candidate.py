@@ -17,6 +17,10 @@ Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
 
+BEYOND = 3.0
+"""Standard deviations by which fits may be beyond the bounds of parameters: at a bound, half of them are."""
+
+
 class Column(NamedTuple):
     """Identify a column of templates: effect, channel (None: all), parameters that are not fitted, and component."""
 
@@ -83,9 +87,24 @@ class Candidate:
         return self.effect(**{**self.effect.parametrization.nearest(coordinates, precision), **self.settings})
 
     def fitted(self, coordinates: Vector, covariance: Matrix) -> Effect:
-        """Return the effect nearest to fitted coordinates, as far as the data constrain them."""
+        """Return the effect within its bounds nearest to fitted coordinates, as far as the data constrain them."""
+        return self._nearest(coordinates, covariance)[0]
+
+    def _nearest(self, coordinates: Vector, covariance: Matrix) -> tuple[Effect, float]:
+        """Return the nearest effect within its bounds, and its distance in standard deviations if that matters."""
         precision: Matrix = np.asarray(np.linalg.pinv(covariance), dtype=np.float64)
-        return self.with_coordinates(self.effect.parametrization.constrained(coordinates, precision), precision)
+        fit = self.effect.parametrization
+        constrained = fit.constrained(coordinates, precision)
+        free = self.with_coordinates(constrained, precision)
+        inside = free.within_bounds()
+        if inside is free:
+            return free, 0.0
+        # Coordinates are linear in the amplitude.
+        unit = fit.coordinates(replace(inside, amplitude=1.0))
+        best = float(unit @ precision @ constrained) / max(float(unit @ precision @ unit), 1e-300)
+        inside = replace(inside, amplitude=best).within_bounds()
+        beyond = constrained - fit.coordinates(inside)
+        return inside, float(np.sqrt(max(float(beyond @ precision @ beyond), 0.0)))
 
     def detected(self, coordinates: Vector, covariance: Matrix) -> Effect:
         """Return :meth:`fitted`; raise InputError if the data do not constrain the effect at all."""
@@ -99,11 +118,16 @@ class Candidate:
         parameters = {"amplitude": effect.amplitude, **effect.parameters()}
         return config.Effect(name=effect.name, channel=self.channel, parameters=parameters)
 
-    def allows(self, amplitudes: Vector) -> bool:
-        """Return True if the amplitudes have the sign, and at most the size, that the effect can have."""
-        if self.effect.parametrization.sign and bool(np.any(amplitudes < 0.0)):
-            return False
-        return float(np.linalg.norm(amplitudes)) <= self.effect.parametrization.max_amplitude
+    def beyond(self, amplitudes: Vector, covariance: Matrix) -> float:
+        """Return how far fitted amplitudes are beyond what the effect can have, in standard deviations.
+
+        It is infinite for another sign, for more than the largest amplitude, and for more than BEYOND.
+        """
+        fit = self.effect.parametrization
+        if (fit.sign and bool(np.any(amplitudes < 0.0))) or float(np.linalg.norm(amplitudes)) > fit.max_amplitude:
+            return np.inf
+        distance = self._nearest(amplitudes, covariance)[1] if self.effect.bounds else 0.0
+        return distance if distance <= BEYOND else np.inf
 
 
 def numbered(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
@@ -132,9 +156,13 @@ def parts_of(
         start = own.stop
 
 
-def within_bounds(candidates: Sequence[Candidate], members: Sequence[int], found: Fit) -> bool:
-    """Return True if every fitted amplitude is within its bounds."""
-    return all(candidates[member].allows(amplitudes) for member, amplitudes, _ in parts_of(candidates, members, found))
+def beyond(candidates: Sequence[Candidate], members: Sequence[int], found: Fit) -> float:
+    """Return how far a fit is beyond the bounds of its effects, in standard deviations; infinite if it is not theirs.
+
+    The nearest effects within their bounds have a chi^2 that is larger by the square of it.
+    """
+    parts = parts_of(candidates, members, found)
+    return float(np.sqrt(sum(candidates[member].beyond(*part) ** 2 for member, *part in parts)))
 
 
 def effects_at(candidates: Sequence[Candidate], members: Sequence[int], found: Fit) -> list[Effect]:
@@ -156,12 +184,14 @@ class TemplateBank:
     error: Matrix  # standard error of the matrix
     curvature: Matrix  # half the second derivative
     labels: tuple[Column, ...]  # identity of each column
+    slice_matrix: Matrix = field(default_factory=lambda: np.zeros((0, 0)))  # of the numbers beside it, (E, K)
 
     def subset(self, rows: NDArray[np.int64], columns: Sequence[int]) -> "TemplateBank":
         """Return some elements and some columns."""
         cut = np.ix_(rows, np.asarray(columns, dtype=np.int64))
         labels = tuple(self.labels[column] for column in columns)
-        return TemplateBank(self.matrix[cut], self.error[cut], self.curvature[cut], labels)
+        beside = self.slice_matrix[:, list(columns)] if len(self.slice_matrix) else self.slice_matrix
+        return TemplateBank(self.matrix[cut], self.error[cut], self.curvature[cut], labels, beside)
 
     def _squares(self, spread: Vector) -> tuple[Vector, Vector]:
         """Return the squared norms of error and matrix over the spread of the data vector, shape (K,) each."""

@@ -48,6 +48,17 @@ class DiagnosisContext:
         """Return the settings of the analysis."""
         return self.analysis.settings
 
+    def reference(self, found: Sequence[config.Effect]) -> Matrix:
+        """Return the data vectors of the skies in which responses to effects are measured, shape (skies, p)."""
+        return self.extended_reference(found)[:, : len(self.ensemble.elements)]
+
+    def extended_reference(self, found: Sequence[config.Effect]) -> Matrix:
+        """Return those of :meth:`reference` with the numbers beside the data vector behind it, (skies, p + E)."""
+        if self.analysis.source_of(found) is None:
+            return self.ensemble.extended.reference
+        assert self.ensemble.external_reference is not None  # simulated where the source can add effects
+        return self.ensemble.external_reference
+
 
 def context(analysis: Analysis, ensemble: NullEnsemble, bank: TemplateBank) -> DiagnosisContext:
     """Prepare the tests of data sets of a model."""
@@ -95,7 +106,16 @@ class DataSet(ABC, Generic[Data]):
 
         By default they are those of the reference, whatever ``skies`` is.
         """
-        return self._simulated(found) - self.context.ensemble.reference
+        return self._simulated(found) - self.context.reference(found)
+
+    @property
+    def extended(self) -> Vector:
+        """Return the data vector with the numbers beside it behind it, if there are any."""
+        return self.x
+
+    def respond_extended(self, found: Sequence[config.Effect], skies: int) -> Matrix:
+        """Return the changes of :meth:`respond` for :attr:`extended`."""
+        return self.respond(found, skies)
 
     def _simulated(self, found: Sequence[config.Effect]) -> Matrix:
         """Return the data vectors of the skies of the reference with effects, shape (rows, p)."""

@@ -45,12 +45,17 @@ SAMPLE_S = 1e-6
 """Seconds that one sample takes on one core, for estimates."""
 
 
-def check(count: int, of_maps: bool) -> None:
-    """Raise InputError for a number of controls that cannot be drawn for these data."""
+def check(count: int, of_maps: bool, external: bool = False) -> None:
+    """Raise InputError for a number of controls that cannot be drawn for these data and this simulator."""
     if count < 0:
         raise InputError(f"controls = {count} is no number of data sets; give 0 or more, better 20.")
     if count and not of_maps:
-        raise InputError(f"{count} controls were asked for, but they are maps and the data a table; give controls = 0.")
+        raise InputError(f"controls = {count}, but they are maps and the data a table; give controls = 0.")
+    if count and external:
+        raise InputError(
+            f"controls = {count}, but mcsim draws them, and the model is simulated by another program; give "
+            "controls = 0: the result says if mcsim agrees with that program."
+        )
 
 
 @dataclass(frozen=True)
@@ -119,15 +124,19 @@ def _tried(run: config.RunConfig, reach: int, by_sample: bool) -> Iterator[tuple
 
 def _refined(run: config.RunConfig, finer: int, lmax: int) -> config.RunConfig:
     """Return a run with finer pixels and more of the sky; a coarse pixel has as much noise, in more samples."""
-    channels = tuple(
-        replace(spec, noise=replace(spec.noise, sigma0_uk=finer * spec.noise.sigma0_uk)) if finer > 1 else spec
-        for spec in run.channels
-    )
+    channels = []
+    for spec in run.channels:
+        noise = spec.noise
+        if finer > 1 and isinstance(noise, config.Noise):
+            noise = replace(noise, sigma0_uk=finer * noise.sigma0_uk)
+        elif finer > 1:
+            raise InputError(f"the noise of channel {spec.name} is of the pixels that are made; keep map.nside.")
+        channels.append(replace(spec, noise=noise))
     return replace(
         run,
         sky=replace(run.sky, lmax=lmax),
         map=replace(run.map, nside=finer * run.map.resolution),
-        channels=channels,
+        channels=tuple(channels),
         biposh=replace(run.biposh, lmax=config.analysis_lmax(run)),
     )
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from mcsim.diagnosis.assemble import result_of
 from mcsim.diagnosis.candidate import columns_of, tables_at
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
+from mcsim.diagnosis.naming import agreeing, unconfirmed
 from mcsim.diagnosis.refine import Refined, Refiner
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import Attribution
@@ -28,15 +29,22 @@ def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
     refined = refiner.run(data.templates(), context.candidates)
     found, partial, reduction = refined.attribution.if_named(context.settings), refined.partial, None
     exchanged = data.exchanged(found)
-    notes = [*exchanged, *data.notes()]
+    notes, refusals = [*exchanged, *data.notes()], list[str]()
     if exchanged:
         # An order of the maps in which the model fits says more than any effect.
         found, partial = found.unexplained(), None
     elif found.explanations:
-        found = _with_errors(data, refined, found)
-        found, reduction = confirmed(context, found, reduction_of(data, refined), notes)
-    if partial is None and not exchanged and not found.faint and found.verdict == "unknown":
+        found, refusals = agreeing(data, refined, found)
+        if found.explanations:
+            found = _with_errors(data, refined, found)
+            found, reduction = confirmed(context, found, reduction_of(data, replace(refined, attribution=found)), notes)
+        if why := unconfirmed(context, found, reduction is not None):
+            refusals.append(why)
+            found, reduction = found.unexplained(), None
+    # What the rest of the data contradicts is not detected in it.
+    if partial is None and not (exchanged or refusals) and not found.faint and found.verdict == "unknown":
         partial = refiner.detected_in(refined.templates, refined.candidates)
+    notes += refusals
     return result_of(data, case, replace(refined, attribution=found, partial=partial), reduction, notes)
 
 

@@ -4,22 +4,17 @@ The formula follows from the hooks that an effect defines, so that a user's effe
 stochastic effect has no matched filter: it shows in the spectra.
 """
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
 from mcsim import systematics
 from mcsim.diagnosis.wiener_filter import FilteredMaps, Model, by_degree
-from mcsim.instrument.scan import MapGrid, scan_key
-from mcsim.simulation.survey import mean_gain
+from mcsim.simulation.pixel_means import gain_of, signal_of
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
-from mcsim.support import folders
 from mcsim.support.arrays import Map
-from mcsim.support.code import class_digest, package_digest
 from mcsim.systematics import Effect
 
 MatchedFilter = Callable[[FilteredMaps], float]
@@ -39,6 +34,8 @@ def matched_filter(model: Model, effect: Effect, channel: int | None) -> Matched
         return None
     if kind.beam is not Effect.beam or kind.pointing is not Effect.pointing or kind.spread is not Effect.spread:
         return _beam_filter(model, effect, channel)
+    if kind.signal is not Effect.signal:
+        return _signal_filter(model, effect, channel)
     factor = effect.noise(owner.site)
     if factor is not None:
         change, parts = np.asarray(factor) - 1.0, model.of(channel)
@@ -92,9 +89,8 @@ def _beam_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter | 
 
 def _gain_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter:
     """Correlate residuals with sky and dipole times the mean gain error of every pixel."""
-    site, parts = model.survey.channels[channel].site, model.of(channel)
-    splits, lmax = len(parts), max(model.lmax, 1)
-    errors = [gain_of(effect, site, (n / splits, (n + 1) / splits)) for n in range(splits)]
+    site, parts, lmax = model.survey.channels[channel].site, model.of(channel), max(model.lmax, 1)
+    errors = [gain_of(effect, site, model.survey.config.map.span(n)) for n in range(len(parts))]
     dipole = healpix.synthesis(dipole_alm(site.dipole_uk, lmax)[None], model.nside, lmax)[0]
 
     def value(filtered: FilteredMaps) -> float:
@@ -104,29 +100,15 @@ def _gain_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter:
     return value
 
 
-_TIMES = 4096
-"""At which a gain is evaluated for the key."""
+def _signal_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter:
+    """Correlate residuals with the mean of what is added to the samples of every pixel."""
+    site, parts = model.survey.channels[channel].site, model.of(channel)
+    signals = [signal_of(effect, site, model.survey.config.map.span(n)) for n in range(len(parts))]
 
+    def value(filtered: FilteredMaps) -> float:
+        return float(sum(np.dot(filtered.residual[i], signal) for i, signal in zip(parts, signals, strict=True)))
 
-def gain_of(effect: Effect, site: systematics.Site, share: tuple[float, float]) -> Map:
-    """Return the mean error of the gain in every pixel, kept on disk: each process of each diagnosis needs it.
-
-    The key has the effect, its code, and its gain at a few thousand times: what an effect takes from elsewhere shows
-    in these.
-    """
-    pointing = site.pointed(effect.name)
-    grid = MapGrid(site.nside, site.frame, share)
-    where = scan_key(pointing.model.with_lines_of_sight(pointing.line.name), grid)
-    period = pointing.model.period_of_samples(pointing.line)
-    times = period * np.linspace(*grid.sample_range(pointing.model, pointing.line), _TIMES)
-    code = class_digest(type(effect)) + package_digest(["mcsim.systematics", "mcsim.simulation"])
-    text = f"{effect!r} {pointing.line!r} {code}".encode()
-    what = hashlib.sha256(text + np.asarray(effect.gain(times, site)).tobytes()).hexdigest()
-
-    def fill(folder: Path) -> None:
-        np.save(folder / "gain.npy", np.asarray(mean_gain((effect,), site, share), dtype=np.float64))
-
-    return np.asarray(np.load(folders.cached(f"gain-{where[:32]}-{what[:32]}", fill) / "gain.npy"))
+    return value
 
 
 def normalised_difference(model: Model, filtered: FilteredMaps, parts: tuple[int, ...]) -> Map:

@@ -24,8 +24,9 @@ from mcsim.sphere.rotation import FRAMES, rotate_biposh
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.systematics import Effect, Library
 
-_SPECTRAL_HOOKS = ("sky", "beam", "pointing", "spread", "orientations", "noise")
-"""Hooks that change spectra of a map. A drift of the gain does so in the lowest degrees only and is no candidate."""
+_SPECTRAL_HOOKS = ("sky", "beam", "pointing", "spread", "orientations", "noise", "excess")
+"""Hooks that change spectra of a map. Gains and signals of samples do so in the lowest degrees only, and are no
+candidates."""
 
 
 class Pair(NamedTuple):

@@ -1,7 +1,7 @@
 """Simulations of the model: the null distribution of the data vector."""
 
 import json
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -29,6 +29,15 @@ class NullEnsemble:
     residual_scatter: Matrix  # standard deviation of the same
     residual_rms: Matrix  # rms of each over this scatter, (n, map)
     redundant: float = 1e-4  # directions with less than this fraction of the largest variance are left out
+    # Of an external model: the reference of its simulator if that can add effects, of the extended data vector,
+    # and the offset of mcsim's routes.
+    external_reference: Matrix | None = None
+    own_offset: Vector | None = None
+    # Numbers beside the data vector, which no test of the gap sees: of the same simulations, (N, E), and all else.
+    slices: Matrix = field(default_factory=lambda: np.zeros((0, 0)))
+    slice_offset: Vector = field(default_factory=lambda: np.zeros(0))
+    slice_reference: Matrix = field(default_factory=lambda: np.zeros((0, 0)))
+    slice_elements: tuple[Element, ...] = ()
 
     @cached_property
     def spread(self) -> Vector:
@@ -39,6 +48,20 @@ class NullEnsemble:
     def gaussian(self) -> SimulatedGaussian:
         """Return the Gaussian with mean and covariance of the simulations, the mean moved by the offset."""
         return SimulatedGaussian.from_simulations(self.simulations, self.offset, self.redundant)
+
+    @cached_property
+    def extended(self) -> "NullEnsemble":
+        """Return the ensemble of the data vector with the numbers beside it behind it, (p + E) elements."""
+        if not self.slice_elements:
+            return self
+        return replace(
+            self,
+            simulations=np.concatenate([self.simulations, self.slices], axis=1),
+            offset=np.concatenate([self.offset, self.slice_offset]),
+            reference=np.concatenate([self.reference, self.slice_reference], axis=1),
+            elements=(*self.elements, *self.slice_elements),
+            slice_elements=(),
+        )
 
     def restrict(self, rows: NDArray[np.int64]) -> "NullEnsemble":
         """Return the ensemble of some elements."""
@@ -71,6 +94,7 @@ def save(path: Path, ensemble: NullEnsemble, bank: TemplateBank) -> None:
     arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
     attributes = {
         "elements": json.dumps([asdict(element) for element in ensemble.elements]),
+        "slice_elements": json.dumps([asdict(element) for element in ensemble.slice_elements]),
         "columns": json.dumps(bank.labels),
         "redundant": ensemble.redundant,
     }
@@ -82,8 +106,11 @@ def load(path: Path) -> tuple[NullEnsemble, TemplateBank]:
     """Read what :func:`save` wrote."""
     with xr.open_zarr(path, consolidated=False) as dataset:
         arrays = {str(name): np.asarray(values) for name, values in dataset.data_vars.items()}
-        elements = TypeAdapter(tuple[Element, ...]).validate_json(dataset.attrs["elements"])
+        elements, beside = (
+            TypeAdapter(tuple[Element, ...]).validate_json(dataset.attrs[key]) for key in ("elements", "slice_elements")
+        )
         columns = TypeAdapter(tuple[Column, ...]).validate_json(dataset.attrs["columns"])
         redundant = float(dataset.attrs["redundant"])
-    bank = TemplateBank(arrays.pop("matrix"), arrays.pop("error"), arrays.pop("curvature"), columns)
-    return NullEnsemble(**arrays, elements=elements, redundant=redundant), bank
+    matrix, error, curvature, beside_matrix = map(arrays.pop, ("matrix", "error", "curvature", "slice_matrix"))
+    bank = TemplateBank(matrix, error, curvature, columns, beside_matrix)
+    return NullEnsemble(**arrays, elements=elements, redundant=redundant, slice_elements=beside), bank

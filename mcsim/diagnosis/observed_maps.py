@@ -1,23 +1,22 @@
 """Observed maps: read them, refuse what the model cannot describe, and prepare them for a diagnosis."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
 
-import healpy
 import numpy as np
 
 from mcsim import config
-from mcsim.diagnosis.campaign import constrained_jobs
+from mcsim.diagnosis.campaign import after_jobs, constrained_jobs
 from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.localisation import Place, places, standardised
+from mcsim.diagnosis.map_checks import checked_map
 from mcsim.diagnosis.selection import Attribution
-from mcsim.diagnosis.wiener_filter import Model, Part, shared_sky, sky_variance
-from mcsim.ensemble.maps import file_names
+from mcsim.diagnosis.wiener_filter import Model, Part, shared_sky
+from mcsim.ensemble.maps import file_names, read_uk
 from mcsim.errors import InputError
-from mcsim.sphere import header, healpix
 from mcsim.stats.look_elsewhere import global_test
 from mcsim.support.arrays import Alm, Map, Matrix, Vector
 
@@ -30,36 +29,50 @@ class ObservedMaps(DataSet[Sequence[Map]]):
     """
 
     @cached_property
-    def _measured(self) -> tuple[Vector, Vector, Map]:
-        """Return data vector, bipolar scan and coarse residuals, shape (map, npix)."""
+    def _measured(self) -> tuple[Vector, Vector, Map, Vector]:
+        """Return data vector, bipolar scan, coarse residuals, shape (map, npix), and the numbers beside them."""
         analysis, ensemble = self.context.analysis, self.context.ensemble
-        size = len(analysis.elements)
-        found = analysis.data_vector(self.data, bipolar_scan=True)
-        x, scan, coarse = np.split(found, [size, size + ensemble.bipolar_scan.shape[1]])
-        return x, scan, coarse.reshape(ensemble.residual_mean.shape)
+        sizes = [len(analysis.elements), len(analysis.slices), ensemble.bipolar_scan.shape[1]]
+        found = analysis.data_vector(self.data, bipolar_scan=True, slices=True)
+        x, beside, scan, coarse = np.split(found, np.cumsum(sizes))
+        return x, scan, coarse.reshape(ensemble.residual_mean.shape), beside
 
     @property
     def x(self) -> Vector:
         """Return the data vector, shape (p,)."""
         return self._measured[0]
 
+    @property
+    def extended(self) -> Vector:
+        """Return the data vector with the numbers beside it behind it, shape (p + E,)."""
+        return np.concatenate([self.x, self._measured[3]])
+
     @cached_property
     def _sky(self) -> Alm:
         return shared_sky(self.context.analysis.model, self.data)
 
     @cached_property
-    def _before(self) -> list[Vector]:
-        """Return data vectors of constrained skies without any effect, as many as were needed so far."""
-        return []
+    def _before(self) -> dict[bool, list[Vector]]:
+        """Return data vectors of constrained skies without any effect, as many as were needed so far.
+
+        The key is True for those of an external simulator.
+        """
+        return {False: [], True: []}
 
     def respond(self, found: Sequence[config.Effect], skies: int) -> Matrix:
         """Return changes of the data vector in ``skies`` constrained skies, shape (rows, p).
 
         Effects with a mean response are simulated in typical skies instead: the observed sky has its power already.
         """
+        return self.respond_extended(found, skies)[:, : len(self.x)]
+
+    def respond_extended(self, found: Sequence[config.Effect], skies: int) -> Matrix:
+        """Return the changes of :meth:`respond` with those of the numbers beside the data vector, (rows, p + E)."""
         typical = [effect for effect in found if self._is_typical(effect)]
         others = [effect for effect in found if not self._is_typical(effect)]
-        shift = super().respond(typical, skies) if typical else np.zeros((1, len(self.x)))
+        shift = np.zeros((1, len(self.extended)))
+        if typical:
+            shift = self._simulated(typical) - self.context.extended_reference(typical)
         if not others:
             return shift
         before, after = self._constrained(others, skies)
@@ -67,21 +80,29 @@ class ObservedMaps(DataSet[Sequence[Map]]):
 
     def pair(self, found: Sequence[config.Effect]) -> tuple[Matrix, Matrix]:
         """Return data vectors of the same skies without effects and with them, shape (rows, p) each."""
+        size = len(self.x)
         if any(self._is_typical(effect) for effect in found):
-            return self.context.ensemble.reference, self._simulated(found)
-        return self._constrained(found, self.context.settings.constrained_skies)
+            return self.context.reference(found), self._simulated(found)[:, :size]
+        before, after = self._constrained(found, self.context.settings.constrained_skies)
+        return before[:, :size], after[:, :size]
+
+    def _simulated(self, found: Sequence[config.Effect]) -> Matrix:
+        """Return extended data vectors of the skies of the reference with effects, shape (rows, p + E)."""
+        jobs = after_jobs(self.context.analysis, found)
+        return np.concatenate(self.ask([replace(job, slices=True) for job in jobs]))
 
     def _constrained(self, found: Sequence[config.Effect], skies: int) -> tuple[Matrix, Matrix]:
-        """Return data vectors of constrained skies without effects and with them, shape (skies, p) each."""
+        """Return extended data vectors of constrained skies without effects and with them, (skies, p + E) each."""
+        source = self.context.analysis.source_of(found, given_sky=True)
 
         def simulated(found: Sequence[config.Effect], first: int) -> Matrix:
             jobs = constrained_jobs(self.context.analysis, found, self._sky, range(first, skies))
-            return np.concatenate(self.ask(jobs))
+            return np.concatenate(self.ask([replace(job, slices=True, source=source) for job in jobs]))
 
-        after = simulated(found, 0)
-        if len(self._before) < skies:
-            self._before.extend(simulated((), len(self._before)))
-        return np.stack(self._before[:skies]), after
+        after, before = simulated(found, 0), self._before[source is not None]
+        if len(before) < skies:
+            before.extend(simulated((), len(before)))
+        return np.stack(before[:skies]), after
 
     def _is_typical(self, effect: config.Effect) -> bool:
         kind = next(one.effect for one in self.context.candidates if one.name == effect.name)
@@ -166,48 +187,14 @@ def checked(model: Model, maps: Sequence[Map]) -> list[Map]:
     if len(maps) != len(model.parts):
         raise InputError(f"{len(maps)} maps were given, the model has {len(model.parts)}; give one for each.")
     arrays = [np.asarray(map_, dtype=np.float64) for map_ in maps]
-    return [_checked(model, part, map_, f"map {part.name}") for part, map_ in zip(model.parts, arrays, strict=True)]
+    return [checked_map(model, part, map_, f"map {part.name}") for part, map_ in zip(model.parts, arrays, strict=True)]
 
 
 def _read(model: Model, part: Part, path: Path) -> Map:
     if not path.is_file():
         raise InputError(f"{path} does not exist; the model has a map {part.name}, give it under that name.")
-    map_, frame, unit = healpix.read_map(path)
-    if frame not in (None, model.frame):
-        raise InputError(f"{path} is in {frame} coordinates, the model in {model.frame}; rotate the map.")
-    factor = header.to_uk(unit, path, model.survey.channels[part.channel].site.frequency_ghz)
-    return _checked(model, part, np.where(map_ == healpy.UNSEEN, map_, factor * map_), str(path))
-
-
-def _checked(model: Model, part: Part, map_: Map, name: str) -> Map:
-    """Return the map if it can be of the survey."""
-    if map_.shape != (12 * model.nside**2,):
-        size = healpy.npix2nside(map_.size) if map_.ndim == 1 and healpy.isnpixok(map_.size) else None
-        found = f"the shape {map_.shape}" if size is None else f"nside {size}"
-        raise InputError(f"{name} has {found}, the model {model.nside}; bring them to the same.")
-    broken = int(np.sum(~np.isfinite(map_)))
-    if broken:
-        raise InputError(f"{name} has {broken} pixels that are not finite; mark what was not observed as UNSEEN.")
-    unseen = map_ == healpy.UNSEEN
-    fiducial, limits = part.precision > 0, model.settings
-    lost = float(np.mean(unseen[fiducial]))
-    if lost > limits.missing_share:
-        raise InputError(
-            f"{name} leaves out {100 * lost:.0f} % of the pixels that the fiducial scan hits, at most "
-            f"{100 * limits.missing_share:.0f} % may be; give the model a mask (map.mask) that leaves them out too."
-        )
-    seen = map_[fiducial & ~unseen]
-    rms = float(np.std(seen))
-    if rms == 0.0:
-        raise InputError(f"{name} is constant; give an observed map.")
-    sky, noise = sky_variance(model.cl, model.response[part.channel]), np.mean(1.0 / part.precision[fiducial])
-    ratio = rms / float(np.sqrt(sky + noise))
-    if not 1.0 / limits.rms_ratio < ratio < limits.rms_ratio:
-        raise InputError(
-            f"{name} has an rms of {rms:.3g} uK where the model expects {rms / ratio:.3g} uK; is it in another "
-            "unit, or is the dipole still in it? Say the unit in its header (TUNIT1), or give it in uK."
-        )
-    return map_
+    map_ = read_uk(path, model.frame, model.survey.channels[part.channel].site.frequency_ghz)
+    return checked_map(model, part, map_, str(path))
 
 
 def exchanges(parts: Sequence[Part]) -> list[tuple[int, ...]]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mcsim.diagnosis.candidate import Candidate, columns_of, effects_at, parts_of, within_bounds
+from mcsim.diagnosis.candidate import Candidate, beyond, columns_of, effects_at, parts_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.errors import InputError
@@ -115,7 +115,7 @@ class Refiner:
             taken = {candidates[member].identity for member in members}
             free = [i for i, one in enumerate(candidates) if one.identity not in taken and i not in refused]
             fits = {i: self._fit(t, candidates, (*members, i)) for i in free}
-            possible = [i for i, fit in fits.items() if within_bounds(candidates, (*members, i), fit)]
+            possible = [i for i, fit in fits.items() if np.isfinite(beyond(candidates, (*members, i), fit))]
             best = min(possible, key=lambda i: self._pvalue(before, fits[i]), default=None)
             if best is None or not self._is_significant(before, fits[best]):
                 break
@@ -123,7 +123,7 @@ class Refiner:
             exact = self._together(candidates, t, together, fits[best])
             if exact is not None:
                 after = self._fit(exact, candidates, together)
-                if within_bounds(candidates, together, after) and self._is_significant(before, after):
+                if np.isfinite(beyond(candidates, together, after)) and self._is_significant(before, after):
                     members, t, before = together, exact, after
                     continue
             refused.add(best)

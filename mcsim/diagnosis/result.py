@@ -11,6 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
+from mcsim.diagnosis.consistency import Comparison, MapCheck
 from mcsim.diagnosis.control_result import Controls
 from mcsim.diagnosis.localisation import Place
 from mcsim.diagnosis.selection import Contrast, Verdict
@@ -28,7 +29,10 @@ PLACES = 12
 
 @dataclass(frozen=True)
 class EffectResult:
-    """One fitted effect: amplitude, standard error and parameters; ``label`` and ``words`` as people read them."""
+    """One fitted effect: amplitude, standard error and parameters; ``label`` and ``words`` as people read them.
+
+    ``consistency`` are its amplitudes in parts of the data, over the fitted one, and ``parts`` the same in words.
+    """
 
     name: str
     channel: str | None
@@ -38,6 +42,8 @@ class EffectResult:
     parameters: dict[str, Any]
     label: str
     words: str
+    consistency: tuple[Comparison, ...] = ()
+    parts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,8 @@ class EffectSet:
         Of the residual that the fit leaves: p-value, and excess chi^2.
     further
         p-value of the most significant further candidate, with the look-elsewhere effect.
+    maps
+        Largest scales of the maps before and after the effects are taken out.
     """
 
     effects: tuple[EffectResult, ...]
@@ -66,6 +74,7 @@ class EffectSet:
     pvalue: float
     further: float
     excess: Measured
+    maps: tuple[MapCheck, ...] = ()
 
     @property
     def label(self) -> str:
@@ -118,6 +127,31 @@ class CandidateResult:
         return float(np.sqrt(max(self.delta_chi2, 0.0)))
 
 
+@dataclass(frozen=True)
+class Agreement:
+    """Say which simulator an external model is, and if mcsim's own simulation of its description agrees with it.
+
+    Attributes
+    ----------
+    simulator
+        In words.
+    pvalue, agrees, skies
+        Of the test with so many of mcsim's skies.
+    nearest
+        What the external simulations look like, seen from mcsim's: the effect, with its amplitude, nearest to the
+        difference.
+    effects
+        Names of the effects whose responses the external simulator makes; those of all others are mcsim's.
+    """
+
+    simulator: str
+    pvalue: float
+    agrees: bool
+    skies: int
+    nearest: str | None
+    effects: tuple[str, ...]
+
+
 @dataclass(frozen=True, eq=False)
 class DiagnosisResult:
     """All that a diagnosis says: the verdict, and what it rests on.
@@ -161,8 +195,12 @@ class DiagnosisResult:
         The run that is the model, as JSON.
     controls
         Diagnoses of data drawn from the model at higher fidelity; None: none were asked for.
+    agreement
+        Of an external model; None where mcsim simulates.
     faint, probability
         True if sets describe the data, but are less probable than all else together; their posterior probability.
+    contradicted
+        Sets that describe the data vector and are not named, because parts of the data do not bear them out.
     """
 
     case: str
@@ -197,6 +235,8 @@ class DiagnosisResult:
     controls: Controls | None = None
     faint: bool = False
     probability: float = 1.0
+    agreement: Agreement | None = None
+    contradicted: tuple[EffectSet, ...] = ()
 
     @property
     def verdict(self) -> dict[str, Any]:
@@ -252,6 +292,8 @@ class DiagnosisResult:
             **faint,
             "effects": sets[0] if sets else [],
             "alternatives": sets[1:],
+            "maps": [] if not self.sets else [asdict(one) for one in self.sets[0].maps],
+            **({"contradicted": [_set_json(one) for one in self.contradicted]} if self.contradicted else {}),
             "odds": [one.odds for one in self.sets],
             "where": [_place_json(place) for place in self.places[:PLACES]],
             "shrink": None if self.held_out is None else _held_out_json(self.held_out),
@@ -267,6 +309,7 @@ class DiagnosisResult:
             "notes": list(self.notes),
             **({"warnings": list(self.warnings)} if self.warnings else {}),
             **({"controls": self.controls.to_json()} if self.controls is not None else {}),
+            **({"simulator": asdict(self.agreement)} if self.agreement else {}),
         }
 
     def to_dataset(self) -> xr.Dataset:
@@ -338,7 +381,22 @@ _OF_CANDIDATES = {"amplitude": "fitted alone", "sigma": "standard error", "delta
 
 
 def _effect_json(effect: EffectResult) -> dict[str, Any]:
-    return {name: value for name, value in vars(effect).items() if name not in ("label", "words")}
+    plain = {name: value for name, value in vars(effect).items() if name not in _NOT_IN_JSON}
+    return plain | {"consistency": [_comparison_json(effect, one) for one in effect.consistency]}
+
+
+_NOT_IN_JSON = ("label", "words", "consistency", "parts")
+
+
+def _comparison_json(effect: EffectResult, one: Comparison) -> dict[str, Any]:
+    """Return the amplitudes of parts of the data in the unit of the effect."""
+    amplitudes = [effect.amplitude * value for value in one.amplitudes]
+    errors = [abs(effect.amplitude) * value for value in one.errors]
+    return {"by": one.kind, "slices": list(one.slices), "amplitude": amplitudes, "sigma": errors, "p": one.pvalue}
+
+
+def _set_json(one: EffectSet) -> dict[str, Any]:
+    return {"effects": [_effect_json(effect) for effect in one.effects], "maps": [asdict(own) for own in one.maps]}
 
 
 def _place_json(place: Place) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Select the smallest sets of candidates that explain the data, and what would tell these sets apart."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Literal
@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mcsim.diagnosis.candidate import Candidate, columns_of, within_bounds
+from mcsim.diagnosis.candidate import Candidate, beyond, columns_of
+from mcsim.diagnosis.consistency import NOT_TESTED, Findings
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.subsets import Subsets
 from mcsim.stats.detection import cosines
@@ -30,7 +31,8 @@ class Explanation:
 
     ``fit`` has the amplitudes of their columns, one member after the other; ``odds`` are posterior odds relative to
     the best explanation, <= 1; ``pvalue`` is that of the residual, with errors of the templates tolerated, and
-    ``further`` the global p-value of the most significant further candidate.
+    ``further`` the global p-value of the most significant further candidate. ``findings`` compare its amplitudes in
+    parts of the data.
     """
 
     members: tuple[int, ...]
@@ -38,6 +40,7 @@ class Explanation:
     odds: float
     pvalue: float
     further: float
+    findings: Findings = NOT_TESTED
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,8 @@ class Attribution:
         the three kinds (no effect, known, unknown) are equally probable before, and look-elsewhere is charged for.
     faint
         True if that is too small for a name.
+    contradicted
+        Sets that parts of the data contradict.
     """
 
     verdict: Verdict
@@ -93,12 +98,26 @@ class Attribution:
     contrasts: tuple[Contrast, ...]
     probability: float = 1.0
     faint: bool = False
+    contradicted: tuple[Explanation, ...] = ()
 
     def if_named(self, settings: DiagnosisSettings) -> "Attribution":
         """Return the attribution without its explanations if these are less probable than all else together."""
         if not self.explanations or self.probability >= settings.named_probability:
             return self
         return replace(self.unexplained(), faint=True)
+
+    def of(self, explanations: Sequence[Explanation]) -> "Attribution":
+        """Return the attribution with some of its explanations, in order."""
+        kept = {one.members: place for place, one in enumerate(explanations)}
+        places = [kept.get(one.members) for one in self.explanations]
+        contrasts = tuple(
+            replace(one, first=first, second=second)
+            for one in self.contrasts
+            if (first := places[one.first]) is not None and (second := places[one.second]) is not None
+        )
+        return replace(
+            self, verdict=_verdict(False, explanations), explanations=tuple(explanations), contrasts=contrasts
+        )
 
     def unexplained(self) -> "Attribution":
         """Return the same attribution with the verdict "unknown" and no explanation."""
@@ -215,8 +234,11 @@ class _Selection:
         known = {found.members: found.evidence for found in accepted}
         for search in searches:
             for subsets in search.rows(1, ()):
-                members = [(int(one),) for one in subsets[:, 0]]
-                known = dict(zip(members, search.solve(subsets).evidence.tolist(), strict=True)) | known
+                evidence = search.solve(subsets).evidence.tolist()
+                alone = (
+                    _Accepted(e, (int(k),), 0.0, 0.0, search.null) for e, k in zip(evidence, subsets[:, 0], strict=True)
+                )
+                known = {one.members: one.evidence for one in self._possible(alone)} | known
         nothing = float(self.null.log_likelihood(searches[0].total))
         everything = special.logsumexp([nothing, searches[0].unknown, *known.values()])
         return float(np.exp(special.logsumexp([found.evidence for found in accepted]) - everything))
@@ -233,7 +255,7 @@ class _Selection:
                 doubted = size > 1 or bool(search.scattered)
                 least = max(best - cut, unknown if doubted else -np.inf)
                 for subsets in search.rows(size, [found.members for found in accepted]):
-                    fresh += filter(self._possible, _sufficient(search, subsets, least, doubted))
+                    fresh += self._possible(_sufficient(search, subsets, least, doubted))
             accepted += fresh
             best = max([best, *(found.evidence for found in fresh)])
         return accepted
@@ -253,14 +275,12 @@ class _Selection:
                 y = wide.whiten(self.x)
                 yield Subsets(wide, y, groups, self.candidates, self.calibration, self.settings, members)
 
-    def _possible(self, found: _Accepted) -> bool:
-        """Return True if the fitted amplitudes of all members are within their bounds."""
-        effects = [self.candidates[member].effect for member in found.members]
-        if not any(
-            effect.parametrization.sign or np.isfinite(effect.parametrization.max_amplitude) for effect in effects
-        ):
-            return True
-        return within_bounds(self.candidates, found.members, self._fit(found.null, found.members))
+    def _possible(self, found: Iterable[_Accepted]) -> Iterator[_Accepted]:
+        """Yield the sets whose fitted amplitudes are possible, with the evidence of the nearest ones within bounds."""
+        for one in found:
+            distance = beyond(self.candidates, one.members, self._fit(one.null, one.members))
+            if np.isfinite(distance):
+                yield replace(one, evidence=one.evidence - 0.5 * distance**2)
 
     def _fit(self, null: SimulatedGaussian, members: tuple[int, ...]) -> Fit:
         return null.fit(self.x, self.t[:, columns_of(self.candidates, members)])

@@ -14,7 +14,10 @@ class DiagnosisSettings:
     without
         Names of effects that are no candidates.
     library
-        Effects by name, as :func:`mcsim.effects` returns them; None: all of these.
+        Effects by name, as :func:`mcsim.effects` returns them; None: those of them that are proposed without a request.
+    including
+        Names of effects that are candidates although they are proposed on request alone; those of a ``library`` that is
+        given always are.
     simulations
         Simulations for the covariance of the data vector; None: ``sims_per_element`` for each of its elements.
     controls
@@ -44,6 +47,17 @@ class DiagnosisSettings:
         Standard deviations by which a fractional reduction on held-out data may miss its prediction, or zero.
     half_snr_share
         Share of an effect's expected S/N that each half needs for a reduction to be measured.
+    consistency_level
+        Global p-value of the comparisons of an effect's amplitude in independent parts of the data, and of what it
+        leaves in them, up to which it is not named.
+    absence_odds
+        Odds of no effect against it, in the data without the part that supports it most, from which on it is not named.
+    consistency_error
+        Relative error of an effect's response in these parts that is tolerated.
+    compared_sets
+        Sets of effects that are simulated for it, the most probable ones.
+    slice_snr
+        Expected S/N of an effect in a part of the data from which on the part counts.
     place_pvalue
         P-value up to which a group of numbers is listed before others of a kind listed already.
     sims_per_element, pilot_sims_per_element
@@ -99,6 +113,8 @@ class DiagnosisSettings:
     rms_ratio, cl_ratio, biposh_ratio
         Largest ratio to the model, either way, of the rms of a map and of C_l, and of BipoSH to their standard
         deviation: beyond it the unit is wrong.
+    agreement_level
+        p-value up to which mcsim's own simulation does not agree with that of an external model.
     small_chi2_pvalue
         Probability of a smaller chi^2 below which a table of spectra is refused.
     correlated_sigma
@@ -122,6 +138,7 @@ class DiagnosisSettings:
 
     without: tuple[str, ...] = ()
     library: Library | None = None
+    including: tuple[str, ...] = ()
     simulations: int | None = None
     controls: int = 0
     alpha: float = 0.05
@@ -138,6 +155,11 @@ class DiagnosisSettings:
     exchanged_pvalue: float = 0.01
     reduction_sigma: float = 3.0
     half_snr_share: float = 0.2
+    consistency_level: float = 0.01
+    absence_odds: float = 20.0
+    consistency_error: float = 0.05
+    compared_sets: int = 4
+    slice_snr: float = 2.0
     place_pvalue: float = 0.01
 
     sims_per_element: int = 10
@@ -181,5 +203,6 @@ class DiagnosisSettings:
     rms_ratio: float = 20.0
     cl_ratio: float = 25.0
     biposh_ratio: float = 1000.0
+    agreement_level: float = 0.01
     small_chi2_pvalue: float = 1e-6
     correlated_sigma: float = 5.0

@@ -66,6 +66,8 @@ KINDS = {
     "biposh": "BipoSH of residual × sky",
     "cross": "cross power of residuals",
     "table": "measured spectrum",
+    "residual": "residual at the largest scales",
+    "gain": "residual × sky at the largest scales",
 }
 """What the elements of the data vector measure, in words."""
 
@@ -101,7 +103,7 @@ def scales(lmax: int) -> list[tuple[int, int]]:
     return [(a, b - 1) for a, b in pairwise(edges)]
 
 
-def _of_map(model: Model, part: int) -> Element:
+def of_map(model: Model, part: int) -> Element:
     """Describe what the elements of a map have in common; maps of a channel are in fold 0 and 1 alternately."""
     own = model.parts[part]
     members = model.of(own.channel)
@@ -116,7 +118,7 @@ def _height(frame: str, to: str, nside: int) -> Map:
 
 def _beam_block(model: Model, part: int) -> Block:
     """Project D_s(l) on B_l l^s, the change of a beam at order s, in few bins."""
-    whole, own, settings = _of_map(model, part), model.parts[part], model.settings
+    whole, own, settings = of_map(model, part), model.parts[part], model.settings
     ell = np.arange(model.lmax + 1)
     beam = model.survey.channels[own.channel].site.beam
     top = settings.beam_orders if part == model.of(own.channel)[0] else settings.split_beam_orders
@@ -142,7 +144,7 @@ def _beam_block(model: Model, part: int) -> Block:
 
 def _dipole_block(model: Model, part: int) -> Block:
     """Measure the dipole of the residual: x, y, z."""
-    alike = replace(_of_map(model, part), ell=(1, 1), L=1, kind="dipole")
+    alike = replace(of_map(model, part), ell=(1, 1), L=1, kind="dipole")
     elements = tuple(replace(alike, name=f"dipole/{alike.name}/{axis}", component=axis) for axis in "xyz")
     one, two = alm_.start(model.lmax, 0) + 1, alm_.start(model.lmax, 1) + 1
 
@@ -157,7 +159,7 @@ def _plane_block(model: Model, part: int) -> Block:
     """Measure the residual along the Galactic plane, against its mean over the sky."""
     profile = 1.0 / (1.0 + (_height(model.frame, "galactic", model.nside) / model.settings.plane_width) ** 2)
     profile -= profile.mean()
-    whole = replace(_of_map(model, part), ell=(2, model.settings.large_scales), frame="galactic", kind="plane")
+    whole = replace(of_map(model, part), ell=(2, model.settings.large_scales), frame="galactic", kind="plane")
     element = replace(whole, name=f"plane/{whole.name}", L=2, M=0, parity="even")
     return Block((element,), lambda filtered: float(filtered.residual[part] @ profile))
 

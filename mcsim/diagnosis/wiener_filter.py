@@ -23,6 +23,7 @@ from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.errors import InputError
 from mcsim.instrument.scan import Moments
 from mcsim.simulation import convolve
+from mcsim.simulation.noise import NoiseOfFiles
 from mcsim.simulation.survey import Survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
@@ -110,6 +111,11 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
             )
         floor = settings.noise_floor * float(np.sqrt(sky_variance(cl, response[index])))
         for m, split in zip(channel.maps, run.map.splits or (None,), strict=True):
+            if isinstance(m.drawn, NoiseOfFiles):
+                raise InputError(
+                    f"the noise of map {m.name} is read from files, of which a diagnosis would need thousands; "
+                    'describe it by noise of kind "white", "depth", "variance", "difference" or "correlated".'
+                )
             seen = m.moments.hits > 0
             if m.weight is not None:
                 seen = seen & (m.weight > 0)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from mcsim.diagnosis.result import DiagnosisResult, EffectResult
+from mcsim.diagnosis.result import Agreement, DiagnosisResult, EffectResult
 from mcsim.diagnosis.selection import Contrast
 from mcsim.stats.excess import Measured
 from mcsim.support.numbers import measured, number, p_equals
@@ -34,6 +34,9 @@ def sentence(result: DiagnosisResult) -> str:
         if len(result.partial) > 1 and result.partial_left is not None:
             left = f"{100 * result.partial_left:.0f} % of the excess χ²"
             partly = f" Detected are {_effects(result.partial)}; they leave {left}."
+        if result.contradicted:
+            sets = "; and ".join(_effects(one.effects) for one in result.contradicted[: SETS + 1])
+            return f"{start}. Parts of the data do not bear out what fits the data vector: {sets}."
         chance = ", which may be chance" if result.test.pvalue > DISAGREES else ""
         return f"{start}{chance}, and no effect of the library explains why.{partly}"
     if result.kind == "degenerate":
@@ -54,10 +57,11 @@ def tested(result: DiagnosisResult) -> str:
     source = f"{len(result.maps)} maps" + (f" ({splits} splits)" if splits > 1 else "")
     if result.residual_maps is None:
         source = "a table of spectra"
+    by = "" if result.agreement is None else f" by {result.agreement.simulator}"
     return (
         f"{len(result.elements)} elements of the data vector, {result.test.dimension} of them independent, measured "
-        f"from {source}; {result.simulations} simulations of the model; {len(result.candidates)} candidate effects, "
-        f"alone and up to {result.settings.max_effects} together"
+        f"from {source}; {result.simulations} simulations of the model{by}; "
+        f"{len(result.candidates)} candidate effects, alone and up to {result.settings.max_effects} together"
     )
 
 
@@ -100,6 +104,19 @@ def status(result: DiagnosisResult) -> str:
     )
 
 
+def agreement(found: Agreement) -> str:
+    """Return if mcsim's own simulation agrees with an external model, and where the responses come from."""
+    how = "agrees" if found.agrees else "does not agree"
+    text = f"mcsim's own simulation of the description {how} with {found.simulator} "
+    text += f"({p_equals(found.pvalue)}, {found.skies} skies)"
+    if not found.agrees and found.nearest is not None:
+        text += f"; nearest to what {found.simulator} has beside it is {found.nearest}"
+    whose = f"those of {', '.join(found.effects)} are {found.simulator}'s" if found.effects else ""
+    if found.agrees:
+        return f"{text}. Responses to effects are mcsim's{f', but {whose}' if whose else ''}."
+    return f"{text}. Responses to effects are mcsim's and approximate{f', but {whose}' if whose else ''}."
+
+
 def chi2(result: DiagnosisResult) -> str:
     """Return the unbiased chi^2 of the data vector, its degrees of freedom and the global p-value."""
     dof = result.test.dimension
@@ -127,6 +144,22 @@ def held_out(result: DiagnosisResult) -> str:
         f"Adding the best fit to the simulator removes {percent(found.achieved)} of the excess χ² of {found.data}; "
         f"{percent(found.predicted)} was predicted; {left}."
     )
+
+
+def compared_parts(result: DiagnosisResult) -> list[str]:
+    """Return the amplitudes of each named effect in parts of the data, and what it removes from the maps."""
+    found = [
+        f"{effect.label}: {text} ({p_equals(one.pvalue)})"
+        for effect in result.effects
+        for one, text in zip(effect.consistency, effect.parts, strict=True)
+    ]
+    for one in result.sets[0].maps if result.sets else ():
+        fall, forecast = number(one.before - one.after), number(one.forecast)
+        maps = " and ".join(one.maps)
+        found.append(
+            f"Largest scales of {maps}: χ² falls by {fall}, {forecast} forecast; {p_equals(one.pvalue)} of the rest"
+        )
+    return found
 
 
 def percent(fraction: Measured) -> str:
@@ -160,6 +193,10 @@ def summary(result: DiagnosisResult, folder: Path) -> list[str]:
     if result.partial:
         rows += [("detected", _numbered(result.partial))]
     if result.sets:
+        tests = [one for effect in result.effects for one in effect.consistency]
+        least = min((one.pvalue for one in tests), default=1.0)
+        if tests:
+            rows.append(("parts agree", f"{len(tests)} comparisons of amplitudes, the least likely {p_equals(least)}"))
         rows.append(("held-out data", held_out(result)))
     if result.kind != "none":
         first = result.places[0]

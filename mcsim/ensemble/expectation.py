@@ -134,6 +134,11 @@ def noise_mean(survey: Survey, number: int, modes: Sequence[Indices]) -> NDArray
     """Return the mean BipoSH of the noise of a map, uK^2, shape (mode, lmax + 1)."""
     m = [m for channel in survey.channels for m in channel.maps][number]
     L_max, lmax = max(L for L, _, _ in modes), survey.lmax
+    if m.drawn is not None:
+        raise InputError(
+            f"the noise of map {m.name} is not white, and predictions are of white noise; simulate it with mcsim run, "
+            'or give the channel noise of kind "white", "depth" or "variance".'
+        )
     if m.noise_uk is None:
         return np.zeros((len(modes), lmax + 1), dtype=np.complex128)
     power = m.noise_uk**2 * nside2pixarea(m.moments.nside)

@@ -16,8 +16,8 @@ from mcsim.config.preparation import frame_of
 from mcsim.ensemble import opening, store
 from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError
-from mcsim.simulation import differencing
-from mcsim.simulation.channels import check_effects, load_beam
+from mcsim.simulation import differencing, noise
+from mcsim.simulation.channels import check_effects, load_beam, refuse_external
 from mcsim.simulation.preparation import preparation
 from mcsim.simulation.survey import Survey
 from mcsim.sphere import alm as alm_
@@ -163,6 +163,7 @@ class Cost:
     memory: float
     each_s: float
     preparation: str  # what preparing the maps adds, in words
+    noise: tuple[str, ...] = ()  # what is known of noise that is estimated or drawn, in words
 
     def lines(self, number: int, workers: int) -> list[str]:
         """Return lines on memory, preparation and time for a number of realizations."""
@@ -170,6 +171,7 @@ class Cost:
         return [
             f"  memory  {self.memory / 1e9:.2f} GB per worker, {workers} workers",
             *([f"  prepare {self.preparation}"] if self.preparation else []),
+            *(f"  noise   {line}" for line in self.noise),
             f"  time    {self.each_s:.3g} s per realization and core, {hours:.3g} core-hours,"
             f" {60.0 * hours / workers:.3g} minutes with {workers} workers on as many idle cores",
         ]
@@ -178,6 +180,7 @@ class Cost:
 def describe(source: str | Path, part: slice | None = None, workers: int | None = None) -> str:
     """Return a text on the cost of a run: realizations, tasks, memory, disk, files and time."""
     run = config.load(source)
+    refuse_external(run)
     check_effects(run)
     number, found = len(wanted(run, part)), cost(run)
     memory, *rest = found.lines(number, workers or run.compute.workers)
@@ -219,8 +222,8 @@ def cost(run: config.RunConfig) -> Cost:
         grid = f"nside {nside} to {config.prepared_grid(run)[0]}"
         words = f"{extra:g} further transforms per realization and {480e-9 * nside**2:.2g} GB per worker, {grid}"
     estimates = pairs * (2 if run.ensemble.paired else 1)
-    each_s = transform * transforms + estimation * estimates + differencing.seconds(run)
-    return Cost(planned, memory, each_s, words)
+    each_s = transform * transforms + estimation * estimates + differencing.seconds(run) + noise.seconds(run)
+    return Cost(planned, memory, each_s, words, tuple(noise.in_words(run)))
 
 
 def _timed(nside: int, lmax_sky: int, lmax: int, L_max: int) -> tuple[float, float]:

@@ -28,11 +28,11 @@ class Look:
 def look_at_beams(
     source: str | Path, lmax: int = 2048, m_max: int | None = None, pixel_deg: float | None = None
 ) -> Iterator[Look]:
-    """Yield the text and figure of the beams of a run configuration, of a beam map, or of a file of b_lm.
+    """Yield the text and figure of the beams of a run configuration, of a beam map, or of a file of b_lm or B_l.
 
-    ``source`` is a TOML configuration or packaged workflow (every channel is shown), or a FITS file: an image is a beam
-    map, a table holds b_lm. ``m_max`` is by default chosen from the beam, and ``pixel_deg``, the side of a pixel of a
-    beam map in degrees, read from its header.
+    ``source`` is a TOML configuration or packaged workflow (every channel is shown), or a file: a FITS image is a beam
+    map, a FITS table holds b_lm, a text (.txt, .dat) B_l. ``m_max`` is by default chosen from the
+    beam, and ``pixel_deg``, the side of a pixel of a beam map in degrees, read from its header.
     """
     path = Path(source)
     if path.is_dir() or (not path.exists() and path.suffix not in ("", ".toml")):
@@ -46,9 +46,12 @@ def look_at_beams(
             spec = channel.beam
             image = channels.load_beam_map(channel.name, spec) if isinstance(spec, config.BeamMap) else None
             yield _look_at(channel.name, channels.load_beam(channel, lmax), image)
-    elif beams.holds_image(path):
+    elif path.suffix not in (".txt", ".dat") and beams.holds_image(path):
         image = beams.read_map(path, pixel_deg=pixel_deg)
         yield _look_at(path.name, beams.Beam.from_map(image, lmax, m_max), image)
+    elif path.suffix in (".txt", ".dat"):
+        window = beams.read_window(path)
+        yield _look_at(path.name, beams.Beam.from_window(window, min(lmax, window.size - 1)), None)
     else:
         yield _look_at(path.name, beams.Beam.from_blm(path, lmax, m_max), None)
 

@@ -14,6 +14,9 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import rotation
 from mcsim.support import resources
 
+CIRCULAR = (config.BeamGaussian, config.BeamWindow)
+"""Beams that have no m_max."""
+
 WHOLE = 4
 """Orders that a beam has at least without its m_max, where its source has them."""
 
@@ -43,6 +46,9 @@ def _beam(channel: str, spec: config.Beam, lmax: int) -> beams.Beam:
         case config.BeamBlm():
             file = config.channel_path(spec.path, channel)
             return beams.Beam.from_blm(file, lmax, mmax=spec.m_max).rotated(np.deg2rad(spec.angle_deg))
+        case config.BeamWindow():
+            file = config.channel_path(spec.path, channel)
+            return beams.Beam.from_window(file, lmax, extension=spec.extension, column=spec.column)
 
 
 def load_beam_map(channel: str, spec: config.BeamMap) -> beams.BeamMap:
@@ -63,7 +69,7 @@ def scan_model(
     """Return the scan model of a channel, at the sampling and with the line of sight that the channel asks for."""
     model = scan.ScanModel.load(str(config.channel_path(chosen.model, spec.name, split)))
     if isinstance(chosen, config.ScanHitAveraged) and chosen.line_of_sight is not None:
-        model = model.with_lines_of_sight(chosen.line_of_sight)
+        model = model.with_lines_of_sight(chosen.line_of_sight.replace("{split}", str(split)))
     return model if chosen.sample_period_s is None else model.with_sampling(chosen.sample_period_s)
 
 
@@ -87,6 +93,16 @@ def effects_on(
     return tuple(acting)
 
 
+def refuse_external(run: config.RunConfig) -> None:
+    """Raise InputError for a run whose maps another simulator makes."""
+    if run.simulator is not None or run.ensemble.maps is not None:
+        key = "ensemble.maps" if run.simulator is None else "simulator"
+        given = run.simulator or run.ensemble.maps
+        raise InputError(
+            f"{run.name} has {key} = {given!r}, which only a diagnosis of maps takes; remove it to simulate with mcsim."
+        )
+
+
 def check_effects(run: config.RunConfig) -> None:
     """Refuse a run with an effect that is not known, or cannot act where it is put, as the run would; make no map."""
     for spec in run.channels:
@@ -95,17 +111,29 @@ def check_effects(run: config.RunConfig) -> None:
             continue
         if run.map.grid == "gl":
             refuse_pixel_effects(spec.name, acting)
+        if isinstance(spec.scan, config.ScanDifferencing):
+            refuse_excess(spec.name, acting)
         site = site_of(run, spec)
         systematics.seen_through(acting, site)
         systematics.looked_at(acting, np.zeros(alm_.size(site.lmax), complex), site, run.ensemble.seed, 0)
         for effect in acting:
             effect.gain(np.zeros(1), site)
+        systematics.check_added(acting, site)
+
+
+def refuse_excess(channel: str, acting: tuple[systematics.Effect, ...]) -> None:
+    """Refuse noise of effects in a differencing scan, whose samples are differences."""
+    for effect in systematics.disturbing(acting):
+        raise InputError(
+            f"effect {effect.name} on channel {channel} adds noise to samples of one beam, but the scan takes "
+            "differences; remove it, or use noise.sigma0_uk."
+        )
 
 
 def refuse_pixel_effects(channel: str, acting: tuple[systematics.Effect, ...]) -> None:
     """Refuse effects that act on pixels, for a grid of rings."""
     for effect in acting:
-        for hook in ("gain", "noise", "spread", "orientations"):
+        for hook in ("gain", "signal", "noise", "excess", "spread", "orientations"):
             if getattr(type(effect), hook) is not getattr(systematics.Effect, hook):
                 raise InputError(
                     f'effect {effect.name} on channel {channel} acts on pixels, but grid = "gl" has none; remove it '
@@ -138,7 +166,7 @@ def site_b_of(site: systematics.Site, spec: config.Channel) -> systematics.Site:
 
 
 def _is_cut(spec: config.Beam) -> bool:
-    return not isinstance(spec, config.BeamGaussian) and spec.m_max is not None
+    return not isinstance(spec, CIRCULAR) and spec.m_max is not None
 
 
 def _whole(load: Callable[[config.Channel, int], beams.Beam], spec: config.Channel, lmax: int) -> beams.Beam:
@@ -155,7 +183,7 @@ def _whole(load: Callable[[config.Channel, int], beams.Beam], spec: config.Chann
 def _with_m_max(spec: config.Channel, m_max: int | None) -> config.Channel:
     """Return a channel whose beams have another m_max."""
     beam, beam_b = (
-        each if each is None or isinstance(each, config.BeamGaussian) else replace(each, m_max=m_max)
+        each if each is None or isinstance(each, CIRCULAR) else replace(each, m_max=m_max)
         for each in (spec.beam, spec.beam_b)
     )
     return replace(spec, beam=beam or spec.beam, beam_b=beam_b)
@@ -171,6 +199,8 @@ def _described(spec: config.Channel) -> tuple[systematics.Pointing | None, float
             if spec.scan.line_of_sight is None and name not in [line.name for line in model.lines_of_sight]:
                 return None, dipole_uk
             return systematics.Pointing(model, model.line_of_sight(name)), dipole_uk
+        case config.ScanHitAveraged() if "{split}" in f"{spec.scan.model}{spec.scan.line_of_sight}":
+            return None, None  # splits were pointed in different ways
         case config.ScanHitAveraged():
             model = scan_model(spec, spec.scan, None)
             lines = model.select()

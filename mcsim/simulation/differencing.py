@@ -37,7 +37,8 @@ def seconds(run: config.RunConfig) -> float:
         for channel in run.channels
         if isinstance(channel.scan, config.ScanDifferencing)
     ]
-    return SECONDS_PER_SAMPLE * sum(model.samples(model.pair(pair)[0]) for model, pair in models)
+    surveys = len(splits) if run.map.split_by == "sets" else 1
+    return SECONDS_PER_SAMPLE * surveys * sum(model.samples(model.pair(pair)[0]) for model, pair in models)
 
 
 def maps(

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.errors import InputError
 from mcsim.simulation import windows
-from mcsim.simulation.channels import load_beam
+from mcsim.simulation.channels import CIRCULAR, load_beam
 from mcsim.simulation.survey import Channel, Survey
 from mcsim.sphere import spectra
 
@@ -124,7 +124,7 @@ def check(survey: Survey) -> None:
 
 def _window(run: config.RunConfig, spec: config.Channel, channel: Channel, lmax: int) -> NDArray[np.float64]:
     """Return B_l times pixel window and preparation of a channel, up to an lmax beyond the sky's."""
-    circular = spec if isinstance(spec.beam, config.BeamGaussian) else replace(spec, beam=replace(spec.beam, m_max=0))
+    circular = spec if isinstance(spec.beam, CIRCULAR) else replace(spec, beam=replace(spec.beam, m_max=0))
     try:
         window = load_beam(circular, lmax).window.copy()
     except InputError:  # a file that ends earlier: go on as a Gaussian

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.config import preparation as declared
 from mcsim.errors import InputError
-from mcsim.instrument.beams import Beam
+from mcsim.instrument.beams import Beam, read_window
 from mcsim.instrument.scan import Moments
-from mcsim.simulation import windows
 from mcsim.simulation.channels import load_beam
 from mcsim.simulation.steps import NEGLIGIBLE, Average, Filled, Filter, Regression, Rotated, Step, Weighted
 from mcsim.sphere import header, healpix, rotation
@@ -169,11 +168,11 @@ def _change_of_beam(step: declared.Smooth, spec: config.Channel, lmax: int) -> N
     if step.fwhm_arcmin is not None:
         target = healpy.gauss_beam(np.deg2rad(step.fwhm_arcmin / 60.0), lmax)
     else:
-        target = windows.read_beam(config.channel_path(str(step.window), spec.name), lmax)
+        target = read_window(config.channel_path(str(step.window), spec.name), lmax)
     if step.own_fwhm_arcmin is not None:
         own = healpy.gauss_beam(np.deg2rad(step.own_fwhm_arcmin / 60.0), lmax)
     elif step.own_window is not None:
-        own = windows.read_beam(config.channel_path(step.own_window, spec.name), lmax)
+        own = read_window(config.channel_path(step.own_window, spec.name), lmax)
     else:
         own = load_beam(spec, lmax).window
     end = int(np.argmin(np.append(np.minimum(np.abs(target), np.abs(own)) > NEGLIGIBLE, False)))

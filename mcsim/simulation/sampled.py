@@ -8,7 +8,7 @@ import healpy
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim import systematics
+from mcsim import config, systematics
 from mcsim.errors import InputError
 from mcsim.instrument.scan import MapGrid
 from mcsim.simulation import simulate, tod
@@ -28,14 +28,15 @@ def maps(
     """Return names and maps of one realization, each the plain mean of its samples, in the order of the survey's.
 
     The maps are in uK, shape (npix,), ``healpy.UNSEEN`` where nothing was observed. The sky and what effects draw are
-    those of :func:`mcsim.simulation.simulate.maps`, the noise is a draw of its own. The threads of the interpolation do
-    not change the result; its accuracy ``epsilon`` is relative to the dipole where there is one. InputError as of
-    :func:`check`.
+    those of :func:`mcsim.simulation.simulate.maps`, the noise is a draw of its own, of samples or, where the run gives
+    it for pixels, of the map. The threads of the interpolation do not change the result; its accuracy ``epsilon`` is
+    relative to the dipole where there is one. InputError as of :func:`check`.
 
     Notes
     -----
     For every sample: its true pointing (moved, or earlier), the sky and the dipole through the true beam there, times
-    one plus the error of the gain, less the dipole through the fiducial beam at the fiducial pointing, plus noise.
+    one plus the error of the gain, less the dipole through the fiducial beam at the fiducial pointing, plus what
+    effects add to samples, plus noise.
     An effect acts by its ``moved`` and ``lags`` where it has them, else by the beam that its ``pointing`` gives.
     """
     run, sky = survey.config, simulate.draw_sky(survey, realization)
@@ -52,13 +53,23 @@ def maps(
         beam = systematics.seen_through(acting, site, [effect for effect in acting if not _moves(effect)])
         observe = tod.sky_signal(seen, site.lmax, beam, epsilon, nthreads)
         for index, m in enumerate(channel.maps):
-            grid = MapGrid(site.nside, site.frame, (index / len(channel.maps), (index + 1) / len(channel.maps)))
-            stages = list(after)
-            if spec.noise.sigma0_uk > 0.0:
-                draw = rng.generator(run.ensemble.seed, realization, f"noise/{m.name}")
-                stages.append(tod.white_noise(spec.noise.sigma0_uk, draw, _noise_factor(channel)))
+            grid = MapGrid(site.nside, site.frame, run.map.span(index))
+            stages = [*after, _added(channel)]
+            if run.map.split_by == "rings":
+                stages.append(tod.every_ring(site.pointed("of rings").model.spin_period_s, len(channel.maps), index))
+            draw = rng.generator(run.ensemble.seed, realization, f"noise/{m.name}")
+            given = spec.noise_of(run.map.splits[index] if run.map.splits else None)
+            of_samples = isinstance(given, config.Noise) and given.hits is None
+            if isinstance(given, config.Noise) and of_samples and given.sigma0_uk > 0.0:
+                stages.append(tod.white_noise(given.sigma0_uk, draw, _noise_factor(channel)))
+            for effect in systematics.disturbing(acting):
+                draw = rng.generator(run.ensemble.seed, realization, f"effect/{effect.name}/noise/{m.name}")
+                stages.append(_disturbed(effect, draw))
             stream = tod.through(_seen(channel, grid, observe), stages)
             map_uk = tod.bin_samples(stream, site.nside)[0]
+            if not of_samples:
+                noise = 0.0 if m.noise_uk is None else m.noise(run.ensemble.seed, realization)
+                map_uk = np.where(m.moments.hits > 0, map_uk + noise, healpy.UNSEEN)
             found.append((m.name, map_uk if m.preparation is None else m.preparation.apply(map_uk)))
     return found
 
@@ -155,6 +166,28 @@ def _gained(channel: Channel) -> tod.Stage:
                 if error is not None:
                     gain = gain + error
             yield replace(chunk, signal_uk=gain * chunk.signal_uk)
+
+    return stage
+
+
+def _added(channel: Channel) -> tod.Stage:
+    """Return a stage that adds the signals of effects."""
+    acting, site = systematics.adding(channel.effects), channel.site
+
+    def stage(stream: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
+        for chunk in stream:
+            signals = (effect.signal(chunk.time_s, chunk.theta, chunk.phi, chunk.psi, site) for effect in acting)
+            yield replace(chunk, signal_uk=sum(signals, start=chunk.signal_uk))
+
+    return stage
+
+
+def _disturbed(effect: systematics.Effect, draw: np.random.Generator) -> tod.Stage:
+    """Return a stage that adds an effect's noise to every sample."""
+
+    def stage(stream: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
+        for chunk in stream:
+            yield replace(chunk, signal_uk=chunk.signal_uk + effect.excess(np.ones(chunk.time_s.size), draw))
 
     return stage
 

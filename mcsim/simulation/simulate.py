@@ -107,7 +107,7 @@ class MapParts:
     smooth
         The sky through the circular part of the beam at the pixels' centres; None where its a_lm stand for it.
     extra
-        The rest of the circular-beam control: centroids, noise, gain. None: nothing.
+        The rest of the circular-beam control: centroids, noise, gain, what effects add to samples. None: nothing.
     difference
         What the rest of the beam adds. None: nothing.
     """
@@ -204,10 +204,15 @@ def _map_parts(
         if m.moments.dtheta is not None and gradient is not None:
             extra.append(convolve.centroid_map(gradient, m.moments))
         if m.noise_uk is not None:
-            draw = rng.generator(seed, realization, f"noise/{m.name}")
-            extra.append(m.noise_uk * draw.standard_normal(m.noise_uk.size))
+            extra.append(m.noise(seed, realization))
+        for effect in systematics.disturbing(channel.effects):
+            draw = rng.generator(seed, realization, f"effect/{effect.name}/noise/{m.name}")
+            hits = m.moments.hits
+            extra.append(np.divide(effect.excess(hits, draw), hits, out=np.zeros_like(hits), where=hits > 0.0))
         if m.gain is not None and whole is not None:
             extra.append(m.gain * whole)
+        if m.signal_uk is not None:
+            extra.append(m.signal_uk)
         difference = convolve.noncircular_map(spins, m.moments) if spins else None
         yield m, MapParts(flat, sum(extra[1:], start=extra[0]) if extra else None, difference)
 

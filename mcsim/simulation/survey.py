@@ -1,6 +1,6 @@
 """From a configuration to what a realization needs: spectrum, beam responses, moments, weights, estimator tables."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -13,11 +13,21 @@ from mcsim.bipolar import Estimator, estimator
 from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
 from mcsim.instrument.scan import MapGrid
-from mcsim.simulation import convolve, mapmaking, tod
-from mcsim.simulation.channels import effects_on, refuse_pixel_effects, scan_model, site_b_of, site_of
+from mcsim.simulation import convolve, mapmaking
+from mcsim.simulation.channels import (
+    effects_on,
+    refuse_excess,
+    refuse_external,
+    refuse_pixel_effects,
+    scan_model,
+    site_b_of,
+    site_of,
+)
+from mcsim.simulation.noise import DrawnNoise, of_map
+from mcsim.simulation.pixel_means import mean_gain, mean_signal
 from mcsim.simulation.preparation import Preparation, preparation
 from mcsim.simulation.rings import Rings, limit_rings, parallel_transport_rings
-from mcsim.sphere import healpix, spectra
+from mcsim.sphere import healpix, rng, spectra
 from mcsim.sphere.mask import read_mask
 from mcsim.systematics import Effect, Library, Site, seen_through, spread_of
 
@@ -40,8 +50,13 @@ class SurveyMap:
         Pairs of pixels of a differencing scan; ``None``: any other scan.
     gain
         Mean relative error of the gain over the samples of a pixel, shape (npix,); ``None``: no error.
+    signal_uk
+        Mean of what effects add to the samples of a pixel, shape (npix,); ``None``: nothing.
     preparation
         What is done to the map after it is made; ``None``: nothing.
+    drawn
+        How noise that is not white comes into the map, whose standard deviation noise_uk then describes; ``None``:
+        white.
     """
 
     name: str
@@ -50,7 +65,19 @@ class SurveyMap:
     noise_uk: NDArray[np.float64] | None
     pairs: mapmaking.DifferencingScan | None = None
     gain: NDArray[np.float64] | None = None
+    signal_uk: NDArray[np.float64] | None = None
     preparation: Preparation | None = None
+    drawn: DrawnNoise | None = None
+
+    def noise(self, seed: int, realization: int) -> NDArray[np.float64]:
+        """Return the noise of a realization before any preparation, uK, shape (npix,); the map must have some."""
+        assert self.noise_uk is not None  # the caller looked
+        if self.drawn is None:
+            draw = rng.generator(seed, realization, f"noise/{self.name}")
+            return self.noise_uk * draw.standard_normal(self.noise_uk.size)
+        level = self.drawn.level_uk
+        changed = np.divide(self.noise_uk, level, out=np.zeros(level.size), where=level > 0.0)
+        return np.asarray(changed * self.drawn.draw(seed, realization))
 
     @property
     def left_to_apply(self) -> NDArray[np.float64] | None:
@@ -187,6 +214,7 @@ def survey(
     memory-mapped, so that workers share them. ``orders``: moments up to this order even where the beam needs fewer (of
     a file of moments, all that it has). ``library``: the effects that the run may name; default: the catalogue.
     """
+    refuse_external(run)
     lmax = config.analysis_lmax(run)
     cl = None if run.sky.spectrum is None else spectra.load(run.sky.spectrum, run.sky.lmax)
     made = tuple(_channel(run, channel, nthreads, progress, orders, library) for channel in run.channels)
@@ -219,10 +247,11 @@ def _channel(
     splits = run.map.splits or (None,)
     maps = []
     for index, split in enumerate(splits):
-        grid = MapGrid(run.map.resolution, run.map.frame, (index / len(splits), (index + 1) / len(splits)))
+        grid = MapGrid(run.map.resolution, run.map.frame, run.map.span(index))
         pairs = None
         if isinstance(spec.scan, config.ScanDifferencing):
             model = scan_model(spec, spec.scan, split)
+            refuse_excess(spec.name, acting)
             pairs = mapmaking.prepare(model, spec.scan.pair, grid, nthreads=nthreads, progress=progress)
             moments = _hits_alone(pairs, max(beam.mmax, 1))
         else:
@@ -233,6 +262,8 @@ def _channel(
                 moments = _moments_of_file(path, grid.nside, wanted, grid.frame)
             else:
                 moments = _moments(spec, split, grid, max(smax, 1), nthreads, progress)
+                if run.map.split_by == "rings" and isinstance(spec.scan, config.ScanHitAveraged):
+                    moments = replace(moments, hits=moments.hits / len(splits))
             # An effect may give the beam higher orders than a file of moments has: they are left out.
             beam = beam.truncated(moments.smax) if acting and moments.smax < beam.mmax else beam
         maps.append(_with_effects(_survey_map(run, spec, split, moments, pairs), acting, site, grid.time_range))
@@ -252,7 +283,7 @@ def _prepared(run: config.RunConfig, spec: config.Channel, channel: Channel) -> 
         moments = steps.moments(m.moments)
         noise = None if m.noise_uk is None else steps.noise_uk(m.noise_uk, m.moments.hits)
         weight = _weight(run, spec, split, m.name, moments, steps.weight())
-        maps.append(replace(m, moments=moments, noise_uk=noise, weight=weight, gain=None))
+        maps.append(replace(m, moments=moments, noise_uk=noise, weight=weight, gain=None, signal_uk=None))
     pixels, smoothing = steps.pixel_window(run.sky.lmax), steps.beam_window(run.sky.lmax)
     return replace(
         channel,
@@ -296,11 +327,12 @@ def _side_b(spec: config.Channel, window: NDArray[np.float64], site: Site, actin
     imbalance, short = spec.scan.transmission_imbalance, 0
     for effect in acting:
         imbalance, short = effect.differencing(imbalance, short)
+    assert isinstance(spec.noise, config.Noise)  # the configuration refuses other noise of differences
     return SideB(beam, response, other.beam, spec.scan, spec.noise.sigma0_uk, imbalance, short)
 
 
 def _with_effects(m: SurveyMap, acting: tuple[Effect, ...], site: Site, share: tuple[float, float]) -> SurveyMap:
-    """Return the map with what effects make of its moments, noise and gain."""
+    """Return the map with what effects make of its moments, noise and gain, and with what they add."""
     moments, noise, spread = m.moments, m.noise_uk, spread_of(acting)
     for effect in acting:
         moments = effect.orientations(moments, site)
@@ -309,23 +341,8 @@ def _with_effects(m: SurveyMap, acting: tuple[Effect, ...], site: Site, share: t
             noise = noise * np.sqrt(np.clip(factor, 0.0, None))
     if spread != 1.0 and moments.dtheta is not None and moments.dphi is not None:
         moments = replace(moments, dtheta=spread * moments.dtheta, dphi=spread * moments.dphi)
-    return replace(m, moments=moments, noise_uk=noise, gain=mean_gain(acting, site, share))
-
-
-def mean_gain(acting: tuple[Effect, ...], site: Site, share: tuple[float, float]) -> NDArray[np.float64] | None:
-    """Return the mean relative error of the gain in every pixel, by a pass over the pointing of part of the survey."""
-    drifting = [effect for effect in acting if effect.gain(np.zeros(1), site) is not None]
-    if not drifting:
-        return None
-    pointing = site.pointed(drifting[0].name)
-
-    def errors() -> Iterator[tod.Samples]:
-        for chunk in tod.samples(pointing.model, pointing.line, MapGrid(site.nside, site.frame, share)):
-            gains = [effect.gain(chunk.time_s, site) for effect in drifting]
-            yield replace(chunk, signal_uk=sum((g for g in gains if g is not None), start=chunk.signal_uk))
-
-    mean, hits = tod.bin_samples(errors(), site.nside)
-    return np.where(hits > 0, mean, 0.0)
+    gain, signal = mean_gain(acting, site, share), mean_signal(acting, site, share)
+    return replace(m, moments=moments, noise_uk=noise, gain=gain, signal_uk=signal)
 
 
 def _window(run: config.RunConfig, spec: config.Channel) -> NDArray[np.float64]:
@@ -374,17 +391,14 @@ def _survey_map(
 ) -> SurveyMap:
     """Return a map without effects: moments, weights of its pixels, and noise."""
     name = spec.name if split is None else f"{spec.name}:{split}"
-    observed = moments.hits > 0
-    if not observed.any():
+    if not np.any(moments.hits > 0):
         raise InputError(
             f"The scan of map {name} hits no pixel of nside {moments.nside}; check the scan of the channel."
         )
-    noise = None
-    if spec.noise.sigma0_uk > 0 and pairs is None:
-        noise = np.divide(spec.noise.sigma0_uk, np.sqrt(moments.hits), out=np.zeros(observed.size), where=observed)
+    moments, noise, drawn = (moments, None, None) if pairs is not None else of_map(run, spec, split, moments)
     steps = preparation(run, spec, split)
     weight = None if steps is not None else _weight(run, spec, split, name, moments)
-    return SurveyMap(name, moments, weight, noise, pairs, preparation=steps)
+    return SurveyMap(name, moments, weight, noise, pairs, preparation=steps, drawn=drawn)
 
 
 def _weight(
@@ -399,8 +413,9 @@ def _weight(
     weight = (moments.hits > 0).astype(float)
     if run.biposh.weighting == "hits":
         weight *= moments.hits
-    if run.map.mask is not None:
-        path = config.channel_path(run.map.mask, spec.name, split)
+    mask = spec.mask or run.map.mask
+    if mask is not None:
+        path = config.channel_path(mask, spec.name, split)
         weight *= read_mask(path, moments.nside, moments.frame, run.map.mask_frame, run.map.mask_apodisation_deg)
     if done is not None:
         weight *= done

@@ -12,7 +12,7 @@ variables of its generator, since chunks come in the order of time.
 import math
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import ducc0
@@ -139,6 +139,17 @@ def white_noise(sigma0_uk: float, rng: np.random.Generator, factor: Map | None =
             noise = sigma0_uk * rng.standard_normal(chunk.signal_uk.size)
             noise = noise if factor is None else noise * factor[chunk.pixel]
             yield replace(chunk, signal_uk=chunk.signal_uk + noise)
+
+    return stage
+
+
+def every_ring(spin_period_s: float, number: int, index: int) -> Stage:
+    """Return a stage that keeps every ``number``-th ring, one turn of the spin each, from ring ``index`` on."""
+
+    def stage(stream: Iterable[Samples]) -> Iterator[Samples]:
+        for chunk in stream:
+            own = np.floor(chunk.time_s / spin_period_s).astype(np.int64) % number == index
+            yield Samples(**{each.name: getattr(chunk, each.name)[own] for each in fields(chunk)})
 
     return stage
 

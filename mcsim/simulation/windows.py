@@ -1,12 +1,10 @@
-"""Windows in l of what is done to maps: means over pixels, squared kernels, files of B_l."""
+"""Windows in l of what is done to maps: means over pixels, squared kernels."""
 
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.errors import InputError
 from mcsim.sphere import healpix
 from mcsim.sphere.checks import NSIDE_MAX
 
@@ -39,25 +37,3 @@ def of_average(fine: int, coarse: int, lmax: int) -> Window:
         window = window * healpix.pixel_window(split * coarse, lmax) / finest
     window.setflags(write=False)
     return window
-
-
-def read_beam(path: Path, lmax: int) -> Window:
-    """Read B_l from l = 0 to lmax: a text table (B_l, or ell and B_l), a FITS table or a .npy file.
-
-    Raise InputError if the file cannot be read, ends below lmax, or does not start at 1.
-    """
-    if path.suffix in (".npy", ".fits", ".fit", ".gz"):
-        return healpix.read_pixel_window(path, lmax)
-    try:
-        table = np.loadtxt(path, ndmin=2)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as a table of B_l ({error}); give columns ell and B_l.") from None
-    if table.shape[1] > 1 and not np.array_equal(table[:, 0], np.arange(len(table))):
-        raise InputError(f"{path} does not count ell from 0 in its first column; give every ell from 0 on.")
-    window: Window = table[:, 1] if table.shape[1] > 1 else table[:, 0]
-    if window.size <= lmax or abs(window[0] - 1.0) > 0.01 or not np.all(np.isfinite(window)):
-        raise InputError(
-            f"{path} holds B_l up to l = {window.size - 1}, from {window[0]:g} on; give finite B_l from 1 at l = 0 up "
-            f"to l = {lmax}."
-        )
-    return window[: lmax + 1]

@@ -20,6 +20,7 @@ _RJ = r"rj|a|ant(?:enna)?|rayleigh[\s_-]*jeans|b|brightness"
 _KELVIN = re.compile(
     rf"(milli|micro|nano|mu|m|u|n|)[\s_-]*(?:kelvin|k)[\W_]*(?:({_CMB})|({_RJ}))?(?:[\W_]*temp\w*)?\W*"
 )
+_SQUARE = re.compile(r"\(?([^()]*?)\)?\s*(?:\^|\*\*)?\s*\(?2\)?")
 _SILENT = {"", "unknown", "none", "n/a", "undefined"}
 
 _FRAMES = {
@@ -84,6 +85,19 @@ def to_uk(unit: str | None, path: Path, frequency_ghz: float | None = None) -> f
     if kelvin:
         return _PREFIXES[kelvin[1]] * _brightness_to_k(unit, path, frequency_ghz, None)
     return 1e6 * _brightness_to_k(unit, path, frequency_ghz, text)
+
+
+def to_uk2(unit: str | None, path: Path, frequency_ghz: float | None = None) -> float:
+    """Return the factor from a unit of variance, such as K_CMB^2 or mK**2, to uK^2; 1 if the header gives none.
+
+    Raise InputError for a unit that is no square of what :func:`to_uk` knows.
+    """
+    if (unit or "").strip().lower() in _SILENT:
+        return 1.0
+    squared = _SQUARE.fullmatch(str(unit).strip())
+    if squared is None:
+        raise InputError(f"{path} is in {unit!r}, where a variance is in uK^2, mK^2 or K^2; give variances.")
+    return to_uk(squared[1], path, frequency_ghz) ** 2
 
 
 def _brightness_to_k(unit: str | None, path: Path, frequency_ghz: float | None, text: str | None) -> float:

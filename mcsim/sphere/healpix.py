@@ -162,11 +162,23 @@ def _mean_legendre(face: int, nside: int, split: int, lmax: int) -> NDArray[np.f
     return mean
 
 
-def read_map(path: Path) -> tuple[Map, str | None, str | None]:
-    """Read the first map of a HEALPix FITS file in RING order, and its frame and unit if the header has them.
+TEMPERATURE = ("TEMPERATURE", "I_STOKES", "TEMP", "INTENSITY", "I")
+"""Names of columns with the temperature, in the maps of WMAP, Planck and others."""
 
-    A .npy file holds an array of shape (npix,) in RING order; its frame and unit are None. Raise InputError if the file
-    cannot be read as a HEALPix map, does not say whether it is RING or NESTED, or names an unknown frame.
+HITS = ("N_OBS", "HITS", "NOBS", "HIT", "NHITS")
+"""Names of columns with the number of observations, in the maps of WMAP, Planck and others."""
+
+VARIANCE = ("II_COV", "VARIANCE", "I_VAR", "COV_II", "VAR_I", "VAR")
+"""Names of columns with the variance of the temperature."""
+
+
+def read_map(path: Path, names: tuple[str, ...] = ()) -> tuple[Map, str | None, str | None]:
+    """Read a map of a HEALPix FITS file in RING order, and its frame and unit if the header has them.
+
+    It is the column that is called one of ``names``; without names the temperature, or else the first column. A file
+    with a single column need not name it. A .npy file holds an array of shape (npix,) in RING order; its frame and unit
+    are None. Raise InputError if the file cannot be read as a HEALPix map, does not say whether it is RING or NESTED,
+    or names an unknown frame.
     """
     if path.suffix == ".npy":
         array = read_npy(path, "biuf").astype(np.float64)
@@ -176,18 +188,35 @@ def read_map(path: Path) -> tuple[Map, str | None, str | None]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", category=AstropyUserWarning)
-            map_, header = healpy.read_map(path, dtype=float, h=True)
+            field = _column_called(path, names)
+            map_, header = healpy.read_map(path, dtype=float, h=True, field=field)
+    except InputError:
+        raise
     except Exception as error:  # libraries raise errors of any type for a broken file
         raise InputError(f"{path} cannot be read as a HEALPix map ({error}); give a complete FITS map.") from error
     keywords = dict(header)
     if str(keywords.get("ORDERING", "")).strip().upper() not in ("RING", "NESTED"):
         raise InputError(f"{path} does not say how its pixels are ordered; write ORDERING = RING or NESTED there.")
     # A map with explicit pixel indices has them in its first column and the values in its second.
-    column = 2 if str(keywords.get("INDXSCHM", "")).strip().upper() == "EXPLICIT" else 1
+    column = (2 if str(keywords.get("INDXSCHM", "")).strip().upper() == "EXPLICIT" else 1) + field
     unit = str(keywords.get(f"TUNIT{column}", "")).strip() or None
     if str(keywords.get("TEMPTYPE", "")).strip().upper().startswith("ANT"):
         unit = f"{unit or 'K'} antenna"
     return np.asarray(map_), frame_named(keywords.get("COORDSYS"), str(path)), unit
+
+
+def _column_called(path: Path, names: tuple[str, ...]) -> int:
+    """Return the number of the map called one of ``names`` (none: of temperature), not counting pixel indices."""
+    with opened(path) as hdus:
+        columns = [name.upper() for name in hdus[1].columns.names]
+        explicit = str(hdus[1].header.get("INDXSCHM", "")).strip().upper() == "EXPLICIT"
+    columns = columns[1:] if explicit else columns
+    for name in names or TEMPERATURE:
+        if name in columns:
+            return columns.index(name)
+    if len(columns) == 1 or not names:
+        return 0
+    raise InputError(f"{path} has the columns {', '.join(columns)} and none called {' or '.join(names)}; name it so.")
 
 
 def read_pixel_window(path: Path, lmax: int, nside: int | None = None) -> NDArray[np.float64]:

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
+from types import FunctionType
 
 
 def package_digest(packages: Iterable[str], libraries: Iterable[str] = ()) -> str:
@@ -18,13 +19,14 @@ def package_digest(packages: Iterable[str], libraries: Iterable[str] = ()) -> st
     return hashlib.sha256("\n".join(found).encode()).hexdigest()
 
 
-def class_digest(kind: type) -> str:
-    """Return the SHA-256 of the packages of a user that define a class and its bases; those of mcsim do not count.
+def class_digest(kind: type | FunctionType) -> str:
+    """Return the SHA-256 of the packages of a user that define a function, or a class and its bases.
 
-    A class whose source cannot be read, typed at a prompt for instance, gets a new digest at every call.
+    Those of mcsim do not count. Code whose source cannot be read, typed at a prompt for instance, gets a new digest at
+    every call.
     """
     found = [f"{kind.__module__}.{kind.__qualname__}"]
-    for base in kind.__mro__:
+    for base in kind.__mro__ if isinstance(kind, type) else (kind,):
         top = base.__module__.partition(".")[0]
         if top == "mcsim" or (top in sys.stdlib_module_names and top != "__main__"):
             continue

@@ -1,11 +1,27 @@
 """The library of effects: one file each, found by name; other packages add theirs by entry points."""
 
-from mcsim.systematics.base import Alm, Draw, Effect, Map, Pointing, Site, Wording, looked_at, seen_through, spread_of
+from mcsim.systematics.base import (
+    Alm,
+    Bound,
+    Draw,
+    Effect,
+    Map,
+    Pointing,
+    Site,
+    Wording,
+    adding,
+    check_added,
+    disturbing,
+    looked_at,
+    seen_through,
+    spread_of,
+)
 from mcsim.systematics.parametrization import Parametrization
 from mcsim.systematics.registry import Library, basis_of, build, catalogue, checked, effects, get
 
 __all__ = [
     "Alm",
+    "Bound",
     "Draw",
     "Effect",
     "Library",
@@ -14,10 +30,13 @@ __all__ = [
     "Pointing",
     "Site",
     "Wording",
+    "adding",
     "basis_of",
     "build",
     "catalogue",
+    "check_added",
     "checked",
+    "disturbing",
     "effects",
     "get",
     "looked_at",

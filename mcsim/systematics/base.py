@@ -1,9 +1,9 @@
 """Effects: named changes of the simulation, each absent at zero amplitude.
 
-An effect acts through hooks, one for each stage of a survey, composed in the order sky, beam, pointing, gain, noise,
-map. A hook that an effect does not define changes nothing. Every hook serves both routes: the default one (spin maps
-and orientation moments) and the sample-by-sample one, so that an effect that is added to a run, is
-a candidate of a diagnosis, or acts in the time-ordered reference is one and the same.
+An effect acts through hooks, one for each stage of a survey, composed in the order sky, beam, pointing, gain, signal,
+noise, map. A hook that an effect does not define changes nothing. Every hook serves both routes: the default one (spin
+maps and orientation moments) and the sample-by-sample one, so that an effect that is added to a run, is a candidate of
+a diagnosis, or acts in the time-ordered reference is one and the same.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -114,12 +114,26 @@ class Wording:
     negative: str | None = None
 
 
+@dataclass(frozen=True)
+class Bound:
+    """Bound a parameter of an effect by what is possible: a diagnosis names no effect beyond it.
+
+    ``source`` says where the range, both ends included, is from.
+    """
+
+    parameter: str
+    low: float
+    high: float
+    source: str
+
+
 @dataclass(frozen=True, kw_only=True)
 class Effect:
     """Derive an effect from this class, whose hooks change nothing.
 
     A subclass is a frozen dataclass whose fields are its parameters, ``amplitude`` first. Zero amplitude is no effect:
-    ``sky``, ``beam`` and ``pointing`` are not called then, and what the other hooks return changes nothing.
+    ``sky``, ``beam``, ``pointing``, ``signal`` and ``excess`` are not called then; what the others return changes
+    nothing.
 
     Attributes
     ----------
@@ -137,8 +151,12 @@ class Effect:
         Amplitude at which responses are measured: small enough to be linear.
     variants
         Fixed parameters with which the effect is a candidate, one candidate for each.
+    bounds
+        Ranges of the parameters that are possible; angles and directions have none.
     parametrization
         How a diagnosis fits it; left out: the amplitude alone, of either sign.
+    proposed
+        False: a diagnosis proposes it only where it is asked for by name (``mcsim diagnose --with NAME``).
 
     Examples
     --------
@@ -173,7 +191,9 @@ class Effect:
     source: ClassVar[str] = ""
     step: ClassVar[float]
     variants: ClassVar[tuple[Mapping[str, Any], ...]] = ({},)
+    bounds: ClassVar[tuple[Bound, ...]] = ()
     parametrization: ClassVar[Parametrization] = Parametrization()
+    proposed: ClassVar[bool] = True
 
     amplitude: float = 0.0
 
@@ -205,9 +225,17 @@ class Effect:
         """Return the relative error of the gain at times since the start, shape (n,); None: no error."""
         return None
 
+    def signal(self, time_s: Vector, theta: Vector, phi: Vector, psi: Vector, site: Site) -> Vector:
+        """Return what is added to samples at these times and fiducial pointings, uK, shape (n,)."""
+        return np.zeros_like(time_s)
+
     def noise(self, site: Site) -> Map | None:
         """Return the factor of the variance of every pixel's samples, shape (npix,); None: one."""
         return None
+
+    def excess(self, count: Vector, rng: np.random.Generator) -> Vector:
+        """Return the sums, uK, shape (n,), of what is added at random to each of ``count`` samples, shape (n,)."""
+        return np.zeros_like(count)
 
     def spread(self) -> float:
         """Return the factor by which samples move towards the centre of their pixel."""
@@ -256,6 +284,12 @@ class Effect:
         if amplitude < 0.0 and how.negative is not None:
             return how.negative.format(measured(-how.scale * amplitude, how.scale * sigma, how.symbol))
         return how.text.format(measured(how.scale * amplitude + how.offset, how.scale * sigma, how.symbol))
+
+    def within_bounds(self) -> Self:
+        """Return the effect with each parameter moved to the nearest value within its bounds."""
+        values = {one.parameter: getattr(self, one.parameter) for one in self.bounds}
+        moved = {one.parameter: min(max(values[one.parameter], one.low), one.high) for one in self.bounds}
+        return self if moved == values else replace(self, **moved)
 
     def direction(self) -> str:
         """Return where the amplitude points, in words; empty for an effect without a direction."""
@@ -320,6 +354,24 @@ def seen_through(acting: Sequence[Effect], site: Site, displacing: Sequence[Effe
 def spread_of(acting: Iterable[Effect]) -> float:
     """Return the factor by which the samples' offsets from the centre of their pixel shrink."""
     return float(np.prod([effect.spread() for effect in acting]))
+
+
+def adding(acting: Iterable[Effect]) -> list[Effect]:
+    """Return the effects that add a signal to samples."""
+    return [one for one in acting if one.amplitude != 0.0 and type(one).signal is not Effect.signal]
+
+
+def disturbing(acting: Iterable[Effect]) -> list[Effect]:
+    """Return the effects that add noise of their own to samples."""
+    return [one for one in acting if one.amplitude != 0.0 and type(one).excess is not Effect.excess]
+
+
+def check_added(acting: Iterable[Effect], site: Site) -> None:
+    """Raise InputError for an effect that adds a signal to samples which it cannot know in this channel."""
+    for effect in adding(acting):
+        site.pointed(effect.name)
+        once = np.zeros(1)
+        effect.signal(once, once, once, once, site)
 
 
 def looked_at(acting: Iterable[Effect], sky: Alm, site: Site, seed: int, realization: int) -> Alm:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from mcsim.instrument.beams import Beam
-from mcsim.systematics.base import Effect, Site, Wording
+from mcsim.systematics.base import Bound, Effect, Site, Wording
 from mcsim.systematics.parametrization import Parametrization, Vector
 from mcsim.systematics.shape import shape
 
@@ -83,6 +83,7 @@ class BeamComa(Effect):
     signature = "L = 1 and 3, d = +-1, through w_1 and w_3; changes sign where the scan reverses (half1 - half2)."
     source = "Born & Wolf, Principles of Optics, Sec. 5.3, in the lowest Hermite order that keeps the centroid"
     step = 0.01
+    bounds = (Bound("amplitude", -0.5, 0.5, "the response stays positive within two sigmas of the centre"),)
     parametrization = _FourAngles()
 
     angle_deg: float = 0.0

@@ -6,7 +6,7 @@ import numpy as np
 
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
-from mcsim.systematics.base import Effect, Site, Wording, scan_direction
+from mcsim.systematics.base import Bound, Effect, Site, Wording, scan_direction
 from mcsim.systematics.parametrization import Angle
 from mcsim.systematics.shape import stretched
 
@@ -31,6 +31,14 @@ class BeamEllipticity(Effect):
     signature = "Even L, growing as l^2, fixed to the scan through w_2."
     source = "Joshi et al. arXiv:1210.7318, Sec. IV; Fosalba et al. 2002, Phys. Rev. D 65, 063003"
     step = 0.02
+    bounds = (
+        Bound(
+            "amplitude",
+            -1.0,
+            1.0,
+            "axis ratios of real beams are at most 1.4 (Planck 2015 results IV, A&A 594, A4)",
+        ),
+    )
     parametrization = Angle(multiple=2)
 
     angle_deg: float = 0.0

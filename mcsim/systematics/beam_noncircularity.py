@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mcsim.instrument.beams import Beam
-from mcsim.systematics.base import Effect, Site, Wording
+from mcsim.systematics.base import Bound, Effect, Site, Wording
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +28,14 @@ class BeamNoncircularity(Effect):
     signature = "L of the orders left out: 2 and 4 of an ellipse, 1 and 3 of a lopsided beam, in the scan's frame."
     source = "Joshi et al. arXiv:1210.7318, Sec. IV"
     step = 0.05
+    bounds = (
+        Bound(
+            "amplitude",
+            -2.0,
+            2.0,
+            "1 is the beam as measured; a prior of this library: at most twice that",
+        ),
+    )
 
     def beam(self, beam: Beam, site: Site) -> Beam:
         """Add a share of the orders that were left out."""

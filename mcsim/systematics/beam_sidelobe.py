@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
-from mcsim.systematics.base import Effect, Site, Wording
+from mcsim.systematics.base import Bound, Effect, Site, Wording
 from mcsim.systematics.parametrization import Parametrization, Vector
 from mcsim.systematics.shape import shape
 
@@ -59,6 +59,12 @@ class BeamSidelobe(Effect):
     signature = "A halo at low l, pick-up of the plane and the dipole, and with q the m = 2 part of b_lm."
     source = "Barnes et al. 2003, ApJS 148, 51 (WMAP's sidelobes, negative and positive); the shape is a model"
     step = 1e-5
+    bounds = (
+        Bound("amplitude", -0.08, 0.08, "beyond it the default ring holds more than the main beam"),
+        Bound("quadrupole", -1.0, 1.0, "the ring has one sign all around"),
+        Bound("radius_sigmas", 0.0, 20.0, "a ring around the main beam, by definition; fixed in a fit"),
+        Bound("width_sigmas", 0.5, 20.0, "narrower rings are none that the beam's coefficients hold; fixed in a fit"),
+    )
     parametrization = _RoundAndQuadrupole()
     variants = ({"calibrated": "none"}, {"calibrated": "dipole"})
 

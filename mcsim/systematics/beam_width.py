@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
-from mcsim.systematics.base import Effect, Site, Wording
+from mcsim.systematics.base import Bound, Effect, Site, Wording
 from mcsim.systematics.shape import stretched
 
 
@@ -20,6 +20,14 @@ class BeamWidth(Effect):
     signature = "L = 0: the power falls off sooner, in this channel alone."
     source = "Huffenberger et al. 2010, A&A 513, A23 (errors of measured beams)"
     step = 0.005
+    bounds = (
+        Bound(
+            "amplitude",
+            -0.5,
+            0.5,
+            "a prior of this library: a measured width is known to a half",
+        ),
+    )
 
     def beam(self, beam: Beam, site: Site) -> Beam:
         """Stretch the beam."""

@@ -10,7 +10,7 @@ from scipy.sparse.linalg import expm_multiply
 
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
-from mcsim.systematics.base import Alm, DirectedEffect, Draw, Site, Wording
+from mcsim.systematics.base import Alm, Bound, DirectedEffect, Draw, Site, Wording
 from mcsim.systematics.parametrization import SkyVector
 
 
@@ -37,6 +37,7 @@ class Boost(DirectedEffect):
     signature = "L = 1, d = 1, growing as l: to be seen from l of about 1000 on."
     source = "Challinor & van Leeuwen 2002, Phys. Rev. D 65, 103001; Planck 2013 results XXVII"
     step = 1e-4
+    bounds = (Bound("amplitude", 0.0, 0.01, "a prior of this library: eight times our velocity, v/c = 1.23e-3"),)
     parametrization = SkyVector(max_amplitude=0.01, mean_response=True, matched_filter=False)
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from mcsim.systematics.base import Alm, DirectedEffect, Draw, Site, Wording
+from mcsim.systematics.base import Alm, Bound, DirectedEffect, Draw, Site, Wording
 from mcsim.systematics.parametrization import SkyVector
 from mcsim.systematics.product import multiplied
 
@@ -20,6 +20,7 @@ class DipoleModulation(DirectedEffect):
     signature = "L = 1, d = 1, the same in every channel and split, at all l."
     source = "Gordon et al. 2005, Phys. Rev. D 72, 103002"
     step = 0.01
+    bounds = (Bound("amplitude", 0.0, 1.0, "beyond it the signal changes sign in a part of the sky"),)
     parametrization = SkyVector(matched_filter=False)
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from mcsim.sphere.sky import dipole_alm
-from mcsim.systematics.base import Alm, DirectedEffect, Draw, Site, Wording
+from mcsim.systematics.base import Alm, Bound, DirectedEffect, Draw, Site, Wording
 from mcsim.systematics.parametrization import SkyVector
 
 
@@ -20,6 +20,7 @@ class DipoleResidual(DirectedEffect):
     signature = "l = 1, the same in both halves."
     source = "Hinshaw et al. 2009, ApJS 180, 225 (the dipole and its error)"
     step = 0.5
+    bounds = (Bound("amplitude", 0.0, 340.0, "a tenth of the CMB's dipole (Hinshaw et al. 2009, ApJS 180, 225)"),)
     parametrization = SkyVector(matched_filter=False)
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:

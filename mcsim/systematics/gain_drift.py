@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mcsim.systematics.base import Effect, Site, Wording
+from mcsim.systematics.base import Bound, Effect, Site, Wording
 from mcsim.systematics.parametrization import Angle, Vector
 
 
@@ -35,6 +35,7 @@ class GainDrift(Effect):
     )
     source = "Jarosik et al. 2007, ApJS 170, 263, Sec. 2 (gain model and its residuals)"
     step = 2e-4
+    bounds = (Bound("amplitude", 0.0, 0.1, "a prior of this library: far beyond any radiometer in use"),)
     parametrization = Angle(parameter="phase_deg")
 
     phase_deg: float = 0.0

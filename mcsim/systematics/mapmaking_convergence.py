@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from mcsim.systematics.base import Effect, Wording
+from mcsim.systematics.base import Bound, Effect, Wording
 from mcsim.systematics.parametrization import Parametrization
 
 
@@ -19,6 +19,7 @@ class MapmakingConvergence(Effect):
     signature = "Stripes in the frame of the scan, at the largest scales; acts on differencing scans only."
     source = "Hinshaw et al. 2003, ApJS 148, 63, Sec. 3 (iterations of the map-making)"
     step = 1.0
+    bounds = (Bound("amplitude", 0.0, 1000.0, "a prior of this library: map-makings end after fewer iterations"),)
     parametrization = Parametrization(sign=1)
 
     def differencing(self, imbalance: float, iterations_short: int) -> tuple[float, int]:

@@ -11,7 +11,7 @@ from mcsim.errors import InputError
 from mcsim.sphere import healpix
 from mcsim.sphere.checks import check_complete
 from mcsim.sphere.rotation import rotation_matrix
-from mcsim.systematics.base import Effect, Map, Site, Wording
+from mcsim.systematics.base import Bound, Effect, Map, Site, Wording
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +34,7 @@ class NoiseAnisotropy(Effect):
     signature = "Autos only, L = 2, M = 0 of the ecliptic frame; the variance map of half differences."
     source = "The pattern is the lowest one that a scan symmetric about the ecliptic makes"
     step = 0.05
+    bounds = (Bound("amplitude", -0.5, 1.0, "no variance is negative, the pattern being from -1 to 2"),)
 
     template: str = ""
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mcsim.errors import InputError
-from mcsim.systematics.base import Effect, Map, Site, Wording
+from mcsim.systematics.base import Bound, Effect, Map, Site, Wording
 from mcsim.systematics.parametrization import Parametrization
 
 
@@ -21,6 +21,7 @@ class NoiseLevel(Effect):
     signature = "Autos only, flat in l, as the hits."
     source = "Jarosik et al. 2011, ApJS 192, 14 (sigma0 per channel, and its error)"
     step = 0.01
+    bounds = (Bound("amplitude", -0.9, 3.0, "a prior of this library: noise is known to a factor of four"),)
     parametrization = Parametrization(matched_filter=False)
 
     def noise(self, site: Site) -> Map | None:

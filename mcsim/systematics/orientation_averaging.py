@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mcsim.instrument.scan import MapGrid, Moments, ScanModel, cached_moments
-from mcsim.systematics.base import Effect, Site, Wording
+from mcsim.systematics.base import Bound, Effect, Site, Wording
 from mcsim.systematics.parametrization import Parametrization
 
 
@@ -33,6 +33,9 @@ class OrientationAveraging(Effect):
     signature = "L = 2, M = 0 falls to 0.66 of what parallel transport gives, and other M appear."
     source = "Joshi et al. arXiv:1210.7318, Sec. V"
     step = 0.05
+    bounds = (
+        Bound("amplitude", 0.0, 1.25, "0 is the model and 1 the real scan; a quarter more for errors of the latter"),
+    )
     parametrization = Parametrization(sign=1)
     variants = ({"model": "wmap"},)
 

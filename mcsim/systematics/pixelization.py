@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from mcsim.systematics.base import Effect, Wording
+from mcsim.systematics.base import Bound, Effect, Wording
 from mcsim.systematics.parametrization import Parametrization
 
 
@@ -25,6 +25,7 @@ class Pixelization(Effect):
     signature = "Small scales, depending on nside, and the gradient of the sky at pixels that are hit unevenly."
     source = "Gorski et al. 2005, ApJ 622, 759, Sec. 6 (window functions)"
     step = 0.1
+    bounds = (Bound("amplitude", -2.0, 2.0, "beyond it samples stand outside of their pixels"),)
     parametrization = Parametrization(max_amplitude=2.0)
 
     def spread(self) -> float:

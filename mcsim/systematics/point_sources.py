@@ -6,7 +6,7 @@ import numpy as np
 
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.sky import gaussian_alm
-from mcsim.systematics.base import Alm, Draw, Effect, Site, Wording
+from mcsim.systematics.base import Alm, Bound, Draw, Effect, Site, Wording
 from mcsim.systematics.parametrization import Parametrization
 
 _NARROWEST = 5
@@ -31,6 +31,14 @@ class PointSources(Effect):
     signature = "Flat C_l, in autos and crosses of all channels alike."
     source = "Tegmark & Efstathiou 1996, MNRAS 281, 1297; Wright et al. 2009, ApJS 180, 283"
     step = 1e-4
+    bounds = (
+        Bound(
+            "amplitude",
+            0.0,
+            10.0,
+            "no power is negative; far beyond that of unresolved sources",
+        ),
+    )
     parametrization = Parametrization(sign=-1, stochastic=True, mean_response=True, matched_filter=False)
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:

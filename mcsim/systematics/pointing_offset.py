@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from mcsim.instrument.beams import Beam
-from mcsim.systematics.base import Effect, Site, Wording, scan_direction
+from mcsim.systematics.base import Bound, Effect, Site, Wording, scan_direction
 from mcsim.systematics.parametrization import Angle, Vector
 from mcsim.systematics.shape import displaced
+from mcsim.systematics.spacecraft import axes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +35,9 @@ class PointingOffset(Effect):
     signature = "The gradient of the sky along or across the scan, through w_1; acts on the dipole too."
     source = "Jarosik et al. 2007, ApJS 170, 263 (boresights); Mitra et al. 2011, ApJS 193, 5"
     step = 0.2
+    bounds = (
+        Bound("amplitude", 0.0, 120.0, "a prior of this library: reconstructed pointing is never wrong by two degrees"),
+    )
     parametrization = Angle()
 
     angle_deg: float = 0.0
@@ -47,10 +51,7 @@ class PointingOffset(Effect):
         if self.amplitude == 0.0:
             return theta, phi, psi
         distance, angle = np.deg2rad(self.amplitude / 60.0), np.deg2rad(self.angle_deg)
-        sin_t, cos_t, sin_p, cos_p = np.sin(theta), np.cos(theta), np.sin(phi), np.cos(phi)
-        outward = np.stack([sin_t * cos_p, sin_t * sin_p, cos_t])
-        south = np.stack([cos_t * cos_p, cos_t * sin_p, -sin_t])
-        east = np.stack([-sin_p, cos_p, np.zeros_like(phi)])
+        outward, south, east = axes(theta, phi)
         # Along the displacement and to its left; the first turns down, the second stays.
         forward = np.cos(psi + angle) * south + np.sin(psi + angle) * east
         left = np.cos(psi + angle) * east - np.sin(psi + angle) * south

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mcsim.systematics.base import Alm, Draw, Effect, Site, Wording
+from mcsim.systematics.base import Alm, Bound, Draw, Effect, Site, Wording
 from mcsim.systematics.parametrization import Components, Vector
 from mcsim.systematics.product import multiplied
 
@@ -31,6 +31,7 @@ class QuadrupoleModulation(Effect):
     signature = "L = 2, the same in every channel and split: nearly degenerate with m = 2 in one channel."
     source = "Ackerman, Carroll & Wise 2007, Phys. Rev. D 75, 083502, with a modulation of the sky in place of P(k)"
     step = 0.01
+    bounds = (Bound("amplitude", 0.0, 1.0, "beyond it the signal changes sign in a part of the sky"),)
     parametrization = Components(parameter="components", count=5, matched_filter=False)
 
     components: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 0.0)

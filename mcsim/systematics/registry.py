@@ -16,7 +16,7 @@ from typing import Any
 
 from mcsim.errors import InputError
 from mcsim.systematics import base
-from mcsim.systematics.base import Effect
+from mcsim.systematics.base import Bound, Effect
 from mcsim.systematics.parametrization import Parametrization
 
 ENTRY_POINTS = "mcsim.effects"
@@ -88,6 +88,9 @@ def _flaw(kind: type[Effect]) -> str | None:
     for key, value, largest in (("step", step, float_info.max), ("max_amplitude", fit.max_amplitude, inf)):
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value <= largest:
             return f"has {key} = {value!r}: it needs a number above 0"
+    for one in kind.bounds:
+        if not isinstance(one, Bound) or one.parameter not in {f.name for f in fields(kind)} or not one.low < one.high:
+            return f"has the bound {one!r}: it needs a mcsim.systematics.Bound of a parameter, low < high"
     if fit.sign not in (-1, 0, 1):
         return f"has sign = {fit.sign!r}: it needs -1, 0 or 1"
     try:

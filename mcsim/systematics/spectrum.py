@@ -9,7 +9,7 @@ from scipy.optimize import lsq_linear
 
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
-from mcsim.systematics.base import Alm, Draw, Effect, Site, Wording
+from mcsim.systematics.base import Alm, Bound, Draw, Effect, Site, Wording
 from mcsim.systematics.parametrization import Components, Vector
 
 BANDS = 6
@@ -70,6 +70,9 @@ class Spectrum(Effect):
     signature = "L = 0, every channel alike."
     source = "Follows from the definition"
     step = 0.02
+    bounds = (
+        Bound("amplitude", 0.0, 3.0, "a prior of this library: no band has more than about three times its power"),
+    )
     parametrization = _Bands(parameter="bands", count=BANDS, mean_response=True, matched_filter=False)
 
     bands: tuple[float, ...] = (1.0,) * BANDS

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mcsim.instrument.beams import Beam
-from mcsim.systematics.base import Effect, Site, Wording
+from mcsim.systematics.base import Bound, Effect, Site, Wording
 from mcsim.systematics.shape import smeared
 
 _NODES = 7
@@ -31,6 +31,14 @@ class TimeConstant(Effect):
     signature = "Lag and smear along beam x: nearly degenerate with a pointing offset along the scan, and with m = 2."
     source = "Planck 2013 results VII, A&A 571, A7 (time response of bolometers)"
     step = 0.001
+    bounds = (
+        Bound(
+            "amplitude",
+            -2.0,
+            2.0,
+            "bolometers have tails of about 1 s (Planck 2013 results VII, A&A 571, A7)",
+        ),
+    )
 
     def pointing(self, beam: Beam, site: Site) -> Beam:
         """Trail the beam along the circle of the spin."""

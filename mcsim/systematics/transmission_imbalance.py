@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from mcsim.systematics.base import Effect, Wording
+from mcsim.systematics.base import Bound, Effect, Wording
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,6 +17,14 @@ class TransmissionImbalance(Effect):
     signature = "Stripes of the dipole along the scan; acts on differencing scans only."
     source = "Jarosik et al. 2003, ApJS 145, 413; Hinshaw et al. 2003, ApJS 148, 63"
     step = 1e-3
+    bounds = (
+        Bound(
+            "amplitude",
+            -0.1,
+            0.1,
+            "WMAP's are at most 0.02 (Jarosik et al. 2003, ApJS 145, 413)",
+        ),
+    )
 
     def differencing(self, imbalance: float, iterations_short: int) -> tuple[float, int]:
         """Add to the imbalance."""

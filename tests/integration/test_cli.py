@@ -92,6 +92,28 @@ def test_plot_chooses_modes(mcsim: Command, small_store: Path, tmp_path: Path) -
     assert_refused(mcsim("plot", small_store, "--L", 9), "L = 9")
 
 
+def test_effects_on_request_are_marked_and_proposed_when_asked_for(mcsim: Command, tmp_path: Path) -> None:
+    asked = "--with orbital_dipole"
+    assert asked in mcsim("effects", "orbital_dipole")[1]
+    assert "--with" not in mcsim("effects", "gain_drift")[1]
+    model = """
+schema = 1
+name = "small"
+sky = { spectrum = "wmap7", lmax = 40 }
+map = { nside = 16 }
+[[channel]]
+name = "W1"
+beam = { kind = "gaussian", fwhm_arcmin = 350.0 }
+noise = { sigma0_uk = 30.0 }
+scan = { kind = "hit_averaged", model = "wmap", sample_period_s = 157.8, line_of_sight = "A" }
+"""
+    (tmp_path / "small.toml").write_text(model)
+    command = ("diagnose", "small.toml", "data", "-o", "out", "--dry-run", "--simulations", 400)
+    sizes = [int(mcsim(*command, *more)[1].splitlines()[0].split()[-1]) for more in ((), asked.split())]
+    assert sizes[1] == sizes[0] + 2  # cosine and sine have a matched filter each
+    assert_refused(mcsim(*command, "--with", "orbital_dipol"), "orbital_dipol", "orbital_dipole")
+
+
 @pytest.mark.parametrize("chosen", [{}, {"L": 2, "M": 0}])
 def test_notes_of_a_wide_and_a_narrow_figure_are_whole(small_store: Path, chosen: dict[str, int]) -> None:
     figure = ensemble_figure(small_store, prediction=predict(table()), **chosen)

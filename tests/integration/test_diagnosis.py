@@ -17,6 +17,7 @@ from mcsim.diagnosis.campaign import with_effects
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps, read_maps
+from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.wiener_filter import shared_sky, wiener_filter
 from mcsim.errors import InputError
@@ -96,7 +97,7 @@ def test_no_gap_where_there_is_none(small):
     assert found.verdict["effects"] == []
 
 
-def test_ellipticity_seen_sample_by_sample_is_named_and_shrinks(small):
+def test_ellipticity_seen_sample_by_sample_is_named_and_shrinks(small, tmp_path):
     truth = 0.25
     shared = data_of(small.run, "beam_ellipticity", "W1", amplitude=truth, angle_deg=20.0)
     maps = [map_uk for _, map_uk in sampled.maps(shared, 0)]
@@ -109,6 +110,15 @@ def test_ellipticity_seen_sample_by_sample_is_named_and_shrinks(small):
     assert abs(best["amplitude"] - truth) < 3 * best["sigma"]
     assert verdict["shrink"]["achieved"] > 0.5
     assert abs(verdict["shrink"]["achieved"] - verdict["shrink"]["predicted"]) < 4 * verdict["shrink"]["sigma"]
+    # It is the same in both halves, which measure it independently.
+    halves = next(one for one in best["consistency"] if one["by"] == "halves")
+    assert halves["slices"] == ["half1", "half2"]
+    assert all(
+        abs(a - best["amplitude"]) < 4 * sigma for a, sigma in zip(halves["amplitude"], halves["sigma"], strict=True)
+    )
+    assert "contradicted" not in verdict
+    found.save(tmp_path)
+    assert DiagnosisResult.open(tmp_path).effects == found.effects
 
 
 def mean_squares(learned, name=None, channel=None, skies=20, **parameters):
@@ -275,6 +285,40 @@ def test_the_library_is_an_argument_that_workers_share(small):
     assert rows[0].shape == (len(analysis.elements),)
     matched = [element.candidate == "louder" and element.channels == ("W1",) for element in analysis.elements]
     assert rows[1][matched] > rows[0][matched]
+
+
+def test_effects_on_request_are_proposed_when_they_are_named(small):
+    others = [name for name, kind in systematics.catalogue().items() if kind.proposed and name != "noise_level"]
+    both = ("orbital_dipole", "spin_synchronous_offset")
+    for including, expected in (((), {"noise_level"}), (both, {"noise_level", *both})):
+        settings = DiagnosisSettings(including=including)
+        analysis = analysis_of(small.run, without=others, settings=settings)
+        assert {candidate.name for candidate in analysis.candidates} == expected
+    for effect in ({"name": both[0], "amplitude": 0.2}, {"name": both[1], "amplitude": 50.0}):
+        parameters = {"amplitude": effect["amplitude"], "phase_deg": 45.0}
+        run = with_effects(small.run, [config.Effect(name=effect["name"], channel="W1", parameters=parameters)])
+        rows = [data_vectors(replace(analysis.job(simulated), count=1))[0] for simulated in (small.run, run)]
+        matched = [element.candidate == effect["name"] and element.channels == ("W1",) for element in analysis.elements]
+        # Cosine and sine, of which the effect has as much.
+        change = rows[1][matched] - rows[0][matched]
+        assert change.shape == (2,)
+        assert np.all(change > 0.0)
+
+
+def test_the_cost_of_a_diagnosis_counts_the_effects_on_request(small):
+    least = DiagnosisSettings(simulations=400, without=tuple(n for n in systematics.catalogue() if n != "noise_level"))
+
+    def size(settings):
+        return int(api.describe(small.run, settings).splitlines()[0].split()[-1])
+
+    asked = {"without": tuple(n for n in least.without if n != "gain_spin")}
+    assert size(replace(least, **asked)) == size(least)
+    assert size(replace(least, **asked, including=("gain_spin",))) == size(least) + 4
+    # Of a library that is given all effects are proposed; the level of the noise has no matched filter anyway.
+    library = {"gain_spin": systematics.get("gain_spin")}
+    assert size(DiagnosisSettings(simulations=400, library=library)) == size(least) + 4
+    with refused("gain_spinn", "gain_spin"):
+        api.describe(small.run, replace(least, including=("gain_spinn",)))
 
 
 def test_a_diagnosis_knows_the_library_that_it_is_given(small, tmp_path, monkeypatch):

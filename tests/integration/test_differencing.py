@@ -249,6 +249,12 @@ def test_orders_that_were_left_out_come_back_on_both_sides(year, other):
         np.testing.assert_array_equal(a.side_b.beam.blm, b.side_b.beam.blm)
 
 
+def test_noise_and_signals_of_samples_of_one_beam_are_refused(year):
+    for name in ("excess_noise", "orbital_dipole", "gain_spin"):
+        with refused(name, "W1"):
+            survey(year(effect=[{"name": name, "channel": "W1", "amplitude": 0.1}]))
+
+
 def test_survey_of_another_scan_has_no_side_b():
     shared: Survey = survey(config.load(table()))
     assert shared.channels[0].side_b is None

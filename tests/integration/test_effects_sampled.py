@@ -70,6 +70,14 @@ RESPONSES = {
     "dipole_residual": {"amplitude": 10.0, "lon_deg": 20.0, "lat_deg": 30.0},
     "boost": {"amplitude": 0.001, "lon_deg": 20.0, "lat_deg": 30.0},
     "foreground_residual": {"amplitude": 5.0},
+    "gain_spin": {"amplitude": 0.01, "phase_deg": 30.0},
+    "bandpass_mismatch": {"amplitude": 5.0},
+    "sidelobe_pickup": {"amplitude": 0.002, "width_deg": 20.0},
+    "nonlinearity": {"amplitude": 0.002},
+    "orbital_dipole": {"amplitude": 0.02, "phase_deg": 40.0},
+    "spin_synchronous_offset": {"amplitude": 2.0, "phase_deg": 30.0},
+    "pointing_jitter": {"amplitude": 400.0},
+    "lensing": {"amplitude": 4.0},
 }
 
 
@@ -124,6 +132,26 @@ def test_noise_follows_hits_and_effects():
     np.testing.assert_allclose(noisy.channels[0].maps[0].noise_uk ** 2, variance)
     for part in (np.abs(latitude) < 0.3, np.abs(latitude) > 0.9):
         assert np.mean((noise**2 / variance)[part]) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / part.sum()))
+
+
+def test_excess_noise_has_its_variance_and_its_tails_in_both_routes():
+    """The sum of n Gaussians, n Poisson of mean m: of variance m and fourth moment 3 (m + m^2), pixel by pixel."""
+    fraction, glitch_uk = 0.01, 200.0
+    noisy, quiet = prepared("excess_noise", 0.0, amplitude=fraction, glitch_uk=glitch_uk), prepared(dipole_uk=0.0)
+    hits = quiet.channels[0].maps[0].moments.hits
+    mean = fraction * hits
+    routes = [
+        simulate.maps(noisy, 0)[0] - simulate.maps(quiet, 0)[0],
+        sampled.maps(noisy, 0, epsilon=1e-4)[0][1] - sampled.maps(quiet, 0, epsilon=1e-4)[0][1],
+    ]
+    for map_uk in routes:
+        square = (map_uk * hits / glitch_uk) ** 2
+        error = np.sqrt(np.sum(3.0 * (mean + mean**2) - mean**2))
+        assert abs(np.sum(square - mean)) < 4.0 * error
+        # Pixels without a hit are the share exp(-m), whatever the size of the others.
+        empty = np.exp(-mean)
+        assert abs(np.sum((square < 1e-6) - empty)) < 4.0 * np.sqrt(np.sum(empty * (1.0 - empty)))
+    assert abs(np.corrcoef(*routes)[0, 1]) < 4.0 / np.sqrt(hits.size)
 
 
 def test_what_samples_cannot_do_is_refused():

@@ -9,6 +9,8 @@ import pytest
 
 import mcsim
 from mcsim import config
+from mcsim.diagnosis.campaign import with_effects
+from mcsim.ensemble.external import source_of
 from mcsim.simulation import sampled
 from mcsim.simulation.survey import survey
 
@@ -59,3 +61,22 @@ def test_a_simulator_of_others_makes_our_maps_and_its_arguments_are_named(name, 
     found = mcsim.compare(list(ours.values()), list(theirs.simulate(given, **arguments).values()), run)
     assert [d.name for d in found.channels[0].differences] == [difference]
     assert all(np.isfinite(m).all() for m in made.values())
+
+
+def test_litebird_sim_as_a_model_adds_an_effect_to_the_sky_that_it_is_given(monkeypatch):
+    pytest.importorskip("litebird_sim")
+    monkeypatch.syspath_prepend(str(FOLDER))
+    theirs = importlib.import_module("external_model")
+    scan = {"kind": "hit_averaged", "model": "wmap", "line_of_sight": "B", "sample_period_s": 1201.0}
+    channel = dict(theirs.MODEL["channel"][1], scan=scan, noise={"sigma0_uk": 0.0})
+    run = config.load(dict(theirs.MODEL, channel=[channel]))
+    effect = config.Effect(name="beam_ellipticity", channel="W1", parameters={"amplitude": -0.3, "angle_deg": 20.0})
+    sky = importlib.import_module("inputs").of(run, 3).sky
+    source = source_of(run, theirs.Litebird)
+    plain, changed = source.maps(0, 0, (), sky), source.maps(0, 0, (effect,), sky)
+    ours = [dict(sampled.maps(survey(with_effects(run, own)), 3)) for own in ((), (effect,))]
+    for before, after, name in zip(plain, changed, ours[0], strict=True):
+        seen = (before != healpy.UNSEEN) & (ours[0][name] != healpy.UNSEEN)
+        expected = ours[1][name] - ours[0][name]
+        assert np.std((before - ours[0][name])[seen]) < 1e-4 * np.std(before[seen])
+        assert np.std((after - before - expected)[seen]) < 0.02 * np.std(expected[seen])

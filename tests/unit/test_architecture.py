@@ -28,6 +28,7 @@ ORDER = (
     "plot",
     "comparison",
     "diagnosis",
+    "information",
     "benchmark",
     "cli",
 )
@@ -45,7 +46,7 @@ RESERVED = {
 # Pure science: numbers in, numbers out. It imports nothing of the wiring, which reads configurations, stores and draws.
 SCIENCE = {
     f"mcsim.{name}" for name in ("errors", "support", "sphere", "stats", "instrument", "systematics", "bipolar")
-} | {f"mcsim.simulation.{name}" for name in ("convolve", "mapmaking", "rings", "tod")}
+} | {f"mcsim.simulation.{name}" for name in ("convolve", "inverse_covariance", "mapmaking", "rings", "tod")}
 
 PUBLIC = {
     "mcsim.config": [
@@ -54,6 +55,7 @@ PUBLIC = {
         "BeamEllipticalGaussian",
         "BeamGaussian",
         "BeamMap",
+        "BeamWindow",
         "Biposh",
         "Channel",
         "Compute",

@@ -141,6 +141,16 @@ def test_a_key_is_read_as_it_was_written(tmp_path_factory, members, without, see
     assert read_key(folder, "case-000") == open_key(folder, "case-000") == written
 
 
+def test_effects_on_request_are_settings_of_a_challenge(tmp_path):
+    asked = Settings(config.load("quickstart"), including=("gain_spin",))
+    asked.write(tmp_path, 3)
+    assert Settings.read(tmp_path) == asked
+    with pytest.raises(InputError):
+        Settings(config.load("quickstart")).write(tmp_path, 3)
+    with refused("gain_spinn", "gain_spin"):
+        replace(asked, including=("gain_spinn",))
+
+
 def test_settings_are_read_as_they_were_written(folder):
     found = Settings.read(folder)
     assert found == Settings(config.load("quickstart"))

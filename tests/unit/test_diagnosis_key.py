@@ -28,7 +28,11 @@ RUN = config.load(resources.workflow("quickstart"))
 
 def key(effect, settings=None, run=RUN):
     analysis = SimpleNamespace(
-        candidates=(Candidate(effect, None, (0,)),), elements=(), settings=settings or DiagnosisSettings(), library=()
+        candidates=(Candidate(effect, None, (0,)),),
+        elements=(),
+        settings=settings or DiagnosisSettings(),
+        library=(),
+        source=None,
     )
     return api._key(run, analysis)
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from mcsim import systematics
-from mcsim.diagnosis import matched_filters
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import ScanModel
-from mcsim.simulation.survey import mean_gain
+from mcsim.simulation import pixel_means
+from mcsim.simulation.pixel_means import mean_gain
 
 HALVES = ((0.0, 0.5), (0.5, 1.0))
 
@@ -29,15 +29,13 @@ def test_gain_of_every_half_is_kept_apart(monkeypatch: pytest.MonkeyPatch) -> No
     )
     drifts = [systematics.get("gain_drift")(amplitude=0.01, phase_deg=phase) for phase in (0.0, 90.0)]
     passes = []
-    monkeypatch.setattr(matched_filters, "mean_gain", lambda *args: passes.append(args) or mean_gain(*args))
+    monkeypatch.setattr(pixel_means, "mean_gain", lambda *args: passes.append(args) or mean_gain(*args))
     for _ in range(2):
         for drift in drifts:
             for share in HALVES:
-                np.testing.assert_array_equal(
-                    matched_filters.gain_of(drift, site, share), mean_gain((drift,), site, share)
-                )
+                np.testing.assert_array_equal(pixel_means.gain_of(drift, site, share), mean_gain((drift,), site, share))
     assert len(passes) == 4
     # A sine of the year is positive in its first half and as negative in its second.
-    first, second = (matched_filters.gain_of(drifts[1], site, share).mean() for share in HALVES)
+    first, second = (pixel_means.gain_of(drifts[1], site, share).mean() for share in HALVES)
     assert first == pytest.approx(0.01 * 2 / np.pi, rel=0.1)
     assert second == pytest.approx(-first, rel=0.1)

@@ -16,6 +16,17 @@ from mcsim.systematics.parametrization import Angle
 from refusals import refused
 
 LMAX, NSIDE = 48, 8
+ON_REQUEST = {
+    "sidelobe_pickup",
+    "gain_spin",
+    "bandpass_mismatch",
+    "nonlinearity",
+    "orbital_dipole",
+    "spin_synchronous_offset",
+    "pointing_jitter",
+    "lensing",
+    "excess_noise",
+}
 NAMES = {
     "beam_ellipticity",
     "beam_coma",
@@ -38,6 +49,7 @@ NAMES = {
     "mapmaking_convergence",
     "orientation_averaging",
     "spectrum",
+    *ON_REQUEST,
 }
 
 
@@ -62,6 +74,7 @@ def site() -> systematics.Site:
 
 def test_the_library_holds_what_is_named():
     assert set(systematics.catalogue()) == NAMES
+    assert {name for name, kind in systematics.catalogue().items() if not kind.proposed} == ON_REQUEST
     for kind in systematics.catalogue().values():
         assert kind.scope in ("channel", "common")
         assert all((kind.unit, kind.cause, kind.signature, kind.source))
@@ -76,6 +89,8 @@ def test_zero_amplitude_changes_nothing(name, site):
     assert systematics.looked_at([effect], sky, site, 1, 0) is sky
     assert systematics.seen_through([effect], site) is site.beam
     assert effect.gain(np.arange(3.0), site) is None
+    assert not systematics.adding([effect])
+    assert not systematics.disturbing([effect])
     assert effect.noise(site) is None
     assert effect.spread() == 1.0
     assert effect.differencing(0.01, 2) == (0.01, 2)
@@ -93,6 +108,9 @@ PARAMETERS = {
     "beam_sidelobe": {"quadrupole": -0.4},
     "pointing_offset": {"angle_deg": -120.0},
     "gain_drift": {"phase_deg": 100.0},
+    "gain_spin": {"phase_deg": 100.0},
+    "orbital_dipole": {"phase_deg": -70.0},
+    "spin_synchronous_offset": {"phase_deg": 170.0},
     "dipole_residual": {"lon_deg": 200.0, "lat_deg": -35.0},
     "dipole_modulation": {"lon_deg": 20.0, "lat_deg": 80.0},
     "boost": {"lon_deg": 264.0, "lat_deg": 48.0},

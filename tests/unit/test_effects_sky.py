@@ -13,8 +13,9 @@ from mcsim.instrument.scan import Moments, ScanModel
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotate_alm, rotate_pixels
-from mcsim.sphere.sky import gaussian_alm
+from mcsim.sphere.sky import dipole_alm, gaussian_alm
 from mcsim.sphere.spectra import load
+from mcsim.systematics import lensing
 from refusals import refused
 
 LMAX, NSIDE = 64, 16
@@ -94,6 +95,35 @@ def test_boost_keeps_the_power_and_is_undone_by_the_opposite_one(site, sky):
     np.testing.assert_allclose(again, sky, atol=1e-10 * np.abs(sky).max())
     with refused("boost", "amplitude", 1):
         kind(amplitude=1.0, **TOWARDS).sky(sky, site, draw)
+
+
+def test_lensing_reads_the_sky_at_the_ends_of_arcs(site, sky, points):
+    """A potential a AXIS . n draws every direction towards the axis, by a times the sine of their distance."""
+    smooth = alm_.multiply(sky, (np.arange(LMAX + 1) <= LMAX // 3).astype(float), LMAX)
+    found = lensing.remapped(smooth, dipole_alm(0.2 * AXIS, LMAX), LMAX)
+    seen = healpy.ang2vec(*points.T)
+    distance = np.arccos(seen @ AXIS)
+    across = AXIS - np.cos(distance)[:, None] * seen
+    towards = across / np.linalg.norm(across, axis=1, keepdims=True)
+    reach = (0.2 * np.sin(distance))[:, None]
+    theta, phi = healpy.vec2ang(np.cos(reach) * seen + np.sin(reach) * towards)
+    expected = at(smooth, np.stack([theta, phi], axis=1))
+    assert np.std(expected - at(smooth, points)) > 1.0
+    np.testing.assert_allclose(at(found, points), expected, atol=1e-4 * np.std(expected))
+
+
+def test_lensing_has_the_deflections_of_the_fiducial_power(site, sky):
+    ell = np.arange(2001.0)
+    power = lensing.potential(2000)
+    assert power[100] == pytest.approx(2.0 * np.pi * 1.0145e-7 / (100.0 * 101.0) ** 2, rel=0.01)
+    deflection = np.sqrt(np.sum((2.0 * ell + 1.0) * ell * (ell + 1.0) * power) / (4.0 * np.pi))
+    assert 60.0 * np.rad2deg(deflection) == pytest.approx(2.4, abs=0.06)
+    kind = systematics.get("lensing")
+    weak, strong = (kind(amplitude=amplitude).sky(sky, site, draw) - sky for amplitude in (0.01, 0.04))
+    # Of first order in the deflection, whose power is the amplitude: twice as far.
+    np.testing.assert_allclose(strong, 2.0 * weak, atol=0.05 * np.abs(strong).max())
+    with refused("lensing", -1):
+        kind(amplitude=-1.0).sky(sky, site, draw)
 
 
 def test_dipole_residual_adds_a_vector(site, sky, points):

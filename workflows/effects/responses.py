@@ -4,7 +4,8 @@
 
 INSTRUMENT is a folder with ``scan.toml`` (how the survey was pointed), ``cl_tt.txt`` (the sky's spectrum) and the
 moments ``moments_W1_half1.fits`` and ``moments_W1_half2.fits``: nside 128, a year at 2 s. FOLDER takes the responses
-(``responses.npz``), so that the picture ``effects.png`` can be drawn again without them. About 6 minutes on two cores.
+(``responses.npz``), so that the pictures can be drawn again without them: ``effects.png``, and
+``effects-on-request.png`` of those that a diagnosis proposes on request. About 6 and 3 minutes on two cores.
 """
 
 import argparse
@@ -49,6 +50,15 @@ PARAMETERS: dict[str, dict[str, Any]] = {
     "orientation_averaging": {"amplitude": 1.0},
     "transmission_imbalance": {"amplitude": 0.005},
     "mapmaking_convergence": {"amplitude": 15.0},
+    "sidelobe_pickup": {"amplitude": 0.002},
+    "nonlinearity": {"amplitude": 0.001},
+    "gain_spin": {"amplitude": 0.001, "phase_deg": 30.0},
+    "bandpass_mismatch": {"amplitude": 3.0},
+    "orbital_dipole": {"amplitude": 0.01, "phase_deg": 30.0},
+    "spin_synchronous_offset": {"amplitude": 1.0, "phase_deg": 30.0},
+    "pointing_jitter": {"amplitude": 25.0},
+    "lensing": {"amplitude": 1.0},
+    "excess_noise": {"amplitude": 0.001},
 }
 NOISE = ("noise_anisotropy", "noise_level")
 DIFFERENCING = ("transmission_imbalance", "mapmaking_convergence")
@@ -72,7 +82,11 @@ def main() -> None:
             known[name] = response(name, arguments, plain)
             np.savez(store, **known)
         report(name, known[name])
-    draw({name: known[name] for name in PARAMETERS if name in known}, arguments.output / "effects.png")
+    found = {name: known[name] for name in PARAMETERS if name in known}
+    for proposed, picture in ((True, "effects.png"), (False, "effects-on-request.png")):
+        shown = {name: maps for name, maps in found.items() if systematics.get(name).proposed is proposed}
+        if shown:
+            draw(shown, arguments.output / picture, TITLE if proposed else TITLE.split(". The last three")[0])
 
 
 def response(name: str, arguments: argparse.Namespace, plain: dict[str | None, tuple[list[Map], list[Map]]]) -> Map:
@@ -81,7 +95,7 @@ def response(name: str, arguments: argparse.Namespace, plain: dict[str | None, t
         effect = systematics.build(name, PARAMETERS[name])
         factor = effect.noise(prepared(name, arguments).channels[0].site)
         return np.array([factor - 1.0])
-    if name in DIFFERENCING or name == "orientation_averaging":
+    if name in DIFFERENCING or name in ("orientation_averaging", "excess_noise"):
         return simulate.maps(prepared(name, arguments), 0)[:1] - simulate.maps(prepared(None, arguments, name), 0)[:1]
     like = name if name == "beam_noncircularity" else None
     if like not in plain:
@@ -159,19 +173,20 @@ def report(name: str, maps: Map) -> None:
         )
 
 
-def draw(found: dict[str, Map], path: Path) -> None:
+def draw(found: dict[str, Map], path: Path, title: str) -> None:
     """A map of the response of the first half and the spectra of both routes, for every effect."""
-    columns, rows = 7, 3
-    figure = plt.figure(figsize=(23, 12))
+    columns, rows = (7, 3) if len(found) > 10 else (5, 2)
+    wide, high = 7 / columns, 3 / rows
+    figure = plt.figure(figsize=(23 / wide, 12 / high))
     for place, (name, maps) in enumerate(found.items()):
         column, row = place % columns, place // columns
-        left, bottom = 0.03 + column * 0.139, 0.663 - row * 0.309
+        left, bottom = 0.03 + column * 0.139 * wide, 1.0 - (0.33 + row * 0.304) * high
         shown = healpy.smoothing(maps[0], fwhm=np.deg2rad(1.5)) if len(maps) == 4 else maps[0]
         reach = np.percentile(np.abs(shown - (0.0 if name in NOISE else shown.mean())), 99.0)
         colours = {"cmap": "RdBu_r", "min": -reach, "max": reach}
         image = healpy.cartview(shown, return_projected_map=True, fig=99, xsize=500, **colours)
         plt.close(99)
-        axes = figure.add_axes((left, bottom + 0.128, 0.124, 0.122), projection="mollweide")
+        axes = figure.add_axes((left, bottom + 0.128 * high, 0.124 * wide, 0.122 * high), projection="mollweide")
         lon, lat = (
             np.linspace(-np.pi, np.pi, image.shape[1] + 1),
             np.linspace(-np.pi / 2, np.pi / 2, image.shape[0] + 1),
@@ -183,13 +198,13 @@ def draw(found: dict[str, Map], path: Path) -> None:
         unit = "of the variance" if name in NOISE else "uK"
         axes.set_title(f"{name}\n{PARAMETERS[name]['amplitude']:g} {effect.unit}", fontsize=9)
         axes.text(0.5, -0.07, f"±{reach:.2g} {unit}", transform=axes.transAxes, ha="center", va="top", fontsize=7.5)
-        below = figure.add_axes((left + 0.012, bottom, 0.112, 0.1))
+        below = figure.add_axes((left + 0.012 * wide, bottom, 0.112 * wide, 0.1 * high))
         spectra(below, name, maps)
         if row == rows - 1 or place + columns >= len(found):
             below.set_xlabel("l", fontsize=8)
         if column == 0:
             below.set_ylabel("l(l+1)C/2π, uK²", fontsize=8)
-    figure.text(0.5, 0.997, TITLE, ha="center", va="top", fontsize=11)
+    figure.text(0.5, 0.997, title, ha="center", va="top", fontsize=11)
     figure.savefig(path, dpi=75)
     plt.close(figure)
 

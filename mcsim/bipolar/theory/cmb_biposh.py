@@ -243,8 +243,9 @@ def _spin_table(low: int, high: int, smax: int, L_max: int, response: NDArray[np
     family = np.zeros(2 * L_max + 1)
     for l1 in range(low, high):
         for L1 in range(L_max + 1):
+            zero = 0 * L1  # a literal 0 is a type of its own to numba, compiled anew
             for s in range(min(smax, L1) + 1):
-                bottom, n = threej_family(l1, L1, np.int64(0), s, family)  # a plain 0 is a type of its own to numba
+                bottom, n = threej_family(l1, L1, zero, s, family)
                 for ell in range(bottom, min(bottom + n, lsky + 1)):
                     symbol = family[ell - bottom]
                     mirrored = symbol if (l1 + L1 + ell) % 2 == 0 else -symbol

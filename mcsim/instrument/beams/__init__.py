@@ -4,6 +4,7 @@ from mcsim.instrument.beams.beam import Beam
 from mcsim.instrument.beams.beammap import BeamMap, blm_of_map, find_centre, holds_image, read_map
 from mcsim.instrument.beams.coefficients import MMAX_TOLERANCE, choose_mmax
 from mcsim.instrument.beams.summary import BeamSummary, format_summary, summarize
+from mcsim.instrument.beams.window import read_window
 
 __all__ = [
     "MMAX_TOLERANCE",
@@ -16,5 +17,6 @@ __all__ = [
     "format_summary",
     "holds_image",
     "read_map",
+    "read_window",
     "summarize",
 ]

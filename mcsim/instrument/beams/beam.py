@@ -14,6 +14,7 @@ from mcsim.instrument.beams.beammap import DEFAULT_CUT_DEG, BeamMap, placed, rea
 from mcsim.instrument.beams.coefficients import check_mmax, choose_mmax, cut, power_by_order
 from mcsim.instrument.beams.files import checked_blm
 from mcsim.instrument.beams.gaussian import elliptical_blm
+from mcsim.instrument.beams.window import read_window
 from mcsim.sphere.checks import check_angle, check_finite
 from mcsim.support.npy import read_npz
 
@@ -234,6 +235,50 @@ class Beam:
             return cls._saved(source, lmax, mmax)
         blm, origin = checked_blm(source, lmax)
         return cls.normalized(blm, mmax, origin)
+
+    @classmethod
+    def from_window(
+        cls,
+        source: NDArray | str | Path,
+        lmax: int | None = None,
+        *,
+        extension: str | None = None,
+        column: str | None = None,
+    ) -> Self:
+        """Return the circular beam of a window B_l.
+
+        Parameters
+        ----------
+        source
+            B_l from l = 0; or a file of them: text with B_l, or with ell, B_l and more (WMAP's ampl_bl tables), a FITS
+            table (Planck's instrument models, beam windows and CMB maps), or .npy.
+        lmax
+            Largest degree, no more than the source's; ``None``: the source's.
+        extension, column
+            Name (or number) of the FITS table, and of its column; ``None``: the only ones that can be B_l.
+
+        Returns
+        -------
+        Beam
+            Normalised to B_0 = 1; its ``integral`` is B_0 of the source.
+
+        Raises
+        ------
+        InputError
+            If the source cannot be read, stops before lmax, does not start at 1, exceeds it, or leaves a choice.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from mcsim import Beam
+        >>> ell = np.arange(101)
+        >>> beam = Beam.from_window(np.exp(-0.5 * ell * (ell + 1) * 0.01**2))
+        >>> beam.mmax, f"{beam.window[100]:.3f}"
+        (0, '0.604')
+        """
+        window = read_window(source, lmax, extension, column)
+        blm = np.sqrt((2 * np.arange(window.size) + 1) / (4 * np.pi)) * window
+        return cls.normalized(blm[None].astype(np.complex128), 0, "the window B_l")
 
     @classmethod
     def _saved(cls, path: str | Path, lmax: int | None, mmax: int | None) -> Self:

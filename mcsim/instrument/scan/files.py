@@ -86,7 +86,8 @@ def _from_fits(path: str | Path, where: str, smax: int | None, frame: str | None
             raise InputError(f"{where}: column {name} is not finite in {bad.sum()} pixels, first {np.argmax(bad)}.")
     if hits.min() < 0.0:
         raise InputError(f"{where}: HITS is {hits.min():g} in pixel {hits.argmin()}, but it must be >= 0.")
-    w = np.array([columns[f"RE_{s}"] + 1j * columns[f"IM_{s}"] for s in range(1, smax + 1)])
+    orders = [columns[f"RE_{s}"] + 1j * columns[f"IM_{s}"] for s in range(1, smax + 1)]
+    w = np.array(orders, dtype=np.complex128).reshape(smax, hits.size)
     # Single precision may exceed 1 by 6e-8.
     largest = np.abs(w).max(initial=0.0)
     if largest > 1.0 + 1e-6:

@@ -1,0 +1,351 @@
+"""Compare the amplitude of an effect in independent parts of the data: a name must agree with all of them."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from mcsim.diagnosis.candidate import Candidate
+from mcsim.diagnosis.null_ensemble import NullEnsemble
+from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.diagnosis.slices import northern
+from mcsim.diagnosis.summaries import Element, bins
+from mcsim.stats.gaussian import SimulatedGaussian
+from mcsim.support.arrays import Matrix, Vector
+from mcsim.support.numbers import number, p_equals
+from mcsim.systematics import Effect
+
+Rows = NDArray[np.int64]
+
+LARGE = 12
+"""Highest degree of the largest scales."""
+
+FRAMES = ("ecliptic", "galactic", "equatorial")
+
+SPARE = 2
+"""Simulations per element that a comparison needs."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Hold the amplitudes of one effect in independent parts of the data, beside the other effects of its set.
+
+    Attributes
+    ----------
+    kind, slices
+        What the data are divided by ("halves", "degrees", "hemispheres", "map": the largest scales of one map, against
+        all of the data), and the parts in words.
+    amplitudes, errors
+        Of each part, over the amplitude of the fit.
+    pvalue
+        Probability that amplitudes are so different if the effect acts.
+    odds
+        Odds of no effect against this one in the data without the part that supports it most.
+    """
+
+    kind: str
+    slices: tuple[str, ...]
+    amplitudes: tuple[float, ...]
+    errors: tuple[float, ...]
+    pvalue: float
+    odds: float = 1.0
+
+
+@dataclass(frozen=True)
+class MapCheck:
+    """Hold chi^2 of the largest scales of a channel's maps before and after a set of effects is taken out.
+
+    ``forecast`` is the expected fall; ``pvalue`` that of what is left, in ``dof`` degrees of freedom.
+    """
+
+    maps: tuple[str, ...]
+    before: float
+    after: float
+    forecast: float
+    dof: int
+    pvalue: float
+
+
+@dataclass(frozen=True)
+class Findings:
+    """Hold the comparisons of each effect of a set, and the checks of maps, with the global p-value of all of them."""
+
+    comparisons: tuple[tuple[Comparison, ...], ...] = ()
+    maps: tuple[MapCheck, ...] = ()
+
+    @property
+    def pvalue(self) -> float:
+        """Return the smallest p-value times the number of tests: Bonferroni's bound."""
+        each = [one.pvalue for own in self.comparisons for one in own] + [one.pvalue for one in self.maps]
+        return min(1.0, len(each) * min(each, default=1.0))
+
+    @property
+    def odds(self) -> float:
+        """Return the largest odds of no effect against one of the effects, in the data without one part."""
+        return max((one.odds for own in self.comparisons for one in own), default=1.0)
+
+    def contradict(self, settings: DiagnosisSettings) -> bool:
+        """Return True if parts of the data contradict one another, or most of them the effect."""
+        return self.pvalue <= settings.consistency_level or self.odds >= settings.absence_odds
+
+    @property
+    def measured(self) -> bool:
+        """Return True if independent parts have measured the amplitude of every effect."""
+        return bool(self.comparisons) and all(any(len(one.slices) > 1 for one in own) for own in self.comparisons)
+
+
+NOT_TESTED = Findings()
+
+
+@dataclass(frozen=True)
+class Action:
+    """Describe what a fitted effect does to the data and the numbers beside them, p + E together.
+
+    ``response`` is that at the fitted amplitude, shape (p + E,), and ``error`` the relative error of the amplitude;
+    ``directions``, shape (p + E, K - 1), are the responses to changes of its parameters that leave the amplitude.
+    """
+
+    response: Vector
+    directions: Matrix
+    error: float
+
+    @classmethod
+    def of(cls, response: Vector, t: Matrix, theta: Vector, covariance: Matrix) -> "Action":
+        """Make it from the response and templates, shape (p + E, K), fitted with these amplitudes."""
+        weight = np.linalg.pinv(covariance) @ theta
+        snr = float(weight @ theta)
+        # Independent of the amplitude in the metric of the fit.
+        rest = np.linalg.svd(weight[None])[2][1:].T
+        return cls(response, t @ rest, 1.0 / np.sqrt(max(snr, 1.0)))
+
+
+@dataclass(frozen=True)
+class Division:
+    """Divide elements, the ``rows``, into parts: ``keep`` are matrices that keep a part, (rows, rows) each."""
+
+    kind: str
+    words: tuple[str, ...]
+    rows: Rows
+    keep: tuple[Matrix, ...]
+
+
+@dataclass(frozen=True)
+class Slices:
+    """Test sets of effects in parts of a data vector and of the numbers beside it.
+
+    ``ensemble`` and ``z``, shape (p + E,), are both together; the last E elements are the numbers beside. ``splits``
+    are names, in the order of the folds, of a frame's maps up to the degree ``lmax``.
+    """
+
+    ensemble: NullEnsemble
+    z: Vector
+    beside: int
+    splits: tuple[str, ...]
+    lmax: int
+    settings: DiagnosisSettings
+    _nulls: dict[bytes, SimulatedGaussian] = field(default_factory=dict, repr=False)  # of rows that were needed so far
+
+    def findings(self, candidates: Sequence[Candidate], actions: Sequence[Action]) -> Findings:
+        """Test a set of effects by what each does to the data.
+
+        Notes
+        -----
+        The amplitudes of a comparison, the directions of all effects and the amplitudes of the others are fitted
+        together; that the amplitudes are equal is Rao's exact small-sample test
+        (:func:`mcsim.stats.gaussian.nested_pvalue`), correlations of the parts included. Parts in which the effect has
+        an expected S/N below ``slice_snr`` are left out. Responses are tolerated to be wrong by ``consistency_error``
+        of their white norm. Odds without the best part are those of amplitude 0 against 1 in all others.
+        """
+        # More noise is more of chi^2 everywhere: what is left in the maps then says nothing of the effect.
+        noisy = any(candidate.effect.noise is not Effect.noise for candidate in candidates)
+        free = np.concatenate([action.directions for action in actions], axis=1)
+        comparisons = []
+        for place, (candidate, action) in enumerate(zip(candidates, actions, strict=True)):
+            others = [other.response for k, other in enumerate(actions) if k != place]
+            beside = np.column_stack([free, *others])
+            divisions = (self._compared(one, action, beside) for one in self._divisions(candidate.channel))
+            own = [one for one in divisions if one is not None]
+            if len(candidates) == 1 and not noisy:
+                own += self._of_maps(candidate.channel, action)
+            comparisons.append(tuple(own))
+        channels = {candidate.channel for candidate in candidates}
+        names = {element.channels[0] for element in self.ensemble.elements[len(self.z) - self.beside :]}
+        seen = sorted(names if None in channels else {one for one in channels if one is not None})
+        responses = np.column_stack([action.response for action in actions])
+        checks = (self._left(channel, responses, free) for channel in ([] if noisy else seen))
+        return Findings(tuple(comparisons), tuple(check for check in checks if check is not None))
+
+    def _own(self, channel: str | None) -> list[tuple[int, Element]]:
+        """Return the elements of a channel, or of all, that are no matched filters."""
+        found = enumerate(self.ensemble.elements)
+        return [
+            (row, e) for row, e in found if e.statistic != "score" and (channel is None or set(e.channels) == {channel})
+        ]
+
+    def _divisions(self, channel: str | None) -> Iterator[Division]:
+        own, first = self._own(channel), len(self.z) - self.beside
+        halves = [[row for row, e in own if e.fold == fold] for fold in (0, 1)]
+        words = tuple(" and ".join(self.splits[fold::2]) for fold in (0, 1)) if len(self.splits) > 1 else _HALVES
+        yield _of_rows("halves", words, halves)
+        middle = bins(2, self.lmax, 2)[0][1]
+        ranges = [(0, LARGE), (LARGE + 1, middle), (middle + 1, self.lmax)]
+        degrees: list[list[int]] = [[], [], []]
+        for row, e in own:
+            if e.ell is not None:
+                place = 0 if e.ell[1] <= LARGE else 1 if e.ell[1] <= middle else 2
+                if place < 2 or e.ell[0] > middle:
+                    degrees[place].append(row)
+        yield _of_rows("degrees", tuple(f"ℓ {low}–{high}" for low, high in ranges), degrees)
+        beside = [(row, e) for row, e in own if row >= first]
+        for frame in FRAMES if beside else ():
+            north = northern([e for _, e in beside], frame)
+            words = tuple(f"the {frame} {side}" for side in ("north", "south"))
+            rows = np.array([row for row, _ in beside])
+            yield Division("hemispheres", words, rows, (north, np.eye(len(rows)) - north))
+
+    def _null(self, rows: Rows) -> SimulatedGaussian | None:
+        """Return the null distribution of some elements; None if there are too few simulations, or none of these."""
+        if not 0 < len(rows) <= len(self.ensemble.simulations) // SPARE:
+            return None
+        key = rows.tobytes()
+        if key not in self._nulls:
+            self._nulls[key] = self.ensemble.restrict(rows).gaussian
+        return self._nulls[key]
+
+    def _compared(self, division: Division, action: Action, others: Matrix) -> Comparison | None:
+        """Return the comparison of a division's parts; None if the effect does not show in two of them."""
+        response = action.response
+        division = self._clear(division, response)
+        null = self._null(division.rows)
+        if null is None or len(division.keep) < 2:
+            return None
+        rows = division.rows
+        x, beside, count = self.z[rows], others[rows], others.shape[1]
+        parts = [one @ response[rows] for one in division.keep]
+        whole = null.fit(x, np.column_stack([beside, response[rows]]))
+        apart = null.fit(x, np.column_stack([beside, *parts]))
+        amplitudes, errors = apart.amplitudes[count:], apart.errors[count:]
+        fitted, further = null.dimension - whole.dimension, whole.dimension - apart.dimension
+        if further < 1 or np.any(errors == 0.0):
+            return None
+        allowance = self._tolerated(null, whole.amplitudes[-1] * response[rows])
+        p = float(null.nested_test(max(whole.chi2 - apart.chi2, 0.0), whole.chi2, further, fitted, allowance))
+        best = int(np.argmax(amplitudes / errors))
+        found = null.fit(x, np.column_stack([beside, parts[best], sum(parts) - parts[best]]))
+        variance = found.errors[-1] ** 2 + action.error**2 + self.settings.consistency_error**2
+        odds = float(np.exp(min((0.5 - found.amplitudes[-1]) / variance, _LARGEST)))
+        return Comparison(
+            division.kind, division.words, tuple(map(float, amplitudes)), tuple(map(float, errors)), p, odds
+        )
+
+    def _clear(self, division: Division, response: Vector) -> Division:
+        """Return a division without parts in which a response does not show; neighbours that do together are one."""
+        rows = division.rows
+        kept: list[Matrix] = []
+        words: list[str] = []
+        null = self._null(rows)
+        if null is None:
+            return replace(division, keep=())
+        pending, names = np.zeros((len(rows), len(rows))), list[str]()
+        for keep, word in zip(division.keep, division.words, strict=True):
+            pending, names = pending + keep, [*names, word]
+            if null.expected_snr(pending @ response[rows]) >= self.settings.slice_snr:
+                kept, words = [*kept, pending], [*words, " and ".join(names)]
+                pending, names = np.zeros_like(pending), []
+        inside = np.flatnonzero(np.sum(kept, axis=0).any(axis=1)) if kept else np.arange(0)
+        return replace(
+            division, rows=rows[inside], keep=tuple(one[np.ix_(inside, inside)] for one in kept), words=tuple(words)
+        )
+
+    def _tolerated(self, null: SimulatedGaussian, *changes: Vector) -> float:
+        """Return the squared S/N of the errors of changes of elements that are tolerated."""
+        return sum((self.settings.consistency_error * null.expected_snr(change)) ** 2 for change in changes)
+
+    def _maps(self, channel: str | None) -> dict[str, list[int]]:
+        """Return the rows beside the data vector of each map of a channel, or of all, by name."""
+        found: dict[str, list[int]] = {}
+        for row in range(len(self.z) - self.beside, len(self.z)):
+            e = self.ensemble.elements[row]
+            if channel is None or e.channels == (channel,):
+                found.setdefault(" ".join(filter(None, (e.channels[0], e.split))), []).append(row)
+        return found
+
+    def _of_maps(self, channel: str | None, action: Action) -> Iterator[Comparison]:
+        """Yield the amplitude in each map's largest scales, against that of the fit with its relative error."""
+        response = action.response
+        for name, members in self._maps(channel).items():
+            rows = np.array(members)
+            null = self._null(rows)
+            if null is None or null.expected_snr(response[rows]) < self.settings.slice_snr:
+                continue
+            found = null.fit(self.z[rows], np.column_stack([response[rows], action.directions[rows]]))
+            amplitude, own = float(found.amplitudes[0]), float(found.errors[0])
+            tolerated = np.sqrt(own**2 + action.error**2 + self.settings.consistency_error**2)
+            p = float(2.0 * special.stdtr(found.dof, -abs(amplitude - 1.0) / tolerated)) if own > 0.0 else 1.0
+            yield Comparison("map", (name,), (amplitude,), (own,), p)
+
+    def _left(self, channel: str, responses: Matrix, directions: Matrix) -> MapCheck | None:
+        """Return chi^2 of a channel's largest scales before and after effects are taken out; None if not known."""
+        maps = self._maps(channel)
+        rows = np.array([row for members in maps.values() for row in members], dtype=np.int64)
+        null = self._null(rows)
+        if null is None:
+            return None
+        x = self.z[rows]
+        t, count = np.column_stack([responses[rows], directions[rows]]), responses.shape[1]
+        forecast = null.expected_snr(t[:, :count].sum(axis=1)) ** 2
+        found = null.fit(x, t)
+        tolerated = self._tolerated(null, *(t * found.amplitudes)[:, :count].T)
+        p = float(null.residual_test(found.chi2, null.dimension - found.dimension, tolerated))
+        scale = null.hartlap_factor
+        return MapCheck(tuple(maps), scale * null.chi2(x), scale * found.chi2, forecast, found.dimension, p)
+
+
+_LARGEST = 100.0
+"""Largest logarithm of odds."""
+
+_HALVES = ("even degrees and pixels", "odd degrees and pixels")
+
+
+def _of_rows(kind: str, words: tuple[str, ...], parts: Sequence[Sequence[int]]) -> Division:
+    """Return a division into parts of rows by themselves."""
+    rows = np.array([row for part in parts for row in part], dtype=np.int64)
+    which = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    return Division(kind, words, rows, tuple(np.diag((which == k).astype(float)) for k in range(len(parts))))
+
+
+def contradiction(findings: Findings, candidates: Sequence[Candidate], effects: Sequence[Effect], level: float) -> str:
+    """Return in words the part of the data that contradicts a set of effects, at this level of the p-value."""
+    pairs = zip(candidates, effects, findings.comparisons, strict=True)
+    each = [(candidate, effect, one) for candidate, effect, own in pairs for one in own]
+    worst = min((one.pvalue for _, _, one in each), default=1.0)
+    if findings.pvalue > level:
+        candidate, effect, one = max(each, key=lambda own: own[2].odds)
+        return (
+            f"{candidate.title} would be {amplitudes(one, effect)}; without the part that supports it most, the data "
+            f"are {number(one.odds, 2)} times as probable without it"
+        )
+    left = min(findings.maps, key=lambda one: one.pvalue, default=None)
+    if left is not None and left.pvalue < worst:
+        maps, before, after = " and ".join(left.maps), number(left.before), number(left.after)
+        return (
+            f"the largest scales of {maps} do not agree with it: χ² is {before} before and {after} after it is taken "
+            f"out, for {left.dof} degrees of freedom ({p_equals(left.pvalue)})"
+        )
+    candidate, effect, one = min(each, key=lambda own: own[2].pvalue)
+    return f"{candidate.title} would be {amplitudes(one, effect)} ({p_equals(one.pvalue)})"
+
+
+def amplitudes(one: Comparison, effect: Effect) -> str:
+    """Return the amplitudes of a comparison in words, in the unit of the effect at its fitted amplitude."""
+    parts = zip(one.slices, one.amplitudes, one.errors, strict=True)
+    words = [f"{_strength(effect, a, sigma)} in {where}" for where, a, sigma in parts]
+    if one.kind == "map":
+        words.append(f"{_strength(effect, 1.0, 0.0)} in all of the data")
+    return " and ".join(words)
+
+
+def _strength(effect: Effect, factor: float, error: float) -> str:
+    return effect.format_amplitude(factor * effect.amplitude, error * abs(effect.amplitude))

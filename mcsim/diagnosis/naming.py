@@ -1,0 +1,91 @@
+"""Name only what agrees with all parts of the data, and what some part of them can measure by itself."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from mcsim.diagnosis.candidate import Candidate, parts_of
+from mcsim.diagnosis.consistency import Action, Slices, contradiction
+from mcsim.diagnosis.context import DataSet, DiagnosisContext
+from mcsim.diagnosis.refine import Refined
+from mcsim.diagnosis.selection import Attribution, Explanation
+from mcsim.errors import InputError
+from mcsim.support.arrays import Vector
+from mcsim.systematics import Effect
+
+
+def agreeing(data: DataSet[Any], refined: Refined, found: Attribution) -> tuple[Attribution, list[str]]:
+    """Return the attribution without sets that the data cannot bear out, and a sentence on each of these.
+
+    The effects of a set are simulated at their amplitudes, and these are compared in parts of the data. An effect whose
+    pattern on the sky is drawn has no such response: it is told from other signals on the sky by its frequencies alone.
+    """
+    context, slices = data.context, slices_of(data)
+    settings, candidates = context.settings, context.candidates
+    frequencies = {channel.frequency_ghz for channel in context.run.channels}
+    kept: list[Explanation] = []
+    refused: list[Explanation] = []
+    sentences: list[str] = []
+    for place, one in enumerate(found.explanations):
+        members, why = [candidates[member] for member in one.members], ""
+        if any(_drawn(candidate) for candidate in members):
+            if len(frequencies) == 1:
+                why = "at a single frequency it looks like any signal that is fixed to the sky"
+        elif place < settings.compared_sets:
+            one = replace(one, findings=slices.findings(members, list(_actions(data, refined, one))))
+            if one.findings.contradict(settings):
+                why = contradiction(one.findings, members, _effects(context, one), settings.consistency_level)
+        (refused if why else kept).append(one)
+        if why:
+            best = " and ".join(candidate.title for candidate in members)
+            sentences.append(f"The data vector fits {best}, which is not named: {why}.")
+    return replace(found.of(kept), contradicted=tuple(refused)), sentences
+
+
+def slices_of(data: DataSet[Any]) -> Slices:
+    """Return the parts of a data set, in which amplitudes are compared."""
+    context, z = data.context, data.extended
+    model = context.analysis.model
+    beside = len(z) - len(data.x)
+    return Slices(context.ensemble.extended, z, beside, context.run.map.splits, model.lmax, context.settings)
+
+
+def unconfirmed(context: DiagnosisContext, found: Attribution, reduced: bool) -> str:
+    """Return a sentence if no part of the data can confirm the only effect of an attribution, else nothing.
+
+    ``reduced`` is True if its reduction was measured on held-out data.
+    """
+    if found.verdict != "effect" or reduced:
+        return ""
+    (one,) = found.explanations
+    candidate = context.candidates[one.members[0]]
+    if _drawn(candidate) or one.findings.measured:
+        return ""
+    return f"The data vector fits {candidate.title}, which is not named: no two parts of the data measure it."
+
+
+def _drawn(candidate: Candidate) -> bool:
+    """Return True if an effect draws its pattern on the sky, so that no mean response describes it."""
+    return candidate.effect.parametrization.stochastic and not candidate.effect.parametrization.mean_response
+
+
+def _effects(context: DiagnosisContext, one: Explanation) -> list[Effect]:
+    candidates = context.candidates
+    return [candidates[member].fitted(*part) for member, *part in parts_of(candidates, one.members, one.fit)]
+
+
+def _actions(data: DataSet[Any], refined: Refined, one: Explanation) -> Iterator[Action]:
+    """Yield what each effect of a set does to the data, simulated at its amplitude if it can be."""
+    context, bank = data.context, data.context.bank
+    whole = np.concatenate([refined.templates, bank.slice_matrix]) if len(bank.slice_matrix) else refined.templates
+    for member, theta, covariance in parts_of(context.candidates, one.members, one.fit):
+        candidate = context.candidates[member]
+        t = whole[:, list(candidate.columns)]
+        try:
+            table = candidate.table(candidate.detected(theta, covariance))
+            response: Vector = data.respond_extended([table], context.settings.constrained_skies).mean(axis=0)
+        except InputError:
+            response = t @ theta
+        yield Action.of(response, t, theta, covariance)

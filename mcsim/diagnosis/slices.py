@@ -1,0 +1,98 @@
+"""Numbers beside the data vector: what each map shows by itself at the largest scales.
+
+No test of the gap sees them, so that they cost it no power. They are what an effect must agree with before it is named.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+
+import ducc0
+import healpy
+import numpy as np
+
+from mcsim.diagnosis.summaries import Element, of_map
+from mcsim.diagnosis.wiener_filter import FilteredMaps, Model
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix
+from mcsim.sphere.rotation import rotation_matrix
+from mcsim.support.arrays import Alm, Matrix, Vector
+
+DEGREES = {"residual": 4, "gain": 2}
+"""Highest degree of the residual, and of residual times sky: a gain that depends on direction."""
+
+NSIDE = 32
+"""Of the pixels that real harmonics are integrated over."""
+
+
+def elements_of(model: Model) -> tuple[Element, ...]:
+    """Describe the numbers of every map, in the order of :func:`values_of`."""
+    found = []
+    for part in range(len(model.parts)):
+        alike = of_map(model, part)
+        for kind, top in DEGREES.items():
+            for degree, order, component in _real(min(top, model.lmax)):
+                own = replace(alike, name=f"{kind}/{alike.name}/{degree},{order}{component[:1]}", L=degree, M=order)
+                # The product with the sky has its power at all degrees of the sky.
+                ell = (degree, degree) if kind == "residual" else None
+                found.append(replace(own, kind=kind, ell=ell, component=component or None))
+    return tuple(found)
+
+
+def values_of(model: Model, filtered: FilteredMaps) -> Vector:
+    """Return real coefficients of every map's residual over its noise variance, and of that times the sky."""
+    found = []
+    low, top = (min(one, model.lmax) for one in DEGREES.values())
+    geometry = healpix.geometry(model.nside)
+    for i in range(len(model.parts)):
+        product = filtered.residual[i] * filtered.expected[i]
+        gain = ducc0.sht.adjoint_synthesis(map=product[None], spin=0, lmax=top, nthreads=1, **geometry)[0]
+        found += [_coefficients(filtered.adjoint[i], model.lmax, low), _coefficients(gain, top, top)]
+    return np.concatenate(found)
+
+
+def _real(lmax: int) -> list[tuple[int, int, str]]:
+    """Return degree, order and component of real harmonics."""
+    parts = [(degree, order) for degree in range(lmax + 1) for order in range(degree + 1)]
+    return [(*one, word) for one in parts for word in (("real", "imaginary") if one[1] else ("",))]
+
+
+def _coefficients(alm: Alm, lmax: int, top: int) -> Vector:
+    """Return the coefficients of real harmonics up to the degree ``top``."""
+    found = []
+    for degree, order, component in _real(top):
+        value = alm[alm_.start(lmax, order) + degree]
+        part = value.imag if component == "imaginary" else value.real
+        found.append(part * (np.sqrt(2.0) if order else 1.0))
+    return np.array(found)
+
+
+def northern(elements: Sequence[Element], frame: str) -> Matrix:
+    """Return the matrix that keeps the northern hemisphere of a frame, shape (E, E), for elements of one map frame.
+
+    What it leaves of the identity keeps the southern one. Signals beyond the highest degree are left out.
+    """
+    found = np.zeros((len(elements), len(elements)))
+    groups: dict[tuple[str, str | None, str], list[int]] = {}
+    for row, one in enumerate(elements):
+        groups.setdefault((one.channels[0], one.split, one.kind), []).append(row)
+    for rows in groups.values():
+        top = max(elements[row].L or 0 for row in rows)
+        found[np.ix_(rows, rows)] = _overlap(elements[rows[0]].frame or frame, frame, top)
+    return found
+
+
+@lru_cache(maxsize=16)
+def _overlap(frame: str, to: str, top: int) -> Matrix:
+    """Return the integrals of products of real harmonics over a hemisphere."""
+    npix = 12 * NSIDE**2
+    rows = []
+    for degree, order, component in _real(top):
+        alm = np.zeros((1, alm_.size(top)), dtype=np.complex128)
+        unit = 1.0 if order == 0 else np.sqrt(0.5)
+        alm[0, alm_.start(top, order) + degree] = 1j * unit if component == "imaginary" else unit
+        rows.append(healpix.synthesis(alm, NSIDE, top)[0])
+    harmonics = np.stack(rows)
+    height = rotation_matrix(frame, to)[2] @ np.stack(healpy.pix2vec(NSIDE, np.arange(npix)))
+    weight = np.where(np.abs(height) < 1e-9, 0.5, height > 0.0) * 4.0 * np.pi / npix
+    return np.asarray((harmonics * weight) @ harmonics.T)

@@ -1,0 +1,233 @@
+"""Simulators of other programs: a function, a class or stored maps in place of a run."""
+
+import hashlib
+import inspect
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Any
+
+import cloudpickle
+import numpy as np
+import xarray as xr
+
+from mcsim import config
+from mcsim.config import arrays
+from mcsim.ensemble.external_maps import Part, Source, StoredMaps, fits_maps, hash_of, parts_of, stacked
+from mcsim.errors import InputError, RunError
+from mcsim.support.arrays import Alm
+from mcsim.support.code import class_digest
+
+SEEDS = 1 << 20
+"""Realizations of a stream of seeds."""
+
+LARGEST = 1 << 16
+"""Bytes of a pickled simulator up to which it goes with every task; a larger one is a file in the cache."""
+
+_GOLDEN = 2654435769
+"""2^32 over the golden ratio, odd: multiples modulo 2^32 are all different, and far apart."""
+
+
+@dataclass(frozen=True)
+class Code(Source):
+    """A function or class; ``made`` is the pickle of a function that returns it, ``held`` a hash of what it holds."""
+
+    made: bytes = b""
+    held: str = ""
+
+    def words(self, seed: int, realization: int) -> str:
+        """Return which maps these are, for messages."""
+        return f"{self.label} with seed {seed_of(seed, realization)}"
+
+    def identity(self) -> str:
+        """Return a hash of the source code and of ``state``, or without one of everything that the object holds."""
+        simulator = _loaded(self.made)
+        state = getattr(simulator, "state", None)
+        held = self.held if state is None else repr(state)
+        return hash_of(class_digest(_definition(simulator)), held, self.effects, self.takes_sky)
+
+    def _given(self, seed: int, realization: int, effects: Sequence[config.Effect], sky: Alm | None) -> Any:
+        own: dict[str, Any] = {"effects": tuple(effects)} if effects else {}
+        if sky is not None:
+            own["sky"] = sky
+        try:
+            return _method(_loaded(self.made))(seed_of(seed, realization), **own)
+        except InputError:
+            raise
+        except Exception as error:  # whatever a foreign program does
+            reason = str(error).partition("\n")[0]
+            raise RunError(
+                f"{self.words(seed, realization)} fails ({type(error).__name__}: {reason}); mend it."
+            ) from error
+
+
+def named_source(run: config.RunConfig) -> tuple[config.RunConfig, str | None]:
+    """Return a run without the simulator or stored maps that it names, and these; None: mcsim simulates."""
+    bare = replace(run, simulator=None, ensemble=replace(run.ensemble, maps=None))
+    return bare, run.simulator or run.ensemble.maps
+
+
+def source_of(run: config.RunConfig, given: Any) -> Source:
+    """Return the source of maps of a survey that ``run`` describes.
+
+    Parameters
+    ----------
+    run
+        Description of sky, beams, scans and noise.
+    given
+        A function ``simulate(seed, effects=())``, or an object with such a method, or its class, which is made with the
+        run if it takes an argument; the same as text, ``package.module:name`` or ``file.py:name``. Or
+        stored maps: a template of FITS files with {realization}, {channel} and {split}; a Zarr store or .npy file; an
+        xarray object or array with the dimension ``realization`` first.
+
+    Raises
+    ------
+    InputError
+        If it cannot be loaded, has no such method, or lacks a map.
+    """
+    parts = tuple(parts_of(run))
+    if isinstance(given, xr.DataArray | xr.Dataset | np.ndarray):
+        return StoredMaps(parts, "the given maps", path=stacked(given, parts))
+    if isinstance(given, str | Path):
+        text = str(given)
+        if "{" in text.replace("{{", ""):
+            return fits_maps(parts, text)
+        if ":" not in os.path.basename(text):
+            if not os.path.exists(text):
+                raise InputError(f"{text} does not exist; give stored maps, or a simulator as package.module:name.")
+            return StoredMaps(parts, Path(text).name, path=os.path.abspath(text))
+        made = cloudpickle.dumps(partial(_resolved, text, config.to_json(run), _written(text.rpartition(":")[0])))
+        # The run is a part of what tells diagnoses apart already.
+        return _code(parts, os.path.basename(text), made, os.path.basename(text))
+    label = getattr(given, "__name__", type(_whole(given)).__name__)
+    if isinstance(given, type):
+        return _code(parts, label, cloudpickle.dumps(partial(_instance, given, config.to_json(run))), label)
+    try:
+        made = cloudpickle.dumps(partial(_same, given))
+    except Exception as error:  # of any type, from what the object holds
+        raise InputError(f"the simulator {given!r} cannot be sent to workers ({error}); hold no open files.") from error
+    held = hashlib.sha256(made).hexdigest()
+    if len(made) > LARGEST:
+        kept = arrays.kept(lambda folder: (folder / "simulator").write_bytes(made), "simulator") / "simulator"
+        made = cloudpickle.dumps(partial(_read, str(kept)))
+    return _code(parts, label, made, held)
+
+
+def seed_of(seed: int, realization: int) -> int:
+    """Return the seed below 2^32 of one realization of a stream: no two are the same, or within a few of each other.
+
+    Simulators add small numbers to a seed (one for each detector), so that neighbours would share noise.
+    """
+    if not 0 <= realization < SEEDS:
+        raise InputError(f"realization {realization} has no seed; there are {SEEDS} of a stream.")
+    return (seed * SEEDS + realization) * _GOLDEN % (1 << 32)
+
+
+def _code(parts: tuple[Part, ...], label: str, made: bytes, held: str) -> Code:
+    """Return the source of a simulator, from what it says of itself."""
+    simulator = _loaded(made)
+    method, effects = _method(simulator), getattr(simulator, "effects", ())
+    if isinstance(effects, str) or not all(isinstance(name, str) for name in effects):
+        raise InputError(f"{label}.effects = {effects!r} is no list of names; give those of effects that it can add.")
+    takes = inspect.signature(method).parameters
+    if not takes or (effects and "effects" not in takes):
+        missing = "effects" if takes else "seed"
+        raise InputError(f"simulate of {label} has no argument {missing}; define simulate(seed, effects=()).")
+    return Code(parts, label, tuple(effects), "sky" in takes, made, held)
+
+
+def _same(given: Any) -> Any:
+    return given
+
+
+def _read(path: str) -> Any:
+    return cloudpickle.loads(Path(path).read_bytes())()
+
+
+@lru_cache(maxsize=2)
+def _loaded(made: bytes) -> Any:
+    """Make a simulator once per process: what it keeps serves all its realizations."""
+    try:
+        return cloudpickle.loads(made)()
+    except ImportError as error:  # of an object from a module that this process does not find
+        raise InputError(f"a worker cannot load the simulator ({error}); install its module.") from error
+
+
+def _method(simulator: Any) -> Callable[..., Any]:
+    found = getattr(simulator, "simulate", simulator)
+    if not callable(found):
+        raise InputError(
+            f"{simulator!r} is no simulator; give a function or an object with simulate(seed, effects=())."
+        )
+    return found
+
+
+def _whole(simulator: Any) -> Any:
+    """Return the function of a partial one."""
+    while isinstance(simulator, partial):
+        simulator = simulator.func
+    return simulator
+
+
+def _definition(simulator: Any) -> Any:
+    """Return the class or function whose source code makes the maps."""
+    found = _whole(simulator)
+    if inspect.ismethod(found):
+        found = found.__self__
+    return found if inspect.isfunction(found) or isinstance(found, type) else type(found)
+
+
+def _resolved(text: str, run: str, written: str) -> Any:
+    """Import a simulator; a class is made, with the description if it takes an argument."""
+    module, _, name = text.rpartition(":")
+    try:
+        found: Any = _of_path(module, written) if module.endswith(".py") else import_module(module)
+        for part in name.split("."):
+            found = getattr(found, part)
+        return _instance(found, run)
+    except InputError:
+        raise
+    except Exception as error:  # whatever a foreign module does when it is imported
+        reason = str(error).partition("\n")[0]
+        raise InputError(
+            f"simulator = {text!r} cannot be loaded ({type(error).__name__}: {reason}); mend or install it."
+        ) from error
+
+
+def _instance(found: Any, run: str) -> Any:
+    """Make a class, with the description if it takes an argument; another object stays as it is."""
+    if not isinstance(found, type):
+        return found
+    return found(config.from_json(run)) if inspect.signature(found).parameters else found()
+
+
+def _written(path: str) -> str:
+    """Return a hash of a file, so that one that is changed is loaded again; "" for a module."""
+    if not path.endswith(".py"):
+        return ""
+    if not os.path.isfile(path):
+        raise InputError(f"{path} does not exist; give the file of the simulator.")
+    return arrays.sha256_of(Path(path))
+
+
+def _of_path(path: str, written: str) -> Any:
+    """Import a file as ``python file.py`` would: what stands beside it can be imported."""
+    name = f"{Path(path).stem}_{hash_of(path, written)[:8]}"
+    if name not in sys.modules:
+        if os.path.dirname(path) not in sys.path:
+            sys.path.insert(0, os.path.dirname(path))
+        spec = spec_from_file_location(name, path)
+        assert spec is not None  # of a name that ends with .py
+        assert spec.loader is not None
+        sys.modules[name] = module_from_spec(spec)
+        try:
+            spec.loader.exec_module(sys.modules[name])
+        except BaseException:
+            del sys.modules[name]
+            raise
+    return sys.modules[name]

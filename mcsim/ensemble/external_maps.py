@@ -1,0 +1,292 @@
+"""Maps of another program: the maps of one realization in order, and those that are stored as files."""
+
+import glob
+import hashlib
+import os
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from string import Formatter
+from typing import Any, NamedTuple
+
+import healpy
+import numpy as np
+import xarray as xr
+
+from mcsim import config
+from mcsim.config import arrays
+from mcsim.ensemble.maps import read_uk
+from mcsim.errors import InputError
+from mcsim.sphere import header
+from mcsim.support.arrays import Alm, Map
+
+
+class Part(NamedTuple):
+    """Name one map: as in a run (``W1:half1``), its channel and split, and what its unit and frame are read with."""
+
+    name: str
+    channel: str
+    split: str | None
+    frequency_ghz: float | None
+    frame: str
+
+
+@dataclass(frozen=True)
+class Source(ABC):
+    """Offer simulated maps of another program.
+
+    Attributes
+    ----------
+    parts
+        The maps of one realization, in order.
+    label
+        The source in words.
+    effects
+        Names of the effects that it can add.
+    takes_sky
+        True if the sky can be given.
+    """
+
+    parts: tuple[Part, ...]
+    label: str
+    effects: tuple[str, ...] = ()
+    takes_sky: bool = False
+
+    @property
+    def count(self) -> int | None:
+        """Return the number of realizations; None: as many as are wanted."""
+        return None
+
+    def words(self, seed: int, realization: int) -> str:
+        """Return which maps these are, for messages."""
+        return f"realization {realization} of {self.label}"
+
+    def maps(
+        self, seed: int, realization: int, effects: Sequence[config.Effect] = (), sky: Alm | None = None
+    ) -> list[Map]:
+        """Return the maps of one realization, uK, in the order of the parts; InputError if one is missing.
+
+        ``seed`` tells streams of realizations apart; ``sky``: a_lm in place of those that would be drawn.
+        """
+        where = self.words(seed, realization)
+        return in_order(self._given(seed, realization, effects, sky), self.parts, where)
+
+    @abstractmethod
+    def identity(self) -> str:
+        """Return a hash of all that the maps depend on, besides the description of the instrument."""
+
+    @abstractmethod
+    def _given(self, seed: int, realization: int, effects: Sequence[config.Effect], sky: Alm | None) -> Any:
+        """Return maps by name, as mappings or xarray objects."""
+
+
+def in_order(given: Any, parts: Sequence[Part], where: str) -> list[Map]:
+    """Return maps in the order of the parts, uK; InputError if one is missing, or is no array of numbers.
+
+    ``given``: mappings, xarray objects, or both nested: channel, then split. Names may be ``W1:half1``, ``W1/half1`` or
+    ``W1_half1``, and an attribute ``units`` says another unit.
+    """
+    names = {alias: part for part in parts for alias in (part.name, *(part.name.replace(":", s) for s in "/_"))}
+    if len(parts) == 1:
+        names[""] = parts[0]
+    found = {}
+    for labels, one in _flat(given):
+        part = names.get(":".join(labels))
+        if part is not None:
+            found[part.name] = _in_uk(one, part, where)
+    missing = [part.name for part in parts if part.name not in found]
+    if missing:
+        there = ", ".join(":".join(labels) or "an unnamed map" for labels, _ in _flat(given)) or "none"
+        raise InputError(f"{where} lacks the map {missing[0]}; it has {there}.")
+    return [found[part.name] for part in parts]
+
+
+def _flat(given: Any, labels: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield arrays with the names of their channels and splits."""
+    if isinstance(given, xr.Dataset):
+        whole = [one for one in given.data_vars.values() if {"map_name", "channel"} & set(one.dims)]
+        given = whole[0] if whole else dict(given.data_vars)
+    if isinstance(given, xr.DataArray):
+        for dim in ("map_name", "channel", "split"):
+            if dim in given.dims:
+                for place, label in enumerate(given[dim].values):
+                    yield from _flat(given.isel({dim: place}), (*labels, str(label)))
+                return
+    if isinstance(given, Mapping):
+        for name, one in given.items():
+            yield from _flat(one, (*labels, str(name)))
+    elif given is not None:
+        yield labels, given
+
+
+def _in_uk(one: Any, part: Part, where: str) -> Map:
+    try:
+        found = np.asarray(one, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{where} has a map {part.name} that is no array of numbers; give uK in RING order.") from None
+    unit = getattr(one, "attrs", {}).get("units")
+    factor = header.to_uk(unit, Path(f"the map {part.name} of {where}"), part.frequency_ghz)
+    return found if factor == 1.0 else np.where(found == healpy.UNSEEN, found, factor * found)
+
+
+def parts_of(run: config.RunConfig) -> Iterator[Part]:
+    """Yield the maps of a run, as they are analysed."""
+    frame = config.prepared_grid(run)[1]
+    frequencies = {channel.name: channel.frequency_ghz for channel in run.channels}
+    for name in config.map_names(run):
+        channel, _, split = name.partition(":")
+        yield Part(name, channel, split or None, frequencies[channel], frame)
+
+
+@dataclass(frozen=True)
+class FitsMaps(Source):
+    """FITS files, named by a template with {realization}, {channel} and {split}."""
+
+    template: str = ""
+    realizations: tuple[int, ...] = ()
+
+    @property
+    def count(self) -> int:
+        """Return the number of realizations."""
+        return len(self.realizations)
+
+    def words(self, seed: int, realization: int) -> str:
+        """Return which maps these are, for messages."""
+        return f"realization {self.realizations[realization]} of {self.label}"
+
+    def identity(self) -> str:
+        """Return a hash of names, sizes and contents of the files."""
+        files = [self._path(part, r) for r in self.realizations for part in self.parts]
+        return hash_of(*map(_of_file, files))
+
+    def _path(self, part: Part, realization: int) -> Path:
+        return Path(self.template.format(channel=part.channel, split=part.split, realization=realization))
+
+    def _given(self, seed: int, realization: int, effects: Sequence[config.Effect], sky: Alm | None) -> Any:
+        files = {part.name: (part, self._path(part, self.realizations[realization])) for part in self.parts}
+        return {name: read_uk(path, part.frame, part.frequency_ghz) for name, (part, path) in files.items()}
+
+
+@dataclass(frozen=True)
+class StoredMaps(Source):
+    """A Zarr store that xarray opens, or a .npy file of shape (realization, map, pixel)."""
+
+    path: str = ""
+
+    def _opened(self) -> Any:
+        """Return an array of the maps of a .npy file, or the dataset of a store."""
+        if not self.path.endswith(".npy"):
+            return _zarr(self.path, os.stat(self.path).st_mtime_ns)
+        found = np.load(self.path, mmap_mode="r")
+        if found.ndim != 3 or found.shape[1] != len(self.parts):
+            raise InputError(
+                f"{self.path} has the shape {found.shape}; give (realization, map, pixel), with the "
+                f"{len(self.parts)} maps {', '.join(part.name for part in self.parts)}."
+            )
+        return found
+
+    @property
+    def count(self) -> int:
+        """Return the number of realizations."""
+        found = self._opened()
+        return len(found) if isinstance(found, np.ndarray) else int(found.sizes["realization"])
+
+    def identity(self) -> str:
+        """Return a hash of names, sizes and contents of the files."""
+        path = Path(self.path)
+        files = sorted(one for one in path.rglob("*") if one.is_file()) if path.is_dir() else [path]
+        return hash_of(*((str(one.relative_to(path)), *_of_file(one)[1:]) for one in files))
+
+    def _given(self, seed: int, realization: int, effects: Sequence[config.Effect], sky: Alm | None) -> Any:
+        found = self._opened()
+        if isinstance(found, np.ndarray):
+            return {part.name: one for part, one in zip(self.parts, found[realization], strict=True)}
+        return found.isel(realization=realization)
+
+
+def fits_maps(parts: tuple[Part, ...], template: str) -> FitsMaps:
+    """Find the realizations of a template."""
+    found = FitsMaps(parts, Path(template).name, template=os.path.abspath(template))
+    first = parts[0]
+    pattern, expression = "", ""
+    try:
+        for text, field, _, _ in Formatter().parse(found.template):
+            pattern, expression = pattern + glob.escape(text), expression + re.escape(text)
+            if field is not None:
+                own = {"channel": first.channel, "split": first.split}.get(field)
+                pattern += "*" if own is None else glob.escape(own)
+                expression += r"(\d+)" if own is None else re.escape(own)
+        matches = [re.fullmatch(expression, path) for path in glob.glob(pattern)]
+        numbers = sorted({int(match[1]) for match in matches if match is not None and match.re.groups})
+        numbers = [r for r in numbers if os.path.isfile(found._path(first, r))]
+    except (ValueError, KeyError, IndexError) as error:
+        raise InputError(
+            f"{template} is no template of files ({error}); use {{realization}}, {{channel}} and {{split}}."
+        ) from None
+    if not numbers:
+        raise InputError(f"no file fits {template}; write {{realization}} where its number stands, once.")
+    if len({found._path(part, numbers[0]) for part in parts}) < len(parts):
+        raise InputError(f"{template} has one file for several maps; write {{channel}} and {{split}} into it.")
+    for r in numbers:
+        for part in parts:
+            if not os.path.isfile(found._path(part, r)):
+                raise InputError(f"{found._path(part, r)} does not exist, the map {part.name} of realization {r}.")
+    return FitsMaps(parts, found.label, template=found.template, realizations=tuple(numbers))
+
+
+@lru_cache(maxsize=1)
+def _zarr(path: str, written_ns: int) -> Any:
+    """Open a store once for all realizations, and again if it was written anew."""
+    try:
+        found = xr.open_zarr(path, chunks=None, consolidated=False)
+    except Exception as error:  # whatever is in the folder
+        raise InputError(f"{path} cannot be opened as a Zarr store ({error}); give one of maps.") from error
+    return _checked_stack(found, path)
+
+
+def _checked_stack(found: Any, where: str) -> Any:
+    if "realization" not in found.sizes:
+        raise InputError(f"{where} has the dimensions {', '.join(map(str, found.sizes))}; name one realization.")
+    return found
+
+
+def stacked(given: Any, parts: tuple[Part, ...]) -> str:
+    """Write maps that are in memory once into the cache, and return the path of the file."""
+    if isinstance(given, np.ndarray):
+        if given.ndim != 3:
+            raise InputError(f"the given maps have the shape {given.shape}; give (realization, map, pixel).")
+        names = [part.name for part in parts]
+        if given.shape[1] != len(names):
+            raise InputError(f"{given.shape[1]} maps of a realization were given, the model has {', '.join(names)}.")
+        given = xr.DataArray(given, dims=("realization", "map_name", "pixel"), coords={"map_name": names})
+    stack = _checked_stack(given, "what is given")
+    number = int(stack.sizes["realization"])
+
+    def rows(r: int) -> list[Map]:
+        return in_order(stack.isel(realization=r), parts, f"realization {r} of the given maps")
+
+    shapes = {one.shape for one in rows(0)}
+    if len(shapes) > 1 or len(shape := shapes.pop()) != 1:
+        raise InputError("the given maps are no maps of one resolution; give arrays over pixels, in RING order.")
+
+    def write(folder: Path) -> None:
+        whole = np.lib.format.open_memmap(
+            folder / "maps.npy", mode="w+", dtype=np.float64, shape=(number, len(parts), *shape)
+        )
+        for r in range(number):
+            whole[r] = np.stack(rows(r))
+        whole.flush()
+
+    return str(arrays.kept(write, "maps") / "maps.npy")
+
+
+def _of_file(path: Path) -> tuple[str, int, str]:
+    return path.name, path.stat().st_size, arrays.sha256_of(path)
+
+
+def hash_of(*parts: Any) -> str:
+    """Return the SHA-256 of values, from their texts."""
+    return hashlib.sha256("\n".join(map(repr, parts)).encode()).hexdigest()

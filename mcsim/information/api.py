@@ -1,0 +1,235 @@
+"""The limit of a model before any data: sigma of every effect, detectable amplitudes, what can be told apart."""
+
+import os
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mcsim import config, systematics
+from mcsim.diagnosis.analysis import Analysis, analysis_of
+from mcsim.diagnosis.candidate import Candidate, numbered
+from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.errors import InputError
+from mcsim.information import figure
+from mcsim.information.dense import dense, size_of
+from mcsim.information.derivatives import derivatives
+from mcsim.information.fisher import Information, Probes, group_of, stochastic
+from mcsim.information.result import Limits, limits_of
+from mcsim.information.settings import LimitSettings
+from mcsim.simulation import convolve
+from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap
+from mcsim.support import folders
+from mcsim.support.progress import reporting
+
+PICTURE = "limit.png"
+
+RESPONSE = 3.0
+"""Cost of a response over that of the circular maps of a sky, on average over the library."""
+
+
+def limit(
+    model: str | Path | Mapping[str, Any] | config.RunConfig,
+    output: str | Path | None = None,
+    *,
+    settings: LimitSettings | None = None,
+    quiet: bool = True,
+) -> Limits:
+    """Compute what any analysis of a model's maps could measure at best, before any data.
+
+    Parameters
+    ----------
+    model
+        Fiducial model of sky, beams, scan, noise, mask and splits: a run.
+    output
+        Folder for ``limit.json``, ``limit.zarr`` and ``limit.png``; None: nothing is written.
+    settings
+        Effects, nuisances, levels, random probes; default: those of :class:`mcsim.LimitSettings`.
+    quiet
+        Report no progress.
+
+    Returns
+    -------
+    Limits
+        For every effect the standard error of its amplitude, the amplitude that is detected, and that at which it is
+        told apart from the most similar other one; and the Fisher matrix behind them.
+
+    Raises
+    ------
+    InputError
+        If the run has no noise, no spectrum or no pixels, prepares its maps, or an effect is not known.
+
+    Notes
+    -----
+    The Fisher information of all maps jointly, the sky common to them and unknown, F_ij = 1/2 Tr[C^-1 dC_i C^-1 dC_j] +
+    dmu_i' C^-1 dmu_j (Tegmark, Taylor & Heavens 1997, ApJ 480, 22, eq. 15), by random probes
+    (:mod:`mcsim.information.fisher`) or from whole matrices (:mod:`mcsim.information.dense`). No unbiased estimate has
+    a smaller error (Cramer and Rao). Checked against numerical derivatives of the likelihood, and against the sum over
+    BipoSH coefficients for one map: tests/unit/test_information.py.
+
+    Examples
+    --------
+    >>> import mcsim
+    >>> run = {
+    ...     "schema": 1,
+    ...     "name": "one map",
+    ...     "sky": {"spectrum": "wmap7", "lmax": 8},
+    ...     "map": {"nside": 4},
+    ...     "channel": [
+    ...         {
+    ...             "name": "W1",
+    ...             "frequency_ghz": 94.0,
+    ...             "beam": {"kind": "gaussian", "fwhm_arcmin": 1200.0},
+    ...             "noise": {"sigma0_uk": 10.0},
+    ...             "scan": {"kind": "parallel_transport"},
+    ...         }
+    ...     ],
+    ... }
+    >>> found = mcsim.limit(run, settings=mcsim.LimitSettings(only=("noise_level",), dense=True))
+    >>> found.effects[0].name, round(float(found.effects[0].sigma), 2)
+    ('noise_level', 0.07)
+    """
+    run = model if isinstance(model, config.RunConfig) else config.load(model)
+    settings = settings or LimitSettings()
+    if output is not None:
+        folders.writable(Path(output))
+    nthreads = os.cpu_count() or 1
+    analysis, candidates = _candidates(run, settings, nthreads)
+    filtered = inverse_covariance(analysis, settings, nthreads)
+    total = sum(len(candidate.columns) for candidate in candidates)
+    cl = analysis.model.survey.cl
+    assert cl is not None  # a model of the analysis has one
+    with reporting("derivatives of the maps", total, "components", quiet) as report:
+        changes = []
+        for number, derivative in enumerate(derivatives(analysis, candidates, filtered.observe, nthreads), 1):
+            changes.append(derivative)
+            report(number)
+    if settings.dense:
+        with reporting("whole matrices", total, "components", quiet) as report:
+            information: Information = dense(filtered, changes, cl, report)
+        method = "From whole matrices"
+    else:
+        steps = settings.probes * total
+        with reporting("random probes", steps, "responses", quiet) as report:
+            information = stochastic(filtered, changes, cl, Probes(settings.probes, settings.seed), report)
+        method = f"From {settings.probes} random probes"
+    tests = sum(not _is_nuisance(candidate, settings) for candidate in analysis.candidates)
+    found = limits_of(candidates, information, tests, method, run.name, settings)
+    if output is not None:
+        found.save(output)
+        figure.limit_figure(found).savefig(Path(output) / PICTURE)
+    return found
+
+
+def describe(run: config.RunConfig, settings: LimitSettings) -> str:
+    """Return a text on the cost of a limit: components, probes, transforms, memory and time."""
+    analysis, candidates = _candidates(run, settings, nthreads := os.cpu_count() or 1)
+    filtered = inverse_covariance(analysis, settings, nthreads)
+    columns = sum(len(candidate.columns) for candidate in candidates)
+    head = f"{run.name}: {len(candidates)} effects of {columns} components, {len(filtered.maps)} maps"
+    if settings.dense:
+        size = size_of(filtered, columns)
+        return f"{head}\n  memory  {size.bytes / 1e9:.3g} GB for {size.pixels} pixels and {size.modes} modes of the sky"
+    probes = Probes(settings.probes)
+    memory = 8.0 * filtered.precision.size * (group_of(probes, filtered) + 4 * columns)
+    start = time.perf_counter()
+    filtered.wiener(filtered.observe(np.ones(filtered.size, dtype=complex)))
+    solved_s = time.perf_counter() - start
+    start = time.perf_counter()
+    filtered.observe(np.ones(filtered.size, dtype=complex))
+    made_s = time.perf_counter() - start
+    solutions = probes.number + columns
+    total_s = solutions * solved_s + RESPONSE * made_s * columns * probes.number
+    return "\n".join(
+        [
+            head,
+            f"  probes  {probes.number}: {columns * probes.number} responses, {solutions} solutions of the inverse "
+            f"covariance of {solved_s:.3g} s each",
+            f"  memory  {memory / 1e9:.2f} GB",
+            f"  time    about {total_s / 60.0:.3g} minutes with {nthreads} threads",
+        ]
+    )
+
+
+def widths(given: Iterable[str]) -> dict[str, float]:
+    """Return nuisances from texts ``EFFECT=WIDTH`` or ``EFFECT:CHANNEL=WIDTH``; InputError for anything else."""
+    found = {}
+    for text in given:
+        name, _, width = text.partition("=")
+        try:
+            found[name] = float(width)
+        except ValueError:
+            raise InputError(f"nuisance {text!r} says no width; give EFFECT=WIDTH, as in beam_width=0.01.") from None
+    return found
+
+
+def inverse_covariance(analysis: Analysis, settings: LimitSettings, nthreads: int = 1) -> InverseCovariance:
+    """Return the inverse covariance of a model's maps; InputError for a channel without noise."""
+    shared = analysis.model.survey
+    maps = []
+    for channel in shared.channels:
+        response = convolve.Response(channel.response.factors[: settings.orders + 1])
+        for m in channel.maps:
+            if m.noise_uk is None:
+                raise InputError(
+                    f"map {m.name} has no noise, so that nothing limits it; give channel {channel.name} a "
+                    "noise.sigma0_uk above 0."
+                )
+            seen = (m.moments.hits > 0) & (m.noise_uk > 0.0)
+            if m.weight is not None:
+                seen = seen & (m.weight > 0.0)
+            precision = np.divide(1.0, m.noise_uk**2, out=np.zeros(seen.size), where=seen)
+            maps.append(ObservedMap(response, precision, m.moments if settings.orders else None))
+    assert shared.cl is not None  # a model of the analysis has one
+    cl = shared.cl.copy()
+    cl[:2] += 4.0 * np.pi * settings.unknown_dipole_uk**2 / np.array([1.0, 3.0])
+    return InverseCovariance(cl, maps, settings.tolerance, nthreads)
+
+
+def _candidates(
+    run: config.RunConfig, settings: LimitSettings, nthreads: int
+) -> tuple[Analysis, tuple[Candidate, ...]]:
+    """Return the analysis with every effect that applies, and those that are asked for, nuisances included."""
+    if run.preparation:
+        raise InputError(
+            "the limit is that of maps as they are made, but the run prepares its maps; leave [[preparation]] out."
+        )
+    if run.simulator is not None:
+        raise InputError(
+            f"the limit needs derivatives of mcsim's own maps, but simulator = {str(run.simulator)!r} makes those of "
+            "the run; leave it out."
+        )
+    if settings.probes < 3:
+        raise InputError(f"probes = {settings.probes} are too few to tell an error; give 3 or more.")
+    if not 0.0 <= settings.unknown_dipole_uk < np.inf:
+        raise InputError(f"unknown_dipole_uk = {settings.unknown_dipole_uk:g} is no rms; give 0 or more.")
+    if settings.orders < 0:
+        raise InputError(f"orders = {settings.orders} is no azimuthal order; give 0 or more.")
+    library = systematics.catalogue() if settings.library is None else systematics.checked(settings.library)
+    for name in (*settings.only, *settings.without):
+        systematics.get(name, library)
+    named = dict.fromkeys((*settings.only, *(name.partition(":")[0] for name in settings.nuisances)))
+    orders = max(DiagnosisSettings().beam_orders, settings.orders)
+    fits = DiagnosisSettings(beam_orders=orders, including=tuple(name for name in named if name in library))
+    analysis = analysis_of(run, settings.without, nthreads, fits, library)
+    known = {one for c in analysis.candidates for one in (c.name, f"{c.name}:{c.channel}")}
+    for name, width in settings.nuisances.items():
+        if name not in known:
+            raise InputError(f"nuisance {name!r} is no effect of this model; choose from {', '.join(sorted(known))}.")
+        if not 0.0 < width < np.inf:
+            raise InputError(f"nuisance {name} has a width of {width:g}; give the width of its prior, above 0.")
+    wanted = [
+        candidate
+        for candidate in analysis.candidates
+        if not settings.only or candidate.name in settings.only or _is_nuisance(candidate, settings)
+    ]
+    if all(_is_nuisance(candidate, settings) for candidate in wanted):
+        raise InputError("no effect is left to compute a limit of; ask for one that applies to the model.")
+    return analysis, numbered([replace(candidate) for candidate in wanted])
+
+
+def _is_nuisance(candidate: Candidate, settings: LimitSettings) -> bool:
+    return bool({candidate.name, f"{candidate.name}:{candidate.channel}"} & set(settings.nuisances))

@@ -1,0 +1,230 @@
+"""Derivatives of a survey's maps with respect to effects: of the response to the sky, of the mean, of the noise."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim import systematics
+from mcsim.diagnosis.analysis import Analysis
+from mcsim.diagnosis.campaign import with_effects
+from mcsim.diagnosis.candidate import Candidate
+from mcsim.simulation import convolve, simulate
+from mcsim.simulation.survey import Channel, Survey, survey
+from mcsim.sphere import alm as alm_
+from mcsim.sphere.sky import dipole_alm
+from mcsim.support.arrays import Alm, Vector
+from mcsim.systematics import Effect
+
+Maps = NDArray[np.float64]
+Observe = Callable[[Alm], Maps]
+"""Return the maps of all channels, shape (map, npix), of a sky."""
+
+DRAWS = 64
+"""Realizations that the mean of an effect of random shape is estimated from, in two halves."""
+
+STEP = 0.1
+"""Share of an effect's ``step``: an ellipticity of either sign bends the response by half of itself."""
+
+NEGLIGIBLE = 1e-12
+"""Orders whose derivative is below this share of the largest are rounding."""
+
+_HOOKS = ("sky", "beam", "pointing", "gain", "noise", "spread", "orientations", "differencing")
+
+
+@dataclass(frozen=True, eq=False)
+class Derivative:
+    """Hold the derivative of maps with respect to one coordinate of an effect.
+
+    Attributes
+    ----------
+    maps
+        Which maps of the survey change.
+    plus, minus, width
+        Surveys of these maps alone, without noise, and the difference of the coordinate between them;
+        ``minus`` None: ``plus`` is linear in the sky and is the derivative itself.
+    observe
+        Maps of all channels from a sky, for an effect on the sky alone: the response of the inverse covariance, of
+        which what such an effect changes must be no more and no less; None: the simulator's.
+    factor
+        What the sky is multiplied with at first, shape (lmax + 1,); None: nothing.
+    dipole
+        Coefficients of the dipole that the survey sees besides, uK.
+    noise
+        Derivative of the variance of every pixel, uK^2, shape (own maps, npix); None: it does not change.
+    stochastic
+        True if the shape of what is added is random.
+    """
+
+    maps: slice
+    plus: Survey
+    minus: Survey | None
+    width: float
+    observe: Observe | None
+    factor: Vector | None
+    dipole: Alm
+    noise: Maps | None
+    stochastic: bool
+
+    def of_sky(self, sky: Alm) -> Maps:
+        """Return the derivative of the maps of a sky, without what does not depend on it, uK per unit."""
+        return np.asarray(self._changes(sky) - self._constant)
+
+    @cached_property
+    def mean(self) -> tuple[Maps, Maps]:
+        """Return the derivative of the mean of the maps, uK per unit; two independent estimates if it is random."""
+        empty = np.zeros_like(self.dipole)
+        if self.minus is None:
+            found = self._changes(self.dipole) if self.factor is None else np.zeros_like(self._constant)
+            return found, found
+        if not self.stochastic:
+            found = self._changes(empty, with_dipole=True)
+            return found, found
+        drawn = [self._changes(empty, realization, with_dipole=True) for realization in range(DRAWS)]
+        return np.mean(drawn[::2], axis=0), np.mean(drawn[1::2], axis=0)
+
+    @cached_property
+    def _constant(self) -> Maps:
+        """What changes in the maps of the first realization whatever the sky, uK per unit, shape (maps, npix)."""
+        return self._changes(np.zeros_like(self.dipole))
+
+    def _changes(self, sky: Alm, realization: int = 0, with_dipole: bool = False) -> Maps:
+        lmax = self.plus.config.sky.lmax
+        seen = sky if self.factor is None else alm_.multiply(sky, self.factor, lmax)
+        if self.observe is not None:
+            return self._through(self.observe, seen, realization)
+        found = _maps(self.plus, seen, realization, with_dipole)
+        if self.minus is None:
+            return found
+        return np.asarray((found - _maps(self.minus, seen, realization, with_dipole)) / self.width)
+
+    def _through(self, observe: Observe, sky: Alm, realization: int) -> Maps:
+        """Return what changes in the maps if the sky alone does; channels that see the same share the transforms."""
+        found: list[Maps] = []
+        last, maps, first = None, np.zeros((0, 0)), self.maps.start
+        for number, channel in enumerate(self.plus.channels):
+            change = sky
+            if self.minus is not None:
+                other = self.minus.channels[number]
+                upper, lower = (_looked_at(one, sky, realization) for one in (channel, other))
+                change = (upper - lower) / self.width
+            if last is None or not np.array_equal(change, last):
+                last, maps = change, observe(change)
+            found.append(maps[first : first + len(channel.maps)])
+            first += len(channel.maps)
+        return np.concatenate(found)
+
+
+def _looked_at(channel: Channel, sky: Alm, realization: int) -> Alm:
+    return systematics.looked_at(channel.effects, sky, channel.site, 0, realization)
+
+
+def _maps(shared: Survey, sky: Alm, realization: int, with_dipole: bool) -> Maps:
+    seen = shared if with_dipole else replace(shared, channels=tuple(_without_dipole(c) for c in shared.channels))
+    hit = np.stack([m.moments.hits > 0 for channel in shared.channels for m in channel.maps])
+    return np.where(hit, simulate.maps(seen, realization, sky=sky), 0.0)
+
+
+def _without_dipole(channel: Channel) -> Channel:
+    return replace(channel, site=replace(channel.site, dipole_uk=np.zeros(3)))
+
+
+def derivatives(
+    analysis: Analysis, candidates: Sequence[Candidate], observe: Observe, nthreads: int = 1
+) -> Iterator[Derivative]:
+    """Yield the derivative with respect to every coordinate of candidates, in the order of their columns.
+
+    ``observe`` is the response of the inverse covariance. The effects are those of the simulator, what a run with
+    ``[[effect]]`` makes at plus and minus a small amplitude.
+    """
+    for candidate in candidates:
+        for basis in candidate.basis:
+            yield _derivative(analysis, candidate, basis.scaled(STEP), observe, nthreads)
+
+
+def _derivative(analysis: Analysis, candidate: Candidate, basis: Effect, observe: Observe, nthreads: int) -> Derivative:
+    fiducial = analysis.model.survey
+    run, kind = fiducial.config, type(basis)
+    own, first = [], 0
+    for channel in fiducial.channels:
+        if candidate.channel in (None, channel.name):
+            own.append(slice(first, first + len(channel.maps)))
+        first += len(channel.maps)
+    maps = slice(own[0].start, own[-1].stop)
+    specs = tuple(spec for spec in run.channels if candidate.channel in (None, spec.name))
+    only = replace(run, channels=specs)
+    dipole = dipole_alm(fiducial.channels[0].site.dipole_uk, run.sky.lmax)
+    fit = kind.parametrization
+    known = dict(analysis.library)
+
+    def at(sign: int) -> Survey:
+        changed = with_effects(only, [candidate.table(basis.scaled(sign))]) if sign else only
+        return survey(changed, nthreads=nthreads, library=known)
+
+    step = float(np.linalg.norm(fit.coordinates(basis)))
+    signs = (1, -1) if fit.sign == 0 else (fit.sign, 0)
+    upper, lower = (at(sign) for sign in signs)
+    width = step * (signs[0] - signs[1])
+    noise = _noise_change(upper, lower, width)
+    plus, minus = _quiet(upper), _quiet(lower)
+    if fit.stochastic and fit.sign < 0:
+        # What is drawn is a Gaussian sky of its own with a power proportional to the amplitude.
+        factor = _power_factor(fiducial, replace(basis, amplitude=abs(basis.amplitude)), fit.coordinates(basis))
+        own_survey = _quiet(survey(only, nthreads=nthreads, library=known))
+        return Derivative(maps, own_survey, None, 1.0, observe, factor, np.zeros_like(dipole), noise, True)
+    changed = [name for name in _HOOKS if getattr(kind, name) is not getattr(Effect, name)]
+    if not run.effects and not set(changed) - {"beam", "pointing"}:
+        channels = tuple(_difference(a, b, width) for a, b in zip(plus.channels, minus.channels, strict=True))
+        return Derivative(maps, replace(plus, channels=channels), None, 1.0, None, None, dipole, noise, False)
+    through = observe if changed == ["sky"] and not fit.stochastic else None
+    return Derivative(maps, plus, minus, width, through, None, dipole, noise, fit.stochastic)
+
+
+def _quiet(shared: Survey) -> Survey:
+    """Return a survey without noise."""
+    channels = tuple(
+        replace(channel, maps=tuple(replace(m, noise_uk=None) for m in channel.maps)) for channel in shared.channels
+    )
+    return replace(shared, channels=channels)
+
+
+def _difference(plus: Channel, minus: Channel, width: float) -> Channel:
+    """Return a channel whose response is the derivative of that of two, which differ in nothing else."""
+    a, b = plus.response.factors, minus.response.factors
+    change = np.zeros((max(len(a), len(b)), a.shape[1]), dtype=np.complex128)
+    change[: len(a)] += a
+    change[: len(b)] -= b
+    size = np.abs(change).max(axis=1)
+    change[size < NEGLIGIBLE * np.abs(a).max()] = 0.0
+    wide = plus if len(a) >= len(b) else minus
+    return replace(wide, response=convolve.Response(change / width), effects=())
+
+
+def _noise_change(plus: Survey, minus: Survey, width: float) -> Maps | None:
+    """Return the derivative of the variance of every pixel, None if there is none."""
+    ends = []
+    for shared in (plus, minus):
+        rows = [m.noise_uk for channel in shared.channels for m in channel.maps]
+        ends.append(np.stack([np.zeros(12 * shared.nside**2) if row is None else row**2 for row in rows]))
+    change = np.asarray((ends[0] - ends[1]) / width)
+    return change if change.any() else None
+
+
+def _power_factor(fiducial: Survey, effect: Effect, coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return Q_l / 2 C_l for an effect that adds a random sky of spectrum Q_l times its coordinate.
+
+    The covariance changes by P Q P^t, as it does by P F S P^t + P S F P^t with F this factor.
+    """
+    assert fiducial.cl is not None  # a model of the analysis has one
+    site, lmax = fiducial.channels[0].site, fiducial.config.sky.lmax
+    empty = np.zeros(alm_.size(lmax), dtype=np.complex128)
+    power = np.zeros(lmax + 1)
+    for realization in range(DRAWS):
+        drawn = systematics.looked_at((effect,), empty, site, fiducial.config.ensemble.seed, realization)
+        weight = np.full(drawn.size, 2.0)
+        weight[: lmax + 1] = 1.0
+        power += np.bincount(alm_.degrees(lmax), weight * np.abs(drawn) ** 2, lmax + 1)
+    power /= DRAWS * (2.0 * np.arange(lmax + 1) + 1.0) * float(np.linalg.norm(coordinates))
+    return np.divide(power, 2.0 * fiducial.cl, out=np.zeros(lmax + 1), where=fiducial.cl > 0.0)

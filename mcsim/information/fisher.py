@@ -1,0 +1,143 @@
+r"""Fisher information of maps that share an unknown Gaussian sky, from random probes.
+
+With d = P s + n and C = P S P^t + N, let an effect change P by dP, the variance of the noise by dN and the mean by dmu.
+For x = C^-1 d and s^ = S P^t x let
+
+    b_i = dP_i s^ + dN_i x / 2,     so that     d' C^-1 dC_i C^-1 d / 2 = x' b_i.
+
+b_i = B_i x is linear in x, and dC_i = B_i + B_i^t. If x and y are made of independent data of the model, their
+covariance is C^-1, and
+
+    1/2 Tr[C^-1 dC_i C^-1 dC_j] = 1/2 E[(x'b_i(y) + y'b_i(x)) (x'b_j(y) + y'b_j(x))],
+
+for x'b_i(y) + y'b_i(x) = x' dC_i y. All pairs of a set of probes are averaged: one solution of C^-1 for each, and the
+error falls as one over their number. No adjoint of dP is needed, so that the simulator itself is the operator. To this
+dmu_i' C^-1 dmu_j is added, without probes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.information.derivatives import Derivative
+from mcsim.simulation.inverse_covariance import InverseCovariance, product
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import rng
+from mcsim.sphere.sky import gaussian_alm
+from mcsim.support.arrays import Alm, Cl, Matrix
+from mcsim.support.progress import Reporter
+
+Maps = NDArray[np.float64]
+
+PAIRED_BYTES = 1 << 30
+"""Memory for probes that are paired with each other; more probes are done in groups."""
+
+
+@dataclass(frozen=True)
+class Information:
+    """Hold a Fisher matrix, shape (K, K), per unit of each coordinate, and the relative error of its diagonal, (K,)."""
+
+    fisher: Matrix
+    error: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Probes:
+    """Say how many random probes are drawn, and with which seed."""
+
+    number: int
+    seed: int = 0
+
+
+def group_of(probes: Probes, filtered: InverseCovariance) -> int:
+    """Return how many probes are paired with each other at once."""
+    return max(3, min(probes.number, PAIRED_BYTES // (8 * filtered.precision.size)))
+
+
+def stochastic(
+    filtered: InverseCovariance, derivatives: Sequence[Derivative], cl: Cl, probes: Probes, report: Reporter
+) -> Information:
+    """Estimate the Fisher information by random probes; ``report`` counts the applications of a derivative.
+
+    ``cl`` is the spectrum of the sky that effects act on, uK^2, shape (lmax + 1,), at most that of the inverse
+    covariance.
+
+    Notes
+    -----
+    The relative error of the diagonal is by jackknife over the probes; it is about 2/number.
+    """
+    K, group, done = len(derivatives), group_of(probes, filtered), 0.0
+    found: list[Matrix] = []
+    variance = []
+    for first in range(0, probes.number, group):
+        members = range(first, min(first + group, probes.number))
+        if len(members) < 3 and found:
+            break
+        drawn = [_draw(filtered, cl, probes.seed, number) for number in members]
+        table = np.zeros((K, len(members), len(members)))  # x_k . b_i(x_l)
+        for column, (x, sky) in enumerate(drawn):
+            for row, derivative in enumerate(derivatives):
+                response = _response(derivative, x, sky)
+                table[row, :, column] = [np.vdot(other[derivative.maps], response) for other, _ in drawn]
+                done += 1.0
+                report(done)
+        both = (table + np.swapaxes(table, 1, 2)) * (1.0 - np.eye(len(members)))
+        flat = both.reshape(K, -1)
+        found.append(0.5 * flat @ flat.T / (len(members) * (len(members) - 1)))
+        variance.append(_left_out(0.5 * both**2))
+    first_half, second_half = zip(*(derivative.mean for derivative in derivatives), strict=True)
+    total = np.mean(found, axis=0) + _filtered_products(filtered, derivatives, first_half, second_half)
+    size = np.diag(total)
+    error = np.sqrt(np.mean(variance, axis=0) / len(variance))
+    return Information((total + total.T) / 2.0, np.divide(error, size, out=np.zeros(K), where=size > 0.0))
+
+
+def _draw(filtered: InverseCovariance, cl: Cl, seed: int, number: int) -> tuple[Maps, Alm]:
+    """Return x = C^-1 d of data that the model makes, and s^ of the sky of spectrum ``cl``."""
+    sky = gaussian_alm(filtered.cl, rng.generator(seed, number, "information/sky"))
+    noise = rng.generator(seed, number, "information/noise").standard_normal(filtered.precision.shape)
+    seen = filtered.precision > 0.0
+    scale = np.divide(1.0, np.sqrt(filtered.precision), out=np.zeros_like(noise), where=seen)
+    data = np.where(seen, filtered.observe(sky) + scale * noise, 0.0)
+    found = filtered.wiener(data)
+    share = np.divide(cl, filtered.cl, out=np.zeros_like(cl), where=filtered.cl > 0.0)
+    return filtered.apply(data, found), alm_.multiply(found, share, filtered.lmax)
+
+
+def _response(derivative: Derivative, x: Maps, sky: Alm) -> Maps:
+    """Return b = dP s^ + dN x / 2 of the derivative's own maps."""
+    if derivative.noise is None:
+        return derivative.of_sky(sky)
+    return derivative.of_sky(sky) + 0.5 * derivative.noise * x[derivative.maps]
+
+
+def _filtered_products(
+    filtered: InverseCovariance, derivatives: Sequence[Derivative], left: Sequence[Maps], right: Sequence[Maps]
+) -> Matrix:
+    """Return a_i' C^-1 b_j = a_i' N^-1 b_j - (P^t N^-1 a_i)' (S^-1 + P^t N^-1 P)^-1 (P^t N^-1 b_j)."""
+    own = [derivative.maps for derivative in derivatives]
+    found = np.zeros((len(own), len(own)))
+    seen = [filtered.of_own(maps, part) for maps, part in zip(left, own, strict=True)]
+    others = [filtered.of_own(maps, part) for maps, part in zip(right, own, strict=True)]
+    for j, (maps, part) in enumerate(zip(right, own, strict=True)):
+        if not maps.any():
+            continue
+        sky = filtered.solve(others[j])
+        for i in range(len(own)):
+            low, high = max(part.start, own[i].start), min(part.stop, own[i].stop)
+            if low < high:
+                a = left[i][low - own[i].start : high - own[i].start]
+                b = maps[low - part.start : high - part.start]
+                found[i, j] = np.sum(a * filtered.precision[low:high] * b)
+            found[i, j] -= product(seen[i], sky, filtered.lmax)
+    return found
+
+
+def _left_out(products: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the jackknife variance of the mean over pairs of different probes, symmetric (K, n, n) to (K,)."""
+    n = products.shape[1]
+    each = products.sum(axis=2)
+    without = (each.sum(axis=1)[:, None] - 2.0 * each) / ((n - 1) * (n - 2))
+    return np.asarray((n - 1) * without.var(axis=1))

@@ -1,0 +1,270 @@
+"""What a Fisher matrix says of effects: errors, detectable amplitudes, and which can be told apart."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from mcsim.diagnosis.candidate import Candidate, columns_of, numbered
+from mcsim.information.fisher import Information
+from mcsim.information.settings import LimitSettings
+from mcsim.stats.detection import snr_needed, snr_to_separate
+from mcsim.support.arrays import Matrix
+from mcsim.support.folders import unwritable, write_whole
+from mcsim.support.numbers import number
+
+TABLE, STORE = "limit.json", "limit.zarr"
+
+RESOLVED = 1e-10
+"""Directions of an effect with less than this share of its largest information are unconstrained."""
+
+
+@dataclass(frozen=True)
+class EffectLimit:
+    """The limit of one effect.
+
+    Attributes
+    ----------
+    name, channel, settings, unit, label
+        Of the effect; ``channel`` None: acts in all.
+    components
+        Number of its linear components.
+    sigma, error
+        Standard error of its amplitude, for the root mean square response over its components, in ``unit``; and the
+        relative error of that from random probes, 0 if there are none. Infinite where the maps do not respond.
+    amplitude_90_known
+        Amplitude that is detected with the power asked for if this effect is the only one that is tested.
+    amplitude_90
+        The same if all effects of the library are tested (Bonferroni).
+    similar, correlation
+        Index of the other effect with the most similar response, None without one, and their canonical correlation.
+    separable
+        Amplitude at which the right one of the two is chosen with the probability asked for.
+    """
+
+    name: str
+    channel: str | None
+    settings: dict[str, Any]
+    unit: str
+    label: str
+    components: int
+    sigma: float
+    error: float
+    amplitude_90_known: float
+    amplitude_90: float
+    similar: int | None
+    correlation: float
+    separable: float
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """Hold the limit of every effect, and the Fisher matrix behind it.
+
+    Attributes
+    ----------
+    model
+        Name of the run.
+    effects
+        In the order of the library.
+    correlation
+        Largest canonical correlation of the responses of each pair of effects, shape (effects, effects).
+    fisher
+        Per unit of each component, nuisances marginalised, shape (K, K).
+    components
+        Label of every row of it.
+    tests
+        Effects that the look-elsewhere correction counts.
+    method
+        How the matrix was computed, in words.
+    settings
+        With which it was computed.
+    """
+
+    model: str
+    effects: tuple[EffectLimit, ...]
+    correlation: Matrix
+    fisher: Matrix
+    components: tuple[str, ...]
+    tests: int
+    method: str
+    settings: LimitSettings
+
+    @property
+    def conventions(self) -> str:
+        """Say what the amplitudes mean."""
+        s = self.settings
+        known, one = snr_needed(1, 1, 1, None, s.alpha, s.power), snr_needed(1, self.tests, 1, None, s.alpha, s.power)
+        return (
+            f"Detected: with {100 * s.power:g} % power at a global level of {100 * s.alpha:g} %, S/N {known:.2f} for "
+            f"one component that alone is tested, {one:.2f} with Bonferroni's correction for {self.tests} effects. "
+            f"Told apart: the right one of two chosen with {100 * s.separation:g} % probability."
+        )
+
+    def lines(self) -> list[str]:
+        """Return the table as text."""
+        rows: list[tuple[str, ...]] = []
+        rows.append(("effect", "unit", "sigma", "detected alone", "detected", "most similar", "|rho|", "told apart"))
+        for one in self.effects:
+            other = "–" if one.similar is None else self.effects[one.similar].label
+            amplitudes = (one.sigma, one.amplitude_90_known, one.amplitude_90)
+            similar = (other, f"{one.correlation:.2f}", number(one.separable))
+            rows.append((one.label, one.unit, *map(number, amplitudes), *similar))
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        side = ["<", "<", ">", ">", ">", "<", ">", ">"]
+        table = ["  ".join(f"{cell:{side[i]}{widths[i]}}" for i, cell in enumerate(row)) for row in rows]
+        worst = max((one.error for one in self.effects), default=0.0)
+        error = f" Errors of sigma from random probes: at most {100 * worst:.2g} %." if worst else ""
+        known = [f"{name} ± {width:g}" for name, width in self.settings.nuisances.items()]
+        marginal = [f"Marginalised over {', '.join(known)}."] if known else []
+        return [*(line.rstrip() for line in table), self.conventions, f"{self.method}.{error}", *marginal]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the table in the layout of ``limit.json``."""
+        s = self.settings
+        return {
+            "schema": 1,
+            "model": self.model,
+            "alpha": s.alpha,
+            "power": s.power,
+            "separation": s.separation,
+            "tests": self.tests,
+            "conventions": self.conventions,
+            "method": self.method,
+            "nuisances": dict(s.nuisances),
+            "effects": [self._effect_json(one) for one in self.effects],
+        }
+
+    def _effect_json(self, one: EffectLimit) -> dict[str, Any]:
+        other = None if one.similar is None else self.effects[one.similar]
+        similar = None if other is None else {key: getattr(other, key) for key in ("name", "channel", "settings")}
+        named = {key: getattr(one, key) for key in ("name", "channel", "settings", "unit", "components")}
+        amplitudes = {key: getattr(one, key) for key in ("sigma", "amplitude_90_known", "amplitude_90", "separable")}
+        finite = {key: value if np.isfinite(value) else None for key, value in amplitudes.items()}
+        return named | finite | {"sigma_relative_error": one.error, "similar": similar, "correlation": one.correlation}
+
+    def to_dataset(self) -> xr.Dataset:
+        """Return table, correlations and Fisher matrix with names and units."""
+        labels = np.array([one.label for one in self.effects], dtype=object)
+        named = {
+            "sigma": "standard error of the amplitude, rms over components",
+            "amplitude_90_known": "amplitude detected if this effect alone is tested",
+            "amplitude_90": "amplitude detected among all effects",
+            "separable": "amplitude at which it is told apart from the most similar effect",
+        }
+        columns: dict[str, Any] = {}
+        for key, text in named.items():
+            values = np.array([getattr(one, key) for one in self.effects])
+            columns[key] = ("effect", values, {"units": "see unit", "long_name": text})
+        columns["unit"] = ("effect", np.array([one.unit for one in self.effects], dtype=object))
+        error = np.array([one.error for one in self.effects])
+        columns["sigma_relative_error"] = ("effect", error, {"units": "1", "long_name": "error from random probes"})
+        shape = ("effect", "other"), self.correlation
+        columns["correlation"] = (*shape, {"units": "1", "long_name": "largest canonical correlation of responses"})
+        text = "Fisher information per unit of each component, nuisances marginalised"
+        columns["fisher"] = (("component", "component_"), self.fisher, {"units": "1/units^2", "long_name": text})
+        names = np.array(self.components, dtype=object)
+        coordinates = {"effect": labels, "other": labels, "component": names, "component_": names}
+        attributes = {"model": self.model, "conventions": self.conventions, "method": self.method, "tests": self.tests}
+        return xr.Dataset(columns, coordinates, attributes)
+
+    def save(self, folder: str | Path) -> None:
+        """Write ``limit.json`` and ``limit.zarr`` into a folder, made where it does not exist."""
+        target = Path(folder)
+        with unwritable(target, "choose another folder"):
+            target.mkdir(parents=True, exist_ok=True)
+            self.to_dataset().to_zarr(target / STORE, mode="w", consolidated=False)
+            write_whole(target / TABLE, json.dumps(self.to_json(), indent=2, ensure_ascii=False) + "\n")
+
+
+def marginalised(fisher: Matrix, nuisances: Sequence[int], widths: Sequence[float]) -> Matrix:
+    """Return the Fisher matrix of the other rows, marginalised over nuisances with Gaussian priors of these widths.
+
+    Notes
+    -----
+    F_tt - F_tn (F_nn + diag(1/width^2))^-1 F_nt, the inverse of the covariance of the rows that are left.
+    """
+    rest = [row for row in range(len(fisher)) if row not in set(nuisances)]
+    if not len(nuisances):
+        return fisher
+    own = fisher[np.ix_(nuisances, nuisances)] + np.diag(1.0 / np.asarray(widths, dtype=float) ** 2)
+    across = fisher[np.ix_(nuisances, rest)]
+    return np.asarray(fisher[np.ix_(rest, rest)] - across.T @ np.linalg.solve(own, across))
+
+
+def canonical_correlations(fisher: Matrix, groups: Sequence[Sequence[int]]) -> Matrix:
+    """Return the largest canonical correlation of each pair of groups of rows, shape (groups, groups).
+
+    It is the largest singular value of F_ii^-1/2 F_ij F_jj^-1/2; 0 for a group without information.
+    """
+    roots = []
+    for group in groups:
+        values, vectors = np.linalg.eigh(fisher[np.ix_(group, group)])
+        kept = values > RESOLVED * max(values[-1], 0.0)
+        roots.append(vectors[:, kept] / np.sqrt(values[kept]))
+    found = np.eye(len(groups))
+    for i, one in enumerate(groups):
+        for j, other in enumerate(groups[:i]):
+            block = roots[i].T @ fisher[np.ix_(one, other)] @ roots[j]
+            if block.size:
+                found[i, j] = found[j, i] = min(float(np.linalg.norm(block, 2)), 1.0)
+    return found
+
+
+def limits_of(
+    candidates: Sequence[Candidate],
+    information: Information,
+    tests: int,
+    method: str,
+    model: str,
+    settings: LimitSettings,
+) -> Limits:
+    """Turn the Fisher matrix of candidates, nuisances among them, into limits."""
+    width = [_width(candidate, settings) for candidate in candidates]
+    known = [k for k, one in enumerate(width) if one is not None]
+    rows = columns_of(candidates, known)
+    widths = [float(width[k] or 0.0) for k in known for _ in candidates[k].columns]
+    fisher = marginalised(information.fisher, rows, widths)
+    rest = [candidate for candidate, one in zip(candidates, width, strict=True) if one is None]
+    error = np.delete(information.error, rows)
+    left = numbered(rest)
+    correlation = canonical_correlations(fisher, [candidate.columns for candidate in left])
+    found = []
+    for index, candidate in enumerate(left):
+        own = list(candidate.columns)
+        values = np.linalg.eigvalsh(fisher[np.ix_(own, own)])
+        rank = max(int(np.sum(values > RESOLVED * values[-1])), 1)
+        size = float(np.mean(np.maximum(values, 0.0)))
+        sigma = 1.0 / np.sqrt(size) if size > 0.0 else np.inf
+        share = np.diag(fisher)[own] / max(len(own) * size, 1e-300)
+        others = np.where([one.identity == candidate.identity for one in left], -1.0, correlation[index])
+        similar = int(np.argmax(others)) if np.any(others > 0.0) else None
+        rho = 0.0 if similar is None else float(correlation[index, similar])
+        found.append(
+            EffectLimit(
+                *candidate.identity,
+                dict(candidate.settings),
+                candidate.effect.unit,
+                candidate.label,
+                len(own),
+                sigma,
+                float(0.5 * np.sqrt(np.sum((share * error[own]) ** 2))),
+                sigma * snr_needed(rank, 1, rank, None, settings.alpha, settings.power),
+                sigma * snr_needed(rank, tests, rank, None, settings.alpha, settings.power),
+                similar,
+                rho,
+                sigma * float(snr_to_separate(rho, settings.separation)),
+            )
+        )
+    names = tuple(f"{one.label}/{k}" for one in left for k in range(len(one.columns)))
+    return Limits(model, tuple(found), correlation, fisher, names, tests, method, settings)
+
+
+def _width(candidate: Candidate, settings: LimitSettings) -> float | None:
+    """Return the width of a nuisance's prior; None: the candidate is no nuisance."""
+    name, channel = candidate.identity
+    return settings.nuisances.get(f"{name}:{channel}", settings.nuisances.get(name))

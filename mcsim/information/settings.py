@@ -1,0 +1,65 @@
+"""What the limit of a model is computed of, and how."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from mcsim.systematics import Library
+
+
+@dataclass(frozen=True)
+class LimitSettings:
+    """Set effects, nuisances, levels and random probes of :func:`mcsim.limit`.
+
+    Attributes
+    ----------
+    only
+        Names of the effects to compute; empty: all that apply. The look-elsewhere correction is for all in any case.
+    without
+        Names of effects that are left out, of the look-elsewhere correction too.
+    library
+        Effects by name, as :func:`mcsim.effects` returns them; None: all of these.
+    nuisances
+        Width of the Gaussian prior, in the effect's unit, of every coordinate of effects that are unknown but not
+        looked for: ``{"beam_width": 0.01}`` in every channel, ``{"beam_width:W1": 0.01}`` in one. The limits of the
+        others are marginalised over them.
+    unknown_dipole_uk
+        Rms over the sky, in uK, of a monopole and of a dipole that all maps share and of which nothing is known; 0: the
+        model's spectrum says all of the sky. A model without power there knows them, but for noise, and so knows what
+        modulations make of a quadrupole.
+    alpha, power
+        Global level of the test, and its power at the amplitudes that are called detected.
+    separation
+        Probability that the right one of two effects is chosen at the amplitude at which they are told apart.
+    orders
+        Highest azimuthal order of the fiducial beams in the inverse covariance, the centroids of the samples included;
+        0: circular beams at pixel centres. What an effect changes has all orders in any case.
+    probes
+        Number of random probes, 3 or more; the relative error of sigma is about 1/probes.
+    dense
+        Compute whole matrices, without random probes: the reference for small maps.
+    tolerance
+        Relative residual at which the conjugate gradients end. What the sky is above the noise, squared, multiplies it
+        in the largest scales, so that 1e-4 is too much there.
+    seed
+        Of the random probes.
+
+    Examples
+    --------
+    >>> import mcsim
+    >>> mcsim.LimitSettings(only=("beam_width",), nuisances={"gain_drift": 1e-4}).probes
+    64
+    """
+
+    only: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
+    library: Library | None = None
+    nuisances: Mapping[str, float] = field(default_factory=dict)
+    unknown_dipole_uk: float = 0.0
+    alpha: float = 0.05
+    power: float = 0.9
+    separation: float = 0.95
+    orders: int = 0
+    probes: int = 64
+    dense: bool = False
+    tolerance: float = 1e-8
+    seed: int = 0

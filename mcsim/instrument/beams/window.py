@@ -1,0 +1,119 @@
+"""Beam windows B_l: text tables such as WMAP's, FITS tables such as Planck's, .npy files, arrays."""
+
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from mcsim.errors import InputError
+from mcsim.sphere.header import opened
+from mcsim.support.npy import read_npy
+
+Window = NDArray[np.float64]
+
+COLUMNS = ("BL", "B_L", "INT_BEAM", "NOMINAL", "TEMPERATURE", "T", "BEAM")
+"""Names of columns of B_l, the surest first: LFI's instrument model, Planck's CMB maps, HFI's model and windows."""
+
+LARGEST = 1.05
+"""Of |B_l| over B_0: more is no beam."""
+
+
+def read_window(
+    source: str | Path | NDArray, lmax: int | None = None, extension: str | None = None, column: str | None = None
+) -> Window:
+    """Return B_l from l = 0, shape (lmax + 1,), ``lmax`` None: all of it.
+
+    What is read, and what is refused, says :meth:`mcsim.instrument.beams.Beam.from_window`.
+    """
+    if not isinstance(source, str | Path):
+        found, origin = np.asarray(source, dtype=np.float64), "the array of B_l"
+    else:
+        path, origin = Path(source), str(source)
+        if path.suffix == ".npy":
+            found = read_npy(path, "iuf").astype(np.float64)
+        elif _is_fits(path):
+            found, origin = _of_fits(path, extension, column)
+        else:
+            if extension is not None or column is not None:
+                raise InputError(f"{path} is no FITS file, so it has no extension or named column; leave these out.")
+            found = _of_text(path)
+    if found.ndim != 1 or not np.all(np.isfinite(found)):
+        raise InputError(f"{origin} holds no finite B_l, one for each l; repair it.")
+    if abs(found[0] - 1.0) > 0.01 or np.abs(found).max() > LARGEST:
+        raise InputError(
+            f"{origin} starts at B_0 = {found[0]:g} and reaches {np.abs(found).max():g}, where B_l is 1 at l = 0 and "
+            "falls; give B_l, neither its square nor b_l0."
+        )
+    if lmax is not None and found.size <= lmax:
+        raise InputError(f"{origin} holds B_l up to l = {found.size - 1}, but l = {lmax} is needed; lower lmax.")
+    return found if lmax is None else found[: lmax + 1]
+
+
+def _is_fits(path: Path) -> bool:
+    return path.name.lower().removesuffix(".gz").endswith((".fits", ".fit"))
+
+
+def _of_text(path: Path) -> Window:
+    try:
+        table = np.loadtxt(path, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read as a table of B_l ({error}); give columns ell and B_l.") from None
+    if table.shape[1] == 1:
+        return np.asarray(table[:, 0])
+    if not np.array_equal(table[:, 0], np.arange(len(table))):
+        raise InputError(f"{path} does not count ell from 0 in its first column; give every ell from 0 on.")
+    return np.asarray(table[:, 1])
+
+
+def _of_fits(path: Path, extension: str | None, column: str | None) -> tuple[Window, str]:
+    """Return B_l and the name of their table."""
+    try:
+        with opened(path) as hdus:
+            tables = {
+                _name(number, hdu): hdu
+                for number, hdu in enumerate(hdus)
+                if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)
+            }
+            where, field = _chosen(path, tables, extension, column)
+            values = np.asarray(tables[where].data.field(field), dtype=np.float64).ravel()
+    except InputError:
+        raise
+    except Exception as error:  # libraries raise errors of any type for a broken file
+        raise InputError(f"{path} cannot be read as a FITS table of B_l ({error}); give another file.") from error
+    return values, f"{path} ({where}, {field})"
+
+
+def _name(number: int, hdu: fits.BinTableHDU) -> str:
+    return str(hdu.name).strip() or str(number)
+
+
+def _chosen(
+    path: Path, tables: dict[str, fits.BinTableHDU], extension: str | None, column: str | None
+) -> tuple[str, str]:
+    """Return extension and column with B_l: those asked for, or the only ones that it can be."""
+    known = ", ".join(tables) or "none"
+    if extension is not None:
+        tables = {name: hdu for name, hdu in tables.items() if name.upper() == extension.strip().upper()}
+        if not tables:
+            raise InputError(f"{path} has no table {extension!r}; use one of {known}.")
+    found = []
+    for name, hdu in tables.items():
+        names = [str(each) for each in hdu.columns.names]
+        upper = [each.upper() for each in names]
+        wanted = COLUMNS if column is None else (column.strip().upper(),)
+        match = [names[upper.index(each)] for each in wanted if each in upper]
+        # A HEALPix map has a column TEMPERATURE too. The only column of the only table is what it must be.
+        if match and (extension or "PIXTYPE" not in hdu.header):
+            found.append((name, match[0]))
+        elif column is None and len(tables) == len(names) == 1:
+            found.append((name, names[0]))
+    if len(found) != 1:
+        columns = "; ".join(f"{name}: {', '.join(map(str, hdu.columns.names))}" for name, hdu in tables.items())
+        raise InputError(
+            f"{path} has {len(found)} columns that may be B_l ({columns or known}); say which with extension and "
+            "column."
+        )
+    if "_2_" in found[0][1]:
+        raise InputError(f"{path} holds W_l = B_l^2 in {found[0][1]}; give the file of B_l.")
+    return found[0]

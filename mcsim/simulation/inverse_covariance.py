@@ -1,0 +1,291 @@
+r"""Inverse covariance of maps that share one unknown sky, with masks and noise that differs from pixel to pixel.
+
+With d_k the maps, P_k the response of map k (beam, pixel window, and on request the orders of the beam and the
+centroids), N_k its white noise, without weight in pixels that are not observed, and S the covariance of the sky,
+
+    C = P S P^t + N,     C^-1 d = N^-1 (d - P s^),     (S^-1 + sum_k P_k^t N_k^-1 P_k) s^ = sum_k P_k^t N_k^-1 d_k.
+
+The system has the size (lmax + 1)^2 of the sky, however many maps there are. It is solved for u = S^-1/2 s^, in which
+a sky without power at some l is no exception, by conjugate gradients (Wandelt, Larson & Lakshminarayanan 2004,
+Phys. Rev. D 70, 083511; Eriksen et al. 2004, ApJS 155, 227).
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import ducc0
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.linalg import LinearOperator, cg
+
+from mcsim.errors import InputError
+from mcsim.instrument.scan import Moments
+from mcsim.simulation import convolve
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix
+from mcsim.sphere.checks import check_cl
+from mcsim.support.arrays import Alm, Cl, Map, Vector
+
+Maps = NDArray[np.float64]
+"""Shape (map, npix), uK or uK^-1."""
+
+ITERATIONS = 2000
+"""After so many the conjugate gradients are given up."""
+
+BRIGHT, BLOCK = 100.0, 32
+"""Power of the sky over that of the noise above which degrees, up to the second, are preconditioned as a block."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedMap:
+    """Describe one map.
+
+    Attributes
+    ----------
+    response
+        Of the beam times the pixel window. Maps with equal ones share their transforms.
+    precision
+        Inverse variance of the noise in every pixel, uK^-2, shape (npix,); 0 where not observed or masked.
+    moments
+        Orientation moments and centroids of the samples; None: only the circular part of the beam, at pixel centres.
+    """
+
+    response: convolve.Response
+    precision: Map
+    moments: Moments | None = None
+
+    @property
+    def spins(self) -> list[int]:
+        """Return the orders of the beam that act, but 0."""
+        known = 0 if self.moments is None else min(self.response.mmax, self.moments.smax)
+        return [s for s in range(1, known + 1) if self.response.factors[s].any()]
+
+
+class InverseCovariance:
+    """Apply the inverse covariance of maps.
+
+    Parameters
+    ----------
+    cl
+        Spectrum of the sky, uK^2, shape (lmax + 1,).
+    maps
+        The maps in order, of one nside.
+    tolerance
+        Relative residual at which the conjugate gradients end.
+    nthreads
+        Threads of the transforms.
+
+    Raises
+    ------
+    InputError
+        If no map has an observed pixel, pixels differ in number, or a response does not reach lmax.
+
+    Notes
+    -----
+    The preconditioner is diagonal in harmonics: 1/(1 + C_l sum_k (B_kl w_kl)^2 / N_k), with 1/N_k the mean precision of
+    the map's pixels over the whole sky, per sr; and where pixels are missing, whole for the degrees at which the sky is
+    far above the noise (Eriksen et al. 2004). At nside 128, lmax 384 and S/N = 440 at l = 2, three channels of two
+    halves take 16 iterations for 1e-6 on the full sky, 155 with the equator masked up to 15 degrees (586 without the
+    block).
+    Equal to a dense solve to 1e-6 with a mask, uneven noise, the orders of the beam and centroids
+    (tests/unit/test_inverse_covariance.py).
+    """
+
+    def __init__(self, cl: Cl, maps: Sequence[ObservedMap], tolerance: float = 1e-8, nthreads: int = 1) -> None:
+        self.lmax, self.cl, self.maps = len(cl) - 1, cl, tuple(maps)
+        self.tolerance, self.nthreads = tolerance, nthreads
+        check_cl(cl, self.lmax)
+        sizes = {m.precision.size for m in self.maps}
+        if len(sizes) != 1:
+            raise InputError(f"the maps have {sorted(sizes)} pixels; give at least one map, all of one nside.")
+        if any(m.response.lmax != self.lmax for m in self.maps):
+            found = [m.response.lmax for m in self.maps]
+            raise InputError(f"the responses end at l = {found}, the spectrum at {self.lmax}; give all to one lmax.")
+        if not any(m.precision.any() for m in self.maps):
+            raise InputError("no map has an observed pixel; give a precision above 0 somewhere.")
+        self.npix = sizes.pop()
+        self.nside = int(np.sqrt(self.npix // 12))
+        groups: dict[bytes, list[int]] = {}
+        for i, m in enumerate(self.maps):
+            groups.setdefault(m.response.factors.tobytes(), []).append(i)
+        self._members = list(groups.values())  # maps of equal responses
+        self._root = np.sqrt(cl)
+
+    @property
+    def size(self) -> int:
+        """Return the number of coefficients of a sky."""
+        return alm_.size(self.lmax)
+
+    @cached_property
+    def _geometry(self) -> dict[str, object]:
+        return {"lmax": self.lmax, "nthreads": self.nthreads, **healpix.geometry(self.nside)}
+
+    @cached_property
+    def precision(self) -> Maps:
+        """Return the inverse variance of all pixels, uK^-2, shape (map, npix)."""
+        return np.stack([m.precision for m in self.maps])
+
+    def observe(self, sky: Alm) -> Maps:
+        """Return P s, the maps of a sky without noise, uK."""
+        found = np.empty((len(self.maps), self.npix))
+        for members in self._members:
+            shared = [self.maps[i] for i in members]
+            response = shared[0].response
+            circular = convolve.circular_alm(sky, response)
+            found[members] = healpix.synthesis(circular[None], self.nside, self.lmax, nthreads=self.nthreads)[0]
+            moved = self._moved(members)
+            if moved:
+                gradient = healpix.gradient(circular, self.nside, self.lmax, self.nthreads)
+                for i, own in moved.items():
+                    found[i] += convolve.centroid_map(gradient, own)
+            wanted = {s for m in shared for s in m.spins}
+            for s in sorted(wanted):
+                only = convolve.Response(np.where(np.arange(s + 1)[:, None] == s, response.factors[: s + 1], 0.0))
+                spins = convolve.spin_maps(sky, only, self.nside, self.nthreads)
+                for i in members:
+                    moments = self.maps[i].moments
+                    if moments is not None and s in self.maps[i].spins:
+                        found[i] += convolve.noncircular_map(spins, moments)
+        return found
+
+    def adjoint(self, maps: Maps, only: range | None = None) -> Alm:
+        """Return P^t applied to maps: coefficients whose product with a sky is that of the maps with P s.
+
+        ``only``: the maps that are given, the others being zero; None: all.
+        """
+        total = np.zeros(alm_.size(self.lmax), dtype=np.complex128)
+        at = {i: row for row, i in enumerate(range(len(self.maps)) if only is None else only)}
+        for everyone in self._members:
+            members = [i for i in everyone if i in at]
+            if not members:
+                continue
+            response = self.maps[members[0]].response
+            added = np.sum([maps[at[i]] for i in members], axis=0)[None]
+            circular = ducc0.sht.adjoint_synthesis(map=added, spin=0, **self._geometry)[0]
+            moved = self._moved(members)
+            if moved:
+                along = [np.stack([maps[at[i]] * m.dtheta, maps[at[i]] * m.dphi]) for i, m in moved.items()]
+                both = np.sum(along, axis=0)
+                # The gradient of a_lm is the spin-1 synthesis of E = sqrt(l(l + 1)) a_lm, B = 0.
+                electric = ducc0.sht.adjoint_synthesis(map=both, spin=1, **self._geometry)[0]
+                ell = np.arange(self.lmax + 1.0)
+                circular = circular + alm_.multiply(electric, np.sqrt(ell * (ell + 1.0)), self.lmax)
+            total += convolve.circular_alm(circular, response)
+            for s in sorted({s for i in members for s in self.maps[i].spins}):
+                turned = np.zeros((2, self.npix))
+                for i in members:
+                    moments = self.maps[i].moments
+                    if moments is not None and s in self.maps[i].spins:
+                        convolve.turned(maps[at[i]], moments, s, turned)
+                electric, magnetic = ducc0.sht.adjoint_synthesis(map=turned, spin=s, **self._geometry)
+                factor = response.factors[s]  # ducc0's sign: S_s is minus the synthesis
+                total -= 2.0 * alm_.multiply(electric, factor.real, self.lmax)
+                total -= 2.0 * alm_.multiply(magnetic, factor.imag, self.lmax)
+        return total
+
+    def of_own(self, maps: Maps, part: slice) -> Alm:
+        """Return P^t N^-1 applied to some maps, the others being zero; ``part`` says which they are."""
+        return self.adjoint(self.precision[part] * maps, range(len(self.maps))[part])
+
+    def solve(self, sky: Alm) -> Alm:
+        """Return (S^-1 + P^t N^-1 P)^-1 applied to coefficients; InputError if the iterations do not converge."""
+        scale = self._root
+        known = _packed(alm_.multiply(sky, scale, self.lmax), self.lmax)
+        if not known.any():
+            return np.zeros_like(sky)
+
+        def apply(vector: Vector) -> Vector:
+            s = alm_.multiply(_unpacked(vector, self.lmax), scale, self.lmax)
+            back = self.adjoint(self.precision * self.observe(s))
+            return vector + _packed(alm_.multiply(back, scale, self.lmax), self.lmax)
+
+        shape = (known.size, known.size)
+        matrix = LinearOperator(shape, matvec=apply, dtype=np.float64)
+        near = LinearOperator(shape, matvec=self._precondition, dtype=np.float64)
+        found, failed = cg(matrix, known, rtol=self.tolerance, maxiter=ITERATIONS, M=near)
+        if failed:
+            raise InputError(
+                f"the inverse covariance has not converged after {ITERATIONS} iterations: the noise is too small for "
+                "the mask; mask less, or give the maps more noise."
+            )
+        return alm_.multiply(_unpacked(found, self.lmax), scale, self.lmax)
+
+    def wiener(self, maps: Maps) -> Alm:
+        """Return s^ = S P^t C^-1 d, the sky as far as maps tell it, uK."""
+        return self.solve(self.adjoint(self.precision * maps))
+
+    def apply(self, maps: Maps, sky: Alm | None = None) -> Maps:
+        """Return C^-1 d, uK^-1; ``sky`` is s^, if it is known already."""
+        return self.precision * (maps - self.observe(self.wiener(maps) if sky is None else sky))
+
+    def _moved(self, members: Sequence[int]) -> dict[int, Moments]:
+        """Return the moments of those maps that have centroids."""
+        found = {}
+        for i in members:
+            moments = self.maps[i].moments
+            if moments is not None and moments.dtheta is not None:
+                found[i] = moments
+        return found
+
+    @cached_property
+    def _gain(self) -> Vector:
+        """Power of the sky over that of the noise in one mode, if all pixels of a map counted alike; (lmax + 1,)."""
+        gain = sum(m.response.factors[0].real ** 2 * m.precision.sum() for m in self.maps) / (4.0 * np.pi)
+        return np.asarray(self.cl * gain)
+
+    @cached_property
+    def _diagonal(self) -> Vector:
+        return _spread(1.0 / (1.0 + self._gain), self.lmax)
+
+    @cached_property
+    def _largest_scales(self) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+        """Places of low degrees in a packed vector, and the inverse of their part of the matrix; None: not needed."""
+        bright = np.flatnonzero(self._gain > BRIGHT)
+        if bright.size == 0 or all(m.precision.all() for m in self.maps):
+            return None
+        top = min(int(bright[-1]), BLOCK)
+        together = [(self.maps[members[0]].response, self.precision[members].sum(axis=0)) for members in self._members]
+        short = [ObservedMap(convolve.Response(r.factors[:1, : top + 1]), precision) for r, precision in together]
+        low = InverseCovariance(self.cl[: top + 1], short, nthreads=self.nthreads)
+        scale = _spread(low._root, top)
+        columns = [_packed(low.adjoint(low.precision * low.observe(sky)), top) for _, sky in unit_skies(top)]
+        matrix = np.eye(scale.size) + scale[:, None] * np.stack(columns, axis=1) * scale
+        # Both orders of packing are by m, so that degrees up to top keep their order.
+        places = np.flatnonzero(_spread(np.arange(self.lmax + 1), self.lmax) <= top)
+        return places, np.linalg.inv((matrix + matrix.T) / 2.0)
+
+    def _precondition(self, vector: Vector) -> Vector:
+        found = self._diagonal * vector
+        if self._largest_scales is not None:
+            places, inverse = self._largest_scales
+            found[places] = inverse @ vector[places]
+        return found
+
+
+def unit_skies(lmax: int) -> Iterator[tuple[int, Alm]]:
+    """Yield degree and coefficients of an orthonormal basis of the (lmax + 1)^2 real skies."""
+    for k, ell in enumerate(_spread(np.arange(lmax + 1), lmax).tolist()):
+        yield ell, _unpacked(np.where(np.arange((lmax + 1) ** 2) == k, 1.0, 0.0), lmax)
+
+
+def product(a: Alm, b: Alm, lmax: int) -> float:
+    """Return the product of two skies: the sum over all m of a_lm conj(b_lm)."""
+    return float(_packed(a, lmax) @ _packed(b, lmax))
+
+
+def _packed(alm: Alm, lmax: int) -> Vector:
+    """Return coefficients as (lmax + 1)^2 real numbers, whose products are those of the fields."""
+    rest = np.sqrt(2.0) * alm[lmax + 1 :]
+    return np.concatenate([alm[: lmax + 1].real, rest.real, rest.imag])
+
+
+def _unpacked(vector: Vector, lmax: int) -> Alm:
+    zonal, real, imaginary = np.split(vector, [lmax + 1, alm_.size(lmax)])
+    return np.concatenate([zonal.astype(np.complex128), (real + 1j * imaginary) / np.sqrt(2.0)])
+
+
+def _spread(factor: NDArray, lmax: int) -> NDArray:
+    """Return a function of l at the places of packed coefficients."""
+    each = factor[alm_.degrees(lmax)]
+    return np.concatenate([each, each[lmax + 1 :]])

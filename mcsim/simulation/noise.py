@@ -1,0 +1,286 @@
+"""Noise of the pixels of a map: its standard deviation, and how it is drawn, from what a run says of the channel."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+import healpy
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim import config
+from mcsim.config import noise as declared
+from mcsim.errors import InputError
+from mcsim.instrument.scan import MapGrid, Moments
+from mcsim.simulation import timestream
+from mcsim.simulation.channels import scan_model
+from mcsim.sphere import header, healpix
+from mcsim.sphere.checks import UNSEEN_BELOW
+from mcsim.sphere.mask import read_mask
+
+Map = NDArray[np.float64]
+
+
+class DrawnNoise(Protocol):
+    """Noise of a map that is not white."""
+
+    @property
+    def level_uk(self) -> Map:
+        """Its standard deviation, about, shape (npix,), 0 where nothing is observed."""
+
+    def draw(self, seed: int, realization: int) -> Map:
+        """Return the noise of a realization, uK, shape (npix,)."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """Level of white noise from the differences of splits.
+
+    Attributes
+    ----------
+    sigma_uk, error_uk
+        Noise per observation, or, isotropic, of a pixel of one split; its standard error.
+    pixels, splits
+        From how many.
+    isotropic
+        True if the noise was taken to be the same in all pixels.
+    """
+
+    sigma_uk: float
+    error_uk: float
+    pixels: int
+    splits: int
+    isotropic: bool
+
+    def __str__(self) -> str:
+        """Say it in words."""
+        per = "per pixel of a split" if self.isotropic else "per observation"
+        return (
+            f"{self.sigma_uk:.6g} +- {self.error_uk:.2g} uK {per}, from the differences of {self.splits} splits in "
+            f"{self.pixels} pixels"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseOfFiles:
+    """Noise maps in files, ``template`` with {realization}, ``like`` the moments of the map that they are of."""
+
+    template: str
+    like: Moments
+    frequency_ghz: float | None
+    level_uk: Map
+
+    def draw(self, seed: int, realization: int) -> Map:
+        """Return the map of a realization; InputError for a file that cannot be used."""
+        return _noise_map(Path(self.template.format(realization=realization)), self.like, self.frequency_ghz)
+
+
+def of_map(
+    run: config.RunConfig, spec: config.Channel, split: str | None, moments: Moments
+) -> tuple[Moments, Map | None, DrawnNoise | None]:
+    """Return what is known of the noise of a map.
+
+    Returns
+    -------
+    moments
+        Those of the map: a map of hits takes the place of the scan's hits, and what is not observed in a map of hits or
+        variances is not observed.
+    level_uk
+        Standard deviation of the noise, shape (npix,), None: no noise.
+    drawn
+        How noise that is not white is drawn.
+
+    Raises
+    ------
+    InputError
+        If a file of the run cannot be used; its pixels and frame must be those of the maps that are made.
+    """
+    noise = spec.noise_of(split)
+    if isinstance(noise, declared.Noise) and noise.hits is not None:
+        path = config.channel_path(noise.hits, spec.name, split)
+        moments = replace(moments, hits=np.where(moments.hits > 0, _positive(path, moments, healpix.HITS)[0], 0.0))
+    if declared.is_noise_free(noise):
+        return moments, None, None
+    observed = moments.hits > 0
+    match noise:
+        case declared.Noise():
+            return moments, _per_hit(noise.sigma0_uk, moments.hits), None
+        case declared.NoiseDepth():
+            side = np.rad2deg(healpy.nside2resol(moments.nside)) * 60.0
+            return moments, np.where(observed, noise.depth_uk_arcmin / side, 0.0), None
+        case declared.NoiseVariance():
+            path = config.channel_path(noise.variance, spec.name, split)
+            variance, unit = _positive(path, moments, healpix.VARIANCE)
+            variance = header.to_uk2(unit, path, spec.frequency_ghz) * variance
+            moments = replace(moments, hits=np.where(variance > 0.0, moments.hits, 0.0))
+            return moments, np.where(moments.hits > 0, np.sqrt(variance), 0.0), None
+        case declared.NoiseDifference():
+            level, hits = _difference(run, spec, noise, moments)
+            own = [hits[run.map.splits.index(split)]] if split is not None else hits
+            together = np.sum(own, axis=0)
+            own_hits = np.minimum(together, 1.0) * moments.hits if noise.isotropic else together
+            moments = replace(moments, hits=np.where(observed, own_hits, 0.0))
+            return moments, np.where(moments.hits > 0, _per_hit(level.sigma_uk, together), 0.0), None
+        case declared.NoiseRealizations():
+            template = noise.files.replace("{channel}", spec.name).replace("{split}", str(split))
+            first = _noise_map(Path(template.format(realization=0)), moments, spec.frequency_ghz)
+            level_uk = _per_hit(timestream.per_hit(first, moments.hits), moments.hits)
+            return moments, level_uk, NoiseOfFiles(template, moments, spec.frequency_ghz, level_uk)
+        case declared.NoiseCorrelated():
+            correlated = _correlated(run, spec, noise, split, moments)
+            # Every other ring hits a pixel about half as often as all of them; the time stream knows how often.
+            moments = replace(moments, hits=np.where(observed, correlated.hits, 0.0))
+            return moments, correlated.level_uk, correlated
+
+
+def difference_level(run: config.RunConfig, channel: str, split: str | None = None) -> Level:
+    """Return the level of noise of kind "difference" that a channel of a run has, with its error.
+
+    Notes
+    -----
+    With maps m_i of h_i observations each (isotropic: h_i = 1), of noise sigma^2 / h_i and the same sky, and their mean
+    m = sum h_i m_i / sum h_i, sum_i h_i (m_i - m)^2 / sigma^2 is a chi^2 of n - 1 degrees of freedom in every pixel; of
+    two splits it is the half-difference squared over its variance. The mean over N pixels gives sigma, with a relative
+    error of 1 / sqrt(2 N (n - 1)). A constant offset of each split is fitted along. What else differs between the
+    splits (calibration, foregrounds in another beam) counts as noise: mask it.
+    """
+    spec = next((one for one in run.channels if one.name == channel), None)
+    noise = None if spec is None else spec.noise_of(split)
+    if spec is None or not isinstance(noise, declared.NoiseDifference):
+        raise InputError(f'channel {channel} of {run.name} has no noise of kind "difference"; name one that has.')
+    npix = 12 * run.map.resolution**2
+    anywhere = Moments(run.map.resolution, run.map.frame, np.ones(npix), np.zeros((1, npix), dtype=np.complex128))
+    return _difference(run, spec, noise, anywhere)[0]
+
+
+def in_words(run: config.RunConfig) -> list[str]:
+    """Return lines on noise whose level is estimated from data, and on noise that takes time to draw."""
+    lines: dict[str, None] = {}  # splits that share a line have it once
+    for spec in run.channels:
+        for place, split in enumerate(run.map.splits or (None,)):
+            match spec.noise_of(split):
+                case declared.NoiseDifference():
+                    lines[f"{spec.name} {difference_level(run, spec.name, split)}"] = None
+                case declared.NoiseCorrelated() as noise:
+                    name, number = spec.name if split is None else f"{spec.name}:{split}", _samples(run, spec, place)
+                    lines[f"{name} 1/f, {number:.3g} samples for each realization, {noise.map_making}"] = None
+    return list(lines)
+
+
+def seconds(run: config.RunConfig) -> float:
+    """Return the time of a core, for a realization, that correlated noise takes."""
+    return timestream.SECONDS_PER_SAMPLE * sum(
+        _samples(run, spec, place)
+        for spec in run.channels
+        for place, split in enumerate(run.map.splits or (None,))
+        if isinstance(spec.noise_of(split), declared.NoiseCorrelated)
+    )
+
+
+def _samples(run: config.RunConfig, spec: config.Channel, place: int) -> float:
+    """Return the number of samples from which the noise of a split is made."""
+    assert isinstance(spec.scan, config.ScanHitAveraged)  # the configuration refuses other scans
+    model = scan_model(spec, spec.scan, run.map.splits[place] if run.map.splits else None)
+    first, last = run.map.span(place)
+    return (last - first) * sum(model.samples(line) for line in model.select())
+
+
+def _difference(
+    run: config.RunConfig, spec: config.Channel, noise: declared.NoiseDifference, moments: Moments
+) -> tuple[Level, NDArray[np.float64]]:
+    """Return the level of the noise, and the hits of the splits, shape (split, npix)."""
+    paths = [config.channel_path(path, spec.name) for path in noise.maps]
+    maps = np.stack([_temperature(path, moments, spec.frequency_ghz) for path in paths])
+    if noise.isotropic:
+        hits = np.isfinite(maps).astype(np.float64)
+    else:
+        given = [config.channel_path(path, spec.name) for path in noise.hits] or paths
+        hits = np.stack([_positive(path, moments, healpix.HITS)[0] for path in given])
+    used = np.all(np.isfinite(maps) & (hits > 0.0), axis=0)
+    if noise.mask is not None:
+        mask = read_mask(config.channel_path(noise.mask, spec.name), moments.nside, moments.frame, run.map.mask_frame)
+        used &= mask > 0.0
+    if used.sum() < len(maps) + 1:
+        raise InputError(
+            f"the splits {', '.join(map(str, paths))} have {used.sum()} pixels in common outside the mask, too few for "
+            "the level of their noise; widen the mask."
+        )
+    m, h = maps[:, used], hits[:, used]
+    share = h / h.sum(axis=0)
+    apart = m - np.sum(share * m, axis=0)
+    normal = np.diag(h.sum(axis=1)) - h @ share.T
+    offset = np.linalg.lstsq(normal, np.sum(h * apart, axis=1))[0]
+    apart -= offset[:, None] - offset @ share
+    freedom = (len(maps) - 1) * (used.sum() - 1)
+    sigma = float(np.sqrt(np.sum(h * apart**2) / freedom))
+    if sigma == 0.0:
+        raise InputError(f"the splits {', '.join(map(str, paths))} do not differ; give maps of independent noise.")
+    return Level(sigma, sigma / float(np.sqrt(2.0 * freedom)), int(used.sum()), len(maps), noise.isotropic), hits
+
+
+def _correlated(
+    run: config.RunConfig, spec: config.Channel, noise: declared.NoiseCorrelated, split: str | None, moments: Moments
+) -> timestream.CorrelatedNoise:
+    assert isinstance(spec.scan, config.ScanHitAveraged)  # the configuration refuses other scans
+    place, name = 0, spec.name
+    rings = None
+    if split is not None:
+        place = run.map.splits.index(split)
+        if run.map.split_by == "rings":
+            rings = (len(run.map.splits), place)  # rings of one time stream
+        else:
+            name = f"{spec.name}:{split}"
+    grid = MapGrid(moments.nside, moments.frame, run.map.span(place))
+    return timestream.correlated_noise(noise, scan_model(spec, spec.scan, split), grid, f"noise/{name}", rings)
+
+
+def _per_hit(sigma0_uk: float, hits: Map) -> Map:
+    return np.divide(sigma0_uk, np.sqrt(hits), out=np.zeros(hits.size), where=hits > 0)
+
+
+def _noise_map(path: Path, moments: Moments, frequency_ghz: float | None) -> Map:
+    """Return a noise map where the scan observes, 0 elsewhere."""
+    found = _temperature(path, moments, frequency_ghz)
+    missing = int(np.sum(~np.isfinite(found) & (moments.hits > 0)))
+    if missing:
+        raise InputError(
+            f"{path} has no noise in {missing} pixels that the scan observes; give them a value, or set "
+            "them to 0 if a mask leaves them out."
+        )
+    return np.where(moments.hits > 0, found, 0.0)
+
+
+def _temperature(path: Path, moments: Moments, frequency_ghz: float | None) -> Map:
+    """Return a map in uK, NaN where nothing was observed."""
+    values, unit = _fitting(path, moments, ())
+    seen = np.isfinite(values) & (values > UNSEEN_BELOW)
+    return np.where(seen, header.to_uk(unit, path, frequency_ghz) * values, np.nan)
+
+
+def _positive(path: Path, moments: Moments, names: Sequence[str]) -> tuple[Map, str | None]:
+    """Return a map of hits or variances, 0 where nothing was observed, and its unit."""
+    values, unit = _fitting(path, moments, tuple(names))
+    values = np.where(np.isfinite(values) & (values > UNSEEN_BELOW), values, 0.0)
+    if values.min() < 0.0 or not np.any((values > 0.0) & (moments.hits > 0)):
+        raise InputError(
+            f"{path} has values between {values.min():g} and {values.max():g} for {names[0]} where the scan observes; "
+            "they must be positive, and 0 or UNSEEN where nothing was observed."
+        )
+    return values, unit
+
+
+def _fitting(path: Path, moments: Moments, names: tuple[str, ...]) -> tuple[Map, str | None]:
+    """Return a map that has the pixels and the frame of the maps that are made, and its unit."""
+    values, frame, unit = healpix.read_map(path, names)
+    nside = healpy.npix2nside(values.size)
+    if nside != moments.nside:
+        raise InputError(
+            f"{path} has nside {nside}, but maps are made with map.nside = {moments.nside}; set map.nside to {nside} "
+            "(a preparation can degrade the maps)."
+        )
+    if frame not in (None, moments.frame):
+        raise InputError(
+            f'{path} is in {frame} coordinates, but maps are made in {moments.frame} ones; set map.frame = "{frame}".'
+        )
+    return values, unit

@@ -1,0 +1,38 @@
+"""Galactic light that is brighter in one channel than its band says."""
+
+from dataclasses import dataclass
+
+from mcsim.systematics.base import Alm, Draw, Effect, Site, Wording
+from mcsim.systematics.galaxy import morphology
+from mcsim.systematics.parametrization import Parametrization
+
+
+@dataclass(frozen=True, kw_only=True)
+class BandpassMismatch(Effect):
+    """A signal fixed to the sky, strongest in the Galactic plane, in one channel alone.
+
+    Attributes
+    ----------
+    amplitude
+        Root mean square over the full sky, uK; negative where the channel sees less than its band says.
+    template
+        Path of a HEALPix map to be used up to l = 2 nside, brought to rms 1; its frame is what its header says, or
+        galactic. Left out, every realization draws its own, by the model of ``foreground_residual``.
+    """
+
+    name = "bandpass_mismatch"
+    scope = "channel"
+    unit = "uK rms"
+    wording = Wording("{} rms", " µK")
+    cause = "A band whose edges are not those of the colour correction, or that changes with temperature."
+    signature = "Additive along the Galactic plane in one channel alone, also among channels of one frequency."
+    source = "Planck 2015 results II, A&A 594, A2, and IX, A&A 594, A9 (colour corrections, mismatch); Page et al. 2007"
+    step = 3.0
+    parametrization = Parametrization(stochastic=True, matched_filter=False)
+    proposed = False
+
+    template: str = ""
+
+    def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
+        """Add the excess."""
+        return sky + self.amplitude * morphology(self.template, site, draw)

@@ -1,0 +1,36 @@
+"""Where the spacecraft looks and moves: angles and directions that signals of its own depend on."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.instrument.scan import ScanModel
+from mcsim.sphere.rotation import rotation_matrix
+from mcsim.systematics.base import Pointing
+from mcsim.systematics.parametrization import Vector
+
+
+def spin_phase(pointing: Pointing, time_s: Vector) -> Vector:
+    """Return the angle of the line of sight about the spin axis, from the half plane of the Sun, radians.
+
+    Notes
+    -----
+    The spin axis precesses about the anti-Sun direction, and the spin is counted in the frame that precesses with it:
+    the Sun stays at azimuth 0 about the axis.
+    """
+    model = pointing.model
+    start_deg = model.spin_phase_deg + pointing.line.azimuth_deg
+    return np.asarray(2.0 * np.pi * (time_s / model.spin_period_s % 1.0) + np.deg2rad(start_deg))
+
+
+def heading(model: ScanModel, time_s: Vector, frame: str, phase: float = 0.0) -> NDArray[np.float64]:
+    """Return the direction in which the Earth moves, turned by ``phase`` radians towards the Sun, shape (3, n)."""
+    orbit = 2.0 * np.pi * time_s / model.orbit_period_s + np.deg2rad(model.orbit_phase_deg) + phase
+    ecliptic = np.stack([-np.sin(orbit), np.cos(orbit), np.zeros_like(orbit)])
+    return np.asarray(rotation_matrix("ecliptic", frame) @ ecliptic)
+
+
+def axes(theta: Vector, phi: Vector) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return unit vectors outward, south (e_theta) and east (e_phi) at directions, shape (3, n) each."""
+    sin_t, cos_t, sin_p, cos_p = np.sin(theta), np.cos(theta), np.sin(phi), np.cos(phi)
+    outward = np.stack([sin_t * cos_p, sin_t * sin_p, cos_t])
+    return outward, np.stack([cos_t * cos_p, cos_t * sin_p, -sin_t]), np.stack([-sin_p, cos_p, np.zeros_like(phi)])

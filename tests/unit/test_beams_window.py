@@ -1,0 +1,132 @@
+"""Beams from tables of B_l, in the layouts of WMAP and Planck."""
+
+import healpy
+import numpy as np
+import pytest
+from astropy.io import fits
+
+import mcsim
+from mcsim import config
+from mcsim.plot.look import look_at_beams
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import survey
+from refusals import refused
+
+LMAX = 60
+WINDOW = healpy.gauss_beam(np.deg2rad(3.0), LMAX)
+
+
+def hdu(columns, name="", rows=True, **keywords):
+    """Return a table of one value a row, or of one row of values."""
+    made = [
+        fits.Column(key, "D", array=values) if rows else fits.Column(key, f"{len(values)}D", array=values[None])
+        for key, values in columns.items()
+    ]
+    found = fits.BinTableHDU.from_columns(made, name=name or None)
+    found.header.update(keywords)
+    return found
+
+
+def written(path, *hdus):
+    fits.HDUList([fits.PrimaryHDU(), *hdus]).writeto(path)
+    return path
+
+
+def wmap_text(folder):
+    path, error = folder / "ampl_bl_W1.txt", np.full(LMAX + 1, 0.01)
+    header = "WMAP beam transfer function\n l  B_l  fractional error"
+    np.savetxt(path, np.stack([np.arange(LMAX + 1), WINDOW, error], axis=1), fmt=["%d", "%.17g", "%g"], header=header)
+    return path
+
+
+def hfi_windows(folder):
+    return written(folder / "Bl_T_fullsky_143x143.fits", hdu({"TEMPERATURE": WINDOW}, "WINDOW FUNCTIONS"))
+
+
+def cmb_map(folder):
+    map_ = hdu({"I_STOKES": np.ones(12), "TEMPERATURE": np.ones(12)}, "COMP-MAP", PIXTYPE="HEALPIX")
+    return written(folder / "cmb.fits", map_, hdu({"INT_BEAM": WINDOW, "POL_BEAM": 0 * WINDOW}))
+
+
+def plain_text(folder):
+    np.savetxt(folder / "window.txt", WINDOW)
+    return folder / "window.txt"
+
+
+@pytest.fixture
+def lfi(tmp_path):
+    """Instrument model with a window for each band."""
+    bands = [hdu({"BL": WINDOW**power, "BL_ERR": 0 * WINDOW}, f"BEAMWF_{b}", rows=False) for power, b in
+             ((2, "030X030"), (1, "070X070"))]  # fmt: skip
+    return written(tmp_path / "RIMO.fits", hdu({"DETECTOR": np.ones(4)}, "CHANNEL_PARAMETERS"), *bands)
+
+
+@pytest.mark.parametrize("write", [wmap_text, hfi_windows, cmb_map, plain_text])
+def test_published_tables_are_read_as_they_are(write, tmp_path):
+    beam = mcsim.Beam.from_window(write(tmp_path))
+    assert beam.window == pytest.approx(WINDOW, rel=1e-12)
+    assert beam.mmax == 0
+
+
+def test_the_extension_chooses_a_band(lfi):
+    assert mcsim.Beam.from_window(lfi, 20, extension="BEAMWF_070X070").window == pytest.approx(WINDOW[:21])
+    assert mcsim.Beam.from_window(lfi, extension="beamwf_030x030", column="bl").window == pytest.approx(WINDOW**2)
+
+
+def run_with(beam):
+    channel = {"name": "W", "beam": beam, "scan": {"kind": "parallel_transport"}}
+    sky = {"spectrum": "wmap7", "lmax": 40}
+    return config.load({"name": "windows", "sky": sky, "map": {"nside": 16}, "channel": [channel]})
+
+
+def test_a_window_is_the_beam_of_a_channel(tmp_path):
+    """The same maps as through the Gaussian whose window it is."""
+    given = [{"kind": "window", "path": str(wmap_text(tmp_path))}, {"kind": "window", "path": WINDOW}]
+    gaussian = simulate.maps(survey(run_with({"kind": "gaussian", "fwhm_arcmin": 180.0})), 0)
+    for beam in given:
+        assert simulate.maps(survey(run_with(beam)), 0) == pytest.approx(gaussian, abs=1e-9 * np.std(gaussian))
+
+
+def test_its_contents_are_in_the_hash(tmp_path):
+    path = tmp_path / "window.npy"
+    np.save(path, WINDOW)
+    before = config.digest(run_with({"kind": "window", "path": str(path)}))
+    np.save(path, WINDOW**2)
+    assert config.digest(run_with({"kind": "window", "path": str(path)})) != before
+
+
+def test_a_text_of_a_window_is_shown(tmp_path):
+    [look] = look_at_beams(wmap_text(tmp_path))
+    assert "ampl_bl_W1.txt" in look.text
+
+
+@pytest.mark.parametrize(
+    ("values", "named"),
+    [
+        (WINDOW[:30], (29, 40)),
+        (WINDOW**0.5 * 1.5, (1.5,)),
+        (np.append(WINDOW, np.nan), ()),
+        (np.append(WINDOW, 2.0), (2.0,)),
+    ],
+)
+def test_numbers_that_are_no_window_are_refused(values, named):
+    with refused(*named):
+        survey(run_with({"kind": "window", "path": values}))
+
+
+def test_tables_that_leave_a_choice_are_refused(lfi, tmp_path):
+    with refused(lfi, 2, "BEAMWF_030X030", "BEAMWF_070X070", "extension", "column"):
+        mcsim.Beam.from_window(lfi)
+    with refused(lfi, "'X'", "BEAMWF_030X030"):
+        mcsim.Beam.from_window(lfi, extension="X")
+    squared = written(tmp_path / "Wl.fits", hdu({"TT_2_TT": WINDOW**2}, "TT"))
+    with refused(squared, "TT_2_TT"):
+        mcsim.Beam.from_window(squared)
+    from_two = tmp_path / "two.txt"
+    np.savetxt(from_two, np.stack([np.arange(2, 10), np.ones(8)], axis=1))
+    with refused(from_two, "ell"):
+        mcsim.Beam.from_window(from_two)
+    with refused(from_two, "extension"):
+        mcsim.Beam.from_window(from_two, extension="X")
+    with refused(tmp_path / "none.fits", by=mcsim.InputError):
+        mcsim.Beam.from_window(tmp_path / "none.fits")

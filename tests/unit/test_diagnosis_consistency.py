@@ -1,0 +1,173 @@
+"""A name must agree with all parts of the data, and its parameters be possible."""
+
+from dataclasses import fields
+from types import SimpleNamespace
+
+import healpy
+import numpy as np
+import pytest
+from scipy.special import sph_harm_y
+
+from mcsim import systematics
+from mcsim.diagnosis import slices
+from mcsim.diagnosis.candidate import BEYOND, Candidate
+from mcsim.diagnosis.consistency import Action, Slices, contradiction
+from mcsim.diagnosis.null_ensemble import NullEnsemble
+from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.diagnosis.summaries import Element
+from mcsim.sphere import healpix
+from mcsim.sphere.rotation import rotation_matrix
+
+NSIDE = 16
+GAIN = Candidate(systematics.get("gain_drift"), "W1", (0, 1))
+
+
+def real_harmonic(degree, order, component, theta, phi):
+    """sqrt(2) Re Y, or -sqrt(2) Im Y, as scipy has it."""
+    y = sph_harm_y(degree, order, theta, phi)
+    return y.real if order == 0 else np.sqrt(2.0) * (-y.imag if component == "imaginary" else y.real)
+
+
+def pixels(nside=NSIDE):
+    return healpy.pix2ang(nside, np.arange(12 * nside**2))
+
+
+@pytest.fixture(scope="module")
+def model():
+    parts = [SimpleNamespace(channel=0, name=f"W1:{split}", split=split) for split in ("a", "b")]
+    return SimpleNamespace(
+        parts=parts, lmax=24, nside=NSIDE, channels=("W1",), frame="ecliptic", of=lambda channel: (0, 1)
+    )
+
+
+def test_numbers_are_sums_of_pixels_times_real_harmonics(model):
+    draw = np.random.default_rng(1)
+    residual, expected = draw.normal(size=(2, 2, 12 * NSIDE**2))
+    adjoint = [healpix.analysis(one, model.lmax) for one in residual]
+    # The adjoint of a synthesis, not an analysis: pixels count alike.
+    adjoint = [healpy.map2alm(one, model.lmax, iter=0) * 12 * NSIDE**2 / (4.0 * np.pi) for one in residual]
+    found = slices.values_of(model, SimpleNamespace(residual=residual, expected=expected, adjoint=adjoint))
+    elements = slices.elements_of(model)
+    assert len(found) == len(elements) == 2 * (25 + 9)
+    for value, one in zip(found, elements, strict=True):
+        part = ["a", "b"].index(one.split)
+        seen = residual[part] * (expected[part] if one.kind == "gain" else 1.0)
+        assert value == pytest.approx(real_harmonic(one.L, one.M, one.component, *pixels()) @ seen, abs=1e-6)
+
+
+@pytest.mark.parametrize("frame", ["ecliptic", "galactic"])
+def test_a_hemisphere_is_kept_as_by_a_mask(model, frame):
+    elements = [one for one in slices.elements_of(model) if one.split == "a" and one.kind == "residual"]
+    fine = 64
+    theta, phi = pixels(fine)
+    harmonics = np.stack([real_harmonic(one.L, one.M, one.component, theta, phi) for one in elements])
+    draw = np.random.default_rng(2).normal(size=len(elements))
+    height = rotation_matrix("ecliptic", frame)[2] @ np.stack(healpy.pix2vec(fine, np.arange(12 * fine**2)))
+    weight = np.where(np.abs(height) < 1e-9, 0.5, height > 0.0)
+    masked = harmonics @ (weight * (draw @ harmonics)) * 4.0 * np.pi / len(theta)
+    # Pixels along the edge are on one side or the other: sqrt(6 nside) of them at nside 32.
+    assert np.allclose(slices.northern(elements, frame) @ draw, masked, atol=0.02)
+
+
+class Bench:
+    """A gain drift that shows with opposite signs in the halves, beside noise of 400 simulations."""
+
+    def __init__(self):
+        draw = np.random.default_rng(3)
+        modes = [(0, 0, None), (1, 0, None), (1, 1, "real"), (1, 1, "imaginary")]
+        elements = [
+            Element(f"{kind}/{split}/{L}{M}{c}", "map", ("W1",), split, fold, (L, L), L, M, None, "ecliptic", kind, c)
+            for kind in ("beam", "residual")
+            for fold, split in enumerate(("half1", "half2"))
+            for L, M, c in modes
+        ]
+        drawn, empty = draw.normal(size=(400, 16)), np.zeros((0, 16))
+        self.ensemble = NullEnsemble(drawn, np.zeros(16), tuple(elements), empty, empty, empty, empty, empty)
+        shape = draw.normal(size=(4, 2))
+        self.t = np.concatenate([shape, -shape, 2.0 * shape, -2.0 * shape])
+        self.signs = np.repeat([1.0, -1.0, 1.0, -1.0], 4)
+
+    def findings(self, signal, theta, seed=None):
+        z = signal + (0.0 if seed is None else np.random.default_rng([4, seed]).normal(size=16))
+        tested = Slices(self.ensemble, z, 8, ("half1", "half2"), 24, DiagnosisSettings())
+        covariance = np.linalg.inv(self.t.T @ self.t)
+        return tested.findings([GAIN], [Action.of(self.t @ theta, self.t, theta, covariance)])
+
+
+@pytest.fixture(scope="module")
+def bench():
+    return Bench()
+
+
+THETA = np.array([2.0, 1.0])
+
+
+def test_a_true_effect_is_refused_as_seldom_as_the_levels_say(bench):
+    found = [bench.findings(bench.t @ THETA, THETA, seed) for seed in range(300)]
+    refused = sum(one.contradict(DiagnosisSettings()) for one in found)
+    # 1 % of 300, and at most as many by the odds: more than 13 once in a thousand runs.
+    assert refused <= 13
+    assert all(one.measured for one in found)
+    halves = [own.pvalue for one in found for own in one.comparisons[0] if own.kind == "halves"]
+    assert len(halves) == 300
+    # The tolerated error of the response makes small p-values rarer.
+    assert np.mean(np.array(halves) <= 0.05) <= 0.05 + 4 * np.sqrt(0.05 * 0.95 / 300)
+
+
+def test_a_signal_that_is_the_same_in_both_halves_is_no_gain_drift(bench):
+    found = bench.findings(bench.signs * (bench.t @ THETA), THETA)
+    assert found.contradict(DiagnosisSettings())
+    effect = GAIN.fitted(1e-3 * THETA, np.eye(2) * 1e-9)
+    halves = next(one for one in found.comparisons[0] if one.kind == "halves")
+    assert halves.slices == ("half1", "half2")
+    assert np.allclose(halves.amplitudes, [1.0, -1.0], atol=0.1)
+    words = contradiction(found, [GAIN], [effect], DiagnosisSettings().consistency_level)
+    assert "0.22" in words
+    assert "−0.2" in words
+
+
+def test_an_effect_that_only_one_part_shows_is_absent_by_the_odds(bench):
+    signal = np.where(np.arange(16) % 8 < 4, bench.t @ THETA, 0.0)
+    findings = bench.findings(signal, THETA)
+    assert findings.odds >= DiagnosisSettings().absence_odds
+
+
+def test_what_an_effect_leaves_in_the_maps_is_tested(bench):
+    extra = np.where(np.arange(16) == 9, 8.0, 0.0)
+    (left,) = bench.findings(bench.t @ THETA + extra, THETA).maps
+    assert left.maps == ("W1 half1", "W1 half2")
+    assert left.pvalue < 1e-4
+    (right,) = bench.findings(bench.t @ THETA, THETA).maps
+    assert right.pvalue > 0.5
+    assert right.before - right.after == pytest.approx(right.forecast, rel=0.1)
+
+
+@pytest.mark.parametrize("name", sorted(systematics.catalogue()))
+def test_every_parameter_has_a_bound_with_its_source(name):
+    kind = systematics.get(name)
+    bounded = {one.parameter for one in kind.bounds}
+    # Texts are settings, tuples are directions, and any angle is possible.
+    free = {f.name for f in fields(kind) if isinstance(f.default, str | tuple) or f.name.endswith("_deg")}
+    assert bounded | free == {f.name for f in fields(kind)}
+    assert all(one.source and one.low < one.high for one in kind.bounds)
+    assert kind(amplitude=kind.step).within_bounds().amplitude == kind.step
+
+
+@pytest.mark.parametrize(("quadrupole", "error", "possible"), [(27.0, 0.5, False), (1.4, 0.5, True), (0.3, 0.1, True)])
+def test_a_ring_has_one_sign(quadrupole, error, possible):
+    """As fitted to a calibration error: a ring of -1.6e-4 of the peak with a quadrupole of 27 times itself."""
+    ring = Candidate(systematics.get("beam_sidelobe"), "W1", (0, 1), {"calibrated": "none"})
+    a = -1.6e-4
+    coordinates = np.array([a * (1.0 - quadrupole), a * quadrupole])
+    # The sum of both is known to a percent, the share of the second to an error.
+    along, across = np.array([1.0, 1.0]), np.array([1.0, -1.0])
+    covariance = (0.01 * a) ** 2 / 4 * np.outer(along, along) + (error * a) ** 2 * np.outer(across, across)
+    distance = ring.beyond(coordinates, covariance)
+    assert np.isfinite(distance) == possible
+    fitted = ring.fitted(coordinates, covariance)
+    assert abs(fitted.quadrupole) <= 1.0
+    if abs(quadrupole) > 1.0 and possible:
+        assert 0.0 < distance < BEYOND
+        assert fitted.quadrupole == 1.0
+    elif possible:
+        assert distance == 0.0

@@ -1,0 +1,321 @@
+"""Fisher information of maps: against the likelihood itself, closed forms, and random probes against whole matrices."""
+
+import json
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import healpy
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.linalg import cho_factor, cho_solve
+from typer.testing import CliRunner
+
+import mcsim
+from mcsim import config
+from mcsim.bipolar import estimate, estimator
+from mcsim.bipolar.theory import fisher_information
+from mcsim.cli import app
+from mcsim.diagnosis.campaign import with_effects
+from mcsim.information.api import describe, widths
+from mcsim.information.result import Limits, canonical_correlations, marginalised
+from mcsim.simulation import simulate
+from mcsim.simulation.inverse_covariance import unit_skies
+from mcsim.simulation.survey import survey
+from mcsim.sphere import healpix
+from mcsim.sphere.spectra import load
+from refusals import refused
+
+NSIDE, LMAX = 4, 10
+
+
+def channel(name: str, line: str, fwhm: tuple[float, float], sigma0_uk: float) -> dict[str, Any]:
+    beam = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": fwhm[0], "fwhm_minor_arcmin": fwhm[1], "m_max": 2}
+    scan = {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 1501.0, "line_of_sight": line}
+    return {"name": name, "frequency_ghz": 94.0, "beam": beam, "noise": {"sigma0_uk": sigma0_uk}, "scan": scan}
+
+
+def model(**changes: Any) -> config.RunConfig:
+    """Two channels of two halves, elliptical beams, uneven hits, a mask, a dipole."""
+    mask = (np.abs(healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2))[2]) > 0.2).astype(float)
+    table = {
+        "schema": 1,
+        "name": "limits",
+        "sky": {"spectrum": "wmap7", "lmax": LMAX, "dipole_uk": 3364.5},
+        "map": {"nside": NSIDE, "splits": ["half1", "half2"], "mask": mask},
+        "channel": [channel("V1", "A", (1150.0, 900.0), 200.0), channel("W1", "B", (1000.0, 900.0), 300.0)],
+    }
+    return config.load(table | changes)
+
+
+def one_map(nside: int = 16, sigma0_uk: float = 300.0) -> config.RunConfig:
+    only = {
+        "name": "W1",
+        "frequency_ghz": 94.0,
+        "beam": {"kind": "gaussian", "fwhm_arcmin": 1200.0},
+        "noise": {"sigma0_uk": sigma0_uk},
+        "scan": {"kind": "parallel_transport", "psi0_deg": 20.0},
+    }
+    return config.load(
+        {
+            "schema": 1,
+            "name": "one",
+            "sky": {"spectrum": "wmap7", "lmax": 6},
+            "map": {"nside": nside},
+            "channel": [only],
+            "biposh": {"L_max": 2},
+        }
+    )
+
+
+COMPARED = (
+    "beam_ellipticity",
+    "dipole_modulation",
+    "dipole_residual",
+    "gain_drift",
+    "noise_level",
+    "pixelization",
+    "boost",
+)
+
+
+@cache
+def limits(dense: bool) -> Limits:
+    return mcsim.limit(model(), settings=mcsim.LimitSettings(only=COMPARED, dense=dense, orders=2))
+
+
+def expected_log_likelihood(run: config.RunConfig, of: np.ndarray, at: tuple[np.ndarray, np.ndarray]) -> float:
+    """Mean of ln L of ``run`` over data with this covariance and mean, over the pixels ``of``, but for a constant."""
+    mean, covariance = moments_of(run)
+    factor = cho_factor(covariance[np.ix_(of, of)], lower=True)
+    shift = (at[0] - mean)[of]
+    spread = at[1][np.ix_(of, of)] + np.outer(shift, shift)
+    return -np.sum(np.log(np.diag(factor[0]))) - 0.5 * np.trace(cho_solve(factor, spread))
+
+
+def moments_of(run: config.RunConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of the maps of a run, from a map of each unit sky."""
+    made = survey(run)
+    noise = np.concatenate([m.noise_uk for c in made.channels for m in c.maps])
+    quiet = tuple(replace(c, maps=tuple(replace(m, noise_uk=None) for m in c.maps)) for c in made.channels)
+    made = replace(made, channels=quiet)
+    cl = load("wmap7", run.sky.lmax)
+    skies = list(unit_skies(run.sky.lmax))
+    mean = simulate.maps(made, 0, sky=0.0 * skies[0][1]).ravel()
+    response = np.stack([np.sqrt(cl[ell]) * (simulate.maps(made, 0, sky=sky).ravel() - mean) for ell, sky in skies])
+    return mean, response.T @ response + np.diag(noise**2)
+
+
+def effect(name: str, channel: str | None, amplitude: float, **parameters: Any) -> config.Effect:
+    return config.Effect(name=name, channel=channel, parameters={"amplitude": amplitude, **parameters})
+
+
+@pytest.mark.slow
+def test_dense_matrix_is_the_curvature_of_the_likelihood() -> None:
+    """F_ij = - d^2 <ln L> / d theta_i d theta_j, by finite differences of whole covariances and means."""
+    found = limits(dense=True)
+    run = model()
+    at = moments_of(run)
+    filtered_pixels = np.concatenate([m.weight > 0 for c in survey(run).channels for m in c.maps])
+    pixels = np.flatnonzero(filtered_pixels)
+    directions = {
+        "beam_ellipticity (V1)/0": lambda t: effect("beam_ellipticity", "V1", t),
+        "beam_ellipticity (V1)/1": lambda t: effect("beam_ellipticity", "V1", t, angle_deg=45.0),
+        "dipole_modulation (all)/2": lambda t: effect("dipole_modulation", None, t, lat_deg=90.0),
+        "dipole_residual (W1)/0": lambda t: effect("dipole_residual", "W1", t),
+        "gain_drift (V1)/1": lambda t: effect("gain_drift", "V1", t, phase_deg=90.0),
+        "noise_level (W1)/0": lambda t: effect("noise_level", "W1", t),
+        "pixelization (V1)/0": lambda t: effect("pixelization", "V1", t),
+    }
+    zero = expected_log_likelihood(run, pixels, at)
+
+    def curvature(*makers: Any) -> float:
+        rows = [found.components.index(name) for name in makers]
+        step = [0.03 / np.sqrt(found.fisher[row, row]) for row in rows]
+        ends = []
+        for sign in (1.0, -1.0):
+            changed = [directions[name](sign * h) for name, h in zip(makers, step, strict=True)]
+            ends.append(expected_log_likelihood(with_effects(run, changed), pixels, at))
+        return -(ends[0] + ends[1] - 2.0 * zero) / 0.03**2
+
+    for name in directions:
+        assert curvature(name) == pytest.approx(1.0, rel=4e-3), name
+    for a, b in (
+        ("beam_ellipticity (V1)/0", "dipole_modulation (all)/2"),
+        ("gain_drift (V1)/1", "dipole_residual (W1)/0"),
+        ("noise_level (W1)/0", "pixelization (V1)/0"),
+    ):
+        i, j = found.components.index(a), found.components.index(b)
+        rho = found.fisher[i, j] / np.sqrt(found.fisher[i, i] * found.fisher[j, j])
+        assert (curvature(a, b) - 2.0) / 2.0 == pytest.approx(rho, abs=4e-3), (a, b)
+
+
+@pytest.mark.slow
+def test_random_probes_agree_with_whole_matrices() -> None:
+    exact, drawn = limits(dense=True), limits(dense=False)
+    assert exact.components == drawn.components
+    for one, other in zip(exact.effects, drawn.effects, strict=True):
+        # What is known from the dipole needs no probes.
+        assert 0.0 <= other.error < 0.2
+        assert other.sigma == pytest.approx(one.sigma, rel=max(4.0 * other.error, 1e-4)), one.label
+    assert sum(other.error > 0.005 for other in drawn.effects) >= 5
+    assert np.linalg.eigvalsh(drawn.fisher / np.outer(size := np.sqrt(np.diag(drawn.fisher)), size))[0] > 0.0
+    size = np.sqrt(np.diag(exact.fisher))
+    departure = (drawn.fisher - exact.fisher) / np.outer(size, size)
+    # The error of sigma is half of that of the information, and of an effect's components together.
+    error = np.concatenate([[2.0 * one.error * np.sqrt(one.components)] * one.components for one in drawn.effects])
+    assert np.all(np.abs(departure) < 4.0 * np.sqrt(np.add.outer(error**2, error**2)) + 0.05)
+    assert np.sqrt(np.mean(departure**2)) < 0.05
+
+
+def test_one_map_has_the_information_of_its_bipolar_coefficients() -> None:
+    """F = sum (2 - delta_M0) |dA|^2 / ((1 + delta_l1l2) C_l1 C_l2) over l1 <= l2, L, M; these effects end at L = 2."""
+    run = one_map()
+    names = ("quadrupole_modulation", "dipole_modulation", "beam_width", "boost")
+    found = mcsim.limit(run, settings=mcsim.LimitSettings(only=names, dense=True))
+    lmax, shared = run.sky.lmax, survey(run)
+    window = shared.channels[0].response.factors[0].real
+    cl = load("wmap7", lmax)
+    noise = 4.0 * np.pi / (12 * 16**2) * 300.0**2
+    tables = estimator(2, lmax)
+    wanted = [mode for mode in tables.modes if mode.d >= 0]
+    at = [tables.modes.index(mode) for mode in wanted]
+    steps = {
+        "boost (all)/2": effect("boost", None, 1e-3, lat_deg=90.0),
+        "beam_width (W1)/0": effect("beam_width", "W1", 0.005),
+        "dipole_modulation (all)/0": effect("dipole_modulation", None, 0.01),
+        "quadrupole_modulation (all)/1": effect(
+            "quadrupole_modulation", None, 0.01, components=(0.0, 1.0, 0.0, 0.0, 0.0)
+        ),
+    }
+    for name, step in steps.items():
+        ends = [
+            with_effects(run, [replace(step, parameters={**step.parameters, "amplitude": sign * a})])
+            for sign in (1, -1)
+            for a in (step.parameters["amplitude"],)
+        ]
+        mean = []
+        for end in ends:
+            made = survey(end)
+            quiet = tuple(replace(c, maps=tuple(replace(m, noise_uk=None) for m in c.maps)) for c in made.channels)
+            made = replace(made, channels=quiet)
+            found_here = 0.0
+            for ell, sky in unit_skies(lmax):
+                alm = healpix.analysis(simulate.maps(made, 0, sky=sky)[0], lmax, iterations=3)
+                found_here = found_here + cl[ell] * estimate(tables, alm, None)
+            mean.append(found_here)
+        change = (mean[0] - mean[1])[at] / (2.0 * step.parameters["amplitude"])
+        expected = fisher_information(np.nan_to_num(change)[None, None], wanted, (cl * window**2 + noise)[None, None])
+        row = found.components.index(name)
+        assert found.fisher[row, row] == pytest.approx(expected, rel=5e-3), name
+
+
+def test_additive_effect_has_its_signal_to_noise() -> None:
+    """F = s' C^-1 s; the sky has no dipole of its own, so that C is the noise there."""
+    run = one_map()
+    found = mcsim.limit(run, settings=mcsim.LimitSettings(only=("dipole_residual",), dense=True))
+    shared = survey(run)
+    signal = shared.channels[0].response.factors[0, 1].real * healpy.pix2vec(16, np.arange(12 * 16**2))[2]
+    assert found.fisher[2, 2] == pytest.approx(np.sum(signal**2) / 300.0**2, rel=1e-3)
+    np.testing.assert_allclose(found.fisher, found.fisher[2, 2] * np.eye(3), atol=1e-3 * found.fisher[2, 2])
+    assert found.effects[0].sigma == pytest.approx(1.0 / np.sqrt(found.fisher[2, 2]), rel=1e-3)
+
+
+def test_unknown_dipole_hides_one_that_all_maps_share() -> None:
+    """The variance of a residual dipole is that of the noise and that of the sky's: d.n of rms d has it d^2."""
+    run = one_map()
+    settings = mcsim.LimitSettings(only=("dipole_residual",), probes=4)
+    known = mcsim.limit(run, settings=settings)
+    found = mcsim.limit(run, settings=replace(settings, unknown_dipole_uk=5.0))
+    assert found.effects[0].sigma ** 2 == pytest.approx(known.effects[0].sigma ** 2 + 25.0, rel=1e-3)
+    modulated = replace(settings, only=("dipole_modulation",), dense=True)
+    known, found = (mcsim.limit(run, settings=replace(modulated, unknown_dipole_uk=rms)) for rms in (0.0, 1e3))
+    assert found.effects[0].sigma > 1.1 * known.effects[0].sigma
+
+
+def test_power_of_random_sources_is_that_of_their_spectrum() -> None:
+    """F = sum (2l + 1)/2 (B_l^2 / C_l)^2 over l >= 2 for a flat spectrum, by draws that are 64 for each mode."""
+    run = one_map()
+    found = mcsim.limit(run, settings=mcsim.LimitSettings(only=("point_sources",), dense=True))
+    window = survey(run).channels[0].response.factors[0].real ** 2
+    ell, cl = np.arange(7), load("wmap7", 6)
+    noise = 4.0 * np.pi / (12 * 16**2) * 300.0**2
+    each = (2 * ell + 1) / 2 * (window / (cl * window + noise)) ** 2
+    scatter = np.sqrt(np.sum((each[2:] * 2.0) ** 2 * 2.0 / (64 * (2 * ell[2:] + 1)))) / each[2:].sum()
+    assert found.fisher[0, 0] == pytest.approx(each[2:].sum(), rel=4.0 * scatter)
+
+
+@pytest.mark.slow
+def test_orders_of_the_fiducial_beams_change_little() -> None:
+    """The inverse covariance of circular beams in place of the elliptical ones: sigma within 2 %."""
+    exact = limits(dense=True)
+    settings = mcsim.LimitSettings(only=COMPARED, dense=True)
+    circular = mcsim.limit(model(), settings=settings)
+    for one, other in zip(exact.effects, circular.effects, strict=True):
+        assert other.sigma == pytest.approx(one.sigma, rel=0.02), one.label
+
+
+def test_marginalising_is_inverting_a_covariance() -> None:
+    rng = np.random.default_rng(4)
+    root = rng.normal(size=(5, 9))
+    fisher, widths = root @ root.T, np.array([0.3, 0.1])
+    whole = fisher.copy()
+    whole[[1, 3], [1, 3]] += 1.0 / widths**2
+    covariance = np.linalg.inv(whole)[np.ix_([0, 2, 4], [0, 2, 4])]
+    np.testing.assert_allclose(marginalised(fisher, [1, 3], widths), np.linalg.inv(covariance), rtol=1e-10)
+    np.testing.assert_allclose(
+        marginalised(fisher, [1], [1e-12]), fisher[np.ix_([0, 2, 3, 4], [0, 2, 3, 4])], rtol=1e-9
+    )
+    one = fisher[0, 2] / np.sqrt(fisher[0, 0] * fisher[2, 2])
+    assert canonical_correlations(fisher, [[0], [2]])[0, 1] == pytest.approx(abs(one))
+
+
+def test_nuisance_widens_what_it_resembles_and_conventions_are_textbook() -> None:
+    plain = limits(dense=True)
+    settings = replace(plain.settings, nuisances={"pixelization:V1": 0.05})
+    other = mcsim.limit(model(), settings=settings)
+    assert [one.label for one in other.effects] == [
+        one.label for one in plain.effects if one.label != "pixelization (V1)"
+    ]
+    by_label = {one.label: one for one in plain.effects}
+    assert all(one.sigma >= by_label[one.label].sigma * (1.0 - 1e-9) for one in other.effects)
+    assert other.tests == plain.tests - 1
+    noise = by_label["noise_level (V1)"]
+    assert noise.amplitude_90_known / noise.sigma == pytest.approx(3.24, abs=0.005)
+    assert noise.amplitude_90 / noise.sigma > 4.2
+
+
+def test_limits_are_written_and_say_what_they_are(tmp_path) -> None:
+    found = mcsim.limit(model(), tmp_path / "out", settings=mcsim.LimitSettings(only=("noise_level",), dense=True))
+    written = json.loads((tmp_path / "out" / "limit.json").read_text())
+    assert written["effects"][0]["sigma"] == found.effects[0].sigma
+    assert written["effects"][0]["similar"]["channel"] == "W1"
+    with xr.open_zarr(tmp_path / "out" / "limit.zarr", consolidated=False) as stored:
+        np.testing.assert_array_equal(stored.fisher, found.fisher)
+    assert (tmp_path / "out" / "limit.png").stat().st_size > 10_000
+    assert any(line.startswith("noise_level (V1)") for line in found.lines())
+    assert "noise_level" not in describe(model(), mcsim.LimitSettings())
+
+
+def test_command_says_what_it_would_cost_and_reads_nuisances() -> None:
+    said = CliRunner().invoke(app, ["limit", "demo-model", "--dry-run", "--dense", "--only", "noise_level"])
+    assert said.exit_code == 0
+    assert said.output.startswith("demo-model: 2 effects of 2 components, 4 maps")
+    assert widths(["beam_width=0.01", "gain_drift:W1=1e-4"]) == {"beam_width": 0.01, "gain_drift:W1": 1e-4}
+    with refused("beam_width"):
+        widths(["beam_width"])
+
+
+def test_bad_input_is_refused() -> None:
+    quiet = model(channel=[{**channel("V1", "A", (1150.0, 900.0), 0.0)}])
+    with refused("V1:half1", "noise.sigma0_uk"):
+        mcsim.limit(quiet)
+    with refused("no_such"):
+        mcsim.limit(model(), settings=mcsim.LimitSettings(only=("no_such",)))
+    with refused("beam_width:X"):
+        mcsim.limit(model(), settings=mcsim.LimitSettings(nuisances={"beam_width:X": 0.1}))
+    with refused("beam_width", 0):
+        mcsim.limit(model(), settings=mcsim.LimitSettings(nuisances={"beam_width": 0.0}))
+    with refused("probes", 2):
+        mcsim.limit(model(), settings=mcsim.LimitSettings(probes=2))

@@ -1,0 +1,221 @@
+"""Measure how often names are wrong for systematics of no library, and how often true names are refused.
+
+python names.py maps [CASES]     systematics that no library has, added to simulated maps
+python names.py draws [NUMBER]   effects of the library, added to data vectors of simulations
+"""
+
+import json
+import os
+import sys
+from dataclasses import replace
+
+import healpy
+import numpy as np
+
+from mcsim import config, systematics
+from mcsim.diagnosis.analysis import analysis_of, data_vectors
+from mcsim.diagnosis.api import prepared
+from mcsim.diagnosis.campaign import with_effects
+from mcsim.diagnosis.inference import diagnose_data
+from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import survey
+from mcsim.sphere.rotation import rotation_matrix
+
+NSIDE = 32
+MODEL = {
+    "schema": 1,
+    "name": "two-channels",
+    "sky": {"spectrum": "wmap7", "lmax": 64, "dipole_uk": 3364.5},
+    "map": {"nside": NSIDE, "splits": ["half1", "half2"]},
+    "biposh": {"L_max": 2},
+    "channel": [
+        {
+            "name": name,
+            "frequency_ghz": frequency,
+            "beam": {"kind": "gaussian", "fwhm_arcmin": 210.0},
+            "noise": {"sigma0_uk": 30.0},
+            "scan": {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 31.0, "line_of_sight": line},
+        }
+        for name, frequency, line in (("V1", 61.0, "A"), ("W1", 94.0, "B"))
+    ],
+}
+ONE = {**MODEL, "name": "one-channel", "channel": MODEL["channel"][1:]}
+STRENGTHS = (10.0, 20.0, 40.0)
+
+
+def ask(jobs):
+    """Run jobs in this process."""
+    return [data_vectors(job) for job in jobs]
+
+
+def learned(model):
+    """Return the run, and what every data set is tested with."""
+    run = config.load(model)
+    return run, prepared(run, analysis_of(run), ask)
+
+
+def patterns(draw):
+    """Return patterns on the sky of rms 1, shape (npix,), by name."""
+    n = np.stack(healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2)))
+    ecliptic, galactic = (rotation_matrix("ecliptic", to)[2] @ n for to in ("ecliptic", "galactic"))
+    alm = draw.normal(size=(healpy.Alm.getsize(6), 2)) @ [1.0, 1j]
+    low = [np.where(np.arange(7) <= top, 1.0, 0.0) for top in (2, 6)]
+    spot = n.T @ healpy.ang2vec(np.arccos(draw.uniform(-1, 1)), draw.uniform(0, 2 * np.pi))
+    found = {
+        "l <= 2": healpy.alm2map(healpy.almxfl(alm, low[0]), NSIDE),
+        "l <= 6": healpy.alm2map(healpy.almxfl(alm, low[1]), NSIDE),
+        "spot": np.exp((spot - 1.0) / 0.1),
+        "ecliptic band": np.exp(-0.5 * (ecliptic / 0.2) ** 2),
+        "galactic cap": (galactic > 0.6).astype(float),
+    }
+    return {name: one / np.sqrt(np.mean(one**2)) for name, one in found.items()}
+
+
+def systematic(kind, draw, context, seed):
+    """Return a function from strength to maps with a systematic that no library has, (map, npix), and its name."""
+    run, parts = context.run, context.analysis.model.parts
+    shared = survey(run)
+    maps = np.array(list(simulate.maps(shared, seed)))
+    channel = int(draw.integers(len(shared.channels)))
+    own = [2 * channel, 2 * channel + 1]
+    site = shared.channels[channel].site
+    n = np.stack(healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2)))
+    dipole = site.dipole_uk @ n
+    name, pattern = list(patterns(draw).items())[int(draw.integers(5))]
+    one = own[int(draw.integers(2))]
+    change = np.zeros_like(maps)
+    if kind == "additive, fixed to the sky":
+        change[own] = pattern
+    elif kind == "additive, one split":
+        change[one] = pattern
+    elif kind == "additive, fixed to the spacecraft":
+        # A pick-up that follows the orientation of the beam.
+        s, phase = int(draw.integers(1, 3)), draw.uniform(0, 2 * np.pi)
+        name = f"order {s}"
+        for row in own:
+            change[row] = np.real(np.exp(1j * phase) * parts[row].moments.w[s])
+    elif kind == "gain, fixed to the sky":
+        change[own] = pattern * (maps[own] + dipole) * 1e-3
+    elif kind == "gain, one split":
+        name = "constant"
+        change[one] = (maps[one] + dipole) * 1e-3
+    elif kind == "beam, one split":
+        name = str(draw.choice(["beam_ellipticity", "beam_coma", "pointing_offset", "beam_width"]))
+        step = systematics.get(name).step
+        table = config.Effect(name, shared.channels[channel].site.channel, {"amplitude": 2.0 * step})
+        changed = survey(with_effects(run, [table]))
+        change[one] = np.array(list(simulate.maps(changed, seed)))[one] - maps[one]
+    elif kind == "square of the signal":
+        name = "T^2"
+        change[own] = (maps[own] + dipole) ** 2 * 1e-6
+    return (lambda factor: list(maps + factor * change)), f"{kind}: {name}"
+
+
+KINDS = (
+    "additive, fixed to the sky",
+    "additive, one split",
+    "additive, fixed to the spacecraft",
+    "gain, fixed to the sky",
+    "gain, one split",
+    "beam, one split",
+    "square of the signal",
+)
+
+
+def maps(number):
+    """Diagnose cases, and print the verdicts and the number of single names, all of which are wrong."""
+    models = [learned(one) for one in (ONE, MODEL)]
+    verdicts = []
+    for case in range(number):
+        run, context = models[case // len(KINDS) % 2]
+        draw = np.random.default_rng([2026, case])
+        make, name = systematic(KINDS[case % len(KINDS)], draw, context, 900 + case)
+        wanted, null, factor = STRENGTHS[case % len(STRENGTHS)], context.null, 1.0
+        before = context.analysis.data_vector(make(0.0))
+        for _ in range(4):
+            snr = null.expected_snr(context.analysis.data_vector(make(factor)) - before)
+            factor *= wanted / snr
+        found = diagnose_data(ObservedMaps(context, make(factor), ask), f"case-{case}").to_json()
+        named = [(e["name"], e["channel"]) for e in found["effects"]]
+        verdicts.append(found["verdict"])
+        row = [case, run.name, name, wanted, f"{found['gap']['p_value']:.1e}", found["verdict"], named, found["notes"]]
+        print(json.dumps(row, ensure_ascii=False), flush=True)
+    print({verdict: verdicts.count(verdict) for verdict in sorted(set(verdicts))})
+
+
+def draws(number):
+    """Test the true effects of draws in parts of the data, and print the share that is refused."""
+    from mcsim.benchmark.case import Prior
+    from mcsim.benchmark.library import linear_model
+    from mcsim.benchmark.sampler import CaseSampler
+    from mcsim.diagnosis.candidate import columns_of, parts_of
+    from mcsim.diagnosis.consistency import Action, Slices
+    from mcsim.stats.intervals import share
+
+    refused, unmeasured, by_test, strengths = [], [], {}, []
+    for model in (ONE, MODEL):
+        run, context = learned(model)
+        linear = linear_model(context)
+        prior = Prior(none=0.0, one=0.7, two=0.3, left_out=0.0, invented=0.0, weakest=5.0, strongest=50.0)
+        sampler = CaseSampler(prior, linear)
+        kinds = sampler.kinds(7, number)
+        ensemble = context.ensemble.extended
+        kept = len(ensemble.simulations) - len(linear.data)
+        seen = replace(ensemble, simulations=ensemble.simulations[:kept])
+        data = ensemble.simulations[kept:] + ensemble.offset
+        whole = np.concatenate([linear.templates, context.bank.slice_matrix])
+        beside = len(context.bank.slice_matrix)
+        slices = Slices(seen, data[0], beside, run.map.splits, context.analysis.model.lmax, context.settings)
+        for case in range(number // 2):
+            drawn = sampler.draw(kinds, 7, case)
+            members = [one.candidate for one in drawn.members]
+            candidates = [linear.candidates[member] for member in members]
+            if any(
+                one.effect.parametrization.stochastic and not one.effect.parametrization.mean_response
+                for one in candidates
+            ):
+                continue
+            t = whole[:, columns_of(linear.candidates, members)]
+            z = data[case % len(data)] + t @ np.concatenate([one.coordinates for one in drawn.members])
+            fit = linear.null.fit(z[: len(z) - beside], t[: len(z) - beside])
+            actions = []
+            for member, theta, covariance in parts_of(linear.candidates, members, fit):
+                own = whole[:, list(linear.candidates[member].columns)]
+                actions.append(Action.of(own @ theta, own, theta, covariance))
+            found = replace(slices, z=z).findings(candidates, actions)
+            refused.append(found.contradict(context.settings))
+            unmeasured.append(len(members) == 1 and not found.measured)
+            strengths.append(drawn.members[0].strength)
+            for own in found.comparisons:
+                for one in own:
+                    by_test.setdefault(one.kind, []).append(
+                        (one.pvalue <= 0.05, one.odds >= context.settings.absence_odds)
+                    )
+            for one in found.maps:
+                by_test.setdefault("left in the maps", []).append((one.pvalue <= 0.05, False))
+            if refused[-1]:
+                print(
+                    "refused",
+                    run.name,
+                    [c.label for c in candidates],
+                    [round(m.strength, 1) for m in drawn.members],
+                    f"{found.pvalue:.1e} {found.odds:.1f}",
+                    [
+                        (o.kind, o.slices, np.round(o.amplitudes, 2), np.round(o.errors, 2), f"{o.pvalue:.1e}")
+                        for own in found.comparisons
+                        for o in own
+                        if o.pvalue < 1e-3 or o.odds > 20
+                    ],
+                    flush=True,
+                )
+    print("true names refused:", share("refused", refused))
+    print("single ones that no two parts measure:", share("unmeasured", unmeasured))
+    for kind, rows in by_test.items():
+        low, absent = np.mean(rows, axis=0)
+        print(f"{kind}: {len(rows)} tests, p <= 0.05 in {low:.3f}, odds of absence in {absent:.4f}")
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    {"maps": maps, "draws": draws}[sys.argv[1]](int(sys.argv[2]) if len(sys.argv) > 2 else 42)

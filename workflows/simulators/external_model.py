@@ -1,0 +1,222 @@
+"""litebird_sim 0.18 as the model of a diagnosis, and data that its own systematics have changed.
+
+    python workflows/simulators/external_model.py --nulls 100 > external.md
+
+The class is what ``simulator = "external_model.py:Litebird"`` in a run's TOML names. One process; two half-years of two
+detectors, 122 s samples, nside 16.
+"""
+
+import argparse
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import healpy
+import litebird_sim as lbs
+import numpy as np
+from inputs import binned, of, parts
+from litebird import _ECLIPTIC, _pointed
+from scipy.stats import kstest
+
+import mcsim
+from mcsim import config
+from mcsim.diagnosis import campaign
+from mcsim.diagnosis.analysis import analysis_of, data_vectors
+from mcsim.diagnosis.context import context
+from mcsim.diagnosis.external import Kept, agreement
+from mcsim.diagnosis.inference import diagnose_data
+from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.ensemble.external import source_of
+from mcsim.sphere import spectra
+from mcsim.stats.look_elsewhere import global_test
+
+MODEL = {
+    "schema": 1,
+    "name": "litebird-model",
+    "sky": {"spectrum": "wmap7", "lmax": 40},
+    "map": {"nside": 16, "splits": ["half1", "half2"]},
+    "biposh": {"L_max": 2},
+    "channel": [
+        {
+            "name": name,
+            "frequency_ghz": frequency,
+            "beam": {"kind": "gaussian", "fwhm_arcmin": 350.0},
+            "noise": {"sigma0_uk": 20.0},
+            "scan": {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 122.0, "line_of_sight": line},
+        }
+        for name, frequency, line in (("V1", 61.0, "A"), ("W1", 94.0, "B"))
+    ],
+}
+NONE = {"amplitude": 0.0}
+CALLS = 20
+PROPOSED = ("beam_ellipticity", "beam_width", "gain_drift", "noise_level", "pointing_offset")
+
+
+class Litebird:
+    """litebird_sim's scanning, pointing, beams, convolution and noise; binned here.
+
+    ``flaws``: sizes of its systematics in W1, by name: ``ellipticity`` of its Gaussian beam (gauss_beam_to_alm), an
+    ``offset`` of the focal plane in arcmin (PointingSys), a ``drift`` of the gain over each half-year
+    (apply_gaindrift), ``quadratic`` response in 1/K (apply_quadratic_nonlin).
+    """
+
+    effects = ("beam_ellipticity", "beam_width", "noise_level")
+
+    def __init__(self, run: mcsim.RunConfig, **flaws: float) -> None:
+        self.inputs, self.flaws = of(run), flaws
+        self.sigma = {channel.name: channel.noise.sigma0_uk for channel in run.channels}
+        self.fwhm = {channel.name: np.deg2rad(channel.beam.fwhm_arcmin / 60.0) for channel in run.channels}
+        self.cl = spectra.load(run.sky.spectrum, run.sky.lmax)
+        self.scans = []
+        for channel in self.inputs.channels:
+            for name, samples in parts(self.inputs, channel):
+                told = _pointed(channel, samples, None, 0.0, float)
+                angles = self._angles(told)[: len(samples)]
+                if "offset" in flaws and channel.name == "W1":
+                    [seen] = told.observations
+                    told.detectors[0].orient, told.detectors[0].pol = "Q", "T"
+                    told.detectors[0].name = "000_one_horn"  # as its module for pointing wants it
+                    plane = lbs.PointingSys(told, seen, told.detectors).focalplane
+                    plane.add_offset(np.deg2rad(flaws["offset"] / 60.0), "x")
+                    told.prepare_pointings(append_to_report=False)
+                    true = self._angles(told)[: len(samples)]
+                else:
+                    true = angles
+                pixels = healpy.ang2pix(self.inputs.nside, angles[:, 0], angles[:, 1])
+                self.scans.append((channel.name, name, true, pixels))
+
+    @staticmethod
+    def _angles(told):  # type: ignore[no-untyped-def]
+        [seen] = told.observations
+        angles = seen.get_pointings(0)[0].astype(float)
+        angles[:, 1] %= 2.0 * np.pi  # as ducc0 wants them
+        return angles
+
+    def simulate(self, seed, effects=(), sky=None):  # type: ignore[no-untyped-def]
+        """Return the maps of one seed, with effects of mcsim's library, on a given sky if there is one."""
+        draw, lmax = np.random.default_rng(seed), self.inputs.lmax
+        drawn = self._sky(draw)
+        alm = lbs.SphericalHarmonics((drawn if sky is None else sky)[None], lmax, lmax, coordinates=_ECLIPTIC)
+        added = {(e.name, e.channel): e.parameters for e in effects}
+        maps = {}
+        for channel, part, angles, pixels in self.scans:
+            own = {name: given for (name, of_channel), given in added.items() if of_channel == channel}
+            beam, order = self._beam(channel, own)
+            tod = np.zeros(len(pixels))
+            how = lbs.BeamConvolutionParameters(lmax, order, False, 1e-6)
+            lbs.add_convolved_sky_to_one_detector(tod, alm, beam, angles, None, None, how, 1)
+            if channel == "W1":
+                self._respond(tod)
+            noise = np.sqrt(1.0 + own.get("noise_level", NONE)["amplitude"]) * self.sigma[channel]
+            lbs.add_white_noise(tod, noise, draw)
+            maps[part] = binned(self.inputs.nside, iter([(pixels, tod)]))
+        return maps
+
+    def _respond(self, tod):  # type: ignore[no-untyped-def]
+        draw = np.random.default_rng(0)
+        if "drift" in self.flaws:
+            drift = lbs.GainDriftParams(
+                sigma_drift=self.flaws["drift"],
+                calibration_period_sec=len(tod),
+                sampling_dist=lbs.SamplingDist.GAUSSIAN,
+                sampling_gaussian_loc=1.0,
+                sampling_gaussian_scale=0.0,
+            )
+            lbs.apply_gaindrift_for_one_detector(tod, 1.0, drift_params=drift, random=draw)
+        if "quadratic" in self.flaws:
+            bent = lbs.NonLinParams(self.flaws["quadratic"] * 1e-6, 0.0)
+            lbs.apply_quadratic_nonlin_for_one_detector(tod, nl_params=bent, random=draw)
+
+    def _sky(self, draw):  # type: ignore[no-untyped-def]
+        ell, m = healpy.Alm.getlm(self.inputs.lmax)
+        real, imaginary = draw.normal(size=(2, ell.size))
+        return np.sqrt(self.cl[ell]) * np.where(m > 0, (real + 1j * imaginary) / np.sqrt(2.0), real)
+
+    def _beam(self, channel, own):  # type: ignore[no-untyped-def]
+        """Return the beam of a channel with effects, and its highest order."""
+        ellipse = own.get("beam_ellipticity", NONE)
+        if channel == "W1" and "ellipticity" in self.flaws:
+            ellipse = {"amplitude": self.flaws["ellipticity"]}
+        order = 4 if ellipse["amplitude"] else 0
+        fwhm = self.fwhm[channel] * (1.0 + own.get("beam_width", NONE)["amplitude"])
+        ratio, angle = 1.0 + abs(ellipse["amplitude"]), np.deg2rad(ellipse.get("angle_deg", 0.0))
+        if ellipse["amplitude"] < 0.0:
+            angle += np.pi / 2.0
+        return lbs.gauss_beam_to_alm(self.inputs.lmax, order, fwhm, ratio, angle, None), order
+
+
+def ask(jobs):  # type: ignore[no-untyped-def]
+    return [data_vectors(job) for job in jobs]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--nulls", type=int, default=100)
+    parser.add_argument("--per-element", type=int, default=5, help="simulations for each element of the data vector")
+    given = parser.parse_args()
+    run = config.load(MODEL)
+    library = {name: kind for name, kind in mcsim.effects().items() if name in PROPOSED}
+    settings = mcsim.DiagnosisSettings(sims_per_element=given.per_element, scan_sims=100)
+    model = Litebird(run)
+    source = source_of(run, model)
+    analysis = analysis_of(run, library=library, settings=settings, source=source)
+    with tempfile.TemporaryDirectory() as folder:
+        task = Kept(data_vectors, str(Path(folder) / "parts"))
+        start = time.process_time()
+        known = context(analysis, *campaign.learned(analysis, lambda jobs: [task(job) for job in jobs]))
+        found = agreement(known)
+        spent = time.process_time() - start
+    called = sum(job.count for job in campaign.plan(analysis, len(known.ensemble.simulations)).values() if job.source)
+    start = time.process_time()
+    for seed in range(CALLS):
+        model.simulate(seed)
+    theirs = called * (time.process_time() - start) / CALLS
+    print(f"data vector of {known.null.dimension} independent elements, {len(known.ensemble.simulations)} simulations")
+    print(f"agreement of mcsim's own simulation: p = {found.pvalue:.3g}, nearest {found.nearest}")
+    start = time.process_time()
+    native = replace(analysis, source=None)
+    plain = context(native, *campaign.learned(native, ask, len(known.ensemble.simulations)))
+    own = time.process_time() - start
+    print(f"processor time {spent:.0f} s, {theirs:.0f} s of it in litebird_sim ({called} calls); own model {own:.0f} s")
+    print(f"ratio, litebird_sim's own time aside: {(spent - theirs) / own:.2f}", flush=True)
+    data = [analysis.data_vector(source.maps(0, seed)) for seed in range(given.nulls)]
+    for one, name in ((known, "litebird_sim"), (plain, "mcsim")):
+        p = np.array([global_test(one.null, x, one.groups, one.calibration).pvalue for x in data])
+        print(f"null cases, {name} as the model: {np.sum(p < 0.05)} of {len(p)} below 0.05, ", end="")
+        print(f"KS p = {kstest(p, 'uniform').pvalue:.2g}")
+    print(flush=True)
+    print("| systematic of litebird_sim in W1 | p | litebird_sim as the model | p | mcsim as the model |")
+    print("|---|---|---|---|---|")
+    for flaw in (
+        {},
+        {"ellipticity": 0.1},
+        {"ellipticity": 0.2},
+        {"ellipticity": 0.35},
+        {"offset": 4.0},
+        {"offset": 8.0},
+        {"offset": 16.0},
+        {"drift": 0.01},
+        {"drift": 0.03},
+        {"quadratic": 40.0},
+        {"quadratic": 120.0},
+    ):
+        other = Litebird(run, **flaw)
+        maps = other.simulate(4242)
+        data = [maps[name.replace(":", "_")] for name in config.map_names(run)]
+        what = ", ".join(f"{name} {value:g}" for name, value in flaw.items()) or "none"
+        answers = " | ".join(answer(diagnose_data(ObservedMaps(one, data, ask), "case")) for one in (known, plain))
+        print(f"| {what} | {answers} |", flush=True)
+
+
+def answer(result):  # type: ignore[no-untyped-def]
+    """Return p-value and verdict of a diagnosis as two cells of a table."""
+    named = " or ".join(", ".join(f"{e.name} {e.channel} {e.words}" for e in s.effects) for s in result.sets)
+    if result.kind == "unknown":
+        named = f"nearest {result.candidates[result.nearest].label}, cosine {result.cosine:.2f}"
+    return f"{result.test.pvalue:.2g} | {result.kind}{', ' * bool(named)}{named}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
