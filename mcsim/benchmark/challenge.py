@@ -22,7 +22,7 @@ from mcsim.diagnosis.observed_maps import ObservedMaps, read_maps
 from mcsim.ensemble.maps import file_names, write_map
 from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError
-from mcsim.simulation import sampled, simulate
+from mcsim.simulation import nuisance, sampled, simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere import rng
 from mcsim.support.folders import appearing, writable
@@ -102,8 +102,9 @@ def make_case(settings: Settings, folder: Path, truth: Truth) -> None:
 
 
 def maps_of(run: config.RunConfig, truth: Truth, file: str | None = None) -> list[tuple[str, Vector]]:
-    """Simulate the maps of a case, uK, by name."""
+    """Simulate the maps of a case, uK, by name; nuisances of the run are drawn from their priors."""
     acting = [config.Effect(name=m.name, channel=m.channel, parameters=dict(m.parameters)) for m in truth.members]
+    acting += nuisance.tables(run, truth.seed, 0)
     data = seeded(with_effects(run, acting), truth.seed)
     shared = survey(data, library=library_with(file))
     if truth.sampled:

@@ -15,7 +15,7 @@ from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, data_vectors
 from mcsim.diagnosis.api import prepared
 from mcsim.diagnosis.campaign import Batch, after_jobs, asking, batch, seeded, with_effects
 from mcsim.diagnosis.candidate import Candidate, TemplateBank, columns_of, effects_at, numbered
-from mcsim.diagnosis.context import DiagnosisContext, context
+from mcsim.diagnosis.context import DiagnosisContext, calibration_of, context
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.subsets import Subsets
@@ -24,7 +24,7 @@ from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError, RunError
 from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit, SimulatedGaussian, WhitenedTemplates
-from mcsim.stats.look_elsewhere import Calibration, calibrate
+from mcsim.stats.look_elsewhere import Calibration
 
 SKIES = 6
 """Skies that an expected S/N is the mean of."""
@@ -123,12 +123,12 @@ def linear_model(known: DiagnosisContext, without: Sequence[str] = ()) -> Linear
     """
     analysis, ensemble, bank, rows = reduced(known, without)
     kept = len(ensemble.simulations) - int(HELD_OUT * len(ensemble.simulations))
-    seen = replace(ensemble, simulations=ensemble.simulations[:kept])
+    seen = ensemble.first(kept)
     candidates = tuple(replace(candidate, shape_error=None) for candidate in analysis.candidates)
     null, templates = seen.gaussian, bank.significant(ensemble.spread, known.settings)
     groups = null.whiten_groups(templates, [candidate.columns for candidate in candidates])
     halves, data = Halves.of(seen, np.zeros(len(templates))), ensemble.simulations[kept:] + ensemble.offset
-    return LinearModel(null, templates, candidates, calibrate(null, groups), rows, halves, data)
+    return LinearModel(null, templates, candidates, calibration_of(seen, null, groups), rows, halves, data)
 
 
 def reduced(

@@ -20,8 +20,8 @@ from mcsim.systematics.registry import basis_of, catalogue
 
 Vector = NDArray[np.float64]
 
-REDUNDANT = ("pixelization", "spectrum")
-"""pixel_centres says the same; and band powers change with the sky, which two sides have in common."""
+REDUNDANT = ("calibration", "monopole_residual", "pixelization", "spectrum")
+"""calibration, monopole and pixel_centres are differences already; two sides have a sky, and its power, in common."""
 
 
 class EffectDifference(Difference):

@@ -10,13 +10,14 @@ from mcsim.config.load import to_dict
 from mcsim.config.schema import RunConfig, analysis_lmax, pixel_window
 
 
-def science(config: RunConfig) -> dict[str, Any]:
+def science(config: RunConfig, *others: str) -> dict[str, Any]:
     """Return the part of a run that defines its numbers, with file names replaced by hashes of contents.
 
     It has sky, map, channels, effects, preparation, biposh, seed and pairing; not name, compute, the number of
-    realizations, keep_maps or the bins of the summary. A file is represented by the SHA-256 of its contents, a
-    template by those of its files. Skies given one file per realization are represented by the part of their template
-    with the placeholder and by the contents of realization 0; the others are not read.
+    realizations, keep_maps or the bins of the summary, nor sections such as "nuisance" that are not named in
+    ``others``. A file is represented by the SHA-256 of its contents, a template by those of its files. Skies given one
+    file per realization are represented by the part of their template with the placeholder and by the contents of
+    realization 0; the others are not read.
     """
     plain = to_dict(config)
     for entry in paths.entries(plain):
@@ -38,7 +39,7 @@ def science(config: RunConfig) -> dict[str, Any]:
         "schema": plain["schema"],
         **{
             section: plain[section]
-            for section in ("sky", "map", "channel", "effect", "preparation", "biposh")
+            for section in ("sky", "map", "channel", "effect", "preparation", "biposh", *others)
             if section in plain
         },
         "ensemble": {key: plain["ensemble"][key] for key in ("seed", "paired")},

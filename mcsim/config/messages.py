@@ -20,6 +20,7 @@ _TABLES: dict[tuple[str, ...], type] = {
     ("biposh",): schema.Biposh,
     ("ensemble",): schema.Ensemble,
     ("compute",): schema.Compute,
+    ("nuisance",): schema.Nuisance,
     **{("preparation", step.kind): step for step in preparation.STEPS},
     **{
         ("channel", key, kind): table
@@ -32,8 +33,8 @@ _TABLES: dict[tuple[str, ...], type] = {
         for kind, table in tables.items()
     },
 }
-_TOML_NAMES = {"schema_version": "schema", "channels": "channel", "effects": "effect"}
-_REPEATED = {"channel": "[[channel]]", "effect": "[[effect]]", "preparation": "[[preparation]]"}
+_TOML_NAMES = {"schema_version": "schema", "channels": "channel", "effects": "effect", "nuisances": "nuisance"}
+_REPEATED = {key: f"[[{key}]]" for key in ("channel", "effect", "preparation", "nuisance")}
 
 _EXPECTED = {
     "int_type": "a whole number",

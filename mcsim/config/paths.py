@@ -63,6 +63,8 @@ def entries(plain: dict[str, Any]) -> Iterator[Entry]:
         for split, own in of_splits.items() if isinstance(of_splits, dict) else ():
             sections.append(("noise", f"{key}.split_noise.{split}", own, one, split))
     sections += [("effect", f"effect[{n}]", table, every, None) for n, table in enumerate(_tables(plain, "effect"))]
+    given = enumerate(_tables(plain, "nuisance"))
+    sections += [("effect", f"nuisance[{n}].parameters", table.get("parameters"), every, None) for n, table in given]
     for number, table in enumerate(_tables(plain, "preparation")):
         own = table.get("channels")
         names = tuple(map(str, own)) if isinstance(own, list) and own else every

@@ -7,7 +7,7 @@ Every key states the unit of its number. A failed check raises ValueError whose 
 from dataclasses import replace
 from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import AfterValidator, Field, GetCoreSchemaHandler, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, GetCoreSchemaHandler, model_validator
 from pydantic.dataclasses import dataclass
 from pydantic_core import core_schema
 
@@ -252,6 +252,31 @@ class Effect:
     parameters: dict[str, float | str | tuple[float, ...]] = Field(default_factory=dict)
 
 
+Width = Annotated[float, Field(gt=0.0)]
+"""Prior standard deviation."""
+
+
+def _listed(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list | tuple) else (value,)
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Nuisance:
+    """Effect of unknown size that a diagnosis marginalises: normal about zero, with a prior width in its unit.
+
+    ``width``: that of the amplitude or, of an effect with several linear components, of each of them. ``parameters``
+    are the others, ``parameter_widths`` prior widths of those among them that are not known either.
+    """
+
+    effect: PathText
+    width: Annotated[
+        tuple[Width, ...], Field(min_length=1), BeforeValidator(_listed, json_schema_input_type=float | list[float])
+    ]
+    channel: Label | None = None
+    parameters: dict[str, float | str | tuple[float, ...]] = Field(default_factory=dict)
+    parameter_widths: dict[str, Width] = Field(default_factory=dict)
+
+
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class RunConfig:
     """Configuration of a run, from :func:`mcsim.load_config`; frozen: ``dataclasses.replace`` makes another one.
@@ -271,6 +296,8 @@ class RunConfig:
         the tables ``[[effect]]`` and ``[[preparation]]``.
     simulator
         Simulator of another program, ``package.module:name`` or ``file.py:name``, whose maps a diagnosis takes.
+    nuisances
+        Effects that a diagnosis marginalises; in TOML the tables ``[[nuisance]]``.
     biposh, ensemble, compute
         Settings of the estimator, of the realizations and seed, and of the computation.
 
@@ -293,6 +320,7 @@ class RunConfig:
     effects: Annotated[tuple[Effect, ...], Field(alias="effect")] = ()
     preparation: tuple[Step, ...] = ()
     simulator: PathText | None = None
+    nuisances: Annotated[tuple[Nuisance, ...], Field(alias="nuisance")] = ()
     biposh: Biposh = Biposh()
     ensemble: Ensemble = Ensemble()
     compute: Compute = Compute()
@@ -320,12 +348,11 @@ class RunConfig:
             unique(names)
         except ValueError as error:
             raise ValueError(f"channel {error}") from None
-        for effect in self.effects:
-            if effect.channel is not None and effect.channel not in names:
-                raise ValueError(
-                    f"effect {effect.name}: channel = {effect.channel!r} is no channel of the run; use one of "
-                    f"{', '.join(names)}"
-                )
+        acting = [(f"effect {one.name}", one.channel) for one in self.effects]
+        acting += [(f"nuisance {one.effect}", one.channel) for one in self.nuisances]
+        for what, where in acting:
+            if where is not None and where not in names:
+                raise ValueError(f"{what}: channel = {where!r} is no channel of the run; use one of {', '.join(names)}")
         masked = self.map.mask is not None or any(channel.mask is not None for channel in self.channels)
         if not masked and (self.map.mask_frame is not None or self.map.mask_apodisation_deg > 0.0):
             key = "mask_frame" if self.map.mask_frame is not None else "mask_apodisation_deg"

@@ -19,6 +19,7 @@ from mcsim.diagnosis.wiener_filter import Model, model_of, shared_sky, wiener_fi
 from mcsim.ensemble.external_maps import Source
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
+from mcsim.simulation.nuisance import DisturbedSurvey, Nuisance, check_nuisances, nuisances_of
 from mcsim.simulation.survey import Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.support.arrays import Alm, Map, Vector
@@ -63,6 +64,11 @@ class Analysis:
         return slices_.elements_of(self.model) if self.of_maps else ()
 
     @cached_property
+    def nuisances(self) -> tuple[Nuisance, ...]:
+        """Return the nuisances of the run."""
+        return nuisances_of(self.run, dict(self.library))
+
+    @cached_property
     def bipolar_scan(self) -> BipolarScan:
         """Return the scan that localises a departure from the model."""
         return BipolarScan(self.model)
@@ -104,18 +110,25 @@ def analysis_of(
     """Define the analysis of data that ``run``, with the effects that are modelled already, claims to describe.
 
     Effects of the library (default: built-in and registered ones), which the run may name as well, are candidates
-    where they apply, but those called in ``without``, and those that are proposed on request alone and not called in
-    ``settings.including``. ``nthreads`` compute what is computed once. ``source``:
+    where they apply, but those called in ``without``, and those that are proposed on request alone and neither called
+    in ``settings.including`` nor nuisances of the run. ``nthreads`` compute what is computed once. ``source``:
     simulates in place of mcsim.
     """
     settings = settings or DiagnosisSettings()
     known = kinds_of(library)
+    check_nuisances(run, dict(known))
+    if source is not None and run.nuisances:
+        raise InputError(
+            f"nuisances are drawn by mcsim's simulations, but {source.label} simulates in their place; let it draw "
+            "them, and leave [[nuisance]] out."
+        )
+    declared = [one.effect for one in run.nuisances]
     model = model_of(survey(run, nthreads=nthreads, orders=settings.beam_orders, library=dict(known)), settings)
     candidates = numbered(
         [
             Candidate(effect, channel, tuple(range(len(effect.parametrization.basis()))), dict(fixed))
             for name, effect in known
-            if name not in without and (effect.proposed or name in settings.including)
+            if name not in without and (effect.proposed or name in (*settings.including, *declared))
             for channel in ((None,) if effect.scope == "common" else model.channels)
             for fixed in effect.variants
             if _applies(model, effect, channel, fixed)
@@ -191,6 +204,7 @@ class Job:
     settings: DiagnosisSettings = field(default_factory=DiagnosisSettings)
     library: Kinds = field(default_factory=lambda: kinds_of(None))
     source: Source | None = None  # simulates in place of mcsim
+    nuisances: bool = False  # draw those of the run
 
     @property
     def definition(self) -> tuple[str, tuple[str, ...], DiagnosisSettings, Kinds]:
@@ -205,9 +219,8 @@ def data_vectors(job: Job, library: Library | None = None) -> Vector:
     """
     analysis = _analysis(*job.definition)
     rows = []
-    for realization in range(job.first, job.first + job.count):
+    for realization, shared in surveys(job, library):
         if job.sample_by_sample:
-            shared = _survey(job.simulated, job.library if library is None else kinds_of(library))
             maps = [map_uk for _, map_uk in sampled.maps(shared, realization)]
         else:
             sky = None
@@ -217,7 +230,6 @@ def data_vectors(job: Job, library: Library | None = None) -> Vector:
             if job.source is not None:
                 maps = external_maps(job, realization, sky)
             else:
-                shared = _survey(job.simulated, job.library if library is None else kinds_of(library))
                 maps = list(simulate.maps(shared, realization, sky=sky))
         rows.append(analysis.data_vector(maps, job.bipolar_scan, job.slices))
     return np.stack(rows)
@@ -238,6 +250,19 @@ def _seed_and_added(simulated: str, fiducial: str) -> tuple[int, tuple[config.Ef
     """Return the seed of a run, and its effects beyond those of the fiducial one."""
     run = config.from_json(simulated)
     return run.ensemble.seed, run.effects[len(config.from_json(fiducial).effects) :]
+
+
+def surveys(job: Job, library: Library | None = None) -> Iterator[tuple[int, Survey]]:
+    """Yield every realization of a job with its survey: the same for all, but for the nuisances that each draws."""
+    kinds = job.library if library is None else kinds_of(library)
+    disturbed = _disturbed(job.simulated, kinds) if job.nuisances else None
+    for realization in range(job.first, job.first + job.count):
+        yield realization, _survey(job.simulated, kinds) if disturbed is None else disturbed.at(realization)
+
+
+@lru_cache(maxsize=1)
+def _disturbed(simulated: str, kinds: Kinds) -> DisturbedSurvey:
+    return DisturbedSurvey.of(config.from_json(simulated), dict(kinds))
 
 
 @lru_cache(maxsize=32)

@@ -160,7 +160,8 @@ def describe(model: str | Path | config.RunConfig | ExternalModel, settings: Dia
         given = sum(job.count for job in jobs if job.source is not None)
         stored = "" if source.count is None else f", of {source.count} that are stored"
         head += f"; and at most {given} of {source.label}{stored}, whose own cost is not in what follows"
-    lines = [head, *cost(run).lines(number, run.compute.workers)]
+    priors = [f"nuisance: {line}" for one in analysis.nuisances for line in one.lines]
+    lines = [head, *priors, *cost(run).lines(number, run.compute.workers)]
     if count:
         lines += controls.describe(analysis, count, run.compute.workers)
     return "\n".join(lines)
@@ -219,10 +220,11 @@ def _key(run: config.RunConfig, analysis: Analysis) -> str:
 
     Its name, its seed and its number of realizations do not count.
     """
-    science = config.science(run)
+    science = config.science(run, *(("nuisance",) if run.nuisances else ()))
     science["ensemble"] = {}
     effects = {candidate.effect for candidate in analysis.candidates}
-    effects |= {systematics.get(effect.name, dict(analysis.library)) for effect in run.effects}
+    named = [*(one.name for one in run.effects), *(one.effect for one in run.nuisances)]
+    effects |= {systematics.get(name, dict(analysis.library)) for name in named}
     rest = [
         [[candidate.label, [repr(basis) for basis in candidate.basis]] for candidate in analysis.candidates],
         asdict(analysis.settings),

@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from mcsim import config
-from mcsim.diagnosis.candidate import Candidate, parts_of
+from mcsim.diagnosis.candidate import Candidate, columns_of, parts_of
 from mcsim.diagnosis.consistency import amplitudes
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
+from mcsim.diagnosis.nuisance import NuisanceResult, Regression, results
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.result import CandidateResult, DiagnosisResult, EffectResult, EffectSet
 from mcsim.diagnosis.selection import Explanation
@@ -45,6 +46,7 @@ def result_of(
         partial=() if partial is None else tuple(effects_of(candidates, partial.members, partial.fit)),
         partial_left=None if partial is None else partial.left,
         held_out=reduction,
+        nuisances=tuple(_nuisances(data, refined)),
         places=tuple(data.places()),
         candidates=tuple(_candidates(context, refined)),
         elements=context.analysis.elements,
@@ -59,7 +61,7 @@ def result_of(
         residual_maps=residuals,
         residual_range=None if residuals is None else np.quantile(ensemble.residual_rms, [0.025, 0.975], axis=0).T,
         frame=model.frame,
-        notes=tuple(notes),
+        notes=(*notes, *_left_out(context)),
         settings=context.settings,
         provenance={
             "simulations of the model": len(ensemble.simulations),
@@ -89,6 +91,32 @@ def _set_of(context: DiagnosisContext, one: Explanation) -> EffectSet:
         excess=excess_of(one.fit.chi2, one.fit.dimension, context.null.dof),
         maps=one.findings.maps,
     )
+
+
+def _nuisances(data: DataSet, refined: Refined) -> Iterator[NuisanceResult]:
+    """Yield what the data say of the nuisances beside the effects that are named, or else detected, of any size."""
+    context, found, partial = data.context, refined.attribution, refined.partial
+    if context.ensemble.nuisances is None:
+        return
+    members, t = found.explanations[0].members if found.explanations else (), refined.templates
+    if partial is not None and not members:
+        members, t = partial.members, partial.templates
+    scatters = [one for one in (refined.candidates[member].scatter for member in members) if one is not None]
+    null = context.null.with_extra_covariance(*scatters)
+    found_of = Regression.of(context.ensemble, null, t[:, columns_of(refined.candidates, members)])
+    yield from results(context.analysis.nuisances, found_of, data.x)
+
+
+def _left_out(context: DiagnosisContext) -> Iterator[str]:
+    """Yield a sentence on elements that are not tested, if there are any."""
+    ensemble = context.ensemble
+    if ensemble.nuisances is None:
+        return
+    if names := [element.words for element, kept in zip(ensemble.elements, ensemble.tested, strict=True) if not kept]:
+        yield (
+            f"{len(names)} of {len(ensemble.elements)} elements are not tested, because they follow the square of a "
+            f"nuisance as wide as its prior: {'; '.join(names)}."
+        )
 
 
 def effects_of(candidates: Sequence[Candidate], members: Sequence[int], fit: Fit) -> Iterator[EffectResult]:

@@ -14,10 +14,11 @@ from mcsim import config
 from mcsim.diagnosis.analysis import Analysis, Job, data_vectors
 from mcsim.diagnosis.candidate import Candidate, TemplateBank
 from mcsim.diagnosis.localisation import rms
-from mcsim.diagnosis.null_ensemble import NullEnsemble
+from mcsim.diagnosis.null_ensemble import NullEnsemble, without_nuisances
 from mcsim.ensemble import runner
 from mcsim.ensemble.external_maps import Source
 from mcsim.errors import InputError
+from mcsim.simulation.nuisance import draws
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.progress import reporting
 from mcsim.systematics import Effect
@@ -106,8 +107,8 @@ def plan(analysis: Analysis, simulations: int | None = None, time_ordered: bool 
             jobs[Purpose("time-ordered", job.first)] = replace(job, sample_by_sample=True)
             jobs[Purpose("default", job.first)] = job
     for job in _split(analysis.job(seeded(run, _COVARIANCE)), range(wanted)):
-        scanned = job.first < settings.scan_sims
-        jobs[Purpose("null", job.first)] = replace(job, bipolar_scan=scanned, source=analysis.source)
+        drawn = replace(job, nuisances=bool(run.nuisances), bipolar_scan=job.first < settings.scan_sims)
+        jobs[Purpose("null", job.first)] = replace(drawn, source=analysis.source)
     own = analysis.source_of(())
     for job in _split(analysis.job(base), range(settings.noisy_skies)):
         jobs[Purpose("reference", job.first)] = job
@@ -165,7 +166,7 @@ def learned(
         rows = [result[:, :whole] for purpose, result in results.items() if purpose.kind == kind]
         return np.concatenate(rows) if rows else np.zeros((0, whole))
 
-    references = {False: stacked("reference"), True: stacked("external reference")}
+    null, references = stacked("null"), {False: stacked("reference"), True: stacked("external reference")}
     labels = tuple(label for candidate in analysis.candidates for label in candidate.labels)
     matrix, curvature, error = np.zeros((3, whole, len(labels)))
     for candidate, column, sign, effect in _steps(analysis):
@@ -189,7 +190,7 @@ def learned(
     rest = np.concatenate([results[purpose][:, whole:] for purpose in results if jobs[purpose].bipolar_scan])
     numbers = len(analysis.bipolar_scan.elements) if analysis.of_maps else 0
     coarse = rest[:, numbers:].reshape(len(rest), len(analysis.model.parts), -1)
-    null, reference, own_offset = stacked("null"), references[False], None
+    reference, own_offset = references[False], None
     if analysis.source is not None:
         # The mean is that of the external simulations, whatever mcsim's routes differ by.
         own_offset, offset = offset[:size], np.zeros(whole)
@@ -202,6 +203,7 @@ def learned(
         redundant=analysis.settings.redundant,
         external_reference=None if analysis.source is None else references[True],
         own_offset=own_offset,
+        nuisances=_nuisances(analysis, len(null)),
         slices=null[:, size:],
         slice_offset=offset[size:],
         slice_reference=reference[:, size:],
@@ -224,7 +226,8 @@ def _results(analysis: Analysis, jobs: dict[Purpose, Job], ask: Ask, pilot: bool
         raise _too_few(source, size, settings.sims_per_element)
     first = run([one for one in jobs if one.kind == "null" and one.number < few])
     drawn = np.concatenate([result[:, :size] for result in first.values()])
-    independent = SimulatedGaussian.from_simulations(drawn, floor=settings.redundant).dimension
+    quiet = without_nuisances(drawn, _nuisances(analysis, len(drawn)))
+    independent = SimulatedGaussian.from_simulations(quiet, floor=settings.redundant).dimension
     enough = settings.sims_per_element * independent
     if source is not None and source.count is not None and source.count < enough:
         raise _too_few(source, independent, settings.sims_per_element)
@@ -237,6 +240,13 @@ def _too_few(source: Source, independent: int, each: int) -> InputError:
         f"{source.count} realizations of {source.label} are too few for a data vector of {independent} independent "
         f"elements; give {each * independent}, {each} for each, or leave effects out (--without)."
     )
+
+
+def _nuisances(analysis: Analysis, count: int) -> Rows | None:
+    """Return the coordinates of the nuisances that the first simulations of the model draw, shape (count, k)."""
+    if not analysis.nuisances:
+        return None
+    return np.stack([draws(analysis.nuisances, _COVARIANCE, realization)[0] for realization in range(count)])
 
 
 def after_jobs(analysis: Analysis, found: Sequence[config.Effect], skies: int | None = None) -> list[Job]:

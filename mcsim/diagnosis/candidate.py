@@ -43,6 +43,8 @@ class Candidate:
     # Deviations of its response from the mean one if it is stochastic, shape (p, draws), as
     # SimulatedGaussian.with_extra_covariance takes them; None if they are not known.
     scatter: Matrix | None = field(default=None, compare=False)
+    # It is a nuisance as well: its templates are those of the scatter that this makes, and are not refined.
+    nuisance: bool = False
 
     @property
     def name(self) -> str:

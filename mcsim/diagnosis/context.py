@@ -13,11 +13,12 @@ from mcsim.diagnosis.analysis import Analysis
 from mcsim.diagnosis.campaign import Ask, after_jobs, skies
 from mcsim.diagnosis.candidate import Candidate, TemplateBank
 from mcsim.diagnosis.localisation import Place
+from mcsim.diagnosis.nuisance import with_nuisances
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.selection import Attribution
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates
-from mcsim.stats.look_elsewhere import Calibration, calibrate
+from mcsim.stats.look_elsewhere import Calibration, calibrate, calibrate_on
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -70,9 +71,17 @@ def context(analysis: Analysis, ensemble: NullEnsemble, bank: TemplateBank) -> D
         for candidate, own in zip(analysis.candidates, scatter, strict=True)
     )
     templates = bank.significant(ensemble.spread, analysis.settings)
+    if ensemble.nuisances is not None:
+        candidates, templates = with_nuisances(ensemble, null, analysis.nuisances, candidates, templates)
     groups = null.whiten_groups(templates, [candidate.columns for candidate in candidates])
-    calibration = calibrate(null, groups)
+    calibration = calibration_of(ensemble, null, groups)
     return DiagnosisContext(analysis, ensemble, bank, null, candidates, calibration, scatter, templates, groups)
+
+
+def calibration_of(ensemble: NullEnsemble, null: SimulatedGaussian, groups: WhitenedTemplates) -> Calibration:
+    """Return the null distribution of the tests; with nuisances, which make data less Gaussian, from held-out ones."""
+    found = calibrate(null, groups)
+    return found if ensemble.nuisances is None else calibrate_on(found, null, groups, ensemble.simulations)
 
 
 @dataclass(frozen=True, eq=False)

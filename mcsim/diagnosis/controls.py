@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from mcsim import config
+from mcsim.config.noise import AnyNoise
 from mcsim.diagnosis.analysis import Analysis, Kinds
 from mcsim.diagnosis.campaign import Batch, asking, seeded
 from mcsim.diagnosis.context import DiagnosisContext
@@ -25,6 +26,7 @@ from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.ensemble.plan import cost
 from mcsim.errors import InputError, RunError
 from mcsim.simulation import power, sampled, simulate
+from mcsim.simulation.nuisance import DisturbedSurvey
 from mcsim.simulation.survey import Survey
 from mcsim.simulation.survey import survey as survey_
 from mcsim.support import folders
@@ -124,19 +126,25 @@ def _tried(run: config.RunConfig, reach: int, by_sample: bool) -> Iterator[tuple
 
 def _refined(run: config.RunConfig, finer: int, lmax: int) -> config.RunConfig:
     """Return a run with finer pixels and more of the sky; a coarse pixel has as much noise, in more samples."""
-    channels = []
-    for spec in run.channels:
-        noise = spec.noise
-        if finer > 1 and isinstance(noise, config.Noise):
-            noise = replace(noise, sigma0_uk=finer * noise.sigma0_uk)
-        elif finer > 1:
-            raise InputError(f"the noise of channel {spec.name} is of the pixels that are made; keep map.nside.")
-        channels.append(replace(spec, noise=noise))
+
+    def noisier(noise: AnyNoise) -> AnyNoise:
+        if finer > 1 and not isinstance(noise, config.Noise):
+            raise InputError("noise that is not of samples is of the pixels that are made; keep map.nside.")
+        return replace(noise, sigma0_uk=finer * noise.sigma0_uk) if isinstance(noise, config.Noise) else noise
+
+    channels = tuple(
+        replace(
+            spec,
+            noise=noisier(spec.noise),
+            split_noise={split: noisier(noise) for split, noise in spec.split_noise.items()},
+        )
+        for spec in run.channels
+    )
     return replace(
         run,
         sky=replace(run.sky, lmax=lmax),
         map=replace(run.map, nside=finer * run.map.resolution),
-        channels=tuple(channels),
+        channels=channels,
         biposh=replace(run.biposh, lmax=config.analysis_lmax(run)),
     )
 
@@ -144,7 +152,7 @@ def _refined(run: config.RunConfig, finer: int, lmax: int) -> config.RunConfig:
 def draw(run: str, library: Kinds, sample_by_sample: bool, realization: int, folder: str) -> None:
     """Draw the maps of a control into a folder that appears complete or not at all; the task of a worker."""
     with folders.appearing(Path(folder)) as scratch:
-        shared = _survey(run, library)
+        shared = _survey(run, library).at(realization)
         if sample_by_sample:
             maps = np.stack([map_uk for _, map_uk in sampled.maps(shared, realization)])
         else:
@@ -153,9 +161,9 @@ def draw(run: str, library: Kinds, sample_by_sample: bool, realization: int, fol
 
 
 @lru_cache(maxsize=1)
-def _survey(run: str, library: Kinds) -> Survey:
-    """Keep the survey of the last controls."""
-    return survey_(config.from_json(run), library=dict(library))
+def _survey(run: str, library: Kinds) -> DisturbedSurvey:
+    """Keep the survey of the last controls; each draws its own nuisances."""
+    return DisturbedSurvey.of(config.from_json(run), dict(library))
 
 
 def diagnose_controls(known: DiagnosisContext, key: str, count: int, call: Batch, quiet: bool = True) -> Controls:

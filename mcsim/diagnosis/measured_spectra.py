@@ -12,14 +12,13 @@ from mcsim import config
 from mcsim.beamfit.data import Row, Scaling, parts, project
 from mcsim.beamfit.table import check_frame, check_parity, identified, in_uk2, read_ecsv, scaling_of
 from mcsim.bipolar import Mode
-from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, kinds_of
+from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, kinds_of, surveys
 from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.localisation import Place, places
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Block, Element
 from mcsim.errors import InputError
 from mcsim.simulation import simulate
-from mcsim.simulation.survey import survey
 from mcsim.sphere.rotation import FRAMES, rotate_biposh
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.systematics import Effect, Library
@@ -73,8 +72,8 @@ class Spectra:
 
     def __call__(self, job: Job) -> Vector:
         """Return the same numbers of simulations, shape (count, p), by the function that runs an ensemble."""
-        shared = survey(config.from_json(job.simulated), library=dict(job.library))
-        biposh = np.stack([simulate.realize(shared, job.first + r)["biposh"] for r in range(job.count)])
+        realized = [(shared, simulate.realize(shared, realization)) for realization, shared in surveys(job)]
+        shared, biposh = realized[0][0], np.stack([spectra["biposh"] for _, spectra in realized])
         columns = []
         for row, pair in zip(self.rows, self.pairs, strict=True):
             where = shared.pair_names.index(pair.label), shared.estimator.modes.index(row.mode)

@@ -15,6 +15,12 @@ from mcsim.diagnosis.summaries import Element
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector
 
+QUADRATIC = 0.05
+"""Share of an element's variance that may come from squares and products of nuisances."""
+
+ROUND_OFF = 1e-20
+"""Variance, relative to the largest, of a direction that is there only by round-off."""
+
 
 @dataclass(frozen=True)
 class NullEnsemble:
@@ -38,6 +44,7 @@ class NullEnsemble:
     slice_offset: Vector = field(default_factory=lambda: np.zeros(0))
     slice_reference: Matrix = field(default_factory=lambda: np.zeros((0, 0)))
     slice_elements: tuple[Element, ...] = ()
+    nuisances: Matrix | None = None  # coordinates that every simulation drew, (N, k); None: there are none
 
     @cached_property
     def spread(self) -> Vector:
@@ -46,8 +53,43 @@ class NullEnsemble:
 
     @cached_property
     def gaussian(self) -> SimulatedGaussian:
-        """Return the Gaussian with mean and covariance of the simulations, the mean moved by the offset."""
-        return SimulatedGaussian.from_simulations(self.simulations, self.offset, self.redundant)
+        """Return the Gaussian with mean and covariance of the simulations, the mean moved by the offset.
+
+        Which directions are redundant is decided without the nuisances: beside a wide prior all others look small.
+        """
+        if self.nuisances is None:
+            return SimulatedGaussian.from_simulations(self.simulations, self.offset, self.redundant)
+        tested = self.tested
+        kept = SimulatedGaussian.from_simulations(self.quiet[:, tested], floor=self.redundant).whitening
+        wide = SimulatedGaussian.from_simulations(self.simulations[:, tested] @ kept.T, floor=ROUND_OFF)
+        whitening = np.zeros((wide.dimension, len(tested)))
+        whitening[:, tested] = wide.whitening @ kept
+        return replace(wide, mean=self.simulations.mean(axis=0) + self.offset, whitening=whitening)
+
+    @cached_property
+    def tested(self) -> NDArray[np.bool_]:
+        """Return True for elements that are about as Gaussian as the tests take them to be, shape (p,).
+
+        Powers follow the square of a nuisance that is larger than the noise: the share of their variance beside what is
+        linear that products of two nuisances explain may be QUADRATIC, and four standard errors of such a share.
+        """
+        if self.nuisances is None:
+            return np.ones(len(self.elements), dtype=np.bool_)
+        z = _standardised(self.nuisances)
+        one, two = np.triu_indices(z.shape[1])
+        squares = (_standardised(z[:, one] * z[:, two]).T @ _standardised(self.quiet) / len(z)) ** 2
+        share = np.sum(squares - 1.0 / len(z), axis=0)
+        return np.asarray(share < QUADRATIC + 4.0 * np.sqrt(2.0 * len(one)) / len(z))
+
+    @cached_property
+    def quiet(self) -> Matrix:
+        """Return the simulations without what is linear in their nuisances, shape (N, p)."""
+        return without_nuisances(self.simulations, self.nuisances)
+
+    def first(self, count: int) -> "NullEnsemble":
+        """Return the ensemble of the first simulations."""
+        nuisances = None if self.nuisances is None else self.nuisances[:count]
+        return replace(self, simulations=self.simulations[:count], nuisances=nuisances, slices=self.slices[:count])
 
     @cached_property
     def extended(self) -> "NullEnsemble":
@@ -81,11 +123,27 @@ class NullEnsemble:
         -----
         A mean of R skies less that of N simulations has the covariance C (1/R + 1/N); the tests take it to be 1 + 1/N
         times that of the simulations. These are contracted about their mean until it is: the tests stay exact.
+        Nuisances are the same in all skies, and what is linear in them is not contracted.
         """
         count = len(self.simulations)
         scale = np.sqrt((count + realizations) / (realizations * (count + 1.0)))
         mean = self.simulations.mean(axis=0)
-        return replace(self, simulations=mean + scale * (self.simulations - mean))
+        common = self.simulations - self.quiet
+        return replace(self, simulations=mean + scale * (self.quiet - mean) + common)
+
+
+def _standardised(rows: Matrix) -> Matrix:
+    centred = rows - rows.mean(axis=0)
+    spread = np.std(rows, axis=0)
+    return np.asarray(np.divide(centred, spread, out=np.zeros_like(centred), where=spread > 0.0))
+
+
+def without_nuisances(simulations: Matrix, nuisances: Matrix | None) -> Matrix:
+    """Return simulations, shape (N, p), less their regression on the nuisances that they drew, shape (N, k)."""
+    if nuisances is None:
+        return simulations
+    centred = nuisances - nuisances.mean(axis=0)
+    return np.asarray(simulations - centred @ np.linalg.lstsq(centred, simulations, rcond=None)[0])
 
 
 def save(path: Path, ensemble: NullEnsemble, bank: TemplateBank) -> None:

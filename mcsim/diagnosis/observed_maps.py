@@ -13,6 +13,7 @@ from mcsim.diagnosis.campaign import after_jobs, constrained_jobs
 from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.localisation import Place, places, standardised
 from mcsim.diagnosis.map_checks import checked_map
+from mcsim.diagnosis.nuisance import half_given_other
 from mcsim.diagnosis.selection import Attribution
 from mcsim.diagnosis.wiener_filter import Model, Part, shared_sky
 from mcsim.ensemble.maps import file_names, read_uk
@@ -117,6 +118,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
             if (
                 scatter < settings.sky_scatter
                 or candidate.random_response
+                or candidate.nuisance
                 or candidate.effect.parametrization.mean_response
             ):
                 continue
@@ -144,11 +146,11 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         return notes
 
     def halves(self) -> tuple[Matrix, str]:
-        """Return the identity, since the noise of the folds is independent, and the folds in words."""
+        """Return the identity, since only nuisances make the folds depend on each other, and the folds in words."""
         splits, words = self.context.run.map.splits, "odd degrees, alternate pixels"
         if len(splits) > 1:
             words = f"{' and '.join(splits[1::2])} (frozen on {' and '.join(splits[::2])})"
-        return np.eye(len(self.x)), words
+        return half_given_other(self.context.ensemble), words
 
     def places(self) -> list[Place]:
         """Rank the bipolar scan, and those elements of the data vector that are no matched filters."""

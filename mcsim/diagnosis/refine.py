@@ -68,6 +68,8 @@ class Refiner:
         for _ in range(self.context.settings.refine_rounds):
             changed = False
             for index, coordinates, covariance in self._to_try(found, tried):
+                if candidates[index].nuisance:
+                    continue
                 columns, how = list(candidates[index].columns), candidates[index].effect.parametrization
                 nonlinear = self._is_nonlinear(columns, coordinates)
                 stochastic = how.stochastic and (how.sign == 0 or coordinates[0] > 0.0)

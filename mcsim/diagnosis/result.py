@@ -14,6 +14,7 @@ from pydantic import TypeAdapter
 from mcsim.diagnosis.consistency import Comparison, MapCheck
 from mcsim.diagnosis.control_result import Controls
 from mcsim.diagnosis.localisation import Place
+from mcsim.diagnosis.nuisance import NuisanceResult
 from mcsim.diagnosis.selection import Contrast, Verdict
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Element
@@ -197,6 +198,8 @@ class DiagnosisResult:
         Diagnoses of data drawn from the model at higher fidelity; None: none were asked for.
     agreement
         Of an external model; None where mcsim simulates.
+    nuisances
+        What the data say of each component of the declared nuisances, against its prior.
     faint, probability
         True if sets describe the data, but are less probable than all else together; their posterior probability.
     contradicted
@@ -232,6 +235,7 @@ class DiagnosisResult:
     provenance: dict[str, Any]
     configuration: str
     warnings: tuple[str, ...] = ()
+    nuisances: tuple[NuisanceResult, ...] = ()
     controls: Controls | None = None
     faint: bool = False
     probability: float = 1.0
@@ -307,6 +311,7 @@ class DiagnosisResult:
                 if one.detectable is not None
             ],
             "notes": list(self.notes),
+            **({"nuisances": [_nuisance_json(one) for one in self.nuisances]} if self.nuisances else {}),
             **({"warnings": list(self.warnings)} if self.warnings else {}),
             **({"controls": self.controls.to_json()} if self.controls is not None else {}),
             **({"simulator": asdict(self.agreement)} if self.agreement else {}),
@@ -397,6 +402,10 @@ def _comparison_json(effect: EffectResult, one: Comparison) -> dict[str, Any]:
 
 def _set_json(one: EffectSet) -> dict[str, Any]:
     return {"effects": [_effect_json(effect) for effect in one.effects], "maps": [asdict(own) for own in one.maps]}
+
+
+def _nuisance_json(found: NuisanceResult) -> dict[str, Any]:
+    return {f.name: getattr(found, f.name) for f in fields(found) if f.name not in ("label", "words")}
 
 
 def _place_json(place: Place) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from mcsim.diagnosis.nuisance import NuisanceResult
 from mcsim.diagnosis.result import Agreement, DiagnosisResult, EffectResult
 from mcsim.diagnosis.selection import Contrast
 from mcsim.stats.excess import Measured
@@ -201,9 +202,15 @@ def summary(result: DiagnosisResult, folder: Path) -> list[str]:
     if result.kind != "none":
         first = result.places[0]
         rows.append(("where", f"{first.element.words}; z = {first.z:.1f}, {p_equals(first.p)}"))
+    rows += [("nuisance", f"{one.label}: {one.words}{pulled(one)}") for one in result.nuisances]
     rows += [("note", note) for note in result.notes]
     rows.append(("written", f"{folder}: verdict.json, report.html, diagnosis.zarr"))
     return [f"{name:<14}{text}" for name, text in rows]
+
+
+def pulled(one: NuisanceResult) -> str:
+    """Return the pull of a nuisance, or that the data do not constrain it."""
+    return "; not constrained by the data" if one.pull is None else f"; pull {one.pull:.1f}".replace("-", "−")
 
 
 def _numbered(effects: Sequence[EffectResult]) -> str:

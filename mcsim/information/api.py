@@ -197,10 +197,10 @@ def _candidates(
         raise InputError(
             "the limit is that of maps as they are made, but the run prepares its maps; leave [[preparation]] out."
         )
-    if run.simulator is not None:
+    if external := run.simulator or run.ensemble.maps:
         raise InputError(
-            f"the limit needs derivatives of mcsim's own maps, but simulator = {str(run.simulator)!r} makes those of "
-            "the run; leave it out."
+            f"the limit needs derivatives of mcsim's own maps, but those of the run come from {str(external)!r}; leave "
+            "simulator and ensemble.maps out."
         )
     if settings.probes < 3:
         raise InputError(f"probes = {settings.probes} are too few to tell an error; give 3 or more.")

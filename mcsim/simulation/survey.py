@@ -266,7 +266,9 @@ def _channel(
                     moments = replace(moments, hits=moments.hits / len(splits))
             # An effect may give the beam higher orders than a file of moments has: they are left out.
             beam = beam.truncated(moments.smax) if acting and moments.smax < beam.mmax else beam
-        maps.append(_with_effects(_survey_map(run, spec, split, moments, pairs), acting, site, grid.time_range))
+        m = with_effects(_survey_map(run, spec, split, moments, pairs), acting, site)
+        gain, signal = (mean(acting, site, grid.time_range) for mean in (mean_gain, mean_signal))
+        maps.append(replace(m, gain=gain, signal_uk=signal))
     # A pixel whose samples keep closer to its centre blurs less; the window is a Gaussian in all but name.
     spread = spread_of(acting)
     seen_window = window ** (spread * spread)
@@ -331,8 +333,8 @@ def _side_b(spec: config.Channel, window: NDArray[np.float64], site: Site, actin
     return SideB(beam, response, other.beam, spec.scan, spec.noise.sigma0_uk, imbalance, short)
 
 
-def _with_effects(m: SurveyMap, acting: tuple[Effect, ...], site: Site, share: tuple[float, float]) -> SurveyMap:
-    """Return the map with what effects make of its moments, noise and gain, and with what they add."""
+def with_effects(m: SurveyMap, acting: tuple[Effect, ...], site: Site) -> SurveyMap:
+    """Return the map with what effects make of its moments and noise."""
     moments, noise, spread = m.moments, m.noise_uk, spread_of(acting)
     for effect in acting:
         moments = effect.orientations(moments, site)
@@ -341,8 +343,7 @@ def _with_effects(m: SurveyMap, acting: tuple[Effect, ...], site: Site, share: t
             noise = noise * np.sqrt(np.clip(factor, 0.0, None))
     if spread != 1.0 and moments.dtheta is not None and moments.dphi is not None:
         moments = replace(moments, dtheta=spread * moments.dtheta, dphi=spread * moments.dphi)
-    gain, signal = mean_gain(acting, site, share), mean_signal(acting, site, share)
-    return replace(m, moments=moments, noise_uk=noise, gain=gain, signal_uk=signal)
+    return replace(m, moments=moments, noise_uk=noise)
 
 
 def _window(run: config.RunConfig, spec: config.Channel) -> NDArray[np.float64]:

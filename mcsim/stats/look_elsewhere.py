@@ -1,6 +1,6 @@
 """Correct for the look-elsewhere effect: a global p-value for many tests, and for many correlated deviations."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,9 @@ from mcsim.stats.gaussian import COLLINEAR, SimulatedGaussian, WhitenedTemplates
 # Scatter matrices drawn for a calibration. Each serves many data vectors: it costs a thousand times as much.
 SCATTERS = 200
 
+TAIL = 10
+"""Held-out simulations beyond which their ranks say nothing."""
+
 
 @dataclass(frozen=True)
 class Calibration:
@@ -26,28 +29,67 @@ class Calibration:
     smallest, combined
         Sorted draws of the smallest p-value of the candidates, and of the smaller one of the omnibus p-value and the
         global p-value of the candidates.
+    held_out_smallest, held_out_combined
+        Sorted p-values, as these draws give them, of simulations against the others; None: Gaussian data are trusted.
     """
 
     tests: int
     smallest: NDArray[np.float64]
     combined: NDArray[np.float64]
+    held_out_smallest: NDArray[np.float64] | None = None
+    held_out_combined: NDArray[np.float64] | None = None
 
     def global_pvalue(self, smallest: ArrayLike) -> NDArray[np.float64]:
         """Return the probability that the smallest p-value of all candidates is this one or less.
 
         This is its rank among the draws, or Bonferroni's bound if that is lower, beyond the reach of the draws.
         """
-        return np.minimum(_rank(self.smallest, smallest), self.tests * np.asarray(smallest))
+        found = np.minimum(_rank(self.smallest, smallest), self.tests * np.asarray(smallest))
+        return _among(self.held_out_smallest, found)
 
     def combine(self, omnibus: ArrayLike, smallest: ArrayLike) -> NDArray[np.float64]:
         """Return one p-value from that of the omnibus test and the smallest one of the candidates."""
         least = np.minimum(omnibus, self.global_pvalue(smallest))
-        return np.minimum(_rank(self.combined, least), 2.0 * least)
+        return _among(self.held_out_combined, np.minimum(_rank(self.combined, least), 2.0 * least))
 
 
 def _rank(draws: NDArray[np.float64], value: ArrayLike) -> NDArray[np.float64]:
     rank = np.searchsorted(draws, np.asarray(value), side="right")
     return np.asarray((1.0 + rank) / (1.0 + len(draws)), dtype=np.float64)
+
+
+def _among(held_out: NDArray[np.float64] | None, pvalue: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rank of p-values among those of held-out simulations; below the lowest TAIL, in proportion to it."""
+    if held_out is None:
+        return pvalue
+    edge, share = held_out[TAIL - 1], (1.0 + TAIL) / (1.0 + len(held_out))
+    return np.where(pvalue >= edge, _rank(held_out, pvalue), share * pvalue / edge)
+
+
+def calibrate_on(
+    calibration: Calibration, null: SimulatedGaussian, candidates: WhitenedTemplates, simulations: NDArray[np.float64]
+) -> Calibration:
+    """Return a calibration whose p-values are uniform over the simulations of ``null``, shape (N, p_raw).
+
+    For data vectors that are not quite Gaussian: each simulation is tested against all others.
+
+    Notes
+    -----
+    With c = x_i - mean, S the scatter matrix of all N and a = N/(N - 1) c'S^-1 c, the scatter of the others is that
+    less N/(N - 1) c c' (Sherman & Morrison, Ann. Math. Stat. 21, 124, 1950). So chi^2 is (N - 2) a/(1 - a), and its
+    fall by templates (N - 2) b/((1 - a)(1 - a + b)), b the part of a that is along them. Against explicit refits:
+    tests/unit/test_nuisances.py.
+    """
+    count, p, n = len(simulations), null.dimension, null.dof - 1
+    white = (simulations - simulations.mean(axis=0)) @ null.whitening.T
+    scale = count / (count - 1.0) / null.dof
+    a, b = scale * np.sum(white**2, axis=1), scale * candidates.delta_chi2(white)
+    rest = np.maximum(1.0 - a, 1e-12)
+    chi2, falls = n * a / rest, n * b / (rest[:, None] * (rest[:, None] + b))
+    smallest = nested_pvalue(falls, chi2[:, None], candidates.sizes, p, n).min(axis=1)
+    found = replace(calibration, held_out_smallest=np.sort(calibration.global_pvalue(smallest)))
+    combined = found.combine(residual_pvalue(chi2, p, n), smallest)
+    return replace(found, held_out_combined=np.sort(combined))
 
 
 def calibrate(

@@ -63,6 +63,7 @@ PUBLIC = {
         "Ensemble",
         "Map",
         "Noise",
+        "Nuisance",
         "RunConfig",
         "Scan",
         "ScanDifferencing",

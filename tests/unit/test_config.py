@@ -132,6 +132,6 @@ def test_resolved_writes_the_defaults_out_and_loads_as_the_same_run(plain, folde
 
 def test_json_schema_names_every_table(plain):
     schema = config.json_schema()
-    tables = {"schema", "name", "sky", "map", "channel", "effect", "preparation", "simulator", "biposh", "ensemble"}
-    assert set(schema["properties"]) == {*tables, "compute"}
+    tables = {"schema", "name", "sky", "map", "channel", "effect", "preparation", "nuisance", "biposh", "ensemble"}
+    assert set(schema["properties"]) == tables | {"simulator", "compute"}
     assert schema["additionalProperties"] is False

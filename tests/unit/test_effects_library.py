@@ -17,6 +17,8 @@ from refusals import refused
 
 LMAX, NSIDE = 48, 8
 ON_REQUEST = {
+    "calibration",
+    "monopole_residual",
     "sidelobe_pickup",
     "gain_spin",
     "bandpass_mismatch",
@@ -32,11 +34,13 @@ NAMES = {
     "beam_coma",
     "beam_sidelobe",
     "beam_width",
+    "calibration",
     "beam_noncircularity",
     "pointing_offset",
     "time_constant",
     "gain_drift",
     "dipole_residual",
+    "monopole_residual",
     "transmission_imbalance",
     "noise_anisotropy",
     "noise_level",

@@ -1,0 +1,256 @@
+"""Nuisances: effects of unknown size with a prior, which every simulation of a model draws anew."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from mcsim import config, systematics
+from mcsim.errors import InputError
+from mcsim.simulation import convolve
+from mcsim.simulation.channels import site_of
+from mcsim.simulation.pixel_means import gain_of, signal_of
+from mcsim.simulation.survey import Channel, Survey, survey, with_effects
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import rng
+from mcsim.support.arrays import Map, Vector
+from mcsim.systematics import Effect, Library, Site, basis_of, looked_at, seen_through, spread_of
+
+_OF_BEAMS = ("beam", "pointing", "spread")
+
+REACH = 4.0
+"""Largest draw in prior widths; a nuisance must be possible up to there."""
+
+
+@dataclass(frozen=True)
+class Nuisance:
+    """What is known of an effect before the data: its linear coordinates are independent, normal about zero.
+
+    An effect of one sign is half-normal: the absolute value is drawn.
+    """
+
+    effect: type[Effect]
+    channel: str | None  # None: acts in all
+    widths: tuple[float, ...]  # prior standard deviation of each coordinate, in the unit of the amplitude
+    settings: Mapping[str, Any] = field(default_factory=dict)  # parameters that are not drawn, or the centre of those
+    parameter_widths: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def title(self) -> str:
+        """Return the effect in words, with channel and settings."""
+        drawn = [f"{key} ± {width:g}" for key, width in self.parameter_widths.items()]
+        words = [f"{key} = {value}" for key, value in self.settings.items()]
+        return ", ".join((self.effect.label(self.channel), *words, *drawn))
+
+    @property
+    def mean(self) -> Vector:
+        """Return the prior mean of the coordinates, shape (k,)."""
+        return np.array(self.widths) * (np.sqrt(2.0 / np.pi) if self._one_sided else 0.0)
+
+    @property
+    def sigma(self) -> Vector:
+        """Return the prior standard deviation of the coordinates, shape (k,)."""
+        return np.array(self.widths) * (np.sqrt(1.0 - 2.0 / np.pi) if self._one_sided else 1.0)
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """Return the prior of each component in words."""
+        said = [self.effect.format_amplitude(float(m), float(s)) for m, s in zip(self.mean, self.sigma, strict=True)]
+        if len(set(said)) == 1:
+            return (f"{self.title}: {said[0]}" + (f" in each of {len(said)} components" if len(said) > 1 else ""),)
+        return tuple(f"{self.title}, component {k}: {words}" for k, words in enumerate(said, 1))
+
+    @property
+    def _one_sided(self) -> bool:
+        return self.effect.parametrization.sign != 0
+
+    def at(self, coordinates: Vector, **parameters: float) -> Effect:
+        """Return the effect at coordinates, shape (k,)."""
+        own = self.effect.parametrization.nearest(coordinates, np.eye(len(coordinates)))
+        return self.effect(**{**own, **self.settings, **parameters})
+
+    def draw(self, generator: np.random.Generator) -> tuple[Vector, Effect]:
+        """Draw coordinates, shape (k,), and the effect there."""
+        k, names = len(self.widths), list(self.parameter_widths)
+        normal = np.clip(generator.standard_normal(k + len(names)), -REACH, REACH)
+        coordinates = np.array(self.widths) * (np.abs(normal[:k]) if self._one_sided else normal[:k])
+        own = {
+            name: self._centre(name) + self.parameter_widths[name] * z
+            for name, z in zip(names, normal[k:], strict=True)
+        }
+        return coordinates, self.at(coordinates, **own)
+
+    def extremes(self) -> Iterator[Effect]:
+        """Yield the effect at its largest draws, component by component, and with each parameter at either end."""
+        for row, sign in ((row, sign) for row in REACH * np.diag(self.widths) for sign in (1.0, -1.0)):
+            if sign > 0.0 or not self._one_sided:
+                effect = self.at(sign * row)
+                if not np.allclose(self.effect.parametrization.coordinates(effect), sign * row):
+                    raise InputError(f"effect {effect.name} can have no component of {sign * row.max():g}.")
+                yield effect
+        for name, width in self.parameter_widths.items():
+            for sign in (REACH, -REACH):
+                yield self.at(np.array(self.widths), **{name: self._centre(name) + sign * width})
+
+    def _centre(self, name: str) -> float:
+        return float(self.settings.get(name, getattr(self.effect(), name)))
+
+
+Drawn = tuple[tuple[Nuisance, Effect], ...]
+"""Nuisances with the effects that are drawn from them."""
+
+
+def nuisances_of(run: config.RunConfig, library: Library | None = None) -> tuple[Nuisance, ...]:
+    """Return the nuisances of a run, in its order.
+
+    ``library``: default: the catalogue. Raise InputError for an effect or a parameter that is not known, a channel that
+    is missing or superfluous, and another number of widths than the effect has components.
+    """
+    return tuple(_nuisance(run, entry, library) for entry in run.nuisances)
+
+
+def _nuisance(run: config.RunConfig, entry: config.Nuisance, library: Library | None) -> Nuisance:
+    kind = systematics.get(entry.effect, library)
+    if kind.scope == "channel" and entry.channel is None:
+        raise InputError(f'nuisance {kind.name} acts in one channel; say which: channel = "{run.channels[0].name}".')
+    if kind.scope == "common" and entry.channel is not None:
+        raise InputError(f"nuisance {kind.name} is common to all channels; remove its channel = {entry.channel!r}.")
+    k = len(kind.parametrization.basis())
+    if len(entry.width) not in (1, k):
+        numbers = "1 number" if k == 1 else f"1 or {k} numbers"
+        raise InputError(f"nuisance {kind.name}: width has {len(entry.width)} numbers; give {numbers}.")
+    widths = entry.width if len(entry.width) == k else entry.width * k
+    fitted = {"amplitude", *kind.parametrization.nearest(np.ones(k), np.eye(k))}
+    free = [f.name for f in fields(kind) if f.name not in fitted]
+    for name in (*entry.parameters, *entry.parameter_widths):
+        if name not in free:
+            remedy = f"it has {', '.join(free)}" if free else "it has none"
+            raise InputError(f"nuisance {kind.name} has no parameter {name!r} beside what its width is of; {remedy}.")
+    built = systematics.build(kind, dict(entry.parameters))
+    settings = {name: getattr(built, name) for name in entry.parameters}
+    for name in entry.parameter_widths:
+        if not isinstance(getattr(built, name), float):
+            raise InputError(f"nuisance {kind.name}: {name} is no number; remove it from parameter_widths.")
+    return Nuisance(kind, entry.channel, widths, settings, dict(entry.parameter_widths))
+
+
+def check_nuisances(run: config.RunConfig, library: Library | None = None) -> int:
+    """Return the highest order of the beams that nuisances can make.
+
+    Raise InputError for one that is not known, or that four prior widths make impossible.
+    """
+    orders = 0
+    for one in nuisances_of(run, library):
+        try:
+            for effect, spec in product(one.extremes(), run.channels):
+                if one.channel in (None, spec.name):
+                    orders = max(orders, _try(effect, site_of(run, spec)))
+        except InputError as error:
+            text = str(error).rstrip(".")
+            raise InputError(
+                f"nuisance {one.effect.name}: draws reach {REACH:g} prior widths, and there {text}; lower the width or "
+                "remove the nuisance."
+            ) from None
+    return orders
+
+
+def _try(effect: Effect, site: Site) -> int:
+    """Return the highest order of the beam with an effect; raise InputError if it cannot act."""
+    looked_at((effect,), np.zeros(alm_.size(site.lmax), dtype=np.complex128), site, 0, 0)
+    effect.gain(np.zeros(1), site)
+    effect.noise(site)
+    return seen_through((effect,), site).mmax
+
+
+def draws(nuisances: Sequence[Nuisance], seed: int, realization: int) -> tuple[Vector, Drawn]:
+    """Draw all nuisances of one realization: their coordinates, one after the other, and their effects.
+
+    A nuisance that is added does not change those before it; another width changes only the scale.
+    """
+    found = [one.draw(rng.generator(seed, realization, f"nuisance/{number}")) for number, one in enumerate(nuisances)]
+    coordinates = [values for values, _ in found]
+    effects = tuple((one, effect) for one, (_, effect) in zip(nuisances, found, strict=True))
+    return np.concatenate(coordinates) if coordinates else np.zeros(0), effects
+
+
+def tables(run: config.RunConfig, seed: int, realization: int, library: Library | None = None) -> list[config.Effect]:
+    """Return one draw of the nuisances of a run as its ``[[effect]]``, to simulate data with."""
+    drawn = draws(nuisances_of(run, library), seed, realization)[1]
+    return [
+        config.Effect(
+            name=effect.name, channel=one.channel, parameters={"amplitude": effect.amplitude, **effect.parameters()}
+        )
+        for one, effect in drawn
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class DisturbedSurvey:
+    """Make the survey of every realization, with the nuisances that it draws; what they leave alone is shared."""
+
+    survey: Survey
+    nuisances: tuple[Nuisance, ...]
+    library: Library | None = None
+
+    @classmethod
+    def of(cls, run: config.RunConfig, library: Library | None = None) -> "DisturbedSurvey":
+        """Prepare a run; InputError as of :func:`check_nuisances`."""
+        orders = check_nuisances(run, library)
+        return cls(survey(run, orders=orders, library=library), nuisances_of(run, library), library)
+
+    def at(self, realization: int) -> Survey:
+        """Return the survey of one realization."""
+        shared = self.survey
+        _, drawn = draws(self.nuisances, shared.config.ensemble.seed, realization)
+        if any(channel.side_b is not None for channel in shared.channels):
+            run = shared.config
+            acting = (*run.effects, *tables(run, run.ensemble.seed, realization, self.library))
+            return survey(replace(run, effects=acting), library=self.library)
+        channels = tuple(self._disturbed(channel, drawn) for channel in shared.making.channels)
+        if shared.source is None:
+            return replace(shared, channels=channels)
+        return replace(shared, source=replace(shared.source, channels=channels))
+
+    def _disturbed(self, channel: Channel, drawn: Drawn) -> Channel:
+        """Return a channel with the effects that are drawn for it after its own."""
+        more = tuple(effect for one, effect in drawn if one.channel in (None, channel.name))
+        site = channel.site
+        acting = (*channel.effects, *more)
+        beam, response = channel.beam, channel.response
+        if any(getattr(type(effect), hook) is not getattr(Effect, hook) for effect in more for hook in _OF_BEAMS):
+            beam = seen_through(acting, site)
+            beam = beam.truncated(min(beam.mmax, *(m.moments.smax for m in channel.maps)))
+            response = convolve.response(beam, site.lmax, channel.window ** (spread_of(acting) ** 2))
+        maps = []
+        for place, m in enumerate(channel.maps):
+            means: dict[str, Map | None] = {"gain": m.gain, "signal_uk": m.signal_uk}
+            for (number, name, key), basis in self._means.items():
+                if name == channel.name:
+                    effect = drawn[number][1]
+                    added, before = effect.parametrization.coordinates(effect) @ basis[place], means[key]
+                    means[key] = added if before is None else before + added
+            own = with_effects(m, more, site)
+            maps.append(replace(own, gain=means["gain"], signal_uk=means["signal_uk"]))
+        return replace(channel, beam=beam, response=response, maps=tuple(maps), effects=acting)
+
+    @cached_property
+    def _means(self) -> dict[tuple[int, str, str], list[Map]]:
+        """Return the mean errors of the gain, and signals, per coordinate: linear in these, they take a pass each.
+
+        By nuisance, channel, and name in a map: one array of shape (k, npix) for each map of the channel.
+        """
+        found = {}
+        for (number, one), channel in product(enumerate(self.nuisances), self.survey.making.channels):
+            for key, hook, mean in (("gain", "gain", gain_of), ("signal_uk", "signal", signal_of)):
+                if getattr(one.effect, hook) is getattr(Effect, hook) or one.channel not in (None, channel.name):
+                    continue
+                basis, splits = basis_of(one.effect, one.settings), len(channel.maps)
+                shares = [(n / splits, (n + 1) / splits) for n in range(splits)]
+                found[number, channel.name, key] = [
+                    np.stack([mean(effect, channel.site, share) / effect.amplitude for effect in basis])
+                    for share in shares
+                ]
+        return found

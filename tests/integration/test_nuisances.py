@@ -1,0 +1,200 @@
+"""A small instrument whose calibrations and noise are known to within a prior: maps, from beginning to end."""
+
+import json
+from dataclasses import replace
+
+import healpy
+import numpy as np
+import pytest
+import tomli_w
+from scipy.stats import ks_2samp
+
+import mcsim
+from mcsim import cli, config, systematics
+from mcsim.diagnosis import api, campaign, report, words
+from mcsim.diagnosis.analysis import analysis_of, data_vectors
+from mcsim.diagnosis.campaign import seeded, with_effects
+from mcsim.diagnosis.context import context
+from mcsim.diagnosis.inference import diagnose_data
+from mcsim.diagnosis.nuisance import Regression
+from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.ensemble.maps import file_names
+from mcsim.simulation import simulate
+from mcsim.simulation.nuisance import draws, tables
+from mcsim.simulation.survey import survey
+from mcsim.stats.look_elsewhere import global_test
+
+PROPOSED = ("beam_ellipticity", "calibration", "noise_level")
+WITHOUT = tuple(name for name in systematics.catalogue() if name not in PROPOSED)
+WIDTH, NOISE = 0.003, 0.03
+MODEL = {
+    "schema": 1,
+    "name": "company",
+    "sky": {"spectrum": "wmap7", "lmax": 40, "dipole_uk": 3364.5},
+    "map": {"nside": 16, "splits": ["half1", "half2"]},
+    "biposh": {"L_max": 2},
+    "channel": [
+        {
+            "name": name,
+            "frequency_ghz": frequency,
+            "beam": {"kind": "gaussian", "fwhm_arcmin": 350.0},
+            "noise": {"sigma0_uk": 60.0},
+            "scan": {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 61.0, "line_of_sight": line},
+        }
+        for name, frequency, line in (("V1", 61.0, "A"), ("W1", 94.0, "B"))
+    ],
+    "nuisance": [
+        {"effect": effect, "channel": channel, "width": width}
+        for channel in ("V1", "W1")
+        for effect, width in (("calibration", WIDTH), ("noise_level", NOISE))
+    ],
+}
+SIMULATIONS = 400
+
+
+def ask(jobs):
+    return [data_vectors(job) for job in jobs]
+
+
+def learned(run):
+    analysis = analysis_of(run, without=WITHOUT, settings=DiagnosisSettings(including=PROPOSED))
+    return context(analysis, *campaign.learned(analysis, ask, SIMULATIONS, time_ordered=False))
+
+
+@pytest.fixture(scope="module")
+def run():
+    return config.load(MODEL)
+
+
+@pytest.fixture(scope="module")
+def declared(run):
+    return learned(run)
+
+
+@pytest.fixture(scope="module")
+def undeclared(run):
+    return learned(replace(run, nuisances=()))
+
+
+def maps_of(run, *effects, seed=77):
+    return list(simulate.maps(survey(with_effects(seeded(replace(run, nuisances=()), seed), effects)), 0))
+
+
+def calibration(amplitude):
+    return config.Effect(name="calibration", channel="W1", parameters={"amplitude": amplitude})
+
+
+ELLIPSE = config.Effect(name="beam_ellipticity", channel="W1", parameters={"amplitude": 0.5, "angle_deg": 20.0})
+
+
+def test_p_is_uniform_over_the_prior_and_not_without_the_nuisances(declared, undeclared):
+    job = replace(declared.analysis.job(seeded(declared.run, 12)), nuisances=True, count=500)
+    rows = data_vectors(job)
+    p = {}
+    for name, known in (("declared", declared), ("undeclared", undeclared)):
+        p[name] = [global_test(known.null, x, known.groups, known.calibration).pvalue for x in rows]
+    # P-values are ranks among those of the simulations, a sample like that of the data.
+    assert ks_2samp(p["declared"], np.arange(1.0, SIMULATIONS + 1.0) / (SIMULATIONS + 1.0)).pvalue > 1e-3
+    alarms = np.mean(np.array(p["declared"]) <= 0.05)
+    # Binomial, of the data and of the ranks of the simulations.
+    assert abs(alarms - 0.05) < 4.0 * np.sqrt(0.05 * 0.95 * (1.0 / 500 + 1.0 / SIMULATIONS))
+    assert np.mean(np.array(p["undeclared"]) <= 0.05) > 0.9
+    # The posteriors have unit pulls: errors of the mean and width, and of the mean and covariance of the simulations.
+    regression = Regression.of(declared.ensemble, declared.null)
+    mean, sigma = (np.stack(one) for one in zip(*(regression.posterior(x, np.zeros(4)) for x in rows), strict=True))
+    true = np.stack([draws(declared.analysis.nuisances, 12, r)[0] for r in range(500)])
+    pulls = (mean - true) / sigma
+    assert np.all(np.abs(pulls.mean(axis=0)) < 4.0 * np.sqrt(1.0 / 500 + (1.0 + declared.null.dimension) / SIMULATIONS))
+    assert np.all(np.abs(pulls.std(axis=0) - 1.0) < 0.15)
+    assert np.all(sigma.mean(axis=0) < 0.6 * np.array([WIDTH, NOISE] * 2))
+
+
+def test_an_effect_is_named_beside_nuisances_that_are_far_from_zero(run, declared, undeclared):
+    drawn = tables(run, 5, 0)
+    maps = maps_of(run, ELLIPSE, *drawn)
+    found = diagnose_data(ObservedMaps(declared, maps, ask), "declared")
+    assert [(one.name, one.channel) for one in found.effects] == [("beam_ellipticity", "W1")]
+    assert abs(found.effects[0].amplitude - 0.5) < 4.0 * found.effects[0].sigma
+    for one, truth in zip(found.nuisances, drawn, strict=True):
+        assert (one.name, one.channel) == (truth.name, truth.channel)
+        assert abs(one.amplitude - truth.parameters["amplitude"]) < 4.0 * one.sigma
+        assert one.sigma < 0.6 * one.prior_width
+        assert abs(one.pull) < 4.0
+    assert found.held_out.pvalue_after > 1e-3
+    assert abs(found.held_out.achieved.value - found.held_out.predicted.value) < 4.0 * np.hypot(
+        found.held_out.achieved.sigma, found.held_out.predicted.sigma
+    )
+    blind = diagnose_data(ObservedMaps(undeclared, maps, ask), "undeclared")
+    assert [one.name for one in blind.effects] != ["beam_ellipticity"]
+    assert blind.nuisances == ()
+
+
+def test_a_calibration_far_beyond_its_prior_is_named(run, declared):
+    within = diagnose_data(ObservedMaps(declared, maps_of(run, calibration(1.5 * WIDTH)), ask), "within")
+    assert within.kind == "none"
+    assert within.nuisances[2].amplitude == pytest.approx(1.5 * WIDTH, abs=4.0 * within.nuisances[2].sigma)
+    beyond = diagnose_data(ObservedMaps(declared, maps_of(run, calibration(10.0 * WIDTH)), ask), "beyond")
+    best = beyond.effects[0]
+    assert [(one.name, one.channel) for one in beyond.effects] == [("calibration", "W1")]
+    # Its error has the prior, which is part of the model, but for what 500 standard deviations change in the response.
+    assert best.sigma > 0.5 * WIDTH
+    assert best.amplitude == pytest.approx(10.0 * WIDTH, abs=4.0 * best.sigma)
+
+
+def test_the_command_lists_and_writes_nuisances(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(api, "batch", lambda workers: campaign.batch(0))  # in this process
+    monkeypatch.chdir(tmp_path)
+    channel = MODEL["channel"][1]
+    channels = [channel | {"scan": channel["scan"] | {"sample_period_s": 610.0}}]
+    table = MODEL | {"map": {"nside": 8, "splits": ["a", "b"]}, "sky": MODEL["sky"] | {"lmax": 20}, "channel": channels}
+    table["nuisance"] = MODEL["nuisance"][2:]
+    (tmp_path / "model.toml").write_text(tomli_w.dumps(table))
+    small = config.load("model.toml")
+    (tmp_path / "data").mkdir()
+    names = file_names(small)
+    for name, map_uk in zip(config.map_names(small), maps_of(small, calibration(2.0 * WIDTH)), strict=True):
+        healpy.write_map(tmp_path / "data" / names[name], map_uk, coord="E", column_units="uK", dtype=np.float64)
+
+    def mcsim_(*said):
+        monkeypatch.setattr("sys.argv", ["mcsim", *said])
+        code = 0
+        try:
+            cli.main()
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        return code, capsys.readouterr()
+
+    without = [word for name in WITHOUT for word in ("--without", name)]
+    code, said = mcsim_("diagnose", "model.toml", "data", "-o", "out", "--dry-run", *without)
+    assert code == 0
+    assert "nuisance: calibration of W1: 0.00 % ± 0.30 % of the gain" in said.out
+    code, said = mcsim_("diagnose", "model.toml", "data", "-o", "out", "--simulations", "150", *without)
+    assert code == 0
+    assert "nuisance      calibration of W1" in said.out
+    verdict = json.loads((tmp_path / "out" / "verdict.json").read_text())
+    one, two = verdict["nuisances"]
+    assert (one["name"], one["channel"], one["prior_width"]) == ("calibration", "W1", WIDTH)
+    assert abs(one["amplitude"] - 2.0 * WIDTH) < 4.0 * one["sigma"]
+    assert two["name"] == "noise_level"
+    found = mcsim.diagnosis.result.DiagnosisResult.open(tmp_path / "out")
+    assert found.to_json() == verdict
+    assert "Known unknowns" in report.page(found)
+    assert words.pulled(found.nuisances[0]).startswith("; pull ")
+    assert mcsim_("config", "model.toml")[0] == 0
+    table["nuisance"] = [{"effect": "noise_level", "channel": "W1", "width": 0.5}]
+    (tmp_path / "wide.toml").write_text(tomli_w.dumps(table))
+    for command in (("config", "wide.toml"), ("diagnose", "wide.toml", "data", "-o", "new")):
+        code, said = mcsim_(*command)
+        assert code == 2
+        assert "noise_level" in said.err
+        assert said.err.count("\n") == 1
+    assert not (tmp_path / "new" / "verdict.json").exists()
+
+
+def test_settings_without_nuisances_keep_the_verdict(run, undeclared):
+    assert undeclared.ensemble.nuisances is None
+    assert undeclared.calibration.held_out_combined is None
+    found = diagnose_data(ObservedMaps(undeclared, maps_of(run), ask), "plain")
+    assert "nuisances" not in found.to_json()
