@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from mcsim.systematics.base import Alm, Draw, Effect, Site, Wording
+from mcsim.systematics.base import Alm, Bound, Draw, Effect, Site, Wording
 from mcsim.systematics.galaxy import morphology
 from mcsim.systematics.parametrization import Parametrization
 
@@ -28,6 +28,7 @@ class BandpassMismatch(Effect):
     signature = "Additive along the Galactic plane in one channel alone, also among channels of one frequency."
     source = "Planck 2015 results II, A&A 594, A2, and IX, A&A 594, A9 (colour corrections, mismatch); Page et al. 2007"
     step = 3.0
+    bounds = (Bound("amplitude", -500.0, 500.0, "a prior of this library: less than the foreground itself"),)
     parametrization = Parametrization(stochastic=True, matched_filter=False)
     proposed = False
 

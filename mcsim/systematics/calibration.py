@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
-from mcsim.systematics.base import Effect, Site, Wording
+from mcsim.systematics.base import Bound, Effect, Site, Wording
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +27,7 @@ class Calibration(Effect):
     signature = "L = 0 and the dipole: the same factor at all degrees and times, in this channel alone."
     source = "Jarosik et al. 2011, ApJS 192, 14, Sec. 2 (0.2 %); Planck 2015 results V, A&A 594, A5"
     step = 1e-3
+    bounds = (Bound("amplitude", -0.5, 0.5, "a prior of this library: half of the dipole is seen by eye"),)
 
     def beam(self, beam: Beam, site: Site) -> Beam:
         """Scale the beam."""

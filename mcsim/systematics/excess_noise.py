@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mcsim.errors import InputError
-from mcsim.systematics.base import Effect, Wording
+from mcsim.systematics.base import Bound, Effect, Wording
 from mcsim.systematics.parametrization import Parametrization, Vector
 
 
@@ -35,6 +35,10 @@ class ExcessNoise(Effect):
     signature = "Autos only, as more noise: degenerate with noise_level, for tails are not measured."
     source = "Planck 2013 results X, A&A 571, A10 (glitches of HFI and what is left of them)"
     step = 1e-3
+    bounds = (
+        Bound("amplitude", 0.0, 1.0, "a share of the samples"),
+        Bound("glitch_uk", 0.0, 1000000.0, "a size; fixed in a fit"),
+    )
     parametrization = Parametrization(
         sign=1, max_amplitude=1.0, stochastic=True, mean_response=True, matched_filter=False
     )

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mcsim.systematics.base import Effect, Site, Wording
+from mcsim.systematics.base import Bound, Effect, Site, Wording
 from mcsim.systematics.parametrization import Angle, Vector
 from mcsim.systematics.spacecraft import spin_phase
 
@@ -34,6 +34,7 @@ class GainSpin(Effect):
     signature = "Sky and dipole times a pattern fixed to the Sun: additive at low l, in the frame of the scan."
     source = "Jarosik et al. 2007, ApJS 170, 263, Sec. 2.4; Planck 2015 results III, A&A 594, A3 (thermal effects)"
     step = 2e-4
+    bounds = (Bound("amplitude", 0.0, 0.1, "a prior of this library: far beyond any radiometer in use"),)
     parametrization = Angle(parameter="phase_deg")
     proposed = False
 

@@ -10,7 +10,7 @@ from scipy.interpolate import CubicSpline
 
 from mcsim.errors import InputError
 from mcsim.sphere.sky import gaussian_alm
-from mcsim.systematics.base import Alm, Draw, Effect, Site, Wording
+from mcsim.systematics.base import Alm, Bound, Draw, Effect, Site, Wording
 from mcsim.systematics.parametrization import Parametrization
 from mcsim.systematics.spacecraft import axes
 
@@ -54,6 +54,7 @@ class Lensing(Effect):
     signature = "Smoother peaks of C_l and every L in a single sky, the same in all channels; from l of about 500 on."
     source = "Lewis & Challinor 2006, Phys. Rep. 429, 1; Planck 2018 results VIII, A&A 641, A8"
     step = 1.0
+    bounds = (Bound("amplitude", 0.0, 10.0, "a power, and ten times that of the standard model was excluded long ago"),)
     parametrization = Parametrization(
         sign=1, max_amplitude=10.0, stochastic=True, mean_response=True, matched_filter=False
     )

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mcsim.systematics.base import Alm, Draw, Effect, Site, Wording
+from mcsim.systematics.base import Alm, Bound, Draw, Effect, Site, Wording
 from mcsim.systematics.parametrization import Parametrization
 
 
@@ -22,6 +22,7 @@ class MonopoleResidual(Effect):
     signature = "l = 0; behind a mask in the lowest degrees of this channel, the same in both halves."
     source = "Bennett et al. 2003, ApJS 148, 97, Sec. 3 (zero levels of the maps)"
     step = 0.5
+    bounds = (Bound("amplitude", -2.7e6, 2.7e6, "less than the temperature of the sky, 2.7 K"),)
     parametrization = Parametrization(matched_filter=False)
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:

@@ -6,7 +6,7 @@ import numpy as np
 
 from mcsim.errors import InputError
 from mcsim.sphere.sky import dipole_alm
-from mcsim.systematics.base import Alm, Draw, Effect, Site, Wording
+from mcsim.systematics.base import Alm, Bound, Draw, Effect, Site, Wording
 from mcsim.systematics.parametrization import Vector
 from mcsim.systematics.product import multiplied
 
@@ -35,6 +35,7 @@ class Nonlinearity(Effect):
     signature = "A quadrupole aligned with the dipole, and the sky modulated along it, the same in both halves."
     source = "Planck 2018 results III, A&A 641, A3, Sec. 2 and 5 (nonlinearity of converters, dipole distortion)"
     step = 2e-4
+    bounds = (Bound("amplitude", -0.1, 0.1, "a prior of this library: far beyond any converter in use"),)
     proposed = False
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mcsim.systematics.base import Effect, Site, Wording
+from mcsim.systematics.base import Bound, Effect, Site, Wording
 from mcsim.systematics.parametrization import Angle, Vector
 from mcsim.systematics.spacecraft import axes, heading
 
@@ -38,6 +38,7 @@ class OrbitalDipole(Effect):
     signature = "A dipole that turns through the year: of opposite sign in the halves, in the ecliptic plane."
     source = "Planck 2015 results V, A&A 594, A5; Hinshaw et al. 2009, ApJS 180, 225 (the annual dipole calibrates)"
     step = 2e-3
+    bounds = (Bound("amplitude", 0.0, 2.0, "at 2 an orbital dipole of the right size has the opposite sign"),)
     parametrization = Angle(parameter="phase_deg")
     proposed = False
 

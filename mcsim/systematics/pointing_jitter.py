@@ -6,7 +6,7 @@ import numpy as np
 
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
-from mcsim.systematics.base import Effect, Site, Wording
+from mcsim.systematics.base import Bound, Effect, Site, Wording
 from mcsim.systematics.parametrization import Parametrization
 
 
@@ -34,6 +34,7 @@ class PointingJitter(Effect):
     signature = "L = 0, as of a wider beam: degenerate with beam_width for beams that are nearly Gaussian."
     source = "Planck 2015 results IV, A&A 594, A4, Sec. 2, and VII, A&A 594, A7 (pointing and its noise)"
     step = 1.0
+    bounds = (Bound("amplitude", 0.0, 400.0, "a variance, and one of (20 arcmin)^2 is no jitter but a broad beam"),)
     parametrization = Parametrization(sign=1)
     proposed = False
 

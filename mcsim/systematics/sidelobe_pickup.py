@@ -12,7 +12,7 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotation_matrix
 from mcsim.sphere.sky import dipole_alm
-from mcsim.systematics.base import Effect, Site, Wording
+from mcsim.systematics.base import Bound, Effect, Site, Wording
 from mcsim.systematics.galaxy import template_alm
 from mcsim.systematics.parametrization import Vector
 from mcsim.systematics.spacecraft import axes
@@ -59,6 +59,11 @@ class SidelobePickup(Effect):
         "the morphology is a model"
     )
     step = 1e-4
+    bounds = (
+        Bound("amplitude", -0.1, 0.1, "a prior of this library: a tenth of the response is no far sidelobe"),
+        Bound("width_deg", 5.0, 90.0, "a broad lobe; fixed in a fit"),
+        Bound("galaxy_uk", 0.0, 100000.0, "the Galaxy is bright; fixed in a fit"),
+    )
     proposed = False
 
     angle_deg: float = 85.0

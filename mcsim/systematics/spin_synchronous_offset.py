@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mcsim.systematics.base import Effect, Site, Wording
+from mcsim.systematics.base import Bound, Effect, Site, Wording
 from mcsim.systematics.parametrization import Angle, Vector
 from mcsim.systematics.spacecraft import spin_phase
 
@@ -29,6 +29,14 @@ class SpinSynchronousOffset(Effect):
     signature = "A pattern of the ecliptic frame at low l, the same in both halves: stripes are too regular to average."
     source = "Jarosik et al. 2007, ApJS 170, 263, Sec. 2.4 (limits); Planck 2015 results III, A&A 594, A3, Sec. 3"
     step = 0.5
+    bounds = (
+        Bound(
+            "amplitude",
+            0.0,
+            1000.0,
+            "a prior of this library: a mK is seen in the time stream by eye",
+        ),
+    )
     parametrization = Angle(parameter="phase_deg")
     proposed = False
 
