@@ -46,7 +46,8 @@ def make(
 
     It gets ``cases/case-NNN`` (maps, model.toml, question.json, SEAL), ``keys/case-NNN.json`` and ``challenge.json``. A
     folder can be filled in several calls, and a call that was interrupted repeated. The seed of the draws is kept among
-    the keys, because it determines them. ``workers`` is the number of processes; None: the model's; 0: this process.
+    the keys, because it determines them. ``workers`` is the number of processes; None: the model's; 0: this process;
+    or the address of a running scheduler, or a Dask client, whose workers share cache and folder.
     InputError if the run cannot be used, or the folder holds a challenge with other settings.
     """
     if cases < 1:
@@ -148,7 +149,7 @@ def run(folder: str | Path, *, workers: Workers | None = None, quiet: bool = Tru
     """Diagnose the cases of a challenge that have no verdict yet, without looking at the keys; return their number.
 
     The folder, filled by :func:`make`, gets ``verdicts/case-NNN`` with ``verdict.json`` and ``answer.json`` (the data
-    vector and the fits behind the verdict). ``workers`` is the number of processes; None: the model's; 0: this process.
+    vector and the fits behind the verdict). ``workers`` as for :func:`make`.
     InputError if the folder holds no challenge.
     """
     target = Path(folder)

@@ -41,8 +41,8 @@ def score(folder: str | Path, *, workers: Workers | None = None, quiet: bool = T
     """Check the seals of a challenge, open the keys, and compare them with the verdicts.
 
     The folder gets ``score/score.json``, ``score/report.html`` and ``score/score.png``. ``workers`` are the processes
-    that learn the model again, should it not be in the cache; None: the model's; 0: this process. InputError if there
-    is no verdict, or one cannot be read, or a key is not the sealed one.
+    that learn the model again, should it not be in the cache (:func:`mcsim.benchmark.challenge.make`). InputError if
+    there is no verdict, or one cannot be read, or a key is not the sealed one.
     """
     target = Path(folder)
     made = finished_cases(target)
@@ -73,8 +73,8 @@ def score_draws(
 ) -> Score:
     """Score draws of a model's data vector (:func:`draws`), and write the score into a folder.
 
-    :data:`DETECTIONS` more draws are tested for detection alone. ``workers`` is the number of processes; None: the
-    model's; 0: this process.
+    :data:`DETECTIONS` more draws are tested for detection alone. ``workers`` as for
+    :func:`mcsim.benchmark.challenge.make`.
     """
     if number < 1:
         raise InputError(f"a score of {number} draws is none; ask for at least 1.")

@@ -3,6 +3,7 @@
 import logging
 import multiprocessing
 import sys
+from asyncio import CancelledError
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib.machinery import ModuleSpec
@@ -189,12 +190,15 @@ def completed(
     """Call a function on the workers of a cluster; yield the index and the result of each call as it completes.
 
     ``arguments`` may be lazy: three calls are in flight for every present worker thread, so workers may join and leave.
-    The exception of a call is raised, ``distributed.KilledWorker`` if its worker died every time.
+    The exception of a call is raised; RunError if its worker died every time, or the connection is lost.
     """
-    for index, result, killed in answers(Roll(client), function, arguments):
-        if killed is not None:
-            raise killed
-        yield index, result
+    try:
+        for index, result, killed in answers(Roll(client), function, arguments):
+            if killed is not None:
+                raise RunError(f"A task was given up, for {death(killed)}; give workers more memory.") from killed
+            yield index, result
+    except (CancelledError, CommClosedError) as error:
+        raise RunError("The connection to the scheduler is lost; run the same command again.") from error
 
 
 def answers(
