@@ -14,16 +14,19 @@ from mcsim import config
 from mcsim.comparison import report
 from mcsim.comparison.effects import effects_of
 from mcsim.comparison.library import library
+from mcsim.comparison.looks import look
 from mcsim.comparison.pairs import ChannelPair, Comparison, given, read
 from mcsim.comparison.result import ChannelResult, ComparisonResult, DifferenceResult, Verdict
 from mcsim.comparison.search import (
-    ENOUGH,
+    DOUBTFUL,
     EXPLAINED_BY_SAMPLES,
+    INTERPOLATING,
     PRECISION,
     Problem,
     Set,
     alternatives,
     with_sharper_sky,
+    without_noise,
 )
 from mcsim.errors import InputError
 from mcsim.simulation.noise import of_map
@@ -127,21 +130,27 @@ def _channel(pair: ChannelPair, sides: Comparison, accuracy: float) -> ChannelRe
     if rms <= ROUNDING * sky:
         return _result(pair, sides, "identical", [])
     if pair.sky_of_maps:
-        pair = with_sharper_sky(pair)
-    others = {other.name: other.a for other in sides.pairs if other.name != pair.name}
-    problem = Problem(pair, library(sides.frame), others)
+        pair = without_noise(with_sharper_sky(pair))
+    others = [other for other in sides.pairs if other.name != pair.name]
+    problem = Problem(pair, library(sides.frame), others, accuracy * sky)
     sets = problem.best()
-    if sides.run is not None and (not sets or sets[0].left > ENOUGH or problem.needed < EXPLAINED_BY_SAMPLES):
+    if sides.run is not None and (not sets or sets[0].left > problem.enough or problem.needed < EXPLAINED_BY_SAMPLES):
         problem = replace(problem, library=(*problem.library, *effects_of(pair, sides.run)))
         sets = problem.best()
-    if not sets or sets[0].explains < problem.needed:
+    if not sets or not problem.suffices(sets[0]) or sets[0].left > DOUBTFUL:
         sets = sorted([*sets, *problem.best(slow=True)], key=lambda one: one.left)
-    if not sets or sets[0].explains < problem.needed:
+    exchanged = bool(sets) and any(difference.exchanges for difference, _ in sets[0].members)
+    if rms > accuracy * sky and (
+        not sets or not problem.suffices(sets[0]) or (exchanged and sets[0].left > problem.enough)
+    ):
+        behind = problem.behind()
+        if behind and (not sets or behind[0].left < (1.0 - problem.further(sets[0])) * sets[0].left):
+            sets = behind
+    small = rms <= accuracy * sky and bool(sets) and sets[0].names <= INTERPOLATING
+    if not sets or not problem.suffices(sets[0]) or small:
         return _result(pair, sides, "identical" if rms <= accuracy * sky else "unknown", [], problem, sets)
     known = {equal[0] for difference, value in sets[0].members for equal in difference.equivalent(value)}
-    others_too = [
-        one for one in alternatives(sets, problem.needed) if not known.intersection(d.name for d, _ in one.members)
-    ]
+    others_too = [one for one in alternatives(sets, problem) if not known.intersection(d.name for d, _ in one.members)]
     chosen = [sets[0], *others_too]
     return _result(pair, sides, _verdict(chosen), chosen, problem, sets)
 
@@ -181,13 +190,22 @@ def _result(
         noncircular_rms_uk=np.nan if scene is None else _rms(scene.noncircular()[seen]),
         noise_rms_uk=noise,
         left_rms_uk=_rms((pair.b - pair.a - explained)[seen]),
+        looks=_looks(pair, explained) if verdict in ("unknown", "identical") else (),
         unmade_rms_uk=problem.unmade if verdict == "unknown" and problem is not None else 0.0,
         a=pair.a,
         b=pair.b,
         explained=explained,
         seen=seen,
-        hits=None if scene is None else np.stack([m.hits for m in scene.moments]),
+        one_sided=pair.one_sided,
+        hits=pair.hits,
     )
+
+
+def _looks(pair: ChannelPair, explained: NDArray[np.float64]) -> tuple[str, ...]:
+    """Return what is left looks like, in the map that has most of it."""
+    left = np.where(pair.seen, pair.b - pair.a - explained, 0.0)
+    most = int(np.argmax(np.sum(left**2, axis=1)))
+    return look(left[most], pair.a[most], pair.seen[most], None if pair.hits is None else pair.hits[most])
 
 
 def _noise_rms(run: config.RunConfig, pair: ChannelPair) -> float:
@@ -200,6 +218,10 @@ def _noise_rms(run: config.RunConfig, pair: ChannelPair) -> float:
     levels = np.stack(
         [np.zeros(m.npix) if own is None else own for own, m in zip(found, pair.scene.moments, strict=True)]
     )
+    steps = pair.scene.preparations
+    if steps:
+        hits = [m.hits for m in pair.scene.moments]
+        levels = np.stack([step.noise_uk(own, h) for step, own, h in zip(steps, levels, hits, strict=True)])
     return _rms(levels[pair.seen])
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.comparison.pairs import ChannelPair
-from mcsim.comparison.scene import Maps, Scene
+from mcsim.comparison.scene import Maps, PointingFiles, Scene
 from mcsim.systematics.base import Pointing
 
 Vector = NDArray[np.float64]
@@ -29,13 +29,13 @@ class State:
     scene, maps
         Of the prediction; no scene without a model.
     others
-        Side A's maps of the other channels.
+        The other channels.
     """
 
     pair: ChannelPair
     scene: Scene | None
     maps: Maps
-    others: dict[str, Maps]
+    others: Sequence[ChannelPair]
 
     def fit(self, templates: Sequence[Maps]) -> Vector:
         """Return the least-squares amplitudes of templates in what is left, over the pixels that are seen."""
@@ -58,6 +58,14 @@ class Difference:
         True if it cannot be described without a model.
     smooth
         True if the value is refined by least squares.
+    slow
+        True if it is tried only where nothing else explains the maps.
+    enough
+        Share of the variance that a set with it must explain at most to be named; 1: as all sets.
+    linear
+        True if the response is the template of a small amplitude, and so no better than about a per mille.
+    exchanges
+        True if it exchanges pixels or files, which can be taken back before the rest is looked for.
     """
 
     name: ClassVar[str]
@@ -66,6 +74,9 @@ class Difference:
     needs_scene: ClassVar[bool] = True
     smooth: ClassVar[bool] = False
     slow: ClassVar[bool] = False
+    enough: ClassVar[float] = 1.0
+    linear: ClassVar[bool] = False
+    exchanges: ClassVar[bool] = False
 
     def starts(self, state: State) -> list[Vector]:
         """Return the values to try, shape (k,) each."""
@@ -79,7 +90,11 @@ class Difference:
         """Return the maps of side B."""
         return maps
 
-    def sampled(self, value: Vector, pair: ChannelPair, pointing: Pointing) -> Maps | None:
+    def undone(self, maps: Maps, value: Vector) -> Maps | None:
+        """Return maps of side B as they were before the difference; None if that is not known."""
+        return None
+
+    def sampled(self, value: Vector, pair: ChannelPair, pointing: Pointing | PointingFiles) -> Maps | None:
         """Return what side B has more than side A, sample by sample; None: as the scene says."""
         return None
 

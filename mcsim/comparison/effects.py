@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair, quiet
-from mcsim.comparison.scene import Maps
+from mcsim.comparison.scene import Maps, PointingFiles
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
@@ -27,6 +27,8 @@ REDUNDANT = ("calibration", "monopole_residual", "pixelization", "spectrum")
 class EffectDifference(Difference):
     """An effect of the library, linear in its coordinates."""
 
+    linear = True
+
     def __init__(self, kind: type[Effect], templates: Maps, run: config.RunConfig) -> None:
         self.kind, self.templates, self.run = kind, templates, run
 
@@ -38,7 +40,7 @@ class EffectDifference(Difference):
         """Return the maps with the effect's response."""
         return maps + np.tensordot(value, self.templates, 1)
 
-    def sampled(self, value: Vector, pair: ChannelPair, pointing: Pointing) -> Maps | None:
+    def sampled(self, value: Vector, pair: ChannelPair, pointing: Pointing | PointingFiles) -> Maps | None:
         """Return the response of the time-ordered reference; None if the effect does not act on samples."""
         assert pair.scene is not None
         sky: Any = pair.scene.sky  # an array stands for a file

@@ -22,15 +22,19 @@ from mcsim.comparison.scene_differences import (
     PrecessionSign,
     PsiOffset,
     PsiSign,
+    Smoothing,
     SpinSign,
     TimeShift,
 )
+from mcsim.comparison.time_differences import Interpolation, MapMaking
 
 
 def library(frame: str) -> tuple[Difference, ...]:
-    """Return all differences of implementation, for maps in a frame."""
+    """Return all differences of implementation, for skies in a frame."""
     return (
         Unit(), Calibration(), Monopole(), Dipole(), Ordering(), SplitExchanged(), ChannelExchanged(), NoiseShared(),
-        PsiOffset(), PsiSign(), BeamConjugated(), MmaxCut(), LmaxCut(), PixelWindow(), BeamWindow(), PixelCentres(),
+        PsiOffset(), PsiSign(), BeamConjugated(), MmaxCut(), LmaxCut(), PixelWindow(), BeamWindow(), Smoothing(),
+        PixelCentres(),
         TimeShift(), FrameRotated(frame), SpinSign(), PrecessionSign(),
+        MapMaking(), Interpolation(),
     )  # fmt: skip

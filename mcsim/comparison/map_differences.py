@@ -1,5 +1,7 @@
 """Differences of the maps themselves: units, calibration, monopole and dipole, order of pixels, exchanged files."""
 
+from dataclasses import replace
+
 import healpy
 import numpy as np
 
@@ -30,14 +32,15 @@ class Unit(Difference):
     needs_scene = False
 
     def starts(self, state: State) -> list[Vector]:
-        factors = [1e-6, 1e-3, 1e3, 1e6]
-        frequency = None if state.pair.channel is None else state.pair.channel.site.frequency_ghz
-        if frequency is not None:
-            x = 0.047992430 * frequency / header.T_CMB_K  # h nu/(k T)
-            to_cmb = np.expm1(x) ** 2 / (x**2 * np.exp(x))
-            factors += [to_cmb, 1.0 / to_cmb]
         found = 1.0 + float(state.fit([state.maps])[0])
-        return [np.array([f]) for f in factors if found > 0.0 and abs(np.log(f / found)) < 2e-3]
+        if found <= 0.0:
+            return []
+        frequency = None if state.pair.channel is None else state.pair.channel.site.frequency_ghz
+        x = 0.047992430 * (frequency or 0.0) / header.T_CMB_K  # h nu/(k T)
+        to_cmb = np.expm1(x) ** 2 / (x**2 * np.exp(x)) if frequency else 1.0
+        # Factors of ten are exact; antenna temperatures depend on the band and on T_CMB.
+        near = [(f, f) for f in (1e-6, 1e-3, 1e3, 1e6)] + [(f, found) for f in (to_cmb, 1.0 / to_cmb) if f != 1.0]
+        return [np.array([value]) for f, value in near if abs(np.log(f / found)) < 2e-3]
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
         return value[0] * maps
@@ -91,12 +94,29 @@ class Ordering(Difference):
     name, unit = "ordering", "1 = NESTED for RING"
     met = "a header that does not say what the pixels are"
     needs_scene = False
+    exchanges = True
 
     def starts(self, state: State) -> list[Vector]:
-        return [np.array([1.0]), np.array([-1.0])]
+        """Return both ways, if side B is more like the prediction then, dipoles aside."""
+
+        def alike(maps: Maps) -> float:
+            seen = state.pair.seen & (maps != healpy.UNSEEN)
+            axes = np.hstack([_axes(state.pair.nside)[:, one] for one in seen])
+            known = np.vstack([np.ones(axes.shape[1]), axes]).T
+            one, other = (
+                v - known @ np.linalg.lstsq(known, v, rcond=None)[0] for v in (maps[seen], state.pair.b[seen])
+            )
+            return float(np.corrcoef(one, other)[0, 1])
+
+        ways = [np.array([1.0]), np.array([-1.0])]
+        return [way for way in ways if alike(self.maps(state.maps, way, state)) > alike(state.maps)]
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
         order = {"r2n": True} if value[0] > 0 else {"n2r": True}
+        return _complete(np.stack([healpy.reorder(one, **order) for one in maps]), maps)
+
+    def undone(self, maps: Maps, value: Vector) -> Maps:
+        order = {"n2r": True} if value[0] > 0 else {"r2n": True}
         return np.stack([healpy.reorder(one, **order) for one in maps])
 
 
@@ -106,12 +126,16 @@ class SplitExchanged(Difference):
     name, unit = "split_exchanged", "1 = exchanged"
     met = "files of halves that were renamed"
     needs_scene = False
+    exchanges = True
 
     def starts(self, state: State) -> list[Vector]:
         count = len(state.maps)
         return [np.array([float(i), float(j)]) for i in range(count) for j in range(i)]
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
+        return _complete(self.undone(maps, value), maps)
+
+    def undone(self, maps: Maps, value: Vector) -> Maps:
         i, j = value.astype(int)
         order = list(range(len(maps)))
         order[i], order[j] = order[j], order[i]
@@ -119,6 +143,11 @@ class SplitExchanged(Difference):
 
     def amplitude(self, value: Vector) -> float:
         return 1.0
+
+
+def _complete(exchanged: Maps, maps: Maps) -> Maps:
+    """Return exchanged maps, and those that they were where they have no data."""
+    return np.where(exchanged == healpy.UNSEEN, maps, exchanged)
 
 
 class ChannelExchanged(Difference):
@@ -129,30 +158,59 @@ class ChannelExchanged(Difference):
     needs_scene = False
 
     def starts(self, state: State) -> list[Vector]:
-        return [np.array([float(i)]) for i, m in enumerate(state.others.values()) if m.shape == state.maps.shape]
+        return [np.array([float(i)]) for i, other in enumerate(state.others) if other.a.shape == state.maps.shape]
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
-        return list(state.others.values())[int(value[0])]
+        return _complete(state.others[int(value[0])].a, maps)
 
     def amplitude(self, value: Vector) -> float:
         return 1.0
 
 
 class NoiseShared(Difference):
-    """A later split of side B has noise in common with the first one, instead of its own."""
+    """One split of side B has noise in common with another one, or all have with another channel."""
 
     name, unit = "noise_shared", "correlation"
     met = "random seeds that do not depend on the detector or the split"
     needs_scene = False
+    enough = 0.8  # the sky is known no better than the noise lets it be
 
     def starts(self, state: State) -> list[Vector]:
-        return [state.fit([self._other(state.maps)])] if len(state.maps) > 1 else []
+        """Return correlation, split that is changed (-1: all), split or channel that it is shared with, and how.
 
-    @staticmethod
-    def _other(maps: Maps) -> Maps:
-        difference = maps[0] - maps
-        difference[0] = 0.0
-        return difference
+        Noise of the same samples, or of the same deviates and other hits; from maps, or less the sky simulated.
+        """
+        count = len(state.maps)
+        splits = [(j, i) for j in range(count) for i in range(count) if i != j]
+        channels = [(-1, k) for k, other in enumerate(state.others) if other.a.shape == state.maps.shape]
+        simulated = [] if state.pair.scene is None else [(1, 0), (1, 1)]
+        ways = [(*pair, *manner) for pair in splits for manner in [(0, 0), (0, 1), *simulated]]
+        ways += [(*pair, *manner) for pair in channels for manner in simulated]  # as they are, they are exchanged
+        values = [np.array([0.0, *way]) for way in ways]
+        return [value + np.eye(5)[0] * state.fit([self._exchanged(value, state)]) for value in values]
+
+    def _exchanged(self, way: Vector, state: State) -> Maps:
+        """Return other noise less a map's own: the difference of the maps, less that of the sky in them."""
+        pair, (changed, source, simulated, scaled) = state.pair, way[1:].astype(int)
+        zero = np.zeros_like(pair.a)
+        scene = pair.scene
+        own = zero if scene is None else scene.maps()
+        if changed < 0:
+            there = state.others[source]
+            sky = zero
+            if scene is not None and there.scene is not None:
+                sky = replace(there.scene, sky=scene.sky).maps()
+            other, seen, hits = there.a, there.seen & pair.seen, there.hits
+        else:
+            order = np.arange(len(pair.a))
+            order[changed] = source
+            other, seen, sky = pair.a[order], pair.seen & pair.seen[order], own[order]
+            hits = None if pair.hits is None else pair.hits[order]
+        noise = other - pair.a - (sky - own if simulated else zero)
+        if scaled and hits is not None and pair.hits is not None:
+            ratio = np.sqrt(np.divide(hits, pair.hits, out=np.ones_like(hits), where=pair.hits > 0))
+            noise = noise + (ratio - 1.0) * (other - sky)
+        return np.where(seen, noise, 0.0)
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
-        return maps + value[0] * self._other(maps)
+        return maps + value[0] * self._exchanged(value, state)

@@ -9,14 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.comparison.scene import Maps, Scene, scene_of, sky_in
+from mcsim.comparison.scene import Maps, PointingFiles, Scene, scene_of, sky_in
 from mcsim.ensemble.external import named_source, source_of
 from mcsim.ensemble.maps import file_names
 from mcsim.errors import InputError
-from mcsim.simulation import simulate
+from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import Channel, Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import header, healpix
+from mcsim.sphere.checks import UNSEEN_BELOW, check_map
+from mcsim.systematics.base import Pointing
+
+SAMPLES = 100_000_000
+"""Samples of the longest survey that is simulated sample by sample."""
+
+HELD = 20_000_000
+"""The same of samples in files, which are held in memory."""
 
 EXTRA_ORDERS = 3
 """Moments beyond the beam's orders: a displaced beam has them."""
@@ -34,12 +42,20 @@ class ChannelPair:
         Maps, uK, shape (split, npix).
     seen
         What both sides observed, shape (split, npix).
+    one_sided
+        Number of pixels that one side alone observed.
     scene
         What the model says of side A; None without a model.
     channel
-        The same with everything that effects need; None without a model.
+        The same with everything that effects need, before any preparation; None without a model.
+    hits
+        Samples per pixel of the maps, of the model; None without one.
     sky_of_maps
         True if the scene's sky was taken from side A, and not from the model.
+    files
+        Samples of the channel, if the model has them in files.
+    noisy
+        True if noise was filtered out of the sky that side A shows, and so what noise hides of the sky is missing.
     """
 
     name: str
@@ -47,9 +63,24 @@ class ChannelPair:
     a: Maps
     b: Maps
     seen: NDArray[np.bool_]
+    one_sided: int = 0
     scene: Scene | None = None
     channel: Channel | None = None
+    hits: Maps | None = None
     sky_of_maps: bool = False
+
+    files: PointingFiles | None = None
+    noisy: bool = False
+
+    def pointing(self, longest: float = SAMPLES) -> Pointing | PointingFiles | None:
+        """Return the pointing, if it is known and has no more samples than the longest that is wanted."""
+        if self.channel is None or self.hits is None:
+            return None
+        known = self.channel.site.pointing
+        if known is not None:
+            return known if known.model.samples(known.line) <= longest else None
+        number = sum(m.moments.hits.sum() for m in self.channel.maps)
+        return self.files if number <= min(longest, HELD) else None
 
     @property
     def nside(self) -> int:
@@ -63,7 +94,11 @@ class Comparison:
 
     pairs: tuple[ChannelPair, ...]
     run: config.RunConfig | None
-    frame: str
+
+    @property
+    def frame(self) -> str:
+        """Frame of the sky of the model."""
+        return "ecliptic" if self.run is None else self.run.map.frame
 
 
 def read(
@@ -79,6 +114,9 @@ def read(
     run = _model(a, b, model)
     whole = None if run is None else survey(quiet(run), nthreads, orders=_orders(run))
     sides = [_side(side, run, nthreads) for side in (a, b)]
+    for own, other, side in ((0, 1, a), (1, 0, b)):
+        if not Path(side).is_dir() and Path((b, a)[own]).is_dir():
+            sides[own] = _closer(sides[own], sides[other], config.load(side), nthreads)
     if run is None:
         names = [name for name in sides[0] if name in sides[1]]
         groups = {name: [name] for name in names}
@@ -94,7 +132,7 @@ def read(
             "CHANNEL_SPLIT.fits."
         )
     pairs = [_pair(name, maps, sides, whole, nthreads) for name, maps in groups.items()]
-    return Comparison(tuple(pairs), run, "ecliptic" if run is None else run.map.frame)
+    return Comparison(tuple(pairs), run)
 
 
 def given(
@@ -109,11 +147,11 @@ def given(
         if len(side) != len(names):
             raise InputError(f"{len(side)} maps were given, the model has {len(names)}; give one for each.")
     whole = survey(quiet(run), nthreads, orders=_orders(run))
-    sides = [dict(zip(names, (np.asarray(m, dtype=np.float64) for m in side), strict=True)) for side in (a, b)]
+    sides = [dict(zip(names, (np.ma.filled(m, healpy.UNSEEN) for m in side), strict=True)) for side in (a, b)]
     pairs = [
         _pair(c.name, [n for n in names if n.partition(":")[0] == c.name], sides, whole, nthreads) for c in run.channels
     ]
-    return Comparison(tuple(pairs), run, run.map.frame)
+    return Comparison(tuple(pairs), run)
 
 
 def _orders(run: config.RunConfig) -> int:
@@ -121,20 +159,15 @@ def _orders(run: config.RunConfig) -> int:
 
 
 def quiet(run: config.RunConfig) -> config.RunConfig:
-    """Return the run without noise and effects, and with nothing to estimate; InputError if it prepares its maps."""
-    _check_steps(run)
+    """Return the run without noise and effects, and with nothing to estimate; InputError without times of splits."""
+    _check_splits(run)
     run = named_source(run)[0]
     channels = tuple(channel.without_noise() for channel in run.channels)
     biposh = replace(run.biposh, L_max=0, pairs="auto")
     return replace(run, channels=channels, effects=(), biposh=biposh)
 
 
-def _check_steps(run: config.RunConfig) -> None:
-    if run.preparation:
-        raise InputError(
-            f"{run.name} has [[preparation]], but maps are compared as they were made; remove it, and give maps that "
-            "are not prepared."
-        )
+def _check_splits(run: config.RunConfig) -> None:
     if run.map.split_by != "time":
         raise InputError(
             f'{run.name} has map.split_by = "{run.map.split_by}", but the samples of maps that are compared are found '
@@ -165,9 +198,12 @@ def _side(side: str | Path, run: config.RunConfig | None, nthreads: int) -> dict
     if path.is_dir():
         return _folder(path, run)
     own, external = named_source(config.load(side))
-    _check_steps(own)
-    if run is not None and own.map.frame != run.map.frame:
-        raise InputError(f"{side} makes maps in {own.map.frame} coordinates, the model in {run.map.frame}; choose one.")
+    _check_splits(own)
+    wanted = own_frame = config.prepared_grid(own)[1]
+    if run is not None:
+        wanted = config.prepared_grid(run)[1]
+    if own_frame != wanted:
+        raise InputError(f"{side} makes maps in {own_frame} coordinates, the model in {wanted}; choose one.")
     if external is not None:
         return _external(quiet(own), external, nthreads)
     shared = survey(own, nthreads)
@@ -187,6 +223,37 @@ def _external(own: config.RunConfig, given: str, nthreads: int) -> dict[str, NDA
     return dict(zip(config.map_names(own), source.maps(own.ensemble.seed, 0, sky=sky), strict=True))
 
 
+def _closer(
+    made: dict[str, NDArray[np.float64]], wanted: dict[str, NDArray[np.float64]], run: config.RunConfig, nthreads: int
+) -> dict[str, NDArray[np.float64]]:
+    """Return the maps of a run as they were made, or sample by sample if those are closer to the other side's.
+
+    Orientation moments spread samples over their pixels otherwise than another simulator does.
+    """
+    run, external = named_source(run)
+    if external is not None:
+        return made
+    whole = survey(run, nthreads)
+    pointings = [channel.site.pointing for channel in whole.making.channels]
+    if any(p is None or p.model.samples(p.line) > SAMPLES for p in pointings):
+        return made
+    try:
+        exact = dict(sampled.maps(whole, 0, nthreads))
+    except InputError:  # an effect on orientation moments, say
+        return made
+
+    def distance(maps: dict[str, NDArray[np.float64]]) -> float:
+        total = 0.0
+        for name in maps.keys() & wanted.keys():
+            there = wanted[name]
+            if there.size == maps[name].size:
+                both = (maps[name] > UNSEEN_BELOW) & (there > UNSEEN_BELOW) & np.isfinite(there)
+                total += float(np.sum((maps[name] - there)[both] ** 2))
+        return total
+
+    return min(made, exact, key=distance)
+
+
 def _folder(folder: Path, run: config.RunConfig | None) -> dict[str, NDArray[np.float64]]:
     names = {path.stem: path for path in sorted(folder.glob("*.fits"))}
     frequencies: dict[str, float | None] = {}
@@ -200,42 +267,56 @@ def _folder(folder: Path, run: config.RunConfig | None) -> dict[str, NDArray[np.
     found = {}
     for name, path in names.items():
         map_, frame, unit = healpix.read_map(path)
-        if run is not None and frame not in (None, run.map.frame):
-            raise InputError(f"{path} is in {frame} coordinates, the model in {run.map.frame}; rotate the model.")
+        if run is not None and frame not in (None, config.prepared_grid(run)[1]):
+            raise InputError(
+                f"{path} is in {frame} coordinates, the model in {config.prepared_grid(run)[1]}; rotate the model."
+            )
         factor = header.to_uk(unit, path, frequencies.get(name))
-        found[name] = np.where(map_ == healpy.UNSEEN, map_, factor * map_)
+        found[name] = np.where(map_ > UNSEEN_BELOW, factor * map_, healpy.UNSEEN)
     return found
 
 
 def _pair(
     name: str, maps: Sequence[str], sides: Sequence[dict[str, NDArray[np.float64]]], whole: Survey | None, nthreads: int
 ) -> ChannelPair:
-    sizes = {side[m].size for side in sides for m in maps}
-    if len(sizes) > 1:
-        nsides = " and ".join(str(healpy.npix2nside(size)) for size in sorted(sizes))
+    found = {check_map(side[m], name=f"map {m}") for side in sides for m in maps}
+    if len(found) > 1:
+        nsides = " and ".join(str(nside) for nside in sorted(found))
         raise InputError(f"the maps of {name} have nside {nsides}; bring them to the same.")
-    a, b = (np.stack([side[m] for m in maps]) for side in sides)
-    seen = np.isfinite(a) & np.isfinite(b) & (a != healpy.UNSEEN) & (b != healpy.UNSEEN)
+    whole_sides = (np.stack([side[m] for m in maps]).astype(np.float64) for side in sides)
+    a, b = (np.where(np.isfinite(side) & (side > UNSEEN_BELOW), side, healpy.UNSEEN) for side in whole_sides)
+    observed = [side != healpy.UNSEEN for side in (a, b)]
+    seen, one_sided = observed[0] & observed[1], int(np.sum(observed[0] != observed[1]))
     if whole is None:
-        return ChannelPair(name, tuple(maps), a, b, seen)
-    channel = next(c for c in whole.channels if c.name == name)
+        return ChannelPair(name, tuple(maps), a, b, seen, one_sided)
+    finished, channel = (next(c for c in one.channels if c.name == name) for one in (whole, whole.making))
     if channel.side_b is not None:
-        raise InputError(f"channel {name} has a differencing scan, which a comparison cannot describe; leave it out.")
-    if a.shape[1] != channel.maps[0].moments.npix:
         raise InputError(
-            f"the maps of {name} have nside {healpy.npix2nside(a.shape[1])}, the model {whole.config.map.resolution}; "
+            f"channel {name} has a differencing scan, whose map-making a comparison does not repeat; compare maps of "
+            'one side, described by a scan of kind "hit_averaged", or compare without a model.'
+        )
+    if a.shape[1] != 12 * whole.nside**2:
+        raise InputError(
+            f"the maps of {name} have nside {healpy.npix2nside(a.shape[1])}, the model {whole.nside}; "
             "set map.nside to that of the maps."
         )
-    for index, m in enumerate(channel.maps):
-        seen[index] &= m.moments.hits > 0
+    hits = np.stack([m.moments.hits for m in finished.maps])
+    seen &= hits > 0
+    for index, m in enumerate(finished.maps):
         if m.weight is not None:
             seen[index] &= m.weight > 0
     if not seen.any(axis=1).all():
         raise InputError(f"the maps of {name} have no pixel in common with each other and the model; check the scan.")
     sky = whole.config.sky
-    if sky.alm is not None or sky.map is not None:
-        truth = simulate.draw_sky(whole, 0)
-        return ChannelPair(name, tuple(maps), a, b, seen, scene_of(channel, truth, nthreads), channel)
-    empty = scene_of(channel, np.zeros(alm_.size(sky.lmax), complex), nthreads)
-    shown = replace(empty, sky=sky_in(np.where(seen, a, 0.0), seen, empty))
-    return ChannelPair(name, tuple(maps), a, b, seen, shown, channel, sky_of_maps=True)
+    named = sky.alm is not None or sky.map is not None
+    truth = simulate.draw_sky(whole, 0) if named else np.zeros(alm_.size(sky.lmax), complex)
+    scene = scene_of(channel, truth, nthreads)
+    if not named:
+        scene = replace(scene, sky=sky_in(a, seen, scene))
+    files = None
+    spec = next(c for c in whole.config.channels if c.name == name)
+    if isinstance(spec.scan, config.ScanPointing):
+        splits = whole.config.map.splits or (None,)
+        paths = tuple(config.channel_path(spec.scan.path, name, split) for split in splits)
+        files = PointingFiles(paths, channel.site.frame)
+    return ChannelPair(name, tuple(maps), a, b, seen, one_sided, scene, channel, hits, not named, files)

@@ -48,10 +48,14 @@ class ChannelResult:
     rms_uk, sky_rms_uk, noncircular_rms_uk, noise_rms_uk, left_rms_uk
         Of the difference; of the sky without monopole and dipole; of what the beam's shape adds; of the noise that the
         model has; and of what is left. NaN where no model says it.
+    looks
+        What is left looks like, in words, if nothing is named.
     unmade_rms_uk
         Of what the simulation of side A leaves of its maps, if the verdict is "unknown"; else 0.
     a, b, explained, seen
         Maps, uK, shape (split, npix), ``explained`` the part of b - a that the set makes.
+    one_sided
+        Number of pixels that one side alone observed, and that are left out.
     hits
         Samples per pixel, of the model; None without one.
     """
@@ -67,11 +71,13 @@ class ChannelResult:
     noncircular_rms_uk: float
     noise_rms_uk: float
     left_rms_uk: float
+    looks: tuple[str, ...]
     unmade_rms_uk: float
     a: Maps
     b: Maps
     explained: Maps
     seen: NDArray[np.bool_]
+    one_sided: int
     hits: Maps | None
 
     @property
@@ -86,6 +92,10 @@ class ChannelResult:
 
     def sentence(self) -> str:
         """Say what was found in this channel."""
+        holes = f" {self.one_sided} pixels that one side alone observed are left out." if self.one_sided else ""
+        return self._found() + holes
+
+    def _found(self) -> str:
         size = f"{number(self.rms_uk)} uK rms, {number(self.accuracy)} of the sky"
         if self.verdict == "identical":
             return f"{self.name}: identical to an accuracy of {number(self.accuracy)} ({number(self.rms_uk)} uK rms)."
@@ -101,7 +111,10 @@ class ChannelResult:
                     f". The model makes side A itself to {number(self.unmade_rms_uk)} uK rms only: "
                     "check it, or give it the sky (sky.alm), which maps with many holes do not show"
                 )
-            return f"{self.name}: different by {size}, in a way that no difference of the library explains{hint}."
+            looks = f" What is left is {'; '.join(self.looks)}." if self.looks else ""
+            return (
+                f"{self.name}: different by {size}, in a way that no difference of the library explains{hint}.{looks}"
+            )
         named = " and ".join(f"{d.name} = {number(d.amplitude)} {d.unit}" for d in self.differences)
         others = [" and ".join(d.name for d in one) for one in self.alternatives]
         also = f"; {', '.join(others)} would do as well" if others else ""
@@ -173,7 +186,12 @@ class ComparisonResult:
             "differences": [d.to_dict() for c in self.channels for d in c.differences],
             "alternatives": [[d.to_dict() for d in one] for c in self.channels for one in c.alternatives],
             "nearest": [c.nearest.to_dict() for c in self.channels if c.verdict == "unknown" and c.nearest],
-            "left": {"rms_uk": left, "fraction": (left / rms) ** 2 if rms > 0.0 else 0.0},
+            "left": {
+                "rms_uk": left,
+                "fraction": (left / rms) ** 2 if rms > 0.0 else 0.0,
+                "one_sided_pixels": sum(c.one_sided for c in self.channels),
+                "looks": {c.name: list(c.looks) for c in self.channels if c.looks},
+            },
         }
 
     def __str__(self) -> str:

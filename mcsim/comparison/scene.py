@@ -4,15 +4,19 @@ from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 
 import healpy
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.linalg import LinearOperator, gmres
 
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments, ScanModel
 from mcsim.instrument.scan.geometry import MapGrid
+from mcsim.instrument.scan.user_pointing import blocks_of_files
 from mcsim.simulation import convolve, tod
+from mcsim.simulation.preparation import Preparation
 from mcsim.simulation.survey import Channel
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
@@ -29,8 +33,8 @@ KEPT = 4
 EPSILON = 1e-7
 """Accuracy of the interpolation of single samples."""
 
-ITERATIONS = 25
-"""Largest number of iterations for the sky that maps show; holes of many pixels need more than they get."""
+ITERATIONS = 30
+"""Largest number of iterations for the sky that maps show; holes take more than whole maps."""
 
 WEAKEST = 1e-4
 """Share of its largest value below which a beam's window is not divided out."""
@@ -46,6 +50,19 @@ class Transforms:
 
 
 @dataclass(frozen=True, eq=False)
+class PointingFiles:
+    """A user's own samples of a channel: a file for every split, and the frame they are in."""
+
+    paths: tuple[Path, ...]
+    frame: str
+
+    @cached_property
+    def angles(self) -> list[list[tuple[NDArray[np.float64], ...]]]:
+        """Blocks of theta, phi, psi of every split, radians."""
+        return [list(blocks_of_files([path], self.frame)) for path in self.paths]
+
+
+@dataclass(frozen=True, eq=False)
 class Scene:
     """Sky, beam, pixel window and scan of a channel.
 
@@ -57,6 +74,8 @@ class Scene:
         Beam, and pixel window of shape (lmax + 1,).
     moments
         Orientation moments of every split.
+    preparations
+        What is done to the map of every split after it is made; empty: nothing.
     nthreads
         Threads of the transforms.
     psi
@@ -75,6 +94,7 @@ class Scene:
     beam: Beam
     window: NDArray[np.float64]
     moments: tuple[Moments, ...]
+    preparations: tuple[Preparation, ...] = ()
     nthreads: int = 1
     psi: tuple[int, float] = (1, 0.0)
     centred: bool = False
@@ -90,7 +110,7 @@ class Scene:
 
     @property
     def nside(self) -> int:
-        """Of the maps."""
+        """Of the maps, before any preparation."""
         return self.moments[0].nside
 
     @cached_property
@@ -120,15 +140,26 @@ class Scene:
 
     def noncircular(self) -> Maps:
         """Return what the non-circular part of the beam adds to each map."""
+        return self._prepared(self._noncircular())
+
+    def _noncircular(self) -> Maps:
         return np.stack([convolve.noncircular_map(self._transforms.spins, m) for m in self.moments])
+
+    def _prepared(self, made: Maps) -> Maps:
+        """Return maps as they are after their preparation, 0 where they have no data."""
+        if not self.preparations:
+            return made
+        seen = [np.where(m.hits > 0, one, healpy.UNSEEN) for one, m in zip(made, self.moments, strict=True)]
+        done = np.stack([steps.apply(one) for steps, one in zip(self.preparations, seen, strict=True)])
+        return np.where(done == healpy.UNSEEN, 0.0, done)
 
     def maps(self) -> Maps:
         """Return the maps, without noise."""
-        made = self.noncircular() + self._transforms.circular
+        made = self._noncircular() + self._transforms.circular
         for own, m in zip(made, self.moments, strict=True):
             if m.dtheta is not None:
                 own += convolve.centroid_map(self._transforms.gradient, m)
-        return made
+        return self._prepared(made)
 
     def turned(self, angle: float) -> "Scene":
         """Return the scene with all samples turned by an angle, in radians."""
@@ -142,7 +173,26 @@ class Scene:
         moments = tuple(replace(m, w=np.conj(m.w)) for m in self.moments)
         return replace(self, moments=moments, psi=(-self.psi[0], -self.psi[1]))
 
-    def sampled(self, pointing: Pointing, window: NDArray[np.float64]) -> Maps:
+    def stream(self, pointing: Pointing | PointingFiles, split: int) -> Iterable[tod.Samples]:
+        """Return the samples of a split, as the scan of the scene has them."""
+        if isinstance(pointing, PointingFiles):
+            blocks = pointing.angles[split]
+            return (
+                tod.Samples(0.0 * psi, theta, phi, psi, healpy.ang2pix(self.nside, theta, phi), 0.0 * psi)
+                for theta, phi, psi in blocks
+            )
+        count = len(self.moments)
+        grid = MapGrid(self.nside, self.moments[0].frame, (split / count, (split + 1) / count))
+        model = self.motion or pointing.model
+        here = tod.samples(model, pointing.line, grid)
+        if not self.late:
+            return here
+        there = tod.samples(ahead(model, self.late * model.period_of_samples(pointing.line)), pointing.line, grid)
+        return (replace(seen, pixel=binned.pixel) for binned, seen in zip(here, there, strict=True))
+
+    def sampled(
+        self, pointing: Pointing | PointingFiles, window: NDArray[np.float64], signal: tod.Stage | None = None
+    ) -> Maps:
         """Return the maps sample by sample, without the approximations of :meth:`maps`.
 
         Parameters
@@ -151,22 +201,15 @@ class Scene:
             Of the channel.
         window
             Pixel window that the spread of the samples makes by itself, shape (lmax + 1,).
+        signal
+            How samples see the sky, in place of the beam's convolution.
         """
         factor = self.window if self.centred else self.window / window
         sky = alm_.multiply(self.sky, factor, self.lmax)
-        signal = tod.sky_signal(sky, self.lmax, self.beam, EPSILON, self.nthreads)
-        model, count = self.motion or pointing.model, len(self.moments)
-        made = []
-        for i in range(count):
-            grid = MapGrid(self.nside, self.moments[0].frame, (i / count, (i + 1) / count))
-            stream: Iterable[tod.Samples] = tod.samples(model, pointing.line, grid)
-            if self.late:
-                seen = tod.samples(
-                    _ahead(model, self.late * model.period_of_samples(pointing.line)), pointing.line, grid
-                )
-                stream = (replace(there, pixel=here.pixel) for here, there in zip(stream, seen, strict=True))
-            made.append(tod.bin_samples(signal(self._pointed(stream)), self.nside)[0])
-        return np.stack(made)
+        signal = signal or tod.sky_signal(sky, self.lmax, self.beam, EPSILON, self.nthreads)
+        streams = (self.stream(pointing, split) for split in range(len(self.moments)))
+        made = [tod.bin_samples(signal(self._pointed(stream)), self.nside)[0] for stream in streams]
+        return self._prepared(np.stack(made))
 
     def _pointed(self, samples: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
         sign, offset = self.psi
@@ -175,7 +218,7 @@ class Scene:
             yield replace(chunk, theta=theta, phi=phi, psi=sign * chunk.psi + offset)
 
 
-def _ahead(model: ScanModel, seconds: float) -> ScanModel:
+def ahead(model: ScanModel, seconds: float) -> ScanModel:
     """Return a scan model that is ``seconds`` further on its way at t = 0."""
     ways = ("spin", "precession", "orbit")
     phases = {
@@ -186,43 +229,54 @@ def _ahead(model: ScanModel, seconds: float) -> ScanModel:
 
 
 def scene_of(channel: Channel, sky: Alm, nthreads: int) -> Scene:
-    """Return the scene of a channel of a survey, without its effects."""
+    """Return the scene of a channel of a survey, as its maps are made and without its effects."""
     moments = tuple(m.moments for m in channel.maps)
-    return Scene(sky, channel.site.beam, channel.window, moments, nthreads)
+    preparations = tuple(m.preparation for m in channel.maps if m.preparation is not None)
+    return Scene(sky, channel.site.beam, channel.window, moments, preparations, nthreads)
 
 
 def sky_in(maps: Maps, seen: NDArray[np.bool_], empty: Scene, tolerance: float = 1e-5) -> Alm:
-    """Return the sky that a channel's maps show: their mean, with beam and pixel window divided out.
+    """Return the sky whose simulation makes a channel's maps where they are seen.
 
-    What a map of that nside cannot hold, above l = 3 nside - 1, is zero.
+    What maps of that nside cannot hold, above l = 3 nside - 1, is zero, and so is what the beam suppresses.
 
     Parameters
     ----------
     maps, seen
-        Shape (split, npix) each; what is not seen is filled with the sky itself.
+        Shape (split, npix) each.
     empty
         Scene of the channel; its sky is not used.
     tolerance
-        Relative change of the sky at which iterations end; each takes off what the scene adds to the smoothed sky,
-        and fills holes.
+        Residual at which iterations end, over the maps' own size.
+
+    Notes
+    -----
+    GMRES for the sky smoothed by beam and pixel window; the operator is the simulation, then the transform of its
+    mean map with 0 for what is not seen. Without holes that is the unit matrix but for the beam's shape and the
+    quadrature; with holes it has small eigenvalues, and iterations end before it is inverted for those.
     """
     factor = empty.response.factors[0].real
-    inverse = np.divide(1.0, factor, out=np.zeros_like(factor), where=factor > WEAKEST * factor.max())
-    degrees = alm_.degrees(empty.lmax)
+    for steps in empty.preparations[:1]:
+        factor = factor * steps.beam_window(empty.lmax) * steps.pixel_window(empty.lmax)
+    nside = healpy.npix2nside(maps.shape[1])
+    shown = min(empty.lmax, 3 * nside - 1)
+    known = factor[: shown + 1] > WEAKEST * factor.max()
+    inverse = np.divide(1.0, factor[: shown + 1], out=np.zeros(shown + 1), where=known)
     count = np.maximum(seen.sum(axis=0), 1)
-    holes = ~seen.any(axis=0)
-    sky = np.zeros(alm_.size(empty.lmax), dtype=np.complex128)
-    smooth = np.zeros(maps.shape[1])
-    scene = empty
-    for _ in range(ITERATIONS):
-        extra = scene.maps() - smooth if sky.any() else np.zeros_like(maps)
-        mean = np.where(seen, maps - extra, 0.0).sum(axis=0) / count
-        whole = np.where(holes, smooth, mean)
-        shown = min(empty.lmax, 3 * empty.nside - 1)
-        found = healpix.analysis(whole, shown, iterations=3, nthreads=empty.nthreads)
-        before, sky = sky, alm_.multiply(alm_.resize(found, shown, empty.lmax), inverse, empty.lmax)
-        if np.linalg.norm(factor[degrees] * (sky - before)) <= tolerance * np.linalg.norm(factor[degrees] * sky):
-            break
-        scene = replace(empty, sky=sky)
-        smooth = scene._transforms.circular
-    return sky
+    affine = replace(empty, sky=np.zeros_like(empty.sky)).maps() if empty.preparations else np.zeros_like(maps)
+
+    def analysed(values: Maps) -> NDArray[np.float64]:
+        mean = np.where(seen, values, 0.0).sum(axis=0) / count  # with 0 for UNSEEN
+        found = healpix.analysis(mean, shown, nthreads=empty.nthreads)
+        return alm_.multiply(found, known.astype(float), shown).view(np.float64)
+
+    def sky(smooth: NDArray[np.float64]) -> Alm:
+        alm = alm_.multiply(np.ascontiguousarray(smooth).view(np.complex128), inverse, shown)
+        return alm_.resize(alm, shown, empty.lmax)
+
+    def simulated(smooth: NDArray[np.float64]) -> NDArray[np.float64]:
+        return analysed(replace(empty, sky=sky(smooth)).maps() - affine)
+
+    wanted = analysed(maps - affine)
+    operator = LinearOperator((wanted.size, wanted.size), matvec=simulated, dtype=np.float64)
+    return sky(gmres(operator, wanted, rtol=tolerance, restart=ITERATIONS, maxiter=1)[0])

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from mcsim.comparison.differences import Difference, State, Vector
 from mcsim.comparison.pairs import ChannelPair
-from mcsim.comparison.scene import WEAKEST, Maps, Scene
+from mcsim.comparison.scene import WEAKEST, Maps, Scene, ahead
 from mcsim.instrument.scan import Moments
 from mcsim.instrument.scan.pointing import pointing
 from mcsim.sphere import alm as alm_
@@ -19,7 +19,7 @@ from mcsim.sphere import healpix
 from mcsim.sphere.rotation import euler_angles, rotation_matrix
 
 _SMALL = 1e-3
-"""Angle in radians over which the response to an offset of psi is linear."""
+"""Small angle in radians, share of a sample, or change of a variance, over which responses are linear."""
 
 
 class PsiOffset(Difference):
@@ -92,8 +92,10 @@ class FrameRotated(Difference):
     def starts(self, state: State) -> list[Vector]:
         """Return the best angle about each frame's pole, and the rotations from one frame to another."""
         assert state.scene is not None
-        lmax = min(state.scene.lmax, 2 * state.scene.nside)
-        a, b = (_mean_alm(side, state, lmax) for side in (state.maps, state.pair.b))
+        lmax = min(state.scene.lmax, 2 * state.pair.nside)
+        shown = state.scene.preparations[0].frame if state.scene.preparations else self.frame
+        to_sky = rotation_matrix(shown, self.frame)
+        a, b = (_turned(_mean_alm(side, state, lmax), lmax, to_sky) for side in (state.maps, state.pair.b))
         found = []
         for frame in ("ecliptic", "galactic", "equatorial"):
             to_pole = rotation_matrix(self.frame, frame)
@@ -179,12 +181,12 @@ class TimeShift(Difference):
 
 
 def _radians_per_sample(pair: ChannelPair) -> float:
-    """Return the median distance between consecutive samples of a channel."""
+    """Return the median way of a channel's line of sight in the time of a sample, which may be more than a turn."""
     assert pair.channel is not None
     pointed = pair.channel.site.pointed("time_shift")
-    theta, phi, _ = pointing(pointed.model, pointed.line, 0, 4096)
-    n = healpy.ang2vec(theta, phi)
-    return float(np.median(np.arccos(np.clip(np.sum(n[1:] * n[:-1], axis=1), -1.0, 1.0))))
+    later = ahead(pointed.model, _SMALL * pointed.model.period_of_samples(pointed.line))
+    here, there = (healpy.ang2vec(*pointing(m, pointed.line, 0, 4096)[:2]) for m in (pointed.model, later))
+    return float(np.median(np.linalg.norm(there - here, axis=1))) / _SMALL
 
 
 class ReversedMotion(Difference):
@@ -280,6 +282,38 @@ class BeamWindow(Difference):
         return replace(scene, sky=alm_.multiply(scene.sky, factor, scene.lmax))
 
 
+class Smoothing(Difference):
+    """The sky of side B is smoothed by a circular Gaussian more, or less, than that of side A."""
+
+    name, unit = "beam_width", "relative width"
+    met = "a map that is smoothed or deconvolved besides, or a beam of another width"
+    smooth = True
+
+    def starts(self, state: State) -> list[Vector]:
+        """Return the variance of the Gaussian over that of the beam."""
+        assert state.scene is not None
+        step = self.scene(state.scene, np.array([_SMALL]), state.pair).maps() - state.scene.maps()
+        return [np.array([max(_SMALL * state.fit([step])[0], -0.9)])]
+
+    def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
+        ell = np.arange(scene.lmax + 1)
+        factor = np.exp(-0.5 * ell * (ell + 1) * max(value[0], -1.0) * _variance(scene))
+        return replace(scene, sky=alm_.multiply(scene.sky, factor, scene.lmax))
+
+    def amplitude(self, value: Vector) -> float:
+        return float(np.sqrt(max(1.0 + value[0], 0.0)) - 1.0)
+
+    def parameters(self, value: Vector) -> dict[str, float | str]:
+        return {"by": "a circular Gaussian"}
+
+
+def _variance(scene: Scene) -> float:
+    """Return sigma^2 of the Gaussian whose window is the beam's where that has fallen to a half, or ends."""
+    window = scene.beam.window[: scene.lmax + 1] / scene.beam.window[0]
+    end = max(int(np.argmax(np.append(window, 0.0) < 0.5)) - 1, 1)
+    return float(-2.0 * np.log(min(max(window[end], 1e-6), 1.0 - 1e-9)) / (end * (end + 1)))
+
+
 class LmaxCut(Difference):
     """Sky or beam of side B end at a lower degree."""
 
@@ -288,7 +322,7 @@ class LmaxCut(Difference):
 
     def starts(self, state: State) -> list[Vector]:
         assert state.scene is not None
-        lmax = min(state.scene.lmax, 3 * state.scene.nside - 1)
+        lmax = min(state.scene.lmax, 3 * state.pair.nside - 1)
         a, b = (_mean_alm(side, state, lmax) for side in (state.maps, state.pair.b))
         degrees = alm_.degrees(lmax)
         weight = np.where(alm_.orders(lmax) == 0, 1.0, 2.0)

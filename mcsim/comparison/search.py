@@ -4,19 +4,22 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
+import healpy
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
-from mcsim.comparison.scene import Maps, Scene, sky_in
+from mcsim.comparison.scene import Maps, PointingFiles, Scene, sky_in
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix
 from mcsim.systematics.base import Pointing
 
 Vector = NDArray[np.float64]
 
 EXPLAINED = 0.8
-"""Share of a difference map's variance that a set must explain to be named, with orientation moments."""
+"""Share of a difference map's variance that a set must explain to be named, with orientation moments or noisy maps."""
 
 EXPLAINED_BY_SAMPLES = 0.95
 """The same where single samples are simulated, or no simulation is needed."""
@@ -24,20 +27,23 @@ EXPLAINED_BY_SAMPLES = 0.95
 FURTHER = 0.7
 """Share of what is left that a further difference must explain to be added."""
 
+FURTHER_BEYOND = 0.85
+"""The same where what there is explains enough to be named."""
+
 SLIGHT = 0.1
 """Share that a difference must explain to be fitted further, or to be one of several."""
 
 LARGEST = 3
 """Differences that act together."""
 
+DOUBTFUL = 0.01
+"""Share of what a set that is named may leave, beyond which slow differences are tried all the same."""
+
 MEASURED = 4
 """Sets of every size that are simulated sample by sample."""
 
 WORTH = 0.9
 """Share of the variance that a set may leave at most to be simulated sample by sample."""
-
-SAMPLES = 100_000_000
-"""Samples of the longest survey of which that is done."""
 
 KEPT = 3
 """Sets of every size from which larger ones are built."""
@@ -47,6 +53,18 @@ ALIKE = 2.0
 
 ENOUGH = 1e-3
 """Share of the variance below which nothing further is looked for: templates are no better."""
+
+SMALLEST = 0.1
+"""Rms of what is left below which nothing further is looked for either, over that of maps that are called identical."""
+
+INTERPOLATING = frozenset({"beam_width", "interpolation"})
+"""What the interpolation of a sky does too: not named below the accuracy at which maps are called identical."""
+
+NOISY = 0.02
+"""Noise over the sky from which on it is filtered out of the sky that maps show."""
+
+NEAR = 5
+"""Degrees over which the power of noise is averaged."""
 
 PRECISION = 1e-6
 """Share of the variance that no comparison resolves: single precision of maps with a dipole."""
@@ -75,7 +93,7 @@ class Problem:
     """One channel, and what may differ in it.
 
     Sets are searched with orientation moments; those that come first are simulated sample by sample as well, if the
-    pointing is known and no longer than :data:`SAMPLES`, and what that changes is added to their predictions.
+    pointing is known and not too long, and what that changes is added to their predictions.
 
     Attributes
     ----------
@@ -84,12 +102,15 @@ class Problem:
     library
         Differences of implementation and effects.
     others
-        Side A's maps of the other channels.
+        The other channels.
+    floor
+        Rms in uK up to which maps are called identical.
     """
 
     pair: ChannelPair
     library: Sequence[Difference]
-    others: dict[str, Maps]
+    others: Sequence[ChannelPair]
+    floor: float = 0.0
     _corrections: dict[tuple[int, bytes], Maps] = field(default_factory=dict, repr=False)
     _tried: dict[tuple[tuple[int, bytes], ...], Set | None] = field(default_factory=dict, repr=False)
 
@@ -101,6 +122,12 @@ class Problem:
     def total(self) -> float:
         """Sum of squares of the difference over the pixels that are seen."""
         return self._squares(self.pair.a)
+
+    @cached_property
+    def enough(self) -> float:
+        """Share of the variance below which nothing further is looked for."""
+        smallest = (SMALLEST * self.floor) ** 2 * float(self.pair.seen.sum()) / self.total
+        return min(ENOUGH, smallest) if smallest > 0.0 else ENOUGH
 
     def _squares(self, maps: Maps) -> float:
         return float(np.sum((self.pair.b - maps)[self.pair.seen] ** 2))
@@ -128,12 +155,25 @@ class Problem:
     @property
     def needed(self) -> float:
         """Share of the variance that a set must explain to be named."""
-        simple = self._pointing is not None or self.pair.scene is None
+        simple = self.pair.scene is None or (self._pointing is not None and not self.pair.noisy)
         return EXPLAINED_BY_SAMPLES if simple else EXPLAINED
 
+    def suffices(self, found: Set) -> bool:
+        """Return True if a set explains enough to be named."""
+        return found.explains >= min([self.needed, *(difference.enough for difference, _ in found.members)])
+
+    def complete(self, found: Set) -> bool:
+        """Return True if what a set leaves is too little to look for anything in it."""
+        linear = any(difference.linear for difference, _ in found.members)
+        return found.left < (ENOUGH if linear else self.enough)
+
+    def further(self, found: Set) -> float:
+        """Return the share of what a set leaves that a further difference must explain."""
+        return FURTHER_BEYOND if self.suffices(found) else FURTHER
+
     @property
-    def _pointing(self) -> Pointing | None:
-        return pointing_of(self.pair)
+    def _pointing(self) -> Pointing | PointingFiles | None:
+        return self.pair.pointing()
 
     @cached_property
     def _sampled(self) -> Maps:
@@ -201,19 +241,19 @@ class Problem:
         found = self._sorted(self._extended((), library))
         chosen = found
         for _ in range(LARGEST - 1):
-            if not found or found[0].left < ENOUGH:
+            if not found or self.complete(found[0]):
                 break
+            bases = [one for one in found[:KEPT] if one.explains > SLIGHT]
+            bases += [one for one in found[KEPT:] if len(one.members) == 1 and one.members[0][0].exchanges]
             larger = [
                 one
-                for smaller in found[:KEPT]
-                if smaller.explains > SLIGHT
+                for smaller in bases
                 for one in self._extended(smaller.members, library)
                 if one.left < (1.0 - FURTHER) * smaller.left
             ]
-            found = sorted(
-                map(self.polished, sorted(larger, key=lambda one: one.left)[:KEPT]), key=lambda one: one.left
-            )
-            if not found or found[0].left > (1.0 - FURTHER) * chosen[0].left:
+            best = sorted(larger, key=lambda one: one.left)[:KEPT]
+            found = sorted((self.corrected(self.polished(one)) for one in best), key=lambda one: one.left)
+            if not found or found[0].left > (1.0 - self.further(chosen[0])) * chosen[0].left:
                 break
             chosen = found
         return chosen
@@ -231,12 +271,45 @@ class Problem:
         state: State | None = None
         for difference in library:
             key = (*((id(d), v.tobytes()) for d, v in members), (id(difference), b""))
-            if key not in self._tried and difference.name not in present:
+            if difference.name in present or (difference.name in INTERPOLATING and self._is_small(members)):
+                continue
+            if key not in self._tried:
                 state = state or self.state(members)
                 self._tried[key] = self._with(difference, members, state)
             found = self._tried.get(key)
             if found is not None:
                 yield found
+
+    def _is_small(self, members: tuple[tuple[Difference, Vector], ...]) -> bool:
+        """Return True if what a set leaves is no larger than what the interpolation of a sky makes."""
+        return bool(members) and self.left(members) * self.total <= self.floor**2 * self.pair.seen.sum()
+
+    def undone(self, difference: Difference, value: Vector) -> "Problem | None":
+        """Return the problem that is left when side B is freed of a difference; None if that cannot be taken back."""
+        b = difference.undone(self.pair.b, value)
+        if b is None:
+            return None
+        known = (self.pair.a != healpy.UNSEEN) & (b != healpy.UNSEEN)
+        seen = known if self.pair.hits is None else known & (self.pair.hits > 0)
+        if not seen.any(axis=1).all():
+            return None
+        return replace(self, pair=replace(self.pair, b=b, seen=seen), _tried={})
+
+    def behind(self) -> list[Set]:
+        """Return sets of differences that were there before pixels or files were exchanged, the best first."""
+        found = []
+        for difference in self.library:
+            if not difference.exchanges:
+                continue
+            for value in difference.starts(self.state(())):
+                problem = self.undone(difference, value)
+                if problem is None or problem.total == 0.0:
+                    continue
+                sets = problem.best()
+                if not sets or not problem.suffices(sets[0]):
+                    sets = sorted([*sets, *problem.best(slow=True)], key=lambda one: one.left)
+                found += [self._set((*one.members, (difference, value))) for one in sets[:KEPT]]
+        return sorted(found, key=lambda one: one.left)
 
     def _with(self, difference: Difference, members: tuple[tuple[Difference, Vector], ...], state: State) -> Set | None:
         """Return a set with one more difference, at its best value; None if it has no value."""
@@ -286,15 +359,9 @@ class Problem:
         return self._refined(best, index) if best is not None and difference.smooth else best
 
 
-def pointing_of(pair: ChannelPair) -> Pointing | None:
-    """Return the pointing of a channel, where its single samples can be simulated."""
-    pointing = None if pair.channel is None else pair.channel.site.pointing
-    return None if pointing is None or pointing.model.samples(pointing.line) > SAMPLES else pointing
-
-
 def with_sharper_sky(pair: ChannelPair, iterations: int = 2) -> ChannelPair:
     """Return a pair whose sky, which is taken from side A, makes its maps sample by sample too."""
-    scene, pointing = pair.scene, pointing_of(pair)
+    scene, pointing = pair.scene, pair.pointing()
     if scene is None or pointing is None:
         return pair
     for _ in range(iterations):
@@ -304,11 +371,32 @@ def with_sharper_sky(pair: ChannelPair, iterations: int = 2) -> ChannelPair:
     return replace(pair, scene=scene)
 
 
-def alternatives(sets: Sequence[Set], needed: float) -> list[Set]:
+def without_noise(pair: ChannelPair) -> ChannelPair:
+    """Return a pair with the noise filtered out of its sky, if it has two splits, and noise in them.
+
+    A Wiener filter; the power of the noise is that of half the difference of two splits, less what the scan makes.
+    """
+    scene, pointing = pair.scene, pair.pointing()
+    if scene is None or not pair.sky_of_maps or len(pair.a) < 2:
+        return pair
+    made = scene.maps() if pointing is None else scene.sampled(pointing, scene.window)
+    seen, lmax = pair.seen[0] & pair.seen[1], min(scene.lmax, 3 * pair.nside - 1)
+    half = np.where(seen, 0.5 * ((pair.a - made)[0] - (pair.a - made)[1]), 0.0)
+    mean = np.where(seen, 0.5 * (pair.a[0] + pair.a[1]), 0.0)
+    if not seen.any() or half[seen].std() < NOISY * mean[seen].std():
+        return pair
+    noise, both = (healpy.alm2cl(healpix.analysis(map_, lmax, nthreads=scene.nthreads)) for map_ in (half, mean))
+    near = np.ones(NEAR) / NEAR
+    share = np.convolve(noise, near, "same") / np.maximum(np.convolve(both, near, "same"), 1e-300)
+    kept = np.pad(np.clip(1.0 - share, 0.0, 1.0), (0, scene.lmax - lmax))
+    return replace(pair, scene=replace(scene, sky=alm_.multiply(scene.sky, kept, scene.lmax)), noisy=True)
+
+
+def alternatives(sets: Sequence[Set], problem: Problem) -> list[Set]:
     """Return the other sets that explain a difference as well as the best one does."""
-    limit = min(ALIKE * sets[0].left + PRECISION, 1.0 - needed)
+    limit = ALIKE * sets[0].left + PRECISION
     found = {sets[0].names: sets[0]}
     for one in sets[1:]:
-        if one.left <= limit:
+        if one.left <= limit and problem.suffices(one):
             found.setdefault(one.names, one)
     return list(found.values())[1:]

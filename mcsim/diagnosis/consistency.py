@@ -79,7 +79,7 @@ class Findings:
     def pvalue(self) -> float:
         """Return the smallest p-value times the number of tests: Bonferroni's bound."""
         each = [one.pvalue for own in self.comparisons for one in own] + [one.pvalue for one in self.maps]
-        return min(1.0, len(each) * min(each, default=1.0))
+        return min(1.0, len(each) * min(each)) if each else 1.0
 
     @property
     def odds(self) -> float:

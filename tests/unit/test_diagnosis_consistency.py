@@ -11,7 +11,7 @@ from scipy.special import sph_harm_y
 from mcsim import systematics
 from mcsim.diagnosis import slices
 from mcsim.diagnosis.candidate import BEYOND, Candidate
-from mcsim.diagnosis.consistency import Action, Slices, contradiction
+from mcsim.diagnosis.consistency import Action, Findings, Slices, contradiction
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Element
@@ -140,6 +140,11 @@ def test_what_an_effect_leaves_in_the_maps_is_tested(bench):
     (right,) = bench.findings(bench.t @ THETA, THETA).maps
     assert right.pvalue > 0.5
     assert right.before - right.after == pytest.approx(right.forecast, rel=0.1)
+
+
+def test_nothing_contradicts_an_effect_that_no_part_measures():
+    """As an error of the noise level: neither parts nor the largest scales are compared."""
+    assert not Findings(comparisons=((),)).contradict(DiagnosisSettings())
 
 
 @pytest.mark.parametrize("name", sorted(systematics.catalogue()))

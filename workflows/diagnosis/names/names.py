@@ -103,7 +103,8 @@ def systematic(kind, draw, context, seed):
     elif kind == "beam, one split":
         name = str(draw.choice(["beam_ellipticity", "beam_coma", "pointing_offset", "beam_width"]))
         step = systematics.get(name).step
-        table = config.Effect(name, shared.channels[channel].site.channel, {"amplitude": 2.0 * step})
+        owner = shared.channels[channel].site.channel
+        table = config.Effect(name=name, channel=owner, parameters={"amplitude": 2.0 * step})
         changed = survey(with_effects(run, [table]))
         change[one] = np.array(list(simulate.maps(changed, seed)))[one] - maps[one]
     elif kind == "square of the signal":

@@ -1,0 +1,171 @@
+"""Differences that belong to single samples: baselines along the scan, and a sky that is looked up on a grid."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+import healpy
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import lsqr
+
+from mcsim.comparison.differences import Difference, State, Vector
+from mcsim.comparison.pairs import ChannelPair
+from mcsim.comparison.scene import Maps, PointingFiles, Scene
+from mcsim.simulation import convolve, tod
+from mcsim.sphere import healpix
+from mcsim.systematics.base import Pointing
+
+PIXELS_PER_BASELINE = 4
+"""Pixels that are seen for every baseline at least: with fewer, baselines make any map."""
+
+FEWEST = 16
+"""Baselines at least."""
+
+PREDICTED = 0.5
+"""Share of half of the pixels' variance that baselines fitted to the other half must explain."""
+
+SAMPLES = 30_000_000
+"""Samples of the longest survey whose single samples are fitted or looked up."""
+
+FINEST = 4
+"""Largest power of two by which a grid's nside may exceed that of the maps."""
+
+
+class MapMaking(Difference):
+    """Side B lacks offsets of the time line that side A has, or has others: baselines of a destriper."""
+
+    name, unit = "map_making", "uK rms"
+    met = "binned against destriped maps of the same noise, or baselines of another length"
+    slow = True
+    enough = 0.8
+
+    def __init__(self) -> None:
+        self._made: dict[bytes, Maps] = {}
+
+    def starts(self, state: State) -> list[Vector]:
+        """Return rms and length in samples of the baselines that predict half of the pixels best from the others."""
+        pair, pointing = state.pair, state.pair.pointing(SAMPLES)
+        if pointing is None or state.scene is None or state.scene.preparations:
+            return []
+        rest = np.where(pair.seen, pair.b - state.maps, 0.0)
+        number = sum(float(m.hits.sum()) for m in state.scene.moments)
+        length = int(np.ceil(number * PIXELS_PER_BASELINE / pair.seen.sum()))
+        shares = list(_shares(pair, pointing, length))
+        tried: list[tuple[float, int, Maps]] = []
+        while number / length > FEWEST * len(rest):
+            fits = [_fitted(p, one, seen) for p, one, seen in zip(shares, rest, pair.seen, strict=True)]
+            lost = sum(held for held, _ in fits) / float(np.sum(rest**2))
+            tried.append((lost, length, np.stack([made for _, made in fits])))
+            length *= 2
+            shares = [_merged(p) for p in shares]
+        lost, length, made = min(tried, key=lambda one: one[0], default=(1.0, 0, rest))
+        if lost > 1.0 - PREDICTED:
+            return []
+        value = np.array([np.sqrt(np.mean(made[pair.seen] ** 2)), length])
+        self._made[value.tobytes()] = made
+        return [value]
+
+    def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
+        return maps + self._made[value.tobytes()]
+
+    def parameters(self, value: Vector) -> dict[str, float | str]:
+        return {"baseline_samples": float(value[1])}
+
+
+def _shares(pair: ChannelPair, pointing: Pointing | PointingFiles, length: int) -> Iterator[csr_array]:
+    """Yield the share that every baseline has in the samples of every pixel, shape (npix, baseline), of each split."""
+    assert pair.scene is not None
+    for split, moments in enumerate(pair.scene.moments):
+        shape = (moments.npix, int(moments.hits.sum()) // length + 1)
+        hits, done = csr_array(shape), 0
+        for chunk in pair.scene.stream(pointing, split):
+            baseline = (done + np.arange(chunk.pixel.size)) // length
+            hits = hits + csr_array((np.ones(baseline.size), (chunk.pixel, baseline)), shape=shape)
+            done += baseline.size
+        yield csr_array(hits.multiply(1.0 / np.maximum(moments.hits, 1.0)[:, None]))
+
+
+def _merged(share: csr_array) -> csr_array:
+    """Return the same with two baselines in place of one."""
+    coordinates = share.tocoo()
+    width = (share.shape[1] + 1) // 2
+    return csr_array((coordinates.data, (coordinates.row, coordinates.col // 2)), shape=(share.shape[0], width))
+
+
+def _fitted(share: csr_array, rest: NDArray[np.float64], seen: NDArray[np.bool_]) -> tuple[float, NDArray[np.float64]]:
+    """Return the squares that baselines fitted to one half of the pixels leave of the other, and what all make."""
+    half = np.random.default_rng(0).random(rest.size) < 0.5
+    lost = 0.0
+    for fitted in (seen & half, seen & ~half):
+        held = seen & ~fitted
+        found = lsqr(share[fitted], rest[fitted], iter_lim=100)[0]
+        lost += float(np.sum((rest[held] - share[held] @ found) ** 2))
+    made = share @ lsqr(share[seen], rest[seen], iter_lim=100)[0]
+    return lost, np.where(seen, made, 0.0)
+
+
+class Interpolation(Difference):
+    """Side B looks the smoothed sky up on a HEALPix grid: between four pixels, or in the nearest one."""
+
+    name, unit = "interpolation", "nside of the grid"
+    met = "healpy.get_interp_val, or the nearest pixel, of a smoothed map"
+    slow = True
+
+    def __init__(self) -> None:
+        self._made: dict[bytes, Maps] = {}
+
+    def starts(self, state: State) -> list[Vector]:
+        """Return nside, and 1 for an interpolation or 0 for the nearest pixel, of grids whose errors are large enough.
+
+        They fall with the square of nside, and with nside.
+        """
+        if state.scene is None or state.pair.pointing(SAMPLES) is None:
+            return []
+        seen, values = state.pair.seen, []
+        rest = max(float(np.std((state.pair.b - state.maps)[seen])), 1e-300)
+        for linear, power in ((1.0, 2.0), (0.0, 1.0)):
+            coarse = float(np.std(self._response(np.array([state.scene.nside, linear]), state.pair)[seen]))
+            finer = np.log2(max(coarse, 1e-300) / rest) / power
+            wanted = {int(np.floor(finer)), int(np.ceil(finer))}
+            values += [np.array([2.0**k * state.scene.nside, linear]) for k in wanted if 0 <= k <= FINEST]
+        return values
+
+    def _response(self, value: Vector, pair: ChannelPair) -> Maps:
+        key, scene, pointing = value.tobytes(), pair.scene, pair.pointing(SAMPLES)
+        if key not in self._made:
+            assert scene is not None
+            assert pointing is not None
+            if b"" not in self._made:
+                self._made[b""] = scene.sampled(pointing, scene.window)
+            grid = looked_up(scene, int(value[0]), bool(value[1]))
+            self._made[key] = scene.sampled(pointing, scene.window, grid) - self._made[b""]
+        return self._made[key]
+
+    def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
+        return maps + self._response(value, state.pair)
+
+    def parameters(self, value: Vector) -> dict[str, float | str]:
+        return {"between": "four pixels" if value[1] else "the nearest pixel"}
+
+
+def looked_up(scene: Scene, nside: int, linear: bool) -> tod.Stage:
+    """Return a stage that adds the sky through the beam, looked up on a grid at the samples' directions."""
+    response = convolve.response(scene.beam, scene.lmax)
+    circular = convolve.circular_alm(scene.sky, response)
+    smooth = healpix.synthesis(circular[None], nside, scene.lmax, nthreads=scene.nthreads)[0]
+    spins = convolve.spin_maps(scene.sky, response, nside, scene.nthreads)
+
+    def stage(stream: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
+        for chunk in stream:
+            if linear:
+                pixel, weight = healpy.get_interp_weights(nside, chunk.theta, chunk.phi)
+            else:
+                pixel, weight = healpy.ang2pix(nside, chunk.theta, chunk.phi)[None], np.ones(1)[:, None]
+            signal = np.sum(weight * smooth[pixel], axis=0)
+            for s, (real, imaginary) in spins.items():
+                turned = np.cos(s * chunk.psi) * real[pixel] + np.sin(s * chunk.psi) * imaginary[pixel]
+                signal += 2.0 * np.sum(weight * turned, axis=0)
+            yield replace(chunk, signal_uk=chunk.signal_uk + signal)
+
+    return stage

@@ -1,0 +1,201 @@
+"""Inject every difference that ``mcsim compare`` names into maps made by ducc0 and healpy, and count what it says.
+
+    python workflows/simulators/injected.py [single|pair|identical ...] [--only REGEX] [--pairs 20] [--seed 1]
+
+Side B, and side A but of identical pairs, is made by stranger.py. Small surveys (nside 32, lmax 64), so that many fit.
+"""
+
+import argparse
+import random
+import re
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import healpy
+import inputs
+import numpy as np
+from stranger import ELL, LMAX, NPIX, NSIDE, SCANS, Survey, Vector, run_of
+
+import mcsim
+from mcsim import config
+from mcsim.simulation import sampled
+from mcsim.simulation.survey import survey
+from mcsim.sphere.healpix import pixel_window
+from mcsim.sphere.rotation import rotate_alm
+
+
+def turned(sky: Vector, degrees: float) -> Vector:
+    """Return a sky turned about the z axis."""
+    return sky * np.exp(-1j * healpy.Alm.getlm(LMAX)[1] * np.deg2rad(degrees))
+
+
+def changes(given: inputs.Inputs, scan: str) -> dict[str, tuple[dict[str, Any], dict[str, Any]]]:
+    """Return the arguments of two sizes of every difference, by the name that is right."""
+    window, beam = pixel_window(NSIDE, LMAX), given.channels[0].beam.window[: LMAX + 1]
+    x, late = np.array(healpy.pix2vec(NSIDE, np.arange(NPIX))), 0.01 if scan == "litebird" else 0.0005
+    names = [name for c in given.channels for name, _ in inputs.parts(given, c)]
+
+    def filtered(factor: Vector) -> dict[str, Any]:
+        return {"sky": lambda sky: healpy.almxfl(sky, factor)}
+
+    def mapped(change: Callable[[Vector], Vector]) -> dict[str, Any]:
+        return {"after": lambda m: np.where(m == healpy.UNSEEN, m, change(m))}
+
+    def widened(factor: float) -> dict[str, Any]:
+        sigma = np.deg2rad(1.0) * 179.0 / 60.0 / np.sqrt(8.0 * np.log(2.0))
+        return filtered(np.exp(-0.5 * ELL * (ELL + 1) * sigma**2 * (factor**2 - 1.0)))
+
+    def noise(share: float) -> dict[str, Any]:
+        draw = np.random.default_rng(5)
+        own = {name: 60.0 * draw.standard_normal(NPIX) for name in names}
+        first = dict.fromkeys(names, own[names[0]])
+        return {"noise": {n: (1.0 - share) * own[n] + share * first[n] for n in names}}
+
+    return {
+        "psi_offset": ({"psi": lambda p: p + 0.8}, {"psi": lambda p: p + 0.03}),
+        "psi_sign": ({"psi": lambda p: -p},) * 2,
+        "beam_conjugated": ({"beam": lambda b: b.blm.conj()},) * 2,
+        "mmax_cut": ({"beam": lambda b: b.blm[:1]}, {"beam": lambda b: b.blm[:3]}),
+        "lmax_cut": (filtered(ELL <= 40), filtered(ELL <= 57)),
+        "beam_window": (filtered(beam), filtered(1.0 / beam)),
+        "pixel_window": (filtered(window), filtered(1.0 / window)),
+        "pixel_centres": ({"centred": True},) * 2,
+        "time_shift": ({"late": 10.0 * late}, {"late": -late}),
+        "spin_sign": ({"motion": {"spin_period_s": -1.0}},) * 2,
+        "precession_sign": ({"motion": {"precession_period_s": -1.0}},) * 2,
+        "frame_rotated": (
+            {"sky": lambda sky: rotate_alm(sky, LMAX, "galactic", "ecliptic")},
+            {"sky": lambda sky: turned(sky, 0.1)},
+        ),
+        "calibration": (filtered(np.full(LMAX + 1, 1.02)), filtered(np.full(LMAX + 1, 0.9996))),
+        "unit": (mapped(lambda m: 1e-6 * m), mapped(lambda m: m / 1.2505)),
+        "monopole": (mapped(lambda m: m + 5.0), mapped(lambda m: m - 0.3)),
+        "dipole": (mapped(lambda m: m + 3300.0 * x[0]), mapped(lambda m: m + 0.6 * x[1] - 0.3 * x[2])),
+        "ordering": tuple({"after": lambda m, to=to: healpy.reorder(m, **{to: True})} for to in ("r2n", "n2r")),
+        "split_exchanged": ({"exchange": "split"},) * 2,
+        "channel_exchanged": ({"exchange": "channel"},) * 2,
+        "noise_shared": (noise(1.0) | {"base": noise(0.0)}, noise(0.4) | {"base": noise(0.0)}),
+        "map_making": (
+            {"drift_uk": 200.0, "baseline": 256, "base": {"drift_uk": 200.0}},
+            {"drift_uk": 20.0, "baseline": 60, "base": {"drift_uk": 20.0}},
+        ),
+        "interpolation": ({"grid": (NSIDE, True)}, {"grid": (4 * NSIDE, False)}),
+        "pointing_offset": ({"tilt_deg": 0.2}, {"tilt_deg": 0.02}),
+        "beam_width": (widened(1.05), widened(0.995)),
+        "gain_drift": ({"gain": lambda t: 0.02 * np.sin(t)}, {"gain": lambda t: 0.002 * np.cos(t + 0.5)}),
+        "unknown": (
+            mapped(lambda m: m + 1e-3 * m**2 / 10.0),
+            mapped(lambda m: m + 2.0 * np.exp(-((x[0] - 0.8) ** 2 + (x[1] - 0.6) ** 2 + x[2] ** 2) / 0.05)),
+        ),
+    }  # fmt: skip
+
+
+TIMED = frozenset({"time_shift", "spin_sign", "precession_sign", "gain_drift", "pointing_offset", "map_making"})
+"""What needs more than samples without their time."""
+
+
+def sides(run: config.RunConfig, put: list[dict[str, Any]]) -> tuple[dict[str, Vector], dict[str, Vector]]:
+    """Return the maps of both sides, with changes put in on side B."""
+    given = inputs.of(run)
+    change = {key: value for one in put for key, value in one.items()}
+    base, exchange = change.pop("base", {}), change.pop("exchange", None)
+    for key in ("sky", "after"):
+        both = [one[key] for one in put if key in one]
+        if len(both) > 1:
+            change[key] = lambda values, both=both: both[1](both[0](values))
+    a, b = (replace(Survey(given), **one).maps() for one in (base, base | change))
+    if exchange:
+        names = list(b)
+        order = names[1::-1] + names[2:] if exchange == "split" else names[2:] + names[:2]
+        b = dict(zip(names, (b[name] for name in order), strict=True))
+    return a, b
+
+
+def in_files(run: config.RunConfig, folder: str) -> config.RunConfig:
+    """Return a run that knows the samples of its first channel from files alone, in a random order."""
+    given, [spec, *others] = inputs.of(run), run.channels
+    for name, samples in inputs.parts(given, given.channels[0]):
+        angles = np.stack(inputs.pointing(given.channels[0], samples, given.frame), axis=1)
+        np.save(f"{folder}/{name}.npy", np.random.default_rng(1).permutation(angles))
+    scan = config.ScanPointing(path=f"{folder}/{spec.name}_{{split}}.npy")
+    return replace(run, channels=(replace(spec, scan=scan), *others))
+
+
+def judged(scan: str, shape: str, names: tuple[str, ...], sizes: tuple[int, ...], seed: int = 1) -> tuple[str, str]:
+    """Return whether the answer is right, and a row of the table."""
+    channels = ("T", "U") if "channel_exchanged" in names else ("T",)
+    shape = "circular" if "interpolation" in names else shape
+    run = run_of(scan, shape, channels, seed)
+    table = changes(inputs.of(run), scan)
+    put = [table[name][size] for name, size in zip(names, sizes, strict=True)]
+    noise = {"base": table["noise_shared"][0]["base"] if shape == "ellipse noisy" else {}}
+    a, b = sides(run, [noise, *put])
+    if not names:
+        a = dict(sampled.maps(survey(run), 0))
+        if shape == "circular":
+            b = Survey(inputs.of(run), grid=(32 * NSIDE, True)).maps()
+    with tempfile.TemporaryDirectory() as folder:
+        model = in_files(run, folder) if shape == "ellipse file" else run
+        start = time.process_time()
+        found = mcsim.compare(list(a.values()), list(b.values()), model)
+    seconds, channel = time.process_time() - start, found.channels[0]
+    answers = [{d.name for d in one} for one in (channel.differences, *channel.alternatives)]
+    wanted = {name for name in names if name != "unknown"}
+    if channel.verdict in ("unknown", "identical") and not ("unknown" in names or not names):
+        right = channel.verdict
+    elif channel.verdict in ("unknown", "identical"):
+        right = "yes"
+    else:
+        right = "yes" if answers[0] == wanted else "among equals" if wanted in answers else "wrong"
+    said = " + ".join(f"{d.name} {d.amplitude:.4g}" for d in channel.differences) or found.verdict
+    if channel.nearest is not None and not channel.differences:
+        said += f" (nearest {channel.nearest.name}: {channel.nearest.explains:.0%})"
+    others = ", ".join("+".join(sorted(one)) for one in answers[1:])
+    what = " + ".join(f"{name}/{size}" for name, size in zip(names, sizes, strict=True))
+    return right, (
+        f"| {scan} {shape} | {what} | {channel.accuracy:.1e} | {said} | {100 * (1 - channel.left):.2f} | {others} | "
+        f"{right} | {seconds:.0f} |"
+    )
+
+
+def cases(tables: list[str], pairs: int, seed: int) -> Iterator[tuple[str, str, tuple[str, ...], tuple[int, ...]]]:
+    """Yield scan, beam, names and sizes."""
+    draw = random.Random(seed)
+    names = list(changes(inputs.of(run_of("wmap", "ellipse")), "wmap"))
+    kinds = [(scan, shape) for scan in SCANS for shape in ("ellipse", "pear", "ellipse file", "ellipse noisy")]
+    for number, name in enumerate(names if "single" in tables else []):
+        for size in (0, 1):
+            yield (*kinds[(2 * number + size + seed) % len(kinds)], (name,), (size,))
+    alone = ("unknown", "unit", "noise_shared", "channel_exchanged", "map_making", "interpolation")
+    for _ in range(pairs if "pair" in tables else 0):
+        both = tuple(draw.sample([name for name in names if name not in alone], 2))
+        yield (*draw.choice(kinds), both, (draw.randrange(2), draw.randrange(2)))
+    for number in range(pairs if "identical" in tables else 0):
+        yield list(SCANS)[number % 3], ("ellipse", "pear", "circular")[number // 3 % 3], (), ()
+
+
+def main() -> None:
+    """Print the table and the counts."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("tables", nargs="*", default=["single"])
+    parser.add_argument("--only", default="")
+    parser.add_argument("--pairs", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=1)
+    given = parser.parse_args()
+    counts: Counter[str] = Counter()
+    for number, case in enumerate(cases(given.tables, given.pairs, given.seed)):
+        if "file" in case[1] and TIMED.intersection(case[2]):
+            case = (case[0], "ellipse", *case[2:])
+        if re.search(given.only, " ".join(case[2])):
+            right, row = judged(*case, seed=given.seed + number)
+            counts[right] += 1
+            print(row, flush=True)
+    print(dict(counts))
+
+
+if __name__ == "__main__":
+    main()
