@@ -164,7 +164,7 @@ def test_controls_that_cannot_be_drawn_are_refused(monkeypatch, capsys, tmp_path
         mcsim.diagnose(model(50), [], settings=settings(controls=-1))
     with refused("controls", "table"):
         controls.check(3, of_maps=False)
-    with refused("controls", "another program"):
+    with refused("controls", 3):
         controls.check(3, of_maps=True, external=True)
     with pytest.raises(TypeError, match="loud"):
         mcsim.diagnose(model(50), [], loud=True)
