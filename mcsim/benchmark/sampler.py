@@ -38,8 +38,8 @@ class CaseSampler:
         if known < wanted:
             raise InputError(
                 f"a case with {wanted} effects needs as many that reach a signal-to-noise ratio of "
-                f"{self.prior.weakest:g} at a possible amplitude, but the model has {known}; give it less noise or more "
-                "effects, or draw no such case."
+                f"{self.prior.weakest:g} at a possible amplitude, but the model has {known}; give it less noise or "
+                "more effects, or draw no such case."
             )
         while len(members) < wanted:
             found = self._member(draw, self.names[int(draw.integers(len(self.names)))])

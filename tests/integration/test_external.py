@@ -198,8 +198,9 @@ def test_responses_come_from_who_can_add_the_effect(learned):
         if purpose.kind == "response":
             own = learned.bank.labels[purpose.number].effect == "beam_width"
         assert (job.source is not None) == own, purpose
-    assert learned.ensemble.external_reference.shape == learned.ensemble.reference.shape
-    assert not np.allclose(learned.ensemble.external_reference, learned.ensemble.reference)
+    reference = learned.ensemble.extended.reference
+    assert learned.ensemble.external_reference.shape == reference.shape
+    assert not np.allclose(learned.ensemble.external_reference, reference)
     # Of the same instrument, so that the templates agree to the scatter of responses.
     own = replace(learned.analysis, source=None)
     _, bank = campaign.learned(own, lambda jobs: [api.data_vectors(job) for job in jobs], 200)

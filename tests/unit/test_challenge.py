@@ -48,7 +48,7 @@ from refusals import refused
 ENTRIES = 24
 
 SENSITIVITY = 100.0
-"""Response to an amplitude of 1 over the noise of an element: effects show well within the bounds of their parameters."""
+"""Response to an amplitude of 1 over the noise of an element: effects show at amplitudes within their bounds."""
 
 
 def toy(names, simulations=800, seed=1, common=0.0):
