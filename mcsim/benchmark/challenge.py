@@ -20,6 +20,7 @@ from mcsim.diagnosis.campaign import Batch, seeded, with_effects
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps, read_maps
 from mcsim.ensemble.maps import file_names, write_map
+from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError
 from mcsim.simulation import nuisance, sampled, simulate
 from mcsim.simulation.survey import survey
@@ -39,13 +40,14 @@ STRONGER = 1.5
 
 
 def make(
-    settings: Settings, folder: str | Path, cases: int, seed: int, *, workers: int | None = None, quiet: bool = True
+    settings: Settings, folder: str | Path, cases: int, seed: int, *, workers: Workers | None = None, quiet: bool = True
 ) -> Path:
     """Make those of a number of cases of a challenge that are not there yet; return the folder.
 
     It gets ``cases/case-NNN`` (maps, model.toml, question.json, SEAL), ``keys/case-NNN.json`` and ``challenge.json``. A
     folder can be filled in several calls, and a call that was interrupted repeated. The seed of the draws is kept among
-    the keys, because it determines them. ``workers`` is the number of processes; None: the model's; 0: this process.
+    the keys, because it determines them. ``workers`` is the number of processes; None: the model's; 0: this process;
+    or the address of a running scheduler, or a Dask client, whose workers share cache and folder.
     InputError if the run cannot be used, or the folder holds a challenge with other settings.
     """
     if cases < 1:
@@ -143,11 +145,11 @@ def _without_none(value: Any) -> Any:
     return [_without_none(one) for one in value] if isinstance(value, list) else value
 
 
-def run(folder: str | Path, *, workers: int | None = None, quiet: bool = True) -> int:
+def run(folder: str | Path, *, workers: Workers | None = None, quiet: bool = True) -> int:
     """Diagnose the cases of a challenge that have no verdict yet, without looking at the keys; return their number.
 
     The folder, filled by :func:`make`, gets ``verdicts/case-NNN`` with ``verdict.json`` and ``answer.json`` (the data
-    vector and the fits behind the verdict). ``workers`` is the number of processes; None: the model's; 0: this process.
+    vector and the fits behind the verdict). ``workers`` as for :func:`make`.
     InputError if the folder holds no challenge.
     """
     target = Path(folder)

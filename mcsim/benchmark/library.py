@@ -20,6 +20,7 @@ from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.subsets import Subsets
 from mcsim.diagnosis.validation import Halves
+from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError, RunError
 from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit, SimulatedGaussian, WhitenedTemplates
@@ -207,10 +208,10 @@ def _refuse(jobs: Sequence[Job]) -> list[Vector]:
 
 
 @contextmanager
-def workers_of(settings: Settings, workers: int | None, quiet: bool) -> Iterator[Batch]:
+def workers_of(settings: Settings, workers: Workers | None, quiet: bool) -> Iterator[Batch]:
     """Start processes for as long as the block lasts, and learn the model with them if it is not in the cache.
 
-    ``workers`` None: as many as the model says; 0: this process.
+    ``workers`` None: as many as the model says; 0: this process. Or the address of a scheduler, or a client.
     """
     run = settings.model
     with batch(run.compute.workers if workers is None else workers) as call:

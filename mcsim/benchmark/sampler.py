@@ -9,6 +9,7 @@ import numpy as np
 from mcsim.benchmark.case import KINDS, Drawn, Kind, Member, Prior, Vector
 from mcsim.benchmark.library import EffectsLibrary
 from mcsim.benchmark.out_of_library import OutOfLibrary
+from mcsim.errors import InputError
 from mcsim.sphere import rng
 
 
@@ -33,7 +34,14 @@ class CaseSampler:
             name = self.names[order[turn % len(order)]]
             return Drawn(kind=kind, members=(self._member(draw, name),), without=(name,))
         members: dict[tuple[str, str | None], Member] = {}
-        while len(members) < {"none": 0, "one": 1, "two": 2}[kind]:
+        wanted, known = {"none": 0, "one": 1, "two": 2}[kind], sum(map(len, self._groups.values()))
+        if known < wanted:
+            raise InputError(
+                f"a case with {wanted} effects needs as many that reach a signal-to-noise ratio of "
+                f"{self.prior.weakest:g} at a possible amplitude, but the model has {known}; give it less noise or more "
+                "effects, or draw no such case."
+            )
+        while len(members) < wanted:
             found = self._member(draw, self.names[int(draw.integers(len(self.names)))])
             members.setdefault(found.identity, found)
         return Drawn(kind=kind, members=tuple(members.values()))

@@ -19,6 +19,7 @@ from mcsim.diagnosis.candidate import Candidate
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError
 from mcsim.sphere import rng
 from mcsim.stats.detection import power
@@ -36,12 +37,12 @@ STRONG = 8.0
 """Expected S/N from which on an effect that does not act is added as well."""
 
 
-def score(folder: str | Path, *, workers: int | None = None, quiet: bool = True) -> Score:
+def score(folder: str | Path, *, workers: Workers | None = None, quiet: bool = True) -> Score:
     """Check the seals of a challenge, open the keys, and compare them with the verdicts.
 
     The folder gets ``score/score.json``, ``score/report.html`` and ``score/score.png``. ``workers`` are the processes
-    that learn the model again, should it not be in the cache; None: the model's; 0: this process. InputError if there
-    is no verdict, or one cannot be read, or a key is not the sealed one.
+    that learn the model again, should it not be in the cache (:func:`mcsim.benchmark.challenge.make`). InputError if
+    there is no verdict, or one cannot be read, or a key is not the sealed one.
     """
     target = Path(folder)
     made = finished_cases(target)
@@ -62,12 +63,18 @@ def score(folder: str | Path, *, workers: int | None = None, quiet: bool = True)
 
 
 def score_draws(
-    settings: Settings, folder: str | Path, number: int, seed: int, *, workers: int | None = None, quiet: bool = True
+    settings: Settings,
+    folder: str | Path,
+    number: int,
+    seed: int,
+    *,
+    workers: Workers | None = None,
+    quiet: bool = True,
 ) -> Score:
     """Score draws of a model's data vector (:func:`draws`), and write the score into a folder.
 
-    :data:`DETECTIONS` more draws are tested for detection alone. ``workers`` is the number of processes; None: the
-    model's; 0: this process.
+    :data:`DETECTIONS` more draws are tested for detection alone. ``workers`` as for
+    :func:`mcsim.benchmark.challenge.make`.
     """
     if number < 1:
         raise InputError(f"a score of {number} draws is none; ask for at least 1.")

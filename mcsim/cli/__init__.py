@@ -14,7 +14,18 @@ import typer
 from typer import Argument, Option
 
 from mcsim.cli import ensembles
-from mcsim.cli.common import Config, Including, Png, Processes, Simulations, Workers, interrupt_once, save
+from mcsim.cli.common import (
+    Config,
+    Including,
+    Png,
+    Processes,
+    Scheduler,
+    Simulations,
+    Workers,
+    chosen,
+    interrupt_once,
+    save,
+)
 from mcsim.errors import InputError, RunError
 
 app = typer.Typer(
@@ -147,7 +158,9 @@ def diagnose(
     without: Annotated[list[str] | None, Option(metavar="EFFECT", help="Do not propose it; repeatable.")] = None,
     including: Including = None,
     simulations: Simulations = None,
+    controls: Annotated[int, Option(min=0, help="Perfect data sets, drawn at higher fidelity and diagnosed too.")] = 0,
     workers: Processes = None,
+    scheduler: Scheduler = None,
     dry_run: Annotated[bool, Option("--dry-run", help="Say simulations, memory and time; simulate none.")] = False,
 ) -> None:
     """Test maps against a model, and find the effect that the model lacks: where, how large, and if adding it helps."""
@@ -158,16 +171,16 @@ def diagnose(
     from mcsim.diagnosis.words import summary
 
     interrupt_once()
-    run = config.load(model)
+    where, run = chosen(workers, scheduler), config.load(model)
     settings = DiagnosisSettings(
-        without=tuple(without or ()), including=tuple(including or ()), simulations=simulations
+        without=tuple(without or ()), including=tuple(including or ()), simulations=simulations, controls=controls
     )
     if workers is not None:
         run = replace(run, compute=replace(run.compute, workers=workers))
     if dry_run:
         print(describe(run, settings))
         return
-    found = judge(run, data, output, case=case, settings=settings, quiet=False)
+    found = judge(run, data, output, case=case, settings=settings, quiet=False, workers=where)
     print("\n".join(summary(found, output)))
 
 
@@ -254,6 +267,7 @@ def challenge_make(
     including: Including = None,
     simulations: Simulations = None,
     workers: Workers = None,
+    scheduler: Scheduler = None,
 ) -> None:
     """Draw effects, make the maps of the cases, seal the keys."""
     from mcsim import config
@@ -269,24 +283,24 @@ def challenge_make(
         simulations=simulations,
         including=tuple(including or ()),
     )
-    make(shared, output, cases, seed, workers=workers, quiet=False)
+    make(shared, output, cases, seed, workers=chosen(workers, scheduler), quiet=False)
 
 
 @challenge.command("run")
-def challenge_run(folder: Folder, workers: Workers = None) -> None:
+def challenge_run(folder: Folder, workers: Workers = None, scheduler: Scheduler = None) -> None:
     """Diagnose all cases that have no verdict."""
     from mcsim.benchmark.challenge import run as diagnose_all
 
     interrupt_once()
-    print(f"{diagnose_all(folder, workers=workers, quiet=False)} cases diagnosed")
+    print(f"{diagnose_all(folder, workers=chosen(workers, scheduler), quiet=False)} cases diagnosed")
 
 
 @challenge.command("score")
-def challenge_score(folder: Folder, workers: Workers = None) -> None:
+def challenge_score(folder: Folder, workers: Workers = None, scheduler: Scheduler = None) -> None:
     """Open the keys and score the verdicts."""
     from mcsim.benchmark import report, score
 
-    print("\n".join(report.lines(score.score(folder, workers=workers, quiet=False))))
+    print("\n".join(report.lines(score.score(folder, workers=chosen(workers, scheduler), quiet=False))))
 
 
 @challenge.command("draws")
@@ -298,6 +312,7 @@ def challenge_draws(
     including: Including = None,
     simulations: Simulations = None,
     workers: Workers = None,
+    scheduler: Scheduler = None,
 ) -> None:
     """Draw and score compressed data vectors, without maps."""
     from mcsim import config
@@ -305,7 +320,7 @@ def challenge_draws(
     from mcsim.benchmark.folder import Settings
 
     shared = Settings(config.load(model), simulations=simulations, including=tuple(including or ()))
-    found = score.score_draws(shared, output, number, seed, workers=workers, quiet=False)
+    found = score.score_draws(shared, output, number, seed, workers=chosen(workers, scheduler), quiet=False)
     print("\n".join(report.lines(found)))
 
 

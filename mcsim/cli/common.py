@@ -16,8 +16,16 @@ Including = Annotated[
 ]
 Simulations = Annotated[int | None, Option(min=50, help="For the data covariance; default: ten per element.")]
 Processes = Annotated[int | None, Option(min=1, help="Local processes; default: the configuration's.")]
+Scheduler = Annotated[str | None, Option(metavar="ADDRESS", help="Running Dask scheduler, tcp://host:port.")]
 Part = Annotated[str | None, Option(metavar="A:B", help="Only realizations A to B - 1; default: all.")]
 Png = Annotated[Path | None, Option("-o", "--output", metavar="PNG", help="Picture to write.")]
+
+
+def chosen(workers: int | None, scheduler: str | None) -> int | str | None:
+    """Return the number of processes or the address of the scheduler that was asked for; None: neither."""
+    if workers is not None and scheduler is not None:
+        raise InputError("--workers and --scheduler exclude each other: workers of a running scheduler are its own.")
+    return workers if scheduler is None else scheduler
 
 
 def interrupt_once() -> None:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from mcsim.cli.common import Config, Part, Png, Processes, interrupt_once, save
+from mcsim.cli.common import Config, Part, Png, Processes, Scheduler, chosen, interrupt_once, save
 from mcsim.errors import InputError
 
 Store = Annotated[Path, Argument(metavar="STORE", help="Folder that mcsim run wrote.")]
@@ -20,7 +20,7 @@ def run(
     resume: Annotated[bool, Option("--resume", help="Check a store, repair it, and continue it.")] = False,
     realizations: Part = None,
     workers: Processes = None,
-    scheduler: Annotated[str | None, Option(metavar="ADDRESS", help="Running Dask scheduler, tcp://host:port.")] = None,
+    scheduler: Scheduler = None,
     dry_run: Annotated[bool, Option("--dry-run", help="Say memory, disk, files and time; compute nothing.")] = False,
 ) -> None:
     """Run an ensemble; continue it if it was interrupted; extend it if more realizations are asked for.
@@ -31,9 +31,7 @@ def run(
     Exit codes: 0 done; 1 realizations failed or the run could not continue (finished ones are stored: run again); 2 bad
     input, nothing was computed; 130 interrupted by Ctrl-C or SIGTERM (run again to continue).
     """
-    if workers is not None and scheduler is not None:
-        raise InputError("--workers and --scheduler exclude each other: workers of a running scheduler are its own.")
-    part = _slice(realizations)
+    where, part = chosen(workers, scheduler), _slice(realizations)
     if dry_run:
         from mcsim.ensemble import plan
 
@@ -43,7 +41,7 @@ def run(
     try:
         from mcsim.ensemble import runner
 
-        result = runner.run(config, store, resume=resume, realizations=part, workers=scheduler or workers, quiet=False)
+        result = runner.run(config, store, resume=resume, realizations=part, workers=where, quiet=False)
     except KeyboardInterrupt:
         print("mcsim: interrupted; run the same command again to continue.", file=sys.stderr)
         raise typer.Exit(130) from None
@@ -113,13 +111,16 @@ def predict(
     exact: Annotated[bool, Option("--exact", help="To all orders in the beam; default: leading order.")] = False,
     snr: Annotated[bool, Option("--snr", help="Add the signal to noise of every mode.")] = False,
     output: Annotated[Path | None, Option("-o", "--output", metavar="FILE", help=".zarr, .nc or .ecsv.")] = None,
+    workers: Annotated[int | None, Option(min=1, help="Local processes, for the pairs of maps; default: one.")] = None,
+    scheduler: Scheduler = None,
 ) -> None:
     """Predict the summary of a run without Monte Carlo."""
     from mcsim.ensemble import describe, prediction, tables
 
+    where = chosen(workers, scheduler)
     if output is not None:
         tables.check_ending(output)
-    expected = prediction.predict(config, exact=exact, snr=snr, nthreads=os.cpu_count() or 1)
+    expected = prediction.predict(config, exact=exact, snr=snr, nthreads=os.cpu_count() or 1, workers=where)
     print(describe.describe_prediction(expected))
     if output is not None:
         tables.write(expected, output)

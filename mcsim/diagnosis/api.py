@@ -7,13 +7,13 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config, systematics
-from mcsim.diagnosis import campaign, measured_spectra, null_ensemble, report, words
+from mcsim.diagnosis import campaign, controls, measured_spectra, null_ensemble, report, words
 from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, data_vectors
 from mcsim.diagnosis.campaign import asking, batch
 from mcsim.diagnosis.candidate import TemplateBank
@@ -26,6 +26,7 @@ from mcsim.diagnosis.observed_maps import ObservedMaps, checked, read_maps
 from mcsim.diagnosis.result import Agreement, DiagnosisResult
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.ensemble.plan import cost
+from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError
 from mcsim.simulation import power
 from mcsim.support import folders
@@ -37,6 +38,13 @@ LIBRARIES = ("ducc0", "healpy", "numpy", "scipy")
 """What the simulations of a model and their data vectors are computed with."""
 
 
+class Computing(TypedDict, total=False):
+    """Keywords of :func:`diagnose` on which no result depends."""
+
+    quiet: bool
+    workers: Workers | None
+
+
 def diagnose(
     model: str | Path | Mapping[str, Any] | config.RunConfig | ExternalModel,
     data: str | Path | Sequence[NDArray[np.float64]],
@@ -44,16 +52,15 @@ def diagnose(
     *,
     case: str | None = None,
     settings: DiagnosisSettings | None = None,
-    quiet: bool = True,
+    **computing: Unpack[Computing],
 ) -> DiagnosisResult:
     """Diagnose the gap between a simulation and data.
 
     Parameters
     ----------
     model
-        Fiducial model of sky, beams, scan and noise: a run. Its ``compute.workers`` processes simulate. With a
-        simulator of another program, or its stored maps, in place of mcsim's: an :class:`mcsim.ExternalModel`, or a run
-        with ``simulator`` or ``ensemble.maps``.
+        Fiducial model of sky, beams, scan and noise: a run. With a simulator of another program, or its stored maps, in
+        place of mcsim's: an :class:`mcsim.ExternalModel`, or a run with ``simulator`` or ``ensemble.maps``.
     data
         Folder with ``{channel}.fits`` or ``{channel}_{split}.fits``, uK; or the maps themselves, shape (npix,) each, in
         the order channel by channel, split by split; or a table of measured spectra
@@ -63,10 +70,12 @@ def diagnose(
     case
         Name; default: that of the run.
     settings
-        Library of effects, those that are no candidates, levels, cuts, bins and numbers of simulations; default:
-        those of :class:`~mcsim.diagnosis.settings.DiagnosisSettings`.
-    quiet
-        Report no progress.
+        Library of effects, those that are no candidates, levels, cuts, bins, numbers of simulations and of controls;
+        default: those of :class:`~mcsim.diagnosis.settings.DiagnosisSettings`.
+    **computing
+        ``quiet`` (default True): report no progress. ``workers``: number of processes that simulate, 0 for this one
+        (default: the ``compute.workers`` of the run); or the address of a running Dask scheduler, or a
+        ``distributed.Client``, whose workers share the file system.
 
     Returns
     -------
@@ -80,14 +89,16 @@ def diagnose(
     RunError
         If a simulator of another program fails; the same call goes on where it ended.
     """
+    quiet, workers = _computing(**computing)
     run, source = loaded(model)
     settings = settings or DiagnosisSettings()
-    settings, library = _with_library(settings)
+    wanted, (settings, library) = settings.controls, _with_library(settings)
     if output is not None:
         folders.writable(Path(output))
     threads = os.cpu_count() or 1
     task: Callable[[Job], NDArray[np.float64]] = data_vectors
     table = read_spectra(data, run) if isinstance(data, str | Path) and Path(data).is_file() else None
+    controls.check(wanted, of_maps=table is None, external=source is not None)
     if table is not None:
         if source is not None:
             raise InputError(f"{data} is a table, but {source.label} makes maps; give maps, or a run of mcsim.")
@@ -100,12 +111,13 @@ def diagnose(
     if table is None:
         maps = read_maps(analysis.model, data) if isinstance(data, str | Path) else checked(analysis.model, data)
     key = _key(run, analysis)
-    with batch(run.compute.workers) as call:
+    with batch(run.compute.workers if workers is None else workers) as call:
         whole = task if source is None else Kept(task, f"diagnose/{key}.parts")
         with asking(call, quiet, whole, "simulations of the model and of each effect") as ask:
             ensemble, bank = _learned(key, analysis, ask)
+        known = context(analysis, ensemble if table is None else ensemble.of_mean(table.realizations), bank)
+        drawn = controls.diagnose_controls(known, key, wanted, call, quiet) if wanted else None
         with asking(call, quiet, task, "simulations of fitted effects") as ask:
-            known = context(analysis, ensemble if table is None else ensemble.of_mean(table.realizations), bank)
             found: DataSet[Any] = (
                 ObservedMaps(known, maps, ask) if table is None else MeasuredSpectra(known, table, ask)
             )
@@ -114,6 +126,10 @@ def diagnose(
         diagnosis = _with_agreement(diagnosis, agreement(known))
     elif table is None:
         diagnosis = replace(diagnosis, warnings=_warnings(analysis))
+    if drawn is not None:
+        first = (*drawn.warnings, *diagnosis.warnings)
+        done = replace(diagnosis.settings, controls=wanted)
+        diagnosis = replace(diagnosis, controls=drawn, warnings=first, settings=done)
     if output is not None:
         diagnosis.save(output)
         report.write(diagnosis, Path(output) / "report.html")
@@ -127,13 +143,14 @@ def _with_library(settings: DiagnosisSettings) -> tuple[DiagnosisSettings, syste
     for effect in (*settings.without, *settings.including):
         systematics.get(effect, known)
     including = tuple(sorted({name for name in asked if not known[name].proposed}))
-    return replace(settings, without=tuple(settings.without), including=including, library=None), known
+    return replace(settings, without=tuple(settings.without), including=including, library=None, controls=0), known
 
 
 def describe(model: str | Path | config.RunConfig | ExternalModel, settings: DiagnosisSettings) -> str:
     """Return a text on the cost of a diagnosis of maps: simulations, memory, time, and that of preparing the maps."""
     run, source = loaded(model)
-    settings, library = _with_library(settings)
+    count, (settings, library) = settings.controls, _with_library(settings)
+    controls.check(count, of_maps=True, external=source is not None)
     analysis = analysis_of(run, settings.without, os.cpu_count() or 1, settings, library, source)
     power.check(analysis.model.survey)
     jobs, size = campaign.plan(analysis, settings.simulations).values(), len(analysis.elements)
@@ -144,7 +161,14 @@ def describe(model: str | Path | config.RunConfig | ExternalModel, settings: Dia
         stored = "" if source.count is None else f", of {source.count} that are stored"
         head += f"; and at most {given} of {source.label}{stored}, whose own cost is not in what follows"
     priors = [f"nuisance: {line}" for one in analysis.nuisances for line in one.lines]
-    return "\n".join([head, *priors, *cost(run).lines(number, run.compute.workers)])
+    lines = [head, *priors, *cost(run).lines(number, run.compute.workers)]
+    if count:
+        lines += controls.describe(analysis, count, run.compute.workers)
+    return "\n".join(lines)
+
+
+def _computing(quiet: bool = True, workers: Workers | None = None) -> tuple[bool, Workers | None]:
+    return quiet, workers
 
 
 def _with_agreement(diagnosis: DiagnosisResult, found: Agreement) -> DiagnosisResult:

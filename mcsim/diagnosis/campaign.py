@@ -39,13 +39,18 @@ _COVARIANCE, _RESPONSE = (0x6D63 * 1_000 + stream for stream in (1, 2))
 
 
 @contextmanager
-def batch(workers: int) -> Iterator[Batch]:
-    """Open a cluster of ``workers`` processes at the first call; with 0 call in this process."""
+def batch(workers: runner.Workers) -> Iterator[Batch]:
+    """Open a cluster of ``workers`` processes at the first call; with 0 call in this process.
+
+    ``workers`` may be the address of a running scheduler, which is called at once, or a client.
+    """
     with ExitStack() as stack:
+        if not isinstance(workers, int):
+            workers = stack.enter_context(runner.connected(workers))
 
         @cache
         def client() -> Any:
-            return stack.enter_context(runner.local_client(workers))
+            return stack.enter_context(runner.connected(workers))
 
         def call(function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> Iterator[tuple[int, Any]]:
             if workers == 0:

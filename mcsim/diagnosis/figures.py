@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
 
+from mcsim.diagnosis.control_result import Controls
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import Contrast
 from mcsim.diagnosis.summaries import KINDS
@@ -212,6 +213,24 @@ def calibration_figure(result: DiagnosisResult) -> Figure:
     right.legend(frameon=False, fontsize=8, loc="lower right")
     for axes in (left, right):
         _bare(axes)
+    return figure
+
+
+def controls_figure(result: DiagnosisResult, controls: Controls) -> Figure:
+    """Draw the p-values of the controls against their ranks, with that of the data."""
+    figure = Figure(figsize=(5.4, 3.1), layout="constrained")
+    axes, count = figure.subplots(), len(controls.members)
+    p, rank = np.maximum(controls.pvalues, 1e-30), np.arange(1, count + 1)
+    expected = rank / (count + 1.0)
+    axes.fill_between(expected, *stats.beta.interval(0.95, rank, count + 1 - rank), color="0.88", zorder=0)
+    axes.plot([expected[0] / 2.0, 1.0], [expected[0] / 2.0, 1.0], color="black", linewidth=0.8)
+    axes.plot(expected, p, "o", color=BLUE, markersize=5, label="controls")
+    data = max(result.test.pvalue, 1e-30)
+    axes.axhline(data, color=RED, linewidth=1.4, label=f"data, {p_equals(result.test.pvalue)}")
+    axes.axhline(controls.alpha, color="black", linewidth=0.8, linestyle="--")
+    axes.set(xscale="log", yscale="log", xlabel="expected p-value of this rank", ylabel="global p-value")
+    axes.legend(frameon=False, fontsize=8, loc="lower right")
+    _bare(axes)
     return figure
 
 

@@ -61,6 +61,8 @@ def _pictures(result: DiagnosisResult) -> dict[str, dict[str, Any]]:
         "separation": (figures.separation_figure(result), "Matrix: strength needed to choose between candidates."),
         "calibration": (figures.calibration_figure(result), "Histogram and curve: p-values of simulations."),
     }
+    if result.controls is not None:
+        drawn["controls"] = (figures.controls_figure(result, result.controls), f"Steps: {result.controls.counted}.")
     for one in result.contrasts:
         if one.first == 0:
             text = f"Points: elements in which {result.sets[0].label} and {result.sets[one.second].label} differ."

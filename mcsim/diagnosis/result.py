@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from mcsim.diagnosis.consistency import Comparison, MapCheck
+from mcsim.diagnosis.control_result import Controls
 from mcsim.diagnosis.localisation import Place
 from mcsim.diagnosis.nuisance import NuisanceResult
 from mcsim.diagnosis.selection import Contrast, Verdict
@@ -193,6 +194,8 @@ class DiagnosisResult:
         Settings of the diagnosis; numbers of simulations, the seed and the data, by name.
     configuration
         The run that is the model, as JSON.
+    controls
+        Diagnoses of data drawn from the model at higher fidelity; None: none were asked for.
     agreement
         Of an external model; None where mcsim simulates.
     nuisances
@@ -233,6 +236,7 @@ class DiagnosisResult:
     configuration: str
     warnings: tuple[str, ...] = ()
     nuisances: tuple[NuisanceResult, ...] = ()
+    controls: Controls | None = None
     faint: bool = False
     probability: float = 1.0
     agreement: Agreement | None = None
@@ -309,6 +313,7 @@ class DiagnosisResult:
             "notes": list(self.notes),
             **({"nuisances": [_nuisance_json(one) for one in self.nuisances]} if self.nuisances else {}),
             **({"warnings": list(self.warnings)} if self.warnings else {}),
+            **({"controls": self.controls.to_json()} if self.controls is not None else {}),
             **({"simulator": asdict(self.agreement)} if self.agreement else {}),
         }
 

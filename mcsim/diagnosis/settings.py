@@ -20,6 +20,9 @@ class DiagnosisSettings:
         given always are.
     simulations
         Simulations for the covariance of the data vector; None: ``sims_per_element`` for each of its elements.
+    controls
+        Data sets that are drawn from the model at higher fidelity and diagnosed too: what they say tells if the verdict
+        on the data can be trusted (:mod:`mcsim.diagnosis.controls`).
     alpha
         Global p-value up to which the model does not describe the data.
     residual_level, further_level
@@ -119,7 +122,7 @@ class DiagnosisSettings:
 
     Notes
     -----
-    Each setting has a part in the key of the cache: another value simulates the model anew.
+    Each setting but ``controls`` has a part in the key of the cache: another value simulates the model anew.
 
     Examples
     --------
@@ -137,6 +140,7 @@ class DiagnosisSettings:
     library: Library | None = None
     including: tuple[str, ...] = ()
     simulations: int | None = None
+    controls: int = 0
     alpha: float = 0.05
     residual_level: float = 0.02
     further_level: float = 0.005

@@ -185,6 +185,8 @@ def summary(result: DiagnosisResult, folder: Path) -> list[str]:
     """Return a summary for the command line, about ten lines."""
     rows = [("warning", warning) for warning in result.warnings]
     rows += [("case", result.case), ("tested", tested(result)), ("global test", chi2(result))]
+    if result.controls is not None:
+        rows.append(("controls", f"{result.controls.counted}; drawn with {result.controls.drawn}"))
     rows.append(("verdict", f"{result.kind}. {status(result)}"))
     shown = result.sets[: SETS + 1]
     for one in shown:

@@ -1,7 +1,9 @@
 """Prediction of an ensemble's means, errors and detectability from its configuration, without Monte Carlo."""
 
-from dataclasses import replace
-from typing import Any
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -9,15 +11,27 @@ from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.bipolar import estimator
+from mcsim.bipolar.theory import ScannedBeam
 from mcsim.ensemble import detectability, plan, summary
 from mcsim.ensemble.expectation import L_MOMENTS, Means, Source, means, scanned_beams, survey_of
+from mcsim.ensemble.tasks import packages, shared_survey
 from mcsim.simulation import power
 from mcsim.simulation.survey import Survey
 from mcsim.stats.streaming import Sums
 
+if TYPE_CHECKING:
+    from mcsim.ensemble.runner import Workers
+
+Pairs = Iterable[tuple[int, int]]
+
 
 def predict(
-    source: Source, exact: bool = False, snr: bool = False, L_moments: int = L_MOMENTS, nthreads: int = 1
+    source: Source,
+    exact: bool = False,
+    snr: bool = False,
+    L_moments: int = L_MOMENTS,
+    nthreads: int = 1,
+    workers: "Workers | None" = None,
 ) -> xr.Dataset:
     """Predict the summary of an ensemble.
 
@@ -34,6 +48,9 @@ def predict(
         Highest degree of the orientation moments if ``exact``; see :func:`mcsim.bipolar.theory.cmb_biposh_exact`.
     nthreads
         Number of threads.
+    workers
+        Number of processes, the address of a running Dask scheduler, or a ``distributed.Client``, among whose workers
+        the pairs of maps are shared out; default: this process.
 
     Returns
     -------
@@ -68,7 +85,13 @@ def predict(
     survey = survey_of(source, nthreads)
     power.check(survey)
     beams = scanned_beams(survey, L_moments if exact else survey.config.biposh.L_max, nthreads)
-    found = {pair: means(survey, beams, pair, exact, nthreads) for pair in survey.pairs}
+
+    def found_for(whole: Survey, pairs: Pairs) -> dict[tuple[int, int], Means]:
+        if workers is None:
+            return {pair: means(whole, beams, pair, exact, nthreads) for pair in pairs}
+        return _shared_out(whole, list(pairs), exact, L_moments, workers)
+
+    found = found_for(survey, survey.pairs)
     result = _dataset(survey, found)
     result.attrs |= _attributes(survey, L_moments if exact else None)
     if not snr:
@@ -77,9 +100,47 @@ def predict(
     every, whole = found, survey
     if len(beams) > 1 and survey.config.biposh.pairs != "all":
         whole = replace(survey, estimator=estimator(survey.config.biposh.L_max, survey.lmax, both_orders=True))
-        pairs = [(x, y) for x in range(len(beams)) for y in range(x, len(beams))]
-        every = {pair: means(whole, beams, pair, exact, nthreads) for pair in pairs}
+        every = found_for(whole, [(x, y) for x in range(len(beams)) for y in range(x, len(beams))])
     return result.assign(detectability.variables(survey, found, detectability.joint_signal_to_noise(whole, every)))
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What the means of all pairs have in common: the configuration as JSON, its digest, the driver's packages."""
+
+    text: str
+    digest: str
+    packages: tuple[tuple[str, str], ...]
+    both_orders: bool
+    exact: bool
+    L_moments: int
+
+
+def _shared_out(
+    survey: Survey, pairs: list[tuple[int, int]], exact: bool, L_moments: int, workers: "Workers"
+) -> dict[tuple[int, int], Means]:
+    """Return the means of pairs of maps, computed by workers."""
+    from mcsim.ensemble import runner  # dask takes long to load
+
+    run, both = survey.config, any(not mode.in_auto for mode in survey.estimator.modes)
+    job = _Job(config.to_json(run), config.digest(run), packages(), both, exact, L_moments)
+    with runner.connected(workers) as client:
+        done = dict(runner.completed(client, pair_means, [(job, pair) for pair in pairs]))
+    return {pair: done[index] for index, pair in enumerate(pairs)}
+
+
+def pair_means(job: _Job, pair: tuple[int, int]) -> Means:
+    """Return the means of a pair of maps; the task of a worker."""
+    survey, beams = _scanned(job)
+    return means(survey, beams, pair, job.exact)
+
+
+@lru_cache(maxsize=2)
+def _scanned(job: _Job) -> tuple[Survey, tuple[ScannedBeam, ...]]:
+    survey = shared_survey(job.text, job.digest, job.packages)
+    biposh = survey.config.biposh
+    tables = estimator(biposh.L_max, survey.lmax, both_orders=job.both_orders)
+    return replace(survey, estimator=tables), scanned_beams(survey, job.L_moments if job.exact else biposh.L_max)
 
 
 def _dataset(survey: Survey, found: dict[tuple[int, int], Means]) -> xr.Dataset:

@@ -66,7 +66,7 @@ def check_same_packages(where: str, theirs: Iterable[tuple[str, str]], own: Iter
 
 
 @lru_cache(maxsize=1)
-def _survey_of(text: str, digest: str, own: tuple[tuple[str, str], ...]) -> Survey:
+def shared_survey(text: str, digest: str, own: tuple[tuple[str, str], ...]) -> Survey:
     """Return the survey of a configuration, made once per worker process and content of its files."""
     check_same_packages(f"A worker on {platform.node()}", packages(), own)
     run = config.from_json(text)
@@ -81,7 +81,7 @@ def realize_chunk(job: Job, start: int, only: int | None = None) -> tuple[int, l
 
     ``only`` limits it to one realization.
     """
-    shared, target = _survey_of(job.text, job.digest, job.packages), Path(job.path)
+    shared, target = shared_survey(job.text, job.digest, job.packages), Path(job.path)
     done = store.done(target, start, start + job.chunk)
     first, stop = max(start, job.first), min(start + len(done), job.stop)
     computed: dict[int, dict[str, NDArray]] = {}

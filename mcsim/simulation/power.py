@@ -9,6 +9,7 @@ beam widths are off by 0.5 standard deviations, and 7 % instead of 5 % of perfec
 workflows/preparation/check.py); the degree that a refusal names keeps s below ``ENOUGH``.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -70,15 +71,41 @@ def neglected(survey: Survey) -> Neglected | None:
     run = survey.config
     if run.sky.spectrum is None or run.map.grid != "healpix":
         return None
+    last, found = spectra.last(run.sky.spectrum), []
+    for name, tail, shift in _shifts(survey, run.sky.spectrum):
+        missing, own = float(np.sqrt(tail[run.sky.lmax])), float(shift[run.sky.lmax])
+        needed = _first_below(shift, ENOUGH, survey.lmax)
+        if own > (ENOUGH if run.preparation else TOLERANCE):
+            found.append(Neglected(name, survey.nside, run.sky.lmax, needed, run.sky.spectrum, last, missing, own))
+    worst = max(found, key=lambda one: one.shift, default=None)
+    return worst and replace(worst, needed=max(one.needed for one in found))
+
+
+def reach(survey: Survey, tolerance: float) -> int:
+    """Return the degree above which power moves the variance of the pixels of no map by more than ``tolerance``.
+
+    At most that at which the spectrum ends; of a survey of pixels with a spectrum.
+    """
+    assert survey.config.sky.spectrum is not None  # the caller's survey has one
+    shifts = _shifts(survey, survey.config.sky.spectrum)
+    needed = max(_first_below(shift, tolerance, survey.lmax) for _, _, shift in shifts)
+    return min(needed, spectra.last(survey.config.sky.spectrum))
+
+
+def _first_below(shift: NDArray[np.float64], tolerance: float, first: int) -> int:
+    return first + int(np.argmax(shift[first:] <= tolerance))
+
+
+def _shifts(survey: Survey, spectrum: str) -> Iterator[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:
+    """Yield the name of every map, the variance that its pixels see above every degree, and what that moves."""
+    run = survey.config
     top = max(run.sky.lmax, min(REACH * survey.nside, HIGHEST))
-    last = spectra.last(run.sky.spectrum)
-    known = spectra.load(run.sky.spectrum, min(last, top))
+    known = spectra.load(spectrum, min(spectra.last(spectrum), top))
     ell = np.arange(top + 1)
     # Beyond its end the spectrum goes on with constant D_l, which is more than any CMB has.
     end = known.size - 1
     beyond = known[-1] * (end * (end + 1.0)) / np.maximum(ell * (ell + 1.0), 1.0)
     cl = np.where(ell <= end, np.resize(known, top + 1), beyond)
-    found = []
     for spec, channel in zip(run.channels, survey.channels, strict=True):
         seen = (2 * ell + 1) / (4.0 * np.pi) * cl * _window(run, spec, channel, top) ** 2
         tail = np.append(np.cumsum(seen[:0:-1])[::-1], 0.0)
@@ -86,15 +113,7 @@ def neglected(survey: Survey) -> Neglected | None:
             used = m.moments.hits > 0 if m.weight is None else m.weight > 0
             noise = 0.0 if m.noise_uk is None else float(np.mean(m.noise_uk[used] ** 2))
             total = noise + tail[survey.lmax] + SIGNAL_FLOOR**2 * float(seen.sum())
-            shift = np.sqrt(used.sum() / 2.0) * tail / total
-            needed = survey.lmax + int(np.argmax(shift[survey.lmax :] <= ENOUGH))
-            missing, own = float(np.sqrt(tail[run.sky.lmax])), float(shift[run.sky.lmax])
-            if own > (ENOUGH if run.preparation else TOLERANCE):
-                found.append(
-                    Neglected(m.name, survey.nside, run.sky.lmax, needed, run.sky.spectrum, last, missing, own)
-                )
-    worst = max(found, key=lambda one: one.shift, default=None)
-    return worst and replace(worst, needed=max(one.needed for one in found))
+            yield m.name, tail, np.sqrt(used.sum() / 2.0) * tail / total
 
 
 def check(survey: Survey) -> None:

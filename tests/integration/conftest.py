@@ -14,7 +14,7 @@ from distributed.utils import get_mp_context
 
 from mcsim import config
 from mcsim.ensemble import runner
-from mcsim.ensemble.runner import batch
+from mcsim.ensemble.runner import cluster
 
 
 @pytest.fixture(scope="session")
@@ -31,7 +31,7 @@ def client() -> Iterator[Client]:
 @pytest.fixture
 def in_this_process(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let commands run on ``client`` instead of processes, whose start takes seconds."""
-    monkeypatch.setattr(batch, "local_client", lambda workers: nullcontext(client))
+    monkeypatch.setattr(cluster, "local_client", lambda workers: nullcontext(client))
 
 
 @pytest.fixture

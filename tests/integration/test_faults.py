@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -208,7 +209,7 @@ def test_completed_gives_every_result_once(client: Client) -> None:
 
 def test_a_cluster_without_workers_is_not_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     class Deserted:
-        cluster, dashboard_link = None, ""
+        cluster, dashboard_link, as_current = None, "", staticmethod(nullcontext)
 
         def nthreads(self) -> dict[str, int]:
             return {}
@@ -227,7 +228,7 @@ def test_a_cluster_without_workers_is_not_waited_for_for_ever(monkeypatch: pytes
 
 def test_workers_that_join_and_leave_are_logged(tmp_path: Path) -> None:
     class Changing:
-        cluster, dashboard_link = None, ""
+        cluster, dashboard_link, as_current = None, "", staticmethod(nullcontext)
 
         def nthreads(self) -> dict[str, int]:
             return dict.fromkeys(rounds.pop(0), 2)
@@ -314,7 +315,7 @@ def test_result_that_is_lost_with_its_worker_is_waited_for_in_turns(
             return 8
 
     class Alone:
-        cluster, dashboard_link = None, ""
+        cluster, dashboard_link, as_current = None, "", staticmethod(nullcontext)
 
         def nthreads(self) -> dict[str, int]:
             return {"a": 1}

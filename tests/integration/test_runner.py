@@ -4,13 +4,14 @@ import errno
 import shutil
 from pathlib import Path
 
+import distributed
 import numpy as np
 import pytest
 import xarray as xr
 from distributed import Client
 
 from mcsim import config, open_ensemble
-from mcsim.ensemble import opening, runner, store
+from mcsim.ensemble import opening, prediction, runner, store
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from refusals import refused
@@ -115,6 +116,20 @@ def test_chunks_do_not_change_a_bit(chunk: int, small_store: Path, client: Clien
     path = tmp_path / "chunked.zarr"
     runner.run(table(compute={"chunk": chunk}), path, workers=client)
     assert_same(path, small_store)
+
+
+def test_a_client_that_is_not_the_default_of_dask_will_do(
+    small_store: Path, client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    [channel] = table()["channel"]
+    two = table(channel=[channel, channel | {"name": "W2"}])  # three pairs, with modes in both orders
+    monkeypatch.setattr(distributed.client, "_global_clients", {})  # those of other tests are defaults
+    with Client(client.cluster, set_as_default=False) as own:
+        runner.run(table(), tmp_path / "own.zarr", workers=own)
+        shared = prediction.predict(two, exact=True, snr=True, workers=own)
+        assert own.status == "running"
+    assert_same(tmp_path / "own.zarr", small_store)
+    xr.testing.assert_allclose(shared, prediction.predict(two, exact=True, snr=True), rtol=1e-12)
 
 
 def test_separate_processes_give_the_same_bits(small_store: Path, tmp_path: Path) -> None:

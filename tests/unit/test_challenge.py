@@ -47,6 +47,9 @@ from refusals import refused
 
 ENTRIES = 24
 
+SENSITIVITY = 100.0
+"""Response to an amplitude of 1 over the noise of an element: effects show well within the bounds of their parameters."""
+
 
 def toy(names, simulations=800, seed=1, common=0.0):
     """Learn effects with random templates, alike in both folds, and unit noise; ``common``: their cosine."""
@@ -58,7 +61,7 @@ def toy(names, simulations=800, seed=1, common=0.0):
     columns = sum(len(candidate.columns) for candidate in candidates)
     directions = np.linalg.qr(rng.standard_normal((ENTRIES // 2, columns)))[0]
     directions = np.sqrt(1.0 - common) * directions + np.sqrt(common) * directions[:, :1]
-    templates = np.repeat(directions, 2, axis=0)
+    templates = SENSITIVITY * np.repeat(directions, 2, axis=0)
     elements = [Element(f"entry{i}", "map", ("A",), None, i % 2) for i in range(ENTRIES)]
     blocks = [Block(tuple(elements), lambda filtered: np.zeros(ENTRIES))]
     rows = [templates]
@@ -66,7 +69,7 @@ def toy(names, simulations=800, seed=1, common=0.0):
         score = Element(f"score/{candidate.label}/0", "score", ("A",), candidate=candidate.name)
         blocks.append(Block((score,), lambda filtered: np.zeros(1)))
         row = np.zeros((1, columns))
-        row[0, number] = 0.5
+        row[0, number] = 0.5 * SENSITIVITY
         rows.append(row)
     t = np.concatenate(rows)
     p = len(t)
@@ -231,6 +234,13 @@ def test_cases_do_not_depend_on_how_many_there_are(linear):
     for kind, part in (("none", 20), ("one", 45), ("two", 15), ("left_out", 12)):
         share = part / 92
         assert abs(many.count(kind) - 400 * share) < 4 * np.sqrt(400 * share * (1 - share))
+
+
+def test_more_effects_than_can_be_drawn_are_refused():
+    model = linear_model(toy((("beam_width", "A"),)))
+    sampler = CaseSampler(Prior(none=0, one=0, two=1, left_out=0), model)
+    with refused(2, 1):
+        sampler.draw(sampler.kinds(1, 1), 1, 0)
 
 
 def test_what_is_left_out_rotates(linear):

@@ -19,7 +19,7 @@ import mcsim
 from mcsim import config
 from mcsim.bipolar import estimate, estimator
 from mcsim.ensemble import plan
-from mcsim.ensemble.runner import batch
+from mcsim.ensemble.runner import cluster
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments, ScanModel
 from mcsim.simulation import simulate
@@ -143,7 +143,7 @@ def test_examples_run(name, example_folder, monkeypatch) -> None:
     """Each alone and in any order: what one leaves in the folder another may find, as a user's would."""
     monkeypatch.chdir(example_folder)
     monkeypatch.setenv("MCSIM_CACHE", str(example_folder / "cache"))
-    monkeypatch.setattr(batch, "local_client", in_this_process)
+    monkeypatch.setattr(cluster, "local_client", in_this_process)
     one = getattr(mcsim, name)
     module = importlib.import_module(one.__module__)
     tests = [test for test in doctest.DocTestFinder().find(one, name, module=module, globs={}) if test.examples]

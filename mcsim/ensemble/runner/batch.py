@@ -15,7 +15,7 @@ from mcsim import config
 from mcsim.ensemble import plan, repair, store, summary
 from mcsim.ensemble.layout import Layout, listed
 from mcsim.ensemble.lock import locked
-from mcsim.ensemble.runner.cluster import Roll, answers, death, local_client, remote_client
+from mcsim.ensemble.runner.cluster import Roll, Workers, answers, connected, death
 from mcsim.ensemble.tasks import Failure, Job, packages, realize_chunk, summarise_node
 from mcsim.errors import InputError, RunError
 from mcsim.simulation import power, simulate
@@ -45,7 +45,7 @@ def run(
     *,
     resume: bool = False,
     realizations: slice | None = None,
-    workers: int | str | Client | None = None,
+    workers: Workers | None = None,
     quiet: bool = True,
 ) -> Result:
     """Run an ensemble, or continue or extend a stored one.
@@ -107,8 +107,9 @@ def run(
     config.check_skies(loaded, wanted)
     journal = Journal(target, quiet)
     with ExitStack() as stack:
-        if isinstance(workers, str):
-            workers = stack.enter_context(remote_client(workers))
+        client = None
+        if workers is not None and not isinstance(workers, int):
+            client = stack.enter_context(connected(workers))
         with reporting("orientation moments", 1.0, "", quiet) as report:
             shared = survey(loaded, nthreads=os.cpu_count() or 1, progress=report)
         power.check(shared)
@@ -119,9 +120,9 @@ def run(
             _mend(target, shared, journal, quiet)
             if _finished(target, loaded, wanted):
                 return Result(target, int(store.done(target).sum()), 0, ())
-        if not isinstance(workers, Client):
-            workers = stack.enter_context(local_client(workers or loaded.compute.workers))
-        return _run(workers, shared, target, wanted, journal)
+        if client is None:
+            client = stack.enter_context(connected(workers or loaded.compute.workers))
+        return _run(client, shared, target, wanted, journal)
 
 
 def _finished(target: Path, run: config.RunConfig, wanted: range) -> bool:

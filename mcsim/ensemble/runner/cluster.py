@@ -3,6 +3,7 @@
 import logging
 import multiprocessing
 import sys
+from asyncio import CancelledError
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib.machinery import ModuleSpec
@@ -25,6 +26,9 @@ import logging, signal
 signal.signal(signal.SIGINT, signal.SIG_IGN)
 logging.getLogger("distributed").setLevel(logging.CRITICAL)
 """
+
+Workers = int | str | Client
+"""Number of local processes, the address of a running scheduler, or a client, which is left open."""
 
 TURN_S = 30.0
 ALONE_S = 300.0
@@ -87,6 +91,17 @@ def local_client(workers: int) -> Iterator[Client]:
                 f"The worker processes did not start ({type(error).__name__}: {error}); run the same command again "
                 "when the machine is less busy or has more memory."
             ) from error
+        yield client
+
+
+@contextmanager
+def connected(workers: Workers) -> Iterator[Client]:
+    """Yield the client of so many local processes or of the scheduler at an address; or the given one, left open."""
+    if isinstance(workers, Client):
+        _check_workers(workers)
+        yield workers
+        return
+    with remote_client(workers) if isinstance(workers, str) else local_client(workers) as client:
         yield client
 
 
@@ -175,12 +190,15 @@ def completed(
     """Call a function on the workers of a cluster; yield the index and the result of each call as it completes.
 
     ``arguments`` may be lazy: three calls are in flight for every present worker thread, so workers may join and leave.
-    The exception of a call is raised, ``distributed.KilledWorker`` if its worker died every time.
+    The exception of a call is raised; RunError if its worker died every time, or the connection is lost.
     """
-    for index, result, killed in answers(Roll(client), function, arguments):
-        if killed is not None:
-            raise killed
-        yield index, result
+    try:
+        for index, result, killed in answers(Roll(client), function, arguments):
+            if killed is not None:
+                raise RunError(f"A task was given up, for {death(killed)}; give workers more memory.") from killed
+            yield index, result
+    except (CancelledError, CommClosedError) as error:
+        raise RunError("The connection to the scheduler is lost; run the same command again.") from error
 
 
 def answers(
@@ -229,7 +247,8 @@ def _first_of(roll: Roll, flying: list[Future]) -> set[Future]:
     missed = 0
     while True:
         try:
-            return set(wait(flying, timeout=TURN_S, return_when="FIRST_COMPLETED")[0])
+            with roll.client.as_current():  # distributed waits with the default client, which may be another, or none
+                return set(wait(flying, timeout=TURN_S, return_when="FIRST_COMPLETED")[0])
         except TimeoutError:
             missed = 0 if roll.call() else missed + 1
         if missed * TURN_S >= ALONE_S:
