@@ -26,7 +26,7 @@ class BandpassMismatch(Effect):
     wording = Wording("{} rms", " µK")
     cause = "A band whose edges are not those of the colour correction, or that changes with temperature."
     signature = "Additive along the Galactic plane in one channel alone, also among channels of one frequency."
-    source = "Planck 2015 results II, A&A 594, A2, and IX, A&A 594, A9 (colour corrections, mismatch); Page et al. 2007"
+    source = "Planck 2013 results IX, A&A 571, A9 (colour corrections); Planck 2018 results III, A&A 641, A3 (mismatch)"
     step = 3.0
     bounds = (Bound("amplitude", -500.0, 500.0, "a prior of this library: less than the foreground itself"),)
     parametrization = Parametrization(stochastic=True, matched_filter=False)

@@ -36,7 +36,7 @@ class BeamEllipticity(Effect):
             "amplitude",
             -1.0,
             1.0,
-            "axis ratios of real beams are at most 1.4 (Planck 2015 results IV, A&A 594, A4)",
+            "a prior of this library: 1.38 is the largest of Planck LFI (Planck 2013 results II, A&A 571, A2)",
         ),
     )
     parametrization = Angle(multiple=2)

@@ -35,7 +35,7 @@ class Boost(DirectedEffect):
     wording = Wording("v/c = {}")
     cause = "The Solar System moves against the cosmic background."
     signature = "L = 1, d = 1, growing as l: to be seen from l of about 1000 on."
-    source = "Challinor & van Leeuwen 2002, Phys. Rev. D 65, 103001; Planck 2013 results XXVII"
+    source = "Challinor & van Leeuwen 2002, Phys. Rev. D 65, 103001; Planck 2013 results XXVII, A&A 571, A27"
     step = 1e-4
     bounds = (Bound("amplitude", 0.0, 0.01, "a prior of this library: eight times our velocity, v/c = 1.23e-3"),)
     parametrization = SkyVector(max_amplitude=0.01, mean_response=True, matched_filter=False)

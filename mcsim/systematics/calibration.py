@@ -25,7 +25,7 @@ class Calibration(Effect):
     wording = Wording("{} of the gain", " %", 100.0)
     cause = "Absolute calibration on a dipole that is known, or was measured, with an error."
     signature = "L = 0 and the dipole: the same factor at all degrees and times, in this channel alone."
-    source = "Jarosik et al. 2011, ApJS 192, 14, Sec. 2 (0.2 %); Planck 2015 results V, A&A 594, A5"
+    source = "Jarosik et al. 2011, ApJS 192, 14 (0.2 %); Planck 2015 results V, A&A 594, A5"
     step = 1e-3
     bounds = (Bound("amplitude", -0.5, 0.5, "a prior of this library: half of the dipole is seen by eye"),)
 

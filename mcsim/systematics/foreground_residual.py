@@ -38,7 +38,7 @@ class ForegroundResidual(Effect):
     signature = (
         "Additive and fixed to the sky, along the Galactic plane, different from channel to channel in size alone."
     )
-    source = "Bennett et al. 2013, ApJS 208, 20, Sec. 5 (residuals of cleaned bands); the morphology is a model"
+    source = "Bennett et al. 2013, ApJS 208, 20 (residuals of cleaned bands); the morphology is a model"
     step = 5.0
     bounds = (
         Bound("amplitude", -500.0, 500.0, "a prior of this library: less than the foreground itself"),

@@ -33,7 +33,7 @@ class GainDrift(Effect):
     signature = (
         "Sky and dipole modulated with the year: additive at low l, ordered by the scan, opposite in the halves."
     )
-    source = "Jarosik et al. 2007, ApJS 170, 263, Sec. 2 (gain model and its residuals)"
+    source = "Jarosik et al. 2007, ApJS 170, 263 (gain model)"
     step = 2e-4
     bounds = (Bound("amplitude", 0.0, 0.1, "a prior of this library: far beyond any radiometer in use"),)
     parametrization = Angle(parameter="phase_deg")

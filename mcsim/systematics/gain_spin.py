@@ -32,7 +32,7 @@ class GainSpin(Effect):
     wording = Wording("{} of the gain", " %", 100.0)
     cause = "A receiver or its supply that is heated by the Sun once every spin, faster than calibration follows."
     signature = "Sky and dipole times a pattern fixed to the Sun: additive at low l, in the frame of the scan."
-    source = "Jarosik et al. 2007, ApJS 170, 263, Sec. 2.4; Planck 2015 results III, A&A 594, A3 (thermal effects)"
+    source = "Hinshaw et al. 2003, ApJS 148, 63 (limits); Planck 2015 results III, A&A 594, A3 (thermal effects)"
     step = 2e-4
     bounds = (Bound("amplitude", 0.0, 0.1, "a prior of this library: far beyond any radiometer in use"),)
     parametrization = Angle(parameter="phase_deg")

@@ -17,7 +17,7 @@ class MapmakingConvergence(Effect):
     wording = Wording("{} iterations short")
     cause = "Conjugate gradients ended by a count, not by their residual."
     signature = "Stripes in the frame of the scan, at the largest scales; acts on differencing scans only."
-    source = "Hinshaw et al. 2003, ApJS 148, 63, Sec. 3 (iterations of the map-making)"
+    source = "Hinshaw et al. 2003, ApJS 148, 63 (iterative map-making); Jarosik et al. 2007, ApJS 170, 263"
     step = 1.0
     bounds = (Bound("amplitude", 0.0, 1000.0, "a prior of this library: map-makings end after fewer iterations"),)
     parametrization = Parametrization(sign=1)

@@ -20,7 +20,7 @@ class MonopoleResidual(Effect):
     wording = Wording("{}", " µK")
     cause = "Zero level of the maps, which differential instruments and destriped maps leave free."
     signature = "l = 0; behind a mask in the lowest degrees of this channel, the same in both halves."
-    source = "Bennett et al. 2003, ApJS 148, 97, Sec. 3 (zero levels of the maps)"
+    source = "Bennett et al. 2003, ApJS 148, 97 (zero levels); Eriksen et al. arXiv:0709.1037 (offsets left)"
     step = 0.5
     bounds = (Bound("amplitude", -2.7e6, 2.7e6, "less than the temperature of the sky, 2.7 K"),)
     parametrization = Parametrization(matched_filter=False)

@@ -33,7 +33,7 @@ class Nonlinearity(Effect):
     wording = Wording("{} of the gain at the dipole's maximum", " %", 100.0)
     cause = "Analogue-to-digital converters or detectors whose response is curved over the range of the dipole."
     signature = "A quadrupole aligned with the dipole, and the sky modulated along it, the same in both halves."
-    source = "Planck 2018 results III, A&A 641, A3, Sec. 2 and 5 (nonlinearity of converters, dipole distortion)"
+    source = "Planck 2018 results III, A&A 641, A3 (nonlinearity of converters)"
     step = 2e-4
     bounds = (Bound("amplitude", -0.1, 0.1, "a prior of this library: far beyond any converter in use"),)
     proposed = False

@@ -36,7 +36,7 @@ class OrbitalDipole(Effect):
     wording = Wording("{} of the orbital dipole", " %", 100.0)
     cause = "Velocity, time stamps or beam efficiency wrong where the annual dipole is subtracted or calibrates."
     signature = "A dipole that turns through the year: of opposite sign in the halves, in the ecliptic plane."
-    source = "Planck 2015 results V, A&A 594, A5; Hinshaw et al. 2009, ApJS 180, 225 (the annual dipole calibrates)"
+    source = "Hinshaw et al. 2003, ApJS 148, 63, and Planck 2015 results V, A&A 594, A5 (the annual dipole calibrates)"
     step = 2e-3
     bounds = (Bound("amplitude", 0.0, 2.0, "at 2 an orbital dipole of the right size has the opposite sign"),)
     parametrization = Angle(parameter="phase_deg")

@@ -31,7 +31,7 @@ class OrientationAveraging(Effect):
     wording = Wording("{} of the step from parallel transport to the real scan", " %", 100.0)
     cause = "Parallel transport, or one orientation per pixel, in place of the survey's samples."
     signature = "L = 2, M = 0 falls to 0.66 of what parallel transport gives, and other M appear."
-    source = "Joshi et al. arXiv:1210.7318, Sec. V"
+    source = "Joshi et al. arXiv:1210.7318, Sec. VI and last appendix"
     step = 0.05
     bounds = (
         Bound("amplitude", 0.0, 1.25, "0 is the model and 1 the real scan; a quarter more for errors of the latter"),

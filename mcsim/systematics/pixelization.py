@@ -23,7 +23,7 @@ class Pixelization(Effect):
     wording = Wording("{} of the window and the centroids of pixels left out", " %", 100.0)
     cause = "Simulations at the pixels' centres, where the survey has samples all over the pixels."
     signature = "Small scales, depending on nside, and the gradient of the sky at pixels that are hit unevenly."
-    source = "Gorski et al. 2005, ApJ 622, 759, Sec. 6 (window functions)"
+    source = "Gorski et al. 2005, ApJ 622, 759 (HEALPix); the HEALPix Primer (pixel window functions)"
     step = 0.1
     bounds = (Bound("amplitude", -2.0, 2.0, "beyond it samples stand outside of their pixels"),)
     parametrization = Parametrization(max_amplitude=2.0)

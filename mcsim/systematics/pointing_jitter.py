@@ -32,7 +32,7 @@ class PointingJitter(Effect):
     wording = Wording("mean square {}", " arcmin²")
     cause = "Thrusters, wheels or star trackers: attitude that is known with noise, or moves within a sample."
     signature = "L = 0, as of a wider beam: degenerate with beam_width for beams that are nearly Gaussian."
-    source = "Planck 2015 results IV, A&A 594, A4, Sec. 2, and VII, A&A 594, A7 (pointing and its noise)"
+    source = "Planck 2013 results VI, A&A 571, A6 (detector pointing and its errors)"
     step = 1.0
     bounds = (Bound("amplitude", 0.0, 400.0, "a variance, and one of (20 arcmin)^2 is no jitter but a broad beam"),)
     parametrization = Parametrization(sign=1)

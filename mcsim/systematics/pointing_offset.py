@@ -33,7 +33,7 @@ class PointingOffset(Effect):
     wording = Wording("{}", "′")
     cause = "A boresight calibrated on planets, thermal bending, or an error of the time stamps (along the scan)."
     signature = "The gradient of the sky along or across the scan, through w_1; acts on the dipole too."
-    source = "Jarosik et al. 2007, ApJS 170, 263 (boresights); Mitra et al. 2011, ApJS 193, 5"
+    source = "Jarosik et al. 2007, ApJS 170, 263 (WMAP); Planck 2013 results VI, A&A 571, A6 (Planck HFI)"
     step = 0.2
     bounds = (
         Bound("amplitude", 0.0, 120.0, "a prior of this library: reconstructed pointing is never wrong by two degrees"),

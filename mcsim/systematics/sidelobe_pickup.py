@@ -55,7 +55,7 @@ class SidelobePickup(Effect):
     cause = "Spill-over past the mirrors and the baffles, left out of the beam or of the calibration."
     signature = "Galaxy and dipole displaced by the lobe's angle, fixed to the spacecraft: different in the halves."
     source = (
-        "Planck 2015 results III, A&A 594, A3, Sec. 3 (stray light of LFI); Barnes et al. 2003, ApJS 148, 51 (WMAP); "
+        "Planck 2015 results III, A&A 594, A3 (stray light of LFI); Barnes et al. 2003, ApJS 148, 51 (WMAP); "
         "the morphology is a model"
     )
     step = 1e-4

@@ -27,7 +27,7 @@ class SpinSynchronousOffset(Effect):
     wording = Wording("{}", " µK")
     cause = "The Sun heats the spacecraft, or power is switched, in step with the spin."
     signature = "A pattern of the ecliptic frame at low l, the same in both halves: stripes are too regular to average."
-    source = "Jarosik et al. 2007, ApJS 170, 263, Sec. 2.4 (limits); Planck 2015 results III, A&A 594, A3, Sec. 3"
+    source = "Hinshaw et al. 2003, ApJS 148, 63 (limits on the response to the surroundings)"
     step = 0.5
     bounds = (
         Bound(

@@ -36,7 +36,7 @@ class TimeConstant(Effect):
             "amplitude",
             -2.0,
             2.0,
-            "bolometers have tails of about 1 s (Planck 2013 results VII, A&A 571, A7)",
+            "a prior of this library: far beyond the main time constant of any bolometer in use",
         ),
     )
 

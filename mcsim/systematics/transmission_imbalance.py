@@ -15,14 +15,14 @@ class TransmissionImbalance(Effect):
     wording = Wording("x = {}")
     cause = "Losses in the two arms of a differencing radiometer, measured with an error."
     signature = "Stripes of the dipole along the scan; acts on differencing scans only."
-    source = "Jarosik et al. 2003, ApJS 145, 413; Hinshaw et al. 2003, ApJS 148, 63"
+    source = "Hinshaw et al. 2003, ApJS 148, 63; Jarosik et al. 2007, ApJS 170, 263"
     step = 1e-3
     bounds = (
         Bound(
             "amplitude",
             -0.1,
             0.1,
-            "WMAP's are at most 0.02 (Jarosik et al. 2003, ApJS 145, 413)",
+            "a prior of this library: some are 0.01 for WMAP (Hinshaw et al. 2003, ApJS 148, 63)",
         ),
     )
 
