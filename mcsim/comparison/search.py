@@ -303,7 +303,10 @@ class Problem:
                 continue
             for value in difference.starts(self.state(())):
                 problem = self.undone(difference, value)
-                if problem is None or problem.total == 0.0:
+                if problem is None:
+                    continue
+                if problem.total <= problem.floor**2 * problem.pair.seen.sum():
+                    found.append(self._set(((difference, value),)))
                     continue
                 sets = problem.best()
                 if not sets or not problem.suffices(sets[0]):

@@ -166,7 +166,7 @@ def test_controls_that_cannot_be_drawn_are_refused(monkeypatch, capsys, tmp_path
         controls.check(3, of_maps=False)
     with refused("controls", 3):
         controls.check(3, of_maps=True, external=True)
-    with pytest.raises(TypeError, match="loud"):
+    with refused("loud", by=TypeError):
         mcsim.diagnose(model(50), [], loud=True)
     monkeypatch.setattr("sys.argv", ["mcsim", "diagnose", "tiny", "x", "-o", "y", "--workers", "2", "--scheduler", "z"])
     with pytest.raises(SystemExit):
