@@ -153,7 +153,9 @@ def diagnose(
     data: Annotated[
         Path, Argument(metavar="DATA", help="Folder with CHANNEL.fits or CHANNEL_SPLIT.fits, or ECSV table of spectra.")
     ],
-    output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Folder for verdict and report.")],
+    output: Annotated[
+        Path | None, Option("-o", "--output", metavar="DIR", help="Folder for verdict and report; not of --dry-run.")
+    ] = None,
     case: Annotated[str | None, Option(help="Name of the case; default: that of the model.")] = None,
     without: Annotated[list[str] | None, Option(metavar="EFFECT", help="Do not propose it; repeatable.")] = None,
     including: Including = None,
@@ -180,6 +182,10 @@ def diagnose(
     if dry_run:
         print(describe(run, settings))
         return
+    if output is None:
+        raise InputError(
+            "diagnose writes a verdict and a report, and no folder is named for them; give one with -o DIR."
+        )
     found = judge(run, data, output, case=case, settings=settings, quiet=False, workers=where)
     print("\n".join(summary(found, output)))
 

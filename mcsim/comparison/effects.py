@@ -83,8 +83,7 @@ def effects_of(pair: ChannelPair, run: config.RunConfig) -> Iterator[EffectDiffe
     """Yield the effects to which the noise-free maps of a channel respond, with their templates per coordinate."""
     if pair.scene is None:
         return
-    spec = next(channel for channel in run.channels if channel.name == pair.name)
-    alone = quiet(replace(run, channels=(spec,)))
+    alone = quiet(run.of_channels(pair.name))
     sky, nthreads = pair.scene.sky, pair.scene.nthreads
     bare = simulate.maps(survey(alone, nthreads), 0, nthreads, sky)
     for name, kind in catalogue().items():

@@ -82,7 +82,7 @@ def _by_degree(rest: NDArray[np.float64], a: NDArray[np.float64]) -> list[str]:
     ell = np.arange(lmax + 1)
     own, sky = ((2 * ell + 1) * healpy.alm2cl(healpix.analysis(map_, lmax)) for map_ in (rest, a))
     half = int(np.searchsorted(np.cumsum(own), HALF * own.sum()))
-    words = [f"half of its variance is below l = {half}"] if half < FEW * lmax else []
+    words = [f"of low degree: half of its variance is at l <= {half}"] if half < FEW * lmax else []
     edges = np.unique(np.geomspace(2, lmax + 1, _BANDS + 1).astype(int))
     bands = [slice(low, high) for low, high in pairwise(edges)]
     middle = np.array([ell[band].mean() for band in bands])

@@ -18,6 +18,7 @@ from mcsim.simulation.survey import Channel, Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import header, healpix
 from mcsim.sphere.checks import UNSEEN_BELOW, check_map
+from mcsim.support import resources
 from mcsim.systematics.base import Pointing
 
 SAMPLES = 100_000_000
@@ -111,6 +112,9 @@ def read(
     InputError
         If a side cannot be read, or the sides have no map in common.
     """
+    for side in (a, b):
+        if not Path(side).exists() and Path(side).suffix != ".toml" and str(side) not in resources.names("workflows"):
+            raise InputError(f"{side} is neither a folder of maps nor a configuration; give the path of one.")
     run = _model(a, b, model)
     whole = None if run is None else survey(quiet(run), nthreads, orders=_orders(run))
     sides = [_side(side, run, nthreads) for side in (a, b)]

@@ -121,5 +121,5 @@ def _draw_depth(axes: Axes, channel: ChannelResult) -> None:
         rms = np.sqrt(np.bincount(bins, values**2, edges.size - 1) / count)
         axes.loglog(middle, rms, "o-", ms=4, label=label, color=colour)
     axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set(xlabel="samples in a pixel", ylabel="rms  [uK]", title="by depth")
+    axes.set(xlabel="samples in a pixel", ylabel="rms  [uK]", title="by hits")
     axes.legend(frameon=False, fontsize=9)

@@ -109,7 +109,7 @@ class ChannelResult:
             if self.unmade_rms_uk > 0.2 * self.rms_uk:
                 hint += (
                     f". The model makes side A itself to {number(self.unmade_rms_uk)} uK rms only: "
-                    "check it, or give it the sky (sky.alm), which maps with many holes do not show"
+                    "check it, or give it the sky (sky.alm), which maps with noise or many holes do not show"
                 )
             looks = f" What is left is {'; '.join(self.looks)}." if self.looks else ""
             return (

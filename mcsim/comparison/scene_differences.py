@@ -285,7 +285,7 @@ class BeamWindow(Difference):
 class Smoothing(Difference):
     """The sky of side B is smoothed by a circular Gaussian more, or less, than that of side A."""
 
-    name, unit = "beam_width", "relative width"
+    name, unit = "beam_width", "fraction of the FWHM"
     met = "a map that is smoothed or deconvolved besides, or a beam of another width"
     smooth = True
 

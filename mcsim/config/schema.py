@@ -325,6 +325,22 @@ class RunConfig:
     ensemble: Ensemble = Ensemble()
     compute: Compute = Compute()
 
+    def of_channels(self, *names: str) -> Self:
+        """Return the run with these of its channels alone, and with what acts in them."""
+        steps = []
+        for step in self.preparation:
+            own = getattr(step, "channels", ())
+            kept = tuple(name for name in own if name in names)
+            if kept or not own:
+                steps.append(replace(step, channels=kept) if own else step)  # type: ignore[arg-type]
+        return replace(
+            self,
+            channels=tuple(channel for channel in self.channels if channel.name in names),
+            effects=tuple(one for one in self.effects if one.channel in (None, *names)),
+            nuisances=tuple(one for one in self.nuisances if one.channel in (None, *names)),
+            preparation=tuple(steps),
+        )
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         names = tuple(channel.name for channel in self.channels)

@@ -227,7 +227,9 @@ def fits_maps(parts: tuple[Part, ...], template: str) -> FitsMaps:
             f"{template} is no template of files ({error}); use {{realization}}, {{channel}} and {{split}}."
         ) from None
     if not numbers:
-        raise InputError(f"no file fits {template}; write {{realization}} where its number stands, once.")
+        raise InputError(
+            f"no file fits {template}; check its folder, and that {{realization}} stands once, where the number does."
+        )
     if len({found._path(part, numbers[0]) for part in parts}) < len(parts):
         raise InputError(f"{template} has one file for several maps; write {{channel}} and {{split}} into it.")
     for r in numbers:

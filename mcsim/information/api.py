@@ -22,6 +22,7 @@ from mcsim.information.result import Limits, limits_of
 from mcsim.information.settings import LimitSettings
 from mcsim.simulation import convolve
 from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap
+from mcsim.simulation.nuisance import nuisances_of
 from mcsim.support import folders
 from mcsim.support.progress import reporting
 
@@ -60,7 +61,7 @@ def limit(
     Raises
     ------
     InputError
-        If the run has no noise, no spectrum or no pixels, prepares its maps, or an effect is not known.
+        If the run has no white noise, no spectrum or no pixels, prepares its maps, or an effect is not known.
 
     Notes
     -----
@@ -97,6 +98,7 @@ def limit(
     if output is not None:
         folders.writable(Path(output))
     nthreads = os.cpu_count() or 1
+    run, settings = _with_declared(run, settings)
     analysis, candidates = _candidates(run, settings, nthreads)
     filtered = inverse_covariance(analysis, settings, nthreads)
     total = sum(len(candidate.columns) for candidate in candidates)
@@ -126,6 +128,7 @@ def limit(
 
 def describe(run: config.RunConfig, settings: LimitSettings) -> str:
     """Return a text on the cost of a limit: components, probes, transforms, memory and time."""
+    run, settings = _with_declared(run, settings)
     analysis, candidates = _candidates(run, settings, nthreads := os.cpu_count() or 1)
     filtered = inverse_covariance(analysis, settings, nthreads)
     columns = sum(len(candidate.columns) for candidate in candidates)
@@ -173,6 +176,11 @@ def inverse_covariance(analysis: Analysis, settings: LimitSettings, nthreads: in
     for channel in shared.channels:
         response = convolve.Response(channel.response.factors[: settings.orders + 1])
         for m in channel.maps:
+            if m.drawn is not None:
+                raise InputError(
+                    f"the noise of map {m.name} is not white, and the limit is that of white noise; give channel "
+                    f'{channel.name} noise of kind "white", "depth", "variance" or "difference".'
+                )
             if m.noise_uk is None:
                 raise InputError(
                     f"map {m.name} has no noise, so that nothing limits it; give channel {channel.name} a "
@@ -187,6 +195,20 @@ def inverse_covariance(analysis: Analysis, settings: LimitSettings, nthreads: in
     cl = shared.cl.copy()
     cl[:2] += 4.0 * np.pi * settings.unknown_dipole_uk**2 / np.array([1.0, 3.0])
     return InverseCovariance(cl, maps, settings.tolerance, nthreads)
+
+
+def _with_declared(run: config.RunConfig, settings: LimitSettings) -> tuple[config.RunConfig, LimitSettings]:
+    """Return a run without its nuisances, and settings with them; InputError for one that settings cannot hold."""
+    found = {}
+    for one in nuisances_of(run, settings.library and dict(settings.library)):
+        name = one.effect.name if one.channel is None else f"{one.effect.name}:{one.channel}"
+        if one.settings or one.parameter_widths or len(set(one.widths)) > 1:
+            raise InputError(
+                f"nuisance {name} of the run has parameters, or several widths, and a limit knows one width for an "
+                f"effect; leave the table out, and give --nuisance {name}={max(one.widths):g}."
+            )
+        found[name] = one.widths[0]
+    return replace(run, nuisances=()), replace(settings, nuisances=found | dict(settings.nuisances))
 
 
 def _candidates(
@@ -215,7 +237,8 @@ def _candidates(
     orders = max(DiagnosisSettings().beam_orders, settings.orders)
     fits = DiagnosisSettings(beam_orders=orders, including=tuple(name for name in named if name in library))
     analysis = analysis_of(run, settings.without, nthreads, fits, library)
-    known = {one for c in analysis.candidates for one in (c.name, f"{c.name}:{c.channel}")}
+    known = {c.name for c in analysis.candidates}
+    known |= {f"{c.name}:{c.channel}" for c in analysis.candidates if c.channel is not None}
     for name, width in settings.nuisances.items():
         if name not in known:
             raise InputError(f"nuisance {name!r} is no effect of this model; choose from {', '.join(sorted(known))}.")
@@ -227,7 +250,9 @@ def _candidates(
         if not settings.only or candidate.name in settings.only or _is_nuisance(candidate, settings)
     ]
     if all(_is_nuisance(candidate, settings) for candidate in wanted):
-        raise InputError("no effect is left to compute a limit of; ask for one that applies to the model.")
+        raise InputError(
+            "no effect is left to compute a limit of; ask for one that applies to the model and is no nuisance."
+        )
     return analysis, numbered([replace(candidate) for candidate in wanted])
 
 

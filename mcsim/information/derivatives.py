@@ -153,8 +153,7 @@ def _derivative(analysis: Analysis, candidate: Candidate, basis: Effect, observe
             own.append(slice(first, first + len(channel.maps)))
         first += len(channel.maps)
     maps = slice(own[0].start, own[-1].stop)
-    specs = tuple(spec for spec in run.channels if candidate.channel in (None, spec.name))
-    only = replace(run, channels=specs)
+    only = run if candidate.channel is None else run.of_channels(candidate.channel)
     dipole = dipole_alm(fiducial.channels[0].site.dipole_uk, run.sky.lmax)
     fit = kind.parametrization
     known = dict(analysis.library)

@@ -110,9 +110,10 @@ class Limits:
         rows: list[tuple[str, ...]] = []
         rows.append(("effect", "unit", "sigma", "detected alone", "detected", "most similar", "|rho|", "told apart"))
         for one in self.effects:
-            other = "–" if one.similar is None else self.effects[one.similar].label
+            similar = ("–", "–", "–")
+            if one.similar is not None:
+                similar = (self.effects[one.similar].label, f"{one.correlation:.2f}", number(one.separable))
             amplitudes = (one.sigma, one.amplitude_90_known, one.amplitude_90)
-            similar = (other, f"{one.correlation:.2f}", number(one.separable))
             rows.append((one.label, one.unit, *map(number, amplitudes), *similar))
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         side = ["<", "<", ">", ">", ">", "<", ">", ">"]

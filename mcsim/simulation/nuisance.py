@@ -107,9 +107,16 @@ def nuisances_of(run: config.RunConfig, library: Library | None = None) -> tuple
     """Return the nuisances of a run, in its order.
 
     ``library``: default: the catalogue. Raise InputError for an effect or a parameter that is not known, a channel that
-    is missing or superfluous, and another number of widths than the effect has components.
+    is missing or superfluous, another number of widths than the effect has components, and a second table of one.
     """
-    return tuple(_nuisance(run, entry, library) for entry in run.nuisances)
+    found = tuple(_nuisance(run, entry, library) for entry in run.nuisances)
+    for number, one in enumerate(found):
+        if any((one.effect, one.channel, one.settings) == (e.effect, e.channel, e.settings) for e in found[:number]):
+            where = "" if one.channel is None else f" of {one.channel}"
+            raise InputError(
+                f"nuisance {one.effect.name}{where} is declared twice; keep one table, with its own width."
+            )
+    return found
 
 
 def _nuisance(run: config.RunConfig, entry: config.Nuisance, library: Library | None) -> Nuisance:

@@ -42,6 +42,32 @@ def test_names_of_maps_and_pixel_windows_with_splits(plain, folder):
     assert config.pixel_window(run, run.channels[0]) == str(folder / "win.fits")
 
 
+def test_channels_keep_what_acts_in_them():
+    def acting(key, *channels):
+        return [{key: "gain_drift", "channel": name} for name in channels] + [{key: "boost"}]
+
+    table = {
+        "name": "two",
+        "sky": {"spectrum": "wmap7", "lmax": 8},
+        "map": {"nside": 4},
+        "channel": [
+            {"name": n, "beam": {"kind": "gaussian", "fwhm_arcmin": 900.0}, "scan": {"kind": "parallel_transport"}}
+            for n in ("V", "W")
+        ],
+        "effect": acting("name", "V", "W"),
+        "nuisance": [one | {"width": 0.1} for one in acting("effect", "W")],
+        "preparation": [{"kind": "subtract_dipole", "channels": n} for n in (["V"], ["V", "W"], [])],
+    }
+    run = config.load(table)
+    only = run.of_channels("V")
+    assert [channel.name for channel in only.channels] == ["V"]
+    assert [one.channel for one in only.effects] == ["V", None]
+    assert [one.channel for one in only.nuisances] == [None]
+    assert [step.channels for step in only.preparation] == [("V",), ("V",), ()]
+    assert [step.channels for step in run.of_channels("W").preparation] == [("W",), ()]
+    assert run.of_channels("V", "W") == run
+
+
 def test_sky_may_exceed_what_the_pixels_can_analyse(plain, folder):
     run = config.load(changed(changed(plain, "sky.lmax", 1000), "biposh.lmax", 191))
     assert config.analysis_lmax(run) == 191

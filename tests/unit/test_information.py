@@ -286,6 +286,26 @@ def test_nuisance_widens_what_it_resembles_and_conventions_are_textbook() -> Non
     assert noise.amplitude_90 / noise.sigma > 4.2
 
 
+def test_effects_and_nuisances_of_the_run_stay_in_their_channel() -> None:
+    effect = {"name": "gain_drift", "channel": "W1", "amplitude": 0.001}
+    nuisance = {"effect": "beam_width", "channel": "W1", "width": 0.01}
+    settings = mcsim.LimitSettings(only=("pixelization",), dense=True)
+    declared = mcsim.limit(model(effect=[effect], nuisance=[nuisance]), settings=settings)
+    given = mcsim.limit(model(effect=[effect]), settings=replace(settings, nuisances={"beam_width:W1": 0.01}))
+    np.testing.assert_array_equal(declared.fisher, given.fisher)
+    assert (declared.tests, declared.lines()) == (given.tests, given.lines())
+    assert declared.lines()[-1] == "Marginalised over beam_width:W1 ± 0.01."
+    several = {"effect": "dipole_residual", "channel": "V1", "width": [1.0, 2.0, 3.0]}
+    with refused("dipole_residual:V1", "dipole_residual:V1=3"):
+        mcsim.limit(model(nuisance=[several]))
+
+
+def test_noise_that_is_not_white_is_refused() -> None:
+    noise = {"kind": "correlated", "sigma0_uk": 200.0, "f_knee_hz": 1e-5, "f_min_hz": 1e-7, "alpha": 1.0}
+    with refused("V1:half1", "V1", "white"):
+        mcsim.limit(model(channel=[channel("V1", "A", (1150.0, 900.0), 200.0) | {"noise": noise}]))
+
+
 def test_limits_are_written_and_say_what_they_are(tmp_path) -> None:
     found = mcsim.limit(model(), tmp_path / "out", settings=mcsim.LimitSettings(only=("noise_level",), dense=True))
     written = json.loads((tmp_path / "out" / "limit.json").read_text())

@@ -165,6 +165,13 @@ def test_what_cannot_be_a_nuisance_is_refused(nuisance, named):
         check_nuisances(model(nuisance))
 
 
+def test_a_nuisance_is_declared_once():
+    one = {"effect": "calibration", "channel": "V1", "width": 0.01}
+    check_nuisances(model(one, one | {"channel": "W1"}))
+    with refused("calibration", "V1", "twice"):
+        check_nuisances(model(one, one | {"width": 0.02}))
+
+
 def test_nuisances_are_part_of_a_diagnosis_and_not_of_an_ensemble(tmp_path):
     healpy.write_map(tmp_path / "t.fits", np.arange(192.0), coord="E", dtype=np.float64)
     given = {"effect": "foreground_residual", "width": 2.0, "parameters": {"template": "t.fits"}}
