@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from dask.utils import format_time
 
 from mcsim import config
 from mcsim.bipolar import Mode, estimate, estimator, modes
@@ -167,13 +168,13 @@ class Cost:
 
     def lines(self, number: int, workers: int) -> list[str]:
         """Return lines on memory, preparation and time for a number of realizations."""
-        hours = number * self.each_s / 3600.0
+        total_s = number * self.each_s
         return [
             f"  memory  {self.memory / 1e9:.2f} GB per worker, {workers} workers",
             *([f"  prepare {self.preparation}"] if self.preparation else []),
             *(f"  noise   {line}" for line in self.noise),
-            f"  time    {self.each_s:.3g} s per realization and core, {hours:.3g} core-hours,"
-            f" {60.0 * hours / workers:.3g} minutes with {workers} workers on as many idle cores",
+            f"  time    {format_time(self.each_s)} per realization and core, {format_time(total_s)} of processor time,"
+            f" {format_time(total_s / workers)} with {workers} workers on as many idle cores",
         ]
 
 

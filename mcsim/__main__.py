@@ -1,0 +1,5 @@
+"""``python -m mcsim``."""
+
+from mcsim.cli import main
+
+main()
