@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from dask.utils import format_time
 
 from mcsim import config
 from mcsim.bipolar import Mode, estimate, estimator, modes
@@ -24,6 +23,7 @@ from mcsim.simulation.survey import Survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rng, spectra
 from mcsim.sphere.sky import gaussian_alm
+from mcsim.support.numbers import duration
 
 CHUNKS = 128
 CHUNK_BYTES = 1 << 26
@@ -173,8 +173,8 @@ class Cost:
             f"  memory  {self.memory / 1e9:.2f} GB per worker, {workers} workers",
             *([f"  prepare {self.preparation}"] if self.preparation else []),
             *(f"  noise   {line}" for line in self.noise),
-            f"  time    {format_time(self.each_s)} per realization and core, {format_time(total_s)} of processor time,"
-            f" {format_time(total_s / workers)} with {workers} workers on as many idle cores",
+            f"  time    {duration(self.each_s)} per realization and core, {duration(total_s)} of processor time,"
+            f" {duration(total_s / workers)} with {workers} workers on as many idle cores",
         ]
 
 

@@ -44,6 +44,13 @@ def number(value: float, digits: int = 3) -> str:
     return _typeset(f"{value:.{digits}g}")
 
 
+def duration(seconds: float) -> str:
+    """Return a time with three digits, in the largest unit of which there is at least two."""
+    units = (("d", 86400.0), ("h", 3600.0), ("min", 60.0), ("s", 1.0), ("ms", 1e-3))
+    name, size = next((one for one in units if seconds >= 2.0 * one[1]), units[-1])
+    return f"{number(seconds / size)} {name}"
+
+
 def probability(value: float) -> str:
     """Return a p-value with two digits, tiny ones as powers of ten."""
     return "< 10⁻³⁰⁰" if value <= 0.0 else _typeset(f"{value:.2g}")

@@ -28,7 +28,7 @@ from mcsim.stats.excess import HeldOut, Measured
 from mcsim.stats.gaussian import SimulatedGaussian, held_out_pvalues, residual_pvalue
 from mcsim.stats.look_elsewhere import calibrate
 from mcsim.support import resources
-from mcsim.support.numbers import measured, number, p_equals, probability
+from mcsim.support.numbers import duration, measured, number, p_equals, probability
 from pictures import quick_pictures
 from refusals import refused
 
@@ -473,3 +473,11 @@ def test_what_data_do_not_tell_is_no_part_of_an_error():
     (found,) = effects_of([Candidate(kind, None, tuple(range(6)))], (0,), fitted)
     assert found.amplitude == pytest.approx(0.3)
     assert found.sigma == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [(0.0456, "45.6 ms"), (2.0, "2 s"), (119.0, "119 s"), (150.0, "2.5 min"), (9000.0, "2.5 h"), (432000.0, "5 d")],
+)
+def test_durations_are_said_in_a_unit_that_people_use(seconds, words):
+    assert duration(seconds) == words
