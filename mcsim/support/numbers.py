@@ -45,9 +45,9 @@ def number(value: float, digits: int = 3) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Return a time with three digits, in the largest unit of which there is at least two."""
-    units = (("d", 86400.0), ("h", 3600.0), ("min", 60.0), ("s", 1.0), ("ms", 1e-3))
-    name, size = next((one for one in units if seconds >= 2.0 * one[1]), units[-1])
+    """Return a time with three digits: seconds up to two minutes, minutes up to two hours, hours up to two days."""
+    units = (("d", 86400.0, 2.0), ("h", 3600.0, 2.0), ("min", 60.0, 2.0), ("s", 1.0, 1.0), ("ms", 1e-3, 0.0))
+    name, size = next((name, size) for name, size, least in units if seconds >= least * size)
     return f"{number(seconds / size)} {name}"
 
 

@@ -477,7 +477,7 @@ def test_what_data_do_not_tell_is_no_part_of_an_error():
 
 @pytest.mark.parametrize(
     ("seconds", "words"),
-    [(0.0456, "45.6 ms"), (2.0, "2 s"), (119.0, "119 s"), (150.0, "2.5 min"), (9000.0, "2.5 h"), (432000.0, "5 d")],
+    [(0.0456, "45.6 ms"), (1.53, "1.53 s"), (119.0, "119 s"), (150.0, "2.5 min"), (9000.0, "2.5 h"), (432000.0, "5 d")],
 )
 def test_durations_are_said_in_a_unit_that_people_use(seconds, words):
     assert duration(seconds) == words
