@@ -1,6 +1,6 @@
 r"""Fisher information of maps from whole matrices: the reference for small maps.
 
-V_i = dP_i S^1/2 has a column for every unit sky, and V_0 = P S^1/2. With Z_i = C^-1 V_i,
+V_i = dP_i S^1/2 has a column for every unit sky, and V_0 = P S^1/2. With Z_i = C^-1 V_i::
 
     dC_i = V_i V_0^t + V_0 V_i^t + dN_i,
     1/2 Tr[C^-1 dC_i C^-1 dC_j] = Tr[V_0^t Z_i V_0^t Z_j] + Tr[V_j^t Z_i V_0^t Z_0]
