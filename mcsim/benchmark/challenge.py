@@ -13,7 +13,7 @@ from mcsim import config
 from mcsim.benchmark import folder as files
 from mcsim.benchmark.case import Drawn, Member, Truth, Vector
 from mcsim.benchmark.folder import Settings
-from mcsim.benchmark.library import LearnedModel, learned_model, workers_of
+from mcsim.benchmark.models import LearnedModel, learned_model, workers_of
 from mcsim.benchmark.out_of_library import library_with, responses
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.diagnosis.campaign import Batch, seeded, with_effects

@@ -11,7 +11,7 @@ from mcsim.benchmark import report
 from mcsim.benchmark.bayes import BayesClassifier, facts
 from mcsim.benchmark.case import Drawn, Prior, Record, Truth, Vector, pulls
 from mcsim.benchmark.folder import VERDICTS, Settings, finished_cases, open_key, read_json
-from mcsim.benchmark.library import EffectsLibrary, LinearModel, learned_model, linear_model, workers_of
+from mcsim.benchmark.models import EffectsLibrary, LinearModel, learned_model, linear_model, workers_of
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.benchmark.summary import ALPHA, Power, Score
 from mcsim.diagnosis.campaign import Batch

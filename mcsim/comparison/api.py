@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.comparison import report
+from mcsim.comparison.catalogue import library
 from mcsim.comparison.effects import effects_of
-from mcsim.comparison.library import library
 from mcsim.comparison.looks import look
 from mcsim.comparison.pairs import ChannelPair, Comparison, given, read
 from mcsim.comparison.result import ChannelResult, ComparisonResult, DifferenceResult, Verdict

@@ -28,7 +28,7 @@ from mcsim.benchmark.folder import (
     read_key,
     write_key,
 )
-from mcsim.benchmark.library import linear_model, reduced
+from mcsim.benchmark.models import linear_model, reduced
 from mcsim.benchmark.report import lines, write
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.benchmark.score import Draw, _is_named, draws, judge, powers, score, score_draws

@@ -367,7 +367,7 @@ def test_isolation_needs_more_of_closer_effects():
     assert close * np.sqrt(0.005) == pytest.approx(-special.ndtri(0.05), rel=1e-3)
 
 
-def test_four_effects_are_heard_where_no_set_of_three_suffices(bench):
+def test_four_effects_are_detected_where_no_set_of_three_suffices(bench):
     """The four, the strongest first, and what is left is noise; without a gap there is nothing."""
     weights = np.array([30.0, 20.0, 14.0, 10.0])
 

@@ -92,7 +92,7 @@ def test_what_is_none_of_the_library_stays_unknown_beside_two_that_are():
     assert found.verdict == "unknown"
 
 
-def test_amplitudes_that_run_away_are_not_heard():
+def test_amplitudes_that_run_away_are_not_detected():
     """Of a response that turns back upon itself no amplitude is the one that the fit asks for."""
     instrument = Instrument(bend=0.0, cross=0.0)
     saturated = instrument.response
@@ -103,7 +103,7 @@ def test_amplitudes_that_run_away_are_not_heard():
     assert [instrument.candidates[member].channel for member in found.partial.members] == ["B"]
 
 
-def test_what_data_tell_nothing_of_is_neither_heard_nor_simulated(monkeypatch):
+def test_what_data_tell_nothing_of_is_neither_detected_nor_simulated(monkeypatch):
     """However significant: an effect without an amplitude is none."""
     instrument = Instrument(bend=0.0, cross=0.0)
     x = instrument.response(12.0, 14.0) + 10.0 * instrument.sideways[1]

@@ -16,7 +16,7 @@ import numpy as np
 
 from mcsim import config, systematics
 from mcsim.benchmark.case import Drawn, Prior
-from mcsim.benchmark.library import LinearModel, linear_model
+from mcsim.benchmark.models import LinearModel, linear_model
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.diagnosis.analysis import analysis_of, data_vectors
 from mcsim.diagnosis.api import prepared

@@ -15,7 +15,7 @@ import numpy as np
 import mcsim
 from mcsim import config
 from mcsim.benchmark.folder import Settings
-from mcsim.benchmark.library import learned_model, workers_of
+from mcsim.benchmark.models import learned_model, workers_of
 from mcsim.stats.detection import detectable
 
 

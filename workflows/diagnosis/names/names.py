@@ -148,7 +148,7 @@ def maps(number):
 def draws(number):
     """Test the true effects of draws in parts of the data, and print the share that is refused."""
     from mcsim.benchmark.case import Prior
-    from mcsim.benchmark.library import linear_model
+    from mcsim.benchmark.models import linear_model
     from mcsim.benchmark.sampler import CaseSampler
     from mcsim.diagnosis.candidate import columns_of, parts_of
     from mcsim.diagnosis.consistency import Action, Slices
