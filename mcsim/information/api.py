@@ -21,6 +21,7 @@ from mcsim.information.fisher import Information, Probes, group_of, stochastic
 from mcsim.information.result import Limits, limits_of
 from mcsim.information.settings import LimitSettings
 from mcsim.simulation import convolve
+from mcsim.simulation.channels import refuse_external
 from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap
 from mcsim.simulation.nuisance import nuisances_of
 from mcsim.support import folders
@@ -219,11 +220,7 @@ def _candidates(
         raise InputError(
             "the limit is that of maps as they are made, but the run prepares its maps; leave [[preparation]] out."
         )
-    if external := run.simulator or run.ensemble.maps:
-        raise InputError(
-            f"the limit needs derivatives of mcsim's own maps, but those of the run come from {str(external)!r}; leave "
-            "simulator and ensemble.maps out."
-        )
+    refuse_external(run)
     if settings.probes < 3:
         raise InputError(f"probes = {settings.probes} are too few to tell an error; give 3 or more.")
     if not 0.0 <= settings.unknown_dipole_uk < np.inf:

@@ -306,6 +306,18 @@ def test_noise_that_is_not_white_is_refused() -> None:
         mcsim.limit(model(channel=[channel("V1", "A", (1150.0, 900.0), 200.0) | {"noise": noise}]))
 
 
+@pytest.mark.parametrize(
+    ("key", "given"),
+    [
+        ("simulator", {"simulator": "a:B"}),
+        ("ensemble.maps", {"ensemble": {"maps": "{realization}/{channel}_{split}.fits"}}),
+    ],
+)
+def test_maps_of_another_program_have_no_limit(key, given) -> None:
+    with refused(key):
+        mcsim.limit(model(**given))
+
+
 def test_limits_are_written_and_say_what_they_are(tmp_path) -> None:
     found = mcsim.limit(model(), tmp_path / "out", settings=mcsim.LimitSettings(only=("noise_level",), dense=True))
     written = json.loads((tmp_path / "out" / "limit.json").read_text())
