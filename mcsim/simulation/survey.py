@@ -41,11 +41,13 @@ class SurveyMap:
     Attributes
     ----------
     moments
-        Orientation moments of the samples in it; of a differencing scan the hits of both sides, and NaN.
+        Orientation moments of the samples in it; of a differencing scan those of both sides together where they were
+        asked for, else their hits, and NaN.
     weight
         Weight before analysis, shape (npix,), mean square 1; ``None``: every pixel counts alike.
     noise_uk
-        Standard deviation of the noise per pixel, shape (npix,); ``None``: no noise, or noise of differences.
+        Standard deviation of the noise per pixel, shape (npix,), of a differencing scan about, where moments were asked
+        for; ``None``: no noise, or noise of differences.
     pairs
         Pairs of pixels of a differencing scan; ``None``: any other scan.
     gain
@@ -103,10 +105,10 @@ class SideB:
         Beam of side B with effects, its response, and the beam without effects.
     scan, imbalance
         Fiducial transmission imbalance, which map-making uses, and its convergence; the true imbalance.
-    sigma0_uk
-        White noise per difference.
+    sigma0_uk, noise_factor
+        White noise per difference, and the factor of its variance in every pixel, shape (npix,); None: one.
     iterations_short
-        How many iterations before convergence the map-making stops.
+        How many iterations before convergence the map-making stops, which then starts from zeros.
     """
 
     beam: beams.Beam
@@ -114,6 +116,7 @@ class SideB:
     fiducial: beams.Beam
     scan: config.ScanDifferencing
     sigma0_uk: float
+    noise_factor: NDArray[np.float64] | None
     imbalance: float
     iterations_short: int
 
@@ -254,6 +257,8 @@ def _channel(
             refuse_excess(spec.name, acting)
             pairs = mapmaking.prepare(model, spec.scan.pair, grid, nthreads=nthreads, progress=progress)
             moments = _hits_alone(pairs, max(beam.mmax, 1))
+            if orders:
+                moments = _of_both_sides(pairs, max(beam.mmax, orders), nthreads, progress)
         else:
             smax = max(beam.mmax, orders)
             if isinstance(spec.scan, config.ScanMoments):
@@ -266,7 +271,10 @@ def _channel(
                     moments = replace(moments, hits=moments.hits / len(splits))
             # An effect may give the beam higher orders than a file of moments has: they are left out.
             beam = beam.truncated(moments.smax) if acting and moments.smax < beam.mmax else beam
-        m = with_effects(_survey_map(run, spec, split, moments, pairs), acting, site)
+        m = _survey_map(run, spec, split, moments, pairs)
+        if pairs is not None and orders:
+            m = replace(m, noise_uk=_level_of_differences(spec, pairs))
+        m = with_effects(m, acting, site)
         gain, signal = (mean(acting, site, grid.time_range) for mean in (mean_gain, mean_signal))
         maps.append(replace(m, gain=gain, signal_uk=signal))
     # A pixel whose samples keep closer to its centre blurs less; the window is a Gaussian in all but name.
@@ -327,10 +335,18 @@ def _side_b(spec: config.Channel, window: NDArray[np.float64], site: Site, actin
     beam = seen_through(acting, other)
     response = convolve.response(beam, site.lmax, window)
     imbalance, short = spec.scan.transmission_imbalance, 0
+    factor: NDArray[np.float64] | None = None
     for effect in acting:
         imbalance, short = effect.differencing(imbalance, short)
+        own = effect.noise(site)
+        if own is not None:
+            factor = np.clip(own if factor is None else factor * own, 0.0, None)
+    return SideB(beam, response, other.beam, spec.scan, _sigma0_uk(spec), factor, imbalance, short)
+
+
+def _sigma0_uk(spec: config.Channel) -> float:
     assert isinstance(spec.noise, config.Noise)  # the configuration refuses other noise of differences
-    return SideB(beam, response, other.beam, spec.scan, spec.noise.sigma0_uk, imbalance, short)
+    return spec.noise.sigma0_uk
 
 
 def with_effects(m: SurveyMap, acting: tuple[Effect, ...], site: Site) -> SurveyMap:
@@ -381,6 +397,29 @@ def _hits_alone(pairs: mapmaking.DifferencingScan, smax: int) -> scan.Moments:
     """Return the hits of a differencing scan, for weights and masks; its moments mean nothing and are NaN."""
     unknown = np.broadcast_to(np.complex128(np.nan), (smax, pairs.npix))
     return scan.Moments(pairs.grid.nside, pairs.grid.frame, pairs.hits_a + pairs.hits_b, unknown)
+
+
+def _of_both_sides(
+    pairs: mapmaking.DifferencingScan, smax: int, nthreads: int, progress: Progress | None
+) -> scan.Moments:
+    """Return the mean orientation moments of all samples of both sides, which are taken to be at pixel centres."""
+    model = pairs.model.with_lines_of_sight(pairs.side_a.name, pairs.side_b.name)
+    found = scan.Moments.load(scan.cached_moments(model, pairs.grid, smax, nthreads, progress))
+    return replace(found, dtheta=None, dphi=None)
+
+
+def _level_of_differences(spec: config.Channel, pairs: mapmaking.DifferencingScan) -> NDArray[np.float64] | None:
+    """Return about the noise of the pixels, as if partners were known: sigma0 over the root of the sum of weights.
+
+    The rest of the inverse of the normal matrix is of the order of one over the number of partners at small scales;
+    harmonics of low degree l have 1 / (1 - P_l(cos of the angle between the sides)) times this variance.
+    """
+    sigma0_uk = _sigma0_uk(spec)
+    if sigma0_uk == 0.0:
+        return None
+    assert isinstance(spec.scan, config.ScanDifferencing)
+    weight = mapmaking.diagonal(pairs, spec.scan.transmission_imbalance)
+    return np.divide(sigma0_uk, np.sqrt(weight), out=np.zeros_like(weight), where=weight > 0.0)
 
 
 def _survey_map(

@@ -8,7 +8,7 @@ from mcsim.simulation.mapmaking.rhs import (
     rhs_from_maps,
     side_maps,
 )
-from mcsim.simulation.mapmaking.solve import MapmakingReport, StoppingRule, diagonal, solve
+from mcsim.simulation.mapmaking.solve import MapmakingReport, StoppingRule, diagonal, rhs_of_map, solve
 
 __all__ = [
     "DifferenceNoise",
@@ -20,6 +20,7 @@ __all__ = [
     "diagonal",
     "prepare",
     "rhs_from_maps",
+    "rhs_of_map",
     "side_maps",
     "solve",
 ]

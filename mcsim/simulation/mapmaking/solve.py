@@ -115,6 +115,14 @@ def diagonal(scan: DifferencingScan, x: float) -> Map:
     return weight
 
 
+def rhs_of_map(scan: DifferencingScan, map_uk: Map, x: float = 0.0, nthreads: int = 1) -> Map:
+    """Return the right-hand side, uK, shape (npix,), whose solution is a map: N m, without a pass over the samples."""
+    check_imbalance(x)
+    _check_map(scan, map_uk, "map")
+    with ThreadPoolExecutor(max(1, nthreads)) as pool:
+        return apply_normal(scan, x, map_uk, pool, nthreads)
+
+
 def apply_normal(scan: DifferencingScan, x: float, map_uk: Map, pool: ThreadPoolExecutor, parts: int = 1) -> Map:
     """Apply the normal matrix to a map: D m - (1 - x^2) C m, C the counts of pairs; unobserved pixels give 0.
 

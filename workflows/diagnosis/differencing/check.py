@@ -1,0 +1,176 @@
+"""Maps of differencing scans: are p-values uniform where nothing is wrong, and effects named where they are put in?
+
+    python workflows/diagnosis/differencing/check.py [--nside 64] [--skies 200] [--cases 4] [-o FILE.json]
+
+Two channels, V1 and W1 of WMAP's focal plane, each the difference of its two sides, in two halves of a year. Data are
+the maps that ``mcsim run`` keeps, every difference of the survey by itself, with another seed than any simulation of
+the model. Effects are put into W1, each with the amplitude whose expected S/N is nearest to one of SNR.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+
+import mcsim
+from mcsim import config
+from mcsim.diagnosis.analysis import Analysis, analysis_of, data_vectors
+from mcsim.diagnosis.api import prepared
+from mcsim.diagnosis.campaign import asking, batch, with_effects
+from mcsim.diagnosis.context import DiagnosisContext
+from mcsim.diagnosis.inference import diagnose_data
+from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import survey
+from mcsim.stats.look_elsewhere import global_test
+
+PROPOSED = (
+    "beam_ellipticity",
+    "beam_width",
+    "dipole_modulation",
+    "dipole_residual",
+    "mapmaking_convergence",
+    "noise_level",
+    "pointing_offset",
+    "transmission_imbalance",
+)
+PUT_IN = ("beam_ellipticity", "transmission_imbalance", "mapmaking_convergence")
+SNR = (6.0, 10.0)
+SEED = 20261122
+
+
+def model(nside: int) -> mcsim.RunConfig:
+    """Return a model of V1 and W1, S/N per pixel about that of some years of WMAP, at l up to 2 nside."""
+    channels = [
+        {
+            "name": name,
+            "frequency_ghz": frequency,
+            "beam": {"kind": "gaussian", "fwhm_arcmin": 5600.0 / nside},
+            "noise": {"sigma0_uk": 120.0},
+            "scan": {
+                "kind": "differencing",
+                "model": "wmap_focal_plane",
+                "pair": name,
+                "sample_period_s": 30.7 if nside > 32 else 157.8,
+                "tolerance": 1e-6,
+            },
+        }
+        for name, frequency in (("V1", 61.0), ("W1", 94.0))
+    ]
+    return mcsim.load_config(
+        {
+            "name": f"differencing-{nside}",
+            "sky": {"spectrum": "wmap7", "lmax": 2 * nside, "dipole_uk": 3364.5},
+            "map": {"nside": nside, "splits": ["half1", "half2"]},
+            "channel": channels,
+            "biposh": {"L_max": 2},
+            "ensemble": {"keep_maps": True, "paired": False, "seed": SEED},
+        }
+    )
+
+
+def data(run: mcsim.RunConfig, realization: int) -> list[np.ndarray]:
+    """Return the maps that ``mcsim run`` keeps."""
+    return list(simulate.realize(survey(run), realization)["observed_map"])
+
+
+def amplitudes(context: DiagnosisContext, name: str) -> list[tuple[float, float]]:
+    """Return amplitude and expected S/N for every target, by simulations of the effect over a range of amplitudes."""
+    candidate = next(one for one in context.candidates if one.identity == (name, "W1"))
+    t, found = context.templates[:, candidate.columns[0]], []
+    for target in SNR:
+        coordinate = target / context.null.expected_snr(t)
+        amplitude = candidate.with_coordinates(
+            np.array([coordinate] + [0.0] * (len(candidate.columns) - 1)), np.eye(len(candidate.columns))
+        ).amplitude
+        found.append((float(round(amplitude)) if name == "mapmaking_convergence" else float(amplitude), target))
+    return found
+
+
+def nulls(run: mcsim.RunConfig, analysis: Analysis, context: DiagnosisContext, count: int) -> dict:
+    """Return the p-values of skies without effects."""
+    groups = context.null.whiten_groups(context.templates, [one.columns for one in context.candidates])
+    pvalues, omnibus = [], []
+    for realization in range(count):
+        x = analysis.data_vector(data(run, realization))
+        pvalues.append(float(global_test(context.null, x, groups, context.calibration).pvalue))
+        omnibus.append(float(context.null.pvalue(x)))
+    alarms = int(np.sum(np.array(pvalues) <= 0.05))
+    low, high = stats.binomtest(alarms, count).proportion_ci(method="exact")
+    return {
+        "skies": count,
+        "ks_p_value": float(stats.kstest(pvalues, "uniform").pvalue),
+        "ks_p_value_of_chi2": float(stats.kstest(omnibus, "uniform").pvalue),
+        "false_alarms_at_5_percent": alarms,
+        "rate_interval_95": [float(low), float(high)],
+        "smallest": min(pvalues),
+        "p_values": pvalues,
+    }
+
+
+def main() -> None:
+    """Print and write what was found."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--nside", type=int, default=64)
+    parser.add_argument("--skies", type=int, default=200)
+    parser.add_argument("--cases", type=int, default=4, help="skies of each effect and S/N")
+    parser.add_argument("--simulations", type=int, help="of the model; default: ten for each element")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("-o", "--output", type=Path)
+    chosen = parser.parse_args()
+    run = model(chosen.nside)
+    library = {name: kind for name, kind in mcsim.effects().items() if name in PROPOSED}
+    settings = mcsim.DiagnosisSettings(simulations=chosen.simulations)
+    analysis = analysis_of(run, settings=settings, library=library)
+    result: dict = {"nside": chosen.nside, "elements": len(analysis.elements)}
+
+    def write() -> None:
+        if chosen.output is not None:
+            chosen.output.write_text(json.dumps(result, indent=1) + "\n")
+
+    with batch(chosen.workers) as call:
+        with asking(call, True, data_vectors, "simulations of the model") as ask:
+            context = prepared(run, analysis, ask)
+            result["simulations"] = len(context.ensemble.simulations)
+        result["expected_snr_per_unit_coordinate"] = {
+            one.label: float(context.null.expected_snr(context.templates[:, one.columns[0]]))
+            for one in context.candidates
+        }
+        if chosen.skies:
+            result["null"] = nulls(run, analysis, context, chosen.skies)
+        print({k: v for k, v in result.get("null", {}).items() if k != "p_values"}, flush=True)
+        write()
+        result["cases"] = []
+        with asking(call, True, data_vectors, "simulations of fitted effects") as ask:
+            for name in PUT_IN:
+                for place, (amplitude, target) in enumerate(amplitudes(context, name)):
+                    for number in range(chosen.cases):
+                        effect = config.Effect(name=name, channel="W1", parameters={"amplitude": amplitude})
+                        maps = data(
+                            with_effects(run, [effect]), 10_000 * (1 + PUT_IN.index(name)) + 1000 * place + number
+                        )
+                        found = diagnose_data(ObservedMaps(context, maps, ask), name)
+                        best = [
+                            {"name": one.name, "channel": one.channel, "amplitude": one.amplitude, "sigma": one.sigma}
+                            for one in (found.sets[0].effects if found.sets else ())
+                        ]
+                        case = {
+                            "effect": name,
+                            "amplitude": amplitude,
+                            "snr": target,
+                            "p_value": float(found.test.pvalue),
+                            "verdict": found.kind,
+                            "found": best,
+                            "sets": [[f"{e.name} {e.channel}" for e in one.effects] for one in found.sets],
+                            "nearest": str(found.nearest),
+                            "notes": list(found.notes),
+                        }
+                        result["cases"].append(case)
+                        print(case, flush=True)
+                        write()
+
+
+if __name__ == "__main__":
+    main()
