@@ -1,6 +1,8 @@
 """Maps of differencing scans: are p-values uniform where nothing is wrong, and effects named where they are put in?
 
-    python workflows/diagnosis/differencing/check.py [--nside 64] [--skies 200] [--cases 4] [-o FILE.json]
+    python workflows/diagnosis/differencing/check.py [--nside 64] [--skies 200] [--cases 4] [--parts FOLDER] [-o FILE.json]
+
+With ``--parts`` every result of a simulation is kept, and a run that was stopped goes on where it was.
 
 Two channels, V1 and W1 of WMAP's focal plane, each the difference of its two sides, in two halves of a year. Data are
 the maps that ``mcsim run`` keeps, every difference of the survey by itself, with another seed than any simulation of
@@ -8,7 +10,10 @@ the model. Effects are put into W1, each with the amplitude whose expected S/N i
 """
 
 import argparse
+import hashlib
 import json
+from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +21,7 @@ from scipy import stats
 
 import mcsim
 from mcsim import config
-from mcsim.diagnosis.analysis import Analysis, analysis_of, data_vectors
+from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, data_vectors
 from mcsim.diagnosis.api import prepared
 from mcsim.diagnosis.campaign import asking, batch, with_effects
 from mcsim.diagnosis.context import DiagnosisContext
@@ -25,6 +30,7 @@ from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.stats.look_elsewhere import global_test
+from mcsim.support.code import package_digest
 
 PROPOSED = (
     "beam_ellipticity",
@@ -71,6 +77,33 @@ def model(nside: int) -> mcsim.RunConfig:
     )
 
 
+def kept(folder: Path | None, text: str, make: Callable[[], np.ndarray]) -> np.ndarray:
+    """Return an array from a folder, where it is made and kept if it is not there; None: make it."""
+    if folder is None:
+        return make()
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{hashlib.sha256((package_digest(['mcsim']) + text).encode()).hexdigest()[:32]}.npy"
+    if not path.exists():
+        found = make()
+        with path.with_suffix(".part").open("wb") as file:
+            np.save(file, found)
+        path.with_suffix(".part").rename(path)
+    return np.load(path)
+
+
+class Kept:
+    """Data vectors of jobs, kept in a folder."""
+
+    def __init__(self, folder: Path | None) -> None:
+        self.folder = folder
+
+    def __call__(self, job: Job) -> np.ndarray:
+        values = {one.name: getattr(job, one.name) for one in fields(job) if one.name != "library"}
+        values["observed"] = None if job.observed is None else hashlib.sha256(job.observed.tobytes()).hexdigest()
+        text = repr([values, [name for name, _ in job.library]])
+        return kept(self.folder, text, lambda: data_vectors(job))
+
+
 def data(run: mcsim.RunConfig, realization: int) -> list[np.ndarray]:
     """Return the maps that ``mcsim run`` keeps."""
     return list(simulate.realize(survey(run), realization)["observed_map"])
@@ -89,12 +122,13 @@ def amplitudes(context: DiagnosisContext, name: str) -> list[tuple[float, float]
     return found
 
 
-def nulls(run: mcsim.RunConfig, analysis: Analysis, context: DiagnosisContext, count: int) -> dict:
+def nulls(run: mcsim.RunConfig, analysis: Analysis, context: DiagnosisContext, count: int, parts: Path | None) -> dict:
     """Return the p-values of skies without effects."""
     groups = context.null.whiten_groups(context.templates, [one.columns for one in context.candidates])
     pvalues, omnibus = [], []
     for realization in range(count):
-        x = analysis.data_vector(data(run, realization))
+        text = f"{run} {realization} {[element.name for element in analysis.elements]}"
+        x = kept(parts, text, lambda r=realization: analysis.data_vector(data(run, r)))
         pvalues.append(float(global_test(context.null, x, groups, context.calibration).pvalue))
         omnibus.append(float(context.null.pvalue(x)))
     alarms = int(np.sum(np.array(pvalues) <= 0.05))
@@ -118,6 +152,7 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=4, help="skies of each effect and S/N")
     parser.add_argument("--simulations", type=int, help="of the model; default: ten for each element")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--parts", type=Path, help="folder for results of simulations, with which a run goes on")
     parser.add_argument("-o", "--output", type=Path)
     chosen = parser.parse_args()
     run = model(chosen.nside)
@@ -131,7 +166,7 @@ def main() -> None:
             chosen.output.write_text(json.dumps(result, indent=1) + "\n")
 
     with batch(chosen.workers) as call:
-        with asking(call, True, data_vectors, "simulations of the model") as ask:
+        with asking(call, True, Kept(chosen.parts), "simulations of the model") as ask:
             context = prepared(run, analysis, ask)
             result["simulations"] = len(context.ensemble.simulations)
         result["expected_snr_per_unit_coordinate"] = {
@@ -139,11 +174,11 @@ def main() -> None:
             for one in context.candidates
         }
         if chosen.skies:
-            result["null"] = nulls(run, analysis, context, chosen.skies)
+            result["null"] = nulls(run, analysis, context, chosen.skies, chosen.parts)
         print({k: v for k, v in result.get("null", {}).items() if k != "p_values"}, flush=True)
         write()
         result["cases"] = []
-        with asking(call, True, data_vectors, "simulations of fitted effects") as ask:
+        with asking(call, True, Kept(chosen.parts), "simulations of fitted effects") as ask:
             for name in PUT_IN:
                 for place, (amplitude, target) in enumerate(amplitudes(context, name)):
                     for number in range(chosen.cases):
