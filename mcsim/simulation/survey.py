@@ -29,7 +29,7 @@ from mcsim.simulation.preparation import Preparation, preparation
 from mcsim.simulation.rings import Rings, limit_rings, parallel_transport_rings
 from mcsim.sphere import healpix, rng, spectra
 from mcsim.sphere.mask import read_mask
-from mcsim.systematics import Effect, Library, Site, seen_through, spread_of
+from mcsim.systematics import Effect, Library, Site, seen_through, spread_of, variance_factor
 
 Progress = Callable[[float], None]
 
@@ -41,8 +41,7 @@ class SurveyMap:
     Attributes
     ----------
     moments
-        Orientation moments of the samples in it; of a differencing scan those of both sides together where they were
-        asked for, else their hits, and NaN.
+        Orientation moments of its samples; of a differencing scan those of both sides, or, not asked for, hits and NaN.
     weight
         Weight before analysis, shape (npix,), mean square 1; ``None``: every pixel counts alike.
     noise_uk
@@ -256,9 +255,8 @@ def _channel(
             model = scan_model(spec, spec.scan, split)
             refuse_excess(spec.name, acting)
             pairs = mapmaking.prepare(model, spec.scan.pair, grid, nthreads=nthreads, progress=progress)
-            moments = _hits_alone(pairs, max(beam.mmax, 1))
-            if orders:
-                moments = _of_both_sides(pairs, max(beam.mmax, orders), nthreads, progress)
+            smax = max(beam.mmax, orders, 1)
+            moments = pairs.moments(smax, nthreads, progress) if orders else _hits_alone(pairs, smax)
         else:
             smax = max(beam.mmax, orders)
             if isinstance(spec.scan, config.ScanMoments):
@@ -272,8 +270,8 @@ def _channel(
             # An effect may give the beam higher orders than a file of moments has: they are left out.
             beam = beam.truncated(moments.smax) if acting and moments.smax < beam.mmax else beam
         m = _survey_map(run, spec, split, moments, pairs)
-        if pairs is not None and orders:
-            m = replace(m, noise_uk=_level_of_differences(spec, pairs))
+        if pairs is not None and orders and isinstance(spec.scan, config.ScanDifferencing):
+            m = replace(m, noise_uk=mapmaking.level_uk(pairs, spec.scan.transmission_imbalance, _sigma0_uk(spec)))
         m = with_effects(m, acting, site)
         gain, signal = (mean(acting, site, grid.time_range) for mean in (mean_gain, mean_signal))
         maps.append(replace(m, gain=gain, signal_uk=signal))
@@ -335,12 +333,9 @@ def _side_b(spec: config.Channel, window: NDArray[np.float64], site: Site, actin
     beam = seen_through(acting, other)
     response = convolve.response(beam, site.lmax, window)
     imbalance, short = spec.scan.transmission_imbalance, 0
-    factor: NDArray[np.float64] | None = None
     for effect in acting:
         imbalance, short = effect.differencing(imbalance, short)
-        own = effect.noise(site)
-        if own is not None:
-            factor = np.clip(own if factor is None else factor * own, 0.0, None)
+    factor = variance_factor(acting, site)
     return SideB(beam, response, other.beam, spec.scan, _sigma0_uk(spec), factor, imbalance, short)
 
 
@@ -397,29 +392,6 @@ def _hits_alone(pairs: mapmaking.DifferencingScan, smax: int) -> scan.Moments:
     """Return the hits of a differencing scan, for weights and masks; its moments mean nothing and are NaN."""
     unknown = np.broadcast_to(np.complex128(np.nan), (smax, pairs.npix))
     return scan.Moments(pairs.grid.nside, pairs.grid.frame, pairs.hits_a + pairs.hits_b, unknown)
-
-
-def _of_both_sides(
-    pairs: mapmaking.DifferencingScan, smax: int, nthreads: int, progress: Progress | None
-) -> scan.Moments:
-    """Return the mean orientation moments of all samples of both sides, which are taken to be at pixel centres."""
-    model = pairs.model.with_lines_of_sight(pairs.side_a.name, pairs.side_b.name)
-    found = scan.Moments.load(scan.cached_moments(model, pairs.grid, smax, nthreads, progress))
-    return replace(found, dtheta=None, dphi=None)
-
-
-def _level_of_differences(spec: config.Channel, pairs: mapmaking.DifferencingScan) -> NDArray[np.float64] | None:
-    """Return about the noise of the pixels, as if partners were known: sigma0 over the root of the sum of weights.
-
-    The rest of the inverse of the normal matrix is of the order of one over the number of partners at small scales;
-    harmonics of low degree l have 1 / (1 - P_l(cos of the angle between the sides)) times this variance.
-    """
-    sigma0_uk = _sigma0_uk(spec)
-    if sigma0_uk == 0.0:
-        return None
-    assert isinstance(spec.scan, config.ScanDifferencing)
-    weight = mapmaking.diagonal(pairs, spec.scan.transmission_imbalance)
-    return np.divide(sigma0_uk, np.sqrt(weight), out=np.zeros_like(weight), where=weight > 0.0)
 
 
 def _survey_map(

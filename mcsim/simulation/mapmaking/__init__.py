@@ -8,7 +8,7 @@ from mcsim.simulation.mapmaking.rhs import (
     rhs_from_maps,
     side_maps,
 )
-from mcsim.simulation.mapmaking.solve import MapmakingReport, StoppingRule, diagonal, rhs_of_map, solve
+from mcsim.simulation.mapmaking.solve import MapmakingReport, StoppingRule, diagonal, level_uk, rhs_of_map, solve
 
 __all__ = [
     "DifferenceNoise",
@@ -18,6 +18,7 @@ __all__ = [
     "SideMaps",
     "StoppingRule",
     "diagonal",
+    "level_uk",
     "prepare",
     "rhs_from_maps",
     "rhs_of_map",

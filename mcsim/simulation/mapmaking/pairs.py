@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
-from mcsim.instrument.scan import LineOfSight, MapGrid, ScanModel, scan_key
+from mcsim.instrument.scan import LineOfSight, MapGrid, Moments, ScanModel, cached_moments, scan_key
 from mcsim.instrument.scan.pointing import PointingStream, fill_samples
 from mcsim.simulation.tod import chunks
 from mcsim.support import folders
@@ -65,6 +65,12 @@ class DifferencingScan:
         """Number of differences."""
         first, last = self.grid.sample_range(self.model, self.side_a)
         return last - first
+
+    def moments(self, smax: int, nthreads: int = 1, progress: Callable[[float], None] | None = None) -> Moments:
+        """Return the mean orientation moments of all samples of both sides, which stand at their pixels' centres."""
+        model = self.model.with_lines_of_sight(self.side_a.name, self.side_b.name)
+        found = Moments.load(cached_moments(model, self.grid, smax, nthreads, progress))
+        return replace(found, dtheta=None, dphi=None)
 
 
 def prepare(

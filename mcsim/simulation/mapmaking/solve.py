@@ -115,6 +115,18 @@ def diagonal(scan: DifferencingScan, x: float) -> Map:
     return weight
 
 
+def level_uk(scan: DifferencingScan, x: float, sigma0_uk: float) -> Map | None:
+    """Return about the noise of every pixel, uK, shape (npix,), 0 where unobserved; None: no noise.
+
+    It is that of known partners, sigma0 over the root of the weights. Harmonics of a low degree l have
+    1 / (1 - P_l(cos of the angle between the sides)) times this variance, small scales nearly 1.
+    """
+    if sigma0_uk == 0.0:
+        return None
+    weight = diagonal(scan, x)
+    return np.divide(sigma0_uk, np.sqrt(weight), out=np.zeros_like(weight), where=weight > 0.0)
+
+
 def rhs_of_map(scan: DifferencingScan, map_uk: Map, x: float = 0.0, nthreads: int = 1) -> Map:
     """Return the right-hand side, uK, shape (npix,), whose solution is a map: N m, without a pass over the samples."""
     check_imbalance(x)

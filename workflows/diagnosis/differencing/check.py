@@ -1,19 +1,20 @@
 """Maps of differencing scans: are p-values uniform where nothing is wrong, and effects named where they are put in?
 
-    python workflows/diagnosis/differencing/check.py [--nside 64] [--skies 200] [--cases 4] [--parts FOLDER] [-o FILE.json]
+    python workflows/diagnosis/differencing/check.py [--nside 64] [--skies 200] [--cases 4] [--parts FOLDER] [-o FILE]
 
 With ``--parts`` every result of a simulation is kept, and a run that was stopped goes on where it was.
 
 Two channels, V1 and W1 of WMAP's focal plane, each the difference of its two sides, in two halves of a year. Data are
 the maps that ``mcsim run`` keeps, every difference of the survey by itself, with another seed than any simulation of
-the model. Effects are put into W1, each with the amplitude whose expected S/N is nearest to one of SNR.
+the model. Effects are put into W1, each with the amplitude whose expected S/N is nearest to one of SNR; and an ellipse
+into the beam of its side B alone.
 """
 
 import argparse
 import hashlib
 import json
-from collections.abc import Callable
-from dataclasses import fields
+from collections.abc import Callable, Iterator
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ from mcsim.diagnosis.campaign import asking, batch, with_effects
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.stats.look_elsewhere import global_test
@@ -43,6 +45,7 @@ PROPOSED = (
     "transmission_imbalance",
 )
 PUT_IN = ("beam_ellipticity", "transmission_imbalance", "mapmaking_convergence")
+ONE_SIDE = "an ellipse as the beam of side B"
 SNR = (6.0, 10.0)
 SEED = 20261122
 
@@ -144,11 +147,39 @@ def nulls(run: mcsim.RunConfig, analysis: Analysis, context: DiagnosisContext, c
     }
 
 
+def pulls(
+    run: mcsim.RunConfig, analysis: Analysis, context: DiagnosisContext, count: int, parts: Path | None
+) -> dict[str, dict[str, float]]:
+    """Return mean and width of the pulls of the first coordinate of effects, fitted alone with linear templates."""
+    found = {}
+    for place, name in enumerate(("beam_ellipticity", "transmission_imbalance")):
+        candidate = next(one for one in context.candidates if one.identity == (name, "W1"))
+        amplitude, values = amplitudes(context, name)[0][0], []
+        for number in range(count):
+            with_effect = acting(run, name, amplitude)
+            text = f"{with_effect} {100_000 * (1 + place) + number} {[element.name for element in analysis.elements]}"
+            x = kept(
+                parts, text, lambda r=with_effect, n=100_000 * (1 + place) + number: analysis.data_vector(data(r, n))
+            )
+            fit = context.null.fit(x, context.templates[:, list(candidate.columns)])
+            values.append((fit.amplitudes[0] - amplitude) / fit.errors[0])
+        found[name] = {
+            "skies": count,
+            "amplitude": amplitude,
+            "mean": float(np.mean(values)),
+            "mean_error": float(1.0 / np.sqrt(count)),
+            "width": float(np.std(values, ddof=1)),
+            "width_error": float(1.0 / np.sqrt(2.0 * (count - 1))),
+        }
+    return found
+
+
 def main() -> None:
     """Print and write what was found."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--nside", type=int, default=64)
     parser.add_argument("--skies", type=int, default=200)
+    parser.add_argument("--pulls", type=int, default=100, help="skies with each effect whose amplitude is fitted alone")
     parser.add_argument("--cases", type=int, default=4, help="skies of each effect and S/N")
     parser.add_argument("--simulations", type=int, help="of the model; default: ten for each element")
     parser.add_argument("--workers", type=int, default=2)
@@ -177,34 +208,57 @@ def main() -> None:
             result["null"] = nulls(run, analysis, context, chosen.skies, chosen.parts)
         print({k: v for k, v in result.get("null", {}).items() if k != "p_values"}, flush=True)
         write()
+        if chosen.pulls:
+            result["pulls"] = pulls(run, analysis, context, chosen.pulls, chosen.parts)
+            print(result["pulls"], flush=True)
+            write()
         result["cases"] = []
         with asking(call, True, Kept(chosen.parts), "simulations of fitted effects") as ask:
-            for name in PUT_IN:
-                for place, (amplitude, target) in enumerate(amplitudes(context, name)):
-                    for number in range(chosen.cases):
-                        effect = config.Effect(name=name, channel="W1", parameters={"amplitude": amplitude})
-                        maps = data(
-                            with_effects(run, [effect]), 10_000 * (1 + PUT_IN.index(name)) + 1000 * place + number
-                        )
-                        found = diagnose_data(ObservedMaps(context, maps, ask), name)
-                        best = [
-                            {"name": one.name, "channel": one.channel, "amplitude": one.amplitude, "sigma": one.sigma}
-                            for one in (found.sets[0].effects if found.sets else ())
-                        ]
-                        case = {
-                            "effect": name,
-                            "amplitude": amplitude,
-                            "snr": target,
-                            "p_value": float(found.test.pvalue),
-                            "verdict": found.kind,
-                            "found": best,
-                            "sets": [[f"{e.name} {e.channel}" for e in one.effects] for one in found.sets],
-                            "nearest": str(found.nearest),
-                            "notes": list(found.notes),
-                        }
-                        result["cases"].append(case)
-                        print(case, flush=True)
-                        write()
+            for amplitude, target, name, number in cases(context, chosen.cases):
+                maps = data(acting(run, name, amplitude), number)
+                found = diagnose_data(ObservedMaps(context, maps, ask), name)
+                result["cases"].append(described(found, name, amplitude, target))
+                print(result["cases"][-1], flush=True)
+                write()
+
+
+def cases(context: DiagnosisContext, count: int) -> Iterator[tuple[float, float, str, int]]:
+    """Yield amplitude, expected S/N, what is put in, and realization."""
+    for number in range(count):
+        for place, name in enumerate((*PUT_IN, ONE_SIDE)):
+            known = amplitudes(context, "beam_ellipticity" if name == ONE_SIDE else name)
+            for high, (amplitude, target) in enumerate(known):
+                if name == ONE_SIDE and not high:
+                    continue  # half of it is seen
+                yield amplitude, target, name, 10_000 * (1 + place) + 1000 * high + number
+
+
+def acting(run: mcsim.RunConfig, name: str, amplitude: float) -> mcsim.RunConfig:
+    """Return the run with an effect in W1, or with an ellipse as the beam of its side B alone."""
+    if name != ONE_SIDE:
+        return with_effects(run, [config.Effect(name=name, channel="W1", parameters={"amplitude": amplitude})])
+    v1, w1 = run.channels
+    fwhm, stretch = w1.beam.fwhm_arcmin, np.sqrt(1.0 + amplitude)
+    ellipse = config.BeamEllipticalGaussian(fwhm_major_arcmin=fwhm * stretch, fwhm_minor_arcmin=fwhm / stretch)
+    return replace(run, channels=(v1, replace(w1, beam_b=ellipse)))
+
+
+def described(found: DiagnosisResult, name: str, amplitude: float, target: float) -> dict:
+    """Return a case and what was found in it."""
+    return {
+        "effect": name,
+        "amplitude": amplitude,
+        "snr": target,
+        "p_value": float(found.test.pvalue),
+        "verdict": found.kind,
+        "found": [
+            {"name": one.name, "channel": one.channel, "amplitude": one.amplitude, "sigma": one.sigma}
+            for one in (found.sets[0].effects if found.sets else ())
+        ],
+        "sets": [[f"{one.name} {one.channel}" for one in found_set.effects] for found_set in found.sets],
+        "held_out": None if found.held_out is None else float(found.held_out.achieved.value),
+        "notes": list(found.notes),
+    }
 
 
 if __name__ == "__main__":
