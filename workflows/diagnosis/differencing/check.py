@@ -102,6 +102,7 @@ class Kept:
 
     def __call__(self, job: Job) -> np.ndarray:
         values = {one.name: getattr(job, one.name) for one in fields(job) if one.name != "library"}
+        values["settings"] = replace(job.settings, simulations=None)
         values["observed"] = None if job.observed is None else hashlib.sha256(job.observed.tobytes()).hexdigest()
         text = repr([values, [name for name, _ in job.library]])
         return kept(self.folder, text, lambda: data_vectors(job))
