@@ -152,7 +152,8 @@ def test_candidates_are_those_that_differences_can_have():
     own = [one for one in found.elements if one.candidate in only]
     assert [one.fold for one in own] == [0, 1, 0, 1]
     assert [one.split for one in own] == ["half1", "half2"] * 2
-    others = analysis_of(run_of(scan={"kind": "parallel_transport"}), library=library).candidates
+    one_beam = {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 631.2}
+    others = analysis_of(run_of(scan=one_beam), library={name: library[name] for name in only}).candidates
     assert not {one.name for one in others} & only
 
 
@@ -161,7 +162,7 @@ def test_an_imbalance_is_named():
     wanted = ("beam_ellipticity", "transmission_imbalance")
     settings = mcsim.DiagnosisSettings(
         library={name: kind for name, kind in mcsim.effects().items() if name in wanted},
-        simulations=220,
+        simulations=170,
         noisy_skies=6,
         scan_sims=40,
         constrained_skies=3,
@@ -178,6 +179,11 @@ def test_an_imbalance_is_named():
     assert abs(named.amplitude - true) < 4.0 * named.sigma < true
     clean = list(simulate.realize(survey(model), 0)["observed_map"])
     assert mcsim.diagnose(model, clean, settings=settings, workers=0).kind == "none"
+
+
+def test_effects_that_differences_do_not_have_are_refused():
+    with refused("orientation_averaging", "W1", "differences", "hit_averaged"):
+        survey(run_of([effect("orientation_averaging", 1.0)]))
 
 
 def test_the_physical_limit_refuses_differences():

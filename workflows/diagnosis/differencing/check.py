@@ -102,7 +102,7 @@ class Kept:
 
     def __call__(self, job: Job) -> np.ndarray:
         values = {one.name: getattr(job, one.name) for one in fields(job) if one.name != "library"}
-        values["settings"] = replace(job.settings, simulations=None)
+        del values["settings"]  # on which no data vector of this script depends
         values["observed"] = None if job.observed is None else hashlib.sha256(job.observed.tobytes()).hexdigest()
         text = repr([values, [name for name, _ in job.library]])
         return kept(self.folder, text, lambda: data_vectors(job))
@@ -183,13 +183,15 @@ def main() -> None:
     parser.add_argument("--pulls", type=int, default=100, help="skies with each effect whose amplitude is fitted alone")
     parser.add_argument("--cases", type=int, default=4, help="skies of each effect and S/N")
     parser.add_argument("--simulations", type=int, help="of the model; default: ten for each element")
+    parser.add_argument("--responses", type=int, help="skies of common and of noisy responses; default: as a diagnosis")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--parts", type=Path, help="folder for results of simulations, with which a run goes on")
     parser.add_argument("-o", "--output", type=Path)
     chosen = parser.parse_args()
     run = model(chosen.nside)
     library = {name: kind for name, kind in mcsim.effects().items() if name in PROPOSED}
-    settings = mcsim.DiagnosisSettings(simulations=chosen.simulations)
+    fewer = {} if chosen.responses is None else {"noisy_skies": chosen.responses, "common_skies": chosen.responses}
+    settings = mcsim.DiagnosisSettings(simulations=chosen.simulations, **fewer)
     analysis = analysis_of(run, settings=settings, library=library)
     result: dict = {"nside": chosen.nside, "elements": len(analysis.elements)}
 
