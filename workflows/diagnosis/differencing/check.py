@@ -6,8 +6,8 @@ With ``--parts`` every result of a simulation is kept, and a run that was stoppe
 
 Two channels, V1 and W1 of WMAP's focal plane, each the difference of its two sides, in two halves of a year. Data are
 the maps that ``mcsim run`` keeps, every difference of the survey by itself, with another seed than any simulation of
-the model. Effects are put into W1, each with the amplitude whose expected S/N is nearest to one of SNR; and an ellipse
-into the beam of its side B alone.
+the model. Effects are put into W1, with the amplitudes of an expected S/N of 6 and 10, or with six and four iterations
+of the map-making; and an ellipse into the beam of its side B alone.
 """
 
 import argparse
@@ -113,17 +113,16 @@ def data(run: mcsim.RunConfig, realization: int) -> list[np.ndarray]:
     return list(simulate.realize(survey(run), realization)["observed_map"])
 
 
-def amplitudes(context: DiagnosisContext, name: str) -> list[tuple[float, float]]:
-    """Return amplitude and expected S/N for every target, by simulations of the effect over a range of amplitudes."""
+def amplitudes(context: DiagnosisContext, name: str) -> list[tuple[float, float | None]]:
+    """Return amplitudes with their expected S/N; None of a map-making that stops early, which depends on the sky.
+
+    Of that they are two and four iterations more than where its response is measured: six and four are done.
+    """
     candidate = next(one for one in context.candidates if one.identity == (name, "W1"))
-    t, found = context.templates[:, candidate.columns[0]], []
-    for target in SNR:
-        coordinate = target / context.null.expected_snr(t)
-        amplitude = candidate.with_coordinates(
-            np.array([coordinate] + [0.0] * (len(candidate.columns) - 1)), np.eye(len(candidate.columns))
-        ).amplitude
-        found.append((float(round(amplitude)) if name == "mapmaking_convergence" else float(amplitude), target))
-    return found
+    if candidate.step is not None:
+        return [(candidate.step + 2.0, None), (candidate.step + 4.0, None)]
+    per_unit = context.null.expected_snr(context.templates[:, candidate.columns[0]])
+    return [(float(target / per_unit), target) for target in SNR]
 
 
 def nulls(run: mcsim.RunConfig, analysis: Analysis, context: DiagnosisContext, count: int, parts: Path | None) -> dict:
@@ -155,7 +154,7 @@ def pulls(
     found = {}
     for place, name in enumerate(("beam_ellipticity", "transmission_imbalance")):
         candidate = next(one for one in context.candidates if one.identity == (name, "W1"))
-        amplitude, values = amplitudes(context, name)[0][0], []
+        amplitude, values = amplitudes(context, name)[0][0] / 3.0, []  # of S/N 2, where the responses are linear
         for number in range(count):
             with_effect = acting(run, name, amplitude)
             text = f"{with_effect} {100_000 * (1 + place) + number} {[element.name for element in analysis.elements]}"
@@ -225,12 +224,12 @@ def main() -> None:
                 write()
 
 
-def cases(context: DiagnosisContext, count: int) -> Iterator[tuple[float, float, str, int]]:
+def cases(context: DiagnosisContext, count: int) -> Iterator[tuple[float, float | None, str, int]]:
     """Yield amplitude, expected S/N, what is put in, and realization."""
     for number in range(count):
         for place, name in enumerate((*PUT_IN, ONE_SIDE)):
             known = amplitudes(context, "beam_ellipticity" if name == ONE_SIDE else name)
-            for high, (amplitude, target) in enumerate(known):
+            for high, (amplitude, target) in reversed(list(enumerate(known))):
                 if name == ONE_SIDE and not high:
                     continue  # half of it is seen
                 yield amplitude, target, name, 10_000 * (1 + place) + 1000 * high + number
@@ -246,7 +245,7 @@ def acting(run: mcsim.RunConfig, name: str, amplitude: float) -> mcsim.RunConfig
     return replace(run, channels=(v1, replace(w1, beam_b=ellipse)))
 
 
-def described(found: DiagnosisResult, name: str, amplitude: float, target: float) -> dict:
+def described(found: DiagnosisResult, name: str, amplitude: float, target: float | None) -> dict:
     """Return a case and what was found in it."""
     return {
         "effect": name,
