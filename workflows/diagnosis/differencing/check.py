@@ -15,6 +15,7 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -226,12 +227,10 @@ def main() -> None:
 
 def cases(context: DiagnosisContext, count: int) -> Iterator[tuple[float, float | None, str, int]]:
     """Yield amplitude, expected S/N, what is put in, and realization."""
-    for number in range(count):
+    for number, high in product(range(count), (1, 0)):
         for place, name in enumerate((*PUT_IN, ONE_SIDE)):
-            known = amplitudes(context, "beam_ellipticity" if name == ONE_SIDE else name)
-            for high, (amplitude, target) in reversed(list(enumerate(known))):
-                if name == ONE_SIDE and not high:
-                    continue  # half of it is seen
+            amplitude, target = amplitudes(context, "beam_ellipticity" if name == ONE_SIDE else name)[high]
+            if high or name != ONE_SIDE:  # of one side half is seen
                 yield amplitude, target, name, 10_000 * (1 + place) + 1000 * high + number
 
 
