@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
+from mcsim.errors import RunError
 from mcsim.simulation import convolve, mapmaking
 from mcsim.simulation.channels import scan_model
 from mcsim.simulation.survey import Channel, SideB, SurveyMap
@@ -92,12 +93,16 @@ def whole_maps(
 ) -> Iterator[tuple[SurveyMap, Map]]:
     """Yield the sums of the two parts of :func:`maps`, solved for at once, in about half of the time.
 
-    They differ by what the tolerance leaves: tests/integration/test_diagnosis_differencing.py.
+    They differ by what the tolerance leaves: tests/integration/test_diagnosis_differencing.py. RunError says that the
+    conjugate gradients do not converge.
     """
     whole = _side_maps(channel, sky, nthreads)
     start = None if _side_b(channel).iterations_short > 0 else _mean(whole)
     for m, (complete,) in _rhs(channel, [whole], dipole, (seed, realization), nthreads):
-        yield m, _solve(m, channel, complete, start, "the whole beam", nthreads)
+        try:
+            yield m, _solve(m, channel, complete, start, "the whole beam", nthreads)
+        except RuntimeError as error:
+            raise RunError(f"{error}.") from error
 
 
 def of_dipole(channel: Channel, imbalance: float, nthreads: int = 1) -> list[Map]:

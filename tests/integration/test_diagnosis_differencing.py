@@ -9,6 +9,7 @@ import pytest
 import mcsim
 from mcsim import config
 from mcsim.diagnosis.analysis import analysis_of
+from mcsim.errors import RunError
 from mcsim.instrument.scan.pointing import pointing
 from mcsim.simulation import differencing, mapmaking, simulate
 from mcsim.simulation.survey import survey
@@ -179,6 +180,13 @@ def test_an_imbalance_is_named():
     assert abs(named.amplitude - true) < 4.0 * named.sigma < true
     clean = list(simulate.realize(survey(model), 0)["observed_map"])
     assert mcsim.diagnose(model, clean, settings=settings, workers=0).kind == "none"
+
+
+def test_maps_that_do_not_converge_end_in_a_sentence():
+    run = run_of()
+    few = replace(run, channels=tuple(replace(c, scan=replace(c.scan, max_iterations=2)) for c in run.channels))
+    with pytest.raises(RunError, match="max_iterations"):
+        simulate.maps(survey(few), 0)
 
 
 def test_effects_that_differences_do_not_have_are_refused():
