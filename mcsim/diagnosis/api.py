@@ -165,6 +165,8 @@ def describe(model: str | Path | config.RunConfig | ExternalModel, settings: Dia
         head += f"; and at most {given} of {source.label}{stored}, whose own cost is not in what follows"
     priors = [f"nuisance: {line}" for one in analysis.nuisances for line in one.lines]
     lines = [head, *priors, *cost(run).lines(number, run.compute.workers)]
+    if source is None:
+        lines.append(f"after a first verdict unknown: {unlisted.SIMULATIONS} simulations more, once for the model")
     if count:
         lines += controls.describe(analysis, count, run.compute.workers)
     return "\n".join(lines)

@@ -68,8 +68,8 @@ def random_alm(seed, lmax):
     return alm
 
 
-# In the simulator patterns are added to the sky, or multiply it, before the beam, and behind it in the scores. The round
-# part of the beam acts on the samples' offsets in their pixels as well.
+# In the simulator patterns are added to the sky, or multiply it, before the beam, and behind it in the scores. The
+# round part of the beam acts on the samples' offsets in their pixels as well.
 TOLERANCE = {"order 0": 0.1, "order 0 as l^2": 0.1, "added": 0.05, "rotation": 0.05, "gain": 0.1, "square": 0.3}
 
 
