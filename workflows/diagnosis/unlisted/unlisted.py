@@ -2,7 +2,7 @@
 
 python unlisted.py null [MAPS]       maps of the model: nothing is there
 python unlisted.py library [EACH]    every effect of the library, as if it had none, at S/N 8, 12 and 20
-python unlisted.py foreign [CASES]   systematics of no library (../names/names.py), each diagnosed first
+python unlisted.py foreign A:B       systematics of no library (../names/names.py), cases A to B - 1, diagnosed first
 python unlisted.py summary FILE...   the figures and the picture of what these have printed
 """
 
@@ -13,25 +13,26 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "names"))
 
 from names import KINDS, MODEL, ONE, STRENGTHS, ask, learned, systematic
 
-from mcsim import config
 from mcsim.diagnosis import unlisted
 from mcsim.diagnosis.campaign import with_effects
 from mcsim.diagnosis.candidate import Candidate
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.reconstruction.grammar import structures
-from mcsim.reconstruction.search import LEVEL, Search
+from mcsim.reconstruction.search import Search
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
-from mcsim.stats.intervals import share
+from mcsim.stats.intervals import removed, share
 from mcsim.stats.look_elsewhere import global_test
 from mcsim.systematics import catalogue
 
+PICTURE = Path(__file__).parents[2] / "pictures" / "unlisted.png"
 ANY = None
 TRUTH = {
     "beam_coma": ("beam", "scan", ("order 1", "order 3")),
@@ -107,10 +108,10 @@ def row(kind, name, truth, channel, split, strength, verdict, found, reduction):
 
 def null(number):
     """Reconstruct maps of the model, whose gap is tested too."""
-    for which in ("one", "two"):
+    for which in ("two", "one"):
         run, context, scene, search = known(which)
         shared, model = survey(run), context.analysis.model
-        for case in range(number // 2):
+        for case in range(int(number) // 2):
             maps = list(simulate.maps(shared, 50_000 + case))
             found = search.run(unlisted.scores_of_maps(model, scene, maps))
             x = context.analysis.data_vector(maps)
@@ -141,9 +142,9 @@ def library(each):
     """Reconstruct maps with an effect of the library; amplitudes give an S/N in the data vector."""
     run, context, scene, search = known("two")
     model = context.analysis.model
-    for number, (name, truth) in enumerate(TRUTH.items()):
-        kind = catalogue()[name]
-        for turn in range(each):
+    for turn in range(int(each)):
+        for number, (name, truth) in enumerate(TRUTH.items()):
+            kind = catalogue()[name]
             draw = np.random.default_rng([2027, number, turn])
             strength = (8.0, 12.0, 20.0)[turn % 3]
             owner = None if kind.scope == "common" else str(draw.choice(model.channels))
@@ -154,15 +155,15 @@ def library(each):
                 acting = survey(with_effects(run, [candidate.table(scaled(context, candidate, basis, strength))]))
             except Exception as error:
                 print(json.dumps(["left out", name, str(error)]), flush=True)
-                break
+                continue
             maps = list(simulate.maps(acting, seed))
             found, reduction = unlisted.structures_of(ObservedMaps(context, maps, ask), scene, search)
             row("library", name, truth, owner, "alike", strength, "", found, reduction)
 
 
-def foreign(number):
+def foreign(cases):
     """Diagnose maps with systematics of no library, and reconstruct what is missing."""
-    for case in range(number):
+    for case in range(*map(int, cases.split(":"))):
         which = ("one", "two")[case // len(KINDS) % 2]
         run, context, scene, search = known(which)
         draw = np.random.default_rng([2026, case])
@@ -185,30 +186,67 @@ def foreign(number):
         row("foreign", name, FOREIGN[kind], owner, split, wanted, verdict, found, reduction)
 
 
+def told(metric):
+    """Return a share with its interval."""
+    return f"{metric.name}: {metric.value:.3f} [{metric.low:.3f}, {metric.high:.3f}] of {metric.count}"
+
+
+WORDS = ("stage", "frame", "kind", "channel", "split")
+
+
 def summary(files):
     """Print the figures of lines, and draw them."""
     rows = [json.loads(line) for file in files for line in Path(file).read_text().splitlines() if line[:1] == "["]
     nulls = [one for one in rows if one[0] == "null"]
     if nulls:
-        print(share("maps of the model with a structure", [bool(one[3]) for one in nulls]))
+        print(told(share("maps of the model with a structure", [bool(one[3]) for one in nulls])))
         gaps = [one for one in nulls if one[2] <= 0.05]
-        print(share("those with a gap (p <= 0.05) and a structure", [one in gaps and bool(one[3]) for one in nulls]))
-        if gaps:
-            print(share("of those with a gap, with a structure", [bool(one[3]) for one in gaps]))
-    for group in ("library", "foreign"):
+        both = [one[2] <= 0.05 and bool(one[3]) for one in nulls]
+        print(told(share("maps of the model with a gap and a structure", both)))
+        print(told(share("of those with a gap, with a structure", [bool(one[3]) for one in gaps])))
+    figure = Figure(figsize=(8.0, 3.2), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    titles = {"library": "effects of the library, left out", "foreign": "systematics of no library"}
+    for axes, (group, title) in zip(panels, titles.items(), strict=True):
         own = [one for one in rows if one[0] == group]
-        if not own:
-            continue
-        print(group)
-        print(share("  a structure", [bool(one[6]) for one in own]))
-        for key in ("stage", "frame", "kind", "channel", "split"):
-            print(share(f"  right {key}", [one[5].get(key, False) for one in own]))
-        print(share("  all right", [bool(one[5]) and all(one[5].values()) for one in own]))
-        held = [one[7] for one in own if one[7] is not None and one[7][1] < 0.3]
-        if held:
-            print(share("  reduction >= 0.7", [one[0] >= 0.7 for one in held]))
-            print(f"  mean reduction {np.mean([one[0] for one in held]):.2f}, {len(held)} of {len(own)} measured")
-    return LEVEL, config
+        for place, strength in enumerate(sorted({one[3] for one in own})):
+            cases = [one for one in own if one[3] == strength]
+            shares = [share(word, [one[5].get(word, False) for one in cases]) for word in WORDS]
+            shares.append(share("all", [bool(one[5]) and all(one[5].values()) for one in cases]))
+            values = np.array([[one.value, one.value - one.low, one.high - one.value] for one in shares]).T
+            where = np.arange(len(shares)) + 0.2 * (place - 1)
+            label = f"S/N {strength:.0f} ({len(cases)})"
+            axes.errorbar(where, values[0], np.maximum(values[1:], 0.0), fmt="o", markersize=4, capsize=2, label=label)
+            print(group, f"S/N {strength:.0f}", *map(told, shares), sep="\n    ")
+        axes.axhline(0.8, color="black", linestyle=":", linewidth=0.8)
+        axes.set_xticks(range(len(WORDS) + 1), [*WORDS, "all"])
+        axes.set_ylim(0.0, 1.03)
+        axes.set_title(title, fontsize=10)
+        if own:
+            axes.legend(frameon=False, fontsize=8, loc="lower left")
+            report(group, own)
+    panels[0].set_ylabel("share that is right")
+    figure.savefig(PICTURE, dpi=120)
+
+
+def report(group, own):
+    """Print the figures of a group."""
+    print(group)
+    shares = [share("a structure", [bool(one[6]) for one in own])]
+    shares += [share(f"right {word}", [one[5].get(word, False) for one in own]) for word in WORDS]
+    shares.append(share("all right", [bool(one[5]) and all(one[5].values()) for one in own]))
+    shares.append(share("verdict unknown", [one[4] == "unknown" for one in own]))
+    held = [one[7] for one in own if one[7] is not None and one[7][2] > 0.0]
+    if len(held) > 2:
+        pairs = [(one[2], one[2] * (1.0 - one[0])) for one in held]
+        shares.append(removed(f"excess removed from held-out data, {len(held)} of {len(own)} measured", pairs))
+        precise = [one[0] >= 0.7 for one in held if one[1] < 0.3]
+        shares.append(share("reduction of 0.7 or more, where its error is below 0.3", precise))
+    for one in shares:
+        print("  ", told(one))
+    for one in own:
+        if not (one[5] and all(one[5].values())):
+            print("   not right:", one[1], one[2], one[3], one[5], [row[0] for row in one[6]])
 
 
 if __name__ == "__main__":
@@ -216,4 +254,4 @@ if __name__ == "__main__":
     if sys.argv[1] == "summary":
         summary(sys.argv[2:])
     else:
-        {"null": null, "library": library, "foreign": foreign}[sys.argv[1]](int(sys.argv[2]))
+        {"null": null, "library": library, "foreign": foreign}[sys.argv[1]](sys.argv[2])
