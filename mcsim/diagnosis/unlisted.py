@@ -156,7 +156,7 @@ def structures_of(data: ObservedMaps, scene: Scene, search: Search) -> tuple[tup
     analysis = data.context.analysis
     x = scores_of_maps(analysis.model, scene, data.data)
     made = Reconstruction(data, scene, search, x)
-    found = search.run(x, made.left)
+    found = search.run(x, made)
     if not found:
         return (), None
     chosen = [search.grammar[one.structure] for one in found]
@@ -247,6 +247,20 @@ class Reconstruction:
             made = plugin(f"unlisted_{len(chosen)}", structure, fit[0], self.scene)
             self._fitted[key] = ([*fits, fit], *self._calibrated(chosen, [*plugins, made]))
         return self._fitted[key]
+
+    def responses(self, members: Sequence[int], rest: Vector) -> Matrix:
+        """Return what the effects of structures, fitted to scores, make of all scores; their mean where there is none.
+
+        Shape (members, P).
+        """
+        found = self.search.mean_responses(members, rest)
+        for row, k in enumerate(members):
+            structure = self.search.grammar[k]
+            ((theta, _),) = self.search.fit([structure], rest)
+            effect = plugin("unlisted", structure, theta, self.scene)
+            if effect is not None:
+                found[row] = self.simulated([effect]).scores - self.before.scores
+        return found
 
     def left(self, chosen: list[int]) -> Vector:
         """Return the scores without what the effects of structures make of them on this sky."""

@@ -37,11 +37,18 @@ def structure_figure(found: Reconstructed, frame: str) -> Figure | None:
         axes.errorbar(middle, size, sigma, reach_x, fmt="o", color=BLUE, capsize=3, markersize=4)
         axes.axhline(0.0, color="black", linewidth=0.8)
         axes.set_xscale("log")
+        ticks = [*map(int, low), int(high[-1])]
+        axes.set_xticks(ticks, list(map(str, ticks)))
+        axes.minorticks_off()
         axes.set_xlabel("ℓ", fontsize=9)
         axes.set_ylabel(PROFILE.get(found.stage, "power of the signal"), fontsize=9)
         axes.spines[["top", "right"]].set_visible(False)
     return figure
 
 
-PROFILE = {"beam": "change of b_ℓm over b_ℓ0 (ℓ/ℓmax)^m", "power": "relative change of the power", "noise": "score"}
+PROFILE = {
+    "beam": "change of $b_{\\ell m}$ over\n$b_{\\ell 0}\\,(\\ell/\\ell_\\mathrm{max})^m$",
+    "power": "relative change of the power",
+    "noise": "power of the noise, over its error²",
+}
 """What a profile is of, by stage."""

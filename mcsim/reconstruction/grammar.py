@@ -210,7 +210,7 @@ def _profiles(scene: Scene, s: int) -> list[tuple[str, Matrix | None]]:
     edges = np.array(scene.edges(max(s, 1)), dtype=float)
     middle = np.sqrt(edges[:-1] * (edges[1:] - 1.0))
     shape = np.ones(len(middle)) if s else middle / scene.lmax
-    mix = np.kron(shape, np.eye(2 if s else 1))
+    mix: Matrix = np.kron(shape, np.eye(2 if s else 1)).astype(np.float64)
     return [(f"order {s} as l^{s or 2}", mix), (f"order {s}", None)]
 
 

@@ -5,10 +5,11 @@ coordinates, so that a fit needs no templates: theta = C^-1 u, and the fall of c
 from simulations; the tests are exact for their number (:mod:`mcsim.stats.gaussian`).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,10 @@ MOST = 3
 SECOND = 0.1
 """Least fall of chi^2 of a further structure over that of the first: below it may be the square of the first."""
 
+FINALISTS, NEAR, SPARE = 10, 5.0, 2
+"""Structures that are compared by their responses on the sky of the data: how many at most, within which difference of
+the evidence those of one stage and frame, and simulations for each of their scores."""
+
 RARE = 3.0
 """Odds against a structure that is not alike in all splits, and against a gain of sky or dipole alone."""
 
@@ -39,7 +44,14 @@ ALTERNATIVES = 20.0
 """Odds up to which other structures are told beside the best."""
 
 
-Left = Callable[[list[int]], Vector]
+class Sky(Protocol):
+    """What structures do on the sky of the data."""
+
+    def responses(self, members: Sequence[int], rest: Vector) -> Matrix:
+        """Return what structures, fitted to scores, make of all scores, shape (members, P)."""
+
+    def left(self, chosen: list[int]) -> Vector:
+        """Return the scores without what is made of them by structures, shape (P,)."""
 
 
 @dataclass(frozen=True)
@@ -118,32 +130,76 @@ class Search:
         scale = max(float(np.mean(null[null > edge] - edge)), 1.0)
         return TAIL * float(np.exp(-(value - edge) / scale))
 
-    def run(self, scores: Vector, left: Left | None = None) -> list[Found]:
+    def run(self, scores: Vector, sky: "Sky | None" = None) -> list[Found]:
         """Return the structures that are there, the most evident first.
 
-        ``left`` returns what the structures found so far leave of the scores, given their indices; None: what
-        regression on their own scores leaves. It knows this very sky, whose patterns make scores correlated that are
-        independent on average over skies.
+        ``sky`` knows what structures do on the sky of the data, whose patterns make scores correlated that are
+        independent on average over skies. It judges between the finalists, and takes out what is found before the rest
+        is searched; None: by averages over skies.
         """
         found: list[Found] = []
         rest = scores
         for _ in range(MOST):
-            falls = self._falls(rest)
-            values = np.array([
-                -np.inf if null is None else float(evidence(np.array(fall), null.dimension)) - _rarity(structure)
-                for structure, null, fall in zip(self.grammar, self.nulls, falls, strict=True)
-            ])  # fmt: skip
+            values = self.evidences(rest)
             values[[one.structure for one in found]] = -np.inf
-            best = int(np.argmax(values))
-            p = self.pvalue(float(values[best]))
-            if p > LEVEL or (found and falls[best] < SECOND * found[0].delta_chi2):
+            p = self.pvalue(float(values.max()))
+            if p > LEVEL:
                 break
-            order = np.argsort(-values)
-            near = [int(k) for k in order if k != best and values[best] - values[k] < np.log(ALTERNATIVES)]
-            found.append(Found(best, float(values[best]), p, float(falls[best]), tuple(near)))
+            members = self.finalists(values)
+            responses = self.mean_responses(members, rest) if sky is None else sky.responses(members, rest)
+            judged, falls = self.judged(members, rest, responses)
+            order = np.argsort(-judged)
+            best = int(order[0])
+            if found and falls[best] < SECOND * found[0].delta_chi2:
+                break
+            near = [members[k] for k in order[1:] if judged[best] - judged[k] < np.log(ALTERNATIVES)]
+            found.append(Found(members[best], float(values.max()), p, float(falls[best]), tuple(near)))
             chosen = [one.structure for one in found]
-            rest = self.regressed(chosen, scores) if left is None else left(chosen)
+            rest = self.regressed(chosen, scores) if sky is None else sky.left(chosen)
         return found
+
+    def evidences(self, scores: Vector) -> Vector:
+        """Return the evidence of every structure by itself, less the logarithm of the odds against such ones."""
+        found = [
+            -np.inf if null is None else float(evidence(np.array(fall), null.dimension)) - _rarity(structure)
+            for structure, null, fall in zip(self.grammar, self.nulls, self._falls(scores), strict=True)
+        ]
+        return np.array(found)
+
+    def finalists(self, values: Vector) -> list[int]:
+        """Return the most evident structure, those near it, and the best of every other stage and frame.
+
+        All their scores together have as many elements as a fraction 1/SPARE of the simulations at most.
+        """
+        best, seen, chosen, rows = float(values.max()), set[tuple[str, str, str]](), list[int](), 0
+        for k in map(int, np.argsort(-values)):
+            one = self.grammar[k]
+            if len(chosen) == FINALISTS or values[k] <= 0.0:
+                break
+            new = (one.stage, one.acts_on, one.frame) not in seen
+            if (new or best - values[k] < NEAR) and rows + one.size <= len(self.simulations) // SPARE:
+                chosen.append(k)
+                seen.add((one.stage, one.acts_on, one.frame))
+                rows += one.size
+        return chosen or [int(np.argmax(values))]
+
+    def judged(self, members: Sequence[int], scores: Vector, responses: Matrix) -> tuple[Vector, Vector]:
+        """Return evidence and fall of chi^2 of structures in the scores of all of them, by responses (members, P)."""
+        null = SimulatedGaussian.from_simulations(self._rows(members, self.simulations), floor=SMALL)
+        x, t = self._rows(members, scores), self._rows(members, responses)
+        falls = null.hartlap_factor * np.array([null.delta_chi2(x, one[:, None]) for one in t])
+        sizes = (self.grammar[k].size for k in members)
+        each = zip(members, falls, sizes, strict=True)
+        return np.array([float(evidence(fall, size)) - _rarity(self.grammar[k]) for k, fall, size in each]), falls
+
+    def mean_responses(self, members: Sequence[int], scores: Vector) -> Matrix:
+        """Return the responses of all scores to structures as they are fitted, on average over skies, (members, P)."""
+        centred, found = self.simulations - self.simulations.mean(axis=0), []
+        for k in members:
+            ((theta, _),) = self.fit([self.grammar[k]], scores)
+            own = self.grammar[k].of(centred) @ theta
+            found.append(own @ centred / (len(centred) - 1.0))
+        return np.stack(found)
 
     def _falls(self, scores: Vector) -> Vector:
         """Return the unbiased fall of chi^2 of every structure by itself."""
