@@ -50,6 +50,9 @@ ALTERNATIVES = 3
 SKIES = 4
 """Skies, constrained by the data, on which a reconstructed effect is simulated."""
 
+FREE = 5
+"""Coordinates of a pattern on the sky whose responses are simulated one by one, at most."""
+
 FEW = 0.1
 """Share of the largest rms below which a map does not have an effect."""
 
@@ -209,6 +212,8 @@ class Reconstruction:
     search: Search
     x: Vector
     _fitted: dict[tuple[int, ...], Fitted] = field(default_factory=dict, repr=False)
+    _trial: dict[int, Matrix] = field(default_factory=dict, repr=False)
+    _kept: dict[int, Vector] = field(default_factory=dict, repr=False)
 
     def simulated(self, effects: Sequence[Plugin], amplitudes: Sequence[float] = ()) -> Simulated:
         """Return maps, scores and data vectors of skies that the data constrain, with effects at amplitudes."""
@@ -243,24 +248,35 @@ class Reconstruction:
         if (key := tuple(chosen)) not in self._fitted:
             fits, plugins, rest = self.fitted(chosen[:-1])
             structure = self.search.grammar[chosen[-1]]
-            (fit,) = self.search.fit([structure], rest)
+            ((theta, covariance),) = self.search.fit([structure], rest)
+            fit = self._kept.get(chosen[-1], theta), covariance
             made = plugin(f"unlisted_{len(chosen)}", structure, fit[0], self.scene)
             self._fitted[key] = ([*fits, fit], *self._calibrated(chosen, [*plugins, made]))
         return self._fitted[key]
 
-    def responses(self, members: Sequence[int], rest: Vector) -> Matrix:
+    def responses(self, members: Sequence[int], rest: Vector) -> list[Matrix]:
         """Return what the effects of structures, fitted to scores, make of all scores; their mean where there is none.
 
-        Shape (members, P).
+        A pattern of few coordinates acts on few modes of this sky: each of them has its own response. Shape (k, P).
         """
         found = self.search.mean_responses(members, rest)
+        self._trial.clear()
         for row, k in enumerate(members):
             structure = self.search.grammar[k]
             ((theta, _),) = self.search.fit([structure], rest)
-            effect = plugin("unlisted", structure, theta, self.scene)
-            if effect is not None:
-                found[row] = self.simulated([effect]).scores - self.before.scores
+            each = theta[None]
+            if _by_coordinate(structure):
+                each = float(np.linalg.norm(theta)) * np.eye(structure.size)
+            self._trial[k] = each
+            effects = [plugin("unlisted", structure, one, self.scene) for one in each]
+            if None not in effects:
+                rows = [self.simulated([one]).scores for one in effects if one is not None]
+                found[row] = np.stack(rows) - self.before.scores
         return found
+
+    def keep(self, member: int, amplitudes: Vector) -> None:
+        """Keep the coordinates that these amplitudes of the responses mean."""
+        self._kept[member] = amplitudes @ self._trial[member]
 
     def left(self, chosen: list[int]) -> Vector:
         """Return the scores without what the effects of structures make of them on this sky."""
@@ -304,8 +320,9 @@ class Reconstruction:
     def reduction(self, chosen: Sequence[Structure], plugins: Sequence[Plugin | None]) -> HeldOut | None:
         """Return how far effects that are fitted to one half of the data reduce the excess of the other half.
 
-        A structure that is measured map by map is fitted to those of the first fold alone; of others the shape is that
-        of all data. The amplitudes are those that fit the elements of the first fold of the data vector.
+        A structure that is measured map by map is fitted to those of the first fold alone; of others, and of patterns
+        that act on few modes, the shape is that of all data. The amplitudes are those that fit the elements of the
+        first fold of the data vector.
         """
         acting = [(w, one) for w, one in zip(chosen, plugins, strict=True) if one is not None]
         if not acting:
@@ -314,7 +331,7 @@ class Reconstruction:
         splits = [view.split for view in self.scene.views]
         first = []
         for structure, effect in acting:
-            if structure.views and len(self.scene.splits) > 1:
+            if structure.views and len(self.scene.splits) > 1 and not _by_coordinate(structure):
                 half = structure.within(0, splits)
                 if not len(half.weights):
                     return None
@@ -338,3 +355,8 @@ class Reconstruction:
             return change
 
         return halves.reduction(t, respond, (), told)
+
+
+def _by_coordinate(structure: Structure) -> bool:
+    """Return True for a pattern of few coordinates that multiplies the sky."""
+    return structure.frame == "sky" and bool(structure.acts_on) and structure.size <= FREE

@@ -130,7 +130,7 @@ def _of_maps(scene: Scene) -> Iterator[Structure]:
             weights = np.array([factors[scene.views[i].split] for i in kept])
             for stage, acts_on, frame, kind, keys, mix in _forms(scene, split, kept):
                 rows = np.array([[scene.place[(*key[:1], i, *key[1:])] for i in kept] for key in keys])
-                if name is None and frame == "sky" and kind not in ALSO_COMMON:
+                if name is None and (frame == "sky" or stage == "square") and kind not in ALSO_COMMON:
                     continue  # what all channels see alike is the sky itself, which the model knows as random
                 yield Structure(stage, acts_on, frame, kind, name, split, None, rows, weights, mix, tuple(kept))
         yield from _high_orders(scene, name, views)

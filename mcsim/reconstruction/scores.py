@@ -172,7 +172,7 @@ class Scene:
         return {key: row for row, key in enumerate(self.keys)}
 
     @cached_property
-    def _noise_patterns(self) -> NDArray[np.float64]:
+    def _patterns(self) -> NDArray[np.float64]:
         """Return the real harmonics up to degree 2 in every pixel, shape (9, npix)."""
         n = healpy.pix2vec(self.nside, np.arange(12 * self.nside**2))
         return np.stack([real.field(unit, *n) for unit in np.eye(9)])
@@ -189,7 +189,8 @@ class Scene:
             r, sky, adjoint = filtered.residual[i], filtered.expected[i], filtered.adjoint[i]
             whole = sky + self.dipole
             found.append(real.coefficients(adjoint, self.lmax, self.degree))
-            found += [self._low(r * sky, min(GAIN, self.lmax)), self._low(r * whole, min(GAIN, self.lmax))]
+            top = min(GAIN, self.lmax)
+            found += [self._without_dipole(r, sky, adjoint, top), self._low(r * whole, top)]
             found.append(np.array([r @ self.dipole, r @ sky**2, r @ whole**2]))
             through = (alm_.multiply(one, view.response, self.lmax) for one in turned)
             found.append(np.array([_product(adjoint, one, self.lmax) for one in through]))
@@ -198,11 +199,21 @@ class Scene:
                 found += [np.array([(r * factor) @ wave for wave in pair]) for pair in view.waves.values()]
             found += list(self._orders(view, filtered.orders[i], i))
         for channel, difference in enumerate(differences):
-            found.append(0.5 * self._noise_patterns @ difference)
+            found.append(0.5 * self._patterns @ difference)
             if len(own := self.of(channel)) > 1:
                 a, b = filtered.adjoint[own[0]], filtered.adjoint[own[1]]
                 found += [self._powers(a - b, a - b), self._powers(a, b)]
         return np.concatenate([*found, self._of_sky(filtered.sky)])
+
+    def _without_dipole(self, r: Map, sky: Map, adjoint: Alm, top: int) -> Vector:
+        """Return the scores of patterns times the sky, without what these products have of monopole and dipole.
+
+        The model's sky has none, so that they would be most of the score, and follow few modes of this very sky.
+        """
+        patterns = self._patterns[: (top + 1) ** 2]
+        area = 4.0 * np.pi / sky.size
+        leaks = area * (patterns * sky) @ self._patterns[:4].T
+        return self._low(r * sky, top) - leaks @ real.coefficients(adjoint, self.lmax, 1)
 
     def _low(self, product: Map, top: int) -> Vector:
         geometry = healpix.geometry(self.nside)

@@ -32,7 +32,7 @@ FINALISTS, NEAR, SPARE = 10, 5.0, 2
 the evidence those of one stage and frame, and simulations for each of their scores."""
 
 RARE = 3.0
-"""Odds against a structure that is not alike in all splits, and against a gain of sky or dipole alone."""
+"""Odds against a structure that is not alike in all splits, and against a gain or square of sky or dipole alone."""
 
 TAIL = 0.1
 """Share of the simulations by which the tail of the largest evidence is described."""
@@ -47,8 +47,11 @@ ALTERNATIVES = 20.0
 class Sky(Protocol):
     """What structures do on the sky of the data."""
 
-    def responses(self, members: Sequence[int], rest: Vector) -> Matrix:
-        """Return what structures, fitted to scores, make of all scores, shape (members, P)."""
+    def responses(self, members: Sequence[int], rest: Vector) -> list[Matrix]:
+        """Return what structures, fitted to scores, or each of their coordinates make of all scores, (k, P) each."""
+
+    def keep(self, member: int, amplitudes: Vector) -> None:
+        """Take the amplitudes of the responses of a structure for its own."""
 
     def left(self, chosen: list[int]) -> Vector:
         """Return the scores without what is made of them by structures, shape (P,)."""
@@ -147,7 +150,7 @@ class Search:
                 break
             members = self.finalists(values)
             responses = self.mean_responses(members, rest) if sky is None else sky.responses(members, rest)
-            judged, falls = self.judged(members, rest, responses)
+            judged, falls, amplitudes = self.judged(members, rest, responses)
             order = np.argsort(-judged)
             best = int(order[0])
             if found and falls[best] < SECOND * found[0].delta_chi2:
@@ -155,6 +158,8 @@ class Search:
             near = [members[k] for k in order[1:] if judged[best] - judged[k] < np.log(ALTERNATIVES)]
             found.append(Found(members[best], float(values.max()), p, float(falls[best]), tuple(near)))
             chosen = [one.structure for one in found]
+            if sky is not None:
+                sky.keep(members[best], amplitudes[best])
             rest = self.regressed(chosen, scores) if sky is None else sky.left(chosen)
         return found
 
@@ -183,23 +188,29 @@ class Search:
                 rows += one.size
         return chosen or [int(np.argmax(values))]
 
-    def judged(self, members: Sequence[int], scores: Vector, responses: Matrix) -> tuple[Vector, Vector]:
-        """Return evidence and fall of chi^2 of structures in the scores of all of them, by responses (members, P)."""
-        null = SimulatedGaussian.from_simulations(self._rows(members, self.simulations), floor=SMALL)
-        x, t = self._rows(members, scores), self._rows(members, responses)
-        falls = null.hartlap_factor * np.array([null.delta_chi2(x, one[:, None]) for one in t])
-        sizes = (self.grammar[k].size for k in members)
-        each = zip(members, falls, sizes, strict=True)
-        return np.array([float(evidence(fall, size)) - _rarity(self.grammar[k]) for k, fall, size in each]), falls
+    def judged(
+        self, members: Sequence[int], scores: Vector, responses: Sequence[Matrix]
+    ) -> tuple[Vector, Vector, list[Vector]]:
+        """Return evidence, fall of chi^2 and amplitudes of structures in the scores of all of them.
 
-    def mean_responses(self, members: Sequence[int], scores: Vector) -> Matrix:
-        """Return the responses of all scores to structures as they are fitted, on average over skies, (members, P)."""
+        Each has one or more responses, shape (k, P).
+        """
+        null = SimulatedGaussian.from_simulations(self._rows(members, self.simulations), floor=SMALL)
+        x = self._rows(members, scores)
+        fits = [null.fit(x, self._rows(members, one).T) for one in responses]
+        falls = null.hartlap_factor * np.array([one.delta_chi2 for one in fits])
+        each = [self.grammar[k] for k in members]
+        odds = [float(evidence(fall, w.size)) - _rarity(w) for fall, w in zip(falls, each, strict=True)]
+        return np.array(odds), falls, [one.amplitudes for one in fits]
+
+    def mean_responses(self, members: Sequence[int], scores: Vector) -> list[Matrix]:
+        """Return the response of all scores to each structure as it is fitted, on average over skies, (1, P) each."""
         centred, found = self.simulations - self.simulations.mean(axis=0), []
         for k in members:
             ((theta, _),) = self.fit([self.grammar[k]], scores)
             own = self.grammar[k].of(centred) @ theta
-            found.append(own @ centred / (len(centred) - 1.0))
-        return np.stack(found)
+            found.append((own @ centred / (len(centred) - 1.0))[None])
+        return found
 
     def _falls(self, scores: Vector) -> Vector:
         """Return the unbiased fall of chi^2 of every structure by itself."""
@@ -236,7 +247,8 @@ class Search:
 
 def _rarity(structure: Structure) -> float:
     """Return the logarithm of the prior odds against a structure, beside one of the common kind."""
-    rare = (structure.split != ALIKE) + (structure.stage == "gain" and structure.acts_on != "sky and dipole")
+    part = structure.stage in ("gain", "square") and structure.acts_on != "sky and dipole"
+    rare = (structure.split != ALIKE) + part
     return rare * float(np.log(RARE))
 
 

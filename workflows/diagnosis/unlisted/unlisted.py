@@ -1,7 +1,7 @@
 """Measure how often a reconstruction says what an effect is that the library lacks, and how often it is fooled.
 
-python unlisted.py null [MAPS]       maps of the model: nothing is there
-python unlisted.py library [EACH]    every effect of the library, as if it had none, at S/N 8, 12 and 20
+python unlisted.py null MAPS         maps of the model: nothing is there
+python unlisted.py library EACH      every effect of the library, as if it were not there, at S/N 8, 12 and 20
 python unlisted.py foreign A:B       systematics of no library (../names/names.py), cases A to B - 1, diagnosed first
 python unlisted.py summary FILE...   the figures and the picture of what these have printed
 """
@@ -138,12 +138,13 @@ def scaled(context, candidate, basis, strength):
     return basis.scaled(factor)
 
 
-def library(each):
+def library(each, span="0:99"):
     """Reconstruct maps with an effect of the library; amplitudes give an S/N in the data vector."""
     run, context, scene, search = known("two")
     model = context.analysis.model
     for turn in range(int(each)):
-        for number, (name, truth) in enumerate(TRUTH.items()):
+        for number in list(range(len(TRUTH)))[slice(*map(int, span.split(":")))]:
+            name, truth = list(TRUTH.items())[number]
             kind = catalogue()[name]
             draw = np.random.default_rng([2027, number, turn])
             strength = (8.0, 12.0, 20.0)[turn % 3]
@@ -254,4 +255,4 @@ if __name__ == "__main__":
     if sys.argv[1] == "summary":
         summary(sys.argv[2:])
     else:
-        {"null": null, "library": library, "foreign": foreign}[sys.argv[1]](sys.argv[2])
+        {"null": null, "library": library, "foreign": foreign}[sys.argv[1]](*sys.argv[2:])
