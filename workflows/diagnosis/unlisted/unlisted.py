@@ -2,7 +2,7 @@
 
 python unlisted.py null MAPS         maps of the model: nothing is there
 python unlisted.py library EACH      every effect of the library, as if it were not there, at S/N 8, 12 and 20
-python unlisted.py foreign A:B       systematics of no library (../names/names.py), cases A to B - 1, diagnosed first
+python unlisted.py foreign A:B [yes] systematics of no library (../names/names.py), cases A to B - 1; yes: diagnosed too
 python unlisted.py summary FILE...   the figures and the picture of what these have printed
 """
 
@@ -162,8 +162,8 @@ def library(each, span="0:99"):
             row("library", name, truth, owner, "alike", strength, "", found, reduction)
 
 
-def foreign(cases):
-    """Diagnose maps with systematics of no library, and reconstruct what is missing."""
+def foreign(cases, diagnosed="no"):
+    """Reconstruct maps with systematics of no library; diagnose them first if that is wanted."""
     for case in range(*map(int, cases.split(":"))):
         which = ("one", "two")[case // len(KINDS) % 2]
         run, context, scene, search = known(which)
@@ -182,7 +182,7 @@ def foreign(cases):
         split = "alike" if min(own) > 0.0 else run.map.splits[int(np.argmax(own))]
         owner = run.channels[channel].name
         data = ObservedMaps(context, maps, ask)
-        verdict = diagnose_data(data, f"case-{case}").kind
+        verdict = diagnose_data(data, f"case-{case}").kind if diagnosed == "yes" else ""
         found, reduction = unlisted.structures_of(data, scene, search)
         row("foreign", name, FOREIGN[kind], owner, split, wanted, verdict, found, reduction)
 
@@ -236,7 +236,6 @@ def report(group, own):
     shares = [share("a structure", [bool(one[6]) for one in own])]
     shares += [share(f"right {word}", [one[5].get(word, False) for one in own]) for word in WORDS]
     shares.append(share("all right", [bool(one[5]) and all(one[5].values()) for one in own]))
-    shares.append(share("verdict unknown", [one[4] == "unknown" for one in own]))
     held = [one[7] for one in own if one[7] is not None and one[7][2] > 0.0]
     if len(held) > 2:
         pairs = [(one[2], one[2] * (1.0 - one[0])) for one in held]
