@@ -1,13 +1,14 @@
 """Data in realistic company, with the company declared as nuisances and not: p-values, names, pulls.
 
-    python workflows/nuisances/check.py [--draws 600] [--skies 120] [--strength 8] [--seed 2026] [--workers 2] [--knee 0.003] [-o FILE]
+    python workflows/nuisances/check.py [--draws 600] [--skies 120] [--strength 8] [--seed 2026]
+        [--workers 2] [--knee 0.003] [-o FILE]
 
 Two channels at nside 32 with two splits. The company is drawn anew for every data set: calibrations off by 0.3 %, beam
 widths by 0.5 %, noise levels by 3 % (standard deviations), and a foreground of known morphology with 2 uK rms at 94 GHz
 and a spectral index of -3.0 +- 0.3. First, data vectors without an effect: the p-value of the model that declares the
 company must be uniform; that of the model that does not cannot be. Then full skies, half of them with one effect of an
-expected S/N of ``strength`` against the model that declares; both models diagnose each. With ``--knee`` the noise is 1/f
-(in Hz; slope -1 down to 10 uHz, destriped in baselines of an hour), modelled as such.
+expected S/N of ``strength`` against the model that declares; both models diagnose each. With ``--knee`` (in Hz)
+the noise is 1/f, of slope -1 down to 10 uHz, destriped in baselines of an hour, and modelled as such.
 """
 
 import argparse
