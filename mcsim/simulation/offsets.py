@@ -52,7 +52,7 @@ class Expansion:
             powers = [n for n in range(s, order + 1, 2) if n]
             wanted = functions[s] - self.smooth[:, None] if s == 0 else functions[s]
             columns = np.stack([rho**n - (self.means[n] if s == 0 else 0.0) for n in powers])
-            scale = np.abs(columns).max(axis=1)
+            scale = np.maximum(np.abs(columns).max(axis=1), np.finfo(float).tiny)  # of samples at the centres, say
             found = np.linalg.lstsq((columns / scale[:, None] * root).T, (wanted * root).T, rcond=None)[0]
             self.windows |= {(s, n): row / top for n, row, top in zip(powers, found, scale, strict=True)}
 
@@ -62,6 +62,11 @@ def expansion(nside: int, lmax: int, order: int, spread: float = 1.0) -> Expansi
     """Return the expansion for samples all over the pixels, ``spread`` times as far from their centres."""
     r, weight = healpix.distances_from_centres(nside)
     return Expansion(spread * r, weight, lmax, order)
+
+
+def transforms(order: int) -> int:
+    """Return the transforms that powers of offsets up to an order take, in units of one at spin 0."""
+    return sum(1 if s == 0 else 2 for s in range(order + 1) for n in range(s, order + 1, 2) if n)
 
 
 def offset_maps(

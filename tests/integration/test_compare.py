@@ -13,9 +13,10 @@ from typer.testing import CliRunner
 import mcsim
 from mcsim import config
 from mcsim.cli import app
+from mcsim.comparison.pairs import with_known_offsets
 from mcsim.comparison.result import ComparisonResult
 from mcsim.ensemble.maps import write_map
-from mcsim.instrument.scan.geometry import MapGrid
+from mcsim.instrument.scan import MapGrid, write_moments_fits
 from mcsim.simulation import simulate, tod
 from mcsim.simulation.survey import survey
 from mcsim.sphere.rotation import rotate_alm
@@ -192,6 +193,32 @@ def test_an_effect_of_the_library_is_named(simulator, side_a):
     found = mcsim.compare(side_a, side_b, simulator.run)
     assert names(found) == ["pointing_offset"]
     assert found.channels[0].differences[0].amplitude == pytest.approx(2.0, rel=0.03)
+
+
+@pytest.fixture
+def of_moments(simulator, tmp_path) -> dict:
+    """The same run with orientation moments and powers of the samples' offsets in files, and no pointing."""
+    pointing = simulator.site.pointed("")
+    model = pointing.model.with_lines_of_sight(pointing.line.name)
+    for half, split in enumerate(MODEL["map"]["splits"]):
+        grid = MapGrid(NSIDE, "ecliptic", (half / 2, (half + 1) / 2), offset_order=4)
+        write_moments_fits(tmp_path / f"{split}.fits", mcsim.Moments.on_grid(model, grid, 7))
+    scan = {"kind": "moments", "path": str(tmp_path / "{split}.fits")}
+    return {**MODEL, "channel": [{**MODEL["channel"][0], "scan": scan}]}
+
+
+def test_powers_of_offsets_stand_for_samples_that_are_not_known(simulator, side_a, of_moments):
+    """Maps of the same sky are identical, and a difference is explained better, if moments know the offsets."""
+    run, first = (config.load({**of_moments, "map": MODEL["map"] | more}) for more in ({}, {"offset_order": 1}))
+    made = [simulate.maps(survey(with_known_offsets(one)), 0, sky=simulator.sky) for one in (run, first)]
+    better, usual = (mcsim.compare(side_a, list(maps), run).channels[0] for maps in made)
+    assert better.verdict == "identical"
+    assert usual.rms_uk > 10.0 * better.rms_uk
+    turned = simulator(psi=lambda p: p + np.deg2rad(30.0))
+    found = [mcsim.compare(side_a, turned, one).channels[0] for one in (run, first)]
+    print(f"rms {usual.rms_uk:.3g} -> {better.rms_uk:.3g} uK; left {[one.left_rms_uk for one in found]}")
+    assert found[0].differences[0].name == "psi_offset"
+    assert found[0].left_rms_uk <= found[1].left_rms_uk
 
 
 def test_what_no_library_has_is_unknown(simulator, side_a):

@@ -27,10 +27,11 @@ def read_moments(
     """Read moments from a HEALPix table with columns HITS, RE_s, IM_s[, DTHETA, DPHI], or from the .npz file of a run.
 
     The table is the first binary table of the FITS file; RE_s + i IM_s is the mean of e^{-i s psi}. Columns OFFSET_a_b
-    are the means of DTHETA^a DPHI^b of single samples, of degree a + b = 2, 3 and 4, as far as there are any. ``nside``, ``smax``
-    and ``frame`` are what the file must have; None: any, and all orders that follow each other from s = 1. Where a file
-    has no COORDSYS, ``frame`` is taken for it. InputError if the file cannot be read, is NESTED, lacks a column, has
-    another nside or frame, negative hits, non-finite numbers, or a modulus above 1.
+    are the means of DTHETA^a DPHI^b of single samples, of degree a + b = 2, 3 and 4, as far as there are any.
+
+    ``nside``, ``smax`` and ``frame`` are what the file must have; None: any, and all orders that follow each other from
+    s = 1. Where a file has no COORDSYS, ``frame`` is taken for it. InputError if the file cannot be read, is NESTED,
+    lacks a column, has another nside or frame, negative hits, non-finite numbers, or a modulus above 1.
     """
     where = f"moments file {str(path)!r}"
     if frame is not None:
@@ -105,7 +106,8 @@ def _from_fits(path: str | Path, where: str, smax: int | None, frame: str | None
             f"reaches {healpy.max_pixrad(nside):.3g}; give DTHETA and DPHI in radians, or their unit in TUNIT."
         )
     more = np.stack([columns[name] for name in powers]) if powers else None
-    return Moments(nside, stated, hits, w, *(columns[name] for name in offsets), offset_moments=more)
+    dtheta, dphi = (columns.get(name) for name in ("DTHETA", "DPHI"))
+    return Moments(nside, stated, hits, w, dtheta, dphi, more)
 
 
 def _named(order: int) -> dict[str, tuple[int, int]]:

@@ -340,13 +340,24 @@ class Moments:
         """Return the moments with those of the offsets up to a degree, and no higher ones; 0: none."""
         if order == 0:
             return replace(self, dtheta=None, dphi=None, offset_moments=None)
-        if self.offset_order <= order:
+        if self.offset_moments is None or self.offset_order <= order:
             return self
         return replace(self, offset_moments=self.offset_moments[: len(exponents(order))] if order > 1 else None)
 
+    def shrunk(self, factor: float) -> Self:
+        """Return the moments with all offsets multiplied by a factor."""
+        if self.dtheta is None or self.dphi is None:
+            return self
+        more = self.offset_moments
+        if more is not None:
+            more = np.array([factor ** (a + b) for a, b in exponents(self.offset_order)])[:, None] * more
+        return replace(self, dtheta=factor * self.dtheta, dphi=factor * self.dphi, offset_moments=more)
+
     def spin_of_offsets(self, degree: int, spin: int) -> NDArray:
         """Return <rho^(n - s) (dtheta + i dphi)^s> for degree n and spin s, shape (npix,); real at spin 0."""
-        if degree == 1:
+        if self.offset_order < degree or self.dtheta is None or self.dphi is None:
+            raise InputError(f"the moments have offsets up to order {self.offset_order}, below {degree}; stream them.")
+        if self.offset_moments is None or degree == 1:
             return spin_moment(np.stack([self.dtheta, self.dphi]), spin)
         first = len(exponents(degree - 1))
         return spin_moment(self.offset_moments[first : first + degree + 1], spin)

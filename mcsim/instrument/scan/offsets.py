@@ -22,9 +22,9 @@ def order_of(rows: int) -> int | None:
 
 
 def spin_moment(rows: NDArray[np.float64], spin: int) -> NDArray:
-    r"""Return <rho^(n - s) (dtheta + i dphi)^s>, rho^2 = dtheta^2 + dphi^2, from moments of degree n, shape (n + 1, npix).
+    """Return <rho^(n - s) (dtheta + i dphi)^s>, rho^2 = dtheta^2 + dphi^2, from the moments of degree n.
 
-    Row b is <dtheta^(n - b) dphi^b>; spin s <= n, n - s even. Complex; real at spin 0.
+    They are <dtheta^(n - b) dphi^b> in row b, shape (n + 1, npix); s <= n, n - s even. Complex; real at spin 0.
     """
     powers = np.ones(1, dtype=complex)
     for _ in range(spin):

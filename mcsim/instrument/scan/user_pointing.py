@@ -25,9 +25,7 @@ _ENOUGH_ROWS = 10
 """To tell a column of time from angles."""
 
 
-def sums_of_samples(
-    blocks: Iterable[Sequence[NDArray]], nside: int, smax: int, order: int = 1
-) -> NDArray[np.float64]:
+def sums_of_samples(blocks: Iterable[Sequence[NDArray]], nside: int, smax: int, order: int = 1) -> NDArray[np.float64]:
     """Return the sums per pixel (:func:`mcsim.instrument.scan.accumulate.pixel_sums`) of blocks of samples.
 
     A block is theta, phi, psi in radians, shape (n,) each, as of :func:`blocks_of_files` and :func:`checked_samples`;
