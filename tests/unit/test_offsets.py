@@ -10,12 +10,13 @@ from astropy.io import fits
 
 import mcsim
 from mcsim import config
+from mcsim.ensemble import plan
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import MapGrid, Moments, ScanModel, read_moments, write_moments_fits
 from mcsim.instrument.scan.offsets import exponents
 from mcsim.instrument.scan.pointing import pointing
 from mcsim.simulation import simulate
-from mcsim.simulation.offsets import Expansion, expansion, offset_maps
+from mcsim.simulation.offsets import Expansion, expansion, offset_maps, transforms
 from mcsim.simulation.survey import survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
@@ -242,3 +243,12 @@ def test_orders_that_cannot_be_are_refused(sky, beam, streamed) -> None:
         config.load(table(streamed, beam, sky, offset_order=2, pixel_window="none"))
     with refused("map.offset_order", "5"):
         config.load(table(streamed, beam, sky, offset_order=5))
+
+
+def test_a_dry_run_counts_the_transforms(sky, beam, streamed) -> None:
+    assert [transforms(order) for order in (2, 3, 4)] == [5, 9, 14]
+    lines = {
+        order: plan.cost(config.load(table(streamed, beam, sky, offset_order=order))).lines(1, 1) for order in (1, 4)
+    }
+    assert [line for line in lines[4] if "offsets" in line and "14 further transforms" in line]
+    assert not [line for line in lines[1] if "offsets" in line]
