@@ -126,7 +126,7 @@ def draw(found: dict[int, dict[str, float]], path: str) -> None:
     for nside, left in found.items():
         axes.semilogy(list(left), list(left.values()), "o-", label=f"nside {nside}")
     axes.axhline(0.3, color="grey", ls=":", label="0.3")
-    axes.set(ylabel="rms left / rms of the effect of the beam's shape")
+    axes.set(ylabel="rms left / rms of the effect\nof the beam's shape")
     axes.tick_params(axis="x", rotation=20)
     axes.legend()
     figure.savefig(path, dpi=110)
