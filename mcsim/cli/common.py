@@ -13,7 +13,7 @@ Config = Annotated[str, Argument(metavar="CONFIG", help="TOML file, or a package
 Workers = Annotated[int | None, Option(min=0, help="Processes; 0: this one; default: the model's.")]
 Including = Annotated[
     list[str] | None,
-    Option("--with", metavar="EFFECT", help="Propose an effect that is on request, or of a FILE.py; repeatable."),
+    Option("--with", metavar="EFFECT", help="Propose an effect on request, or of FILE.py; repeatable."),
 ]
 Simulations = Annotated[int | None, Option(min=50, help="For the data covariance; default: ten per element.")]
 Processes = Annotated[int | None, Option(min=1, help="Local processes; default: the configuration's.")]
