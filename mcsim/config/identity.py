@@ -46,7 +46,13 @@ def science(config: RunConfig, *others: str) -> dict[str, Any]:
     }
 
 
-_MAP = {"grid": "healpix", "nside": None, "mask_frame": None, "mask_apodisation_deg": 0.0, "split_by": "time"}
+_MAP = {
+    "grid": "healpix",
+    "nside": None,
+    "mask_frame": None,
+    "mask_apodisation_deg": 0.0,
+    "split_by": "time",
+}
 _OF_KIND: dict[str, dict[str, Any]] = {
     "moments": {"model": None, "line_of_sight": None},
     "map": {"angle_deg": 0.0},
@@ -63,13 +69,15 @@ def _leave_out_what_says_nothing(plain: dict[str, Any]) -> None:
     """
     _drop(plain, {"effect": [], "preparation": []})
     _drop(plain["map"], _MAP)
+    if plain["map"].get("offset_order") == 1:
+        del plain["map"]["offset_order"]
     _drop(plain["sky"], {"dipole_uk": None})
     if (plain["sky"]["dipole_lon_deg"], plain["sky"]["dipole_lat_deg"]) == (264.0, 48.24):
         del plain["sky"]["dipole_lon_deg"], plain["sky"]["dipole_lat_deg"]
     for channel in plain["channel"]:
         channel["scan"].pop("max_iterations", None)
         noises = (channel["noise"], *channel["split_noise"].values())
-        _drop(channel, {"beam_b": None, "split_noise": {}, "mask": None})
+        _drop(channel, {"beam_b": None, "split_noise": {}, "mask": None, "foregrounds": True})
         for table in (channel["scan"], channel["beam"], channel.get("beam_b", {"kind": "none"}), *noises):
             _drop(table, _OF_KIND.get(table["kind"], {}))
 

@@ -22,6 +22,7 @@ from mcsim.simulation.channels import (
     scan_model,
     site_b_of,
     site_of,
+    with_offsets,
 )
 from mcsim.simulation.noise import DrawnNoise, of_map
 from mcsim.simulation.pixel_means import mean_gain, mean_signal
@@ -249,14 +250,16 @@ def _channel(
     splits = run.map.splits or (None,)
     maps = []
     for index, split in enumerate(splits):
-        grid = MapGrid(run.map.resolution, run.map.frame, run.map.span(index))
+        offsets = 1 if run.map.offset_order is None else run.map.offset_order
+        grid = MapGrid(run.map.resolution, run.map.frame, run.map.span(index), max(offsets, 1))
         pairs = None
         if isinstance(spec.scan, config.ScanDifferencing):
             model = scan_model(spec, spec.scan, split)
             refuse_excess(spec.name, acting)
             pairs = mapmaking.prepare(model, spec.scan.pair, grid, nthreads=nthreads, progress=progress)
             smax = max(beam.mmax, orders, 1)
-            moments = pairs.moments(smax, nthreads, progress) if orders else _hits_alone(pairs, smax)
+            moments = pairs.moments(smax, nthreads, progress) if orders else pairs.hits_alone(smax)
+            moments = with_offsets(moments, offsets, spec)
         else:
             smax = max(beam.mmax, orders)
             if isinstance(spec.scan, config.ScanMoments):
@@ -267,11 +270,12 @@ def _channel(
                 moments = _moments(spec, split, grid, max(smax, 1), nthreads, progress)
                 if run.map.split_by == "rings" and isinstance(spec.scan, config.ScanHitAveraged):
                     moments = replace(moments, hits=moments.hits / len(splits))
+            moments = with_offsets(moments, offsets, spec)
             # An effect may give the beam higher orders than a file of moments has: they are left out.
             beam = beam.truncated(moments.smax) if acting and moments.smax < beam.mmax else beam
         m = _survey_map(run, spec, split, moments, pairs)
-        if pairs is not None and orders and isinstance(spec.scan, config.ScanDifferencing):
-            m = replace(m, noise_uk=mapmaking.level_uk(pairs, spec.scan.transmission_imbalance, _sigma0_uk(spec)))
+        if pairs is not None and orders:
+            m = replace(m, noise_uk=mapmaking.level_uk(pairs, _sigma0_uk(spec)))
         m = with_effects(m, acting, site)
         gain, signal = (mean(acting, site, grid.time_range) for mean in (mean_gain, mean_signal))
         maps.append(replace(m, gain=gain, signal_uk=signal))
@@ -352,8 +356,8 @@ def with_effects(m: SurveyMap, acting: tuple[Effect, ...], site: Site) -> Survey
         factor = effect.noise(site)
         if factor is not None and noise is not None:
             noise = noise * np.sqrt(np.clip(factor, 0.0, None))
-    if spread != 1.0 and moments.dtheta is not None and moments.dphi is not None:
-        moments = replace(moments, dtheta=spread * moments.dtheta, dphi=spread * moments.dphi)
+    if spread != 1.0:
+        moments = moments.shrunk(spread)
     return replace(m, moments=moments, noise_uk=noise)
 
 
@@ -374,7 +378,7 @@ def _moments(
             return scan.Moments.parallel_transport(grid.nside, spec.scan.psi0_deg, smax, grid.frame)
         case config.ScanPointing():
             path = config.channel_path(spec.scan.path, spec.name, split)
-            return scan.Moments.from_pointing_files([path], grid.nside, smax, grid.frame)
+            return scan.Moments.from_pointing_files([path], grid.nside, smax, grid.frame, grid.offset_order)
         case config.ScanHitAveraged():
             model = scan_model(spec, spec.scan, split)
             return scan.Moments.load(scan.cached_moments(model, grid, smax, nthreads, progress))
@@ -386,12 +390,6 @@ def _moments(
 def _moments_of_file(path: Path, nside: int, smax: int | None, frame: str) -> scan.Moments:
     """Read moments once for all surveys of a process that differ in effects alone."""
     return scan.read_moments(path, nside, smax, frame)
-
-
-def _hits_alone(pairs: mapmaking.DifferencingScan, smax: int) -> scan.Moments:
-    """Return the hits of a differencing scan, for weights and masks; its moments mean nothing and are NaN."""
-    unknown = np.broadcast_to(np.complex128(np.nan), (smax, pairs.npix))
-    return scan.Moments(pairs.grid.nside, pairs.grid.frame, pairs.hits_a + pairs.hits_b, unknown)
 
 
 def _survey_map(

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -70,7 +70,12 @@ class DifferencingScan:
         """Return the mean orientation moments of all samples of both sides, which stand at their pixels' centres."""
         model = self.model.with_lines_of_sight(self.side_a.name, self.side_b.name)
         found = Moments.load(cached_moments(model, self.grid, smax, nthreads, progress))
-        return replace(found, dtheta=None, dphi=None)
+        return found.up_to_offsets(0)
+
+    def hits_alone(self, smax: int) -> Moments:
+        """Return the hits of both sides, for weights and masks; the moments mean nothing and are NaN."""
+        unknown = np.broadcast_to(np.complex128(np.nan), (smax, self.npix))
+        return Moments(self.grid.nside, self.grid.frame, self.hits_a + self.hits_b, unknown)
 
 
 def prepare(

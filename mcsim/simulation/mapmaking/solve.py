@@ -115,16 +115,16 @@ def diagonal(scan: DifferencingScan, x: float) -> Map:
     return weight
 
 
-def level_uk(scan: DifferencingScan, x: float, sigma0_uk: float) -> Map | None:
+def level_uk(scan: DifferencingScan, sigma0_uk: float) -> Map | None:
     """Return about the noise of every pixel, uK, shape (npix,), 0 where unobserved; None: no noise.
 
-    It is that of known partners, sigma0 over the root of the weights. Harmonics of a low degree l have
+    It is that of known partners, sigma0 over the root of the hits. Harmonics of a low degree l have
     1 / (1 - P_l(cos of the angle between the sides)) times this variance, small scales nearly 1.
     """
     if sigma0_uk == 0.0:
         return None
-    weight = diagonal(scan, x)
-    return np.divide(sigma0_uk, np.sqrt(weight), out=np.zeros_like(weight), where=weight > 0.0)
+    hits = scan.hits_a + scan.hits_b
+    return np.divide(sigma0_uk, np.sqrt(hits), out=np.zeros_like(hits), where=hits > 0.0)
 
 
 def rhs_of_map(scan: DifferencingScan, map_uk: Map, x: float = 0.0, nthreads: int = 1) -> Map:
