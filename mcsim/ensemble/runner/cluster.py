@@ -23,8 +23,10 @@ from mcsim.support.progress import Journal
 # Ctrl-C reaches all processes of a terminal. The driver ends the run; workers that lose the driver stay silent.
 _WORKER_SETUP = """
 import logging, signal
+from mcsim.support.loading import loaded
 signal.signal(signal.SIGINT, signal.SIG_IGN)
 logging.getLogger("distributed").setLevel(logging.CRITICAL)
+loaded("mcsim.ensemble.tasks")
 """
 
 Workers = int | str | Client
