@@ -204,6 +204,8 @@ class DiagnosisResult:
         True if sets describe the data, but are less probable than all else together; their posterior probability.
     contradicted
         Sets that describe the data vector and are not named, because parts of the data do not bear them out.
+    untested
+        Elements that are not tested, in words: they follow the square of a nuisance as wide as its prior.
     """
 
     case: str
@@ -241,6 +243,7 @@ class DiagnosisResult:
     probability: float = 1.0
     agreement: Agreement | None = None
     contradicted: tuple[EffectSet, ...] = ()
+    untested: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> dict[str, Any]:
@@ -311,6 +314,7 @@ class DiagnosisResult:
                 if one.detectable is not None
             ],
             "notes": list(self.notes),
+            **({"untested": list(self.untested)} if self.untested else {}),
             **({"nuisances": [_nuisance_json(one) for one in self.nuisances]} if self.nuisances else {}),
             **({"warnings": list(self.warnings)} if self.warnings else {}),
             **({"controls": self.controls.to_json()} if self.controls is not None else {}),
