@@ -163,7 +163,9 @@ def diagnose(
     controls: Annotated[int, Option(min=0, help="Perfect data sets, drawn at higher fidelity and diagnosed too.")] = 0,
     workers: Processes = None,
     scheduler: Scheduler = None,
-    dry_run: Annotated[bool, Option("--dry-run", help="Say simulations, memory and time; simulate none.")] = False,
+    dry_run: Annotated[
+        bool, Option("--dry-run", help="Read DATA; say simulations, memory and time; simulate none.")
+    ] = False,
 ) -> None:
     """Test maps against a model, and find the effect that the model lacks: where, how large, and if adding it helps."""
     from mcsim import config
@@ -180,7 +182,7 @@ def diagnose(
     if workers is not None:
         run = replace(run, compute=replace(run.compute, workers=workers))
     if dry_run:
-        print(describe(run, settings))
+        print(describe(run, settings, data))
         return
     if output is None:
         raise InputError(

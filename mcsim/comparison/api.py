@@ -55,8 +55,9 @@ def compare(
     ----------
     a, b
         Two sides: folders with ``{channel}.fits`` or ``{channel}_{split}.fits``, HEALPix, uK or the unit of their
-        headers, without noise or with the same noise; configurations, of which realization 0 is simulated; or arrays,
-        shape (npix,) each, in the order of the model's maps.
+        headers, without noise or with the same noise, or with a subfolder of these for each realization, of which the
+        first is compared; configurations, of which realization 0 is simulated; or arrays, shape (npix,) each, in the
+        order of the model's maps.
     model
         Run that describes side A: beams, scans, nside, lmax; by default ``model.toml`` in the folders or beside them.
         Without one, only differences of the maps themselves are tried: units, calibration, monopole, dipole, order of

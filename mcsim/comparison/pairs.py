@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.comparison.scene import Maps, PointingFiles, Scene, scene_of, sky_in
 from mcsim.ensemble.external import named_source, source_of
-from mcsim.ensemble.maps import file_names
+from mcsim.ensemble.maps import file_names, first_realization
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.channels import described, known_offsets
@@ -282,6 +282,7 @@ def _closer(
 
 
 def _folder(folder: Path, run: config.RunConfig | None) -> dict[str, NDArray[np.float64]]:
+    folder = first_realization(folder)
     names = {path.stem: path for path in sorted(folder.glob("*.fits"))}
     frequencies: dict[str, float | None] = {}
     if run is not None:

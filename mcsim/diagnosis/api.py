@@ -25,6 +25,7 @@ from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.observed_maps import ObservedMaps, checked, read_maps
 from mcsim.diagnosis.result import Agreement, DiagnosisResult
 from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.ensemble.external_maps import Source
 from mcsim.ensemble.plan import cost
 from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError
@@ -95,18 +96,8 @@ def diagnose(
     wanted, (settings, library) = settings.controls, _with_library(settings)
     if output is not None:
         folders.writable(Path(output))
-    threads = os.cpu_count() or 1
-    task: Callable[[Job], NDArray[np.float64]] = data_vectors
-    table = read_spectra(data, run) if isinstance(data, str | Path) and Path(data).is_file() else None
-    controls.check(wanted, of_maps=table is None, external=source is not None)
-    if table is not None:
-        if source is not None:
-            raise InputError(f"{data} is a table, but {source.label} makes maps; give maps, or a run of mcsim.")
-        run, task = measured_spectra.estimator_for(run, table), table
-        analysis = measured_spectra.analysis_of_spectra(run, table, settings.without, threads, settings, library)
-    else:
-        analysis = analysis_of(run, settings.without, threads, settings, library, source)
-    power.check(analysis.model.survey)
+    run, analysis, table = _analysed(run, source, data, settings, library, wanted)
+    task: Callable[[Job], NDArray[np.float64]] = data_vectors if table is None else table
     maps: Sequence[NDArray[np.float64]] = ()
     if table is None:
         maps = read_maps(analysis.model, data) if isinstance(data, str | Path) else checked(analysis.model, data)
@@ -144,18 +135,27 @@ def _with_library(settings: DiagnosisSettings) -> tuple[DiagnosisSettings, syste
     known = systematics.catalogue() if settings.library is None else systematics.checked(settings.library)
     asked = tuple(settings.including) if settings.library is None else (*settings.including, *known)
     kinds = {name: systematics.get(name, known) for name in (*settings.without, *asked)}
+    if both := {kinds[name].name for name in settings.without} & {kinds[name].name for name in settings.including}:
+        raise InputError(f"{min(both)} is asked for and left out (--with and --without); choose one of them.")
     known = {**known, **{kinds[name].name: kinds[name] for name in asked}}
     including = tuple(sorted({kinds[name].name for name in asked if not kinds[name].proposed}))
     return replace(settings, without=tuple(settings.without), including=including, library=None, controls=0), known
 
 
-def describe(model: str | Path | config.RunConfig | ExternalModel, settings: DiagnosisSettings) -> str:
-    """Return a text on the cost of a diagnosis of maps: simulations, memory, time, and that of preparing the maps."""
+def describe(
+    model: str | Path | config.RunConfig | ExternalModel,
+    settings: DiagnosisSettings,
+    data: str | Path | None = None,
+) -> str:
+    """Return a text on the cost of a diagnosis: simulations, memory, time, and that of preparing the maps.
+
+    Data that are named are read, and refused as :func:`diagnose` refuses them.
+    """
     run, source = loaded(model)
     count, (settings, library) = settings.controls, _with_library(settings)
-    controls.check(count, of_maps=True, external=source is not None)
-    analysis = analysis_of(run, settings.without, os.cpu_count() or 1, settings, library, source)
-    power.check(analysis.model.survey)
+    run, analysis, table = _analysed(run, source, data, settings, library, count)
+    if data is not None and table is None:
+        read_maps(analysis.model, data)
     jobs, size = campaign.plan(analysis, settings.simulations).values(), len(analysis.elements)
     number = sum(job.count for job in jobs if job.source is None)
     head = f"{run.name}: at most {number} simulations before data, for a data vector of {size}"
@@ -170,6 +170,32 @@ def describe(model: str | Path | config.RunConfig | ExternalModel, settings: Dia
     if count:
         lines += controls.describe(analysis, count, run.compute.workers)
     return "\n".join(lines)
+
+
+def _analysed(
+    run: config.RunConfig,
+    source: Source | None,
+    data: str | Path | Sequence[NDArray[np.float64]] | None,
+    settings: DiagnosisSettings,
+    library: systematics.Library,
+    wanted: int,
+) -> tuple[config.RunConfig, Analysis, measured_spectra.Spectra | None]:
+    """Return the run, with the statistics of a table that the data may be, the analysis of the data, and the table.
+
+    InputError is raised for ``wanted`` controls, a simulator or a sky that do not suit the data.
+    """
+    threads = os.cpu_count() or 1
+    table = read_spectra(data, run) if isinstance(data, str | Path) and Path(data).is_file() else None
+    controls.check(wanted, of_maps=table is None, external=source is not None)
+    if table is not None:
+        if source is not None:
+            raise InputError(f"{data} is a table, but {source.label} makes maps; give maps, or a run of mcsim.")
+        run = measured_spectra.estimator_for(run, table)
+        analysis = measured_spectra.analysis_of_spectra(run, table, settings.without, threads, settings, library)
+    else:
+        analysis = analysis_of(run, settings.without, threads, settings, library, source)
+    power.check(analysis.model.survey)
+    return run, analysis, table
 
 
 def _computing(quiet: bool = True, workers: Workers | None = None) -> tuple[bool, Workers | None]:

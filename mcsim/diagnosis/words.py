@@ -226,11 +226,21 @@ def summary(result: DiagnosisResult, folder: Path) -> list[str]:
         rows.append(("where", f"{first.element.words}; z = {first.z:.1f}, {p_equals(first.p)}"))
     rows += [("nuisance", f"{one.label}: {one.words}{pulled(one)}") for one in result.nuisances]
     rows += [("note", note) for note in result.notes]
+    if result.untested:
+        rows.append(("note", f"{untested(result)} The report lists them."))
     rows += [("missing", line) for line in unlisted(result)]
     files = ["verdict.json", "report.html", "diagnosis.zarr"]
     files += [f"{one.name}.py" for one in result.unlisted or () if one.file is not None]
     rows.append(("written", f"{folder}: {', '.join(files)}"))
     return [f"{name:<14}{text}" for name, text in rows]
+
+
+def untested(result: DiagnosisResult) -> str:
+    """Return a sentence on the number of elements that are not tested."""
+    return (
+        f"{len(result.untested)} of {len(result.elements)} elements are not tested, because they follow the square of "
+        "a nuisance as wide as its prior."
+    )
 
 
 def pulled(one: NuisanceResult) -> str:
