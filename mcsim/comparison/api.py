@@ -31,6 +31,9 @@ ROUNDING = 1e-6
 INTERPOLATION = 1e-3
 """The same for the interpolation of a sky between pixels or grid points."""
 
+CLEARLY = 0.1
+"""Share of what a named set leaves that one of exchanged sides must leave at most to be named in its place."""
+
 DOUBTFUL = 0.01
 """Share that a set that is named may leave, beyond which differences of the last stage are tried all the same."""
 
@@ -122,10 +125,14 @@ def compare(
 def _channel(pair: ChannelPair, sides: Comparison, accuracy: float) -> ChannelResult:
     others = [other for other in sides.pairs if other.name != pair.name]
     found = _explained(pair, others, sides, accuracy)
-    if found.verdict != "unknown" or pair.scene is None:
+    if pair.scene is None or found.verdict == "identical" or (found.verdict != "unknown" and found.left < DOUBTFUL):
         return found
     turned = _explained(pair.exchanged(), [other.exchanged() for other in others], sides, accuracy, True)
-    return found if turned.verdict in ("unknown", "identical") else turned
+    if turned.verdict in ("unknown", "identical") or (
+        found.verdict != "unknown" and turned.left > CLEARLY * found.left
+    ):
+        return found
+    return turned
 
 
 def _explained(
@@ -139,8 +146,11 @@ def _explained(
     problem = Problem(pair, others, accuracy * sky, library(sides.frame))
     sets = problem.best()
     if sides.run is not None and not (sets and problem.complete(sets[0])):
-        problem = replace(problem, library=(*problem.library, *effects_of(pair, sides.run)))
+        # An effect of side A is one of side B with the other sign, and was found before sides are exchanged.
+        problem = replace(problem, library=(*problem.library, *(() if exchanged else effects_of(pair, sides.run))))
         sets = problem.best(1)
+    if exchanged and not (sets and problem.suffices(sets[0])):
+        return _result(pair, sides, "unknown", exchanged)
     if not sets or not problem.suffices(sets[0]) or (sets[0].left > DOUBTFUL and not problem.complete(sets[0])):
         sets = sorted([*sets, *problem.best(2)], key=lambda one: one.left)
     swapped = bool(sets) and any(difference.exchanges for difference, _ in sets[0].members)

@@ -7,7 +7,8 @@ import healpy
 import numpy as np
 
 from mcsim.comparison.differences import Difference, State, Vector
-from mcsim.comparison.scene import Maps
+from mcsim.comparison.pairs import ChannelPair
+from mcsim.comparison.scene import Maps, Scene
 from mcsim.sphere import header
 
 
@@ -20,13 +21,23 @@ class Calibration(Difference):
     proportional = True
 
     def starts(self, state: State) -> list[Vector]:
-        return [state.fit([state.maps])]
+        """Return the fraction, and 0 for maps with their noise or 1 for the sky alone, where they have noise."""
+        found = [np.array([*state.fit([state.maps]), 0.0])]
+        if state.scene is not None and state.pair.doubt is not None:
+            found.append(np.array([*state.fit([state.scene.maps()]), 1.0]))
+        return found
+
+    def axes(self, value: Vector) -> Vector:
+        return np.eye(2)[:1]
+
+    def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
+        return replace(scene, sky=(1.0 + value[0]) * scene.sky) if value[1] else scene
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
-        return (1.0 + value[0]) * maps
+        return maps if value[1] else (1.0 + value[0]) * maps
 
     def inverse(self, value: Vector) -> Vector:
-        return -value / (1.0 + value)
+        return np.array([-value[0] / (1.0 + value[0]), value[1]])
 
 
 class Unit(Difference):

@@ -242,6 +242,7 @@ class Prediction:
 
     def fitted(self, found: Set) -> Set:
         """Return a set with all values that may be moved fitted together, by Gauss-Newton steps."""
+        found = replace(found, left=self.left(found.members, found.correction))
         for _ in range(STEPS):
             ways, tangents = self.tangents(found)
             if not ways:
@@ -269,10 +270,7 @@ class Prediction:
         if self._pointing is None or self.pair.scene is None:
             return found
         found = self._measured(found)
-        if (
-            not found.fitted
-            or found.left * self.total <= (SMALLEST * SMALLEST * self.floor) ** 2 * self.pair.seen.sum()
-        ):
+        if not found.fitted or found.left < NOTHING:
             return found
         moved = self.fitted(found)
         if moved.left < WORTHWHILE * found.left:

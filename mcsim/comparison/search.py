@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from mcsim.comparison.differences import Difference, State
-from mcsim.comparison.prediction import Prediction, Set, Vector
+from mcsim.comparison.prediction import UNSURE, Prediction, Set, Vector
 
 FURTHER = 0.7
 """Share of what is left that a further difference must explain to be added."""
@@ -20,6 +20,15 @@ FURTHER_BEYOND = 0.85
 
 SLIGHT = 0.1
 """Share that a difference must explain to be fitted further."""
+
+LARGE = 0.3
+"""Share that a difference must explain by itself to have others tried beside it."""
+
+PROMISING = 0.6
+"""The same of two together: share that they may leave, each times a factor, of what the best one leaves."""
+
+NEARLY = 0.1
+"""Share that a set may leave at most to have its values fitted beside one more without a value."""
 
 LARGEST = 3
 """Differences that act together."""
@@ -102,11 +111,15 @@ class Problem(Prediction):
 
     def _bases(self, found: Sequence[Set]) -> list[Set]:
         """Return the sets from which larger ones are built: the best, those that do best in pairs, and exchanges."""
-        bases = [one for one in found[:KEPT] if one.explains > SLIGHT]
+        bases = [one for one in found[:KEPT] if one.explains > LARGE]
         if len(found[0].members) > 1:
             return bases
         lefts = self._left_by_two(found)
-        pairs = sorted((lefts[i, j], i) for i, j in permutations(range(len(found)), 2))
+        pairs = sorted(
+            (lefts[i, j], i)
+            for i, j in permutations(range(len(found)), 2)
+            if lefts[i, j] < PROMISING * min(found[0].left, 1.0)
+        )
         for _, first in pairs:
             if len(bases) == 2 * KEPT:
                 break
@@ -115,20 +128,20 @@ class Problem(Prediction):
         return bases + [one for one in found if one not in bases and one.members[0][0].exchanges]
 
     def _left_by_two(self, found: Sequence[Set]) -> NDArray[np.float64]:
-        """Return the squares that the responses of every two sets leave together, factors free where values are."""
+        """Return the share that the responses of every two sets leave together, factors free where values are."""
         seen = np.flatnonzero(self.pair.seen)
         some = seen[:: max(1, seen.size // SCREENED)]
         rest = (self.pair.b - self.pair.a).ravel()[some]
         made = np.stack([(self.of(one).maps - self.pair.a).ravel()[some] for one in found])
         products, shares, squares = made @ made.T, made @ rest, float(rest @ rest)
         free = np.array([one.fitted > 0 for one in found])
-        left = np.full(products.shape, squares)
+        left = np.ones(products.shape)
         for i, j in combinations(range(len(found)), 2):
             fixed, moved = ([k for k in (i, j) if free[k] == one] for one in (False, True))
             own = shares[moved] - products[np.ix_(moved, fixed)].sum(axis=1)
             kept = squares - 2.0 * shares[fixed].sum() + products[np.ix_(fixed, fixed)].sum()
             factors = np.linalg.lstsq(products[np.ix_(moved, moved)], own, rcond=1e-12)[0] if moved else own
-            left[i, j] = left[j, i] = kept - own @ factors
+            left[i, j] = left[j, i] = (kept - own @ factors) / squares
         return left
 
     def _extended(self, base: Set, library: Sequence[Difference]) -> list[Set]:
@@ -168,7 +181,11 @@ class Problem(Prediction):
             left = float(np.sum(rest(value) ** 2)) / self.total
             return Set((*base.members, (difference, value)), left, base.correction)
 
-        best = min(map(set_of, difference.starts(state)), key=lambda one: one.left, default=None)
+        sets = [set_of(value) for value in difference.starts(state)]
+        for one in sets if base.fitted else ():
+            if one.fitted == base.fitted and one.left < NEARLY:
+                sets = [*sets, self.fitted(one)]
+        best = min(sets, key=lambda one: one.left, default=None)
         if best is None or not difference.smooth or best.left > (1.0 - SLIGHT) * base.left:
             return best
         first = best.members[-1][1]
@@ -208,7 +225,7 @@ class Problem(Prediction):
 
     def preferred(self, sets: Sequence[Set]) -> list[Set]:
         """Return sets with the best first; of those that are as good, the one with the fewest fitted values."""
-        limit = EQUAL * sets[0].left + PRECISION
+        limit = EQUAL * sets[0].left + UNSURE * self.hidden(sets[0]) + PRECISION
         equal = [one for one in sets if one.left <= limit and self.suffices(one)]
         first = min(equal, key=lambda one: (len(one.members), one.fitted), default=sets[0])
         return [first, *(one for one in sets if one is not first)]
