@@ -31,9 +31,6 @@ SMALLEST = 0.1
 TOLERATED = 1.5
 """A set that is named may leave so many times what noise is expected to hide from its prediction."""
 
-HIDDEN = 1.3
-"""A set that leaves more than so many times that may have something in it that can be found."""
-
 UNSURE = 0.25
 """Share of what noise is expected to hide by which that is uncertain."""
 
@@ -208,7 +205,7 @@ class Prediction:
         """Return True if what a set leaves is too little to look for anything in it."""
         linear = any(difference.linear for difference, _ in found.members)
         enough = ENOUGH if linear else self.enough
-        return found.left < enough or found.left < enough + HIDDEN * self.hidden(found)
+        return found.left < enough
 
     @property
     def _pointing(self) -> Pointing | PointingFiles | None:

@@ -18,6 +18,12 @@ FURTHER = 0.7
 FURTHER_BEYOND = 0.85
 """The same where what there is explains enough to be named."""
 
+VISIBLE = 0.1
+"""Share of what noise hides that a further difference must explain beside it to be added."""
+
+CHANCE = 100.0
+"""The same for each of its values, over the share of one pixel."""
+
 SLIGHT = 0.1
 """Share that a difference must explain to be fitted further."""
 
@@ -98,7 +104,13 @@ class Problem(Prediction):
         return chosen
 
     def adds(self, larger: Set, found: Set) -> bool:
-        """Return True if a larger set explains so much of what a set leaves that it is worth its further members."""
+        """Return True if a larger set explains so much of what a set leaves that it is worth its further members.
+
+        What noise hides is left by both, but no template is like it: a part that it would not make by chance will do.
+        """
+        hidden, values = self.hidden(larger), max(larger.fitted - found.fitted, 1)
+        if found.left - larger.left > hidden * max(VISIBLE, CHANCE * values / healpy.nside2npix(self.pair.nside)) > 0.0:
+            return True
         share = FURTHER_BEYOND if self.suffices(found) else FURTHER
         return self.excess(larger) < (1.0 - share) * self.excess(found)
 
