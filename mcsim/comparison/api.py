@@ -16,9 +16,9 @@ from mcsim.comparison.catalogue import library
 from mcsim.comparison.effects import effects_of
 from mcsim.comparison.looks import look
 from mcsim.comparison.pairs import ChannelPair, Comparison, given, read
-from mcsim.comparison.prediction import Set
+from mcsim.comparison.prediction import PRECISION, Set
 from mcsim.comparison.result import ChannelResult, ComparisonResult, DifferenceResult, Verdict
-from mcsim.comparison.search import INTERPOLATING, PRECISION, Problem
+from mcsim.comparison.search import INTERPOLATING, Problem
 from mcsim.comparison.shown_sky import with_shown_sky
 from mcsim.errors import InputError
 from mcsim.simulation.noise import of_map

@@ -37,6 +37,9 @@ UNSURE = 0.25
 MOST_HIDDEN = 0.5
 """Share of the variance that noise may hide at most from the prediction of a set that is named."""
 
+PRECISION = 1e-6
+"""Share of the variance that no comparison resolves: single precision of maps with a dipole."""
+
 STEP = 1e-3
 """Change of a value over which responses are linear, over the value or its natural size."""
 
@@ -124,7 +127,7 @@ class Prediction:
     def enough(self) -> float:
         """Share of the variance below which nothing further is looked for."""
         smallest = (SMALLEST * self.floor) ** 2 * float(self.pair.seen.sum()) / self.total
-        return min(ENOUGH, smallest) if smallest > 0.0 else ENOUGH
+        return min(ENOUGH, max(smallest, PRECISION)) if smallest > 0.0 else ENOUGH
 
     def _squares(self, maps: Maps) -> float:
         return float(np.sum((self.pair.b - maps)[self.pair.seen] ** 2))

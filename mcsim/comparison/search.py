@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from mcsim.comparison.differences import Difference, State
-from mcsim.comparison.prediction import UNSURE, Prediction, Set, Vector
+from mcsim.comparison.prediction import PRECISION, UNSURE, Prediction, Set, Vector
 
 FURTHER = 0.7
 """Share of what is left that a further difference must explain to be added."""
@@ -62,9 +62,6 @@ EQUAL = 1.1
 
 INTERPOLATING = frozenset({"beam_width", "interpolation"})
 """What the interpolation of a sky does too: not named below the accuracy at which maps are called identical."""
-
-PRECISION = 1e-6
-"""Share of the variance that no comparison resolves: single precision of maps with a dipole."""
 
 
 @dataclass(frozen=True, eq=False)
