@@ -37,6 +37,9 @@ CLEARLY = 0.1
 DOUBTFUL = 0.01
 """Share that a set that is named may leave, beyond which differences of the last stage are tried all the same."""
 
+DOUBTFUL_TOGETHER = 1e-4
+"""The same of several differences, beyond which the model may rather describe side B."""
+
 
 def compare(
     a: str | Path | Sequence[NDArray[np.float64]],
@@ -125,12 +128,13 @@ def compare(
 def _channel(pair: ChannelPair, sides: Comparison, accuracy: float) -> ChannelResult:
     others = [other for other in sides.pairs if other.name != pair.name]
     found = _explained(pair, others, sides, accuracy)
-    if pair.scene is None or found.verdict == "identical" or (found.verdict != "unknown" and found.left < DOUBTFUL):
+    accepted = DOUBTFUL if len(found.differences) == 1 else DOUBTFUL_TOGETHER
+    named = found.verdict != "unknown"
+    if pair.scene is None or found.verdict == "identical" or (named and found.left < accepted):
         return found
     turned = _explained(pair.exchanged(), [other.exchanged() for other in others], sides, accuracy, True)
-    if turned.verdict in ("unknown", "identical") or (
-        found.verdict != "unknown" and turned.left > CLEARLY * found.left
-    ):
+    worse = named and turned.left > CLEARLY * found.left
+    if turned.verdict in ("unknown", "identical") or worse:
         return found
     return turned
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from mcsim.comparison.differences import Difference, State
-from mcsim.comparison.prediction import PRECISION, UNSURE, Prediction, Set, Vector
+from mcsim.comparison.prediction import PRECISION, TOLERATED, UNSURE, Prediction, Set, Vector
 
 FURTHER = 0.7
 """Share of what is left that a further difference must explain to be added."""
@@ -106,7 +106,8 @@ class Problem(Prediction):
         What noise hides is left by both, but no template is like it: a part that it would not make by chance will do.
         """
         hidden, values = self.hidden(larger), max(larger.fitted - found.fitted, 1)
-        if found.left - larger.left > hidden * max(VISIBLE, CHANCE * values / healpy.nside2npix(self.pair.nside)) > 0.0:
+        chance = hidden * max(VISIBLE, CHANCE * values / healpy.nside2npix(self.pair.nside))
+        if larger.left < self.enough + TOLERATED * hidden and found.left - larger.left > chance > 0.0:
             return True
         share = FURTHER_BEYOND if self.suffices(found) else FURTHER
         return self.excess(larger) < (1.0 - share) * self.excess(found)
