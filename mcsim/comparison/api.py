@@ -37,7 +37,7 @@ CLEARLY = 0.1
 DOUBTFUL = 0.01
 """Share that a set that is named may leave, beyond which differences of the last stage are tried all the same."""
 
-DOUBTFUL_TOGETHER = 1e-4
+DOUBTFUL_TOGETHER = 1e-5
 """The same of several differences, beyond which the model may rather describe side B."""
 
 
