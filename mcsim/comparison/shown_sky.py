@@ -44,11 +44,11 @@ def _made(pair: ChannelPair, scene: Scene) -> Maps:
 
 def _sharper(pair: ChannelPair) -> ChannelPair:
     scene = pair.scene
-    if scene is None or pair.pointing() is None:
+    if scene is None or (pair.pointing() is None and scene.offset_order < 2):
         return pair
     for _ in range(ROUNDS):
         missing = np.where(pair.seen, pair.a - _made(pair, scene), 0.0)
-        empty = replace(scene, sky=np.zeros_like(scene.sky))
+        empty = replace(scene.up_to_offsets(1), sky=np.zeros_like(scene.sky))
         scene = replace(scene, sky=scene.sky + sky_in(missing, pair.seen, empty, 1e-2))
     return replace(pair, scene=scene)
 
