@@ -249,7 +249,8 @@ class _Selection:
     def accepted(self) -> list[_Accepted]:
         """Return minimal sufficient sets that are possible and whose evidence is not below the best by the cut.
 
-        All sets of up to EXHAUSTIVE members are tried; larger ones grow from those, until sets of two sizes are there.
+        All sets of up to EXHAUSTIVE members are tried; larger ones grow from those. The search ends one size above the
+        first accepted set.
         """
         accepted: list[_Accepted] = []
         searches = list(self._searches())
@@ -263,7 +264,8 @@ class _Selection:
                 # With thousands of sets to choose from, some triple comes close to anything; so does a wide scatter.
                 doubted = size > 1 or bool(search.scattered)
                 least = max(best - cut, unknown if doubted else -np.inf)
-                tried = search.rows(size) if size <= EXHAUSTIVE else search.grown(subsets[place])
+                every = size - len(search.scattered) <= EXHAUSTIVE
+                tried = search.rows(size) if every else search.grown(subsets[place])
                 subsets[place] = [_without(rows, [found.members for found in accepted]) for rows in tried]
                 for rows in subsets[place]:
                     fresh += self._possible(_sufficient(search, rows, least, doubted))

@@ -23,7 +23,7 @@ RIDGE = 1e-9
 CHUNK = 1000
 
 EXHAUSTIVE = 2
-"""Largest size of which all subsets are tried."""
+"""Largest number of members, beside those whose scatter is known, of which all subsets are tried."""
 
 KEPT = 300
 """Larger subsets of one size that are tried, the most probable ones."""
@@ -92,10 +92,16 @@ class Subsets:
         """Return the rank of each candidate among those to which the data respond, the ones of few columns first."""
         return np.argsort(np.argsort(self.groups.sizes, kind="stable"), kind="stable")
 
+    @cached_property
+    def _free(self) -> Rows:
+        """Return the candidates whose scatter is not known."""
+        return np.flatnonzero([candidate.scatter is None for candidate in self.candidates])
+
     def rows(self, size: int) -> Iterator[Rows]:
         """Yield all subsets without exclusive members, shape (M, size), all of the same ranks."""
-        rows = np.array(list(combinations(range(len(self.candidates)), size)), dtype=np.int64).reshape(-1, size)
-        return self._alike(rows)
+        more = size - len(self.scattered)
+        found = [(*self.scattered, *rest) for rest in combinations(self._free.tolist(), more)] if more >= 0 else []
+        return self._alike(np.array(found, dtype=np.int64).reshape(-1, size))
 
     def grown(self, subsets: Iterable[Rows]) -> Iterator[Rows]:
         """Yield the most probable subsets of one more member, which is significant beside the others.
@@ -104,8 +110,8 @@ class Subsets:
         """
         more = []
         for rows in (part for group in subsets for part in chunks(group)):
-            row, new = np.nonzero(self.beside(rows) <= self.settings.further_level)
-            more.append(np.sort(np.column_stack([rows[row], new]), axis=1))
+            row, new = np.nonzero(self.beside(rows)[:, self._free] <= self.settings.further_level)
+            more.append(np.sort(np.column_stack([rows[row], self._free[new]]), axis=1))
         groups = list(self._alike(np.unique(np.concatenate(more), axis=0))) if more else []
         evidence = [np.concatenate([self.solve(part).evidence for part in chunks(group)]) for group in groups]
         every = np.concatenate([np.empty(0), *evidence])
@@ -119,9 +125,6 @@ class Subsets:
         kept = np.all(self.groups.sizes[rows] > 0, axis=1)
         for i, j in combinations(range(rows.shape[1]), 2):
             kept &= self._identity[rows[:, i]] != self._identity[rows[:, j]]
-        for member, candidate in enumerate(self.candidates):
-            if candidate.scatter is not None:
-                kept &= np.any(rows == member, axis=1) == (member in self.scattered)
         rows = np.take_along_axis(rows[kept], np.argsort(self._order[rows[kept]], axis=1), axis=1)
         pattern, which = np.unique(self.groups.sizes[rows], axis=0, return_inverse=True)
         for index, ranks in enumerate(pattern):
