@@ -58,6 +58,11 @@ def learned(model):
     return run, prepared(run, analysis_of(run), ask)
 
 
+def worded(found):
+    """Return a share and its 95 % interval in words."""
+    return f"{found.name}: {found.value:.3f} [{found.low:.3f}, {found.high:.3f}] of {found.count}"
+
+
 def patterns(draw):
     """Return patterns on the sky of rms 1, shape (npix,), by name."""
     n = np.stack(healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2)))
@@ -213,8 +218,8 @@ def draws(number):
                     ],
                     flush=True,
                 )
-    print("true names refused:", share("refused", refused))
-    print("single ones that no two parts measure:", share("unmeasured", unmeasured))
+    print(worded(share("true names refused", refused)))
+    print(worded(share("single ones that no two parts measure", unmeasured)))
     for kind, rows in by_test.items():
         low, absent = np.mean(rows, axis=0)
         print(f"{kind}: {len(rows)} tests, p <= 0.05 in {low:.3f}, odds of absence in {absent:.4f}")
@@ -244,7 +249,7 @@ def pairs(number):
         row = [case, strengths, verdict["verdict"], [sorted(map(str, one)) for one in answers], verdict["notes"]]
         print(json.dumps(row, ensure_ascii=False), flush=True)
     for place, what in enumerate(("truth in the set", "truth first", "unknown", "a wrong name alone")):
-        print("   ", share(what, [row[place] for row in rows]))
+        print("   ", worded(share(what, [row[place] for row in rows])))
 
 
 def several(number):
@@ -278,7 +283,7 @@ def several(number):
             kept = [row for row in rows if row[0] <= top]
             print(f"{size} effects, {which}: {len(kept)} draws")
             for place, what in enumerate(("truth in the set", "truth first", "unknown", "a wrong name alone"), 1):
-                print("   ", share(what, [row[place] for row in kept]))
+                print("   ", worded(share(what, [row[place] for row in kept])))
 
 
 if __name__ == "__main__":
