@@ -19,6 +19,7 @@ from mcsim.diagnosis.selection import Contrast, Verdict
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Element
 from mcsim.errors import InputError
+from mcsim.reconstruction.result import Reconstructed
 from mcsim.stats.excess import HeldOut, Measured, excess_of
 from mcsim.stats.look_elsewhere import GlobalTest
 from mcsim.support.arrays import Vector
@@ -204,6 +205,9 @@ class DiagnosisResult:
         True if sets describe the data, but are less probable than all else together; their posterior probability.
     contradicted
         Sets that describe the data vector and are not named, because parts of the data do not bear them out.
+    unlisted, unlisted_held_out
+        After an unknown gap, what is missing, the most evident structure first; and the reduction of the excess on
+        held-out data by all of it. None: not looked for, not measured.
     """
 
     case: str
@@ -241,6 +245,8 @@ class DiagnosisResult:
     probability: float = 1.0
     agreement: Agreement | None = None
     contradicted: tuple[EffectSet, ...] = ()
+    unlisted: tuple[Reconstructed, ...] | None = None
+    unlisted_held_out: HeldOut | None = None
 
     @property
     def verdict(self) -> dict[str, Any]:
@@ -311,6 +317,8 @@ class DiagnosisResult:
                 if one.detectable is not None
             ],
             "notes": list(self.notes),
+            **({} if self.unlisted is None else {"unlisted": [one.to_json() for one in self.unlisted]}),
+            **({} if self.unlisted_held_out is None else {"unlisted_shrink": _held_out_json(self.unlisted_held_out)}),
             **({"nuisances": [_nuisance_json(one) for one in self.nuisances]} if self.nuisances else {}),
             **({"warnings": list(self.warnings)} if self.warnings else {}),
             **({"controls": self.controls.to_json()} if self.controls is not None else {}),
@@ -346,10 +354,16 @@ class DiagnosisResult:
         )
 
     def save(self, folder: str | Path) -> None:
-        """Write ``verdict.json`` and ``diagnosis.zarr`` into a folder, made where it does not exist."""
+        """Write ``verdict.json`` and ``diagnosis.zarr`` into a folder, made where it does not exist.
+
+        Reconstructed effects are written there too, a Python file each.
+        """
         target = Path(folder)
         target.mkdir(parents=True, exist_ok=True)
         (target / "verdict.json").write_text(json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n")
+        for one in self.unlisted or ():
+            if one.file is not None:
+                (target / f"{one.name}.py").write_text(one.file, encoding="utf-8")
         self.to_dataset().to_zarr(target / STORE, mode="w", consolidated=False)
 
     @classmethod
