@@ -80,7 +80,7 @@ class EffectsLibrary:
         search = Subsets(self.null, white, self.groups, self.candidates, self.calibration)
         found, best = [], search.total
         for size in range(1, largest + 1):
-            left = [search.solve(rows).chi2.min() for rows in search.rows(size, ()) if len(rows)]
+            left = [search.solve(rows).chi2.min() for rows in search.rows(size)]
             best = min([best, *left])
             found.append(float(np.sqrt(self.null.hartlap_factor * max(best, 0.0))))
         return tuple(found)

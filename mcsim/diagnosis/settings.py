@@ -144,7 +144,7 @@ class DiagnosisSettings:
     alpha: float = 0.05
     residual_level: float = 0.02
     further_level: float = 0.005
-    max_effects: int = 3
+    max_effects: int = 6
     named_probability: float = 0.5
     odds_cut: float = 100.0
     template_error: float = 0.01
