@@ -18,8 +18,9 @@ from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, data_vectors
 from mcsim.diagnosis.campaign import asking, batch
 from mcsim.diagnosis.candidate import TemplateBank
 from mcsim.diagnosis.context import DataSet, DiagnosisContext, context
-from mcsim.diagnosis.external import ExternalModel, Kept, agreement, loaded
+from mcsim.diagnosis.external import Checked, ExternalModel, agreement, loaded
 from mcsim.diagnosis.inference import diagnose_data
+from mcsim.diagnosis.kept import Kept
 from mcsim.diagnosis.measured_spectra import MeasuredSpectra, read_spectra
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.observed_maps import ObservedMaps, checked, read_maps
@@ -112,8 +113,9 @@ def diagnose(
         maps = read_maps(analysis.model, data) if isinstance(data, str | Path) else checked(analysis.model, data)
     key = _key(run, analysis)
     with batch(run.compute.workers if workers is None else workers) as call:
-        whole = task if source is None else Kept(task, f"diagnose/{key}.parts")
-        with asking(call, quiet, whole, "simulations of the model and of each effect") as ask:
+        whole = task if source is None else Checked(task)
+        stage = "simulations of the model and of each effect"
+        with asking(call, quiet, whole, stage, kept(run, analysis)) as ask:
             ensemble, bank = _learned(key, analysis, ask)
         known = context(analysis, ensemble if table is None else ensemble.of_mean(table.realizations), bank)
         drawn = controls.diagnose_controls(known, key, wanted, call, quiet) if wanted else None
@@ -184,6 +186,12 @@ def _warnings(analysis: Analysis) -> tuple[str, ...]:
     """Return a sentence on sky power that maps of a real sky hold and the simulations lack, if there is any."""
     found = power.neglected(analysis.model.survey)
     return () if found is None else (f"{found} Simulated data whose own sky ends there are not concerned.",)
+
+
+def kept(run: config.RunConfig, analysis: Analysis) -> Kept:
+    """Return where the simulations of a model are kept until it is learned."""
+    folder = folders.default_cache_dir().absolute() / f"diagnose/{_key(run, analysis)}.parts"
+    return Kept.of(folder, analysis.model.nside, campaign.PER_TASK)
 
 
 def prepared(run: config.RunConfig, analysis: Analysis, ask: campaign.Ask) -> DiagnosisContext:

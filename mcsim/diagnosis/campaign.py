@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.diagnosis.analysis import Analysis, Job, data_vectors
 from mcsim.diagnosis.candidate import Candidate, TemplateBank
+from mcsim.diagnosis.kept import Kept
 from mcsim.diagnosis.localisation import rms
 from mcsim.diagnosis.null_ensemble import NullEnsemble, without_nuisances
 from mcsim.ensemble import runner
@@ -31,7 +32,7 @@ Ask = Callable[[Sequence[Job]], list[Rows]]
 Batch = Callable[[Callable[..., Any], Iterable[tuple[Any, ...]]], Iterator[tuple[int, Any]]]
 """Call a function with tuples of arguments; yield (index, result) in the order of completion."""
 
-_PER_TASK = 10
+PER_TASK = 10
 _CONSTRAINED_PER_TASK = 4
 
 # The same seed is never used for two purposes, nor for the data of a run that counts from seed 0.
@@ -61,20 +62,32 @@ def batch(workers: runner.Workers) -> Iterator[Batch]:
 
 
 @contextmanager
-def asking(call: Batch, quiet: bool, task: Task = data_vectors, stage: str = "simulations") -> Iterator[Ask]:
-    """Give the function that runs jobs; all that it runs is one stage of the progress."""
+def asking(
+    call: Batch, quiet: bool, task: Task = data_vectors, stage: str = "simulations", kept: Kept | None = None
+) -> Iterator[Ask]:
+    """Give the function that runs jobs; all that it runs is one stage of the progress.
+
+    What is ``kept`` of an earlier call is not simulated again.
+    """
     done = 0.0
     with reporting(stage, 0.0, "skies", quiet) as report:
 
         def ask(jobs: Sequence[Job]) -> list[Rows]:
             nonlocal done
             results = {}
-            report.expect(float(sum(job.count for job in jobs)))
-            for index, result in call(task, ((job,) for job in jobs)):
-                results[index] = result
-                done += jobs[index].count
+            pieces = list(jobs) if kept is None else [piece for job in jobs for piece in kept.missing(job)]
+            total = sum(job.count for job in jobs)
+            report.expect(float(total))
+            done += total - sum(piece.count for piece in pieces)
+            report(done)
+            for index, result in call(task, ((piece,) for piece in pieces)):
+                if kept is None:
+                    results[index] = result
+                else:
+                    kept.keep(pieces[index], result)
+                done += pieces[index].count
                 report(done)
-            return [results[index] for index in range(len(jobs))]
+            return [results[index] for index in range(len(jobs))] if kept is None else [kept.read(job) for job in jobs]
 
         yield ask
 
@@ -121,7 +134,7 @@ def plan(analysis: Analysis, simulations: int | None = None, time_ordered: bool 
     return {purpose: replace(job, slices=analysis.of_maps) for purpose, job in jobs.items()}
 
 
-def _split(job: Job, realizations: range, size: int = _PER_TASK) -> list[Job]:
+def _split(job: Job, realizations: range, size: int = PER_TASK) -> list[Job]:
     """Return jobs of at most ``size`` of these realizations each."""
     stop = realizations.stop
     return [replace(job, first=first, count=min(size, stop - first)) for first in range(realizations.start, stop, size)]

@@ -1,0 +1,114 @@
+"""A diagnosis that is killed while it learns a model goes on where it stopped."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import mcsim
+from mcsim import config
+from mcsim.diagnosis import api, campaign
+from mcsim.diagnosis.kept import Kept
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import survey
+
+MODEL = {
+    "schema": 1,
+    "name": "small",
+    "sky": {"spectrum": "wmap7", "lmax": 24},
+    "map": {"nside": 16, "splits": ["a", "b"]},
+    "biposh": {"L_max": 1},
+    "compute": {"workers": 1},
+    "channel": [
+        {
+            "name": "V",
+            "beam": {"kind": "gaussian", "fwhm_arcmin": 500.0},
+            "noise": {"sigma0_uk": 30.0},
+            "scan": {"kind": "parallel_transport"},
+        }
+    ],
+}
+LIBRARY = {name: kind for name, kind in mcsim.effects().items() if name in ("beam_width", "noise_level")}
+SMALL = {"beam_orders": 1, "split_beam_orders": 1, "sky_bins": 4, "scan_L_max": 1, "scan_bins": 1, "scan_sims": 20}
+SETTINGS = mcsim.DiagnosisSettings(library=LIBRARY, sims_per_element=5, **SMALL)
+
+
+class Killed(BaseException):
+    """What no code catches."""
+
+
+class Counted:
+    """Simulate in this process; count the skies of each purpose, and stop after so many jobs."""
+
+    def __init__(self, monkeypatch, stop=None):
+        self.rows, self.left = [], stop
+        batch = campaign.batch
+        monkeypatch.setattr(api, "batch", lambda workers: batch(0))
+        monkeypatch.setattr(api, "data_vectors", self)
+
+    def __call__(self, job):
+        if self.left is not None:
+            self.left -= 1
+            if self.left < 0:
+                raise Killed
+        self.rows += [(job.simulated, job.bipolar_scan, n) for n in range(job.first, job.first + job.count)]
+        return campaign.data_vectors(job)
+
+
+def data():
+    run = config.load(MODEL)
+    return list(simulate.maps(survey(replace(run, ensemble=replace(run.ensemble, seed=5))), 0))
+
+
+def test_what_was_simulated_is_not_simulated_again_and_the_result_is_the_same(monkeypatch, tmp_path):
+    maps, runs = data(), {}
+    for name, stops in {"whole": [None], "killed": [1, 7, 12, None]}.items():
+        monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / name))
+        rows = []
+        for stop in stops:
+            with monkeypatch.context() as patch:
+                counted = Counted(patch, stop)
+                if stop is not None:
+                    with pytest.raises(Killed):
+                        mcsim.diagnose(MODEL, maps, settings=SETTINGS)
+                    assert len(list((tmp_path / name).glob("diagnose/*.parts/*/*.npy"))) > 0
+                else:
+                    found = mcsim.diagnose(MODEL, maps, settings=SETTINGS)
+                rows += counted.rows
+        assert not list((tmp_path / name).glob("diagnose/*.parts"))
+        runs[name] = sorted(rows), found
+    assert runs["killed"][0] == runs["whole"][0]
+    for field in ("mean", "standard_deviation", "templates", "held_out_pvalues", "data", "residual_maps"):
+        np.testing.assert_array_equal(getattr(runs["killed"][1], field), getattr(runs["whole"][1], field))
+    assert runs["killed"][1].test == runs["whole"][1].test
+
+
+def test_pieces_are_of_realizations_that_are_missing_and_of_the_same_simulations(tmp_path):
+    run = config.load(MODEL)
+    job = replace(api.analysis_of(run, library=LIBRARY).job(run), first=3, count=9)
+    kept = Kept(tmp_path, 4)
+    assert [(piece.first, piece.count) for piece in kept.missing(job)] == [(3, 4), (7, 4), (11, 1)]
+    kept.keep(replace(job, first=5, count=2), np.array([[5.0], [6.0]]))
+    pieces = list(kept.missing(job))
+    assert [(piece.first, piece.count) for piece in pieces] == [(3, 2), (7, 4), (11, 1)]
+    for piece in pieces:
+        kept.keep(piece, np.arange(piece.first, piece.first + piece.count, dtype=float)[:, None])
+    np.testing.assert_array_equal(kept.read(job)[:, 0], np.arange(3.0, 12.0))
+    # Another number of workers is the same simulation; another seed, effect or kind of row is not.
+    busy = campaign.with_effects(run, [])
+    same = api.analysis_of(run, library=LIBRARY).job(replace(busy, compute=replace(run.compute, workers=3)))
+    assert not list(kept.missing(replace(same, first=3, count=9)))
+    wide = config.Effect(name="beam_width", channel="V", parameters={"amplitude": 0.1})
+    for changed in (
+        replace(job, simulated=config.to_json(campaign.seeded(run, 9))),
+        replace(job, simulated=config.to_json(campaign.with_effects(run, [wide]))),
+        replace(job, bipolar_scan=True),
+        replace(job, slices=True),
+        replace(job, nuisances=True),
+        replace(job, sample_by_sample=True),
+    ):
+        assert sum(piece.count for piece in kept.missing(changed)) == 9
+
+
+def test_what_takes_long_is_kept_in_small_pieces(tmp_path):
+    assert [Kept.of(tmp_path, nside, 10).size for nside in (16, 128, 256, 512)] == [10, 10, 2, 2]
