@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config, systematics
-from mcsim.diagnosis import campaign, controls, measured_spectra, null_ensemble, report, words
+from mcsim.diagnosis import campaign, controls, cost, measured_spectra, null_ensemble, report, words
 from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, data_vectors
 from mcsim.diagnosis.campaign import asking, batch
 from mcsim.diagnosis.candidate import TemplateBank
@@ -26,7 +26,6 @@ from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.observed_maps import ObservedMaps, checked, read_maps
 from mcsim.diagnosis.result import Agreement, DiagnosisResult
 from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.ensemble.plan import cost
 from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError
 from mcsim.simulation import power
@@ -99,6 +98,8 @@ def diagnose(
     threads = os.cpu_count() or 1
     task: Callable[[Job], NDArray[np.float64]] = data_vectors
     table = read_spectra(data, run) if isinstance(data, str | Path) and Path(data).is_file() else None
+    if settings.shrink and (run.nuisances or table is not None):
+        settings = settings.without_shrinkage()
     controls.check(wanted, of_maps=table is None, external=source is not None)
     if table is not None:
         if source is not None:
@@ -116,7 +117,7 @@ def diagnose(
         whole = task if source is None else Checked(task)
         stage = "simulations of the model and of each effect"
         with asking(call, quiet, whole, stage, kept(run, analysis)) as ask:
-            ensemble, bank = _learned(key, analysis, ask)
+            ensemble, bank = _learned(key, run, analysis, ask)
         known = context(analysis, ensemble if table is None else ensemble.of_mean(table.realizations), bank)
         drawn = controls.diagnose_controls(known, key, wanted, call, quiet) if wanted else None
         with asking(call, quiet, task, "simulations of fitted effects") as ask:
@@ -149,13 +150,16 @@ def _with_library(settings: DiagnosisSettings) -> tuple[DiagnosisSettings, syste
 
 
 def describe(model: str | Path | config.RunConfig | ExternalModel, settings: DiagnosisSettings) -> str:
-    """Return a text on the cost of a diagnosis of maps: simulations, memory, time, and that of preparing the maps."""
+    """Return a text on the cost of a diagnosis of maps: simulations, memory, disk, time, preparation."""
     run, source = loaded(model)
     count, (settings, library) = settings.controls, _with_library(settings)
     controls.check(count, of_maps=True, external=source is not None)
+    if settings.shrink and run.nuisances:
+        settings = settings.without_shrinkage()
     analysis = analysis_of(run, settings.without, os.cpu_count() or 1, settings, library, source)
     power.check(analysis.model.survey)
-    jobs, size = campaign.plan(analysis, settings.simulations).values(), len(analysis.elements)
+    planned, size = campaign.plan(analysis, settings.simulations), len(analysis.elements)
+    jobs = planned.values()
     number = sum(job.count for job in jobs if job.source is None)
     head = f"{run.name}: at most {number} simulations before data, for a data vector of {size}"
     if source is not None:
@@ -163,7 +167,7 @@ def describe(model: str | Path | config.RunConfig | ExternalModel, settings: Dia
         stored = "" if source.count is None else f", of {source.count} that are stored"
         head += f"; and at most {given} of {source.label}{stored}, whose own cost is not in what follows"
     priors = [f"nuisance: {line}" for one in analysis.nuisances for line in one.lines]
-    lines = [head, *priors, *cost(run).lines(number, run.compute.workers)]
+    lines = [head, *priors, *cost.lines(analysis, planned)]
     if count:
         lines += controls.describe(analysis, count, run.compute.workers)
     return "\n".join(lines)
@@ -190,20 +194,23 @@ def _warnings(analysis: Analysis) -> tuple[str, ...]:
 
 def kept(run: config.RunConfig, analysis: Analysis) -> Kept:
     """Return where the simulations of a model are kept until it is learned."""
-    folder = folders.default_cache_dir().absolute() / f"diagnose/{_key(run, analysis)}.parts"
+    key = _key(run, analysis, analysis.settings.of_a_simulation())
+    folder = folders.default_cache_dir().absolute() / f"diagnose/{key}.parts"
     return Kept.of(folder, analysis.model.nside, campaign.PER_TASK)
 
 
 def prepared(run: config.RunConfig, analysis: Analysis, ask: campaign.Ask) -> DiagnosisContext:
     """Return what every set of maps is tested with, simulated or from the cache."""
-    return context(analysis, *_learned(_key(run, analysis), analysis, ask))
+    return context(analysis, *_learned(_key(run, analysis), run, analysis, ask))
 
 
 def _learned(
     key: str,
+    run: config.RunConfig,
     analysis: Analysis,
     ask: campaign.Ask,
 ) -> tuple[NullEnsemble, TemplateBank]:
+    """Simulate a model or load it from the cache; single simulations stay for the verdict after a first one alone."""
     size, simulations = len(analysis.elements), analysis.settings.simulations
     if simulations is not None and simulations <= size:
         raise InputError(
@@ -219,14 +226,15 @@ def _learned(
         null_ensemble.save(scratch, *campaign.learned(analysis, ask, simulations))
 
     found = null_ensemble.load(folders.cached(name, fill))
-    shutil.rmtree(folders.default_cache_dir() / f"diagnose/{key}.parts", ignore_errors=True)
+    if not analysis.settings.shrink:
+        shutil.rmtree(kept(run, analysis).folder, ignore_errors=True)
     return found
 
 
-def _key(run: config.RunConfig, analysis: Analysis) -> str:
+def _key(run: config.RunConfig, analysis: Analysis, settings: DiagnosisSettings | None = None) -> str:
     """Return a hash of all that the simulations of a model depend on, the code that makes them included.
 
-    Its name, its seed and its number of realizations do not count.
+    ``settings``: in place of those of the analysis. Its name, its seed and its number of realizations do not count.
     """
     science = config.science(run, *(("nuisance",) if run.nuisances else ()))
     science["ensemble"] = {}
@@ -235,7 +243,7 @@ def _key(run: config.RunConfig, analysis: Analysis) -> str:
     effects |= {systematics.get(name, dict(analysis.library)) for name in named}
     rest = [
         [[candidate.label, [repr(basis) for basis in candidate.basis]] for candidate in analysis.candidates],
-        asdict(analysis.settings),
+        asdict(settings or analysis.settings),
         [element.name for element in analysis.elements],
         sorted(class_digest(kind) for kind in effects),
         package_digest((f"mcsim.{name}" for name in CODE), LIBRARIES),

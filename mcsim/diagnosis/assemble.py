@@ -70,6 +70,7 @@ def result_of(
             **data.provenance(),
         },
         configuration=config.to_json(context.run),
+        covariance_dof=null.covariance_dof,
     )
 
 
@@ -171,7 +172,7 @@ def _candidates(context: DiagnosisContext, refined: Refined) -> Iterator[Candida
             amplitude, sigma, words = float("nan"), float("nan"), "no such amplitude"
         reach, size = detectable(null, t[:, columns], len(candidates)), None
         rows = min(max(int(rank[k]), 1), null.dimension)
-        needed = snr_needed(rows, len(candidates), null.dimension, null.n_sims)
+        needed = snr_needed(rows, len(candidates), null.dimension, null.dof + 1)
         if np.isfinite(reach):
             precision = np.eye(len(columns))
             size = abs(candidate.with_coordinates(reach * precision[0], precision).amplitude)

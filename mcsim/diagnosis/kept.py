@@ -70,7 +70,7 @@ class Kept:
 
     def _rows(self, job: Job) -> dict[int, tuple[Path, int]]:
         """Return file and row of every realization that is there."""
-        found = {}
+        found: dict[int, tuple[Path, int]] = {}
         for path in self._stream(job).glob("*-*.npy"):
             first, stop = map(int, path.stem.split("-"))
             found |= {number: (path, number - first) for number in range(first, stop)}

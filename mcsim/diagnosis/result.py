@@ -204,6 +204,8 @@ class DiagnosisResult:
         True if sets describe the data, but are less probable than all else together; their posterior probability.
     contradicted
         Sets that describe the data vector and are not named, because parts of the data do not bear them out.
+    covariance_dof
+        Degrees of freedom of the covariance if it is shrunk: one less than the simulations that these are worth.
     """
 
     case: str
@@ -241,6 +243,7 @@ class DiagnosisResult:
     probability: float = 1.0
     agreement: Agreement | None = None
     contradicted: tuple[EffectSet, ...] = ()
+    covariance_dof: int | None = None
 
     @property
     def verdict(self) -> dict[str, Any]:
@@ -258,9 +261,14 @@ class DiagnosisResult:
         return len(self.held_out_pvalues)
 
     @property
+    def _worth(self) -> dict[str, int]:
+        """Return the number of simulations of a shrunk covariance, and how many of a sample covariance are as good."""
+        return {"simulations": self.simulations, "worth": (self.covariance_dof or 0) + 1}
+
+    @property
     def excess(self) -> Measured:
         """Return the unbiased excess of chi^2 over its degrees of freedom, zero on average where the model is right."""
-        return excess_of(self.test.chi2, self.test.dimension, self.simulations - 1)
+        return excess_of(self.test.chi2, self.test.dimension, self.covariance_dof or self.simulations - 1)
 
     @property
     def z(self) -> Vector:
@@ -313,6 +321,7 @@ class DiagnosisResult:
             "notes": list(self.notes),
             **({"nuisances": [_nuisance_json(one) for one in self.nuisances]} if self.nuisances else {}),
             **({"warnings": list(self.warnings)} if self.warnings else {}),
+            **({"covariance": self._worth} if self.covariance_dof is not None else {}),
             **({"controls": self.controls.to_json()} if self.controls is not None else {}),
             **({"simulator": asdict(self.agreement)} if self.agreement else {}),
         }

@@ -7,7 +7,7 @@ import pytest
 
 import mcsim
 from mcsim import config
-from mcsim.diagnosis import api, campaign
+from mcsim.diagnosis import api, campaign, words
 from mcsim.diagnosis.kept import Kept
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
@@ -81,6 +81,47 @@ def test_what_was_simulated_is_not_simulated_again_and_the_result_is_the_same(mo
     for field in ("mean", "standard_deviation", "templates", "held_out_pvalues", "data", "residual_maps"):
         np.testing.assert_array_equal(getattr(runs["killed"][1], field), getattr(runs["whole"][1], field))
     assert runs["killed"][1].test == runs["whole"][1].test
+
+
+def test_a_first_verdict_is_followed_by_the_whole_one_without_another_simulation(monkeypatch, tmp_path):
+    maps = data()
+    first = mcsim.DiagnosisSettings.quick(library=LIBRARY, **SMALL)
+    assert first.of_a_simulation() == SETTINGS.of_a_simulation()
+    runs = {}
+    for name, asked in {"whole": [SETTINGS], "both": [first, SETTINGS]}.items():
+        monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / name))
+        with monkeypatch.context() as patch:
+            counted = Counted(patch)
+            runs[name] = [mcsim.diagnose(MODEL, maps, settings=one) for one in asked], sorted(counted.rows)
+    (whole,), rows = runs["whole"]
+    (early, late), both = runs["both"]
+    assert both == rows
+    assert late.test == whole.test
+    assert not list((tmp_path / "both").glob("diagnose/*.parts"))
+    # The first verdict has fewer simulations, which are worth more than they are.
+    assert early.simulations < whole.simulations
+    assert early.verdict["covariance"] == {"simulations": early.simulations, "worth": early.covariance_dof + 1}
+    assert early.covariance_dof + 1 > early.simulations
+    assert early.kind == whole.kind == "none"
+    assert "covariance" not in whole.verdict
+    assert early.excess.value == pytest.approx(whole.excess.value, abs=early.excess.sigma)
+    assert f"is worth {early.covariance_dof + 1} of a sample" in words.tested(early)
+
+
+def test_with_nuisances_a_first_verdict_has_the_simulations_of_a_sample_covariance():
+    assert mcsim.DiagnosisSettings.quick().without_shrinkage().sims_per_element == SETTINGS.sims_per_element * 2
+    assert mcsim.DiagnosisSettings.quick(sims_per_element=7).without_shrinkage().sims_per_element == 7
+    assert not mcsim.DiagnosisSettings.quick().without_shrinkage().shrink
+
+
+def test_the_cost_is_said_with_time_memory_and_disk():
+    run = config.load(MODEL)
+    whole = api.describe(run, SETTINGS).splitlines()
+    few = api.describe(run, mcsim.DiagnosisSettings.quick(library=LIBRARY, **SMALL)).splitlines()
+    numbers = [int(lines[0].split("at most ")[1].split()[0]) for lines in (few, whole)]
+    assert numbers[0] < numbers[1]
+    for lines in (few, whole):
+        assert [line.split()[0] for line in lines[1:]] == ["memory", "disk", "time"]
 
 
 def test_pieces_are_of_realizations_that_are_missing_and_of_the_same_simulations(tmp_path):
