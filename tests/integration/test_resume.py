@@ -60,51 +60,52 @@ def data():
     return list(simulate.maps(survey(replace(run, ensemble=replace(run.ensemble, seed=5))), 0))
 
 
-def test_what_was_simulated_is_not_simulated_again_and_the_result_is_the_same(monkeypatch, tmp_path):
-    maps, runs = data(), {}
-    for name, stops in {"whole": [None], "killed": [1, 7, 12, None]}.items():
-        monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / name))
-        rows = []
-        for stop in stops:
-            with monkeypatch.context() as patch:
-                counted = Counted(patch, stop)
-                if stop is not None:
-                    with pytest.raises(Killed):
-                        mcsim.diagnose(MODEL, maps, settings=SETTINGS)
-                    assert len(list((tmp_path / name).glob("diagnose/*.parts/*/*.npy"))) > 0
-                else:
-                    found = mcsim.diagnose(MODEL, maps, settings=SETTINGS)
-                rows += counted.rows
-        assert not list((tmp_path / name).glob("diagnose/*.parts"))
-        runs[name] = sorted(rows), found
-    assert runs["killed"][0] == runs["whole"][0]
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """What was simulated without an interruption, and the result."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MCSIM_CACHE", str(tmp_path_factory.mktemp("cache")))
+        counted = Counted(patch)
+        return mcsim.diagnose(MODEL, data(), settings=SETTINGS), sorted(counted.rows)
+
+
+def test_what_was_simulated_is_not_simulated_again_and_the_result_is_the_same(monkeypatch, tmp_path, whole):
+    monkeypatch.setenv("MCSIM_CACHE", str(tmp_path))
+    maps, rows = data(), []
+    for stop in (1, 7, 12):
+        with monkeypatch.context() as patch:
+            counted = Counted(patch, stop)
+            with pytest.raises(Killed):
+                mcsim.diagnose(MODEL, maps, settings=SETTINGS)
+        rows += counted.rows
+        assert list(tmp_path.glob("diagnose/*.parts/*/*.npy"))
+    with monkeypatch.context() as patch:
+        counted = Counted(patch)
+        found = mcsim.diagnose(MODEL, maps, settings=SETTINGS)
+    assert not list(tmp_path.glob("diagnose/*.parts"))
+    assert sorted(rows + counted.rows) == whole[1]
     for field in ("mean", "standard_deviation", "templates", "held_out_pvalues", "data", "residual_maps"):
-        np.testing.assert_array_equal(getattr(runs["killed"][1], field), getattr(runs["whole"][1], field))
-    assert runs["killed"][1].test == runs["whole"][1].test
+        np.testing.assert_array_equal(getattr(found, field), getattr(whole[0], field))
+    assert found.test == whole[0].test
 
 
-def test_a_first_verdict_is_followed_by_the_whole_one_without_another_simulation(monkeypatch, tmp_path):
-    maps = data()
+def test_a_first_verdict_is_followed_by_the_whole_one_without_another_simulation(monkeypatch, tmp_path, whole):
+    monkeypatch.setenv("MCSIM_CACHE", str(tmp_path))
     first = mcsim.DiagnosisSettings.quick(library=LIBRARY, **SMALL)
     assert first.of_a_simulation() == SETTINGS.of_a_simulation()
-    runs = {}
-    for name, asked in {"whole": [SETTINGS], "both": [first, SETTINGS]}.items():
-        monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / name))
-        with monkeypatch.context() as patch:
-            counted = Counted(patch)
-            runs[name] = [mcsim.diagnose(MODEL, maps, settings=one) for one in asked], sorted(counted.rows)
-    (whole,), rows = runs["whole"]
-    (early, late), both = runs["both"]
-    assert both == rows
-    assert late.test == whole.test
-    assert not list((tmp_path / "both").glob("diagnose/*.parts"))
+    with monkeypatch.context() as patch:
+        counted = Counted(patch)
+        early, late = (mcsim.diagnose(MODEL, data(), settings=one) for one in (first, SETTINGS))
+    assert sorted(counted.rows) == whole[1]
+    assert late.test == whole[0].test
+    assert not list(tmp_path.glob("diagnose/*.parts"))
     # The first verdict has fewer simulations, which are worth more than they are.
-    assert early.simulations < whole.simulations
+    assert early.simulations < late.simulations
     assert early.verdict["covariance"] == {"simulations": early.simulations, "worth": early.covariance_dof + 1}
     assert early.covariance_dof + 1 > early.simulations
-    assert early.kind == whole.kind == "none"
-    assert "covariance" not in whole.verdict
-    assert early.excess.value == pytest.approx(whole.excess.value, abs=early.excess.sigma)
+    assert early.kind == late.kind == "none"
+    assert "covariance" not in late.verdict
+    assert early.excess.value == pytest.approx(late.excess.value, abs=early.excess.sigma)
     assert f"is worth {early.covariance_dof + 1} of a sample" in words.tested(early)
 
 
