@@ -74,20 +74,25 @@ def asking(
 
         def ask(jobs: Sequence[Job]) -> list[Rows]:
             nonlocal done
-            results = {}
-            pieces = list(jobs) if kept is None else [piece for job in jobs for piece in kept.missing(job)]
+            held: list[dict[int, Rows]] = [{} if kept is None else kept.found(job) for job in jobs]
+            pieces = [
+                (known, piece)
+                for job, known in zip(jobs, held, strict=True)
+                for piece in ([job] if kept is None else kept.missing(job, known))
+            ]
             total = sum(job.count for job in jobs)
             report.expect(float(total))
-            done += total - sum(piece.count for piece in pieces)
+            done += total - sum(piece.count for _, piece in pieces)
             report(done)
-            for index, result in call(task, ((piece,) for piece in pieces)):
-                if kept is None:
-                    results[index] = result
-                else:
-                    kept.keep(pieces[index], result)
-                done += pieces[index].count
+            for index, result in call(task, ((piece,) for _, piece in pieces)):
+                known, piece = pieces[index]
+                known.update(zip(range(piece.first, piece.first + piece.count), result, strict=True))
+                if kept is not None:
+                    kept.keep(piece, result)
+                done += piece.count
                 report(done)
-            return [results[index] for index in range(len(jobs))] if kept is None else [kept.read(job) for job in jobs]
+            rows = zip(jobs, held, strict=True)
+            return [np.stack([known[n] for n in range(job.first, job.first + job.count)]) for job, known in rows]
 
         yield ask
 

@@ -4,7 +4,8 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from mcsim.diagnosis.analysis import Job
 from mcsim.support import folders
-from mcsim.support.arrays import Matrix
+from mcsim.support.arrays import Matrix, Vector
 
 NSIDE = 128
 """Up to this resolution a piece has as many realizations as a task, beyond it fewer, as each takes longer."""
@@ -36,10 +37,19 @@ class Kept:
         """Choose the size of pieces for maps of a resolution: what is lost by a kill is about a minute."""
         return cls(folder, max(LEAST, most * NSIDE**2 // max(nside, NSIDE) ** 2))
 
-    def missing(self, job: Job) -> Iterator[Job]:
+    def found(self, job: Job) -> dict[int, Vector]:
+        """Return the rows of a job that are there, by realization."""
+        rows: dict[int, Vector] = {}
+        for path in self._stream(job).glob("*-*.npy"):
+            first, stop = map(int, path.stem.split("-"))
+            if first < job.first + job.count and stop > job.first:
+                with suppress(FileNotFoundError):  # another process has learned the model and removed it
+                    rows.update(zip(range(first, stop), np.load(path), strict=True))
+        return rows
+
+    def missing(self, job: Job, found: Mapping[int, Vector]) -> Iterator[Job]:
         """Yield the pieces of a job that have not been simulated."""
-        there = self._rows(job)
-        wanted = [number for number in range(job.first, job.first + job.count) if number not in there]
+        wanted = [number for number in range(job.first, job.first + job.count) if number not in found]
         while wanted:
             first, count = wanted[0], 1
             while count < min(self.size, len(wanted)) and wanted[count] == first + count:
@@ -56,25 +66,6 @@ class Kept:
             with os.fdopen(handle, "wb") as stream:
                 np.save(stream, rows)
             os.replace(scratch, folder / f"{piece.first}-{piece.first + piece.count}.npy")
-
-    def read(self, job: Job) -> Matrix:
-        """Return the rows of a job, all of which are there."""
-        there, rows = self._rows(job), []
-        held: tuple[Path, Matrix] | None = None
-        for number in range(job.first, job.first + job.count):
-            path, row = there[number]
-            if held is None or held[0] != path:
-                held = path, np.load(path)
-            rows.append(held[1][row])
-        return np.stack(rows)
-
-    def _rows(self, job: Job) -> dict[int, tuple[Path, int]]:
-        """Return file and row of every realization that is there."""
-        found: dict[int, tuple[Path, int]] = {}
-        for path in self._stream(job).glob("*-*.npy"):
-            first, stop = map(int, path.stem.split("-"))
-            found |= {number: (path, number - first) for number in range(first, stop)}
-        return found
 
     def _stream(self, job: Job) -> Path:
         """Return the folder of all realizations of one kind."""
