@@ -160,7 +160,7 @@ def diagnose(
     without: Annotated[list[str] | None, Option(metavar="EFFECT", help="Do not propose it; repeatable.")] = None,
     including: Including = None,
     simulations: Simulations = None,
-    quick: Annotated[bool, Option("--quick", help="First verdict, from a third of the simulations.")] = False,
+    quick: Annotated[bool, Option("--quick", help="First verdict, from fewer simulations.")] = False,
     controls: Annotated[int, Option(min=0, help="Perfect data sets, drawn at higher fidelity and diagnosed too.")] = 0,
     workers: Processes = None,
     scheduler: Scheduler = None,

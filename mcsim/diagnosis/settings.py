@@ -151,7 +151,7 @@ class DiagnosisSettings:
     >>> sorted(mcsim.DiagnosisSettings(library=library, simulations=500).library)
     ['beam_width', 'gain_drift']
 
-    Ask for a first verdict from a third of the simulations:
+    Ask for a first verdict from a third of the simulations for the covariance:
 
     >>> mcsim.DiagnosisSettings.quick(without=("beam_ellipticity",)).sims_per_element
     3
