@@ -249,7 +249,7 @@ class PixelCentres(Difference):
         return [np.ones(1)] if known else []
 
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
-        moments = tuple(replace(m, dtheta=None, dphi=None) for m in scene.moments)
+        moments = tuple(m.up_to_offsets(0) for m in scene.moments)
         return replace(scene, moments=moments, window=np.ones_like(scene.window), centred=True)
 
 

@@ -363,13 +363,17 @@ class Problem:
 
 
 def with_sharper_sky(pair: ChannelPair, iterations: int = 2) -> ChannelPair:
-    """Return a pair whose sky, which is taken from side A, makes its maps sample by sample too."""
+    """Return a pair whose sky, which is taken from side A, makes its maps sample by sample too.
+
+    Where single samples are not known, it makes them with all powers of their offsets.
+    """
     scene, pointing = pair.scene, pair.pointing()
-    if scene is None or pointing is None:
+    if scene is None or (pointing is None and scene.offset_order < 2):
         return pair
     for _ in range(iterations):
-        missing = np.where(pair.seen, pair.a - scene.sampled(pointing, scene.window), 0.0)
-        empty = replace(scene, sky=np.zeros_like(scene.sky))
+        made = scene.maps() if pointing is None else scene.sampled(pointing, scene.window)
+        missing = np.where(pair.seen, pair.a - made, 0.0)
+        empty = replace(scene.up_to_offsets(1), sky=np.zeros_like(scene.sky))
         scene = replace(scene, sky=scene.sky + sky_in(missing, pair.seen, empty, 1e-2))
     return replace(pair, scene=scene)
 

@@ -217,22 +217,29 @@ def data_vectors(job: Job, library: Library | None = None) -> Vector:
 
     This is the task that a worker runs. ``library``: effects that the simulated run may name; default: the job's.
     """
-    analysis = _analysis(*job.definition)
-    rows = []
+    analysis = analysis_for(job)
+    return np.stack([analysis.data_vector(maps, job.bipolar_scan, job.slices) for maps in simulated_maps(job, library)])
+
+
+def analysis_for(job: Job) -> Analysis:
+    """Return the analysis that a job is for; the last one is kept."""
+    return _analysis(*job.definition)
+
+
+def simulated_maps(job: Job, library: Library | None = None) -> Iterator[list[Map]]:
+    """Yield the maps of every realization of a job; ``library`` as for :func:`data_vectors`."""
     for realization, shared in surveys(job, library):
         if job.sample_by_sample:
-            maps = [map_uk for _, map_uk in sampled.maps(shared, realization)]
+            yield [map_uk for _, map_uk in sampled.maps(shared, realization)]
+            continue
+        sky = None
+        if job.observed is not None:
+            seed, _ = _seed_and_added(job.simulated, job.fiducial)
+            sky = _constrained_sky(job.definition, job.observed.tobytes(), seed, realization)
+        if job.source is not None:
+            yield external_maps(job, realization, sky)
         else:
-            sky = None
-            if job.observed is not None:
-                seed, _ = _seed_and_added(job.simulated, job.fiducial)
-                sky = _constrained_sky(job.definition, job.observed.tobytes(), seed, realization)
-            if job.source is not None:
-                maps = external_maps(job, realization, sky)
-            else:
-                maps = list(simulate.maps(shared, realization, sky=sky))
-        rows.append(analysis.data_vector(maps, job.bipolar_scan, job.slices))
-    return np.stack(rows)
+            yield list(simulate.maps(shared, realization, sky=sky))
 
 
 def external_maps(job: Job, realization: int, sky: Alm | None = None) -> list[Map]:

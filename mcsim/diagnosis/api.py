@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config, systematics
-from mcsim.diagnosis import campaign, controls, cost, measured_spectra, null_ensemble, report, words
+from mcsim.diagnosis import campaign, controls, cost, measured_spectra, null_ensemble, report, unlisted, words
 from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, data_vectors
 from mcsim.diagnosis.campaign import asking, batch
 from mcsim.diagnosis.candidate import TemplateBank
@@ -125,6 +125,9 @@ def diagnose(
                 ObservedMaps(known, maps, ask) if table is None else MeasuredSpectra(known, table, ask)
             )
             diagnosis = diagnose_data(found, case or run.name)
+        if diagnosis.kind == "unknown" and isinstance(found, ObservedMaps) and source is None:
+            with asking(call, quiet, unlisted.scores, "simulations of what is not listed") as ask:
+                diagnosis = unlisted.reconstructed(diagnosis, found, ask)
     if source is not None:
         diagnosis = _with_agreement(diagnosis, agreement(known))
     elif table is None:
@@ -143,9 +146,9 @@ def _with_library(settings: DiagnosisSettings) -> tuple[DiagnosisSettings, syste
     """Return settings that name effects of a library, and that library; refuse other names."""
     known = systematics.catalogue() if settings.library is None else systematics.checked(settings.library)
     asked = tuple(settings.including) if settings.library is None else (*settings.including, *known)
-    for effect in (*settings.without, *settings.including):
-        systematics.get(effect, known)
-    including = tuple(sorted({name for name in asked if not known[name].proposed}))
+    kinds = {name: systematics.get(name, known) for name in (*settings.without, *asked)}
+    known = {**known, **{kinds[name].name: kinds[name] for name in asked}}
+    including = tuple(sorted({kinds[name].name for name in asked if not kinds[name].proposed}))
     return replace(settings, without=tuple(settings.without), including=including, library=None, controls=0), known
 
 
@@ -168,6 +171,8 @@ def describe(model: str | Path | config.RunConfig | ExternalModel, settings: Dia
         head += f"; and at most {given} of {source.label}{stored}, whose own cost is not in what follows"
     priors = [f"nuisance: {line}" for one in analysis.nuisances for line in one.lines]
     lines = [head, *priors, *cost.lines(analysis, planned)]
+    if source is None:
+        lines.append(f"after a first verdict unknown: {unlisted.SIMULATIONS} simulations more, once for the model")
     if count:
         lines += controls.describe(analysis, count, run.compute.workers)
     return "\n".join(lines)

@@ -49,7 +49,8 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         return np.concatenate([self.x, self._measured[3]])
 
     @cached_property
-    def _sky(self) -> Alm:
+    def observed_sky(self) -> Alm:
+        """Return the filtered sky of the maps, uK, shape (size,)."""
         return shared_sky(self.context.analysis.model, self.data)
 
     @cached_property
@@ -97,7 +98,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         source = self.context.analysis.source_of(found, given_sky=True)
 
         def simulated(found: Sequence[config.Effect], first: int) -> Matrix:
-            jobs = constrained_jobs(self.context.analysis, found, self._sky, range(first, skies))
+            jobs = constrained_jobs(self.context.analysis, found, self.observed_sky, range(first, skies))
             return np.concatenate(self.ask([replace(job, slices=True, source=source) for job in jobs]))
 
         after, before = simulated(found, 0), self._before[source is not None]

@@ -19,6 +19,7 @@ from mcsim.diagnosis.selection import Contrast, Verdict
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Element
 from mcsim.errors import InputError
+from mcsim.reconstruction.result import Reconstructed
 from mcsim.stats.excess import HeldOut, Measured, excess_of
 from mcsim.stats.look_elsewhere import GlobalTest
 from mcsim.support.arrays import Vector
@@ -204,8 +205,9 @@ class DiagnosisResult:
         True if sets describe the data, but are less probable than all else together; their posterior probability.
     contradicted
         Sets that describe the data vector and are not named, because parts of the data do not bear them out.
-    covariance_dof
-        Degrees of freedom of the covariance if it is shrunk: one less than the simulations that these are worth.
+    unlisted, unlisted_held_out
+        After an unknown gap, what is missing, the most evident structure first; and the reduction of the excess on
+        held-out data by all of it. None: not looked for, not measured.
     """
 
     case: str
@@ -243,7 +245,8 @@ class DiagnosisResult:
     probability: float = 1.0
     agreement: Agreement | None = None
     contradicted: tuple[EffectSet, ...] = ()
-    covariance_dof: int | None = None
+    unlisted: tuple[Reconstructed, ...] | None = None
+    unlisted_held_out: HeldOut | None = None
 
     @property
     def verdict(self) -> dict[str, Any]:
@@ -261,14 +264,9 @@ class DiagnosisResult:
         return len(self.held_out_pvalues)
 
     @property
-    def _worth(self) -> dict[str, int]:
-        """Return the number of simulations of a shrunk covariance, and how many of a sample covariance are as good."""
-        return {"simulations": self.simulations, "worth": (self.covariance_dof or 0) + 1}
-
-    @property
     def excess(self) -> Measured:
         """Return the unbiased excess of chi^2 over its degrees of freedom, zero on average where the model is right."""
-        return excess_of(self.test.chi2, self.test.dimension, self.covariance_dof or self.simulations - 1)
+        return excess_of(self.test.chi2, self.test.dimension, self.provenance.get("worth", self.simulations) - 1)
 
     @property
     def z(self) -> Vector:
@@ -295,13 +293,12 @@ class DiagnosisResult:
         """Return ``verdict.json`` of schema 1."""
         near = self.candidates[self.nearest]
         sets = [[_effect_json(effect) for effect in one.effects] for one in self.sets]
-        faint = {"faint": True, "probability": self.probability} if self.faint else {}
         return {
             "schema": 1,
             "case": self.case,
             "gap": {"p_value": self.test.pvalue, "statistic": self.test.chi2, "dof": self.test.dimension},
             "verdict": self.kind,
-            **faint,
+            **({"faint": True, "probability": self.probability} if self.faint else {}),
             "effects": sets[0] if sets else [],
             "alternatives": sets[1:],
             "maps": [] if not self.sets else [asdict(one) for one in self.sets[0].maps],
@@ -319,9 +316,11 @@ class DiagnosisResult:
                 if one.detectable is not None
             ],
             "notes": list(self.notes),
+            **({} if self.unlisted is None else {"unlisted": [one.to_json() for one in self.unlisted]}),
+            **({} if self.unlisted_held_out is None else {"unlisted_shrink": _held_out_json(self.unlisted_held_out)}),
             **({"nuisances": [_nuisance_json(one) for one in self.nuisances]} if self.nuisances else {}),
             **({"warnings": list(self.warnings)} if self.warnings else {}),
-            **({"covariance": self._worth} if self.covariance_dof is not None else {}),
+            **({"worth": self.provenance["worth"]} if "worth" in self.provenance else {}),
             **({"controls": self.controls.to_json()} if self.controls is not None else {}),
             **({"simulator": asdict(self.agreement)} if self.agreement else {}),
         }
@@ -355,10 +354,16 @@ class DiagnosisResult:
         )
 
     def save(self, folder: str | Path) -> None:
-        """Write ``verdict.json`` and ``diagnosis.zarr`` into a folder, made where it does not exist."""
+        """Write ``verdict.json`` and ``diagnosis.zarr`` into a folder, made where it does not exist.
+
+        Reconstructed effects are written there too, a Python file each.
+        """
         target = Path(folder)
         target.mkdir(parents=True, exist_ok=True)
         (target / "verdict.json").write_text(json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n")
+        for one in self.unlisted or ():
+            if one.file is not None:
+                (target / f"{one.name}.py").write_text(one.file, encoding="utf-8")
         self.to_dataset().to_zarr(target / STORE, mode="w", consolidated=False)
 
     @classmethod

@@ -17,6 +17,7 @@ from mcsim.ensemble import opening, store
 from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError
 from mcsim.simulation import differencing, noise
+from mcsim.simulation import offsets as offsets_
 from mcsim.simulation.channels import check_effects, load_beam, refuse_external
 from mcsim.simulation.preparation import preparation
 from mcsim.simulation.survey import Survey
@@ -165,6 +166,7 @@ class Cost:
     each_s: float
     preparation: str  # what preparing the maps adds, in words
     noise: tuple[str, ...] = ()  # what is known of noise that is estimated or drawn, in words
+    offsets: str = ""  # what powers of the samples' offsets add, in words
 
     def lines(self, number: int, workers: int) -> list[str]:
         """Return lines on memory, preparation and time for a number of realizations."""
@@ -172,6 +174,7 @@ class Cost:
         return [
             f"  memory  {self.memory / 1e9:.2f} GB per worker, {workers} workers",
             *([f"  prepare {self.preparation}"] if self.preparation else []),
+            *([f"  offsets {self.offsets}"] if self.offsets else []),
             *(f"  noise   {line}" for line in self.noise),
             f"  time    {duration(self.each_s)} per realization and core, {duration(total_s)} of processor time,"
             f" {duration(total_s / workers)} with {workers} workers on as many idle cores",
@@ -222,9 +225,15 @@ def cost(run: config.RunConfig) -> Cost:
         transforms, memory = transforms + extra, memory + 480.0 * nside**2
         grid = f"nside {nside} to {config.prepared_grid(run)[0]}"
         words = f"{extra:g} further transforms per realization and {480e-9 * nside**2:.2g} GB per worker, {grid}"
+    offsets, spreading = run.map.offset_order or 0, ""
+    if offsets > 1:
+        spread = [channel for channel in run.channels if not isinstance(channel.scan, config.ScanParallelTransport)]
+        extra = len(spread) * offsets_.transforms(offsets)
+        transforms, memory = transforms + extra, memory + 96.0 * nside**2 * (4 + splits)
+        spreading = f"{extra} further transforms per realization for powers of the samples' offsets up to {offsets}"
     estimates = pairs * (2 if run.ensemble.paired else 1)
     each_s = transform * transforms + estimation * estimates + differencing.seconds(run) + noise.seconds(run)
-    return Cost(planned, memory, each_s, words, tuple(noise.in_words(run)))
+    return Cost(planned, memory, each_s, words, tuple(noise.in_words(run)), spreading)
 
 
 def _timed(nside: int, lmax_sky: int, lmax: int, L_max: int) -> tuple[float, float]:

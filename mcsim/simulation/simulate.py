@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mcsim import bipolar, config, systematics
 from mcsim.simulation import convolve, differencing, rings, skies
+from mcsim.simulation.offsets import Expansion, expansion, offset_maps
 from mcsim.simulation.survey import Channel, Survey, SurveyMap
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rng
@@ -197,11 +198,17 @@ def _map_parts(
     if any(m.gain is not None for m in channel.maps):
         whole = convolve.circular_map(seen, channel.response, nside, nthreads)
     gradient = None
-    if any(m.moments.dtheta is not None for m in channel.maps):
+    terms = _expansion(channel)
+    offsets: list[NDArray[np.float64]] = []
+    if terms is not None:
+        offsets = offset_maps(_unwindowed(channel, seen, dipole), terms, [m.moments for m in channel.maps], nthreads)
+    elif any(m.moments.dtheta is not None for m in channel.maps):
         gradient = made.gradient(circular)
-    for m in channel.maps:
+    for index, m in enumerate(channel.maps):
         extra = []
-        if m.moments.dtheta is not None and gradient is not None:
+        if terms is not None:
+            extra.append(offsets[index])
+        elif m.moments.dtheta is not None and gradient is not None:
             extra.append(convolve.centroid_map(gradient, m.moments))
         if m.noise_uk is not None:
             extra.append(m.noise(seed, realization))
@@ -217,8 +224,30 @@ def _map_parts(
         yield m, MapParts(flat, sum(extra[1:], start=extra[0]) if extra else None, difference)
 
 
+def _expansion(channel: Channel) -> Expansion | None:
+    """Return the expansion in the samples' offsets; None if the pixel window and their mean are all that counts."""
+    order = min((m.moments.offset_order for m in channel.maps), default=0)
+    site = channel.site
+    return expansion(site.nside, site.lmax, order, systematics.spread_of(channel.effects)) if order > 1 else None
+
+
+def _unwindowed(channel: Channel, seen: Alm, dipole: Alm | None) -> Alm:
+    """Return what the circular part of the beam sees, less the dipole, without a pixel window."""
+    lmax = channel.site.lmax
+    circular = convolve.circular_alm(seen, convolve.response(channel.beam, lmax))
+    if dipole is None:
+        return circular
+    return circular - convolve.circular_alm(dipole, convolve.response(channel.site.beam, lmax))
+
+
 def _circular(survey: Survey, channel: Channel, seen: Alm, dipole: Alm | None) -> Alm:
-    """Return what the circular part of the beam sees, less the dipole through the fiducial beam."""
+    """Return what the circular part of the beam sees, less the dipole through the fiducial beam.
+
+    The pixel window is in it; where the samples' offsets count beyond their mean, what stands in its place.
+    """
+    terms = _expansion(channel)
+    if terms is not None:
+        return alm_.multiply(_unwindowed(channel, seen, dipole), terms.smooth, channel.site.lmax)
     circular = convolve.circular_alm(seen, channel.response)
     return circular if dipole is None else circular - convolve.circular_alm(dipole, _fiducial_response(channel))
 

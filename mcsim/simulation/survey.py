@@ -22,6 +22,7 @@ from mcsim.simulation.channels import (
     scan_model,
     site_b_of,
     site_of,
+    with_offsets,
 )
 from mcsim.simulation.noise import DrawnNoise, of_map
 from mcsim.simulation.pixel_means import mean_gain, mean_signal
@@ -247,13 +248,14 @@ def _channel(
     splits = run.map.splits or (None,)
     maps = []
     for index, split in enumerate(splits):
-        grid = MapGrid(run.map.resolution, run.map.frame, run.map.span(index))
+        offsets = 1 if run.map.offset_order is None else run.map.offset_order
+        grid = MapGrid(run.map.resolution, run.map.frame, run.map.span(index), max(offsets, 1))
         pairs = None
         if isinstance(spec.scan, config.ScanDifferencing):
             model = scan_model(spec, spec.scan, split)
             refuse_excess(spec.name, acting)
             pairs = mapmaking.prepare(model, spec.scan.pair, grid, nthreads=nthreads, progress=progress)
-            moments = _hits_alone(pairs, max(beam.mmax, 1))
+            moments = with_offsets(_hits_alone(pairs, max(beam.mmax, 1)), offsets, spec)
         else:
             smax = max(beam.mmax, orders)
             if isinstance(spec.scan, config.ScanMoments):
@@ -264,6 +266,7 @@ def _channel(
                 moments = _moments(spec, split, grid, max(smax, 1), nthreads, progress)
                 if run.map.split_by == "rings" and isinstance(spec.scan, config.ScanHitAveraged):
                     moments = replace(moments, hits=moments.hits / len(splits))
+            moments = with_offsets(moments, offsets, spec)
             # An effect may give the beam higher orders than a file of moments has: they are left out.
             beam = beam.truncated(moments.smax) if acting and moments.smax < beam.mmax else beam
         m = with_effects(_survey_map(run, spec, split, moments, pairs), acting, site)
@@ -341,8 +344,8 @@ def with_effects(m: SurveyMap, acting: tuple[Effect, ...], site: Site) -> Survey
         factor = effect.noise(site)
         if factor is not None and noise is not None:
             noise = noise * np.sqrt(np.clip(factor, 0.0, None))
-    if spread != 1.0 and moments.dtheta is not None and moments.dphi is not None:
-        moments = replace(moments, dtheta=spread * moments.dtheta, dphi=spread * moments.dphi)
+    if spread != 1.0:
+        moments = moments.shrunk(spread)
     return replace(m, moments=moments, noise_uk=noise)
 
 
@@ -363,7 +366,7 @@ def _moments(
             return scan.Moments.parallel_transport(grid.nside, spec.scan.psi0_deg, smax, grid.frame)
         case config.ScanPointing():
             path = config.channel_path(spec.scan.path, spec.name, split)
-            return scan.Moments.from_pointing_files([path], grid.nside, smax, grid.frame)
+            return scan.Moments.from_pointing_files([path], grid.nside, smax, grid.frame, grid.offset_order)
         case config.ScanHitAveraged():
             model = scan_model(spec, spec.scan, split)
             return scan.Moments.load(scan.cached_moments(model, grid, smax, nthreads, progress))

@@ -131,6 +131,28 @@ def _representatives(face: int, nside: int) -> NDArray[np.int64]:
     return pixels + face * nside * nside
 
 
+@lru_cache(maxsize=4)
+def distances_from_centres(nside: int, split: int = 16) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return distances of points all over the pixels from their pixels' centres, radians, by a histogram, and shares.
+
+    A pixel is sampled at the centres of split x split sub-pixels.
+    """
+    check_nside(nside)
+    found, shares = [], []
+    for face, share in _FACES:
+        pixels = _representatives(face, nside)
+        inside = pixels[:, None] * split**2 + np.arange(split**2)
+        points = np.stack(healpy.pix2vec(split * nside, inside, nest=True), axis=-1)
+        centres = np.stack(healpy.pix2vec(nside, pixels, nest=True), axis=-1)
+        found.append(2.0 * np.arcsin(0.5 * np.linalg.norm(points - centres[:, None], axis=-1)).ravel())
+        shares.append(np.full(inside.size, share / inside.size))
+    r, weight = np.concatenate(found), np.concatenate(shares)
+    total, edges = np.histogram(r, 256, range=(0.0, r.max() * (1.0 + 1e-12)), weights=weight)
+    sums, _ = np.histogram(r, edges, weights=weight * r)
+    filled = total > 0.0
+    return sums[filled] / total[filled], total[filled] / total.sum()
+
+
 @lru_cache(maxsize=32)
 def _distances(face: int, nside: int, split: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the cosines between split x split sub-pixel centres of a face's pixels, by a histogram, and their shares.

@@ -13,9 +13,10 @@ from typer.testing import CliRunner
 import mcsim
 from mcsim import config
 from mcsim.cli import app
+from mcsim.comparison.pairs import with_known_offsets
 from mcsim.comparison.result import ComparisonResult
 from mcsim.ensemble.maps import write_map
-from mcsim.instrument.scan.geometry import MapGrid
+from mcsim.instrument.scan import MapGrid, write_moments_fits
 from mcsim.simulation import simulate, tod
 from mcsim.simulation.survey import survey
 from mcsim.sphere.rotation import rotate_alm
@@ -192,6 +193,28 @@ def test_an_effect_of_the_library_is_named(simulator, side_a):
     found = mcsim.compare(side_a, side_b, simulator.run)
     assert names(found) == ["pointing_offset"]
     assert found.channels[0].differences[0].amplitude == pytest.approx(2.0, rel=0.03)
+
+
+def test_powers_of_offsets_stand_for_samples_that_are_not_known(tmp_path):
+    """Maps of the same sky are identical if a file of moments knows the offsets of the samples; no pointing."""
+    beam = {"kind": "gaussian", "fwhm_arcmin": 180.0}
+    simulator = Simulator({**MODEL, "channel": [{**MODEL["channel"][0], "beam": beam}]})
+    pointing = simulator.site.pointed("")
+    model = pointing.model.with_lines_of_sight(pointing.line.name)
+    for half, split in enumerate(MODEL["map"]["splits"]):
+        grid = MapGrid(NSIDE, "ecliptic", (half / 2, (half + 1) / 2), offset_order=4)
+        write_moments_fits(tmp_path / f"{split}.fits", mcsim.Moments.on_grid(model, grid, 5))
+    scan = {"kind": "moments", "path": str(tmp_path / "{split}.fits")}
+    table = {**MODEL, "channel": [{"name": "W1", "beam": beam, "scan": scan}]}
+    run = config.load(table)
+    first = config.load({**table, "map": MODEL["map"] | {"offset_order": 1}})
+    made = [list(simulate.maps(survey(with_known_offsets(one)), 0, sky=simulator.sky)) for one in (run, first)]
+    side_b = simulator()
+    found = mcsim.compare(made[0], side_b, run).channels[0]
+    assert found.verdict == "identical"
+    assert found.rms_uk < 2e-4 * found.sky_rms_uk
+    usual = np.std((np.stack(made[1]) - np.stack(side_b))[np.stack(side_b) != healpy.UNSEEN])
+    assert usual > 50.0 * found.rms_uk
 
 
 def test_what_no_library_has_is_unknown(simulator, side_a):
