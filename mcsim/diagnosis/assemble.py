@@ -68,6 +68,7 @@ def result_of(
             "simulations of the model": len(ensemble.simulations),
             "skies constrained by the data": context.settings.constrained_skies,
             "seed of the run": context.run.ensemble.seed,
+            **({"worth": null.dof + 1} if ensemble.shrink else {}),
             **data.provenance(),
         },
         configuration=config.to_json(context.run),
@@ -167,7 +168,7 @@ def _candidates(context: DiagnosisContext, refined: Refined) -> Iterator[Candida
             amplitude, sigma, words = float("nan"), float("nan"), "no such amplitude"
         reach, size = detectable(null, t[:, columns], len(candidates)), None
         rows = min(max(int(rank[k]), 1), null.dimension)
-        needed = snr_needed(rows, len(candidates), null.dimension, null.n_sims)
+        needed = snr_needed(rows, len(candidates), null.dimension, null.dof + 1)
         if np.isfinite(reach):
             precision = np.eye(len(columns))
             size = abs(candidate.with_coordinates(reach * precision[0], precision).amplitude)

@@ -268,7 +268,7 @@ class DiagnosisResult:
     @property
     def excess(self) -> Measured:
         """Return the unbiased excess of chi^2 over its degrees of freedom, zero on average where the model is right."""
-        return excess_of(self.test.chi2, self.test.dimension, self.simulations - 1)
+        return excess_of(self.test.chi2, self.test.dimension, self.provenance.get("worth", self.simulations) - 1)
 
     @property
     def z(self) -> Vector:
@@ -295,13 +295,12 @@ class DiagnosisResult:
         """Return ``verdict.json`` of schema 1."""
         near = self.candidates[self.nearest]
         sets = [[_effect_json(effect) for effect in one.effects] for one in self.sets]
-        faint = {"faint": True, "probability": self.probability} if self.faint else {}
         return {
             "schema": 1,
             "case": self.case,
             "gap": {"p_value": self.test.pvalue, "statistic": self.test.chi2, "dof": self.test.dimension},
             "verdict": self.kind,
-            **faint,
+            **({"faint": True, "probability": self.probability} if self.faint else {}),
             "effects": sets[0] if sets else [],
             "alternatives": sets[1:],
             "maps": [] if not self.sets else [asdict(one) for one in self.sets[0].maps],
@@ -324,6 +323,7 @@ class DiagnosisResult:
             **({"untested": list(self.untested)} if self.untested else {}),
             **({"nuisances": [_nuisance_json(one) for one in self.nuisances]} if self.nuisances else {}),
             **({"warnings": list(self.warnings)} if self.warnings else {}),
+            **({"worth": self.provenance["worth"]} if "worth" in self.provenance else {}),
             **({"controls": self.controls.to_json()} if self.controls is not None else {}),
             **({"simulator": asdict(self.agreement)} if self.agreement else {}),
         }

@@ -59,6 +59,8 @@ def tested(result: DiagnosisResult) -> str:
     if result.residual_maps is None:
         source = "a table of spectra"
     by = "" if result.agreement is None else f" by {result.agreement.simulator}"
+    if "worth" in result.provenance:
+        by += f", whose shrunk covariance is worth {result.provenance['worth']} of a sample covariance"
     return (
         f"{len(result.elements)} elements of the data vector, {result.test.dimension} of them independent, measured "
         f"from {source}; {result.simulations} simulations of the model{by}; "
