@@ -123,7 +123,13 @@ def check_effects(run: config.RunConfig) -> None:
 
 
 def refuse_excess(channel: str, acting: tuple[systematics.Effect, ...]) -> None:
-    """Refuse noise of effects in a differencing scan, whose samples are differences."""
+    """Refuse effects in a differencing scan that its samples, which are differences, do not have."""
+    for effect in acting:
+        if effect.amplitude != 0.0 and type(effect).orientations is not systematics.Effect.orientations:
+            raise InputError(
+                f"effect {effect.name} on channel {channel} acts on orientation moments, but the scan takes "
+                'differences, which have none; remove it, or give a scan of kind "hit_averaged".'
+            )
     for effect in systematics.disturbing(acting):
         raise InputError(
             f"effect {effect.name} on channel {channel} adds noise to samples of one beam, but the scan takes "

@@ -86,6 +86,12 @@ def maps(survey: Survey, realization: int, nthreads: int = 1, sky: Alm | None = 
     found = []
     made = _circular_maps(survey, nthreads)
     for channel in survey.making.channels:
+        if channel.side_b is not None:
+            run = survey.config
+            seen, dipole = _seen(survey.making, channel, sky, realization)
+            made_at_once = differencing.whole_maps(channel, seen, dipole, run.ensemble.seed, realization, nthreads)
+            found += [_finished(m, map_uk) for m, map_uk in made_at_once]
+            continue
         for m, parts in _map_parts(survey.making, channel, sky, realization, made, smooth=True):
             found.append(_finished(m, parts.total))
     return np.stack(found)

@@ -30,7 +30,7 @@ from mcsim.simulation.preparation import Preparation, preparation
 from mcsim.simulation.rings import Rings, limit_rings, parallel_transport_rings
 from mcsim.sphere import healpix, rng, spectra
 from mcsim.sphere.mask import read_mask
-from mcsim.systematics import Effect, Library, Site, seen_through, spread_of
+from mcsim.systematics import Effect, Library, Site, seen_through, spread_of, variance_factor
 
 Progress = Callable[[float], None]
 
@@ -42,11 +42,12 @@ class SurveyMap:
     Attributes
     ----------
     moments
-        Orientation moments of the samples in it; of a differencing scan the hits of both sides, and NaN.
+        Orientation moments of its samples; of a differencing scan those of both sides, or, not asked for, hits and NaN.
     weight
         Weight before analysis, shape (npix,), mean square 1; ``None``: every pixel counts alike.
     noise_uk
-        Standard deviation of the noise per pixel, shape (npix,); ``None``: no noise, or noise of differences.
+        Standard deviation of the noise per pixel, shape (npix,), of a differencing scan about, where moments were asked
+        for; ``None``: no noise, or noise of differences.
     pairs
         Pairs of pixels of a differencing scan; ``None``: any other scan.
     gain
@@ -104,10 +105,10 @@ class SideB:
         Beam of side B with effects, its response, and the beam without effects.
     scan, imbalance
         Fiducial transmission imbalance, which map-making uses, and its convergence; the true imbalance.
-    sigma0_uk
-        White noise per difference.
+    sigma0_uk, noise_factor
+        White noise per difference, and the factor of its variance in every pixel, shape (npix,); None: one.
     iterations_short
-        How many iterations before convergence the map-making stops.
+        How many iterations before convergence the map-making stops, which then starts from zeros.
     """
 
     beam: beams.Beam
@@ -115,6 +116,7 @@ class SideB:
     fiducial: beams.Beam
     scan: config.ScanDifferencing
     sigma0_uk: float
+    noise_factor: NDArray[np.float64] | None
     imbalance: float
     iterations_short: int
 
@@ -255,7 +257,9 @@ def _channel(
             model = scan_model(spec, spec.scan, split)
             refuse_excess(spec.name, acting)
             pairs = mapmaking.prepare(model, spec.scan.pair, grid, nthreads=nthreads, progress=progress)
-            moments = with_offsets(_hits_alone(pairs, max(beam.mmax, 1)), offsets, spec)
+            smax = max(beam.mmax, orders, 1)
+            moments = pairs.moments(smax, nthreads, progress) if orders else pairs.hits_alone(smax)
+            moments = with_offsets(moments, offsets, spec)
         else:
             smax = max(beam.mmax, orders)
             if isinstance(spec.scan, config.ScanMoments):
@@ -269,7 +273,10 @@ def _channel(
             moments = with_offsets(moments, offsets, spec)
             # An effect may give the beam higher orders than a file of moments has: they are left out.
             beam = beam.truncated(moments.smax) if acting and moments.smax < beam.mmax else beam
-        m = with_effects(_survey_map(run, spec, split, moments, pairs), acting, site)
+        m = _survey_map(run, spec, split, moments, pairs)
+        if pairs is not None and orders:
+            m = replace(m, noise_uk=mapmaking.level_uk(pairs, _sigma0_uk(spec)))
+        m = with_effects(m, acting, site)
         gain, signal = (mean(acting, site, grid.time_range) for mean in (mean_gain, mean_signal))
         maps.append(replace(m, gain=gain, signal_uk=signal))
     # A pixel whose samples keep closer to its centre blurs less; the window is a Gaussian in all but name.
@@ -332,8 +339,13 @@ def _side_b(spec: config.Channel, window: NDArray[np.float64], site: Site, actin
     imbalance, short = spec.scan.transmission_imbalance, 0
     for effect in acting:
         imbalance, short = effect.differencing(imbalance, short)
+    factor = variance_factor(acting, site)
+    return SideB(beam, response, other.beam, spec.scan, _sigma0_uk(spec), factor, imbalance, short)
+
+
+def _sigma0_uk(spec: config.Channel) -> float:
     assert isinstance(spec.noise, config.Noise)  # the configuration refuses other noise of differences
-    return SideB(beam, response, other.beam, spec.scan, spec.noise.sigma0_uk, imbalance, short)
+    return spec.noise.sigma0_uk
 
 
 def with_effects(m: SurveyMap, acting: tuple[Effect, ...], site: Site) -> SurveyMap:
@@ -378,12 +390,6 @@ def _moments(
 def _moments_of_file(path: Path, nside: int, smax: int | None, frame: str) -> scan.Moments:
     """Read moments once for all surveys of a process that differ in effects alone."""
     return scan.read_moments(path, nside, smax, frame)
-
-
-def _hits_alone(pairs: mapmaking.DifferencingScan, smax: int) -> scan.Moments:
-    """Return the hits of a differencing scan, for weights and masks; its moments mean nothing and are NaN."""
-    unknown = np.broadcast_to(np.complex128(np.nan), (smax, pairs.npix))
-    return scan.Moments(pairs.grid.nside, pairs.grid.frame, pairs.hits_a + pairs.hits_b, unknown)
 
 
 def _survey_map(
