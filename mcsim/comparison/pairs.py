@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.comparison.scene import Maps, PointingFiles, Scene, scene_of, sky_in
+from mcsim.comparison.scene import Alm, Maps, PointingFiles, Scene, scene_of, sky_in
 from mcsim.ensemble.external import named_source, source_of
-from mcsim.ensemble.maps import file_names
+from mcsim.ensemble.maps import file_names, first_realization
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.channels import described, known_offsets
@@ -56,8 +56,8 @@ class ChannelPair:
         True if the scene's sky was taken from side A, and not from the model.
     files
         Samples of the channel, if the model has them in files.
-    noisy
-        True if noise was filtered out of the sky that side A shows, and so what noise hides of the sky is missing.
+    doubt
+        A draw of what noise hides of the sky that side A shows, coefficients as the scene's; None if it hides nothing.
     """
 
     name: str
@@ -72,7 +72,7 @@ class ChannelPair:
     sky_of_maps: bool = False
 
     files: PointingFiles | None = None
-    noisy: bool = False
+    doubt: Alm | None = None
 
     def pointing(self, longest: float = SAMPLES) -> Pointing | PointingFiles | None:
         """Return the pointing, if it is known and has no more samples than the longest that is wanted."""
@@ -88,6 +88,13 @@ class ChannelPair:
     def nside(self) -> int:
         """Of the maps."""
         return healpy.npix2nside(self.a.shape[1])
+
+    def exchanged(self) -> "ChannelPair":
+        """Return the pair with side B as side A, and a sky that its maps show."""
+        scene = self.scene
+        if scene is not None and self.sky_of_maps:
+            scene = replace(scene, sky=sky_in(self.b, self.seen, scene.up_to_offsets(1)))
+        return replace(self, a=self.b, b=self.a, scene=scene)
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,6 +289,7 @@ def _closer(
 
 
 def _folder(folder: Path, run: config.RunConfig | None) -> dict[str, NDArray[np.float64]]:
+    folder = first_realization(folder)
     names = {path.stem: path for path in sorted(folder.glob("*.fits"))}
     frequencies: dict[str, float | None] = {}
     if run is not None:

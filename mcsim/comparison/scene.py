@@ -202,6 +202,10 @@ class Scene:
         moments = tuple(replace(m, w=np.conj(m.w)) for m in self.moments)
         return replace(self, moments=moments, psi=(-self.psi[0], -self.psi[1]))
 
+    def at_centres(self) -> "Scene":
+        """Return the scene with all samples at the centres of their pixels; its pixel window stays."""
+        return replace(self.up_to_offsets(0), centred=True)
+
     def stream(self, pointing: Pointing | PointingFiles, split: int) -> Iterable[tod.Samples]:
         """Return the samples of a split, as the scan of the scene has them."""
         if isinstance(pointing, PointingFiles):

@@ -16,6 +16,7 @@ from functools import cached_property, reduce
 
 import ducc0
 import healpy
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -225,6 +226,18 @@ def _transforms(model: Model, members: tuple[int, ...]) -> Iterator[tuple[int, i
 
 def by_degree(a: Alm, b: Alm, lmax: int) -> Cl:
     """Return the sum over all m of a_lm conj(b_lm) for two real fields."""
-    product = a.real * b.real + a.imag * b.imag
-    product[lmax + 1 :] *= 2.0
-    return np.asarray(np.bincount(alm_.degrees(lmax), weights=product, minlength=lmax + 1), dtype=np.float64)
+    found = np.zeros(lmax + 1)
+    _add_by_degree(a, b, found)
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_by_degree(a, b, found):  # type: ignore[no-untyped-def]
+    """Add the products of all orders m, twice for m > 0, in one pass over memory."""
+    place = 0
+    for m in range(found.size):
+        twice = 2.0 if m else 1.0
+        for ell in range(m, found.size):
+            product = a[place].real * b[place].real + a[place].imag * b[place].imag
+            found[ell] += twice * product
+            place += 1

@@ -59,6 +59,8 @@ def tested(result: DiagnosisResult) -> str:
     if result.residual_maps is None:
         source = "a table of spectra"
     by = "" if result.agreement is None else f" by {result.agreement.simulator}"
+    if "worth" in result.provenance:
+        by += f", whose shrunk covariance is worth {result.provenance['worth']} of a sample covariance"
     return (
         f"{len(result.elements)} elements of the data vector, {result.test.dimension} of them independent, measured "
         f"from {source}; {result.simulations} simulations of the model{by}; "
@@ -226,11 +228,21 @@ def summary(result: DiagnosisResult, folder: Path) -> list[str]:
         rows.append(("where", f"{first.element.words}; z = {first.z:.1f}, {p_equals(first.p)}"))
     rows += [("nuisance", f"{one.label}: {one.words}{pulled(one)}") for one in result.nuisances]
     rows += [("note", note) for note in result.notes]
+    if result.untested:
+        rows.append(("note", f"{untested(result)} The report lists them."))
     rows += [("missing", line) for line in unlisted(result)]
     files = ["verdict.json", "report.html", "diagnosis.zarr"]
     files += [f"{one.name}.py" for one in result.unlisted or () if one.file is not None]
     rows.append(("written", f"{folder}: {', '.join(files)}"))
     return [f"{name:<14}{text}" for name, text in rows]
+
+
+def untested(result: DiagnosisResult) -> str:
+    """Return a sentence on the number of elements that are not tested."""
+    return (
+        f"{len(result.untested)} of {len(result.elements)} elements are not tested, because they follow the square of "
+        "a nuisance as wide as its prior."
+    )
 
 
 def pulled(one: NuisanceResult) -> str:

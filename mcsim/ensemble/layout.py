@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mcsim.support.arrays import texts
+
 if TYPE_CHECKING:  # stored ensembles open without the numerics, which load slowly
     from mcsim.bipolar import Mode
 
@@ -62,10 +64,7 @@ class Layout:
         return {
             name: (dim, np.array(values), {"units": "1", "long_name": text})
             for name, (dim, values, text) in numbers.items()
-        } | {
-            name: (dim, np.array(values, dtype=object), {"long_name": text})
-            for name, (dim, values, text) in labels.items()
-        }
+        } | {name: (dim, texts(values), {"long_name": text}) for name, (dim, values, text) in labels.items()}
 
     def kept_attributes(self) -> dict[str, str | int | float]:
         """Return the attributes of kept maps besides unit and long name."""

@@ -46,6 +46,13 @@ def gradient(alm: Alm, nside: int, lmax: int, nthreads: int = 1) -> NDArray[np.f
     return np.asarray(maps)
 
 
+def adjoint(map_: Map, lmax: int, nthreads: int = 1) -> Alm:
+    """Return the adjoint of the spin-0 synthesis, shape (size,): the sum over pixels of the map times conj(Y_lm)."""
+    return np.asarray(
+        ducc0.sht.adjoint_synthesis(map=map_[None], spin=0, lmax=lmax, nthreads=nthreads, **geometry(check_map(map_)))
+    )[0]
+
+
 def analysis(map_: Map, lmax: int, iterations: int = 0, nthreads: int = 1) -> Alm:
     """Return the coefficients of a RING-ordered map, shape (npix,), by ring-weighted quadrature and Jacobi iterations.
 
@@ -65,9 +72,7 @@ def analysis(map_: Map, lmax: int, iterations: int = 0, nthreads: int = 1) -> Al
     weight = _pixel_weights(nside)
 
     def quadrature(residual: Map) -> Alm:
-        weighted = (weight * residual)[None]
-        alm = ducc0.sht.adjoint_synthesis(map=weighted, spin=0, lmax=lmax, nthreads=nthreads, **geometry(nside))
-        return np.asarray(alm)[0]
+        return adjoint(weight * residual, lmax, nthreads)
 
     alm = quadrature(map_)
     for _ in range(iterations):

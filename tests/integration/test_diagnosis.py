@@ -359,6 +359,22 @@ def test_the_cost_of_a_diagnosis_counts_the_effects_on_request(small):
     assert size(DiagnosisSettings(simulations=400, library=library)) == size(least) + 4
     with refused("gain_spinn", "gain_spin"):
         api.describe(small.run, replace(least, including=("gain_spinn",)))
+    with refused("gain_spin", "--with", "--without"):
+        api.describe(small.run, replace(least, including=("gain_spin",), without=("gain_spin",)))
+
+
+def test_the_cost_of_a_diagnosis_is_said_of_data_that_can_be_used(small, folder):
+    settings = DiagnosisSettings(simulations=400, without=tuple(n for n in systematics.catalogue() if n != "boost"))
+    said = [api.describe(small.run, settings, *data).splitlines()[0] for data in ((), (folder,))]
+    assert said[0] == said[1]
+    write(folder, "W1:half2", np.ones(12 * 8**2))
+    with refused("W1_half2.fits", "nside 8", 16):
+        api.describe(small.run, settings, folder)
+    (folder / "00000").mkdir()
+    for path in list(folder.glob("*.fits")):
+        path.rename(folder / "00000" / path.name)
+    with refused("V1_half1.fits", folder / "00000"):
+        api.describe(small.run, settings, folder)
 
 
 def test_a_diagnosis_knows_the_library_that_it_is_given(small, tmp_path, monkeypatch):
