@@ -188,7 +188,7 @@ def _analysed(
     """
     threads = os.cpu_count() or 1
     table = read_spectra(data, run) if isinstance(data, str | Path) and Path(data).is_file() else None
-    if settings.shrink and (run.nuisances or table is not None):
+    if settings.shrinkage and (run.nuisances or table is not None):
         settings = settings.without_shrinkage()
     controls.check(wanted, of_maps=table is None, external=source is not None)
     if table is not None:
@@ -255,7 +255,7 @@ def _learned(
         null_ensemble.save(scratch, *campaign.learned(analysis, ask, simulations))
 
     found = null_ensemble.load(folders.cached(name, fill))
-    if not analysis.settings.shrink:
+    if not analysis.settings.shrinkage:
         shutil.rmtree(kept(run, analysis).folder, ignore_errors=True)
     return found
 

@@ -158,8 +158,11 @@ class Slices:
         an expected S/N below ``slice_snr`` are left out. Responses are tolerated to be wrong by ``consistency_error``
         of their white norm. Odds without the best part are those of amplitude 0 against 1 in all others.
         """
-        # More noise is more of chi^2 everywhere: what is left in the maps then says nothing of the effect.
-        noisy = any(candidate.effect.noise is not Effect.noise for candidate in candidates)
+        # More noise, or a pattern that is drawn, is more of chi^2: what is left in the maps then says nothing of it.
+        noisy = any(
+            candidate.effect.noise is not Effect.noise or candidate.effect.parametrization.stochastic
+            for candidate in candidates
+        )
         free = np.concatenate([action.directions for action in actions], axis=1)
         comparisons = []
         for place, (candidate, action) in enumerate(zip(candidates, actions, strict=True)):

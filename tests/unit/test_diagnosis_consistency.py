@@ -87,11 +87,11 @@ class Bench:
         self.t = np.concatenate([shape, -shape, 2.0 * shape, -2.0 * shape])
         self.signs = np.repeat([1.0, -1.0, 1.0, -1.0], 4)
 
-    def findings(self, signal, theta, seed=None):
+    def findings(self, signal, theta, seed=None, candidate=GAIN):
         z = signal + (0.0 if seed is None else np.random.default_rng([4, seed]).normal(size=16))
         tested = Slices(self.ensemble, z, 8, ("half1", "half2"), 24, DiagnosisSettings())
         covariance = np.linalg.inv(self.t.T @ self.t)
-        return tested.findings([GAIN], [Action.of(self.t @ theta, self.t, theta, covariance)])
+        return tested.findings([candidate], [Action.of(self.t @ theta, self.t, theta, covariance)])
 
 
 @pytest.fixture(scope="module")
@@ -140,6 +140,15 @@ def test_what_an_effect_leaves_in_the_maps_is_tested(bench):
     (right,) = bench.findings(bench.t @ THETA, THETA).maps
     assert right.pvalue > 0.5
     assert right.before - right.after == pytest.approx(right.forecast, rel=0.1)
+
+
+def test_what_a_drawn_pattern_leaves_in_the_maps_is_its_own(bench):
+    """Sources add to the largest scales of the maps, each sky other ones; their mean response says nothing of it."""
+    sources = Candidate(systematics.get("point_sources"), None, (0, 1))
+    extra = np.where(np.arange(16) == 9, 8.0, 0.0)
+    found = bench.findings(bench.t @ THETA + extra, THETA, candidate=sources)
+    assert found.maps == ()
+    assert not any(one.kind == "map" for own in found.comparisons for one in own)
 
 
 def test_nothing_contradicts_an_effect_that_no_part_measures():
