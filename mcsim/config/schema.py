@@ -210,7 +210,11 @@ class Channel:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Biposh:
-    """Settings of the estimator; ``lmax``: by default the sky's; ``iterations``: Jacobi iterations of the analysis."""
+    """Settings of the estimator; ``lmax``: by default the sky's; ``iterations``: Jacobi iterations of the analysis.
+
+    ``filter``: "inverse_covariance" estimates from maps filtered by their inverse covariance, which needs noise, and
+    normalises by ``probes`` random maps (default: as many as the number of bins needs).
+    """
 
     L_max: Annotated[int, Field(ge=0)] = 2
     lmax: Degree | None = None
@@ -218,6 +222,13 @@ class Biposh:
     weighting: Literal["uniform", "hits"] = "uniform"
     iterations: Annotated[int, Field(ge=0, le=20)] = 0
     pairs: Literal["all", "auto"] = "all"
+    filter: Literal["none", "inverse_covariance"] = "none"
+    probes: Annotated[int, Field(ge=8, le=10_000)] | None = None
+
+    @property
+    def filtered(self) -> bool:
+        """Return True if maps are filtered by their inverse covariance."""
+        return self.filter == "inverse_covariance"
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -341,6 +352,10 @@ class RunConfig:
             preparation=tuple(steps),
         )
 
+    def unfiltered(self) -> Self:
+        """Return the run with an estimator that does not filter."""
+        return replace(self, biposh=replace(self.biposh, filter="none", probes=None))
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         names = tuple(channel.name for channel in self.channels)
@@ -356,6 +371,7 @@ class RunConfig:
                 f"{key} = {lmax} is above 3 nside - 1 = {limit} of {of}; "
                 f"set biposh.lmax to at most {limit} or raise nside"
             )
+        _check_filter(self)
         if self.simulator is not None and self.ensemble.maps is not None:
             raise ValueError("both simulator and ensemble.maps are given; keep one of them")
         if self.biposh.L_max > lmax:
@@ -412,6 +428,33 @@ def _check_rings(run: RunConfig) -> None:
     ):
         if given:
             raise ValueError(f'{key} needs pixels, but grid = "gl" has none; remove it {remedy}')
+
+
+def _check_filter(run: RunConfig) -> None:
+    """Refuse settings that the inverse covariance takes the place of, or cannot bear."""
+    if not run.biposh.filtered:
+        if run.biposh.probes is not None:
+            raise ValueError('biposh.probes is given without a filter; remove it or set filter = "inverse_covariance"')
+        return
+    for key, given in (
+        ('map.grid = "gl"', run.map.grid == "gl"),
+        ("[[preparation]]", bool(run.preparation)),
+        ('biposh.weighting = "hits"', run.biposh.weighting == "hits"),
+        (f"biposh.iterations = {run.biposh.iterations}", run.biposh.iterations > 0),
+        ("sky without spectrum", run.sky.spectrum is None),
+    ):
+        if given:
+            raise ValueError(
+                f'{key} does not go with biposh.filter = "inverse_covariance", which weights the pixels of maps as '
+                "they are made by the spectrum of the sky and their noise; change one of the two"
+            )
+    for channel in run.channels:
+        for split in run.map.splits or (None,):
+            if is_noise_free(channel.noise_of(split)) or isinstance(channel.scan, ScanDifferencing):
+                raise ValueError(
+                    f'channel[{channel.name}] has no noise in its pixels, but biposh.filter = "inverse_covariance" '
+                    "needs it; give it noise and a scan of one beam, or remove the filter"
+                )
 
 
 def analysis_lmax(config: RunConfig) -> int:

@@ -81,7 +81,7 @@ def _layout(run: config.RunConfig, pairs: tuple[str, ...], modes: tuple[Mode, ..
     lmax, paired = config.analysis_lmax(run), run.ensemble.paired
     nside, frame = config.prepared_grid(run)
     kept_npix = 12 * nside**2 if run.ensemble.keep_maps else None
-    more: dict[str, Any] = {"frame": frame, "bin_width": run.biposh.summary_bin}
+    more: dict[str, Any] = {"frame": frame, "bin_width": run.biposh.summary_bin, "filtered": run.biposh.filtered}
     bare = Layout(run.ensemble.realizations, 1, config.map_names(run), pairs, modes, lmax, paired, kept_npix, **more)
     chunk = run.compute.chunk or 1
     if run.compute.chunk is not None:
@@ -153,6 +153,7 @@ def stored(path: Path, realizations: int) -> Layout:
             kept,
             frame=frame_of(attrs),
             bin_width=attrs["biposh"]["summary_bin"],
+            filtered="biposh_qml" in found,
         )
 
 
