@@ -64,13 +64,17 @@ class Layout:
         if self.kept_npix is not None:
             labels["map_name"] = ("map_name", self.maps, "map")
         bins = {"bin": ("bin", self.middles(), {"units": "1", "long_name": "middle of the bin in ell"})}
-        return {
-            name: (dim, np.array(values), {"units": "1", "long_name": text})
-            for name, (dim, values, text) in numbers.items()
-        } | (bins if self.filtered else {}) | {
-            name: (dim, np.array(values, dtype=object), {"long_name": text})
-            for name, (dim, values, text) in labels.items()
-        }
+        return (
+            {
+                name: (dim, np.array(values), {"units": "1", "long_name": text})
+                for name, (dim, values, text) in numbers.items()
+            }
+            | (bins if self.filtered else {})
+            | {
+                name: (dim, np.array(values, dtype=object), {"long_name": text})
+                for name, (dim, values, text) in labels.items()
+            }
+        )
 
     def first_ells(self) -> NDArray[np.int64]:
         """Return the first ell of every bin."""

@@ -18,12 +18,16 @@ from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError
 from mcsim.simulation import differencing, noise
 from mcsim.simulation.channels import check_effects, load_beam, refuse_external
+from mcsim.simulation.filtering import Bands, probes_of
 from mcsim.simulation.preparation import preparation
 from mcsim.simulation.survey import Survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rng, spectra
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.support.numbers import duration
+
+SOLUTION, NEAR = 100.0, 0.7
+"""Transforms that a solution of the inverse covariance takes, about, and the share of them with a near one known."""
 
 CHUNKS = 128
 CHUNK_BYTES = 1 << 26
@@ -166,6 +170,7 @@ class Cost:
     each_s: float
     preparation: str  # what preparing the maps adds, in words
     noise: tuple[str, ...] = ()  # what is known of noise that is estimated or drawn, in words
+    filter: str = ""  # what the inverse covariance costs, in words
 
     def lines(self, number: int, workers: int) -> list[str]:
         """Return lines on memory, preparation and time for a number of realizations."""
@@ -173,6 +178,7 @@ class Cost:
         return [
             f"  memory  {self.memory / 1e9:.2f} GB per worker, {workers} workers",
             *([f"  prepare {self.preparation}"] if self.preparation else []),
+            *([f"  filter  {self.filter}"] if self.filter else []),
             *(f"  noise   {line}" for line in self.noise),
             f"  time    {duration(self.each_s)} per realization and core, {duration(total_s)} of processor time,"
             f" {duration(total_s / workers)} with {workers} workers on as many idle cores",
@@ -223,9 +229,20 @@ def cost(run: config.RunConfig) -> Cost:
         transforms, memory = transforms + extra, memory + 480.0 * nside**2
         grid = f"nside {nside} to {config.prepared_grid(run)[0]}"
         words = f"{extra:g} further transforms per realization and {480e-9 * nside**2:.2g} GB per worker, {grid}"
+    filtering = ""
+    if run.biposh.filtered:
+        solutions = len(names) * (1.0 + NEAR * run.ensemble.paired)
+        transforms += SOLUTION * solutions
+        bands = [Bands(planned.modes, lmax, run.biposh.summary_bin, auto) for auto in (True, not both)]
+        probes = probes_of(bands, run.biposh.probes)
+        once_s = probes * (SOLUTION * len(names) * transform + pairs * probes * estimation)
+        filtering = (
+            f"about {SOLUTION * solutions:.0f} further transforms per realization; once, {probes} random maps of each "
+            f"map, {duration(once_s)} of processor time (none if the noise is uniform on the full sky)"
+        )
     estimates = pairs * (2 if run.ensemble.paired else 1)
     each_s = transform * transforms + estimation * estimates + differencing.seconds(run) + noise.seconds(run)
-    return Cost(planned, memory, each_s, words, tuple(noise.in_words(run)))
+    return Cost(planned, memory, each_s, words, tuple(noise.in_words(run)), filtering)
 
 
 def _timed(nside: int, lmax_sky: int, lmax: int, L_max: int) -> tuple[float, float]:

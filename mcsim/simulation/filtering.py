@@ -95,10 +95,10 @@ class MapFilter:
         """Return the filtered coefficients, uK^-1, and the Wiener-filtered sky, uK, near which the next ones may be."""
         window = self.window[: self.inverse.lmax + 1]
         if self.uniform:
-            alm = healpix.analysis(map_uk, self.inverse.lmax, nthreads=self.inverse.nthreads)
-            found = alm_.multiply(alm, 1.0 / (window * self.total), self.inverse.lmax)
-            sky = alm_.multiply(found, self.inverse.cl * self._beam, self.inverse.lmax)
-            return alm_.resize(found, self.inverse.lmax, self.lmax), sky
+            alm = healpix.analysis(map_uk, self.lmax, nthreads=self.inverse.nthreads)
+            found = alm_.multiply(alm, 1.0 / (window * self.total), self.lmax)
+            sky = alm_.multiply(found, self.inverse.cl * self._beam, self.lmax)
+            return found, alm_.resize(sky, self.lmax, self.inverse.lmax)
         observed = np.where(self._precision > 0.0, map_uk, 0.0)[None]
         inverse = self.inverse
         sky = inverse.solve(inverse.adjoint(inverse.precision * observed), near)
