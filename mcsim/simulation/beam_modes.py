@@ -1,6 +1,6 @@
 r"""Quadratic maximum-likelihood modes of a beam in the frame of its scan, from one map.
 
-A beam of orders b_ls, s > 0, changes a map by dP s = 2 Re sum_s w_s S_s. With beta_s = b_ls / b_l0 constant in bins of l,
+A beam of orders b_ls, s > 0, changes a map by dP s = 2 Re sum_s w_s S_s. With beta_s = b_ls / b_l0, constant in bins,
 
     q = y' dP s^,   y = C^-1 d,   s^ = S P^t y,   beta^ = F^-1 (q - <q>),   F = 1/2 Tr[C^-1 dC C^-1 dC'],
 
@@ -37,7 +37,7 @@ class Weighted(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BeamModes:
-    """Estimate of b_ls / b_l0, s = 1 ... ``orders``, in bins of ``width`` degrees.
+    """Estimate b_ls / b_l0, s = 1 ... ``orders``, in bins of ``width`` degrees.
 
     Attributes
     ----------
@@ -52,6 +52,11 @@ class BeamModes:
     ------
     InputError
         If the moments have fewer orders, or other pixels.
+
+    Notes
+    -----
+    Equal to whole matrices at nside 4, and for a slightly elliptical beam the mean is b_l2 / b_l0 of the simulator's
+    beam, sign and phase included (tests/unit/test_beam_modes.py).
     """
 
     filter: MapFilter
