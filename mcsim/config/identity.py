@@ -71,7 +71,7 @@ def _leave_out_what_says_nothing(plain: dict[str, Any]) -> None:
     for channel in plain["channel"]:
         channel["scan"].pop("max_iterations", None)
         noises = (channel["noise"], *channel["split_noise"].values())
-        _drop(channel, {"beam_b": None, "split_noise": {}, "mask": None})
+        _drop(channel, {"beam_b": None, "split_noise": {}, "mask": None, "foregrounds": True})
         for table in (channel["scan"], channel["beam"], channel.get("beam_b", {"kind": "none"}), *noises):
             _drop(table, _OF_KIND.get(table["kind"], {}))
 

@@ -176,7 +176,8 @@ class Channel:
     """One detector or band: a beam under a scan, with noise.
 
     ``beam_b``: beam of side B of a differencing scan; default: ``beam`` mirrored. ``split_noise``: noise of splits that
-    have their own, by name. ``mask``: in place of the run's.
+    have their own, by name. ``mask``: in place of the run's. ``foregrounds``: False for a map of the cosmic microwave
+    background alone, which a component separation made.
     """
 
     name: Label
@@ -187,6 +188,7 @@ class Channel:
     noise: AnyNoise = Noise()
     split_noise: dict[Label, AnyNoise] = Field(default_factory=dict)
     mask: PathText | None = None
+    foregrounds: bool = True
 
     @model_validator(mode="after")
     def _one_or_two_beams(self) -> Self:

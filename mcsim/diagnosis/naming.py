@@ -24,7 +24,7 @@ def agreeing(data: DataSet[Any], refined: Refined, found: Attribution) -> tuple[
     """
     context, slices = data.context, slices_of(data)
     settings, candidates = context.settings, context.candidates
-    frequencies = {channel.frequency_ghz for channel in context.run.channels}
+    frequencies = {channel.frequency_ghz if channel.foregrounds else None for channel in context.run.channels}
     kept: list[Explanation] = []
     refused: list[Explanation] = []
     sentences: list[str] = []

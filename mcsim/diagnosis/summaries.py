@@ -211,7 +211,8 @@ def _repeated_block(model: Model, channel: int) -> Block:
 
 def _contrast_blocks(model: Model) -> list[Block]:
     """Measure the power of the contrast of lowest and highest frequency, common to two splits, by Galactic latitude."""
-    frequencies = [channel.site.frequency_ghz for channel in model.survey.channels]
+    sites = [channel.site for channel in model.survey.channels]
+    frequencies = [site.frequency_ghz if site.foregrounds else None for site in sites]
     known = sorted({f for f in frequencies if f is not None})
     if len(known) < 2 or any(len(model.of(c)) < 2 for c in range(len(frequencies))):
         return []

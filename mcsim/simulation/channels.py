@@ -156,6 +156,7 @@ def site_of(run: config.RunConfig, spec: config.Channel) -> systematics.Site:
         pointing=pointing,
         dipole_uk=amplitude * (rotation.rotation_matrix("galactic", run.map.frame) @ towards),
         whole=partial(_whole, load_beam, spec, run.sky.lmax) if _is_cut(spec.beam) else None,
+        foregrounds=spec.foregrounds,
     )
 
 

@@ -52,6 +52,8 @@ class Site:
         Dipole that the survey sees and subtracts with the fiducial gain: a vector in the frame of the maps.
     whole
         Returns the beam with the orders that it has without an m_max; None if they are not known.
+    foregrounds
+        False: the map is one of a component separation, in which foregrounds are not looked for.
     """
 
     channel: str
@@ -63,6 +65,7 @@ class Site:
     pointing: Pointing | None = None
     dipole_uk: Vector = field(default_factory=lambda: np.zeros(3))
     whole: Callable[[], Beam] | None = None
+    foregrounds: bool = True
 
     def pointed(self, effect: str) -> Pointing:
         """Return the pointing; raise InputError if it is not known."""

@@ -35,17 +35,17 @@ class _FourAngles(Parametrization):
             return {"amplitude": 0.0}  # the data do not respond to it
         measured = precision @ coordinates
 
-        def missed(angle: float) -> float:
+        def fitted(angle: float) -> tuple[float, float]:
+            """Return k at an angle, and what it takes off the distance; the data may not respond to an angle at all."""
             weights = _weights(angle)
-            return -(max(float(weights @ measured), 0.0) ** 2) / float(weights @ precision @ weights)
+            along, size = max(float(weights @ measured), 0.0), float(weights @ precision @ weights)
+            return (along / size, along**2 / size) if size > 0.0 else (0.0, 0.0)
 
         tried = np.linspace(0.0, 2.0 * np.pi, 181)
-        first = tried[int(np.argmin([missed(angle) for angle in tried]))]
+        first = max(tried, key=lambda angle: fitted(angle)[1])
         near = (first - 0.05, first + 0.05)
-        angle = minimize_scalar(missed, bounds=near, method="bounded", options={"xatol": 1e-9}).x
-        weights = _weights(angle)
-        amplitude = max(float(weights @ measured), 0.0) / float(weights @ precision @ weights)
-        return {"amplitude": amplitude, "angle_deg": float(np.rad2deg(angle)) % 360.0}
+        angle = minimize_scalar(lambda a: -fitted(a)[1], bounds=near, method="bounded", options={"xatol": 1e-9}).x
+        return {"amplitude": fitted(angle)[0], "angle_deg": float(np.rad2deg(angle)) % 360.0}
 
 
 def _weights(angle: float) -> Vector:

@@ -25,6 +25,8 @@ class ForegroundResidual(Effect):
 
     Notes
     -----
+    Channels with ``foregrounds = false`` have none of it.
+
     Drawn: p(b) (1 + g), p = 1 / (1 + (sin b / 0.15)^2), g a Gaussian field of C_l ~ l^-2.5, l > 0, and unit variance,
     scaled to rms 1 over the full sky; a model of our own that is bright in the plane and patchy off it, no more.
     """
@@ -50,6 +52,8 @@ class ForegroundResidual(Effect):
     template: str = ""
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Add the residual."""
+        """Add the residual, but to maps that a component separation made."""
+        if not site.foregrounds:
+            return sky
         scale = self.amplitude * (site.frequency(self.name) / REFERENCE_GHZ) ** self.spectral_index
         return sky + scale * morphology(self.template, site, draw)

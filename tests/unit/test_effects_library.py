@@ -163,6 +163,14 @@ def test_coma_off_the_possible_is_brought_to_the_nearest():
     assert best <= min(tried)
 
 
+def test_coma_that_the_data_see_at_some_angles_alone():
+    """At angle 0 the second component is exactly zero, and so is what the data know of it."""
+    seen = np.diag([0.0, 1.0, 0.0, 0.0])
+    found = systematics.get("beam_coma").parametrization.nearest(np.array([0.0, 0.02, 0.0, 0.0]), seen)
+    again = systematics.get("beam_coma").parametrization.coordinates(systematics.build("beam_coma", found))
+    assert again[1] == pytest.approx(0.02)
+
+
 def test_unknown_effects_and_parameters_are_named():
     with refused("gain_drit", "gain_drift"):
         systematics.get("gain_drit")

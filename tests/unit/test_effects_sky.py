@@ -206,6 +206,7 @@ def test_foregrounds_are_fixed_to_the_galaxy_and_grow_with_frequency(site, sky):
     np.testing.assert_allclose(low, 0.5 * drawn, atol=1e-12)
     with refused("W1", "frequency_ghz"):
         kind(amplitude=3.0).sky(sky, replace(site, frequency_ghz=None), draw)
+    assert kind(amplitude=3.0).sky(sky, replace(site, frequency_ghz=None, foregrounds=False), draw) is sky
 
 
 def test_noise_after_a_template(site, tmp_path):

@@ -1,12 +1,14 @@
 """Data in realistic company, with the company declared as nuisances and not: p-values, names, pulls.
 
-    python workflows/nuisances/check.py [--draws 600] [--skies 120] [--strength 8] [--seed 2026] [--workers 2] [-o FILE]
+    python workflows/nuisances/check.py [--draws 600] [--skies 120] [--strength 8] [--seed 2026]
+        [--workers 2] [--knee 0.003] [-o FILE]
 
 Two channels at nside 32 with two splits. The company is drawn anew for every data set: calibrations off by 0.3 %, beam
 widths by 0.5 %, noise levels by 3 % (standard deviations), and a foreground of known morphology with 2 uK rms at 94 GHz
 and a spectral index of -3.0 +- 0.3. First, data vectors without an effect: the p-value of the model that declares the
 company must be uniform; that of the model that does not cannot be. Then full skies, half of them with one effect of an
-expected S/N of ``strength`` against the model that declares; both models diagnose each.
+expected S/N of ``strength`` against the model that declares; both models diagnose each. With ``--knee`` (in Hz)
+the noise is 1/f, of slope -1 down to 10 uHz, destriped in baselines of an hour, and modelled as such.
 """
 
 import argparse
@@ -56,19 +58,23 @@ EFFECTS: tuple[tuple[str, str, dict[str, float]], ...] = (
 )
 
 
-def model(template: Path) -> mcsim.RunConfig:
+def model(template: Path, knee: float | None) -> mcsim.RunConfig:
     """Return the model, company declared; the foreground's morphology is written to ``template``."""
     draw = np.random.default_rng(1)
     galactic = np.array(healpy.Rotator(coord=["E", "G"])(np.array(healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2)))))
     patches = healpy.smoothing(draw.standard_normal(12 * NSIDE**2), fwhm=np.deg2rad(10.0))
     plane = (1.0 + 0.5 * patches / patches.std()) / (1.0 + (galactic[2] / 0.15) ** 2)
     healpy.write_map(template, plane, coord="E", dtype=np.float64, overwrite=True)
+    noise: dict[str, Any] = {"sigma0_uk": 150.0}
+    if knee is not None:
+        noise |= {"kind": "correlated", "f_knee_hz": knee, "f_min_hz": 1e-5, "alpha": 1.0}
+        noise |= {"map_making": "destriped", "baseline_s": 3600.0}
     channels = [
         {
             "name": name,
             "frequency_ghz": frequency,
             "beam": {"kind": "gaussian", "fwhm_arcmin": 180.0},
-            "noise": {"sigma0_uk": 150.0},
+            "noise": noise,
             "scan": {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 30.0, "line_of_sight": line},
         }
         for name, frequency, line in (("V1", 61.0, "A"), ("W1", 94.0, "B"))
@@ -201,10 +207,11 @@ def main() -> None:
     parser.add_argument("--strength", type=float, default=8.0)
     parser.add_argument("--seed", type=int, default=2026)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--knee", type=float, metavar="HZ")
     parser.add_argument("-o", "--output", type=Path)
     chosen = parser.parse_args()
     folder = Path(tempfile.mkdtemp())
-    run = model(folder / "template.fits")
+    run = model(folder / "template.fits", chosen.knee)
     company = {(one.effect, one.channel) for one in run.nuisances}
     with batch(chosen.workers) as call, asking(call, False, data_vectors, "simulations") as ask:
         known = {"declared": learned(run, ask), "not declared": learned(replace(run, nuisances=()), ask)}
