@@ -13,7 +13,8 @@ from pydantic_core import core_schema
 
 from mcsim.config import arrays
 from mcsim.config.beams import BEAMS, AnyBeam
-from mcsim.config.noise import AnyNoise, Noise, check_differences, check_splits, in_words, is_noise_free
+from mcsim.config.consistency import check_filter, check_rings
+from mcsim.config.noise import AnyNoise, Noise, check_differences, check_splits
 from mcsim.config.preparation import Step, check_steps
 from mcsim.config.values import STRICT, Degree, Frame, Label, Nside, PathText, power_of_two, unique
 
@@ -367,13 +368,13 @@ class RunConfig:
         if lmax > self.sky.lmax:
             raise ValueError(f"{key} = {lmax} is above sky.lmax = {self.sky.lmax}; lower it or raise sky.lmax")
         if self.map.grid == "gl":
-            _check_rings(self)
+            check_rings(self)
         elif lmax > limit:
             raise ValueError(
                 f"{key} = {lmax} is above 3 nside - 1 = {limit} of {of}; "
                 f"set biposh.lmax to at most {limit} or raise nside"
             )
-        _check_filter(self)
+        check_filter(self)
         if self.simulator is not None and self.ensemble.maps is not None:
             raise ValueError("both simulator and ensemble.maps are given; keep one of them")
         if self.biposh.L_max > lmax:
@@ -399,64 +400,6 @@ class RunConfig:
                     where = f"channel[{channel.name}].{key}.m_max = {m_max}"
                     raise ValueError(f"{where} is above sky.lmax = {self.sky.lmax}; lower m_max")
         return self
-
-
-def _check_rings(run: RunConfig) -> None:
-    """Refuse settings that need pixels, or moments that depend on more than colatitude."""
-    remedy = 'or set map.grid = "healpix"'
-    for channel in run.channels:
-        kind = channel.scan.kind
-        if not isinstance(channel.scan, ScanParallelTransport | ScanHitAveraged):
-            raise ValueError(
-                f'channel[{channel.name}].scan is of kind "{kind}", which grid = "gl" cannot bear; use '
-                f'"parallel_transport" or "hit_averaged", {remedy}'
-            )
-        if isinstance(channel.scan, ScanHitAveraged) and run.map.frame != "ecliptic":
-            raise ValueError(
-                f'map.frame = "{run.map.frame}", but with grid = "gl" the limit of a scan depends on '
-                f'ecliptic colatitude alone; set frame = "ecliptic" {remedy}'
-            )
-        if not is_noise_free(channel.noise):
-            raise ValueError(
-                f'channel[{channel.name}].{in_words(channel.noise)}, but grid = "gl" has no pixels to draw noise in; '
-                f"remove the noise {remedy}"
-            )
-    for key, given in (
-        ("mask of a channel", any(channel.mask is not None for channel in run.channels)),
-        ("ensemble.keep_maps = true", run.ensemble.keep_maps),
-        ("[[preparation]]", bool(run.preparation)),
-        ('biposh.weighting = "hits"', run.biposh.weighting == "hits"),
-        (f"biposh.iterations = {run.biposh.iterations}", run.biposh.iterations > 0),
-    ):
-        if given:
-            raise ValueError(f'{key} needs pixels, but grid = "gl" has none; remove it {remedy}')
-
-
-def _check_filter(run: RunConfig) -> None:
-    """Refuse settings that the inverse covariance takes the place of, or cannot bear."""
-    if not run.biposh.filtered:
-        if run.biposh.probes is not None:
-            raise ValueError('biposh.probes is given without a filter; remove it or set filter = "inverse_covariance"')
-        return
-    for key, given in (
-        ('map.grid = "gl"', run.map.grid == "gl"),
-        ("[[preparation]]", bool(run.preparation)),
-        ('biposh.weighting = "hits"', run.biposh.weighting == "hits"),
-        (f"biposh.iterations = {run.biposh.iterations}", run.biposh.iterations > 0),
-        ("sky without spectrum", run.sky.spectrum is None),
-    ):
-        if given:
-            raise ValueError(
-                f'{key} does not go with biposh.filter = "inverse_covariance", which weights the pixels of maps as '
-                "they are made by the spectrum of the sky and their noise; change one of the two"
-            )
-    for channel in run.channels:
-        for split in run.map.splits or (None,):
-            if is_noise_free(channel.noise_of(split)) or isinstance(channel.scan, ScanDifferencing):
-                raise ValueError(
-                    f'channel[{channel.name}] has no noise in its pixels, but biposh.filter = "inverse_covariance" '
-                    "needs it; give it noise and a scan of one beam, or remove the filter"
-                )
 
 
 def analysis_lmax(config: RunConfig) -> int:

@@ -90,11 +90,11 @@ class InverseCovariance:
 
     Notes
     -----
-    The preconditioner is diagonal in harmonics: 1/(1 + C_l sum_k (B_kl w_kl)^2 / N_k), with 1/N_k the mean precision of
-    the map's pixels over the whole sky, per sr; and where pixels are missing, whole for the degrees at which the sky is
-    far above the noise (Eriksen et al. 2004). At nside 128, lmax 384 and S/N = 440 at l = 2, three channels of two
-    halves take 16 iterations for 1e-6 on the full sky, 155 with the equator masked up to 15 degrees (586 without the
-    block).
+    The preconditioner is diagonal in harmonics, 1/(1 + C_l sum_k (B_kl w_kl)^2 / N_k), with 1/N_k the mean precision of
+    the map's pixels over the whole sky, per sr. Where pixels are missing, the lower degrees in which the sky is above
+    the noise are those of a nearly solved system of half the degrees on coarser pixels, down to l = 32 (Smith, Zahn &
+    Dore 2007). At S/N = 440 for l = 2 and 1e-6, three channels of two halves at nside 128, lmax 384 take 16 iterations
+    on the full sky, 55 with the equator masked up to 15 degrees (155 with one exact block and the diagonal).
     Equal to a dense solve to 1e-6 with a mask, uneven noise, the orders of the beam and centroids
     (tests/unit/test_inverse_covariance.py).
     """
@@ -247,8 +247,12 @@ class InverseCovariance:
     @cached_property
     def _gain(self) -> Vector:
         """Power of the sky over that of the noise in one mode, if all pixels of a map counted alike; (lmax + 1,)."""
-        gain = sum(m.response.factors[0].real ** 2 * m.precision.sum() for m in self.maps) / (4.0 * np.pi)
-        return np.asarray(self.cl * gain)
+        return np.asarray(self.cl * self._sensitivity / (4.0 * np.pi))
+
+    @cached_property
+    def _sensitivity(self) -> Vector:
+        """Sum over maps of the squared circular response times the precision of all pixels, (lmax + 1,)."""
+        return np.asarray(sum(m.response.factors[0].real ** 2 * m.precision.sum() for m in self.maps))
 
     @cached_property
     def _diagonal(self) -> Vector:
@@ -264,14 +268,13 @@ class InverseCovariance:
         nside = self.nside
         while nside > 8 and nside >= top:
             nside //= 2
-        together = [(self.maps[members[0]].response, self.precision[members].sum(axis=0)) for members in self._members]
-        short = [
-            ObservedMap(convolve.Response(r.factors[:1, : top + 1]), _summed(precision, self.nside, nside))
-            for r, precision in together
-        ]
+        # One map with the mean response stands for all; where they are masked alike that is nearly exact.
+        total = self.precision.sum(axis=0)
+        mean = np.sqrt(self._sensitivity[: top + 1] / total.sum()).astype(np.complex128)
+        single = ObservedMap(convolve.Response(mean[None]), _summed(total, self.nside, nside))
         # Both orders of packing are by m, so that degrees up to top keep their order.
         places = np.flatnonzero(_spread(np.arange(self.lmax + 1), self.lmax) <= top)
-        return places, InverseCovariance(self.cl[: top + 1], short, nthreads=self.nthreads)
+        return places, InverseCovariance(self.cl[: top + 1], [single], nthreads=self.nthreads)
 
     def _precondition(self, vector: Vector) -> Vector:
         found = self._diagonal * vector

@@ -23,12 +23,12 @@ from mcsim.simulation.channels import (
     site_b_of,
     site_of,
 )
-from mcsim.simulation.filtering import TOLERANCE, Filtering, MapFilter, unknown_dipole
-from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap
+from mcsim.simulation.filtering import Filtering
 from mcsim.simulation.noise import DrawnNoise, of_map
 from mcsim.simulation.pixel_means import mean_gain, mean_signal
 from mcsim.simulation.preparation import Preparation, preparation
 from mcsim.simulation.rings import Rings, limit_rings, parallel_transport_rings
+from mcsim.simulation.survey_filter import filtering_of
 from mcsim.sphere import healpix, rng, spectra
 from mcsim.sphere.mask import read_mask
 from mcsim.systematics import Effect, Library, Site, seen_through, spread_of
@@ -230,32 +230,9 @@ def survey(
     pairs = tuple((x, y) for x in range(len(maps)) for y in range(x, len(maps)) if both or x == y)
     norm = tuple(1.0 / _overlap(maps[x], maps[y]) for x, y in pairs)
     tables = estimator(run.biposh.L_max, lmax, both_orders=both and len(maps) > 1)
-    filtering = _filtering(run, made, cl, (pairs, tables), nthreads) if run.biposh.filtered else None
+    filtering = filtering_of(run, made, cl, (pairs, tables), nthreads) if run.biposh.filtered else None
     found = Survey(run, cl, made, lmax, tables, pairs, norm, filtering=filtering)
     return replace(found, channels=channels, source=found) if run.preparation else found
-
-
-def _filtering(
-    run: config.RunConfig,
-    channels: tuple[Channel, ...],
-    cl: NDArray[np.float64] | None,
-    spectra_of: tuple[tuple[tuple[int, int], ...], Estimator],
-    nthreads: int,
-) -> Filtering:
-    """Return the filters of all maps, of the fiducial beams' circular part and the maps' white noise."""
-    assert cl is not None  # the configuration refuses a filter without a spectrum
-    filters = []
-    for channel in channels:
-        response = convolve.response(channel.site.beam.truncated(0), run.sky.lmax, channel.window)
-        for m in channel.maps:
-            assert m.noise_uk is not None  # as well as without noise
-            weight = np.ones(m.noise_uk.size) if m.weight is None else m.weight / m.weight.max()
-            seen = (m.moments.hits > 0) & (m.noise_uk > 0.0)
-            precision = np.divide(weight**2, m.noise_uk**2, out=np.zeros(seen.size), where=seen)
-            inverse = InverseCovariance(unknown_dipole(cl), [ObservedMap(response, precision)], TOLERANCE, nthreads)
-            filters.append(MapFilter(m.name, inverse, channel.window, config.analysis_lmax(run)))
-    pairs, tables = spectra_of
-    return Filtering(tuple(filters), pairs, tables, run.biposh.summary_bin, run.biposh.probes)
 
 
 def _channel(

@@ -26,7 +26,7 @@ from mcsim.simulation.survey import Survey, survey
 
 HERE = Path(__file__).parent
 L_LEAK, L_MOMENTS, PROBES = 6, 32, 40
-MODES = ("L2M0d0", "L2M0d2")
+MODES = {"L2M0d0": r"$A^{20}_{\ell\ell}$", "L2M0d2": r"$A^{20}_{\ell-2,\ell}$"}
 
 
 def expected(shared: Survey, number: int, few: Filtering, probes: list) -> tuple[np.ndarray, np.ndarray]:
@@ -84,6 +84,7 @@ def compared(shared: Survey, filtered: xr.Dataset, plain: xr.Dataset) -> dict[st
                 "sigma_filtered": one.biposh_qml_standard_deviation.values.tolist(),
                 "sigma_plain": scatter.tolist(),
                 "variance_ratio": ((sigma[number, row] / scatter) ** 2).tolist(),
+                "variance_ratio_binned": ((one.biposh_binned_standard_deviation.values / scatter) ** 2).tolist(),
             }
     return result
 
@@ -103,9 +104,10 @@ def draw(result: dict, middle: np.ndarray) -> Figure:
     left, right = figure.subplots(1, 2)
     for name, colour in (("V2", "#c44e22"), ("W1", "#1f5fa8")):
         for mode, marker in zip(MODES, "os", strict=True):
-            one = {key: np.array(value) for key, value in result[f"{name} {mode}"].items()}
+            # The last bin is a single degree at the end.
+            one = {key: np.array(value)[:-1] for key, value in result[f"{name} {mode}"].items()}
             error = np.hypot(one["error"], one["error_of_normalisation"])
-            label = rf"{name}, $A^{{20}}_{{\ell{'-2' if mode.endswith('2') else ''}\,\ell}}$"
+            label = f"{name}, {MODES[mode]}"
             shown = {"color": colour, "marker": marker, "ms": 5, "mfc": colour if marker == "o" else "white"}
             left.errorbar(middle, one["mean"], error, ls="", label=label, **shown)
             left.plot(middle, one["expected"], "-" if marker == "o" else "--", color=colour, lw=1)
@@ -117,7 +119,7 @@ def draw(result: dict, middle: np.ndarray) -> Figure:
     )
     left.axhline(0.0, color="0.7", lw=0.8)
     right.set(
-        xlabel=r"multipole $\ell$", ylabel="variance, filtered / plain estimator", title="one sky", ylim=(0.0, 1.2)
+        xlabel=r"multipole $\ell$", ylabel="variance, filtered / plain estimator", title="one sky", ylim=(0.0, 1.4)
     )
     right.axhline(1.0, color="0.7", lw=0.8)
     for axes in (left, right):
@@ -146,9 +148,11 @@ def main() -> None:
     print("variance, filtered over plain; bins from l =", *first)
     for name, each in result.items():
         print(f"  {name:10s}", *(f"{value:6.2f}" for value in each["variance_ratio"]))
+    alone = np.mean([each["variance_ratio_binned"] for each in result.values()], axis=0)
+    print("each mode normalised alone, mean over modes:", *(f"{value:.2f}" for value in alone))
     seconds = {name: timed(survey(mcsim.load_config(HERE / f"{name}.toml"))) for name in ("filtered", "plain")}
     print(f"one realization: {seconds['filtered']:.2f} s filtered, {seconds['plain']:.2f} s plain, processor time")
-    draw(result, filtered["bin"].values).savefig(arguments.output, dpi=110)
+    draw(result, filtered["bin"].values[:-1]).savefig(arguments.output, dpi=110)
     if arguments.json:
         whole = {"bin_first": first.tolist(), "seconds": seconds, "results": result}
         arguments.json.write_text(json.dumps(whole, indent=1) + "\n")
