@@ -1,8 +1,12 @@
 """Settings of all tests: reproducible hypothesis, a cache of their own, one thread each, and what is slow."""
 
+import gc
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
+
+# Until all tests are collected: modules and tests stay, and the collector would walk through them again and again.
+gc.disable()
 
 # Before numpy is loaded: processes that run side by side would take each other's cores.
 for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -55,6 +59,12 @@ SLOW = {"integration", "statistical"}
 
 FIRST = {"test_prepared_diagnosis", "test_diagnosis", "test_challenge", "test_compare", "test_faults", "test_script"}
 """Files of the longest tests and fixtures: no other process takes them over at the end, and all end together."""
+
+
+def pytest_collection_finish() -> None:
+    """Exempt from collection what was imported and collected; it stays."""
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

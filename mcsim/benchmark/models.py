@@ -12,7 +12,7 @@ from mcsim import config
 from mcsim.benchmark.case import Identity, Member, Vector
 from mcsim.benchmark.folder import Settings
 from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, data_vectors
-from mcsim.diagnosis.api import prepared
+from mcsim.diagnosis.api import kept, prepared
 from mcsim.diagnosis.campaign import Batch, after_jobs, asking, batch, seeded, with_effects
 from mcsim.diagnosis.candidate import Candidate, TemplateBank, columns_of, effects_at, numbered
 from mcsim.diagnosis.context import DiagnosisContext, calibration_of, context
@@ -80,7 +80,7 @@ class EffectsLibrary:
         search = Subsets(self.null, white, self.groups, self.candidates, self.calibration)
         found, best = [], search.total
         for size in range(1, largest + 1):
-            left = [search.solve(rows).chi2.min() for rows in search.rows(size, ()) if len(rows)]
+            left = [search.solve(rows).chi2.min() for rows in search.rows(size)]
             best = min([best, *left])
             found.append(float(np.sqrt(self.null.hartlap_factor * max(best, 0.0))))
         return tuple(found)
@@ -215,6 +215,7 @@ def workers_of(settings: Settings, workers: Workers | None, quiet: bool) -> Iter
     """
     run = settings.model
     with batch(run.compute.workers if workers is None else workers) as call:
-        with asking(call, quiet) as ask:
-            prepared(run, analysis_of(run, settings=_proposing(settings)), ask)
+        analysis = analysis_of(run, settings=_proposing(settings))
+        with asking(call, quiet, kept=kept(run, analysis)) as ask:
+            prepared(run, analysis, ask)
         yield call

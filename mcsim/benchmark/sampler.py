@@ -33,8 +33,12 @@ class CaseSampler:
             order = rng.generator(seed, 0, "challenge/rotation").permutation(len(self.names))
             name = self.names[order[turn % len(order)]]
             return Drawn(kind=kind, members=(self._member(draw, name),), without=(name,))
+        return Drawn(kind=kind, members=self.members(draw, {"none": 0, "one": 1, "two": 2}[kind]))
+
+    def members(self, draw: np.random.Generator, wanted: int) -> tuple[Member, ...]:
+        """Draw effects that act together, each with a strength of its own."""
         members: dict[tuple[str, str | None], Member] = {}
-        wanted, known = {"none": 0, "one": 1, "two": 2}[kind], sum(map(len, self._groups.values()))
+        known = sum(map(len, self._groups.values()))
         if known < wanted:
             raise InputError(
                 f"a case with {wanted} effects needs as many that reach a signal-to-noise ratio of "
@@ -44,7 +48,7 @@ class CaseSampler:
         while len(members) < wanted:
             found = self._member(draw, self.names[int(draw.integers(len(self.names)))])
             members.setdefault(found.identity, found)
-        return Drawn(kind=kind, members=tuple(members.values()))
+        return tuple(members.values())
 
     def kinds(self, seed: int, count: int, out_of_library: bool = False) -> list[Kind]:
         """Draw the kinds of the first cases of a challenge; that of a case does not depend on their number."""
@@ -100,7 +104,7 @@ class CaseSampler:
         constrained = values > 1e-9 * values[-1]
         direction = draw.standard_normal(len(values))
         theta = vectors[:, constrained] @ (direction[constrained] / np.sqrt(values[constrained]))
-        effect = candidate.with_coordinates(np.abs(theta) if fit.sign else theta, gram)
+        effect = candidate.with_coordinates(np.abs(theta) if fit.sign else theta, gram).within_bounds()
         # The parameters reach only some directions, and coordinates need not be linear in the amplitude.
         for _ in range(30):
             snr = np.linalg.norm(white @ fit.coordinates(effect))
@@ -108,6 +112,7 @@ class CaseSampler:
             effect = effect.scaled(float((strength / snr) ** (1.0 / slope)))
             if abs(snr / strength - 1.0) < 1e-9:
                 break
+        effect = effect.within_bounds()
         coordinates = fit.coordinates(effect)
         parameters = {"amplitude": effect.amplitude, **effect.parameters()}
         reached = float(np.linalg.norm(white @ coordinates))

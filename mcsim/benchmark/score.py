@@ -262,6 +262,6 @@ def powers(model: LinearModel, number: int, seed: int) -> Power:
         by_gap=np.array([one.pvalue <= ALPHA for one in tested]),
         grid=grid,
         limit=mean_power(None),
-        finite=mean_power(model.null.n_sims),
+        finite=mean_power(model.null.dof + 1),
         null_gap=np.array([test(x).pvalue for x in model.data]),
     )

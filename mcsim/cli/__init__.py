@@ -160,10 +160,11 @@ def diagnose(
     without: Annotated[list[str] | None, Option(metavar="EFFECT", help="Do not propose it; repeatable.")] = None,
     including: Including = None,
     simulations: Simulations = None,
+    quick: Annotated[bool, Option("--quick", help="First verdict, from fewer simulations.")] = False,
     controls: Annotated[int, Option(min=0, help="Perfect data sets, drawn at higher fidelity and diagnosed too.")] = 0,
     workers: Processes = None,
     scheduler: Scheduler = None,
-    dry_run: Annotated[bool, Option("--dry-run", help="Say simulations, memory and time; simulate none.")] = False,
+    dry_run: Annotated[bool, Option("--dry-run", help="Read DATA; say what it takes; simulate none.")] = False,
 ) -> None:
     """Test maps against a model, and find the effect that the model lacks: where, how large, and if adding it helps."""
     from mcsim import config
@@ -174,13 +175,14 @@ def diagnose(
 
     interrupt_once()
     where, run = chosen(workers, scheduler), config.load(model)
-    settings = DiagnosisSettings(
+    chosen_settings = DiagnosisSettings.quick if quick else DiagnosisSettings
+    settings = chosen_settings(
         without=tuple(without or ()), including=tuple(including or ()), simulations=simulations, controls=controls
     )
     if workers is not None:
         run = replace(run, compute=replace(run.compute, workers=workers))
     if dry_run:
-        print(describe(run, settings))
+        print(describe(run, settings, data))
         return
     if output is None:
         raise InputError(

@@ -12,7 +12,8 @@ from mcsim.errors import InputError
 Config = Annotated[str, Argument(metavar="CONFIG", help="TOML file, or a packaged workflow such as quickstart.")]
 Workers = Annotated[int | None, Option(min=0, help="Processes; 0: this one; default: the model's.")]
 Including = Annotated[
-    list[str] | None, Option("--with", metavar="EFFECT", help="Propose an effect that is on request; repeatable.")
+    list[str] | None,
+    Option("--with", metavar="EFFECT", help="Propose an effect on request, or of FILE.py; repeatable."),
 ]
 Simulations = Annotated[int | None, Option(min=50, help="For the data covariance; default: ten per element.")]
 Processes = Annotated[int | None, Option(min=1, help="Local processes; default: the configuration's.")]

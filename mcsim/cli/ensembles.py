@@ -10,6 +10,7 @@ from typer import Argument, Option
 
 from mcsim.cli.common import Config, Part, Png, Processes, Scheduler, chosen, interrupt_once, save
 from mcsim.errors import InputError
+from mcsim.support.loading import loaded
 
 Store = Annotated[Path, Argument(metavar="STORE", help="Folder that mcsim run wrote.")]
 
@@ -39,8 +40,7 @@ def run(
         return
     interrupt_once()
     try:
-        from mcsim.ensemble import runner
-
+        runner = loaded("mcsim.ensemble.runner")
         result = runner.run(config, store, resume=resume, realizations=part, workers=where, quiet=False)
     except KeyboardInterrupt:
         print("mcsim: interrupted; run the same command again to continue.", file=sys.stderr)

@@ -16,18 +16,10 @@ from mcsim.comparison.catalogue import library
 from mcsim.comparison.effects import effects_of
 from mcsim.comparison.looks import look
 from mcsim.comparison.pairs import ChannelPair, Comparison, given, read
+from mcsim.comparison.prediction import PRECISION, Set
 from mcsim.comparison.result import ChannelResult, ComparisonResult, DifferenceResult, Verdict
-from mcsim.comparison.search import (
-    DOUBTFUL,
-    EXPLAINED_BY_SAMPLES,
-    INTERPOLATING,
-    PRECISION,
-    Problem,
-    Set,
-    alternatives,
-    with_sharper_sky,
-    without_noise,
-)
+from mcsim.comparison.search import INTERPOLATING, Problem
+from mcsim.comparison.shown_sky import with_shown_sky
 from mcsim.errors import InputError
 from mcsim.simulation.noise import of_map
 from mcsim.support import folders
@@ -38,6 +30,15 @@ ROUNDING = 1e-6
 
 INTERPOLATION = 1e-3
 """The same for the interpolation of a sky between pixels or grid points."""
+
+CLEARLY = 0.1
+"""Share of what a named set leaves that one of exchanged sides must leave at most to be named in its place."""
+
+DOUBTFUL = 0.01
+"""Share that a set that is named may leave, beyond which differences of the last stage are tried all the same."""
+
+DOUBTFUL_TOGETHER = 1e-5
+"""The same of several differences, beyond which the model may rather describe side B."""
 
 
 def compare(
@@ -55,8 +56,9 @@ def compare(
     ----------
     a, b
         Two sides: folders with ``{channel}.fits`` or ``{channel}_{split}.fits``, HEALPix, uK or the unit of their
-        headers, without noise or with the same noise; configurations, of which realization 0 is simulated; or arrays,
-        shape (npix,) each, in the order of the model's maps.
+        headers, without noise or with the same noise, or with a subfolder of these for each realization, of which the
+        first is compared; configurations, of which realization 0 is simulated; or arrays, shape (npix,) each, in the
+        order of the model's maps.
     model
         Run that describes side A: beams, scans, nside, lmax; by default ``model.toml`` in the folders or beside them.
         Without one, only differences of the maps themselves are tried: units, calibration, monopole, dipole, order of
@@ -125,34 +127,53 @@ def compare(
 
 
 def _channel(pair: ChannelPair, sides: Comparison, accuracy: float) -> ChannelResult:
-    seen = pair.seen
-    rms, sky = _rms((pair.b - pair.a)[seen]), _sky_rms(pair)
-    if rms <= ROUNDING * sky:
-        return _result(pair, sides, "identical", [])
-    if pair.sky_of_maps:
-        pair = without_noise(with_sharper_sky(pair))
     others = [other for other in sides.pairs if other.name != pair.name]
-    problem = Problem(pair, library(sides.frame), others, accuracy * sky)
+    found = _explained(pair, others, sides, accuracy)
+    accepted = DOUBTFUL if len(found.differences) == 1 else DOUBTFUL_TOGETHER
+    named = found.verdict != "unknown"
+    if pair.scene is None or found.verdict == "identical" or (named and found.left < accepted):
+        return found
+    turned = _explained(pair.exchanged(), [other.exchanged() for other in others], sides, accuracy, True)
+    worse = named and turned.left > CLEARLY * found.left
+    if turned.verdict in ("unknown", "identical") or worse:
+        return found
+    return turned
+
+
+def _explained(
+    pair: ChannelPair, others: Sequence[ChannelPair], sides: Comparison, accuracy: float, exchanged: bool = False
+) -> ChannelResult:
+    """Return what explains a pair whose side A is described by the model; ``exchanged``: it is the other's side B."""
+    rms, sky = _rms((pair.b - pair.a)[pair.seen]), _sky_rms(pair)
+    if rms <= ROUNDING * sky:
+        return _result(pair, sides, "identical", exchanged)
+    pair = with_shown_sky(pair)
+    problem = Problem(pair, others, accuracy * sky, library(sides.frame))
     sets = problem.best()
-    if sides.run is not None and (not sets or sets[0].left > problem.enough or problem.needed < EXPLAINED_BY_SAMPLES):
-        problem = replace(problem, library=(*problem.library, *effects_of(pair, sides.run)))
-        sets = problem.best()
-    if not sets or not problem.suffices(sets[0]) or sets[0].left > DOUBTFUL:
-        sets = sorted([*sets, *problem.best(slow=True)], key=lambda one: one.left)
-    exchanged = bool(sets) and any(difference.exchanges for difference, _ in sets[0].members)
+    if sides.run is not None and not (sets and problem.complete(sets[0])):
+        # An effect of side A is one of side B with the other sign, and was found before sides are exchanged.
+        problem = replace(problem, library=(*problem.library, *(() if exchanged else effects_of(pair, sides.run))))
+        sets = problem.best(1)
+    if exchanged and not (sets and problem.suffices(sets[0])):
+        return _result(pair, sides, "unknown", exchanged)
+    if not sets or not problem.suffices(sets[0]) or (sets[0].left > DOUBTFUL and not problem.complete(sets[0])):
+        sets = sorted([*sets, *problem.best(2)], key=lambda one: one.left)
+    swapped = bool(sets) and any(difference.exchanges for difference, _ in sets[0].members)
     if rms > accuracy * sky and (
-        not sets or not problem.suffices(sets[0]) or (exchanged and sets[0].left > problem.enough)
+        not sets or not problem.suffices(sets[0]) or (swapped and sets[0].left > problem.enough)
     ):
         behind = problem.behind()
-        if behind and (not sets or behind[0].left < (1.0 - problem.further(sets[0])) * sets[0].left):
+        if behind and (not sets or problem.adds(behind[0], sets[0])):
             sets = behind
     small = rms <= accuracy * sky and bool(sets) and sets[0].names <= INTERPOLATING
     if not sets or not problem.suffices(sets[0]) or small:
-        return _result(pair, sides, "identical" if rms <= accuracy * sky else "unknown", [], problem, sets)
+        verdict: Verdict = "identical" if rms <= accuracy * sky else "unknown"
+        return _result(pair, sides, verdict, exchanged, [], problem, sets)
+    sets = problem.preferred(sets)
     known = {equal[0] for difference, value in sets[0].members for equal in difference.equivalent(value)}
-    others_too = [one for one in alternatives(sets, problem) if not known.intersection(d.name for d, _ in one.members)]
+    others_too = [one for one in problem.alternatives(sets) if not known.intersection(d.name for d, _ in one.members)]
     chosen = [sets[0], *others_too]
-    return _result(pair, sides, _verdict(chosen), chosen, problem, sets)
+    return _result(pair, sides, _verdict(chosen), exchanged, chosen, problem, sets)
 
 
 def _verdict(chosen: Sequence[Set]) -> Verdict:
@@ -165,16 +186,17 @@ def _result(
     pair: ChannelPair,
     sides: Comparison,
     verdict: Verdict,
-    chosen: Sequence[Set],
+    exchanged: bool,
+    chosen: Sequence[Set] = (),
     problem: Problem | None = None,
     sets: Sequence[Set] = (),
 ) -> ChannelResult:
     seen, explained = pair.seen, np.zeros_like(pair.a)
     if chosen and problem is not None:
-        explained = problem.state(chosen[0].members).maps - pair.a
-    described = [_described(one, pair.name, problem) for one in chosen if problem is not None]
-    same = [other for one, own in zip(chosen, described, strict=False) for other in _equivalent(one, own)]
-    nearest = _described(sets[0], pair.name, problem)[0] if sets and problem is not None else None
+        explained = problem.of(chosen[0]).maps - pair.a
+    described = [_described(one, pair.name, problem, exchanged) for one in chosen if problem is not None]
+    same = [other for one, own in zip(chosen, described, strict=False) for other in _equivalent(one, own, exchanged)]
+    nearest = _described(sets[0], pair.name, problem, exchanged)[0] if sets and problem is not None else None
     scene, noise = pair.scene, np.nan
     if sides.run is not None and scene is not None:
         noise = _noise_rms(sides.run, pair)
@@ -192,12 +214,13 @@ def _result(
         left_rms_uk=_rms((pair.b - pair.a - explained)[seen]),
         looks=_looks(pair, explained) if verdict in ("unknown", "identical") else (),
         unmade_rms_uk=problem.unmade if verdict == "unknown" and problem is not None else 0.0,
-        a=pair.a,
-        b=pair.b,
-        explained=explained,
+        a=pair.b if exchanged else pair.a,
+        b=pair.a if exchanged else pair.b,
+        explained=-explained if exchanged else explained,
         seen=seen,
         one_sided=pair.one_sided,
         hits=pair.hits,
+        reversed=exchanged,
     )
 
 
@@ -225,12 +248,12 @@ def _noise_rms(run: config.RunConfig, pair: ChannelPair) -> float:
     return _rms(levels[pair.seen])
 
 
-def _described(found: Set, channel: str, problem: Problem | None) -> tuple[DifferenceResult, ...]:
-    assert problem is not None
+def _described(found: Set, channel: str, problem: Problem, exchanged: bool) -> tuple[DifferenceResult, ...]:
     described = []
-    for index, (difference, value) in enumerate(found.members):
+    for index, (difference, made) in enumerate(found.members):
+        value = difference.inverse(made) if exchanged else made
         rest = (*found.members[:index], *found.members[index + 1 :])
-        without = problem.left(rest) if rest else 1.0
+        without = problem.left(rest, found.correction) if rest else 1.0
         described.append(
             DifferenceResult(
                 difference.name, channel, difference.amplitude(value), difference.unit,
@@ -240,12 +263,12 @@ def _described(found: Set, channel: str, problem: Problem | None) -> tuple[Diffe
     return tuple(described)
 
 
-def _equivalent(found: Set, own: tuple[DifferenceResult, ...]) -> list[tuple[DifferenceResult, ...]]:
+def _equivalent(found: Set, own: tuple[DifferenceResult, ...], exchanged: bool) -> list[tuple[DifferenceResult, ...]]:
     """Return the sets that make the same maps under other names."""
     return [
         (*own[:i], replace(d, name=name, amplitude=amplitude, unit=unit, parameters={}), *own[i + 1 :])
         for i, (d, (difference, value)) in enumerate(zip(own, found.members, strict=True))
-        for name, amplitude, unit in difference.equivalent(value)
+        for name, amplitude, unit in difference.equivalent(difference.inverse(value) if exchanged else value)
     ]
 
 

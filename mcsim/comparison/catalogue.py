@@ -26,7 +26,7 @@ from mcsim.comparison.scene_differences import (
     SpinSign,
     TimeShift,
 )
-from mcsim.comparison.time_differences import Interpolation, MapMaking
+from mcsim.comparison.time_differences import FarTimeShift, Interpolation, MapMaking
 
 
 def library(frame: str) -> tuple[Difference, ...]:
@@ -36,5 +36,5 @@ def library(frame: str) -> tuple[Difference, ...]:
         PsiOffset(), PsiSign(), BeamConjugated(), MmaxCut(), LmaxCut(), PixelWindow(), BeamWindow(), Smoothing(),
         PixelCentres(),
         TimeShift(), FrameRotated(frame), SpinSign(), PrecessionSign(),
-        MapMaking(), Interpolation(),
+        FarTimeShift(), MapMaking(), Interpolation(),
     )  # fmt: skip

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.comparison.pairs import ChannelPair
-from mcsim.comparison.scene import Maps, PointingFiles, Scene
-from mcsim.systematics.base import Pointing
+from mcsim.comparison.scene import Maps, Scene
 
 Vector = NDArray[np.float64]
 
@@ -30,19 +29,31 @@ class State:
         Of the prediction; no scene without a model.
     others
         The other channels.
+    free
+        Orthonormal changes of the prediction that are fitted besides, over the pixels that are seen, shape (k, n).
     """
 
     pair: ChannelPair
     scene: Scene | None
     maps: Maps
     others: Sequence[ChannelPair]
+    free: NDArray[np.float64] | None = None
 
     def fit(self, templates: Sequence[Maps]) -> Vector:
         """Return the least-squares amplitudes of templates in what is left, over the pixels that are seen."""
-        seen = self.pair.seen
-        t = np.stack([one[seen] for one in templates])
-        found = np.linalg.lstsq(t @ t.T, t @ (self.pair.b - self.maps)[seen], rcond=1e-12)[0]
-        return np.asarray(found, dtype=np.float64)
+        t = np.stack([self.beside(one) for one in templates])
+        size = np.maximum(np.linalg.norm(t, axis=1), 1e-300)
+        t /= size[:, None]
+        return np.asarray(np.linalg.lstsq(t @ t.T, t @ self.rest(self.maps), rcond=1e-12)[0] / size)
+
+    def beside(self, maps: Maps) -> Vector:
+        """Return maps over the pixels that are seen, without the part of the changes that are fitted besides."""
+        values = maps[self.pair.seen]
+        return values if self.free is None else values - (self.free @ values) @ self.free
+
+    def rest(self, maps: Maps) -> Vector:
+        """Return what maps leave of side B, as :meth:`beside` does."""
+        return self.beside(self.pair.b - maps)
 
 
 class Difference:
@@ -58,10 +69,14 @@ class Difference:
         True if it cannot be described without a model.
     smooth
         True if the value is refined by least squares.
-    slow
-        True if it is tried only where nothing else explains the maps.
+    natural
+        Size of a value that is neither small nor large.
+    stage
+        When it is tried: 0 at once, 1 where those leave something, 2 where nothing else explains the maps.
     enough
         Share of the variance that a set with it must explain at most to be named; 1: as all sets.
+    proportional
+        True if the response is proportional to the value, which is then fitted at once.
     linear
         True if the response is the template of a small amplitude, and so no better than about a per mille.
     exchanges
@@ -73,8 +88,10 @@ class Difference:
     met: ClassVar[str]
     needs_scene: ClassVar[bool] = True
     smooth: ClassVar[bool] = False
-    slow: ClassVar[bool] = False
+    natural: ClassVar[float] = 1.0
+    stage: ClassVar[int] = 0
     enough: ClassVar[float] = 1.0
+    proportional: ClassVar[bool] = False
     linear: ClassVar[bool] = False
     exchanges: ClassVar[bool] = False
 
@@ -94,7 +111,23 @@ class Difference:
         """Return maps of side B as they were before the difference; None if that is not known."""
         return None
 
-    def sampled(self, value: Vector, pair: ChannelPair, pointing: Pointing | PointingFiles) -> Maps | None:
+    def axes(self, value: Vector) -> Vector:
+        """Return unit vectors along which the value may be moved, shape (any, k)."""
+        return np.eye(value.size) if self.smooth or self.proportional else np.zeros((0, value.size))
+
+    def within(self, value: Vector) -> Vector:
+        """Return the nearest value that is possible."""
+        return value
+
+    def inverse(self, value: Vector) -> Vector:
+        """Return the value that says what side A does otherwise than side B."""
+        return -value if self.smooth or self.proportional else value
+
+    def response(self, value: Vector, scene: Scene, pair: ChannelPair) -> Maps | None:
+        """Return what it makes of a scene whose sky is not that of ``maps``; None: what scene and maps say."""
+        return None
+
+    def sampled(self, value: Vector, scene: Scene, pair: ChannelPair) -> Maps | None:
         """Return what side B has more than side A, sample by sample; None: as the scene says."""
         return None
 

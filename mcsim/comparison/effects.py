@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair, quiet
-from mcsim.comparison.scene import Maps, PointingFiles
+from mcsim.comparison.scene import Alm, Maps, Scene
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
+from mcsim.sphere import alm as alm_
 from mcsim.systematics import Effect
-from mcsim.systematics.base import Pointing
 from mcsim.systematics.registry import basis_of, catalogue
 
 Vector = NDArray[np.float64]
@@ -27,7 +27,9 @@ REDUNDANT = ("calibration", "monopole_residual", "pixelization", "spectrum")
 class EffectDifference(Difference):
     """An effect of the library, linear in its coordinates."""
 
-    linear = True
+    linear = proportional = True
+    natural = 1e-9
+    stage = 1
 
     def __init__(self, kind: type[Effect], templates: Maps, run: config.RunConfig) -> None:
         self.kind, self.templates, self.run = kind, templates, run
@@ -40,17 +42,43 @@ class EffectDifference(Difference):
         """Return the maps with the effect's response."""
         return maps + np.tensordot(value, self.templates, 1)
 
-    def sampled(self, value: Vector, pair: ChannelPair, pointing: Pointing | PointingFiles) -> Maps | None:
+    def response(self, value: Vector, scene: Scene, pair: ChannelPair) -> Maps:
+        """Return the effect's response on a scene."""
+        bare, acting = (
+            simulate.maps(survey(run, scene.nthreads), 0, scene.nthreads, self._sky(scene, pair))
+            for run in self._runs(value, scene, pair)
+        )
+        return acting - bare
+
+    def sampled(self, value: Vector, scene: Scene, pair: ChannelPair) -> Maps | None:
         """Return the response of the time-ordered reference; None if the effect does not act on samples."""
-        assert pair.scene is not None
-        sky: Any = pair.scene.sky  # an array stands for a file
-        alone = replace(self.run, sky=replace(self.run.sky, spectrum=None, map=None, alm=sky))
-        sides = [alone, replace(alone, effects=(_table(self._effect(value), pair.name),))]
+        sky: Any = self._sky(scene, pair)  # an array stands for a file
+        sides = [
+            replace(run, sky=replace(run.sky, spectrum=None, map=None, alm=sky))
+            for run in self._runs(value, scene, pair)
+        ]
         try:
-            bare, acting = (sampled.maps(survey(run, pair.scene.nthreads), 0, pair.scene.nthreads) for run in sides)
+            bare, acting = (sampled.maps(survey(run, scene.nthreads), 0, scene.nthreads) for run in sides)
         except InputError:
             return None
         return np.stack([more - less for (_, more), (_, less) in zip(acting, bare, strict=True)])
+
+    def _sky(self, scene: Scene, pair: ChannelPair) -> Alm:
+        """Return the sky of a scene, with what its pixel window has more than the samples' spread makes."""
+        assert pair.scene is not None
+        factor = np.ones_like(scene.window) if scene.centred else scene.window / pair.scene.window
+        return alm_.multiply(scene.sky, factor, scene.lmax)
+
+    def _runs(self, value: Vector, scene: Scene, pair: ChannelPair) -> tuple[config.RunConfig, config.RunConfig]:
+        """Return the run through the beam of a scene, without the effect and with it."""
+        assert pair.scene is not None
+        [channel], beam = self.run.channels, scene.beam
+        if beam is not pair.scene.beam or scene.psi[1]:
+            turn = np.exp(-1j * np.arange(beam.mmax + 1) * scene.psi[1])
+            table: Any = replace(beam, blm=turn[:, None] * beam.blm)
+            channel = replace(channel, beam=table)
+        alone = replace(self.run, channels=(channel,))
+        return alone, replace(alone, effects=(_table(self._effect(value), pair.name),))
 
     def _effect(self, value: Vector) -> Effect:
         return self.kind(**self.kind.parametrization.nearest(value, np.eye(value.size)))

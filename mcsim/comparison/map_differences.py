@@ -1,12 +1,14 @@
 """Differences of the maps themselves: units, calibration, monopole and dipole, order of pixels, exchanged files."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import healpy
 import numpy as np
 
 from mcsim.comparison.differences import Difference, State, Vector
-from mcsim.comparison.scene import Maps
+from mcsim.comparison.pairs import ChannelPair
+from mcsim.comparison.scene import Maps, Scene
 from mcsim.sphere import header
 
 
@@ -16,12 +18,26 @@ class Calibration(Difference):
     name, unit = "calibration", "fraction"
     met = "a beam that is not normalised, or another calibration"
     needs_scene = False
+    proportional = True
 
     def starts(self, state: State) -> list[Vector]:
-        return [state.fit([state.maps])]
+        """Return the fraction, and 0 for maps with their noise or 1 for the sky alone, where they have noise."""
+        found = [np.array([*state.fit([state.maps]), 0.0])]
+        if state.scene is not None and state.pair.doubt is not None:
+            found.append(np.array([*state.fit([state.scene.maps()]), 1.0]))
+        return found
+
+    def axes(self, value: Vector) -> Vector:
+        return np.eye(2)[:1]
+
+    def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
+        return replace(scene, sky=(1.0 + value[0]) * scene.sky) if value[1] else scene
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
-        return (1.0 + value[0]) * maps
+        return maps if value[1] else (1.0 + value[0]) * maps
+
+    def inverse(self, value: Vector) -> Vector:
+        return np.array([-value[0] / (1.0 + value[0]), value[1]])
 
 
 class Unit(Difference):
@@ -36,14 +52,18 @@ class Unit(Difference):
         if found <= 0.0:
             return []
         frequency = None if state.pair.channel is None else state.pair.channel.site.frequency_ghz
-        x = 0.047992430 * (frequency or 0.0) / header.T_CMB_K  # h nu/(k T)
-        to_cmb = np.expm1(x) ** 2 / (x**2 * np.exp(x)) if frequency else 1.0
-        # Factors of ten are exact; antenna temperatures depend on the band and on T_CMB.
-        near = [(f, f) for f in (1e-6, 1e-3, 1e3, 1e6)] + [(f, found) for f in (to_cmb, 1.0 / to_cmb) if f != 1.0]
+        # Factors of ten are exact; antenna temperature and brightness depend on the band and on T_CMB.
+        near = [(f, f) for f in (1e-6, 1e-3, 1e3, 1e6)]
+        for unit in ("uK_RJ", "MJy/sr", "Jy/sr") if frequency else ():
+            factor = header.to_uk(unit, Path("map"), frequency)
+            near += [(1.0 / factor, found), (factor, found)]
         return [np.array([value]) for f, value in near if abs(np.log(f / found)) < 2e-3]
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
         return value[0] * maps
+
+    def inverse(self, value: Vector) -> Vector:
+        return 1.0 / value
 
     def equivalent(self, value: Vector) -> list[tuple[str, float, str]]:
         return [("calibration", float(value[0]) - 1.0, "fraction")]
@@ -55,6 +75,7 @@ class Monopole(Difference):
     name, unit = "monopole", "uK"
     met = "a mean that one map-maker subtracts"
     needs_scene = False
+    proportional = True
 
     def starts(self, state: State) -> list[Vector]:
         return [state.fit([np.ones_like(state.maps)])]
@@ -69,6 +90,7 @@ class Dipole(Difference):
     name, unit = "dipole", "uK"
     met = "the solar dipole left in, or subtracted, on one side"
     needs_scene = False
+    proportional = True
 
     def starts(self, state: State) -> list[Vector]:
         return [state.fit([np.broadcast_to(axis, state.maps.shape) for axis in _axes(state.pair.nside)])]
@@ -118,6 +140,9 @@ class Ordering(Difference):
     def undone(self, maps: Maps, value: Vector) -> Maps:
         order = {"n2r": True} if value[0] > 0 else {"r2n": True}
         return np.stack([healpy.reorder(one, **order) for one in maps])
+
+    def inverse(self, value: Vector) -> Vector:
+        return -value
 
 
 class SplitExchanged(Difference):
@@ -174,6 +199,9 @@ class NoiseShared(Difference):
     met = "random seeds that do not depend on the detector or the split"
     needs_scene = False
     enough = 0.8  # the sky is known no better than the noise lets it be
+
+    def axes(self, value: Vector) -> Vector:
+        return np.eye(value.size)[:1]
 
     def starts(self, state: State) -> list[Vector]:
         """Return correlation, split that is changed (-1: all), split or channel that it is shared with, and how.

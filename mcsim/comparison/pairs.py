@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.comparison.scene import Maps, PointingFiles, Scene, scene_of, sky_in
+from mcsim.comparison.scene import Alm, Maps, PointingFiles, Scene, scene_of, sky_in
 from mcsim.ensemble.external import named_source, source_of
-from mcsim.ensemble.maps import file_names
+from mcsim.ensemble.maps import file_names, first_realization
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
+from mcsim.simulation.channels import described, known_offsets
 from mcsim.simulation.survey import Channel, Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import header, healpix
@@ -55,8 +56,8 @@ class ChannelPair:
         True if the scene's sky was taken from side A, and not from the model.
     files
         Samples of the channel, if the model has them in files.
-    noisy
-        True if noise was filtered out of the sky that side A shows, and so what noise hides of the sky is missing.
+    doubt
+        A draw of what noise hides of the sky that side A shows, coefficients as the scene's; None if it hides nothing.
     """
 
     name: str
@@ -71,7 +72,7 @@ class ChannelPair:
     sky_of_maps: bool = False
 
     files: PointingFiles | None = None
-    noisy: bool = False
+    doubt: Alm | None = None
 
     def pointing(self, longest: float = SAMPLES) -> Pointing | PointingFiles | None:
         """Return the pointing, if it is known and has no more samples than the longest that is wanted."""
@@ -87,6 +88,13 @@ class ChannelPair:
     def nside(self) -> int:
         """Of the maps."""
         return healpy.npix2nside(self.a.shape[1])
+
+    def exchanged(self) -> "ChannelPair":
+        """Return the pair with side B as side A, and a sky that its maps show."""
+        scene = self.scene
+        if scene is not None and self.sky_of_maps:
+            scene = replace(scene, sky=sky_in(self.b, self.seen, scene.up_to_offsets(1)))
+        return replace(self, a=self.b, b=self.a, scene=scene)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +124,7 @@ def read(
         if not Path(side).exists() and Path(side).suffix != ".toml" and str(side) not in resources.names("workflows"):
             raise InputError(f"{side} is neither a folder of maps nor a configuration; give the path of one.")
     run = _model(a, b, model)
+    run = None if run is None else with_known_offsets(run)
     whole = None if run is None else survey(quiet(run), nthreads, orders=_orders(run))
     sides = [_side(side, run, nthreads) for side in (a, b)]
     for own, other, side in ((0, 1, a), (1, 0, b)):
@@ -150,6 +159,7 @@ def given(
     for side in (a, b):
         if len(side) != len(names):
             raise InputError(f"{len(side)} maps were given, the model has {len(names)}; give one for each.")
+    run = with_known_offsets(run)
     whole = survey(quiet(run), nthreads, orders=_orders(run))
     sides = [dict(zip(names, (np.ma.filled(m, healpy.UNSEEN) for m in side), strict=True)) for side in (a, b)]
     pairs = [
@@ -169,6 +179,26 @@ def quiet(run: config.RunConfig) -> config.RunConfig:
     channels = tuple(channel.without_noise() for channel in run.channels)
     biposh = replace(run.biposh, L_max=0, pairs="auto", filter="none", probes=None)
     return replace(run, channels=channels, effects=(), biposh=biposh)
+
+
+def with_known_offsets(run: config.RunConfig) -> config.RunConfig:
+    """Return a run with all powers of the samples' offsets that its scans know, unless it says how many.
+
+    Where every sample can be simulated by itself, that takes their place.
+    """
+    if run.map.offset_order is not None or run.map.grid != "healpix" or run.map.pixel_window == "none":
+        return run
+    known = [1 if _has_samples(spec) else known_offsets(run, spec) for spec in run.channels]
+    order = min((order for order in known if order > 1), default=1)
+    whole = [known_offsets(run, spec) >= order for spec in run.channels]
+    return replace(run, map=replace(run.map, offset_order=order)) if order > 1 and all(whole) else run
+
+
+def _has_samples(spec: config.Channel) -> bool:
+    if isinstance(spec.scan, config.ScanPointing):
+        return True
+    pointing = described(spec)[0]
+    return pointing is not None and pointing.model.samples(pointing.line) <= SAMPLES
 
 
 def _check_splits(run: config.RunConfig) -> None:
@@ -210,7 +240,7 @@ def _side(side: str | Path, run: config.RunConfig | None, nthreads: int) -> dict
         raise InputError(f"{side} makes maps in {own_frame} coordinates, the model in {wanted}; choose one.")
     if external is not None:
         return _external(quiet(own), external, nthreads)
-    shared = survey(own, nthreads)
+    shared = survey(with_known_offsets(own), nthreads)
     return dict(zip(shared.map_names, simulate.maps(shared, 0, nthreads), strict=True))
 
 
@@ -259,6 +289,7 @@ def _closer(
 
 
 def _folder(folder: Path, run: config.RunConfig | None) -> dict[str, NDArray[np.float64]]:
+    folder = first_realization(folder)
     names = {path.stem: path for path in sorted(folder.glob("*.fits"))}
     frequencies: dict[str, float | None] = {}
     if run is not None:
@@ -316,7 +347,7 @@ def _pair(
     truth = simulate.draw_sky(whole, 0) if named else np.zeros(alm_.size(sky.lmax), complex)
     scene = scene_of(channel, truth, nthreads)
     if not named:
-        scene = replace(scene, sky=sky_in(a, seen, scene))
+        scene = replace(scene, sky=sky_in(a, seen, scene.up_to_offsets(1)))
     files = None
     spec = next(c for c in whole.config.channels if c.name == name)
     if isinstance(spec.scan, config.ScanPointing):

@@ -58,6 +58,8 @@ class ChannelResult:
         Number of pixels that one side alone observed, and that are left out.
     hits
         Samples per pixel, of the model; None without one.
+    reversed
+        True if the model describes side B, and the differences were found in side A; they say B relative to A.
     """
 
     name: str
@@ -79,6 +81,7 @@ class ChannelResult:
     seen: NDArray[np.bool_]
     one_sided: int
     hits: Maps | None
+    reversed: bool = False
 
     @property
     def accuracy(self) -> float:
@@ -118,6 +121,7 @@ class ChannelResult:
         named = " and ".join(f"{d.name} = {number(d.amplitude)} {d.unit}" for d in self.differences)
         others = [" and ".join(d.name for d in one) for one in self.alternatives]
         also = f"; {', '.join(others)} would do as well" if others else ""
+        also += "; the model describes side B" if self.reversed else ""
         return (
             f"{self.name}: different by {size}, by {named}, which explains {100 * (1 - self.left):.2f} % and leaves "
             f"{number(self.left_rms_uk)} uK{also}."
@@ -183,6 +187,7 @@ class ComparisonResult:
                 "of_noncircular": _ratio(rms, self._rms("noncircular_rms_uk")),
                 "of_noise": _ratio(rms, self._rms("noise_rms_uk")),
             },
+            "model_describes": {c.name: "b" for c in self.channels if c.reversed},
             "differences": [d.to_dict() for c in self.channels for d in c.differences],
             "alternatives": [[d.to_dict() for d in one] for c in self.channels for one in c.alternatives],
             "nearest": [c.nearest.to_dict() for c in self.channels if c.verdict == "unknown" and c.nearest],

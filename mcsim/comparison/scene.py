@@ -16,6 +16,7 @@ from mcsim.instrument.scan import Moments, ScanModel
 from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.user_pointing import blocks_of_files
 from mcsim.simulation import convolve, tod
+from mcsim.simulation.offsets import expansion, offset_maps
 from mcsim.simulation.preparation import Preparation
 from mcsim.simulation.survey import Channel
 from mcsim.sphere import alm as alm_
@@ -42,11 +43,14 @@ WEAKEST = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Transforms:
-    """The sky through each order of the beam at the pixels' centres: S_0, its gradient, and S_s by s, uK."""
+    """The sky through each order of the beam at the pixels' centres, and what the samples' offsets add to it, uK.
+
+    ``circular`` is S_0, ``spins`` are S_s by s; ``offsets`` hold a map of every split.
+    """
 
     circular: NDArray[np.float64]
-    gradient: NDArray[np.float64]
     spins: dict[int, NDArray[np.float64]]
+    offsets: list[NDArray[np.float64]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,18 +129,44 @@ class Scene:
 
     @property
     def _transforms(self) -> Transforms:
-        key = (self.sky.tobytes(), self.response.factors.tobytes())
+        places = (b"" if m.dtheta is None else m.dtheta.tobytes() for m in self.moments)
+        key = (self.sky.tobytes(), self.response.factors.tobytes(), *places, bytes([self.offset_order]))
         if key not in self.kept:
-            circular = convolve.circular_alm(self.sky, self.response)
+            circular, offsets = self._circular()
             self.kept[key] = Transforms(
-                healpix.synthesis(circular[None], self.nside, self.lmax, nthreads=self.nthreads)[0],
-                healpix.gradient(circular, self.nside, self.lmax, self.nthreads),
-                convolve.spin_maps(self.sky, self.response, self.nside, self.nthreads),
+                circular, convolve.spin_maps(self.sky, self.response, self.nside, self.nthreads), offsets
             )
             while len(self.kept) > KEPT:
                 self.kept.popitem(last=False)
         self.kept.move_to_end(key)
         return self.kept[key]
+
+    @property
+    def offset_order(self) -> int:
+        """Highest power of the samples' offsets that counts."""
+        return min(m.offset_order for m in self.moments)
+
+    def up_to_offsets(self, order: int) -> "Scene":
+        """Return the scene with lower powers of the samples' offsets alone."""
+        return replace(self, moments=tuple(m.up_to_offsets(order) for m in self.moments))
+
+    def _circular(self) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
+        """Return S_0 and what the samples' offsets add to it in every split."""
+        circular = convolve.circular_alm(self.sky, self.response)
+        if self.offset_order > 1:
+            terms = expansion(self.nside, self.lmax, self.offset_order)
+            # The expansion has a window of its own; what a difference makes of the scene's remains.
+            own = healpix.pixel_window(self.nside, self.lmax)
+            circular = alm_.multiply(circular, 1.0 / own, self.lmax)
+            offsets = offset_maps(circular, terms, self.moments, self.nthreads)
+            circular = alm_.multiply(circular, terms.smooth, self.lmax)
+        elif any(m.dtheta is not None for m in self.moments):
+            gradient = healpix.gradient(circular, self.nside, self.lmax, self.nthreads)
+            none = np.zeros(gradient.shape[1])
+            offsets = [none if m.dtheta is None else convolve.centroid_map(gradient, m) for m in self.moments]
+        else:
+            offsets = []
+        return healpix.synthesis(circular[None], self.nside, self.lmax, nthreads=self.nthreads)[0], offsets
 
     def noncircular(self) -> Maps:
         """Return what the non-circular part of the beam adds to each map."""
@@ -156,9 +186,8 @@ class Scene:
     def maps(self) -> Maps:
         """Return the maps, without noise."""
         made = self._noncircular() + self._transforms.circular
-        for own, m in zip(made, self.moments, strict=True):
-            if m.dtheta is not None:
-                own += convolve.centroid_map(self._transforms.gradient, m)
+        for own, added in zip(made, self._transforms.offsets, strict=False):
+            own += added
         return self._prepared(made)
 
     def turned(self, angle: float) -> "Scene":
@@ -172,6 +201,10 @@ class Scene:
         """Return the scene with all samples' orientations of the other sign."""
         moments = tuple(replace(m, w=np.conj(m.w)) for m in self.moments)
         return replace(self, moments=moments, psi=(-self.psi[0], -self.psi[1]))
+
+    def at_centres(self) -> "Scene":
+        """Return the scene with all samples at the centres of their pixels; its pixel window stays."""
+        return replace(self.up_to_offsets(0), centred=True)
 
     def stream(self, pointing: Pointing | PointingFiles, split: int) -> Iterable[tod.Samples]:
         """Return the samples of a split, as the scan of the scene has them."""

@@ -160,6 +160,7 @@ class TimeShift(Difference):
     name, unit = "time_shift", "samples"
     met = "time stamps at the end of an integration instead of its middle"
     smooth = True
+    natural = 1e-3
 
     def starts(self, state: State) -> list[Vector]:
         """Return the shift that fits best, if it is small beside the beam: farther on, the sky is another one."""
@@ -193,10 +194,11 @@ class ReversedMotion(Difference):
     """A motion of the scan of side B turns the other way round."""
 
     unit = "1 = reversed"
-    slow = True
+    stage = 1
 
     def __init__(self, motion: str) -> None:
         self.motion = motion
+        self._made: dict[tuple[float, float], tuple[Moments, ...]] = {}
 
     def starts(self, state: State) -> list[Vector]:
         known = state.pair.channel is not None and state.pair.channel.site.pointing is not None
@@ -205,17 +207,20 @@ class ReversedMotion(Difference):
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
         assert pair.channel is not None
         pointing = pair.channel.site.pointed(self.name)
-        period = getattr(pointing.model, self.motion)
-        model = replace(pointing.model, **{self.motion: -period}).with_lines_of_sight(pointing.line.name)
-        count = len(scene.moments)
-        moments = tuple(
-            Moments.from_model(
-                model, scene.nside, scene.moments[0].smax, pair.channel.site.frame, (i / count, (i + 1) / count),
-                scene.nthreads,
-            )
-            for i in range(count)
-        )  # fmt: skip
-        return replace(scene, moments=moments, motion=model)
+        model = scene.motion or pointing.model
+        model = replace(model, **{self.motion: -getattr(model, self.motion)}).with_lines_of_sight(pointing.line.name)
+        count, key = len(scene.moments), (model.spin_period_s, model.precession_period_s)
+        if key not in self._made:
+            self._made[key] = tuple(
+                Moments.from_model(
+                    model, scene.nside, scene.moments[0].smax, pair.channel.site.frame, (i / count, (i + 1) / count),
+                    scene.nthreads,
+                )
+                for i in range(count)
+            )  # fmt: skip
+        moved = replace(scene, moments=self._made[key], motion=model, psi=(1, 0.0))
+        oriented = (moved if scene.psi[0] > 0 else moved.reversed()).turned(scene.psi[1])
+        return oriented.at_centres() if scene.centred else oriented
 
 
 class SpinSign(ReversedMotion):
@@ -249,8 +254,7 @@ class PixelCentres(Difference):
         return [np.ones(1)] if known else []
 
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
-        moments = tuple(replace(m, dtheta=None, dphi=None) for m in scene.moments)
-        return replace(scene, moments=moments, window=np.ones_like(scene.window), centred=True)
+        return replace(scene.at_centres(), window=np.ones_like(scene.window))
 
 
 class PixelWindow(Difference):
@@ -265,6 +269,9 @@ class PixelWindow(Difference):
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
         own = healpix.pixel_window(scene.nside, scene.lmax)
         return replace(scene, window=scene.window * own ** value[0])
+
+    def inverse(self, value: Vector) -> Vector:
+        return -value
 
 
 class BeamWindow(Difference):
@@ -281,6 +288,9 @@ class BeamWindow(Difference):
         factor = np.where(window > WEAKEST, np.maximum(window, WEAKEST) ** value[0], 1.0 if value[0] < 0 else 0.0)
         return replace(scene, sky=alm_.multiply(scene.sky, factor, scene.lmax))
 
+    def inverse(self, value: Vector) -> Vector:
+        return -value
+
 
 class Smoothing(Difference):
     """The sky of side B is smoothed by a circular Gaussian more, or less, than that of side A."""
@@ -288,6 +298,10 @@ class Smoothing(Difference):
     name, unit = "beam_width", "fraction of the FWHM"
     met = "a map that is smoothed or deconvolved besides, or a beam of another width"
     smooth = True
+    natural = 0.1
+
+    def within(self, value: Vector) -> Vector:
+        return np.maximum(value, -0.99)
 
     def starts(self, state: State) -> list[Vector]:
         """Return the variance of the Gaussian over that of the beam."""

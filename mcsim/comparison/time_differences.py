@@ -32,12 +32,16 @@ FINEST = 4
 """Largest power of two by which a grid's nside may exceed that of the maps."""
 
 
+FAR = 0.1
+"""Rms over the sky's of what is left from which on time stamps of another part of the sky may make it."""
+
+
 class MapMaking(Difference):
     """Side B lacks offsets of the time line that side A has, or has others: baselines of a destriper."""
 
     name, unit = "map_making", "uK rms"
     met = "binned against destriped maps of the same noise, or baselines of another length"
-    slow = True
+    stage = 2
     enough = 0.8
 
     def __init__(self) -> None:
@@ -110,7 +114,7 @@ class Interpolation(Difference):
 
     name, unit = "interpolation", "nside of the grid"
     met = "healpy.get_interp_val, or the nearest pixel, of a smoothed map"
-    slow = True
+    stage = 2
 
     def __init__(self) -> None:
         self._made: dict[bytes, Maps] = {}
@@ -118,7 +122,7 @@ class Interpolation(Difference):
     def starts(self, state: State) -> list[Vector]:
         """Return nside, and 1 for an interpolation or 0 for the nearest pixel, of grids whose errors are large enough.
 
-        They fall with the square of nside, and with nside.
+        They fall with the square of nside, and with nside. The nearest pixel of the maps' own nside is its centre.
         """
         if state.scene is None or state.pair.pointing(SAMPLES) is None:
             return []
@@ -128,7 +132,7 @@ class Interpolation(Difference):
             coarse = float(np.std(self._response(np.array([state.scene.nside, linear]), state.pair)[seen]))
             finer = np.log2(max(coarse, 1e-300) / rest) / power
             wanted = {int(np.floor(finer)), int(np.ceil(finer))}
-            values += [np.array([2.0**k * state.scene.nside, linear]) for k in wanted if 0 <= k <= FINEST]
+            values += [np.array([2.0**k * state.scene.nside, linear]) for k in wanted if 1.0 - linear <= k <= FINEST]
         return values
 
     def _response(self, value: Vector, pair: ChannelPair) -> Maps:
@@ -169,3 +173,34 @@ def looked_up(scene: Scene, nside: int, linear: bool) -> tod.Stage:
             yield replace(chunk, signal_uk=chunk.signal_uk + signal)
 
     return stage
+
+
+class FarTimeShift(Difference):
+    """The signal of side B is attributed to a pointing one sample earlier, or later, however far that is."""
+
+    name, unit = "time_shift", "samples"
+    met = "time stamps, or a file of pointings, off by one"
+    stage = 2
+
+    def __init__(self) -> None:
+        self._made: dict[bytes, Maps] = {}
+
+    def starts(self, state: State) -> list[Vector]:
+        """Return a sample more, and less, if what is left is as large as another part of the sky makes it."""
+        pair, seen = state.pair, state.pair.seen
+        if state.scene is None or pair.channel is None or pair.channel.site.pointing is None:
+            return []
+        far = np.std((pair.b - state.maps)[seen]) > FAR * np.std(pair.a[seen])
+        return [np.array([way]) for way in (1.0, -1.0)] if far and pair.pointing(SAMPLES) is not None else []
+
+    def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
+        key, scene, pointing = value.tobytes(), state.pair.scene, state.pair.pointing(SAMPLES)
+        if key not in self._made:
+            assert scene is not None
+            assert pointing is not None
+            there, here = (replace(scene, late=late).sampled(pointing, scene.window) for late in (value[0], 0.0))
+            self._made[key] = there - here
+        return maps + self._made[key]
+
+    def inverse(self, value: Vector) -> Vector:
+        return -value

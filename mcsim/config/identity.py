@@ -48,7 +48,13 @@ def science(config: RunConfig, *others: str) -> dict[str, Any]:
     }
 
 
-_MAP = {"grid": "healpix", "nside": None, "mask_frame": None, "mask_apodisation_deg": 0.0, "split_by": "time"}
+_MAP = {
+    "grid": "healpix",
+    "nside": None,
+    "mask_frame": None,
+    "mask_apodisation_deg": 0.0,
+    "split_by": "time",
+}
 _OF_KIND: dict[str, dict[str, Any]] = {
     "moments": {"model": None, "line_of_sight": None},
     "map": {"angle_deg": 0.0},
@@ -65,6 +71,8 @@ def _leave_out_what_says_nothing(plain: dict[str, Any]) -> None:
     """
     _drop(plain, {"effect": [], "preparation": []})
     _drop(plain["map"], _MAP)
+    if plain["map"].get("offset_order") == 1:
+        del plain["map"]["offset_order"]
     _drop(plain["sky"], {"dipole_uk": None})
     if (plain["sky"]["dipole_lon_deg"], plain["sky"]["dipole_lat_deg"]) == (264.0, 48.24):
         del plain["sky"]["dipole_lon_deg"], plain["sky"]["dipole_lat_deg"]

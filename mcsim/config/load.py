@@ -92,7 +92,7 @@ def to_dict(config: RunConfig) -> dict[str, Any]:
     plain: dict[str, Any] = _ADAPTER.dump_python(config, mode="json", by_alias=True)
     for effect in plain["effect"]:
         effect |= effect.pop("parameters")
-    for table, key in ((plain, "simulator"), (plain["ensemble"], "maps")):
+    for table, key in ((plain, "simulator"), (plain["ensemble"], "maps"), (plain["map"], "offset_order")):
         if table[key] is None:  # as in stores of runs without it
             del table[key]
     if not config.biposh.filtered:

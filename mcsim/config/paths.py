@@ -79,6 +79,9 @@ def entries(plain: dict[str, Any]) -> Iterator[Entry]:
                 for place, item in enumerate(value if isinstance(value, list) else []):
                     if isinstance(item, str) and item.strip():
                         yield Entry(f"{where}.{field}[{place}]", value, place, rule, speaks_of, split)
+    for number, table in enumerate(_tables(plain, "effect")):
+        if str(table.get("name")).endswith(".py"):
+            yield Entry(f"effect[{number}].name", table, "name", Rule(), every)
     if ".py:" in str(plain.get("simulator")):
         yield Entry("simulator", plain, "simulator", Rule(checked=False), every)
 

@@ -59,6 +59,8 @@ class Map:
     of its soft edge.
     ``split_by``: "time": equal spans, one after the other; "rings": every n-th ring, in turn; "sets": each from the
     whole of its scan.
+    ``offset_order``: highest power, 0 to 4, of the samples' offsets from their pixels' centres that counts; 1: the
+    pixel window and the mean offset. Default: 1; in a comparison, as far as the scan is known.
     """
 
     nside: Nside | None = None
@@ -70,6 +72,7 @@ class Map:
     splits: Annotated[tuple[Label, ...], AfterValidator(unique)] = ()
     split_by: Literal["time", "rings", "sets"] = "time"
     pixel_window: PathText | None = None
+    offset_order: Annotated[int, Field(ge=0, le=4)] | None = None
 
     @property
     def resolution(self) -> int:
@@ -88,6 +91,12 @@ class Map:
         for key in ("nside", "mask", "splits", "pixel_window") if self.grid == "gl" else ():
             if getattr(self, key) not in (None, (), "none"):
                 raise ValueError(f'{key} is given, but grid = "gl" has no pixels; remove {key} or set grid = "healpix"')
+        if (self.offset_order or 0) > 1 and (self.grid == "gl" or self.pixel_window == "none"):
+            other = 'grid = "gl"' if self.grid == "gl" else 'pixel_window = "none"'
+            raise ValueError(
+                f"offset_order = {self.offset_order} spreads samples over pixels, but {other} has none that do; remove "
+                "offset_order"
+            )
         if self.split_by != "time" and not self.splits:
             raise ValueError(f'split_by = "{self.split_by}" is given without splits; name them, or remove split_by')
         return self

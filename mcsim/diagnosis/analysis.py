@@ -12,13 +12,13 @@ from mcsim.diagnosis import slices as slices_
 from mcsim.diagnosis.candidate import Candidate, numbered
 from mcsim.diagnosis.localisation import BipolarScan, coarse_residuals
 from mcsim.diagnosis.map_checks import checked_map
-from mcsim.diagnosis.matched_filters import matched_filter
+from mcsim.diagnosis.matched_filters import differencing_filters, matched_filter
 from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.diagnosis.summaries import Block, Element, blocks_of
+from mcsim.diagnosis.summaries import Block, Element, blocks_of, of_map
 from mcsim.diagnosis.wiener_filter import Model, model_of, shared_sky, wiener_filter
 from mcsim.ensemble.external_maps import Source
 from mcsim.errors import InputError
-from mcsim.simulation import sampled, simulate
+from mcsim.simulation import differencing, sampled, simulate
 from mcsim.simulation.nuisance import DisturbedSurvey, Nuisance, check_nuisances, nuisances_of
 from mcsim.simulation.survey import Survey, survey
 from mcsim.sphere import alm as alm_
@@ -126,7 +126,13 @@ def analysis_of(
     model = model_of(survey(run, nthreads=nthreads, orders=settings.beam_orders, library=dict(known)), settings)
     candidates = numbered(
         [
-            Candidate(effect, channel, tuple(range(len(effect.parametrization.basis()))), dict(fixed))
+            Candidate(
+                effect,
+                channel,
+                tuple(range(len(effect.parametrization.basis()))),
+                dict(fixed),
+                step=_step(model, effect, channel),
+            )
             for name, effect in known
             if name not in without and (effect.proposed or name in (*settings.including, *declared))
             for channel in ((None,) if effect.scope == "common" else model.channels)
@@ -148,12 +154,14 @@ def kinds_of(library: Library | None) -> Kinds:
 def _applies(model: Model, kind: type[Effect], channel: str | None, settings: Mapping[str, Any]) -> bool:
     """Return True if an effect can be there: what it depends on is known, and it changes something.
 
-    Left out are effects on differencing, which a diagnosis does not take, on noise if there is none, and on
-    orientations that are a scan's already or that a circular beam does not show.
+    Left out are effects on noise if there is none, on orientations that are a scan's already or that a circular beam
+    does not show, on differencing in other scans, and on the samples of one beam in differencing scans.
     """
-    if kind.differencing is not Effect.differencing:
-        return False
     owners = [c for c in model.survey.channels if channel in (None, c.name)]
+    if kind.differencing is not Effect.differencing and any(owner.side_b is None for owner in owners):
+        return False
+    if kind.excess is not Effect.excess and any(owner.side_b is not None for owner in owners):
+        return False
     if kind.orientations is not Effect.orientations:
         scans = [spec.scan for spec in model.survey.config.channels if channel in (None, spec.name)]
         if not all(isinstance(scan, config.ScanParallelTransport) for scan in scans):
@@ -175,10 +183,21 @@ def _applies(model: Model, kind: type[Effect], channel: str | None, settings: Ma
     return not (quiet and (kind.noise is not Effect.noise or kind.excess is not Effect.excess))
 
 
+def _step(model: Model, kind: type[Effect], channel: str | None) -> float | None:
+    """Return the amplitude at which responses are measured if it depends on the model: iterations of map-making."""
+    if kind.differencing is Effect.differencing or kind(amplitude=kind.step).differencing(0.0, 0)[1] == 0:
+        return None
+    (owner,) = (c for c in model.survey.making.channels if c.name == channel)
+    return float(differencing.iterations_to_spare(owner, simulate.draw_sky(model.survey, 0)))
+
+
 def _matched_blocks(model: Model, candidates: Sequence[Candidate]) -> Iterator[Block]:
     for candidate in candidates:
         channels = model.channels if candidate.channel is None else (candidate.channel,)
         where = None if candidate.channel is None else model.channels.index(candidate.channel)
+        if candidate.effect.differencing is not Effect.differencing:
+            yield from _blocks_by_map(model, candidate)
+            continue
         for number, basis in enumerate(candidate.basis):
             found = matched_filter(model, basis, where)
             if found is not None:
@@ -186,6 +205,17 @@ def _matched_blocks(model: Model, candidates: Sequence[Candidate]) -> Iterator[B
                 name, words = f"score/{candidate.label}/{number}", candidate.title
                 alike = Element(name, "score", channels, kind="matched", effect=words, candidate=candidate.name)
                 yield Block((replace(alike, component=component),), found)
+
+
+def _blocks_by_map(model: Model, candidate: Candidate) -> Iterator[Block]:
+    """Yield the matched filters of an effect on differencing, one for each map: nothing else of a map shows it."""
+    assert candidate.channel is not None
+    where = model.channels.index(candidate.channel)
+    filters = differencing_filters(model, candidate.basis[0], where)
+    for part, found in zip(model.of(where), filters, strict=bool(filters)):
+        alike = replace(of_map(model, part), kind="matched", frame=None)
+        own = replace(alike, name=f"score/{candidate.label}/{alike.name}", component=alike.split)
+        yield Block((replace(own, effect=candidate.title, candidate=candidate.name),), found)
 
 
 @dataclass(frozen=True)
@@ -217,22 +247,29 @@ def data_vectors(job: Job, library: Library | None = None) -> Vector:
 
     This is the task that a worker runs. ``library``: effects that the simulated run may name; default: the job's.
     """
-    analysis = _analysis(*job.definition)
-    rows = []
+    analysis = analysis_for(job)
+    return np.stack([analysis.data_vector(maps, job.bipolar_scan, job.slices) for maps in simulated_maps(job, library)])
+
+
+def analysis_for(job: Job) -> Analysis:
+    """Return the analysis that a job is for; the last one is kept."""
+    return _analysis(*job.definition)
+
+
+def simulated_maps(job: Job, library: Library | None = None) -> Iterator[list[Map]]:
+    """Yield the maps of every realization of a job; ``library`` as for :func:`data_vectors`."""
     for realization, shared in surveys(job, library):
         if job.sample_by_sample:
-            maps = [map_uk for _, map_uk in sampled.maps(shared, realization)]
+            yield [map_uk for _, map_uk in sampled.maps(shared, realization)]
+            continue
+        sky = None
+        if job.observed is not None:
+            seed, _ = _seed_and_added(job.simulated, job.fiducial)
+            sky = _constrained_sky(job.definition, job.observed.tobytes(), seed, realization)
+        if job.source is not None:
+            yield external_maps(job, realization, sky)
         else:
-            sky = None
-            if job.observed is not None:
-                seed, _ = _seed_and_added(job.simulated, job.fiducial)
-                sky = _constrained_sky(job.definition, job.observed.tobytes(), seed, realization)
-            if job.source is not None:
-                maps = external_maps(job, realization, sky)
-            else:
-                maps = list(simulate.maps(shared, realization, sky=sky))
-        rows.append(analysis.data_vector(maps, job.bipolar_scan, job.slices))
-    return np.stack(rows)
+            yield list(simulate.maps(shared, realization, sky=sky))
 
 
 def external_maps(job: Job, realization: int, sky: Alm | None = None) -> list[Map]:

@@ -13,19 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config, systematics
-from mcsim.diagnosis import campaign, controls, measured_spectra, null_ensemble, report, words
+from mcsim.diagnosis import campaign, controls, cost, measured_spectra, null_ensemble, report, unlisted, words
 from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, data_vectors
 from mcsim.diagnosis.campaign import asking, batch
 from mcsim.diagnosis.candidate import TemplateBank
 from mcsim.diagnosis.context import DataSet, DiagnosisContext, context
-from mcsim.diagnosis.external import ExternalModel, Kept, agreement, loaded
+from mcsim.diagnosis.external import Checked, ExternalModel, agreement, loaded
 from mcsim.diagnosis.inference import diagnose_data
+from mcsim.diagnosis.kept import Kept
 from mcsim.diagnosis.measured_spectra import MeasuredSpectra, read_spectra
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.observed_maps import ObservedMaps, checked, read_maps
 from mcsim.diagnosis.result import Agreement, DiagnosisResult
 from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.ensemble.plan import cost
+from mcsim.ensemble.external_maps import Source
 from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError
 from mcsim.simulation import power
@@ -95,26 +96,17 @@ def diagnose(
     wanted, (settings, library) = settings.controls, _with_library(settings)
     if output is not None:
         folders.writable(Path(output))
-    threads = os.cpu_count() or 1
-    task: Callable[[Job], NDArray[np.float64]] = data_vectors
-    table = read_spectra(data, run) if isinstance(data, str | Path) and Path(data).is_file() else None
-    controls.check(wanted, of_maps=table is None, external=source is not None)
-    if table is not None:
-        if source is not None:
-            raise InputError(f"{data} is a table, but {source.label} makes maps; give maps, or a run of mcsim.")
-        run, task = measured_spectra.estimator_for(run, table), table
-        analysis = measured_spectra.analysis_of_spectra(run, table, settings.without, threads, settings, library)
-    else:
-        analysis = analysis_of(run, settings.without, threads, settings, library, source)
-    power.check(analysis.model.survey)
+    run, analysis, table = _analysed(run, source, data, settings, library, wanted)
+    task: Callable[[Job], NDArray[np.float64]] = data_vectors if table is None else table
     maps: Sequence[NDArray[np.float64]] = ()
     if table is None:
         maps = read_maps(analysis.model, data) if isinstance(data, str | Path) else checked(analysis.model, data)
     key = _key(run, analysis)
     with batch(run.compute.workers if workers is None else workers) as call:
-        whole = task if source is None else Kept(task, f"diagnose/{key}.parts")
-        with asking(call, quiet, whole, "simulations of the model and of each effect") as ask:
-            ensemble, bank = _learned(key, analysis, ask)
+        whole = task if source is None else Checked(task)
+        stage = "simulations of the model and of each effect"
+        with asking(call, quiet, whole, stage, kept(run, analysis)) as ask:
+            ensemble, bank = _learned(key, run, analysis, ask)
         known = context(analysis, ensemble if table is None else ensemble.of_mean(table.realizations), bank)
         drawn = controls.diagnose_controls(known, key, wanted, call, quiet) if wanted else None
         with asking(call, quiet, task, "simulations of fitted effects") as ask:
@@ -122,6 +114,9 @@ def diagnose(
                 ObservedMaps(known, maps, ask) if table is None else MeasuredSpectra(known, table, ask)
             )
             diagnosis = diagnose_data(found, case or run.name)
+        if diagnosis.kind == "unknown" and isinstance(found, ObservedMaps) and source is None:
+            with asking(call, quiet, unlisted.scores, "simulations of what is not listed") as ask:
+                diagnosis = unlisted.reconstructed(diagnosis, found, ask)
     if source is not None:
         diagnosis = _with_agreement(diagnosis, agreement(known))
     elif table is None:
@@ -140,20 +135,30 @@ def _with_library(settings: DiagnosisSettings) -> tuple[DiagnosisSettings, syste
     """Return settings that name effects of a library, and that library; refuse other names."""
     known = systematics.catalogue() if settings.library is None else systematics.checked(settings.library)
     asked = tuple(settings.including) if settings.library is None else (*settings.including, *known)
-    for effect in (*settings.without, *settings.including):
-        systematics.get(effect, known)
-    including = tuple(sorted({name for name in asked if not known[name].proposed}))
+    kinds = {name: systematics.get(name, known) for name in (*settings.without, *asked)}
+    if both := {kinds[name].name for name in settings.without} & {kinds[name].name for name in settings.including}:
+        raise InputError(f"{min(both)} is asked for and left out (--with and --without); choose one of them.")
+    known = {**known, **{kinds[name].name: kinds[name] for name in asked}}
+    including = tuple(sorted({kinds[name].name for name in asked if not kinds[name].proposed}))
     return replace(settings, without=tuple(settings.without), including=including, library=None, controls=0), known
 
 
-def describe(model: str | Path | config.RunConfig | ExternalModel, settings: DiagnosisSettings) -> str:
-    """Return a text on the cost of a diagnosis of maps: simulations, memory, time, and that of preparing the maps."""
+def describe(
+    model: str | Path | config.RunConfig | ExternalModel,
+    settings: DiagnosisSettings,
+    data: str | Path | None = None,
+) -> str:
+    """Return a text on the cost of a diagnosis: simulations, memory, disk, time, and that of preparing the maps.
+
+    Data that are named are read, and refused as :func:`diagnose` refuses them.
+    """
     run, source = loaded(model)
     count, (settings, library) = settings.controls, _with_library(settings)
-    controls.check(count, of_maps=True, external=source is not None)
-    analysis = analysis_of(run, settings.without, os.cpu_count() or 1, settings, library, source)
-    power.check(analysis.model.survey)
-    jobs, size = campaign.plan(analysis, settings.simulations).values(), len(analysis.elements)
+    run, analysis, table = _analysed(run, source, data, settings, library, count)
+    if data is not None and table is None:
+        read_maps(analysis.model, data)
+    planned, size = campaign.plan(analysis, settings.simulations), len(analysis.elements)
+    jobs = planned.values()
     number = sum(job.count for job in jobs if job.source is None)
     head = f"{run.name}: at most {number} simulations before data, for a data vector of {size}"
     if source is not None:
@@ -161,10 +166,40 @@ def describe(model: str | Path | config.RunConfig | ExternalModel, settings: Dia
         stored = "" if source.count is None else f", of {source.count} that are stored"
         head += f"; and at most {given} of {source.label}{stored}, whose own cost is not in what follows"
     priors = [f"nuisance: {line}" for one in analysis.nuisances for line in one.lines]
-    lines = [head, *priors, *cost(run).lines(number, run.compute.workers)]
+    lines = [head, *priors, *cost.lines(analysis, planned)]
+    if source is None:
+        lines.append(f"after a first verdict unknown: {unlisted.SIMULATIONS} simulations more, once for the model")
     if count:
         lines += controls.describe(analysis, count, run.compute.workers)
     return "\n".join(lines)
+
+
+def _analysed(
+    run: config.RunConfig,
+    source: Source | None,
+    data: str | Path | Sequence[NDArray[np.float64]] | None,
+    settings: DiagnosisSettings,
+    library: systematics.Library,
+    wanted: int,
+) -> tuple[config.RunConfig, Analysis, measured_spectra.Spectra | None]:
+    """Return the run, with the statistics of a table that the data may be, the analysis of the data, and the table.
+
+    InputError is raised for ``wanted`` controls, a simulator or a sky that do not suit the data.
+    """
+    threads = os.cpu_count() or 1
+    table = read_spectra(data, run) if isinstance(data, str | Path) and Path(data).is_file() else None
+    if settings.shrink and (run.nuisances or table is not None):
+        settings = settings.without_shrinkage()
+    controls.check(wanted, of_maps=table is None, external=source is not None)
+    if table is not None:
+        if source is not None:
+            raise InputError(f"{data} is a table, but {source.label} makes maps; give maps, or a run of mcsim.")
+        run = measured_spectra.estimator_for(run, table)
+        analysis = measured_spectra.analysis_of_spectra(run, table, settings.without, threads, settings, library)
+    else:
+        analysis = analysis_of(run, settings.without, threads, settings, library, source)
+    power.check(analysis.model.survey)
+    return run, analysis, table
 
 
 def _computing(quiet: bool = True, workers: Workers | None = None) -> tuple[bool, Workers | None]:
@@ -186,16 +221,25 @@ def _warnings(analysis: Analysis) -> tuple[str, ...]:
     return () if found is None else (f"{found} Simulated data whose own sky ends there are not concerned.",)
 
 
+def kept(run: config.RunConfig, analysis: Analysis) -> Kept:
+    """Return where the simulations of a model are kept until it is learned."""
+    key = _key(run, analysis, analysis.settings.of_a_simulation())
+    folder = folders.default_cache_dir().absolute() / f"diagnose/{key}.parts"
+    return Kept.of(folder, analysis.model.nside, campaign.PER_TASK)
+
+
 def prepared(run: config.RunConfig, analysis: Analysis, ask: campaign.Ask) -> DiagnosisContext:
     """Return what every set of maps is tested with, simulated or from the cache."""
-    return context(analysis, *_learned(_key(run, analysis), analysis, ask))
+    return context(analysis, *_learned(_key(run, analysis), run, analysis, ask))
 
 
 def _learned(
     key: str,
+    run: config.RunConfig,
     analysis: Analysis,
     ask: campaign.Ask,
 ) -> tuple[NullEnsemble, TemplateBank]:
+    """Simulate a model or load it from the cache; single simulations stay for the verdict after a first one alone."""
     size, simulations = len(analysis.elements), analysis.settings.simulations
     if simulations is not None and simulations <= size:
         raise InputError(
@@ -211,14 +255,15 @@ def _learned(
         null_ensemble.save(scratch, *campaign.learned(analysis, ask, simulations))
 
     found = null_ensemble.load(folders.cached(name, fill))
-    shutil.rmtree(folders.default_cache_dir() / f"diagnose/{key}.parts", ignore_errors=True)
+    if not analysis.settings.shrink:
+        shutil.rmtree(kept(run, analysis).folder, ignore_errors=True)
     return found
 
 
-def _key(run: config.RunConfig, analysis: Analysis) -> str:
+def _key(run: config.RunConfig, analysis: Analysis, settings: DiagnosisSettings | None = None) -> str:
     """Return a hash of all that the simulations of a model depend on, the code that makes them included.
 
-    Its name, its seed and its number of realizations do not count.
+    ``settings``: in place of those of the analysis. Its name, its seed and its number of realizations do not count.
     """
     science = config.science(run, *(("nuisance",) if run.nuisances else ()))
     science["ensemble"] = {}
@@ -227,7 +272,7 @@ def _key(run: config.RunConfig, analysis: Analysis) -> str:
     effects |= {systematics.get(name, dict(analysis.library)) for name in named}
     rest = [
         [[candidate.label, [repr(basis) for basis in candidate.basis]] for candidate in analysis.candidates],
-        asdict(analysis.settings),
+        asdict(settings or analysis.settings),
         [element.name for element in analysis.elements],
         sorted(class_digest(kind) for kind in effects),
         package_digest((f"mcsim.{name}" for name in CODE), LIBRARIES),

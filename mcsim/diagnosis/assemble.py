@@ -61,12 +61,14 @@ def result_of(
         residual_maps=residuals,
         residual_range=None if residuals is None else np.quantile(ensemble.residual_rms, [0.025, 0.975], axis=0).T,
         frame=model.frame,
-        notes=(*notes, *_left_out(context)),
+        notes=tuple(notes),
+        untested=tuple(_untested(context)),
         settings=context.settings,
         provenance={
             "simulations of the model": len(ensemble.simulations),
             "skies constrained by the data": context.settings.constrained_skies,
             "seed of the run": context.run.ensemble.seed,
+            **({"worth": null.dof + 1} if ensemble.shrink else {}),
             **data.provenance(),
         },
         configuration=config.to_json(context.run),
@@ -107,16 +109,11 @@ def _nuisances(data: DataSet, refined: Refined) -> Iterator[NuisanceResult]:
     yield from results(context.analysis.nuisances, found_of, data.x)
 
 
-def _left_out(context: DiagnosisContext) -> Iterator[str]:
-    """Yield a sentence on elements that are not tested, if there are any."""
+def _untested(context: DiagnosisContext) -> Iterator[str]:
+    """Yield the elements that are not tested, in words."""
     ensemble = context.ensemble
-    if ensemble.nuisances is None:
-        return
-    if names := [element.words for element, kept in zip(ensemble.elements, ensemble.tested, strict=True) if not kept]:
-        yield (
-            f"{len(names)} of {len(ensemble.elements)} elements are not tested, because they follow the square of a "
-            f"nuisance as wide as its prior: {'; '.join(names)}."
-        )
+    if ensemble.nuisances is not None:
+        yield from (one.words for one, kept in zip(ensemble.elements, ensemble.tested, strict=True) if not kept)
 
 
 def effects_of(candidates: Sequence[Candidate], members: Sequence[int], fit: Fit) -> Iterator[EffectResult]:
@@ -171,7 +168,7 @@ def _candidates(context: DiagnosisContext, refined: Refined) -> Iterator[Candida
             amplitude, sigma, words = float("nan"), float("nan"), "no such amplitude"
         reach, size = detectable(null, t[:, columns], len(candidates)), None
         rows = min(max(int(rank[k]), 1), null.dimension)
-        needed = snr_needed(rows, len(candidates), null.dimension, null.n_sims)
+        needed = snr_needed(rows, len(candidates), null.dimension, null.dof + 1)
         if np.isfinite(reach):
             precision = np.eye(len(columns))
             size = abs(candidate.with_coordinates(reach * precision[0], precision).amplitude)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.diagnosis.analysis import Analysis, Job, data_vectors
 from mcsim.diagnosis.candidate import Candidate, TemplateBank
+from mcsim.diagnosis.kept import Kept
 from mcsim.diagnosis.localisation import rms
 from mcsim.diagnosis.null_ensemble import NullEnsemble, without_nuisances
 from mcsim.ensemble import runner
@@ -31,7 +32,7 @@ Ask = Callable[[Sequence[Job]], list[Rows]]
 Batch = Callable[[Callable[..., Any], Iterable[tuple[Any, ...]]], Iterator[tuple[int, Any]]]
 """Call a function with tuples of arguments; yield (index, result) in the order of completion."""
 
-_PER_TASK = 10
+PER_TASK = 10
 _CONSTRAINED_PER_TASK = 4
 
 # The same seed is never used for two purposes, nor for the data of a run that counts from seed 0.
@@ -61,20 +62,37 @@ def batch(workers: runner.Workers) -> Iterator[Batch]:
 
 
 @contextmanager
-def asking(call: Batch, quiet: bool, task: Task = data_vectors, stage: str = "simulations") -> Iterator[Ask]:
-    """Give the function that runs jobs; all that it runs is one stage of the progress."""
+def asking(
+    call: Batch, quiet: bool, task: Task = data_vectors, stage: str = "simulations", kept: Kept | None = None
+) -> Iterator[Ask]:
+    """Give the function that runs jobs; all that it runs is one stage of the progress.
+
+    What is ``kept`` of an earlier call is not simulated again.
+    """
     done = 0.0
     with reporting(stage, 0.0, "skies", quiet) as report:
 
         def ask(jobs: Sequence[Job]) -> list[Rows]:
             nonlocal done
-            results = {}
-            report.expect(float(sum(job.count for job in jobs)))
-            for index, result in call(task, ((job,) for job in jobs)):
-                results[index] = result
-                done += jobs[index].count
+            held: list[dict[int, Rows]] = [{} if kept is None else kept.found(job) for job in jobs]
+            pieces = [
+                (known, piece)
+                for job, known in zip(jobs, held, strict=True)
+                for piece in ([job] if kept is None else kept.missing(job, known))
+            ]
+            total = sum(job.count for job in jobs)
+            report.expect(float(total))
+            done += total - sum(piece.count for _, piece in pieces)
+            report(done)
+            for index, result in call(task, ((piece,) for _, piece in pieces)):
+                known, piece = pieces[index]
+                known.update(zip(range(piece.first, piece.first + piece.count), result, strict=True))
+                if kept is not None:
+                    kept.keep(piece, result)
+                done += piece.count
                 report(done)
-            return [results[index] for index in range(len(jobs))]
+            rows = zip(jobs, held, strict=True)
+            return [np.stack([known[n] for n in range(job.first, job.first + job.count)]) for job, known in rows]
 
         yield ask
 
@@ -121,7 +139,7 @@ def plan(analysis: Analysis, simulations: int | None = None, time_ordered: bool 
     return {purpose: replace(job, slices=analysis.of_maps) for purpose, job in jobs.items()}
 
 
-def _split(job: Job, realizations: range, size: int = _PER_TASK) -> list[Job]:
+def _split(job: Job, realizations: range, size: int = PER_TASK) -> list[Job]:
     """Return jobs of at most ``size`` of these realizations each."""
     stop = realizations.stop
     return [replace(job, first=first, count=min(size, stop - first)) for first in range(realizations.start, stop, size)]
@@ -201,6 +219,7 @@ def learned(
         rest[:, :numbers],
         *residuals,
         redundant=analysis.settings.redundant,
+        shrink=analysis.settings.shrink,
         external_reference=None if analysis.source is None else references[True],
         own_offset=own_offset,
         nuisances=_nuisances(analysis, len(null)),

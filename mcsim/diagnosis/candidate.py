@@ -45,6 +45,7 @@ class Candidate:
     scatter: Matrix | None = field(default=None, compare=False)
     # It is a nuisance as well: its templates are those of the scatter that this makes, and are not refined.
     nuisance: bool = False
+    step: float | None = None  # amplitude at which its response is measured; None: that of the effect
 
     @property
     def name(self) -> str:
@@ -77,7 +78,8 @@ class Candidate:
     @property
     def basis(self) -> tuple[Effect, ...]:
         """Return the effects whose responses span it, one for each column."""
-        return basis_of(self.effect, self.settings)
+        found = basis_of(self.effect, self.settings)
+        return found if self.step is None else tuple(replace(one, amplitude=self.step) for one in found)
 
     @property
     def random_response(self) -> bool:

@@ -24,8 +24,8 @@ LARGE = 12
 
 FRAMES = ("ecliptic", "galactic", "equatorial")
 
-SPARE = 2
-"""Simulations per element that a comparison needs."""
+SPARE, SPARE_SHRUNK = 2.0, 1.5
+"""Simulations per element that a comparison needs; with a shrunk covariance."""
 
 
 @dataclass(frozen=True)
@@ -207,7 +207,8 @@ class Slices:
 
     def _null(self, rows: Rows) -> SimulatedGaussian | None:
         """Return the null distribution of some elements; None if there are too few simulations, or none of these."""
-        if not 0 < len(rows) <= len(self.ensemble.simulations) // SPARE:
+        spare = SPARE_SHRUNK if self.ensemble.shrink else SPARE
+        if not 0 < len(rows) <= len(self.ensemble.simulations) // spare:
             return None
         key = rows.tobytes()
         if key not in self._nulls:

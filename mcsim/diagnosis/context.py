@@ -18,7 +18,7 @@ from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.selection import Attribution
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates
-from mcsim.stats.look_elsewhere import Calibration, calibrate, calibrate_on
+from mcsim.stats.look_elsewhere import Calibration, calibrate, calibrate_in_folds, calibrate_on
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -79,9 +79,14 @@ def context(analysis: Analysis, ensemble: NullEnsemble, bank: TemplateBank) -> D
 
 
 def calibration_of(ensemble: NullEnsemble, null: SimulatedGaussian, groups: WhitenedTemplates) -> Calibration:
-    """Return the null distribution of the tests; with nuisances, which make data less Gaussian, from held-out ones."""
+    """Return the null distribution of the tests, on held-out simulations with nuisances or a shrunk covariance.
+
+    Nuisances make data less Gaussian; a shrunk covariance is better for some templates than for others.
+    """
     found = calibrate(null, groups)
-    return found if ensemble.nuisances is None else calibrate_on(found, null, groups, ensemble.simulations)
+    if ensemble.nuisances is not None:
+        return calibrate_on(found, null, groups, ensemble.simulations)
+    return calibrate_in_folds(found, null, groups) if null.folds else found
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,5 @@
 """Diagnose with the simulator of somebody else: the model, its batch, and if mcsim's own simulation agrees with it."""
 
-import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,10 +19,8 @@ from mcsim.ensemble.external_maps import Source
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import held_out_pvalues
 from mcsim.stats.look_elsewhere import global_test
-from mcsim.support import folders
 from mcsim.support.arrays import Map, Matrix
 
-FILE = "vectors.npy"
 REPEATS = 1e-6
 """Rms difference over the rms up to which two maps of one seed are the same: threads add numbers in any order."""
 
@@ -82,28 +78,16 @@ def loaded(
 
 
 @dataclass(frozen=True)
-class Kept:
-    """A task that keeps the results of an external simulator in the cache, so that a batch can be resumed."""
+class Checked:
+    """A task that tests the seeds of an external simulator before the first of its simulations."""
 
     task: Task
-    folder: str  # in the cache
 
     def __call__(self, job: Job) -> Matrix:
-        """Return the data vectors of a job, simulated or kept."""
-        if job.source is None:
-            return self.task(job)
-        run = json.loads(job.simulated)
-        text = json.dumps([run["effect"], run["ensemble"]["seed"], job.first, job.count, job.bipolar_scan])
-
-        def fill(scratch: Path) -> None:
-            if job.first == 0 and job.source is not None and job.source.count is None:
-                _check_seeds(job)
-            np.save(scratch / FILE, self.task(job))
-
-        found: Matrix = np.load(
-            folders.cached(f"{self.folder}/{hashlib.sha256(text.encode()).hexdigest()}", fill) / FILE
-        )
-        return found
+        """Return the data vectors of a job."""
+        if job.source is not None and job.first == 0 and job.source.count is None:
+            _check_seeds(job)
+        return self.task(job)
 
 
 def _check_seeds(job: Job) -> None:

@@ -42,12 +42,15 @@ def excess_figure(result: DiagnosisResult) -> Figure:
         rows.append(("after the fit", result.sets[0].excess, BLUE))
         of = "the data that were fitted"
     beside: dict[str, Any] = {"xytext": (6, 0), "textcoords": "offset points", "va": "center", "fontsize": 9}
+    ends = [max(one.value + one.sigma, 0.0) for _, one, _ in rows]
+    if found is not None:
+        ends[1] = max(ends[1], expected)  # the number stands beyond the line of what was predicted
     for row, (_, one, colour) in enumerate(rows):
         axes.barh(row, one.value, 0.62, color=colour, xerr=one.sigma, capsize=3, error_kw={"linewidth": 1.2})
-        axes.annotate(measured(one.value, one.sigma), (max(one.value + one.sigma, 0.0), row), **beside)
+        axes.annotate(measured(one.value, one.sigma), (ends[row], row), **beside)
     axes.set_yticks(range(len(rows)), [label for label, *_ in rows])
     axes.set_ylim(len(rows) - 0.45, -0.55)
-    reach = max(one.value + one.sigma for _, one, _ in rows)
+    reach = max(ends)
     low = min(0.0, expected, *(one.value - one.sigma for _, one, _ in rows))
     axes.set_xlim(1.1 * low, max(1.4 * reach, -0.35 * low, 1.0))
     axes.axvline(0.0, color="black", linewidth=0.8)

@@ -6,12 +6,15 @@ stochastic effect has no matched filter: it shows in the spectra.
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from mcsim import systematics
 from mcsim.diagnosis.wiener_filter import FilteredMaps, Model, by_degree
+from mcsim.simulation import differencing
 from mcsim.simulation.pixel_means import gain_of, signal_of
+from mcsim.simulation.survey import Channel, SurveyMap
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
 from mcsim.support.arrays import Map
@@ -109,6 +112,33 @@ def _signal_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter:
         return float(sum(np.dot(filtered.residual[i], signal) for i, signal in zip(parts, signals, strict=True)))
 
     return value
+
+
+def differencing_filters(model: Model, effect: Effect, channel: int) -> list[MatchedFilter]:
+    """Correlate each map's residual with what an effect on differencing does to it.
+
+    That is what map-making leaves of the dipole, or does not reach of the sky that is expected. No filters if there is
+    no dipole, or for maps whose pixels are no longer those of the map-making.
+    """
+    owner, parts = model.survey.making.channels[channel], model.of(channel)
+    assert owner.side_b is not None  # only such channels have these candidates
+    imbalance, short = effect.differencing(owner.side_b.imbalance, owner.side_b.iterations_short)
+    if model.survey.source is not None:
+        return []
+    if short > owner.side_b.iterations_short:
+        return [partial(_unreached, owner, m, i) for i, m in zip(parts, owner.maps, strict=True)]
+    if not owner.site.dipole_uk.any():
+        return []
+    left = differencing.of_dipole(owner, imbalance)
+    return [partial(_along, i, map_uk) for i, map_uk in zip(parts, left, strict=True)]
+
+
+def _along(part: int, map_uk: Map, filtered: FilteredMaps) -> float:
+    return float(np.dot(filtered.residual[part], map_uk))
+
+
+def _unreached(owner: Channel, m: SurveyMap, part: int, filtered: FilteredMaps) -> float:
+    return _along(part, differencing.not_converged(owner, m, filtered.expected[part]), filtered)
 
 
 def normalised_difference(model: Model, filtered: FilteredMaps, parts: tuple[int, ...]) -> Map:

@@ -16,7 +16,7 @@ from mcsim.diagnosis.map_checks import checked_map
 from mcsim.diagnosis.nuisance import half_given_other
 from mcsim.diagnosis.selection import Attribution
 from mcsim.diagnosis.wiener_filter import Model, Part, shared_sky
-from mcsim.ensemble.maps import file_names, read_uk
+from mcsim.ensemble.maps import file_names, first_realization, read_uk
 from mcsim.errors import InputError
 from mcsim.stats.look_elsewhere import global_test
 from mcsim.support.arrays import Alm, Map, Matrix, Vector
@@ -49,7 +49,8 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         return np.concatenate([self.x, self._measured[3]])
 
     @cached_property
-    def _sky(self) -> Alm:
+    def observed_sky(self) -> Alm:
+        """Return the filtered sky of the maps, uK, shape (size,)."""
         return shared_sky(self.context.analysis.model, self.data)
 
     @cached_property
@@ -97,7 +98,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         source = self.context.analysis.source_of(found, given_sky=True)
 
         def simulated(found: Sequence[config.Effect], first: int) -> Matrix:
-            jobs = constrained_jobs(self.context.analysis, found, self._sky, range(first, skies))
+            jobs = constrained_jobs(self.context.analysis, found, self.observed_sky, range(first, skies))
             return np.concatenate(self.ask([replace(job, slices=True, source=source) for job in jobs]))
 
         after, before = simulated(found, 0), self._before[source is not None]
@@ -194,7 +195,9 @@ def checked(model: Model, maps: Sequence[Map]) -> list[Map]:
 
 def _read(model: Model, part: Part, path: Path) -> Map:
     if not path.is_file():
-        raise InputError(f"{path} does not exist; the model has a map {part.name}, give it under that name.")
+        inside = first_realization(path.parent)
+        remedy = "give it under that name" if inside == path.parent else f"give the folder of a realization, {inside}"
+        raise InputError(f"{path} does not exist; the model has a map {part.name}, {remedy}.")
     map_ = read_uk(path, model.frame, model.survey.channels[part.channel].site.frequency_ghz)
     return checked_map(model, part, map_, str(path))
 

@@ -71,7 +71,7 @@ class Refiner:
                 if candidates[index].nuisance:
                     continue
                 columns, how = list(candidates[index].columns), candidates[index].effect.parametrization
-                nonlinear = self._is_nonlinear(columns, coordinates)
+                nonlinear = how.nonlinear or self._is_nonlinear(columns, coordinates)
                 stochastic = how.stochastic and (how.sign == 0 or coordinates[0] > 0.0)
                 if not (nonlinear or stochastic) or self._has_settled(done.get(index), coordinates, covariance):
                     continue

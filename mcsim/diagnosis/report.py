@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from mcsim.diagnosis import figures, words
 from mcsim.diagnosis.result import PLACES, DiagnosisResult
+from mcsim.reconstruction.figure import structure_figure
 from mcsim.support import page as page_
 from mcsim.support.numbers import measured, number, p_equals, probability
 
@@ -67,6 +68,8 @@ def _pictures(result: DiagnosisResult) -> dict[str, dict[str, Any]]:
         if one.first == 0:
             text = f"Points: elements in which {result.sets[0].label} and {result.sets[one.second].label} differ."
             drawn[f"contrast{one.second}"] = (figures.contrast_figure(result, one), text)
+    for place, found in enumerate(result.unlisted or (), 1):
+        drawn[f"unlisted{place}"] = (structure_figure(found, result.frame), f"Map and profile: {found.says}.")
     return {name: _picture(figure, text) for name, (figure, text) in drawn.items() if figure is not None}
 
 

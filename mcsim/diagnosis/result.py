@@ -8,7 +8,6 @@ from typing import Any, get_type_hints
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from mcsim.diagnosis.consistency import Comparison, MapCheck
@@ -19,9 +18,10 @@ from mcsim.diagnosis.selection import Contrast, Verdict
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.summaries import Element
 from mcsim.errors import InputError
+from mcsim.reconstruction.result import Reconstructed
 from mcsim.stats.excess import HeldOut, Measured, excess_of
 from mcsim.stats.look_elsewhere import GlobalTest
-from mcsim.support.arrays import Vector
+from mcsim.support.arrays import Vector, texts
 
 STORE = "diagnosis.zarr"
 PLACES = 12
@@ -204,6 +204,11 @@ class DiagnosisResult:
         True if sets describe the data, but are less probable than all else together; their posterior probability.
     contradicted
         Sets that describe the data vector and are not named, because parts of the data do not bear them out.
+    unlisted, unlisted_held_out
+        After an unknown gap, what is missing, the most evident structure first; and the reduction of the excess on
+        held-out data by all of it. None: not looked for, not measured.
+    untested
+        Elements that are not tested, in words: they follow the square of a nuisance as wide as its prior.
     """
 
     case: str
@@ -241,6 +246,9 @@ class DiagnosisResult:
     probability: float = 1.0
     agreement: Agreement | None = None
     contradicted: tuple[EffectSet, ...] = ()
+    unlisted: tuple[Reconstructed, ...] | None = None
+    unlisted_held_out: HeldOut | None = None
+    untested: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> dict[str, Any]:
@@ -260,7 +268,7 @@ class DiagnosisResult:
     @property
     def excess(self) -> Measured:
         """Return the unbiased excess of chi^2 over its degrees of freedom, zero on average where the model is right."""
-        return excess_of(self.test.chi2, self.test.dimension, self.simulations - 1)
+        return excess_of(self.test.chi2, self.test.dimension, self.provenance.get("worth", self.simulations) - 1)
 
     @property
     def z(self) -> Vector:
@@ -287,20 +295,19 @@ class DiagnosisResult:
         """Return ``verdict.json`` of schema 1."""
         near = self.candidates[self.nearest]
         sets = [[_effect_json(effect) for effect in one.effects] for one in self.sets]
-        faint = {"faint": True, "probability": self.probability} if self.faint else {}
         return {
             "schema": 1,
             "case": self.case,
             "gap": {"p_value": self.test.pvalue, "statistic": self.test.chi2, "dof": self.test.dimension},
             "verdict": self.kind,
-            **faint,
+            **({"faint": True, "probability": self.probability} if self.faint else {}),
             "effects": sets[0] if sets else [],
             "alternatives": sets[1:],
             "maps": [] if not self.sets else [asdict(one) for one in self.sets[0].maps],
             **({"contradicted": [_set_json(one) for one in self.contradicted]} if self.contradicted else {}),
             "odds": [one.odds for one in self.sets],
             "where": [_place_json(place) for place in self.places[:PLACES]],
-            "shrink": None if self.held_out is None else _held_out_json(self.held_out),
+            "shrink": None if self.held_out is None else self.held_out.to_json(),
             "nearest": {"name": near.name, "channel": near.channel, "cosine": self.cosine},
             "heard": [_effect_json(effect) for effect in self.partial],
             "left": self.partial_left,
@@ -311,8 +318,12 @@ class DiagnosisResult:
                 if one.detectable is not None
             ],
             "notes": list(self.notes),
+            **({} if self.unlisted is None else {"unlisted": [one.to_json() for one in self.unlisted]}),
+            **({} if self.unlisted_held_out is None else {"unlisted_shrink": self.unlisted_held_out.to_json()}),
+            **({"untested": list(self.untested)} if self.untested else {}),
             **({"nuisances": [_nuisance_json(one) for one in self.nuisances]} if self.nuisances else {}),
             **({"warnings": list(self.warnings)} if self.warnings else {}),
+            **({"worth": self.provenance["worth"]} if "worth" in self.provenance else {}),
             **({"controls": self.controls.to_json()} if self.controls is not None else {}),
             **({"simulator": asdict(self.agreement)} if self.agreement else {}),
         }
@@ -336,20 +347,26 @@ class DiagnosisResult:
         return xr.Dataset(
             variables,
             coords={
-                "element": _texts(one.name for one in self.elements),
-                "description": ("element", _texts(one.words for one in self.elements)),
-                "candidate": _texts(one.label for one in self.candidates),
-                "unit": ("candidate", _texts(one.unit for one in self.candidates)),
+                "element": texts(one.name for one in self.elements),
+                "description": ("element", texts(one.words for one in self.elements)),
+                "candidate": texts(one.label for one in self.candidates),
+                "unit": ("candidate", texts(one.unit for one in self.candidates)),
             }
-            | ({} if self.residual_maps is None else {"map": _texts(self.maps)}),
+            | ({} if self.residual_maps is None else {"map": texts(self.maps)}),
             attrs={"result": json.dumps(rest, default=asdict)},
         )
 
     def save(self, folder: str | Path) -> None:
-        """Write ``verdict.json`` and ``diagnosis.zarr`` into a folder, made where it does not exist."""
+        """Write ``verdict.json`` and ``diagnosis.zarr`` into a folder, made where it does not exist.
+
+        Reconstructed effects are written there too, a Python file each.
+        """
         target = Path(folder)
         target.mkdir(parents=True, exist_ok=True)
         (target / "verdict.json").write_text(json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n")
+        for one in self.unlisted or ():
+            if one.file is not None:
+                (target / f"{one.name}.py").write_text(one.file, encoding="utf-8")
         self.to_dataset().to_zarr(target / STORE, mode="w", consolidated=False)
 
     @classmethod
@@ -414,23 +431,3 @@ def _place_json(place: Place) -> dict[str, Any]:
     found["statistic"] = {"score": "map", "noise": "cl"}.get(e.statistic, e.statistic)
     lists = {key: list(value) for key, value in found.items() if isinstance(value, tuple)}
     return found | lists | {"z": place.z, "p": place.p}
-
-
-def _held_out_json(found: HeldOut) -> dict[str, Any]:
-    return {
-        "predicted": found.predicted.value,
-        "achieved": found.achieved.value,
-        "sigma": found.achieved.sigma,
-        "sigma_predicted": found.predicted.sigma,
-        "gap_before": found.before.value,
-        "sigma_before": found.before.sigma,
-        "gap_after": found.after.value,
-        "sigma_after": found.after.sigma,
-        "p_value_after": found.pvalue_after,
-        "data": found.data,
-    }
-
-
-def _texts(words: Any) -> NDArray[np.object_]:
-    """Return texts as objects: Zarr 3 has no stable form for numpy's texts of fixed length."""
-    return np.array(list(words), dtype=object)

@@ -12,7 +12,7 @@ from scipy import special
 from mcsim.diagnosis.candidate import Candidate, beyond, columns_of
 from mcsim.diagnosis.consistency import NOT_TESTED, Findings
 from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.diagnosis.subsets import Subsets
+from mcsim.diagnosis.subsets import EXHAUSTIVE, Rows, Subsets, chunks
 from mcsim.stats.detection import cosines
 from mcsim.stats.gaussian import Fit, SimulatedGaussian
 from mcsim.stats.look_elsewhere import Calibration, GlobalTest, global_test
@@ -20,9 +20,6 @@ from mcsim.stats.look_elsewhere import Calibration, GlobalTest, global_test
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 Verdict = Literal["none", "effect", "mixture", "degenerate", "unknown"]
-
-# Subsets that are solved at once; bounds the memory to some 100 MB.
-CHUNK = 1000
 
 
 @dataclass(frozen=True)
@@ -80,8 +77,9 @@ class Attribution:
     correlation
         Largest canonical correlation of each pair of candidates, shape (C, C).
     probability
-        Posterior probability of the accepted sets beside no effect, an unknown effect and every other effect alone;
-        the three kinds (no effect, known, unknown) are equally probable before, and look-elsewhere is charged for.
+        Posterior probability of the accepted sets beside no effect, an unknown effect and every effect alone that is
+        in none of them; the three kinds (no effect, known, unknown) are equally probable before, and look-elsewhere is
+        charged for.
     faint
         True if that is too small for a name.
     contradicted
@@ -229,14 +227,19 @@ class _Selection:
             yield Contrast(first, second, float(np.sqrt(squared)), tuple(order.tolist()), tuple(shares[order].tolist()))
 
     def probability(self, accepted: Sequence[_Accepted]) -> float:
-        """Return the posterior probability of accepted sets; see :class:`Attribution`."""
+        """Return the posterior probability of accepted sets; see :class:`Attribution`.
+
+        A part of an accepted set is no rival of the names in it.
+        """
         searches = list(self._searches())
         known = {found.members: found.evidence for found in accepted}
         for search in searches:
-            for subsets in search.rows(1, ()):
+            for subsets in search.rows(1):
                 evidence = search.solve(subsets).evidence.tolist()
                 alone = (
-                    _Accepted(e, (int(k),), 0.0, 0.0, search.null) for e, k in zip(evidence, subsets[:, 0], strict=True)
+                    _Accepted(e, (int(k),), 0.0, 0.0, search.null)
+                    for e, k in zip(evidence, subsets[:, 0], strict=True)
+                    if not any(k in found.members for found in accepted)
                 )
                 known = {one.members: one.evidence for one in self._possible(alone)} | known
         nothing = float(self.null.log_likelihood(searches[0].total))
@@ -244,18 +247,28 @@ class _Selection:
         return float(np.exp(special.logsumexp([found.evidence for found in accepted]) - everything))
 
     def accepted(self) -> list[_Accepted]:
-        """Return minimal sufficient sets that are possible and whose evidence is not below the best by the cut."""
+        """Return minimal sufficient sets that are possible and whose evidence is not below the best by the cut.
+
+        All sets of up to EXHAUSTIVE members are tried; larger ones grow from those. The search ends one size above the
+        first accepted set.
+        """
         accepted: list[_Accepted] = []
         searches = list(self._searches())
+        subsets: list[list[Rows]] = [[] for _ in searches]
         best, unknown, cut = -np.inf, searches[0].unknown, np.log(self.settings.odds_cut)
         for size in range(1, self.settings.max_effects + 1):
+            if accepted and size > max(len(accepted[0].members) + 1, EXHAUSTIVE):
+                break
             fresh: list[_Accepted] = []
-            for search in searches:
+            for place, search in enumerate(searches):
                 # With thousands of sets to choose from, some triple comes close to anything; so does a wide scatter.
                 doubted = size > 1 or bool(search.scattered)
                 least = max(best - cut, unknown if doubted else -np.inf)
-                for subsets in search.rows(size, [found.members for found in accepted]):
-                    fresh += self._possible(_sufficient(search, subsets, least, doubted))
+                every = size - len(search.scattered) <= EXHAUSTIVE
+                tried = search.rows(size) if every else search.grown(subsets[place])
+                subsets[place] = [_without(rows, [found.members for found in accepted]) for rows in tried]
+                for rows in subsets[place]:
+                    fresh += self._possible(_sufficient(search, rows, least, doubted))
             accepted += fresh
             best = max([best, *(found.evidence for found in fresh)])
         return accepted
@@ -286,17 +299,24 @@ class _Selection:
         return null.fit(self.x, self.t[:, columns_of(self.candidates, members)])
 
 
-def _sufficient(search: Subsets, subsets: NDArray[np.int64], least: float, doubted: bool) -> Iterator[_Accepted]:
+def _without(rows: Rows, accepted: Sequence[tuple[int, ...]]) -> Rows:
+    """Return the subsets that have no accepted part."""
+    kept = np.ones(len(rows), dtype=bool)
+    for part in accepted:
+        kept &= ~np.all([np.any(rows == member, axis=1) for member in part], axis=0)
+    return rows[kept]
+
+
+def _sufficient(search: Subsets, subsets: Rows, least: float, doubted: bool) -> Iterator[_Accepted]:
     """Yield the sufficient ones of subsets of the same ranks; each member of doubted ones has to be significant."""
-    solved, settings = search.solve(subsets), search.settings
-    passing = np.flatnonzero((solved.pvalue > settings.residual_level) & (solved.evidence >= least))
-    for first in range(0, len(passing), CHUNK):
-        rows = passing[first : first + CHUNK]
-        further = search.further(subsets[rows], solved.chi2[rows], solved.allowance[rows])
-        alone = further > settings.further_level
+    settings = search.settings
+    for rows in chunks(subsets):
+        solved = search.solve(rows)
+        kept = (solved.pvalue > settings.residual_level) & (solved.evidence >= least)
         if doubted:
-            alone &= search.least_needed(subsets[rows]) <= settings.further_level
-        for row, beside in zip(rows[alone], further[alone], strict=True):
-            members = tuple(int(member) for member in subsets[row])
-            numbers = float(solved.evidence[row]), members, float(solved.pvalue[row]), float(beside)
-            yield _Accepted(*numbers, search.null)
+            kept[kept] &= search.least_needed(rows[kept]) <= settings.further_level
+        further = search.beside(rows[kept]).min(axis=1) if kept.any() else np.empty(0)
+        numbers = zip(solved.evidence[kept], solved.pvalue[kept], further, rows[kept].tolist(), strict=True)
+        for evidence, pvalue, beside, members in numbers:
+            if beside > settings.further_level:
+                yield _Accepted(float(evidence), tuple(members), float(pvalue), float(beside), search.null)

@@ -1,8 +1,22 @@
 """All levels, cuts, bins and numbers of simulations of a diagnosis, in one object."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 from mcsim.systematics import Library
+
+_FIRST = {
+    "shrink": True,
+    "sims_per_element": 3,
+    "pilot_sims_per_element": 2,
+    "channel_skies": 2,
+    "typical_skies": 3,
+    "common_skies": 6,
+    "noisy_skies": 12,
+    "time_ordered_skies": 2,
+    "scan_sims": 100,
+}
+"""Numbers of simulations of a first verdict."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +76,8 @@ class DiagnosisSettings:
         P-value up to which a group of numbers is listed before others of a kind listed already.
     sims_per_element, pilot_sims_per_element
         Simulations per independent element of the data vector; and per element, after which these are counted.
+    shrink
+        Take the covariance from few simulations: shrunk (:func:`mcsim.stats.shrinkage.shrunk`), not that of the sample.
     redundant
         Directions of the data vector with less than this fraction of the largest variance are dropped.
     response_modes
@@ -134,6 +150,11 @@ class DiagnosisSettings:
     >>> library = {name: kind for name, kind in mcsim.effects().items() if name in ("gain_drift", "beam_width")}
     >>> sorted(mcsim.DiagnosisSettings(library=library, simulations=500).library)
     ['beam_width', 'gain_drift']
+
+    Ask for a first verdict from a third of the simulations for the covariance:
+
+    >>> mcsim.DiagnosisSettings.quick(without=("beam_ellipticity",)).sims_per_element
+    3
     """
 
     without: tuple[str, ...] = ()
@@ -144,7 +165,7 @@ class DiagnosisSettings:
     alpha: float = 0.05
     residual_level: float = 0.02
     further_level: float = 0.005
-    max_effects: int = 3
+    max_effects: int = 6
     named_probability: float = 0.5
     odds_cut: float = 100.0
     template_error: float = 0.01
@@ -164,6 +185,7 @@ class DiagnosisSettings:
 
     sims_per_element: int = 10
     pilot_sims_per_element: int = 3
+    shrink: bool = False
     redundant: float = 1e-4
     response_modes: int = 1 << 14
     channel_skies: int = 3
@@ -206,3 +228,25 @@ class DiagnosisSettings:
     agreement_level: float = 0.01
     small_chi2_pvalue: float = 1e-6
     correlated_sigma: float = 5.0
+
+    @classmethod
+    def quick(cls, **changes: Any) -> "DiagnosisSettings":
+        """Return the settings of a first verdict, with changes by name.
+
+        There are fewer simulations of everything: the covariance is shrunk, responses are averaged over fewer skies.
+        The same model diagnosed with the default settings goes on with these simulations. With nuisances, and for
+        measured spectra, the covariance is that of as many simulations as otherwise.
+        """
+        return cls(**(_FIRST | changes))
+
+    def without_shrinkage(self) -> "DiagnosisSettings":
+        """Return the settings with as many simulations as a sample covariance needs."""
+        whole = DiagnosisSettings()
+        few = self.sims_per_element == _FIRST["sims_per_element"]
+        names = ("sims_per_element", "pilot_sims_per_element") if few else ()
+        return replace(self, shrink=False, **{name: getattr(whole, name) for name in names})
+
+    def of_a_simulation(self) -> "DiagnosisSettings":
+        """Return the settings with the default numbers of simulations, on which no single simulation depends."""
+        whole = DiagnosisSettings()
+        return replace(self, simulations=None, **{name: getattr(whole, name) for name in _FIRST})

@@ -13,10 +13,9 @@ import numpy as np
 
 from mcsim.diagnosis.summaries import Element, of_map
 from mcsim.diagnosis.wiener_filter import FilteredMaps, Model
-from mcsim.sphere import alm as alm_
-from mcsim.sphere import healpix
+from mcsim.sphere import healpix, real
 from mcsim.sphere.rotation import rotation_matrix
-from mcsim.support.arrays import Alm, Matrix, Vector
+from mcsim.support.arrays import Matrix, Vector
 
 DEGREES = {"residual": 4, "gain": 2}
 """Highest degree of the residual, and of residual times sky: a gain that depends on direction."""
@@ -31,7 +30,7 @@ def elements_of(model: Model) -> tuple[Element, ...]:
     for part in range(len(model.parts)):
         alike = of_map(model, part)
         for kind, top in DEGREES.items():
-            for degree, order, component in _real(min(top, model.lmax)):
+            for degree, order, component in real.harmonics(min(top, model.lmax)):
                 own = replace(alike, name=f"{kind}/{alike.name}/{degree},{order}{component[:1]}", L=degree, M=order)
                 # The product with the sky has its power at all degrees of the sky.
                 ell = (degree, degree) if kind == "residual" else None
@@ -47,24 +46,8 @@ def values_of(model: Model, filtered: FilteredMaps) -> Vector:
     for i in range(len(model.parts)):
         product = filtered.residual[i] * filtered.expected[i]
         gain = ducc0.sht.adjoint_synthesis(map=product[None], spin=0, lmax=top, nthreads=1, **geometry)[0]
-        found += [_coefficients(filtered.adjoint[i], model.lmax, low), _coefficients(gain, top, top)]
+        found += [real.coefficients(filtered.adjoint[i], model.lmax, low), real.coefficients(gain, top, top)]
     return np.concatenate(found)
-
-
-def _real(lmax: int) -> list[tuple[int, int, str]]:
-    """Return degree, order and component of real harmonics."""
-    parts = [(degree, order) for degree in range(lmax + 1) for order in range(degree + 1)]
-    return [(*one, word) for one in parts for word in (("real", "imaginary") if one[1] else ("",))]
-
-
-def _coefficients(alm: Alm, lmax: int, top: int) -> Vector:
-    """Return the coefficients of real harmonics up to the degree ``top``."""
-    found = []
-    for degree, order, component in _real(top):
-        value = alm[alm_.start(lmax, order) + degree]
-        part = value.imag if component == "imaginary" else value.real
-        found.append(part * (np.sqrt(2.0) if order else 1.0))
-    return np.array(found)
 
 
 def northern(elements: Sequence[Element], frame: str) -> Matrix:
@@ -86,13 +69,8 @@ def northern(elements: Sequence[Element], frame: str) -> Matrix:
 def _overlap(frame: str, to: str, top: int) -> Matrix:
     """Return the integrals of products of real harmonics over a hemisphere."""
     npix = 12 * NSIDE**2
-    rows = []
-    for degree, order, component in _real(top):
-        alm = np.zeros((1, alm_.size(top)), dtype=np.complex128)
-        unit = 1.0 if order == 0 else np.sqrt(0.5)
-        alm[0, alm_.start(top, order) + degree] = 1j * unit if component == "imaginary" else unit
-        rows.append(healpix.synthesis(alm, NSIDE, top)[0])
-    harmonics = np.stack(rows)
+    units = [healpix.synthesis(real.to_alm(unit, top)[None], NSIDE, top)[0] for unit in np.eye((top + 1) ** 2)]
+    harmonics = np.stack(units)
     height = rotation_matrix(frame, to)[2] @ np.stack(healpy.pix2vec(NSIDE, np.arange(npix)))
     weight = np.where(np.abs(height) < 1e-9, 0.5, height > 0.0) * 4.0 * np.pi / npix
     return np.asarray((harmonics * weight) @ harmonics.T)

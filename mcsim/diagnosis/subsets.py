@@ -1,6 +1,6 @@
-"""Fit and test all subsets of the candidates."""
+"""Fit and test subsets of the candidates."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations
@@ -18,6 +18,17 @@ from mcsim.support.arrays import Vector
 
 # Relative to columns of norm one: keeps the normal equations of degenerate effects solvable, far below any noise.
 RIDGE = 1e-9
+
+# Subsets that are solved at once; bounds the memory to some 100 MB.
+CHUNK = 1000
+
+EXHAUSTIVE = 2
+"""Largest number of members, beside those whose scatter is known, of which all subsets are tried."""
+
+KEPT = 300
+"""Larger subsets of one size that are tried, the most probable ones."""
+
+Rows = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -71,40 +82,65 @@ class Subsets:
         return np.array([default if c.shape_error is None else c.shape_error for c in self.candidates])
 
     @cached_property
-    def _identity(self) -> NDArray[np.int64]:
+    def _identity(self) -> Rows:
         """Return a number of each candidate; those that exclude each other share it."""
         names = [candidate.identity for candidate in self.candidates]
         return np.array([names.index(name) for name in names])
 
-    def rows(self, size: int, accepted: Sequence[tuple[int, ...]]) -> Iterator[NDArray[np.int64]]:
-        """Yield subsets without exclusive members or an accepted part, shape (M, size), all of the same ranks."""
-        present = np.flatnonzero(self.groups.sizes > 0)
-        present = present[np.argsort(self.groups.sizes[present], kind="stable")]
-        rows = np.array(list(combinations(present, size)), dtype=np.int64).reshape(-1, size)
-        kept = np.ones(len(rows), dtype=bool)
-        for i, j in combinations(range(size), 2):
+    @cached_property
+    def _order(self) -> Rows:
+        """Return the rank of each candidate among those to which the data respond, the ones of few columns first."""
+        return np.argsort(np.argsort(self.groups.sizes, kind="stable"), kind="stable")
+
+    @cached_property
+    def _free(self) -> Rows:
+        """Return the candidates whose scatter is not known."""
+        return np.flatnonzero([candidate.scatter is None for candidate in self.candidates])
+
+    def rows(self, size: int) -> Iterator[Rows]:
+        """Yield all subsets without exclusive members, shape (M, size), all of the same ranks."""
+        more = size - len(self.scattered)
+        found = [(*self.scattered, *rest) for rest in combinations(self._free.tolist(), more)] if more >= 0 else []
+        return self._alike(np.array(found, dtype=np.int64).reshape(-1, size))
+
+    def grown(self, subsets: Iterable[Rows]) -> Iterator[Rows]:
+        """Yield the most probable subsets of one more member, which is significant beside the others.
+
+        In a subset whose members are all needed each is significant beside the others: nothing else can be sufficient.
+        """
+        more = []
+        for rows in (part for group in subsets for part in chunks(group)):
+            row, new = np.nonzero(self.beside(rows)[:, self._free] <= self.settings.further_level)
+            more.append(np.sort(np.column_stack([rows[row], self._free[new]]), axis=1))
+        groups = list(self._alike(np.unique(np.concatenate(more), axis=0))) if more else []
+        evidence = [np.concatenate([self.solve(part).evidence for part in chunks(group)]) for group in groups]
+        every = np.concatenate([np.empty(0), *evidence])
+        least = np.partition(every, -KEPT)[-KEPT] if len(every) > KEPT else -np.inf
+        for group, own in zip(groups, evidence, strict=True):
+            if np.any(own >= least):
+                yield group[own >= least]
+
+    def _alike(self, rows: Rows) -> Iterator[Rows]:
+        """Yield subsets of possible members in order, all of the same ranks; none of as many columns as elements."""
+        kept = np.all(self.groups.sizes[rows] > 0, axis=1)
+        for i, j in combinations(range(rows.shape[1]), 2):
             kept &= self._identity[rows[:, i]] != self._identity[rows[:, j]]
-        for member, candidate in enumerate(self.candidates):
-            if candidate.scatter is not None:
-                kept &= np.any(rows == member, axis=1) == (member in self.scattered)
-        for part in accepted:
-            kept &= ~np.all([np.any(rows == member, axis=1) for member in part], axis=0)
-        rows = rows[kept]
+        rows = np.take_along_axis(rows[kept], np.argsort(self._order[rows[kept]], axis=1), axis=1)
         pattern, which = np.unique(self.groups.sizes[rows], axis=0, return_inverse=True)
         for index, ranks in enumerate(pattern):
             if ranks.sum() < self.null.dimension:
                 yield rows[which.ravel() == index]
 
-    def _columns(self, subsets: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def _columns(self, subsets: Rows) -> tuple[Rows, Rows]:
         """Return the columns of each subset, shape (M, K), and the member to which each belongs, shape (K,)."""
         ranks = self.groups.sizes[subsets[0]]
         parts = [self.groups.start[subsets[:, i], None] + np.arange(rank) for i, rank in enumerate(ranks)]
         return np.concatenate(parts, axis=1), np.repeat(np.arange(len(ranks)), ranks)
 
-    def _matrix(self, columns: NDArray[np.int64]) -> Vector:
+    def _matrix(self, columns: Rows) -> Vector:
         return self._gram[columns[:, :, None], columns[:, None, :]] + RIDGE * np.eye(columns.shape[1])
 
-    def solve(self, subsets: NDArray[np.int64]) -> Solved:
+    def solve(self, subsets: Rows) -> Solved:
         """Fit subsets, all of the same ranks."""
         columns, place = self._columns(subsets)
         count, size = subsets.shape
@@ -124,7 +160,7 @@ class Subsets:
             allowance=allowance,
         )
 
-    def least_needed(self, subsets: NDArray[np.int64]) -> Vector:
+    def least_needed(self, subsets: Rows) -> Vector:
         """Return the global p-value of each subset's least significant member beside its others, shape (M,)."""
         if not len(subsets):
             return np.empty(0)
@@ -142,28 +178,33 @@ class Subsets:
             largest = np.maximum(largest, self.calibration.global_pvalue(pvalues))
         return largest
 
-    def further(self, subsets: NDArray[np.int64], chi2: Vector, allowance: Vector) -> Vector:
-        """Return the global p-value of the most significant candidate beside each subset, shape (M,)."""
-        if not len(subsets):
-            return np.empty(0)
+    def beside(self, subsets: Rows) -> Vector:
+        """Return the global p-value of each candidate beside each subset, shape (M, C); 1 if members exclude it."""
+        solved = self.solve(subsets)
         columns, _ = self._columns(subsets)
         count, K = columns.shape
         across = self._gram[columns]
-        solved = np.linalg.solve(self._matrix(columns), across)
-        left = self._projection - np.einsum("mk,mkj->mj", self._projection[columns], solved)
-        smallest = np.ones(count)
+        weights = np.linalg.solve(self._matrix(columns), across)
+        left = self._projection - np.einsum("mk,mkj->mj", self._projection[columns], weights)
+        found = np.ones((count, len(self.candidates)))
         for rank in np.unique(self.groups.sizes[self.groups.sizes > 0]):
             others = np.flatnonzero(self.groups.sizes == rank)
             index = self.groups.start[others, None] + np.arange(rank)
             block = self._gram[index[:, :, None], index[:, None, :]] - np.einsum(
-                "mkci,mkcj->mcij", across[:, :, index], solved[:, :, index]
+                "mkci,mkcj->mcij", across[:, :, index], weights[:, :, index]
             )
             values, vectors = np.linalg.eigh(block)
             along = np.einsum("mcij,mci->mcj", vectors, left[:, index])
             kept = values > COLLINEAR
             delta_chi2 = np.sum(np.where(kept, along**2 / np.where(kept, values, 1.0), 0.0), axis=-1)
-            ranks = kept.sum(axis=-1)
-            pvalues = self.null.nested_test(delta_chi2, chi2[:, None], ranks, K, allowance[:, None])
+            pvalues = self.null.nested_test(
+                delta_chi2, solved.chi2[:, None], kept.sum(axis=-1), K, solved.allowance[:, None]
+            )
             exclusive = np.any(self._identity[subsets][:, :, None] == self._identity[others], axis=1)
-            smallest = np.minimum(smallest, np.where(exclusive, 1.0, pvalues).min(axis=1))
-        return self.calibration.global_pvalue(smallest)
+            found[:, others] = np.where(exclusive, 1.0, pvalues)
+        return self.calibration.global_pvalue(found)
+
+
+def chunks(rows: Rows) -> Iterator[Rows]:
+    """Yield parts that are solved at once."""
+    return (rows[first : first + CHUNK] for first in range(0, len(rows), CHUNK))

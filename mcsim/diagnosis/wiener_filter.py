@@ -16,6 +16,7 @@ from functools import cached_property, reduce
 
 import ducc0
 import healpy
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,7 +25,7 @@ from mcsim.errors import InputError
 from mcsim.instrument.scan import Moments
 from mcsim.simulation import convolve
 from mcsim.simulation.noise import NoiseOfFiles
-from mcsim.simulation.survey import Survey
+from mcsim.simulation.survey import Channel, Survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
@@ -91,9 +92,9 @@ class FilteredMaps:
 
 
 def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
-    """Prepare a survey for the filter; raise InputError if a diagnosis cannot take it.
+    """Prepare a survey for the filter; raise InputError unless it has a spectrum of the sky, and pixels.
 
-    It needs a spectrum of the sky, pixels, and no channel that reads differences of two beams.
+    Of a channel that reads differences of two beams, the filter knows the mean of both sides.
     """
     if survey.cl is None:
         raise InputError("a diagnosis needs the spectrum of the sky; give sky.spectrum.")
@@ -101,14 +102,10 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
     if run.map.grid == "gl":
         raise InputError('a diagnosis compares maps of pixels; give the model map.grid = "healpix" and map.nside.')
     cl = survey.cl[: lmax + 1]
-    response = np.stack([channel.response.factors[0, : lmax + 1].real for channel in survey.channels])
+    both = zip(survey.channels, survey.making.channels, strict=True)
+    response = np.stack([_circular(channel, made)[: lmax + 1] for channel, made in both])
     parts = []
     for index, channel in enumerate(survey.channels):
-        if channel.side_b is not None:
-            raise InputError(
-                f"channel {channel.name} reads differences of two beams, which a diagnosis cannot take yet; describe "
-                'the map by a scan of kind "hit_averaged" or "moments".'
-            )
         floor = settings.noise_floor * float(np.sqrt(sky_variance(cl, response[index])))
         for m, split in zip(channel.maps, run.map.splits or (None,), strict=True):
             if isinstance(m.drawn, NoiseOfFiles):
@@ -127,6 +124,18 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
     sky_power = cl * gain / (1.0 + cl * gain)
     dipole = dipole_alm(survey.channels[0].site.dipole_uk, lmax)
     return Model(survey, lmax, survey.nside, cl, response, tuple(parts), dipole, sky_power, settings)
+
+
+def _circular(channel: Channel, made: Channel) -> Cl:
+    """Return B_l w_l of a channel; of a differencing scan their mean over both sides.
+
+    ``made`` is the channel before its maps are prepared.
+    """
+    own = channel.response.factors[0].real
+    if made.side_b is None:
+        return own
+    a, b = made.response.factors[0].real, made.side_b.response.factors[0].real
+    return np.asarray(own * np.divide(0.5 * (a + b), a, out=np.ones_like(a), where=a != 0.0))
 
 
 def sky_variance(cl: Cl, response: Cl) -> float:
@@ -217,6 +226,18 @@ def _transforms(model: Model, members: tuple[int, ...]) -> Iterator[tuple[int, i
 
 def by_degree(a: Alm, b: Alm, lmax: int) -> Cl:
     """Return the sum over all m of a_lm conj(b_lm) for two real fields."""
-    product = a.real * b.real + a.imag * b.imag
-    product[lmax + 1 :] *= 2.0
-    return np.asarray(np.bincount(alm_.degrees(lmax), weights=product, minlength=lmax + 1), dtype=np.float64)
+    found = np.zeros(lmax + 1)
+    _add_by_degree(a, b, found)
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_by_degree(a, b, found):  # type: ignore[no-untyped-def]
+    """Add the products of all orders m, twice for m > 0, in one pass over memory."""
+    place = 0
+    for m in range(found.size):
+        twice = 2.0 if m else 1.0
+        for ell in range(m, found.size):
+            product = a[place].real * b[place].real + a[place].imag * b[place].imag
+            found[ell] += twice * product
+            place += 1

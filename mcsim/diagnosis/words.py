@@ -59,6 +59,8 @@ def tested(result: DiagnosisResult) -> str:
     if result.residual_maps is None:
         source = "a table of spectra"
     by = "" if result.agreement is None else f" by {result.agreement.simulator}"
+    if "worth" in result.provenance:
+        by += f", whose shrunk covariance is worth {result.provenance['worth']} of a sample covariance"
     return (
         f"{len(result.elements)} elements of the data vector, {result.test.dimension} of them independent, measured "
         f"from {source}; {result.simulations} simulations of the model{by}; "
@@ -147,6 +149,28 @@ def held_out(result: DiagnosisResult) -> str:
     )
 
 
+def unlisted(result: DiagnosisResult) -> list[str]:
+    """Return what is missing after an unknown gap, in the words of the grammar; empty if it was not looked for."""
+    if result.unlisted is None:
+        return []
+    if not result.unlisted:
+        return ["No structure that the grammar can say is significant: what is missing stays unknown."]
+    found = [one.sentence for one in result.unlisted]
+    held = result.unlisted_held_out
+    if all(one.file is None for one in result.unlisted):
+        return [*found, "No effect of the simulator can be like it, so that its reduction is not measured."]
+    if held is None:
+        return [*found, "Its reduction on held-out data is not measured: they do not respond to it by themselves."]
+    if held.before.value <= 0.0 or held.achieved.sigma >= LARGEST_ERROR:
+        before, after = (measured(one.value, one.sigma) for one in (held.before, held.after))
+        return [*found, f"Excess χ² of {held.data} too small to measure a reduction: {before} before, {after} after."]
+    left = f"what remains there {residual(held.pvalue_after)}"
+    return [
+        *found,
+        f"Added to the simulator, this removes {percent(held.achieved)} of the excess χ² of {held.data}; {left}.",
+    ]
+
+
 def compared_parts(result: DiagnosisResult) -> list[str]:
     """Return the amplitudes of each named effect in parts of the data, and what it removes from the maps."""
     found = [
@@ -204,8 +228,21 @@ def summary(result: DiagnosisResult, folder: Path) -> list[str]:
         rows.append(("where", f"{first.element.words}; z = {first.z:.1f}, {p_equals(first.p)}"))
     rows += [("nuisance", f"{one.label}: {one.words}{pulled(one)}") for one in result.nuisances]
     rows += [("note", note) for note in result.notes]
-    rows.append(("written", f"{folder}: verdict.json, report.html, diagnosis.zarr"))
+    if result.untested:
+        rows.append(("note", f"{untested(result)} The report lists them."))
+    rows += [("missing", line) for line in unlisted(result)]
+    files = ["verdict.json", "report.html", "diagnosis.zarr"]
+    files += [f"{one.name}.py" for one in result.unlisted or () if one.file is not None]
+    rows.append(("written", f"{folder}: {', '.join(files)}"))
     return [f"{name:<14}{text}" for name, text in rows]
+
+
+def untested(result: DiagnosisResult) -> str:
+    """Return a sentence on the number of elements that are not tested."""
+    return (
+        f"{len(result.untested)} of {len(result.elements)} elements are not tested, because they follow the square of "
+        "a nuisance as wide as its prior."
+    )
 
 
 def pulled(one: NuisanceResult) -> str:

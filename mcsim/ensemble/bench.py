@@ -4,6 +4,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ def bench(nside: int = 512, lmax: int = 1024, repeats: int = 5) -> Iterator[str]
     yield f"nside {nside}, lmax {lmax}, m_max 2, L_max 2, paired; one thread; medians of {repeats} interleaved pairs"
     yield from _realization(nside, lmax, repeats)
     yield from _workers(nside, lmax, 16 * repeats)
+    yield _offsets(nside, lmax, repeats)
     yield _moments(nside)
 
 
@@ -74,6 +76,23 @@ def _workers(nside: int, lmax: int, realizations: int) -> Iterator[str]:
             f"(start, store and summary included), peak memory of a worker {peak / 1e9:.2f} GB"
         )
     yield f"  2 workers over 1: {rates[1] / rates[0]:.2f}"
+
+
+def _offsets(nside: int, lmax: int, repeats: int) -> str:
+    """Return the time of a realization with powers of the samples' offsets over that with their mean alone."""
+    draw, npix = np.random.default_rng(0), 12 * nside**2
+    w = np.exp(1j * draw.uniform(0.0, 2.0 * np.pi, (2, npix)))
+    offsets = draw.standard_normal((14, npix)) / nside
+    moments = scan.Moments(nside, "ecliptic", np.ones(npix), w, offsets[0], offsets[1], offsets[2:] / nside)
+    shared = survey(_run(nside, lmax, 0.0, 1))
+    spread = []
+    for order in (1, 2, 3, 4):
+        own = tuple(replace(m, moments=moments.up_to_offsets(order)) for m in shared.channels[0].maps)
+        spread.append(replace(shared, channels=(replace(shared.channels[0], maps=own),)))
+        simulate.realize(spread[-1], 0)
+    seconds = np.array([[_seconds(simulate.realize, one, r) for one in spread] for r in range(repeats)])
+    ratios = ", ".join(f"{ratio:.2f}" for ratio in np.median(seconds[:, 1:] / seconds[:, :1], axis=0))
+    return f"  realization with the samples' offsets up to power 2, 3 and 4 over one with their mean: ratio {ratios}"
 
 
 def _moments(nside: int) -> str:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mcsim.support.arrays import texts
+
 if TYPE_CHECKING:  # stored ensembles open without the numerics, which load slowly
     from mcsim.bipolar import Mode
 
@@ -70,10 +72,7 @@ class Layout:
                 for name, (dim, values, text) in numbers.items()
             }
             | (bins if self.filtered else {})
-            | {
-                name: (dim, np.array(values, dtype=object), {"long_name": text})
-                for name, (dim, values, text) in labels.items()
-            }
+            | {name: (dim, texts(values), {"long_name": text}) for name, (dim, values, text) in labels.items()}
         )
 
     def first_ells(self) -> NDArray[np.int64]:

@@ -129,6 +129,12 @@ def read_uk(path: Path, frame: str, frequency_ghz: float | None) -> NDArray[np.f
     return np.where(map_ == healpy.UNSEEN, map_, factor * map_)
 
 
+def first_realization(folder: Path) -> Path:
+    """Return the subfolder of realization 0 where :func:`write_maps` made one for each; else the folder itself."""
+    first = folder / f"{0:05d}"
+    return first if first.is_dir() and not any(folder.glob("*.fits")) else folder
+
+
 def file_names(run: config.RunConfig) -> dict[str, str]:
     """Return the file name of every map of a run: ``{channel}.fits`` or ``{channel}_{split}.fits``."""
     names = {name: f"{name.replace(':', '_')}.fits" for name in config.map_names(run)}

@@ -17,6 +17,7 @@ from mcsim.ensemble import opening, store
 from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError
 from mcsim.simulation import differencing, noise
+from mcsim.simulation import offsets as offsets_
 from mcsim.simulation.channels import check_effects, load_beam, refuse_external
 from mcsim.simulation.filtering import Bands, probes_of
 from mcsim.simulation.preparation import preparation
@@ -170,6 +171,7 @@ class Cost:
     each_s: float
     preparation: str  # what preparing the maps adds, in words
     noise: tuple[str, ...] = ()  # what is known of noise that is estimated or drawn, in words
+    offsets: str = ""  # what powers of the samples' offsets add, in words
     filter: str = ""  # what the inverse covariance costs, in words
 
     def lines(self, number: int, workers: int) -> list[str]:
@@ -178,6 +180,7 @@ class Cost:
         return [
             f"  memory  {self.memory / 1e9:.2f} GB per worker, {workers} workers",
             *([f"  prepare {self.preparation}"] if self.preparation else []),
+            *([f"  offsets {self.offsets}"] if self.offsets else []),
             *([f"  filter  {self.filter}"] if self.filter else []),
             *(f"  noise   {line}" for line in self.noise),
             f"  time    {duration(self.each_s)} per realization and core, {duration(total_s)} of processor time,"
@@ -233,16 +236,24 @@ def cost(run: config.RunConfig) -> Cost:
     if run.biposh.filtered:
         solutions = len(names) * (1.0 + NEAR * run.ensemble.paired)
         transforms += SOLUTION * solutions
-        bands = [Bands(planned.modes, lmax, run.biposh.summary_bin, auto) for auto in (True, not both)]
+        bands = [
+            Bands(planned.modes, lmax, run.biposh.summary_bin, auto) for auto in {True, not (both and len(names) > 1)}
+        ]
         probes = probes_of(bands, run.biposh.probes)
         once_s = probes * (SOLUTION * len(names) * transform + pairs * probes * estimation)
         filtering = (
             f"about {SOLUTION * solutions:.0f} further transforms per realization; once, {probes} random maps of each "
             f"map, {duration(once_s)} of processor time (none if the noise is uniform on the full sky)"
         )
+    offsets, spreading = run.map.offset_order or 0, ""
+    if offsets > 1:
+        spread = [channel for channel in run.channels if not isinstance(channel.scan, config.ScanParallelTransport)]
+        extra = len(spread) * offsets_.transforms(offsets)
+        transforms, memory = transforms + extra, memory + 96.0 * nside**2 * (4 + splits)
+        spreading = f"{extra} further transforms per realization for powers of the samples' offsets up to {offsets}"
     estimates = pairs * (2 if run.ensemble.paired else 1)
     each_s = transform * transforms + estimation * estimates + differencing.seconds(run) + noise.seconds(run)
-    return Cost(planned, memory, each_s, words, tuple(noise.in_words(run)), filtering)
+    return Cost(planned, memory, each_s, words, tuple(noise.in_words(run)), spreading, filtering)
 
 
 def _timed(nside: int, lmax_sky: int, lmax: int, L_max: int) -> tuple[float, float]:

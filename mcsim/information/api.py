@@ -175,6 +175,11 @@ def inverse_covariance(analysis: Analysis, settings: LimitSettings, nthreads: in
     shared = analysis.model.survey
     maps = []
     for channel in shared.channels:
+        if channel.side_b is not None:
+            raise InputError(
+                f"channel {channel.name} reads differences of two beams, whose maps have noise that is not white; "
+                'describe the map by a scan of kind "hit_averaged" or "moments".'
+            )
         response = convolve.Response(channel.response.factors[: settings.orders + 1])
         for m in channel.maps:
             if m.drawn is not None:

@@ -13,7 +13,7 @@ from mcsim.diagnosis.candidate import Candidate, columns_of, numbered
 from mcsim.information.fisher import Information
 from mcsim.information.settings import LimitSettings
 from mcsim.stats.detection import snr_needed, snr_to_separate
-from mcsim.support.arrays import Matrix
+from mcsim.support.arrays import Matrix, texts
 from mcsim.support.folders import unwritable, write_whole
 from mcsim.support.numbers import number
 
@@ -150,7 +150,7 @@ class Limits:
 
     def to_dataset(self) -> xr.Dataset:
         """Return table, correlations and Fisher matrix with names and units."""
-        labels = np.array([one.label for one in self.effects], dtype=object)
+        labels = texts(one.label for one in self.effects)
         named = {
             "sigma": "standard error of the amplitude, rms over components",
             "amplitude_90_known": "amplitude detected if this effect alone is tested",
@@ -161,14 +161,14 @@ class Limits:
         for key, text in named.items():
             values = np.array([getattr(one, key) for one in self.effects])
             columns[key] = ("effect", values, {"units": "see unit", "long_name": text})
-        columns["unit"] = ("effect", np.array([one.unit for one in self.effects], dtype=object))
+        columns["unit"] = ("effect", texts(one.unit for one in self.effects))
         error = np.array([one.error for one in self.effects])
         columns["sigma_relative_error"] = ("effect", error, {"units": "1", "long_name": "error from random probes"})
         shape = ("effect", "other"), self.correlation
         columns["correlation"] = (*shape, {"units": "1", "long_name": "largest canonical correlation of responses"})
         text = "Fisher information per unit of each component, nuisances marginalised"
         columns["fisher"] = (("component", "component_"), self.fisher, {"units": "1/units^2", "long_name": text})
-        names = np.array(self.components, dtype=object)
+        names = texts(self.components)
         coordinates = {"effect": labels, "other": labels, "component": names, "component_": names}
         attributes = {"model": self.model, "conventions": self.conventions, "method": self.method, "tests": self.tests}
         return xr.Dataset(columns, coordinates, attributes)

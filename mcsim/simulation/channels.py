@@ -10,6 +10,7 @@ import numpy as np
 from mcsim import config, systematics
 from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
+from mcsim.instrument.scan.offsets import HIGHEST
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import rotation
 from mcsim.support import resources
@@ -122,12 +123,46 @@ def check_effects(run: config.RunConfig) -> None:
 
 
 def refuse_excess(channel: str, acting: tuple[systematics.Effect, ...]) -> None:
-    """Refuse noise of effects in a differencing scan, whose samples are differences."""
+    """Refuse effects in a differencing scan that its samples, which are differences, do not have."""
+    for effect in acting:
+        if effect.amplitude != 0.0 and type(effect).orientations is not systematics.Effect.orientations:
+            raise InputError(
+                f"effect {effect.name} on channel {channel} acts on orientation moments, but the scan takes "
+                'differences, which have none; remove it, or give a scan of kind "hit_averaged".'
+            )
     for effect in systematics.disturbing(acting):
         raise InputError(
             f"effect {effect.name} on channel {channel} adds noise to samples of one beam, but the scan takes "
             "differences; remove it, or use noise.sigma0_uk."
         )
+
+
+def with_offsets(moments: scan.Moments, order: int, spec: config.Channel) -> scan.Moments:
+    """Return moments with those of the samples' offsets that a run asks for, and no others.
+
+    InputError if they are not known; where samples stand at the centres of their pixels there are none.
+    """
+    found = moments.up_to_offsets(order)
+    if 1 < order != found.offset_order and not isinstance(spec.scan, config.ScanParallelTransport):
+        remedy = f"lower it, or give columns DTHETA, DPHI and OFFSET_a_b up to a + b = {order}"
+        if isinstance(spec.scan, config.ScanDifferencing):
+            remedy = "remove it, since a differencing scan has none"
+        raise InputError(
+            f"map.offset_order = {order}, but the moments of channel {spec.name} have offsets up to order "
+            f"{found.offset_order}; {remedy}."
+        )
+    return found
+
+
+def known_offsets(run: config.RunConfig, spec: config.Channel) -> int:
+    """Return the highest power of the samples' offsets that the moments of a channel can have."""
+    match spec.scan:
+        case config.ScanMoments():
+            paths = [config.channel_path(spec.scan.path, spec.name, split) for split in run.map.splits or (None,)]
+            return min(scan.read_moments(path).offset_order for path in paths)
+        case config.ScanDifferencing():
+            return 1
+    return HIGHEST
 
 
 def refuse_pixel_effects(channel: str, acting: tuple[systematics.Effect, ...]) -> None:
@@ -143,7 +178,7 @@ def refuse_pixel_effects(channel: str, acting: tuple[systematics.Effect, ...]) -
 
 def site_of(run: config.RunConfig, spec: config.Channel) -> systematics.Site:
     """Return what effects may know of a channel."""
-    pointing, dipole = _described(spec)
+    pointing, dipole = described(spec)
     amplitude = run.sky.dipole_uk if run.sky.dipole_uk is not None else dipole or 0.0
     towards = healpy.ang2vec(run.sky.dipole_lon_deg, run.sky.dipole_lat_deg, lonlat=True)
     return systematics.Site(
@@ -190,7 +225,7 @@ def _with_m_max(spec: config.Channel, m_max: int | None) -> config.Channel:
     return replace(spec, beam=beam or spec.beam, beam_b=beam_b)
 
 
-def _described(spec: config.Channel) -> tuple[systematics.Pointing | None, float | None]:
+def described(spec: config.Channel) -> tuple[systematics.Pointing | None, float | None]:
     """Return how a channel was pointed, if one line of sight says it all, and the dipole that its description names."""
     match spec.scan:
         case config.ScanMoments() if spec.scan.model is not None:

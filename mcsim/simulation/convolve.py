@@ -125,12 +125,12 @@ def noncircular_map(maps: dict[int, NDArray[np.float64]], moments: Moments) -> h
     for s, pair in maps.items():
         check_shape(pair, (2, total.size), f"the map S_{s} beside moments of nside {moments.nside}")
     for s, (real, imag) in maps.items():
-        _add_twice_real_part(moments.w[s - 1], real, imag, total)
+        add_twice_real_part(moments.w[s - 1], real, imag, total)
     return total
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_twice_real_part(w, real, imag, total):  # type: ignore[no-untyped-def]
+def add_twice_real_part(w, real, imag, total):  # type: ignore[no-untyped-def]
     """Add 2 Re(w (real + i imag)) to ``total`` in one pass over memory, which is what this costs."""
     for pixel in range(total.size):
         total[pixel] += 2.0 * (w[pixel].real * real[pixel] - w[pixel].imag * imag[pixel])

@@ -7,15 +7,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
+from mcsim.errors import RunError
 from mcsim.simulation import convolve, mapmaking
 from mcsim.simulation.channels import scan_model
 from mcsim.simulation.survey import Channel, SideB, SurveyMap
 from mcsim.sphere import rng
+from mcsim.sphere.sky import dipole_alm
 
 Map = NDArray[np.float64]
+Sides = tuple[mapmaking.SideMaps, mapmaking.SideMaps]
 
 SECONDS_PER_SAMPLE = 1.5e-7
 """Time of one core for a difference: 100 ns for two right-hand sides, the rest for 26 iterations (W1, nside 128)."""
+
+
+FEW = 8
+"""Iterations after which a map lacks some uK at the largest scales: where responses to stopping early are measured."""
 
 
 def sides(run: config.RunConfig) -> dict[str, str]:
@@ -61,14 +68,101 @@ def maps(
     Map-making is linear, so the circular-beam control and what the rest of the beams adds are solved for apart, each to
     the tolerance asked for relative to itself: the paired difference does not inherit the residual of the much larger
     control. The control starts from the mean of the two circular maps, which is the solution itself where these are
-    equal and there is no noise.
+    equal and there is no noise. A map-making that stops early is not linear: it starts from zeros, as one that does not
+    know the sky, and is run for the control and for the whole.
     """
-    side_b, nside = channel.side_b, channel.site.nside
-    assert side_b is not None  # the caller has told the channels apart
-    whole_a, whole_b = (mapmaking.side_maps(sky, r, nside, nthreads) for r in (channel.response, side_b.response))
-    circular_a, circular_b = whole_a[:, :1], whole_b[:, :1]
-    start = 0.5 * (circular_a[:, 0] + circular_b[:, 0])
-    skies, x = [(circular_a, circular_b), (whole_a, whole_b)], side_b.scan.transmission_imbalance
+    short = _side_b(channel).iterations_short > 0
+    whole = _side_maps(channel, sky, nthreads)
+    circular = whole[0][:, :1], whole[1][:, :1]
+    start = None if short else _mean(circular)
+    for m, (control, complete) in _rhs(channel, [circular, whole], dipole, (seed, realization), nthreads):
+        smooth = _solve(m, channel, control, start, "the circular-beam control", nthreads)
+        if short:
+            yield m, smooth, _solve(m, channel, complete, None, "the whole beam", nthreads) - smooth
+        else:
+            yield m, smooth, _solve(m, channel, complete - control, None, "the non-circular part", nthreads)
+
+
+def whole_maps(
+    channel: Channel,
+    sky: NDArray[np.complex128],
+    dipole: NDArray[np.complex128] | None,
+    seed: int,
+    realization: int,
+    nthreads: int = 1,
+) -> Iterator[tuple[SurveyMap, Map]]:
+    """Yield the sums of the two parts of :func:`maps`, solved for at once, in about half of the time.
+
+    They differ by what the tolerance leaves: tests/integration/test_diagnosis_differencing.py. RunError says that the
+    conjugate gradients do not converge.
+    """
+    whole = _side_maps(channel, sky, nthreads)
+    start = None if _side_b(channel).iterations_short > 0 else _mean(whole)
+    for m, (complete,) in _rhs(channel, [whole], dipole, (seed, realization), nthreads):
+        try:
+            yield m, _solve(m, channel, complete, start, "the whole beam", nthreads)
+        except RuntimeError as error:
+            raise RunError(f"{error}.") from error
+
+
+def of_dipole(channel: Channel, imbalance: float, nthreads: int = 1) -> list[Map]:
+    """Return what the dipole leaves in the maps where the true imbalance is another, uK, shape (npix,) each."""
+    side_b = _side_b(channel)
+    other = replace(channel, side_b=replace(side_b, imbalance=imbalance, sigma0_uk=0.0, iterations_short=0))
+    dipole = dipole_alm(channel.site.dipole_uk, channel.site.lmax)
+    return [map_uk for _, map_uk in whole_maps(other, dipole, dipole, 0, 0, nthreads)]
+
+
+def not_converged(channel: Channel, m: SurveyMap, sky_uk: Map, nthreads: int = 1) -> Map:
+    """Return what the map of a sky, uK, shape (npix,), lacks after FEW iterations from zeros."""
+    x, seen = _side_b(channel).scan.transmission_imbalance, m.moments.hits > 0.0
+    map_uk = np.where(seen, sky_uk - (float(np.mean(sky_uk[seen])) if x == 0.0 else 0.0), 0.0)
+    rule = mapmaking.StoppingRule(max_iterations=FEW)
+    rhs = mapmaking.rhs_of_map(_pairs(m), map_uk, x, nthreads)
+    return np.where(seen, mapmaking.solve(_pairs(m), rhs, x, rule, nthreads=nthreads)[0] - map_uk, 0.0)
+
+
+def iterations_to_spare(channel: Channel, sky: NDArray[np.complex128], nthreads: int = 1) -> int:
+    """Return how many iterations more than FEW the first map of a sky takes to converge, >= 1."""
+    scan, m = _side_b(channel).scan, channel.maps[0]
+    x, rule = scan.transmission_imbalance, mapmaking.StoppingRule(scan.tolerance, scan.max_iterations)
+    sky_uk = convolve.circular_map(sky, channel.response, channel.site.nside, nthreads)
+    rhs = mapmaking.rhs_of_map(_pairs(m), np.where(m.moments.hits > 0.0, sky_uk, 0.0), x, nthreads)
+    return max(mapmaking.solve(_pairs(m), rhs, x, rule, nthreads=nthreads)[1].iterations - FEW, 1)
+
+
+def _side_b(channel: Channel) -> SideB:
+    assert channel.side_b is not None  # the caller has told the channels apart
+    return channel.side_b
+
+
+def _pairs(m: SurveyMap) -> mapmaking.DifferencingScan:
+    assert m.pairs is not None  # as of every map of such a channel
+    return m.pairs
+
+
+def _side_maps(channel: Channel, sky: NDArray[np.complex128], nthreads: int) -> Sides:
+    a, b = channel.response, _side_b(channel).response
+    return mapmaking.side_maps(sky, a, channel.site.nside, nthreads), mapmaking.side_maps(
+        sky, b, channel.site.nside, nthreads
+    )
+
+
+def _mean(sides: Sides) -> Map:
+    """Return the mean of what the circular parts of both beams see."""
+    return np.asarray(0.5 * (sides[0][:, 0] + sides[1][:, 0]))
+
+
+def _rhs(
+    channel: Channel,
+    skies: list[Sides],
+    dipole: NDArray[np.complex128] | None,
+    draw: tuple[int, int],
+    nthreads: int,
+) -> Iterator[tuple[SurveyMap, NDArray[np.float64]]]:
+    """Yield every map with its right-hand sides, shape (skies, npix); ``draw`` has seed and realization."""
+    side_b, nside = _side_b(channel), channel.site.nside
+    x = side_b.scan.transmission_imbalance
     removed = None
     if dipole is not None:
         fiducial = [
@@ -77,25 +171,23 @@ def maps(
         dipole_a, dipole_b = (mapmaking.side_maps(dipole, response, nside, nthreads) for response in fiducial)
         removed = [(dipole_a, dipole_b)]
     for m in channel.maps:
-        assert m.pairs is not None  # as of every map of such a channel
-        noise = mapmaking.DifferenceNoise(side_b.sigma0_uk, rng.generator(seed, realization, f"noise/{m.name}"))
+        generator = rng.generator(*draw, f"noise/{m.name}")
+        noise = mapmaking.DifferenceNoise(side_b.sigma0_uk, generator, side_b.noise_factor)
         imbalance = mapmaking.Imbalance(side_b.imbalance, x)
-        control, complete = mapmaking.rhs_from_maps(m.pairs, skies, imbalance, noise, nthreads)
+        found = mapmaking.rhs_from_maps(_pairs(m), skies, imbalance, noise, nthreads)
         if removed is not None:
-            known = mapmaking.rhs_from_maps(m.pairs, removed, mapmaking.Imbalance(x), nthreads=nthreads)[0]
-            control, complete = control - known, complete - known
-        circular = _solve(m, side_b, control, start, "the circular-beam control", nthreads)
-        yield m, circular, _solve(m, side_b, complete - control, None, "the non-circular part", nthreads)
+            found = found - mapmaking.rhs_from_maps(_pairs(m), removed, mapmaking.Imbalance(x), nthreads=nthreads)
+        yield m, found
 
 
-def _solve(m: SurveyMap, side_b: SideB, rhs: Map, start: Map | None, what: str, nthreads: int) -> Map:
-    assert m.pairs is not None  # as of every map of such a channel
+def _solve(m: SurveyMap, channel: Channel, rhs: Map, start: Map | None, what: str, nthreads: int) -> Map:
+    side_b = _side_b(channel)
     chosen = side_b.scan
     x, rule = chosen.transmission_imbalance, mapmaking.StoppingRule(chosen.tolerance, chosen.max_iterations)
-    map_uk, report = mapmaking.solve(m.pairs, rhs, x, rule, start, nthreads)
+    map_uk, report = mapmaking.solve(_pairs(m), rhs, x, rule, start, nthreads)
     if side_b.iterations_short > 0 and report.converged:
-        short = replace(rule, max_iterations=max(report.iterations - side_b.iterations_short, 0))
-        map_uk, _ = mapmaking.solve(m.pairs, rhs, x, short, start, nthreads)
+        short = replace(rule, max_iterations=max(report.iterations - side_b.iterations_short, 1))
+        map_uk, _ = mapmaking.solve(_pairs(m), rhs, x, short, start, nthreads)
     if not report.converged:
         raise RuntimeError(
             f"map {m.name}, {what}: the map-making reached a relative residual of {report.relative_residual:.2g} in "

@@ -8,6 +8,7 @@ from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments
 from mcsim.simulation import convolve
+from mcsim.simulation.offsets import expansion, offset_maps
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 
@@ -29,6 +30,7 @@ def observe(
     pixel_window
         Whether samples spread over the pixels: the map is then smoothed by the pixel window. ``None``: where the
         moments have centroids (``dtheta``, ``dphi``), that is where they are of samples and not of pixels' centres.
+        Moments of offsets beyond the mean (``offset_moments``) bring their own.
     nthreads
         Threads of the transforms.
 
@@ -47,7 +49,8 @@ def observe(
     T(n) = S_0(n) + 2 Re sum_{s > 0} w_s(n) S_s(n) + d(n) . grad S_0(n), with S_s(n) = sum_lm k_l a_lm b_ls sY_lm(n),
     k_l = sqrt(4 pi/(2l + 1)), the moments w_s and the centroids d, where known (arXiv:1210.7318, Sec. III). It is the
     mean of the samples that ``ducc0.totalconvolve`` gives one by one, to 1e-12 of the map without pixel window and
-    centroids (tests/unit/test_public_api.py).
+    centroids (tests/unit/test_public_api.py). With ``offset_moments`` the gradient term becomes the first of a series
+    in the samples' offsets (:mod:`mcsim.simulation.offsets`).
 
     Examples
     --------
@@ -70,8 +73,14 @@ def observe(
     spread = moments.dtheta is not None if pixel_window is None else pixel_window
     response = convolve.response(beam, lmax, healpix.pixel_window(nside, lmax) if spread else None)
     circular = convolve.circular_alm(sky, response)
+    terms = expansion(nside, lmax, moments.offset_order) if moments.offset_order > 1 and spread else None
+    if terms is not None:
+        bare = convolve.circular_alm(sky, convolve.response(beam, lmax))
+        circular = alm_.multiply(bare, terms.smooth, lmax)
     total = healpix.synthesis(circular[None], nside, lmax, nthreads=nthreads)[0]
-    if moments.dtheta is not None:
+    if terms is not None:
+        total = total + offset_maps(bare, terms, [moments], nthreads)[0]
+    elif moments.dtheta is not None:
         total = total + convolve.centroid_map(healpix.gradient(circular, nside, lmax, nthreads), moments)
     if spins := convolve.spin_maps(sky, response, nside, nthreads):
         total = total + convolve.noncircular_map(spins, moments)

@@ -95,7 +95,9 @@ class Preparation:
         hits = hits * (moments.nside / self.nside) ** 2
         moved = self.nside != moments.nside or self.frame != moments.frame
         found = Moments(self.nside, self.frame, np.nan_to_num(hits), np.nan_to_num(w))
-        return found if moved else replace(found, dtheta=moments.dtheta, dphi=moments.dphi)
+        if moved:
+            return found
+        return replace(found, dtheta=moments.dtheta, dphi=moments.dphi, offset_moments=moments.offset_moments)
 
     def site(self, site: Site) -> Site:
         """Return what effects may know of a channel whose maps are prepared."""

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from functools import reduce
 
 import healpy
 import numpy as np
@@ -194,5 +193,5 @@ def _disturbed(effect: systematics.Effect, draw: np.random.Generator) -> tod.Sta
 
 def _noise_factor(channel: Channel) -> Map | None:
     """Return the factor of the noise per sample in every pixel, shape (npix,); None: one."""
-    factors = [own for effect in channel.effects if (own := effect.noise(channel.site)) is not None]
-    return np.sqrt(np.clip(reduce(np.multiply, factors), 0.0, None)) if factors else None
+    factor = systematics.variance_factor(channel.effects, channel.site)
+    return None if factor is None else np.sqrt(factor)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mcsim import bipolar, config, systematics
 from mcsim.simulation import convolve, differencing, rings, skies
+from mcsim.simulation.offsets import Expansion, expansion, offset_maps
 from mcsim.simulation.survey import Channel, Survey, SurveyMap
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rng
@@ -88,6 +89,12 @@ def maps(survey: Survey, realization: int, nthreads: int = 1, sky: Alm | None = 
     found = []
     made = _circular_maps(survey, nthreads)
     for channel in survey.making.channels:
+        if channel.side_b is not None:
+            run = survey.config
+            seen, dipole = _seen(survey.making, channel, sky, realization)
+            made_at_once = differencing.whole_maps(channel, seen, dipole, run.ensemble.seed, realization, nthreads)
+            found += [_finished(m, map_uk) for m, map_uk in made_at_once]
+            continue
         for m, parts in _map_parts(survey.making, channel, sky, realization, made, smooth=True):
             found.append(_finished(m, parts.total))
     return np.stack(found)
@@ -221,11 +228,17 @@ def _map_parts(
     if any(m.gain is not None for m in channel.maps):
         whole = convolve.circular_map(seen, channel.response, nside, nthreads)
     gradient = None
-    if any(m.moments.dtheta is not None for m in channel.maps):
+    terms = _expansion(channel)
+    offsets: list[NDArray[np.float64]] = []
+    if terms is not None:
+        offsets = offset_maps(_unwindowed(channel, seen, dipole), terms, [m.moments for m in channel.maps], nthreads)
+    elif any(m.moments.dtheta is not None for m in channel.maps):
         gradient = made.gradient(circular)
-    for m in channel.maps:
+    for index, m in enumerate(channel.maps):
         extra = []
-        if m.moments.dtheta is not None and gradient is not None:
+        if terms is not None:
+            extra.append(offsets[index])
+        elif m.moments.dtheta is not None and gradient is not None:
             extra.append(convolve.centroid_map(gradient, m.moments))
         if m.noise_uk is not None:
             extra.append(m.noise(seed, realization))
@@ -241,8 +254,30 @@ def _map_parts(
         yield m, MapParts(flat, sum(extra[1:], start=extra[0]) if extra else None, difference)
 
 
+def _expansion(channel: Channel) -> Expansion | None:
+    """Return the expansion in the samples' offsets; None if the pixel window and their mean are all that counts."""
+    order = min((m.moments.offset_order for m in channel.maps), default=0)
+    site = channel.site
+    return expansion(site.nside, site.lmax, order, systematics.spread_of(channel.effects)) if order > 1 else None
+
+
+def _unwindowed(channel: Channel, seen: Alm, dipole: Alm | None) -> Alm:
+    """Return what the circular part of the beam sees, less the dipole, without a pixel window."""
+    lmax = channel.site.lmax
+    circular = convolve.circular_alm(seen, convolve.response(channel.beam, lmax))
+    if dipole is None:
+        return circular
+    return circular - convolve.circular_alm(dipole, convolve.response(channel.site.beam, lmax))
+
+
 def _circular(survey: Survey, channel: Channel, seen: Alm, dipole: Alm | None) -> Alm:
-    """Return what the circular part of the beam sees, less the dipole through the fiducial beam."""
+    """Return what the circular part of the beam sees, less the dipole through the fiducial beam.
+
+    The pixel window is in it; where the samples' offsets count beyond their mean, what stands in its place.
+    """
+    terms = _expansion(channel)
+    if terms is not None:
+        return alm_.multiply(_unwindowed(channel, seen, dipole), terms.smooth, channel.site.lmax)
     circular = convolve.circular_alm(seen, channel.response)
     return circular if dipole is None else circular - convolve.circular_alm(dipole, _fiducial_response(channel))
 

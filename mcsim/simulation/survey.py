@@ -22,6 +22,7 @@ from mcsim.simulation.channels import (
     scan_model,
     site_b_of,
     site_of,
+    with_offsets,
 )
 from mcsim.simulation.filtering import Filtering
 from mcsim.simulation.noise import DrawnNoise, of_map
@@ -31,7 +32,7 @@ from mcsim.simulation.rings import Rings, limit_rings, parallel_transport_rings
 from mcsim.simulation.survey_filter import filtering_of
 from mcsim.sphere import healpix, rng, spectra
 from mcsim.sphere.mask import read_mask
-from mcsim.systematics import Effect, Library, Site, seen_through, spread_of
+from mcsim.systematics import Effect, Library, Site, seen_through, spread_of, variance_factor
 
 Progress = Callable[[float], None]
 
@@ -43,11 +44,12 @@ class SurveyMap:
     Attributes
     ----------
     moments
-        Orientation moments of the samples in it; of a differencing scan the hits of both sides, and NaN.
+        Orientation moments of its samples; of a differencing scan those of both sides, or, not asked for, hits and NaN.
     weight
         Weight before analysis, shape (npix,), mean square 1; ``None``: every pixel counts alike.
     noise_uk
-        Standard deviation of the noise per pixel, shape (npix,); ``None``: no noise, or noise of differences.
+        Standard deviation of the noise per pixel, shape (npix,), of a differencing scan about, where moments were asked
+        for; ``None``: no noise, or noise of differences.
     pairs
         Pairs of pixels of a differencing scan; ``None``: any other scan.
     gain
@@ -105,10 +107,10 @@ class SideB:
         Beam of side B with effects, its response, and the beam without effects.
     scan, imbalance
         Fiducial transmission imbalance, which map-making uses, and its convergence; the true imbalance.
-    sigma0_uk
-        White noise per difference.
+    sigma0_uk, noise_factor
+        White noise per difference, and the factor of its variance in every pixel, shape (npix,); None: one.
     iterations_short
-        How many iterations before convergence the map-making stops.
+        How many iterations before convergence the map-making stops, which then starts from zeros.
     """
 
     beam: beams.Beam
@@ -116,6 +118,7 @@ class SideB:
     fiducial: beams.Beam
     scan: config.ScanDifferencing
     sigma0_uk: float
+    noise_factor: NDArray[np.float64] | None
     imbalance: float
     iterations_short: int
 
@@ -157,10 +160,8 @@ class Channel:
 class Survey:
     """Everything that all realizations of a run share.
 
-    ``pairs`` are indices into the maps in order, with 1 / <w_x w_y> of their weights in ``pair_norm``. Where maps are
-    prepared, the channels describe the prepared maps (pixels, moments, noise, weights, beams and pixel windows), and
-    ``source`` the survey whose maps are made; None where the maps are analysed as they are made. ``filtering``: the
-    inverse covariance of the maps; None where they are analysed without.
+    ``pairs`` are indices of maps, ``pair_norm`` 1 / <w_x w_y> of their weights. Prepared maps are what the channels
+    describe (noise, weights, windows), and ``source`` is the survey whose maps are made; None without preparation.
     """
 
     config: config.RunConfig
@@ -171,7 +172,7 @@ class Survey:
     pairs: tuple[tuple[int, int], ...]
     pair_norm: tuple[float, ...]
     source: "Survey | None" = None
-    filtering: Filtering | None = None
+    filtering: Filtering | None = None  # inverse covariances of the maps
 
     @property
     def making(self) -> "Survey":
@@ -214,24 +215,23 @@ def survey(
 ) -> Survey:
     """Load or compute everything that the realizations of a run share; InputError for files that do not fit it.
 
-    Moments of scan models, and pairs of pixels of differencing scans, are computed once, cached on disk and
-    memory-mapped, so that workers share them. ``orders``: moments up to this order even where the beam needs fewer (of
-    a file of moments, all that it has). ``library``: the effects that the run may name; default: the catalogue.
+    Moments of scan models, and pairs of pixels of differencing scans, are computed once and cached for all workers.
+    ``orders``: moments up to this order even where the beam needs fewer (of a file of moments, all that it has).
+    ``library``: the effects that the run may name; default: the catalogue.
     """
     refuse_external(run)
-    lmax = config.analysis_lmax(run)
     cl = None if run.sky.spectrum is None else spectra.load(run.sky.spectrum, run.sky.lmax)
     made = tuple(_channel(run, channel, nthreads, progress, orders, library) for channel in run.channels)
     channels = (
         tuple(_prepared(run, *each) for each in zip(run.channels, made, strict=True)) if run.preparation else made
     )
     maps = [m for channel in channels for m in channel.maps]
-    both = run.biposh.pairs == "all"
-    pairs = tuple((x, y) for x in range(len(maps)) for y in range(x, len(maps)) if both or x == y)
+    size, both = len(maps), run.biposh.pairs == "all"
+    pairs = tuple((x, y) for x in range(size) for y in range(x, size) if both or x == y)
     norm = tuple(1.0 / _overlap(maps[x], maps[y]) for x, y in pairs)
-    tables = estimator(run.biposh.L_max, lmax, both_orders=both and len(maps) > 1)
-    filtering = filtering_of(run, made, cl, (pairs, tables), nthreads) if run.biposh.filtered else None
-    found = Survey(run, cl, made, lmax, tables, pairs, norm, filtering=filtering)
+    tables = estimator(run.biposh.L_max, config.analysis_lmax(run), both_orders=both and size > 1)
+    filters = filtering_of(run, made, cl, (pairs, tables), nthreads)
+    found = Survey(run, cl, made, config.analysis_lmax(run), tables, pairs, norm, None, filters)
     return replace(found, channels=channels, source=found) if run.preparation else found
 
 
@@ -252,13 +252,16 @@ def _channel(
     splits = run.map.splits or (None,)
     maps = []
     for index, split in enumerate(splits):
-        grid = MapGrid(run.map.resolution, run.map.frame, run.map.span(index))
+        offsets = 1 if run.map.offset_order is None else run.map.offset_order
+        grid = MapGrid(run.map.resolution, run.map.frame, run.map.span(index), max(offsets, 1))
         pairs = None
         if isinstance(spec.scan, config.ScanDifferencing):
             model = scan_model(spec, spec.scan, split)
             refuse_excess(spec.name, acting)
             pairs = mapmaking.prepare(model, spec.scan.pair, grid, nthreads=nthreads, progress=progress)
-            moments = _hits_alone(pairs, max(beam.mmax, 1))
+            smax = max(beam.mmax, orders, 1)
+            moments = pairs.moments(smax, nthreads, progress) if orders else pairs.hits_alone(smax)
+            moments = with_offsets(moments, offsets, spec)
         else:
             smax = max(beam.mmax, orders)
             if isinstance(spec.scan, config.ScanMoments):
@@ -269,9 +272,13 @@ def _channel(
                 moments = _moments(spec, split, grid, max(smax, 1), nthreads, progress)
                 if run.map.split_by == "rings" and isinstance(spec.scan, config.ScanHitAveraged):
                     moments = replace(moments, hits=moments.hits / len(splits))
+            moments = with_offsets(moments, offsets, spec)
             # An effect may give the beam higher orders than a file of moments has: they are left out.
             beam = beam.truncated(moments.smax) if acting and moments.smax < beam.mmax else beam
-        m = with_effects(_survey_map(run, spec, split, moments, pairs), acting, site)
+        m = _survey_map(run, spec, split, moments, pairs)
+        if pairs is not None and orders:
+            m = replace(m, noise_uk=mapmaking.level_uk(pairs, _sigma0_uk(spec)))
+        m = with_effects(m, acting, site)
         gain, signal = (mean(acting, site, grid.time_range) for mean in (mean_gain, mean_signal))
         maps.append(replace(m, gain=gain, signal_uk=signal))
     # A pixel whose samples keep closer to its centre blurs less; the window is a Gaussian in all but name.
@@ -334,8 +341,13 @@ def _side_b(spec: config.Channel, window: NDArray[np.float64], site: Site, actin
     imbalance, short = spec.scan.transmission_imbalance, 0
     for effect in acting:
         imbalance, short = effect.differencing(imbalance, short)
+    factor = variance_factor(acting, site)
+    return SideB(beam, response, other.beam, spec.scan, _sigma0_uk(spec), factor, imbalance, short)
+
+
+def _sigma0_uk(spec: config.Channel) -> float:
     assert isinstance(spec.noise, config.Noise)  # the configuration refuses other noise of differences
-    return SideB(beam, response, other.beam, spec.scan, spec.noise.sigma0_uk, imbalance, short)
+    return spec.noise.sigma0_uk
 
 
 def with_effects(m: SurveyMap, acting: tuple[Effect, ...], site: Site) -> SurveyMap:
@@ -346,8 +358,8 @@ def with_effects(m: SurveyMap, acting: tuple[Effect, ...], site: Site) -> Survey
         factor = effect.noise(site)
         if factor is not None and noise is not None:
             noise = noise * np.sqrt(np.clip(factor, 0.0, None))
-    if spread != 1.0 and moments.dtheta is not None and moments.dphi is not None:
-        moments = replace(moments, dtheta=spread * moments.dtheta, dphi=spread * moments.dphi)
+    if spread != 1.0:
+        moments = moments.shrunk(spread)
     return replace(m, moments=moments, noise_uk=noise)
 
 
@@ -368,7 +380,7 @@ def _moments(
             return scan.Moments.parallel_transport(grid.nside, spec.scan.psi0_deg, smax, grid.frame)
         case config.ScanPointing():
             path = config.channel_path(spec.scan.path, spec.name, split)
-            return scan.Moments.from_pointing_files([path], grid.nside, smax, grid.frame)
+            return scan.Moments.from_pointing_files([path], grid.nside, smax, grid.frame, grid.offset_order)
         case config.ScanHitAveraged():
             model = scan_model(spec, spec.scan, split)
             return scan.Moments.load(scan.cached_moments(model, grid, smax, nthreads, progress))
@@ -380,12 +392,6 @@ def _moments(
 def _moments_of_file(path: Path, nside: int, smax: int | None, frame: str) -> scan.Moments:
     """Read moments once for all surveys of a process that differ in effects alone."""
     return scan.read_moments(path, nside, smax, frame)
-
-
-def _hits_alone(pairs: mapmaking.DifferencingScan, smax: int) -> scan.Moments:
-    """Return the hits of a differencing scan, for weights and masks; its moments mean nothing and are NaN."""
-    unknown = np.broadcast_to(np.complex128(np.nan), (smax, pairs.npix))
-    return scan.Moments(pairs.grid.nside, pairs.grid.frame, pairs.hits_a + pairs.hits_b, unknown)
 
 
 def _survey_map(

@@ -19,8 +19,13 @@ def filtering_of(
     cl: NDArray[np.float64] | None,
     spectra_of: tuple[tuple[tuple[int, int], ...], Estimator],
     nthreads: int,
-) -> Filtering:
-    """Return the filters of the maps of a survey's channels: circular part of the fiducial beams, white noise."""
+) -> Filtering | None:
+    """Return the filters of the maps of a survey's channels: circular part of the fiducial beams, white noise.
+
+    None: the run does not filter.
+    """
+    if not run.biposh.filtered:
+        return None
     assert cl is not None  # the configuration refuses a filter without a spectrum
     filters = []
     for channel in channels:

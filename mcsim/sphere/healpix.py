@@ -46,6 +46,13 @@ def gradient(alm: Alm, nside: int, lmax: int, nthreads: int = 1) -> NDArray[np.f
     return np.asarray(maps)
 
 
+def adjoint(map_: Map, lmax: int, nthreads: int = 1) -> Alm:
+    """Return the adjoint of the spin-0 synthesis, shape (size,): the sum over pixels of the map times conj(Y_lm)."""
+    return np.asarray(
+        ducc0.sht.adjoint_synthesis(map=map_[None], spin=0, lmax=lmax, nthreads=nthreads, **geometry(check_map(map_)))
+    )[0]
+
+
 def analysis(map_: Map, lmax: int, iterations: int = 0, nthreads: int = 1) -> Alm:
     """Return the coefficients of a RING-ordered map, shape (npix,), by ring-weighted quadrature and Jacobi iterations.
 
@@ -65,9 +72,7 @@ def analysis(map_: Map, lmax: int, iterations: int = 0, nthreads: int = 1) -> Al
     weight = _pixel_weights(nside)
 
     def quadrature(residual: Map) -> Alm:
-        weighted = (weight * residual)[None]
-        alm = ducc0.sht.adjoint_synthesis(map=weighted, spin=0, lmax=lmax, nthreads=nthreads, **geometry(nside))
-        return np.asarray(alm)[0]
+        return adjoint(weight * residual, lmax, nthreads)
 
     alm = quadrature(map_)
     for _ in range(iterations):
@@ -129,6 +134,28 @@ def _representatives(face: int, nside: int) -> NDArray[np.int64]:
     above = (cell ^ (cell >> 1)) & 1 == 0
     pixels = cell * step + np.where(above, 3 * step // 4, max(step // 4 - 1, 0))
     return pixels + face * nside * nside
+
+
+@lru_cache(maxsize=4)
+def distances_from_centres(nside: int, split: int = 16) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return distances of points all over the pixels from their pixels' centres, radians, by a histogram, and shares.
+
+    A pixel is sampled at the centres of split x split sub-pixels.
+    """
+    check_nside(nside)
+    found, shares = [], []
+    for face, share in _FACES:
+        pixels = _representatives(face, nside)
+        inside = pixels[:, None] * split**2 + np.arange(split**2)
+        points = np.stack(healpy.pix2vec(split * nside, inside, nest=True), axis=-1)
+        centres = np.stack(healpy.pix2vec(nside, pixels, nest=True), axis=-1)
+        found.append(2.0 * np.arcsin(0.5 * np.linalg.norm(points - centres[:, None], axis=-1)).ravel())
+        shares.append(np.full(inside.size, share / inside.size))
+    r, weight = np.concatenate(found), np.concatenate(shares)
+    total, edges = np.histogram(r, 256, range=(0.0, r.max() * (1.0 + 1e-12)), weights=weight)
+    sums, _ = np.histogram(r, edges, weights=weight * r)
+    filled = total > 0.0
+    return sums[filled] / total[filled], total[filled] / total.sum()
 
 
 @lru_cache(maxsize=32)

@@ -72,7 +72,7 @@ def detectable(
     # The data may have fewer elements than the effect has components.
     columns = max(int(np.sum(response > 1e-12 * response[-1])), 1)
     mean = float(np.sqrt(np.mean(np.maximum(response, 0.0))))
-    return snr_needed(columns, tests, null.dimension, null.n_sims, alpha, target) / mean if mean else np.inf
+    return snr_needed(columns, tests, null.dimension, null.dof + 1, alpha, target) / mean if mean else np.inf
 
 
 def confusion(strength: ArrayLike, cosine: ArrayLike) -> NDArray[np.float64]:

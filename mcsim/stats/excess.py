@@ -1,6 +1,7 @@
 """Excess chi^2 of data over what the simulations expect, and its reduction once an effect is in the simulator."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -30,6 +31,21 @@ class HeldOut:
     after: Measured
     pvalue_after: float
     data: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the reduction as ``verdict.json`` has it."""
+        return {
+            "predicted": self.predicted.value,
+            "achieved": self.achieved.value,
+            "sigma": self.achieved.sigma,
+            "sigma_predicted": self.predicted.sigma,
+            "gap_before": self.before.value,
+            "sigma_before": self.before.sigma,
+            "gap_after": self.after.value,
+            "sigma_after": self.after.sigma,
+            "p_value_after": self.pvalue_after,
+            "data": self.data,
+        }
 
 
 def excess(null: SimulatedGaussian, x: Vector) -> Measured:

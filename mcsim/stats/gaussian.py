@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 from mcsim.errors import InputError
+from mcsim.stats.shrinkage import Fold, shrunk
 from mcsim.support.arrays import Matrix, Vector
 
 # A direction is empty if its variance, or its part outside a span, is below this fraction of its size.
@@ -94,22 +95,33 @@ class SimulatedGaussian:
         Number N of simulations.
     log_jacobian
         Logarithm of the factor by which :meth:`with_extra_covariance` has shrunk volumes in white coordinates.
+    covariance_dof
+        Degrees of freedom n of the covariance if it is no sample covariance; None: N - 1.
+    folds
+        Then the simulations in white coordinates of others; simulation i is in fold i modulo their number.
     """
 
     mean: NDArray[np.float64]
     whitening: NDArray[np.float64]
     n_sims: int
     log_jacobian: float = 0.0
+    covariance_dof: int | None = None
+    folds: tuple[Fold, ...] = ()
 
     @classmethod
     def from_simulations(
-        cls, simulations: NDArray[np.float64], offset: NDArray[np.float64] | None = None, floor: float = 1e-8
+        cls,
+        simulations: NDArray[np.float64],
+        offset: NDArray[np.float64] | None = None,
+        floor: float = 1e-8,
+        shrink: bool = False,
     ) -> "SimulatedGaussian":
         """Estimate mean and covariance from simulations, shape (N, p_raw).
 
         ``offset``: known difference between the mean of the data and that of the simulations, shape (p_raw,).
-        Eigenvalues of the correlation matrix below the fraction ``floor`` of the largest are left out. Raise InputError
-        if an element is not finite or constant, or there are fewer than p + 7 simulations.
+        Eigenvalues of the correlation matrix below the fraction ``floor`` of the largest are left out. ``shrink``: a
+        covariance from few simulations (:func:`mcsim.stats.shrinkage.shrunk`). Raise InputError if an element is not
+        finite or constant, or there are fewer than p + 7 simulations.
         """
         mean = simulations.mean(axis=0)
         centred = simulations - mean
@@ -125,8 +137,11 @@ class SimulatedGaussian:
                 f"{count} simulations are too few for {dimension} independent elements; give at least {dimension + 7}, "
                 f"better {10 * dimension}."
             )
-        whitening = np.sqrt(count - 1.0) * right[kept] / singular[kept, None] / scale
-        return cls(mean if offset is None else mean + offset, whitening, count)
+        centre = mean if offset is None else mean + offset
+        if shrink:
+            found = shrunk(simulations, floor)
+            return cls(centre, found.whitening, count, covariance_dof=found.dof, folds=found.folds)
+        return cls(centre, np.sqrt(count - 1.0) * right[kept] / singular[kept, None] / scale, count)
 
     @property
     def dimension(self) -> int:
@@ -135,8 +150,8 @@ class SimulatedGaussian:
 
     @property
     def dof(self) -> int:
-        """Return n = N - 1, the degrees of freedom of the sample covariance."""
-        return self.n_sims - 1
+        """Return n, the degrees of freedom of the covariance: N - 1 of a sample covariance."""
+        return self.n_sims - 1 if self.covariance_dof is None else self.covariance_dof
 
     @property
     def hartlap_factor(self) -> float:
@@ -299,8 +314,14 @@ def held_out_pvalues(simulations: Matrix, null: SimulatedGaussian) -> Vector:
     With c = x_i - mean, S the scatter of all N and a = N/(N - 1) c'S^-1 c, the scatter of the others is
     S - N/(N - 1) c c', and x_i less their mean is N/(N - 1) c: its square in their scatter, over 1 + 1/(N - 1), is
     a/(1 - a) (Sherman & Morrison, Ann. Math. Stat. 21, 124, 1950).
-    Against explicit refits: tests/unit/test_diagnosis_report.py.
+    Against explicit refits: tests/unit/test_diagnosis_report.py. With a shrunk covariance the others are those of other
+    folds.
     """
+    if null.folds:
+        square = np.empty(len(simulations))
+        for number, fold in enumerate(null.folds):
+            square[number :: len(null.folds)] = np.sum(fold.white**2, axis=1)
+        return residual_pvalue(square, null.dimension, null.dof)
     count = len(simulations)
     white = (simulations - simulations.mean(axis=0)) @ null.whitening.T
     a = np.sum(white**2, axis=1) / null.dof * count / (count - 1)

@@ -31,6 +31,8 @@ class Calibration:
         global p-value of the candidates.
     held_out_smallest, held_out_combined
         Sorted p-values, as these draws give them, of simulations against the others; None: Gaussian data are trusted.
+    power
+        Of the global p-value of the candidates, below 1 if that of simulations against others is too often small.
     """
 
     tests: int
@@ -38,6 +40,7 @@ class Calibration:
     combined: NDArray[np.float64]
     held_out_smallest: NDArray[np.float64] | None = None
     held_out_combined: NDArray[np.float64] | None = None
+    power: float = 1.0
 
     def global_pvalue(self, smallest: ArrayLike) -> NDArray[np.float64]:
         """Return the probability that the smallest p-value of all candidates is this one or less.
@@ -45,7 +48,7 @@ class Calibration:
         This is its rank among the draws, or Bonferroni's bound if that is lower, beyond the reach of the draws.
         """
         found = np.minimum(_rank(self.smallest, smallest), self.tests * np.asarray(smallest))
-        return _among(self.held_out_smallest, found)
+        return _among(self.held_out_smallest, found**self.power)
 
     def combine(self, omnibus: ArrayLike, smallest: ArrayLike) -> NDArray[np.float64]:
         """Return one p-value from that of the omnibus test and the smallest one of the candidates."""
@@ -90,6 +93,27 @@ def calibrate_on(
     found = replace(calibration, held_out_smallest=np.sort(calibration.global_pvalue(smallest)))
     combined = found.combine(residual_pvalue(chi2, p, n), smallest)
     return replace(found, held_out_combined=np.sort(combined))
+
+
+def calibrate_in_folds(calibration: Calibration, null: SimulatedGaussian, candidates: WhitenedTemplates) -> Calibration:
+    """Return a calibration for a shrunk covariance, by its simulations against those of other folds.
+
+    Notes
+    -----
+    Such a covariance is better for some templates than for others, so that the smallest p-value is too small. If p^a is
+    uniform, log p has the mean -1/a: the power is estimated by maximum likelihood, within a/sqrt(N).
+    """
+    chi2, falls = [], []
+    for fold in null.folds:
+        turned = fold.turn @ candidates.basis
+        pairs = zip(candidates.start[:-1], candidates.start[1:], strict=True)
+        basis = np.concatenate([np.linalg.qr(turned[:, low:high])[0] for low, high in pairs], axis=1)
+        chi2.append(np.sum(fold.white**2, axis=1))
+        falls.append(replace(candidates, basis=basis).delta_chi2(fold.white))
+    total = np.concatenate(chi2)
+    scores = null.nested_test(np.concatenate(falls), total[:, None], candidates.sizes)
+    found = calibration.global_pvalue(scores.min(axis=1))
+    return replace(calibration, power=min(1.0, -1.0 / float(np.mean(np.log(np.maximum(found, 1e-300))))))
 
 
 def calibrate(

@@ -1,5 +1,6 @@
 """Identify code by its content, so that nothing in a cache is older than the code that made it."""
 
+import ast
 import hashlib
 import inspect
 import sys
@@ -14,16 +15,14 @@ from types import FunctionType
 def package_digest(packages: Iterable[str], libraries: Iterable[str] = ()) -> str:
     """Return the SHA-256 of the source files of packages or modules, and of the versions of libraries."""
     files = [path for name in sorted(packages) for path in _files(name)]
-    found = [hashlib.sha256(path.read_bytes()).hexdigest() for path in files]
-    found += [f"{name} {version(name)}" for name in sorted(libraries)]
-    return hashlib.sha256("\n".join(found).encode()).hexdigest()
+    return _digest(files, *(f"{name} {version(name)}" for name in sorted(libraries)))
 
 
 def class_digest(kind: type | FunctionType) -> str:
     """Return the SHA-256 of the packages of a user that define a function, or a class and its bases.
 
-    Those of mcsim do not count. Code whose source cannot be read, typed at a prompt for instance, gets a new digest at
-    every call.
+    Of a module in no package, what it imports from its own folder counts as well. Those of mcsim do not count. Code
+    whose source cannot be read, typed at a prompt for instance, gets a new digest at every call.
     """
     found = [f"{kind.__module__}.{kind.__qualname__}"]
     for base in kind.__mro__ if isinstance(kind, type) else (kind,):
@@ -31,10 +30,38 @@ def class_digest(kind: type | FunctionType) -> str:
         if top == "mcsim" or (top in sys.stdlib_module_names and top != "__main__"):
             continue
         try:
-            found.append(inspect.getsource(base) if top == "__main__" else package_digest([top]))
-        except (ImportError, OSError, TypeError):
+            found.append(inspect.getsource(base) if top == "__main__" else _digest(_with_imports(_files(top))))
+        except (ImportError, OSError, SyntaxError, TypeError):
             found.append(uuid.uuid4().hex)
     return hashlib.sha256("\n".join(found).encode()).hexdigest()
+
+
+def _digest(files: Iterable[Path], *more: str) -> str:
+    found = [*(hashlib.sha256(path.read_bytes()).hexdigest() for path in files), *more]
+    return hashlib.sha256("\n".join(found).encode()).hexdigest()
+
+
+def _with_imports(files: list[Path]) -> list[Path]:
+    """Return the files of a package; of a single module also those that it imports, directly or not, from its folder.
+
+    A package of that folder counts as a whole.
+    """
+    folder, found, waiting = files[0].parent, set[Path](), list(files)
+    if len(files) > 1 or files[0].name == "__init__.py" or folder.name == "site-packages":
+        return files
+    while waiting:
+        path = waiting.pop()
+        if path in found:
+            continue
+        found.add(path)
+        for node in ast.walk(ast.parse(path.read_bytes())):
+            names = [one.name for one in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                names = [node.module]
+            for top in {name.partition(".")[0] for name in names}:
+                waiting += [one for one in (folder / f"{top}.py",) if one.is_file()]
+                waiting += (folder / top).rglob("*.py")
+    return sorted(found)
 
 
 def _files(name: str) -> list[Path]:

@@ -15,6 +15,7 @@ from mcsim.systematics.base import (
     looked_at,
     seen_through,
     spread_of,
+    variance_factor,
 )
 from mcsim.systematics.parametrization import Parametrization
 from mcsim.systematics.registry import Library, basis_of, build, catalogue, checked, effects, get
@@ -42,4 +43,5 @@ __all__ = [
     "looked_at",
     "seen_through",
     "spread_of",
+    "variance_factor",
 ]

@@ -359,6 +359,12 @@ def spread_of(acting: Iterable[Effect]) -> float:
     return float(np.prod([effect.spread() for effect in acting]))
 
 
+def variance_factor(acting: Iterable[Effect], site: Site) -> Map | None:
+    """Return the factor of the variance of every pixel's samples, shape (npix,), >= 0; None: one."""
+    factors = [own for effect in acting if (own := effect.noise(site)) is not None]
+    return np.clip(np.prod(factors, axis=0), 0.0, None) if factors else None
+
+
 def adding(acting: Iterable[Effect]) -> list[Effect]:
     """Return the effects that add a signal to samples."""
     return [one for one in acting if one.amplitude != 0.0 and type(one).signal is not Effect.signal]

@@ -19,7 +19,6 @@ class Calibration(Effect):
 
     name = "calibration"
     scope = "channel"
-    proposed = False
     unit = "fraction"
     title = "calibration"
     wording = Wording("{} of the gain", " %", 100.0)

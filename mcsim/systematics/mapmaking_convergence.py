@@ -3,12 +3,15 @@
 from dataclasses import dataclass
 
 from mcsim.systematics.base import Bound, Effect, Wording
-from mcsim.systematics.parametrization import Parametrization
+from mcsim.systematics.parametrization import Steps
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapmakingConvergence(Effect):
-    """The map-making stops ``amplitude`` iterations (rounded) before it has converged."""
+    """The map-making, from a map of zeros, stops ``amplitude`` iterations (rounded) before it has converged.
+
+    One iteration is done at least.
+    """
 
     name = "mapmaking_convergence"
     scope = "channel"
@@ -18,9 +21,10 @@ class MapmakingConvergence(Effect):
     cause = "Conjugate gradients ended by a count, not by their residual."
     signature = "Stripes in the frame of the scan, at the largest scales; acts on differencing scans only."
     source = "Hinshaw et al. 2003, ApJS 148, 63 (iterative map-making); Jarosik et al. 2007, ApJS 170, 263"
-    step = 1.0
+    step = 20.0
     bounds = (Bound("amplitude", 0.0, 1000.0, "a prior of this library: map-makings end after fewer iterations"),)
-    parametrization = Parametrization(sign=1)
+    # What is missing of W1's half years falls by 1.2 to 1.9 with each of the first iterations (nside 16 and 64).
+    parametrization = Steps(sign=1, factor=1.5)
 
     def differencing(self, imbalance: float, iterations_short: int) -> tuple[float, int]:
         """Add to the missing iterations."""

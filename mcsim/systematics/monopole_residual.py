@@ -14,7 +14,6 @@ class MonopoleResidual(Effect):
 
     name = "monopole_residual"
     scope = "channel"
-    proposed = False
     unit = "uK"
     title = "residual monopole"
     wording = Wording("{}", " µK")

@@ -32,6 +32,8 @@ class Parametrization:
     matched_filter
         True if the data vector of a diagnosis has a matched filter for it: not if a hook draws random numbers, nor if
         dipoles, variances, spectra and modulations, which are always measured, contain all of it.
+    nonlinear
+        True if the response is simulated anew at whatever amplitude is fitted.
     """
 
     sign: Literal[-1, 0, 1] = 0
@@ -39,6 +41,7 @@ class Parametrization:
     stochastic: bool = False
     mean_response: bool = False
     matched_filter: bool = True
+    nonlinear: bool = False
 
     def basis(self) -> tuple[Mapping[str, Any], ...]:
         """Return the parameters of the k effects whose responses span all others; their amplitude is the step."""
@@ -118,6 +121,23 @@ class Components(Parametrization):
         """Return norm and direction; no direction of zeros."""
         norm = float(np.linalg.norm(coordinates))
         return {"amplitude": norm} | ({self.parameter: tuple(map(float, coordinates / norm))} if norm else {})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Steps(Parametrization):
+    """Fit a whole number n with each unit of which the response grows by a ``factor``, as factor^n - 1."""
+
+    nonlinear: bool = True
+    factor: float
+
+    def coordinates(self, effect: Any) -> Vector:
+        """Return factor^n - 1, n the amplitude rounded."""
+        return np.array([self.factor ** round(effect.amplitude) - 1.0])
+
+    def nearest(self, coordinates: Vector, precision: NDArray[np.float64]) -> dict[str, Any]:
+        """Return n, not rounded; a negative amplitude, whatever its size, for a negative coordinate."""
+        value = float(coordinates[0])
+        return {"amplitude": value if value < 0.0 else float(np.log1p(value) / np.log(self.factor))}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,7 +2,9 @@
 
 import difflib
 import inspect
+import os
 import pkgutil
+import sys
 from collections import UserDict
 from collections.abc import Mapping
 from dataclasses import fields
@@ -10,6 +12,7 @@ from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from math import inf, isfinite
+from pathlib import Path
 from sys import float_info
 from types import MappingProxyType
 from typing import Any
@@ -108,14 +111,47 @@ def _flaw(kind: type[Effect]) -> str | None:
 def get(name: str, library: Library | None = None) -> type[Effect]:
     """Return the effect called ``name``; InputError, with what comes close, if there is none.
 
-    ``library``: default: :func:`catalogue`.
+    A name that ends in .py is the path of a file that defines the effect. ``library``: default: :func:`catalogue`.
     """
+    if name.endswith(".py"):
+        return of_file(name)
     known = catalogue() if library is None else library
     if name not in known:
         near = difflib.get_close_matches(name, known, n=1)
         hint = f"did you mean {near[0]}?" if near else f"choose from {', '.join(sorted(known))}."
         raise InputError(f"there is no effect {name!r}; {hint}")
     return known[name]
+
+
+@cache
+def of_file(path: str) -> type[Effect]:
+    """Return the effect that a Python file defines; InputError if it cannot be run, or defines none or several.
+
+    The file becomes a module by its stem, and its folder is on the path of this process and those that it starts:
+    workers can then load the effect as well.
+    """
+    file = Path(path).absolute()
+    if not file.is_file():
+        raise InputError(f"{path} is no file; name a Python file that defines an effect.")
+    folder = str(file.parent)
+    sys.path.insert(0, folder)
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (folder, os.environ.get("PYTHONPATH"))))
+    try:
+        module = import_module(file.stem)
+    except Exception as error:  # whatever a foreign file does when it is run
+        raise InputError(f"{path} cannot be run ({error}); mend it.") from error
+    if Path(str(module.__file__)).absolute() != file:
+        raise InputError(f"{path} has the name of another module, {module.__file__}; rename it.")
+    found = [
+        kind
+        for _, kind in inspect.getmembers(module, inspect.isclass)
+        if kind.__module__ == module.__name__ and issubclass(kind, Effect)
+    ]
+    if len(found) != 1:
+        raise InputError(f"{path} defines {len(found)} effects; let it define one class derived from mcsim.Effect.")
+    if (flaw := _flaw(found[0])) is not None:
+        raise InputError(f"the effect of {path} {flaw}; mend it.")
+    return found[0]
 
 
 def build(kind: str | type[Effect], parameters: Mapping[str, Any], library: Library | None = None) -> Effect:

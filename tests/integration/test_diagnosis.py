@@ -1,6 +1,7 @@
 """A small instrument from beginning to end: no gap, a gap that is explained, a simulator that is broken, bad data."""
 
 import json
+import sys
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
@@ -11,7 +12,7 @@ from scipy.stats import kstest
 
 import mcsim
 from mcsim import config, systematics
-from mcsim.diagnosis import api, campaign, localisation
+from mcsim.diagnosis import api, campaign, localisation, report, unlisted, words
 from mcsim.diagnosis.analysis import analysis_of, data_vectors
 from mcsim.diagnosis.campaign import with_effects
 from mcsim.diagnosis.context import context
@@ -119,6 +120,45 @@ def test_ellipticity_seen_sample_by_sample_is_named_and_shrinks(small, tmp_path)
     assert "contradicted" not in verdict
     found.save(tmp_path)
     assert DiagnosisResult.open(tmp_path).effects == found.effects
+
+
+def test_an_unlisted_effect_is_described_written_and_shrinks(small, tmp_path, monkeypatch):
+    """A gain that follows the year, which the library of this instrument does not have."""
+    monkeypatch.setattr(unlisted, "SIMULATIONS", 200)
+    monkeypatch.setattr("sys.path", list(sys.path))
+    monkeypatch.setenv("PYTHONPATH", "")
+    monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / "cache"))
+    shared = data_of(small.run, "gain_drift", "W1", amplitude=1.5e-3, phase_deg=40.0)
+    data = ObservedMaps(small, list(simulate.maps(shared, 0)), ask)
+    before = diagnose_data(data, "drift")
+    assert before.kind == "unknown"
+    assert before.unlisted is None
+    found = unlisted.reconstructed(before, data, lambda jobs: [unlisted.scores(job) for job in jobs])
+    first = found.unlisted[0]
+    assert (first.stage, first.frame, first.kind, first.channel) == ("gain", "time", "year", "W1")
+    assert first.pvalue < 1e-4
+    assert "annual gain drift" in first.cause
+    assert found.unlisted_held_out.achieved.value > 0.5
+    # The rms of what the gain makes of the dipole and the sky, within the error of the amplitude and of the shape.
+    clean = data_of(small.run)
+    rows = [np.array(list(simulate.maps(one, 0))) for one in (shared, clean)]
+    expected = float(np.sqrt(np.mean((rows[0] - rows[1])[2:] ** 2)))
+    assert abs(first.rms_uk / expected - 1.0) < 4.0 * first.relative_error
+    found.save(tmp_path / "out")
+    opened = DiagnosisResult.open(tmp_path / "out")
+    assert (opened.unlisted, opened.unlisted_held_out) == (found.unlisted, found.unlisted_held_out)
+    verdict = json.loads((tmp_path / "out" / "verdict.json").read_text())
+    assert verdict["unlisted"][0]["file"] == "unlisted_1.py"
+    assert verdict["unlisted_shrink"]["achieved"] == found.unlisted_held_out.achieved.value
+    kind = systematics.get(str(tmp_path / "out" / "unlisted_1.py"))
+    wave = kind(amplitude=1.0).gain(np.linspace(0.0, 3e7, 50), data_of(small.run).channels[1].site)
+    truth = 1.5e-3 * np.cos(2.0 * np.pi * np.linspace(0.0, 3e7, 50) / 31558149.8 - np.deg2rad(40.0))
+    assert np.sqrt(np.mean((wave - truth) ** 2)) < 4.0 * first.relative_error * np.sqrt(np.mean(truth**2))
+    lines = words.summary(found, tmp_path / "out")
+    assert sum(line.startswith("missing") for line in lines) == len(found.unlisted) + 1
+    assert first.sentence in words.unlisted(found)
+    with quick_pictures():
+        assert first.says in report.page(found)
 
 
 def mean_squares(learned, name=None, channel=None, skies=20, **parameters):
@@ -319,6 +359,22 @@ def test_the_cost_of_a_diagnosis_counts_the_effects_on_request(small):
     assert size(DiagnosisSettings(simulations=400, library=library)) == size(least) + 4
     with refused("gain_spinn", "gain_spin"):
         api.describe(small.run, replace(least, including=("gain_spinn",)))
+    with refused("gain_spin", "--with", "--without"):
+        api.describe(small.run, replace(least, including=("gain_spin",), without=("gain_spin",)))
+
+
+def test_the_cost_of_a_diagnosis_is_said_of_data_that_can_be_used(small, folder):
+    settings = DiagnosisSettings(simulations=400, without=tuple(n for n in systematics.catalogue() if n != "boost"))
+    said = [api.describe(small.run, settings, *data).splitlines()[0] for data in ((), (folder,))]
+    assert said[0] == said[1]
+    write(folder, "W1:half2", np.ones(12 * 8**2))
+    with refused("W1_half2.fits", "nside 8", 16):
+        api.describe(small.run, settings, folder)
+    (folder / "00000").mkdir()
+    for path in list(folder.glob("*.fits")):
+        path.rename(folder / "00000" / path.name)
+    with refused("V1_half1.fits", folder / "00000"):
+        api.describe(small.run, settings, folder)
 
 
 def test_a_diagnosis_knows_the_library_that_it_is_given(small, tmp_path, monkeypatch):

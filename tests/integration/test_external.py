@@ -15,7 +15,6 @@ from scipy.stats import kstest
 import mcsim
 from mcsim import cli, config
 from mcsim.diagnosis import api, campaign
-from mcsim.diagnosis.external import Kept
 from mcsim.ensemble.external import seed_of, source_of
 from mcsim.ensemble.external_maps import in_order, parts_of
 from mcsim.ensemble.maps import write_map
@@ -168,8 +167,7 @@ def learned(tmp_path_factory):
         run = config.load(MODEL)
         source = source_of(run, Plain(effects=("beam_width",)))
         analysis = api.analysis_of(run, library=LIBRARY, settings=replace(SETTINGS, library=None), source=source)
-        task = Kept(api.data_vectors, "parts")
-        return api.context(analysis, *campaign.learned(analysis, lambda jobs: [task(job) for job in jobs]))
+        return api.context(analysis, *campaign.learned(analysis, lambda jobs: [api.data_vectors(job) for job in jobs]))
 
 
 def test_null_skies_of_a_simulator_of_somebody_else_are_uniform(learned):

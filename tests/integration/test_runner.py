@@ -12,6 +12,7 @@ from distributed import Client
 
 from mcsim import config, open_ensemble
 from mcsim.ensemble import opening, prediction, runner, store
+from mcsim.ensemble.runner import cluster
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from refusals import refused
@@ -162,8 +163,9 @@ def test_foreign_folder_is_refused(client: Client, tmp_path: Path) -> None:
     assert (tmp_path / "thesis.tex").read_text() == "precious"
 
 
-def test_unreachable_scheduler(tmp_path: Path) -> None:
-    with refused("tcp://127.0.0.1:1", "5 s"):
+def test_unreachable_scheduler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "ANSWER_S", 0.4)
+    with refused("tcp://127.0.0.1:1", "0.4 s"):
         runner.run(table(), tmp_path / "x.zarr", workers="tcp://127.0.0.1:1")
     assert list(tmp_path.iterdir()) == []
 

@@ -1,5 +1,7 @@
 """The default route against the time-ordered reference: what pixel window and centroid offsets explain."""
 
+from dataclasses import replace
+
 import healpy
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments, ScanModel
 from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.simulation import convolve, mapmaking, tod
+from mcsim.simulation.observe import observe
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.sphere.spectra import load
@@ -73,6 +76,24 @@ def test_window_and_centroid_explain_what_pixels_do(sky, beam, moments):
     assert np.std(missing - terms[:, 0]) < 0.7 * np.std(missing)
     assert np.std(left) < 0.6 * np.std(missing - terms[:, 0])
     assert np.std(left) < 0.025 * np.std(found[seen])
+
+
+def test_powers_of_the_offsets_explain_what_is_left(sky, beam):
+    """Each power of the offsets leaves less of a circular beam's map; of the whole beam's, less than its shape makes.
+
+    The correlation of offsets with orientations, which no power contains, is some tenths of the effect of the shape.
+    """
+    moments = Moments.on_grid(MODEL.with_lines_of_sight("A"), replace(HALF, offset_order=4), beam.mmax)
+    seen, left = moments.hits > 0, {}
+    for name, seen_through in (("circular", beam.truncated(0)), ("whole", beam)):
+        found, _ = tod.observe(MODEL, LINE, HALF, [tod.sky_signal(sky, LMAX, seen_through, 1e-7)])
+        made = [observe(sky, seen_through, moments.up_to_offsets(order)) for order in (1, 2, 3, 4)]
+        left[name] = [np.std((found - one)[seen]) for one in made]
+    effect = np.std(default_route(sky, beam, moments, None)[1][seen])
+    print(f"effect {effect:.3f} uK; left with powers up to 1, 2, 3, 4: {left}")
+    for before, after, share in zip(left["circular"], left["circular"][1:], (0.25, 0.7, 0.4), strict=False):
+        assert after < share * before
+    assert left["whole"][3] < 0.3 * effect
 
 
 def test_differencing_at_true_pointing_differs_by_what_pixels_do(sky, beam, rhs_from_samples, tmp_path):

@@ -27,6 +27,7 @@ ORDER = (
     "beamfit",
     "plot",
     "comparison",
+    "reconstruction",
     "diagnosis",
     "information",
     "benchmark",

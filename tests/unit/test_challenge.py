@@ -275,6 +275,16 @@ def test_strengths_are_the_drawn_ones(learned, linear):
         assert length == pytest.approx(found.strength, rel=0.15)
 
 
+def test_drawn_effects_are_possible():
+    """Also where the isotropic direction asks for a parameter beyond its bounds."""
+    linear = linear_model(toy((("beam_sidelobe", "A"), ("beam_width", "A"))))
+    sampler = CaseSampler(Prior(), linear)
+    for case in range(30):
+        for one in sampler.members(np.random.default_rng(case), 2):
+            effect = linear.candidates[one.candidate].effect(**one.parameters)
+            assert effect.within_bounds() is effect
+
+
 @pytest.mark.parametrize("wrong", [{"weakest": 5.0, "strongest": 2.0}, {"weakest": 0.0}, {"one": -0.1}])
 def test_a_prior_that_is_none_is_refused(wrong):
     with pytest.raises(InputError):

@@ -46,6 +46,30 @@ def test_a_module_beside_it_counts(plugin):
     assert class_digest(kind) != before
 
 
+def test_what_a_module_imports_from_its_folder_counts(tmp_path, monkeypatch):
+    """Directly, through another, or from a package there, and nothing else that lies there."""
+    files = {
+        "single_module_of_a_user": "import numpy\nfrom first_of_a_user import E\n" + SOURCE,
+        "first_of_a_user": "def f():\n    import second_of_a_user.inner\nE = 0.1\n",
+        "second_of_a_user/inner": "E = 0.1\n",
+        "unused_of_a_user": "E = 0.1\n",
+    }
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    importlib.invalidate_caches()
+    kind = importlib.import_module("single_module_of_a_user").Thing
+    digests = [class_digest(kind)]
+    for name, text in files.items():
+        (tmp_path / f"{name}.py").write_text(text + "F = 1\n")
+        digests.append(class_digest(kind))
+    for name in files:
+        sys.modules.pop(name, None)
+    assert len(set(digests)) == 4
+    assert digests[4] == digests[3], "a file that is not imported"
+
+
 def test_versions_count():
     assert package_digest(["mcsim.stats"], ["numpy"]) != package_digest(["mcsim.stats"])
     assert package_digest(["mcsim.stats"]) != package_digest(["mcsim.stats.gaussian"])

@@ -3,6 +3,7 @@
 import copy
 import time
 from dataclasses import replace
+from itertools import combinations
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,6 +15,7 @@ from mcsim.diagnosis.inference import confirmed
 from mcsim.diagnosis.refine import PartialExplanation, Refiner
 from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.diagnosis.subsets import Subsets
 from mcsim.stats.detection import cosines, detectable, log_evidence, posterior, snr_needed, snr_to_separate
 from mcsim.stats.excess import HeldOut, Measured
 from mcsim.stats.gaussian import SimulatedGaussian
@@ -94,6 +96,43 @@ def test_mixtures_are_minimal(bench, members):
     # 95 % less three sigma.
     assert len(right) >= 20
     assert right[0].explanations[0].odds == 1.0
+
+
+@pytest.mark.parametrize("size", [4, 5, 6])
+def test_up_to_six_effects_are_found_at_once(bench, size):
+    members = tuple(range(size))
+    found = verdicts(bench, bench.t[:, members] @ np.linspace(7.0, 14.0, size), 20)
+    right = [one for one in found if any(set(e.members) == set(members) for e in one.explanations)]
+    # 95 % less three sigma.
+    assert len(right) >= 16
+
+
+def test_sets_that_grow_are_those_of_a_search_of_all():
+    """Of three effects among fourteen that are alike, with cosines about 0.5."""
+    common = directions(1, 30)
+    bench = Bench(directions(14, 31) + common, singles(14))
+    settings = DiagnosisSettings()
+    triples = np.array(list(combinations(range(14), 3)))
+    sizes = []
+    for seed in range(12):
+        x = bench.t[:, [2, 7, 11]] @ [12.0, -9.0, 15.0] + np.random.default_rng(seed).normal(size=P)
+        search = Subsets(
+            bench.null, bench.null.whiten(x), bench.whitened_templates, bench.candidates, bench.calibration, settings
+        )
+        solved = search.solve(triples)
+        wanted = (
+            (solved.pvalue > settings.residual_level)
+            & (search.least_needed(triples) <= settings.further_level)
+            & (search.beside(triples).min(axis=1) > settings.further_level)
+            & (solved.evidence >= solved.evidence.max() - np.log(settings.odds_cut))
+        )
+        found = bench.diagnose_maps(x - np.random.default_rng(seed).normal(size=P), seed)
+        if found.explanations and len(found.explanations[0].members) == 3:
+            best = solved.evidence[wanted].max()
+            near = wanted & (solved.evidence >= best - np.log(settings.odds_cut))
+            assert {tuple(sorted(e.members)) for e in found.explanations} == set(map(tuple, triples[near].tolist()))
+            sizes.append(int(near.sum()))
+    assert len(sizes) >= 9
 
 
 def test_a_faint_departure_is_not_named_and_a_clear_one_is(bench):

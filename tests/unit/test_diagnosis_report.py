@@ -5,6 +5,7 @@ import re
 from dataclasses import fields, replace
 from functools import lru_cache
 from html.parser import HTMLParser
+from pathlib import Path
 from types import SimpleNamespace
 
 import healpy
@@ -481,3 +482,28 @@ def test_what_data_do_not_tell_is_no_part_of_an_error():
 )
 def test_durations_are_said_in_a_unit_that_people_use(seconds, words):
     assert duration(seconds) == words
+
+
+def test_elements_that_are_not_tested_are_counted_and_folded(diagnoses):
+    result = replace(diagnoses["none"], untested=("power of V", "power of W"))
+    page = report.page(result)
+    said = f"2 of {P} elements are not tested"
+    assert page.count(said) == 1
+    assert page.index("<summary>" + said) < page.index("<li>power of V</li>")
+    assert result.to_json()["untested"] == ["power of V", "power of W"]
+    assert "untested" not in diagnoses["none"].to_json()
+    assert [said in line for line in words.summary(result, Path("out"))].count(True) == 1
+
+
+def test_no_number_is_crossed_by_the_line_of_what_was_predicted(diagnoses):
+    """Wherever it is: below the bar, within it, or far beyond."""
+    own = diagnoses["effect"]
+    for share in (-0.2, 0.5, 1.02):
+        held_out = replace(own.held_out, predicted=replace(own.held_out.predicted, value=share))
+        figure = plots.excess_figure(replace(own, held_out=held_out))
+        (axes,) = figure.axes
+        figure.canvas.draw()
+        line = axes.lines[0].get_window_extent()
+        for text in axes.texts:
+            assert not text.get_window_extent().overlaps(line)
+            assert text.get_window_extent().x1 < figure.bbox.x1

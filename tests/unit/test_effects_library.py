@@ -17,8 +17,6 @@ from refusals import refused
 
 LMAX, NSIDE = 48, 8
 ON_REQUEST = {
-    "calibration",
-    "monopole_residual",
     "sidelobe_pickup",
     "gain_spin",
     "bandpass_mismatch",

@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 
 from mcsim import config
+from mcsim.simulation import power
+from mcsim.simulation.survey import survey
 from mcsim.support import resources
 from refusals import refused
 
@@ -65,3 +67,4 @@ def test_demonstration_differs_from_its_model_by_one_effect():
     model, truth = (config.load(name) for name in ("demo-model", "demo-truth"))
     assert [(effect.name, effect.channel) for effect in truth.effects] == [("beam_ellipticity", "W1")]
     assert replace(truth, name=model.name, effects=(), ensemble=model.ensemble) == model
+    assert power.neglected(survey(model)) is None  # its report opens without a warning

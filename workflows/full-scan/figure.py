@@ -88,14 +88,14 @@ def turned_factor(delta_deg: np.ndarray) -> np.ndarray:
 
 
 def draw_spectrum(axes: Axes, summaries: dict[str, xr.Dataset], mode: str, lines: dict[float, str]) -> None:
-    """Binned spectra of the runs, and parallel transport scaled by the three factors."""
+    """Binned spectra of the runs, and parallel transport scaled by the smallest and the largest factor."""
     for number, (run, (marker, colour, label)) in enumerate(STYLE.items()):
         one = summaries[run].sel(pair="W1,W1", mode=mode)
         x, value = one["bin"].values, one["biposh_difference_binned_mean"].values.real
         error = one["biposh_difference_binned_standard_error"].values
         axes.errorbar(x + 1.5 * (number - 1.5), value, error, fmt=marker, ms=4, lw=1, color=colour, label=label)
         if run == "parallel-transport":
-            for factor, line in zip(lines, ("-", "--", ":"), strict=True):
+            for factor, line in zip((min(lines), max(lines)), (":", "-"), strict=True):
                 axes.plot(x, factor * value, line, color="0.55", lw=1, label=f"parallel transport × {factor:.3f}")
     axes.axhline(0, color="0.8", lw=0.8)
     axes.set_xlabel(r"multipole $\ell$")

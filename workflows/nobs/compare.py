@@ -127,6 +127,7 @@ def main() -> None:
         axes.set_xlabel("|ecliptic latitude|  [degrees]")
         axes.set_ylabel(text)
         axes.legend(frameon=False, fontsize=8, loc="upper left" if axes is left else "best")
+    left.set_ylim(top=1.75)  # room for the legend
     right.axhline(1.0, color="0.7", lw=0.8)
     figure.savefig(output, dpi=100)
 

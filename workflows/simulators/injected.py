@@ -94,8 +94,19 @@ def changes(given: inputs.Inputs, scan: str) -> dict[str, tuple[dict[str, Any], 
     }  # fmt: skip
 
 
+SHARE = ACCURACY = 1e-3
+"""Of two changes each must add this to the variance of the difference, and to its rms over the sky's."""
+
 TIMED = frozenset({"time_shift", "spin_sign", "precession_sign", "gain_drift", "pointing_offset", "map_making"})
 """What needs more than samples without their time."""
+
+
+Prepared = tuple[config.RunConfig, dict[str, Any], list[dict[str, Any]]]
+
+
+def untimed(scan: str, shape: str, names: tuple[str, ...]) -> tuple[str, str]:
+    """Return scan and beam, without files of samples where the time of samples matters."""
+    return scan, "ellipse" if "file" in shape and TIMED.intersection(names) else shape
 
 
 def sides(run: config.RunConfig, put: list[dict[str, Any]]) -> tuple[dict[str, Vector], dict[str, Vector]]:
@@ -115,6 +126,31 @@ def sides(run: config.RunConfig, put: list[dict[str, Any]]) -> tuple[dict[str, V
     return a, b
 
 
+def prepared(scan: str, shape: str, names: tuple[str, ...], sizes: tuple[int, ...], seed: int) -> Prepared:
+    """Return the run of a case, the noise of both sides, and the changes of side B."""
+    channels = ("T", "U") if "channel_exchanged" in names else ("T",)
+    run = run_of(scan, "circular" if "interpolation" in names else shape, channels, seed)
+    table = changes(inputs.of(run), scan)
+    noise = {"base": table["noise_shared"][0]["base"] if shape == "ellipse noisy" else {}}
+    return run, noise, [table[name][size] for name, size in zip(names, sizes, strict=True)]
+
+
+def matters(scan: str, shape: str, names: tuple[str, ...], sizes: tuple[int, ...], seed: int) -> bool:
+    """Return True if each of two changes adds a per mille of the variance to the other, and of the sky's rms."""
+    run, noise, put = prepared(scan, shape, names, sizes, seed)
+    a, b = sides(run, [noise, *put])
+    seen = {name: (a[name] != healpy.UNSEEN) & (b[name] != healpy.UNSEEN) for name in a}
+
+    def rms(one: dict[str, Vector], other: dict[str, Vector]) -> float:
+        return float(
+            np.std(np.concatenate([(one[n] - other[n])[s & (other[n] != healpy.UNSEEN)] for n, s in seen.items()]))
+        )
+
+    added = [rms(b, sides(run, [noise, one])[1]) for one in put]
+    sky = rms(a, {name: 0.0 * map_ for name, map_ in a.items()})
+    return min(added) > max(SHARE**0.5 * rms(a, b), ACCURACY * sky)
+
+
 def in_files(run: config.RunConfig, folder: str) -> config.RunConfig:
     """Return a run that knows the samples of its first channel from files alone, in a random order."""
     given, [spec, *others] = inputs.of(run), run.channels
@@ -127,12 +163,7 @@ def in_files(run: config.RunConfig, folder: str) -> config.RunConfig:
 
 def judged(scan: str, shape: str, names: tuple[str, ...], sizes: tuple[int, ...], seed: int = 1) -> tuple[str, str]:
     """Return whether the answer is right, and a row of the table."""
-    channels = ("T", "U") if "channel_exchanged" in names else ("T",)
-    shape = "circular" if "interpolation" in names else shape
-    run = run_of(scan, shape, channels, seed)
-    table = changes(inputs.of(run), scan)
-    put = [table[name][size] for name, size in zip(names, sizes, strict=True)]
-    noise = {"base": table["noise_shared"][0]["base"] if shape == "ellipse noisy" else {}}
+    run, noise, put = prepared(scan, shape, names, sizes, seed)
     a, b = sides(run, [noise, *put])
     if not names:
         a = dict(sampled.maps(survey(run), 0))
@@ -171,9 +202,13 @@ def cases(tables: list[str], pairs: int, seed: int) -> Iterator[tuple[str, str, 
         for size in (0, 1):
             yield (*kinds[(2 * number + size + seed) % len(kinds)], (name,), (size,))
     alone = ("unknown", "unit", "noise_shared", "channel_exchanged", "map_making", "interpolation")
-    for _ in range(pairs if "pair" in tables else 0):
+    drawn = 0
+    while drawn < (pairs if "pair" in tables else 0):
         both = tuple(draw.sample([name for name in names if name not in alone], 2))
-        yield (*draw.choice(kinds), both, (draw.randrange(2), draw.randrange(2)))
+        case = (*untimed(*draw.choice(kinds), both), both, (draw.randrange(2), draw.randrange(2)))
+        if matters(*case, seed=seed + drawn):
+            drawn += 1
+            yield case
     for number in range(pairs if "identical" in tables else 0):
         yield list(SCANS)[number % 3], ("ellipse", "pear", "circular")[number // 3 % 3], (), ()
 
@@ -188,8 +223,7 @@ def main() -> None:
     given = parser.parse_args()
     counts: Counter[str] = Counter()
     for number, case in enumerate(cases(given.tables, given.pairs, given.seed)):
-        if "file" in case[1] and TIMED.intersection(case[2]):
-            case = (case[0], "ellipse", *case[2:])
+        case = (*untimed(*case[:3]), *case[2:])
         if re.search(given.only, " ".join(case[2])):
             right, row = judged(*case, seed=given.seed + number)
             counts[right] += 1

@@ -79,6 +79,9 @@ class Survey:
             for name, samples in inputs.parts(self.given, channel):
                 theta, phi, psi = inputs.pointing(channel, samples, self.given.frame)
                 pixel = healpy.ang2pix(NSIDE, theta, phi)
+                noise = self.noise.get(name, np.zeros(NPIX)) / np.sqrt(
+                    np.maximum(np.bincount(pixel, minlength=NPIX), 1)
+                )
                 line = channel.line
                 line = replace(line, boresight_angle_deg=line.boresight_angle_deg + self.tilt_deg)
                 true = replace(channel, line=line, model=replace(channel.model, **{
@@ -101,8 +104,7 @@ class Survey:
                     tod = tod - destriped(tod, pixel, self.baseline)
                 hits = np.bincount(pixel, minlength=NPIX)
                 mean = np.bincount(pixel, tod, NPIX) / np.maximum(hits, 1)
-                mean = mean + self.noise.get(name, np.zeros(NPIX)) / np.sqrt(np.maximum(hits, 1))
-                found[name] = self.after(np.where(hits > 0, mean, healpy.UNSEEN))
+                found[name] = self.after(np.where(hits > 0, mean + noise, healpy.UNSEEN))
         return found
 
     def _signal(self, beam: mcsim.Beam) -> Callable[..., Vector]:

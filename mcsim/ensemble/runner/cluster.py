@@ -23,12 +23,17 @@ from mcsim.support.progress import Journal
 # Ctrl-C reaches all processes of a terminal. The driver ends the run; workers that lose the driver stay silent.
 _WORKER_SETUP = """
 import logging, signal
+from mcsim.support.loading import loaded
 signal.signal(signal.SIGINT, signal.SIG_IGN)
 logging.getLogger("distributed").setLevel(logging.CRITICAL)
+loaded("mcsim.ensemble.tasks")
 """
 
 Workers = int | str | Client
 """Number of local processes, the address of a running scheduler, or a client, which is left open."""
+
+ANSWER_S = 5.0
+"""Time in which the scheduler at an address answers."""
 
 TURN_S = 30.0
 ALONE_S = 300.0
@@ -109,7 +114,7 @@ def connected(workers: Workers) -> Iterator[Client]:
 def remote_client(scheduler: str) -> Iterator[Client]:
     """Yield the client of a running scheduler, whose workers have the driver's packages."""
     try:
-        client = Client(scheduler, timeout=5)
+        client = Client(scheduler, timeout=ANSWER_S)
     except (OSError, ValueError, TypeError, RuntimeError) as error:
         certificates = "certificates that Dask's configuration names in distributed.comm.tls"
         if scheduler.startswith("tls://") and isinstance(error, TypeError):  # from a call without an ssl_context
@@ -118,7 +123,8 @@ def remote_client(scheduler: str) -> Iterator[Client]:
             refusal = f"Nobody at {scheduler} accepts the {certificates}; take those of the scheduler's authority"
         else:
             why = type(error).__name__
-            refusal = f"No Dask scheduler answers at {scheduler} within 5 s ({why}); start one or correct the address"
+            late = f"within {ANSWER_S:g} s ({why})"
+            refusal = f"No Dask scheduler answers at {scheduler} {late}; start one or correct the address"
         raise InputError(f"{refusal}.") from error
     with client:
         _check_workers(client)

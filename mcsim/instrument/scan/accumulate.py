@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.model import ScanModel
+from mcsim.instrument.scan.offsets import add_powers, centres, exponents
 from mcsim.instrument.scan.pointing import BLOCK, PointingStream, fill_block, fill_pixels
 from mcsim.sphere.checks import check_whole
 
@@ -32,8 +33,9 @@ def stream_sums(
     -----
     Time is cut into 16 ranges, whatever the number of threads; each is summed on its own and the sums are added
     in the order of time: the result does not depend on ``nthreads``, bit for bit. The memory does: one accumulator of
-    8 (4 + 2 smax) bytes per pixel for each thread and one for the sum. Besides e^{-i s psi} a pixel sums its samples'
-    unit vectors: their mean against the pixel's centre is the centroid offset. ``progress`` takes the fraction done.
+    8 (4 + 2 smax) bytes per pixel for each thread and one for the sum; 24, 56 or 96 bytes more each for offsets of
+    order 2, 3 or 4, and 24 for the centres. Besides e^{-i s psi} a pixel sums its samples' unit vectors: their mean
+    against the pixel's centre is the centroid offset. ``progress`` takes the fraction done.
     """
     check_whole(smax, "smax", 1)
     tasks = []
@@ -43,23 +45,25 @@ def stream_sums(
         stream = PointingStream(model, line, grid.frame)
         tasks += [(stream, low, high) for low, high in pairwise(edges) if high > low]
     done, everything = 0, sum(high - low for _, low, high in tasks)
+    order = grid.offset_order
+    middle = centres(grid.nside) if order > 1 else np.empty((0, 3))
 
     def run(task: tuple[PointingStream, int, int], sums: NDArray[np.float64]) -> NDArray[np.float64]:
         nonlocal done
         stream, low, high = task
         for first in range(low, high, _CHUNK):
             count = min(_CHUNK, high - first)
-            _add_samples(stream.at(first), count, grid.nside, smax, sums)
+            _add_samples(stream.at(first), count, grid.nside, smax, order, middle, sums)
             done += count
             if progress is not None:
                 progress(done / everything)
         return sums
 
-    total = pixel_sums(grid.nside, smax)
+    total = pixel_sums(grid.nside, smax, order)
     waiting = iter(tasks)
     with ThreadPoolExecutor(max(1, nthreads)) as pool:
         first_tasks = islice(waiting, max(1, nthreads))
-        running = deque(pool.submit(run, task, pixel_sums(grid.nside, smax)) for task in first_tasks)
+        running = deque(pool.submit(run, task, pixel_sums(grid.nside, smax, order)) for task in first_tasks)
         while running:
             sums = running.popleft().result()
             total += sums
@@ -69,9 +73,12 @@ def stream_sums(
     return total
 
 
-def pixel_sums(nside: int, smax: int) -> NDArray[np.float64]:
-    """Return zeros, shape (npix, 4 + 2 smax): hits, sums of the unit vector, of cos(s psi) and of -sin(s psi)."""
-    columns = 4 + 2 * smax
+def pixel_sums(nside: int, smax: int, order: int = 1) -> NDArray[np.float64]:
+    """Return zeros, shape (npix, 4 + 2 smax + p): hits, sums of the unit vector, of cos(s psi) and of -sin(s psi).
+
+    The last p are sums of the powers of the offsets of degree 2 to ``order``.
+    """
+    columns = 4 + 2 * smax + len(exponents(order))
     memory = np.zeros(12 * nside * nside * columns + _CACHE_LINE // 8)
     # At smax 2 each pixel is one cache line, if the first one starts at its boundary.
     offset = (-memory.ctypes.data % _CACHE_LINE) // 8
@@ -93,7 +100,7 @@ def add_sample(sums, pixel, x, y, z, cos_psi, sin_psi, smax):  # type: ignore[no
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_samples(start, count, nside, smax, sums):  # type: ignore[no-untyped-def]
+def _add_samples(start, count, nside, smax, order, middle, sums):  # type: ignore[no-untyped-def]
     work = np.empty((6, BLOCK))
     pixels = np.empty(BLOCK, dtype=np.int64)
     touched = 0.0
@@ -107,4 +114,8 @@ def _add_samples(start, count, nside, smax, sums):  # type: ignore[no-untyped-de
             touched += sums[pixels[k], 0]
         for k in range(size):
             add_sample(sums, pixels[k], work[0, k], work[1, k], work[2, k], work[3, k], work[4, k], smax)
+        if order > 1:
+            for k in range(size):
+                pixel = pixels[k]
+                add_powers(sums[pixel], 4 + 2 * smax, order, middle[pixel], work[0, k], work[1, k], work[2, k])
     return touched

@@ -1,5 +1,6 @@
 """Files of moments: HEALPix tables in FITS, and the arrays of an object that a run was given in place of a file."""
 
+import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.instrument.scan.geometry import check_frame
 from mcsim.instrument.scan.moments import Moments
+from mcsim.instrument.scan.offsets import HIGHEST, exponents
 from mcsim.sphere.checks import nside_of
 from mcsim.sphere.header import frame_named, radians
 from mcsim.sphere.rotation import FRAMES
@@ -24,10 +26,12 @@ def read_moments(
 ) -> Moments:
     """Read moments from a HEALPix table with columns HITS, RE_s, IM_s[, DTHETA, DPHI], or from the .npz file of a run.
 
-    The table is the first binary table of the FITS file; RE_s + i IM_s is the mean of e^{-i s psi}. ``nside``, ``smax``
-    and ``frame`` are what the file must have; None: any, and all orders that follow each other from s = 1. Where a file
-    has no COORDSYS, ``frame`` is taken for it. InputError if the file cannot be read, is NESTED, lacks a column, has
-    another nside or frame, negative hits, non-finite numbers, or a modulus above 1.
+    The table is the first binary table of the FITS file; RE_s + i IM_s is the mean of e^{-i s psi}. Columns OFFSET_a_b
+    are the means of DTHETA^a DPHI^b of single samples, of degree a + b = 2, 3 and 4, as far as there are any.
+
+    ``nside``, ``smax`` and ``frame`` are what the file must have; None: any, and all orders that follow each other from
+    s = 1. Where a file has no COORDSYS, ``frame`` is taken for it. InputError if the file cannot be read, is NESTED,
+    lacks a column, has another nside or frame, negative hits, non-finite numbers, or a modulus above 1.
     """
     where = f"moments file {str(path)!r}"
     if frame is not None:
@@ -77,8 +81,9 @@ def _from_fits(path: str | Path, where: str, smax: int | None, frame: str | None
     offsets = [name for name in ("DTHETA", "DPHI") if name in columns]
     if len(offsets) == 1:
         raise InputError(f"{where} has {offsets[0]} alone; give both DTHETA and DPHI or neither.")
+    powers = _powers_in(columns, where)
     seen = hits > 0.0
-    for name in ("HITS", *needed, *offsets):
+    for name in ("HITS", *needed, *offsets, *powers):
         if name != "HITS":
             columns[name] = np.where(seen, columns[name], 0.0)
         bad = ~np.isfinite(columns[name])
@@ -92,13 +97,39 @@ def _from_fits(path: str | Path, where: str, smax: int | None, frame: str | None
     largest = np.abs(w).max(initial=0.0)
     if largest > 1.0 + 1e-6:
         raise InputError(f"{where}: a moment has modulus {largest:g}, but means of e^(-i s psi) are <= 1.")
-    farthest = max((float(np.abs(columns[name]).max()) for name in offsets), default=0.0)
+    reach = [float(np.abs(columns[name]).max()) for name in offsets]
+    reach += [float(np.abs(columns[name]).max()) ** (1.0 / sum(powers[name])) for name in powers]
+    farthest = max(reach, default=0.0)
     if farthest > 2.0 * healpy.max_pixrad(nside):
         raise InputError(
             f"{where}: samples lie {farthest:g} rad from their pixel's centre, but a pixel of nside {nside} "
             f"reaches {healpy.max_pixrad(nside):.3g}; give DTHETA and DPHI in radians, or their unit in TUNIT."
         )
-    return Moments(nside, stated, hits, w, *(columns[name] for name in offsets))
+    more = np.stack([columns[name] for name in powers]) if powers else None
+    dtheta, dphi = (columns.get(name) for name in ("DTHETA", "DPHI"))
+    return Moments(nside, stated, hits, w, dtheta, dphi, more)
+
+
+def _named(order: int) -> dict[str, tuple[int, int]]:
+    """Return the columns of the moments of offsets of degree 2 to ``order``, with their exponents."""
+    return {f"OFFSET_{a}_{b}": (a, b) for a, b in exponents(order)}
+
+
+def _powers_in(columns: dict[str, NDArray[np.float64]], where: str) -> dict[str, tuple[int, int]]:
+    """Return the columns OFFSET_a_b of a table, up to the highest degree of which there is one."""
+    found = [sum(powers) for name, powers in _named(HIGHEST).items() if name in columns]
+    wanted = _named(max(found, default=1))
+    lacking = [name for name in ("DTHETA", *wanted) if name not in columns] if wanted else []
+    if lacking:
+        raise InputError(f"{where} has columns OFFSET_a_b but not {lacking[0]}; give all up to the highest a + b.")
+    return wanted
+
+
+def _to_radians(name: str, unit: str) -> float:
+    """Return the factor from the unit of a column to powers of radians: of OFFSET_a_b rad2, deg3, arcmin**4."""
+    degree = sum(_named(HIGHEST).get(name, (1,)))
+    base = re.fullmatch(rf"(.*?[a-z])\s*(?:\*\*|\^)?\s*\(?{degree}\)?", unit.strip().lower()) if degree > 1 else None
+    return radians(unit if base is None else base[1]) ** degree
 
 
 def _read_table(path: str | Path, where: str) -> tuple[dict[str, NDArray[np.float64]], dict[str, Any]]:
@@ -115,8 +146,8 @@ def _read_table(path: str | Path, where: str) -> tuple[dict[str, NDArray[np.floa
                     name.upper(): np.array(table.data[name], dtype=np.float64).ravel() for name in table.columns.names
                 }
                 for column in table.columns:
-                    if column.unit and column.name.upper() in ("DTHETA", "DPHI"):
-                        columns[column.name.upper()] *= radians(column.unit)
+                    if column.unit and column.name.upper() in ("DTHETA", "DPHI", *_named(HIGHEST)):
+                        columns[column.name.upper()] *= _to_radians(column.name.upper(), column.unit)
                 header = {key: table.header.get(key) for key in ("NSIDE", "ORDERING", "COORDSYS")}
     except Exception as error:  # libraries raise whatever a broken file makes of them
         raise InputError(f"{where} cannot be read: {error}; give a complete FITS table.") from None
@@ -134,6 +165,10 @@ def write_moments_fits(path: str | Path, moments: Moments) -> None:
     if moments.dtheta is not None and moments.dphi is not None:
         arrays["DTHETA"], arrays["DPHI"] = moments.dtheta, moments.dphi
     units = {"DTHETA": "rad", "DPHI": "rad"}
+    if moments.offset_moments is not None:
+        powers = _named(moments.offset_order)
+        arrays |= dict(zip(powers, moments.offset_moments, strict=True))
+        units |= {name: f"rad{sum(degree)}" for name, degree in powers.items()}
     table = fits.BinTableHDU.from_columns(
         [fits.Column(name=name, format="D", unit=units.get(name), array=array) for name, array in arrays.items()]
     )

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from mcsim.errors import InputError
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
+from mcsim.instrument.scan.offsets import HIGHEST
 from mcsim.sphere.checks import check_nside
 from mcsim.sphere.rotation import FRAMES
 
@@ -16,14 +17,20 @@ def check_frame(frame: str) -> None:
 
 @dataclass(frozen=True)
 class MapGrid:
-    """HEALPix resolution and frame of a map, and its part of a survey: (0, 0.5) is the first half of the samples."""
+    """HEALPix resolution and frame of a map, and its part of a survey: (0, 0.5) is the first half of the samples.
+
+    ``offset_order``: highest degree, 1 to 4, of the moments of the samples' offsets from their pixels' centres.
+    """
 
     nside: int
     frame: str = "ecliptic"
     time_range: tuple[float, float] = (0.0, 1.0)
+    offset_order: int = 1
 
     def __post_init__(self) -> None:
         """Raise InputError for an nside that is no power of two, an unknown frame, or no increasing time range."""
+        if self.offset_order not in range(1, HIGHEST + 1):
+            raise InputError(f"offset_order is {self.offset_order}, but it must be a whole number from 1 to {HIGHEST}.")
         check_nside(self.nside)
         check_frame(self.frame)
         start, stop = self.time_range

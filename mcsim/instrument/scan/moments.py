@@ -2,9 +2,8 @@
 
 import hashlib
 import json
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -17,13 +16,14 @@ from mcsim.instrument.scan.accumulate import stream_sums
 from mcsim.instrument.scan.geometry import MapGrid, check_frame
 from mcsim.instrument.scan.limit import limit_moments
 from mcsim.instrument.scan.model import NUMBERS, ScanModel
+from mcsim.instrument.scan.offsets import HIGHEST, exponents, order_of, spin_moment
 from mcsim.instrument.scan.user_pointing import blocks_of_files, checked_samples, sums_of_samples
 from mcsim.sphere.checks import check_nside, check_shape, check_whole
 from mcsim.support import folders
 from mcsim.support.code import package_digest
 
 _META = "moments.json"
-_ARRAYS = ("hits", "w", "dtheta", "dphi")
+_ARRAYS = ("hits", "w", "dtheta", "dphi", "offset_moments")
 _PIXELS = 1 << 18
 """Whose centroids are computed at once, to save memory."""
 
@@ -43,6 +43,9 @@ class Moments:
     dtheta, dphi
         Mean offset of the samples from the pixel's centre along e_theta and e_phi, in radians (components of the
         mean direction in the tangent plane at the centre), shape (npix,); None if zero or unknown.
+    offset_moments
+        Mean products dtheta^a dphi^b of the samples' own offsets: (a, b) = (2, 0), (1, 1), (0, 2), then (3, 0), (2, 1)
+        and so on, in rad^(a + b). Shape (3, npix), (7, npix) or (12, npix), up to degree 2, 3 or 4; None if unknown.
 
     Examples
     --------
@@ -58,6 +61,7 @@ class Moments:
     w: NDArray[np.complex128]
     dtheta: NDArray[np.float64] | None = None
     dphi: NDArray[np.float64] | None = None
+    offset_moments: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         """Raise InputError unless frame, nside and the sizes of the arrays agree."""
@@ -73,6 +77,11 @@ class Moments:
         for name, offset in (("dtheta", self.dtheta), ("dphi", self.dphi)):
             if offset is not None:
                 check_shape(offset, (npix,), f"{name} of moments of nside {self.nside}")
+        if self.offset_moments is not None:
+            if self.dtheta is None:
+                raise InputError("offset_moments are given without dtheta and dphi; give these as well.")
+            rows = len(exponents(order_of(len(self.offset_moments)) or HIGHEST))
+            check_shape(self.offset_moments, (rows, npix), f"offset_moments of nside {self.nside}")
 
     @classmethod
     def from_model(
@@ -116,8 +125,25 @@ class Moments:
         >>> print(f"{np.mean(moments.w[1].real):.2f}")
         0.55
         """
+        return cls.on_grid(model, MapGrid(nside, frame, time_range), smax, nthreads)
+
+    @classmethod
+    def on_grid(cls, model: ScanModel | str | Path, grid: MapGrid, smax: int = 4, nthreads: int = 1) -> Self:
+        """Return the moments of a survey on a grid, with those of its samples' offsets up to ``grid.offset_order``.
+
+        The rest is as in :meth:`from_model`.
+
+        Examples
+        --------
+        >>> from mcsim import Moments, ScanModel
+        >>> from mcsim.instrument.scan import MapGrid
+        >>> model = ScanModel.load("wmap").with_sampling(60.0)
+        >>> moments = Moments.on_grid(model, MapGrid(8, offset_order=2))
+        >>> moments.offset_order, moments.offset_moments.shape
+        (2, (3, 768))
+        """
         survey = model if isinstance(model, ScanModel) else ScanModel.load(model)
-        return cls._from_sums(stream_sums(survey, MapGrid(nside, frame, time_range), smax, nthreads), frame)
+        return cls._from_sums(stream_sums(survey, grid, smax, nthreads), grid)
 
     @classmethod
     def from_pointing(
@@ -156,11 +182,17 @@ class Moments:
         shapes = [array.shape for array in arrays]
         if len(set(shapes)) > 1 or arrays[0].ndim != 1 or not arrays[0].size:
             raise InputError(f"theta, phi and psi have the shapes {shapes}; give three arrays of one length, (n,).")
-        return cls._from_sums(sums_of_samples([checked_samples(arrays, "the pointing")], nside, smax), frame)
+        samples = checked_samples(arrays, "the pointing")
+        return cls._from_sums(sums_of_samples([samples], nside, smax), MapGrid(nside, frame))
 
     @classmethod
     def from_pointing_files(
-        cls, paths: str | Path | Sequence[str | Path], nside: int, smax: int = 4, frame: str = "ecliptic"
+        cls,
+        paths: str | Path | Sequence[str | Path],
+        nside: int,
+        smax: int = 4,
+        frame: str = "ecliptic",
+        offset_order: int = 1,
     ) -> Self:
         """Return the moments of samples that are given one by one in files.
 
@@ -173,6 +205,8 @@ class Moments:
             text of 3 or 4 columns.
         nside, smax, frame
             As in :meth:`from_pointing`.
+        offset_order
+            Highest degree of the moments of the samples' offsets, 1 to 4.
 
         Raises
         ------
@@ -181,13 +215,15 @@ class Moments:
             another frame, is empty, or has a value that is not real and finite, a theta outside 0 to pi, or a phi or
             psi beyond two turns.
         """
-        check_frame(frame)
-        return cls._from_sums(sums_of_samples(blocks_of_files(paths, frame), nside, smax), frame)
+        grid = MapGrid(nside, frame, offset_order=offset_order)
+        return cls._from_sums(sums_of_samples(blocks_of_files(paths, frame), nside, smax, offset_order), grid)
 
     @classmethod
-    def _from_sums(cls, sums: NDArray[np.float64], frame: str) -> Self:
+    def _from_sums(cls, sums: NDArray[np.float64], grid: MapGrid) -> Self:
         """Return the moments of an accumulator of :func:`mcsim.instrument.scan.accumulate.pixel_sums`."""
-        nside, smax = math.isqrt(len(sums) // 12), sums.shape[1] // 2 - 2
+        nside, powers = grid.nside, len(exponents(grid.offset_order))
+        first_power = sums.shape[1] - powers
+        smax = first_power // 2 - 2
         hits = sums[:, 0].copy()
         inverse = np.divide(1.0, hits, out=np.zeros_like(hits), where=hits > 0.0)
         w = np.empty((smax, hits.size), dtype=np.complex128)
@@ -201,7 +237,8 @@ class Moments:
             x, y, z = (sums[part, axis] * inverse[part] for axis in (1, 2, 3))
             dtheta[part] = np.cos(theta) * (x * np.cos(phi) + y * np.sin(phi)) - np.sin(theta) * z
             dphi[part] = y * np.cos(phi) - x * np.sin(phi)
-        return cls(nside, frame, hits, w, dtheta, dphi)
+        more = np.ascontiguousarray(sums[:, first_power:].T) * inverse if powers else None
+        return cls(nside, grid.frame, hits, w, dtheta, dphi, more)
 
     @classmethod
     def parallel_transport(cls, nside: int, psi0_deg: float = 0.0, smax: int = 4, frame: str = "ecliptic") -> Self:
@@ -292,6 +329,39 @@ class Moments:
         """Number of pixels."""
         return int(self.hits.shape[0])
 
+    @property
+    def offset_order(self) -> int:
+        """Highest degree of the moments of the samples' offsets that are known; 0: none."""
+        if self.offset_moments is not None:
+            return order_of(len(self.offset_moments)) or 0
+        return 0 if self.dtheta is None else 1
+
+    def up_to_offsets(self, order: int) -> Self:
+        """Return the moments with those of the offsets up to a degree, and no higher ones; 0: none."""
+        if order == 0:
+            return replace(self, dtheta=None, dphi=None, offset_moments=None)
+        if self.offset_moments is None or self.offset_order <= order:
+            return self
+        return replace(self, offset_moments=self.offset_moments[: len(exponents(order))] if order > 1 else None)
+
+    def shrunk(self, factor: float) -> Self:
+        """Return the moments with all offsets multiplied by a factor."""
+        if self.dtheta is None or self.dphi is None:
+            return self
+        more = self.offset_moments
+        if more is not None:
+            more = np.array([factor ** (a + b) for a, b in exponents(self.offset_order)])[:, None] * more
+        return replace(self, dtheta=factor * self.dtheta, dphi=factor * self.dphi, offset_moments=more)
+
+    def spin_of_offsets(self, degree: int, spin: int) -> NDArray:
+        """Return <rho^(n - s) (dtheta + i dphi)^s> for degree n and spin s, shape (npix,); real at spin 0."""
+        if self.offset_order < degree or self.dtheta is None or self.dphi is None:
+            raise InputError(f"the moments have offsets up to order {self.offset_order}, below {degree}; stream them.")
+        if self.offset_moments is None or degree == 1:
+            return spin_moment(np.stack([self.dtheta, self.dphi]), spin)
+        first = len(exponents(degree - 1))
+        return spin_moment(self.offset_moments[first : first + degree + 1], spin)
+
     def as_table(self, folder: Path) -> dict[str, str]:
         """Write the moments into a folder; return the table that stands for them in a run."""
         arrays = {name: value for name in _ARRAYS if (value := getattr(self, name)) is not None}
@@ -306,7 +376,7 @@ class Moments:
             array = getattr(self, name)
             if array is not None:
                 np.save(folder / f"{name}.npy", array)
-        meta = {"nside": self.nside, "frame": self.frame, "offsets": self.dtheta is not None}
+        meta = {"nside": self.nside, "frame": self.frame, "offsets": self.offset_order}
         (folder / _META).write_text(json.dumps(meta))
 
     @classmethod
@@ -329,7 +399,7 @@ class Moments:
         mode: Any = "r" if mmap else None
         try:
             meta = json.loads((folder / _META).read_text())
-            names = _ARRAYS if meta["offsets"] else _ARRAYS[:2]
+            names = _ARRAYS[: (2, 4, 5)[min(meta["offsets"], 2)]]
             arrays = {name: np.load(folder / f"{name}.npy", mmap_mode=mode) for name in names}
             return cls(nside=meta["nside"], frame=meta["frame"], **arrays)
         except (OSError, ValueError, KeyError) as error:
@@ -348,7 +418,7 @@ def scan_key(model: ScanModel, grid: MapGrid, smax: int = 0) -> str:
         package_digest(["mcsim.instrument.scan"], ["healpy", "numpy"]),
         {name: float(getattr(model, name)) for name in NUMBERS},
         lines,
-        [grid.nside, grid.frame, *(float(edge) for edge in grid.time_range)],
+        [grid.nside, grid.frame, *(float(edge) for edge in grid.time_range), grid.offset_order],
         smax,
     ]
     return hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()
@@ -370,6 +440,6 @@ def cached_moments(
     """
 
     def fill(folder: Path) -> None:
-        Moments._from_sums(stream_sums(model, grid, smax, nthreads, progress), grid.frame).save(folder)
+        Moments._from_sums(stream_sums(model, grid, smax, nthreads, progress), grid).save(folder)
 
     return folders.cached(f"moments-{scan_key(model, grid, smax)}", fill, cache_dir)

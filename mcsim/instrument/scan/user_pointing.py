@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.instrument.scan.accumulate import add_sample, pixel_sums
+from mcsim.instrument.scan.offsets import add_powers, centres
 from mcsim.instrument.scan.pointing import quarter_turns, ring_pixel
 from mcsim.sphere.checks import LARGEST_ANGLE, check_nside, check_whole
 from mcsim.sphere.header import frame_named, radians
@@ -24,16 +25,18 @@ _ENOUGH_ROWS = 10
 """To tell a column of time from angles."""
 
 
-def sums_of_samples(blocks: Iterable[Sequence[NDArray]], nside: int, smax: int) -> NDArray[np.float64]:
+def sums_of_samples(blocks: Iterable[Sequence[NDArray]], nside: int, smax: int, order: int = 1) -> NDArray[np.float64]:
     """Return the sums per pixel (:func:`mcsim.instrument.scan.accumulate.pixel_sums`) of blocks of samples.
 
-    A block is theta, phi, psi in radians, shape (n,) each, as of :func:`blocks_of_files` and :func:`checked_samples`.
+    A block is theta, phi, psi in radians, shape (n,) each, as of :func:`blocks_of_files` and :func:`checked_samples`;
+    ``order`` is that of the moments of their offsets.
     """
     check_nside(nside)
     check_whole(smax, "smax", 1)
-    sums = pixel_sums(nside, smax)
+    sums = pixel_sums(nside, smax, order)
+    middle = centres(nside) if order > 1 else np.empty((0, 3))
     for theta, phi, psi in blocks:
-        _add_angles(theta, phi, psi, nside, smax, sums)
+        _add_angles(theta, phi, psi, nside, smax, order, middle, sums)
     return sums
 
 
@@ -138,10 +141,11 @@ def checked_samples(columns: Sequence[NDArray[np.float64]], where: str) -> tuple
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_angles(theta, phi, psi, nside, smax, sums):  # type: ignore[no-untyped-def]
+def _add_angles(theta, phi, psi, nside, smax, order, middle, sums):  # type: ignore[no-untyped-def]
     for k in range(theta.size):
         sin_theta = math.sin(theta[k])
         x, y, z = sin_theta * math.cos(phi[k]), sin_theta * math.sin(phi[k]), math.cos(theta[k])
-        add_sample(
-            sums, ring_pixel(nside, quarter_turns(x, y), x, y, z), x, y, z, math.cos(psi[k]), math.sin(psi[k]), smax
-        )
+        pixel = ring_pixel(nside, quarter_turns(x, y), x, y, z)
+        add_sample(sums, pixel, x, y, z, math.cos(psi[k]), math.sin(psi[k]), smax)
+        if order > 1:
+            add_powers(sums[pixel], 4 + 2 * smax, order, middle[pixel], x, y, z)

@@ -8,7 +8,7 @@ from mcsim.simulation.mapmaking.rhs import (
     rhs_from_maps,
     side_maps,
 )
-from mcsim.simulation.mapmaking.solve import MapmakingReport, StoppingRule, diagonal, solve
+from mcsim.simulation.mapmaking.solve import MapmakingReport, StoppingRule, diagonal, level_uk, rhs_of_map, solve
 
 __all__ = [
     "DifferenceNoise",
@@ -18,8 +18,10 @@ __all__ = [
     "SideMaps",
     "StoppingRule",
     "diagonal",
+    "level_uk",
     "prepare",
     "rhs_from_maps",
+    "rhs_of_map",
     "side_maps",
     "solve",
 ]

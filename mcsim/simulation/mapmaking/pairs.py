@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
-from mcsim.instrument.scan import LineOfSight, MapGrid, ScanModel, scan_key
+from mcsim.instrument.scan import LineOfSight, MapGrid, Moments, ScanModel, cached_moments, scan_key
 from mcsim.instrument.scan.pointing import PointingStream, fill_samples
 from mcsim.simulation.tod import chunks
 from mcsim.support import folders
@@ -65,6 +65,17 @@ class DifferencingScan:
         """Number of differences."""
         first, last = self.grid.sample_range(self.model, self.side_a)
         return last - first
+
+    def moments(self, smax: int, nthreads: int = 1, progress: Callable[[float], None] | None = None) -> Moments:
+        """Return the mean orientation moments of all samples of both sides, which stand at their pixels' centres."""
+        model = self.model.with_lines_of_sight(self.side_a.name, self.side_b.name)
+        found = Moments.load(cached_moments(model, self.grid, smax, nthreads, progress))
+        return found.up_to_offsets(0)
+
+    def hits_alone(self, smax: int) -> Moments:
+        """Return the hits of both sides, for weights and masks; the moments mean nothing and are NaN."""
+        unknown = np.broadcast_to(np.complex128(np.nan), (smax, self.npix))
+        return Moments(self.grid.nside, self.grid.frame, self.hits_a + self.hits_b, unknown)
 
 
 def prepare(

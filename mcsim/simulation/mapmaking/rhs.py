@@ -58,10 +58,14 @@ BALANCED = Imbalance()
 
 @dataclass(frozen=True)
 class DifferenceNoise:
-    """White noise of ``sigma0_uk`` per difference, drawn from generators that are spawned from ``rng``."""
+    """White noise of ``sigma0_uk`` per difference, drawn from generators that are spawned from ``rng``.
+
+    ``factor``: of the variance in every pixel, shape (npix,); a difference has the mean of its two pixels'. None: one.
+    """
 
     sigma0_uk: float
     rng: np.random.Generator
+    factor: Map | None = None
 
     def __post_init__(self) -> None:
         """Raise InputError unless sigma0_uk is finite and >= 0."""
@@ -94,11 +98,13 @@ def rhs_from_maps(
     a, b = (PointingStream(scan.model, line, scan.grid.frame) for line in (scan.side_a, scan.side_b))
     x, weight = imbalance.true, imbalance.weight
     gains = np.array([1.0 + x, x - 1.0, 1.0 + weight, weight - 1.0])
+    factor = np.zeros(0) if noise is None or noise.factor is None else noise.factor
 
     def run(share: list[tuple[int, int]]) -> NDArray[np.float64]:
         rhs = np.zeros((scan.npix, len(skies)))
         for low, high in share:
-            _add_chunk((a.at(low), side_a), (b.at(low), side_b), scan.grid.nside, gains, draw(low, high), rhs)
+            own = draw(low, high)
+            _add_chunk((a.at(low), side_a), (b.at(low), side_b), scan.grid.nside, gains, own, factor, rhs)
         return rhs
 
     total = np.zeros((scan.npix, len(skies)))
@@ -130,7 +136,7 @@ def _stacked(scan: DifferencingScan, maps: list[SideMaps]) -> NDArray[np.float64
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_chunk(side_of_a, side_of_b, nside, gains, noise, rhs):  # type: ignore[no-untyped-def]
+def _add_chunk(side_of_a, side_of_b, nside, gains, noise, factor, rhs):  # type: ignore[no-untyped-def]
     """Add the differences of consecutive samples to ``rhs``; a side is where its stream starts, and its maps."""
     pixel_a, pixel_b = np.empty(BLOCK, dtype=np.int64), np.empty(BLOCK, dtype=np.int64)
     difference = np.empty((rhs.shape[1], BLOCK))
@@ -141,6 +147,11 @@ def _add_chunk(side_of_a, side_of_b, nside, gains, noise, rhs):  # type: ignore[
                 difference[sky, k] = noise[first + k]
         _add_side(side_of_a, first, nside, gains[0], pixel_a[:size], difference)
         _add_side(side_of_b, first, nside, gains[1], pixel_b[:size], difference)
+        if factor.size > 0:
+            for k in range(size):
+                more = np.sqrt(0.5 * (factor[pixel_a[k]] + factor[pixel_b[k]])) - 1.0
+                for sky in range(rhs.shape[1]):
+                    difference[sky, k] += more * noise[first + k]
         for sky in range(rhs.shape[1]):
             for k in range(size):
                 rhs[pixel_a[k], sky] += gains[2] * difference[sky, k]

@@ -115,6 +115,26 @@ def diagonal(scan: DifferencingScan, x: float) -> Map:
     return weight
 
 
+def level_uk(scan: DifferencingScan, sigma0_uk: float) -> Map | None:
+    """Return about the noise of every pixel, uK, shape (npix,), 0 where unobserved; None: no noise.
+
+    It is that of known partners, sigma0 over the root of the hits. Harmonics of a low degree l have
+    1 / (1 - P_l(cos of the angle between the sides)) times this variance, small scales nearly 1.
+    """
+    if sigma0_uk == 0.0:
+        return None
+    hits = scan.hits_a + scan.hits_b
+    return np.divide(sigma0_uk, np.sqrt(hits), out=np.zeros_like(hits), where=hits > 0.0)
+
+
+def rhs_of_map(scan: DifferencingScan, map_uk: Map, x: float = 0.0, nthreads: int = 1) -> Map:
+    """Return the right-hand side, uK, shape (npix,), whose solution is a map: N m, without a pass over the samples."""
+    check_imbalance(x)
+    _check_map(scan, map_uk, "map")
+    with ThreadPoolExecutor(max(1, nthreads)) as pool:
+        return apply_normal(scan, x, map_uk, pool, nthreads)
+
+
 def apply_normal(scan: DifferencingScan, x: float, map_uk: Map, pool: ThreadPoolExecutor, parts: int = 1) -> Map:
     """Apply the normal matrix to a map: D m - (1 - x^2) C m, C the counts of pairs; unobserved pixels give 0.
 

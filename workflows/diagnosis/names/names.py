@@ -1,7 +1,9 @@
 """Measure how often names are wrong for systematics of no library, and how often true names are refused.
 
-python names.py maps [CASES]     systematics that no library has, added to simulated maps
-python names.py draws [NUMBER]   effects of the library, added to data vectors of simulations
+python names.py maps [CASES]       systematics that no library has, added to simulated maps
+python names.py draws [NUMBER]     effects of the library, added to data vectors of simulations
+python names.py several [NUMBER]   one to five effects of the library at once, added to data vectors
+python names.py pairs [CASES]      two effects of the library at once, in simulated maps
 """
 
 import json
@@ -18,6 +20,7 @@ from mcsim.diagnosis.api import prepared
 from mcsim.diagnosis.campaign import with_effects
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere.rotation import rotation_matrix
@@ -53,6 +56,11 @@ def learned(model):
     """Return the run, and what every data set is tested with."""
     run = config.load(model)
     return run, prepared(run, analysis_of(run), ask)
+
+
+def worded(found):
+    """Return a share and its 95 % interval in words."""
+    return f"{found.name}: {found.value:.3f} [{found.low:.3f}, {found.high:.3f}] of {found.count}"
 
 
 def patterns(draw):
@@ -210,13 +218,76 @@ def draws(number):
                     ],
                     flush=True,
                 )
-    print("true names refused:", share("refused", refused))
-    print("single ones that no two parts measure:", share("unmeasured", unmeasured))
+    print(worded(share("true names refused", refused)))
+    print(worded(share("single ones that no two parts measure", unmeasured)))
     for kind, rows in by_test.items():
         low, absent = np.mean(rows, axis=0)
         print(f"{kind}: {len(rows)} tests, p <= 0.05 in {low:.3f}, odds of absence in {absent:.4f}")
 
 
+def pairs(number):
+    """Diagnose maps with two effects, each at S/N 5 to 20, and print how often both are named."""
+    from mcsim.benchmark.case import Prior
+    from mcsim.benchmark.models import linear_model
+    from mcsim.benchmark.sampler import CaseSampler
+    from mcsim.stats.intervals import share
+
+    run, context = learned(MODEL)
+    sampler = CaseSampler(Prior(weakest=5.0, strongest=20.0), linear_model(context))
+    rows = []
+    for case in range(number):
+        members = sampler.members(np.random.default_rng([22, case]), 2)
+        tables = [config.Effect(name=m.name, channel=m.channel, parameters=m.parameters) for m in members]
+        found = list(simulate.maps(survey(with_effects(run, tables)), 7000 + case))
+        verdict = diagnose_data(ObservedMaps(context, found, ask), f"pair-{case}").to_json()
+        sets = [verdict["effects"], *verdict["alternatives"]]
+        answers = [{(e["name"], e["channel"]) for e in one} for one in sets if one]
+        truth = {one.identity for one in members}
+        wrong = verdict["verdict"] in ("effect", "mixture") and not answers[0] <= truth
+        rows.append((truth in answers, truth in answers[:1], verdict["verdict"] == "unknown", wrong))
+        strengths = {f"{m.name} {m.channel or ''}": round(m.strength, 1) for m in members}
+        row = [case, strengths, verdict["verdict"], [sorted(map(str, one)) for one in answers], verdict["notes"]]
+        print(json.dumps(row, ensure_ascii=False), flush=True)
+    for place, what in enumerate(("truth in the set", "truth first", "unknown", "a wrong name alone")):
+        print("   ", worded(share(what, [row[place] for row in rows])))
+
+
+def several(number):
+    """Attribute draws of one to five effects, each at S/N 5 to 20, and print how often all of them are named."""
+    from mcsim.benchmark.case import Prior
+    from mcsim.benchmark.models import linear_model
+    from mcsim.benchmark.sampler import CaseSampler
+    from mcsim.diagnosis.selection import attribute
+    from mcsim.stats.intervals import share
+
+    linear = linear_model(learned(MODEL)[1])
+    sampler, settings = CaseSampler(Prior(weakest=5.0, strongest=20.0), linear), DiagnosisSettings()
+    for size in range(1, 6):
+        rows = []
+        for case in range(number):
+            members = sampler.members(np.random.default_rng([size, case]), size)
+            truth = {one.identity for one in members}
+            responses = [linear.response([one]) for one in members]
+            rivals = np.array([identity not in truth for identity in linear.identities])
+            alike = 0.0
+            for one, response in zip(members, responses, strict=True):
+                others = rivals | np.isin(np.arange(len(rivals)), [o.candidate for o in members if o is not one])
+                alike = max(alike, float(linear.cosines(response)[others].max()))
+            x = linear.data[case % len(linear.data)] + sum(responses)
+            found = attribute(linear.null, x, linear.templates, linear.candidates, linear.calibration)
+            said = found.if_named(settings)
+            answers = [{linear.identities[member] for member in one.members} for one in said.explanations]
+            wrong = said.verdict in ("effect", "mixture") and not answers[0] <= truth
+            rows.append((alike, truth in answers, truth in answers[:1], said.verdict == "unknown", wrong))
+        for which, top in (("all", 1.1), ("|rho| <= 0.7", 0.7)):
+            kept = [row for row in rows if row[0] <= top]
+            print(f"{size} effects, {which}: {len(kept)} draws")
+            for place, what in enumerate(("truth in the set", "truth first", "unknown", "a wrong name alone"), 1):
+                print("   ", worded(share(what, [row[place] for row in kept])))
+
+
 if __name__ == "__main__":
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    {"maps": maps, "draws": draws}[sys.argv[1]](int(sys.argv[2]) if len(sys.argv) > 2 else 42)
+    {"maps": maps, "draws": draws, "pairs": pairs, "several": several}[sys.argv[1]](
+        int(sys.argv[2]) if len(sys.argv) > 2 else 42
+    )

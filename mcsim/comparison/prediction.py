@@ -1,0 +1,295 @@
+"""What a set of differences makes of the maps of side A, and how much it leaves of those of side B."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.comparison.differences import Difference, State
+from mcsim.comparison.pairs import ChannelPair
+from mcsim.comparison.scene import Alm, Maps, PointingFiles, Scene
+from mcsim.systematics.base import Pointing
+
+Vector = NDArray[np.float64]
+Members = tuple[tuple[Difference, Vector], ...]
+"""Differences with their values."""
+
+EXPLAINED = 0.8
+"""Share of a difference map's variance that a set must explain to be named, with orientation moments."""
+
+EXPLAINED_BY_SAMPLES = 0.95
+"""The same where single samples are simulated, or no simulation is needed."""
+
+ENOUGH = 1e-3
+"""Share of the variance below which nothing further is looked for: templates are no better."""
+
+SMALLEST = 0.1
+"""Rms of what is left below which nothing further is looked for either, over that of maps that are called identical."""
+
+TOLERATED = 1.5
+"""A set that is named may leave so many times what noise is expected to hide from its prediction."""
+
+UNSURE = 0.25
+"""Share of what noise is expected to hide by which that is uncertain."""
+
+MOST_HIDDEN = 0.5
+"""Share of the variance that noise may hide at most from the prediction of a set that is named."""
+
+PRECISION = 1e-6
+"""Share of the variance that no comparison resolves: single precision of maps with a dipole."""
+
+STEP = 1e-3
+"""Change of a value over which responses are linear, over the value or its natural size."""
+
+STEPS = 4
+"""Steps of a joint fit at most."""
+
+NOTHING = 1e-8
+"""Share of the variance below which values are not fitted again."""
+
+WORTHWHILE = 0.98
+"""Share of what was left before that a step must leave at most to be followed by another one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Set:
+    """Differences with their values.
+
+    Attributes
+    ----------
+    members
+        Differences with their values.
+    left
+        Share of the variance that they leave.
+    correction
+        What single samples change in their prediction, uK, shape (split, npix); None: not measured.
+    """
+
+    members: Members
+    left: float
+    correction: Maps | None = None
+
+    @property
+    def explains(self) -> float:
+        """Share of the variance of the difference map."""
+        return 1.0 - self.left
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Of the differences, in any order."""
+        return frozenset(difference.name for difference, _ in self.members)
+
+    @property
+    def fitted(self) -> int:
+        """Number of values that were fitted."""
+        return sum(len(difference.axes(value)) for difference, value in self.members)
+
+    def moved(self, index: int, by: Vector) -> Members:
+        """Return the members with one value moved."""
+        difference, value = self.members[index]
+        return (*self.members[:index], (difference, value + by), *self.members[index + 1 :])
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """One channel, and what sets of differences make of it.
+
+    Sets are predicted with orientation moments; those that come first are simulated sample by sample as well, if the
+    pointing is known and not too long, and what that changes is added to their predictions.
+
+    Attributes
+    ----------
+    pair
+        The channel on both sides.
+    others
+        The other channels.
+    floor
+        Rms in uK up to which maps are called identical.
+    """
+
+    pair: ChannelPair
+    others: Sequence[ChannelPair]
+    floor: float
+    _hidden: dict[tuple[tuple[int, bytes], ...], float] = field(default_factory=dict, repr=False, kw_only=True)
+
+    @cached_property
+    def _bare(self) -> Maps | None:
+        return None if self.pair.scene is None else self.pair.scene.maps()
+
+    @cached_property
+    def total(self) -> float:
+        """Sum of squares of the difference over the pixels that are seen."""
+        return self._squares(self.pair.a)
+
+    @cached_property
+    def enough(self) -> float:
+        """Share of the variance below which nothing further is looked for."""
+        smallest = (SMALLEST * self.floor) ** 2 * float(self.pair.seen.sum()) / self.total
+        return min(ENOUGH, max(smallest, PRECISION)) if smallest > 0.0 else ENOUGH
+
+    def _squares(self, maps: Maps) -> float:
+        return float(np.sum((self.pair.b - maps)[self.pair.seen] ** 2))
+
+    def state(self, members: Members, correction: Maps | None = None) -> State:
+        """Return the prediction of a set: scenes first, then maps, each in the order of the set."""
+        scene, maps = self.scene(members), self.pair.a
+        if scene is not None and self._bare is not None and scene is not self.pair.scene:
+            maps = maps + (scene.maps() - self._bare)
+        if correction is not None:
+            maps = maps + correction
+        state = State(self.pair, scene, maps, self.others)
+        for difference, value in members:
+            state = replace(state, maps=difference.maps(state.maps, value, state))
+        return state
+
+    def scene(self, members: Members) -> Scene | None:
+        """Return the scene of side B."""
+        scene = self.pair.scene
+        for difference, value in members:
+            scene = None if scene is None else difference.scene(scene, value, self.pair)
+        return scene
+
+    def of(self, found: Set) -> State:
+        """Return the prediction of a set, single samples included where they were measured."""
+        return self.state(found.members, found.correction)
+
+    def left(self, members: Members, correction: Maps | None = None) -> float:
+        """Return the share of the variance that a set leaves."""
+        return self._squares(self.state(members, correction).maps) / self.total
+
+    def hidden(self, found: Set) -> float:
+        """Return the share of the variance that noise is expected to hide from the prediction of a set.
+
+        That is what the set makes of a draw of the sky that the maps do not show.
+        """
+        scene = self.pair.scene
+        if self.pair.doubt is None or scene is None or not found.members:
+            return 0.0
+        key = tuple((id(difference), value.tobytes()) for difference, value in found.members)
+        if key not in self._hidden:
+            self._hidden[key] = self._squares_hidden(found.members, scene, self.pair.doubt)
+        return self._hidden[key]
+
+    def _squares_hidden(self, members: Members, scene: Scene, doubt: Alm) -> float:
+        made = []
+        for sky in (doubt, np.zeros_like(doubt)):
+            own = replace(self.pair, a=np.zeros_like(self.pair.a), scene=replace(scene, sky=sky))
+            alone = replace(self, pair=own)
+            made.append(alone.state(members).maps + alone._of_effects(members))
+        return float(np.sum((made[0] - made[1])[self.pair.seen] ** 2)) / self.total
+
+    def _of_effects(self, members: Members) -> Maps | float:
+        """Return what effects, whose templates are of the sky that is known, make of the scene's own sky."""
+        scene = self.scene(members)
+        made = [d.response(v, scene, self.pair) for d, v in members] if scene is not None else []
+        return sum((one for one in made if one is not None), 0.0)
+
+    def needed(self) -> float:
+        """Return the share of the variance that a set must explain to be named."""
+        simple = self.pair.scene is None or self._pointing is not None
+        return EXPLAINED_BY_SAMPLES if simple else EXPLAINED
+
+    def excess(self, found: Set) -> float:
+        """Return the share of the variance that a set leaves beyond what noise hides, or the uncertainty of that."""
+        hidden = self.hidden(found)
+        return max(found.left - hidden, UNSURE * hidden)
+
+    def suffices(self, found: Set) -> bool:
+        """Return True if a set explains enough to be named."""
+        needed = min([self.needed(), *(difference.enough for difference, _ in found.members)])
+        if found.explains >= needed:
+            return True
+        hidden = self.hidden(found)
+        return hidden <= MOST_HIDDEN and found.explains + TOLERATED * hidden >= needed
+
+    def complete(self, found: Set) -> bool:
+        """Return True if what a set leaves is too little to look for anything in it."""
+        linear = any(difference.linear for difference, _ in found.members)
+        enough = ENOUGH if linear else self.enough
+        return found.left < enough
+
+    @property
+    def _pointing(self) -> Pointing | PointingFiles | None:
+        return self.pair.pointing()
+
+    @cached_property
+    def _sampled(self) -> Maps:
+        assert self.pair.scene is not None
+        assert self._pointing is not None
+        return self.pair.scene.sampled(self._pointing, self.pair.scene.window)
+
+    @cached_property
+    def unmade(self) -> float:
+        """Rms in uK of what the simulation of side A, with the sky that its maps show, leaves of them."""
+        if self.pair.scene is None or self._bare is None:
+            return 0.0
+        made = self._bare if self._pointing is None else self._sampled
+        return float(np.sqrt(np.mean((self.pair.a - made)[self.pair.seen] ** 2)))
+
+    def tangents(self, found: Set) -> tuple[list[tuple[int, Vector]], list[Maps]]:
+        """Return the ways in which the values of a set may be moved, and what each changes in its prediction."""
+        ways = [
+            (index, axis)
+            for index, (difference, value) in enumerate(found.members)
+            for axis in STEP * max(float(np.abs(value).max()), difference.natural) * difference.axes(value)
+        ]
+        if not ways:
+            return [], []
+        here = self.of(found).maps
+        return ways, [self.state(found.moved(*way), found.correction).maps - here for way in ways]
+
+    def fitted(self, found: Set) -> Set:
+        """Return a set with all values that may be moved fitted together, by Gauss-Newton steps."""
+        found = replace(found, left=self.left(found.members, found.correction))
+        for _ in range(STEPS):
+            ways, tangents = self.tangents(found)
+            if not ways:
+                break
+            step = self.of(found).fit(tangents)
+            better = found
+            for share in (1.0, 0.3):
+                members = found.members
+                for (index, axis), size in zip(ways, step, strict=True):
+                    members = Set(members, 0.0).moved(index, share * size * axis)
+                members = tuple((difference, difference.within(value)) for difference, value in members)
+                better = Set(members, self.left(members, found.correction), found.correction)
+                if better.left < found.left:
+                    break
+            if better.left >= found.left:
+                break
+            worthwhile = better.left < WORTHWHILE * found.left
+            found = better
+            if not worthwhile:
+                break
+        return found
+
+    def corrected(self, found: Set) -> Set:
+        """Return a set with its share measured sample by sample, and its values fitted again beside that."""
+        if self._pointing is None or self.pair.scene is None:
+            return found
+        found = self._measured(found)
+        if not found.fitted or found.left < NOTHING:
+            return found
+        moved = self.fitted(found)
+        if moved.left < WORTHWHILE * found.left:
+            found = min(found, self._measured(moved), key=lambda one: one.left)
+        return found
+
+    def _measured(self, found: Set) -> Set:
+        base, pointing = self.pair.scene, self._pointing
+        if base is None or pointing is None or self._bare is None:
+            return found
+        scene, correction = self.scene(found.members), np.zeros_like(self.pair.a)
+        assert scene is not None
+        if scene is not base:
+            correction += scene.sampled(pointing, base.window) - self._sampled - (scene.maps() - self._bare)
+        for difference, value in found.members:
+            exact = difference.sampled(value, scene, self.pair)
+            if exact is not None:
+                correction += exact - (difference.maps(self.pair.a, value, self.state(())) - self.pair.a)
+        if not correction.any():
+            return found
+        correction = np.where(self.pair.seen, correction, 0.0)
+        return Set(found.members, self.left(found.members, correction), correction)

@@ -1,0 +1,157 @@
+"""The sky that the maps of side A show: sharpened sample by sample, and freed of noise."""
+
+from dataclasses import replace
+
+import healpy
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.linalg import LinearOperator, cg
+
+from mcsim.comparison.pairs import ChannelPair
+from mcsim.comparison.scene import WEAKEST, Alm, Maps, Scene, sky_in
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix
+
+NOISY = 0.02
+"""Noise over the sky from which on it is filtered out of the sky that maps show."""
+
+UNSHOWN = 1e-3
+"""The same where single samples are simulated: what is left then is noise, or of a sky that holes hide."""
+
+NEAR = 5
+"""Degrees over which power is averaged."""
+
+ROUNDS = 2
+"""How often the sky is corrected for what its simulation leaves of the maps."""
+
+ITERATIONS = 100
+"""Largest number of steps of the filter."""
+
+
+def with_shown_sky(pair: ChannelPair) -> ChannelPair:
+    """Return a pair whose sky, if it is taken from side A, makes its maps sample by sample, but for their noise."""
+    if pair.scene is None or not pair.sky_of_maps:
+        return pair
+    pair = _sharper(pair)
+    weight = _weight(pair)
+    return pair if weight is None else _filtered(pair, weight)
+
+
+def _made(pair: ChannelPair, scene: Scene) -> Maps:
+    pointing = pair.pointing()
+    return scene.maps() if pointing is None else scene.sampled(pointing, scene.window)
+
+
+def _sharper(pair: ChannelPair) -> ChannelPair:
+    scene = pair.scene
+    if scene is None or (pair.pointing() is None and scene.offset_order < 2):
+        return pair
+    for _ in range(ROUNDS):
+        missing = np.where(pair.seen, pair.a - _made(pair, scene), 0.0)
+        empty = replace(scene.up_to_offsets(1), sky=np.zeros_like(scene.sky))
+        scene = replace(scene, sky=scene.sky + sky_in(missing, pair.seen, empty, 1e-2))
+    return replace(pair, scene=scene)
+
+
+def _weight(pair: ChannelPair) -> Maps | None:
+    """Return the inverse variance of the noise of every pixel, 1/uK^2, shape (split, npix); None without noise.
+
+    It is that of the difference of two splits, shared out as 1 over samples or evenly, whichever is more likely.
+    """
+    if pair.scene is None or pair.hits is None or len(pair.a) < 2 or pair.scene.preparations:
+        return None
+    seen = pair.seen[0] & pair.seen[1]
+    rest = (pair.a - _made(pair, pair.scene))[:2, seen]
+    mean = 0.5 * (pair.a[0] + pair.a[1])[seen]
+    least = NOISY if pair.pointing() is None else UNSHOWN
+    if not seen.any() or 0.5 * (rest[0] - rest[1]).std() < least * mean.std():
+        return None
+    found = []
+    for power in (1.0, 0.0):
+        shape = np.maximum(pair.hits, 1.0) ** power
+        spread = np.sum(1.0 / shape[:2, seen], axis=0)
+        variance = float(np.mean((rest[0] - rest[1]) ** 2 / spread))
+        found.append((float(np.mean(np.log(variance * spread))), np.where(pair.seen, shape / variance, 0.0)))
+    return min(found, key=lambda one: one[0])[1]
+
+
+def _filtered(pair: ChannelPair, weight: Maps) -> ChannelPair:
+    """Return a pair whose sky is the mean of what it may be, its noise given, with a draw of how far off that may be.
+
+    Notes
+    -----
+    A Wiener filter with weights of every pixel (Gaussian constrained realizations: Hoffman & Ribak 1991, ApJ 380, L5).
+    The power of the sky is that of the maps less that of the noise.
+    """
+    scene = pair.scene
+    assert scene is not None
+    lmax = min(scene.lmax, 3 * pair.nside - 1)
+    factor = scene.response.factors[0].real[: lmax + 1]
+    known = factor > WEAKEST * factor.max()
+    inverse = np.divide(1.0, factor, out=np.zeros_like(factor), where=known)
+    total = weight.sum(axis=0)
+    noise = healpy.nside2pixarea(pair.nside) / np.mean(total[total > 0.0])
+    near = np.ones(NEAR) / NEAR
+    shown = healpy.alm2cl(alm_.multiply(alm_.resize(scene.sky, scene.lmax, lmax), factor, lmax))
+    power = np.maximum(np.convolve(shown, near, "same") - noise, 1e-3 * noise) * known
+
+    def sky_of(values: NDArray[np.float64]) -> Alm:
+        smooth = _wiener(values, total, power, scene.nthreads)
+        return alm_.resize(alm_.multiply(smooth, inverse, lmax), lmax, scene.lmax)
+
+    def seen_by_circle(sky: Alm) -> NDArray[np.float64]:
+        smooth = alm_.multiply(alm_.resize(sky, scene.lmax, lmax), factor, lmax)
+        return healpix.synthesis(smooth[None], pair.nside, lmax, nthreads=scene.nthreads)[0]
+
+    sky = scene.sky
+    for _ in range(ROUNDS):
+        rest = np.where(pair.seen, pair.a - _made(pair, replace(scene, sky=sky)), 0.0)
+        sky = sky_of(np.sum(weight * rest, axis=0) + total * seen_by_circle(sky))
+    draw = np.random.default_rng(0)
+    other = _draw(power, draw)
+    values = total * healpix.synthesis(other[None], pair.nside, lmax, nthreads=scene.nthreads)[0]
+    other = alm_.resize(alm_.multiply(other, inverse, lmax), lmax, scene.lmax)
+    doubt = other - sky_of(values + np.sqrt(total) * draw.standard_normal(total.size))
+    return replace(pair, scene=replace(scene, sky=sky), doubt=doubt)
+
+
+def _draw(power: NDArray[np.float64], draw: np.random.Generator) -> Alm:
+    """Return Gaussian coefficients with a power spectrum."""
+    lmax = power.size - 1
+    real, imaginary = draw.standard_normal((2, alm_.size(lmax)))
+    alm = np.where(alm_.orders(lmax) == 0, real, (real + 1j * imaginary) / np.sqrt(2.0))
+    return alm_.multiply(alm, np.sqrt(power), lmax)
+
+
+def _wiener(
+    weighted: NDArray[np.float64], weight: NDArray[np.float64], power: NDArray[np.float64], nthreads: int
+) -> Alm:
+    """Return the mean of the coefficients whose map, times a weight, was ``weighted`` but for noise.
+
+    Parameters
+    ----------
+    weighted, weight
+        Map times inverse variance of the noise, and that; shape (npix,).
+    power
+        Of the sky, shape (lmax + 1,).
+    """
+    lmax, nside = power.size - 1, healpy.npix2nside(weight.size)
+    size = np.sqrt(np.where(alm_.orders(lmax) == 0, 1.0, 2.0))  # so that the product of vectors is that of maps
+
+    def of_map(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        alm = healpix.adjoint(values, lmax, nthreads)
+        return (size * alm_.multiply(alm, np.sqrt(power), lmax)).view(np.float64)
+
+    def to_alm(vector: NDArray[np.float64]) -> Alm:
+        return alm_.multiply(np.ascontiguousarray(vector).view(np.complex128) / size, np.sqrt(power), lmax)
+
+    def applied(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+        return vector + of_map(weight * healpix.synthesis(to_alm(vector)[None], nside, lmax, nthreads=nthreads)[0])
+
+    diagonal = 1.0 + np.repeat(power[alm_.degrees(lmax)], 2) * weight.sum() / (4.0 * np.pi)
+    shape = (diagonal.size, diagonal.size)
+    found, _ = cg(
+        LinearOperator(shape, matvec=applied, dtype=np.float64), of_map(weighted), rtol=1e-6, maxiter=ITERATIONS,
+        M=LinearOperator(shape, matvec=lambda v: v / diagonal, dtype=np.float64),
+    )  # fmt: skip
+    return to_alm(found)

@@ -1,0 +1,25 @@
+"""Free-form reconstruction of what a simulation lacks: a small grammar, its search, and effects of its forms."""
+
+from mcsim.reconstruction.forms import (
+    AddedPattern,
+    AddedToSamples,
+    BeamOrder,
+    GainOverTime,
+    GainPattern,
+    NoisePattern,
+    RotatedSky,
+    SkyPower,
+    SquaredSignal,
+)
+
+__all__ = [
+    "AddedPattern",
+    "AddedToSamples",
+    "BeamOrder",
+    "GainOverTime",
+    "GainPattern",
+    "NoisePattern",
+    "RotatedSky",
+    "SkyPower",
+    "SquaredSignal",
+]

@@ -1,0 +1,298 @@
+"""Effects of free form: each is a stage of the simulation at which numbers that were found, not physics, act.
+
+A reconstruction writes a class derived from one of these, with its numbers as class variables. Its only parameter is
+``amplitude``: 1 as it was found, 0 absent. Patterns on the sky are real coefficients in the frame of the maps
+(:mod:`mcsim.sphere.real`).
+"""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import pairwise
+from typing import ClassVar, Literal
+
+import ducc0
+import healpy
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.errors import InputError
+from mcsim.instrument.beams import Beam
+from mcsim.instrument.scan.model import SECONDS_PER_DAY
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix, real
+from mcsim.sphere.sky import dipole_alm
+from mcsim.systematics.base import Alm, Draw, Effect, Map, Site
+from mcsim.systematics.parametrization import Parametrization, Vector
+from mcsim.systematics.product import multiplied
+from mcsim.systematics.spacecraft import spin_phase
+
+REFERENCE_GHZ = 94.0
+_NSIDE = 128
+"""Of the map that a pattern of low degree is looked up in."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Form(Effect):
+    """Derive the forms from this class.
+
+    Attributes
+    ----------
+    frame
+        Of the maps for which the numbers hold; None: any.
+    """
+
+    name: ClassVar[str] = "form"
+    scope: ClassVar[Literal["channel", "common"]] = "channel"
+    unit = "1 = as found"
+    cause = "Not known: reconstructed from data."
+    signature = "As reconstructed."
+    step = 1.0
+    proposed = False
+    parametrization = Parametrization(matched_filter=False)
+    frame: ClassVar[str | None] = None
+
+    def check_frame(self, site: Site) -> None:
+        """Raise InputError for maps in another frame than that of the numbers."""
+        if self.frame is not None and site.frame != self.frame:
+            raise InputError(
+                f"effect {self.name} was reconstructed in the {self.frame} frame, but the maps are {site.frame}; "
+                f'simulate with map.frame = "{self.frame}".'
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AddedPattern(Form):
+    """A pattern fixed to the sky is added, uK, times (frequency / 94 GHz)^``index``."""
+
+    coefficients: ClassVar[tuple[float, ...]]
+    index: ClassVar[float] = 0.0
+
+    def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
+        """Add the pattern."""
+        self.check_frame(site)
+        factor = self.amplitude
+        if self.index:
+            factor *= (site.frequency(self.name) / REFERENCE_GHZ) ** self.index
+        return sky + factor * real.to_alm(np.array(self.coefficients), site.lmax)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GainPattern(Form):
+    """The gain has a pattern fixed to the sky: it acts on sky, on dipole, or on both."""
+
+    coefficients: ClassVar[tuple[float, ...]]
+    on_sky: ClassVar[bool] = True
+    on_dipole: ClassVar[bool] = True
+
+    def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
+        """Add what the gain multiplies."""
+        self.check_frame(site)
+        seen = sky if self.on_sky else np.zeros_like(sky)
+        if self.on_dipole:
+            seen = seen + dipole_alm(site.dipole_uk, site.lmax)
+        values, degree = np.array(self.coefficients), int(np.sqrt(len(self.coefficients))) - 1
+        return sky + self.amplitude * multiplied(seen, site.lmax, lambda *n: real.field(values, *n), degree)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RotatedSky(Form):
+    """The sky is turned by a small vector, radians: its gradient along a rotation is added."""
+
+    rotation: ClassVar[tuple[float, float, float]]
+
+    def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
+        """Add the change of sky and dipole."""
+        self.check_frame(site)
+        whole = sky + dipole_alm(site.dipole_uk, site.lmax)
+        changes = (w * turned for w, turned in zip(self.rotation, rotations(whole, site.lmax), strict=True))
+        return sky + self.amplitude * sum(changes, start=np.zeros_like(sky))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SquaredSignal(Form):
+    """The signal has its square added, times ``per_uk``: that of sky and dipole, or of the sky alone."""
+
+    per_uk: ClassVar[float]
+    on_dipole: ClassVar[bool] = True
+
+    def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
+        """Add the square, up to the sky's own degree."""
+        whole = sky + dipole_alm(site.dipole_uk, site.lmax) if self.on_dipole else sky
+        return sky + self.amplitude * self.per_uk * squared(whole, site.lmax)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SkyPower(Form):
+    """The power of the sky is larger by ``values``, a fraction, in ranges of degrees that start at ``edges``."""
+
+    scope = "common"
+    edges: ClassVar[tuple[int, ...]]
+    values: ClassVar[tuple[float, ...]]
+
+    def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
+        """Multiply the coefficients."""
+        more = self.amplitude * steps(self.edges, self.values, site.lmax).real
+        return alm_.multiply(sky, np.sqrt(np.maximum(1.0 + more, 0.0)), site.lmax)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BeamOrder(Form):
+    """The order m of the beam changes by value * B_l (l / lmax)^max(m, 1), in ranges of degrees from ``edges`` on.
+
+    ``edges`` has one number more than ``values``: the last is ``top`` + 1.
+    """
+
+    order: ClassVar[int]
+    edges: ClassVar[tuple[int, ...]]
+    values: ClassVar[tuple[complex, ...]]
+    top: ClassVar[int]
+
+    def beam(self, beam: Beam, site: Site) -> Beam:
+        """Add to one row of b_lm."""
+        blm = np.zeros((max(beam.mmax, self.order) + 1, beam.lmax + 1), dtype=np.complex128)
+        blm[: beam.mmax + 1] = beam.blm
+        ell = np.arange(beam.lmax + 1.0)
+        kernel = site.beam.blm[0].real * (ell / self.top) ** max(self.order, 1)
+        change = self.amplitude * steps(self.edges, self.values, beam.lmax) * kernel
+        change[: self.order] = 0.0
+        blm[self.order] += change
+        return replace(beam, blm=blm)
+
+
+@dataclass(frozen=True, kw_only=True)
+class InTime(Form):
+    """Derive forms that depend on time from this class.
+
+    Attributes
+    ----------
+    wave
+        "": constant; "spin": ``harmonic`` times the spin phase; "year"; "orientation": ``harmonic`` times psi; "sky":
+        a pattern.
+    coefficients
+        Of cosine and sine, or of the pattern, or the constant.
+    splits
+        Factor in each of as many equal parts of the survey's time.
+    """
+
+    wave: ClassVar[str] = ""
+    harmonic: ClassVar[int] = 1
+    coefficients: ClassVar[tuple[float, ...]]
+    splits: ClassVar[tuple[float, ...]] = (1.0,)
+
+    def factor(self, time_s: Vector, site: Site) -> Vector:
+        """Return the factor of the split that each time is in."""
+        if len(set(self.splits)) == 1:
+            return np.full(len(time_s), self.splits[0])
+        whole = site.pointed(self.name).model.duration_days * SECONDS_PER_DAY
+        place = np.floor(np.asarray(time_s) / whole * len(self.splits)).astype(int)
+        return np.array(self.splits)[np.clip(place, 0, len(self.splits) - 1)]
+
+    def over_time(self, time_s: Vector, psi: Vector | None, site: Site) -> Vector:
+        """Return constant or wave."""
+        if not self.wave:
+            return np.full(len(time_s), self.coefficients[0])
+        if self.wave == "spin":
+            phase = self.harmonic * spin_phase(site.pointed(self.name), time_s)
+        elif self.wave == "year":
+            phase = 2.0 * np.pi * time_s / site.pointed(self.name).model.orbit_period_s
+        else:
+            assert psi is not None
+            phase = self.harmonic * psi
+        return np.asarray(self.coefficients[0] * np.cos(phase) + self.coefficients[1] * np.sin(phase))
+
+
+@dataclass(frozen=True, kw_only=True)
+class AddedToSamples(InTime):
+    """Samples have a signal added, uK, whatever the sky: a wave, or a pattern in some splits."""
+
+    def signal(self, time_s: Vector, theta: Vector, phi: Vector, psi: Vector, site: Site) -> Vector:
+        """Return the signal."""
+        if self.wave == "sky":
+            self.check_frame(site)
+            value = _map_of(self.coefficients)[healpy.ang2pix(_NSIDE, theta, phi)]
+        else:
+            value = self.over_time(time_s, psi, site)
+        return np.asarray(self.amplitude * self.factor(time_s, site) * value)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GainOverTime(InTime):
+    """The gain of sky and dipole varies in time: a wave, or a constant in some splits."""
+
+    def gain(self, time_s: Vector, site: Site) -> Vector | None:
+        """Return the error of the gain."""
+        if self.amplitude == 0.0:
+            return None
+        return np.asarray(self.amplitude * self.factor(time_s, site) * self.over_time(time_s, None, site))
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoisePattern(Form):
+    """The variance of the noise is larger by a pattern on the sky, as a fraction."""
+
+    coefficients: ClassVar[tuple[float, ...]]
+
+    def noise(self, site: Site) -> Map | None:
+        """Return one plus the pattern, at least zero."""
+        if self.amplitude == 0.0:
+            return None
+        self.check_frame(site)
+        n = healpy.pix2vec(site.nside, np.arange(12 * site.nside**2))
+        return np.maximum(1.0 + self.amplitude * real.field(np.array(self.coefficients), *n), 0.0)
+
+
+def steps(edges: tuple[int, ...], values: tuple[complex, ...], lmax: int) -> NDArray[np.complex128]:
+    """Return the function of l that has a value between each two edges, and is 0 elsewhere, shape (lmax + 1,)."""
+    found = np.zeros(lmax + 1, dtype=np.complex128)
+    for (low, high), value in zip(pairwise(edges), values, strict=True):
+        found[low:high] = value
+    return found
+
+
+def rotations(alm: Alm, lmax: int) -> tuple[Alm, Alm, Alm]:
+    """Return the changes of a map when it is turned about x, y and z, per radian.
+
+    Notes
+    -----
+    T(n) goes to T(n - omega x n): a change of -i omega . L a, with L_z a_lm = m a_lm and (L_+- a)_lm =
+    sqrt(l (l + 1) - m (m -+ 1)) a_{l, m -+ 1}.
+    """
+    degree, order = alm_.degrees(lmax).astype(float), alm_.orders(lmax)
+    up, down = np.zeros_like(alm), np.zeros_like(alm)
+    for m in range(lmax + 1):
+        here = slice(alm_.start(lmax, m) + m, alm_.start(lmax, m) + lmax + 1)
+        if m:
+            below = alm[alm_.start(lmax, m - 1) + m : alm_.start(lmax, m - 1) + lmax + 1]
+        else:  # a_{l,-1} = -conj(a_l1)
+            below = np.append(0.0, -np.conj(alm[alm_.start(lmax, 1) + 1 : alm_.start(lmax, 1) + lmax + 1]))
+        ell = degree[here]
+        up[here] = np.sqrt(np.maximum(ell * (ell + 1) - m * (m - 1), 0.0)) * below
+        above = np.zeros(len(ell), dtype=np.complex128)
+        if m < lmax:
+            above[1:] = alm[alm_.start(lmax, m + 1) + m + 1 : alm_.start(lmax, m + 1) + lmax + 1]
+        down[here] = np.sqrt(np.maximum(ell * (ell + 1) - m * (m + 1), 0.0)) * above
+    return -0.5j * (up + down), -0.5 * (up - down), -1j * order * alm
+
+
+def squared(alm: Alm, lmax: int) -> Alm:
+    """Return the coefficients, up to ``lmax``, of the square of a map, on Gauss-Legendre rings that hold it."""
+    options = {"lmax": lmax, "spin": 0, "geometry": "GL", "nthreads": 1}
+    rings = (3 * lmax) // 2 + 2
+    values = ducc0.sht.synthesis_2d(alm=alm[None], ntheta=rings, nphi=2 * rings, **options)
+    return np.asarray(ducc0.sht.analysis_2d(map=values**2, **options))[0]
+
+
+@lru_cache(maxsize=4)
+def _map_of(coefficients: tuple[float, ...]) -> Map:
+    top = int(np.sqrt(len(coefficients))) - 1
+    return np.asarray(healpix.synthesis(real.to_alm(np.array(coefficients), top)[None], _NSIDE, top)[0])
+
+
+FORMS: dict[str, type[Form]] = {
+    kind.__name__: kind
+    for kind in (
+        AddedPattern, GainPattern, RotatedSky, SquaredSignal, SkyPower, BeamOrder, AddedToSamples, GainOverTime,
+        NoisePattern,
+    )
+}  # fmt: skip
+"""The forms by the name of their class."""

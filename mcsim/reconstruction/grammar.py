@@ -1,0 +1,244 @@
+"""The grammar: every structure that a reconstruction can say, with the scores that measure it.
+
+A structure acts at a stage (added to the signal, a gain, the beam, a square, a rotation, the noise, the sky), in a
+frame (sky, scan, spacecraft, time), in one channel or all, and in the splits alike, oppositely, or in one of them.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.reconstruction.forms import REFERENCE_GHZ
+from mcsim.reconstruction.scores import GAIN, ORDERS, Key, Scene
+from mcsim.sphere import real
+from mcsim.sphere.rotation import rotation_matrix
+from mcsim.support.arrays import Matrix, Vector
+
+ALIKE, OPPOSITE = "alike", "opposite"
+
+ALSO_COMMON = ("monopole", "dipole")
+"""Patterns that all channels may have alike: skies of a model have none of them."""
+
+INDICES = (-3.0, -2.0, 1.5)
+"""Power of the frequency, in thermodynamic units, of signals of several channels: synchrotron, free-free, dust."""
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """One structure of the grammar.
+
+    Attributes
+    ----------
+    stage
+        "added", "gain", "beam", "square", "rotation", "noise", "power" or "modulation".
+    acts_on
+        What it multiplies: "sky", "dipole", "sky and dipole", or "" if nothing.
+    frame
+        "sky", "scan", "spacecraft", "time", or "" for noise and for the sky's own power.
+    kind
+        What varies: "monopole", "degrees 0-2", "latitude ecliptic", "order 2", "year", "spin 1", "constant", ...
+    channel
+        Name; None: all of them.
+    split
+        "alike", "opposite", or the name of the only split that has it.
+    index
+        Power of the frequency of what is added to all channels; None: it is not scaled.
+    rows, weights
+        Places of the scores, shape (K, maps), and the factor of each map, shape (maps,): a score of the structure is
+        their weighted sum over maps.
+    mix
+        Matrix from these sums to the coordinates, shape (coordinates, K); None: they are the coordinates.
+    views
+        Indices of the maps.
+    """
+
+    stage: str
+    acts_on: str
+    frame: str
+    kind: str
+    channel: str | None
+    split: str
+    index: float | None
+    rows: NDArray[np.int64] = field(repr=False)
+    weights: Vector = field(repr=False)
+    mix: Matrix | None = field(default=None, repr=False)
+    views: tuple[int, ...] = field(default=(), repr=False)
+
+    @property
+    def size(self) -> int:
+        """Return the number of coordinates."""
+        return len(self.rows) if self.mix is None else len(self.mix)
+
+    @property
+    def says(self) -> tuple[str, str, str, str, str | None, str, float | None]:
+        """Return all that it says, without its scores."""
+        return self.stage, self.acts_on, self.frame, self.kind, self.channel, self.split, self.index
+
+    def of(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the scores of the structure, shape (..., size), from all, shape (..., P)."""
+        found = (scores[..., self.rows] * self.weights).sum(axis=-1)
+        return found if self.mix is None else found @ self.mix.T
+
+    def within(self, split: int, splits: Sequence[int]) -> "Structure":
+        """Return the same, measured in the maps of one split; ``splits`` are those of all maps."""
+        kept = [k for k, view in enumerate(self.views) if splits[view] == split]
+        return Structure(
+            *self.says, self.rows[:, kept], self.weights[kept], self.mix, tuple(self.views[k] for k in kept)
+        )
+
+
+def structures(scene: Scene) -> tuple[Structure, ...]:
+    """Return every structure of the grammar for the maps of a survey."""
+    found = [*_of_maps(scene), *_of_channels(scene)]
+    ranges = range(len(scene.fine) - 1)
+    found.append(_plain(scene, "power", "", "", "power", None, [("power", b) for b in ranges]))
+    return tuple(found)
+
+
+def _plain(
+    scene: Scene, stage: str, acts_on: str, frame: str, kind: str, channel: str | None, keys: list[Key]
+) -> Structure:
+    rows = np.array([[scene.place[key]] for key in keys])
+    return Structure(stage, acts_on, frame, kind, channel, ALIKE, None, rows, np.ones(1))
+
+
+def _of_channels(scene: Scene) -> Iterator[Structure]:
+    """Yield the structures of a channel's noise, and of its power that is common to splits."""
+    _, ecliptic = _latitudes(scene.frame, 2)[0]
+    for c, name in enumerate(scene.channels):
+        keys: list[Key] = [("noise", c, j) for j in range(9)]
+        rows = np.array([[scene.place[key]] for key in keys])
+        mixes = {"level": np.eye(9)[:1], "latitude ecliptic": ecliptic[[0, 2]], "degrees 0-2": np.eye(9)}
+        for kind, mix in mixes.items():
+            yield Structure("noise", "", "", kind, name, ALIKE, None, rows, np.ones(1), mix)
+        if len(scene.of(c)) > 1:
+            ranges = range(len(scene.fine) - 1)
+            yield _plain(scene, "noise", "", "", "spectrum", name, [("difference", c, b) for b in ranges])
+            yield _plain(scene, "added", "", "sky", "power", name, [("common", c, b) for b in ranges])
+
+
+def _of_maps(scene: Scene) -> Iterator[Structure]:
+    """Yield the structures that are measured in maps, for one channel and for all."""
+    groups: list[tuple[str | None, tuple[int, ...]]] = [(name, scene.of(c)) for c, name in enumerate(scene.channels)]
+    if len(groups) > 1:
+        groups.append((None, tuple(range(len(scene.views)))))
+    for name, views in groups:
+        for split, factors in _splits(scene.splits):
+            kept = [i for i in views if factors[scene.views[i].split] != 0.0]
+            weights = np.array([factors[scene.views[i].split] for i in kept])
+            for stage, acts_on, frame, kind, keys, mix in _forms(scene, split, kept):
+                rows = np.array([[scene.place[(*key[:1], i, *key[1:])] for i in kept] for key in keys])
+                if name is None and (frame == "sky" or stage == "square") and kind not in ALSO_COMMON:
+                    continue  # what all channels see alike is the sky itself, which the model knows as random
+                yield Structure(stage, acts_on, frame, kind, name, split, None, rows, weights, mix, tuple(kept))
+        yield from _high_orders(scene, name, views)
+    yield from _modulations(scene)
+    if len({f for f in scene.frequencies if f is not None}) > 1 and None not in scene.frequencies:
+        yield from _scaled(scene)
+
+
+def _splits(splits: Sequence[str]) -> Iterator[tuple[str, tuple[float, ...]]]:
+    yield ALIKE, (1.0,) * len(splits)
+    if len(splits) == 2:
+        yield OPPOSITE, (1.0, -1.0)
+    if len(splits) > 1:
+        for k, name in enumerate(splits):
+            yield name, tuple(float(j == k) for j in range(len(splits)))
+
+
+_Form = tuple[str, str, str, str, list[Key], Matrix | None]
+
+
+def _forms(scene: Scene, split: str, kept: list[int]) -> Iterator[_Form]:
+    """Yield stage, what it acts on, frame, kind, keys without the map, and mix."""
+    view = scene.views[kept[0]]
+    yield from _added(scene)
+    for s in range(1, len(view.w[:ORDERS]) + 1):
+        yield "added", "", "spacecraft", f"orientation {s}", [("orientation", s, c) for c in (0, 1)], None
+    for name in view.waves:
+        yield "added", "", "time", name, [("wave", name, c) for c in (0, 1)], None
+    yield "gain", "sky and dipole", "", "constant", [("gain", 0)], None
+    for s in range(min(scene.split_orders, len(view.w)) + 1):
+        for kind, mix in _profiles(scene, s):
+            yield "beam", "sky", "scan", kind, _beam(scene, s), mix
+    if split != ALIKE:
+        return
+    top = min(GAIN, scene.lmax)
+    for acts_on, key in (("sky and dipole", "gain"), ("sky", "gain of the sky")):
+        if key != "gain":
+            yield "gain", acts_on, "", "constant", [(key, 0)], None
+        for degree in range(1, top + 1):
+            rows: list[Key] = [(key, j) for j in range((degree + 1) ** 2)]
+            yield "gain", acts_on, "sky", f"degrees 0-{degree}", rows, None
+    yield "gain", "dipole", "", "constant", [("dipole",)], None
+    for name in view.waves:
+        yield "gain", "sky and dipole", "time", name, [("gain wave", name, c) for c in (0, 1)], None
+    yield "square", "sky and dipole", "", "square", [("square",)], None
+    yield "square", "sky", "", "square", [("square of the sky",)], None
+    yield "rotation", "sky and dipole", "sky", "rotation", [("rotation", axis) for axis in range(3)], None
+
+
+def _added(scene: Scene) -> Iterator[_Form]:
+    """Yield patterns on the sky that are added: of few degrees, and zonal ones."""
+    yield "added", "", "sky", "monopole", [("added", 0)], None
+    yield "added", "", "sky", "dipole", [("added", j) for j in (1, 2, 3)], None
+    for degree in sorted({min(top, scene.degree) for top in (2, 4, scene.degree)}):
+        yield "added", "", "sky", f"degrees 0-{degree}", [("added", j) for j in range((degree + 1) ** 2)], None
+    keys: list[Key] = [("added", j) for j in range((scene.degree + 1) ** 2)]
+    for kind, zonal in _latitudes(scene.frame, scene.degree):
+        yield "added", "", "sky", kind, keys, zonal
+
+
+def _latitudes(frame: str, top: int) -> list[tuple[str, Matrix]]:
+    """Return the real coefficients of patterns of one latitude alone, by what they are called."""
+    poles = {name: rotation_matrix(frame, name)[2] for name in ("ecliptic", "galactic")}
+    return [(f"latitude {name}", real.zonal(pole, top)) for name, pole in poles.items()]
+
+
+def _beam(scene: Scene, s: int) -> list[Key]:
+    ranges = range(len(scene.edges(max(s, 1))) - 1)
+    return [("beam", s, b, c) for b in ranges for c in ((0, 1) if s else (0,))]
+
+
+def _profiles(scene: Scene, s: int) -> list[tuple[str, Matrix | None]]:
+    """Return the profiles of a change of a beam at order s, by what they are called: free in ranges, or a power of l.
+
+    The power is s, as for the derivatives of a Gaussian, and 2 for s = 0, as for its width.
+    """
+    edges = np.array(scene.edges(max(s, 1)), dtype=float)
+    middle = np.sqrt(edges[:-1] * (edges[1:] - 1.0))
+    shape = np.ones(len(middle)) if s else middle / scene.lmax
+    mix: Matrix = np.kron(shape, np.eye(2 if s else 1)).astype(np.float64)
+    return [(f"order {s} as l^{s or 2}", mix), (f"order {s}", None)]
+
+
+def _high_orders(scene: Scene, name: str | None, views: tuple[int, ...]) -> Iterator[Structure]:
+    """Yield the orders of a beam that are measured in the sum of a channel's maps, which stands in its first."""
+    first = [i for i in views if i == scene.of(scene.views[i].channel)[0]]
+    for s in range(scene.split_orders + 1, min(ORDERS, len(scene.views[views[0]].w)) + 1):
+        rows = np.array([[scene.place[(*key[:1], i, *key[1:])] for i in first] for key in _beam(scene, s)])
+        for kind, mix in _profiles(scene, s):
+            yield Structure("beam", "sky", "scan", kind, name, ALIKE, None, rows, np.ones(len(first)), mix)
+
+
+def _modulations(scene: Scene) -> Iterator[Structure]:
+    """Yield patterns that multiply the sky itself: in all channels alike, without the dipole, of one degree each."""
+    views = tuple(range(len(scene.views)))
+    for degree in range(1, min(GAIN, scene.lmax) + 1):
+        places = range(degree**2, (degree + 1) ** 2)
+        rows = np.array([[scene.place["gain of the sky", i, j] for i in views] for j in places])
+        ones = np.ones(len(views))
+        yield Structure("modulation", "sky", "sky", f"degree {degree}", None, ALIKE, None, rows, ones, None, views)
+
+
+def _scaled(scene: Scene) -> Iterator[Structure]:
+    """Yield what is added to all channels in proportion to a power of the frequency."""
+    frequencies = np.array([scene.frequencies[view.channel] or REFERENCE_GHZ for view in scene.views])
+    views = tuple(range(len(scene.views)))
+    for index in INDICES:
+        weights = (frequencies / REFERENCE_GHZ) ** index
+        for stage, acts_on, frame, kind, keys, mix in _added(scene):
+            rows = np.array([[scene.place[(*key[:1], i, *key[1:])] for i in views] for key in keys])
+            yield Structure(stage, acts_on, frame, kind, None, ALIKE, index, rows, weights, mix, views)

@@ -1,0 +1,147 @@
+"""From a structure and its coordinates to an effect: as a class for the simulator, and as a Python file."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pprint import pformat
+from typing import Any
+
+import numpy as np
+
+from mcsim.reconstruction.forms import FORMS, Form
+from mcsim.reconstruction.grammar import ALIKE, OPPOSITE, Structure
+from mcsim.reconstruction.scores import Scene
+from mcsim.support.arrays import Vector
+
+CONSTANT = float(np.sqrt(4.0 * np.pi))
+"""Real coefficient of degree 0 of a map that is one everywhere."""
+
+_FILE = '''"""{sentence}
+
+Written by mcsim diagnose from the data: no physics. Use it in a run,
+
+    [[effect]]
+    name = "{name}.py"{channel}
+    amplitude = 1.0
+
+propose it in a diagnosis with mcsim diagnose --with {name}.py, or offer it under the entry points mcsim.effects.
+"""
+
+from dataclasses import dataclass
+
+from mcsim.reconstruction import {base}
+
+
+@dataclass(frozen=True, kw_only=True)
+class {title}({base}):
+    """As it was found at amplitude 1."""
+
+{body}
+'''
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """An effect of a form: the name of its base class, and its class variables."""
+
+    name: str
+    base: str
+    channel: str | None
+    values: dict[str, Any]
+
+    def kind(self) -> type[Form]:
+        """Return the class."""
+        values = {"__module__": __name__, "__annotations__": {}, "name": self.name, **self.values}
+        made: type[Form] = dataclass(frozen=True, kw_only=True)(type(self.name, (FORMS[self.base],), values))
+        return made
+
+    def scaled(self, factor: float) -> "Plugin":
+        """Return the effect with ``factor`` times the numbers that its amplitude multiplies."""
+        key = next(k for k in ("coefficients", "values", "rotation", "per_uk") if k in self.values)
+        old = self.values[key]
+        new = factor * old if isinstance(old, float) else tuple(factor * one for one in old)
+        return replace(self, values={**self.values, key: new})
+
+    def source(self, sentence: str) -> str:
+        """Return the text of a Python file that defines the effect."""
+        values = {"name": self.name, "signature": sentence, **self.values}
+        lines = [f"    {key} = {_literal(value)}" for key, value in values.items()]
+        channel = f'\n    channel = "{self.channel}"' if self.values.get("scope") != "common" else ""
+        title = "".join(part.capitalize() for part in self.name.split("_"))
+        text = {"sentence": sentence.replace("\\", ""), "name": self.name, "base": self.base, "title": title}
+        return _FILE.format(**text, channel=channel, body="\n".join(lines))
+
+
+def _literal(value: Any) -> str:
+    return pformat(value, width=100, compact=True).replace("\n", "\n    ")
+
+
+def plugin(name: str, structure: Structure, theta: Vector, scene: Scene) -> Plugin | None:
+    """Return the effect of a structure with fitted coordinates; None if no effect of the simulator can be like it.
+
+    These are powers of unknown patterns, beams that differ between splits, and what depends on time or orientation
+    where the pointing is not known.
+    """
+    made = _form(structure, theta, scene)
+    if made is None:
+        return None
+    base, values = made
+    if base in ("AddedToSamples", "GainOverTime") and not scene.timed:
+        return None
+    common = structure.channel is None and len(scene.channels) > 1
+    scope = {"scope": "common"} if common or base == "SkyPower" else {}
+    on_sky = base in ("AddedPattern", "GainPattern", "RotatedSky", "NoisePattern") or values.get("wave") == "sky"
+    frame = {"frame": scene.frame} if on_sky else {}
+    return Plugin(name, base, structure.channel or scene.channels[0], {**scope, **frame, **values})
+
+
+def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[str, Any]] | None:
+    """Return the name of the form, and its class variables."""
+    pattern, alike = _numbers(structure, theta), structure.split == ALIKE
+    splits = {} if alike else {"splits": _factors(structure.split, scene.splits)}
+    wave, _, harmonic = structure.kind.partition(" ")
+    timed: dict[str, Any] = {"wave": wave, "coefficients": tuple(map(float, theta)), **splits}
+    if structure.frame in ("spacecraft", "time"):
+        timed["harmonic"] = int(harmonic or 1)
+    match structure.stage, structure.frame:
+        case "added", "sky" if structure.kind != "power":
+            if alike:
+                return "AddedPattern", {"coefficients": pattern, "index": structure.index or 0.0}
+            return "AddedToSamples", {"wave": "sky", "coefficients": pattern, **splits}
+        case "added", "spacecraft" | "time":
+            return "AddedToSamples", timed
+        case "gain", "time":
+            return "GainOverTime", timed
+        case "gain", _ if not alike:
+            return "GainOverTime", {"coefficients": (float(theta[0]) / CONSTANT,), **splits}
+        case "gain", _:
+            one = (float(theta[0]) * CONSTANT,) if structure.acts_on == "dipole" else pattern
+            acting = {"on_sky": "sky" in structure.acts_on, "on_dipole": "dipole" in structure.acts_on}
+            return "GainPattern", {"coefficients": one, **acting}
+        case "beam", _ if alike:
+            order = int(structure.kind.split()[1])
+            values = tuple(map(complex, np.reshape(pattern, (-1, 2)) @ [1.0, 1j])) if order else pattern
+            edges = scene.edges(max(order, 1))
+            return "BeamOrder", {"order": order, "edges": edges, "top": scene.lmax, "values": values}
+        case "square", _:
+            return "SquaredSignal", {"per_uk": float(theta[0]), "on_dipole": "dipole" in structure.acts_on}
+        case "rotation", _:
+            return "RotatedSky", {"rotation": tuple(map(float, theta))}
+        case "noise", _ if structure.kind != "spectrum":
+            return "NoisePattern", {"coefficients": pattern}
+        case "power", _:
+            return "SkyPower", {"edges": scene.fine, "values": tuple(map(float, theta))}
+        case "modulation", _:
+            degree = int(structure.kind.split()[1])
+            pattern = (*(0.0,) * degree**2, *pattern)
+            return "GainPattern", {"coefficients": pattern, "on_sky": True, "on_dipole": False}
+    return None
+
+
+def _numbers(structure: Structure, theta: Vector) -> tuple[float, ...]:
+    """Return the real coefficients of a pattern."""
+    found = theta if structure.mix is None else structure.mix.T @ theta
+    return tuple(map(float, np.append(0.0, found) if structure.kind == "dipole" else found))
+
+
+def _factors(split: str, splits: Sequence[str]) -> tuple[float, ...]:
+    return (1.0, -1.0) if split == OPPOSITE else tuple(float(name == split) for name in splits)

@@ -1,0 +1,83 @@
+"""What a reconstruction says of one structure: typed, for reports, ``verdict.json`` and the command line."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from mcsim.support.numbers import measured, p_equals
+
+NSIDE = 16
+"""Of the pictures."""
+
+
+@dataclass(frozen=True)
+class Reconstructed:
+    """A structure that no effect of the library makes.
+
+    Attributes
+    ----------
+    stage, acts_on, frame, kind, channel, split, index
+        What it is, in the words of the grammar (:class:`mcsim.reconstruction.grammar.Structure`).
+    says
+        The same in plain words.
+    pvalue, delta_chi2
+        Global p-value, all of the grammar charged, and unbiased fall of chi^2.
+    coordinates
+        Number of numbers that describe it.
+    rms_uk
+        Of what it adds to the maps that it acts in, uK; None if no effect can be like it.
+    relative_error
+        Of its amplitude.
+    cause
+        A known effect that makes such structures, with its reference; "" if none.
+    alternatives
+        Structures that are less probable by a factor of 20 at most, in plain words.
+    profile
+        First and last degree, size and error of its profile in l; empty without one.
+    picture
+        What it adds to one map, uK, RING, nside 16, and the name of that map; empty if not known.
+    name, file
+        Of the effect, and the text of the Python file that defines it; None if no effect can be like it.
+    """
+
+    stage: str
+    acts_on: str
+    frame: str
+    kind: str
+    channel: str | None
+    split: str
+    index: float | None
+    says: str
+    pvalue: float
+    delta_chi2: float
+    coordinates: int
+    rms_uk: float | None
+    relative_error: float
+    cause: str
+    alternatives: tuple[str, ...]
+    profile: tuple[tuple[int, int, float, float], ...]
+    picture: tuple[float, ...]
+    picture_of: str
+    name: str | None
+    file: str | None
+
+    @property
+    def sentence(self) -> str:
+        """Return what is missing, how large it is and how significant."""
+        text = self.says[:1].upper() + self.says[1:]
+        size = "" if self.rms_uk is None else f": {measured(self.rms_uk, self.rms_uk * self.relative_error, ' µK')} rms"
+        return f"{text}{size} ({p_equals(self.pvalue)})."
+
+    def to_json(self) -> dict[str, Any]:
+        """Return its entry of ``verdict.json``."""
+        left_out = ("picture", "picture_of", "file", "says")
+        plain = {key: value for key, value in asdict(self).items() if key not in left_out}
+        keys = ("ell_min", "ell_max", "size", "sigma")
+        profile = [dict(zip(keys, row, strict=True)) for row in self.profile]
+        file = None if self.file is None else f"{self.name}.py"
+        return {
+            "sentence": self.sentence,
+            **plain,
+            "alternatives": list(self.alternatives),
+            "profile": profile,
+            "file": file,
+        }

@@ -1,0 +1,254 @@
+"""Scores of elementary structures in filtered maps: how strongly each looks to be there, before any fit.
+
+The score of a structure t_i, what it adds to map i, is sum_i <r_i, t_i> with r_i the residual over its noise variance:
+the derivative of the log-likelihood in its amplitude. Structures that act on the sky are computed from the filtered
+sky. Scores of variances and powers are such derivatives too.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Protocol
+
+import ducc0
+import healpy
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.reconstruction.forms import rotations
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix, real
+from mcsim.sphere.sky import dipole_alm
+from mcsim.support.arrays import Alm, Cl, Map, Vector
+
+ADDED, GAIN = 8, 2
+"""Highest degree of patterns that are added, and of those that multiply."""
+
+ORDERS = 4
+"""Highest order of a beam, and of what follows its orientation."""
+
+BINS = 4
+"""Ranges of degrees of a profile in l, equal in log l."""
+
+Key = tuple[str | int, ...]
+
+
+class Filtered(Protocol):
+    """Maps after a filter, as the filter of a diagnosis returns them."""
+
+    @property
+    def sky(self) -> Alm:
+        """Return the filtered sky, uK, shape (size,)."""
+
+    @property
+    def expected(self) -> NDArray[np.float64]:
+        """Return it as each map would show it, shape (map, npix)."""
+
+    @property
+    def residual(self) -> NDArray[np.float64]:
+        """Return the residuals over their noise variance, shape (map, npix)."""
+
+    @property
+    def adjoint(self) -> NDArray[np.complex128]:
+        """Return the adjoint synthesis of the residuals, shape (map, size)."""
+
+    @property
+    def orders(self) -> NDArray[np.complex128]:
+        """Return the products of residuals and sky by order and degree, shape (map, orders, lmax + 1)."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Describe one map.
+
+    Attributes
+    ----------
+    channel, split
+        Indices.
+    w
+        Orientation moments, shape (smax, npix).
+    waves
+        Means over the samples of every pixel of the cosine and sine of waves, by their names.
+    response
+        B_l w_l of the channel, shape (lmax + 1,).
+    kernel
+        b_l0 of its beam, shape (lmax + 1,).
+    """
+
+    channel: int
+    split: int
+    w: NDArray[np.complex128]
+    waves: Mapping[str, tuple[Map, Map]]
+    response: Cl
+    kernel: Cl
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Describe the maps of a survey, and name their scores.
+
+    Attributes
+    ----------
+    channels, frequencies, splits
+        Names, GHz or None, names ("" for the only one).
+    frame, nside, lmax
+        Of the maps and of the filtered sky.
+    dipole_uk
+        That the survey sees besides, shape (3,).
+    cl, sky_power
+        Spectrum of the sky, and that of the filtered sky over it, shape (lmax + 1,).
+    split_orders
+        Highest order of a beam that is measured in each map by itself.
+    views
+        Maps, channel by channel.
+    timed
+        True if it is known when and how every sample was pointed, and splits are spans of time.
+    """
+
+    channels: tuple[str, ...]
+    frequencies: tuple[float | None, ...]
+    splits: tuple[str, ...]
+    frame: str
+    nside: int
+    lmax: int
+    dipole_uk: Vector
+    cl: Cl
+    sky_power: Cl
+    split_orders: int
+    views: tuple[View, ...]
+    timed: bool
+
+    @property
+    def degree(self) -> int:
+        """Return the highest degree of patterns that are added."""
+        return min(ADDED, self.lmax)
+
+    def edges(self, first: int) -> tuple[int, ...]:
+        """Return where ranges of degrees from ``first`` on start, and lmax + 1."""
+        inner = np.geomspace(max(first, 2), self.lmax + 1, BINS + 1).round().astype(int)
+        return tuple(sorted({first, *map(int, inner)}))
+
+    @property
+    def fine(self) -> tuple[int, ...]:
+        """Return the ranges of powers: degrees whose patterns are not measured one by one, if there are enough."""
+        return self.edges(ADDED + 1 if self.lmax >= 2 * ADDED else 2)
+
+    def of(self, channel: int) -> tuple[int, ...]:
+        """Return the maps of a channel."""
+        return tuple(i for i, view in enumerate(self.views) if view.channel == channel)
+
+    @cached_property
+    def dipole(self) -> Map:
+        """Return the dipole in every pixel, uK."""
+        return self.dipole_uk @ np.stack(healpy.pix2vec(self.nside, np.arange(12 * self.nside**2)))
+
+    @cached_property
+    def keys(self) -> tuple[Key, ...]:
+        """Name the scores in the order of :meth:`values`."""
+        found: list[Key] = []
+        for i, view in enumerate(self.views):
+            found += [("added", i, j) for j in range((self.degree + 1) ** 2)]
+            for kind in ("gain of the sky", "gain"):
+                found += [(kind, i, j) for j in range((min(GAIN, self.lmax) + 1) ** 2)]
+            found += [("dipole", i), ("square of the sky", i), ("square", i)]
+            found += [("rotation", i, axis) for axis in range(3)]
+            found += [("orientation", i, s, c) for s in range(1, len(view.w[:ORDERS]) + 1) for c in (0, 1)]
+            found += [(kind, i, name, c) for kind in ("wave", "gain wave") for name in view.waves for c in (0, 1)]
+            for s in range(min(ORDERS, len(view.w)) + 1):
+                if s <= self.split_orders or i == self.of(view.channel)[0]:
+                    ranges = range(len(self.edges(max(s, 1))) - 1)
+                    found += [("beam", i, s, b, c) for b in ranges for c in ((0, 1) if s else (0,))]
+        for channel in range(len(self.channels)):
+            found += [("noise", channel, j) for j in range(9)]
+            if len(self.of(channel)) > 1:
+                found += [(kind, channel, b) for kind in ("difference", "common") for b in range(len(self.fine) - 1)]
+        found += [("power", b) for b in range(len(self.fine) - 1)]
+        return tuple(found)
+
+    @cached_property
+    def place(self) -> dict[Key, int]:
+        """Return the place of every score."""
+        return {key: row for row, key in enumerate(self.keys)}
+
+    @cached_property
+    def _patterns(self) -> NDArray[np.float64]:
+        """Return the real harmonics up to degree 2 in every pixel, shape (9, npix)."""
+        n = healpy.pix2vec(self.nside, np.arange(12 * self.nside**2))
+        return np.stack([real.field(unit, *n) for unit in np.eye(9)])
+
+    def values(self, filtered: Filtered, differences: Sequence[Map]) -> Vector:
+        """Return the scores, shape (len(keys),).
+
+        ``differences`` are u^2 - 1 of every pixel and channel, u the difference of its maps over the noise.
+        """
+        found: list[NDArray[np.float64]] = []
+        looked_at = filtered.sky + dipole_alm(self.dipole_uk, self.lmax)
+        turned = rotations(looked_at, self.lmax)
+        for i, view in enumerate(self.views):
+            r, sky, adjoint = filtered.residual[i], filtered.expected[i], filtered.adjoint[i]
+            whole = sky + self.dipole
+            found.append(real.coefficients(adjoint, self.lmax, self.degree))
+            top = min(GAIN, self.lmax)
+            found += [self._without_dipole(r, sky, adjoint, top), self._low(r * whole, top)]
+            found.append(np.array([r @ self.dipole, r @ sky**2, r @ whole**2]))
+            through = (alm_.multiply(one, view.response, self.lmax) for one in turned)
+            found.append(np.array([_product(adjoint, one, self.lmax) for one in through]))
+            found += [np.array([r @ w.real, -(r @ w.imag)]) for w in view.w[:ORDERS]]
+            for factor in (1.0, whole):
+                found += [np.array([(r * factor) @ wave for wave in pair]) for pair in view.waves.values()]
+            found += list(self._orders(view, filtered.orders[i], i))
+        for channel, difference in enumerate(differences):
+            found.append(0.5 * self._patterns @ difference)
+            if len(own := self.of(channel)) > 1:
+                a, b = filtered.adjoint[own[0]], filtered.adjoint[own[1]]
+                found += [self._powers(a - b, a - b), self._powers(a, b)]
+        return np.concatenate([*found, self._of_sky(filtered.sky)])
+
+    def _without_dipole(self, r: Map, sky: Map, adjoint: Alm, top: int) -> Vector:
+        """Return the scores of patterns times the sky, without what these products have of monopole and dipole.
+
+        The model's sky has none, so that they would be most of the score, and follow few modes of this very sky.
+        """
+        patterns = self._patterns[: (top + 1) ** 2]
+        area = 4.0 * np.pi / sky.size
+        leaks = area * (patterns * sky) @ self._patterns[:4].T
+        return self._low(r * sky, top) - leaks @ real.coefficients(adjoint, self.lmax, 1)
+
+    def _low(self, product: Map, top: int) -> Vector:
+        geometry = healpix.geometry(self.nside)
+        alm = ducc0.sht.adjoint_synthesis(map=product[None], spin=0, lmax=top, nthreads=1, **geometry)[0]
+        return real.coefficients(alm, top, top)
+
+    def _orders(self, view: View, orders: NDArray[np.complex128], i: int) -> list[Vector]:
+        ell, found = np.arange(self.lmax + 1), []
+        for s in range(min(ORDERS, len(view.w)) + 1):
+            if s > self.split_orders and i != self.of(view.channel)[0]:
+                continue
+            edges = self.edges(max(s, 1))
+            profile = orders[s] * view.kernel * (ell / self.lmax) ** max(s, 1)
+            for low, high in pairwise(edges):
+                total = profile[low:high].sum()
+                found.append(np.array([total.real, total.imag] if s else [total.real]))
+        return found
+
+    def _powers(self, a: Alm, b: Alm) -> Vector:
+        """Return the power in ranges of degrees."""
+        power = np.bincount(alm_.degrees(self.lmax), _twice(self.lmax) * (a * b.conj()).real, self.lmax + 1)
+        edges = self.fine
+        return np.array([power[low:high].sum() for low, high in pairwise(edges)])
+
+    def _of_sky(self, sky: Alm) -> Vector:
+        """Return the scores of the sky's power."""
+        inverse = np.divide(1.0, self.cl, out=np.zeros(self.lmax + 1), where=self.cl > 0.0)
+        weight = _twice(self.lmax) * np.abs(sky) ** 2
+        power = 0.5 * inverse * np.bincount(alm_.degrees(self.lmax), weight, self.lmax + 1)
+        return np.array([power[low:high].sum() for low, high in pairwise(self.fine)])
+
+
+def _twice(lmax: int) -> Vector:
+    return np.where(alm_.orders(lmax) == 0, 1.0, 2.0)
+
+
+def _product(a: Alm, b: Alm, lmax: int) -> float:
+    return float(np.sum(_twice(lmax) * (a.real * b.real + a.imag * b.imag)))

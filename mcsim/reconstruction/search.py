@@ -1,0 +1,265 @@
+"""Search of the grammar: which structures are there, how significant they are, and with which coordinates.
+
+Scores u of a structure of K coordinates have under the model the covariance C that is also their response to the
+coordinates, so that a fit needs no templates: theta = C^-1 u, and the fall of chi^2 is T = u' C^-1 u. C is estimated
+from simulations; the tests are exact for their number (:mod:`mcsim.stats.gaussian`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.reconstruction.grammar import ALIKE, Structure
+from mcsim.stats.gaussian import SimulatedGaussian
+from mcsim.support.arrays import Matrix, Vector
+
+LEVEL = 0.01
+"""Global p-value, all of the grammar charged, up to which a structure is there."""
+
+MOST = 3
+"""Largest number of structures."""
+
+SECOND = 0.1
+"""Least fall of chi^2 of a further structure over that of the first: below it may be the square of the first."""
+
+FINALISTS, NEAR, SPARE = 10, 5.0, 2
+"""Structures that are compared by their responses on the sky of the data: how many at most, within which difference of
+the evidence those of one stage and frame, and simulations for each of their scores."""
+
+RARE = 3.0
+"""Odds against a structure that is not alike in all splits, and against a gain or square of sky or dipole alone."""
+
+TAIL = 0.1
+"""Share of the simulations by which the tail of the largest evidence is described."""
+
+SMALL = 1e-6
+"""Variance, relative to the largest, of a direction in which scores are not inverted."""
+
+ALTERNATIVES = 20.0
+"""Odds up to which other structures are told beside the best."""
+
+
+class Sky(Protocol):
+    """What structures do on the sky of the data."""
+
+    def responses(self, members: Sequence[int], rest: Vector) -> list[Matrix]:
+        """Return what structures, fitted to scores, or each of their coordinates make of all scores, (k, P) each."""
+
+    def keep(self, member: int, amplitudes: Vector) -> None:
+        """Take the amplitudes of the responses of a structure for its own."""
+
+    def left(self, chosen: list[int]) -> Vector:
+        """Return the scores without what is made of them by structures, shape (P,)."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """A structure that is there.
+
+    Attributes
+    ----------
+    structure
+        Index in the grammar.
+    evidence
+        Logarithm of its odds against none, in what those found before it leave.
+    pvalue
+        Global p-value: probability that the best of all structures has as large an evidence in data of the model.
+    delta_chi2
+        Fall of chi^2, unbiased.
+    alternatives
+        Indices of structures less probable by ALTERNATIVES at most, the most probable first.
+    """
+
+    structure: int
+    evidence: float
+    pvalue: float
+    delta_chi2: float
+    alternatives: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """Search scores for structures; ``simulations`` are scores of the model, shape (N, P)."""
+
+    grammar: tuple[Structure, ...]
+    simulations: Matrix
+
+    @cached_property
+    def nulls(self) -> tuple[SimulatedGaussian | None, ...]:
+        """Return the null distribution of every structure; None for one that the maps do not measure."""
+        return tuple(self._null(one) for one in self.grammar)
+
+    def _rows(self, chosen: Sequence[int], scores: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.concatenate([self.grammar[k].of(scores) for k in chosen], axis=-1)
+
+    def _null(self, structure: Structure) -> SimulatedGaussian | None:
+        rows = structure.of(self.simulations)
+        spread = rows.std(axis=0)
+        if not np.all(spread > 1e-12 * max(float(np.abs(rows).max()), 1e-300)) or rows.shape[1] + 10 > len(rows):
+            return None
+        return SimulatedGaussian.from_simulations(rows)
+
+    @cached_property
+    def largest(self) -> Vector:
+        """Return the largest evidence over the grammar of every simulation against all others, shape (N,)."""
+        count, best = len(self.simulations), np.full(len(self.simulations), -np.inf)
+        for structure, null in zip(self.grammar, self.nulls, strict=True):
+            if null is None:
+                continue
+            white = (structure.of(self.simulations) - null.mean) @ null.whitening.T
+            a = np.sum(white**2, axis=1) / null.dof * count / (count - 1)
+            square = (null.dof - 1) * a / np.maximum(1.0 - a, 1e-12)
+            fall = square * (null.dof - null.dimension - 2) / (null.dof - 1)
+            best = np.maximum(best, evidence(fall, null.dimension) - _rarity(structure))
+        return best
+
+    def pvalue(self, value: float) -> float:
+        """Return the global p-value of an evidence: by rank, beyond the last TAIL of simulations exponential.
+
+        Notes
+        -----
+        The mean excess over a high quantile is the scale of an exponential tail (Pickands, Ann. Stat. 3, 119, 1975,
+        with shape 0); odds against none have such a tail, of scale 1 at most in theory (Markov's inequality).
+        """
+        null = np.sort(self.largest)
+        edge = float(np.quantile(null, 1.0 - TAIL))
+        if value <= edge:
+            return float((1 + np.sum(null >= value)) / (1 + len(null)))
+        scale = max(float(np.mean(null[null > edge] - edge)), 1.0)
+        return TAIL * float(np.exp(-(value - edge) / scale))
+
+    def run(self, scores: Vector, sky: "Sky | None" = None) -> list[Found]:
+        """Return the structures that are there, the most evident first.
+
+        ``sky`` knows what structures do on the sky of the data, whose patterns make scores correlated that are
+        independent on average over skies. It judges between the finalists, and takes out what is found before the rest
+        is searched; None: by averages over skies.
+        """
+        found: list[Found] = []
+        rest = scores
+        for _ in range(MOST):
+            values = self.evidences(rest)
+            values[[one.structure for one in found]] = -np.inf
+            p = self.pvalue(float(values.max()))
+            if p > LEVEL:
+                break
+            members = self.finalists(values)
+            responses = self.mean_responses(members, rest) if sky is None else sky.responses(members, rest)
+            judged, falls, amplitudes = self.judged(members, rest, responses)
+            order = np.argsort(-judged)
+            best = int(order[0])
+            if found and falls[best] < SECOND * found[0].delta_chi2:
+                break
+            near = [members[k] for k in order[1:] if judged[best] - judged[k] < np.log(ALTERNATIVES)]
+            found.append(Found(members[best], float(values.max()), p, float(falls[best]), tuple(near)))
+            chosen = [one.structure for one in found]
+            if sky is not None:
+                sky.keep(members[best], amplitudes[best])
+            rest = self.regressed(chosen, scores) if sky is None else sky.left(chosen)
+        return found
+
+    def evidences(self, scores: Vector) -> Vector:
+        """Return the evidence of every structure by itself, less the logarithm of the odds against such ones."""
+        found = [
+            -np.inf if null is None else float(evidence(np.array(fall), null.dimension)) - _rarity(structure)
+            for structure, null, fall in zip(self.grammar, self.nulls, self._falls(scores), strict=True)
+        ]
+        return np.array(found)
+
+    def finalists(self, values: Vector) -> list[int]:
+        """Return the most evident structure, those near it, and the best of every other stage and frame.
+
+        All their scores together have as many elements as a fraction 1/SPARE of the simulations at most.
+        """
+        best, seen, chosen, rows = float(values.max()), set[tuple[str, str, str]](), list[int](), 0
+        for k in map(int, np.argsort(-values)):
+            one = self.grammar[k]
+            if len(chosen) == FINALISTS or values[k] <= 0.0:
+                break
+            new = (one.stage, one.acts_on, one.frame) not in seen
+            if (new or best - values[k] < NEAR) and rows + one.size <= len(self.simulations) // SPARE:
+                chosen.append(k)
+                seen.add((one.stage, one.acts_on, one.frame))
+                rows += one.size
+        return chosen or [int(np.argmax(values))]
+
+    def judged(
+        self, members: Sequence[int], scores: Vector, responses: Sequence[Matrix]
+    ) -> tuple[Vector, Vector, list[Vector]]:
+        """Return evidence, fall of chi^2 and amplitudes of structures in the scores of all of them.
+
+        Each has one or more responses, shape (k, P).
+        """
+        null = SimulatedGaussian.from_simulations(self._rows(members, self.simulations), floor=SMALL)
+        x = self._rows(members, scores)
+        fits = [null.fit(x, self._rows(members, one).T) for one in responses]
+        falls = null.hartlap_factor * np.array([one.delta_chi2 for one in fits])
+        each = [self.grammar[k] for k in members]
+        odds = [float(evidence(fall, w.size)) - _rarity(w) for fall, w in zip(falls, each, strict=True)]
+        return np.array(odds), falls, [one.amplitudes for one in fits]
+
+    def mean_responses(self, members: Sequence[int], scores: Vector) -> list[Matrix]:
+        """Return the response of all scores to each structure as it is fitted, on average over skies, (1, P) each."""
+        centred, found = self.simulations - self.simulations.mean(axis=0), []
+        for k in members:
+            ((theta, _),) = self.fit([self.grammar[k]], scores)
+            own = self.grammar[k].of(centred) @ theta
+            found.append((own @ centred / (len(centred) - 1.0))[None])
+        return found
+
+    def _falls(self, scores: Vector) -> Vector:
+        """Return the unbiased fall of chi^2 of every structure by itself."""
+        pairs = zip(self.grammar, self.nulls, strict=True)
+        return np.array([0.0 if n is None else n.hartlap_factor * n.chi2(w.of(scores)) for w, n in pairs])
+
+    def regressed(self, chosen: Sequence[int], scores: Vector) -> Vector:
+        """Return what the regression of all scores on those of chosen structures leaves."""
+        rows = self._rows(chosen, self.simulations)
+        null = SimulatedGaussian.from_simulations(rows, floor=SMALL)
+        white = null.whitening.T
+        slopes = (rows - null.mean) @ white @ white.T
+        slopes = slopes.T @ (self.simulations - self.simulations.mean(axis=0)) / null.dof
+        return np.asarray(scores - (self._rows(chosen, scores) - null.mean) @ slopes)
+
+    def fit(self, chosen: Sequence[Structure], scores: Vector) -> list[tuple[Vector, Matrix]]:
+        """Return the coordinates of structures, fitted together, and the covariance of each.
+
+        Directions that the scores hardly measure stay at zero.
+        """
+        rows = np.concatenate([one.of(self.simulations) for one in chosen], axis=1)
+        null = SimulatedGaussian.from_simulations(rows, floor=SMALL)
+        covariance = null.hartlap_factor * null.whitening.T @ null.whitening
+        theta = covariance @ (np.concatenate([one.of(scores) for one in chosen]) - null.mean)
+        ends = np.cumsum([0] + [one.size for one in chosen])
+        return [(theta[a:b], covariance[a:b, a:b]) for a, b in pairwise(ends)]
+
+    def amplitudes(self, chosen: Sequence[Structure], scores: Vector, responses: Matrix) -> Vector:
+        """Return the factors of simulated responses, shape (count, P), with which they describe the scores best."""
+        null = SimulatedGaussian.from_simulations(np.concatenate([w.of(self.simulations) for w in chosen], axis=1))
+        x, t = (np.concatenate([w.of(one) for w in chosen], axis=-1) for one in (scores, responses))
+        return null.fit(x, t.T).amplitudes
+
+
+def _rarity(structure: Structure) -> float:
+    """Return the logarithm of the prior odds against a structure, beside one of the common kind."""
+    part = structure.stage in ("gain", "square") and structure.acts_on != "sky and dipole"
+    rare = (structure.split != ALIKE) + part
+    return rare * float(np.log(RARE))
+
+
+def evidence(fall: NDArray[np.float64], size: int) -> NDArray[np.float64]:
+    """Return the logarithm of the odds of K coordinates, of unknown size but alike in all directions, against none.
+
+    Notes
+    -----
+    With a Gaussian prior of variance tau^2 in white coordinates the odds are (1 + tau^2)^(-K/2) exp(T/2 tau^2 /
+    (1 + tau^2)), T the fall of chi^2; at their largest, 1 + tau^2 = T/K, their logarithm is (T - K - K log(T/K))/2
+    (George & Foster, Biometrika 87, 731, 2000, with its local empirical Bayes choice).
+    """
+    ratio = np.maximum(fall / size, 1.0)
+    return 0.5 * size * (ratio - 1.0 - np.log(ratio))

@@ -1,0 +1,162 @@
+"""A structure in a sentence, and the known effect that makes such structures."""
+
+from itertools import pairwise
+
+import numpy as np
+
+from mcsim.reconstruction.grammar import ALIKE, OPPOSITE, Structure
+from mcsim.reconstruction.scores import Scene
+from mcsim.support.arrays import Matrix, Vector
+from mcsim.systematics import Library
+from mcsim.systematics.base import scan_direction
+
+_DERIVATIVES = {2: "second derivative", 3: "third derivative", 4: "fourth derivative"}
+
+_LIKE: tuple[tuple[tuple[str, str, str], str], ...] = (
+    (("beam", "scan", "order 0"), "beam_width"),
+    (("beam", "scan", "order 1"), "pointing_offset"),
+    (("beam", "scan", "order 2"), "beam_ellipticity"),
+    (("beam", "scan", "order 3"), "beam_coma"),
+    (("gain", "time", "year"), "gain_drift"),
+    (("gain", "time", "spin"), "gain_spin"),
+    (("gain", "", "constant"), "calibration"),
+    (("added", "time", "spin"), "spin_synchronous_offset"),
+    (("added", "spacecraft", ""), "sidelobe_pickup"),
+    (("added", "sky", "dipole"), "dipole_residual"),
+    (("added", "sky", "monopole"), "monopole_residual"),
+    (("added", "sky", "latitude galactic"), "foreground_residual"),
+    (("square", "", ""), "nonlinearity"),
+    (("noise", "", "latitude"), "noise_anisotropy"),
+    (("noise", "", "level"), "noise_level"),
+    (("power", "", ""), "point_sources"),
+    (("modulation", "sky", "degree 1"), "dipole_modulation"),
+    (("modulation", "sky", "degree 2"), "quadrupole_modulation"),
+)
+"""Stage, frame and how the kind starts of structures that an effect of the library makes; the first that fits."""
+
+
+def cause(structure: Structure, library: Library) -> str:
+    """Return a known cause of such structures with its reference, or nothing."""
+    name = "foreground_residual" if structure.index is not None else ""
+    for (stage, frame, kind), effect in _LIKE if not name else ():
+        if structure.stage == stage and structure.frame == frame and structure.kind.startswith(kind):
+            name = effect
+            break
+    if name not in library:
+        return ""
+    kind_ = library[name]
+    source = f" ({kind_.source})" if kind_.source else ""
+    return f"{kind_.label()}: {kind_.cause.rstrip('.')}{source}"
+
+
+def says(structure: Structure, theta: Vector, scene: Scene) -> str:
+    """Return what a structure is and where, as the beginning of a sentence."""
+    return ", ".join(
+        filter(None, (_what(structure, theta), _degrees(structure, theta, scene), *_where(structure, scene)))
+    )
+
+
+def _what(structure: Structure, theta: Vector) -> str:
+    kind, number = structure.kind, structure.kind.rpartition(" ")[2]
+    on = structure.acts_on.replace("sky and dipole", "sky and dipole alike")
+    match structure.stage, structure.frame:
+        case "added", "sky":
+            return f"is added to the signal, fixed to the sky ({_pattern(kind)})"
+        case "added", "spacecraft":
+            return f"is added to the signal, fixed to the spacecraft (order {number} in the orientation of the beam)"
+        case "added", _:
+            return f"is added to the signal and follows the {_wave(kind)}"
+        case "gain", "time":
+            return f"is proportional to {on}, and follows the {_wave(kind)}"
+        case "gain", "sky":
+            return f"is proportional to {on}, with a pattern fixed to the sky ({_pattern(kind)})"
+        case "gain", _:
+            return f"is proportional to {on}"
+        case "beam", _:
+            return _order(int(kind.split()[1]), theta)
+        case "square", _:
+            return f"follows the square of {structure.acts_on}"
+        case "rotation", _:
+            return "follows the gradient of the sky along a rotation fixed to the sky"
+        case "noise", _:
+            shape = {"level": "everywhere alike", "spectrum": "at some degrees more than at others"}
+            return f"is noise ({shape.get(kind) or _pattern(kind)})"
+        case "power", _:
+            return "is power of the sky itself"
+    return f"modulates the sky itself ({_pattern(kind)})"
+
+
+def _order(order: int, theta: Vector) -> str:
+    if order == 0:
+        return "follows the sky, as a change of the round part of the beam does"
+    # b_lm of a beam turned by a has the phase e^(-i m a); a displacement along x has b_l1 < 0, a stretch b_l2 > 0.
+    total = complex(np.sum(theta.reshape(-1, 2) @ [1.0, 1j])) * (-1) ** order
+    angle = -np.rad2deg(np.angle(total)) / order
+    name = "gradient" if order == 1 else _DERIVATIVES[order]
+    return f"follows the {name} of the sky {scan_direction(angle, 360.0 / order)}"
+
+
+def _pattern(kind: str) -> str:
+    first, _, rest = kind.partition(" ")
+    if first == "latitude":
+        return f"by {rest} latitude"
+    if first in ("degrees", "degree"):
+        return f"ℓ {rest.replace('-', '–')}"
+    return {"power": "pattern not known, by its power in ℓ"}.get(kind, kind)
+
+
+def _wave(kind: str) -> str:
+    return "year" if kind == "year" else "spin phase" if kind.endswith("1") else "spin phase, twice a spin"
+
+
+def _degrees(structure: Structure, theta: Vector, scene: Scene) -> str:
+    """Return the degrees with most of a profile, for a profile."""
+    if (spans := profile_ranges(structure, scene)) is None:
+        return ""
+    if structure.mix is not None:
+        return f"growing as ℓ{SUPERSCRIPT[structure.kind[-1]]}"
+    sizes = np.abs(theta.reshape(len(spans), -1)).sum(axis=1)
+    low, high = spans[int(np.argmax(sizes))]
+    return f"most at ℓ {low}–{high}" if high > low else f"most at ℓ {low}"
+
+
+SUPERSCRIPT = {"1": "", "2": "²", "3": "³", "4": "⁴"}
+
+
+def _where(structure: Structure, scene: Scene) -> list[str]:
+    several = len(scene.channels) > 1
+    alone = f"{structure.channel} alone" if several else f"{structure.channel}"
+    found = ["all channels" if structure.channel is None and several else alone]
+    if structure.channel is None and not several:
+        found = []
+    if structure.index is not None:
+        found.append(f"as the frequency to the power {structure.index:g}".replace("-", "−"))
+    if len(scene.splits) > 1 and structure.views:
+        same = {ALIKE: "the same in all splits", OPPOSITE: f"opposite in {' and '.join(scene.splits)}"}
+        found.append(same.get(structure.split, f"in {structure.split} alone"))
+    return found
+
+
+def profile_ranges(structure: Structure, scene: Scene) -> list[tuple[int, int]] | None:
+    """Return the ranges of degrees, both ends included, of a structure with a profile in l; None for others."""
+    if structure.stage == "beam":
+        edges = scene.edges(max(int(structure.kind.split()[1]), 1))
+    elif structure.kind in ("power", "spectrum"):
+        edges = scene.fine
+    else:
+        return None
+    return [(low, high - 1) for low, high in pairwise(edges)]
+
+
+def profile(
+    structure: Structure, theta: Vector, covariance: Matrix, scene: Scene
+) -> tuple[tuple[int, int, float, float], ...]:
+    """Return the profile in l: first and last degree, size and its error; of a complex one the modulus."""
+    if (spans := profile_ranges(structure, scene)) is None:
+        return ()
+    if structure.mix is not None:
+        theta, covariance = structure.mix.T @ theta, structure.mix.T @ covariance @ structure.mix
+    values, errors = theta.reshape(len(spans), -1), np.sqrt(np.diag(covariance)).reshape(len(spans), -1)
+    sizes = values[:, 0] if values.shape[1] == 1 else np.linalg.norm(values, axis=1)
+    spread = np.sqrt(np.mean(errors**2, axis=1))
+    return tuple((*span, float(a), float(e)) for span, a, e in zip(spans, sizes, spread, strict=True))

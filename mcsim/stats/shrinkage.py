@@ -1,0 +1,117 @@
+"""Estimate a covariance from little more simulations than elements, and measure by cross-validation how good it is."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mcsim.support.arrays import Matrix, Vector
+
+SIGNIFICANT = 4.0
+"""Standard errors of a correlation from which on it is a part of the target."""
+
+LEAST = 0.5
+"""Smallest eigenvalue of the target over that of the sample correlation: a target cut to zeros may have none."""
+
+FOLDS = 10
+LARGEST = 1_000_000
+"""Degrees of freedom of a covariance that is as good as known."""
+
+
+class Fold(NamedTuple):
+    """Hold simulations in coordinates in which the covariance of all others is one.
+
+    ``white``: shape (count, p_f). ``turn``: from the white coordinates of all to these, shape (p_f, p).
+    """
+
+    white: Matrix
+    turn: Matrix
+
+
+class Shrunk(NamedTuple):
+    """Hold a whitening, shape (p, p_raw), and what it is worth.
+
+    ``dof``: degrees of freedom of the sample covariance that would be as good. ``folds``: simulation i is in fold i
+    modulo ``FOLDS``.
+    """
+
+    whitening: Matrix
+    dof: int
+    folds: tuple[Fold, ...]
+
+
+def shrunk(simulations: Matrix, floor: float) -> Shrunk:
+    """Return a shrunk covariance of simulations, shape (N, p_raw), N > p, with its worth.
+
+    ``floor``: eigenvalues of the correlation matrix below this fraction of the largest are left out.
+
+    Notes
+    -----
+    With A = C^-1/2 C_true C^-1/2, held-out simulations in white coordinates have mean square tr A, and mean squared
+    products tr A^2. A sample covariance with n degrees of freedom has p tr A^2/(tr A)^2 = (n - 1)/(n - p - 3) and
+    tr A = n p/(n - p - 1) (moments of the inverse Wishart and F distributions): the first says n, the second the scale.
+    The tests of Hotelling and Rao with this n are then right for mean and variance of chi^2, and for the mean square
+    of the amplitude of an average template. Figures: docs/science/statistics.md.
+    """
+    spread = simulations.std(axis=0)
+    z = simulations / spread
+    values, vectors = np.linalg.eigh(np.corrcoef(z.T))
+    basis = vectors[:, values > floor * values[-1]].T
+    whitening, folds = _whitening(z, basis), []
+    p, count = len(whitening), len(simulations)
+    total, products, pairs = 0.0, 0.0, 0
+    for number in range(FOLDS):
+        out = np.arange(count) % FOLDS == number
+        rest = z[~out]
+        own = _whitening(rest, basis)
+        white = (z[out] - rest.mean(axis=0)) @ own.T / np.sqrt(1.0 + 1.0 / len(rest))
+        gram = white @ white.T
+        total += float(np.trace(gram))
+        products += float(np.sum(gram**2) - np.sum(np.diag(gram) ** 2))
+        pairs += len(white) * (len(white) - 1)
+        folds.append(Fold(white, own @ np.linalg.pinv(whitening)))
+    ratio = p * products / pairs / (total / count) ** 2
+    dof = int(min(max((ratio * (p + 3) - 1.0) / max(ratio - 1.0, 1e-9), p + 7), LARGEST))
+    scale = float(np.sqrt(dof * p / (dof - p - 1.0) / (total / count)))
+    return Shrunk(scale * whitening / spread, dof, tuple(Fold(scale * one.white, one.turn) for one in folds))
+
+
+def _whitening(z: Matrix, basis: Matrix) -> Matrix:
+    """Return coordinates in which the shrunk covariance is one, shape (p, p_raw).
+
+    ``z``: simulations of unit variance, shape (N, p_raw); ``basis``: directions that are not redundant, (p, p_raw).
+
+    Notes
+    -----
+    Most elements are hardly correlated. The target has the correlations that are significant, the others zero; in
+    coordinates in which the target is one, eigenvalues are shrunk by the formula of Ledoit & Wolf.
+    """
+    n, centred = len(z) - 1, z - z.mean(axis=0)
+    sample = centred.T @ centred / n
+    smallest = float(np.linalg.eigvalsh(basis @ sample @ basis.T)[0])
+    target = np.where(np.abs(sample) >= SIGNIFICANT / np.sqrt(n), sample, 0.0)
+    values, vectors = np.linalg.eigh(basis @ target @ basis.T)
+    first = (vectors / np.sqrt(np.maximum(values, LEAST * smallest))).T @ basis
+    values, vectors = np.linalg.eigh(first @ sample @ first.T)
+    return np.asarray((vectors / np.sqrt(shrunk_eigenvalues(values, n))).T @ first)
+
+
+def shrunk_eigenvalues(values: Vector, n: int) -> Vector:
+    """Return the eigenvalues of a covariance that minimise the expected loss, given those of a sample one, shape (p,).
+
+    ``n``: degrees of freedom of the sample covariance, >= p.
+
+    Notes
+    -----
+    Ledoit & Wolf, Ann. Statist. 48, 3043 (2020), Eqs. 4.3, 4.7, 4.8 and 4.11: the density of the sample eigenvalues and
+    its Hilbert transform, both from an Epanechnikov kernel of width n^(-1/3) in proportion to each eigenvalue.
+    """
+    width = n ** (-1.0 / 3.0) * values[None, :]
+    x = (values[:, None] - values[None, :]) / width
+    root = np.sqrt(5.0)
+    density = np.mean(0.75 / root * np.maximum(1.0 - x**2 / 5.0, 0.0) / width, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        edge = 0.75 / (root * np.pi) * (1.0 - x**2 / 5.0) * np.log(np.abs((root - x) / (root + x)))
+    hilbert = np.mean((np.where(np.isfinite(edge), edge, 0.0) - 0.3 / np.pi * x) / width, axis=1)
+    share = len(values) / n
+    real = 1.0 - share - np.pi * share * values * hilbert
+    return np.asarray(values / ((np.pi * share * values * density) ** 2 + real**2))

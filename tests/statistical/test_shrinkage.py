@@ -1,0 +1,98 @@
+"""A covariance from few simulations: its eigenvalues, what it is worth, and uniform p-values with it."""
+
+import numpy as np
+import pytest
+from scipy.stats import kstest
+
+from mcsim.stats.gaussian import SimulatedGaussian, held_out_pvalues
+from mcsim.stats.look_elsewhere import calibrate, calibrate_in_folds
+from mcsim.stats.shrinkage import FOLDS, _whitening, shrunk_eigenvalues
+from refusals import refused
+
+P, N = 24, 72
+
+
+def root(seed=0, p=P):
+    """A few strong correlations among elements of different scale, the rest weak: as in data vectors."""
+    rng = np.random.default_rng(seed)
+    loadings = np.where(rng.random((p, 5)) < 0.3, rng.normal(size=(p, 5)), 0.0)
+    covariance = np.eye(p) + loadings @ loadings.T
+    scale = 10.0 ** rng.uniform(-3.0, 3.0, p)
+    return np.linalg.cholesky(scale[:, None] * covariance * scale)
+
+
+def test_eigenvalues_are_those_of_the_truth_along_the_sample_vectors():
+    """The estimate is to be u'Cu for every sample eigenvector u; sample eigenvalues are far from it."""
+    rng, p, n = np.random.default_rng(1), 120, 240
+    truth = np.repeat([1.0, 3.0, 10.0], p // 3)
+    draws = rng.normal(size=(n, p)) * np.sqrt(truth)
+    values, vectors = np.linalg.eigh(draws.T @ draws / n)
+    best = np.sum(vectors**2 * truth[:, None], axis=0)
+    found = shrunk_eigenvalues(values, n)
+    assert np.sqrt(np.mean((found / best - 1.0) ** 2)) < 0.1
+    assert np.sqrt(np.mean((values / best - 1.0) ** 2)) > 0.5
+    # Simulations without end: the sample eigenvalues.
+    np.testing.assert_allclose(shrunk_eigenvalues(truth[:80:40], 10**9), truth[:80:40], rtol=0.01)
+
+
+def test_pvalues_are_uniform_and_the_worth_is_that_of_a_sample_covariance():
+    """Four data of each of 250 ensembles; templates are tested at once, as in a diagnosis."""
+    rng, mixing = np.random.default_rng(2), root()
+    templates = mixing @ rng.normal(size=(P, 6))
+    omnibus, combined, worth, kept = [], [], [], []
+    for number in range(250):
+        simulations = rng.normal(size=(N, P)) @ mixing.T
+        null = SimulatedGaussian.from_simulations(simulations, shrink=True)
+        data = rng.normal(size=(4, P)) @ mixing.T
+        chi2 = np.sum(null.whiten(data) ** 2, axis=1)
+        omnibus += list(null.residual_test(chi2))
+        worth.append(null.dof)
+        # Signal-to-noise squared of optimal weights, over that of the true covariance.
+        weights = null.whitening.T @ null.whiten_templates(templates)
+        signal = np.sum(weights * templates, axis=0) ** 2 / np.sum((mixing.T @ weights) ** 2, axis=0)
+        kept.append(np.mean(signal / np.sum(np.linalg.solve(mixing, templates) ** 2, axis=0)))
+        if number < 60:
+            groups = null.whiten_groups(templates, [[0], [1], [2], [3], [4, 5]])
+            calibration = calibrate_in_folds(calibrate(null, groups, draws=400), null, groups)
+            smallest = null.nested_test(groups.delta_chi2(null.whiten(data)), chi2[:, None], groups.sizes).min(axis=1)
+            combined += list(calibration.combine(null.residual_test(chi2), smallest))
+    for pvalues in (omnibus, combined):
+        assert kstest(pvalues, "uniform").pvalue > 1e-3
+        below = np.mean(np.array(pvalues) < 0.05)
+        assert abs(below - 0.05) < 4.0 * np.sqrt(0.05 * 0.95 / len(pvalues))
+    # A sample covariance of N keeps 1 - P/(N - 1) of the squared signal-to-noise ratio.
+    n = float(np.median(worth))
+    assert n > 1.3 * N
+    assert np.mean(kept) > 1.0 - P / n - 0.03
+    assert np.mean(kept) > 1.0 - P / (N - 1.0) + 0.05
+
+
+def test_simulations_are_tested_with_the_covariance_of_the_others():
+    simulations = np.random.default_rng(3).normal(size=(N, P)) @ root().T
+    null = SimulatedGaussian.from_simulations(simulations, shrink=True)
+    found = held_out_pvalues(simulations, null)
+    z = simulations / simulations.std(axis=0)
+    scale = np.linalg.norm(null.whitening * simulations.std(axis=0)) / np.linalg.norm(_whitening(z, np.eye(P)))
+    for i in range(0, N, 7):
+        out = np.arange(N) % FOLDS == i % FOLDS
+        others = scale * _whitening(z[~out], np.eye(P))
+        white = others @ (z[i] - z[~out].mean(axis=0)) / np.sqrt(1.0 + 1.0 / (~out).sum())
+        assert found[i] == pytest.approx(float(null.residual_test(white @ white)), rel=1e-6)
+        # Templates keep lengths and angles, in the coordinates of all and of the others.
+        turned = null.folds[i % FOLDS].turn @ null.whitening[:, :2]
+        own = others[:, :2] / simulations.std(axis=0)[:2]
+        np.testing.assert_allclose(turned.T @ turned, own.T @ own, rtol=1e-6)
+
+
+@pytest.mark.parametrize("count", [P + 5, 10 * P])
+def test_many_simulations_need_no_shrinkage_and_too_few_are_refused(count):
+    simulations = np.random.default_rng(4).normal(size=(count, P)) @ root().T
+    if count < P + 7:
+        with refused(count, P + 7):
+            SimulatedGaussian.from_simulations(simulations, shrink=True)
+        return
+    found, plain = (SimulatedGaussian.from_simulations(simulations, shrink=one) for one in (True, False))
+    assert found.dof > 0.8 * plain.dof
+    data = np.random.default_rng(5).normal(size=(50, P)) @ root().T
+    ratio = np.sum(found.whiten(data) ** 2, axis=1) / np.sum(plain.whiten(data) ** 2, axis=1)
+    assert np.abs(ratio - 1.0).max() < 0.4

@@ -1,0 +1,285 @@
+"""The grammar of unlisted effects: its scores against maps that the simulator makes, its search, its plug-ins."""
+
+from dataclasses import replace
+from functools import lru_cache
+from itertools import pairwise
+
+import healpy
+import numpy as np
+import pytest
+from scipy import stats
+
+from mcsim import config, systematics
+from mcsim.diagnosis import api, unlisted
+from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.diagnosis.wiener_filter import model_of, wiener_filter
+from mcsim.instrument.beams import Beam
+from mcsim.reconstruction import forms, words
+from mcsim.reconstruction.figure import structure_figure
+from mcsim.reconstruction.grammar import ALIKE, Structure, structures
+from mcsim.reconstruction.plugin import plugin
+from mcsim.reconstruction.result import Reconstructed
+from mcsim.reconstruction.search import ALTERNATIVES, LEVEL, MOST, Search, evidence
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import survey
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix, real
+from refusals import refused
+
+LMAX, NSIDE = 24, 16
+MODEL = {
+    "schema": 1,
+    "name": "unlisted",
+    "sky": {"spectrum": "wmap7", "lmax": LMAX, "dipole_uk": 3364.5},
+    "map": {"nside": NSIDE, "splits": ["half1", "half2"]},
+    "biposh": {"L_max": 2},
+    "channel": [
+        {
+            "name": name,
+            "frequency_ghz": frequency,
+            "beam": {"kind": "gaussian", "fwhm_arcmin": 300.0},
+            "noise": {"sigma0_uk": 30.0},
+            "scan": {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 311.0, "line_of_sight": line},
+        }
+        for name, frequency, line in (("V1", 61.0, "A"), ("W1", 94.0, "B"))
+    ],
+}
+
+
+@lru_cache(maxsize=1)
+def seen():
+    """Run, scene, filtered sky, residuals and scores of one realization."""
+    run = config.load(MODEL)
+    model = model_of(survey(run, orders=4), DiagnosisSettings())
+    maps = list(simulate.maps(model.survey, 7))
+    scene = unlisted.scene_of(model)
+    return run, scene, wiener_filter(model, maps), unlisted.scores_of_maps(model, scene, maps)
+
+
+@lru_cache(maxsize=1)
+def grammar():
+    return structures(seen()[1])
+
+
+def random_alm(seed, lmax):
+    draw = np.random.default_rng(seed).normal(size=(2, alm_.size(lmax)))
+    alm = draw[0] + 1j * draw[1]
+    alm[: lmax + 1] = alm[: lmax + 1].real
+    return alm
+
+
+# In the simulator patterns are added to the sky, or multiply it, before the beam, and behind it in the scores. The
+# round part of the beam acts on the samples' offsets in their pixels as well.
+TOLERANCE = {"order 0": 0.1, "order 0 as l^2": 0.1, "added": 0.05, "rotation": 0.05, "gain": 0.1, "square": 0.3}
+
+
+@pytest.mark.parametrize(
+    ("stage", "frame", "kind", "split"),
+    [
+        ("added", "sky", "degrees 0-4", ALIKE),
+        ("added", "sky", "degrees 0-4", "half2"),
+        ("added", "sky", "dipole", "opposite"),
+        ("added", "sky", "latitude galactic", ALIKE),
+        ("added", "spacecraft", "orientation 1", ALIKE),
+        ("added", "spacecraft", "orientation 2", "half1"),
+        ("added", "time", "year", ALIKE),
+        ("added", "time", "spin 1", "opposite"),
+        ("gain", "", "constant", ALIKE),
+        ("gain", "", "constant", "half2"),
+        ("gain", "sky", "degrees 0-2", ALIKE),
+        ("gain", "time", "year", ALIKE),
+        ("beam", "scan", "order 0", ALIKE),
+        ("beam", "scan", "order 1", ALIKE),
+        ("beam", "scan", "order 2", ALIKE),
+        ("beam", "scan", "order 1 as l^1", ALIKE),
+        ("beam", "scan", "order 0 as l^2", ALIKE),
+        ("beam", "scan", "order 4", ALIKE),
+        ("square", "", "square", ALIKE),
+        ("rotation", "sky", "rotation", ALIKE),
+    ],
+)
+def test_a_score_is_the_product_of_residuals_and_what_the_effect_adds(stage, frame, kind, split):
+    """The effect that a structure becomes, in the simulator, adds the map whose product with the residual it scores."""
+    run, scene, filtered, u = seen()
+    structure = next(
+        w for w in grammar() if (w.stage, w.frame, w.kind, w.split, w.channel) == (stage, frame, kind, split, "W1")
+    )
+    theta = np.random.default_rng(3).normal(size=structure.size) * 1e-3
+    effect = plugin("unlisted_1", structure, theta, scene)
+    table = config.Effect(name="unlisted_1", channel="W1", parameters={"amplitude": 1.0})
+    acting = survey(replace(run, effects=(table,)), library={"unlisted_1": effect.kind()})
+    before = simulate.maps(survey(run), 0, sky=filtered.sky)
+    added = [a - b for a, b in zip(simulate.maps(acting, 0, sky=filtered.sky), before, strict=True)]
+    assert not np.any(added[:2])  # the other channel
+    products = np.array([r @ one for r, one in zip(filtered.residual, added, strict=True)])
+    scale = np.sqrt(sum(r @ r * (one @ one) for r, one in zip(filtered.residual, added, strict=True)) / NSIDE**2 / 12)
+    assert abs(products.sum() - theta @ structure.of(u)) < TOLERANCE.get(kind, TOLERANCE.get(stage, 0.01)) * scale
+
+
+def test_real_harmonics_are_those_of_a_lm():
+    values = np.random.default_rng(1).normal(size=25)
+    n = healpy.pix2vec(8, np.arange(768))
+    map_ = healpix.synthesis(real.to_alm(values, 6)[None], 8, 6)[0]
+    np.testing.assert_allclose(real.field(values, *n), map_, atol=1e-12)
+    np.testing.assert_allclose(real.coefficients(real.to_alm(values, 6), 6, 4), values, atol=1e-14)
+    pole = np.array([0.6, 0.0, 0.8])
+    np.testing.assert_allclose(
+        real.field(real.zonal(pole, 2)[1], *n), np.sqrt(0.75 / np.pi) * (pole @ np.stack(n)), atol=1e-12
+    )
+
+
+def test_a_rotation_moves_the_map():
+    alm, angle, n = random_alm(2, 6), 1e-5, np.stack(healpy.pix2vec(8, np.arange(768)))
+    values = real.coefficients(alm, 6, 6)
+    for axis, change in enumerate(forms.rotations(alm, 6)):
+        back = n - angle * np.cross(np.eye(3)[axis], n.T).T
+        moved = (real.field(values, *(back / np.linalg.norm(back, axis=0))) - real.field(values, *n)) / angle
+        found = healpix.synthesis(change[None], 8, 6)[0]
+        np.testing.assert_allclose(found, moved, atol=1e-3 * np.abs(moved).max())
+
+
+def test_a_square_is_that_of_the_map():
+    alm = random_alm(4, 8)
+    square = healpix.synthesis(alm[None], 32, 8)[0] ** 2
+    np.testing.assert_allclose(forms.squared(alm, 8), healpix.analysis(square, 8, 5), atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters", "order", "expected"),
+    [
+        ("pointing_offset", {"angle_deg": 0.0}, 1, "along the scan"),
+        ("pointing_offset", {"angle_deg": 90.0}, 1, "across the scan"),
+        ("beam_ellipticity", {"angle_deg": 0.0}, 2, "along the scan"),
+        ("beam_ellipticity", {"angle_deg": 90.0}, 2, "across the scan"),
+        ("beam_ellipticity", {"angle_deg": 30.0}, 2, "at 30° to the scan"),
+    ],
+)
+def test_the_direction_of_a_beam_is_said(name, parameters, order, expected):
+    beam = Beam.gaussian(300.0, LMAX)
+    site = systematics.Site("W1", 94.0, "ecliptic", NSIDE, LMAX, beam)
+    effect = systematics.get(name)(amplitude=0.01, **parameters)
+    change = systematics.seen_through((effect,), site).blm[order]
+    kernel = beam.blm[0].real * (np.arange(LMAX + 1) / LMAX) ** order
+    structure = next(w for w in grammar() if w.says[:4] == ("beam", "sky", "scan", f"order {order}"))
+    edges = seen()[1].edges(order)
+    v = np.array([np.mean(change[low:high] / kernel[low:high]) for low, high in pairwise(edges)])
+    theta = np.stack([v.real, v.imag], axis=1).ravel()
+    assert expected in words.says(structure, theta, seen()[1])
+
+
+def plain(stage, rows):
+    places = np.array(rows)[:, None]
+    return Structure(stage, "", "", "any", "W1", ALIKE, None, places, np.ones(1), None, (0,))
+
+
+def toy(count, seed=0):
+    """A grammar of overlapping structures of Gaussian scores of 12 unequal, correlated elements, and draws of them."""
+    mix = np.random.default_rng(5).normal(size=(12, 12)) + 3.0 * np.eye(12)
+    chosen = tuple(plain(str(k), rows) for k, rows in enumerate([*([k] for k in range(12)), range(4), range(4, 12)]))
+    return chosen, np.random.default_rng(seed).normal(size=(count, 12)) @ mix.T, mix
+
+
+def test_nothing_is_found_in_data_of_the_model():
+    chosen, simulations, mix = toy(400)
+    search = Search(chosen, simulations)
+    data = np.random.default_rng(9).normal(size=(600, 12)) @ mix.T
+    found = sum(bool(search.run(one)) for one in data)
+    # The threshold is known from 400 simulations: its own scatter is that of about LEVEL 400 of them.
+    assert found <= 600 * LEVEL + 4.0 * np.sqrt(600 * LEVEL * (1.0 + 600 / 400))
+    values = [
+        max(float(evidence(np.array(f), w.size)) for f, w in zip(search._falls(one), chosen, strict=True))
+        for one in data
+    ]
+    p = np.array([search.pvalue(value) for value in values])
+    assert stats.kstest(p, "uniform").statistic < 4.0 * np.sqrt(1 / 600 + 1 / 400) * 0.5
+
+
+def test_what_is_there_is_found_with_its_size():
+    chosen, simulations, mix = toy(400)
+    search = Search(chosen, simulations)
+    covariance = mix @ mix.T
+    theta = np.zeros(12)
+    theta[2] = 10.0 / np.sqrt(covariance[2, 2])
+    x = covariance @ theta + simulations.mean(axis=0)
+    (found,) = search.run(x)
+    assert found.structure == 2
+    assert found.pvalue < 1e-9
+    assert abs(found.delta_chi2 - 100.0) < 5.0 * 100.0 * np.sqrt(2.0 / 400)
+    ((fitted, sigma),) = search.fit([chosen[2]], x)
+    assert abs(fitted[0] - theta[2]) < 5.0 * theta[2] * np.sqrt(2.0 / 400)
+    assert abs(sigma[0, 0] * covariance[2, 2] - 1.0) < 5.0 * np.sqrt(2.0 / 400)
+    response = (x - simulations.mean(axis=0)) / 2.0
+    assert np.allclose(search.amplitudes([chosen[2]], x, response[None]), [2.0])
+
+
+def test_evidence_falls_with_the_number_of_coordinates():
+    falls = np.array([80.0, 80.0, 80.0])
+    each = [float(evidence(falls[k : k + 1], size)[0]) for k, size in enumerate((1, 4, 30))]
+    assert each == sorted(each, reverse=True)
+    assert evidence(np.array([3.0]), 4)[0] == 0.0
+    assert MOST >= 1
+    assert ALTERNATIVES > 1.0
+
+
+@pytest.mark.parametrize(("stage", "kind"), [("beam", "order 2"), ("added", "degrees 0-2"), ("gain", "year")])
+def test_a_file_is_the_same_effect(stage, kind, tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.path", list(__import__("sys").path))
+    monkeypatch.setenv("PYTHONPATH", "")
+    scene = seen()[1]
+    structure = next(w for w in grammar() if (w.stage, w.kind, w.split, w.channel) == (stage, kind, ALIKE, "V1"))
+    name = f"unlisted_of_{stage}"
+    effect = plugin(name, structure, np.linspace(0.1, 0.7, structure.size) / 3.0, scene)
+    path = tmp_path / f"{name}.py"
+    path.write_text(effect.source('Says "so".'))
+    kind_, made = systematics.get(str(path)), effect.kind()
+    assert (kind_.name, kind_.scope, kind_.proposed) == (name, "channel", False)
+    variables = [key for key in vars(made) if not key.startswith("_") and key not in ("amplitude", "signature")]
+    assert {key: getattr(kind_, key) for key in variables} == {key: getattr(made, key) for key in variables}
+    settings, library = api._with_library(DiagnosisSettings(including=(str(path),)))
+    assert (settings.including, library[name]) == ((name,), kind_)
+    run = {**MODEL, "effect": [{"name": str(path), "channel": "V1", "amplitude": 1.0}]}
+    loaded = config.load(run)
+    before = config.digest(loaded)
+    path.write_text(path.read_text() + "\n# changed\n")
+    assert config.digest(loaded) != before
+
+
+def test_a_file_without_one_effect_is_refused(tmp_path):
+    with refused(str(tmp_path / "none.py")):
+        systematics.get(str(tmp_path / "none.py"))
+    (tmp_path / "mcsim_two_of.py").write_text("x = 1\n")
+    with refused(str(tmp_path / "mcsim_two_of.py"), 0):
+        systematics.get(str(tmp_path / "mcsim_two_of.py"))
+    (tmp_path / "mcsim_broken.py").write_text("1 / 0\n")
+    with refused(str(tmp_path / "mcsim_broken.py")):
+        systematics.get(str(tmp_path / "mcsim_broken.py"))
+
+
+def test_every_structure_has_words_and_a_picture():
+    scene = seen()[1]
+    for structure in grammar():
+        theta = np.linspace(0.5, 1.0, structure.size)
+        text = words.says(structure, theta, scene)
+        assert text
+        assert (structure.channel or "") in text
+        profile = words.profile(structure, theta, np.eye(structure.size), scene)
+        assert bool(profile) == (words.profile_ranges(structure, scene) is not None)
+    found = Reconstructed(
+        *structure.says,
+        text,
+        1e-5,
+        30.0,
+        1,
+        0.8,
+        0.1,
+        "",
+        (),
+        ((2, 8, 1.0, 0.1),),
+        (1.0,) * 192,
+        "W1",
+        "unlisted_1",
+        "x",
+    )
+    assert "0.80 µK ± 0.08 µK" in found.sentence
+    assert found.to_json()["file"] == "unlisted_1.py"
+    assert len(structure_figure(found, "ecliptic").axes) == 3
