@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.bipolar import Mode, bennett_factor, parse_mode
+from mcsim.bipolar.modes import bin_factor
 from mcsim.ensemble import opening, store
-from mcsim.ensemble.summary import bin_factor
 from mcsim.errors import InputError
 
 Kind = Literal["plain", "difference"]

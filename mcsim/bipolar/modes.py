@@ -103,3 +103,17 @@ def to_bennett(biposh: NDArray, modes: Sequence[Indices]) -> NDArray:
     """Return BipoSH of shape (..., n_mode, lmax + 1) in the Bennett normalisation; every mode has even parity."""
     lmax = biposh.shape[-1] - 1
     return biposh * np.stack([bennett_factor(mode, lmax) for mode in modes])
+
+
+def bin_factor(mode: Mode, lmax: int) -> NDArray[np.float64]:
+    """Return the factor that makes A^{LM}_{l1 l2} smooth in ell = l2, shape (lmax + 1,).
+
+    It is l(l+1)/2pi times the Bennett factor for even parity. For odd parity, which has no such factor, it is
+    l(l+1)/2pi times (-1)^l ((2 l1 + 1)(2 l2 + 1))^{-1/4}, which removes the same alternation of sign and growth with l.
+    """
+    ell = np.arange(lmax + 1, dtype=float)
+    spectrum = ell * (ell + 1.0) / (2.0 * np.pi)
+    if mode.parity == "even":
+        return spectrum * bennett_factor(mode, lmax)
+    other = np.maximum(ell - mode.d, 0.0)
+    return spectrum * np.where(ell % 2 == 0, 1.0, -1.0) * ((2.0 * other + 1.0) * (2.0 * ell + 1.0)) ** -0.25

@@ -177,7 +177,7 @@ def quiet(run: config.RunConfig) -> config.RunConfig:
     _check_splits(run)
     run = named_source(run)[0]
     channels = tuple(channel.without_noise() for channel in run.channels)
-    biposh = replace(run.biposh, L_max=0, pairs="auto")
+    biposh = replace(run.biposh, L_max=0, pairs="auto", filter="none", probes=None)
     return replace(run, channels=channels, effects=(), biposh=biposh)
 
 

@@ -31,6 +31,8 @@ def science(config: RunConfig, *others: str) -> dict[str, Any]:
         entry.holder[entry.field] = contents
     _leave_out_what_says_nothing(plain)
     plain["biposh"]["lmax"] = analysis_lmax(config)
+    if config.biposh.filtered:
+        plain["biposh"]["bin"] = plain["biposh"]["summary_bin"]  # its bins are part of the estimates
     del plain["biposh"]["summary_bin"]
     window = plain["map"].pop("pixel_window")
     for table, channel in zip(plain["channel"], config.channels, strict=True):

@@ -95,6 +95,8 @@ def to_dict(config: RunConfig) -> dict[str, Any]:
     for table, key in ((plain, "simulator"), (plain["ensemble"], "maps"), (plain["map"], "offset_order")):
         if table[key] is None:  # as in stores of runs without it
             del table[key]
+    if not config.biposh.filtered:
+        del plain["biposh"]["filter"], plain["biposh"]["probes"]
     return plain
 
 

@@ -13,7 +13,8 @@ from pydantic_core import core_schema
 
 from mcsim.config import arrays
 from mcsim.config.beams import BEAMS, AnyBeam
-from mcsim.config.noise import AnyNoise, Noise, check_differences, check_splits, in_words, is_noise_free
+from mcsim.config.consistency import check_filter, check_rings
+from mcsim.config.noise import AnyNoise, Noise, check_differences, check_splits
 from mcsim.config.preparation import Step, check_steps
 from mcsim.config.values import STRICT, Degree, Frame, Label, Nside, PathText, power_of_two, unique
 
@@ -221,7 +222,11 @@ class Channel:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Biposh:
-    """Settings of the estimator; ``lmax``: by default the sky's; ``iterations``: Jacobi iterations of the analysis."""
+    """Settings of the estimator; ``lmax``: by default the sky's; ``iterations``: Jacobi iterations of the analysis.
+
+    ``filter``: "inverse_covariance" estimates from maps filtered by their inverse covariance, which needs noise, and
+    normalises by ``probes`` random maps (default: as many as the number of bins needs).
+    """
 
     L_max: Annotated[int, Field(ge=0)] = 2
     lmax: Degree | None = None
@@ -229,6 +234,13 @@ class Biposh:
     weighting: Literal["uniform", "hits"] = "uniform"
     iterations: Annotated[int, Field(ge=0, le=20)] = 0
     pairs: Literal["all", "auto"] = "all"
+    filter: Literal["none", "inverse_covariance"] = "none"
+    probes: Annotated[int, Field(ge=8, le=10_000)] | None = None
+
+    @property
+    def filtered(self) -> bool:
+        """Return True if maps are filtered by their inverse covariance."""
+        return self.filter == "inverse_covariance"
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -352,6 +364,10 @@ class RunConfig:
             preparation=tuple(steps),
         )
 
+    def unfiltered(self) -> Self:
+        """Return the run with an estimator that does not filter."""
+        return replace(self, biposh=replace(self.biposh, filter="none", probes=None))
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         names = tuple(channel.name for channel in self.channels)
@@ -361,12 +377,13 @@ class RunConfig:
         if lmax > self.sky.lmax:
             raise ValueError(f"{key} = {lmax} is above sky.lmax = {self.sky.lmax}; lower it or raise sky.lmax")
         if self.map.grid == "gl":
-            _check_rings(self)
+            check_rings(self)
         elif lmax > limit:
             raise ValueError(
                 f"{key} = {lmax} is above 3 nside - 1 = {limit} of {of}; "
                 f"set biposh.lmax to at most {limit} or raise nside"
             )
+        check_filter(self)
         if self.simulator is not None and self.ensemble.maps is not None:
             raise ValueError("both simulator and ensemble.maps are given; keep one of them")
         if self.biposh.L_max > lmax:
@@ -392,37 +409,6 @@ class RunConfig:
                     where = f"channel[{channel.name}].{key}.m_max = {m_max}"
                     raise ValueError(f"{where} is above sky.lmax = {self.sky.lmax}; lower m_max")
         return self
-
-
-def _check_rings(run: RunConfig) -> None:
-    """Refuse settings that need pixels, or moments that depend on more than colatitude."""
-    remedy = 'or set map.grid = "healpix"'
-    for channel in run.channels:
-        kind = channel.scan.kind
-        if not isinstance(channel.scan, ScanParallelTransport | ScanHitAveraged):
-            raise ValueError(
-                f'channel[{channel.name}].scan is of kind "{kind}", which grid = "gl" cannot bear; use '
-                f'"parallel_transport" or "hit_averaged", {remedy}'
-            )
-        if isinstance(channel.scan, ScanHitAveraged) and run.map.frame != "ecliptic":
-            raise ValueError(
-                f'map.frame = "{run.map.frame}", but with grid = "gl" the limit of a scan depends on '
-                f'ecliptic colatitude alone; set frame = "ecliptic" {remedy}'
-            )
-        if not is_noise_free(channel.noise):
-            raise ValueError(
-                f'channel[{channel.name}].{in_words(channel.noise)}, but grid = "gl" has no pixels to draw noise in; '
-                f"remove the noise {remedy}"
-            )
-    for key, given in (
-        ("mask of a channel", any(channel.mask is not None for channel in run.channels)),
-        ("ensemble.keep_maps = true", run.ensemble.keep_maps),
-        ("[[preparation]]", bool(run.preparation)),
-        ('biposh.weighting = "hits"', run.biposh.weighting == "hits"),
-        (f"biposh.iterations = {run.biposh.iterations}", run.biposh.iterations > 0),
-    ):
-        if given:
-            raise ValueError(f'{key} needs pixels, but grid = "gl" has none; remove it {remedy}')
 
 
 def analysis_lmax(config: RunConfig) -> int:

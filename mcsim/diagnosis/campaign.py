@@ -120,7 +120,7 @@ def plan(analysis: Analysis, simulations: int | None = None, time_ordered: bool 
     jobs: dict[Purpose, Job] = {}
     known = all(channel.site.pointing is not None for channel in analysis.model.survey.channels)
     if time_ordered and analysis.of_maps and known:
-        quiet = replace(base, channels=tuple(c.without_noise() for c in base.channels))
+        quiet = replace(base.unfiltered(), channels=tuple(c.without_noise() for c in base.channels))
         for job in _split(analysis.job(quiet), range(settings.time_ordered_skies), 1):
             jobs[Purpose("time-ordered", job.first)] = replace(job, sample_by_sample=True)
             jobs[Purpose("default", job.first)] = job

@@ -1,7 +1,7 @@
 """Mean BipoSH of a survey's maps: of their signal, of their circular-beam control, and of their noise."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,10 +61,17 @@ def scanned_beams(survey: Survey, L_max: int, nthreads: int = 1) -> tuple[Scanne
                 "predict the same model with hit_averaged instead."
             )
     return tuple(
-        ScannedBeam(channel.beam.blm * channel.window, _orientations(spec.scan, channel, m, L_max, nthreads))
+        ScannedBeam(
+            channel.beam.blm * channel.window, _orientations(spec.scan, channel, _weighted(survey, m), L_max, nthreads)
+        )
         for spec, channel in zip(survey.config.channels, survey.channels, strict=True)
         for m in channel.maps
     )
+
+
+def _weighted(survey: Survey, m: SurveyMap) -> SurveyMap:
+    """Return a map with the weights that its estimates are of: none if their normalisation takes them out."""
+    return m if survey.filtering is None else replace(m, weight=None)
 
 
 def without_windows(
@@ -132,7 +139,7 @@ def spectrum(survey: Survey) -> NDArray[np.float64]:
 
 def noise_mean(survey: Survey, number: int, modes: Sequence[Indices]) -> NDArray[np.complex128]:
     """Return the mean BipoSH of the noise of a map, uK^2, shape (mode, lmax + 1)."""
-    m = [m for channel in survey.channels for m in channel.maps][number]
+    m = _weighted(survey, [m for channel in survey.channels for m in channel.maps][number])
     L_max, lmax = max(L for L, _, _ in modes), survey.lmax
     if m.drawn is not None:
         raise InputError(

@@ -29,6 +29,7 @@ class Layout:
     kept_name: str = "observed_map"
     frame: str = ""
     bin_width: int = 50
+    filtered: bool = False
 
     def variables(self) -> dict[str, tuple[tuple[str, ...], str, str, str]]:
         """Return dimensions, type, unit and long name of every array over realizations."""
@@ -37,6 +38,9 @@ class Layout:
             "biposh": (("pair", "mode", "ell"), "complex128", "uK^2", coefficients),
             "cl": (("pair", "ell"), "float64", "uK^2", "power spectrum C_l"),
         }
+        if self.filtered:
+            text = "quadratic maximum-likelihood l(l+1)/2pi A^{LM}, by bin"
+            spectra["biposh_qml"] = (("pair", "mode", "bin"), "complex128", "uK^2", text)
         found = dict(spectra)
         if self.paired:
             for name, (dims, dtype, unit, text) in spectra.items():
@@ -61,10 +65,24 @@ class Layout:
         }
         if self.kept_npix is not None:
             labels["map_name"] = ("map_name", self.maps, "map")
-        return {
-            name: (dim, np.array(values), {"units": "1", "long_name": text})
-            for name, (dim, values, text) in numbers.items()
-        } | {name: (dim, texts(values), {"long_name": text}) for name, (dim, values, text) in labels.items()}
+        bins = {"bin": ("bin", self.middles(), {"units": "1", "long_name": "middle of the bin in ell"})}
+        return (
+            {
+                name: (dim, np.array(values), {"units": "1", "long_name": text})
+                for name, (dim, values, text) in numbers.items()
+            }
+            | (bins if self.filtered else {})
+            | {name: (dim, texts(values), {"long_name": text}) for name, (dim, values, text) in labels.items()}
+        )
+
+    def first_ells(self) -> NDArray[np.int64]:
+        """Return the first ell of every bin."""
+        return np.arange(0, self.lmax + 1, self.bin_width)
+
+    def middles(self) -> NDArray[np.float64]:
+        """Return the middle of every bin in ell."""
+        first = self.first_ells()
+        return np.asarray((first + np.append(first[1:] - 1, self.lmax)) / 2.0)
 
     def kept_attributes(self) -> dict[str, str | int | float]:
         """Return the attributes of kept maps besides unit and long name."""
@@ -78,6 +96,7 @@ class Layout:
             "pair": len(self.pairs),
             "mode": len(self.modes),
             "ell": self.lmax + 1,
+            "bin": len(self.first_ells()),
             "map_name": len(self.maps),
             "pixel": self.kept_npix or 0,
         }

@@ -19,12 +19,16 @@ from mcsim.errors import InputError
 from mcsim.simulation import differencing, noise
 from mcsim.simulation import offsets as offsets_
 from mcsim.simulation.channels import check_effects, load_beam, refuse_external
+from mcsim.simulation.filtering import Bands, probes_of
 from mcsim.simulation.preparation import preparation
 from mcsim.simulation.survey import Survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rng, spectra
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.support.numbers import duration
+
+SOLUTION, NEAR = 100.0, 0.7
+"""Transforms that a solution of the inverse covariance takes, about, and the share of them with a near one known."""
 
 CHUNKS = 128
 CHUNK_BYTES = 1 << 26
@@ -82,7 +86,7 @@ def _layout(run: config.RunConfig, pairs: tuple[str, ...], modes: tuple[Mode, ..
     lmax, paired = config.analysis_lmax(run), run.ensemble.paired
     nside, frame = config.prepared_grid(run)
     kept_npix = 12 * nside**2 if run.ensemble.keep_maps else None
-    more: dict[str, Any] = {"frame": frame, "bin_width": run.biposh.summary_bin}
+    more: dict[str, Any] = {"frame": frame, "bin_width": run.biposh.summary_bin, "filtered": run.biposh.filtered}
     bare = Layout(run.ensemble.realizations, 1, config.map_names(run), pairs, modes, lmax, paired, kept_npix, **more)
     chunk = run.compute.chunk or 1
     if run.compute.chunk is not None:
@@ -154,6 +158,7 @@ def stored(path: Path, realizations: int) -> Layout:
             kept,
             frame=frame_of(attrs),
             bin_width=attrs["biposh"]["summary_bin"],
+            filtered="biposh_qml" in found,
         )
 
 
@@ -167,6 +172,7 @@ class Cost:
     preparation: str  # what preparing the maps adds, in words
     noise: tuple[str, ...] = ()  # what is known of noise that is estimated or drawn, in words
     offsets: str = ""  # what powers of the samples' offsets add, in words
+    filter: str = ""  # what the inverse covariance costs, in words
 
     def lines(self, number: int, workers: int) -> list[str]:
         """Return lines on memory, preparation and time for a number of realizations."""
@@ -175,6 +181,7 @@ class Cost:
             f"  memory  {self.memory / 1e9:.2f} GB per worker, {workers} workers",
             *([f"  prepare {self.preparation}"] if self.preparation else []),
             *([f"  offsets {self.offsets}"] if self.offsets else []),
+            *([f"  filter  {self.filter}"] if self.filter else []),
             *(f"  noise   {line}" for line in self.noise),
             f"  time    {duration(self.each_s)} per realization and core, {duration(total_s)} of processor time,"
             f" {duration(total_s / workers)} with {workers} workers on as many idle cores",
@@ -225,6 +232,19 @@ def cost(run: config.RunConfig) -> Cost:
         transforms, memory = transforms + extra, memory + 480.0 * nside**2
         grid = f"nside {nside} to {config.prepared_grid(run)[0]}"
         words = f"{extra:g} further transforms per realization and {480e-9 * nside**2:.2g} GB per worker, {grid}"
+    filtering = ""
+    if run.biposh.filtered:
+        solutions = len(names) * (1.0 + NEAR * run.ensemble.paired)
+        transforms += SOLUTION * solutions
+        bands = [
+            Bands(planned.modes, lmax, run.biposh.summary_bin, auto) for auto in {True, not (both and len(names) > 1)}
+        ]
+        probes = probes_of(bands, run.biposh.probes)
+        once_s = probes * (SOLUTION * len(names) * transform + pairs * probes * estimation)
+        filtering = (
+            f"about {SOLUTION * solutions:.0f} further transforms per realization; once, {probes} random maps of each "
+            f"map, {duration(once_s)} of processor time (none if the noise is uniform on the full sky)"
+        )
     offsets, spreading = run.map.offset_order or 0, ""
     if offsets > 1:
         spread = [channel for channel in run.channels if not isinstance(channel.scan, config.ScanParallelTransport)]
@@ -233,7 +253,7 @@ def cost(run: config.RunConfig) -> Cost:
         spreading = f"{extra} further transforms per realization for powers of the samples' offsets up to {offsets}"
     estimates = pairs * (2 if run.ensemble.paired else 1)
     each_s = transform * transforms + estimation * estimates + differencing.seconds(run) + noise.seconds(run)
-    return Cost(planned, memory, each_s, words, tuple(noise.in_words(run)), spreading)
+    return Cost(planned, memory, each_s, words, tuple(noise.in_words(run)), spreading, filtering)
 
 
 def _timed(nside: int, lmax_sky: int, lmax: int, L_max: int) -> tuple[float, float]:

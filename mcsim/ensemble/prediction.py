@@ -163,6 +163,10 @@ def _dataset(survey: Survey, found: dict[tuple[int, int], Means]) -> xr.Dataset:
         scatter[f"{name}_binned"] = variances = summary.binned(layout, scatter[name], power=2)
         if not name.endswith("difference"):
             comoment[f"{name}_binned"] = variances[..., None] * np.eye(variances.shape[-1])
+    if survey.filtering is not None:
+        for name in ("biposh", "biposh_circular", "biposh_difference"):
+            numbers, bins = name.replace("biposh", summary.QML), survey.filtering.band_powers(mean[name])
+            mean[numbers], scatter[numbers] = bins, np.full(bins.shape, np.nan)
     # Build the sums of two realizations with these variances, so that the summary's own code makes the dataset.
     result = summary.dataset(layout, Sums(2, mean, scatter, comoment), plan.attributes(run))
     for name in mean:
@@ -177,7 +181,9 @@ def _attributes(survey: Survey, L_moments: int | None) -> dict[str, Any]:
     if L_moments is not None:
         order = f"all orders, w_s up to L = {L_moments}"
     mask = "full sky"
-    if any(m.weight is not None for channel in survey.channels for m in channel.maps):
+    if survey.filtering is not None:
+        mask = "filtered by the inverse covariance: as on the full sky, but for the errors"
+    if survey.filtering is None and any(m.weight is not None for channel in survey.channels for m in channel.maps):
         mask = "weights W act as w_s -> W^2 w_s and on the errors; their own mode coupling is left out"
     window, left_out = "none: rings without pixels", "nothing"
     if run.map.grid == "healpix":

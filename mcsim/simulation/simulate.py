@@ -43,13 +43,16 @@ def realize(survey: Survey, realization: int, nthreads: int = 1) -> dict[str, ND
     Returns
     -------
     dict
-        ``biposh`` (pair, mode, lmax + 1) complex and ``cl`` (pair, lmax + 1), uK^2; with pairing the same of the
-        circular-beam control, ``biposh_circular`` and ``cl_circular``; with kept maps ``observed_map`` (map, npix), uK.
+        ``biposh`` (pair, mode, lmax + 1) complex and ``cl`` (pair, lmax + 1), uK^2; with a filter ``biposh_qml`` (pair,
+        mode, bin); with pairing the same of the circular-beam control, ``biposh_circular`` and so on; with kept maps
+        ``observed_map`` (map, npix), uK.
     """
     ensemble = survey.config.ensemble
     sky = draw_sky(survey, realization)
     made = _circular_maps(survey, nthreads)
     observe = _observe if survey.source is None else _observe_prepared
+    if survey.filtering is not None:
+        observe = _observe_filtered
     observed = [result for channel in survey.channels for result in observe(survey, channel, sky, realization, made)]
     result = _spectra(survey, [o.alm for o in observed], "")
     if ensemble.paired:
@@ -183,6 +186,27 @@ def _observe_prepared(
     return results
 
 
+def _observe_filtered(
+    survey: Survey, channel: Channel, sky: Alm, realization: int, made: convolve.CircularMaps
+) -> list[Observed]:
+    """Return the maps of a channel for one sky, filtered by their inverse covariance; see :class:`MapFilter`."""
+    ensemble = survey.config.ensemble
+    assert survey.filtering is not None  # the caller looked
+    filters = {each.name: each for each in survey.filtering.filters}
+    results = []
+    for m, parts in _map_parts(survey, channel, sky, realization, made, smooth=True):
+        circular, near = None, None
+        if ensemble.paired:
+            circular, near = filters[m.name].apply(replace(parts, difference=None).total)
+        alm = circular
+        if circular is None or parts.difference is not None:
+            alm, _ = filters[m.name].apply(parts.total, near)
+        kept = np.where(m.moments.hits > 0, parts.total, healpy.UNSEEN) if ensemble.keep_maps else None
+        assert alm is not None  # one of the two is made
+        results.append(Observed(alm, circular, kept))
+    return results
+
+
 def _map_parts(
     survey: Survey, channel: Channel, sky: Alm, realization: int, made: convolve.CircularMaps, smooth: bool
 ) -> Iterator[tuple[SurveyMap, MapParts]]:
@@ -303,6 +327,8 @@ def _is_exact(survey: Survey, m: SurveyMap) -> bool:
 
 
 def _spectra(survey: Survey, alms: list[Alm], suffix: str) -> dict[str, NDArray]:
+    if survey.filtering is not None:
+        return {f"{name}{suffix}": values for name, values in survey.filtering.measure(alms).items()}
     modes, lmax = len(survey.estimator.modes), survey.lmax
     coefficients = np.empty((len(survey.pairs), modes, lmax + 1), dtype=np.complex128)
     cl = np.empty((len(survey.pairs), lmax + 1))

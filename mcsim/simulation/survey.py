@@ -24,10 +24,12 @@ from mcsim.simulation.channels import (
     site_of,
     with_offsets,
 )
+from mcsim.simulation.filtering import Filtering
 from mcsim.simulation.noise import DrawnNoise, of_map
 from mcsim.simulation.pixel_means import mean_gain, mean_signal
 from mcsim.simulation.preparation import Preparation, preparation
 from mcsim.simulation.rings import Rings, limit_rings, parallel_transport_rings
+from mcsim.simulation.survey_filter import filtering_of
 from mcsim.sphere import healpix, rng, spectra
 from mcsim.sphere.mask import read_mask
 from mcsim.systematics import Effect, Library, Site, seen_through, spread_of, variance_factor
@@ -158,9 +160,8 @@ class Channel:
 class Survey:
     """Everything that all realizations of a run share.
 
-    ``pairs`` are indices into the maps in order, with 1 / <w_x w_y> of their weights in ``pair_norm``. Where maps are
-    prepared, the channels describe the prepared maps (pixels, moments, noise, weights, beams and pixel windows), and
-    ``source`` the survey whose maps are made; None where the maps are analysed as they are made.
+    ``pairs`` are indices of maps, ``pair_norm`` 1 / <w_x w_y> of their weights. Prepared maps are what the channels
+    describe (noise, weights, windows), and ``source`` is the survey whose maps are made; None without preparation.
     """
 
     config: config.RunConfig
@@ -171,6 +172,7 @@ class Survey:
     pairs: tuple[tuple[int, int], ...]
     pair_norm: tuple[float, ...]
     source: "Survey | None" = None
+    filtering: Filtering | None = None  # inverse covariances of the maps
 
     @property
     def making(self) -> "Survey":
@@ -213,23 +215,23 @@ def survey(
 ) -> Survey:
     """Load or compute everything that the realizations of a run share; InputError for files that do not fit it.
 
-    Moments of scan models, and pairs of pixels of differencing scans, are computed once, cached on disk and
-    memory-mapped, so that workers share them. ``orders``: moments up to this order even where the beam needs fewer (of
-    a file of moments, all that it has). ``library``: the effects that the run may name; default: the catalogue.
+    Moments of scan models, and pairs of pixels of differencing scans, are computed once and cached for all workers.
+    ``orders``: moments up to this order even where the beam needs fewer (of a file of moments, all that it has).
+    ``library``: the effects that the run may name; default: the catalogue.
     """
     refuse_external(run)
-    lmax = config.analysis_lmax(run)
     cl = None if run.sky.spectrum is None else spectra.load(run.sky.spectrum, run.sky.lmax)
     made = tuple(_channel(run, channel, nthreads, progress, orders, library) for channel in run.channels)
     channels = (
         tuple(_prepared(run, *each) for each in zip(run.channels, made, strict=True)) if run.preparation else made
     )
     maps = [m for channel in channels for m in channel.maps]
-    both = run.biposh.pairs == "all"
-    pairs = tuple((x, y) for x in range(len(maps)) for y in range(x, len(maps)) if both or x == y)
+    size, both = len(maps), run.biposh.pairs == "all"
+    pairs = tuple((x, y) for x in range(size) for y in range(x, size) if both or x == y)
     norm = tuple(1.0 / _overlap(maps[x], maps[y]) for x, y in pairs)
-    tables = estimator(run.biposh.L_max, lmax, both_orders=both and len(maps) > 1)
-    found = Survey(run, cl, made, lmax, tables, pairs, norm)
+    tables = estimator(run.biposh.L_max, config.analysis_lmax(run), both_orders=both and size > 1)
+    filters = filtering_of(run, made, cl, (pairs, tables), nthreads)
+    found = Survey(run, cl, made, config.analysis_lmax(run), tables, pairs, norm, None, filters)
     return replace(found, channels=channels, source=found) if run.preparation else found
 
 

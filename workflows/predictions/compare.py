@@ -18,8 +18,8 @@ from scipy import stats
 import mcsim
 from mcsim import config
 from mcsim.bipolar import Mode
+from mcsim.bipolar.modes import bin_factor
 from mcsim.ensemble import prediction
-from mcsim.ensemble.summary import bin_factor
 
 BINS = 3
 

@@ -113,6 +113,9 @@ def run(
         with reporting("orientation moments", 1.0, "", quiet) as report:
             shared = survey(loaded, nthreads=os.cpu_count() or 1, progress=report)
         power.check(shared)
+        if shared.filtering is not None:
+            with reporting("normalisation of the filter", 1.0, "", quiet) as report:
+                shared.filtering.fisher(report)
         simulate.draw_sky(shared, wanted.start)  # finds bad sky files before a store is made
         stack.enter_context(locked(target))
         stack.enter_context(_written_down(journal, loaded, wanted))

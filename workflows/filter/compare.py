@@ -1,0 +1,162 @@
+"""Hold quadratic maximum-likelihood A^{LM} of the WMAP-7 beams outside KQ85 against prediction and plain estimator.
+
+    python workflows/filter/compare.py wmap7-filtered.zarr wmap7-plain.zarr -o filter.png [--json result.json]
+
+The prediction is that of the full sky, exact in the beam, for M = 0 up to L = 6 (the scan depends on longitude by its
+samples alone). What L > 2 adds to the bins of L <= 2 through the mask is computed with the random maps that normalise
+the estimates.
+"""
+
+import argparse
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+
+import mcsim
+from mcsim.bipolar import Estimator, estimate, estimator
+from mcsim.ensemble.expectation import means, scanned_beams
+from mcsim.simulation import simulate
+from mcsim.simulation.filtering import Bands, Filtering
+from mcsim.simulation.survey import Survey, survey
+
+HERE = Path(__file__).parent
+L_LEAK, L_MOMENTS, PROBES = 6, 32, 40
+MODES = {"L2M0d0": r"$A^{20}_{\ell\ell}$", "L2M0d2": r"$A^{20}_{\ell-2,\ell}$"}
+
+
+def expected(shared: Survey, number: int, few: Filtering, probes: list) -> tuple[np.ndarray, np.ndarray]:
+    """Mean band powers of what the beam adds, (mode, bin), and the error of the normalisation and of themselves."""
+    x, y = shared.pairs[number]
+    every = estimator(L_LEAK, shared.lmax)
+    zonal = tuple(mode for mode in every.modes if mode.M == 0)
+    tables = Estimator(shared.lmax, zonal, tuple(band for band in every.bands if band.M == 0))
+    wide = replace(shared, estimator=tables)
+    found = means(wide, scanned_beams(wide, L_MOMENTS), (x, y), exact=True)
+    added = np.nan_to_num(found.beam - found.circular)
+    own, bands = few.bands[number], Bands(tables.modes, shared.lmax, shared.lmax + 1, True)
+
+    def change(first: np.ndarray, second: np.ndarray) -> float:
+        both = 0.5 * (estimate(tables, first, second) + estimate(tables, second, first))
+        return float(2.0 * np.sum(bands.count * (added.conj() * np.nan_to_num(both)).real))
+
+    joint = few.response(probes, number, change)
+    fisher, mixed = joint[:-1, :-1], joint[:-1, -1]
+    mean = np.linalg.solve(fisher, mixed)
+    # What of the change is no sum of the bins adds scatter to the regression on them.
+    left = max(joint[-1, -1] - mixed @ mean, 0.0)
+    pairs = [n * (n - 1) / 2 for n in (shared.filtering.drawn, len(probes))]
+    sigma2 = np.diag(shared.filtering.inverses[number])
+    variance = (sigma2 * (mixed @ mean) + mean**2) / pairs[0] + sigma2 * left / pairs[1]
+    parts = own.spectra(variance)
+    return own.spectra(mean), np.sqrt(parts.real + parts.imag)
+
+
+def compared(shared: Survey, filtered: xr.Dataset, plain: xr.Dataset) -> dict[str, dict[str, list[float]]]:
+    """Means, errors, pulls and variance ratios by channel and mode; bins from the second on."""
+    filtering = shared.filtering
+    assert filtering is not None
+    few = replace(filtering, probes=PROBES)
+    probes, result = few.probed(), {}
+    sigma = filtering.errors()
+    for number, pair in enumerate(shared.pair_names):
+        wanted, uncertain = expected(shared, number, few, probes)
+        for row, mode in enumerate(shared.estimator.modes):
+            if mode.L == 0:
+                continue
+            one = filtered.sel(pair=pair, mode=mode.name)
+            other = plain.sel(pair=pair, mode=mode.name)
+            mean, error = one.biposh_qml_difference_mean.values, one.biposh_qml_difference_standard_error.values
+            total = np.hypot(error, uncertain[row]) / (np.sqrt(2.0) if mode.M else 1.0)  # of one part
+            part = np.imag if mode.M == 0 and mode.parity == "odd" else np.real
+            scatter = other.biposh_binned_standard_deviation.values
+            result[f"{pair.split(',')[0]} {mode.name}"] = {
+                "mean": part(mean).tolist(),
+                "error": error.tolist(),
+                "expected": part(wanted[row]).tolist(),
+                "error_of_normalisation": uncertain[row].tolist(),
+                "pull": (part(mean - wanted[row]) / total).tolist(),
+                "sigma_fisher": sigma[number, row].tolist(),
+                "sigma_filtered": one.biposh_qml_standard_deviation.values.tolist(),
+                "sigma_plain": scatter.tolist(),
+                "variance_ratio": ((sigma[number, row] / scatter) ** 2).tolist(),
+                "variance_ratio_binned": ((one.biposh_binned_standard_deviation.values / scatter) ** 2).tolist(),
+            }
+    return result
+
+
+def timed(shared: Survey) -> float:
+    """Processor time of a realization, s."""
+    simulate.realize(shared, 0)
+    start = time.process_time()
+    simulate.realize(shared, 1)
+    simulate.realize(shared, 2)
+    return (time.process_time() - start) / 2.0
+
+
+def draw(result: dict, middle: np.ndarray) -> Figure:
+    """Means on the left, variance ratios on the right."""
+    figure = Figure(figsize=(11.0, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for name, colour in (("V2", "#c44e22"), ("W1", "#1f5fa8")):
+        for mode, marker in zip(MODES, "os", strict=True):
+            # The last bin is a single degree at the end.
+            one = {key: np.array(value)[:-1] for key, value in result[f"{name} {mode}"].items()}
+            error = np.hypot(one["error"], one["error_of_normalisation"])
+            label = f"{name}, {MODES[mode]}"
+            shown = {"color": colour, "marker": marker, "ms": 5, "mfc": colour if marker == "o" else "white"}
+            left.errorbar(middle, one["mean"], error, ls="", label=label, **shown)
+            left.plot(middle, one["expected"], "-" if marker == "o" else "--", color=colour, lw=1)
+            right.plot(middle, one["variance_ratio"], "-" if marker == "o" else "--", label=label, **shown)
+    left.set(
+        xlabel=r"multipole $\ell$",
+        ylabel=r"$\ell(\ell+1)A/2\pi$  [$\mu$K$^2$]",
+        title="mean: points; prediction: lines",
+    )
+    left.axhline(0.0, color="0.7", lw=0.8)
+    right.set(
+        xlabel=r"multipole $\ell$", ylabel="variance, filtered / plain estimator", title="one sky", ylim=(0.0, 1.4)
+    )
+    right.axhline(1.0, color="0.7", lw=0.8)
+    for axes in (left, right):
+        axes.legend(frameon=False, fontsize=9)
+    return figure
+
+
+def main() -> None:
+    """Read the stores, compare, draw, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("filtered", type=Path)
+    parser.add_argument("plain", type=Path)
+    parser.add_argument("-o", "--output", type=Path, default=Path("filter.png"))
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    filtered, plain = (mcsim.open_summary(path).load() for path in (arguments.filtered, arguments.plain))
+    shared = survey(mcsim.load_config(HERE / "filtered.toml"))
+    result = compared(shared, filtered, plain)
+    pulls = np.concatenate([each["pull"] for each in result.values()])
+    ratio = np.concatenate(
+        [np.square(each["sigma_filtered"]) / np.square(each["sigma_fisher"]) for each in result.values()]
+    )
+    print(f"pulls of {pulls.size} means: rms {np.sqrt(np.mean(pulls**2)):.2f}, largest {np.abs(pulls).max():.1f}")
+    print(f"variance of {int(filtered['count'])} skies over that of the Fisher matrix: {ratio.mean():.3f}")
+    first = filtered["bin_first"].values
+    print("variance, filtered over plain; bins from l =", *first)
+    for name, each in result.items():
+        print(f"  {name:10s}", *(f"{value:6.2f}" for value in each["variance_ratio"]))
+    alone = np.mean([each["variance_ratio_binned"] for each in result.values()], axis=0)
+    print("each mode normalised alone, mean over modes:", *(f"{value:.2f}" for value in alone))
+    seconds = {name: timed(survey(mcsim.load_config(HERE / f"{name}.toml"))) for name in ("filtered", "plain")}
+    print(f"one realization: {seconds['filtered']:.2f} s filtered, {seconds['plain']:.2f} s plain, processor time")
+    draw(result, filtered["bin"].values[:-1]).savefig(arguments.output, dpi=110)
+    if arguments.json:
+        whole = {"bin_first": first.tolist(), "seconds": seconds, "results": result}
+        arguments.json.write_text(json.dumps(whole, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
