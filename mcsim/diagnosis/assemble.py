@@ -68,7 +68,7 @@ def result_of(
             "simulations of the model": len(ensemble.simulations),
             "skies constrained by the data": context.settings.constrained_skies,
             "seed of the run": context.run.ensemble.seed,
-            **({"worth": null.dof + 1} if ensemble.shrink else {}),
+            **({"worth": null.dof + 1} if null.covariance_dof is not None else {}),
             **data.provenance(),
         },
         configuration=config.to_json(context.run),
