@@ -105,9 +105,7 @@ def bench(nearest_candidates: bool) -> SimpleNamespace:
         run=replace(config.load(resources.workflow("quickstart")), name=EVIL),
         analysis=SimpleNamespace(elements=tuple(elements()), model=fiducial),
         settings=DiagnosisSettings(beam_bins=(5, 2, 2, 1, 1), place_pvalue=0.0123),
-        ensemble=SimpleNamespace(
-            shrink=False, simulations=simulations, residual_rms=1.0 + 0.1 * spread, nuisances=None
-        ),
+        ensemble=SimpleNamespace(simulations=simulations, residual_rms=1.0 + 0.1 * spread, nuisances=None),
         null=model,
         candidates=candidates,
         calibration=calibrate(
