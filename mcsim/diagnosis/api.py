@@ -98,7 +98,7 @@ def diagnose(
     threads = os.cpu_count() or 1
     task: Callable[[Job], NDArray[np.float64]] = data_vectors
     table = read_spectra(data, run) if isinstance(data, str | Path) and Path(data).is_file() else None
-    if settings.shrink and (run.nuisances or table is not None):
+    if settings.shrunk and (run.nuisances or table is not None):
         settings = settings.without_shrinkage()
     controls.check(wanted, of_maps=table is None, external=source is not None)
     if table is not None:
@@ -157,7 +157,7 @@ def describe(model: str | Path | config.RunConfig | ExternalModel, settings: Dia
     run, source = loaded(model)
     count, (settings, library) = settings.controls, _with_library(settings)
     controls.check(count, of_maps=True, external=source is not None)
-    if settings.shrink and run.nuisances:
+    if settings.shrunk and run.nuisances:
         settings = settings.without_shrinkage()
     analysis = analysis_of(run, settings.without, os.cpu_count() or 1, settings, library, source)
     power.check(analysis.model.survey)
@@ -231,7 +231,7 @@ def _learned(
         null_ensemble.save(scratch, *campaign.learned(analysis, ask, simulations))
 
     found = null_ensemble.load(folders.cached(name, fill))
-    if not analysis.settings.shrink:
+    if not analysis.settings.shrunk:
         shutil.rmtree(kept(run, analysis).folder, ignore_errors=True)
     return found
 
