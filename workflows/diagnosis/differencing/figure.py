@@ -58,7 +58,7 @@ def main() -> None:
     right.axhline(1.0, color="k", lw=0.8, ls=":")
     right.set_xticks(range(len(PUT_IN)), [name.replace("_", "\n") for name in PUT_IN])
     right.set_ylabel("amplitude found / put in")
-    figure.tight_layout()
+    figure.subplots_adjust(hspace=0.25)
     figure.savefig(chosen.output, dpi=110)
 
 
