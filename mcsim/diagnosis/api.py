@@ -202,7 +202,7 @@ def _analysed(
     """
     threads = os.cpu_count() or 1
     table = read_spectra(data, run) if isinstance(data, str | Path) and Path(data).is_file() else None
-    if settings.shrinkage and (run.nuisances or table is not None):
+    if settings.shrunk and (run.nuisances or table is not None):
         settings = settings.without_shrinkage()
     controls.check(wanted, of_maps=table is None, external=source is not None)
     if table is not None:
