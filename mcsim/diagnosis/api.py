@@ -96,8 +96,20 @@ def diagnose(
     wanted, (settings, library) = settings.controls, _with_library(settings)
     if output is not None:
         folders.writable(Path(output))
-    run, analysis, table = _analysed(run, source, data, settings, library, wanted)
-    task: Callable[[Job], NDArray[np.float64]] = data_vectors if table is None else table
+    threads = os.cpu_count() or 1
+    task: Callable[[Job], NDArray[np.float64]] = data_vectors
+    table = read_spectra(data, run) if isinstance(data, str | Path) and Path(data).is_file() else None
+    if settings.shrunk and (run.nuisances or table is not None):
+        settings = settings.without_shrinkage()
+    controls.check(wanted, of_maps=table is None, external=source is not None)
+    if table is not None:
+        if source is not None:
+            raise InputError(f"{data} is a table, but {source.label} makes maps; give maps, or a run of mcsim.")
+        run, task = measured_spectra.estimator_for(run, table), table
+        analysis = measured_spectra.analysis_of_spectra(run, table, settings.without, threads, settings, library)
+    else:
+        analysis = analysis_of(run, settings.without, threads, settings, library, source)
+    power.check(analysis.model.survey)
     maps: Sequence[NDArray[np.float64]] = ()
     if table is None:
         maps = read_maps(analysis.model, data) if isinstance(data, str | Path) else checked(analysis.model, data)
@@ -154,9 +166,11 @@ def describe(
     """
     run, source = loaded(model)
     count, (settings, library) = settings.controls, _with_library(settings)
-    run, analysis, table = _analysed(run, source, data, settings, library, count)
-    if data is not None and table is None:
-        read_maps(analysis.model, data)
+    controls.check(count, of_maps=True, external=source is not None)
+    if settings.shrunk and run.nuisances:
+        settings = settings.without_shrinkage()
+    analysis = analysis_of(run, settings.without, os.cpu_count() or 1, settings, library, source)
+    power.check(analysis.model.survey)
     planned, size = campaign.plan(analysis, settings.simulations), len(analysis.elements)
     jobs = planned.values()
     number = sum(job.count for job in jobs if job.source is None)
@@ -188,7 +202,7 @@ def _analysed(
     """
     threads = os.cpu_count() or 1
     table = read_spectra(data, run) if isinstance(data, str | Path) and Path(data).is_file() else None
-    if settings.shrinkage and (run.nuisances or table is not None):
+    if settings.shrunk and (run.nuisances or table is not None):
         settings = settings.without_shrinkage()
     controls.check(wanted, of_maps=table is None, external=source is not None)
     if table is not None:
@@ -255,7 +269,7 @@ def _learned(
         null_ensemble.save(scratch, *campaign.learned(analysis, ask, simulations))
 
     found = null_ensemble.load(folders.cached(name, fill))
-    if not analysis.settings.shrinkage:
+    if not analysis.settings.shrunk:
         shutil.rmtree(kept(run, analysis).folder, ignore_errors=True)
     return found
 

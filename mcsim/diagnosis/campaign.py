@@ -219,7 +219,7 @@ def learned(
         rest[:, :numbers],
         *residuals,
         redundant=analysis.settings.redundant,
-        shrink=analysis.settings.shrinkage,
+        shrunk=analysis.settings.shrunk,
         external_reference=None if analysis.source is None else references[True],
         own_offset=own_offset,
         nuisances=_nuisances(analysis, len(null)),

@@ -210,7 +210,7 @@ class Slices:
 
     def _null(self, rows: Rows) -> SimulatedGaussian | None:
         """Return the null distribution of some elements; None if there are too few simulations, or none of these."""
-        spare = SPARE_SHRUNK if self.ensemble.shrink else SPARE
+        spare = SPARE_SHRUNK if self.ensemble.shrunk else SPARE
         if not 0 < len(rows) <= len(self.ensemble.simulations) // spare:
             return None
         key = rows.tobytes()

@@ -45,7 +45,7 @@ class NullEnsemble:
     slice_reference: Matrix = field(default_factory=lambda: np.zeros((0, 0)))
     slice_elements: tuple[Element, ...] = ()
     nuisances: Matrix | None = None  # coordinates that every simulation drew, (N, k); None: there are none
-    shrink: bool = False  # few simulations, whose covariance is shrunk; not with nuisances
+    shrunk: bool = False  # few simulations, whose covariance is shrunk; not with nuisances
 
     @cached_property
     def spread(self) -> Vector:
@@ -59,7 +59,7 @@ class NullEnsemble:
         Which directions are redundant is decided without the nuisances: beside a wide prior all others look small.
         """
         if self.nuisances is None:
-            return SimulatedGaussian.from_simulations(self.simulations, self.offset, self.redundant, self.shrink)
+            return SimulatedGaussian.from_simulations(self.simulations, self.offset, self.redundant, self.shrunk)
         tested = self.tested
         kept = SimulatedGaussian.from_simulations(self.quiet[:, tested], floor=self.redundant).whitening
         wide = SimulatedGaussian.from_simulations(self.simulations[:, tested] @ kept.T, floor=ROUND_OFF)
@@ -156,7 +156,7 @@ def save(path: Path, ensemble: NullEnsemble, bank: TemplateBank) -> None:
         "slice_elements": json.dumps([asdict(element) for element in ensemble.slice_elements]),
         "columns": json.dumps(bank.labels),
         "redundant": ensemble.redundant,
-        "shrink": ensemble.shrink,
+        "shrunk": ensemble.shrunk,
     }
     variables = {name: ([f"{name}_{axis}" for axis in range(array.ndim)], array) for name, array in arrays.items()}
     xr.Dataset(variables, attrs=attributes).to_zarr(path, mode="w", consolidated=False)
@@ -170,10 +170,10 @@ def load(path: Path) -> tuple[NullEnsemble, TemplateBank]:
             TypeAdapter(tuple[Element, ...]).validate_json(dataset.attrs[key]) for key in ("elements", "slice_elements")
         )
         columns = TypeAdapter(tuple[Column, ...]).validate_json(dataset.attrs["columns"])
-        redundant, shrink = float(dataset.attrs["redundant"]), bool(dataset.attrs["shrink"])
+        redundant, shrunk = float(dataset.attrs["redundant"]), bool(dataset.attrs["shrunk"])
     matrix, error, curvature, beside_matrix = map(arrays.pop, ("matrix", "error", "curvature", "slice_matrix"))
     bank = TemplateBank(matrix, error, curvature, columns, beside_matrix)
     return (
-        NullEnsemble(**arrays, elements=elements, slice_elements=beside, redundant=redundant, shrink=shrink),
+        NullEnsemble(**arrays, elements=elements, slice_elements=beside, redundant=redundant, shrunk=shrunk),
         bank,
     )

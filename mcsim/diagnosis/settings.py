@@ -6,7 +6,7 @@ from typing import Any
 from mcsim.systematics import Library
 
 _FIRST = {
-    "shrinkage": True,
+    "shrunk": True,
     "sims_per_element": 3,
     "pilot_sims_per_element": 2,
     "channel_skies": 2,
@@ -76,7 +76,7 @@ class DiagnosisSettings:
         P-value up to which a group of numbers is listed before others of a kind listed already.
     sims_per_element, pilot_sims_per_element
         Simulations per independent element of the data vector; and per element, after which these are counted.
-    shrinkage
+    shrunk
         Take the covariance from few simulations: shrunk (:func:`mcsim.stats.shrinkage.shrunk`), not that of the sample.
     redundant
         Directions of the data vector with less than this fraction of the largest variance are dropped.
@@ -185,7 +185,7 @@ class DiagnosisSettings:
 
     sims_per_element: int = 10
     pilot_sims_per_element: int = 3
-    shrinkage: bool = False
+    shrunk: bool = False
     redundant: float = 1e-4
     response_modes: int = 1 << 14
     channel_skies: int = 3
@@ -244,7 +244,7 @@ class DiagnosisSettings:
         whole = DiagnosisSettings()
         few = self.sims_per_element == _FIRST["sims_per_element"]
         names = ("sims_per_element", "pilot_sims_per_element") if few else ()
-        return replace(self, shrinkage=False, **{name: getattr(whole, name) for name in names})
+        return replace(self, shrunk=False, **{name: getattr(whole, name) for name in names})
 
     def of_a_simulation(self) -> "DiagnosisSettings":
         """Return the settings with the default numbers of simulations, on which no single simulation depends."""

@@ -112,7 +112,7 @@ def test_a_first_verdict_is_followed_by_the_whole_one_without_another_simulation
 def test_with_nuisances_a_first_verdict_has_the_simulations_of_a_sample_covariance():
     assert mcsim.DiagnosisSettings.quick().without_shrinkage().sims_per_element == SETTINGS.sims_per_element * 2
     assert mcsim.DiagnosisSettings.quick(sims_per_element=7).without_shrinkage().sims_per_element == 7
-    assert not mcsim.DiagnosisSettings.quick().without_shrinkage().shrinkage
+    assert not mcsim.DiagnosisSettings.quick().without_shrinkage().shrunk
 
 
 def test_the_cost_is_said_with_time_memory_and_disk():
