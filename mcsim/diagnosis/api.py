@@ -96,20 +96,8 @@ def diagnose(
     wanted, (settings, library) = settings.controls, _with_library(settings)
     if output is not None:
         folders.writable(Path(output))
-    threads = os.cpu_count() or 1
-    task: Callable[[Job], NDArray[np.float64]] = data_vectors
-    table = read_spectra(data, run) if isinstance(data, str | Path) and Path(data).is_file() else None
-    if settings.shrunk and (run.nuisances or table is not None):
-        settings = settings.without_shrinkage()
-    controls.check(wanted, of_maps=table is None, external=source is not None)
-    if table is not None:
-        if source is not None:
-            raise InputError(f"{data} is a table, but {source.label} makes maps; give maps, or a run of mcsim.")
-        run, task = measured_spectra.estimator_for(run, table), table
-        analysis = measured_spectra.analysis_of_spectra(run, table, settings.without, threads, settings, library)
-    else:
-        analysis = analysis_of(run, settings.without, threads, settings, library, source)
-    power.check(analysis.model.survey)
+    run, analysis, table = _analysed(run, source, data, settings, library, wanted)
+    task: Callable[[Job], NDArray[np.float64]] = data_vectors if table is None else table
     maps: Sequence[NDArray[np.float64]] = ()
     if table is None:
         maps = read_maps(analysis.model, data) if isinstance(data, str | Path) else checked(analysis.model, data)
@@ -166,11 +154,9 @@ def describe(
     """
     run, source = loaded(model)
     count, (settings, library) = settings.controls, _with_library(settings)
-    controls.check(count, of_maps=True, external=source is not None)
-    if settings.shrunk and run.nuisances:
-        settings = settings.without_shrinkage()
-    analysis = analysis_of(run, settings.without, os.cpu_count() or 1, settings, library, source)
-    power.check(analysis.model.survey)
+    run, analysis, table = _analysed(run, source, data, settings, library, count)
+    if data is not None and table is None:
+        read_maps(analysis.model, data)
     planned, size = campaign.plan(analysis, settings.simulations), len(analysis.elements)
     jobs = planned.values()
     number = sum(job.count for job in jobs if job.source is None)

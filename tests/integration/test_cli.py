@@ -17,6 +17,7 @@ from astropy.table import Table
 
 from mcsim import cli, config, open_summary
 from mcsim.ensemble import tables
+from mcsim.ensemble.maps import write_map
 from mcsim.ensemble.prediction import predict
 from mcsim.plot.spectra import ensemble_figure
 from refusals import unnamed
@@ -108,6 +109,8 @@ noise = { sigma0_uk = 30.0 }
 scan = { kind = "hit_averaged", model = "wmap", sample_period_s = 157.8, line_of_sight = "A" }
 """
     (tmp_path / "small.toml").write_text(model)
+    (tmp_path / "data").mkdir()
+    write_map(tmp_path / "data" / "W1.fits", 60.0 * np.random.default_rng(1).standard_normal(3072), "ecliptic")
     command = ("diagnose", "small.toml", "data", "-o", "out", "--dry-run", "--simulations", 400)
     sizes = [int(mcsim(*command, *more)[1].splitlines()[0].split()[-1]) for more in ((), asked.split())]
     assert sizes[1] == sizes[0] + 2  # cosine and sine have a matched filter each

@@ -185,7 +185,7 @@ def test_an_imbalance_is_named():
 def test_maps_that_do_not_converge_end_in_a_sentence():
     run = run_of()
     few = replace(run, channels=tuple(replace(c, scan=replace(c.scan, max_iterations=2)) for c in run.channels))
-    with pytest.raises(RunError, match="max_iterations"):
+    with refused("max_iterations", by=RunError):
         simulate.maps(survey(few), 0)
 
 

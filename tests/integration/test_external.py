@@ -402,8 +402,12 @@ def test_only_a_diagnosis_takes_a_simulator(tmp_path):
     assert "maps" not in config.to_dict(config.load(MODEL))["ensemble"]
 
 
-def test_the_command_line_says_what_a_simulator_is_asked_for(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["mcsim", "diagnose", str(EXAMPLE), "data", "-o", "out", "--dry-run"])
+def test_the_command_line_says_what_a_simulator_is_asked_for(monkeypatch, capsys, tmp_path):
+    run = config.load(EXAMPLE)
+    for split in run.map.splits:
+        name = tmp_path / f"{run.channels[0].name}_{split}.fits"
+        write_map(name, 60.0 * np.random.default_rng(1).standard_normal(12 * run.map.nside**2), run.map.frame)
+    monkeypatch.setattr(sys, "argv", ["mcsim", "diagnose", str(EXAMPLE), str(tmp_path), "-o", "out", "--dry-run"])
     with pytest.raises(SystemExit) as stop:
         cli.main()
     assert stop.value.code == 0
