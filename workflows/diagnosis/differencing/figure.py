@@ -39,8 +39,10 @@ def main() -> None:
     results = [json.loads(path.read_text()) for path in chosen.files]
     figure = plt.figure(figsize=(10.0, 7.0))
     for place, (title, map_uk) in enumerate(maps()):
-        healpy.mollview(map_uk, fig=figure.number, sub=(2, 2, place + 1), title=title, cmap="RdBu_r", notext=True)
-    left, right = figure.add_subplot(2, 2, 3), figure.add_subplot(2, 2, 4)
+        healpy.mollview(
+            map_uk, fig=figure.number, sub=(2, 2, place + 1), title=title, cmap="RdBu_r", notext=True, format="%.2g"
+        )
+    left, right = (figure.add_axes((x, 0.08, 0.4, 0.36)) for x in (0.07, 0.57))
     for result in results:
         p = np.sort(result["null"]["p_values"])
         left.step(p, np.arange(1, p.size + 1) / p.size, where="post", label=f"nside {result['nside']}, {p.size} skies")
@@ -58,7 +60,6 @@ def main() -> None:
     right.axhline(1.0, color="k", lw=0.8, ls=":")
     right.set_xticks(range(len(PUT_IN)), [name.replace("_", "\n") for name in PUT_IN])
     right.set_ylabel("amplitude found / put in")
-    figure.subplots_adjust(hspace=0.25)
     figure.savefig(chosen.output, dpi=110)
 
 
