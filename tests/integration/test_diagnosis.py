@@ -11,13 +11,14 @@ import pytest
 from scipy.stats import kstest
 
 import mcsim
+from instruments import data_of, two_channels
 from mcsim import config, systematics
 from mcsim.diagnosis import api, campaign, localisation, report, unlisted, words
 from mcsim.diagnosis.analysis import analysis_of, data_vectors
 from mcsim.diagnosis.campaign import with_effects
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.inference import diagnose_data
-from mcsim.diagnosis.observed_maps import ObservedMaps, read_maps
+from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.wiener_filter import shared_sky, wiener_filter
@@ -30,23 +31,7 @@ from pictures import quick_pictures
 from refusals import refused
 
 PROPOSED = ("beam_ellipticity", "pointing_offset", "noise_level", "dipole_modulation")
-MODEL = {
-    "schema": 1,
-    "name": "small",
-    "sky": {"spectrum": "wmap7", "lmax": 40, "dipole_uk": 3364.5},
-    "map": {"nside": 16, "splits": ["half1", "half2"]},
-    "biposh": {"L_max": 2},
-    "channel": [
-        {
-            "name": name,
-            "frequency_ghz": frequency,
-            "beam": {"kind": "gaussian", "fwhm_arcmin": 350.0},
-            "noise": {"sigma0_uk": 30.0},
-            "scan": {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 61.0, "line_of_sight": line},
-        }
-        for name, frequency, line in (("V1", 61.0, "A"), ("W1", 94.0, "B"))
-    ],
-}
+MODEL = two_channels("small")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,12 +51,6 @@ def small():
     run = config.load(MODEL)
     analysis = analysis_of(run, without=[name for name in systematics.catalogue() if name not in PROPOSED])
     return context(analysis, *campaign.learned(analysis, ask, 260, time_ordered=False))
-
-
-def data_of(run, name=None, channel=None, seed=77, **parameters):
-    found = () if name is None else (config.Effect(name=name, channel=channel, parameters=parameters),)
-    changed = with_effects(replace(run, ensemble=replace(run.ensemble, seed=seed)), found)
-    return survey(changed)
 
 
 def test_both_folds_have_every_range_of_the_sky(small):
@@ -363,20 +342,6 @@ def test_the_cost_of_a_diagnosis_counts_the_effects_on_request(small):
         api.describe(small.run, replace(least, including=("gain_spin",), without=("gain_spin",)))
 
 
-def test_the_cost_of_a_diagnosis_is_said_of_data_that_can_be_used(small, folder):
-    settings = DiagnosisSettings(simulations=400, without=tuple(n for n in systematics.catalogue() if n != "boost"))
-    said = [api.describe(small.run, settings, *data).splitlines()[0] for data in ((), (folder,))]
-    assert said[0] == said[1]
-    write(folder, "W1:half2", np.ones(12 * 8**2))
-    with refused("W1_half2.fits", "nside 8", 16):
-        api.describe(small.run, settings, folder)
-    (folder / "00000").mkdir()
-    for path in list(folder.glob("*.fits")):
-        path.rename(folder / "00000" / path.name)
-    with refused("V1_half1.fits", folder / "00000"):
-        api.describe(small.run, settings, folder)
-
-
 def test_a_diagnosis_knows_the_library_that_it_is_given(small, tmp_path, monkeypatch):
     """And names an effect that is in no catalogue; ``without`` is read in that library too."""
     monkeypatch.setenv("MCSIM_CACHE", str(tmp_path))
@@ -408,20 +373,6 @@ def test_columns_and_matched_filters_know_their_candidate(small):
         assert (element.candidate in known) if element.kind == "matched" else element.candidate is None
 
 
-def test_what_cannot_be_done_is_said_before_anything_is_learned(small, folder):
-    (folder / "file").write_text("")
-    for changes, named in (
-        ({"output": folder / "file"}, (folder / "file",)),
-        ({"settings": DiagnosisSettings(without=("beam_elipticity",))}, ("beam_elipticity", "beam_ellipticity")),
-        ({"data": [np.zeros(3072)]}, ("1 maps", 4)),
-        ({"data": [np.zeros(48)] * 4}, ("V1:half1", "nside 2", 16)),
-        ({"settings": DiagnosisSettings(simulations=20)}, ("20 simulations", 167, 334)),
-    ):
-        with refused(*named):
-            mcsim.diagnose(**({"model": small.run, "data": folder, "output": folder / "new" / "verdict"} | changes))
-    assert not (folder / "new").exists()
-
-
 def test_exchanged_channels_are_noticed(small):
     run = replace(
         small.run,
@@ -431,73 +382,6 @@ def test_exchanged_channels_are_noticed(small):
     found = diagnose_data(ObservedMaps(small, maps, ask), "wide").verdict
     # No effect of this library widens a beam: whatever is said, it is no single confident name.
     assert found["verdict"] in ("unknown", "mixture", "degenerate")
-
-
-@pytest.fixture
-def folder(small, tmp_path):
-    for part, map_uk in zip(small.analysis.model.parts, simulate.maps(data_of(small.run), 0), strict=True):
-        write(tmp_path, part.name, map_uk)
-    return tmp_path
-
-
-def write(folder, name, map_uk, **options):
-    path = folder / f"{name.replace(':', '_')}.fits"
-    healpy.write_map(path, map_uk, overwrite=True, dtype=np.float64, column_units=options.pop("unit", "uK"), **options)
-
-
-def test_maps_are_read_as_they_were_written(small, folder):
-    maps = read_maps(small.analysis.model, folder)
-    expected = simulate.maps(data_of(small.run), 0)
-    assert all(np.array_equal(a, b) for a, b in zip(maps, expected, strict=True))
-
-
-def test_a_nested_map_with_an_honest_header_is_read(small, folder):
-    expected = simulate.maps(data_of(small.run), 0)[0]
-    write(folder, "V1:half1", healpy.reorder(expected, r2n=True), nest=True)
-    assert np.array_equal(read_maps(small.analysis.model, folder)[0], expected)
-
-
-@pytest.mark.parametrize(
-    ("change", "options", "named"),
-    [
-        (lambda m: np.where(m == healpy.UNSEEN, m, m / 1000.0), {"unit": ""}, ("0.0443 uK", "45 uK", "TUNIT1")),
-        (lambda m: np.full_like(m, 3.0), {}, ("V1_half1.fits", "constant")),
-        (lambda m: np.where(np.arange(m.size) == 5, np.nan, m), {}, ("1 pixels", "finite", "UNSEEN")),
-        (lambda m: np.where(np.arange(m.size) < m.size // 2, healpy.UNSEEN, m), {}, ("50 %", "1 %", "map.mask")),
-        (lambda m: m, {"coord": "G"}, ("galactic", "ecliptic")),
-        (lambda m: healpy.ud_grade(m, 8), {}, ("nside 8", 16)),
-    ],
-)
-def test_hostile_data_end_in_a_sentence(small, folder, change, options, named):
-    map_uk = simulate.maps(data_of(small.run), 0)[0]
-    write(folder, "V1:half1", change(map_uk), **options)
-    with refused(*named):
-        read_maps(small.analysis.model, folder)
-
-
-def test_data_in_mk_with_a_header_are_read(small, folder):
-    expected = simulate.maps(data_of(small.run), 0)[0]
-    write(folder, "V1:half1", np.where(expected == healpy.UNSEEN, expected, expected / 1000.0), unit="mK")
-    assert np.allclose(read_maps(small.analysis.model, folder)[0], expected, rtol=1e-12)
-
-
-def test_data_in_antenna_temperature_are_read(small, folder):
-    expected = simulate.maps(data_of(small.run), 0)[0]
-    frequency = small.run.channels[0].frequency_ghz
-    assert frequency is not None
-    x = 6.62607015e-34 * frequency * 1e9 / (1.380649e-23 * 2.7255)
-    factor = np.expm1(x) ** 2 / (x**2 * np.exp(x))
-    write(folder, "V1:half1", np.where(expected == healpy.UNSEEN, expected, expected / factor), unit="uK_RJ")
-    assert np.allclose(read_maps(small.analysis.model, folder)[0], expected, rtol=1e-6)
-    write(folder, "V1:half1", expected, unit="V")
-    with refused("V1_half1.fits", "'V'", "uK"):
-        read_maps(small.analysis.model, folder)
-
-
-def test_a_missing_file_is_named(small, folder):
-    (folder / "W1_half2.fits").unlink()
-    with refused("W1_half2.fits", "W1:half2"):
-        read_maps(small.analysis.model, folder)
 
 
 def test_the_verdict_is_json_and_the_evidence_opens(small, tmp_path):

@@ -10,6 +10,7 @@ import tomli_w
 from scipy.stats import ks_2samp
 
 import mcsim
+from instruments import two_channels
 from mcsim import cli, config, systematics
 from mcsim.diagnosis import api, campaign, report, words
 from mcsim.diagnosis.analysis import analysis_of, data_vectors
@@ -28,22 +29,7 @@ from mcsim.stats.look_elsewhere import global_test
 PROPOSED = ("beam_ellipticity", "calibration", "noise_level")
 WITHOUT = tuple(name for name in systematics.catalogue() if name not in PROPOSED)
 WIDTH, NOISE = 0.003, 0.03
-MODEL = {
-    "schema": 1,
-    "name": "company",
-    "sky": {"spectrum": "wmap7", "lmax": 40, "dipole_uk": 3364.5},
-    "map": {"nside": 16, "splits": ["half1", "half2"]},
-    "biposh": {"L_max": 2},
-    "channel": [
-        {
-            "name": name,
-            "frequency_ghz": frequency,
-            "beam": {"kind": "gaussian", "fwhm_arcmin": 350.0},
-            "noise": {"sigma0_uk": 60.0},
-            "scan": {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 61.0, "line_of_sight": line},
-        }
-        for name, frequency, line in (("V1", 61.0, "A"), ("W1", 94.0, "B"))
-    ],
+MODEL = two_channels("company", sigma0_uk=60.0) | {
     "nuisance": [
         {"effect": effect, "channel": channel, "width": width}
         for channel in ("V1", "W1")

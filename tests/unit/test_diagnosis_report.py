@@ -16,7 +16,7 @@ from scipy import stats
 from mcsim import config, systematics
 from mcsim.diagnosis import figures as plots
 from mcsim.diagnosis import localisation, report, words
-from mcsim.diagnosis.assemble import effects_of, result_of
+from mcsim.diagnosis.assemble import result_of
 from mcsim.diagnosis.candidate import Candidate, numbered
 from mcsim.diagnosis.localisation import Place
 from mcsim.diagnosis.refine import Refined
@@ -29,7 +29,7 @@ from mcsim.stats.excess import HeldOut, Measured
 from mcsim.stats.gaussian import SimulatedGaussian, held_out_pvalues, residual_pvalue
 from mcsim.stats.look_elsewhere import calibrate
 from mcsim.support import resources
-from mcsim.support.numbers import duration, measured, number, p_equals, probability
+from mcsim.support.numbers import p_equals
 from pictures import quick_pictures
 from refusals import refused
 
@@ -403,30 +403,9 @@ def test_standardised_maps_have_unit_variance_for_any_number_of_simulations():
     assert np.nanmean(z**2) == pytest.approx(1.0, abs=5.0 * np.sqrt((2.0 + 6.0 / 7.0) / pixels))
 
 
-@pytest.mark.parametrize(
-    ("value", "sigma", "text"),
-    [
-        (0.10034, 0.0098, "0.100 ± 0.010"),
-        (1.1592, 0.0081, "1.159 ± 0.008"),
-        (123.4, 12.0, "123 ± 12"),
-        (-2.5e-7, 3e-8, "(−2.50 ± 0.30) × 10⁻⁷"),
-        (-0.00001, 0.0039, "0.000 ± 0.004"),
-        (0.3, 0.0, "0.3"),
-        (float("nan"), 1.0, "–"),
-    ],
-)
-def test_values_are_written_to_the_digits_of_their_errors(value, sigma, text):
-    assert measured(value, sigma) == text
-
-
 def test_parameters_that_are_not_set_are_left_out():
     given = {"angle_deg": -3.0, "template": "", "axis": [1.0, 0.5], "kind": "dipole", "other": None}
     assert report.parameters(given) == "angle_deg = −3, axis = (1, 0.5), kind = dipole"
-
-
-def test_tiny_probabilities_are_powers_of_ten():
-    assert probability(1.04e-8) == "1 × 10⁻⁸"
-    assert number(float("inf")) == "∞"
 
 
 def test_elements_in_words():
@@ -435,53 +414,6 @@ def test_elements_in_words():
     assert found[4].endswith("half1, ℓ 2–11, imaginary")
     assert found[-6] != found[-5] == "matched filter: offset of V, component 2"
     assert found[-2] == "other, V"
-
-
-@pytest.mark.parametrize("name", systematics.catalogue())
-def test_amplitudes_of_every_effect_are_printed_with_their_error(name):
-    kind = systematics.get(name)
-    effect = systematics.basis_of(kind)[0]
-    assert "±" in effect.describe(0.1 * kind.step)
-    assert "±" not in effect.describe()
-    assert "_" not in kind.label("W1").replace("C_ℓ", "")
-
-
-def test_amplitudes_have_the_units_that_people_read():
-    ellipse, offset = (systematics.get(name) for name in ("beam_ellipticity", "pointing_offset"))
-    assert ellipse(amplitude=0.1592, angle_deg=2.0).describe(0.0081) == (
-        "axis ratio 1.159 ± 0.008 with the major axis along the scan"
-    )
-    assert offset(amplitude=1.53, angle_deg=178.0).describe(0.041) == "1.53′ ± 0.04′ against the scan"
-    assert offset(amplitude=1.53, angle_deg=-37.0).direction() == "at −37° to the scan"
-    assert systematics.get("noise_level").format_amplitude(-0.095, 0.01) == "9.5 % ± 1.0 % less noise"
-    assert ellipse.label("W1") == "beam ellipticity of W1"
-
-
-def test_an_amplitude_at_the_edge_of_the_possible_has_an_error():
-    kind = systematics.get("spectrum")
-    errors = np.array([0.2, 0.02, 0.02, 0.02, 0.02, 0.02])
-    less_than_nothing = SimpleNamespace(amplitudes=np.array([-1.1, 0, 0, 0, 0, 0]), covariance=np.diag(errors**2))
-    (found,) = effects_of([Candidate(kind, None, tuple(range(6)))], (0,), less_than_nothing)
-    assert found.amplitude == pytest.approx(0.99)
-    # One error up is -0.9.
-    assert found.sigma == pytest.approx((0.99 - 0.9) / 2.0, rel=1e-3)
-
-
-def test_what_data_do_not_tell_is_no_part_of_an_error():
-    kind = systematics.get("spectrum")
-    errors = np.array([0.02, 0.02, 0.02, 0.02, 0.02, 0.4])
-    fitted = SimpleNamespace(amplitudes=np.array([0.3, 0, 0, 0, 0, 1.0]), covariance=np.diag(errors**2))
-    (found,) = effects_of([Candidate(kind, None, tuple(range(6)))], (0,), fitted)
-    assert found.amplitude == pytest.approx(0.3)
-    assert found.sigma == pytest.approx(0.02)
-
-
-@pytest.mark.parametrize(
-    ("seconds", "words"),
-    [(0.0456, "45.6 ms"), (1.53, "1.53 s"), (119.0, "119 s"), (150.0, "2.5 min"), (9000.0, "2.5 h"), (432000.0, "5 d")],
-)
-def test_durations_are_said_in_a_unit_that_people_use(seconds, words):
-    assert duration(seconds) == words
 
 
 def test_elements_that_are_not_tested_are_counted_and_folded(diagnoses):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from instruments import two_channels
 from mcsim import config, systematics
 from mcsim.diagnosis.analysis import analysis_of
 from mcsim.diagnosis.api import _key, describe
@@ -34,23 +35,8 @@ NSIDE, LMAX = 8, 16
 
 
 def model(*nuisances, **changes):
-    table = {
-        "name": "nuisances",
-        "sky": {"spectrum": "wmap7", "lmax": LMAX, "dipole_uk": 3364.5},
-        "map": {"nside": NSIDE, "splits": ["a", "b"]},
-        "biposh": {"L_max": 2},
-        "channel": [
-            {
-                "name": name,
-                "frequency_ghz": frequency,
-                "beam": {"kind": "gaussian", "fwhm_arcmin": 800.0},
-                "noise": {"sigma0_uk": 30.0},
-                "scan": {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 300.0, "line_of_sight": line},
-            }
-            for name, frequency, line in (("V1", 61.0, "A"), ("W1", 94.0, "B"))
-        ],
-        "nuisance": list(nuisances),
-    }
+    table = two_channels("nuisances", lmax=LMAX, nside=NSIDE, fwhm_arcmin=800.0, period_s=300.0)
+    table |= {"map": {"nside": NSIDE, "splits": ["a", "b"]}, "nuisance": list(nuisances)}
     return config.load(table | changes)
 
 

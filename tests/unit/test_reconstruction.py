@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from instruments import two_channels
 from mcsim import config, systematics
 from mcsim.diagnosis import api, unlisted
 from mcsim.diagnosis.settings import DiagnosisSettings
@@ -27,23 +28,7 @@ from mcsim.sphere import healpix, real
 from refusals import refused
 
 LMAX, NSIDE = 24, 16
-MODEL = {
-    "schema": 1,
-    "name": "unlisted",
-    "sky": {"spectrum": "wmap7", "lmax": LMAX, "dipole_uk": 3364.5},
-    "map": {"nside": NSIDE, "splits": ["half1", "half2"]},
-    "biposh": {"L_max": 2},
-    "channel": [
-        {
-            "name": name,
-            "frequency_ghz": frequency,
-            "beam": {"kind": "gaussian", "fwhm_arcmin": 300.0},
-            "noise": {"sigma0_uk": 30.0},
-            "scan": {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 311.0, "line_of_sight": line},
-        }
-        for name, frequency, line in (("V1", 61.0, "A"), ("W1", 94.0, "B"))
-    ],
-}
+MODEL = two_channels("unlisted", lmax=LMAX, nside=NSIDE, fwhm_arcmin=300.0, period_s=311.0)
 
 
 @lru_cache(maxsize=1)
