@@ -40,7 +40,7 @@ MODEL = {
                 "kind": "elliptical_gaussian", "fwhm_major_arcmin": 400.0, "fwhm_minor_arcmin": 320.0,
                 "angle_deg": 20.0, "m_max": 4,
             },
-            "scan": {"kind": "hit_averaged", "model": "wmap", "line_of_sight": "A", "sample_period_s": 121.0},
+            "scan": {"kind": "hit_averaged", "model": "wmap", "line_of_sight": "A", "sample_period_s": 361.0},
         }
     ],
     "ensemble": {"seed": 3},
@@ -275,7 +275,7 @@ PEAR.blm[1] += 0.2 * np.exp(0.7j) * PEAR.blm[0] * (np.arange(33) / 32) ** 3
 PEAR.blm[3, 3:] += 0.1 * np.exp(-0.4j) * PEAR.blm[0, 3:] * (np.arange(3, 33) / 32) ** 3
 
 
-def small(model: str = "wmap", beam: mcsim.Beam = PEAR, period_s: float = 121.0, **more: object) -> dict:
+def small(model: str = "wmap", beam: mcsim.Beam = PEAR, period_s: float = 361.0, **more: object) -> dict:
     """Return a run of nside 16 with a beam of odd orders."""
     line = {"line_of_sight": "A"} if model == "wmap" else {}
     scan = {"kind": "hit_averaged", "model": model, "sample_period_s": period_s} | line
@@ -385,7 +385,7 @@ def test_stripes_of_a_binned_map_are_those_that_a_destriper_takes_off():
     drift -= drift.mean()
 
     def offsets(chunk: tod.Samples) -> NDArray[np.float64]:
-        return drift[(chunk.time_s / (256 * 121.0)).astype(int)]
+        return drift[(chunk.time_s / (256 * 361.0)).astype(int)]
 
     found = mcsim.compare(simulator(added=offsets), simulator(), simulator.run)
     assert names(found) == ["map_making"]
@@ -486,7 +486,7 @@ def test_the_model_may_describe_the_other_side(name, simulator, side_a):
 def test_time_stamps_a_whole_sample_off_are_named_however_far_that_is():
     simulator = Simulator(small())
     pointing = simulator.site.pointed("")
-    ahead = scene.ahead(pointing.model, 121.0)
+    ahead = scene.ahead(pointing.model, 361.0)
     observe = tod.sky_signal(simulator.sky, 32, PEAR, 1e-8, 1)
 
     def late(half: int) -> NDArray[np.float64]:
