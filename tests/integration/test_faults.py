@@ -30,7 +30,7 @@ from mcsim.simulation import simulate
 from mcsim.support.progress import Journal
 from refusals import refused
 
-from .conftest import ensemble, table
+from .conftest import table
 from .test_runner import assert_same
 
 
