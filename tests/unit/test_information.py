@@ -271,6 +271,7 @@ def test_marginalising_is_inverting_a_covariance() -> None:
     assert canonical_correlations(fisher, [[0], [2]])[0, 1] == pytest.approx(abs(one))
 
 
+@pytest.mark.slow
 def test_nuisance_widens_what_it_resembles_and_conventions_are_textbook() -> None:
     plain = limits(dense=True)
     settings = replace(plain.settings, nuisances={"pixelization:V1": 0.05})
