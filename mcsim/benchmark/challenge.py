@@ -16,9 +16,10 @@ from mcsim.benchmark.folder import Settings
 from mcsim.benchmark.models import LearnedModel, learned_model, workers_of
 from mcsim.benchmark.out_of_library import library_with, responses
 from mcsim.benchmark.sampler import CaseSampler
-from mcsim.diagnosis.campaign import Batch, seeded, with_effects
+from mcsim.datavector.campaign import Batch, seeded, with_effects
+from mcsim.datavector.map_checks import read_maps
 from mcsim.diagnosis.inference import diagnose_data
-from mcsim.diagnosis.observed_maps import ObservedMaps, read_maps
+from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.ensemble.maps import file_names, write_map
 from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.benchmark.case import Identity, Member, Vector
 from mcsim.benchmark.folder import Settings
-from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, data_vectors
+from mcsim.datavector.analysis import Analysis, Job, analysis_of, data_vectors
+from mcsim.datavector.campaign import Batch, after_jobs, asking, batch, seeded, with_effects
+from mcsim.datavector.candidate import Candidate, TemplateBank, columns_of, effects_at, numbered
+from mcsim.datavector.null_ensemble import NullEnsemble
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.api import kept, prepared
-from mcsim.diagnosis.campaign import Batch, after_jobs, asking, batch, seeded, with_effects
-from mcsim.diagnosis.candidate import Candidate, TemplateBank, columns_of, effects_at, numbered
 from mcsim.diagnosis.context import DiagnosisContext, calibration_of, context
-from mcsim.diagnosis.null_ensemble import NullEnsemble
-from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.subsets import Subsets
 from mcsim.diagnosis.validation import Halves
 from mcsim.ensemble.runner import Workers

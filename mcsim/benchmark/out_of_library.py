@@ -9,8 +9,8 @@ from pathlib import Path
 
 from mcsim import config, systematics
 from mcsim.benchmark.case import Vector
-from mcsim.diagnosis.analysis import Job, data_vectors
-from mcsim.diagnosis.campaign import Batch, with_effects
+from mcsim.datavector.analysis import Job, data_vectors
+from mcsim.datavector.campaign import Batch, with_effects
 from mcsim.errors import InputError
 from mcsim.systematics import Effect, Library
 

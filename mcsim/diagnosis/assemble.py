@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from mcsim import config
-from mcsim.diagnosis.candidate import Candidate, columns_of, parts_of
+from mcsim.datavector.candidate import Candidate, columns_of, parts_of
 from mcsim.diagnosis.consistency import amplitudes
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.nuisance import NuisanceResult, Regression, results

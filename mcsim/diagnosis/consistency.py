@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mcsim.diagnosis.candidate import Candidate
-from mcsim.diagnosis.null_ensemble import NullEnsemble
-from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.diagnosis.slices import northern
-from mcsim.diagnosis.summaries import Element, bins
+from mcsim.datavector.candidate import Candidate
+from mcsim.datavector.null_ensemble import NullEnsemble
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.slices import northern
+from mcsim.datavector.summaries import Element, bins
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.support.numbers import number, p_equals

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.diagnosis.analysis import Analysis
-from mcsim.diagnosis.campaign import Ask, after_jobs, skies
-from mcsim.diagnosis.candidate import Candidate, TemplateBank
+from mcsim.datavector.analysis import Analysis
+from mcsim.datavector.campaign import Ask, after_jobs, skies
+from mcsim.datavector.candidate import Candidate, TemplateBank
+from mcsim.datavector.null_ensemble import NullEnsemble
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.localisation import Place
 from mcsim.diagnosis.nuisance import with_nuisances
-from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.selection import Attribution
-from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration, calibrate, calibrate_in_folds, calibrate_on
 

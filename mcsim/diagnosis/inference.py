@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mcsim.datavector.candidate import columns_of, tables_at
 from mcsim.diagnosis.assemble import result_of
-from mcsim.diagnosis.candidate import columns_of, tables_at
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.naming import agreeing, unconfirmed
 from mcsim.diagnosis.refine import Refined, Refiner

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mcsim.diagnosis.candidate import Candidate, parts_of
+from mcsim.datavector.candidate import Candidate, parts_of
 from mcsim.diagnosis.consistency import Action, Slices, contradiction
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.refine import Refined

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mcsim.diagnosis.candidate import Candidate, beyond, columns_of, effects_at, parts_of
+from mcsim.datavector.candidate import Candidate, beyond, columns_of, effects_at, parts_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.errors import InputError

@@ -10,13 +10,13 @@ import numpy as np
 import xarray as xr
 from pydantic import TypeAdapter
 
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.summaries import Element
 from mcsim.diagnosis.consistency import Comparison, MapCheck
 from mcsim.diagnosis.control_result import Controls
 from mcsim.diagnosis.localisation import Place
 from mcsim.diagnosis.nuisance import NuisanceResult
 from mcsim.diagnosis.selection import Contrast, Verdict
-from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.diagnosis.summaries import Element
 from mcsim.errors import InputError
 from mcsim.reconstruction.result import Reconstructed
 from mcsim.stats.excess import HeldOut, Measured, excess_of

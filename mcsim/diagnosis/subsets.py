@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mcsim.diagnosis.candidate import Candidate
-from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.datavector.candidate import Candidate
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.stats.detection import log_evidence
 from mcsim.stats.gaussian import COLLINEAR, SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration

@@ -27,9 +27,10 @@ ORDER = (
     "beamfit",
     "plot",
     "comparison",
+    "datavector",
     "reconstruction",
-    "diagnosis",
     "information",
+    "diagnosis",
     "benchmark",
     "cli",
 )
@@ -39,7 +40,7 @@ RESERVED = {
     "zarr": {"mcsim.ensemble.store"},
     "dask": {"mcsim.ensemble.runner"},
     "distributed": {"mcsim.ensemble.runner"},
-    "pydantic": {"mcsim.config", "mcsim.diagnosis"},
+    "pydantic": {"mcsim.config", "mcsim.datavector", "mcsim.diagnosis"},
     "typer": {"mcsim.cli"},
     "camb": set(),
 }

@@ -9,12 +9,12 @@ import pytest
 from scipy.special import sph_harm_y
 
 from mcsim import systematics
-from mcsim.diagnosis import slices
-from mcsim.diagnosis.candidate import BEYOND, Candidate
+from mcsim.datavector import slices
+from mcsim.datavector.candidate import BEYOND, Candidate
+from mcsim.datavector.null_ensemble import NullEnsemble
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.summaries import Element
 from mcsim.diagnosis.consistency import Action, Findings, Slices, contradiction
-from mcsim.diagnosis.null_ensemble import NullEnsemble
-from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.diagnosis.summaries import Element
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotation_matrix
 

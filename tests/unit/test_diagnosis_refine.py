@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mcsim.diagnosis.candidate import Candidate
+from mcsim.datavector.candidate import Candidate
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.refine import Refiner
 from mcsim.diagnosis.selection import attribute
-from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate
 from mcsim.systematics import Effect, Parametrization

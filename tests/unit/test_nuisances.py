@@ -9,13 +9,13 @@ from scipy import stats
 
 from instruments import two_channels
 from mcsim import config, systematics
-from mcsim.diagnosis.analysis import analysis_of
+from mcsim.datavector.analysis import analysis_of
+from mcsim.datavector.candidate import Candidate, numbered
+from mcsim.datavector.null_ensemble import NullEnsemble
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.summaries import Element
 from mcsim.diagnosis.api import _key, describe
-from mcsim.diagnosis.candidate import Candidate, numbered
 from mcsim.diagnosis.nuisance import Regression, half_given_other, results, with_nuisances
-from mcsim.diagnosis.null_ensemble import NullEnsemble
-from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.diagnosis.summaries import Element
 from mcsim.simulation import simulate
 from mcsim.simulation.nuisance import (
     DisturbedSurvey,

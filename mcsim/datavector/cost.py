@@ -6,10 +6,10 @@ import time
 from collections.abc import Mapping
 from dataclasses import replace
 
-from mcsim.diagnosis.analysis import Analysis, Job
-from mcsim.diagnosis.campaign import Purpose
-from mcsim.diagnosis.localisation import coarse_residuals
-from mcsim.diagnosis.wiener_filter import wiener_filter
+from mcsim.datavector.analysis import Analysis, Job
+from mcsim.datavector.bipolar_scan import coarse_residuals
+from mcsim.datavector.campaign import Purpose
+from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.ensemble.plan import cost
 from mcsim.simulation import simulate
 

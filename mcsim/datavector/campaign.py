@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.diagnosis.analysis import Analysis, Job, data_vectors
-from mcsim.diagnosis.candidate import Candidate, TemplateBank
-from mcsim.diagnosis.kept import Kept
-from mcsim.diagnosis.localisation import rms
-from mcsim.diagnosis.null_ensemble import NullEnsemble, without_nuisances
+from mcsim.datavector.analysis import Analysis, Job, data_vectors
+from mcsim.datavector.bipolar_scan import rms
+from mcsim.datavector.candidate import Candidate, TemplateBank
+from mcsim.datavector.kept import Kept
+from mcsim.datavector.null_ensemble import NullEnsemble, without_nuisances
 from mcsim.ensemble import runner
 from mcsim.ensemble.external_maps import Source
 from mcsim.errors import InputError

@@ -10,8 +10,8 @@ import xarray as xr
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from mcsim.diagnosis.candidate import Column, TemplateBank
-from mcsim.diagnosis.summaries import Element
+from mcsim.datavector.candidate import Column, TemplateBank
+from mcsim.datavector.summaries import Element
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import Fit
 from mcsim.systematics import Effect, basis_of
