@@ -11,7 +11,7 @@ import tomli_w
 
 from mcsim import config
 from mcsim.benchmark import folder as files
-from mcsim.benchmark.case import Drawn, Member, Truth, Vector
+from mcsim.benchmark.case import Drawn, Member, Truth
 from mcsim.benchmark.folder import Settings
 from mcsim.benchmark.models import LearnedModel, learned_model, workers_of
 from mcsim.benchmark.out_of_library import library_with, responses
@@ -26,6 +26,7 @@ from mcsim.errors import InputError
 from mcsim.simulation import nuisance, sampled, simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere import rng
+from mcsim.support.arrays import Vector
 from mcsim.support.folders import appearing, writable
 from mcsim.support.progress import reporting
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.benchmark.case import Identity, Member, Vector
+from mcsim.benchmark.case import Identity, Member
 from mcsim.benchmark.folder import Settings
 from mcsim.datavector.analysis import Analysis, Job, analysis_of, data_vectors
 from mcsim.datavector.campaign import Batch, after_jobs, asking, batch, seeded, with_effects
@@ -25,6 +25,7 @@ from mcsim.errors import InputError, RunError
 from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit, SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration
+from mcsim.support.arrays import Vector
 
 SKIES = 6
 """Skies that an expected S/N is the mean of."""

@@ -6,11 +6,12 @@ from functools import cached_property
 
 import numpy as np
 
-from mcsim.benchmark.case import KINDS, Drawn, Kind, Member, Prior, Vector
+from mcsim.benchmark.case import KINDS, Drawn, Kind, Member, Prior
 from mcsim.benchmark.models import EffectsLibrary
 from mcsim.benchmark.out_of_library import OutOfLibrary
 from mcsim.errors import InputError
 from mcsim.sphere import rng
+from mcsim.support.arrays import Vector
 
 
 @dataclass(frozen=True)

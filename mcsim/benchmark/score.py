@@ -9,7 +9,7 @@ import numpy as np
 
 from mcsim.benchmark import report
 from mcsim.benchmark.bayes import BayesClassifier, facts
-from mcsim.benchmark.case import Drawn, Prior, Record, Truth, Vector, pulls
+from mcsim.benchmark.case import Drawn, Prior, Record, Truth, pulls
 from mcsim.benchmark.folder import VERDICTS, Settings, finished_cases, open_key, read_json
 from mcsim.benchmark.models import EffectsLibrary, LinearModel, learned_model, linear_model, workers_of
 from mcsim.benchmark.sampler import CaseSampler
@@ -24,6 +24,7 @@ from mcsim.errors import InputError
 from mcsim.sphere import rng
 from mcsim.stats.detection import power
 from mcsim.stats.look_elsewhere import GlobalTest, global_test
+from mcsim.support.arrays import Vector
 from mcsim.support.folders import writable
 
 CASES_PER_TASK = 20

@@ -26,7 +26,7 @@ from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import LineOfSight, MapGrid, ScanModel
 from mcsim.instrument.scan.pointing import PointingStream, fill_samples
 from mcsim.sphere.checks import check_alm, check_nside, check_shape
-from mcsim.sphere.healpix import Map
+from mcsim.support.arrays import Map
 
 CHUNK = 1 << 18
 """Samples of a chunk: 12 MB of arrays, and enough of them that the interpolation does not wait for its set-up."""
