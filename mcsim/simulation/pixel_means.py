@@ -101,4 +101,5 @@ def _kept(what: str, where: tuple[Effect, Site, tuple[float, float]], values: Ma
     def fill(folder: Path) -> None:
         np.save(folder / f"{what}.npy", np.asarray(mean((effect,), site, share), dtype=np.float64))
 
-    return np.asarray(np.load(folders.cached(f"{what}-{scan[:32]}-{own[:32]}", fill) / f"{what}.npy"))
+    # Mapped, so that all processes share it.
+    return np.asarray(np.load(folders.cached(f"{what}-{scan[:32]}-{own[:32]}", fill) / f"{what}.npy", mmap_mode="r"))
