@@ -112,9 +112,10 @@ class BipolarScan:
                 response = np.where(np.arange(lmax + 1) >= 2, model.response[channel], 0.0)
                 left = alm_.multiply(np.asarray(total), response, lmax)
             own = np.nan_to_num(bipolar.estimate(self.tables, left, filtered.sky))
-            views = [own if to == model.frame else rotate_biposh(own, modes, model.frame, to) for to in FRAMES]
-            found.append([[view[:, low : high + 1].sum(axis=1) for low, high in self._bins] for view in views])
-        return np.moveaxis(np.array(found), 2, 3)
+            found.append(np.stack([own[:, low : high + 1].sum(axis=1) for low, high in self._bins], axis=1))
+        sums = np.stack(found)  # a rotation mixes modes of the same degrees: it may come after the sums
+        views = [sums if to == model.frame else rotate_biposh(sums, modes, model.frame, to) for to in FRAMES]
+        return np.stack(views, axis=1)
 
 
 def coarse_residuals(model: Model, filtered: FilteredMaps) -> Map:

@@ -419,7 +419,8 @@ def test_elements_in_words():
 
 def test_elements_that_are_not_tested_are_counted_and_folded(diagnoses):
     result = replace(diagnoses["none"], untested=("power of V", "power of W"))
-    page = report.page(result)
+    with quick_pictures():
+        page = report.page(result)
     said = f"2 of {P} elements are not tested"
     assert page.count(said) == 1
     assert page.index("<summary>" + said) < page.index("<li>power of V</li>")
