@@ -314,14 +314,16 @@ def with_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, before: Matrix,
     -----
     A strong effect changes the scatter of the data. The fit is linear, so that it is applied to every sky. The variance
     of each amplitude grows by its excess among the skies with the effects over that without them: the same skies, whose
-    common scatter cancels. Correlations stay; errors are not made smaller.
+    common scatter cancels. The response that is fitted is a mean of as many skies: the variance of the amplitudes that
+    the changes of single skies have, over their number, adds. Correlations stay; errors are not made smaller.
     """
     basis, back = orthonormal(null.whiten_templates(t))
-    without, acting = (
-        np.var(back @ basis.T @ null.whiten_templates(rows.T), axis=1, ddof=1) for rows in (before, after)
+    without, acting, change = (
+        np.var(back @ basis.T @ null.whiten_templates(rows.T), axis=1, ddof=1)
+        for rows in (before, after, after - before)
     )
-    own = np.diag(found.covariance)
-    factor = np.sqrt(1.0 + np.divide(np.maximum(acting - without, 0.0), own, out=np.zeros_like(own), where=own > 0.0))
+    own, added = np.diag(found.covariance), np.maximum(acting - without + change / len(before), 0.0)
+    factor = np.sqrt(1.0 + np.divide(added, own, out=np.zeros_like(own), where=own > 0.0))
     return replace(found, covariance=factor[:, None] * found.covariance * factor)
 
 
