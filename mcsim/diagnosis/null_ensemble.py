@@ -164,6 +164,7 @@ def save(path: Path, ensemble: NullEnsemble, bank: TemplateBank) -> None:
         "columns": json.dumps(bank.labels),
         "redundant": ensemble.redundant,
         "shrunk": ensemble.shrunk,
+        "skies": ensemble.skies,
     }
     variables = {name: ([f"{name}_{axis}" for axis in range(array.ndim)], array) for name, array in arrays.items()}
     xr.Dataset(variables, attrs=attributes).to_zarr(path, mode="w", consolidated=False)
@@ -178,9 +179,10 @@ def load(path: Path) -> tuple[NullEnsemble, TemplateBank]:
         )
         columns = TypeAdapter(tuple[Column, ...]).validate_json(dataset.attrs["columns"])
         redundant, shrunk = float(dataset.attrs["redundant"]), bool(dataset.attrs["shrunk"])
+        skies = int(dataset.attrs["skies"])
     matrix, error, curvature, beside_matrix = map(arrays.pop, ("matrix", "error", "curvature", "slice_matrix"))
     bank = TemplateBank(matrix, error, curvature, columns, beside_matrix)
-    return (
-        NullEnsemble(**arrays, elements=elements, slice_elements=beside, redundant=redundant, shrunk=shrunk),
-        bank,
+    kept = NullEnsemble(
+        **arrays, elements=elements, slice_elements=beside, redundant=redundant, shrunk=shrunk, skies=skies
     )
+    return kept, bank
