@@ -131,6 +131,15 @@ class DataSet(ABC, Generic[Data]):
         """Return the changes of :meth:`respond` for :attr:`extended`."""
         return self.respond(found, skies)
 
+    def scatter(self, changes: Matrix) -> Matrix:
+        """Return deviations of changes by a stochastic effect, shape (draws, p), from their mean, (p, draws).
+
+        They are those of one draw from the mean of as many as there are, as
+        :meth:`~mcsim.stats.gaussian.SimulatedGaussian.with_extra_covariance` takes them.
+        """
+        share = (1.0 / self.realizations + 1.0 / len(changes)) / (len(changes) - 1.0)
+        return np.asarray(np.sqrt(share) * (changes - changes.mean(axis=0)).T)
+
     def _simulated(self, found: Sequence[config.Effect]) -> Matrix:
         """Return the data vectors of the skies of the reference with effects, shape (rows, p)."""
         return np.concatenate(self.ask(after_jobs(self.context.analysis, found)))

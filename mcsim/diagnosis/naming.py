@@ -83,9 +83,13 @@ def _actions(data: DataSet[Any], refined: Refined, one: Explanation) -> Iterator
     for member, theta, covariance in parts_of(context.candidates, one.members, one.fit):
         candidate = context.candidates[member]
         t = whole[:, list(candidate.columns)]
+        draws, scatter = refined.candidates[member].scatter is not None, None
+        skies = context.settings.scatter_skies if draws else context.settings.constrained_skies
         try:
             table = candidate.table(candidate.detected(theta, covariance))
-            response: Vector = data.respond_extended([table], context.settings.constrained_skies).mean(axis=0)
+            changes = data.respond_extended([table], skies)
+            response: Vector = changes.mean(axis=0)
+            scatter = data.scatter(changes) if draws else None
         except InputError:
             response = t @ theta
-        yield Action.of(response, t, theta, covariance)
+        yield Action.of(response, t, theta, covariance, scatter)

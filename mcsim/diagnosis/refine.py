@@ -9,6 +9,7 @@ from mcsim.datavector.candidate import Candidate, beyond, columns_of, effects_at
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.errors import InputError
+from mcsim.stats.excess import scatter_chi2
 from mcsim.stats.gaussian import Fit
 from mcsim.support.arrays import Matrix, Vector
 
@@ -60,7 +61,7 @@ class Refiner:
         -----
         A response that is simulated at its coordinates changes its templates to the secant, exact there. A candidate
         that can have neither the fitted amplitude nor half of it is taken out. Of a stochastic one the scatter of the
-        response is kept.
+        response is kept, of any other one the chi^2 that its scatter adds to a residual.
         """
         t, tried = t.copy(), list(candidates)
         done: dict[int, Vector] = {}
@@ -73,23 +74,23 @@ class Refiner:
                 columns, how = list(candidates[index].columns), candidates[index].effect.parametrization
                 nonlinear = how.nonlinear or self._is_nonlinear(columns, coordinates)
                 stochastic = how.stochastic and (how.sign == 0 or coordinates[0] > 0.0)
-                if not (nonlinear or stochastic) or self._has_settled(done.get(index), coordinates, covariance):
+                if self._has_settled(done.get(index), coordinates, covariance):
                     continue
                 done[index] = coordinates
                 answer = self._simulated(candidates[index], coordinates, covariance, stochastic)
                 changed = True
                 if answer is None:
-                    t[:, columns] = 0.0
+                    if nonlinear or stochastic:
+                        t[:, columns] = 0.0
                     continue
-                at, changes = answer
-                response = changes.mean(axis=0)
-                if stochastic:
-                    # The scatter of one draw about the mean of as many as there are.
-                    share = (1.0 / self.data.realizations + 1.0 / len(changes)) / (len(changes) - 1.0)
-                    scatter = np.sqrt(share) * (changes - response).T
-                    tried[index] = replace(tried[index], scatter=scatter, shape_error=None)
+                at, changes, pair = answer
                 if nonlinear:
-                    t[:, columns] += self._beyond(t[:, columns], at, response)
+                    t[:, columns] += self._beyond(t[:, columns], at, changes.mean(axis=0))
+                if stochastic:
+                    tried[index] = replace(tried[index], scatter=self.data.scatter(changes), shape_error=None)
+                elif pair is not None:
+                    added = scatter_chi2(self.context.null, t[:, columns], *pair)
+                    tried[index] = replace(tried[index], scatter_chi2=added)
             if not changed:
                 break
             found = self._attribute(t, tried)
@@ -191,16 +192,19 @@ class Refiner:
 
     def _simulated(
         self, candidate: Candidate, coordinates: Vector, covariance: Matrix, stochastic: bool
-    ) -> tuple[Vector, Matrix] | None:
-        """Return coordinates and responses at the fitted amplitude or half of it; None if the effect can have neither.
+    ) -> tuple[Vector, Matrix, tuple[Matrix, Matrix] | None] | None:
+        """Return coordinates, responses and data without and with the effect at the fitted amplitude or half of it.
 
-        A linear fit may lie somewhat beyond what the effect can be, and the effect be there; far beyond it is not.
+        None if the effect can have neither. A linear fit may lie somewhat beyond what the effect can be, and the effect
+        be there; far beyond it is not. The data are None of a stochastic effect, and where there are none.
         """
         for factor in (1.0, 0.5):
             try:
                 effect = candidate.detected(factor * coordinates, covariance / factor**2)
-                response = self.data.respond([candidate.table(effect)], self._skies(stochastic))
-                return effect.parametrization.coordinates(effect), response
+                tables = [candidate.table(effect)]
+                pair = None if stochastic else self.data.pair(tables)
+                changes = self.data.respond(tables, self._skies(stochastic)) if pair is None else pair[1] - pair[0]
+                return effect.parametrization.coordinates(effect), changes, pair
             except InputError:
                 continue
         return None
