@@ -14,7 +14,7 @@ from mcsim.benchmark.folder import Settings
 from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, data_vectors
 from mcsim.diagnosis.api import kept, prepared
 from mcsim.diagnosis.campaign import Batch, after_jobs, asking, batch, seeded, with_effects
-from mcsim.diagnosis.candidate import Candidate, TemplateBank, columns_of, effects_at, numbered
+from mcsim.diagnosis.candidate import Candidate, TemplateBank, columns_of, coordinates_of, effects_at, numbered
 from mcsim.diagnosis.context import DiagnosisContext, calibration_of, context
 from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.settings import DiagnosisSettings
@@ -108,7 +108,7 @@ class LinearModel(EffectsLibrary):
 
         def respond(frozen: Fit) -> Vector:
             effects = effects_at(self.candidates, members, frozen)
-            return np.asarray(t @ np.concatenate([effect.parametrization.coordinates(effect) for effect in effects]))
+            return np.asarray(t @ coordinates_of(self.candidates, members, effects))
 
         try:
             return replace(self.halves, x=x).reduction(t, respond)

@@ -120,7 +120,8 @@ def effects_of(candidates: Sequence[Candidate], members: Sequence[int], fit: Fit
     """Yield the effects of a fit; raise InputError if no effect has such an amplitude."""
     for member, theta, covariance in parts_of(candidates, members, fit):
         candidate = candidates[member]
-        effect, sigma = candidate.fitted(theta, covariance), _sigma(candidate, theta, covariance)
+        effect, sigma = candidate.fitted(theta, covariance), _sigma(candidate, theta, covariance, "amplitude")
+        errors = {name: _sigma(candidate, theta, covariance, name) for name in candidate.parametrization.measured}
         yield EffectResult(
             name=effect.name,
             channel=candidate.channel,
@@ -132,23 +133,25 @@ def effects_of(candidates: Sequence[Candidate], members: Sequence[int], fit: Fit
                 for key, value in effect.parameters().items()
             },
             label=candidate.title,
-            words=effect.describe(sigma),
+            words=effect.describe(sigma, errors),
+            errors=errors,
         )
 
 
-def _sigma(candidate: Candidate, theta: Vector, covariance: Vector) -> float:
-    """Return the standard error of the amplitude, from its slopes in the coordinates over their own errors.
+def _sigma(candidate: Candidate, theta: Vector, covariance: Vector, parameter: str) -> float:
+    """Return the standard error of a parameter, from its slopes in the coordinates over their own errors.
 
-    A step of one error moves also an amplitude at the edge of what is possible. What the data do not constrain is not
+    A step of one error moves also a value at the edge of what is possible. What the data do not constrain is not
     varied.
     """
     scale = np.sqrt(np.diag(covariance))
     precision = np.asarray(np.linalg.pinv(covariance), dtype=np.float64)
-    constrained = candidate.effect.parametrization.constrained(theta, precision)
+    constrained = candidate.parametrization.constrained(theta, precision)
     slopes: Vector = np.zeros(len(theta))
     for k in np.flatnonzero((scale > 0.0) & ((constrained != 0.0) | (theta == 0.0))):
         step = scale[k] * np.eye(len(theta))[k]
-        up, down = (candidate.with_coordinates(constrained + sign, precision).amplitude for sign in (step, -step))
+        ends = (candidate.with_coordinates(constrained + sign, precision) for sign in (step, -step))
+        up, down = (getattr(one, parameter) for one in ends)
         slopes[k] = (up - down) / (2.0 * scale[k])
     return float(np.sqrt(max(float(slopes @ covariance @ slopes), 0.0)))
 

@@ -1,10 +1,10 @@
 """Infer from one data set whether, where, by which effects and how far it departs from the model."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim.diagnosis.assemble import result_of
 from mcsim.diagnosis.candidate import columns_of, tables_at
@@ -16,10 +16,9 @@ from mcsim.diagnosis.selection import Attribution
 from mcsim.diagnosis.validation import Halves
 from mcsim.errors import InputError
 from mcsim.stats.excess import HeldOut
-from mcsim.stats.gaussian import Fit, with_scatter
+from mcsim.stats.gaussian import Fit, with_drawn_scatter, with_scatter
+from mcsim.support.arrays import Matrix, Vector
 from mcsim.support.numbers import measured
-
-Vector = NDArray[np.float64]
 
 
 def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
@@ -81,20 +80,25 @@ def confirmed(
 def _with_errors(data: DataSet[Any], refined: Refined, found: Attribution) -> Attribution:
     """Return the attribution, the best set with the errors that its amplitudes have with its effects in the data.
 
-    The scatter of stochastic effects is known already: the fit was made with it.
+    Of stochastic effects it is the scatter of the draws with which the fit was made.
     """
     context, best = data.context, found.explanations[0]
-    if any(refined.candidates[member].scatter is not None for member in best.members):
-        return found
+    t = refined.templates[:, columns_of(context.candidates, best.members)]
+    if scatters := _scatters(refined, best.members):
+        own = replace(best, fit=with_drawn_scatter(context.null, t, best.fit, scatters))
+        return replace(found, explanations=(own, *found.explanations[1:]))
     try:
         pair = data.pair(tables_at(context.candidates, best.members, best.fit))
     except InputError:
         pair = None  # between what was fitted and what can be
     if pair is None:
         return found
-    t = refined.templates[:, columns_of(context.candidates, best.members)]
     own = replace(best, fit=with_scatter(context.null, t, best.fit, *pair))
     return replace(found, explanations=(own, *found.explanations[1:]))
+
+
+def _scatters(refined: Refined, members: Sequence[int]) -> list[Matrix]:
+    return [one for one in (refined.candidates[member].scatter for member in members) if one is not None]
 
 
 def reduction_of(data: DataSet[Any], refined: Refined) -> HeldOut | None:
@@ -107,7 +111,7 @@ def reduction_of(data: DataSet[Any], refined: Refined) -> HeldOut | None:
     context = data.context
     members, best = refined.attribution.explanations[0].members, refined.attribution.explanations[0].fit
     t = refined.templates[:, columns_of(context.candidates, members)]
-    scatters = [one for one in (refined.candidates[member].scatter for member in members) if one is not None]
+    scatters = _scatters(refined, members)
     snr = context.null.expected_snr(t @ best.amplitudes)
     matrix, words = data.halves()
     t, scatters = matrix @ t, [matrix @ one for one in scatters]

@@ -68,7 +68,7 @@ def unconfirmed(context: DiagnosisContext, found: Attribution, reduced: bool) ->
 
 def _drawn(candidate: Candidate) -> bool:
     """Return True if an effect draws its pattern on the sky, so that no mean response describes it."""
-    return candidate.effect.parametrization.stochastic and not candidate.effect.parametrization.mean_response
+    return candidate.parametrization.stochastic and not candidate.parametrization.mean_response
 
 
 def _effects(context: DiagnosisContext, one: Explanation) -> list[Effect]:

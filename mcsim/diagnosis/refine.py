@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mcsim.diagnosis.candidate import Candidate, beyond, columns_of, effects_at, parts_of
+from mcsim.diagnosis.candidate import Candidate, beyond, columns_of, coordinates_of, effects_at, parts_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.errors import InputError
@@ -70,7 +70,7 @@ class Refiner:
             for index, coordinates, covariance in self._to_try(found, tried):
                 if candidates[index].nuisance:
                     continue
-                columns, how = list(candidates[index].columns), candidates[index].effect.parametrization
+                columns, how = list(candidates[index].columns), candidates[index].parametrization
                 nonlinear = how.nonlinear or self._is_nonlinear(columns, coordinates)
                 stochastic = how.stochastic and (how.sign == 0 or coordinates[0] > 0.0)
                 if not (nonlinear or stochastic) or self._has_settled(done.get(index), coordinates, covariance):
@@ -168,7 +168,7 @@ class Refiner:
             except InputError:
                 return None
             t = t.copy()
-            at = np.concatenate([effect.parametrization.coordinates(effect) for effect in effects])
+            at = coordinates_of(candidates, members, effects)
             t[:, columns] += self._beyond(t[:, columns], at, response)
             before, fitted = fitted, self.context.null.fit(self.data.x, t[:, columns])
             if self._has_settled(before.amplitudes, fitted.amplitudes, fitted.covariance, share):
@@ -200,7 +200,7 @@ class Refiner:
             try:
                 effect = candidate.detected(factor * coordinates, covariance / factor**2)
                 response = self.data.respond([candidate.table(effect)], self._skies(stochastic))
-                return effect.parametrization.coordinates(effect), response
+                return candidate.parametrization.coordinates(effect), response
             except InputError:
                 continue
         return None
@@ -218,16 +218,14 @@ class Refiner:
         # Single ones too: a strong effect has a nonlinear response, and a stochastic one scatters it, until only a
         # mixture seems to be sufficient.
         ranked = [int(index) for index in np.argsort([-single.delta_chi2 for single in found.singles])]
-        stochastic = {
-            candidates[index].identity for index in work if candidates[index].effect.parametrization.stochastic
-        }
+        stochastic = {candidates[index].identity for index in work if candidates[index].parametrization.stochastic}
         for place, index in enumerate(ranked):
             single, candidate = found.singles[index], candidates[index]
             pvalue = float(self.context.calibration.global_pvalue(single.nested_pvalue))
-            detected = candidate.effect.parametrization.stochastic and pvalue <= self.context.settings.stochastic_level
+            detected = candidate.parametrization.stochastic and pvalue <= self.context.settings.stochastic_level
             if place < self.context.settings.tried or (detected and candidate.identity not in stochastic):
                 work.setdefault(index, (index, single.amplitudes, single.covariance))
-                if candidate.effect.parametrization.stochastic:
+                if candidate.parametrization.stochastic:
                     stochastic.add(candidate.identity)
         return list(work.values())
 
