@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from mcsim import config
-from mcsim.diagnosis.candidate import Candidate, columns_of, parts_of
+from mcsim.diagnosis.candidate import Candidate, columns_of, parts_of, scatters_of
 from mcsim.diagnosis.consistency import amplitudes
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.nuisance import NuisanceResult, Regression, results
@@ -103,8 +103,7 @@ def _nuisances(data: DataSet, refined: Refined) -> Iterator[NuisanceResult]:
     members, t = found.explanations[0].members if found.explanations else (), refined.templates
     if partial is not None and not members:
         members, t = partial.members, partial.templates
-    scatters = [one for one in (refined.candidates[member].scatter for member in members) if one is not None]
-    null = context.null.with_extra_covariance(*scatters)
+    null = context.null.with_extra_covariance(*scatters_of(refined.candidates, members))
     found_of = Regression.of(context.ensemble, null, t[:, columns_of(refined.candidates, members)])
     yield from results(context.analysis.nuisances, found_of, data.x)
 

@@ -175,6 +175,11 @@ def beyond(candidates: Sequence[Candidate], members: Sequence[int], found: Fit) 
     return float(np.sqrt(sum(candidates[member].beyond(*part) ** 2 for member, *part in parts)))
 
 
+def scatters_of(candidates: Sequence[Candidate], members: Sequence[int]) -> list[Matrix]:
+    """Return the scatter of the responses of members where it is known."""
+    return [one for one in (candidates[member].scatter for member in members) if one is not None]
+
+
 def coordinates_of(candidates: Sequence[Candidate], members: Sequence[int], effects: Sequence[Effect]) -> Vector:
     """Return the coordinates of effects of some candidates, one after the other."""
     pairs = zip(members, effects, strict=True)

@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mcsim.diagnosis.candidate import Candidate, beyond, columns_of, coordinates_of, effects_at, parts_of
+from mcsim.diagnosis.candidate import Candidate, beyond, columns_of, coordinates_of, effects_at, parts_of, scatters_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.errors import InputError
-from mcsim.stats.gaussian import Fit
+from mcsim.stats.gaussian import Fit, with_drawn_scatter
 from mcsim.support.arrays import Matrix, Vector
 
 
@@ -133,7 +133,12 @@ class Refiner:
             return None
         excess = null.hartlap_factor * total - null.dimension
         left = null.hartlap_factor * before.chi2 - before.dimension
-        return PartialExplanation(members, before, min(max(left / excess, 0.0), 1.0) if excess > 0.0 else 1.0, t)
+        own = t[:, columns_of(candidates, members)]
+        fit = before
+        if scatters := scatters_of(candidates, members):
+            wide = null.with_extra_covariance(*scatters).fit(self.data.x, own)
+            fit = with_drawn_scatter(null, own, wide, scatters)
+        return PartialExplanation(members, fit, min(max(left / excess, 0.0), 1.0) if excess > 0.0 else 1.0, t)
 
     def _fit(self, t: Matrix, candidates: Sequence[Candidate], members: tuple[int, ...]) -> Fit:
         return self.context.null.fit(self.data.x, t[:, columns_of(candidates, members)])
