@@ -60,9 +60,10 @@ class Refiner:
         -----
         A response that is simulated at its coordinates changes its templates to the secant, exact there. A candidate
         that can have neither the fitted amplitude nor half of it is taken out. Of a stochastic one the scatter of the
-        response is kept.
+        response is kept. Where its power counts, which grows as the square of the amplitude, the secant at a_0 finds
+        a^2/a_0 for a: the mean of this and a_0 is Newton's step.
         """
-        t, tried = t.copy(), list(candidates)
+        linear, t, tried = t, t.copy(), list(candidates)
         done: dict[int, Vector] = {}
         found = self._attribute(t, tried)
         for _ in range(self.context.settings.refine_rounds):
@@ -75,6 +76,9 @@ class Refiner:
                 stochastic = how.stochastic and (how.sign == 0 or coordinates[0] > 0.0)
                 if not (nonlinear or stochastic) or self._has_settled(done.get(index), coordinates, covariance):
                     continue
+                if stochastic and index in done:
+                    share = self._squared(linear[:, columns], t[:, columns], done[index])
+                    coordinates = done[index] + (coordinates - done[index]) / (1.0 + share)
                 done[index] = coordinates
                 answer = self._simulated(candidates[index], coordinates, covariance, stochastic)
                 changed = True
@@ -179,6 +183,11 @@ class Refiner:
             if self._has_settled(before.amplitudes, fitted.amplitudes, fitted.covariance, share):
                 return t
         return None
+
+    def _squared(self, linear: Matrix, t: Matrix, at: Vector) -> float:
+        """Return the share of the response of templates at coordinates that is not in the linear ones, 0 to 1."""
+        first, whole = self.context.null.whiten_templates(np.stack([linear @ at, t @ at], axis=1)).T
+        return float(np.clip(1.0 - first @ whole / max(float(whole @ whole), 1e-300), 0.0, 1.0))
 
     def _skies(self, stochastic: bool) -> int:
         return self.context.settings.scatter_skies if stochastic else self.context.settings.constrained_skies

@@ -51,6 +51,7 @@ def test_an_index_is_a_coordinate_where_the_channels_tell_it() -> None:
     assert len(own.columns) == 1
 
 
+@pytest.mark.slow
 def test_no_gap_where_there_is_none(three: DiagnosisContext) -> None:
     shared = data_of(three.run)
     p = [
@@ -66,7 +67,7 @@ def test_no_gap_where_there_is_none(three: DiagnosisContext) -> None:
 def test_amplitude_and_index_of_drawn_patterns_are_found(three: DiagnosisContext) -> None:
     truth = 6.0
     shared = data_of(three.run, "foreground_residual", amplitude=truth, spectral_index=INDEX)
-    pulls, named, cases = [], 0, 8
+    pulls, named, cases = [], 0, 6
     for number in range(cases):
         found = diagnose_data(ObservedMaps(three, list(simulate.maps(shared, number)), ask), str(number))
         if [one.name for one in found.effects] != ["foreground_residual"]:
@@ -76,12 +77,13 @@ def test_amplitude_and_index_of_drawn_patterns_are_found(three: DiagnosisContext
         named += 1
         index = (own["parameters"]["spectral_index"] - INDEX) / own["errors"]["spectral_index"]
         pulls.append([(own["amplitude"] - truth) / own["sigma"], index])
-        assert f"index {own['parameters']['spectral_index']:.1f}" in found.effects[0].words
+        assert "±" in found.effects[0].words.split("index")[1]
     assert named > cases // 2
     # The mean square of n pulls is 1 with an error of sqrt(2 / n): 3.5 sigma.
     assert np.all(np.mean(np.square(pulls), axis=0) < 1.0 + 3.5 * np.sqrt(2.0 / named))
 
 
+@pytest.mark.slow
 def test_an_index_that_cannot_be_told_is_said_not_to_be_fitted() -> None:
     analysis = small(clean=False)
     known = context(analysis, *campaign.learned(analysis, ask, 300, time_ordered=False))
