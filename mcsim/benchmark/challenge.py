@@ -133,8 +133,8 @@ def _measured(model: LearnedModel, member: Member, seed: int) -> Member:
             continue
         if strength > STRONGER * member.strength and attempt + 1 < ATTEMPTS:
             continue
-        coordinates = tuple(float(value) for value in effect.parametrization.coordinates(effect))
-        if not candidate.effect.parametrization.stochastic:
+        coordinates = tuple(float(value) for value in candidate.parametrization.coordinates(effect))
+        if not candidate.parametrization.stochastic:
             strength = model.expected_snr_on_sky(candidate.table(effect), seed)
         return replace(member, parameters=parameters, coordinates=coordinates, strength=strength)
     raise InputError(f"effect {member.name} can have no amplitude that is strong enough; leave it out.")

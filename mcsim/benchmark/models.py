@@ -13,7 +13,7 @@ from mcsim.benchmark.case import Identity, Member
 from mcsim.benchmark.folder import Settings
 from mcsim.datavector.analysis import Analysis, Job, analysis_of, data_vectors
 from mcsim.datavector.campaign import Batch, after_jobs, asking, batch, seeded, with_effects
-from mcsim.datavector.candidate import Candidate, TemplateBank, columns_of, effects_at, numbered
+from mcsim.datavector.candidate import Candidate, TemplateBank, columns_of, coordinates_of, effects_at, numbered
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.api import kept, prepared
@@ -109,7 +109,7 @@ class LinearModel(EffectsLibrary):
 
         def respond(frozen: Fit) -> Vector:
             effects = effects_at(self.candidates, members, frozen)
-            return np.asarray(t @ np.concatenate([effect.parametrization.coordinates(effect) for effect in effects]))
+            return np.asarray(t @ coordinates_of(self.candidates, members, effects))
 
         try:
             return replace(self.halves, x=x).reduction(t, respond)

@@ -124,14 +124,21 @@ def analysis_of(
         )
     declared = [one.effect for one in run.nuisances]
     model = model_of(survey(run, nthreads=nthreads, orders=settings.beam_orders, library=dict(known)), settings)
+    frequencies = [c.site.frequency_ghz if c.site.foregrounds else None for c in model.survey.channels]
+    # A nuisance is fitted in the coordinates of its prior.
+    fits = {
+        name: kind.parametrization if name in declared else kind.parametrization.seen_at(frequencies)
+        for name, kind in known
+    }
     candidates = numbered(
         [
             Candidate(
                 effect,
                 channel,
-                tuple(range(len(effect.parametrization.basis()))),
+                tuple(range(len(fits[name].basis()))),
                 dict(fixed),
                 step=_step(model, effect, channel),
+                fit=fits[name],
             )
             for name, effect in known
             if name not in without and (effect.proposed or name in (*settings.including, *declared))

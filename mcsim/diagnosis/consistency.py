@@ -169,7 +169,7 @@ class Slices:
             return replace(self, scatters=scatters, _nulls={}).findings(candidates, actions)
         # More noise, or a pattern that is drawn, is more of chi^2: what is left in the maps then says nothing of it.
         noisy = any(
-            candidate.effect.noise is not Effect.noise or candidate.effect.parametrization.stochastic
+            candidate.effect.noise is not Effect.noise or candidate.parametrization.stochastic
             for candidate in candidates
         )
         free = np.concatenate([action.directions for action in actions], axis=1)

@@ -117,7 +117,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
                 scatter < settings.sky_scatter
                 or candidate.random_response
                 or candidate.nuisance
-                or candidate.effect.parametrization.mean_response
+                or candidate.parametrization.mean_response
             ):
                 continue
             for place, (column, basis) in enumerate(zip(candidate.columns, candidate.basis, strict=True)):
@@ -125,7 +125,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
                     response = self.respond([candidate.table(basis)], settings.constrained_skies).mean(axis=0)
                 except InputError:
                     continue
-                step = basis.parametrization.coordinates(basis)[place]
+                step = candidate.parametrization.coordinates(basis)[place]
                 t[:, column] = response / step - context.bank.curvature[:, column] * step
         return t
 

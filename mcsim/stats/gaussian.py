@@ -327,6 +327,39 @@ def with_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, before: Matrix,
     return replace(found, covariance=factor[:, None] * found.covariance * factor)
 
 
+def with_drawn_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, scatters: Sequence[Matrix]) -> Fit:
+    """Return a fit of templates, shape (p_raw, K), with the errors that patterns which are drawn give its amplitudes.
+
+    ``null`` is the distribution without them; ``scatters``, with which it was widened for the fit, are deviations as of
+    :meth:`SimulatedGaussian.with_extra_covariance`.
+
+    Notes
+    -----
+    The weights of the fit avoid the scatter of the very draws that it is known from: these would make errors too small.
+    Each draw is fitted with the scatter of all others, and the mean square of what it adds to the amplitudes stands in
+    place of the scatter (leave-one-out cross-validation; Stone, JRSS B 36, 111, 1974). Pulls:
+    tests/statistical/test_drawn_scatter.py.
+    """
+    white, scale = np.linalg.pinv(null.whitening), (null.dof + found.chi2) / (found.dof - 2)
+
+    def weights(extra: Sequence[Matrix]) -> Matrix:
+        wide = null.with_extra_covariance(*extra)
+        basis, back = orthonormal(wide.whiten_templates(t))
+        return np.asarray(back @ basis.T @ wide.whitening / np.sqrt(1.0 + 1.0 / null.n_sims))
+
+    own = weights(scatters) @ white * np.sqrt(1.0 + 1.0 / null.n_sims)
+    covariance = scale * own @ own.T
+    for place, draws in enumerate(scatters):
+        count = draws.shape[1]
+        for k in range(count):
+            # The mean of the others, whose deviations from that of all add up to nothing with this one's.
+            others = np.delete(draws, k, axis=1) + draws[:, [k]] / (count - 1.0)
+            others *= np.sqrt((count - 1.0) / (count - 2.0))
+            added = weights([*scatters[:place], others, *scatters[place + 1 :]]) @ draws[:, k]
+            covariance += np.outer(added, added)
+    return replace(found, covariance=covariance)
+
+
 def held_out_pvalues(simulations: Matrix, null: SimulatedGaussian) -> Vector:
     """Return the p-value of every simulation, shape (N, p_raw), against all others, shape (N,): uniform."""
     chi2, n = null.held_out(simulations)

@@ -193,11 +193,16 @@ def _checked(what: str, value: Any, default: Any) -> Any:
     return float(value)
 
 
-def basis_of(kind: type[Effect], settings: Mapping[str, Any] | None = None) -> tuple[Effect, ...]:
-    """Return the effects, of amplitude ``step``, whose responses span those of all parameters but the ``settings``."""
+def basis_of(
+    kind: type[Effect], settings: Mapping[str, Any] | None = None, fit: Parametrization | None = None
+) -> tuple[Effect, ...]:
+    """Return the effects, of amplitude ``step``, whose responses span those of all parameters but the ``settings``.
+
+    ``fit``: default: the parametrization of the effect.
+    """
     return tuple(
         kind(**{"amplitude": kind.step, **parameters, **(settings or {})})
-        for parameters in kind.parametrization.basis()
+        for parameters in (kind.parametrization if fit is None else fit).basis()
     )
 
 
