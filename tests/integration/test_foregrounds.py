@@ -9,8 +9,8 @@ from scipy.stats import kstest
 
 from instruments import data_of, two_channels
 from mcsim import config, systematics
+from mcsim.datavector import campaign
 from mcsim.datavector.analysis import Analysis, Job, analysis_of, data_vectors
-from mcsim.diagnosis import campaign
 from mcsim.diagnosis.context import DiagnosisContext, context
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
