@@ -28,9 +28,10 @@ ORDER = (
     "beamfit",
     "plot",
     "comparison",
+    "datavector",
     "reconstruction",
-    "diagnosis",
     "information",
+    "diagnosis",
     "benchmark",
     "cli",
 )
@@ -40,7 +41,7 @@ RESERVED = {
     "zarr": {"mcsim.ensemble.store"},
     "dask": {"mcsim.ensemble.runner"},
     "distributed": {"mcsim.ensemble.runner"},
-    "pydantic": {"mcsim.config", "mcsim.diagnosis"},
+    "pydantic": {"mcsim.config", "mcsim.datavector", "mcsim.diagnosis"},
     "typer": {"mcsim.cli"},
     "camb": set(),
 }

@@ -17,7 +17,7 @@ from mcsim import config
 from mcsim.bipolar import estimate, estimator
 from mcsim.bipolar.theory import fisher_information
 from mcsim.cli import app
-from mcsim.diagnosis.campaign import with_effects
+from mcsim.datavector.campaign import with_effects
 from mcsim.information.api import describe, widths
 from mcsim.information.result import Limits, canonical_correlations, marginalised
 from mcsim.simulation import simulate

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 import mcsim
-from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.datavector.settings import DiagnosisSettings
 
 HERE = Path(__file__).parent
 TOLERANCE = 1e-9

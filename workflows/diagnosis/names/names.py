@@ -15,12 +15,12 @@ import healpy
 import numpy as np
 
 from mcsim import config, systematics
-from mcsim.diagnosis.analysis import analysis_of, data_vectors
+from mcsim.datavector.analysis import analysis_of, data_vectors
+from mcsim.datavector.campaign import with_effects
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.api import prepared
-from mcsim.diagnosis.campaign import with_effects
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
-from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere.rotation import rotation_matrix
@@ -158,7 +158,7 @@ def draws(number):
     from mcsim.benchmark.case import Prior
     from mcsim.benchmark.models import linear_model
     from mcsim.benchmark.sampler import CaseSampler
-    from mcsim.diagnosis.candidate import columns_of, parts_of
+    from mcsim.datavector.candidate import columns_of, parts_of
     from mcsim.diagnosis.consistency import Action, Slices
     from mcsim.stats.intervals import share
 
