@@ -106,6 +106,7 @@ class Scene:
     late: float = 0.0
     step: float = 0.0
     kept: OrderedDict[tuple[bytes, ...], Transforms] = field(default_factory=OrderedDict, repr=False)
+    _made: dict[int, Maps] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def lmax(self) -> int:
@@ -127,7 +128,7 @@ class Scene:
             beam = moved.truncated(min(moved.mmax, self.moments[0].smax))
         return convolve.response(beam, self.lmax, self.window)
 
-    @property
+    @cached_property
     def _transforms(self) -> Transforms:
         places = (b"" if m.dtheta is None else m.dtheta.tobytes() for m in self.moments)
         key = (self.sky.tobytes(), self.response.factors.tobytes(), *places, bytes([self.offset_order]))
@@ -184,11 +185,17 @@ class Scene:
         return np.where(done == healpy.UNSEEN, 0.0, done)
 
     def maps(self) -> Maps:
-        """Return the maps, without noise."""
+        """Return the maps, without noise; read-only."""
+        return self._maps
+
+    @cached_property
+    def _maps(self) -> Maps:
         made = self._noncircular() + self._transforms.circular
         for own, added in zip(made, self._transforms.offsets, strict=False):
             own += added
-        return self._prepared(made)
+        made = self._prepared(made)
+        made.setflags(write=False)
+        return made
 
     def turned(self, angle: float) -> "Scene":
         """Return the scene with all samples turned by an angle, in radians."""
@@ -237,12 +244,18 @@ class Scene:
         signal
             How samples see the sky, in place of the beam's convolution.
         """
+        own = signal is None and window is self.window
+        if own and id(pointing) in self._made:
+            return self._made[id(pointing)]
         factor = self.window if self.centred else self.window / window
         sky = alm_.multiply(self.sky, factor, self.lmax)
         signal = signal or tod.sky_signal(sky, self.lmax, self.beam, EPSILON, self.nthreads)
         streams = (self.stream(pointing, split) for split in range(len(self.moments)))
-        made = [tod.bin_samples(signal(self._pointed(stream)), self.nside)[0] for stream in streams]
-        return self._prepared(np.stack(made))
+        made = self._prepared(np.stack([tod.bin_samples(signal(self._pointed(s)), self.nside)[0] for s in streams]))
+        made.setflags(write=False)
+        if own:
+            self._made[id(pointing)] = made
+        return made
 
     def _pointed(self, samples: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
         sign, offset = self.psi

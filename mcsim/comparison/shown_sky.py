@@ -21,6 +21,9 @@ UNSHOWN = 1e-3
 NEAR = 5
 """Degrees over which power is averaged."""
 
+MADE = 0.1
+"""Share of what single samples leave of side A that orientation moments leave at most if it was made from those."""
+
 ROUNDS = 2
 """How often the sky is corrected for what its simulation leaves of the maps."""
 
@@ -30,11 +33,30 @@ ITERATIONS = 100
 
 def with_shown_sky(pair: ChannelPair) -> ChannelPair:
     """Return a pair whose sky, if it is taken from side A, makes its maps sample by sample, but for their noise."""
-    if pair.scene is None or not pair.sky_of_maps:
+    if pair.scene is None:
         return pair
-    pair = _sharper(pair)
-    weight = _weight(pair)
-    return pair if weight is None else _filtered(pair, weight)
+    found = _sharper(pair) if pair.sky_of_maps else pair
+    made = None if found.scene is None or pair.pointing() is None else _made(found, found.scene)
+    if made is not None and _left(pair, pair.scene.maps()) < MADE * _left(found, made):
+        found = _of_moments(pair)
+    weight = _weight(found) if pair.sky_of_maps else None
+    return found if weight is None else _filtered(found, weight)
+
+
+def _left(pair: ChannelPair, made: Maps) -> float:
+    """Return the squares that a simulation leaves of side A."""
+    return float(np.sum((pair.a - made)[pair.seen] ** 2))
+
+
+def _of_moments(pair: ChannelPair) -> ChannelPair:
+    """Return a pair whose side A was made from orientation moments, with what single samples change in it.
+
+    If side B lacks that as well, no single samples are simulated.
+    """
+    assert pair.scene is not None
+    spread = np.where(pair.seen, _made(pair, pair.scene) - pair.scene.maps(), 0.0)
+    has = np.sum(spread * np.where(pair.seen, pair.b - pair.a, 0.0)) > 0.5 * np.sum(spread**2)
+    return replace(pair, a=pair.a + spread, spread=spread) if has else replace(pair, by_moments=True)
 
 
 def _made(pair: ChannelPair, scene: Scene) -> Maps:
