@@ -61,7 +61,7 @@ class ChannelPair:
     spread
         What single samples change in side A, uK, if it was made from orientation moments and ``a`` has it since; None.
     by_moments
-        True if both sides were made from orientation moments, so that single samples have no say.
+        True if side A was made from orientation moments or at the pixels' centres, so that no single sample has a say.
     """
 
     name: str

@@ -171,7 +171,7 @@ class Problem(Prediction):
         for difference in library:
             if difference.name in present or (difference.name in INTERPOLATING and small):
                 continue
-            key = (*((id(d), v.tobytes()) for d, v in base.members), (id(difference), b""))
+            key = (*base.key, (id(difference), b""))
             if key not in self._tried:
                 state = state or self._freed(base)
                 self._tried[key] = self._with(difference, base, state)
@@ -212,7 +212,7 @@ class Problem(Prediction):
 
     def of_pair(self, pair: ChannelPair, others: Sequence[ChannelPair]) -> "Problem":
         """Return the problem of another pair."""
-        return replace(self, pair=pair, others=others, _tried={}, _hidden={})
+        return replace(self, pair=pair, others=others, _tried={}, _hidden={}, _exact={})
 
     def worse_alone_than(self, other: "Problem") -> bool:
         """Return True if a difference of the first stages leaves less of the other problem by itself."""

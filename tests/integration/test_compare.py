@@ -266,6 +266,17 @@ def test_a_side_that_was_made_from_orientation_moments_is_recognised(both, simul
         assert mcsim.compare(list(of_moments[0]), side_a, simulator.run).accuracy < 1e-5
 
 
+def test_maps_at_the_centres_of_pixels_are_recognised(simulator):
+    """Maps of a pipeline without a scan: one through the pixel window, one without it."""
+    run = replace(simulator.run, map=replace(simulator.run.map, splits=()))
+    smooth = healpy.almxfl(simulator.sky, simulator.site.beam.window)
+    without = healpy.alm2map(smooth, NSIDE, lmax=LMAX)
+    found = mcsim.compare([healpy.alm2map(healpy.almxfl(smooth, mcsim_window()), NSIDE, lmax=LMAX)], [without], run)
+    assert names(found) == ["pixel_window"]
+    assert found.channels[0].differences[0].amplitude == -1.0
+    assert found.channels[0].left < 1e-4
+
+
 def test_files_are_compared_from_the_command_line(tmp_path, simulator, side_a):
     sides = {"a": side_a, "b": scaled(side_a, 1.01)}
     for side, maps in sides.items():
