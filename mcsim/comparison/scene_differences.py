@@ -22,7 +22,7 @@ _SMALL = 1e-3
 """Small angle in radians, share of a sample, or change of a variance, over which responses are linear."""
 
 
-FAINT = 0.03
+FAINT = 0.1
 """Share of the rms below which a time shift that explains it is not looked for."""
 
 
