@@ -31,6 +31,9 @@ ROUNDING = 1e-6
 INTERPOLATION = 1e-3
 """The same for the interpolation of a sky between pixels or grid points."""
 
+INTERPOLATED = 0.02
+"""Share of the variance that a width of the beam leaves at least of such an interpolation's error."""
+
 CLEARLY = 0.1
 """Share of what a named set leaves that one of exchanged sides must leave at most to be named in its place."""
 
@@ -128,12 +131,16 @@ def compare(
 
 def _channel(pair: ChannelPair, sides: Comparison, accuracy: float) -> ChannelResult:
     others = [other for other in sides.pairs if other.name != pair.name]
-    found = _explained(pair, others, sides, accuracy)
+    found, problem = _explained(pair, others, sides, accuracy)
     accepted = DOUBTFUL if len(found.differences) == 1 else DOUBTFUL_TOGETHER
     named = found.verdict != "unknown"
-    if pair.scene is None or found.verdict == "identical" or (named and found.left < accepted):
+    if problem is None or pair.scene is None or found.verdict == "identical" or (named and found.left < accepted):
         return found
-    turned = _explained(pair.exchanged(), [other.exchanged() for other in others], sides, accuracy, True)
+    turned_pair, turned_others = pair.exchanged(), [other.exchanged() for other in others]
+    shown = turned_pair if problem.pair.doubt is None else with_shown_sky(turned_pair)
+    if not problem.worse_alone_than(problem.of_pair(shown, turned_others)):
+        return found
+    turned, _ = _explained(turned_pair, turned_others, sides, accuracy, True)
     worse = named and turned.left > CLEARLY * found.left
     if turned.verdict in ("unknown", "identical") or worse:
         return found
@@ -142,12 +149,18 @@ def _channel(pair: ChannelPair, sides: Comparison, accuracy: float) -> ChannelRe
 
 def _explained(
     pair: ChannelPair, others: Sequence[ChannelPair], sides: Comparison, accuracy: float, exchanged: bool = False
-) -> ChannelResult:
-    """Return what explains a pair whose side A is described by the model; ``exchanged``: it is the other's side B."""
-    rms, sky = _rms((pair.b - pair.a)[pair.seen]), _sky_rms(pair)
+) -> tuple[ChannelResult, Problem | None]:
+    """Return what explains a pair whose side A is described by the model, and the problem that was solved, if any.
+
+    ``exchanged``: it is the other's side B.
+    """
+    sky = _sky_rms(pair)
+    if _rms((pair.b - pair.a)[pair.seen]) <= ROUNDING * sky:
+        return _result(pair, sides, "identical", exchanged), None
+    pair = with_shown_sky(pair).where_different(ROUNDING * sky)
+    rms = _rms((pair.b - pair.a)[pair.seen])
     if rms <= ROUNDING * sky:
-        return _result(pair, sides, "identical", exchanged)
-    pair = with_shown_sky(pair)
+        return _result(pair, sides, "identical", exchanged), None
     problem = Problem(pair, others, accuracy * sky, library(sides.frame))
     sets = problem.best()
     if sides.run is not None and not (sets and problem.complete(sets[0])):
@@ -155,25 +168,24 @@ def _explained(
         problem = replace(problem, library=(*problem.library, *(() if exchanged else effects_of(pair, sides.run))))
         sets = problem.best(1)
     if exchanged and not (sets and problem.suffices(sets[0])):
-        return _result(pair, sides, "unknown", exchanged)
+        return _result(pair, sides, "unknown", exchanged), problem
     if not sets or not problem.suffices(sets[0]) or (sets[0].left > DOUBTFUL and not problem.complete(sets[0])):
         sets = sorted([*sets, *problem.best(2)], key=lambda one: one.left)
-    swapped = bool(sets) and any(difference.exchanges for difference, _ in sets[0].members)
-    if rms > accuracy * sky and (
-        not sets or not problem.suffices(sets[0]) or (swapped and sets[0].left > problem.enough)
-    ):
+    swapped = bool(sets) and any(difference.exchanges for difference, _ in problem.preferred(sets)[0].members)
+    if rms > accuracy * sky and (not sets or not problem.suffices(sets[0]) or swapped):
         behind = problem.behind()
         if behind and (not sets or problem.adds(behind[0], sets[0])):
             sets = behind
     small = rms <= accuracy * sky and bool(sets) and sets[0].names <= INTERPOLATING
+    small = small and ("interpolation" in sets[0].names or sets[0].left > INTERPOLATED)
     if not sets or not problem.suffices(sets[0]) or small:
         verdict: Verdict = "identical" if rms <= accuracy * sky else "unknown"
-        return _result(pair, sides, verdict, exchanged, [], problem, sets)
+        return _result(pair, sides, verdict, exchanged, [], problem, sets), problem
     sets = problem.preferred(sets)
     known = {equal[0] for difference, value in sets[0].members for equal in difference.equivalent(value)}
     others_too = [one for one in problem.alternatives(sets) if not known.intersection(d.name for d, _ in one.members)]
     chosen = [sets[0], *others_too]
-    return _result(pair, sides, _verdict(chosen), exchanged, chosen, problem, sets)
+    return _result(pair, sides, _verdict(chosen), exchanged, chosen, problem, sets), problem
 
 
 def _verdict(chosen: Sequence[Set]) -> Verdict:
@@ -219,6 +231,8 @@ def _result(
         explained=-explained if exchanged else explained,
         seen=seen,
         one_sided=pair.one_sided,
+        differing=pair.differing,
+        spread_rms_uk=0.0 if pair.spread is None else _rms(pair.spread[seen]),
         hits=pair.hits,
         reversed=exchanged,
     )

@@ -80,7 +80,7 @@ class Difference:
     linear
         True if the response is the template of a small amplitude, and so no better than about a per mille.
     exchanges
-        True if it exchanges pixels or files, which can be taken back before the rest is looked for.
+        True if it exchanges pixels, files or units, which can be taken back before the rest is looked for.
     """
 
     name: ClassVar[str]

@@ -31,8 +31,11 @@ class EffectDifference(Difference):
     natural = 1e-9
     stage = 1
 
-    def __init__(self, kind: type[Effect], templates: Maps, run: config.RunConfig) -> None:
+    def __init__(
+        self, kind: type[Effect], templates: Maps, run: config.RunConfig, bare: dict[bytes, Maps] | None = None
+    ) -> None:
         self.kind, self.templates, self.run = kind, templates, run
+        self._bare = {} if bare is None else bare
 
     def starts(self, state: State) -> list[Vector]:
         """Return the coordinates that fit best."""
@@ -53,15 +56,23 @@ class EffectDifference(Difference):
     def sampled(self, value: Vector, scene: Scene, pair: ChannelPair) -> Maps | None:
         """Return the response of the time-ordered reference; None if the effect does not act on samples."""
         sky: Any = self._sky(scene, pair)  # an array stands for a file
-        sides = [
+        bare, acting = (
             replace(run, sky=replace(run.sky, spectrum=None, map=None, alm=sky))
             for run in self._runs(value, scene, pair)
-        ]
+        )
+
+        def made(run: config.RunConfig) -> Maps:
+            return np.stack([m for _, m in sampled.maps(survey(run, scene.nthreads), 0, scene.nthreads)])
+
         try:
-            bare, acting = (sampled.maps(survey(run, scene.nthreads), 0, scene.nthreads) for run in sides)
+            more = made(acting)
         except InputError:
             return None
-        return np.stack([more - less for (_, more), (_, less) in zip(acting, bare, strict=True)])
+        key = sky.tobytes() + scene.beam.blm.tobytes() + np.float64(scene.psi[1]).tobytes()
+        if key not in self._bare:
+            self._bare.clear()
+            self._bare[key] = made(bare)
+        return more - self._bare[key]
 
     def _sky(self, scene: Scene, pair: ChannelPair) -> Alm:
         """Return the sky of a scene, with what its pixel window has more than the samples' spread makes."""
@@ -114,6 +125,7 @@ def effects_of(pair: ChannelPair, run: config.RunConfig) -> Iterator[EffectDiffe
     alone = quiet(run.of_channels(pair.name))
     sky, nthreads = pair.scene.sky, pair.scene.nthreads
     bare = simulate.maps(survey(alone, nthreads), 0, nthreads, sky)
+    sampled_bare: dict[bytes, Maps] = {}
     for name, kind in catalogue().items():
         if kind.parametrization.stochastic or name in REDUNDANT or not kind.proposed:
             continue
@@ -127,7 +139,7 @@ def effects_of(pair: ChannelPair, run: config.RunConfig) -> Iterator[EffectDiffe
         except InputError:  # it depends on what the model does not say: a frequency, a pointing, a differencing scan
             continue
         if any(t.any() for t in templates):
-            yield EffectDifference(kind, np.stack(templates), alone)
+            yield EffectDifference(kind, np.stack(templates), alone, sampled_bare)
 
 
 def _table(effect: Effect, channel: str) -> config.Effect:

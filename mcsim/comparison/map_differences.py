@@ -11,6 +11,9 @@ from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.scene import Maps, Scene
 from mcsim.sphere import header
 
+SCREENED = 50_000
+"""Pixels on which orders of pixels are compared at most."""
+
 
 class Calibration(Difference):
     """The maps of side B are those of side A times a factor."""
@@ -21,8 +24,13 @@ class Calibration(Difference):
     proportional = True
 
     def starts(self, state: State) -> list[Vector]:
-        """Return the fraction, and 0 for maps with their noise or 1 for the sky alone, where they have noise."""
-        found = [np.array([*state.fit([state.maps]), 0.0])]
+        """Return the fraction, and 0 for maps with their noise or 1 for the sky alone, where they have noise.
+
+        Maps that share less than half of their variance are not each other's times a factor.
+        """
+        found, seen = [np.array([*state.fit([state.maps]), 0.0])], state.pair.seen
+        if 2.0 * np.sum(((1.0 + found[0][0]) * state.maps[seen]) ** 2) < np.sum(state.pair.b[seen] ** 2):
+            return []
         if state.scene is not None and state.pair.doubt is not None:
             found.append(np.array([*state.fit([state.scene.maps()]), 1.0]))
         return found
@@ -46,21 +54,28 @@ class Unit(Difference):
     name, unit = "unit", "factor"
     met = "K taken for uK, or antenna for CMB temperature"
     needs_scene = False
+    exchanges = True
 
     def starts(self, state: State) -> list[Vector]:
         found = 1.0 + float(state.fit([state.maps])[0])
+        size = float(np.std(state.pair.b[state.pair.seen]) / np.std(state.maps[state.pair.seen]))
+        # Factors of ten are exact, whatever else differs; antenna temperature depends on the band and on T_CMB.
+        near = {f for f in (1e-6, 1e-3, 1e3, 1e6) for x in (size, found) if 0.1 < x / f < 10.0}
+        tens = [np.array([f]) for f in sorted(near)]
         if found <= 0.0:
-            return []
+            return tens
         frequency = None if state.pair.channel is None else state.pair.channel.site.frequency_ghz
-        # Factors of ten are exact; antenna temperature and brightness depend on the band and on T_CMB.
-        near = [(f, f) for f in (1e-6, 1e-3, 1e3, 1e6)]
+        bands = []
         for unit in ("uK_RJ", "MJy/sr", "Jy/sr") if frequency else ():
             factor = header.to_uk(unit, Path("map"), frequency)
-            near += [(1.0 / factor, found), (factor, found)]
-        return [np.array([value]) for f, value in near if abs(np.log(f / found)) < 2e-3]
+            bands += [1.0 / factor, factor]
+        return tens + [np.array([found]) for f in bands if abs(np.log(f / found)) < 2e-3]
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
         return value[0] * maps
+
+    def undone(self, maps: Maps, value: Vector) -> Maps:
+        return np.where(maps == healpy.UNSEEN, maps, maps / value[0])
 
     def inverse(self, value: Vector) -> Vector:
         return 1.0 / value
@@ -122,7 +137,8 @@ class Ordering(Difference):
         """Return both ways, if side B is more like the prediction then, dipoles aside."""
 
         def alike(maps: Maps) -> float:
-            seen = state.pair.seen & (maps != healpy.UNSEEN)
+            some = np.arange(maps.shape[1]) % max(1, maps.shape[1] // SCREENED) == 0
+            seen = state.pair.seen & (maps != healpy.UNSEEN) & some
             axes = np.hstack([_axes(state.pair.nside)[:, one] for one in seen])
             known = np.vstack([np.ones(axes.shape[1]), axes]).T
             one, other = (
@@ -135,7 +151,7 @@ class Ordering(Difference):
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
         order = {"r2n": True} if value[0] > 0 else {"n2r": True}
-        return _complete(np.stack([healpy.reorder(one, **order) for one in maps]), maps)
+        return _complete(np.stack([healpy.reorder(one, **order) for one in maps]), state)
 
     def undone(self, maps: Maps, value: Vector) -> Maps:
         order = {"n2r": True} if value[0] > 0 else {"r2n": True}
@@ -158,7 +174,7 @@ class SplitExchanged(Difference):
         return [np.array([float(i), float(j)]) for i in range(count) for j in range(i)]
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
-        return _complete(self.undone(maps, value), maps)
+        return _complete(self.undone(maps, value), state)
 
     def undone(self, maps: Maps, value: Vector) -> Maps:
         i, j = value.astype(int)
@@ -170,9 +186,9 @@ class SplitExchanged(Difference):
         return 1.0
 
 
-def _complete(exchanged: Maps, maps: Maps) -> Maps:
-    """Return exchanged maps, and those that they were where they have no data."""
-    return np.where(exchanged == healpy.UNSEEN, maps, exchanged)
+def _complete(exchanged: Maps, state: State) -> Maps:
+    """Return exchanged maps, and side B where they have no data and so nothing to say."""
+    return np.where(exchanged == healpy.UNSEEN, state.pair.b, exchanged)
 
 
 class ChannelExchanged(Difference):
@@ -186,7 +202,7 @@ class ChannelExchanged(Difference):
         return [np.array([float(i)]) for i, other in enumerate(state.others) if other.a.shape == state.maps.shape]
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
-        return _complete(state.others[int(value[0])].a, maps)
+        return _complete(state.others[int(value[0])].a, state)
 
     def amplitude(self, value: Vector) -> float:
         return 1.0
@@ -232,7 +248,7 @@ class NoiseShared(Difference):
         else:
             order = np.arange(len(pair.a))
             order[changed] = source
-            other, seen, sky = pair.a[order], pair.seen & pair.seen[order], own[order]
+            other, seen, sky = pair.a[order], pair.seen & (pair.a[order] != healpy.UNSEEN), own[order]
             hits = None if pair.hits is None else pair.hits[order]
         noise = other - pair.a - (sky - own if simulated else zero)
         if scaled and hits is not None and pair.hits is not None:

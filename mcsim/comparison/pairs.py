@@ -58,6 +58,10 @@ class ChannelPair:
         Samples of the channel, if the model has them in files.
     doubt
         A draw of what noise hides of the sky that side A shows, coefficients as the scene's; None if it hides nothing.
+    spread
+        What single samples change in side A, uK, if it was made from orientation moments and ``a`` has it since; None.
+    by_moments
+        True if side A was made from orientation moments or at the pixels' centres, so that no single sample has a say.
     """
 
     name: str
@@ -73,10 +77,12 @@ class ChannelPair:
 
     files: PointingFiles | None = None
     doubt: Alm | None = None
+    spread: Maps | None = None
+    by_moments: bool = False
 
     def pointing(self, longest: float = SAMPLES) -> Pointing | PointingFiles | None:
         """Return the pointing, if it is known and has no more samples than the longest that is wanted."""
-        if self.channel is None or self.hits is None:
+        if self.channel is None or self.hits is None or self.by_moments:
             return None
         known = self.channel.site.pointing
         if known is not None:
@@ -88,6 +94,17 @@ class ChannelPair:
     def nside(self) -> int:
         """Of the maps."""
         return healpy.npix2nside(self.a.shape[1])
+
+    @property
+    def differing(self) -> tuple[str, ...]:
+        """Names of the maps that are compared."""
+        return tuple(name for name, seen in zip(self.splits, self.seen, strict=True) if seen.any())
+
+    def where_different(self, least: float) -> "ChannelPair":
+        """Return the pair without maps whose difference has an rms of ``least`` uK at most, unless that are all."""
+        rest = np.where(self.seen, self.b - self.a, 0.0)
+        small = np.sum(rest**2, axis=1) <= least**2 * self.seen.sum(axis=1)
+        return self if small.all() or not small.any() else replace(self, seen=self.seen & ~small[:, None])
 
     def exchanged(self) -> "ChannelPair":
         """Return the pair with side B as side A, and a sky that its maps show."""
@@ -311,6 +328,18 @@ def _folder(folder: Path, run: config.RunConfig | None) -> dict[str, NDArray[np.
     return found
 
 
+def _without_holes(map_uk: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a map with UNSEEN for whatever stands for a pixel without data: NaN, UNSEEN in any unit, zeros.
+
+    Two pixels of a simulated sky are not exactly 0.
+    """
+    known = np.isfinite(map_uk) & (map_uk > 1e-9 * UNSEEN_BELOW)
+    zero = map_uk == 0.0
+    if 1 < zero.sum() < known.sum():
+        known &= ~zero
+    return np.where(known, map_uk, healpy.UNSEEN)
+
+
 def _pair(
     name: str, maps: Sequence[str], sides: Sequence[dict[str, NDArray[np.float64]]], whole: Survey | None, nthreads: int
 ) -> ChannelPair:
@@ -319,7 +348,7 @@ def _pair(
         nsides = " and ".join(str(nside) for nside in sorted(found))
         raise InputError(f"the maps of {name} have nside {nsides}; bring them to the same.")
     whole_sides = (np.stack([side[m] for m in maps]).astype(np.float64) for side in sides)
-    a, b = (np.where(np.isfinite(side) & (side > UNSEEN_BELOW), side, healpy.UNSEEN) for side in whole_sides)
+    a, b = (np.stack([_without_holes(one) for one in side]) for side in whole_sides)
     observed = [side != healpy.UNSEEN for side in (a, b)]
     seen, one_sided = observed[0] & observed[1], int(np.sum(observed[0] != observed[1]))
     if whole is None:

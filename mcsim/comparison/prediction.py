@@ -82,6 +82,11 @@ class Set:
         return frozenset(difference.name for difference, _ in self.members)
 
     @property
+    def key(self) -> tuple[tuple[int, bytes], ...]:
+        """The differences and their values, to look the set up by."""
+        return tuple((id(difference), value.tobytes()) for difference, value in self.members)
+
+    @property
     def fitted(self) -> int:
         """Number of values that were fitted."""
         return sum(len(difference.axes(value)) for difference, value in self.members)
@@ -113,6 +118,7 @@ class Prediction:
     others: Sequence[ChannelPair]
     floor: float
     _hidden: dict[tuple[tuple[int, bytes], ...], float] = field(default_factory=dict, repr=False, kw_only=True)
+    _exact: dict[tuple[tuple[int, bytes], ...], Set] = field(default_factory=dict, repr=False, kw_only=True)
 
     @cached_property
     def _bare(self) -> Maps | None:
@@ -167,10 +173,9 @@ class Prediction:
         scene = self.pair.scene
         if self.pair.doubt is None or scene is None or not found.members:
             return 0.0
-        key = tuple((id(difference), value.tobytes()) for difference, value in found.members)
-        if key not in self._hidden:
-            self._hidden[key] = self._squares_hidden(found.members, scene, self.pair.doubt)
-        return self._hidden[key]
+        if found.key not in self._hidden:
+            self._hidden[found.key] = self._squares_hidden(found.members, scene, self.pair.doubt)
+        return self._hidden[found.key]
 
     def _squares_hidden(self, members: Members, scene: Scene, doubt: Alm) -> float:
         made = []
@@ -188,7 +193,7 @@ class Prediction:
 
     def needed(self) -> float:
         """Return the share of the variance that a set must explain to be named."""
-        simple = self.pair.scene is None or self._pointing is not None
+        simple = self.pair.scene is None or self.pair.by_moments or self._pointing is not None
         return EXPLAINED_BY_SAMPLES if simple else EXPLAINED
 
     def excess(self, found: Set) -> float:
@@ -269,6 +274,11 @@ class Prediction:
         """Return a set with its share measured sample by sample, and its values fitted again beside that."""
         if self._pointing is None or self.pair.scene is None:
             return found
+        if found.key not in self._exact:
+            self._exact[found.key] = self._refined(found)
+        return self._exact[found.key]
+
+    def _refined(self, found: Set) -> Set:
         found = self._measured(found)
         if not found.fitted or found.left < NOTHING:
             return found

@@ -58,6 +58,10 @@ class ChannelResult:
         Number of pixels that one side alone observed, and that are left out.
     hits
         Samples per pixel, of the model; None without one.
+    differing
+        Names of the maps that differ at all, of which the rest is said.
+    spread_rms_uk
+        Of what single samples change in side A, if that was made from orientation moments; it is taken off first.
     reversed
         True if the model describes side B, and the differences were found in side A; they say B relative to A.
     """
@@ -81,6 +85,8 @@ class ChannelResult:
     seen: NDArray[np.bool_]
     one_sided: int
     hits: Maps | None
+    differing: tuple[str, ...] = ()
+    spread_rms_uk: float = 0.0
     reversed: bool = False
 
     @property
@@ -95,8 +101,12 @@ class ChannelResult:
 
     def sentence(self) -> str:
         """Say what was found in this channel."""
-        holes = f" {self.one_sided} pixels that one side alone observed are left out." if self.one_sided else ""
-        return self._found() + holes
+        more = f" {self.one_sided} pixels that one side alone observed are left out." if self.one_sided else ""
+        if self.spread_rms_uk:
+            more += f" What single samples change in side A, {number(self.spread_rms_uk)} uK rms, is taken off first."
+        if len(self.differing) < len(self.splits):
+            more += f" That is {', '.join(self.differing)}; the other maps are identical."
+        return self._found() + more
 
     def _found(self) -> str:
         size = f"{number(self.rms_uk)} uK rms, {number(self.accuracy)} of the sky"
@@ -196,7 +206,9 @@ class ComparisonResult:
                 "fraction": (left / rms) ** 2 if rms > 0.0 else 0.0,
                 "one_sided_pixels": sum(c.one_sided for c in self.channels),
                 "looks": {c.name: list(c.looks) for c in self.channels if c.looks},
+                "single_samples_uk": {c.name: c.spread_rms_uk for c in self.channels if c.spread_rms_uk},
             },
+            "maps": {c.name: list(c.differing) for c in self.channels if len(c.differing) < len(c.splits)},
         }
 
     def __str__(self) -> str:

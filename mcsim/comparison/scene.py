@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import healpy
 import numpy as np
@@ -30,6 +31,9 @@ Maps = NDArray[np.float64]
 
 KEPT = 4
 """Transforms that are kept: scenes with the same sky and beam differ in their moments alone."""
+
+KEPT_BEAMS = 64
+"""Displaced beams that are kept: one for every time shift that is tried."""
 
 EPSILON = 1e-7
 """Accuracy of the interpolation of single samples."""
@@ -90,8 +94,8 @@ class Scene:
         Scan model in place of the channel's; None: that.
     late, step
         Samples by which the signal of a pointing is attributed to an earlier one, and their distance in radians.
-    kept
-        Transforms of scenes made from this one.
+    kept, moved
+        Transforms of scenes made from this one, and their displaced beams.
     """
 
     sky: Alm
@@ -106,6 +110,8 @@ class Scene:
     late: float = 0.0
     step: float = 0.0
     kept: OrderedDict[tuple[bytes, ...], Transforms] = field(default_factory=OrderedDict, repr=False)
+    moved: OrderedDict[tuple[bytes, float], Beam] = field(default_factory=OrderedDict, repr=False)
+    _made: dict[int, Maps] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def lmax(self) -> int:
@@ -123,21 +129,21 @@ class Scene:
         beam = self.beam
         if self.late:
             way = self.late * self.step
-            moved = displaced(beam, 0.0 if way >= 0.0 else np.pi, abs(way))
-            beam = moved.truncated(min(moved.mmax, self.moments[0].smax))
+            key = (beam.blm.tobytes(), way)
+            if key not in self.moved:
+                moved = displaced(beam, 0.0 if way >= 0.0 else np.pi, abs(way))
+                _keep(self.moved, key, moved.truncated(min(moved.mmax, self.moments[0].smax)), KEPT_BEAMS)
+            beam = self.moved[key]
         return convolve.response(beam, self.lmax, self.window)
 
-    @property
+    @cached_property
     def _transforms(self) -> Transforms:
         places = (b"" if m.dtheta is None else m.dtheta.tobytes() for m in self.moments)
         key = (self.sky.tobytes(), self.response.factors.tobytes(), *places, bytes([self.offset_order]))
         if key not in self.kept:
             circular, offsets = self._circular()
-            self.kept[key] = Transforms(
-                circular, convolve.spin_maps(self.sky, self.response, self.nside, self.nthreads), offsets
-            )
-            while len(self.kept) > KEPT:
-                self.kept.popitem(last=False)
+            spins = convolve.spin_maps(self.sky, self.response, self.nside, self.nthreads)
+            _keep(self.kept, key, Transforms(circular, spins, offsets), KEPT)
         self.kept.move_to_end(key)
         return self.kept[key]
 
@@ -184,11 +190,17 @@ class Scene:
         return np.where(done == healpy.UNSEEN, 0.0, done)
 
     def maps(self) -> Maps:
-        """Return the maps, without noise."""
+        """Return the maps, without noise; read-only."""
+        return self._maps
+
+    @cached_property
+    def _maps(self) -> Maps:
         made = self._noncircular() + self._transforms.circular
         for own, added in zip(made, self._transforms.offsets, strict=False):
             own += added
-        return self._prepared(made)
+        made = self._prepared(made)
+        made.setflags(write=False)
+        return made
 
     def turned(self, angle: float) -> "Scene":
         """Return the scene with all samples turned by an angle, in radians."""
@@ -237,18 +249,31 @@ class Scene:
         signal
             How samples see the sky, in place of the beam's convolution.
         """
+        own = signal is None and window is self.window
+        if own and id(pointing) in self._made:
+            return self._made[id(pointing)]
         factor = self.window if self.centred else self.window / window
         sky = alm_.multiply(self.sky, factor, self.lmax)
         signal = signal or tod.sky_signal(sky, self.lmax, self.beam, EPSILON, self.nthreads)
         streams = (self.stream(pointing, split) for split in range(len(self.moments)))
-        made = [tod.bin_samples(signal(self._pointed(stream)), self.nside)[0] for stream in streams]
-        return self._prepared(np.stack(made))
+        made = self._prepared(np.stack([tod.bin_samples(signal(self._pointed(s)), self.nside)[0] for s in streams]))
+        made.setflags(write=False)
+        if own:
+            self._made[id(pointing)] = made
+        return made
 
     def _pointed(self, samples: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
         sign, offset = self.psi
         for chunk in samples:
             theta, phi = healpy.pix2ang(self.nside, chunk.pixel) if self.centred else (chunk.theta, chunk.phi)
             yield replace(chunk, theta=theta, phi=phi, psi=sign * chunk.psi + offset)
+
+
+def _keep(kept: OrderedDict[Any, Any], key: object, value: object, most: int) -> None:
+    """Keep a value, and forget the ones that were longest without use."""
+    kept[key] = value
+    while len(kept) > most:
+        kept.popitem(last=False)
 
 
 def ahead(model: ScanModel, seconds: float) -> ScanModel:

@@ -22,6 +22,10 @@ _SMALL = 1e-3
 """Small angle in radians, share of a sample, or change of a variance, over which responses are linear."""
 
 
+FAINT = 0.1
+"""Share of the rms below which a time shift that explains it is not looked for."""
+
+
 class PsiOffset(Difference):
     """psi of side B is that of side A plus an angle."""
 
@@ -172,8 +176,10 @@ class TimeShift(Difference):
         bare, value = scene.maps(), 0.05 * largest
         for _ in range(3):
             moved = self.scene(scene, np.array([value]), pair).maps() - bare
-            value = float(np.clip(value * state.fit([moved])[0], -largest, largest))
-            if abs(value) < 1e-6 * largest:
+            size = float(state.fit([moved])[0])
+            value = float(np.clip(value * size, -largest, largest))
+            told = size * np.linalg.norm(state.beside(moved)) / np.linalg.norm(state.rest(state.maps)).clip(1e-300)
+            if abs(value) < 1e-6 * largest or abs(told) < FAINT:
                 return []
         return [np.array([value])]
 

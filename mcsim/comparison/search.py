@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from mcsim.comparison.differences import Difference, State
+from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.prediction import PRECISION, TOLERATED, UNSURE, Prediction, Set, Vector
 
 FURTHER = 0.7
@@ -50,6 +51,12 @@ KEPT = 3
 
 TRIED = 8
 """Larger sets whose values are fitted together."""
+
+HARDER = 4.0
+"""Share of the variance that an exchange may leave at most by itself, if what was there before it is looked for."""
+
+SOONER = 0.8
+"""Times what it leaves of side B that a difference may leave of side A to have the sides exchanged."""
 
 SCREENED = 200_000
 """Pixels on which pairs are compared at most."""
@@ -164,7 +171,7 @@ class Problem(Prediction):
         for difference in library:
             if difference.name in present or (difference.name in INTERPOLATING and small):
                 continue
-            key = (*((id(d), v.tobytes()) for d, v in base.members), (id(difference), b""))
+            key = (*base.key, (id(difference), b""))
             if key not in self._tried:
                 state = state or self._freed(base)
                 self._tried[key] = self._with(difference, base, state)
@@ -203,6 +210,16 @@ class Problem(Prediction):
         fit = least_squares(rest, first, x_scale=scale, diff_step=1e-3, max_nfev=8, xtol=1e-7)
         return min(best, set_of(difference.within(np.asarray(fit.x))), key=lambda one: one.left)
 
+    def of_pair(self, pair: ChannelPair, others: Sequence[ChannelPair]) -> "Problem":
+        """Return the problem of another pair."""
+        return replace(self, pair=pair, others=others, _tried={}, _hidden={}, _exact={})
+
+    def worse_alone_than(self, other: "Problem") -> bool:
+        """Return True if a difference of the first stages leaves less of the other problem by itself."""
+        library = [d for d in self.library if d.stage < 2 and not d.linear]
+        own, there = ({one.names: one.left for one in p._extended(Set((), 1.0), library)} for p in (self, other))
+        return any(left < SOONER * own.get(names, 1.0) for names, left in there.items())
+
     def undone(self, difference: Difference, value: Vector) -> "Problem | None":
         """Return the problem that is left when side B is freed of a difference; None if that cannot be taken back."""
         b = difference.undone(self.pair.b, value)
@@ -210,9 +227,9 @@ class Problem(Prediction):
             return None
         known = (self.pair.a != healpy.UNSEEN) & (b != healpy.UNSEEN)
         seen = known if self.pair.hits is None else known & (self.pair.hits > 0)
-        if not seen.any(axis=1).all():
+        if not seen.any():
             return None
-        return replace(self, pair=replace(self.pair, b=b, seen=seen), _tried={}, _hidden={})
+        return self.of_pair(replace(self.pair, b=b, seen=seen), self.others)
 
     def behind(self) -> list[Set]:
         """Return sets of differences that were there before pixels or files were exchanged, the best first."""
@@ -220,7 +237,7 @@ class Problem(Prediction):
         for difference in self.library:
             for value in difference.starts(self.state(())) if difference.exchanges else ():
                 problem = self.undone(difference, value)
-                if problem is None:
+                if problem is None or self.left(((difference, value),)) > HARDER:
                     continue
                 if problem.total <= problem.floor**2 * problem.pair.seen.sum():
                     sets = [Set((), 0.0)]
@@ -229,6 +246,8 @@ class Problem(Prediction):
                     if not sets or not problem.suffices(sets[0]):
                         sets = sorted([*sets, *problem.best(2)], key=lambda one: one.left)
                 for one in sets[:KEPT]:
+                    if difference.name in one.names or not problem.suffices(one):
+                        continue
                     members = (*one.members, (difference, value))
                     found.append(Set(members, self.left(members, one.correction), one.correction))
         return sorted(found, key=lambda one: one.left)

@@ -21,6 +21,9 @@ UNSHOWN = 1e-3
 NEAR = 5
 """Degrees over which power is averaged."""
 
+MADE = 0.1
+"""Share of what a simulation leaves of side A that another one leaves at most if side A was made that way."""
+
 ROUNDS = 2
 """How often the sky is corrected for what its simulation leaves of the maps."""
 
@@ -30,11 +33,41 @@ ITERATIONS = 100
 
 def with_shown_sky(pair: ChannelPair) -> ChannelPair:
     """Return a pair whose sky, if it is taken from side A, makes its maps sample by sample, but for their noise."""
-    if pair.scene is None or not pair.sky_of_maps:
+    if pair.scene is None:
         return pair
-    pair = _sharper(pair)
-    weight = _weight(pair)
-    return pair if weight is None else _filtered(pair, weight)
+    found = _as_made(pair, _sharper(pair) if pair.sky_of_maps else pair)
+    weight = _weight(found) if pair.sky_of_maps else None
+    return found if weight is None else _filtered(found, weight)
+
+
+def _left(pair: ChannelPair, made: Maps) -> float:
+    """Return the squares that a simulation leaves of side A."""
+    return float(np.sum((pair.a - made)[pair.seen] ** 2))
+
+
+def _as_made(pair: ChannelPair, found: ChannelPair) -> ChannelPair:
+    """Return a pair as side A was made: by single samples, orientation moments, or at the pixels' centres.
+
+    ``found`` has the sky of single samples, ``pair`` that of orientation moments. If side A was made from moments and
+    side B from single samples, what those change is added to side A; else they are not simulated.
+    """
+    scene = pair.scene
+    assert scene is not None
+    assert found.scene is not None
+    left = _left(found, _made(found, found.scene))
+    if left <= UNSHOWN**2 * np.var(pair.a[pair.seen]) * pair.seen.sum():
+        return found
+    centred = [scene.at_centres(), replace(scene.at_centres(), beam=scene.beam.truncated(0))]
+    if pair.sky_of_maps:
+        centred = [replace(one, sky=sky_in(pair.a, pair.seen, one)) for one in centred]
+    best = min([scene, *centred], key=lambda one: _left(pair, one.maps()))
+    if _left(pair, best.maps()) > MADE * left:
+        return found
+    if best is scene and pair.pointing() is not None:
+        spread = np.where(pair.seen, _made(pair, scene) - scene.maps(), 0.0)
+        if np.sum(spread * np.where(pair.seen, pair.b - pair.a, 0.0)) > 0.5 * np.sum(spread**2):
+            return replace(pair, a=pair.a + spread, spread=spread)
+    return replace(pair, scene=best, by_moments=True)
 
 
 def _made(pair: ChannelPair, scene: Scene) -> Maps:

@@ -1,7 +1,7 @@
 """Differences that belong to single samples: baselines along the scan, and a sky that is looked up on a grid."""
 
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import fields, replace
 
 import healpy
 import numpy as np
@@ -31,6 +31,11 @@ SAMPLES = 30_000_000
 FINEST = 4
 """Largest power of two by which a grid's nside may exceed that of the maps."""
 
+BAND = 0.02
+"""Share of the sky in which grids are tried."""
+
+TELLING = 0.1
+"""Share of the rms there that a grid's errors must explain."""
 
 FAR = 0.1
 """Rms over the sky's of what is left from which on time stamps of another part of the sky may make it."""
@@ -53,19 +58,22 @@ class MapMaking(Difference):
         if pointing is None or state.scene is None or state.scene.preparations:
             return []
         rest = np.where(pair.seen, pair.b - state.maps, 0.0)
-        number = sum(float(m.hits.sum()) for m in state.scene.moments)
+        number, total = sum(float(m.hits.sum()) for m in state.scene.moments), float(np.sum(rest**2))
         length = int(np.ceil(number * PIXELS_PER_BASELINE / pair.seen.sum()))
         shares = list(_shares(pair, pointing, length))
-        tried: list[tuple[float, int, Maps]] = []
+        # Longer baselines are sums of the shortest ones, which explain the most of the pixels that they are fitted to.
+        if np.sum((rest - _all_fitted(shares, rest, pair.seen)) ** 2) > (1.0 - PREDICTED) * total:
+            return []
+        tried = [(1.0, length, shares)]
         while number / length > FEWEST * len(rest):
-            fits = [_fitted(p, one, seen) for p, one, seen in zip(shares, rest, pair.seen, strict=True)]
-            lost = sum(held for held, _ in fits) / float(np.sum(rest**2))
-            tried.append((lost, length, np.stack([made for _, made in fits])))
+            lost = sum(_lost(p, r, s) for p, r, s in zip(shares, rest, pair.seen, strict=True) if s.any()) / total
+            tried.append((lost, length, shares))
             length *= 2
             shares = [_merged(p) for p in shares]
-        lost, length, made = min(tried, key=lambda one: one[0], default=(1.0, 0, rest))
+        lost, length, shares = min(tried, key=lambda one: one[0])
         if lost > 1.0 - PREDICTED:
             return []
+        made = _all_fitted(shares, rest, pair.seen)
         value = np.array([np.sqrt(np.mean(made[pair.seen] ** 2)), length])
         self._made[value.tobytes()] = made
         return [value]
@@ -97,16 +105,26 @@ def _merged(share: csr_array) -> csr_array:
     return csr_array((coordinates.data, (coordinates.row, coordinates.col // 2)), shape=(share.shape[0], width))
 
 
-def _fitted(share: csr_array, rest: NDArray[np.float64], seen: NDArray[np.bool_]) -> tuple[float, NDArray[np.float64]]:
-    """Return the squares that baselines fitted to one half of the pixels leave of the other, and what all make."""
+def _lost(share: csr_array, rest: NDArray[np.float64], seen: NDArray[np.bool_]) -> float:
+    """Return the squares that baselines fitted to either half of the pixels leave of the other."""
     half = np.random.default_rng(0).random(rest.size) < 0.5
     lost = 0.0
     for fitted in (seen & half, seen & ~half):
         held = seen & ~fitted
         found = lsqr(share[fitted], rest[fitted], iter_lim=100)[0]
         lost += float(np.sum((rest[held] - share[held] @ found) ** 2))
-    made = share @ lsqr(share[seen], rest[seen], iter_lim=100)[0]
-    return lost, np.where(seen, made, 0.0)
+    return lost
+
+
+def _all_fitted(shares: Sequence[csr_array], rest: Maps, seen: NDArray[np.bool_]) -> Maps:
+    """Return what baselines that are fitted to all pixels make of them, 0 where they are not seen."""
+    made = np.zeros_like(rest)
+    for index, share in enumerate(shares):
+        if not seen[index].any():
+            continue
+        own = share[seen[index]]
+        made[index, seen[index]] = own @ lsqr(own, rest[index, seen[index]], iter_lim=100)[0]
+    return made
 
 
 class Interpolation(Difference):
@@ -117,33 +135,50 @@ class Interpolation(Difference):
     stage = 2
 
     def __init__(self) -> None:
-        self._made: dict[bytes, Maps] = {}
+        self._made: dict[tuple[float, ...], Maps] = {}
 
     def starts(self, state: State) -> list[Vector]:
         """Return nside, and 1 for an interpolation or 0 for the nearest pixel, of grids whose errors are large enough.
 
         They fall with the square of nside, and with nside. The nearest pixel of the maps' own nside is its centre.
+        Fine grids are large: those that explain nothing of a band of pixels are not made of the whole sky.
         """
-        if state.scene is None or state.pair.pointing(SAMPLES) is None:
+        pair = state.pair
+        if state.scene is None or pair.pointing(SAMPLES) is None:
             return []
-        seen, values = state.pair.seen, []
-        rest = max(float(np.std((state.pair.b - state.maps)[seen])), 1e-300)
+        band = np.zeros_like(pair.seen)
+        band[:, slice(None) if state.scene.preparations else _band(pair)] = True
+        here, values = band & pair.seen, []
+        free = np.zeros((0, int(here.sum()))) if state.free is None else state.free[:, band[pair.seen]]
+        beside = np.linalg.qr(free.T)[0]
+
+        def size(maps: Maps) -> float:
+            rest = maps[here]
+            return max(float(np.std(rest - beside @ (beside.T @ rest))), 1e-300)
+
+        rest = pair.b - state.maps
         for linear, power in ((1.0, 2.0), (0.0, 1.0)):
-            coarse = float(np.std(self._response(np.array([state.scene.nside, linear]), state.pair)[seen]))
-            finer = np.log2(max(coarse, 1e-300) / rest) / power
-            wanted = {int(np.floor(finer)), int(np.ceil(finer))}
-            values += [np.array([2.0**k * state.scene.nside, linear]) for k in wanted if 1.0 - linear <= k <= FINEST]
+            finer = (
+                np.log2(size(self._response(np.array([state.scene.nside, linear]), pair, True)) / size(rest)) / power
+            )
+            for k in {int(np.floor(finer)), int(np.ceil(finer))}:
+                value = np.array([2.0**k * state.scene.nside, linear])
+                if not 1.0 - linear <= k <= FINEST:
+                    continue
+                if size(rest - self._response(value, pair, True)) < (1.0 - TELLING) * size(rest):
+                    values.append(value)
         return values
 
-    def _response(self, value: Vector, pair: ChannelPair) -> Maps:
-        key, scene, pointing = value.tobytes(), pair.scene, pair.pointing(SAMPLES)
+    def _response(self, value: Vector, pair: ChannelPair, narrow: bool = False) -> Maps:
+        scene, pointing = pair.scene, pair.pointing(SAMPLES)
+        assert scene is not None
+        assert pointing is not None
+        pixels = _band(pair) if narrow and not scene.preparations else slice(0, 12 * scene.nside**2)
+        key = (*value, pixels.start, pixels.stop)
         if key not in self._made:
-            assert scene is not None
-            assert pointing is not None
-            if b"" not in self._made:
-                self._made[b""] = scene.sampled(pointing, scene.window)
-            grid = looked_up(scene, int(value[0]), bool(value[1]))
-            self._made[key] = scene.sampled(pointing, scene.window, grid) - self._made[b""]
+            grid = looked_up(scene, int(value[0]), bool(value[1]), pixels)
+            change = scene.sampled(pointing, scene.window, grid) - scene.sampled(pointing, scene.window)
+            self._made[key] = np.where(pair.seen, change, 0.0)
         return self._made[key]
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
@@ -153,24 +188,42 @@ class Interpolation(Difference):
         return {"between": "four pixels" if value[1] else "the nearest pixel"}
 
 
-def looked_up(scene: Scene, nside: int, linear: bool) -> tod.Stage:
-    """Return a stage that adds the sky through the beam, looked up on a grid at the samples' directions."""
+def _band(pair: ChannelPair) -> slice:
+    """Return the band of pixels, a share :data:`BAND` of the sky along its parallels, that is seen best."""
+    known = np.append(0, np.cumsum(pair.seen.sum(axis=0)))
+    width = int(np.ceil(BAND * pair.a.shape[1]))
+    first = int(np.argmax(known[width:] - known[:-width]))
+    return slice(first, first + width)
+
+
+def looked_up(scene: Scene, nside: int, linear: bool, pixels: slice) -> tod.Stage:
+    """Return a stage that adds the sky through the beam, looked up on a grid at the samples' directions.
+
+    Samples outside ``pixels``, along the parallels of the maps, are dropped.
+    """
     response = convolve.response(scene.beam, scene.lmax)
     circular = convolve.circular_alm(scene.sky, response)
-    smooth = healpix.synthesis(circular[None], nside, scene.lmax, nthreads=scene.nthreads)[0]
-    spins = convolve.spin_maps(scene.sky, response, nside, scene.nthreads)
+    theta = healpy.pix2ang(scene.nside, np.array([pixels.start, pixels.stop - 1]))[0]
+    theta = np.clip(theta + np.array([-1.0, 1.0]) * np.sqrt(np.pi) / scene.nside, 0.0, np.pi)
+    rings = healpix.rings_between(nside, *theta)
+    start = int(healpix.geometry(nside)["ringstart"][rings.start])
+    smooth = healpix.synthesis(circular[None], nside, scene.lmax, nthreads=scene.nthreads, rings=rings)[0]
+    spins = convolve.spin_maps(scene.sky, response, nside, scene.nthreads, rings)
 
     def stage(stream: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
         for chunk in stream:
+            inside = (chunk.pixel >= pixels.start) & (chunk.pixel < pixels.stop)
+            kept = tod.Samples(**{each.name: getattr(chunk, each.name)[inside] for each in fields(chunk)})
             if linear:
-                pixel, weight = healpy.get_interp_weights(nside, chunk.theta, chunk.phi)
+                pixel, weight = healpy.get_interp_weights(nside, kept.theta, kept.phi)
             else:
-                pixel, weight = healpy.ang2pix(nside, chunk.theta, chunk.phi)[None], np.ones(1)[:, None]
+                pixel, weight = healpy.ang2pix(nside, kept.theta, kept.phi)[None], np.ones(1)[:, None]
+            pixel = pixel - start
             signal = np.sum(weight * smooth[pixel], axis=0)
             for s, (real, imaginary) in spins.items():
-                turned = np.cos(s * chunk.psi) * real[pixel] + np.sin(s * chunk.psi) * imaginary[pixel]
+                turned = np.cos(s * kept.psi) * real[pixel] + np.sin(s * kept.psi) * imaginary[pixel]
                 signal += 2.0 * np.sum(weight * turned, axis=0)
-            yield replace(chunk, signal_uk=chunk.signal_uk + signal)
+            yield replace(kept, signal_uk=kept.signal_uk + signal)
 
     return stage
 
@@ -198,8 +251,8 @@ class FarTimeShift(Difference):
         if key not in self._made:
             assert scene is not None
             assert pointing is not None
-            there, here = (replace(scene, late=late).sampled(pointing, scene.window) for late in (value[0], 0.0))
-            self._made[key] = there - here
+            there = replace(scene, late=value[0]).sampled(pointing, scene.window)
+            self._made[key] = there - scene.sampled(pointing, scene.window)
         return maps + self._made[key]
 
     def inverse(self, value: Vector) -> Vector:

@@ -89,9 +89,11 @@ class CircularMaps:
 
 
 def spin_maps(
-    alm: NDArray[np.complex128], response: Response, nside: int, nthreads: int = 1
+    alm: NDArray[np.complex128], response: Response, nside: int, nthreads: int = 1, rings: slice | None = None
 ) -> dict[int, NDArray[np.float64]]:
     """Return S_s at pixel centres for every s > 0 that the beam has: real and imaginary parts, shape (2, npix), in uK.
+
+    ``rings``: of these rings alone.
 
     Notes
     -----
@@ -108,7 +110,7 @@ def spin_maps(
         electric_magnetic = np.stack(
             [alm_.multiply(alm, factor.real, response.lmax), alm_.multiply(alm, factor.imag, response.lmax)]
         )
-        maps[s] = healpix.synthesis(electric_magnetic, nside, response.lmax, spin=s, nthreads=nthreads)
+        maps[s] = healpix.synthesis(electric_magnetic, nside, response.lmax, s, nthreads, rings)
     return maps
 
 

@@ -25,15 +25,28 @@ def geometry(nside: int) -> dict[str, Any]:
     return dict(ducc0.healpix.Healpix_Base(nside, "RING").sht_info())
 
 
-def synthesis(alm: Alm, nside: int, lmax: int, spin: int = 0, nthreads: int = 1) -> NDArray[np.float64]:
+def rings_between(nside: int, north: float, south: float) -> slice:
+    """Return the rings between two colatitudes, radians, and the next one on either side."""
+    theta = geometry(nside)["theta"]
+    first, last = np.searchsorted(theta, [north, south])
+    return slice(max(int(first) - 2, 0), min(int(last) + 2, theta.size))
+
+
+def synthesis(
+    alm: Alm, nside: int, lmax: int, spin: int = 0, nthreads: int = 1, rings: slice | None = None
+) -> NDArray[np.float64]:
     """Return the map of a_lm: (1, npix) from (1, size) at spin 0, else (2, npix) from E and B (2, size).
 
+    ``rings``: make these alone, one after the other, as :func:`rings_between` gives them.
     Raise InputError if the coefficients do not fit ``lmax`` and ``spin``, or nside is not whole (any number will do).
     """
     check_whole(nside, "nside", 1)
     check_alm(alm, lmax, shape=(2 if spin else 1,))
-    maps = ducc0.sht.synthesis(alm=alm, spin=spin, lmax=lmax, nthreads=nthreads, **geometry(nside))
-    return np.asarray(maps)
+    where = geometry(nside)
+    if rings is not None:
+        where = {key: values[rings] for key, values in where.items()}
+        where["ringstart"] = where["ringstart"] - where["ringstart"][0]
+    return np.asarray(ducc0.sht.synthesis(alm=alm, spin=spin, lmax=lmax, nthreads=nthreads, **where))
 
 
 def gradient(alm: Alm, nside: int, lmax: int, nthreads: int = 1) -> NDArray[np.float64]:

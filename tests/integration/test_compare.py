@@ -239,6 +239,45 @@ def test_single_precision_and_interpolation_are_no_difference(simulator, side_a)
     assert found.accuracy == pytest.approx(0.02 / found.channels[0].sky_rms_uk, rel=0.02)
 
 
+def test_a_unit_of_one_split_alone_is_named(simulator, side_a):
+    found = mcsim.compare(side_a, [side_a[0], *scaled(side_a[1:], 1e-6)], simulator.run)
+    assert names(found) == ["unit"]
+    assert found.to_dict()["maps"] == {"W1": ["W1:half2"]}
+    assert "W1:half2; the other maps are identical" in str(found)
+
+
+def test_zeros_that_stand_for_holes_hide_nothing(simulator, side_a):
+    hole = np.abs(healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2))[2]) < 0.3
+    filled = [[np.where(hole, 0.0, m) for m in side] for side in (side_a, CASES["pixel_window"][0](simulator, side_a))]
+    assert names(mcsim.compare(*filled, simulator.run)) == ["pixel_window"]
+
+
+@pytest.mark.parametrize("both", [False, True])
+def test_a_side_that_was_made_from_orientation_moments_is_recognised(both, simulator, side_a):
+    """What single samples change in such maps is a per cent of the sky, and larger than this width."""
+    window = np.exp(-0.5 * np.arange(LMAX + 1) * np.arange(1, LMAX + 2) * np.deg2rad(0.35) ** 2)
+    narrow, wide = simulator.sky, healpy.almxfl(simulator.sky, window)
+    of_moments = [simulate.maps(survey(simulator.run), 0, sky=sky) for sky in (narrow, wide)]
+    side_b = list(of_moments[1]) if both else simulator(sky=wide)
+    found = mcsim.compare(list(of_moments[0]), side_b, simulator.run)
+    assert names(found) == ["beam_width"]
+    assert found.channels[0].left < 1e-4
+    assert (found.channels[0].spread_rms_uk > 0.0) == (not both)
+    if not both:
+        assert mcsim.compare(list(of_moments[0]), side_a, simulator.run).accuracy < 1e-5
+
+
+def test_maps_at_the_centres_of_pixels_are_recognised(simulator):
+    """Maps of a pipeline without a scan: one through the pixel window, one without it."""
+    run = replace(simulator.run, map=replace(simulator.run.map, splits=()))
+    smooth = healpy.almxfl(simulator.sky, simulator.site.beam.window)
+    without = healpy.alm2map(smooth, NSIDE, lmax=LMAX)
+    found = mcsim.compare([healpy.alm2map(healpy.almxfl(smooth, mcsim_window()), NSIDE, lmax=LMAX)], [without], run)
+    assert names(found) == ["pixel_window"]
+    assert found.channels[0].differences[0].amplitude == -1.0
+    assert found.channels[0].left < 1e-4
+
+
 def test_files_are_compared_from_the_command_line(tmp_path, simulator, side_a):
     sides = {"a": side_a, "b": scaled(side_a, 1.01)}
     for side, maps in sides.items():
@@ -303,16 +342,17 @@ def test_a_run_is_simulated_sample_by_sample_where_the_other_side_is(tmp_path):
 
 
 def test_sloppy_maps_are_read(tmp_path, simulator, side_a):
-    """NaN, masked arrays, single precision with its own UNSEEN, and pixels that one side alone observed."""
+    """NaN, masked arrays, single precision with its own UNSEEN, zeros, and pixels that one side alone observed."""
     rough = [m.astype(np.float32) for m in side_a]
     rough[0][:100] = np.float32(healpy.UNSEEN)
     rough[1] = np.ma.masked_where(np.arange(side_a[1].size) < 50, side_a[1])
     given = [m.copy() for m in side_a]
     given[0][200:250] = np.nan
+    given[1][300:320] = 0.0
     found = mcsim.compare(given, rough, simulator.run)
     assert found.verdict == "identical"
-    assert found.to_dict()["left"]["one_sided_pixels"] == 200
-    assert "200 pixels" in str(found)
+    assert found.to_dict()["left"]["one_sided_pixels"] == 220
+    assert "220 pixels" in str(found)
     with refused(100):
         mcsim.compare([np.zeros(100)] * 2, side_a, simulator.run)
 

@@ -87,3 +87,14 @@ def test_read_pixel_window(tmp_path) -> None:
     path.write_text("not FITS")
     with refused("window.fits"):
         healpix.read_pixel_window(path, 5)
+
+
+@pytest.mark.parametrize("spin", [0, 2])
+def test_rings_that_are_made_alone_are_those_of_the_whole_map(spin: int) -> None:
+    sky = np.stack([smooth_sky(16)] * (2 if spin else 1))
+    rings = healpix.rings_between(8, 1.0, 1.3)
+    where = healpix.geometry(8)
+    assert where["theta"][rings.start] < 1.0 < 1.3 < where["theta"][rings.stop - 1]
+    first, last = where["ringstart"][[rings.start, rings.stop]]
+    whole = healpix.synthesis(sky, 8, 16, spin)
+    np.testing.assert_allclose(healpix.synthesis(sky, 8, 16, spin, rings=rings), whole[:, first:last], atol=1e-13)
