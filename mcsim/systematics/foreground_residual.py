@@ -27,7 +27,8 @@ class ForegroundResidual(Effect):
 
     Notes
     -----
-    Channels with ``foregrounds = false`` have none of it.
+    Channels with ``foregrounds = false`` have none of it. A diagnosis fits the index to three or more
+    frequencies, or to two beside such a channel.
 
     Drawn: p(b) (1 + g), p = 1 / (1 + (sin b / 0.15)^2), g a Gaussian field of C_l ~ l^-2.5, l > 0, and unit variance,
     scaled to rms 1 over the full sky; a model of our own that is bright in the plane and patchy off it, no more.
