@@ -14,12 +14,12 @@ from mcsim.benchmark.folder import Settings
 from mcsim.datavector.analysis import Analysis, Job, analysis_of, data_vectors
 from mcsim.datavector.campaign import Batch, after_jobs, asking, batch, seeded, with_effects
 from mcsim.datavector.candidate import Candidate, TemplateBank, columns_of, coordinates_of, effects_at, numbered
+from mcsim.datavector.halves import Halves
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.api import kept, prepared
 from mcsim.diagnosis.context import DiagnosisContext, calibration_of, context
 from mcsim.diagnosis.subsets import Subsets
-from mcsim.diagnosis.validation import Halves
 from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError, RunError
 from mcsim.stats.excess import HeldOut

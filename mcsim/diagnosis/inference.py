@@ -7,6 +7,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from mcsim.datavector.candidate import columns_of, parts_of, scatters_of, tables_at
+from mcsim.datavector.halves import Halves
 from mcsim.diagnosis.assemble import result_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.drawn import as_seen
@@ -14,7 +15,6 @@ from mcsim.diagnosis.naming import agreeing, unconfirmed
 from mcsim.diagnosis.refine import Refined, Refiner
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import Attribution
-from mcsim.diagnosis.validation import Halves
 from mcsim.errors import InputError
 from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit, with_drawn_scatter, with_scatter

@@ -10,9 +10,9 @@ import numpy as np
 from mcsim import config
 from mcsim.datavector.analysis import simulated_maps
 from mcsim.datavector.campaign import Ask, constrained_jobs
+from mcsim.datavector.halves import Halves
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
-from mcsim.diagnosis.validation import Halves
 from mcsim.reconstruction import words
 from mcsim.reconstruction.grammar import Structure, structures
 from mcsim.reconstruction.plugin import Plugin, plugin
