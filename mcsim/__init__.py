@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from mcsim.comparison.api import compare
     from mcsim.config import RunConfig
     from mcsim.config import load as load_config
+    from mcsim.datavector.settings import DiagnosisSettings
     from mcsim.diagnosis.api import diagnose
     from mcsim.diagnosis.external import ExternalModel
-    from mcsim.diagnosis.settings import DiagnosisSettings
     from mcsim.ensemble.maps import write_maps
     from mcsim.ensemble.opening import open_ensemble, open_summary
     from mcsim.ensemble.prediction import predict
@@ -72,7 +72,7 @@ __all__ = [
 
 _HOME = {
     "Beam": "mcsim.instrument.beams",
-    "DiagnosisSettings": "mcsim.diagnosis.settings",
+    "DiagnosisSettings": "mcsim.datavector.settings",
     "Effect": "mcsim.systematics",
     "ExternalModel": "mcsim.diagnosis.external",
     "InputError": "mcsim.errors",

@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 from mcsim import config
-from mcsim.diagnosis.campaign import with_effects
+from mcsim.datavector.campaign import with_effects
 from mcsim.simulation.survey import Survey, survey
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from mcsim.beamfit.effective_beam import Fit, comparisons
 from mcsim.errors import InputError
+from mcsim.support.numbers import measured
 
 
 @dataclass(frozen=True)
@@ -71,13 +72,13 @@ def _arccos(cosine: float, error: float) -> tuple[float, float]:
 
 def report(fits: Sequence[Fit]) -> str:
     """Return a text that describes fits of several models to the same data."""
-    measured = fits[0].measured
-    modes = ", ".join(mode.name for mode in measured.modes)
-    first = min(row.ell_min for row in measured.rows)
+    data = fits[0].measured
+    modes = ", ".join(mode.name for mode in data.modes)
+    first = min(row.ell_min for row in data.rows)
     lines = [
-        f"{measured.origin}: {measured.kind} spectra {modes}, ell = {first}-{measured.lmax}, {len(measured.rows)} bins",
+        f"{data.origin}: {data.kind} spectra {modes}, ell = {first}-{data.lmax}, {len(data.rows)} bins",
         f"  {_order(fits)}",
-        f"  {_tests(measured.simulations)}",
+        f"  {_tests(data.simulations)}",
     ]
     for one in fits:
         lines += _model(one)
@@ -109,7 +110,7 @@ def _tests(simulations: int | None) -> str:
 def _model(one: Fit) -> list[str]:
     solution = one.solution
     values = ", ".join(
-        f"{name} = {value:.5g} +- {error:.2g}"
+        f"{name} = {measured(value, error)}"
         for name, value, error in zip(one.model.parameters, solution.parameters, solution.errors, strict=True)
     )
     lines = [
@@ -121,11 +122,11 @@ def _model(one: Fit) -> list[str]:
     if one.model.name == "orientation":
         angles = orientation(one)
         lines.append(
-            f"    two sides: {angles.symmetric_deg:.3g} +- {angles.symmetric_error_deg:.2g} deg apart, turned either "
-            f"way by half; or {angles.one_sided_deg:.3g} +- {angles.one_sided_error_deg:.2g} deg, one as configured"
+            f"    two sides: {measured(angles.symmetric_deg, angles.symmetric_error_deg, ' deg')} apart, turned either "
+            f"way by half; or {measured(angles.one_sided_deg, angles.one_sided_error_deg, ' deg')}, one as configured"
         )
-        if angles.common_deg is not None:
-            lines.append(f"    both turned by {angles.common_deg:.3g} +- {angles.common_error_deg:.2g} deg")
+        if angles.common_deg is not None and angles.common_error_deg is not None:
+            lines.append(f"    both turned by {measured(angles.common_deg, angles.common_error_deg, ' deg')}")
     if one.each:
         each = one.to_dict()["realizations"]
         pulls = ", ".join(f"{name} {width:.3f}" for name, width in each["pull_width"].items())

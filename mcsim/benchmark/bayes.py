@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from mcsim.benchmark.case import Answer, Drawn, Vector
+from mcsim.benchmark.case import Answer, Drawn
 from mcsim.benchmark.models import EffectsLibrary
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.sphere import rng
 from mcsim.stats.detection import pair_log_marginals, posterior
+from mcsim.support.arrays import Vector
 
 
 @dataclass(frozen=True, eq=False)

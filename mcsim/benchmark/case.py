@@ -5,19 +5,17 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mcsim.errors import InputError
+from mcsim.support.arrays import Vector
+from mcsim.systematics.signatures import Place
 
-Vector = NDArray[np.float64]
 Kind = Literal["none", "one", "two", "left_out", "invented"]
 Identity = tuple[str, str | None]
 """Name of an effect and of its channel; None: all channels."""
 Answer = frozenset[Identity]
 """Effects that act together; the empty set: no effect."""
-
-Place = tuple[str | None, int | None, str | None]
-"""Frame, L and parity of a place, None where it has none."""
 
 KINDS: tuple[Kind, ...] = get_args(Kind)
 IN_LIBRARY = ("none", "one", "two")

@@ -11,20 +11,22 @@ import tomli_w
 
 from mcsim import config
 from mcsim.benchmark import folder as files
-from mcsim.benchmark.case import Drawn, Member, Truth, Vector
+from mcsim.benchmark.case import Drawn, Member, Truth
 from mcsim.benchmark.folder import Settings
 from mcsim.benchmark.models import LearnedModel, learned_model, workers_of
 from mcsim.benchmark.out_of_library import library_with, responses
 from mcsim.benchmark.sampler import CaseSampler
-from mcsim.diagnosis.campaign import Batch, seeded, with_effects
+from mcsim.datavector.campaign import Batch, seeded, with_effects
+from mcsim.datavector.map_checks import read_maps
 from mcsim.diagnosis.inference import diagnose_data
-from mcsim.diagnosis.observed_maps import ObservedMaps, read_maps
+from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.ensemble.maps import file_names, write_map
 from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError
 from mcsim.simulation import nuisance, sampled, simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere import rng
+from mcsim.support.arrays import Vector
 from mcsim.support.folders import appearing, writable
 from mcsim.support.progress import reporting
 
@@ -131,8 +133,8 @@ def _measured(model: LearnedModel, member: Member, seed: int) -> Member:
             continue
         if strength > STRONGER * member.strength and attempt + 1 < ATTEMPTS:
             continue
-        coordinates = tuple(float(value) for value in effect.parametrization.coordinates(effect))
-        if not candidate.effect.parametrization.stochastic:
+        coordinates = tuple(float(value) for value in candidate.parametrization.coordinates(effect))
+        if not candidate.parametrization.stochastic:
             strength = model.expected_snr_on_sky(candidate.table(effect), seed)
         return replace(member, parameters=parameters, coordinates=coordinates, strength=strength)
     raise InputError(f"effect {member.name} can have no amplitude that is strong enough; leave it out.")

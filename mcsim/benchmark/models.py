@@ -9,22 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.benchmark.case import Identity, Member, Vector
+from mcsim.benchmark.case import Identity, Member
 from mcsim.benchmark.folder import Settings
-from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, data_vectors
+from mcsim.datavector.analysis import Analysis, Job, analysis_of, data_vectors
+from mcsim.datavector.campaign import Batch, after_jobs, asking, batch, seeded, with_effects
+from mcsim.datavector.candidate import Candidate, TemplateBank, columns_of, coordinates_of, effects_at, numbered
+from mcsim.datavector.halves import Halves
+from mcsim.datavector.null_ensemble import NullEnsemble
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.api import kept, prepared
-from mcsim.diagnosis.campaign import Batch, after_jobs, asking, batch, seeded, with_effects
-from mcsim.diagnosis.candidate import Candidate, TemplateBank, columns_of, effects_at, numbered
 from mcsim.diagnosis.context import DiagnosisContext, calibration_of, context
-from mcsim.diagnosis.null_ensemble import NullEnsemble
-from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.subsets import Subsets
-from mcsim.diagnosis.validation import Halves
 from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError, RunError
 from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit, SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration
+from mcsim.support.arrays import Vector
 
 SKIES = 6
 """Skies that an expected S/N is the mean of."""
@@ -108,7 +109,7 @@ class LinearModel(EffectsLibrary):
 
         def respond(frozen: Fit) -> Vector:
             effects = effects_at(self.candidates, members, frozen)
-            return np.asarray(t @ np.concatenate([effect.parametrization.coordinates(effect) for effect in effects]))
+            return np.asarray(t @ coordinates_of(self.candidates, members, effects))
 
         try:
             return replace(self.halves, x=x).reduction(t, respond)

@@ -6,11 +6,12 @@ from functools import cached_property
 
 import numpy as np
 
-from mcsim.benchmark.case import KINDS, Drawn, Kind, Member, Prior, Vector
+from mcsim.benchmark.case import KINDS, Drawn, Kind, Member, Prior
 from mcsim.benchmark.models import EffectsLibrary
 from mcsim.benchmark.out_of_library import OutOfLibrary
 from mcsim.errors import InputError
 from mcsim.sphere import rng
+from mcsim.support.arrays import Vector
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ class CaseSampler:
             largest = float(np.max(np.linalg.norm(self._white(index), axis=0)))
             # Of an effect without response and without a limit the product is NaN, which is not larger.
             amplitudes = [one.high for one in candidate.effect.bounds if one.parameter == "amplitude"]
-            limit = min([candidate.effect.parametrization.max_amplitude, *amplitudes])
+            limit = min([candidate.parametrization.max_amplitude, *amplitudes])
             if limit * largest >= self.prior.weakest:
                 found.setdefault(candidate.name, {}).setdefault(candidate.channel, []).append(index)
         return {name: list(channels.values()) for name, channels in found.items()}
@@ -99,7 +100,7 @@ class CaseSampler:
             self._white(index),
             self.prior.strength(draw),
         )
-        gram, fit = white.T @ white, candidate.effect.parametrization
+        gram, fit = white.T @ white, candidate.parametrization
         values, vectors = np.linalg.eigh(gram)
         constrained = values > 1e-9 * values[-1]
         direction = draw.standard_normal(len(values))

@@ -9,21 +9,22 @@ import numpy as np
 
 from mcsim.benchmark import report
 from mcsim.benchmark.bayes import BayesClassifier, facts
-from mcsim.benchmark.case import Drawn, Prior, Record, Truth, Vector, pulls
+from mcsim.benchmark.case import Drawn, Prior, Record, Truth, pulls
 from mcsim.benchmark.folder import VERDICTS, Settings, finished_cases, open_key, read_json
 from mcsim.benchmark.models import EffectsLibrary, LinearModel, learned_model, linear_model, workers_of
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.benchmark.summary import ALPHA, Power, Score
-from mcsim.diagnosis.campaign import Batch
-from mcsim.diagnosis.candidate import Candidate
+from mcsim.datavector.campaign import Batch
+from mcsim.datavector.candidate import Candidate
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.selection import Attribution, attribute
-from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError
 from mcsim.sphere import rng
 from mcsim.stats.detection import power
 from mcsim.stats.look_elsewhere import GlobalTest, global_test
+from mcsim.support.arrays import Vector
 from mcsim.support.folders import writable
 
 CASES_PER_TASK = 20

@@ -6,7 +6,7 @@ Stored at ell = l2 with d = l2 - l1, in the Hajian-Souradeep normalisation,
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numba
 import numpy as np
@@ -26,6 +26,21 @@ class Estimator:
     lmax: int
     modes: tuple[Mode, ...]
     bands: tuple[Band, ...]
+
+    @cached_property
+    def rows(self) -> tuple[tuple[tuple[int, Mode, slice], ...], ...]:
+        """Return the modes of every band, each with its row in a result and the ell at which it exists."""
+        found: list[tuple[tuple[int, Mode, slice], ...]] = []
+        for b in self.bands:
+            members = [(row, mode) for row, mode in enumerate(self.modes) if (mode.M, mode.d) == (b.M, b.d)]
+            found.append(tuple((row, mode, _range(existing(mode.L, mode.d, self.lmax))) for row, mode in members))
+        return tuple(found)
+
+
+def _range(exists: NDArray[np.bool_]) -> slice:
+    """Return the ell that are true, of which none is false between two others."""
+    where = np.flatnonzero(exists)
+    return slice(int(where[0]), int(where[-1]) + 1) if where.size else slice(0)
 
 
 @lru_cache(maxsize=4)
@@ -73,20 +88,19 @@ def estimate(
     x = _parts(alm_x)
     y = x if alm_y is None else _parts(alm_y)
     result = np.full((len(tables.modes), tables.lmax + 1), complex(np.nan, np.nan))
-    for b in tables.bands:
+    for b, rows in zip(tables.bands, tables.rows, strict=True):
         if auto and b.d < 0:
             continue
         total = np.zeros((b.L_max - b.L_min + 1, 2, tables.lmax + 1))
         _accumulate(x, y, tables.lmax, b, total)
-        for row, mode in enumerate(tables.modes):
-            if (mode.M, mode.d) != (b.M, b.d) or (auto and not mode.in_auto):
+        for row, mode, exists in rows:
+            if auto and not mode.in_auto:
                 continue
-            real, imag = total[mode.L - b.L_min]
+            real, imag = total[mode.L - b.L_min, :, exists]
             if mode.M == 0:
                 # The sum counts m > 0 twice; of m and -m together only this part remains.
                 real, imag = (real, 0.0 * imag) if mode.parity == "even" else (0.0 * real, imag)
-            exists = existing(mode.L, mode.d, tables.lmax)
-            result[row, exists] = (real + 1j * imag)[exists]
+            result[row, exists] = real + 1j * imag
     return result
 
 

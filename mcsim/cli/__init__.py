@@ -168,9 +168,9 @@ def diagnose(
 ) -> None:
     """Test maps against a model, and find the effect that the model lacks: where, how large, and if adding it helps."""
     from mcsim import config
+    from mcsim.datavector.settings import DiagnosisSettings
     from mcsim.diagnosis.api import describe
     from mcsim.diagnosis.api import diagnose as judge
-    from mcsim.diagnosis.settings import DiagnosisSettings
     from mcsim.diagnosis.words import summary
 
     interrupt_once()

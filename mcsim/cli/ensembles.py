@@ -157,7 +157,7 @@ def prepare(
     maps: Annotated[list[str], Argument(metavar="MAP...", help="CHANNEL.fits or CHANNEL_SPLIT.fits, or NAME=FILE.")],
     folder: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Folder to fill; nothing is replaced.")],
 ) -> None:
-    """Prepare observed maps as CONFIG prepares its simulated maps, by the steps of [[preparation]]."""
+    """Prepare observed maps as CONFIG prepares its simulated maps, by its steps of preparation."""
     from mcsim.ensemble.prepare import prepare_files
 
     for path in prepare_files(config, maps, folder):

@@ -13,27 +13,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config, systematics
-from mcsim.diagnosis import campaign, controls, cost, measured_spectra, null_ensemble, report, unlisted, words
-from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, data_vectors
-from mcsim.diagnosis.campaign import asking, batch
-from mcsim.diagnosis.candidate import TemplateBank
+from mcsim.datavector import campaign, cost, null_ensemble, spectra_table
+from mcsim.datavector.analysis import Analysis, Job, analysis_of, data_vectors
+from mcsim.datavector.campaign import asking, batch
+from mcsim.datavector.candidate import TemplateBank
+from mcsim.datavector.kept import Kept
+from mcsim.datavector.map_checks import checked, read_maps
+from mcsim.datavector.null_ensemble import NullEnsemble
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.spectra_table import read_spectra
+from mcsim.diagnosis import controls, report, unlisted, words
 from mcsim.diagnosis.context import DataSet, DiagnosisContext, context
 from mcsim.diagnosis.external import Checked, ExternalModel, agreement, loaded
 from mcsim.diagnosis.inference import diagnose_data
-from mcsim.diagnosis.kept import Kept
-from mcsim.diagnosis.measured_spectra import MeasuredSpectra, read_spectra
-from mcsim.diagnosis.null_ensemble import NullEnsemble
-from mcsim.diagnosis.observed_maps import ObservedMaps, checked, read_maps
+from mcsim.diagnosis.measured_spectra import MeasuredSpectra
+from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import Agreement, DiagnosisResult
-from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.ensemble.external_maps import Source
 from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError
+from mcsim.reconstruction import simulated_scores
 from mcsim.simulation import power
 from mcsim.support import folders
 from mcsim.support.code import class_digest, package_digest
 
-CODE = ("config", "sphere", "stats", "instrument", "systematics", "bipolar", "simulation", "beamfit", "diagnosis")
+CODE = ("config", "sphere", "stats", "instrument", "systematics", "bipolar", "simulation", "beamfit", "datavector")
 EXTERNAL = ("external", "external_maps")
 LIBRARIES = ("ducc0", "healpy", "numpy", "scipy")
 """What the simulations of a model and their data vectors are computed with."""
@@ -65,14 +69,14 @@ def diagnose(
     data
         Folder with ``{channel}.fits`` or ``{channel}_{split}.fits``, uK; or the maps themselves, shape (npix,) each, in
         the order channel by channel, split by split; or a table of measured spectra
-        (:func:`mcsim.diagnosis.measured_spectra.read_spectra`).
+        (:func:`mcsim.datavector.spectra_table.read_spectra`).
     output
         Folder for ``verdict.json``, ``diagnosis.zarr`` and ``report.html``; None: nothing is written.
     case
         Name; default: that of the run.
     settings
         Library of effects, those that are no candidates, levels, cuts, bins, numbers of simulations and of controls;
-        default: those of :class:`~mcsim.diagnosis.settings.DiagnosisSettings`.
+        default: those of :class:`~mcsim.datavector.settings.DiagnosisSettings`.
     **computing
         ``quiet`` (default True): report no progress. ``workers``: number of processes that simulate, 0 for this one
         (default: the ``compute.workers`` of the run); or the address of a running Dask scheduler, or a
@@ -115,7 +119,7 @@ def diagnose(
             )
             diagnosis = diagnose_data(found, case or run.name)
         if diagnosis.kind == "unknown" and isinstance(found, ObservedMaps) and source is None:
-            with asking(call, quiet, unlisted.scores, "simulations of what is not listed") as ask:
+            with asking(call, quiet, simulated_scores.scores, "simulations of what is not listed") as ask:
                 diagnosis = unlisted.reconstructed(diagnosis, found, ask)
     if source is not None:
         diagnosis = _with_agreement(diagnosis, agreement(known))
@@ -168,7 +172,8 @@ def describe(
     priors = [f"nuisance: {line}" for one in analysis.nuisances for line in one.lines]
     lines = [head, *priors, *cost.lines(analysis, planned)]
     if source is None:
-        lines.append(f"after a first verdict unknown: {unlisted.SIMULATIONS} simulations more, once for the model")
+        more = simulated_scores.SIMULATIONS
+        lines.append(f"after a first verdict unknown: {more} simulations more, once for the model")
     if count:
         lines += controls.describe(analysis, count, run.compute.workers)
     return "\n".join(lines)
@@ -181,7 +186,7 @@ def _analysed(
     settings: DiagnosisSettings,
     library: systematics.Library,
     wanted: int,
-) -> tuple[config.RunConfig, Analysis, measured_spectra.Spectra | None]:
+) -> tuple[config.RunConfig, Analysis, spectra_table.Spectra | None]:
     """Return the run, with the statistics of a table that the data may be, the analysis of the data, and the table.
 
     InputError is raised for ``wanted`` controls, a simulator or a sky that do not suit the data.
@@ -194,8 +199,8 @@ def _analysed(
     if table is not None:
         if source is not None:
             raise InputError(f"{data} is a table, but {source.label} makes maps; give maps, or a run of mcsim.")
-        run = measured_spectra.estimator_for(run, table)
-        analysis = measured_spectra.analysis_of_spectra(run, table, settings.without, threads, settings, library)
+        run = spectra_table.estimator_for(run, table)
+        analysis = spectra_table.analysis_of_spectra(run, table, settings.without, threads, settings, library)
     else:
         analysis = analysis_of(run, settings.without, threads, settings, library, source)
     power.check(analysis.model.survey)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from mcsim import config
-from mcsim.diagnosis.candidate import Candidate, columns_of, parts_of
+from mcsim.datavector.candidate import Candidate, columns_of, parts_of, scatters_of
 from mcsim.diagnosis.consistency import amplitudes
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.nuisance import NuisanceResult, Regression, results
@@ -103,8 +103,7 @@ def _nuisances(data: DataSet, refined: Refined) -> Iterator[NuisanceResult]:
     members, t = found.explanations[0].members if found.explanations else (), refined.templates
     if partial is not None and not members:
         members, t = partial.members, partial.templates
-    scatters = [one for one in (refined.candidates[member].scatter for member in members) if one is not None]
-    null = context.null.with_extra_covariance(*scatters)
+    null = context.null.with_extra_covariance(*scatters_of(refined.candidates, members))
     found_of = Regression.of(context.ensemble, null, t[:, columns_of(refined.candidates, members)])
     yield from results(context.analysis.nuisances, found_of, data.x)
 
@@ -120,7 +119,8 @@ def effects_of(candidates: Sequence[Candidate], members: Sequence[int], fit: Fit
     """Yield the effects of a fit; raise InputError if no effect has such an amplitude."""
     for member, theta, covariance in parts_of(candidates, members, fit):
         candidate = candidates[member]
-        effect, sigma = candidate.fitted(theta, covariance), _sigma(candidate, theta, covariance)
+        effect, sigma = candidate.fitted(theta, covariance), _sigma(candidate, theta, covariance, "amplitude")
+        errors = {name: _sigma(candidate, theta, covariance, name) for name in candidate.parametrization.measured}
         yield EffectResult(
             name=effect.name,
             channel=candidate.channel,
@@ -132,23 +132,25 @@ def effects_of(candidates: Sequence[Candidate], members: Sequence[int], fit: Fit
                 for key, value in effect.parameters().items()
             },
             label=candidate.title,
-            words=effect.describe(sigma),
+            words=effect.describe(sigma, errors),
+            errors=errors,
         )
 
 
-def _sigma(candidate: Candidate, theta: Vector, covariance: Vector) -> float:
-    """Return the standard error of the amplitude, from its slopes in the coordinates over their own errors.
+def _sigma(candidate: Candidate, theta: Vector, covariance: Vector, parameter: str) -> float:
+    """Return the standard error of a parameter, from its slopes in the coordinates over their own errors.
 
-    A step of one error moves also an amplitude at the edge of what is possible. What the data do not constrain is not
+    A step of one error moves also a value at the edge of what is possible. What the data do not constrain is not
     varied.
     """
     scale = np.sqrt(np.diag(covariance))
     precision = np.asarray(np.linalg.pinv(covariance), dtype=np.float64)
-    constrained = candidate.effect.parametrization.constrained(theta, precision)
+    constrained = candidate.parametrization.constrained(theta, precision)
     slopes: Vector = np.zeros(len(theta))
     for k in np.flatnonzero((scale > 0.0) & ((constrained != 0.0) | (theta == 0.0))):
         step = scale[k] * np.eye(len(theta))[k]
-        up, down = (candidate.with_coordinates(constrained + sign, precision).amplitude for sign in (step, -step))
+        ends = (candidate.with_coordinates(constrained + sign, precision) for sign in (step, -step))
+        up, down = (getattr(one, parameter) for one in ends)
         slopes[k] = (up - down) / (2.0 * scale[k])
     return float(np.sqrt(max(float(slopes @ covariance @ slopes), 0.0)))
 

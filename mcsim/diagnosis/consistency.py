@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mcsim.diagnosis.candidate import Candidate
-from mcsim.diagnosis.null_ensemble import NullEnsemble
-from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.diagnosis.slices import northern
-from mcsim.diagnosis.summaries import Element, bins
+from mcsim.datavector.candidate import Candidate
+from mcsim.datavector.null_ensemble import NullEnsemble
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.slices import northern
+from mcsim.datavector.summaries import Element, bins
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.support.numbers import number, p_equals
@@ -105,20 +105,24 @@ class Action:
 
     ``response`` is that at the fitted amplitude, shape (p + E,), and ``error`` the relative error of the amplitude;
     ``directions``, shape (p + E, K - 1), are the responses to changes of its parameters that leave the amplitude.
+    ``scatter``, shape (p + E, draws), has the deviations of the draws of a stochastic effect.
     """
 
     response: Vector
     directions: Matrix
     error: float
+    scatter: Matrix | None = None
 
     @classmethod
-    def of(cls, response: Vector, t: Matrix, theta: Vector, covariance: Matrix) -> "Action":
+    def of(
+        cls, response: Vector, t: Matrix, theta: Vector, covariance: Matrix, scatter: Matrix | None = None
+    ) -> "Action":
         """Make it from the response and templates, shape (p + E, K), fitted with these amplitudes."""
         weight = np.linalg.pinv(covariance) @ theta
         snr = float(weight @ theta)
         # Independent of the amplitude in the metric of the fit.
         rest = np.linalg.svd(weight[None])[2][1:].T
-        return cls(response, t @ rest, 1.0 / np.sqrt(max(snr, 1.0)))
+        return cls(response, t @ rest, 1.0 / np.sqrt(max(snr, 1.0)), scatter)
 
 
 @dataclass(frozen=True)
@@ -145,6 +149,7 @@ class Slices:
     splits: tuple[str, ...]
     lmax: int
     settings: DiagnosisSettings
+    scatters: tuple[Matrix, ...] = ()  # of stochastic effects, (p + E, draws), that add to the covariance
     _nulls: dict[bytes, SimulatedGaussian] = field(default_factory=dict, repr=False)  # of rows that were needed so far
 
     def findings(self, candidates: Sequence[Candidate], actions: Sequence[Action]) -> Findings:
@@ -156,11 +161,15 @@ class Slices:
         together; that the amplitudes are equal is Rao's exact small-sample test
         (:func:`mcsim.stats.gaussian.nested_pvalue`), correlations of the parts included. Parts in which the effect has
         an expected S/N below ``slice_snr`` are left out. Responses are tolerated to be wrong by ``consistency_error``
-        of their white norm. Odds without the best part are those of amplitude 0 against 1 in all others.
+        of their white norm. Odds without the best part are those of amplitude 0 against 1 in all others. The scatter of
+        stochastic effects is a part of the covariance.
         """
+        scatters = tuple(action.scatter for action in actions if action.scatter is not None)
+        if scatters and not self.scatters:
+            return replace(self, scatters=scatters, _nulls={}).findings(candidates, actions)
         # More noise, or a pattern that is drawn, is more of chi^2: what is left in the maps then says nothing of it.
         noisy = any(
-            candidate.effect.noise is not Effect.noise or candidate.effect.parametrization.stochastic
+            candidate.effect.noise is not Effect.noise or candidate.parametrization.stochastic
             for candidate in candidates
         )
         free = np.concatenate([action.directions for action in actions], axis=1)
@@ -215,7 +224,8 @@ class Slices:
             return None
         key = rows.tobytes()
         if key not in self._nulls:
-            self._nulls[key] = self.ensemble.restrict(rows).gaussian
+            own = self.ensemble.restrict(rows).gaussian
+            self._nulls[key] = own.with_extra_covariance(*(one[rows] for one in self.scatters))
         return self._nulls[key]
 
     def _compared(self, division: Division, action: Action, others: Matrix) -> Comparison | None:

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.diagnosis.analysis import Analysis
-from mcsim.diagnosis.campaign import Ask, after_jobs, skies
-from mcsim.diagnosis.candidate import Candidate, TemplateBank
+from mcsim.datavector.analysis import Analysis
+from mcsim.datavector.campaign import Ask, after_jobs, skies
+from mcsim.datavector.candidate import Candidate, TemplateBank
+from mcsim.datavector.null_ensemble import NullEnsemble
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.localisation import Place
 from mcsim.diagnosis.nuisance import with_nuisances
-from mcsim.diagnosis.null_ensemble import NullEnsemble
 from mcsim.diagnosis.selection import Attribution
-from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration, calibrate, calibrate_in_folds, calibrate_on
 
@@ -130,6 +130,15 @@ class DataSet(ABC, Generic[Data]):
     def respond_extended(self, found: Sequence[config.Effect], skies: int) -> Matrix:
         """Return the changes of :meth:`respond` for :attr:`extended`."""
         return self.respond(found, skies)
+
+    def scatter(self, changes: Matrix) -> Matrix:
+        """Return deviations of changes by a stochastic effect, shape (draws, p), from their mean, (p, draws).
+
+        They are those of one draw from the mean of as many as there are, as
+        :meth:`~mcsim.stats.gaussian.SimulatedGaussian.with_extra_covariance` takes them.
+        """
+        share = (1.0 / self.realizations + 1.0 / len(changes)) / (len(changes) - 1.0)
+        return np.asarray(np.sqrt(share) * (changes - changes.mean(axis=0)).T)
 
     def _simulated(self, found: Sequence[config.Effect]) -> Matrix:
         """Return the data vectors of the skies of the reference with effects, shape (rows, p)."""

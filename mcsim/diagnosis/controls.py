@@ -17,8 +17,8 @@ import numpy as np
 
 from mcsim import config
 from mcsim.config.noise import AnyNoise
-from mcsim.diagnosis.analysis import Analysis, Kinds
-from mcsim.diagnosis.campaign import Batch, asking, seeded
+from mcsim.datavector.analysis import Analysis, Kinds
+from mcsim.datavector.campaign import Batch, asking, seeded
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.control_result import Control, Controls
 from mcsim.diagnosis.inference import diagnose_data

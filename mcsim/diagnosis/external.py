@@ -9,9 +9,9 @@ import numpy as np
 from scipy.stats import ks_2samp
 
 from mcsim import config
-from mcsim.diagnosis.analysis import Job, external_maps
+from mcsim.datavector.analysis import Job, external_maps
+from mcsim.datavector.campaign import Task
 from mcsim.diagnosis.assemble import effects_of
-from mcsim.diagnosis.campaign import Task
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.result import Agreement
 from mcsim.ensemble.external import SEEDS, named_source, source_of

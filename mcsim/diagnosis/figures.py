@@ -9,10 +9,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
 
+from mcsim.datavector.summaries import KINDS
 from mcsim.diagnosis.control_result import Controls
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import Contrast
-from mcsim.diagnosis.summaries import KINDS
 from mcsim.plot.sky import mollweide
 from mcsim.stats.detection import snr_to_separate
 from mcsim.support.numbers import measured, p_equals

@@ -4,22 +4,22 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
+from mcsim.datavector.candidate import columns_of, parts_of, scatters_of, tables_at
+from mcsim.datavector.halves import Halves
 from mcsim.diagnosis.assemble import result_of
-from mcsim.diagnosis.candidate import columns_of, tables_at
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
+from mcsim.diagnosis.drawn import as_seen
 from mcsim.diagnosis.naming import agreeing, unconfirmed
 from mcsim.diagnosis.refine import Refined, Refiner
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import Attribution
-from mcsim.diagnosis.validation import Halves
 from mcsim.errors import InputError
 from mcsim.stats.excess import HeldOut
-from mcsim.stats.gaussian import Fit, with_scatter
+from mcsim.stats.gaussian import Fit, with_drawn_scatter, with_scatter
+from mcsim.support.arrays import Vector
 from mcsim.support.numbers import measured
-
-Vector = NDArray[np.float64]
 
 
 def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
@@ -45,6 +45,8 @@ def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
     if partial is None and not (exchanged or refusals) and not found.faint and found.verdict == "unknown":
         partial = refiner.detected_in(refined.templates, refined.candidates)
     notes += refusals
+    for own in found.explanations[:1] if partial is None else [partial]:
+        notes += as_seen(context, own.members, own.fit)
     return result_of(data, case, replace(refined, attribution=found, partial=partial), reduction, notes)
 
 
@@ -81,18 +83,19 @@ def confirmed(
 def _with_errors(data: DataSet[Any], refined: Refined, found: Attribution) -> Attribution:
     """Return the attribution, the best set with the errors that its amplitudes have with its effects in the data.
 
-    The scatter of stochastic effects is known already: the fit was made with it.
+    Of stochastic effects it is the scatter of the draws with which the fit was made.
     """
     context, best = data.context, found.explanations[0]
-    if any(refined.candidates[member].scatter is not None for member in best.members):
-        return found
+    t = refined.templates[:, columns_of(context.candidates, best.members)]
+    if scatters := scatters_of(refined.candidates, best.members):
+        own = replace(best, fit=with_drawn_scatter(context.null, t, best.fit, scatters))
+        return replace(found, explanations=(own, *found.explanations[1:]))
     try:
         pair = data.pair(tables_at(context.candidates, best.members, best.fit))
     except InputError:
         pair = None  # between what was fitted and what can be
     if pair is None:
         return found
-    t = refined.templates[:, columns_of(context.candidates, best.members)]
     own = replace(best, fit=with_scatter(context.null, t, best.fit, *pair))
     return replace(found, explanations=(own, *found.explanations[1:]))
 
@@ -102,25 +105,37 @@ def reduction_of(data: DataSet[Any], refined: Refined) -> HeldOut | None:
 
     None if there are no halves, one of them is hardly sensitive to the effects, or the half that is fitted asks for an
     amplitude that an effect cannot have. Without splits the halves are degrees and pixels, which constrain beams and
-    pointing little.
+    pointing little. Fitted parameters that are given with an error, like a spectral index, are those of all data: the
+    powers in a half tell hardly more than an amplitude.
     """
     context = data.context
     members, best = refined.attribution.explanations[0].members, refined.attribution.explanations[0].fit
     t = refined.templates[:, columns_of(context.candidates, members)]
-    scatters = [one for one in (refined.candidates[member].scatter for member in members) if one is not None]
+    scatters = scatters_of(refined.candidates, members)
     snr = context.null.expected_snr(t @ best.amplitudes)
     matrix, words = data.halves()
     t, scatters = matrix @ t, [matrix @ one for one in scatters]
     halves = Halves.of(context.ensemble.remix(matrix), matrix @ data.x)
     if halves is None or halves.expected_snr(t @ best.amplitudes) < context.settings.half_snr_share * snr:
         return None
+    parts = parts_of(context.candidates, members, best)
+    free = block_diag(
+        *(
+            theta[:, None] if context.candidates[member].parametrization.measured else np.eye(len(theta))
+            for member, theta, _ in parts
+        )
+    )
 
     def respond(frozen: Fit) -> Vector:
+        if free.shape[1] < len(free):
+            # Where the coordinates of an effect move together, those of all data say which of them are near.
+            covariance = free @ frozen.covariance @ free.T + best.covariance
+            frozen = replace(frozen, amplitudes=free @ frozen.amplitudes, covariance=covariance)
         acting = tables_at(context.candidates, members, frozen)
         change: Vector = matrix @ data.respond(acting, context.settings.constrained_skies).mean(axis=0)
         return change
 
     try:
-        return halves.reduction(t, respond, scatters, words)
+        return halves.reduction(t @ free, respond, scatters, words)
     except InputError:
         return None

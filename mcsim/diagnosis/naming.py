@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from mcsim.diagnosis.candidate import Candidate, parts_of
+from mcsim.datavector.candidate import parts_of
 from mcsim.diagnosis.consistency import Action, Slices, contradiction
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
+from mcsim.diagnosis.drawn import is_drawn
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.selection import Attribution, Explanation
 from mcsim.errors import InputError
@@ -30,7 +31,7 @@ def agreeing(data: DataSet[Any], refined: Refined, found: Attribution) -> tuple[
     sentences: list[str] = []
     for place, one in enumerate(found.explanations):
         members, why = [candidates[member] for member in one.members], ""
-        if any(_drawn(candidate) for candidate in members):
+        if any(is_drawn(candidate) for candidate in members):
             if len(frequencies) == 1:
                 why = "at a single frequency it looks like any signal that is fixed to the sky"
         elif place < settings.compared_sets:
@@ -61,14 +62,9 @@ def unconfirmed(context: DiagnosisContext, found: Attribution, reduced: bool) ->
         return ""
     (one,) = found.explanations
     candidate = context.candidates[one.members[0]]
-    if _drawn(candidate) or one.findings.measured:
+    if is_drawn(candidate) or one.findings.measured:
         return ""
     return f"The data vector fits {candidate.title}, which is not named: no two parts of the data measure it."
-
-
-def _drawn(candidate: Candidate) -> bool:
-    """Return True if an effect draws its pattern on the sky, so that no mean response describes it."""
-    return candidate.effect.parametrization.stochastic and not candidate.effect.parametrization.mean_response
 
 
 def _effects(context: DiagnosisContext, one: Explanation) -> list[Effect]:
@@ -83,9 +79,13 @@ def _actions(data: DataSet[Any], refined: Refined, one: Explanation) -> Iterator
     for member, theta, covariance in parts_of(context.candidates, one.members, one.fit):
         candidate = context.candidates[member]
         t = whole[:, list(candidate.columns)]
+        draws, scatter = refined.candidates[member].scatter is not None, None
+        skies = context.settings.scatter_skies if draws else context.settings.constrained_skies
         try:
             table = candidate.table(candidate.detected(theta, covariance))
-            response: Vector = data.respond_extended([table], context.settings.constrained_skies).mean(axis=0)
+            changes = data.respond_extended([table], skies)
+            response: Vector = changes.mean(axis=0)
+            scatter = data.scatter(changes) if draws else None
         except InputError:
             response = t @ theta
-        yield Action.of(response, t, theta, covariance)
+        yield Action.of(response, t, theta, covariance, scatter)

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mcsim.diagnosis.candidate import Candidate
-from mcsim.diagnosis.null_ensemble import NullEnsemble
+from mcsim.datavector.candidate import Candidate
+from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.simulation.nuisance import Nuisance
 from mcsim.stats.gaussian import SimulatedGaussian, orthonormal
 from mcsim.support.arrays import Matrix, Vector

@@ -4,19 +4,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 
 from mcsim import config
-from mcsim.diagnosis.campaign import after_jobs, constrained_jobs
+from mcsim.datavector.campaign import after_jobs, constrained_jobs
+from mcsim.datavector.wiener_filter import Part, shared_sky
 from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.localisation import Place, places, standardised
-from mcsim.diagnosis.map_checks import checked_map
 from mcsim.diagnosis.nuisance import half_given_other
 from mcsim.diagnosis.selection import Attribution
-from mcsim.diagnosis.wiener_filter import Model, Part, shared_sky
-from mcsim.ensemble.maps import file_names, first_realization, read_uk
 from mcsim.errors import InputError
 from mcsim.stats.look_elsewhere import global_test
 from mcsim.support.arrays import Alm, Map, Matrix, Vector
@@ -120,7 +117,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
                 scatter < settings.sky_scatter
                 or candidate.random_response
                 or candidate.nuisance
-                or candidate.effect.parametrization.mean_response
+                or candidate.parametrization.mean_response
             ):
                 continue
             for place, (column, basis) in enumerate(zip(candidate.columns, candidate.basis, strict=True)):
@@ -128,7 +125,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
                     response = self.respond([candidate.table(basis)], settings.constrained_skies).mean(axis=0)
                 except InputError:
                     continue
-                step = basis.parametrization.coordinates(basis)[place]
+                step = candidate.parametrization.coordinates(basis)[place]
                 t[:, column] = response / step - context.bank.curvature[:, column] * step
         return t
 
@@ -168,38 +165,6 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         ensemble = self.context.ensemble
         drawn = len(ensemble.bipolar_scan)
         return standardised(self._measured[2], ensemble.residual_mean, ensemble.residual_scatter, drawn)
-
-
-def read_maps(model: Model, folder: str | Path) -> list[Map]:
-    """Read the maps of every channel and split, in the order of the model's, uK.
-
-    The folder has ``{channel}.fits``, or ``{channel}_{split}.fits`` where the model has splits: HEALPix in uK (or the
-    unit of its header), ``healpy.UNSEEN`` if not observed, in RING order or with a header that says another. InputError
-    is raised if a file is missing or unreadable, has another nside, frame or unit, or values that are no map of this
-    survey: not finite, constant, without what the fiducial scan hits, or far from the size of the model.
-    """
-    folder, names = Path(folder), file_names(model.survey.config)
-    if not folder.is_dir():
-        first = names[model.parts[0].name]
-        raise InputError(f"{folder} is no folder; give one with the observed maps, {first} and so on.")
-    return [_read(model, part, folder / names[part.name]) for part in model.parts]
-
-
-def checked(model: Model, maps: Sequence[Map]) -> list[Map]:
-    """Check maps given as arrays, in the order of the model's, uK, like those of a folder."""
-    if len(maps) != len(model.parts):
-        raise InputError(f"{len(maps)} maps were given, the model has {len(model.parts)}; give one for each.")
-    arrays = [np.asarray(map_, dtype=np.float64) for map_ in maps]
-    return [checked_map(model, part, map_, f"map {part.name}") for part, map_ in zip(model.parts, arrays, strict=True)]
-
-
-def _read(model: Model, part: Part, path: Path) -> Map:
-    if not path.is_file():
-        inside = first_realization(path.parent)
-        remedy = "give it under that name" if inside == path.parent else f"give the folder of a realization, {inside}"
-        raise InputError(f"{path} does not exist; the model has a map {part.name}, {remedy}.")
-    map_ = read_uk(path, model.frame, model.survey.channels[part.channel].site.frequency_ghz)
-    return checked_map(model, part, map_, str(path))
 
 
 def exchanges(parts: Sequence[Part]) -> list[tuple[int, ...]]:

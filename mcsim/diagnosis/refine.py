@@ -5,11 +5,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mcsim.diagnosis.candidate import Candidate, beyond, columns_of, effects_at, parts_of
+from mcsim.datavector.candidate import Candidate, beyond, columns_of, coordinates_of, effects_at, parts_of, scatters_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.errors import InputError
-from mcsim.stats.gaussian import Fit
+from mcsim.stats.excess import scatter_chi2
+from mcsim.stats.gaussian import Fit, with_drawn_scatter
 from mcsim.support.arrays import Matrix, Vector
 
 
@@ -60,9 +61,11 @@ class Refiner:
         -----
         A response that is simulated at its coordinates changes its templates to the secant, exact there. A candidate
         that can have neither the fitted amplitude nor half of it is taken out. Of a stochastic one the scatter of the
-        response is kept.
+        response is kept, of any other one the chi^2 that its scatter adds to a residual. Where the power of a
+        stochastic one counts, which grows as the square of the amplitude, the secant at a_0 finds a^2/a_0 for a: the
+        mean of this and a_0 is Newton's step.
         """
-        t, tried = t.copy(), list(candidates)
+        linear, t, tried = t, t.copy(), list(candidates)
         done: dict[int, Vector] = {}
         found = self._attribute(t, tried)
         for _ in range(self.context.settings.refine_rounds):
@@ -70,26 +73,29 @@ class Refiner:
             for index, coordinates, covariance in self._to_try(found, tried):
                 if candidates[index].nuisance:
                     continue
-                columns, how = list(candidates[index].columns), candidates[index].effect.parametrization
+                columns, how = list(candidates[index].columns), candidates[index].parametrization
                 nonlinear = how.nonlinear or self._is_nonlinear(columns, coordinates)
                 stochastic = how.stochastic and (how.sign == 0 or coordinates[0] > 0.0)
-                if not (nonlinear or stochastic) or self._has_settled(done.get(index), coordinates, covariance):
+                if self._has_settled(done.get(index), coordinates, covariance):
                     continue
+                if stochastic and index in done:
+                    share = self._squared(linear[:, columns], t[:, columns], done[index])
+                    coordinates = done[index] + (coordinates - done[index]) / (1.0 + share)
                 done[index] = coordinates
                 answer = self._simulated(candidates[index], coordinates, covariance, stochastic)
                 changed = True
                 if answer is None:
-                    t[:, columns] = 0.0
+                    if nonlinear or stochastic:
+                        t[:, columns] = 0.0
                     continue
-                at, changes = answer
-                response = changes.mean(axis=0)
-                if stochastic:
-                    # The scatter of one draw about the mean of as many as there are.
-                    share = (1.0 / self.data.realizations + 1.0 / len(changes)) / (len(changes) - 1.0)
-                    scatter = np.sqrt(share) * (changes - response).T
-                    tried[index] = replace(tried[index], scatter=scatter, shape_error=None)
+                at, changes, pair = answer
                 if nonlinear:
-                    t[:, columns] += self._beyond(t[:, columns], at, response)
+                    t[:, columns] += self._beyond(t[:, columns], at, changes.mean(axis=0))
+                if stochastic:
+                    tried[index] = replace(tried[index], scatter=self.data.scatter(changes), shape_error=None)
+                elif pair is not None:
+                    added = scatter_chi2(self.context.null, t[:, columns], *pair)
+                    tried[index] = replace(tried[index], scatter_chi2=added)
             if not changed:
                 break
             found = self._attribute(t, tried)
@@ -133,7 +139,12 @@ class Refiner:
             return None
         excess = null.hartlap_factor * total - null.dimension
         left = null.hartlap_factor * before.chi2 - before.dimension
-        return PartialExplanation(members, before, min(max(left / excess, 0.0), 1.0) if excess > 0.0 else 1.0, t)
+        own = t[:, columns_of(candidates, members)]
+        fit = before
+        if scatters := scatters_of(candidates, members):
+            wide = null.with_extra_covariance(*scatters).fit(self.data.x, own)
+            fit = with_drawn_scatter(null, own, wide, scatters)
+        return PartialExplanation(members, fit, min(max(left / excess, 0.0), 1.0) if excess > 0.0 else 1.0, t)
 
     def _fit(self, t: Matrix, candidates: Sequence[Candidate], members: tuple[int, ...]) -> Fit:
         return self.context.null.fit(self.data.x, t[:, columns_of(candidates, members)])
@@ -168,12 +179,17 @@ class Refiner:
             except InputError:
                 return None
             t = t.copy()
-            at = np.concatenate([effect.parametrization.coordinates(effect) for effect in effects])
+            at = coordinates_of(candidates, members, effects)
             t[:, columns] += self._beyond(t[:, columns], at, response)
             before, fitted = fitted, self.context.null.fit(self.data.x, t[:, columns])
             if self._has_settled(before.amplitudes, fitted.amplitudes, fitted.covariance, share):
                 return t
         return None
+
+    def _squared(self, linear: Matrix, t: Matrix, at: Vector) -> float:
+        """Return the share of the response of templates at coordinates that is not in the linear ones, 0 to 1."""
+        first, whole = self.context.null.whiten_templates(np.stack([linear @ at, t @ at], axis=1)).T
+        return float(np.clip(1.0 - first @ whole / max(float(whole @ whole), 1e-300), 0.0, 1.0))
 
     def _skies(self, stochastic: bool) -> int:
         return self.context.settings.scatter_skies if stochastic else self.context.settings.constrained_skies
@@ -191,16 +207,19 @@ class Refiner:
 
     def _simulated(
         self, candidate: Candidate, coordinates: Vector, covariance: Matrix, stochastic: bool
-    ) -> tuple[Vector, Matrix] | None:
-        """Return coordinates and responses at the fitted amplitude or half of it; None if the effect can have neither.
+    ) -> tuple[Vector, Matrix, tuple[Matrix, Matrix] | None] | None:
+        """Return coordinates, responses and data without and with the effect at the fitted amplitude or half of it.
 
-        A linear fit may lie somewhat beyond what the effect can be, and the effect be there; far beyond it is not.
+        None if the effect can have neither. A linear fit may lie somewhat beyond what the effect can be, and the effect
+        be there; far beyond it is not. The data are None of a stochastic effect, and where there are none.
         """
         for factor in (1.0, 0.5):
             try:
                 effect = candidate.detected(factor * coordinates, covariance / factor**2)
-                response = self.data.respond([candidate.table(effect)], self._skies(stochastic))
-                return effect.parametrization.coordinates(effect), response
+                tables = [candidate.table(effect)]
+                pair = None if stochastic else self.data.pair(tables)
+                changes = self.data.respond(tables, self._skies(stochastic)) if pair is None else pair[1] - pair[0]
+                return candidate.parametrization.coordinates(effect), changes, pair
             except InputError:
                 continue
         return None
@@ -218,16 +237,14 @@ class Refiner:
         # Single ones too: a strong effect has a nonlinear response, and a stochastic one scatters it, until only a
         # mixture seems to be sufficient.
         ranked = [int(index) for index in np.argsort([-single.delta_chi2 for single in found.singles])]
-        stochastic = {
-            candidates[index].identity for index in work if candidates[index].effect.parametrization.stochastic
-        }
+        stochastic = {candidates[index].identity for index in work if candidates[index].parametrization.stochastic}
         for place, index in enumerate(ranked):
             single, candidate = found.singles[index], candidates[index]
             pvalue = float(self.context.calibration.global_pvalue(single.nested_pvalue))
-            detected = candidate.effect.parametrization.stochastic and pvalue <= self.context.settings.stochastic_level
+            detected = candidate.parametrization.stochastic and pvalue <= self.context.settings.stochastic_level
             if place < self.context.settings.tried or (detected and candidate.identity not in stochastic):
                 work.setdefault(index, (index, single.amplitudes, single.covariance))
-                if candidate.effect.parametrization.stochastic:
+                if candidate.parametrization.stochastic:
                     stochastic.add(candidate.identity)
         return list(work.values())
 

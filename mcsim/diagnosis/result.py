@@ -1,7 +1,7 @@
 """The result of a diagnosis: one typed object that the report, the figures and the command line read."""
 
 import json
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -10,13 +10,13 @@ import numpy as np
 import xarray as xr
 from pydantic import TypeAdapter
 
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.summaries import Element
 from mcsim.diagnosis.consistency import Comparison, MapCheck
 from mcsim.diagnosis.control_result import Controls
 from mcsim.diagnosis.localisation import Place
 from mcsim.diagnosis.nuisance import NuisanceResult
 from mcsim.diagnosis.selection import Contrast, Verdict
-from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.diagnosis.summaries import Element
 from mcsim.errors import InputError
 from mcsim.reconstruction.result import Reconstructed
 from mcsim.stats.excess import HeldOut, Measured, excess_of
@@ -32,7 +32,8 @@ PLACES = 12
 class EffectResult:
     """One fitted effect: amplitude, standard error and parameters; ``label`` and ``words`` as people read them.
 
-    ``consistency`` are its amplitudes in parts of the data, over the fitted one, and ``parts`` the same in words.
+    ``errors`` are those of fitted parameters. ``consistency`` are its amplitudes in parts of the data, over the fitted
+    one, and ``parts`` the same in words.
     """
 
     name: str
@@ -45,6 +46,7 @@ class EffectResult:
     words: str
     consistency: tuple[Comparison, ...] = ()
     parts: tuple[str, ...] = ()
+    errors: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mcsim.diagnosis.candidate import Candidate, beyond, columns_of
+from mcsim.datavector.candidate import Candidate, beyond, columns_of
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.consistency import NOT_TESTED, Findings
-from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.subsets import EXHAUSTIVE, Rows, Subsets, chunks
 from mcsim.stats.detection import cosines
 from mcsim.stats.gaussian import Fit, SimulatedGaussian

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mcsim.diagnosis.candidate import Candidate
-from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.datavector.candidate import Candidate
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.stats.detection import log_evidence
 from mcsim.stats.gaussian import COLLINEAR, SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration
@@ -33,7 +33,7 @@ Rows = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Solved:
-    """Hold the fits of M subsets, shape (M,) each."""
+    """Hold the fits of M subsets, shape (M,) each; ``allowance`` is the squared error of their templates."""
 
     chi2: Vector
     pvalue: Vector
@@ -80,6 +80,11 @@ class Subsets:
         """Return the relative error of each candidate's templates."""
         default = self.settings.template_error
         return np.array([default if c.shape_error is None else c.shape_error for c in self.candidates])
+
+    @cached_property
+    def _scatters(self) -> Vector:
+        """Return the chi^2 that each candidate's scatter adds to a residual, over its fitted part."""
+        return np.array([candidate.scatter_chi2 for candidate in self.candidates])
 
     @cached_property
     def _identity(self) -> Rows:
@@ -150,12 +155,14 @@ class Subsets:
         delta_chi2 = np.minimum(np.sum(score * fitted, axis=1), self.total)
         part = np.zeros((count, size))
         np.add.at(part.T, place, fitted.T**2)
-        allowance = np.sum(self._errors[subsets] ** 2 * np.minimum(part, delta_chi2[:, None]), axis=1)
+        part = np.minimum(part, delta_chi2[:, None])
+        allowance = np.sum(self._errors[subsets] ** 2 * part, axis=1)
+        scatter = np.sum(self._scatters[subsets] * part, axis=1)
         weights = np.array([candidate.prior for candidate in self.candidates])
         prior = special.gammaln(size + 1) + np.log(weights / weights.sum())[subsets].sum(axis=1)
         return Solved(
             chi2=self.total - delta_chi2,
-            pvalue=null.residual_test(self.total - delta_chi2, K, allowance),
+            pvalue=null.residual_test(self.total - delta_chi2, K, allowance + scatter),
             evidence=log_evidence(null, self.total, delta_chi2, K, self.settings.prior_snr) + prior,
             allowance=allowance,
         )

@@ -43,7 +43,7 @@ def describe(path: str | Path) -> str:
         found += ["  strongest binned spectra (mean over error):"] if rows else []
         for row in rows:
             bounds = f"l = {row.bin_first}-{row.bin_last}"
-            found.append(f"    {row.pair}  {row.mode:8s} {bounds:14s} {row.value:.4g} uK^2, {row.sigma:.1f} sigma")
+            found.append(f"    {row.pair}  {row.mode:8s} {bounds:14s} {_value(row.value)} uK^2, {row.sigma:.1f} sigma")
     return "\n".join(found)
 
 
@@ -80,8 +80,14 @@ def _spectra(prediction: xr.Dataset) -> list[str]:
     for pair, mode in zip(best["pair"][:shown], best["mode"][:shown], strict=True):
         for row in rows[(rows["pair"] == pair) & (rows["mode"] == mode)].dropna().itertuples():
             bounds = f"{row.bin_first}-{row.bin_last}"
-            value = row.value if row.value.imag else row.value.real
-            text.append(f"    {pair:<16} {mode:<9} {bounds:<11} {value:>22.4g} {row.error:>10.3g}")
+            text.append(f"    {pair:<16} {mode:<9} {bounds:<11} {_value(row.value):>22} {row.error:>10.3g}")
     if len(best) > shown:
         text.append(f"    and {len(best) - shown} weaker spectra: write all with -o FILE.ecsv")
     return text
+
+
+def _value(value: complex) -> str:
+    """Return a coefficient with four digits, without the part that vanishes identically."""
+    if not value.imag:
+        return f"{value.real:.4g}"
+    return f"{value:.4g}" if value.real else f"{value.imag:.4g}j"

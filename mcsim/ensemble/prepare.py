@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mcsim import config
 from mcsim.ensemble.maps import file_names, write_map
@@ -13,9 +13,9 @@ from mcsim.errors import InputError
 from mcsim.simulation.preparation import preparation
 from mcsim.sphere import header, healpix
 from mcsim.sphere.checks import UNSEEN_BELOW, check_map
+from mcsim.support.arrays import Map
 from mcsim.support.folders import appearing, unwritable, writable
 
-Map = NDArray[np.float64]
 Source = str | Path | Mapping[str, Any] | config.RunConfig
 
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from mcsim import config, systematics
-from mcsim.diagnosis.analysis import Analysis, analysis_of
-from mcsim.diagnosis.candidate import Candidate, numbered
-from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.datavector.analysis import Analysis, analysis_of
+from mcsim.datavector.candidate import Candidate, numbered
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.errors import InputError
 from mcsim.information import figure
 from mcsim.information.dense import dense, size_of

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import systematics
-from mcsim.diagnosis.analysis import Analysis
-from mcsim.diagnosis.campaign import with_effects
-from mcsim.diagnosis.candidate import Candidate
+from mcsim.datavector.analysis import Analysis
+from mcsim.datavector.campaign import with_effects
+from mcsim.datavector.candidate import Candidate
 from mcsim.simulation import convolve, simulate
 from mcsim.simulation.survey import Channel, Survey, survey
 from mcsim.sphere import alm as alm_

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from mcsim.diagnosis.candidate import Candidate, columns_of, numbered
+from mcsim.datavector.candidate import Candidate, columns_of, numbered
 from mcsim.information.fisher import Information
 from mcsim.information.settings import LimitSettings
 from mcsim.stats.detection import snr_needed, snr_to_separate

@@ -9,13 +9,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Protocol
 
 import ducc0
 import healpy
 import numpy as np
 from numpy.typing import NDArray
 
+from mcsim.datavector.wiener_filter import FilteredMaps
 from mcsim.reconstruction.forms import rotations
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, real
@@ -32,30 +32,6 @@ BINS = 4
 """Ranges of degrees of a profile in l, equal in log l."""
 
 Key = tuple[str | int, ...]
-
-
-class Filtered(Protocol):
-    """Maps after a filter, as the filter of a diagnosis returns them."""
-
-    @property
-    def sky(self) -> Alm:
-        """Return the filtered sky, uK, shape (size,)."""
-
-    @property
-    def expected(self) -> NDArray[np.float64]:
-        """Return it as each map would show it, shape (map, npix)."""
-
-    @property
-    def residual(self) -> NDArray[np.float64]:
-        """Return the residuals over their noise variance, shape (map, npix)."""
-
-    @property
-    def adjoint(self) -> NDArray[np.complex128]:
-        """Return the adjoint synthesis of the residuals, shape (map, size)."""
-
-    @property
-    def orders(self) -> NDArray[np.complex128]:
-        """Return the products of residuals and sky by order and degree, shape (map, orders, lmax + 1)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +153,7 @@ class Scene:
         n = healpy.pix2vec(self.nside, np.arange(12 * self.nside**2))
         return np.stack([real.field(unit, *n) for unit in np.eye(9)])
 
-    def values(self, filtered: Filtered, differences: Sequence[Map]) -> Vector:
+    def values(self, filtered: FilteredMaps, differences: Sequence[Map]) -> Vector:
         """Return the scores, shape (len(keys),).
 
         ``differences`` are u^2 - 1 of every pixel and channel, u the difference of its maps over the noise.

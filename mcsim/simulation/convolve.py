@@ -19,6 +19,7 @@ from mcsim.instrument.scan import Moments
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.checks import check_alm, check_cl, check_nside, check_shape
+from mcsim.support.arrays import Map
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def circular_alm(alm: NDArray[np.complex128], response: Response) -> NDArray[np.
     return alm_.multiply(alm, response.factors[0].real, response.lmax)
 
 
-def circular_map(alm: NDArray[np.complex128], response: Response, nside: int, nthreads: int = 1) -> healpix.Map:
+def circular_map(alm: NDArray[np.complex128], response: Response, nside: int, nthreads: int = 1) -> Map:
     """Return S_0, the sky through the circular part of the beam at pixel centres, uK, shape (npix,)."""
     return healpix.synthesis(circular_alm(alm, response)[None], nside, response.lmax, nthreads=nthreads)[0]
 
@@ -68,7 +69,7 @@ class CircularMaps:
         self._alm: NDArray[np.complex128] | None = None
         self._made: dict[str, NDArray[np.float64]] = {}
 
-    def map(self, alm: NDArray[np.complex128]) -> healpix.Map:
+    def map(self, alm: NDArray[np.complex128]) -> Map:
         """Return the sky at pixel centres, uK, shape (npix,); read-only."""
         return self._once(alm, "map", lambda: healpix.synthesis(alm[None], *self._grid, nthreads=self.nthreads)[0])
 
@@ -113,7 +114,7 @@ def spin_maps(
     return maps
 
 
-def noncircular_map(maps: dict[int, NDArray[np.float64]], moments: Moments) -> healpix.Map:
+def noncircular_map(maps: dict[int, NDArray[np.float64]], moments: Moments) -> Map:
     """Return 2 Re sum_{s > 0} w_s S_s, what the non-circular part of the beam adds under a scan, uK, shape (npix,).
 
     InputError if the moments have fewer orders than the maps, or another nside.
@@ -138,7 +139,7 @@ def add_twice_real_part(w, real, imag, total):  # type: ignore[no-untyped-def]
         total[pixel] += 2.0 * (w[pixel].real * real[pixel] - w[pixel].imag * imag[pixel])
 
 
-def turned(map_: healpix.Map, moments: Moments, s: int, total: NDArray[np.float64]) -> None:
+def turned(map_: Map, moments: Moments, s: int, total: NDArray[np.float64]) -> None:
     """Add conj(w_s) times a map to ``total``, real and imaginary part, shape (2, npix): adjoint to w_s S_s."""
     check_shape(map_, (moments.npix,), f"the map beside moments of nside {moments.nside}")
     check_shape(total, (2, moments.npix), f"the sum beside moments of nside {moments.nside}")
@@ -153,7 +154,7 @@ def _add_turned(map_, w, total):  # type: ignore[no-untyped-def]
         total[1, pixel] -= map_[pixel] * w[pixel].imag
 
 
-def centroid_map(gradient: NDArray[np.float64], moments: Moments) -> healpix.Map:
+def centroid_map(gradient: NDArray[np.float64], moments: Moments) -> Map:
     """Return d . grad S_0 for samples whose mean position is off the pixel centre by d, uK, shape (npix,).
 
     The gradient is d/dtheta and 1/sin(theta) d/dphi of S_0, shape (2, npix), uK/rad; d is the moments'.

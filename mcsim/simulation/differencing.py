@@ -13,8 +13,8 @@ from mcsim.simulation.channels import scan_model
 from mcsim.simulation.survey import Channel, SideB, SurveyMap
 from mcsim.sphere import rng
 from mcsim.sphere.sky import dipole_alm
+from mcsim.support.arrays import Map
 
-Map = NDArray[np.float64]
 Sides = tuple[mapmaking.SideMaps, mapmaking.SideMaps]
 
 SECONDS_PER_SAMPLE = 1.5e-7

@@ -18,8 +18,7 @@ from mcsim.simulation.channels import scan_model
 from mcsim.sphere import header, healpix
 from mcsim.sphere.checks import UNSEEN_BELOW
 from mcsim.sphere.mask import read_mask
-
-Map = NDArray[np.float64]
+from mcsim.support.arrays import Map
 
 
 class DrawnNoise(Protocol):

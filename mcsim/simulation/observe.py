@@ -11,11 +11,12 @@ from mcsim.simulation import convolve
 from mcsim.simulation.offsets import expansion, offset_maps
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
+from mcsim.support.arrays import Map
 
 
 def observe(
     alm: ArrayLike, beam: Beam, moments: Moments, *, pixel_window: bool | None = None, nthreads: int = 1
-) -> healpix.Map:
+) -> Map:
     """Return the map of a sky seen by a beam under a scan.
 
     Parameters

@@ -22,8 +22,7 @@ from mcsim.instrument.scan import Moments
 from mcsim.simulation import convolve
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
-
-Alm = NDArray[np.complex128]
+from mcsim.support.arrays import Alm
 
 
 class Expansion:

@@ -28,7 +28,7 @@ def mean_gain(acting: tuple[Effect, ...], site: Site, share: tuple[float, float]
     def errors(chunk: tod.Samples) -> Iterator[Map]:
         return (g for effect in drifting if (g := effect.gain(chunk.time_s, site)) is not None)
 
-    return _mean_of_samples(errors, site.pointed(drifting[0].name), site, share)
+    return _mean_of_samples(errors, site.pointed(drifting[0].name), site, share, angles=False)
 
 
 def mean_signal(acting: tuple[Effect, ...], site: Site, share: tuple[float, float]) -> Map | None:
@@ -48,11 +48,16 @@ def _mean_of_samples(
     pointing: Pointing,
     site: Site,
     share: tuple[float, float],
+    angles: bool = True,
 ) -> Map:
-    """Return the mean of a sum of terms over the samples of every pixel, zero in pixels without any."""
+    """Return the mean of a sum of terms over the samples of every pixel, zero in pixels without any.
+
+    ``angles`` False: the terms take times alone.
+    """
 
     def stream() -> Iterator[tod.Samples]:
-        for chunk in tod.samples(pointing.model, pointing.line, MapGrid(site.nside, site.frame, share)):
+        grid = MapGrid(site.nside, site.frame, share)
+        for chunk in tod.samples(pointing.model, pointing.line, grid, angles=angles):
             yield replace(chunk, signal_uk=sum(terms(chunk), start=chunk.signal_uk))
 
     mean, hits = tod.bin_samples(stream(), site.nside)
@@ -96,4 +101,5 @@ def _kept(what: str, where: tuple[Effect, Site, tuple[float, float]], values: Ma
     def fill(folder: Path) -> None:
         np.save(folder / f"{what}.npy", np.asarray(mean((effect,), site, share), dtype=np.float64))
 
-    return np.asarray(np.load(folders.cached(f"{what}-{scan[:32]}-{own[:32]}", fill) / f"{what}.npy"))
+    # Mapped, so that all processes share it.
+    return np.asarray(np.load(folders.cached(f"{what}-{scan[:32]}-{own[:32]}", fill) / f"{what}.npy", mmap_mode="r"))

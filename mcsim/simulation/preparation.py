@@ -22,9 +22,8 @@ from mcsim.simulation.steps import NEGLIGIBLE, Average, Filled, Filter, Regressi
 from mcsim.sphere import header, healpix, rotation
 from mcsim.sphere.checks import UNSEEN_BELOW, check_map
 from mcsim.sphere.mask import read_mask
+from mcsim.support.arrays import Map
 from mcsim.systematics import Site
-
-Map = NDArray[np.float64]
 
 LARGEST_GAIN = 10.0
 """Of B_l by a change of the beam: a target that asks for more is narrower than the beam."""

@@ -25,9 +25,7 @@ from mcsim.instrument.scan.limit import caustics, graded_rule, limit_moments
 from mcsim.simulation.convolve import Response
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.checks import check_alm, check_angle
-
-Alm = NDArray[np.complex128]
-Vector = NDArray[np.float64]
+from mcsim.support.arrays import Alm, Vector
 
 _ROUND_OFF = 1e8
 """Loss of digits that the division by sin^s(theta) on the ring next to the pole may cost."""

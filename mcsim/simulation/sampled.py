@@ -14,8 +14,7 @@ from mcsim.simulation import simulate, tod
 from mcsim.simulation.survey import Channel, Survey
 from mcsim.sphere import rng
 from mcsim.sphere.sky import dipole_alm
-
-Map = NDArray[np.float64]
+from mcsim.support.arrays import Map
 
 EPSILON = 1e-9
 """Accuracy asked of the interpolation, relative to sky and dipole together."""

@@ -15,8 +15,7 @@ from mcsim.simulation.survey import Channel, Survey, SurveyMap
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rng
 from mcsim.sphere.sky import dipole_alm, gaussian_alm
-
-Alm = NDArray[np.complex128]
+from mcsim.support.arrays import Alm
 
 
 @dataclass(frozen=True)

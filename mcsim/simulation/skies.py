@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import header, healpix
+from mcsim.support.arrays import Alm
 from mcsim.support.npy import read_npy
-
-Alm = NDArray[np.complex128]
 
 LARGEST_UK = 1e12
 """Of a user's sky."""

@@ -14,8 +14,7 @@ from mcsim.errors import InputError
 from mcsim.simulation import windows
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rotation
-
-Map = NDArray[np.float64]
+from mcsim.support.arrays import Map
 
 ITERATIONS = 1
 """Jacobi iterations of the analysis of maps that are smoothed or degraded in harmonics."""

@@ -24,9 +24,8 @@ from mcsim.instrument.scan import LineOfSight, MapGrid, ScanModel, scan_key
 from mcsim.simulation import tod
 from mcsim.sphere import rng
 from mcsim.support import folders
+from mcsim.support.arrays import Map
 from mcsim.support.code import package_digest
-
-Map = NDArray[np.float64]
 
 SECONDS_PER_SAMPLE = 1.2e-7
 """Time of one core for a sample of correlated noise: pointing, random numbers, filter, sums."""

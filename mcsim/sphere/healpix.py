@@ -15,10 +15,8 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.sphere.checks import check_alm, check_complete, check_map, check_nside, check_whole
 from mcsim.sphere.header import frame_named, opened
+from mcsim.support.arrays import Alm, Map
 from mcsim.support.npy import read_npy
-
-Map = NDArray[np.float64]
-Alm = NDArray[np.complex128]
 
 
 @lru_cache(maxsize=4)

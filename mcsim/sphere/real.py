@@ -9,9 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import sph_harm_y
 
 from mcsim.sphere import alm as alm_
-
-Vector = NDArray[np.float64]
-Alm = NDArray[np.complex128]
+from mcsim.support.arrays import Alm, Vector
 
 
 def harmonics(lmax: int) -> list[tuple[int, int, str]]:

@@ -138,7 +138,7 @@ def log_evidence(
     g = np.asarray(widths).reshape((-1,) + (1,) * T.ndim) ** 2
     wide = 1.0 + null.curvature(chi2 + T / (1.0 + g)) * g
     each = null.log_likelihood(chi2 + T / wide) - 0.5 * K * np.log(wide)
-    return special.logsumexp(each, axis=0) - np.log(len(widths))
+    return np.asarray(np.logaddexp.reduce(each, axis=0) - np.log(len(widths)))
 
 
 def posterior(

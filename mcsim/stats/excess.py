@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from mcsim.stats.gaussian import SimulatedGaussian
+from mcsim.stats.gaussian import SimulatedGaussian, orthonormal
 from mcsim.support.arrays import Matrix, Vector
 
 
@@ -65,6 +65,28 @@ def excess_of(chi2: float, p: int, n: int) -> Measured:
     value = (n - p - 1) / n * chi2 - p
     length, d = max(value, 0.0), n - p + 1
     return Measured(value, float(np.sqrt(2.0 * ((p + length) ** 2 + (p + 2.0 * length) * (d - 2)) / (d - 4))))
+
+
+def scatter_chi2(null: SimulatedGaussian, t: Matrix, before: Matrix, after: Matrix) -> float:
+    """Return the chi^2 that effects add to a residual by their scatter, over their squared white response, >= 0.
+
+    ``before`` and ``after`` are data vectors of the same skies without the effects and with them, shape
+    (skies, p_raw), ``t`` the templates that are fitted, shape (p_raw, K).
+
+    Notes
+    -----
+    With P the projection off the templates, in white coordinates, chi^2 of the residual grows by
+    tr P (C_after - C_before) on average, and by tr P C_change/skies because the response is a mean of as many skies.
+    The common scatter of the same skies cancels. As a noncentrality this has the variance of such a scatter, but for
+    2 tr (P (C_after - C_before))^2. Tests: tests/statistical/test_elliptical.py.
+    """
+    change = after - before
+    basis, _ = orthonormal(null.whiten_templates(t))
+    without, acting, own = (null.whiten_templates((rows - rows.mean(axis=0)).T) for rows in (before, after, change))
+    squares = [float(np.sum((one - basis @ (basis.T @ one)) ** 2)) for one in (without, acting, own)]
+    added = (squares[1] - squares[0] + squares[2] / len(change)) / (len(change) - 1.0)
+    size = float(np.sum(null.whiten_templates(change.mean(axis=0)[:, None]) ** 2))
+    return max(null.hartlap_factor * added / size, 0.0) if size > 0.0 else 0.0
 
 
 def expected_fall(test: SimulatedGaussian, t: Matrix, amplitudes: Vector, covariance: Matrix) -> Measured:

@@ -1,7 +1,8 @@
 """Test and fit a Gaussian data vector whose mean and covariance are known from a limited number of simulations.
 
 With N simulations of p elements and S the scatter matrix (the sum of squares about their mean), the tests are those of
-Hotelling (1931) and Rao (1959): exact for every N > p, and the usual chi^2 tests for N -> infinity.
+Hotelling (1931) and Rao (1959): exact for every N > p, and the usual chi^2 tests for N -> infinity. The tests of chi^2
+allow for a factor that scales the covariance of each realization (:mod:`mcsim.stats.elliptical`).
 """
 
 from collections.abc import Sequence
@@ -9,9 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import special
 
 from mcsim.errors import InputError
+from mcsim.stats.elliptical import f_tail, leave_one_out, scale_variance
 from mcsim.stats.shrinkage import Fold, shrunk
 from mcsim.support.arrays import Matrix, Vector
 
@@ -99,6 +100,8 @@ class SimulatedGaussian:
         Degrees of freedom n of the covariance if it is no sample covariance; None: N - 1.
     folds
         Then the simulations in white coordinates of others; simulation i is in fold i modulo their number.
+    scale_variance
+        Variance of a factor that scales the covariance of each realization; 0 if the data vector is Gaussian.
     """
 
     mean: NDArray[np.float64]
@@ -107,6 +110,7 @@ class SimulatedGaussian:
     log_jacobian: float = 0.0
     covariance_dof: int | None = None
     folds: tuple[Fold, ...] = ()
+    scale_variance: float = 0.0
 
     @classmethod
     def from_simulations(
@@ -140,8 +144,10 @@ class SimulatedGaussian:
         centre = mean if offset is None else mean + offset
         if shrink:
             found = shrunk(simulations, floor)
-            return cls(centre, found.whitening, count, covariance_dof=found.dof, folds=found.folds)
-        return cls(centre, np.sqrt(count - 1.0) * right[kept] / singular[kept, None] / scale, count)
+            null = cls(centre, found.whitening, count, covariance_dof=found.dof, folds=found.folds)
+        else:
+            null = cls(centre, np.sqrt(count - 1.0) * right[kept] / singular[kept, None] / scale, count)
+        return replace(null, scale_variance=scale_variance(*null.held_out(simulations), null.dimension))
 
     @property
     def dimension(self) -> int:
@@ -194,7 +200,7 @@ class SimulatedGaussian:
 
     def residual_test(self, chi2: ArrayLike, fitted: ArrayLike = 0, allowance: ArrayLike = 0.0) -> NDArray[np.float64]:
         """Return the p-value of chi^2 after ``fitted`` columns have been fitted; see :func:`residual_pvalue`."""
-        return residual_pvalue(chi2, self.dimension - np.asarray(fitted), self.dof, allowance)
+        return residual_pvalue(chi2, self.dimension - np.asarray(fitted), self.dof, allowance, self.scale_variance)
 
     def nested_test(
         self,
@@ -263,6 +269,19 @@ class SimulatedGaussian:
         """Return the same covariance about another mean, shape (p_raw,)."""
         return replace(self, mean=mean)
 
+    def held_out(self, simulations: Matrix) -> tuple[Vector, int]:
+        """Return chi^2 of every simulation, shape (N, p_raw), against all others, shape (N,), and its dof n.
+
+        With a shrunk covariance the others are those of other folds. Against explicit refits:
+        tests/unit/test_diagnosis_report.py.
+        """
+        if self.folds:
+            square = np.empty(len(simulations))
+            for number, fold in enumerate(self.folds):
+                square[number :: len(self.folds)] = np.sum(fold.white**2, axis=1)
+            return square, self.dof
+        return leave_one_out((simulations - simulations.mean(axis=0)) @ self.whitening.T), self.dof - 1
+
     def with_extra_covariance(self, *draws: NDArray[np.float64]) -> "SimulatedGaussian":
         """Add independent Gaussian covariances, each known from a few draws.
 
@@ -295,38 +314,56 @@ def with_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, before: Matrix,
     -----
     A strong effect changes the scatter of the data. The fit is linear, so that it is applied to every sky. The variance
     of each amplitude grows by its excess among the skies with the effects over that without them: the same skies, whose
-    common scatter cancels. Correlations stay; errors are not made smaller.
+    common scatter cancels. The response that is fitted is a mean of as many skies: the variance of the amplitudes that
+    the changes of single skies have, over their number, adds. Correlations stay; errors are not made smaller.
     """
     basis, back = orthonormal(null.whiten_templates(t))
-    without, acting = (
-        np.var(back @ basis.T @ null.whiten_templates(rows.T), axis=1, ddof=1) for rows in (before, after)
+    without, acting, change = (
+        np.var(back @ basis.T @ null.whiten_templates(rows.T), axis=1, ddof=1)
+        for rows in (before, after, after - before)
     )
-    own = np.diag(found.covariance)
-    factor = np.sqrt(1.0 + np.divide(np.maximum(acting - without, 0.0), own, out=np.zeros_like(own), where=own > 0.0))
+    own, added = np.diag(found.covariance), np.maximum(acting - without + change / len(before), 0.0)
+    factor = np.sqrt(1.0 + np.divide(added, own, out=np.zeros_like(own), where=own > 0.0))
     return replace(found, covariance=factor[:, None] * found.covariance * factor)
 
 
-def held_out_pvalues(simulations: Matrix, null: SimulatedGaussian) -> Vector:
-    """Return the p-value of every simulation against all others, shape (N,): uniform for Gaussian data vectors.
+def with_drawn_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, scatters: Sequence[Matrix]) -> Fit:
+    """Return a fit of templates, shape (p_raw, K), with the errors that patterns which are drawn give its amplitudes.
+
+    ``null`` is the distribution without them; ``scatters``, with which it was widened for the fit, are deviations as of
+    :meth:`SimulatedGaussian.with_extra_covariance`.
 
     Notes
     -----
-    With c = x_i - mean, S the scatter of all N and a = N/(N - 1) c'S^-1 c, the scatter of the others is
-    S - N/(N - 1) c c', and x_i less their mean is N/(N - 1) c: its square in their scatter, over 1 + 1/(N - 1), is
-    a/(1 - a) (Sherman & Morrison, Ann. Math. Stat. 21, 124, 1950).
-    Against explicit refits: tests/unit/test_diagnosis_report.py. With a shrunk covariance the others are those of other
-    folds.
+    The weights of the fit avoid the scatter of the very draws that it is known from: these would make errors too small.
+    Each draw is fitted with the scatter of all others, and the mean square of what it adds to the amplitudes stands in
+    place of the scatter (leave-one-out cross-validation; Stone, JRSS B 36, 111, 1974). Pulls:
+    tests/statistical/test_drawn_scatter.py.
     """
-    if null.folds:
-        square = np.empty(len(simulations))
-        for number, fold in enumerate(null.folds):
-            square[number :: len(null.folds)] = np.sum(fold.white**2, axis=1)
-        return residual_pvalue(square, null.dimension, null.dof)
-    count = len(simulations)
-    white = (simulations - simulations.mean(axis=0)) @ null.whitening.T
-    a = np.sum(white**2, axis=1) / null.dof * count / (count - 1)
-    square = (null.dof - 1) * a / np.maximum(1.0 - a, 1e-12)
-    return residual_pvalue(square, null.dimension, null.dof - 1)
+    white, scale = np.linalg.pinv(null.whitening), (null.dof + found.chi2) / (found.dof - 2)
+
+    def weights(extra: Sequence[Matrix]) -> Matrix:
+        wide = null.with_extra_covariance(*extra)
+        basis, back = orthonormal(wide.whiten_templates(t))
+        return np.asarray(back @ basis.T @ wide.whitening / np.sqrt(1.0 + 1.0 / null.n_sims))
+
+    own = weights(scatters) @ white * np.sqrt(1.0 + 1.0 / null.n_sims)
+    covariance = scale * own @ own.T
+    for place, draws in enumerate(scatters):
+        count = draws.shape[1]
+        for k in range(count):
+            # The mean of the others, whose deviations from that of all add up to nothing with this one's.
+            others = np.delete(draws, k, axis=1) + draws[:, [k]] / (count - 1.0)
+            others *= np.sqrt((count - 1.0) / (count - 2.0))
+            added = weights([*scatters[:place], others, *scatters[place + 1 :]]) @ draws[:, k]
+            covariance += np.outer(added, added)
+    return replace(found, covariance=covariance)
+
+
+def held_out_pvalues(simulations: Matrix, null: SimulatedGaussian) -> Vector:
+    """Return the p-value of every simulation, shape (N, p_raw), against all others, shape (N,): uniform."""
+    chi2, n = null.held_out(simulations)
+    return residual_pvalue(chi2, null.dimension, n, scale=null.scale_variance)
 
 
 def ledoit_wolf(white: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -348,21 +385,23 @@ def ledoit_wolf(white: NDArray[np.float64]) -> NDArray[np.float64]:
     return (1.0 - weight) * found + weight * mean * np.eye(p)
 
 
-def residual_pvalue(chi2: ArrayLike, dimension: ArrayLike, n: int, allowance: ArrayLike = 0.0) -> NDArray[np.float64]:
+def residual_pvalue(
+    chi2: ArrayLike, dimension: ArrayLike, n: int, allowance: ArrayLike = 0.0, scale: float = 0.0
+) -> NDArray[np.float64]:
     """Return the probability of a larger chi^2 of the residual after K columns have been fitted, or of the data.
 
     ``dimension`` is q = p - K, ``n`` the number of simulations less one, ``allowance`` the squared signal-to-noise
-    ratio of an error of the model that is tolerated.
+    ratio of an error of the model that is tolerated, and ``scale`` the variance of a factor of mean one that scales the
+    covariance of each realization.
 
     Notes
     -----
-    (n - q + 1)/q chi^2/n ~ F(q, n - q + 1) (Hotelling, Ann. Math. Stat. 2, 360, 1931). An error of the model
-    makes it noncentral, whatever its direction; the tail is Patnaik's approximation (Biometrika 36, 202, 1949),
-    exact without the error.
+    (n - q + 1)/q chi^2/n ~ F(q, n - q + 1) (Hotelling, Ann. Math. Stat. 2, 360, 1931). For an error of the model and a
+    scale see :func:`mcsim.stats.elliptical.f_tail`: exact without both.
     """
     q = np.asarray(dimension, dtype=float)
     f = (n - q + 1.0) / np.maximum(q, 1.0) * np.asarray(chi2) / n
-    return np.where(q > 0.0, _f_tail(f, np.maximum(q, 1.0), n - q + 1.0, allowance), 1.0)
+    return np.where(q > 0.0, f_tail(f, np.maximum(q, 1.0), n - q + 1.0, allowance, scale), 1.0)
 
 
 def nested_pvalue(
@@ -382,13 +421,7 @@ def nested_pvalue(
     K, T = np.asarray(columns, dtype=float), np.asarray(delta_chi2)
     d2 = n - np.asarray(dimension, dtype=float) + 1.0
     f = d2 / np.maximum(K, 1.0) * T / (n + np.maximum(np.asarray(chi2) - T, 0.0))
-    return np.where(K > 0.0, _f_tail(f, np.maximum(K, 1.0), d2, allowance), 1.0)
-
-
-def _f_tail(f: ArrayLike, d1: ArrayLike, d2: ArrayLike, noncentrality: ArrayLike) -> NDArray[np.float64]:
-    d1, extra = np.asarray(d1), np.asarray(noncentrality)
-    scale = (d1 + extra) / d1
-    return special.fdtrc((d1 + extra) ** 2 / (d1 + 2.0 * extra), d2, np.maximum(f, 0.0) / scale)
+    return np.where(K > 0.0, f_tail(f, np.maximum(K, 1.0), d2, allowance), 1.0)
 
 
 def orthonormal(white: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

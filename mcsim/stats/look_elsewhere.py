@@ -91,7 +91,7 @@ def calibrate_on(
     chi2, falls = n * a / rest, n * b / (rest[:, None] * (rest[:, None] + b))
     smallest = nested_pvalue(falls, chi2[:, None], candidates.sizes, p, n).min(axis=1)
     found = replace(calibration, held_out_smallest=np.sort(calibration.global_pvalue(smallest)))
-    combined = found.combine(residual_pvalue(chi2, p, n), smallest)
+    combined = found.combine(residual_pvalue(chi2, p, n, scale=null.scale_variance), smallest)
     return replace(found, held_out_combined=np.sort(combined))
 
 

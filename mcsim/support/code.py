@@ -6,10 +6,16 @@ import inspect
 import sys
 import uuid
 from collections.abc import Iterable
-from importlib import import_module
-from importlib.metadata import version
+from functools import cache
+from importlib import import_module, metadata
 from pathlib import Path
 from types import FunctionType
+
+
+@cache
+def version(library: str) -> str:
+    """Return the version of an installed library; its metadata are parsed once."""
+    return metadata.version(library)
 
 
 def package_digest(packages: Iterable[str], libraries: Iterable[str] = ()) -> str:

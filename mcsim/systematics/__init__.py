@@ -18,7 +18,7 @@ from mcsim.systematics.base import (
     variance_factor,
 )
 from mcsim.systematics.parametrization import Parametrization
-from mcsim.systematics.registry import Library, basis_of, build, catalogue, checked, effects, get
+from mcsim.systematics.registry import Library, basis_of, build, catalogue, checked, effects, get, in_file
 
 __all__ = [
     "Alm",
@@ -40,6 +40,7 @@ __all__ = [
     "disturbing",
     "effects",
     "get",
+    "in_file",
     "looked_at",
     "seen_through",
     "spread_of",

@@ -298,8 +298,8 @@ class Effect:
         """Return where the amplitude points, in words; empty for an effect without a direction."""
         return ""
 
-    def describe(self, sigma: float = 0.0) -> str:
-        """Return amplitude, error and direction as people read them."""
+    def describe(self, sigma: float = 0.0, errors: Mapping[str, float] | None = None) -> str:
+        """Return amplitude, error and direction as people read them; ``errors``: of other fitted parameters."""
         return " ".join(filter(None, (self.format_amplitude(self.amplitude, sigma), self.direction())))
 
     def along(self, parameter: str) -> Vector:

@@ -1,10 +1,12 @@
 """Galactic light that the cleaning left."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
+from mcsim.support.numbers import measured
 from mcsim.systematics.base import Alm, Bound, Draw, Effect, Site, Wording
 from mcsim.systematics.galaxy import morphology
-from mcsim.systematics.parametrization import Parametrization
+from mcsim.systematics.parametrization import PowerLaw
 
 REFERENCE_GHZ = 94.0
 
@@ -25,7 +27,8 @@ class ForegroundResidual(Effect):
 
     Notes
     -----
-    Channels with ``foregrounds = false`` have none of it.
+    Channels with ``foregrounds = false`` have none of it. A diagnosis fits the index to three or more
+    frequencies, or to two beside such a channel.
 
     Drawn: p(b) (1 + g), p = 1 / (1 + (sin b / 0.15)^2), g a Gaussian field of C_l ~ l^-2.5, l > 0, and unit variance,
     scaled to rms 1 over the full sky; a model of our own that is bright in the plane and patchy off it, no more.
@@ -44,12 +47,20 @@ class ForegroundResidual(Effect):
     step = 5.0
     bounds = (
         Bound("amplitude", -500.0, 500.0, "a prior of this library: less than the foreground itself"),
-        Bound("spectral_index", -4.0, 4.0, "from synchrotron to dust; fixed in a fit"),
+        Bound("spectral_index", -4.0, 4.0, "from synchrotron to dust"),
     )
-    parametrization = Parametrization(stochastic=True, matched_filter=False)
+    parametrization = PowerLaw(
+        stochastic=True, matched_filter=False, parameter="spectral_index", reference_ghz=REFERENCE_GHZ
+    )
 
     spectral_index: float = 2.0
     template: str = ""
+
+    def describe(self, sigma: float = 0.0, errors: Mapping[str, float] | None = None) -> str:
+        """Return amplitude and index, and whether this was fitted."""
+        error = (errors or {}).get("spectral_index")
+        index = measured(self.spectral_index, error or 0.0)
+        return f"{super().describe(sigma)}, index {index}" + (" (not fitted)" if error is None else "")
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
         """Add the residual, but to maps that a component separation made."""

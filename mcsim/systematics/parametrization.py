@@ -1,8 +1,8 @@
 """How an effect is parametrised for a linear fit. This stands beside its physics, which knows nothing of a fit."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Literal
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,15 @@ class Parametrization:
     mean_response: bool = False
     matched_filter: bool = True
     nonlinear: bool = False
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """Return the parameters beside the amplitude that are given with an error."""
+        return ()
+
+    def seen_at(self, frequencies_ghz: Iterable[float | None]) -> Self:
+        """Return how the effect is fitted to channels of these frequencies; None: one without foregrounds."""
+        return self
 
     def basis(self) -> tuple[Mapping[str, Any], ...]:
         """Return the parameters of the k effects whose responses span all others; their amplitude is the step."""
@@ -138,6 +147,79 @@ class Steps(Parametrization):
         """Return n, not rounded; a negative amplitude, whatever its size, for a negative coordinate."""
         value = float(coordinates[0])
         return {"amplitude": value if value < 0.0 else float(np.log1p(value) / np.log(self.factor))}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PowerLaw(Parametrization):
+    """Fit a signal that grows as a power of frequency, and its index where the channels can tell it.
+
+    Attributes
+    ----------
+    parameter
+        Name of the index, which is that of the effect where it is not fitted.
+    reference_ghz
+        Frequency to which the amplitude belongs.
+    ratios
+        Frequencies of the channels over that of the reference; none: the index is not fitted.
+
+    Notes
+    -----
+    With x the ratios, A x^index is fitted as c_1 x^2 + c_2 x^-2: exact at two frequencies, by least squares at more.
+    Maps of one sky tell a signal in it only by their differences: an index takes two, of three frequencies, or of two
+    and a map without foregrounds.
+    """
+
+    parameter: str
+    reference_ghz: float
+    ratios: tuple[float, ...] = ()
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """Return the index where it is fitted."""
+        return (self.parameter,) if self.ratios else ()
+
+    def seen_at(self, frequencies_ghz: Iterable[float | None]) -> Self:
+        """Return the same with the index fitted if there are two differences of frequencies to fit it to."""
+        seen = set(frequencies_ghz)
+        ratios = tuple(sorted(one / self.reference_ghz for one in seen if one is not None))
+        return replace(self, ratios=ratios) if len(seen) > 2 else self
+
+    def basis(self) -> tuple[Mapping[str, Any], ...]:
+        """Return the pivots of the index."""
+        return tuple({self.parameter: float(index)} for index in _PIVOTS) if self.ratios else ({},)
+
+    def coordinates(self, effect: Any) -> Vector:
+        """Return the amplitudes at the pivots."""
+        if not self.ratios:
+            return super().coordinates(effect)
+        return np.asarray(effect.amplitude * self._unit(np.array([getattr(effect, self.parameter)]))[:, 0])
+
+    def nearest(self, coordinates: Vector, precision: NDArray[np.float64]) -> dict[str, Any]:
+        """Return amplitude and index; where no power law has these coordinates, the index is as steep as can be."""
+        if not self.ratios:
+            return super().nearest(coordinates, precision)
+        indices = np.linspace(-_STEEPEST, _STEEPEST, 401)
+        for _ in range(4):
+            along, size = self._projected(indices, coordinates, precision)
+            best = int(np.argmax(along**2 / size))
+            indices = np.linspace(indices[max(best - 1, 0)], indices[min(best + 1, len(indices) - 1)], 41)
+        index = float(indices[len(indices) // 2])
+        along, size = self._projected(np.array([index]), coordinates, precision)
+        return {"amplitude": float(along[0] / size[0]), self.parameter: index}
+
+    def _unit(self, indices: Vector) -> Vector:
+        """Return the coordinates at unit amplitude, shape (2, indices)."""
+        x = np.array(self.ratios)[:, None]
+        return np.asarray(np.linalg.pinv(x**_PIVOTS) @ x**indices)
+
+    def _projected(self, indices: Vector, at: Vector, precision: NDArray[np.float64]) -> tuple[Vector, Vector]:
+        """Return the products of the unit coordinates with others, and with themselves, in the metric."""
+        unit = self._unit(indices)
+        return unit.T @ precision @ at, np.maximum(np.sum(unit * (precision @ unit), axis=0), 1e-300)
+
+
+_PIVOTS = np.array([2.0, -2.0])
+_STEEPEST = 12.0
 
 
 @dataclass(frozen=True, kw_only=True)

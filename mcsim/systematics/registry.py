@@ -123,16 +123,24 @@ def get(name: str, library: Library | None = None) -> type[Effect]:
     return known[name]
 
 
-@cache
 def of_file(path: str) -> type[Effect]:
-    """Return the effect that a Python file defines; InputError if it cannot be run, or defines none or several.
+    """Return the effect that a Python file defines; InputError if it cannot be run, or defines none or several."""
+    found = in_file(path)
+    if len(found) != 1:
+        raise InputError(f"{path} defines {len(found)} effects; let it define one class derived from mcsim.Effect.")
+    return found[0]
+
+
+@cache
+def in_file(path: str) -> tuple[type[Effect], ...]:
+    """Return the effects that a Python file defines; InputError if it cannot be run, or an effect is not whole.
 
     The file becomes a module by its stem, and its folder is on the path of this process and those that it starts:
-    workers can then load the effect as well.
+    workers can then load the effects as well.
     """
     file = Path(path).absolute()
     if not file.is_file():
-        raise InputError(f"{path} is no file; name a Python file that defines an effect.")
+        raise InputError(f"{path} is no file; name a Python file that defines a class derived from mcsim.Effect.")
     folder = str(file.parent)
     sys.path.insert(0, folder)
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (folder, os.environ.get("PYTHONPATH"))))
@@ -142,16 +150,15 @@ def of_file(path: str) -> type[Effect]:
         raise InputError(f"{path} cannot be run ({error}); mend it.") from error
     if Path(str(module.__file__)).absolute() != file:
         raise InputError(f"{path} has the name of another module, {module.__file__}; rename it.")
-    found = [
+    found = tuple(
         kind
         for _, kind in inspect.getmembers(module, inspect.isclass)
         if kind.__module__ == module.__name__ and issubclass(kind, Effect)
-    ]
-    if len(found) != 1:
-        raise InputError(f"{path} defines {len(found)} effects; let it define one class derived from mcsim.Effect.")
-    if (flaw := _flaw(found[0])) is not None:
-        raise InputError(f"the effect of {path} {flaw}; mend it.")
-    return found[0]
+    )
+    for kind in found:
+        if (flaw := _flaw(kind)) is not None:
+            raise InputError(f"the effect {kind.__name__} of {path} {flaw}; mend it.")
+    return found
 
 
 def build(kind: str | type[Effect], parameters: Mapping[str, Any], library: Library | None = None) -> Effect:
@@ -186,11 +193,16 @@ def _checked(what: str, value: Any, default: Any) -> Any:
     return float(value)
 
 
-def basis_of(kind: type[Effect], settings: Mapping[str, Any] | None = None) -> tuple[Effect, ...]:
-    """Return the effects, of amplitude ``step``, whose responses span those of all parameters but the ``settings``."""
+def basis_of(
+    kind: type[Effect], settings: Mapping[str, Any] | None = None, fit: Parametrization | None = None
+) -> tuple[Effect, ...]:
+    """Return the effects, of amplitude ``step``, whose responses span those of all parameters but the ``settings``.
+
+    ``fit``: default: the parametrization of the effect.
+    """
     return tuple(
         kind(**{"amplitude": kind.step, **parameters, **(settings or {})})
-        for parameters in kind.parametrization.basis()
+        for parameters in (kind.parametrization if fit is None else fit).basis()
     )
 
 

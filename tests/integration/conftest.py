@@ -79,3 +79,11 @@ def small_store(client: Client, tmp_path_factory: pytest.TempPathFactory) -> Pat
     path = tmp_path_factory.mktemp("store") / "small.zarr"
     runner.run(config.load(table()), path, workers=client)
     return path
+
+
+@pytest.fixture(scope="session")
+def short_store(client: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its first three realizations, to be copied and extended."""
+    path = tmp_path_factory.mktemp("store") / "short.zarr"
+    runner.run(config.load(table(**ensemble(3))), path, workers=client)
+    return path

@@ -15,8 +15,8 @@ from mcsim.benchmark.challenge import make, run
 from mcsim.benchmark.folder import Settings, finished_cases, key_path, read_key
 from mcsim.benchmark.out_of_library import library_with, load
 from mcsim.benchmark.summary import confusion
-from mcsim.diagnosis.analysis import analysis_of
-from mcsim.diagnosis.observed_maps import read_maps
+from mcsim.datavector.analysis import analysis_of
+from mcsim.datavector.map_checks import read_maps
 from refusals import refused
 
 OUT_OF_LIBRARY = str(Path(__file__).parents[1] / "out_of_library.py")

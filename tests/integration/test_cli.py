@@ -1,13 +1,16 @@
 """The command line as a user meets it: outputs, exit codes, one sentence for bad input, nothing left behind."""
 
+import inspect
 import io
 import json
+import re
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -71,6 +74,19 @@ def test_help_loads_no_heavy_library() -> None:
     for command in ("run", "merge", "info", "plot", "predict", "fit", "beam", "scan", "bench", "config", "maps"):
         assert command in done.stdout
     assert done.stdout.rstrip().endswith("[]")
+
+
+@pytest.mark.parametrize("command", [one.callback for one in cli.app.registered_commands], ids=lambda one: one.__name__)
+def test_help_prints_what_is_written(mcsim: Command, command: Callable[..., None]) -> None:
+    """Text in square brackets would be taken for markup, and vanish."""
+    _, out, _ = mcsim(command.__name__.rstrip("_"), "--help")
+    printed = re.sub(r"[^\w\[\]]", "", out)
+    texts = [inspect.getdoc(command).partition("\n\n")[0]]
+    texts += [
+        one.__metadata__[0].help for one in get_type_hints(command, include_extras=True).values() if get_args(one)
+    ]
+    missing = [text for text in texts if text and re.sub(r"[^\w\[\]]", "", text) not in printed]
+    assert not missing
 
 
 def test_info_and_exports(mcsim: Command, small_store: Path, tmp_path: Path) -> None:

@@ -8,12 +8,12 @@ import pytest
 
 import mcsim
 from mcsim import cli, config
+from mcsim.datavector.analysis import analysis_of
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis import controls, words
-from mcsim.diagnosis.analysis import analysis_of
 from mcsim.diagnosis.api import describe
 from mcsim.diagnosis.control_result import Control, Controls
 from mcsim.diagnosis.result import DiagnosisResult
-from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from pictures import quick_pictures

@@ -13,16 +13,18 @@ from scipy.stats import kstest
 import mcsim
 from instruments import data_of, two_channels
 from mcsim import config, systematics
-from mcsim.diagnosis import api, campaign, localisation, report, unlisted, words
-from mcsim.diagnosis.analysis import analysis_of, data_vectors
-from mcsim.diagnosis.campaign import with_effects
+from mcsim.datavector import bipolar_scan, campaign
+from mcsim.datavector.analysis import analysis_of, data_vectors
+from mcsim.datavector.campaign import with_effects
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.wiener_filter import shared_sky, wiener_filter
+from mcsim.diagnosis import api, localisation, report, unlisted, words
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
-from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.diagnosis.wiener_filter import shared_sky, wiener_filter
 from mcsim.errors import InputError
+from mcsim.reconstruction import simulated_scores
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
 from mcsim.stats.look_elsewhere import global_test
@@ -112,7 +114,7 @@ def test_an_unlisted_effect_is_described_written_and_shrinks(small, tmp_path, mo
     before = diagnose_data(data, "drift")
     assert before.kind == "unknown"
     assert before.unlisted is None
-    found = unlisted.reconstructed(before, data, lambda jobs: [unlisted.scores(job) for job in jobs])
+    found = unlisted.reconstructed(before, data, lambda jobs: [simulated_scores.scores(job) for job in jobs])
     first = found.unlisted[0]
     assert (first.stage, first.frame, first.kind, first.channel) == ("gain", "time", "year", "W1")
     assert first.pvalue < 1e-4
@@ -146,7 +148,7 @@ def mean_squares(learned, name=None, channel=None, skies=20, **parameters):
     count, rows = len(ensemble.bipolar_scan), []
     for realization in range(skies):
         filtered = wiener_filter(learned.analysis.model, list(simulate.maps(shared, realization)))
-        x = localisation.coarse_residuals(learned.analysis.model, filtered)
+        x = bipolar_scan.coarse_residuals(learned.analysis.model, filtered)
         z = localisation.standardised(x, ensemble.residual_mean, ensemble.residual_scatter, count)
         rows.append(np.nanmean(z**2, axis=1))
     return np.array(rows)
@@ -166,7 +168,7 @@ def test_residual_maps_of_the_model_have_unit_rms(small, masked, tmp_path):
         pixels = int(seen.sum())
         # Not the noise alone: the filter leaves much of the sky behind a mask.
         filtered = wiener_filter(analysis.model, list(simulate.maps(data_of(run), 0)))
-        x = localisation.coarse_residuals(analysis.model, filtered)[:, seen]
+        x = bipolar_scan.coarse_residuals(analysis.model, filtered)[:, seen]
         noise = np.sqrt([part.precision[seen] for part in analysis.model.parts])
         assert np.sqrt(np.mean((x / noise) ** 2)) > 1.2
     found = mean_squares(learned)

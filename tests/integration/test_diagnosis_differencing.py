@@ -8,7 +8,7 @@ import pytest
 
 import mcsim
 from mcsim import config
-from mcsim.diagnosis.analysis import analysis_of
+from mcsim.datavector.analysis import analysis_of
 from mcsim.errors import RunError
 from mcsim.instrument.scan.pointing import pointing
 from mcsim.simulation import differencing, mapmaking, simulate

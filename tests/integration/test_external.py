@@ -14,7 +14,8 @@ from scipy.stats import kstest
 
 import mcsim
 from mcsim import cli, config
-from mcsim.diagnosis import api, campaign
+from mcsim.datavector import campaign
+from mcsim.diagnosis import api
 from mcsim.ensemble.external import seed_of, source_of
 from mcsim.ensemble.external_maps import in_order, parts_of
 from mcsim.ensemble.maps import write_map

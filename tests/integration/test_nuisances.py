@@ -12,14 +12,15 @@ from scipy.stats import ks_2samp
 import mcsim
 from instruments import two_channels
 from mcsim import cli, config, systematics
-from mcsim.diagnosis import api, campaign, report, words
-from mcsim.diagnosis.analysis import analysis_of, data_vectors
-from mcsim.diagnosis.campaign import seeded, with_effects
+from mcsim.datavector import campaign
+from mcsim.datavector.analysis import analysis_of, data_vectors
+from mcsim.datavector.campaign import seeded, with_effects
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.diagnosis import api, report, words
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.nuisance import Regression
 from mcsim.diagnosis.observed_maps import ObservedMaps
-from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.ensemble.maps import file_names
 from mcsim.simulation import simulate
 from mcsim.simulation.nuisance import draws, tables

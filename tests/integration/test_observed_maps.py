@@ -7,10 +7,10 @@ import pytest
 import mcsim
 from instruments import data_of, two_channels
 from mcsim import config, systematics
+from mcsim.datavector.analysis import Analysis, analysis_of
+from mcsim.datavector.map_checks import read_maps
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis import api
-from mcsim.diagnosis.analysis import Analysis, analysis_of
-from mcsim.diagnosis.observed_maps import read_maps
-from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.simulation import simulate
 from refusals import refused
 

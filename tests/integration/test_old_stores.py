@@ -36,12 +36,17 @@ def new(client: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture
-def old(client: Client, tmp_path: Path) -> Path:
-    path = tmp_path / "old.zarr"
+@pytest.fixture(scope="module")
+def three(client: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("old") / "old.zarr"
     runner.run(table(**ensemble(3, keep_maps=True)), path, workers=client)
     made_old(path)
     return path
+
+
+@pytest.fixture
+def old(three: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(three, tmp_path / "old.zarr"))
 
 
 def assert_maps(old: Path, new: Path) -> None:

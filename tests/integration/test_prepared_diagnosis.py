@@ -10,9 +10,10 @@ import pytest
 
 import mcsim
 from mcsim import cli, config
-from mcsim.diagnosis import api, campaign, report, words
+from mcsim.datavector import campaign
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.diagnosis import api, report, words
 from mcsim.diagnosis.api import describe
-from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.ensemble import plan
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey

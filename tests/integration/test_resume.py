@@ -7,8 +7,9 @@ import pytest
 
 import mcsim
 from mcsim import config
-from mcsim.diagnosis import api, campaign, words
-from mcsim.diagnosis.kept import Kept
+from mcsim.datavector import campaign
+from mcsim.datavector.kept import Kept
+from mcsim.diagnosis import api, words
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 

@@ -37,10 +37,11 @@ def test_scripts_need_no_guard(way: str, tmp_path: Path) -> None:
 def test_workers_of_a_pool_are_told_where_to_call(tmp_path: Path) -> None:
     (tmp_path / "small.json").write_text(json.dumps(table(**ensemble(2), compute={"workers": 1})))
     (tmp_path / "study.py").write_text(
-        "import json, multiprocessing, mcsim\n"
+        "import json, multiprocessing\n"
+        "from mcsim import run\n"  # before the pool, whose worker is a fork
         "if __name__ == '__main__':\n"
         "    with multiprocessing.Pool(1) as pool:\n"
-        "        pool.apply(mcsim.run, (json.load(open('small.json')), 'small.zarr'))\n"
+        "        pool.apply(run, (json.load(open('small.json')), 'small.zarr'))\n"
     )
     done = subprocess.run([sys.executable, "study.py"], cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert "InputError" in done.stderr

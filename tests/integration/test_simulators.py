@@ -9,7 +9,7 @@ import pytest
 
 import mcsim
 from mcsim import config
-from mcsim.diagnosis.campaign import with_effects
+from mcsim.datavector.campaign import with_effects
 from mcsim.ensemble.external import source_of
 from mcsim.simulation import sampled
 from mcsim.simulation.survey import survey

@@ -4,6 +4,7 @@ import ast
 import importlib
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -27,9 +28,10 @@ ORDER = (
     "beamfit",
     "plot",
     "comparison",
+    "datavector",
     "reconstruction",
-    "diagnosis",
     "information",
+    "diagnosis",
     "benchmark",
     "cli",
 )
@@ -39,7 +41,7 @@ RESERVED = {
     "zarr": {"mcsim.ensemble.store"},
     "dask": {"mcsim.ensemble.runner"},
     "distributed": {"mcsim.ensemble.runner"},
-    "pydantic": {"mcsim.config", "mcsim.diagnosis"},
+    "pydantic": {"mcsim.config", "mcsim.datavector", "mcsim.diagnosis"},
     "typer": {"mcsim.cli"},
     "camb": set(),
 }
@@ -104,6 +106,7 @@ def module_name(path: Path) -> str:
 MODULES = {module_name(path): path for path in sorted(ROOT.rglob("*.py"))}
 
 
+@cache
 def imports(name: str, whole: bool) -> set[str]:
     """Modules that a module imports; ``whole`` includes imports inside functions."""
     found = set()

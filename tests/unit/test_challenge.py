@@ -32,17 +32,18 @@ from mcsim.benchmark.models import linear_model, reduced
 from mcsim.benchmark.report import lines, write
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.benchmark.score import Draw, _is_named, draws, judge, powers, score, score_draws
-from mcsim.benchmark.summary import SIGNATURES, Score, any_place_right, confusion
-from mcsim.diagnosis.analysis import Analysis
-from mcsim.diagnosis.campaign import batch
-from mcsim.diagnosis.candidate import Candidate, TemplateBank, numbered
+from mcsim.benchmark.summary import Score, any_place_right, confusion
+from mcsim.datavector.analysis import Analysis
+from mcsim.datavector.campaign import batch
+from mcsim.datavector.candidate import Candidate, TemplateBank, numbered
+from mcsim.datavector.null_ensemble import NullEnsemble
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.summaries import Block, Element
 from mcsim.diagnosis.context import context
-from mcsim.diagnosis.null_ensemble import NullEnsemble
-from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.diagnosis.summaries import Block, Element
 from mcsim.errors import InputError
 from mcsim.stats.look_elsewhere import global_test
 from mcsim.support.folders import write_whole
+from mcsim.systematics.signatures import SIGNATURES
 from refusals import refused
 
 ENTRIES = 24

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from mcsim.diagnosis.candidate import Candidate
+from mcsim.datavector.candidate import Candidate
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.inference import confirmed
 from mcsim.diagnosis.refine import PartialExplanation, Refiner
 from mcsim.diagnosis.selection import Attribution, attribute
-from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.diagnosis.subsets import Subsets
 from mcsim.stats.detection import cosines, detectable, log_evidence, posterior, snr_needed, snr_to_separate
 from mcsim.stats.excess import HeldOut, Measured

@@ -9,12 +9,12 @@ import pytest
 from scipy.special import sph_harm_y
 
 from mcsim import systematics
-from mcsim.diagnosis import slices
-from mcsim.diagnosis.candidate import BEYOND, Candidate
+from mcsim.datavector import slices
+from mcsim.datavector.candidate import BEYOND, Candidate
+from mcsim.datavector.null_ensemble import NullEnsemble
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.summaries import Element
 from mcsim.diagnosis.consistency import Action, Findings, Slices, contradiction
-from mcsim.diagnosis.null_ensemble import NullEnsemble
-from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.diagnosis.summaries import Element
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotation_matrix
 
@@ -87,11 +87,11 @@ class Bench:
         self.t = np.concatenate([shape, -shape, 2.0 * shape, -2.0 * shape])
         self.signs = np.repeat([1.0, -1.0, 1.0, -1.0], 4)
 
-    def findings(self, signal, theta, seed=None, candidate=GAIN):
+    def findings(self, signal, theta, seed=None, candidate=GAIN, scatter=None):
         z = signal + (0.0 if seed is None else np.random.default_rng([4, seed]).normal(size=16))
         tested = Slices(self.ensemble, z, 8, ("half1", "half2"), 24, DiagnosisSettings())
         covariance = np.linalg.inv(self.t.T @ self.t)
-        return tested.findings([candidate], [Action.of(self.t @ theta, self.t, theta, covariance)])
+        return tested.findings([candidate], [Action.of(self.t @ theta, self.t, theta, covariance, scatter)])
 
 
 @pytest.fixture(scope="module")
@@ -112,6 +112,20 @@ def test_a_true_effect_is_refused_as_seldom_as_the_levels_say(bench):
     assert len(halves) == 300
     # The tolerated error of the response makes small p-values rarer.
     assert np.mean(np.array(halves) <= 0.05) <= 0.05 + 4 * np.sqrt(0.05 * 0.95 / 300)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_scatter_of_draws_is_no_contradiction(bench, known):
+    """A stochastic effect whose draws differ by three times the noise, in every element; 24 are known."""
+    draw, refused = np.random.default_rng(5), 0
+    for seed in range(100):
+        draws = 3.0 * draw.normal(size=(16, 24))
+        scatter = (draws - draws.mean(axis=1, keepdims=True)) * np.sqrt((1.0 + 1.0 / 24.0) / 23.0)
+        signal = 3.0 * (bench.t @ THETA + draw.normal(size=16))
+        found = bench.findings(signal, 3.0 * THETA, seed, scatter=scatter if known else None)
+        refused += found.contradict(DiagnosisSettings())
+    # 1 % of 100, and more than 5 once in a thousand runs.
+    assert refused <= 5 if known else refused >= 30
 
 
 def test_a_signal_that_is_the_same_in_both_halves_is_no_gain_drift(bench):

@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import pytest
 
 from mcsim import config
+from mcsim.datavector.candidate import Candidate
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis import api
-from mcsim.diagnosis.candidate import Candidate
-from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.support import resources
 
 SOURCE = """

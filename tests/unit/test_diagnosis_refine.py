@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mcsim.diagnosis.candidate import Candidate
+from mcsim.datavector.candidate import Candidate
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.refine import Refiner
 from mcsim.diagnosis.selection import attribute
-from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate
 from mcsim.systematics import Effect, Parametrization
@@ -36,7 +36,8 @@ class Unconstrained(Parametrization):
 class Instrument:
     """Three effects on evidence of unit normals, with a response that is no straight line."""
 
-    def __init__(self, bend: float, cross: float) -> None:
+    def __init__(self, bend: float, cross: float, noise: float | None = None) -> None:
+        self.noise = noise
         rng = np.random.default_rng(21)
         directions = np.linalg.qr(rng.normal(size=(P, 5)))[0].T
         self.t, self.sideways = directions[:3].T, directions[3:]
@@ -55,10 +56,17 @@ class Instrument:
         self.analysis.append(amplitudes)
         return np.tile(self.response(amplitudes.get("A", 0.0), amplitudes.get("B", 0.0)), (skies, 1))
 
+    def pair(self, tables) -> tuple[np.ndarray, np.ndarray] | None:
+        """Noise grows by a factor, if there is one."""
+        if self.noise is None:
+            return None
+        before = np.random.default_rng(22).normal(size=(8, P))
+        return before, self.noise * before + self.respond(tables, 8)
+
     def refined(self, x: np.ndarray):
         bank = SimpleNamespace(curvature=self.curvature)
         context = SimpleNamespace(null=self.null, calibration=self.calibration, bank=bank, settings=DiagnosisSettings())
-        data = SimpleNamespace(context=context, x=x, respond=self.respond, realizations=1)
+        data = SimpleNamespace(context=context, x=x, respond=self.respond, pair=self.pair, realizations=1)
         return Refiner(data).run(self.t, self.candidates)
 
 
@@ -71,6 +79,15 @@ def test_a_bent_response_is_found_at_its_amplitude(amplitude):
     found = instrument.refined(x).attribution
     assert [explanation.members for explanation in found.explanations] == [(0,)]
     assert found.explanations[0].fit.amplitudes == pytest.approx([amplitude], abs=0.3)
+
+
+@pytest.mark.parametrize(("noise", "verdict"), [(None, "unknown"), (1.2, "effect")])
+def test_an_effect_may_leave_the_chi2_that_its_scatter_adds(noise, verdict):
+    instrument = Instrument(bend=0.0, cross=0.0, noise=noise)
+    scatter = np.random.default_rng(24).normal(size=P)
+    # A residual 1.25 times as large as the noise of the model: below the level of 0.02.
+    x = instrument.response(12.0, 0.0) + 1.25 * np.sqrt(P) * scatter / np.linalg.norm(scatter)
+    assert instrument.refined(x).attribution.verdict == verdict
 
 
 def test_effects_that_change_each_other_are_simulated_together():

@@ -14,16 +14,17 @@ import pytest
 from scipy import stats
 
 from mcsim import config, systematics
+from mcsim.datavector import bipolar_scan
+from mcsim.datavector.candidate import Candidate, numbered
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.summaries import Element
 from mcsim.diagnosis import figures as plots
 from mcsim.diagnosis import localisation, report, words
 from mcsim.diagnosis.assemble import result_of
-from mcsim.diagnosis.candidate import Candidate, numbered
 from mcsim.diagnosis.localisation import Place
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import attribute
-from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.diagnosis.summaries import Element
 from mcsim.stats.detection import confusion, snr_needed
 from mcsim.stats.excess import HeldOut, Measured
 from mcsim.stats.gaussian import SimulatedGaussian, held_out_pvalues, residual_pvalue
@@ -357,7 +358,7 @@ def test_tables_of_spectra_have_no_map_pictures(diagnoses, tmp_path):
 
 
 def test_largest_picture_leaves_the_page_small(diagnoses):
-    sky = np.random.default_rng(1).normal(size=(20, 12 * localisation.NSIDE**2))
+    sky = np.random.default_rng(1).normal(size=(20, 12 * bipolar_scan.NSIDE**2))
     sky[3] *= 2.0
     names, ends = tuple(f"W:{k}" for k in range(20)), np.tile([0.97, 1.03], (20, 1))
     figure = plots.residual_figure(replace(diagnoses["effect"], residual_maps=sky, maps=names, residual_range=ends))
@@ -386,9 +387,9 @@ def test_simulations_held_out_are_uniform():
 def test_coarse_residuals_add_up_the_pixels_of_each_coarse_one():
     nside, rng = 64, np.random.default_rng(6)
     residual = rng.normal(size=(2, 12 * nside**2))
-    found = localisation.coarse_residuals(SimpleNamespace(nside=nside), SimpleNamespace(residual=residual))
-    assert healpy.npix2nside(found.shape[1]) == localisation.NSIDE
-    inside = healpy.ang2pix(localisation.NSIDE, *healpy.pix2ang(nside, np.arange(residual.shape[1]))) == 2000
+    found = bipolar_scan.coarse_residuals(SimpleNamespace(nside=nside), SimpleNamespace(residual=residual))
+    assert healpy.npix2nside(found.shape[1]) == bipolar_scan.NSIDE
+    inside = healpy.ang2pix(bipolar_scan.NSIDE, *healpy.pix2ang(nside, np.arange(residual.shape[1]))) == 2000
     np.testing.assert_allclose(found[:, 2000], residual[:, inside].sum(axis=1))
 
 
@@ -418,7 +419,8 @@ def test_elements_in_words():
 
 def test_elements_that_are_not_tested_are_counted_and_folded(diagnoses):
     result = replace(diagnoses["none"], untested=("power of V", "power of W"))
-    page = report.page(result)
+    with quick_pictures():
+        page = report.page(result)
     said = f"2 of {P} elements are not tested"
     assert page.count(said) == 1
     assert page.index("<summary>" + said) < page.index("<li>power of V</li>")

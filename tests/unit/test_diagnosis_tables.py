@@ -7,13 +7,15 @@ import pytest
 from astropy.table import Table
 
 from mcsim import bipolar, config, systematics
-from mcsim.diagnosis import campaign, report
-from mcsim.diagnosis import measured_spectra as tables
-from mcsim.diagnosis.analysis import Job
-from mcsim.diagnosis.campaign import with_effects
+from mcsim.datavector import campaign
+from mcsim.datavector import spectra_table as tables
+from mcsim.datavector.analysis import Job
+from mcsim.datavector.campaign import with_effects
+from mcsim.datavector.spectra_table import read_spectra
+from mcsim.diagnosis import report
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.inference import diagnose_data
-from mcsim.diagnosis.measured_spectra import read_spectra
+from mcsim.diagnosis.measured_spectra import MeasuredSpectra, _views
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere.rotation import rotate_biposh
@@ -80,7 +82,7 @@ def small(tmp_path_factory):
 
 def judged(small, folder, table):
     spectra = read(folder, table)
-    return diagnose_data(tables.MeasuredSpectra(small, spectra, lambda jobs: [spectra(job) for job in jobs]), "table")
+    return diagnose_data(MeasuredSpectra(small, spectra, lambda jobs: [spectra(job) for job in jobs]), "table")
 
 
 @pytest.mark.slow
@@ -131,7 +133,7 @@ def test_power_spectra_are_those_of_the_pair(tmp_path):
 
 def test_other_frames_are_those_of_rotated_coefficients(tmp_path):
     spectra = read(tmp_path, measured(RUN))
-    views = list(tables._views(spectra))
+    views = list(_views(spectra))
     # d = 2 lacks M > 0 and is not turned.
     assert len(views) == 2 * len(BINS)
     at = {(row.mode, row.ell_min, row.imaginary): value for row, value in zip(spectra.rows, spectra.value, strict=True)}
@@ -200,14 +202,14 @@ def test_a_mean_of_more_skies_than_it_says_is_refused(small, tmp_path):
     spectra = read(tmp_path, table)
     quiet = small.null.mean + 0.01 * (spectra.value - small.null.mean)
     with refused(10, "realizations", "unit"):
-        diagnose_data(tables.MeasuredSpectra(small, replace(spectra, value=quiet), lambda jobs: []), "quiet")
+        diagnose_data(MeasuredSpectra(small, replace(spectra, value=quiet), lambda jobs: []), "quiet")
 
 
 def test_errors_that_the_model_does_not_have_are_noted(small, tmp_path):
     spectra = read(tmp_path, measured(RUN))
     spread = small.ensemble.simulations.std(axis=0)
     for factor, noted in ((1.0, 0), (3.0, 1)):
-        found = tables.MeasuredSpectra(small, replace(spectra, error=factor * spread), lambda jobs: [])
+        found = MeasuredSpectra(small, replace(spectra, error=factor * spread), lambda jobs: [])
         assert len(found.notes()) == noted
 
 
@@ -219,7 +221,7 @@ def test_correlated_bins_are_freed_of_what_others_predict(small, tmp_path):
     drawn[:, fresh] += drawn[:, used]
     correlated = replace(small, ensemble=replace(small.ensemble, simulations=drawn))
     spectra = replace(read(tmp_path, measured(RUN)), value=drawn[0])
-    found = tables.MeasuredSpectra(correlated, spectra, lambda jobs: [])
+    found = MeasuredSpectra(correlated, spectra, lambda jobs: [])
     turn, words = found.halves()
     assert "1 of them" in words
     left = np.corrcoef(drawn @ turn.T, rowvar=False)
@@ -245,7 +247,7 @@ def test_a_few_power_spectra_alone_are_judged(tmp_path):
 
     ensemble, bank = campaign.learned(analysis, ask, 60)
     learned = context(analysis, ensemble.of_mean(SKIES), bank)
-    found = diagnose_data(tables.MeasuredSpectra(learned, spectra, ask), "few")
+    found = diagnose_data(MeasuredSpectra(learned, spectra, ask), "few")
     assert found.verdict["verdict"] != "none"
     assert "beam_coma" not in [effect["name"] for effect in found.verdict["effects"]]
     report.write(found, tmp_path / "report.html")

@@ -209,6 +209,54 @@ def test_foregrounds_are_fixed_to_the_galaxy_and_grow_with_frequency(site, sky):
     assert kind(amplitude=3.0).sky(sky, replace(site, frequency_ghz=None, foregrounds=False), draw) is sky
 
 
+def test_an_index_is_fitted_where_two_differences_of_channels_tell_it():
+    plain = systematics.get("foreground_residual").parametrization
+    for seen in ((94.0,), (94.0, None), (61.0, 94.0), (61.0, 94.0, 94.0)):
+        assert plain.seen_at(seen) == plain
+        assert (plain.basis(), plain.measured) == (({},), ())
+    for seen in ((61.0, 94.0, None), (41.0, 61.0, 94.0)):
+        assert plain.seen_at(seen).measured == ("spectral_index",)
+        assert len(plain.seen_at(seen).basis()) == 2
+
+
+@pytest.mark.parametrize("seen", [(61.0, 94.0, None), (30.0, 44.0, 70.0), (23.0, 33.0, 41.0, 61.0, 94.0)])
+def test_amplitude_and_index_are_those_of_their_coordinates(seen):
+    kind, metric = systematics.get("foreground_residual"), np.array([[2.0, 0.9], [0.9, 1.0]])
+    fit = kind.parametrization.seen_at(seen)
+    for amplitude, index in ((3.0, 2.0), (3.0, -2.0), (-5.0, 0.4), (2.0, -3.1), (40.0, 3.9)):
+        effect = kind(amplitude=amplitude, spectral_index=index)
+        found = fit.nearest(fit.coordinates(effect), metric)
+        assert found == pytest.approx({"amplitude": amplitude, "spectral_index": index}, rel=1e-4, abs=1e-4)
+        assert fit.coordinates(effect.scaled(2.0)) == pytest.approx(2.0 * fit.coordinates(effect))
+    ends = [fit.coordinates(kind(amplitude=1.0, **parameters)) for parameters in fit.basis()]
+    np.testing.assert_allclose(ends, np.eye(2), atol=1e-12)
+
+
+def test_coordinates_at_two_frequencies_are_exact():
+    """c_1 x^2 + c_2 x^-2 is x^index at either."""
+    kind, x = systematics.get("foreground_residual"), np.array([61.0, 94.0]) / 94.0
+    for index in (-3.0, 0.4, 1.5):
+        c = kind.parametrization.seen_at((61.0, 94.0, None)).coordinates(kind(amplitude=1.0, spectral_index=index))
+        np.testing.assert_allclose(c[0] * x**2 + c[1] * x**-2.0, x**index, rtol=1e-12)
+
+
+def test_signals_of_two_signs_have_the_steepest_index():
+    """No power law is negative at 61 and positive at 94 GHz; the nearest has nothing at 61."""
+    kind = systematics.get("foreground_residual")
+    fit = kind.parametrization.seen_at((61.0, 94.0, None))
+    x = np.array([61.0, 94.0]) / 94.0
+    matrix = np.stack([x**2, x**-2.0], axis=1)
+    found = fit.nearest(np.linalg.solve(matrix, [-0.05, 1.0]), matrix.T @ matrix)
+    assert found["spectral_index"] > 10.0
+    assert found["amplitude"] == pytest.approx(1.0, abs=0.01)
+
+
+def test_an_index_is_printed_with_its_error_or_as_not_fitted():
+    effect = systematics.get("foreground_residual")(amplitude=48.2, spectral_index=0.4)
+    assert effect.describe(5.1, {"spectral_index": 0.03}).endswith("rms at 94 GHz, index 0.400 ± 0.030")
+    assert effect.describe(5.1).endswith("rms at 94 GHz, index 0.4 (not fitted)")
+
+
 def test_noise_after_a_template(site, tmp_path):
     path = str(tmp_path / "pattern.fits")
     pattern = healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2))[0]

@@ -150,6 +150,7 @@ def variance_of_probes(t: np.ndarray, first: np.ndarray, second: np.ndarray, num
     return result
 
 
+@pytest.mark.slow
 def test_random_probes_estimate_the_fisher_matrix(products, filters) -> None:
     """Of one map and of two, element by element."""
     number = 64

@@ -17,7 +17,7 @@ from mcsim import config
 from mcsim.bipolar import estimate, estimator
 from mcsim.bipolar.theory import fisher_information
 from mcsim.cli import app
-from mcsim.diagnosis.campaign import with_effects
+from mcsim.datavector.campaign import with_effects
 from mcsim.information.api import describe, widths
 from mcsim.information.result import Limits, canonical_correlations, marginalised
 from mcsim.simulation import simulate
@@ -271,6 +271,7 @@ def test_marginalising_is_inverting_a_covariance() -> None:
     assert canonical_correlations(fisher, [[0], [2]])[0, 1] == pytest.approx(abs(one))
 
 
+@pytest.mark.slow
 def test_nuisance_widens_what_it_resembles_and_conventions_are_textbook() -> None:
     plain = limits(dense=True)
     settings = replace(plain.settings, nuisances={"pixelization:V1": 0.05})

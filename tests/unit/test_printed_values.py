@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mcsim import systematics
+from mcsim.datavector.candidate import Candidate
 from mcsim.diagnosis.assemble import effects_of
-from mcsim.diagnosis.candidate import Candidate
 from mcsim.support.numbers import duration, measured, number, probability
 
 

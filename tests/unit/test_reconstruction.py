@@ -11,11 +11,11 @@ from scipy import stats
 
 from instruments import two_channels
 from mcsim import config, systematics
-from mcsim.diagnosis import api, unlisted
-from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.diagnosis.wiener_filter import model_of, wiener_filter
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.wiener_filter import model_of, wiener_filter
+from mcsim.diagnosis import api
 from mcsim.instrument.beams import Beam
-from mcsim.reconstruction import forms, words
+from mcsim.reconstruction import forms, simulated_scores, words
 from mcsim.reconstruction.figure import structure_figure
 from mcsim.reconstruction.grammar import ALIKE, Structure, structures
 from mcsim.reconstruction.plugin import plugin
@@ -37,8 +37,8 @@ def seen():
     run = config.load(MODEL)
     model = model_of(survey(run, orders=4), DiagnosisSettings())
     maps = list(simulate.maps(model.survey, 7))
-    scene = unlisted.scene_of(model)
-    return run, scene, wiener_filter(model, maps), unlisted.scores_of_maps(model, scene, maps)
+    scene = simulated_scores.scene_of(model)
+    return run, scene, wiener_filter(model, maps), simulated_scores.scores_of_maps(model, scene, maps)
 
 
 @lru_cache(maxsize=1)

@@ -81,6 +81,13 @@ def test_at_pixel_centres_only_the_direction_changes():
     np.testing.assert_array_equal(moved.phi, phi)
 
 
+def test_without_angles_times_and_pixels_are_the_same():
+    whole_, bare = (whole(tod.samples(MODEL, LINE, GRID, angles=angles)) for angles in (True, False))
+    np.testing.assert_array_equal(bare.time_s, whole_.time_s)
+    np.testing.assert_array_equal(bare.pixel, whole_.pixel)
+    assert bare.theta.size == bare.phi.size == bare.psi.size == 0
+
+
 def test_signal_is_the_integral_of_sky_times_turned_beam(sky, beam):
     """The beam turned to (phi, theta, psi) by its Euler angles, then integrated against the sky."""
     stream = next(iter(tod.samples(MODEL, LINE, GRID)))

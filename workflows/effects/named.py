@@ -18,14 +18,14 @@ from mcsim import config, systematics
 from mcsim.benchmark.case import Drawn, Prior
 from mcsim.benchmark.models import LinearModel, linear_model
 from mcsim.benchmark.sampler import CaseSampler
-from mcsim.diagnosis.analysis import analysis_of, data_vectors
+from mcsim.datavector.analysis import analysis_of, data_vectors
+from mcsim.datavector.campaign import asking, batch, seeded, with_effects
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.api import prepared
-from mcsim.diagnosis.campaign import asking, batch, seeded, with_effects
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.selection import attribute
-from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.simulation import sampled
 from mcsim.simulation.survey import survey
 from mcsim.stats.intervals import share

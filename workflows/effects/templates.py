@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.diagnosis.analysis import Job, analysis_of, data_vectors
+from mcsim.datavector.analysis import Job, analysis_of, data_vectors
+from mcsim.datavector.campaign import asking, batch, seeded, with_effects
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.api import prepared
-from mcsim.diagnosis.campaign import asking, batch, seeded, with_effects
-from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.systematics import Effect
 
 SEED = 20121026

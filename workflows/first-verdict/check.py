@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import kstest
 
-from mcsim.diagnosis.null_ensemble import load
-from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.datavector.null_ensemble import load
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate, calibrate_in_folds
 

@@ -3,6 +3,8 @@
     python workflows/golden/check.py              compare; exit code 1 if anything differs
     python workflows/golden/check.py effect none  only the results whose names contain a word
     python workflows/golden/check.py --freeze     write the numbers anew: only where a change of them is meant
+    python workflows/golden/check.py --fresh 10 effect mixture    name the effects of ten other data sets instead, with
+                                                  the default number of simulations
 
 Run it before and after a change that must not alter a result. It takes two minutes on two cores.
 """
@@ -20,7 +22,7 @@ from typing import Any
 import numpy as np
 
 import mcsim
-from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.datavector.settings import DiagnosisSettings
 
 HERE = Path(__file__).parent
 TOLERANCE = 1e-9
@@ -152,16 +154,20 @@ def ensemble(name: str, folder: Path) -> dict[str, str]:
     return found
 
 
-def verdict(name: str, folder: Path) -> dict[str, Any]:
-    """Make data with effects in them, and diagnose them."""
+def verdict(name: str, folder: Path, other: int | None = None) -> dict[str, Any]:
+    """Make data with effects in them, and diagnose them; ``other`` data with the default number of simulations."""
     effects, seed, proposed = VERDICTS[name]
+    simulations = 260
+    if other is not None:
+        seed, simulations = 2000 + other, None
+        folder = folder / str(other)
     data = MODEL | {"ensemble": {"realizations": 1, "seed": seed, "keep_maps": True, "paired": False}}
     mcsim.run(data | ({"effect": effects} if effects else {}), folder / f"data-{name}.zarr")
     with mcsim.open_ensemble(folder / f"data-{name}.zarr") as opened:
         maps = list(opened[next(str(key) for key in opened.data_vars if "map" in str(key))].values[0])
     left_out = tuple(effect for effect in mcsim.effects() if effect not in proposed)
     out = folder / f"out-{name}"
-    mcsim.diagnose(MODEL, maps, out, case=name, settings=DiagnosisSettings(without=left_out, simulations=260))
+    mcsim.diagnose(MODEL, maps, out, case=name, settings=DiagnosisSettings(without=left_out, simulations=simulations))
     found: dict[str, Any] = json.loads((out / "verdict.json").read_text())
     return found
 
@@ -183,11 +189,25 @@ def differences(old: Any, new: Any, where: str = "") -> Iterator[str]:
         yield f"{where}: {old!r} became {new!r}"
 
 
+def fresh(name: str, folder: Path, number: int) -> None:
+    """Diagnose other data with the effects of a verdict, and print what they are called."""
+    truth = sorted((one["name"], one.get("channel")) for one in VERDICTS[name][0])
+    right = 0
+    for other in range(number):
+        found = verdict(name, folder, other)
+        named = sorted((one["name"], one["channel"]) for one in found["effects"])
+        single = found["verdict"] in ("effect", "mixture")
+        right += single and named == truth
+        print(f"{name} {other}: {found['verdict']} {named}", flush=True)
+    print(f"{name}: {right} of {number} have the right name alone")
+
+
 def main() -> int:
     """Compare or freeze."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("words", nargs="*", help="parts of names; default: everything")
     parser.add_argument("--freeze", action="store_true", help="write the numbers anew")
+    parser.add_argument("--fresh", type=int, help="number of other data sets of each verdict")
     chosen = parser.parse_args()
     makers: dict[str, Callable[[str, Path], Any]] = dict.fromkeys(ENSEMBLES, ensemble) | dict.fromkeys(
         VERDICTS, verdict
@@ -197,6 +217,10 @@ def main() -> int:
         os.environ["MCSIM_CACHE"] = str(Path(scratch) / "cache")
         for name, make in makers.items():
             if chosen.words and not any(word in name for word in chosen.words):
+                continue
+            if chosen.fresh is not None:
+                if name in VERDICTS and name in chosen.words:
+                    fresh(name, Path(scratch), chosen.fresh)
                 continue
             found, file = make(name, Path(scratch)), HERE / f"{name}.json"
             if chosen.freeze:

@@ -26,14 +26,14 @@ from scipy import stats
 
 import mcsim
 from mcsim import config
-from mcsim.diagnosis.analysis import analysis_of, data_vectors
+from mcsim.datavector.analysis import analysis_of, data_vectors
+from mcsim.datavector.campaign import Ask, asking, batch, seeded, with_effects
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.api import prepared
-from mcsim.diagnosis.campaign import Ask, asking, batch, seeded, with_effects
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.nuisance import Regression
 from mcsim.diagnosis.observed_maps import ObservedMaps
-from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.simulation import nuisance, simulate
 from mcsim.simulation.survey import survey
 from mcsim.stats.look_elsewhere import global_test

@@ -18,9 +18,9 @@ import numpy as np
 from scipy import stats
 
 import mcsim
-from mcsim.diagnosis.analysis import analysis_of, data_vectors
+from mcsim.datavector.analysis import analysis_of, data_vectors
+from mcsim.datavector.campaign import asking, batch
 from mcsim.diagnosis.api import prepared
-from mcsim.diagnosis.campaign import asking, batch
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.stats.look_elsewhere import global_test

@@ -22,8 +22,8 @@ from scipy.stats import kstest
 
 import mcsim
 from mcsim import config
-from mcsim.diagnosis import campaign
-from mcsim.diagnosis.analysis import analysis_of, data_vectors
+from mcsim.datavector import campaign
+from mcsim.datavector.analysis import analysis_of, data_vectors
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.external import Kept, agreement
 from mcsim.diagnosis.inference import diagnose_data

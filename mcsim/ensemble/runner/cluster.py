@@ -167,13 +167,13 @@ class Roll:
     def text(self) -> str:
         """Return a text on the workers at the last call, and the address of the dashboard."""
         link = self.client.dashboard_link
-        threads = f"{_count(len(self.there))} with {sum(self.there.values())} threads"
+        threads = f"{_count(len(self.there))} with {_count(sum(self.there.values()), 'thread')}"
         text = threads if self.there else "no worker yet: waiting for one"
         return f"{text}; dashboard {link}" if find_spec("bokeh") and link else text
 
 
-def _count(number: int) -> str:
-    return f"{number} worker" if number == 1 else f"{number} workers"
+def _count(number: int, noun: str = "worker") -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def _some(names: Iterable[str]) -> str:

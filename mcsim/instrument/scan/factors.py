@@ -14,8 +14,7 @@ from mcsim.errors import InputError
 from mcsim.instrument.scan.limit import limit_moments, limit_quadrature
 from mcsim.instrument.scan.model import ScanModel
 from mcsim.instrument.scan.moments import Moments
-
-Vector = NDArray[np.float64]
+from mcsim.support.arrays import Vector
 
 LATITUDE_EDGES_DEG = tuple(range(0, 91, 10))
 ELLS = (50, 100, 200, 400)

@@ -14,7 +14,7 @@ from mcsim.simulation import convolve
 from mcsim.simulation.mapmaking.pairs import DifferencingScan, parts
 from mcsim.simulation.mapmaking.solve import check_imbalance
 from mcsim.simulation.tod import check_noise, chunks
-from mcsim.sphere.healpix import Map
+from mcsim.support.arrays import Map
 
 SideMaps = NDArray[np.float64]
 """S_0, then 2 Re S_s and 2 Im S_s for s = 1 ... mmax of one beam at pixel centres, in uK, shape (npix, 1 + 2 mmax)."""

@@ -10,7 +10,7 @@ from numba import njit
 
 from mcsim.errors import InputError
 from mcsim.simulation.mapmaking.pairs import DifferencingScan
-from mcsim.sphere.healpix import Map
+from mcsim.support.arrays import Map
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,9 @@ from scipy import stats
 
 import mcsim
 from mcsim import config
-from mcsim.diagnosis.analysis import Analysis, Job, analysis_of, data_vectors
+from mcsim.datavector.analysis import Analysis, Job, analysis_of, data_vectors
+from mcsim.datavector.campaign import asking, batch, with_effects
 from mcsim.diagnosis.api import prepared
-from mcsim.diagnosis.campaign import asking, batch, with_effects
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps

@@ -4,6 +4,7 @@ python names.py maps [CASES]       systematics that no library has, added to sim
 python names.py draws [NUMBER]     effects of the library, added to data vectors of simulations
 python names.py several [NUMBER]   one to five effects of the library at once, added to data vectors
 python names.py pairs [CASES]      two effects of the library at once, in simulated maps
+python names.py null [NUMBER]      data vectors of simulations without any effect: how often p-values are small
 """
 
 import json
@@ -15,12 +16,12 @@ import healpy
 import numpy as np
 
 from mcsim import config, systematics
-from mcsim.diagnosis.analysis import analysis_of, data_vectors
+from mcsim.datavector.analysis import analysis_of, data_vectors
+from mcsim.datavector.campaign import seeded, with_effects
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.api import prepared
-from mcsim.diagnosis.campaign import with_effects
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
-from mcsim.diagnosis.settings import DiagnosisSettings
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere.rotation import rotation_matrix
@@ -44,6 +45,14 @@ MODEL = {
     ],
 }
 ONE = {**MODEL, "name": "one-channel", "channel": MODEL["channel"][1:]}
+WIDE = {"beam": {"kind": "gaussian", "fwhm_arcmin": 350.0}}
+SMALL = {
+    **MODEL,
+    "name": "two-channels-16",
+    "sky": {**MODEL["sky"], "lmax": 40},
+    "map": {**MODEL["map"], "nside": 16},
+    "channel": [one | WIDE for one in MODEL["channel"]],
+}
 STRENGTHS = (10.0, 20.0, 40.0)
 
 
@@ -60,7 +69,7 @@ def learned(model):
 
 def worded(found):
     """Return a share and its 95 % interval in words."""
-    return f"{found.name}: {found.value:.3f} [{found.low:.3f}, {found.high:.3f}] of {found.count}"
+    return f"{found.name}: {found.value:.4f} [{found.low:.4f}, {found.high:.4f}] of {found.count}"
 
 
 def patterns(draw):
@@ -158,7 +167,7 @@ def draws(number):
     from mcsim.benchmark.case import Prior
     from mcsim.benchmark.models import linear_model
     from mcsim.benchmark.sampler import CaseSampler
-    from mcsim.diagnosis.candidate import columns_of, parts_of
+    from mcsim.datavector.candidate import columns_of, parts_of
     from mcsim.diagnosis.consistency import Action, Slices
     from mcsim.stats.intervals import share
 
@@ -286,8 +295,28 @@ def several(number):
                 print("   ", worded(share(what, [row[place] for row in kept])))
 
 
+def null(number):
+    """Test simulations of three models against others, and print how often p-values are small."""
+    from mcsim.stats.gaussian import residual_pvalue
+    from mcsim.stats.intervals import share
+    from mcsim.stats.look_elsewhere import global_test
+
+    for model in (SMALL, ONE, MODEL):
+        run, context = learned(model)
+        known, fresh = context.null, context.analysis.job(seeded(run, 2027))
+        jobs = [replace(fresh, first=first, count=100) for first in range(0, number, 100)]
+        data = np.concatenate(ask(jobs)) + context.ensemble.offset
+        tests = [global_test(known, x, context.groups, context.calibration) for x in data]
+        plain = residual_pvalue([one.chi2 for one in tests], known.dimension, known.dof)
+        print(f"{run.name}: p = {known.dimension}, {known.n_sims} simulations, Var u = {known.scale_variance:.4f}")
+        for level in (0.05, 0.02, 0.001):
+            print("   ", worded(share(f"gap, p <= {level}", [one.pvalue <= level for one in tests])))
+            print("   ", worded(share(f"chi^2, p <= {level}", [one.omnibus <= level for one in tests])))
+            print("   ", worded(share(f"chi^2 for Var u = 0, p <= {level}", plain <= level)), flush=True)
+
+
 if __name__ == "__main__":
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    {"maps": maps, "draws": draws, "pairs": pairs, "several": several}[sys.argv[1]](
+    {"maps": maps, "draws": draws, "pairs": pairs, "several": several, "null": null}[sys.argv[1]](
         int(sys.argv[2]) if len(sys.argv) > 2 else 42
     )

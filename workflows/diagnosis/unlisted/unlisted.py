@@ -19,11 +19,12 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "names"))
 
 from names import KINDS, MODEL, ONE, STRENGTHS, ask, learned, systematic
 
+from mcsim.datavector.campaign import with_effects
+from mcsim.datavector.candidate import Candidate
 from mcsim.diagnosis import unlisted
-from mcsim.diagnosis.campaign import with_effects
-from mcsim.diagnosis.candidate import Candidate
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.reconstruction import simulated_scores
 from mcsim.reconstruction.grammar import structures
 from mcsim.reconstruction.search import Search
 from mcsim.simulation import simulate
@@ -81,8 +82,8 @@ FOREIGN = {
 def known(which):
     """Return run, context, scene and search of a model."""
     run, context = learned({"one": ONE, "two": MODEL}[which])
-    null = unlisted.null_scores(context.analysis, lambda jobs: [unlisted.scores(job) for job in jobs])
-    scene = unlisted.scene_of(context.analysis.model)
+    null = simulated_scores.null_scores(context.analysis, lambda jobs: [simulated_scores.scores(job) for job in jobs])
+    scene = simulated_scores.scene_of(context.analysis.model)
     return run, context, scene, Search(structures(scene), null)
 
 
@@ -113,7 +114,7 @@ def null(number):
         shared, model = survey(run), context.analysis.model
         for case in range(int(number) // 2):
             maps = list(simulate.maps(shared, 50_000 + case))
-            found = search.run(unlisted.scores_of_maps(model, scene, maps))
+            found = search.run(simulated_scores.scores_of_maps(model, scene, maps))
             x = context.analysis.data_vector(maps)
             p = global_test(context.null, x, context.groups, context.calibration).pvalue
             print(json.dumps(["null", which, p, [one.pvalue for one in found]]), flush=True)

@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 
 from mcsim import systematics
-from mcsim.diagnosis.wiener_filter import FilteredMaps, Model, by_degree
+from mcsim.datavector.wiener_filter import FilteredMaps, Model, by_degree
 from mcsim.simulation import differencing
 from mcsim.simulation.pixel_means import gain_of, signal_of
 from mcsim.simulation.survey import Channel, SurveyMap

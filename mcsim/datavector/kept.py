@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mcsim.diagnosis.analysis import Job
+from mcsim.datavector.analysis import Job
 from mcsim.support import folders
 from mcsim.support.arrays import Matrix, Vector
 

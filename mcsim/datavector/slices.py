@@ -11,8 +11,8 @@ import ducc0
 import healpy
 import numpy as np
 
-from mcsim.diagnosis.summaries import Element, of_map
-from mcsim.diagnosis.wiener_filter import FilteredMaps, Model
+from mcsim.datavector.summaries import Element, of_map
+from mcsim.datavector.wiener_filter import FilteredMaps, Model
 from mcsim.sphere import healpix, real
 from mcsim.sphere.rotation import rotation_matrix
 from mcsim.support.arrays import Matrix, Vector

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.diagnosis.settings import DiagnosisSettings
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import Fit
-from mcsim.systematics import Effect, basis_of
+from mcsim.systematics import Effect, Parametrization, basis_of
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -43,14 +43,23 @@ class Candidate:
     # Deviations of its response from the mean one if it is stochastic, shape (p, draws), as
     # SimulatedGaussian.with_extra_covariance takes them; None if they are not known.
     scatter: Matrix | None = field(default=None, compare=False)
+    # Otherwise the chi^2 that its effect adds to a residual by scattering the data, over the white norm of its response
+    # squared; 0 if it is not known.
+    scatter_chi2: float = 0.0
     # It is a nuisance as well: its templates are those of the scatter that this makes, and are not refined.
     nuisance: bool = False
     step: float | None = None  # amplitude at which its response is measured; None: that of the effect
+    fit: Parametrization | None = None  # how these channels let it be fitted; None: as the effect says
 
     @property
     def name(self) -> str:
         """Return the name of the effect."""
         return self.effect.name
+
+    @property
+    def parametrization(self) -> Parametrization:
+        """Return how it is fitted."""
+        return self.effect.parametrization if self.fit is None else self.fit
 
     @property
     def identity(self) -> tuple[str, str | None]:
@@ -78,17 +87,17 @@ class Candidate:
     @property
     def basis(self) -> tuple[Effect, ...]:
         """Return the effects whose responses span it, one for each column."""
-        found = basis_of(self.effect, self.settings)
+        found = basis_of(self.effect, self.settings, self.parametrization)
         return found if self.step is None else tuple(replace(one, amplitude=self.step) for one in found)
 
     @property
     def random_response(self) -> bool:
         """Return True if its templates are measured from random draws, not from an effect that is taken away."""
-        return self.effect.parametrization.stochastic and self.effect.parametrization.sign >= 0
+        return self.parametrization.stochastic and self.parametrization.sign >= 0
 
     def with_coordinates(self, coordinates: Vector, precision: Matrix) -> Effect:
         """Return the effect nearest to coordinates in the metric ``precision``."""
-        return self.effect(**{**self.effect.parametrization.nearest(coordinates, precision), **self.settings})
+        return self.effect(**{**self.parametrization.nearest(coordinates, precision), **self.settings})
 
     def fitted(self, coordinates: Vector, covariance: Matrix) -> Effect:
         """Return the effect within its bounds nearest to fitted coordinates, as far as the data constrain them."""
@@ -97,7 +106,7 @@ class Candidate:
     def _nearest(self, coordinates: Vector, covariance: Matrix) -> tuple[Effect, float]:
         """Return the nearest effect within its bounds, and its distance in standard deviations if that matters."""
         precision: Matrix = np.asarray(np.linalg.pinv(covariance), dtype=np.float64)
-        fit = self.effect.parametrization
+        fit = self.parametrization
         constrained = fit.constrained(coordinates, precision)
         free = self.with_coordinates(constrained, precision)
         inside = free.within_bounds()
@@ -127,7 +136,7 @@ class Candidate:
 
         It is infinite for another sign, for more than the largest amplitude, and for more than BEYOND.
         """
-        fit = self.effect.parametrization
+        fit = self.parametrization
         if (fit.sign and bool(np.any(amplitudes < 0.0))) or float(np.linalg.norm(amplitudes)) > fit.max_amplitude:
             return np.inf
         distance = self._nearest(amplitudes, covariance)[1] if self.effect.bounds else 0.0
@@ -167,6 +176,17 @@ def beyond(candidates: Sequence[Candidate], members: Sequence[int], found: Fit) 
     """
     parts = parts_of(candidates, members, found)
     return float(np.sqrt(sum(candidates[member].beyond(*part) ** 2 for member, *part in parts)))
+
+
+def scatters_of(candidates: Sequence[Candidate], members: Sequence[int]) -> list[Matrix]:
+    """Return the scatter of the responses of members where it is known."""
+    return [one for one in (candidates[member].scatter for member in members) if one is not None]
+
+
+def coordinates_of(candidates: Sequence[Candidate], members: Sequence[int], effects: Sequence[Effect]) -> Vector:
+    """Return the coordinates of effects of some candidates, one after the other."""
+    pairs = zip(members, effects, strict=True)
+    return np.concatenate([candidates[member].parametrization.coordinates(effect) for member, effect in pairs])
 
 
 def effects_at(candidates: Sequence[Candidate], members: Sequence[int], found: Fit) -> list[Effect]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.diagnosis.null_ensemble import NullEnsemble
+from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.stats.excess import HeldOut, excess, expected_fall, expected_fall_of_draw, held_out
 from mcsim.stats.gaussian import Fit, SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector

@@ -6,10 +6,12 @@ import time
 from collections.abc import Mapping
 from dataclasses import replace
 
-from mcsim.diagnosis.analysis import Analysis, Job
-from mcsim.diagnosis.campaign import Purpose
-from mcsim.diagnosis.localisation import coarse_residuals
-from mcsim.diagnosis.wiener_filter import wiener_filter
+import numpy as np
+
+from mcsim.datavector.analysis import Analysis, Job
+from mcsim.datavector.bipolar_scan import coarse_residuals
+from mcsim.datavector.campaign import Purpose
+from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.ensemble.plan import cost
 from mcsim.simulation import simulate
 
@@ -25,7 +27,8 @@ def lines(analysis: Analysis, jobs: Mapping[Purpose, Job]) -> list[str]:
 
     Notes
     -----
-    The memory of a worker is the largest that this process has had, and the orientation moments of further surveys.
+    The memory of a worker is the largest that this process has had, and the orientation moments of further surveys
+    where they are not mapped from the cache, which all surveys and workers share.
     """
     survey = analysis.model.survey
     each_s = min(_seconds(analysis, number) for number in range(2))
@@ -33,7 +36,8 @@ def lines(analysis: Analysis, jobs: Mapping[Purpose, Job]) -> list[str]:
     scan = len(analysis.bipolar_scan.elements) + coarse_residuals(analysis.model, filtered).size
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1.0 if sys.platform == "darwin" else 1024.0)
     maps = [m for channel in survey.channels for m in channel.maps]
-    moments = sum(m.moments.w.nbytes + 3.0 * m.moments.hits.nbytes for m in maps)
+    own = [m for m in maps if not isinstance(m.moments.w, np.memmap)]
+    moments = sum(m.moments.w.nbytes + 3.0 * m.moments.hits.nbytes for m in own)
     number = sum(job.count for job in jobs.values() if job.source is None)
     sampled = sum(job.count for job in jobs.values() if job.sample_by_sample)
     samples_s = SAMPLE_S * float(sum(m.moments.hits.sum() for m in maps)) * sampled

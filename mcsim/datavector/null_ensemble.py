@@ -10,8 +10,8 @@ import xarray as xr
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from mcsim.diagnosis.candidate import Column, TemplateBank
-from mcsim.diagnosis.summaries import Element
+from mcsim.datavector.candidate import Column, TemplateBank
+from mcsim.datavector.summaries import Element
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector
 
@@ -46,6 +46,7 @@ class NullEnsemble:
     slice_elements: tuple[Element, ...] = ()
     nuisances: Matrix | None = None  # coordinates that every simulation drew, (N, k); None: there are none
     shrunk: bool = False  # few simulations, whose covariance is shrunk; not with nuisances
+    skies: int = 1  # of which the data are the mean
 
     @cached_property
     def spread(self) -> Vector:
@@ -58,6 +59,11 @@ class NullEnsemble:
 
         Which directions are redundant is decided without the nuisances: beside a wide prior all others look small.
         """
+        found = self._of_one()
+        return replace(found, scale_variance=found.scale_variance / self.skies)
+
+    def _of_one(self) -> SimulatedGaussian:
+        """Return the Gaussian for data of a single sky."""
         if self.nuisances is None:
             return SimulatedGaussian.from_simulations(self.simulations, self.offset, self.redundant, self.shrunk)
         tested = self.tested
@@ -124,13 +130,14 @@ class NullEnsemble:
         -----
         A mean of R skies less that of N simulations has the covariance C (1/R + 1/N); the tests take it to be 1 + 1/N
         times that of the simulations. These are contracted about their mean until it is: the tests stay exact.
-        Nuisances are the same in all skies, and what is linear in them is not contracted.
+        Nuisances are the same in all skies, and what is linear in them is not contracted. The variance of a scale, like
+        any kurtosis, falls as 1/R.
         """
         count = len(self.simulations)
         scale = np.sqrt((count + realizations) / (realizations * (count + 1.0)))
         mean = self.simulations.mean(axis=0)
         common = self.simulations - self.quiet
-        return replace(self, simulations=mean + scale * (self.quiet - mean) + common)
+        return replace(self, simulations=mean + scale * (self.quiet - mean) + common, skies=realizations)
 
 
 def _standardised(rows: Matrix) -> Matrix:
@@ -157,6 +164,7 @@ def save(path: Path, ensemble: NullEnsemble, bank: TemplateBank) -> None:
         "columns": json.dumps(bank.labels),
         "redundant": ensemble.redundant,
         "shrunk": ensemble.shrunk,
+        "skies": ensemble.skies,
     }
     variables = {name: ([f"{name}_{axis}" for axis in range(array.ndim)], array) for name, array in arrays.items()}
     xr.Dataset(variables, attrs=attributes).to_zarr(path, mode="w", consolidated=False)
@@ -171,9 +179,10 @@ def load(path: Path) -> tuple[NullEnsemble, TemplateBank]:
         )
         columns = TypeAdapter(tuple[Column, ...]).validate_json(dataset.attrs["columns"])
         redundant, shrunk = float(dataset.attrs["redundant"]), bool(dataset.attrs["shrunk"])
+        skies = int(dataset.attrs["skies"])
     matrix, error, curvature, beside_matrix = map(arrays.pop, ("matrix", "error", "curvature", "slice_matrix"))
     bank = TemplateBank(matrix, error, curvature, columns, beside_matrix)
-    return (
-        NullEnsemble(**arrays, elements=elements, slice_elements=beside, redundant=redundant, shrunk=shrunk),
-        bank,
+    kept = NullEnsemble(
+        **arrays, elements=elements, slice_elements=beside, redundant=redundant, shrunk=shrunk, skies=skies
     )
+    return kept, bank

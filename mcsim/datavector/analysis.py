@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from mcsim import config, systematics
-from mcsim.diagnosis import slices as slices_
-from mcsim.diagnosis.candidate import Candidate, numbered
-from mcsim.diagnosis.localisation import BipolarScan, coarse_residuals
-from mcsim.diagnosis.map_checks import checked_map
-from mcsim.diagnosis.matched_filters import differencing_filters, matched_filter
-from mcsim.diagnosis.settings import DiagnosisSettings
-from mcsim.diagnosis.summaries import Block, Element, blocks_of, of_map
-from mcsim.diagnosis.wiener_filter import Model, model_of, shared_sky, wiener_filter
+from mcsim.datavector import slices as slices_
+from mcsim.datavector.bipolar_scan import BipolarScan, coarse_residuals
+from mcsim.datavector.candidate import Candidate, numbered
+from mcsim.datavector.map_checks import checked_map
+from mcsim.datavector.matched_filters import differencing_filters, matched_filter
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.summaries import Block, Element, blocks_of, of_map
+from mcsim.datavector.wiener_filter import Model, model_of, shared_sky, wiener_filter
 from mcsim.ensemble.external_maps import Source
 from mcsim.errors import InputError
 from mcsim.simulation import differencing, sampled, simulate
@@ -124,14 +124,21 @@ def analysis_of(
         )
     declared = [one.effect for one in run.nuisances]
     model = model_of(survey(run, nthreads=nthreads, orders=settings.beam_orders, library=dict(known)), settings)
+    frequencies = [c.site.frequency_ghz if c.site.foregrounds else None for c in model.survey.channels]
+    # A nuisance is fitted in the coordinates of its prior.
+    fits = {
+        name: kind.parametrization if name in declared else kind.parametrization.seen_at(frequencies)
+        for name, kind in known
+    }
     candidates = numbered(
         [
             Candidate(
                 effect,
                 channel,
-                tuple(range(len(effect.parametrization.basis()))),
+                tuple(range(len(fits[name].basis()))),
                 dict(fixed),
                 step=_step(model, effect, channel),
+                fit=fits[name],
             )
             for name, effect in known
             if name not in without and (effect.proposed or name in (*settings.including, *declared))

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.diagnosis.analysis import Analysis, Job, data_vectors
-from mcsim.diagnosis.candidate import Candidate, TemplateBank
-from mcsim.diagnosis.kept import Kept
-from mcsim.diagnosis.localisation import rms
-from mcsim.diagnosis.null_ensemble import NullEnsemble, without_nuisances
+from mcsim.datavector.analysis import Analysis, Job, data_vectors
+from mcsim.datavector.bipolar_scan import rms
+from mcsim.datavector.candidate import Candidate, TemplateBank
+from mcsim.datavector.kept import Kept
+from mcsim.datavector.null_ensemble import NullEnsemble, without_nuisances
 from mcsim.ensemble import runner
 from mcsim.ensemble.external_maps import Source
 from mcsim.errors import InputError
@@ -150,7 +150,7 @@ def _steps(analysis: Analysis) -> Iterator[tuple[Candidate, int, int, Effect]]:
     for candidate in analysis.candidates:
         for column, effect in zip(candidate.columns, candidate.basis, strict=True):
             for sign in (1, -1):
-                if candidate.effect.parametrization.sign in (0, sign):
+                if candidate.parametrization.sign in (0, sign):
                     yield candidate, column, sign, effect.scaled(sign)
 
 
@@ -163,7 +163,7 @@ def skies(analysis: Analysis, candidate: Candidate) -> int:
         return settings.noisy_skies
     fewest = settings.channel_skies
     if candidate.channel is None:
-        fewest = settings.typical_skies if candidate.effect.parametrization.mean_response else settings.common_skies
+        fewest = settings.typical_skies if candidate.parametrization.mean_response else settings.common_skies
     return min(max(fewest, -(-settings.response_modes // analysis.model.lmax**2)), settings.noisy_skies)
 
 
@@ -192,7 +192,7 @@ def learned(
         if sign < 0 and other is not None:
             continue  # done with the other sign
         here = results[Purpose("response", column, sign)]
-        step = effect.parametrization.coordinates(effect)[candidate.columns.index(column)]
+        step = candidate.parametrization.coordinates(effect)[candidate.columns.index(column)]
         same = references[jobs[Purpose("response", column, sign)].source is not None][: len(here)]
         if other is None:
             each = (here - same) / step

@@ -1,0 +1,1 @@
+"""The data vector: what is measured in maps or spectra, its simulations, and its responses to effects."""

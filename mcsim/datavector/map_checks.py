@@ -1,0 +1,78 @@
+"""Read observed maps, and refuse maps that a survey cannot have made."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import healpy
+import numpy as np
+
+from mcsim.datavector.wiener_filter import Model, Part, sky_variance
+from mcsim.ensemble.maps import file_names, first_realization, read_uk
+from mcsim.errors import InputError
+from mcsim.support.arrays import Map
+
+
+def checked_map(model: Model, part: Part, map_: Map, name: str) -> Map:
+    """Return the map, called ``name``, if it can be of the survey; else raise InputError."""
+    if map_.shape != (12 * model.nside**2,):
+        size = healpy.npix2nside(map_.size) if map_.ndim == 1 and healpy.isnpixok(map_.size) else None
+        found = f"the shape {map_.shape}" if size is None else f"nside {size}"
+        raise InputError(
+            f"{name} has {found}, the model {model.nside}; set map.nside of the model to that of the data, or say in "
+            "[[preparation]] how they were degraded."
+        )
+    broken = int(np.sum(~np.isfinite(map_)))
+    if broken:
+        raise InputError(f"{name} has {broken} pixels that are not finite; mark what was not observed as UNSEEN.")
+    unseen = map_ == healpy.UNSEEN
+    fiducial, limits = part.precision > 0, model.settings
+    lost = float(np.mean(unseen[fiducial]))
+    if lost > limits.missing_share:
+        raise InputError(
+            f"{name} leaves out {100 * lost:.0f} % of the pixels that the fiducial scan hits, at most "
+            f"{100 * limits.missing_share:.0f} % may be; give the model a mask (map.mask) that leaves them out too."
+        )
+    seen = map_[fiducial & ~unseen]
+    rms = float(np.std(seen))
+    if rms == 0.0:
+        raise InputError(f"{name} is constant; give an observed map.")
+    sky, noise = sky_variance(model.cl, model.response[part.channel]), np.mean(1.0 / part.precision[fiducial])
+    ratio = rms / float(np.sqrt(sky + noise))
+    if not 1.0 / limits.rms_ratio < ratio < limits.rms_ratio:
+        raise InputError(
+            f"{name} has an rms of {rms:.3g} uK where the model expects {rms / ratio:.3g} uK; is it in another "
+            "unit, or is the dipole still in it? Say the unit in its header (TUNIT1), or give it in uK."
+        )
+    return map_
+
+
+def read_maps(model: Model, folder: str | Path) -> list[Map]:
+    """Read the maps of every channel and split, in the order of the model's, uK.
+
+    The folder has ``{channel}.fits``, or ``{channel}_{split}.fits`` where the model has splits: HEALPix in uK (or the
+    unit of its header), ``healpy.UNSEEN`` if not observed, in RING order or with a header that says another. InputError
+    is raised if a file is missing or unreadable, has another nside, frame or unit, or values that are no map of this
+    survey: not finite, constant, without what the fiducial scan hits, or far from the size of the model.
+    """
+    folder, names = Path(folder), file_names(model.survey.config)
+    if not folder.is_dir():
+        first = names[model.parts[0].name]
+        raise InputError(f"{folder} is no folder; give one with the observed maps, {first} and so on.")
+    return [_read(model, part, folder / names[part.name]) for part in model.parts]
+
+
+def checked(model: Model, maps: Sequence[Map]) -> list[Map]:
+    """Check maps given as arrays, in the order of the model's, uK, like those of a folder."""
+    if len(maps) != len(model.parts):
+        raise InputError(f"{len(maps)} maps were given, the model has {len(model.parts)}; give one for each.")
+    arrays = [np.asarray(map_, dtype=np.float64) for map_ in maps]
+    return [checked_map(model, part, map_, f"map {part.name}") for part, map_ in zip(model.parts, arrays, strict=True)]
+
+
+def _read(model: Model, part: Part, path: Path) -> Map:
+    if not path.is_file():
+        inside = first_realization(path.parent)
+        remedy = "give it under that name" if inside == path.parent else f"give the folder of a realization, {inside}"
+        raise InputError(f"{path} does not exist; the model has a map {part.name}, {remedy}.")
+    map_ = read_uk(path, model.frame, model.survey.channels[part.channel].site.frequency_ghz)
+    return checked_map(model, part, map_, str(path))

@@ -1,0 +1,127 @@
+"""Scores of the grammar in maps of a model: of data, and of simulations of it."""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from mcsim import config
+from mcsim.datavector.analysis import Analysis, Job, Kinds, analysis_for, simulated_maps
+from mcsim.datavector.campaign import Ask, seeded
+from mcsim.datavector.matched_filters import normalised_difference
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.wiener_filter import Model, wiener_filter
+from mcsim.reconstruction.forms import AddedToSamples
+from mcsim.reconstruction.scores import Scene, View
+from mcsim.simulation.pixel_means import signal_of
+from mcsim.support import folders
+from mcsim.support.arrays import Map, Matrix, Vector
+from mcsim.support.code import package_digest
+
+SIMULATIONS = 400
+"""Of the model, for mean and covariance of the scores: as many realizations more, once for each model."""
+
+SEED = 0x6D63 * 1_000 + 4
+"""Of these simulations; those of the data vector and of the controls have others."""
+
+PER_TASK = 10
+
+WAVES = {"spin 1": ("spin", 1), "spin 2": ("spin", 2), "year": ("year", 1)}
+"""Waves in time by name: of what, and which harmonic."""
+
+CODE = (
+    *("config", "sphere", "instrument", "systematics", "simulation", "reconstruction.forms", "reconstruction.scores"),
+    *(f"datavector.{name}" for name in ("analysis", "matched_filters", "wiener_filter")),
+)
+"""What scores of simulations are computed with."""
+
+
+def scene_of(model: Model) -> Scene:
+    """Return the maps of a model as the grammar needs them."""
+    run = model.survey.config
+    splits = run.map.splits or ("",)
+    timed = run.map.split_by == "time" and all(c.site.pointing is not None for c in model.survey.channels)
+    views = []
+    for i, part in enumerate(model.parts):
+        channel = model.survey.channels[part.channel]
+        split = model.of(part.channel).index(i)
+        waves: dict[str, tuple[Map, Map]] = {}
+        if timed:
+            span = run.map.span(split)
+            for name, (wave, harmonic) in WAVES.items():
+                pair = [signal_of(_wave(wave, harmonic, c)(amplitude=1.0), channel.site, span) for c in (0, 1)]
+                seen = part.precision > 0
+                waves[name] = (np.where(seen, pair[0], 0.0), np.where(seen, pair[1], 0.0))
+        kernel = channel.site.beam.blm[0, : model.lmax + 1].real
+        moments = np.where(np.isfinite(part.moments.w), part.moments.w, 0.0)
+        views.append(View(part.channel, split, moments, waves, model.response[part.channel], kernel))
+    return Scene(
+        channels=model.channels,
+        frequencies=tuple(channel.site.frequency_ghz for channel in model.survey.channels),
+        splits=splits,
+        frame=model.frame,
+        nside=model.nside,
+        lmax=model.lmax,
+        dipole_uk=np.asarray(model.survey.channels[0].site.dipole_uk),
+        cl=model.cl,
+        sky_power=model.sky_power,
+        split_orders=model.settings.split_beam_orders,
+        views=tuple(views),
+        timed=timed,
+    )
+
+
+@lru_cache(maxsize=16)
+def _wave(of: str, order: int, component: int) -> type[AddedToSamples]:
+    """Return the effect that adds the cosine (component 0) or sine of a wave."""
+
+    class Wave(AddedToSamples):
+        name = f"wave_{of}_{order}_{component}"
+        wave, harmonic, coefficients = of, order, (1.0 - component, 0.0 + component)
+
+    return Wave
+
+
+def scores_of_maps(model: Model, scene: Scene, maps: Sequence[Map]) -> Vector:
+    """Return the scores of the grammar, shape (P,)."""
+    filtered = wiener_filter(model, maps)
+    channels = range(len(model.channels))
+    return scene.values(filtered, [normalised_difference(model, filtered, model.of(c)) for c in channels])
+
+
+def scores(job: Job) -> Matrix:
+    """Return the scores of the simulations of a job, shape (count, P): the task that a worker runs."""
+    model, scene = analysis_for(job).model, scene_for(job)
+    return np.stack([scores_of_maps(model, scene, maps) for maps in simulated_maps(job)])
+
+
+def scene_for(job: Job) -> Scene:
+    """Return the scene of the model of a job; the last one is kept."""
+    return _scene(*job.definition)
+
+
+@lru_cache(maxsize=1)
+def _scene(fiducial: str, without: tuple[str, ...], settings: DiagnosisSettings, library: Kinds) -> Scene:
+    job = Job(fiducial, fiducial, 0, 0, without=without, settings=settings, library=library)
+    return scene_of(analysis_for(job).model)
+
+
+def null_scores(analysis: Analysis, ask: Ask) -> Matrix:
+    """Return the scores of simulations of the model, shape (SIMULATIONS, P), simulated or from the cache."""
+    run = analysis.run
+    science = config.science(run, *(("nuisance",) if run.nuisances else ()))
+    identity = [science | {"ensemble": {}}, SIMULATIONS, package_digest(f"mcsim.{name}" for name in CODE)]
+    identity.append(asdict(replace(analysis.settings, without=(), including=())))
+    key = hashlib.sha256(json.dumps(identity, sort_keys=True, default=str).encode()).hexdigest()[:32]
+
+    def fill(folder: Path) -> None:
+        job = replace(analysis.job(seeded(run, SEED)), nuisances=bool(run.nuisances))
+        starts = range(0, SIMULATIONS, PER_TASK)
+        jobs = [replace(job, first=k, count=min(PER_TASK, SIMULATIONS - k)) for k in starts]
+        np.save(folder / "scores.npy", np.concatenate(ask(jobs)))
+
+    return np.asarray(np.load(folders.cached(f"diagnose/unlisted-{key}", fill) / "scores.npy"))
