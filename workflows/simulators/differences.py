@@ -174,7 +174,11 @@ def singles() -> Iterator[Case]:
     for tilt in (0.1, 0.01):
         yield Case(T, f"boresight {tilt:g} deg off", ("pointing_offset",), made(T, displaced_deg=tilt))
     yield Case(L, "its own precision (1e-5, single)", (), made(L, single_precision=True, epsilon=1e-5), "planck")
-    yield Case(H, "nearest pixel of nside 512", (), made(H, finer=8, interpolated=False), circular=True)
+    yield Case(H, "nearest pixel of nside 512", ("interpolation",), made(H, finer=8, interpolated=False), circular=True)
+    width = np.arange(LMAX + 1) * np.arange(1, LMAX + 2) * np.deg2rad(4.0 / 60.0) ** 2 / (16.0 * np.log(2.0))
+    yield Case(
+        T, "sky divided by a beam of 4 arcmin", ("beam_width",), lambda i: simulated(T, with_sky(i, np.exp(width)))
+    )  # fmt: skip
     S = "toast3"
     yield Case(S, "SimTotalconvolve(calibrate=False)", ("calibration",), made(S, calibrate=False))
     yield Case(S, "SimTotalconvolve(fwhm=4 arcmin)", ("beam_width",), made(S, fwhm_arcmin=4.0))
