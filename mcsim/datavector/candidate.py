@@ -78,11 +78,12 @@ class Candidate:
 
     @property
     def title(self) -> str:
-        """Return the effect in words, with channel and settings."""
-        return ", ".join((self.effect.label(self.channel), *self._settings()))
+        """Return the effect in words, with channel and the settings that are not the effect's own."""
+        usual = self.effect()
+        return ", ".join((self.effect.label(self.channel), *self._settings(vars(usual))))
 
-    def _settings(self) -> Iterator[str]:
-        return (f"{key} = {value}" for key, value in self.settings.items())
+    def _settings(self, but: Mapping[str, Any] | None = None) -> Iterator[str]:
+        return (f"{key} = {value}" for key, value in self.settings.items() if but is None or but[key] != value)
 
     @property
     def basis(self) -> tuple[Effect, ...]:
