@@ -81,3 +81,14 @@ def test_amplitude_and_index_of_drawn_patterns_are_found(three: DiagnosisContext
     assert named > cases // 2
     # The mean square of n pulls is 1 with an error of sqrt(2 / n): 3.5 sigma.
     assert np.all(np.mean(np.square(pulls), axis=0) < 1.0 + 3.5 * np.sqrt(2.0 / named))
+
+
+@pytest.mark.slow
+def test_an_index_that_cannot_be_told_is_said_not_to_be_fitted() -> None:
+    analysis = small(clean=False)
+    known = context(analysis, *campaign.learned(analysis, ask, 300, time_ordered=False))
+    shared = data_of(known.run, "foreground_residual", amplitude=3.0, spectral_index=2.0)
+    (own,) = diagnose_data(ObservedMaps(known, list(simulate.maps(shared, 0)), ask), "two").effects
+    assert own.name == "foreground_residual"
+    assert own.words.endswith("index 2 (not fitted)")
+    assert own.errors == {}
