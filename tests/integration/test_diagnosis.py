@@ -105,7 +105,7 @@ def test_ellipticity_seen_sample_by_sample_is_named_and_shrinks(small, tmp_path)
 
 def test_an_unlisted_effect_is_described_written_and_shrinks(small, tmp_path, monkeypatch):
     """A gain that follows the year, which the library of this instrument does not have."""
-    monkeypatch.setattr(unlisted, "SIMULATIONS", 200)
+    monkeypatch.setattr(simulated_scores, "SIMULATIONS", 200)
     monkeypatch.setattr("sys.path", list(sys.path))
     monkeypatch.setenv("PYTHONPATH", "")
     monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / "cache"))
