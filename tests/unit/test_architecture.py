@@ -196,3 +196,15 @@ def test_configuration_is_light():
     code = f"import sys, mcsim.config; print([name for name in {heavy} if name in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
+
+
+def test_scripts_import_what_there_is():
+    missing = []
+    for script in sorted((ROOT.parent / "workflows").rglob("*.py")):
+        for node in ast.walk(ast.parse(script.read_text())):
+            if isinstance(node, ast.ImportFrom) and inside(str(node.module), {"mcsim"}):
+                module = importlib.import_module(str(node.module))
+                names = [alias.name for alias in node.names]
+                known = [name for name in names if hasattr(module, name) or f"{node.module}.{name}" in MODULES]
+                missing += [f"{script.name}: {node.module}.{name}" for name in names if name not in known]
+    assert not missing
