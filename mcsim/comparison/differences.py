@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.scene import Maps, Scene
-
-Vector = NDArray[np.float64]
+from mcsim.support.arrays import Vector
 
 
 @dataclass(frozen=True, eq=False)

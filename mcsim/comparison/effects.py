@@ -5,20 +5,18 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair, quiet
-from mcsim.comparison.scene import Alm, Maps, Scene
+from mcsim.comparison.scene import Maps, Scene
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere import alm as alm_
+from mcsim.support.arrays import Alm, Vector
 from mcsim.systematics import Effect
 from mcsim.systematics.registry import basis_of, catalogue
-
-Vector = NDArray[np.float64]
 
 REDUNDANT = ("calibration", "monopole_residual", "pixelization", "spectrum")
 """calibration, monopole and pixel_centres are differences already; two sides have a sky, and its power, in common."""

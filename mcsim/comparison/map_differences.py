@@ -6,10 +6,11 @@ from pathlib import Path
 import healpy
 import numpy as np
 
-from mcsim.comparison.differences import Difference, State, Vector
+from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.scene import Maps, Scene
 from mcsim.sphere import header
+from mcsim.support.arrays import Vector
 
 SCREENED = 50_000
 """Pixels on which orders of pixels are compared at most."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.comparison.scene import Alm, Maps, PointingFiles, Scene, scene_of, sky_in
+from mcsim.comparison.scene import Maps, PointingFiles, Scene, scene_of, sky_in
 from mcsim.ensemble.external import named_source, source_of
 from mcsim.ensemble.maps import file_names, first_realization
 from mcsim.errors import InputError
@@ -20,6 +20,7 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import header, healpix
 from mcsim.sphere.checks import UNSEEN_BELOW, check_map
 from mcsim.support import resources
+from mcsim.support.arrays import Alm
 from mcsim.systematics.base import Pointing
 
 SAMPLES = 100_000_000

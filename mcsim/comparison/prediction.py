@@ -5,14 +5,13 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
-from mcsim.comparison.scene import Alm, Maps, PointingFiles, Scene
+from mcsim.comparison.scene import Maps, PointingFiles, Scene
+from mcsim.support.arrays import Alm, Vector
 from mcsim.systematics.base import Pointing
 
-Vector = NDArray[np.float64]
 Members = tuple[tuple[Difference, Vector], ...]
 """Differences with their values."""
 

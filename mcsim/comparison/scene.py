@@ -22,10 +22,10 @@ from mcsim.simulation.preparation import Preparation
 from mcsim.simulation.survey import Channel
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
+from mcsim.support.arrays import Alm
 from mcsim.systematics.base import Pointing
 from mcsim.systematics.shape import displaced
 
-Alm = NDArray[np.complex128]
 Maps = NDArray[np.float64]
 """Maps of one channel, uK, shape (split, npix)."""
 
@@ -111,7 +111,8 @@ class Scene:
     step: float = 0.0
     kept: OrderedDict[tuple[bytes, ...], Transforms] = field(default_factory=OrderedDict, repr=False)
     moved: OrderedDict[tuple[bytes, float], Beam] = field(default_factory=OrderedDict, repr=False)
-    _made: dict[int, Maps] = field(default_factory=dict, init=False, repr=False)
+    # By identity of a pointing, which is held so that no other one can have it.
+    _made: dict[int, tuple[object, Maps]] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def lmax(self) -> int:
@@ -251,7 +252,7 @@ class Scene:
         """
         own = signal is None and window is self.window
         if own and id(pointing) in self._made:
-            return self._made[id(pointing)]
+            return self._made[id(pointing)][1]
         factor = self.window if self.centred else self.window / window
         sky = alm_.multiply(self.sky, factor, self.lmax)
         signal = signal or tod.sky_signal(sky, self.lmax, self.beam, EPSILON, self.nthreads)
@@ -259,7 +260,7 @@ class Scene:
         made = self._prepared(np.stack([tod.bin_samples(signal(self._pointed(s)), self.nside)[0] for s in streams]))
         made.setflags(write=False)
         if own:
-            self._made[id(pointing)] = made
+            self._made[id(pointing)] = pointing, made
         return made
 
     def _pointed(self, samples: Iterable[tod.Samples]) -> Iterator[tod.Samples]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
-from mcsim.comparison.differences import Difference, State, Vector
+from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.scene import WEAKEST, Maps, Scene, ahead
 from mcsim.instrument.scan import Moments
@@ -17,6 +17,7 @@ from mcsim.instrument.scan.pointing import pointing
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import euler_angles, rotation_matrix
+from mcsim.support.arrays import Vector
 
 _SMALL = 1e-3
 """Small angle in radians, share of a sample, or change of a variance, over which responses are linear."""

@@ -11,7 +11,8 @@ from scipy.optimize import least_squares
 
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
-from mcsim.comparison.prediction import PRECISION, TOLERATED, UNSURE, Prediction, Set, Vector
+from mcsim.comparison.prediction import PRECISION, TOLERATED, UNSURE, Prediction, Set
+from mcsim.support.arrays import Vector
 
 FURTHER = 0.7
 """Share of what is left that a further difference must explain to be added."""

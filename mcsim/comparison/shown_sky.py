@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import LinearOperator, cg
 
 from mcsim.comparison.pairs import ChannelPair
-from mcsim.comparison.scene import WEAKEST, Alm, Maps, Scene, sky_in
+from mcsim.comparison.scene import WEAKEST, Maps, Scene, sky_in
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
+from mcsim.support.arrays import Alm
 
 NOISY = 0.02
 """Noise over the sky from which on it is filtered out of the sky that maps show."""

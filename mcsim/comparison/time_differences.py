@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import lsqr
 
-from mcsim.comparison.differences import Difference, State, Vector
+from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.scene import Maps, PointingFiles, Scene
 from mcsim.simulation import convolve, tod
 from mcsim.sphere import healpix
+from mcsim.support.arrays import Vector
 from mcsim.systematics.base import Pointing
 
 PIXELS_PER_BASELINE = 4

@@ -11,11 +11,8 @@ from mcsim import config
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import Fit
+from mcsim.support.arrays import Matrix, Vector
 from mcsim.systematics import Effect, Parametrization, basis_of
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
-
 
 BEYOND = 3.0
 """Standard deviations by which fits may be beyond the bounds of parameters: at a bound, half of them are."""

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.datavector.analysis import Analysis
@@ -19,9 +18,8 @@ from mcsim.diagnosis.nuisance import with_nuisances
 from mcsim.diagnosis.selection import Attribution
 from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration, calibrate, calibrate_in_folds, calibrate_on
+from mcsim.support.arrays import Matrix, Vector
 
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 Data = TypeVar("Data")
 
 

@@ -6,7 +6,6 @@ from itertools import combinations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from mcsim.datavector.candidate import Candidate, beyond, columns_of
@@ -16,9 +15,8 @@ from mcsim.diagnosis.subsets import EXHAUSTIVE, Rows, Subsets, chunks
 from mcsim.stats.detection import cosines
 from mcsim.stats.gaussian import Fit, SimulatedGaussian
 from mcsim.stats.look_elsewhere import Calibration, GlobalTest, global_test
+from mcsim.support.arrays import Matrix, Vector
 
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 Verdict = Literal["none", "effect", "mixture", "degenerate", "unknown"]
 
 

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 from scipy.optimize import minimize
 
-Vector = NDArray[np.float64]
+from mcsim.support.arrays import Vector
 
 
 @dataclass(frozen=True)
