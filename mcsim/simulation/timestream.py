@@ -8,7 +8,7 @@ more than its sums over pixels, P^T y, and over baselines, F^T y.
 
 import hashlib
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
@@ -223,11 +223,7 @@ def _timed(
 
 
 def _adding(following: Callable[[int], Map]) -> tod.Stage:
-    def stage(stream: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
-        for chunk in stream:
-            yield replace(chunk, signal_uk=chunk.signal_uk + following(chunk.time_s.size))
-
-    return stage
+    return tod.with_signal(lambda chunk: chunk.signal_uk + following(chunk.time_s.size))
 
 
 def _baseline_s(of: CorrelatedNoise) -> float:
