@@ -14,7 +14,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 
-import ducc0
 import healpy
 import numba
 import numpy as np
@@ -149,7 +148,6 @@ def wiener_filter(model: Model, maps: Sequence[Map]) -> FilteredMaps:
     clean, seen = _clean(model, maps)
     sky = _sky(model, clean)
     looked_at = sky + model.dipole
-    transform = {"lmax": lmax, "nthreads": 1, **healpix.geometry(model.nside)}
     expected = np.empty((len(model.parts), seen[0].size))
     residual, adjoint = np.empty_like(expected), np.empty((len(model.parts), sky.size), dtype=np.complex128)
     orders = np.zeros((len(model.parts), top + 1, lmax + 1), dtype=np.complex128)
@@ -165,13 +163,13 @@ def wiener_filter(model: Model, maps: Sequence[Map]) -> FilteredMaps:
             if part.moments.dtheta is not None:
                 expected[i] += convolve.centroid_map(made.gradient(through), part.moments)
             residual[i] = np.where(seen[i], part.precision * (clean[i] - expected[i]), 0.0)
-            adjoint[i] = ducc0.sht.adjoint_synthesis(map=residual[i][None], spin=0, **transform)[0]
+            adjoint[i] = healpix.adjoint(residual[i], lmax)
             orders[i, 0] = window * k * by_degree(looked_at, adjoint[i], lmax)
         for i, s, together in _transforms(model, members):
             turned = np.zeros((2, residual.shape[1]))
             for j in together:
                 convolve.turned(residual[j], model.parts[j].moments, s, turned)
-            electric, magnetic = ducc0.sht.adjoint_synthesis(map=turned, spin=s, **transform)
+            electric, magnetic = healpix.adjoint(turned, lmax, spin=s)
             # ducc0's sign: S_s is minus the synthesis of E = Re(k b) a, B = Im(k b) a.
             both = by_degree(looked_at, electric, lmax) + 1j * by_degree(looked_at, magnetic, lmax)
             orders[i, s] = -2.0 * window * k * both

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-import ducc0
 import numpy as np
 from numpy.typing import NDArray
 
@@ -101,10 +100,7 @@ class BeamModes:
         fields = []
         for s, pair in enumerate(turned, 1):
             convolve.turned(y, self.moments, s, pair)
-            geometry = healpix.geometry(inverse.nside)
-            fields.append(
-                ducc0.sht.adjoint_synthesis(map=pair, spin=s, lmax=inverse.lmax, nthreads=inverse.nthreads, **geometry)
-            )
+            fields.append(healpix.adjoint(pair, inverse.lmax, inverse.nthreads, spin=s))
         return Weighted(sky, np.stack(fields))
 
     def products(self, one: Weighted, other: Weighted) -> Vector:

@@ -22,7 +22,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import ducc0
 import numpy as np
 from numpy.typing import NDArray
 
@@ -102,10 +101,7 @@ class MapFilter:
         observed = np.where(self._precision > 0.0, map_uk, 0.0)[None]
         inverse = self.inverse
         sky = inverse.solve(inverse.adjoint(inverse.precision * observed), near)
-        geometry = healpix.geometry(inverse.nside)
-        found = ducc0.sht.adjoint_synthesis(
-            map=inverse.apply(observed, sky), spin=0, lmax=inverse.lmax, nthreads=inverse.nthreads, **geometry
-        )[0]
+        found = healpix.adjoint(inverse.apply(observed, sky)[0], inverse.lmax, inverse.nthreads)
         found = alm_.multiply(found, window, inverse.lmax)
         # Where the sky is far above the noise the difference of the two loses digits; s^ = S B x does not.
         power = inverse.cl * self._beam

@@ -13,7 +13,7 @@ from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
-from mcsim.sphere.checks import check_alm, check_complete, check_map, check_nside, check_whole
+from mcsim.sphere.checks import check_alm, check_complete, check_map, check_nside, check_whole, nside_of
 from mcsim.sphere.header import frame_named, opened
 from mcsim.support.arrays import Alm, Map
 from mcsim.support.npy import read_npy
@@ -57,11 +57,15 @@ def gradient(alm: Alm, nside: int, lmax: int, nthreads: int = 1) -> NDArray[np.f
     return np.asarray(maps)
 
 
-def adjoint(map_: Map, lmax: int, nthreads: int = 1) -> Alm:
-    """Return the adjoint of the spin-0 synthesis, shape (size,): the sum over pixels of the map times conj(Y_lm)."""
-    return np.asarray(
-        ducc0.sht.adjoint_synthesis(map=map_[None], spin=0, lmax=lmax, nthreads=nthreads, **geometry(check_map(map_)))
-    )[0]
+def adjoint(map_: NDArray[np.float64], lmax: int, nthreads: int = 1, spin: int = 0) -> Alm:
+    """Return the adjoint of the synthesis: the sum over pixels of the map times conj(Y_lm), shape (size,) at spin 0.
+
+    At other spins a map of shape (2, npix) gives E and B, shape (2, size).
+    """
+    maps = map_ if spin else map_[None]
+    nside = nside_of(map_.shape[-1], "the map") if spin else check_map(map_)
+    found = ducc0.sht.adjoint_synthesis(map=maps, spin=spin, lmax=lmax, nthreads=nthreads, **geometry(nside))
+    return np.asarray(found if spin else found[0])
 
 
 def analysis(map_: Map, lmax: int, iterations: int = 0, nthreads: int = 1) -> Alm:
