@@ -28,7 +28,7 @@ from mcsim.simulation.survey import Channel, Survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
-from mcsim.support.arrays import Alm, Cl, Map
+from mcsim.support.arrays import Alm, Cl, Map, divided
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Model:
     @cached_property
     def inverse_cl(self) -> Cl:
         """Return 1/C_l, zero where C_l is, uK^-2."""
-        return np.divide(1.0, self.cl, out=np.zeros(self.lmax + 1), where=self.cl > 0)
+        return divided(1.0, self.cl)
 
     def of(self, channel: int) -> tuple[int, ...]:
         """Return the indices of the channel's maps."""

@@ -15,7 +15,7 @@ from mcsim.simulation import convolve, simulate
 from mcsim.simulation.survey import Channel, Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.sky import dipole_alm
-from mcsim.support.arrays import Alm, Vector
+from mcsim.support.arrays import Alm, Vector, divided
 from mcsim.systematics import Effect
 
 Maps = NDArray[np.float64]
@@ -226,4 +226,4 @@ def _power_factor(fiducial: Survey, effect: Effect, coordinates: NDArray[np.floa
         weight[: lmax + 1] = 1.0
         power += np.bincount(alm_.degrees(lmax), weight * np.abs(drawn) ** 2, lmax + 1)
     power /= DRAWS * (2.0 * np.arange(lmax + 1) + 1.0) * float(np.linalg.norm(coordinates))
-    return np.divide(power, 2.0 * fiducial.cl, out=np.zeros(lmax + 1), where=fiducial.cl > 0.0)
+    return divided(power, 2.0 * fiducial.cl)

@@ -19,7 +19,7 @@ from mcsim.reconstruction.forms import rotations
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, real
 from mcsim.sphere.sky import dipole_alm
-from mcsim.support.arrays import Alm, Cl, Map, Vector
+from mcsim.support.arrays import Alm, Cl, Map, Vector, divided
 
 ADDED, GAIN = 8, 2
 """Highest degree of patterns that are added, and of those that multiply."""
@@ -210,9 +210,8 @@ class Scene:
 
     def _of_sky(self, sky: Alm) -> Vector:
         """Return the scores of the sky's power."""
-        inverse = np.divide(1.0, self.cl, out=np.zeros(self.lmax + 1), where=self.cl > 0.0)
         weight = _twice(self.lmax) * np.abs(sky) ** 2
-        power = 0.5 * inverse * np.bincount(alm_.degrees(self.lmax), weight, self.lmax + 1)
+        power = 0.5 * divided(1.0, self.cl) * np.bincount(alm_.degrees(self.lmax), weight, self.lmax + 1)
         return np.array([power[low:high].sum() for low, high in pairwise(self.fine)])
 
 

@@ -24,7 +24,7 @@ from mcsim.simulation import convolve
 from mcsim.simulation.filtering import LOWEST, MapFilter
 from mcsim.sphere import healpix, rng
 from mcsim.sphere.sky import gaussian_alm
-from mcsim.support.arrays import Alm, Map, Matrix, Vector
+from mcsim.support.arrays import Alm, Map, Matrix, Vector, divided
 
 
 class Weighted(NamedTuple):
@@ -136,9 +136,7 @@ class BeamModes:
         inverse, name = self.filter.inverse, self.filter.name
         sky = gaussian_alm(inverse.cl, rng.generator(0, number, f"beam modes/{name}/sky"))
         noise = rng.generator(0, number, f"beam modes/{name}/noise").standard_normal(inverse.npix)
-        precision = inverse.precision[0]
-        scale = np.divide(1.0, np.sqrt(precision), out=np.zeros(inverse.npix), where=precision > 0.0)
-        return self.weighted(inverse.observe(sky)[0] + scale * noise)
+        return self.weighted(inverse.observe(sky)[0] + divided(1.0, np.sqrt(inverse.precision[0])) * noise)
 
     def spectra(self, numbers: Vector) -> NDArray[np.complex128]:
         """Return real numbers as beta, shape (order, bin), NaN where an order does not exist."""

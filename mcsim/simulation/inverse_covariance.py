@@ -25,7 +25,7 @@ from mcsim.simulation import convolve
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.checks import check_cl
-from mcsim.support.arrays import Alm, Cl, Map, Vector
+from mcsim.support.arrays import Alm, Cl, Map, Vector, divided
 
 Maps = NDArray[np.float64]
 """Shape (map, npix), uK or uK^-1."""
@@ -201,8 +201,7 @@ class InverseCovariance:
             return np.zeros_like(sky)
         begin = None
         if near is not None:
-            unscaled = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
-            begin = _packed(alm_.multiply(near, unscaled, self.lmax), self.lmax)
+            begin = _packed(alm_.multiply(near, divided(1.0, scale), self.lmax), self.lmax)
         found, used = conjugate_gradients(self._normal, known, self._precondition, (self.tolerance, ITERATIONS), begin)
         if used > ITERATIONS:
             raise InputError(

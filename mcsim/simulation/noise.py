@@ -18,7 +18,7 @@ from mcsim.simulation.channels import scan_model
 from mcsim.sphere import header, healpix
 from mcsim.sphere.checks import UNSEEN_BELOW
 from mcsim.sphere.mask import read_mask
-from mcsim.support.arrays import Map
+from mcsim.support.arrays import Map, divided
 
 
 class DrawnNoise(Protocol):
@@ -104,7 +104,7 @@ def of_map(
     observed = moments.hits > 0
     match noise:
         case declared.Noise():
-            return moments, _per_hit(noise.sigma0_uk, moments.hits), None
+            return moments, divided(noise.sigma0_uk, np.sqrt(moments.hits)), None
         case declared.NoiseDepth():
             side = np.rad2deg(healpy.nside2resol(moments.nside)) * 60.0
             return moments, np.where(observed, noise.depth_uk_arcmin / side, 0.0), None
@@ -120,11 +120,11 @@ def of_map(
             together = np.sum(own, axis=0)
             own_hits = np.minimum(together, 1.0) * moments.hits if noise.isotropic else together
             moments = replace(moments, hits=np.where(observed, own_hits, 0.0))
-            return moments, np.where(moments.hits > 0, _per_hit(level.sigma_uk, together), 0.0), None
+            return moments, np.where(moments.hits > 0, divided(level.sigma_uk, np.sqrt(together)), 0.0), None
         case declared.NoiseRealizations():
             template = noise.files.replace("{channel}", spec.name).replace("{split}", str(split))
             first = _noise_map(Path(template.format(realization=0)), moments, spec.frequency_ghz)
-            level_uk = _per_hit(timestream.per_hit(first, moments.hits), moments.hits)
+            level_uk = divided(timestream.per_hit(first, moments.hits), np.sqrt(moments.hits))
             return moments, level_uk, NoiseOfFiles(template, moments, spec.frequency_ghz, level_uk)
         case declared.NoiseCorrelated():
             correlated = _correlated(run, spec, noise, split, moments)
@@ -232,10 +232,6 @@ def _correlated(
             name = f"{spec.name}:{split}"
     grid = MapGrid(moments.nside, moments.frame, run.map.span(place))
     return timestream.correlated_noise(noise, scan_model(spec, spec.scan, split), grid, f"noise/{name}", rings)
-
-
-def _per_hit(sigma0_uk: float, hits: Map) -> Map:
-    return np.divide(sigma0_uk, np.sqrt(hits), out=np.zeros(hits.size), where=hits > 0)
 
 
 def _noise_map(path: Path, moments: Moments, frequency_ghz: float | None) -> Map:

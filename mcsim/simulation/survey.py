@@ -32,6 +32,7 @@ from mcsim.simulation.rings import Rings, limit_rings, parallel_transport_rings
 from mcsim.simulation.survey_filter import filtering_of
 from mcsim.sphere import healpix, rng, spectra
 from mcsim.sphere.mask import read_mask
+from mcsim.support.arrays import divided
 from mcsim.systematics import Effect, Library, Site, seen_through, spread_of, variance_factor
 
 Progress = Callable[[float], None]
@@ -79,17 +80,13 @@ class SurveyMap:
         if self.drawn is None:
             draw = rng.generator(seed, realization, f"noise/{self.name}")
             return self.noise_uk * draw.standard_normal(self.noise_uk.size)
-        level = self.drawn.level_uk
-        changed = np.divide(self.noise_uk, level, out=np.zeros(level.size), where=level > 0.0)
-        return np.asarray(changed * self.drawn.draw(seed, realization))
+        return divided(self.noise_uk, self.drawn.level_uk) * self.drawn.draw(seed, realization)
 
     @property
     def left_to_apply(self) -> NDArray[np.float64] | None:
         """Return the part of the weight that the preparation has not multiplied the map with already."""
         done = None if self.preparation is None else self.preparation.weight()
-        if self.weight is None or done is None:
-            return self.weight
-        return np.divide(self.weight, done, out=np.zeros(done.size), where=done > 0.0)
+        return self.weight if self.weight is None or done is None else divided(self.weight, done)
 
     @property
     def sky_fraction(self) -> float:

@@ -26,7 +26,7 @@ from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import LineOfSight, MapGrid, ScanModel
 from mcsim.instrument.scan.pointing import PointingStream, fill_samples
 from mcsim.sphere.checks import check_alm, check_nside, check_shape
-from mcsim.support.arrays import Map
+from mcsim.support.arrays import Map, divided
 
 CHUNK = 1 << 18
 """Samples of a chunk: 12 MB of arrays, and enough of them that the interpolation does not wait for its set-up."""
@@ -190,7 +190,7 @@ def bin_samples(stream: Iterable[Samples], nside: int) -> tuple[Map, Map]:
                 f"a sample is in pixel {chunk.pixel.max()}, but nside {nside} has {hits.size}; give its own nside."
             )
         _add(chunk.pixel, chunk.signal_uk, sums)
-    return np.divide(total, hits, out=np.full(hits.size, healpy.UNSEEN), where=hits > 0.0), hits.copy()
+    return divided(total, hits, healpy.UNSEEN), hits.copy()
 
 
 def observe(
