@@ -18,9 +18,9 @@ import xarray as xr
 
 from mcsim import config
 from mcsim.config import arrays
-from mcsim.ensemble.maps import read_uk
 from mcsim.errors import InputError
 from mcsim.sphere import header
+from mcsim.sphere.healpix import read_uk
 from mcsim.support.arrays import Alm, Map
 
 

@@ -11,8 +11,8 @@ from mcsim import config
 from mcsim.ensemble.maps import file_names, write_map
 from mcsim.errors import InputError
 from mcsim.simulation.preparation import preparation
-from mcsim.sphere import header, healpix
-from mcsim.sphere.checks import UNSEEN_BELOW, check_map
+from mcsim.sphere.checks import check_map
+from mcsim.sphere.healpix import read_uk
 from mcsim.support.arrays import Map
 from mcsim.support.folders import appearing, unwritable, writable
 
@@ -129,10 +129,4 @@ def _read(run: config.RunConfig, names: Mapping[str, str], file: str) -> tuple[s
     if named not in names:
         known = ", ".join(names.values())
         raise InputError(f"{file} is none of {known}; rename it, or say which map it is: NAME={file}.")
-    map_, frame, unit = healpix.read_map(Path(path))
-    if frame not in (None, run.map.frame):
-        raise InputError(
-            f"{path} is in {frame} coordinates, map.frame is {run.map.frame}; set map.frame to that of the data."
-        )
-    factor = header.to_uk(unit, Path(path), _channel(run, named)[0].frequency_ghz)
-    return named, np.where(map_ > UNSEEN_BELOW, factor * map_, map_)
+    return named, read_uk(Path(path), run.map.frame, _channel(run, named)[0].frequency_ghz)

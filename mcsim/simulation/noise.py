@@ -248,14 +248,15 @@ def _noise_map(path: Path, moments: Moments, frequency_ghz: float | None) -> Map
 
 def _temperature(path: Path, moments: Moments, frequency_ghz: float | None) -> Map:
     """Return a map in uK, NaN where nothing was observed."""
-    values, unit = _fitting(path, moments, ())
-    seen = np.isfinite(values) & (values > UNSEEN_BELOW)
-    return np.where(seen, header.to_uk(unit, path, frequency_ghz) * values, np.nan)
+    values = healpix.read_uk(path, moments.frame, frequency_ghz)
+    _check_nside(values, path, moments)
+    return np.where(np.isfinite(values) & (values > UNSEEN_BELOW), values, np.nan)
 
 
 def _positive(path: Path, moments: Moments, names: Sequence[str]) -> tuple[Map, str | None]:
     """Return a map of hits or variances, 0 where nothing was observed, and its unit."""
-    values, unit = _fitting(path, moments, tuple(names))
+    values, _, unit = healpix.read_map(path, tuple(names), moments.frame)
+    _check_nside(values, path, moments)
     values = np.where(np.isfinite(values) & (values > UNSEEN_BELOW), values, 0.0)
     if values.min() < 0.0 or not np.any((values > 0.0) & (moments.hits > 0)):
         raise InputError(
@@ -265,17 +266,10 @@ def _positive(path: Path, moments: Moments, names: Sequence[str]) -> tuple[Map, 
     return values, unit
 
 
-def _fitting(path: Path, moments: Moments, names: tuple[str, ...]) -> tuple[Map, str | None]:
-    """Return a map that has the pixels and the frame of the maps that are made, and its unit."""
-    values, frame, unit = healpix.read_map(path, names)
+def _check_nside(values: Map, path: Path, moments: Moments) -> None:
     nside = healpy.npix2nside(values.size)
     if nside != moments.nside:
         raise InputError(
             f"{path} has nside {nside}, but maps are made with map.nside = {moments.nside}; set map.nside to {nside} "
             "(a preparation can degrade the maps)."
         )
-    if frame not in (None, moments.frame):
-        raise InputError(
-            f'{path} is in {frame} coordinates, but maps are made in {moments.frame} ones; set map.frame = "{frame}".'
-        )
-    return values, unit
