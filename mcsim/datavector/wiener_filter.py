@@ -106,7 +106,7 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
     parts = []
     for index, channel in enumerate(survey.channels):
         floor = settings.noise_floor * float(np.sqrt(sky_variance(cl, response[index])))
-        for m, split in zip(channel.maps, run.map.splits or (None,), strict=True):
+        for m, split in zip(channel.maps, run.map.each_split, strict=True):
             if isinstance(m.drawn, NoiseOfFiles):
                 raise InputError(
                     f"the noise of map {m.name} is read from files, of which a diagnosis would need thousands; "

@@ -70,7 +70,7 @@ def write_maps(
     >>> sorted(file.name for file in folder.iterdir())
     ['demo.fits']
     """
-    run = source if isinstance(source, config.RunConfig) else config.load(source)
+    run = config.load(source)
     if run.map.grid != "healpix":
         raise InputError(f'{run.name} has map.grid = "{run.map.grid}" and so no pixels; set map.grid = "healpix".')
     alone = not isinstance(realizations, slice | None)

@@ -123,7 +123,7 @@ def _looked_at(channel: Channel, sky: Alm, realization: int) -> Alm:
 
 def _maps(shared: Survey, sky: Alm, realization: int, with_dipole: bool) -> Maps:
     seen = shared if with_dipole else replace(shared, channels=tuple(_without_dipole(c) for c in shared.channels))
-    hit = np.stack([m.moments.hits > 0 for channel in shared.channels for m in channel.maps])
+    hit = np.stack([m.moments.hits > 0 for m in shared.maps])
     return np.where(hit, simulate.maps(seen, realization, sky=sky), 0.0)
 
 
@@ -205,7 +205,7 @@ def _noise_change(plus: Survey, minus: Survey, width: float) -> Maps | None:
     """Return the derivative of the variance of every pixel, None if there is none."""
     ends = []
     for shared in (plus, minus):
-        rows = [m.noise_uk for channel in shared.channels for m in channel.maps]
+        rows = [m.noise_uk for m in shared.maps]
         ends.append(np.stack([np.zeros(12 * shared.nside**2) if row is None else row**2 for row in rows]))
     change = np.asarray((ends[0] - ends[1]) / width)
     return change if change.any() else None

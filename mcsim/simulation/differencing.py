@@ -38,7 +38,7 @@ def sides(run: config.RunConfig) -> dict[str, str]:
 
 def seconds(run: config.RunConfig) -> float:
     """Estimate the time that one realization of all differencing channels takes one core."""
-    splits = run.map.splits or (None,)
+    splits = run.map.each_split
     models = [
         (scan_model(channel, channel.scan, splits[0]), channel.scan.pair)
         for channel in run.channels

@@ -156,32 +156,30 @@ def difference_level(run: config.RunConfig, channel: str, split: str | None = No
 def in_words(run: config.RunConfig) -> list[str]:
     """Return lines on noise whose level is estimated from data, and on noise that takes time to draw."""
     lines: dict[str, None] = {}  # splits that share a line have it once
-    for spec in run.channels:
-        for place, split in enumerate(run.map.splits or (None,)):
-            match spec.noise_of(split):
-                case declared.NoiseDifference():
-                    lines[f"{spec.name} {difference_level(run, spec.name, split)}"] = None
-                case declared.NoiseCorrelated() as noise:
-                    name, number = spec.name if split is None else f"{spec.name}:{split}", _samples(run, spec, place)
-                    lines[f"{name} 1/f, {number:.3g} samples for each realization, {noise.map_making}"] = None
+    for one in run.each_map:
+        match one.channel.noise_of(one.split):
+            case declared.NoiseDifference():
+                lines[f"{one.channel.name} {difference_level(run, one.channel.name, one.split)}"] = None
+            case declared.NoiseCorrelated() as noise:
+                number = _samples(run, *one)
+                lines[f"{one.name} 1/f, {number:.3g} samples for each realization, {noise.map_making}"] = None
     return list(lines)
 
 
 def seconds(run: config.RunConfig) -> float:
     """Return the time of a core, for a realization, that correlated noise takes."""
     return timestream.SECONDS_PER_SAMPLE * sum(
-        _samples(run, spec, place)
-        for spec in run.channels
-        for place, split in enumerate(run.map.splits or (None,))
+        _samples(run, spec, split)
+        for spec, split in run.each_map
         if isinstance(spec.noise_of(split), declared.NoiseCorrelated)
     )
 
 
-def _samples(run: config.RunConfig, spec: config.Channel, place: int) -> float:
+def _samples(run: config.RunConfig, spec: config.Channel, split: str | None) -> float:
     """Return the number of samples from which the noise of a split is made."""
     assert isinstance(spec.scan, config.ScanHitAveraged)  # the configuration refuses other scans
-    model = scan_model(spec, spec.scan, run.map.splits[place] if run.map.splits else None)
-    first, last = run.map.span(place)
+    model = scan_model(spec, spec.scan, split)
+    first, last = run.map.span(run.map.each_split.index(split))
     return (last - first) * sum(model.samples(line) for line in model.select())
 
 

@@ -56,7 +56,7 @@ def maps(
             if run.map.split_by == "rings":
                 stages.append(tod.every_ring(site.pointed("of rings").model.spin_period_s, len(channel.maps), index))
             draw = rng.generator(run.ensemble.seed, realization, f"noise/{m.name}")
-            given = spec.noise_of(run.map.splits[index] if run.map.splits else None)
+            given = spec.noise_of(run.map.each_split[index])
             of_samples = isinstance(given, config.Noise) and given.hits is None
             if isinstance(given, config.Noise) and of_samples and given.sigma0_uk > 0.0:
                 stages.append(tod.white_noise(given.sigma0_uk, draw, _noise_factor(channel)))
