@@ -12,6 +12,7 @@ from mcsim.bipolar import Mode, bennett_factor, parse_mode
 from mcsim.bipolar.modes import bin_factor
 from mcsim.ensemble import opening, store
 from mcsim.errors import InputError
+from mcsim.support.arrays import divided
 
 Kind = Literal["plain", "difference"]
 
@@ -146,7 +147,7 @@ def project(
         exists = np.isfinite(inside)
         count = exists.sum(axis=-1)
         total = np.where(exists, inside, 0.0).sum(axis=-1)
-        mean = np.divide(total, count, out=np.full(total.shape, np.nan + 0j), where=count > 0)
+        mean = divided(total, count, np.nan)
         columns.append(mean.imag if row.imaginary else mean.real)
     return np.stack(columns, axis=-1)
 

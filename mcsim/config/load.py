@@ -20,7 +20,7 @@ from mcsim.support import resources
 _ADAPTER = TypeAdapter(RunConfig)
 
 
-def load(source: str | Path | Mapping[str, Any], base: str | Path | None = None) -> RunConfig:
+def load(source: str | Path | Mapping[str, Any] | RunConfig, base: str | Path | None = None) -> RunConfig:
     """Read and check a run.
 
     Parameters
@@ -30,7 +30,7 @@ def load(source: str | Path | Mapping[str, Any], base: str | Path | None = None)
         file exists; or a dict of the same structure. In a dict an array may stand in place of a file (``sky.spectrum``,
         ``sky.alm``, ``sky.map``, masks, ``map.pixel_window``, the ``path`` of a beam, the maps of ``noise``), a
         :class:`mcsim.Beam` in place of a beam, and :class:`mcsim.Moments` or a :class:`mcsim.ScanModel` in place of a
-        scan.
+        scan. A configuration that is loaded already is returned as it is.
     base
         Folder that the relative paths of a dict start from; default: the working folder. Relative paths in a file start
         from its folder.
@@ -68,6 +68,8 @@ def load(source: str | Path | Mapping[str, Any], base: str | Path | None = None)
     >>> run.channels[0].scan.kind
     'moments'
     """
+    if isinstance(source, RunConfig):
+        return source
     if isinstance(source, Mapping):
         where, folder = "configuration", Path(base or ".")
         plain = _plain(arrays.in_files(source), where)

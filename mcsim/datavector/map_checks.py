@@ -7,8 +7,9 @@ import healpy
 import numpy as np
 
 from mcsim.datavector.wiener_filter import Model, Part, sky_variance
-from mcsim.ensemble.maps import file_names, first_realization, read_uk
+from mcsim.ensemble.maps import file_names, first_realization
 from mcsim.errors import InputError
+from mcsim.sphere.healpix import read_uk
 from mcsim.support.arrays import Map
 
 

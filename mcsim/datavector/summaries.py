@@ -12,7 +12,7 @@ from mcsim.datavector.wiener_filter import FilteredMaps, Model, by_degree
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotation_matrix
-from mcsim.support.arrays import Map, Vector
+from mcsim.support.arrays import Map, Vector, divided
 
 
 @dataclass(frozen=True)
@@ -259,7 +259,7 @@ def _sky_block(model: Model) -> Block:
 
     def values(filtered: FilteredMaps) -> Vector:
         power = by_degree(filtered.sky, filtered.sky, lmax) / (2 * ell + 1)
-        ratio = np.divide(power, expected, out=np.ones(lmax + 1), where=expected > 0)
+        ratio = divided(power, expected, 1.0)
         return np.asarray(means @ (ratio - 1.0))
 
     return Block(tuple(elements), values)

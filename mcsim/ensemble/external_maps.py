@@ -18,9 +18,9 @@ import xarray as xr
 
 from mcsim import config
 from mcsim.config import arrays
-from mcsim.ensemble.maps import read_uk
 from mcsim.errors import InputError
 from mcsim.sphere import header
+from mcsim.sphere.healpix import read_uk
 from mcsim.support.arrays import Alm, Map
 
 
@@ -135,10 +135,8 @@ def _in_uk(one: Any, part: Part, where: str) -> Map:
 def parts_of(run: config.RunConfig) -> Iterator[Part]:
     """Yield the maps of a run, as they are analysed."""
     frame = config.prepared_grid(run)[1]
-    frequencies = {channel.name: channel.frequency_ghz for channel in run.channels}
-    for name in config.map_names(run):
-        channel, _, split = name.partition(":")
-        yield Part(name, channel, split or None, frequencies[channel], frame)
+    for one in run.each_map:
+        yield Part(one.name, one.channel.name, one.split, one.channel.frequency_ghz, frame)
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,6 @@ from mcsim.ensemble import plan
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
-from mcsim.sphere import header as header_
-from mcsim.sphere import healpix
 from mcsim.support.folders import appearing, unwritable, writable
 from mcsim.support.progress import reporting
 
@@ -72,7 +70,7 @@ def write_maps(
     >>> sorted(file.name for file in folder.iterdir())
     ['demo.fits']
     """
-    run = source if isinstance(source, config.RunConfig) else config.load(source)
+    run = config.load(source)
     if run.map.grid != "healpix":
         raise InputError(f'{run.name} has map.grid = "{run.map.grid}" and so no pixels; set map.grid = "healpix".')
     alone = not isinstance(realizations, slice | None)
@@ -115,18 +113,6 @@ def write_map(path: Path, map_uk: NDArray[np.float64], frame: str, header: list[
         path, map_uk, dtype=np.float64, coord=_COORDINATES[frame], column_units="uK", column_names=["TEMPERATURE"],
         fits_IDL=False, extra_header=header or (),
     )  # fmt: skip
-
-
-def read_uk(path: Path, frame: str, frequency_ghz: float | None) -> NDArray[np.float64]:
-    """Read a map in RING order, uK; InputError if its header names another frame, or a unit that is none."""
-    map_, found, unit = healpix.read_map(path)
-    if found not in (None, frame):
-        raise InputError(
-            f'{path} is in {found} coordinates, the model in {frame}; set map.frame = "{found}" in the model, so '
-            "that its scan and noise are computed there."
-        )
-    factor = header_.to_uk(unit, path, frequency_ghz)
-    return np.where(map_ == healpy.UNSEEN, map_, factor * map_)
 
 
 def first_realization(folder: Path) -> Path:

@@ -227,7 +227,7 @@ def cost(run: config.RunConfig) -> Cost:
     memory += planned.chunk * planned.realization_bytes()
     words = ""
     if run.preparation:
-        steps = [preparation(run, channel, split) for channel in run.channels for split in run.map.splits or (None,)]
+        steps = [preparation(run, *one) for one in run.each_map]
         extra = (1 + run.ensemble.paired) * sum(each.transforms for each in steps if each is not None)
         transforms, memory = transforms + extra, memory + 480.0 * nside**2
         grid = f"nside {nside} to {config.prepared_grid(run)[0]}"

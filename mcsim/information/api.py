@@ -94,7 +94,7 @@ def limit(
     >>> found.effects[0].name, round(float(found.effects[0].sigma), 2)
     ('noise_level', 0.07)
     """
-    run = model if isinstance(model, config.RunConfig) else config.load(model)
+    run = config.load(model)
     settings = settings or LimitSettings()
     if output is not None:
         folders.writable(Path(output))

@@ -26,7 +26,7 @@ from mcsim.simulation.inverse_covariance import InverseCovariance, product
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import rng
 from mcsim.sphere.sky import gaussian_alm
-from mcsim.support.arrays import Alm, Cl, Matrix
+from mcsim.support.arrays import Alm, Cl, Matrix, divided
 from mcsim.support.progress import Reporter
 
 Maps = NDArray[np.float64]
@@ -91,7 +91,7 @@ def stochastic(
     total = np.mean(found, axis=0) + _filtered_products(filtered, derivatives, first_half, second_half)
     size = np.diag(total)
     error = np.sqrt(np.mean(variance, axis=0) / len(variance))
-    return Information((total + total.T) / 2.0, np.divide(error, size, out=np.zeros(K), where=size > 0.0))
+    return Information((total + total.T) / 2.0, divided(error, size))
 
 
 def _draw(filtered: InverseCovariance, cl: Cl, seed: int, number: int) -> tuple[Maps, Alm]:
@@ -99,10 +99,10 @@ def _draw(filtered: InverseCovariance, cl: Cl, seed: int, number: int) -> tuple[
     sky = gaussian_alm(filtered.cl, rng.generator(seed, number, "information/sky"))
     noise = rng.generator(seed, number, "information/noise").standard_normal(filtered.precision.shape)
     seen = filtered.precision > 0.0
-    scale = np.divide(1.0, np.sqrt(filtered.precision), out=np.zeros_like(noise), where=seen)
+    scale = divided(1.0, np.sqrt(filtered.precision))
     data = np.where(seen, filtered.observe(sky) + scale * noise, 0.0)
     found = filtered.wiener(data)
-    share = np.divide(cl, filtered.cl, out=np.zeros_like(cl), where=filtered.cl > 0.0)
+    share = divided(cl, filtered.cl)
     return filtered.apply(data, found), alm_.multiply(found, share, filtered.lmax)
 
 

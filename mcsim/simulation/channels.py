@@ -158,7 +158,7 @@ def known_offsets(run: config.RunConfig, spec: config.Channel) -> int:
     """Return the highest power of the samples' offsets that the moments of a channel can have."""
     match spec.scan:
         case config.ScanMoments():
-            paths = [config.channel_path(spec.scan.path, spec.name, split) for split in run.map.splits or (None,)]
+            paths = [config.channel_path(spec.scan.path, spec.name, split) for split in run.map.each_split]
             return min(scan.read_moments(path).offset_order for path in paths)
         case config.ScanDifferencing():
             return 1

@@ -15,7 +15,7 @@ from mcsim.simulation.survey import Channel, Survey, SurveyMap
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rng
 from mcsim.sphere.sky import dipole_alm, gaussian_alm
-from mcsim.support.arrays import Alm
+from mcsim.support.arrays import Alm, divided
 
 
 @dataclass(frozen=True)
@@ -243,8 +243,7 @@ def _map_parts(
             extra.append(m.noise(seed, realization))
         for effect in systematics.disturbing(channel.effects):
             draw = rng.generator(seed, realization, f"effect/{effect.name}/noise/{m.name}")
-            hits = m.moments.hits
-            extra.append(np.divide(effect.excess(hits, draw), hits, out=np.zeros_like(hits), where=hits > 0.0))
+            extra.append(divided(effect.excess(m.moments.hits, draw), m.moments.hits))
         if m.gain is not None and whole is not None:
             extra.append(m.gain * whole)
         if m.signal_uk is not None:

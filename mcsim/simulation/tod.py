@@ -26,7 +26,7 @@ from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import LineOfSight, MapGrid, ScanModel
 from mcsim.instrument.scan.pointing import PointingStream, fill_samples
 from mcsim.sphere.checks import check_alm, check_nside, check_shape
-from mcsim.support.arrays import Map
+from mcsim.support.arrays import Map, divided
 
 CHUNK = 1 << 18
 """Samples of a chunk: 12 MB of arrays, and enough of them that the interpolation does not wait for its set-up."""
@@ -88,6 +88,16 @@ def samples(
         yield Samples(time_s, theta, phi, psi, pixel, np.zeros(high - low))
 
 
+def with_signal(signal: Callable[[Samples], Map]) -> Stage:
+    """Return a stage that gives every chunk the signal that a function returns for it, uK, shape (n,)."""
+
+    def stage(stream: Iterable[Samples]) -> Iterator[Samples]:
+        for chunk in stream:
+            yield replace(chunk, signal_uk=signal(chunk))
+
+    return stage
+
+
 def sky_signal(
     alm: NDArray[np.complex128], lmax: int, beam: Beam, epsilon: float = EPSILON, nthreads: int = 1
 ) -> Stage:
@@ -137,13 +147,11 @@ def white_noise(sigma0_uk: float, rng: np.random.Generator, factor: Map | None =
     """
     check_noise(sigma0_uk)
 
-    def stage(stream: Iterable[Samples]) -> Iterator[Samples]:
-        for chunk in stream:
-            noise = sigma0_uk * rng.standard_normal(chunk.signal_uk.size)
-            noise = noise if factor is None else noise * factor[chunk.pixel]
-            yield replace(chunk, signal_uk=chunk.signal_uk + noise)
+    def noisy(chunk: Samples) -> Map:
+        noise = sigma0_uk * rng.standard_normal(chunk.signal_uk.size)
+        return chunk.signal_uk + (noise if factor is None else noise * factor[chunk.pixel])
 
-    return stage
+    return with_signal(noisy)
 
 
 def every_ring(spin_period_s: float, number: int, index: int) -> Stage:
@@ -182,7 +190,7 @@ def bin_samples(stream: Iterable[Samples], nside: int) -> tuple[Map, Map]:
                 f"a sample is in pixel {chunk.pixel.max()}, but nside {nside} has {hits.size}; give its own nside."
             )
         _add(chunk.pixel, chunk.signal_uk, sums)
-    return np.divide(total, hits, out=np.full(hits.size, healpy.UNSEEN), where=hits > 0.0), hits.copy()
+    return divided(total, hits, healpy.UNSEEN), hits.copy()
 
 
 def observe(

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from mcsim.errors import InputError
 from mcsim.stats.elliptical import f_tail, leave_one_out, scale_variance
 from mcsim.stats.shrinkage import Fold, shrunk
-from mcsim.support.arrays import Matrix, Vector
+from mcsim.support.arrays import Matrix, Vector, divided
 
 # A direction is empty if its variance, or its part outside a span, is below this fraction of its size.
 COLLINEAR = 1e-6
@@ -323,7 +323,7 @@ def with_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, before: Matrix,
         for rows in (before, after, after - before)
     )
     own, added = np.diag(found.covariance), np.maximum(acting - without + change / len(before), 0.0)
-    factor = np.sqrt(1.0 + np.divide(added, own, out=np.zeros_like(own), where=own > 0.0))
+    factor = np.sqrt(1.0 + divided(added, own))
     return replace(found, covariance=factor[:, None] * found.covariance * factor)
 
 
@@ -427,7 +427,7 @@ def nested_pvalue(
 def orthonormal(white: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return an orthonormal basis (p, r) of the columns (p, K), and the matrix (K, r) from it to amplitudes."""
     size = np.linalg.norm(white, axis=0)
-    inverse = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
+    inverse = divided(1.0, size)
     left, singular, right = np.linalg.svd(white * inverse, full_matrices=False)
     kept = singular > COLLINEAR
     return left[:, kept], inverse[:, None] * right[kept].T / singular[kept]

@@ -6,6 +6,7 @@ import numpy as np
 
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.sky import gaussian_alm
+from mcsim.support.arrays import divided
 from mcsim.systematics.base import Alm, Bound, Draw, Effect, Site, Wording
 from mcsim.systematics.parametrization import Parametrization
 
@@ -45,8 +46,7 @@ class PointSources(Effect):
         """Add the sources, or take their power away."""
         if self.amplitude > 0.0:
             return sky + gaussian_alm(np.full(site.lmax + 1, self.amplitude), draw("sources"))
-        power = _power_around(sky, site.lmax)
-        scale = np.divide(self.amplitude, power, out=np.zeros_like(power), where=power > 0.0)
+        scale = divided(self.amplitude, _power_around(sky, site.lmax))
         return alm_.multiply(sky, np.sqrt(np.maximum(1.0 + scale, 0.0)), site.lmax)
 
 

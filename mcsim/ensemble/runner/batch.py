@@ -93,7 +93,7 @@ def run(
     """
     if isinstance(workers, int) and workers < 1:
         raise InputError(f"workers = {workers} is too small; give at least 1, or the address of a scheduler.")
-    loaded = source if isinstance(source, config.RunConfig) else config.load(source)
+    loaded = config.load(source)
     wanted = plan.wanted(loaded, realizations)
     target = Path(path) if path is not None else plan.default_store(loaded, realizations)
     exists = plan.exists(target)

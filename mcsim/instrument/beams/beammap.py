@@ -58,14 +58,14 @@ class BeamMap:
             raise InputError(f"cut_rad = {self.cut_rad:g} of a beam map must be above 0 and at most pi/2: give radians")
         _check_centre(image, self.centre)
 
-    def blm(self, lmax: int, mmax: int | None = None, nthreads: int = 1) -> NDArray[np.complex128]:
+    def blm(self, lmax: int, mmax: int | None = None) -> NDArray[np.complex128]:
         """Return the coefficients up to the largest order that the cut can hold, in the map's unit times sr."""
         check_lmax(lmax)
         if mmax is not None:
             check_mmax(mmax, lmax)
         # No order above lmax sin(cut) fits inside the cut, so that this holds the beam's whole power up to lmax.
         holds_all = min(lmax, ceil(lmax * sin(min(self.cut_rad, pi / 2))) + 32)
-        return blm_of_map(self, lmax, max(holds_all, mmax or 0), nthreads)
+        return blm_of_map(self, lmax, max(holds_all, mmax or 0))
 
     def without_pixel_window(self) -> Self:
         """Return the map with the window of its pixels divided out, for values that are means over the pixels."""
@@ -203,7 +203,7 @@ def find_centre(image: NDArray[np.float64], origin: str = "the beam map") -> tup
     return float(column + box.sum(axis=0) @ offset / total), float(row + box.sum(axis=1) @ offset / total)
 
 
-def blm_of_map(beam_map: BeamMap, lmax: int, mmax: int, nthreads: int = 1) -> NDArray[np.complex128]:
+def blm_of_map(beam_map: BeamMap, lmax: int, mmax: int) -> NDArray[np.complex128]:
     """Sum a beam map into its harmonic coefficients, in the map's unit times sr.
 
     Return b_lm, shape (mmax + 1, lmax + 1); raise InputError if the pixels are too coarse for lmax, or nothing but
@@ -228,7 +228,7 @@ def blm_of_map(beam_map: BeamMap, lmax: int, mmax: int, nthreads: int = 1) -> ND
         raise InputError(f"the beam map is zero within {cut_deg:g} deg of its centre: check centre and cut")
     where = np.stack([theta, phi], axis=1)
     alm = ducc0.sht.adjoint_synthesis_general(
-        map=value[None], lmax=lmax, mmax=mmax, spin=0, loc=where, epsilon=1e-12, nthreads=nthreads
+        map=value[None], lmax=lmax, mmax=mmax, spin=0, loc=where, epsilon=1e-12, nthreads=1
     )[0]
     return unpacked(alm, lmax, mmax)
 

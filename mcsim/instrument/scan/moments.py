@@ -20,6 +20,7 @@ from mcsim.instrument.scan.offsets import HIGHEST, exponents, order_of, spin_mom
 from mcsim.instrument.scan.user_pointing import blocks_of_files, checked_samples, sums_of_samples
 from mcsim.sphere.checks import check_nside, check_shape, check_whole
 from mcsim.support import folders
+from mcsim.support.arrays import divided
 from mcsim.support.code import package_digest
 
 _META = "moments.json"
@@ -225,7 +226,7 @@ class Moments:
         first_power = sums.shape[1] - powers
         smax = first_power // 2 - 2
         hits = sums[:, 0].copy()
-        inverse = np.divide(1.0, hits, out=np.zeros_like(hits), where=hits > 0.0)
+        inverse = divided(1.0, hits)
         w = np.empty((smax, hits.size), dtype=np.complex128)
         for s in range(smax):
             w[s].real = sums[:, 4 + 2 * s] * inverse
