@@ -19,8 +19,11 @@ NOISY = 0.02
 UNSHOWN = 1e-3
 """The same where single samples are simulated: what is left then is noise, or of a sky that holes hide."""
 
-BY_MOMENTS = 1e-4
-"""What orientation moments leave of side A at most, over the sky, if it was made from them; samples leave more."""
+SHARP = 1e-4
+"""What a simulation leaves of side A, over the sky, from which on the sky is not corrected further.
+
+Orientation moments leave more of maps of single samples.
+"""
 
 WHOLE = 0.99
 """Share of the pixels from which on holes hide nothing."""
@@ -70,7 +73,7 @@ def _as_made(pair: ChannelPair, found: ChannelPair) -> ChannelPair:
     if left <= UNSHOWN**2 * _sky(pair):
         return found
     best = scene
-    if _left(pair, scene.maps()) > BY_MOMENTS**2 * _sky(pair):
+    if _left(pair, scene.maps()) > SHARP**2 * _sky(pair):
         centred = [scene.at_centres(), replace(scene.at_centres(), beam=scene.beam.truncated(0))]
         if pair.sky_of_maps:
             centred = [replace(one, sky=sky_in(pair.a, pair.seen, one)) for one in centred]
@@ -93,8 +96,8 @@ def _sharper(pair: ChannelPair) -> ChannelPair:
     scene = pair.scene
     if scene is None or (pair.pointing() is None and scene.offset_order < 2):
         return pair
-    limit = UNSHOWN**2 * _sky(pair)
-    if _left(pair, scene.maps()) <= BY_MOMENTS**2 * _sky(pair):
+    limit = SHARP**2 * _sky(pair)
+    if _left(pair, scene.maps()) <= limit:
         return pair
     for _ in range(ROUNDS):
         missing = np.where(pair.seen, pair.a - _made(pair, scene), 0.0)
