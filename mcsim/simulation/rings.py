@@ -169,7 +169,8 @@ def _times_sine_power(alm, real, imag, s, start, result):  # type: ignore[no-unt
                 even[ell] = up * even_below + m * o + down * even[ell + 1]
                 odd[ell] = up * odd_below + m * e + down * odd[ell + 1]
                 even_below, odd_below = e, o
-        result[start[m] : start[m] + lmax + s + 1 - m] = even[m : lmax + s + 1]
+        for ell in range(m, lmax + s + 1):  # a loop: numba takes seconds to compile the assignment of a slice
+            result[start[m] + ell - m] = even[ell]
 
 
 def _rings(moments: Callable[[Vector], dict[int, Alm]], breaks: Vector, degree: int) -> tuple[Rings, ...]:
