@@ -19,7 +19,6 @@ from typing import Any
 import ducc0
 import healpy
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
@@ -28,6 +27,7 @@ from mcsim.instrument.scan import LineOfSight, MapGrid, ScanModel
 from mcsim.instrument.scan.pointing import PointingStream, fill_samples
 from mcsim.sphere.checks import check_alm, check_nside, check_shape
 from mcsim.support.arrays import Map, divided
+from mcsim.support.compiled import njit
 
 CHUNK = 1 << 18
 """Samples of a chunk: 12 MB of arrays, and enough of them that the interpolation does not wait for its set-up."""
@@ -220,7 +220,7 @@ def observe(
     return bin_samples(through(samples(model, line, grid, at_pixel_centres), stages), grid.nside)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _add(pixel, signal, sums):  # type: ignore[no-untyped-def]
     for k in range(pixel.size):
         sums[pixel[k], 0] += signal[k]

@@ -15,7 +15,8 @@ def read_npy(path: str | Path, kind: str = "biufc", ndims: tuple[int, ...] = (1,
     except Exception as error:  # libraries raise errors of any type for a broken file
         raise InputError(f"{path} cannot be read as an array of numpy ({error}); write it with numpy.save.") from error
     if array.ndim not in ndims or array.dtype.kind not in kind:
-        wanted = f"{'numbers' if 'c' in kind else 'real numbers'} in {' or '.join(map(str, ndims))} dimensions"
+        kinds = {"c": "complex numbers", "biufc": "numbers"}
+        wanted = f"{kinds.get(kind, 'real numbers')} in {' or '.join(map(str, ndims))} dimensions"
         raise InputError(f"{path} holds {array.dtype} of shape {array.shape}; give {wanted}.")
     return array
 
