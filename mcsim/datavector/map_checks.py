@@ -10,7 +10,7 @@ from mcsim.datavector.wiener_filter import Model, Part, sky_variance
 from mcsim.ensemble.maps import file_names, first_realization
 from mcsim.errors import InputError
 from mcsim.sphere.healpix import read_uk
-from mcsim.support.arrays import Map
+from mcsim.support.arrays import Map, reals
 
 
 def checked_map(model: Model, part: Part, map_: Map, name: str) -> Map:
@@ -66,8 +66,11 @@ def checked(model: Model, maps: Sequence[Map]) -> list[Map]:
     """Check maps given as arrays, in the order of the model's, uK, like those of a folder."""
     if len(maps) != len(model.parts):
         raise InputError(f"{len(maps)} maps were given, the model has {len(model.parts)}; give one for each.")
-    arrays = [np.asarray(map_, dtype=np.float64) for map_ in maps]
-    return [checked_map(model, part, map_, f"map {part.name}") for part, map_ in zip(model.parts, arrays, strict=True)]
+    named = [(part, f"map {part.name}") for part in model.parts]
+    return [
+        checked_map(model, part, reals(map_, name, healpy.UNSEEN), name)
+        for (part, name), map_ in zip(named, maps, strict=True)
+    ]
 
 
 def _read(model: Model, part: Part, path: Path) -> Map:

@@ -194,7 +194,7 @@ class DiagnosisSettings:
     noisy_skies: int = 24
     table_skies: int = 24
     constrained_skies: int = 8
-    scatter_skies: int = 24
+    scatter_skies: int = 48
     time_ordered_skies: int = 6
     scan_sims: int = 300
 

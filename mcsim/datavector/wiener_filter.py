@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from functools import cached_property, reduce
 
 import healpy
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,6 +28,7 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
 from mcsim.support.arrays import Alm, Cl, Map, divided
+from mcsim.support.compiled import njit
 
 
 @dataclass(frozen=True)
@@ -229,7 +229,7 @@ def by_degree(a: Alm, b: Alm, lmax: int) -> Cl:
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _add_by_degree(a, b, found):  # type: ignore[no-untyped-def]
     """Add the products of all orders m, twice for m > 0, in one pass over memory."""
     place = 0

@@ -21,7 +21,7 @@ from mcsim.config import arrays
 from mcsim.errors import InputError
 from mcsim.sphere import header
 from mcsim.sphere.healpix import read_uk
-from mcsim.support.arrays import Alm, Map
+from mcsim.support.arrays import Alm, Map, reals
 from mcsim.support.folders import unreadable
 
 
@@ -124,10 +124,7 @@ def _flat(given: Any, labels: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str,
 
 
 def _in_uk(one: Any, part: Part, where: str) -> Map:
-    try:
-        found = np.asarray(one, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{where} has a map {part.name} that is no array of numbers; give uK in RING order.") from None
+    found = reals(one, f"the map {part.name} of {where}", healpy.UNSEEN)
     unit = getattr(one, "attrs", {}).get("units")
     factor = header.to_uk(unit, Path(f"the map {part.name} of {where}"), part.frequency_ghz)
     return found if factor == 1.0 else np.where(found == healpy.UNSEEN, found, factor * found)

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, overload
 
-import numpy as np
+import healpy
 from numpy.typing import ArrayLike
 
 from mcsim import config
@@ -14,7 +14,7 @@ from mcsim.errors import InputError
 from mcsim.simulation.preparation import preparation
 from mcsim.sphere.checks import check_map
 from mcsim.sphere.healpix import read_uk
-from mcsim.support.arrays import Map
+from mcsim.support.arrays import Map, reals
 from mcsim.support.folders import appearing, unwritable, writable
 
 Source = str | Path | Mapping[str, Any] | config.RunConfig
@@ -87,7 +87,7 @@ def prepare(maps: Mapping[str, ArrayLike] | Sequence[ArrayLike], source: Source)
 
 def _prepared(run: config.RunConfig, name: str, map_: ArrayLike) -> Map:
     spec, split = _map_called(run, name)
-    given = np.asarray(map_, dtype=np.float64)
+    given = reals(map_, f"map {name}", healpy.UNSEEN)
     check_map(given, run.map.resolution, f"map {name}")
     steps = preparation(run, spec, split, observed=True)
     assert steps is not None  # the run has steps

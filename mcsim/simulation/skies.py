@@ -29,7 +29,7 @@ def read_alm(path: Path, lmax: int, frame: str) -> Alm:
     temperature, or has values that are not finite or of no sky in uK.
     """
     if path.suffix == ".npy":
-        given = read_npy(path)
+        given = read_npy(path, "c")
         mmax, keywords = healpy.Alm.getlmax(given.size), fits.Header()
     else:
         given, mmax, keywords = _read_fits_alm(path)
@@ -39,8 +39,7 @@ def read_alm(path: Path, lmax: int, frame: str) -> Alm:
         raise InputError(f"{path} holds a_lm up to l = {found}, m = {mmax}; the sky needs both up to {lmax}.")
     if not np.all(np.isfinite(alm)):
         raise InputError(f"{path} holds a_lm that are not finite; repair the file.")
-    if np.abs(alm[: found + 1].imag).max() > 1e-6 * np.abs(alm).max():
-        raise InputError(f"{path} has complex a_l0, where a real sky has real ones; check the order of its a_lm.")
+    alm_.check_order(alm, found, str(path))
     stated = header.frame_named(keywords.get("COORDSYS"), str(path))
     if stated not in (None, frame):
         raise InputError(f"{path} is in {stated} coordinates, the run's maps in {frame}; rotate the sky first.")

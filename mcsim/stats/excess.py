@@ -1,6 +1,6 @@
 """Excess chi^2 of data over what the simulations expect, and its reduction once an effect is in the simulator."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -140,7 +140,8 @@ def held_out(before: SimulatedGaussian, after: SimulatedGaussian, x: Vector, exp
     -----
     A = 1 - G1/G0. Both excesses have the same noise e of the data: with d = true mean - mean before and D = mean after
     - mean before, dA = (2 (D - A d).e - A (e'e - p))/G0, hence var A = (4 |D - A d|^2 + 2 p A^2)/G0^2, to which the
-    errors of the covariances add 2 ((p + G1)^2 + (1 - A)^2 (p + G0)^2)/(d2 - 4)/G0^2. Pulls: tests/statistical.
+    errors of the covariances add 2 ((p + G1)^2 + (1 - A)^2 (p + G0)^2)/(d2 - 4)/G0^2. Pulls: tests/statistical. A
+    covariance that a few draws of the effects tell scales chi^2 afterwards (:mod:`mcsim.stats.few_draws`).
     """
     first, last = excess(before, x), excess(after, x)
     share = expected.value / first.value
@@ -155,5 +156,7 @@ def held_out(before: SimulatedGaussian, after: SimulatedGaussian, x: Vector, exp
     mismatch = max(moved - 2.0 * fraction * along + fraction**2 * distance, 0.0)
     noise = (4.0 * mismatch + 2.0 * p * fraction**2) * (d2 - 2) / (d2 - 4)
     scatter = 2.0 * ((p + length) ** 2 + (1.0 - fraction) ** 2 * (p + distance) ** 2) / (d2 - 4)
+    scaled = (after.scale_variance - before.scale_variance) * p * (p + 2)
+    scatter, last = scatter + scaled, replace(last, sigma=float(np.hypot(last.sigma, np.sqrt(scaled))))
     sigma = float(np.sqrt(noise + scatter)) / abs(first.value)
     return HeldOut(forecast, Measured(fraction, sigma), first, last, after.pvalue(x), data)

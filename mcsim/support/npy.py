@@ -14,7 +14,8 @@ def read_npy(path: str | Path, kind: str = "biufc", ndims: tuple[int, ...] = (1,
     with unreadable(path, "an array of numpy", "write it with numpy.save"):
         array = np.load(path, allow_pickle=False)
     if array.ndim not in ndims or array.dtype.kind not in kind:
-        wanted = f"{'numbers' if 'c' in kind else 'real numbers'} in {' or '.join(map(str, ndims))} dimensions"
+        kinds = {"c": "complex numbers", "biufc": "numbers"}
+        wanted = f"{kinds.get(kind, 'real numbers')} in {' or '.join(map(str, ndims))} dimensions"
         raise InputError(f"{path} holds {array.dtype} of shape {array.shape}; give {wanted}.")
     return array
 

@@ -15,7 +15,8 @@ from mcsim.instrument.beams.coefficients import check_mmax, choose_mmax, cut, po
 from mcsim.instrument.beams.files import checked_blm
 from mcsim.instrument.beams.gaussian import elliptical_blm
 from mcsim.instrument.beams.window import read_window
-from mcsim.sphere.checks import check_angle, check_finite
+from mcsim.sphere.checks import check_angle, check_finite, check_shape
+from mcsim.support.arrays import reals
 from mcsim.support.npy import read_npz
 
 DEFAULT_LMAX = 2048
@@ -184,7 +185,7 @@ class Beam:
         elif pixel_deg is None:
             raise InputError("pixel_deg is not given, but an array does not say it; give the side of a pixel in deg")
         else:
-            image = np.asarray(source, dtype=np.float64)
+            image = reals(source, "the beam map")
             beam_map = placed(image, pixel_deg, cut_deg=cut_deg, centre=centre)
         lmax = min(DEFAULT_LMAX, int(pi / beam_map.pixel_rad)) if lmax is None else lmax
         return cls.normalized(beam_map.blm(lmax, mmax), mmax, "the beam map")
@@ -384,6 +385,8 @@ class Beam:
 
         ``theta``, ``phi``: angle from the beam's centre and azimuth from its x axis towards y, radians, of one shape.
         """
+        theta, phi = reals(theta, "theta"), reals(phi, "phi")
+        check_shape(phi, theta.shape, "phi")
         if np.any((theta < 0.0) | (theta > np.pi)):
             raise InputError("theta must lie between 0 and pi radians: give the angle from the centre of the beam.")
         direction = np.stack([np.ravel(theta), np.ravel(phi) % (2 * np.pi)], axis=1)

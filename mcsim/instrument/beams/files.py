@@ -10,6 +10,7 @@ from mcsim.errors import InputError
 from mcsim.instrument.beams.coefficients import cut, power_by_order, unpacked
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.header import opened
+from mcsim.support.arrays import numbers
 from mcsim.support.folders import unreadable
 from mcsim.support.npy import read_npy
 
@@ -29,7 +30,7 @@ def checked_blm(source: str | Path | NDArray, lmax: int | None = None) -> tuple[
         blm = _of_array(read_npy(path, ndims=(1, 2))) if path.suffix == ".npy" else _read(path)
     else:
         origin = "the array of b_lm"
-        blm = _of_array(np.asarray(source))
+        blm = _of_array(numbers(source, origin))
     blm = cut(blm, lmax, origin)
     if not np.all(np.isfinite(blm)):
         raise InputError(f"{origin} has coefficients that are not finite: repair it before use")

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.sphere.header import opened
+from mcsim.support.arrays import reals
 from mcsim.support.folders import unreadable
 from mcsim.support.npy import read_npy
 
@@ -28,7 +29,7 @@ def read_window(
     What is read, and what is refused, says :meth:`mcsim.instrument.beams.Beam.from_window`.
     """
     if not isinstance(source, str | Path):
-        found, origin = np.asarray(source, dtype=np.float64), "the array of B_l"
+        found, origin = reals(source, "the array of B_l"), "the array of B_l"
     else:
         path, origin = Path(source), str(source)
         if path.suffix == ".npy":
@@ -39,7 +40,7 @@ def read_window(
             if extension is not None or column is not None:
                 raise InputError(f"{path} is no FITS file, so it has no extension or named column; leave these out.")
             found = _of_text(path)
-    if found.ndim != 1 or not np.all(np.isfinite(found)):
+    if found.ndim != 1 or not found.size or not np.all(np.isfinite(found)):
         raise InputError(f"{origin} holds no finite B_l, one for each l; repair it.")
     if abs(found[0] - 1.0) > 0.01 or np.abs(found).max() > LARGEST:
         raise InputError(

@@ -20,7 +20,7 @@ from mcsim.instrument.scan.offsets import HIGHEST, exponents, order_of, spin_mom
 from mcsim.instrument.scan.user_pointing import blocks_of_files, checked_samples, sums_of_samples
 from mcsim.sphere.checks import check_nside, check_shape, check_whole
 from mcsim.support import folders
-from mcsim.support.arrays import divided
+from mcsim.support.arrays import divided, reals
 from mcsim.support.code import package_digest
 
 _META = "moments.json"
@@ -179,7 +179,8 @@ class Moments:
         (array([2.]), array([0.]))
         """
         check_frame(frame)
-        arrays = [np.atleast_1d(np.asarray(angle, dtype=np.float64)) for angle in (theta, phi, psi)]
+        given = {"theta": theta, "phi": phi, "psi": psi}
+        arrays = [np.atleast_1d(reals(angle, name)) for name, angle in given.items()]
         shapes = [array.shape for array in arrays]
         if len(set(shapes)) > 1 or arrays[0].ndim != 1 or not arrays[0].size:
             raise InputError(f"theta, phi and psi have the shapes {shapes}; give three arrays of one length, (n,).")

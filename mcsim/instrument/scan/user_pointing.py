@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
@@ -18,6 +17,7 @@ from mcsim.instrument.scan.offsets import add_powers, centres
 from mcsim.instrument.scan.pointing import quarter_turns, ring_pixel
 from mcsim.sphere.checks import LARGEST_ANGLE, check_nside, check_whole
 from mcsim.sphere.header import first_table, frame_named, radians
+from mcsim.support.compiled import njit
 from mcsim.support.folders import unreadable
 
 _ROWS = 1 << 20
@@ -133,7 +133,7 @@ def checked_samples(columns: Sequence[NDArray[np.float64]], where: str) -> tuple
     return tuple(columns)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _add_angles(theta, phi, psi, nside, smax, order, middle, sums):  # type: ignore[no-untyped-def]
     for k in range(theta.size):
         sin_theta = math.sin(theta[k])

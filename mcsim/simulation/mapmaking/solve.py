@@ -6,11 +6,11 @@ from itertools import pairwise
 
 import healpy
 import numpy as np
-from numba import njit
 
 from mcsim.errors import InputError
 from mcsim.simulation.mapmaking.pairs import DifferencingScan
 from mcsim.support.arrays import Map, divided
+from mcsim.support.compiled import njit
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ def _norm(vector: Map) -> float:
     return float(np.sqrt(np.sum(vector * vector)))
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _rows(row_start, partner, count, weight, coupling, map_uk, low, high, result):  # type: ignore[no-untyped-def]
     for row in range(low, high):
         first, last = row_start[row], row_start[row + 1]
