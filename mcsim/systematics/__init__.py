@@ -1,4 +1,4 @@
-"""The library of effects: one file each, found by name; other packages add theirs by entry points."""
+"""The library of effects, found by name, in files by what they act on; other packages add theirs by entry points."""
 
 from mcsim.systematics.base import (
     Alm,

@@ -280,7 +280,7 @@ class Effect:
 
         Examples
         --------
-        >>> from mcsim.systematics.beam_ellipticity import BeamEllipticity
+        >>> from mcsim.systematics.beams import BeamEllipticity
         >>> BeamEllipticity.format_amplitude(0.159, 0.008)
         'axis ratio 1.159 ± 0.008'
         """
