@@ -188,7 +188,7 @@ def _observe_prepared(
 def _observe_filtered(
     survey: Survey, channel: Channel, sky: Alm, realization: int, made: convolve.CircularMaps
 ) -> list[Observed]:
-    """Return the maps of a channel for one sky, filtered by their inverse covariance; see :class:`MapFilter`."""
+    """Return the maps of a channel for one sky, filtered by :class:`mcsim.simulation.filtering.MapFilter`."""
     ensemble = survey.config.ensemble
     assert survey.filtering is not None  # the caller looked
     filters = {each.name: each for each in survey.filtering.filters}
