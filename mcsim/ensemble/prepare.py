@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any, overload
 
 import healpy
-import numpy as np
 from numpy.typing import ArrayLike
 
 from mcsim import config

@@ -39,7 +39,9 @@ def read_alm(path: Path, lmax: int, frame: str) -> Alm:
     if not np.all(np.isfinite(alm)):
         raise InputError(f"{path} holds a_lm that are not finite; repair the file.")
     alm_.check_order(alm, found, str(path))
-    _check_frame(path, header.frame_named(keywords.get("COORDSYS"), str(path)), frame)
+    stated = header.frame_named(keywords.get("COORDSYS"), str(path))
+    if stated not in (None, frame):
+        raise InputError(f"{path} is in {stated} coordinates, the run's maps in {frame}; rotate the sky first.")
     factor = header.to_uk(str(keywords.get("TUNIT2", "")), path)
     alm = alm if factor == 1.0 else factor * alm
     _check_size(path, alm)
