@@ -38,8 +38,8 @@ def load(source: str | Path | Mapping[str, Any] | RunConfig, base: str | Path | 
     Returns
     -------
     RunConfig
-        Its paths are absolute; :func:`channel_path` and :func:`sky_path` fill {channel}, {split} and {realization}.
-        All its files exist.
+        Its paths are absolute, and all its files exist; :func:`mcsim.config.channel_path` and
+        :func:`mcsim.config.sky_path` fill {channel}, {split} and {realization}.
 
     Raises
     ------

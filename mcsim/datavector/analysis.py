@@ -178,11 +178,7 @@ def _applies(model: Model, kind: type[Effect], channel: str | None, settings: Ma
     effect = systematics.basis_of(kind, settings)[0]
     try:
         for owner in owners:
-            effect.gain(np.zeros(1), owner.site)
-            effect.noise(owner.site)
-            systematics.seen_through((effect,), owner.site)
-            systematics.looked_at((effect,), np.zeros_like(model.dipole), replace(owner.site, lmax=model.lmax), 0, 0)
-            systematics.check_added((effect,), owner.site)
+            systematics.tried((effect,), replace(owner.site, lmax=model.lmax))
             effect.orientations(owner.maps[0].moments, owner.site)
     except InputError:
         return False

@@ -21,7 +21,7 @@ from mcsim.support.arrays import Alm, Map, Matrix, Vector
 
 @dataclass(frozen=True, eq=False)
 class ObservedMaps(DataSet[Sequence[Map]]):
-    """Offer observed maps, from :func:`read_maps` or :func:`checked`, as a data set.
+    """Offer observed maps, as :mod:`mcsim.datavector.map_checks` reads them, as a data set.
 
     Responses to effects are simulated in skies that the filtered maps constrain.
     """

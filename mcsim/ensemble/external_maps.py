@@ -22,6 +22,7 @@ from mcsim.errors import InputError
 from mcsim.sphere import header
 from mcsim.sphere.healpix import read_uk
 from mcsim.support.arrays import Alm, Map, reals
+from mcsim.support.folders import unreadable
 
 
 class Part(NamedTuple):
@@ -237,10 +238,8 @@ def fits_maps(parts: tuple[Part, ...], template: str) -> FitsMaps:
 @lru_cache(maxsize=1)
 def _zarr(path: str, written_ns: int) -> Any:
     """Open a store once for all realizations, and again if it was written anew."""
-    try:
+    with unreadable(path, "a Zarr store", "give one of maps"):
         found = xr.open_zarr(path, chunks=None, consolidated=False)
-    except Exception as error:  # whatever is in the folder
-        raise InputError(f"{path} cannot be opened as a Zarr store ({error}); give one of maps.") from error
     return _checked_stack(found, path)
 
 

@@ -10,7 +10,7 @@ import xarray as xr
 from astropy.table import Table
 
 from mcsim.errors import InputError
-from mcsim.support.folders import unwritable
+from mcsim.support.folders import unreadable, unwritable
 
 
 def spectra(summary: xr.Dataset, kind: str) -> pd.DataFrame:
@@ -116,16 +116,11 @@ def read_prediction(path: str | Path) -> xr.Dataset:
     source = Path(path)
     if not source.exists():
         raise InputError(f"{source} does not exist; give what mcsim predict -o wrote, or a configuration.")
-    try:
+    with unreadable(source, "a prediction", "give what mcsim predict -o wrote"):
         found = xr.open_zarr(source) if source.is_dir() else _from_table(source)
         if "biposh_binned_mean" not in found:
             raise KeyError("biposh_binned_mean")
         found = found.load()
-    except Exception as error:  # libraries raise errors of any type for a foreign file
-        raise InputError(
-            f"{source} cannot be read as a prediction ({type(error).__name__}: {' '.join(str(error).split())}); give "
-            "what mcsim predict -o wrote."
-        ) from error
     return found.assign_attrs(prediction=found.attrs.get("prediction", f"from {source.name}"))
 
 

@@ -24,8 +24,6 @@ from numpy.typing import NDArray
 from mcsim.information.derivatives import Derivative
 from mcsim.simulation.inverse_covariance import InverseCovariance, product
 from mcsim.sphere import alm as alm_
-from mcsim.sphere import rng
-from mcsim.sphere.sky import gaussian_alm
 from mcsim.support.arrays import Alm, Cl, Matrix, divided
 from mcsim.support.progress import Reporter
 
@@ -96,11 +94,7 @@ def stochastic(
 
 def _draw(filtered: InverseCovariance, cl: Cl, seed: int, number: int) -> tuple[Maps, Alm]:
     """Return x = C^-1 d of data that the model makes, and s^ of the sky of spectrum ``cl``."""
-    sky = gaussian_alm(filtered.cl, rng.generator(seed, number, "information/sky"))
-    noise = rng.generator(seed, number, "information/noise").standard_normal(filtered.precision.shape)
-    seen = filtered.precision > 0.0
-    scale = divided(1.0, np.sqrt(filtered.precision))
-    data = np.where(seen, filtered.observe(sky) + scale * noise, 0.0)
+    data = filtered.draw("information", number, seed)
     found = filtered.wiener(data)
     share = divided(cl, filtered.cl)
     return filtered.apply(data, found), alm_.multiply(found, share, filtered.lmax)

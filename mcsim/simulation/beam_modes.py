@@ -22,9 +22,8 @@ from mcsim.errors import InputError
 from mcsim.instrument.scan import Moments
 from mcsim.simulation import convolve
 from mcsim.simulation.filtering import LOWEST, MapFilter
-from mcsim.sphere import healpix, rng
-from mcsim.sphere.sky import gaussian_alm
-from mcsim.support.arrays import Alm, Map, Matrix, Vector, divided
+from mcsim.sphere import healpix
+from mcsim.support.arrays import Alm, Map, Matrix, Vector
 
 
 class Weighted(NamedTuple):
@@ -133,10 +132,7 @@ class BeamModes:
 
     def probe(self, number: int) -> Weighted:
         """Return a random map of the filter's covariance, weighted."""
-        inverse, name = self.filter.inverse, self.filter.name
-        sky = gaussian_alm(inverse.cl, rng.generator(0, number, f"beam modes/{name}/sky"))
-        noise = rng.generator(0, number, f"beam modes/{name}/noise").standard_normal(inverse.npix)
-        return self.weighted(inverse.observe(sky)[0] + divided(1.0, np.sqrt(inverse.precision[0])) * noise)
+        return self.weighted(self.filter.inverse.draw(f"beam modes/{self.filter.name}", number)[0])
 
     def spectra(self, numbers: Vector) -> NDArray[np.complex128]:
         """Return real numbers as beta, shape (order, bin), NaN where an order does not exist."""

@@ -30,8 +30,7 @@ from mcsim.bipolar.modes import Mode, bin_factor, existing
 from mcsim.errors import InputError
 from mcsim.simulation.inverse_covariance import InverseCovariance
 from mcsim.sphere import alm as alm_
-from mcsim.sphere import healpix, rng
-from mcsim.sphere.sky import gaussian_alm
+from mcsim.sphere import healpix
 from mcsim.support import folders
 from mcsim.support.arrays import Alm, Map, Matrix, Vector, divided
 from mcsim.support.code import package_digest
@@ -112,11 +111,7 @@ class MapFilter:
 
     def probe(self, number: int) -> Alm:
         """Return filtered coefficients of random data of the filter's own covariance."""
-        inverse = self.inverse
-        sky = gaussian_alm(inverse.cl, rng.generator(0, number, f"filter/{self.name}/sky"))
-        noise = rng.generator(0, number, f"filter/{self.name}/noise").standard_normal(inverse.npix)
-        scale = divided(1.0, np.sqrt(self._precision))
-        return self.apply(inverse.observe(sky)[0] + scale * noise)[0]
+        return self.apply(self.inverse.draw(f"filter/{self.name}", number)[0])[0]
 
     @property
     def _precision(self) -> Map:

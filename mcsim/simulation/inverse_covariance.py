@@ -23,8 +23,9 @@ from mcsim.errors import InputError
 from mcsim.instrument.scan import Moments
 from mcsim.simulation import convolve
 from mcsim.sphere import alm as alm_
-from mcsim.sphere import healpix
+from mcsim.sphere import healpix, rng
 from mcsim.sphere.checks import check_cl
+from mcsim.sphere.sky import gaussian_alm
 from mcsim.support.arrays import Alm, Cl, Map, Vector, divided
 
 Maps = NDArray[np.float64]
@@ -185,6 +186,13 @@ class InverseCovariance:
                 total -= 2.0 * alm_.multiply(electric, factor.real, self.lmax)
                 total -= 2.0 * alm_.multiply(magnetic, factor.imag, self.lmax)
         return total
+
+    def draw(self, name: str, number: int, seed: int = 0) -> Maps:
+        """Draw maps of this covariance, uK, 0 where nothing is observed; ``name`` is that of the random numbers."""
+        sky = gaussian_alm(self.cl, rng.generator(seed, number, f"{name}/sky"))
+        noise = rng.generator(seed, number, f"{name}/noise").standard_normal(self.precision.shape)
+        seen = self.precision > 0.0
+        return np.where(seen, self.observe(sky) + divided(1.0, np.sqrt(self.precision)) * noise, 0.0)
 
     def of_own(self, maps: Maps, part: slice) -> Alm:
         """Return P^t N^-1 applied to some maps, the others being zero; ``part`` says which they are."""

@@ -12,6 +12,7 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import header, healpix
 from mcsim.sphere.checks import UNSEEN_BELOW
 from mcsim.support.arrays import Alm
+from mcsim.support.folders import unreadable
 from mcsim.support.npy import read_npy
 
 LARGEST_UK = 1e12
@@ -49,13 +50,9 @@ def read_alm(path: Path, lmax: int, frame: str) -> Alm:
 
 
 def _read_fits_alm(path: Path) -> tuple[Alm, int, fits.Header]:
-    try:
+    with unreadable(path, "a_lm", "give a FITS file as healpy.write_alm makes it"):
         alm, mmax = healpy.read_alm(path, return_mmax=True)
         return alm, int(mmax), fits.getheader(path, 1)
-    except Exception as error:  # libraries raise whatever a broken file makes of them
-        raise InputError(
-            f"{path} cannot be read as a_lm ({error}); give a FITS file as healpy.write_alm makes it."
-        ) from error
 
 
 def read_map(path: Path, lmax: int, frame: str, frequency_ghz: float | None = None) -> Alm:

@@ -16,6 +16,7 @@ from mcsim.errors import InputError
 from mcsim.sphere.checks import UNSEEN_BELOW, check_alm, check_complete, check_map, check_nside, check_whole, nside_of
 from mcsim.sphere.header import frame_named, opened, to_uk
 from mcsim.support.arrays import Alm, Map
+from mcsim.support.folders import unreadable
 from mcsim.support.npy import read_npy
 
 
@@ -227,15 +228,10 @@ def read_map(path: Path, names: tuple[str, ...] = (), frame: str | None = None) 
         if not healpy.isnpixok(array.size):
             raise InputError(f"{path} has {array.size} pixels, which is no HEALPix map; give all 12 nside^2 pixels.")
         return array, None, None
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", category=AstropyUserWarning)
-            field = _column_called(path, names)
-            map_, header = healpy.read_map(path, dtype=float, h=True, field=field)
-    except InputError:
-        raise
-    except Exception as error:  # libraries raise errors of any type for a broken file
-        raise InputError(f"{path} cannot be read as a HEALPix map ({error}); give a complete FITS map.") from error
+    with unreadable(path, "a HEALPix map", "give a complete FITS map"), warnings.catch_warnings():
+        warnings.simplefilter("error", category=AstropyUserWarning)
+        field = _column_called(path, names)
+        map_, header = healpy.read_map(path, dtype=float, h=True, field=field)
     keywords = dict(header)
     if str(keywords.get("ORDERING", "")).strip().upper() not in ("RING", "NESTED"):
         raise InputError(f"{path} does not say how its pixels are ordered; write ORDERING = RING or NESTED there.")
@@ -298,8 +294,5 @@ def read_pixel_window(path: Path, lmax: int, nside: int | None = None) -> NDArra
 
 
 def _fits_pixel_window(path: Path) -> tuple[NDArray, int | None]:
-    try:
-        with opened(path) as hdus:
-            return np.asarray(hdus[1].data.field(0), dtype=float).ravel(), hdus[1].header.get("NSIDE")
-    except Exception as error:  # libraries raise errors of any type for a broken file
-        raise InputError(f"{path} is not a FITS pixel window ({error}); give a HEALPix pixel_window file.") from error
+    with unreadable(path, "a pixel window", "give a HEALPix pixel_window file"), opened(path) as hdus:
+        return np.asarray(hdus[1].data.field(0), dtype=float).ravel(), hdus[1].header.get("NSIDE")

@@ -39,6 +39,17 @@ def unwritable(name: str | Path, remedy: str) -> Iterator[None]:
         raise InputError(f"{name} cannot be written ({error.strerror or error}); {remedy}.") from error
 
 
+@contextmanager
+def unreadable(name: str | Path, what: str, remedy: str) -> Iterator[None]:
+    """Turn whatever a library raises for a broken file into an InputError."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # of any type
+        raise InputError(f"{name} cannot be read as {what} ({error}); {remedy}.") from error
+
+
 def write_whole(path: Path, text: str) -> None:
     """Write a file that appears complete or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)

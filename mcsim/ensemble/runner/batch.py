@@ -59,7 +59,7 @@ def run(
     resume
         Require an existing store, check all of it first, and compute damaged realizations again.
     realizations
-        Compute only these; :func:`merge` joins such slices.
+        Compute only these; :func:`mcsim.merge` joins such slices.
     workers
         Number of processes of a local cluster; default: the configuration's. Or the address of a running scheduler,
         ``tcp://host:port`` (or ``tls://``, with the keys that Dask's configuration names), whose workers share the file

@@ -20,7 +20,7 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
     Parameters
     ----------
     paths
-        Stores that :func:`run` made with ``realizations``.
+        Stores that :func:`mcsim.run` made with ``realizations``.
     path
         The new store.
     quiet

@@ -15,6 +15,7 @@ from mcsim.errors import InputError
 from mcsim.instrument.beams.coefficients import check_lmax, check_mmax, unpacked
 from mcsim.sphere.checks import check_finite
 from mcsim.sphere.header import opened
+from mcsim.support.folders import unreadable
 from mcsim.support.npy import read_npy
 
 Projection = Literal["equidistant", "orthographic", "equal_area"]
@@ -263,11 +264,8 @@ _PROJECTIONS: dict[Projection, tuple[_Function, _Function, _Function]] = {
 
 def holds_image(path: str | Path) -> bool:
     """Return True if a FITS file holds an image, as beam maps do, and not just tables; InputError for no FITS."""
-    try:
-        with opened(Path(path)) as hdus:
-            return any(hdu.is_image and hdu.header.get("NAXIS", 0) >= 2 for hdu in hdus)
-    except Exception as error:  # libraries raise whatever a broken file makes of them
-        raise InputError(f"{path} cannot be read as a FITS file ({error}): give a beam map or b_lm") from error
+    with unreadable(path, "a FITS file", "give a beam map or b_lm"), opened(Path(path)) as hdus:
+        return any(hdu.is_image and hdu.header.get("NAXIS", 0) >= 2 for hdu in hdus)
 
 
 def _read_image(path: Path, plane: int) -> tuple[NDArray[np.float64], fits.Header]:
@@ -275,13 +273,10 @@ def _read_image(path: Path, plane: int) -> tuple[NDArray[np.float64], fits.Heade
         raise InputError(f"beam map {path} does not exist: give the path of a FITS image")
     if path.suffix == ".npy":
         return read_npy(path, "iuf", (2,)).astype(np.float64), fits.Header()
-    try:
-        with opened(path) as hdus:
-            images = [hdu for hdu in hdus if hdu.is_image and hdu.data is not None]
-            image = np.array(images[0].data, dtype=np.float64) if images else np.zeros(0)
-            header = images[0].header.copy() if images else fits.Header()
-    except Exception as error:  # libraries raise whatever a broken file makes of them
-        raise InputError(f"{path} cannot be read as a FITS image ({error}): it may be truncated") from error
+    with unreadable(path, "a FITS image", "it may be truncated"), opened(path) as hdus:
+        images = [hdu for hdu in hdus if hdu.is_image and hdu.data is not None]
+        image = np.array(images[0].data, dtype=np.float64) if images else np.zeros(0)
+        header = images[0].header.copy() if images else fits.Header()
     if not image.size:
         raise InputError(f"{path} holds no image: a beam map is a two-dimensional FITS image")
     if str(header.get("BUNIT", "")).strip().lower().startswith("db"):

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.sphere.header import opened
 from mcsim.support.arrays import reals
+from mcsim.support.folders import unreadable
 from mcsim.support.npy import read_npy
 
 Window = NDArray[np.float64]
@@ -56,10 +57,8 @@ def _is_fits(path: Path) -> bool:
 
 
 def _of_text(path: Path) -> Window:
-    try:
+    with unreadable(path, "a table of B_l", "give columns ell and B_l"):
         table = np.loadtxt(path, ndmin=2)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as a table of B_l ({error}); give columns ell and B_l.") from None
     if table.shape[1] == 1:
         return np.asarray(table[:, 0])
     if not np.array_equal(table[:, 0], np.arange(len(table))):
@@ -69,24 +68,15 @@ def _of_text(path: Path) -> Window:
 
 def _of_fits(path: Path, extension: str | None, column: str | None) -> tuple[Window, str]:
     """Return B_l and the name of their table."""
-    try:
-        with opened(path) as hdus:
-            tables = {
-                _name(number, hdu): hdu
-                for number, hdu in enumerate(hdus)
-                if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)
-            }
-            where, field = _chosen(path, tables, extension, column)
-            values = np.asarray(tables[where].data.field(field), dtype=np.float64).ravel()
-    except InputError:
-        raise
-    except Exception as error:  # libraries raise errors of any type for a broken file
-        raise InputError(f"{path} cannot be read as a FITS table of B_l ({error}); give another file.") from error
+    with unreadable(path, "a FITS table of B_l", "give another file"), opened(path) as hdus:
+        tables = {
+            str(hdu.name).strip() or str(number): hdu
+            for number, hdu in enumerate(hdus)
+            if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)
+        }
+        where, field = _chosen(path, tables, extension, column)
+        values = np.asarray(tables[where].data.field(field), dtype=np.float64).ravel()
     return values, f"{path} ({where}, {field})"
-
-
-def _name(number: int, hdu: fits.BinTableHDU) -> str:
-    return str(hdu.name).strip() or str(number)
 
 
 def _chosen(

@@ -1,7 +1,6 @@
 """Files of moments: HEALPix tables in FITS, and the arrays of an object that a run was given in place of a file."""
 
 import re
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,9 @@ from mcsim.instrument.scan.geometry import check_frame
 from mcsim.instrument.scan.moments import Moments
 from mcsim.instrument.scan.offsets import HIGHEST, exponents
 from mcsim.sphere.checks import nside_of
-from mcsim.sphere.header import frame_named, radians
+from mcsim.sphere.header import first_table, frame_named, opened, radians
 from mcsim.sphere.rotation import FRAMES
+from mcsim.support.folders import unreadable
 from mcsim.support.npy import read_npz
 
 
@@ -134,23 +134,13 @@ def _to_radians(name: str, unit: str) -> float:
 
 def _read_table(path: str | Path, where: str) -> tuple[dict[str, NDArray[np.float64]], dict[str, Any]]:
     """Return columns (upper-case names, flattened, float64) and HEALPix keywords of a file's first binary table."""
-    try:
-        # A truncated file warns when opened and fails when read: one message is enough.
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with fits.open(path) as hdus:
-                table = next((hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU)), None)
-                if table is None:
-                    raise ValueError("it has no binary table")
-                columns = {
-                    name.upper(): np.array(table.data[name], dtype=np.float64).ravel() for name in table.columns.names
-                }
-                for column in table.columns:
-                    if column.unit and column.name.upper() in ("DTHETA", "DPHI", *_named(HIGHEST)):
-                        columns[column.name.upper()] *= _to_radians(column.name.upper(), column.unit)
-                header = {key: table.header.get(key) for key in ("NSIDE", "ORDERING", "COORDSYS")}
-    except Exception as error:  # libraries raise whatever a broken file makes of them
-        raise InputError(f"{where} cannot be read: {error}; give a complete FITS table.") from None
+    with unreadable(where, "a table of moments", "give a complete FITS table"), opened(Path(path)) as hdus:
+        table = first_table(hdus)
+        columns = {name.upper(): np.array(table.data[name], dtype=np.float64).ravel() for name in table.columns.names}
+        for column in table.columns:
+            if column.unit and column.name.upper() in ("DTHETA", "DPHI", *_named(HIGHEST)):
+                columns[column.name.upper()] *= _to_radians(column.name.upper(), column.unit)
+        header = {key: table.header.get(key) for key in ("NSIDE", "ORDERING", "COORDSYS")}
     sizes = {array.size for array in columns.values()}
     if len(sizes) != 1:
         raise InputError(f"{where} has columns of different sizes {sorted(sizes)}; write it again.")
