@@ -344,15 +344,15 @@ def test_the_cost_of_a_diagnosis_counts_the_effects_on_request(small):
         api.describe(small.run, replace(least, including=("gain_spin",), without=("gain_spin",)))
 
 
-def test_a_diagnosis_knows_the_library_that_it_is_given(small, tmp_path, monkeypatch):
+def test_a_diagnosis_knows_the_library_that_it_is_given(tmp_path, monkeypatch):
     """And names an effect that is in no catalogue; ``without`` is read in that library too."""
     monkeypatch.setenv("MCSIM_CACHE", str(tmp_path))
     monkeypatch.setattr(api, "batch", lambda workers: campaign.batch(0))  # in this process
-    run = small.run
-    louder = config.Effect(name="louder", channel="W1", parameters={"amplitude": 0.2})
+    run = config.load(two_channels("tiny", lmax=20, nside=8, fwhm_arcmin=700.0))
+    louder = config.Effect(name="louder", channel="W1", parameters={"amplitude": 0.4})
     seeded = replace(run, ensemble=replace(run.ensemble, seed=77))
     maps = list(simulate.maps(survey(with_effects(seeded, [louder]), library={"louder": Louder}), 0))
-    settings = DiagnosisSettings(library={"louder": Louder}, simulations=320)
+    settings = DiagnosisSettings(library={"louder": Louder}, simulations=240)
     with quick_pictures():
         found = mcsim.diagnose(run, maps, tmp_path / "out", settings=settings)
     assert {(one.name, one.channel) for one in found.candidates} == {("louder", "V1"), ("louder", "W1")}
