@@ -98,11 +98,15 @@ class _HeldOut:
         trace = more * (self.values.sum() - less * self.squares.sum(axis=1))
         same, own = (scale * _WEIGHTS)[:, None] * trace / self.p, more * (scale * (1.0 - _WEIGHTS))[:, None]
         inside, outside, f = 1.0 + same[..., None] + own[..., None] * self.values, 1.0 + same, own * less
-        first, second, third = (np.sum(self.squares / inside**n, axis=-1) for n in (1, 2, 3))
+        inverse = 1.0 / inside
+        squared = inverse * inverse
+        first, second, third = (
+            np.einsum("kq,wkq->wk", self.squares, one) for one in (inverse, squared, squared * inverse)
+        )
         left = 1.0 - f * first
         # Traces of the inverse and of its square, which noise of variance one contributes.
-        trace_one = np.sum(1.0 / inside, axis=-1) + rest / outside + f * second / left
-        trace_two = np.sum(1.0 / inside**2, axis=-1) + rest / outside**2
+        trace_one = np.sum(inverse, axis=-1) + rest / outside + f * second / left
+        trace_two = np.sum(squared, axis=-1) + rest / outside**2
         trace_two += 2.0 * f * third / left + (f * second / left) ** 2
         chi2 = trace_one + count * first / left
         volume = np.sum(np.log(inside), axis=-1) + rest * np.log(outside) + np.log(left)
