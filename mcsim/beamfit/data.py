@@ -12,6 +12,7 @@ from mcsim.bipolar import Mode, bennett_factor, parse_mode
 from mcsim.bipolar.modes import bin_factor
 from mcsim.ensemble import opening, store
 from mcsim.errors import InputError
+from mcsim.support.folders import user_path
 
 Kind = Literal["plain", "difference"]
 
@@ -209,7 +210,7 @@ def realizations(path: str | Path, rows: Sequence[Row], scaling: Scaling, kind: 
 
     InputError if the store has another lmax or lacks the pair, a mode or the circular-beam controls.
     """
-    target = Path(path)
+    target = user_path(path)
     with opening.open_ensemble(target) as ensemble:
         labels = {str(name): number for number, name in enumerate(ensemble["mode"].values)}
         pairs = [str(name) for name in ensemble["pair"].values]

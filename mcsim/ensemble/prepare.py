@@ -15,7 +15,7 @@ from mcsim.simulation.preparation import preparation
 from mcsim.sphere import header, healpix
 from mcsim.sphere.checks import UNSEEN_BELOW, check_map
 from mcsim.support.arrays import Map, reals
-from mcsim.support.folders import appearing, unwritable, writable
+from mcsim.support.folders import appearing, unwritable, user_path, writable
 
 Source = str | Path | Mapping[str, Any] | config.RunConfig
 
@@ -109,7 +109,7 @@ def prepare_files(source: Source, files: Sequence[str], folder: str | Path) -> l
     of the header; without them uK and the frame of the run.
     """
     run = source if isinstance(source, config.RunConfig) else config.load(source)
-    target, names = Path(folder), file_names(run)
+    target, names = user_path(folder), file_names(run)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise InputError(f"{target} is not a new folder, and nothing is written over; choose another folder with -o.")
     done = prepare(dict(_read(run, names, file) for file in files), run)
@@ -130,7 +130,7 @@ def _read(run: config.RunConfig, names: Mapping[str, str], file: str) -> tuple[s
     if named not in names:
         known = ", ".join(names.values())
         raise InputError(f"{file} is none of {known}; rename it, or say which map it is: NAME={file}.")
-    map_, frame, unit = healpix.read_map(Path(path))
+    map_, frame, unit = healpix.read_map(user_path(path))
     if frame not in (None, run.map.frame):
         raise InputError(
             f"{path} is in {frame} coordinates, map.frame is {run.map.frame}; set map.frame to that of the data."

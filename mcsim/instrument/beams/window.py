@@ -1,5 +1,6 @@
 """Beam windows B_l: text tables such as WMAP's, FITS tables such as Planck's, .npy files, arrays."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.sphere.header import opened
 from mcsim.support.arrays import reals
+from mcsim.support.folders import user_path
 from mcsim.support.npy import read_npy
 
 Window = NDArray[np.float64]
@@ -30,7 +32,7 @@ def read_window(
     if not isinstance(source, str | Path):
         found, origin = reals(source, "the array of B_l"), "the array of B_l"
     else:
-        path, origin = Path(source), str(source)
+        path, origin = user_path(source), str(source)
         if path.suffix == ".npy":
             found = read_npy(path, "iuf").astype(np.float64)
         elif _is_fits(path):
@@ -57,7 +59,9 @@ def _is_fits(path: Path) -> bool:
 
 def _of_text(path: Path) -> Window:
     try:
-        table = np.loadtxt(path, ndmin=2)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of an empty file, which is refused
+            table = np.loadtxt(path, ndmin=2)
     except (OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read as a table of B_l ({error}); give columns ell and B_l.") from None
     if table.shape[1] == 1:
