@@ -13,6 +13,7 @@ from mcsim.bipolar.modes import bin_factor
 from mcsim.ensemble import opening, store
 from mcsim.errors import InputError
 from mcsim.support.arrays import divided
+from mcsim.support.folders import user_path
 
 Kind = Literal["plain", "difference"]
 
@@ -210,7 +211,7 @@ def realizations(path: str | Path, rows: Sequence[Row], scaling: Scaling, kind: 
 
     InputError if the store has another lmax or lacks the pair, a mode or the circular-beam controls.
     """
-    target = Path(path)
+    target = user_path(path)
     with opening.open_ensemble(target) as ensemble:
         labels = {str(name): number for number, name in enumerate(ensemble["mode"].values)}
         pairs = [str(name) for name in ensemble["pair"].values]

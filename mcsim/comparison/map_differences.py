@@ -17,6 +17,10 @@ SCREENED = 50_000
 """Pixels on which orders of pixels are compared at most."""
 
 
+MORE_ALIKE = 0.2
+"""By how much mirrored maps must correlate more with side B: maps of different skies do so by chance, or a little."""
+
+
 class Calibration(Difference):
     """The maps of side B are those of side A times a factor."""
 
@@ -172,7 +176,7 @@ class FrameReversed(Difference):
 
     def starts(self, state: State) -> list[Vector]:
         """Return the mirrored coordinate (0 longitude, 1 latitude), and 1 for the sky alone, where B is more alike."""
-        bare = _alike(state.maps, state)
+        bare = _alike(state.maps, state) + MORE_ALIKE
         ways = [axis for axis in (0, 1) if _alike(_complete(_mirrored(state.maps, axis), state), state) > bare]
         levels = [0] if state.scene is None or state.scene.preparations else [0, 1]
         return [np.array([axis, level], dtype=float) for axis in ways for level in levels]

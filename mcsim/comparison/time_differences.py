@@ -6,8 +6,8 @@ from dataclasses import fields, replace
 import healpy
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array
-from scipy.sparse.linalg import lsqr
+from scipy.sparse import csc_array, diags_array
+from scipy.sparse.linalg import aslinearoperator, lsqr
 
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
@@ -94,7 +94,7 @@ def _shares(pair: ChannelPair, pointing: Pointing | PointingFiles, length: int) 
     assert pair.scene is not None
     for split, moments in enumerate(pair.scene.moments):
         pixels = np.concatenate([one.astype(np.int32) for one in pair.scene.pixels(pointing, split)])
-        edges = np.append(np.arange(0, pixels.size, length), pixels.size)
+        edges = np.append(np.arange(0, pixels.size, length), pixels.size).astype(np.int32)
         yield csc_array((1.0 / moments.hits[pixels], pixels, edges), shape=(moments.npix, edges.size - 1))
 
 
@@ -108,7 +108,7 @@ def _made_by_baselines(
     share: csc_array, rest: NDArray[np.float64], fitted: NDArray[np.bool_], accuracy: float
 ) -> NDArray[np.float64]:
     """Return what baselines that are fitted to some pixels make of all, shape (npix,)."""
-    own = csc_array((share.data * fitted[share.indices], share.indices, share.indptr), shape=share.shape)
+    own = aslinearoperator(diags_array(fitted.astype(float))) @ aslinearoperator(share)
     found = lsqr(own, np.where(fitted, rest, 0.0), atol=accuracy, btol=accuracy, iter_lim=100)[0]
     return np.asarray(share @ found)
 

@@ -16,6 +16,7 @@ from mcsim.config.preparation import grid_after
 from mcsim.config.schema import RunConfig, analysis_lmax, pixel_window
 from mcsim.errors import InputError
 from mcsim.support import resources
+from mcsim.support.folders import user_path
 
 _ADAPTER = TypeAdapter(RunConfig)
 
@@ -71,10 +72,10 @@ def load(source: str | Path | Mapping[str, Any] | RunConfig, base: str | Path | 
     if isinstance(source, RunConfig):
         return source
     if isinstance(source, Mapping):
-        where, folder = "configuration", Path(base or ".")
+        where, folder = "configuration", user_path(base or ".")
         plain = _plain(arrays.in_files(source), where)
     else:
-        path = Path(source)
+        path = user_path(source)
         where = str(source)
         plain, folder = _read(path if os.path.isfile(path) else resources.workflow(source))
     paths.make_absolute(plain, folder, where)
@@ -136,7 +137,7 @@ def json_schema() -> dict[str, Any]:
 
 def _read(path: Path) -> tuple[dict[str, Any], Path]:
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}); check its permissions.") from None
     except UnicodeDecodeError:

@@ -13,7 +13,8 @@ from mcsim.ensemble import plan
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
-from mcsim.support.folders import appearing, unwritable, writable
+from mcsim.sphere.checks import check_whole
+from mcsim.support.folders import appearing, unwritable, user_path, writable
 from mcsim.support.progress import reporting
 
 _COORDINATES = {"ecliptic": "E", "galactic": "G", "equatorial": "C"}
@@ -74,11 +75,16 @@ def write_maps(
     if run.map.grid != "healpix":
         raise InputError(f'{run.name} has map.grid = "{run.map.grid}" and so no pixels; set map.grid = "healpix".')
     alone = not isinstance(realizations, slice | None)
-    part = realizations if isinstance(realizations, slice | None) else slice(int(realizations), int(realizations) + 1)
+    if isinstance(realizations, slice | None):
+        part = realizations
+    else:
+        check_whole(realizations, "realizations")
+        part = slice(int(realizations), int(realizations) + 1)
     wanted = plan.wanted(run, part)
     names = file_names(run)
-    targets = {r: Path(folder) if alone else Path(folder) / f"{r:05d}" for r in wanted}
-    if Path(folder).exists() and not Path(folder).is_dir():
+    whole = user_path(folder)
+    targets = {r: whole if alone else whole / f"{r:05d}" for r in wanted}
+    if whole.exists() and not whole.is_dir():
         raise InputError(f"{folder} is a file; choose a folder with -o.")
     for target in targets.values():
         if target.exists() and (not target.is_dir() or any(target.iterdir())):
@@ -91,7 +97,7 @@ def write_maps(
         for channel in shared.channels:
             sampled.check(channel)
     simulate.draw_sky(shared, wanted.start)  # finds bad sky files before a folder is made
-    writable(Path(folder) if not alone else Path(folder).absolute().parent)
+    writable(whole if not alone else whole.absolute().parent)
     ascii_name = run.name.encode("ascii", "backslashreplace").decode()  # as FITS headers require
     header = [("RUN", ascii_name), ("DIGEST", config.digest(run))]
     with reporting("maps", float(len(wanted)), "realizations", quiet) as report:

@@ -49,6 +49,8 @@ def wanted(run: config.RunConfig, part: slice | None) -> range:
     total = run.ensemble.realizations
     if part is None:
         return range(total)
+    if not isinstance(part, slice) or part.step not in (None, 1):
+        raise InputError(f"realizations = {part!r} is no slice of consecutive ones; give slice(A, B).")
     start, stop = part.start or 0, total if part.stop is None else part.stop
     if not 0 <= start < stop <= total:
         raise InputError(

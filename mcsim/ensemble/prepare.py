@@ -15,7 +15,7 @@ from mcsim.simulation.preparation import preparation
 from mcsim.sphere.checks import check_map
 from mcsim.sphere.healpix import read_uk
 from mcsim.support.arrays import Map, reals
-from mcsim.support.folders import appearing, unwritable, writable
+from mcsim.support.folders import appearing, unwritable, user_path, writable
 
 Source = str | Path | Mapping[str, Any] | config.RunConfig
 
@@ -108,7 +108,7 @@ def prepare_files(source: Source, files: Sequence[str], folder: str | Path) -> l
     of the header; without them uK and the frame of the run.
     """
     run = config.load(source)
-    target, names = Path(folder), file_names(run)
+    target, names = user_path(folder), file_names(run)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise InputError(f"{target} is not a new folder, and nothing is written over; choose another folder with -o.")
     done = prepare(dict(_read(run, names, file) for file in files), run)
@@ -129,4 +129,4 @@ def _read(run: config.RunConfig, names: Mapping[str, str], file: str) -> tuple[s
     if named not in names:
         known = ", ".join(names.values())
         raise InputError(f"{file} is none of {known}; rename it, or say which map it is: NAME={file}.")
-    return named, read_uk(Path(path), run.map.frame, _map_called(run, named).channel.frequency_ghz)
+    return named, read_uk(user_path(path), run.map.frame, _map_called(run, named).channel.frequency_ghz)

@@ -109,25 +109,25 @@ def expected_fall(test: SimulatedGaussian, t: Matrix, amplitudes: Vector, covari
 
 
 def expected_fall_of_draw(
-    wide: SimulatedGaussian, t: Matrix, covariance: Matrix, seen: Measured, here: Vector, there: Vector
+    wide: SimulatedGaussian, t: Matrix, covariance: Matrix, seen: Measured, shares: Vector
 ) -> Measured:
     """Return the fall of chi^2 to expect for a stochastic effect: all data see the same draw.
 
     ``wide`` is the null distribution of the data that judge, with the scatter of the effect, and ``t`` are its
     templates, shape (p_test, K); ``covariance`` is that of the frozen amplitudes from noise alone, and ``seen`` the
-    excess chi^2 of the data that were fitted. ``here`` and ``there``, shape (draws,), are squared signal-to-noise
-    ratios of draws of the response in the data that judge, and in those that were fitted.
+    excess chi^2 of the data that were fitted. ``shares``, shape (draws,), are ratios of the squared signal-to-noise
+    ratio of draws of the response in the data that judge to that in those that were fitted.
 
     Notes
     -----
-    The fall is the excess of the fitted data times the ratio of the mean squares, less tr(F V) for the error of the
-    frozen amplitudes, F of the wide distribution. How closely the squares of a draw keep to that ratio is part of its
-    error.
+    The fall is the excess of the fitted data times the mean share, less tr(F V) for the error of the frozen amplitudes,
+    F of the wide distribution. The scatter of the shares is part of its error: the brightness of a draw is in both
+    squares.
     """
-    share = float(np.mean(here) / np.mean(there))
+    share = float(np.mean(shares))
     white = wide.whiten_templates(t)
     lost = wide.hartlap_factor * float(np.trace(white.T @ white @ covariance))
-    sigma = float(np.hypot(share * seen.sigma, np.std(here - share * there, ddof=1)))
+    sigma = float(np.hypot(share * seen.sigma, seen.value * np.std(shares, ddof=1)))
     return Measured(share * seen.value - lost, sigma)
 
 

@@ -1,7 +1,9 @@
 """Estimate the covariance of a random pattern from a few draws of it, for data that hold one more draw beside noise."""
 
+from dataclasses import dataclass
+from typing import NamedTuple
+
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.support.arrays import Matrix, Vector
@@ -39,43 +41,77 @@ def covariance_of_draws(deviations: Matrix) -> tuple[Matrix, float]:
     total = float(np.sum(deviations**2))
     if total == 0.0:
         return np.zeros((p, p)), 0.0
-    # Along the eigenvectors of S: its eigenvalues (q,), and the squares of the draws (k, q).
-    _, singular, right = np.linalg.svd(deviations, full_matrices=False)
-    values, squares, rest = singular**2, (singular[:, None] * right).T ** 2, p - len(singular)
-    # The scatter of all but draw z is S - less z z', times more.
-    less, more = count / (count - 1.0), (count - 1.0) / (count - 2.0)
-    flat = more * (total - less * squares.sum(axis=1)) / p
-
-    def variances(scale: Vector) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return those without the downdate along (W, k, q) and off the draws (W, k), and the weight of z z' (W, 1)."""
-        same, own = (scale * _WEIGHTS)[:, None] * flat, (scale * (1.0 - _WEIGHTS))[:, None] * more
-        return 1.0 + same[..., None] + own[..., None] * values, 1.0 + same, own * less
-
-    def chi2(scale: Vector) -> NDArray[np.float64]:
-        """Return that of every held-out draw, averaged over noise, shape (W, k) (Sherman & Morrison 1950)."""
-        inside, outside, own = variances(scale)
-        first, second = (np.sum(squares / inside**n, axis=-1) for n in (1, 2))
-        along = (own * second + count * first) / (1.0 - own * first)
-        return np.asarray(np.sum(1.0 / inside, axis=-1) + rest / outside + along)
-
+    held = _HeldOut.of(deviations)
     low, high = np.full(len(_WEIGHTS), -_LOG_RANGE), np.full(len(_WEIGHTS), _LOG_RANGE)
     for _ in range(_STEPS):
         middle = 0.5 * (low + high)
-        narrow = chi2(np.exp(middle)).mean(axis=1) > p
+        narrow = held.judge(np.exp(middle)).chi2.mean(axis=1) > p
         low, high = np.where(narrow, middle, low), np.where(narrow, high, middle)
-    scale = np.exp(high)
-    inside, outside, own = variances(scale)
-    first, second, third = (np.sum(squares / inside**n, axis=-1) for n in (1, 2, 3))
-    left, each = 1.0 - own * first, chi2(scale)
-    volume = np.sum(np.log(inside), axis=-1) + rest * np.log(outside) + np.log(left)
-    likelihood = -0.5 * (volume + each).mean(axis=1)
-    best = int(np.argmax(np.where(high < _LOG_RANGE, likelihood, -np.inf)))
-    flatter = np.sum(1.0 / inside**2, axis=-1) + rest / outside**2
-    flatter += 2.0 * own * third / left + (own * second / left) ** 2 + 2.0 * count * second / left**2
-    variance = float(2.0 * flatter[best].mean() + np.var(each[best], ddof=1))
-    weight = _WEIGHTS[best]
-    found = (1.0 - weight) * deviations @ deviations.T + weight * total / p * np.eye(p)
-    return scale[best] * found, max(variance - 2.0 * p, 0.0) / (p * (p + 2.0))
+    found = held.judge(np.exp(high))
+    best = int(np.argmax(np.where(high < _LOG_RANGE, found.log_likelihood, -np.inf)))
+    variance = float(found.noise_variance[best] + np.var(found.chi2[best], ddof=1))
+    weight, scale = _WEIGHTS[best], np.exp(high[best])
+    covariance = scale * ((1.0 - weight) * deviations @ deviations.T + weight * total / p * np.eye(p))
+    return covariance, max(variance - 2.0 * p, 0.0) / (p * (p + 2.0))
+
+
+class _Judged(NamedTuple):
+    """Hold what held-out draws say of W covariances.
+
+    ``chi2`` is that of each of k draws, averaged over noise, shape (W, k), ``noise_variance`` the variance that noise
+    gives it, averaged over draws, and ``log_likelihood`` the mean of theirs, up to a constant, shape (W,) both.
+    """
+
+    chi2: Matrix
+    noise_variance: Vector
+    log_likelihood: Vector
+
+
+@dataclass(frozen=True)
+class _HeldOut:
+    """Judge covariances of p elements by draws that they do not know.
+
+    ``values``, shape (q,), are the eigenvalues of S, and ``squares``, shape (k, q), those of the deviations of k draws
+    along its eigenvectors.
+    """
+
+    p: int
+    values: Vector
+    squares: Matrix
+
+    @classmethod
+    def of(cls, deviations: Matrix) -> "_HeldOut":
+        """Take the draws' deviations from their mean, shape (p, k)."""
+        _, singular, right = np.linalg.svd(deviations, full_matrices=False)
+        return cls(len(deviations), singular**2, (singular[:, None] * right).T ** 2)
+
+    def judge(self, scale: Vector) -> _Judged:
+        """Judge the covariances of all weights, each with its scale, shape (W,).
+
+        Notes
+        -----
+        The covariance of all but the draw z is (k - 1)/(k - 2) (S - k/(k - 1) z z'). Inverse and determinant of a
+        matrix D - f z z' are those of Sherman & Morrison (Ann. Math. Stat. 21, 124, 1950).
+        """
+        count, rest = len(self.squares), self.p - len(self.values)
+        more, less = (count - 1.0) / (count - 2.0), count / (count - 1.0)
+        trace = more * (self.values.sum() - less * self.squares.sum(axis=1))
+        same, own = (scale * _WEIGHTS)[:, None] * trace / self.p, more * (scale * (1.0 - _WEIGHTS))[:, None]
+        inside, outside, f = 1.0 + same[..., None] + own[..., None] * self.values, 1.0 + same, own * less
+        inverse = 1.0 / inside
+        squared = inverse * inverse
+        first, second, third = (
+            np.einsum("kq,wkq->wk", self.squares, one) for one in (inverse, squared, squared * inverse)
+        )
+        left = 1.0 - f * first
+        # Traces of the inverse and of its square, which noise of variance one contributes.
+        trace_one = np.sum(inverse, axis=-1) + rest / outside + f * second / left
+        trace_two = np.sum(squared, axis=-1) + rest / outside**2
+        trace_two += 2.0 * f * third / left + (f * second / left) ** 2
+        chi2 = trace_one + count * first / left
+        volume = np.sum(np.log(inside), axis=-1) + rest * np.log(outside) + np.log(left)
+        noise = 2.0 * trace_two + 4.0 * count * second / left**2
+        return _Judged(chi2, noise.mean(axis=1), -0.5 * (volume + chi2).mean(axis=1))
 
 
 def without(deviations: Matrix, k: int) -> Matrix:

@@ -6,8 +6,17 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from mcsim.errors import InputError
+
+
+def user_path(given: Any) -> Path:
+    """Return a path that a user gives, with ~ for the home; InputError for what is no path."""
+    try:
+        return Path(given).expanduser()
+    except (TypeError, RuntimeError) as error:  # RuntimeError: no such home is known
+        raise InputError(f"{given!r} is no path of a file or folder ({error}); give one.") from None
 
 
 @contextmanager
@@ -73,7 +82,7 @@ def writable(folder: Path) -> None:
 def default_cache_dir() -> Path:
     """Return $MCSIM_CACHE, or $XDG_CACHE_HOME/mcsim, or ~/.cache/mcsim."""
     if own := os.environ.get("MCSIM_CACHE"):
-        return Path(own)
+        return user_path(own)
     if xdg := os.environ.get("XDG_CACHE_HOME"):
         return Path(xdg) / "mcsim"
     return Path.home() / ".cache" / "mcsim"

@@ -63,6 +63,8 @@ def catalogue() -> Library:
 
 def checked(library: Library) -> Library:
     """Return a library as it was given; raise InputError if one of its effects is none, or bears another name."""
+    if not isinstance(library, Mapping) or not library:
+        raise InputError(f"library = {library!r} has no effects by name; give some of mcsim.effects().")
     for name, kind in library.items():
         if not (isinstance(kind, type) and issubclass(kind, Effect)):
             raise InputError(f"effect {name} of the library is {kind!r}; give a class derived from mcsim.Effect.")

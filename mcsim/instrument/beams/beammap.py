@@ -15,7 +15,7 @@ from mcsim.errors import InputError
 from mcsim.instrument.beams.coefficients import check_lmax, check_mmax, unpacked
 from mcsim.sphere.checks import check_finite
 from mcsim.sphere.header import opened
-from mcsim.support.folders import unreadable
+from mcsim.support.folders import unreadable, user_path
 from mcsim.support.npy import read_npy
 
 Projection = Literal["equidistant", "orthographic", "equal_area"]
@@ -117,7 +117,7 @@ def read_map(
     |b_l2| in V and W, 8e-5 and 4e-4 in K. The plane of projection is taken to touch the sphere at the beam's centre;
     that the WMAP maps have the optic axis there, up to 3 deg away, is of the same order.
     """
-    image, header = _read_image(Path(path), plane)
+    image, header = _read_image(user_path(path), plane)
     pixel_deg = _pixel_deg(header, path) if pixel_deg is None else pixel_deg
     return placed(image, pixel_deg, cut_deg=cut_deg, centre=centre, projection=projection, origin=str(path))
 

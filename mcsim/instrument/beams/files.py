@@ -11,7 +11,7 @@ from mcsim.instrument.beams.coefficients import cut, power_by_order, unpacked
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.header import opened
 from mcsim.support.arrays import numbers
-from mcsim.support.folders import unreadable
+from mcsim.support.folders import unreadable, user_path
 from mcsim.support.npy import read_npy
 
 LEAST_CIRCULAR_POWER = 0.5
@@ -26,7 +26,7 @@ def checked_blm(source: str | Path | NDArray, lmax: int | None = None) -> tuple[
     What is read, and what is refused, says :meth:`mcsim.instrument.beams.Beam.from_blm`.
     """
     if isinstance(source, str | Path):
-        path, origin = Path(source), str(source)
+        path, origin = user_path(source), str(source)
         blm = _of_array(read_npy(path, ndims=(1, 2))) if path.suffix == ".npy" else _read(path)
     else:
         origin = "the array of b_lm"

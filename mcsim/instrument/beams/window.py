@@ -1,5 +1,6 @@
 """Beam windows B_l: text tables such as WMAP's, FITS tables such as Planck's, .npy files, arrays."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.sphere.header import opened
 from mcsim.support.arrays import reals
-from mcsim.support.folders import unreadable
+from mcsim.support.folders import unreadable, user_path
 from mcsim.support.npy import read_npy
 
 Window = NDArray[np.float64]
@@ -31,7 +32,7 @@ def read_window(
     if not isinstance(source, str | Path):
         found, origin = reals(source, "the array of B_l"), "the array of B_l"
     else:
-        path, origin = Path(source), str(source)
+        path, origin = user_path(source), str(source)
         if path.suffix == ".npy":
             found = read_npy(path, "iuf").astype(np.float64)
         elif _is_fits(path):
@@ -57,7 +58,8 @@ def _is_fits(path: Path) -> bool:
 
 
 def _of_text(path: Path) -> Window:
-    with unreadable(path, "a table of B_l", "give columns ell and B_l"):
+    with unreadable(path, "a table of B_l", "give columns ell and B_l"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of an empty file, which is refused
         table = np.loadtxt(path, ndmin=2)
     if table.shape[1] == 1:
         return np.asarray(table[:, 0])

@@ -37,6 +37,7 @@ def read_moments(
     if frame is not None:
         check_frame(frame)
     found = _from_npz(path, where) if Path(path).suffix == ".npz" else _from_fits(path, where, smax, frame)
+    check_moments(found, where)
     if nside not in (None, found.nside):
         raise InputError(f"{where} has nside {found.nside}, but the maps have nside {nside}; use moments of it.")
     if frame not in (None, found.frame):
@@ -89,25 +90,31 @@ def _from_fits(path: str | Path, where: str, smax: int | None, frame: str | None
         bad = ~np.isfinite(columns[name])
         if bad.any():
             raise InputError(f"{where}: column {name} is not finite in {bad.sum()} pixels, first {np.argmax(bad)}.")
-    if hits.min() < 0.0:
-        raise InputError(f"{where}: HITS is {hits.min():g} in pixel {hits.argmin()}, but it must be >= 0.")
     orders = [columns[f"RE_{s}"] + 1j * columns[f"IM_{s}"] for s in range(1, smax + 1)]
     w = np.array(orders, dtype=np.complex128).reshape(smax, hits.size)
-    # Single precision may exceed 1 by 6e-8.
-    largest = np.abs(w).max(initial=0.0)
-    if largest > 1.0 + 1e-6:
-        raise InputError(f"{where}: a moment has modulus {largest:g}, but means of e^(-i s psi) are <= 1.")
-    reach = [float(np.abs(columns[name]).max()) for name in offsets]
-    reach += [float(np.abs(columns[name]).max()) ** (1.0 / sum(powers[name])) for name in powers]
-    farthest = max(reach, default=0.0)
-    if farthest > 2.0 * healpy.max_pixrad(nside):
-        raise InputError(
-            f"{where}: samples lie {farthest:g} rad from their pixel's centre, but a pixel of nside {nside} "
-            f"reaches {healpy.max_pixrad(nside):.3g}; give DTHETA and DPHI in radians, or their unit in TUNIT."
-        )
     more = np.stack([columns[name] for name in powers]) if powers else None
     dtheta, dphi = (columns.get(name) for name in ("DTHETA", "DPHI"))
     return Moments(nside, stated, hits, w, dtheta, dphi, more)
+
+
+def check_moments(moments: Moments, where: str) -> None:
+    """Raise InputError for values that the samples of no pixel have; ``where`` names them in messages."""
+    hits, w = (array[..., : 1 if array.strides[-1] == 0 else None] for array in (moments.hits, moments.w))
+    if not hits.min() >= 0.0:
+        pixel = int(np.argmin(hits))  # that of a NaN, if there is one
+        raise InputError(f"{where}: HITS is {hits[pixel]:g} in pixel {pixel}; give 0 where nothing was observed.")
+    largest = np.max([np.abs(row).max() for row in w], initial=0.0)
+    if not largest <= 1.0 + 1e-6:  # single precision may exceed 1 by 6e-8
+        raise InputError(f"{where}: a moment has modulus {largest:g}, but means of e^(-i s psi) are <= 1.")
+    offsets = [(row, 1) for row in (moments.dtheta, moments.dphi) if row is not None]
+    if moments.offset_moments is not None:
+        offsets += [(row, sum(ab)) for row, ab in zip(moments.offset_moments, exponents(HIGHEST), strict=False)]
+    farthest = np.max([np.abs(row).max() ** (1.0 / degree) for row, degree in offsets], initial=0.0)
+    if not farthest <= 2.0 * healpy.max_pixrad(moments.nside):
+        raise InputError(
+            f"{where}: samples lie {farthest:g} rad from their pixel's centre, but a pixel of nside {moments.nside} "
+            f"reaches {healpy.max_pixrad(moments.nside):.3g}; give DTHETA and DPHI in radians, or their unit in TUNIT."
+        )
 
 
 def _named(order: int) -> dict[str, tuple[int, int]]:

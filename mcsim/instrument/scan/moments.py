@@ -84,6 +84,10 @@ class Moments:
             rows = len(exponents(order_of(len(self.offset_moments)) or HIGHEST))
             check_shape(self.offset_moments, (rows, npix), f"offset_moments of nside {self.nside}")
 
+    def _arrays(self) -> dict[str, NDArray]:
+        """Return the arrays that there are, by name."""
+        return {name: value for name in _ARRAYS if (value := getattr(self, name)) is not None}
+
     @classmethod
     def from_model(
         cls,
@@ -366,18 +370,16 @@ class Moments:
 
     def as_table(self, folder: Path) -> dict[str, str]:
         """Write the moments into a folder; return the table that stands for them in a run."""
-        arrays = {name: value for name in _ARRAYS if (value := getattr(self, name)) is not None}
+        arrays: dict[str, Any] = self._arrays()
         np.savez(folder / "moments.npz", nside=self.nside, frame=self.frame, **arrays)
         return {"kind": "moments", "path": "moments.npz"}
 
     def save(self, folder: str | Path) -> None:
         """Write the arrays as .npy files into ``folder``, which is created."""
-        folder = Path(folder)
+        folder = folders.user_path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        for name in _ARRAYS:
-            array = getattr(self, name)
-            if array is not None:
-                np.save(folder / f"{name}.npy", array)
+        for name, array in self._arrays().items():
+            np.save(folder / f"{name}.npy", array)
         meta = {"nside": self.nside, "frame": self.frame, "offsets": self.offset_order}
         (folder / _META).write_text(json.dumps(meta))
 
@@ -397,7 +399,7 @@ class Moments:
         InputError
             If the folder does not hold complete moments.
         """
-        folder = Path(folder)
+        folder = folders.user_path(folder)
         mode: Any = "r" if mmap else None
         try:
             meta = json.loads((folder / _META).read_text())

@@ -18,7 +18,7 @@ from mcsim.instrument.scan.pointing import quarter_turns, ring_pixel
 from mcsim.sphere.checks import LARGEST_ANGLE, check_nside, check_whole
 from mcsim.sphere.header import first_table, frame_named, radians
 from mcsim.support.compiled import njit
-from mcsim.support.folders import unreadable
+from mcsim.support.folders import unreadable, user_path
 
 _ROWS = 1 << 20
 _NAMES = ("theta", "phi", "psi")
@@ -44,7 +44,7 @@ def sums_of_samples(blocks: Iterable[Sequence[NDArray]], nside: int, smax: int, 
 def blocks_of_files(paths: str | Path | Sequence[str | Path], frame: str) -> Iterator[tuple[NDArray[np.float64], ...]]:
     """Read theta, phi, psi from one file or several, block by block; InputError where they cannot be used."""
     for path in [paths] if isinstance(paths, str | Path) else paths:
-        yield from _blocks(Path(path), frame)
+        yield from _blocks(user_path(path), frame)
 
 
 def _blocks(path: Path, frame: str) -> Iterator[tuple[NDArray[np.float64], ...]]:
