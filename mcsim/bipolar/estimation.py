@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from mcsim.bipolar.modes import Mode, existing, modes
 from mcsim.errors import InputError
-from mcsim.sphere import alm as alm_
 from mcsim.sphere.checks import check_alm, check_finite, check_whole
 from mcsim.sphere.clebsch import Band, band
+from mcsim.support.arrays import Alm, Cl
 from mcsim.support.compiled import njit
 
 
@@ -114,10 +114,26 @@ def power_spectrum(alm_x: NDArray[np.complex128], alm_y: NDArray[np.complex128],
     """
     check_alm(alm_x, lmax, "alm_x")
     check_alm(alm_y, lmax, "alm_y")
-    product = alm_x.real * alm_y.real + alm_x.imag * alm_y.imag
-    product[lmax + 1 :] *= 2.0
-    total = np.bincount(alm_.degrees(lmax), weights=product, minlength=lmax + 1)
-    return total / (2.0 * np.arange(lmax + 1) + 1.0)
+    return by_degree(alm_x, alm_y, lmax) / (2.0 * np.arange(lmax + 1) + 1.0)
+
+
+def by_degree(a: Alm, b: Alm, lmax: int) -> Cl:
+    """Return the sum over all m of a_lm conj(b_lm) of two real fields, shape (lmax + 1,); sizes are not checked."""
+    found = np.zeros(lmax + 1)
+    _add_by_degree(a, b, found)
+    return found
+
+
+@njit(nogil=True)
+def _add_by_degree(a, b, found):  # type: ignore[no-untyped-def]
+    """Add the products of all orders m, twice for m > 0, in one pass over memory."""
+    place = 0
+    for m in range(found.size):
+        twice = 2.0 if m else 1.0
+        for ell in range(m, found.size):
+            product = a[place].real * b[place].real + a[place].imag * b[place].imag
+            found[ell] += twice * product
+            place += 1
 
 
 def _parts(alm: NDArray[np.complex128]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

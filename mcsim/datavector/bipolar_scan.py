@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from mcsim import bipolar
 from mcsim.beamfit.data import parts
+from mcsim.bipolar import by_degree
 from mcsim.datavector.summaries import Element, bins, scales
-from mcsim.datavector.wiener_filter import FilteredMaps, Model, by_degree
+from mcsim.datavector.wiener_filter import FilteredMaps, Model
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.rotation import FRAMES, rotate_biposh
 from mcsim.support.arrays import Map, Vector, divided

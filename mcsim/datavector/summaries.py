@@ -7,8 +7,9 @@ from itertools import pairwise, product
 import healpy
 import numpy as np
 
+from mcsim.bipolar import by_degree
 from mcsim.datavector.matched_filters import normalised_difference
-from mcsim.datavector.wiener_filter import FilteredMaps, Model, by_degree
+from mcsim.datavector.wiener_filter import FilteredMaps, Model
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotation_matrix

@@ -18,6 +18,7 @@ import healpy
 import numpy as np
 from numpy.typing import NDArray
 
+from mcsim.bipolar import by_degree
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.errors import InputError
 from mcsim.instrument.scan import Moments
@@ -28,7 +29,6 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
 from mcsim.support.arrays import Alm, Cl, Map, divided
-from mcsim.support.compiled import njit
 
 
 @dataclass(frozen=True)
@@ -220,22 +220,3 @@ def _transforms(model: Model, members: tuple[int, ...]) -> Iterator[tuple[int, i
             yield from ((i, s, (i,)) for i in filtered)
         elif filtered:
             yield filtered[0], s, filtered
-
-
-def by_degree(a: Alm, b: Alm, lmax: int) -> Cl:
-    """Return the sum over all m of a_lm conj(b_lm) for two real fields."""
-    found = np.zeros(lmax + 1)
-    _add_by_degree(a, b, found)
-    return found
-
-
-@njit(nogil=True)
-def _add_by_degree(a, b, found):  # type: ignore[no-untyped-def]
-    """Add the products of all orders m, twice for m > 0, in one pass over memory."""
-    place = 0
-    for m in range(found.size):
-        twice = 2.0 if m else 1.0
-        for ell in range(m, found.size):
-            product = a[place].real * b[place].real + a[place].imag * b[place].imag
-            found[ell] += twice * product
-            place += 1
