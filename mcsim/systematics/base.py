@@ -160,7 +160,8 @@ class Effect:
     parametrization
         How a diagnosis fits it; left out: the amplitude alone, of either sign.
     proposed
-        False: a diagnosis proposes it only where it is asked for by name (``mcsim diagnose --with NAME``).
+        False: a diagnosis proposes it only where it is asked for by name (``mcsim diagnose --with NAME``), or where it
+        explains the data in the place of an effect that is about to be named.
 
     Examples
     --------
