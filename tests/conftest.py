@@ -57,7 +57,18 @@ def rhs_from_samples() -> Callable[..., np.ndarray]:
 SLOW = {"integration", "statistical"}
 
 
-FIRST = {"test_prepared_diagnosis", "test_diagnosis", "test_challenge", "test_compare", "test_faults", "test_script"}
+FIRST = {
+    "test_challenge",
+    "test_compare",
+    "test_compare_sides",
+    "test_controls",
+    "test_diagnosis",
+    "test_faults",
+    "test_foregrounds",
+    "test_nuisances",
+    "test_prepared_diagnosis",
+    "test_script",
+}
 """Files of the longest tests and fixtures: no other process takes them over at the end, and all end together."""
 
 

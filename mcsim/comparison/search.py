@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
-from mcsim.comparison.prediction import PRECISION, TOLERATED, UNSURE, Prediction, Set
+from mcsim.comparison.prediction import EXPLAINED, PRECISION, TOLERATED, UNSURE, Prediction, Set
 from mcsim.support.arrays import Vector
 
 FURTHER = 0.7
@@ -44,8 +44,11 @@ LARGEST = 3
 MEASURED = 4
 """Sets of every size that are simulated sample by sample."""
 
-WORTH = 0.9
-"""Share of the variance that a set may leave at most to be simulated sample by sample."""
+WORTH, WORTH_IN_NOISE = 0.5, 0.9
+"""Share of the variance that a set may leave at most to be simulated sample by sample.
+
+Once one is found that leaves nothing, it is what moments alone may leave of the others.
+"""
 
 KEPT = 3
 """Sets of every size from which larger ones are built: the best, and as many that do best beside another."""
@@ -123,8 +126,12 @@ class Problem(Prediction):
     def _sorted(self, sets: Iterable[Set]) -> list[Set]:
         """Return sets with the best one first, the first ones measured sample by sample."""
         ranked = sorted(sets, key=lambda one: one.left)
-        promising = [one for one in ranked if one.left < WORTH][:MEASURED]
-        ranked[: len(promising)] = map(self.corrected, promising)
+        worth = WORTH if self.pair.doubt is None else WORTH_IN_NOISE
+        for index, one in enumerate(ranked[:MEASURED]):
+            if one.left < worth:
+                ranked[index] = self.corrected(one)
+                if self.complete(ranked[index]):
+                    worth = 1.0 - EXPLAINED
         return sorted(ranked, key=lambda one: one.left)
 
     def _bases(self, found: Sequence[Set]) -> list[Set]:

@@ -57,7 +57,7 @@ def shrunk(simulations: Matrix, floor: float) -> Shrunk:
     values, vectors = np.linalg.eigh(np.corrcoef(z.T))
     basis = vectors[:, values > floor * values[-1]].T
     whitening, folds = _whitening(z, basis), []
-    p, count = len(whitening), len(simulations)
+    p, count, back = len(whitening), len(simulations), np.linalg.pinv(whitening)
     total, products, pairs = 0.0, 0.0, 0
     for number in range(FOLDS):
         out = np.arange(count) % FOLDS == number
@@ -68,7 +68,7 @@ def shrunk(simulations: Matrix, floor: float) -> Shrunk:
         total += float(np.trace(gram))
         products += float(np.sum(gram**2) - np.sum(np.diag(gram) ** 2))
         pairs += len(white) * (len(white) - 1)
-        folds.append(Fold(white, own @ np.linalg.pinv(whitening)))
+        folds.append(Fold(white, own @ back))
     ratio = p * products / pairs / (total / count) ** 2
     dof = int(min(max((ratio * (p + 3) - 1.0) / max(ratio - 1.0, 1e-9), p + 7), LARGEST))
     scale = float(np.sqrt(dof * p / (dof - p - 1.0) / (total / count)))

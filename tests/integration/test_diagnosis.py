@@ -13,12 +13,12 @@ from scipy.stats import kstest
 import mcsim
 from instruments import data_of, two_channels
 from mcsim import config, systematics
-from mcsim.datavector import bipolar_scan, campaign
-from mcsim.datavector.analysis import analysis_of, data_vectors
+from mcsim.datavector import bipolar_scan, campaign, localisation
+from mcsim.datavector.analysis import analysis_of, data_vectors, on_request
 from mcsim.datavector.campaign import with_effects
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import shared_sky, wiener_filter
-from mcsim.diagnosis import api, localisation, report, unlisted, words
+from mcsim.diagnosis import api, report, unlisted, words
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
@@ -326,6 +326,22 @@ def test_effects_on_request_are_proposed_when_they_are_named(small):
         assert np.all(change > 0.0)
 
 
+@pytest.mark.parametrize(
+    ("name", "amplitude", "rivals"), [("noise_level", 0.3, ["louder"]), ("beam_ellipticity", 0.25, [])]
+)
+def test_an_effect_on_request_is_named_beside_what_it_cannot_be_told_from(small, name, amplitude, rivals):
+    """Unless it is asked for it is no candidate, and nothing else changes."""
+    library = (*small.analysis.library, ("louder", type("OnRequest", (Louder,), {"proposed": False})))
+    known = replace(small, analysis=replace(small.analysis, library=library))
+    assert [one.identity for one in on_request(known.analysis)] == [("louder", "V1"), ("louder", "W1")]
+    shared = data_of(small.run, name, "W1", amplitude=amplitude)
+    found = diagnose_data(ObservedMaps(known, list(simulate.maps(shared, 1)), ask), name)
+    named = [[(one.name, one.channel) for one in effects.effects] for effects in found.sets]
+    assert sorted(named) == sorted([(one, "W1")] for one in [name, *rivals])
+    assert found.kind == ("degenerate" if rivals else "effect")
+    assert len(found.candidates) == len(small.candidates) + len(rivals)
+
+
 def test_the_cost_of_a_diagnosis_counts_the_effects_on_request(small):
     least = DiagnosisSettings(simulations=400, without=tuple(n for n in systematics.catalogue() if n != "noise_level"))
 
@@ -344,15 +360,15 @@ def test_the_cost_of_a_diagnosis_counts_the_effects_on_request(small):
         api.describe(small.run, replace(least, including=("gain_spin",), without=("gain_spin",)))
 
 
-def test_a_diagnosis_knows_the_library_that_it_is_given(small, tmp_path, monkeypatch):
+def test_a_diagnosis_knows_the_library_that_it_is_given(tmp_path, monkeypatch):
     """And names an effect that is in no catalogue; ``without`` is read in that library too."""
     monkeypatch.setenv("MCSIM_CACHE", str(tmp_path))
     monkeypatch.setattr(api, "batch", lambda workers: campaign.batch(0))  # in this process
-    run = small.run
-    louder = config.Effect(name="louder", channel="W1", parameters={"amplitude": 0.2})
+    run = config.load(two_channels("tiny", lmax=20, nside=8, fwhm_arcmin=700.0))
+    louder = config.Effect(name="louder", channel="W1", parameters={"amplitude": 0.4})
     seeded = replace(run, ensemble=replace(run.ensemble, seed=77))
     maps = list(simulate.maps(survey(with_effects(seeded, [louder]), library={"louder": Louder}), 0))
-    settings = DiagnosisSettings(library={"louder": Louder}, simulations=320)
+    settings = DiagnosisSettings(library={"louder": Louder}, simulations=240)
     with quick_pictures():
         found = mcsim.diagnose(run, maps, tmp_path / "out", settings=settings)
     assert {(one.name, one.channel) for one in found.candidates} == {("louder", "V1"), ("louder", "W1")}

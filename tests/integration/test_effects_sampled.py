@@ -12,35 +12,33 @@ from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import Survey, survey
 from refusals import refused
 
-NSIDE, LMAX = 32, 95
+NSIDE = 16
 EPSILON = 1e-7
 """Of the interpolation, relative to the dipole: 0.3 nK."""
-
-
-ROUND = {"kind": "gaussian", "fwhm_arcmin": 300.0}
 
 
 def prepared(
     name: str | None = None,
     dipole_uk: float = 3364.5,
     sigma0_uk: float = 0.0,
-    beam: dict[str, Any] = ROUND,
-    period_s: float = 32.0,
+    beam: dict[str, Any] | None = None,
+    nside: int = NSIDE,
+    denser: float = 1.0,
     **parameters: Any,
 ) -> Survey:
-    """A year of WMAP's scan, a sample every 32 s, 80 in a pixel of nside 32; a beam three pixels wide."""
+    """A year of WMAP's scan, 80 samples in a pixel, or ``denser``; a beam three pixels wide, round if not given."""
     table: dict[str, Any] = {
         "schema": 1,
         "name": "effect",
-        "sky": {"spectrum": "wmap7", "lmax": LMAX, "dipole_uk": dipole_uk},
-        "map": {"nside": NSIDE},
+        "sky": {"spectrum": "wmap7", "lmax": 3 * nside - 1, "dipole_uk": dipole_uk},
+        "map": {"nside": nside},
         "channel": [
             {
                 "name": "W1",
                 "frequency_ghz": 94.0,
-                "beam": beam,
+                "beam": beam or {"kind": "gaussian", "fwhm_arcmin": 9600.0 / nside},
                 "noise": {"sigma0_uk": sigma0_uk},
-                "scan": {"kind": "hit_averaged", "model": "wmap", "sample_period_s": period_s},
+                "scan": {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 32768.0 / nside**2 / denser},
             }
         ],
         "biposh": {"L_max": 2},
@@ -53,21 +51,16 @@ def prepared(
 
 
 @lru_cache
-def plain(period_s: float = 32.0) -> tuple[np.ndarray, np.ndarray]:
+def plain(nside: int = NSIDE, denser: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Maps of both routes without effects."""
-    run = prepared(period_s=period_s)
+    run = prepared(nside=nside, denser=denser)
     ((name, map_uk),) = sampled.maps(run, 0, epsilon=EPSILON)
     assert (name,) == run.map_names
     return simulate.maps(run, 0)[0], map_uk
 
 
-@pytest.fixture
-def without() -> tuple[np.ndarray, np.ndarray]:
-    return plain()
-
-
-DENSER = {"beam_coma": 16.0}
-"""Seconds between samples where the scatter of samples in a pixel tells the routes apart."""
+DENSER = {"beam_coma": 2.0}
+"""Times as many samples where their scatter in a pixel tells the routes apart."""
 
 
 RESPONSES = {
@@ -76,7 +69,7 @@ RESPONSES = {
     "beam_sidelobe": {"amplitude": 0.002, "quadrupole": 0.5, "calibrated": "dipole"},
     "beam_width": {"amplitude": 0.02},
     "calibration": {"amplitude": 0.003},
-    "pointing_offset": {"amplitude": 5.0, "angle_deg": 70.0},
+    "pointing_offset": {"amplitude": 10.0, "angle_deg": 70.0},
     "time_constant": {"amplitude": 0.05},
     "gain_drift": {"amplitude": 0.01, "phase_deg": 30.0},
     "dipole_residual": {"amplitude": 10.0, "lon_deg": 20.0, "lat_deg": 30.0},
@@ -89,16 +82,16 @@ RESPONSES = {
     "nonlinearity": {"amplitude": 0.002},
     "orbital_dipole": {"amplitude": 0.02, "phase_deg": 40.0},
     "spin_synchronous_offset": {"amplitude": 2.0, "phase_deg": 30.0},
-    "pointing_jitter": {"amplitude": 400.0},
+    "pointing_jitter": {"amplitude": 800.0},
     "lensing": {"amplitude": 4.0},
 }
 
 
 @pytest.mark.parametrize("name", RESPONSES)
 def test_both_routes_respond_alike(name):
-    period_s = DENSER.get(name, 32.0)
-    parameters, without = RESPONSES[name], plain(period_s)
-    changed = prepared(name, period_s=period_s, **parameters)
+    denser = DENSER.get(name, 1.0)
+    parameters, without = RESPONSES[name], plain(denser=denser)
+    changed = prepared(name, denser=denser, **parameters)
     default = simulate.maps(changed, 0)[0] - without[0]
     reference = sampled.maps(changed, 0, epsilon=EPSILON)[0][1] - without[1]
     product = default @ reference / np.sqrt((default @ default) * (reference @ reference))
@@ -110,7 +103,7 @@ def test_both_routes_respond_alike(name):
 
 def test_a_beam_with_all_of_its_orders_back_is_the_beam():
     """In both routes, where the fiducial beam is the circular part alone and the effect adds the rest."""
-    ellipse = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 320.0, "fwhm_minor_arcmin": 280.0, "angle_deg": 20.0}
+    ellipse = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 640.0, "fwhm_minor_arcmin": 560.0, "angle_deg": 20.0}
     fiducial = ellipse | {"m_max": 0}
     whole, circular = (prepared(beam=beam, dipole_uk=0.0) for beam in (ellipse | {"m_max": 4}, fiducial))
     restored = prepared("beam_noncircularity", beam=fiducial, dipole_uk=0.0, amplitude=1.0)
@@ -123,12 +116,12 @@ def test_a_beam_with_all_of_its_orders_back_is_the_beam():
         assert np.abs(found - expected).max() < 1e-5 * np.std(expected - without)
 
 
-def test_samples_at_the_centres_lose_window_and_centroid(without):
+def test_samples_at_the_centres_lose_window_and_centroid():
     """The scatter of the samples in a pixel, which the default route does not know, keeps the two at a cosine of 0.97.
 
     Without a dipole: it is taken off with the fiducial window.
     """
-    changed = prepared("pixelization", dipole_uk=0.0, amplitude=1.0)
+    without, changed = plain(nside=32), prepared("pixelization", dipole_uk=0.0, nside=32, amplitude=1.0)
     centred = [simulate.maps(changed, 0)[0], sampled.maps(changed, 0, epsilon=EPSILON)[0][1]]
     default, reference = (map_uk - plain for map_uk, plain in zip(centred, without, strict=True))
     assert default @ reference / np.sqrt((default @ default) * (reference @ reference)) > 0.96

@@ -26,6 +26,7 @@ from mcsim.simulation import simulate
 from mcsim.simulation.nuisance import draws, tables
 from mcsim.simulation.survey import survey
 from mcsim.stats.look_elsewhere import global_test
+from pictures import quick_pictures
 
 PROPOSED = ("beam_ellipticity", "calibration", "noise_level")
 WITHOUT = tuple(name for name in systematics.catalogue() if name not in PROPOSED)
@@ -157,7 +158,8 @@ def test_the_command_lists_and_writes_nuisances(run, tmp_path, monkeypatch, caps
     code, said = mcsim_("diagnose", "model.toml", "data", "-o", "out", "--dry-run", *without)
     assert code == 0
     assert "nuisance: calibration of W1: 0.00 % ± 0.30 % of the gain" in said.out
-    code, said = mcsim_("diagnose", "model.toml", "data", "-o", "out", "--simulations", "150", *without)
+    with quick_pictures():
+        code, said = mcsim_("diagnose", "model.toml", "data", "-o", "out", "--simulations", "150", *without)
     assert code == 0
     assert "nuisance      calibration of W1" in said.out
     verdict = json.loads((tmp_path / "out" / "verdict.json").read_text())
@@ -167,7 +169,8 @@ def test_the_command_lists_and_writes_nuisances(run, tmp_path, monkeypatch, caps
     assert two["name"] == "noise_level"
     found = mcsim.diagnosis.result.DiagnosisResult.open(tmp_path / "out")
     assert found.to_json() == verdict
-    assert "Known unknowns" in report.page(found)
+    with quick_pictures():
+        assert "Known unknowns" in report.page(found)
     assert words.pulled(found.nuisances[0]).startswith("; pull ")
     assert mcsim_("config", "model.toml")[0] == 0
     table["nuisance"] = [{"effect": "noise_level", "channel": "W1", "width": 0.5}]

@@ -21,18 +21,18 @@ from pictures import quick_pictures
 
 PROPOSED = ("beam_ellipticity", "noise_level", "dipole_modulation")
 SETTINGS = DiagnosisSettings(without=tuple(name for name in mcsim.effects() if name not in PROPOSED))
-FINE, COARSE = 64, 16
+FINE, COARSE = 32, 8
 MASK = (np.abs(healpy.pix2vec(COARSE, np.arange(12 * COARSE**2))[2]) > 0.25).astype(float)
 
 
-def model(lmax=150, steps=True):
+def model(lmax=75, steps=True):
     channels = [
         {
             "name": name,
             "frequency_ghz": frequency,
-            "beam": {"kind": "gaussian", "fwhm_arcmin": 150.0},
-            "noise": {"sigma0_uk": 600.0},
-            "scan": {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 30.0, "line_of_sight": line},
+            "beam": {"kind": "gaussian", "fwhm_arcmin": 300.0},
+            "noise": {"sigma0_uk": 300.0},
+            "scan": {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 121.0, "line_of_sight": line},
         }
         for name, frequency, line in (("V1", 61.0, "A"), ("W1", 94.0, "B"))
     ]
@@ -40,7 +40,7 @@ def model(lmax=150, steps=True):
         "name": "prepared",
         "sky": {"spectrum": "wmap7", "lmax": lmax},
         "map": {"nside": FINE if steps else COARSE, "mask": MASK},
-        "biposh": {"L_max": 2, "lmax": 32},
+        "biposh": {"L_max": 2, "lmax": 16},
         "channel": channels,
         "preparation": [
             {"kind": "degrade", "nside": COARSE},
@@ -93,14 +93,14 @@ def test_prepared_maps_of_the_model_agree_with_it_and_an_effect_is_found(maps, t
 @pytest.mark.slow
 @pytest.mark.usefixtures("forked_workers")
 def test_a_model_that_lacks_power_of_the_sky_is_told_so(maps, tmp_path):
-    """Without the steps and the power above l = 40. Nothing of the verdict is asked, so few simulations will do."""
-    bare = diagnosed(model(40, steps=False), maps, tmp_path, 200)
+    """Without the steps and the power above l = 20. Nothing of the verdict is asked, so few simulations will do."""
+    bare = diagnosed(model(20, steps=False), maps, tmp_path, 200)
     assert len(bare.warnings) == 1
     assert "set sky.lmax to" in bare.warnings[0]
     assert json.loads((tmp_path / "verdict.json").read_text())["warnings"] == list(bare.warnings)
     assert words.summary(bare, tmp_path)[0].startswith("warning")
     with quick_pictures():
-        assert "Warning: sky.lmax = 40" in report.page(bare)
+        assert "Warning: sky.lmax = 20" in report.page(bare)
     assert mcsim.diagnosis.result.DiagnosisResult.open(tmp_path).warnings == bare.warnings
 
 
@@ -112,7 +112,7 @@ def test_the_cost_of_a_preparation_is_said():
     # Two channels, map and control, four transforms each.
     assert "prepare 16 further transforms" in plan.describe(config.to_dict(smoothed))
     text = describe(run, SETTINGS)
-    assert "nside 64 to 16" in text
+    assert f"nside {FINE} to {COARSE}" in text
     assert "further transforms" not in plan.describe(config.to_dict(model(steps=False)))
 
 

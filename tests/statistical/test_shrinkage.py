@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
+from mcsim.stats import look_elsewhere
 from mcsim.stats.gaussian import SimulatedGaussian, held_out_pvalues
 from mcsim.stats.look_elsewhere import calibrate, calibrate_in_folds
 from mcsim.stats.shrinkage import FOLDS, _whitening, shrunk_eigenvalues
@@ -35,8 +36,9 @@ def test_eigenvalues_are_those_of_the_truth_along_the_sample_vectors():
     np.testing.assert_allclose(shrunk_eigenvalues(truth[:80:40], 10**9), truth[:80:40], rtol=0.01)
 
 
-def test_pvalues_are_uniform_and_the_worth_is_that_of_a_sample_covariance():
+def test_pvalues_are_uniform_and_the_worth_is_that_of_a_sample_covariance(monkeypatch):
     """Four data of each of 250 ensembles; templates are tested at once, as in a diagnosis."""
+    monkeypatch.setattr(look_elsewhere, "SCATTERS", 40)  # each for ten draws, not two: the number of draws counts here
     rng, mixing = np.random.default_rng(2), root()
     templates = mixing @ rng.normal(size=(P, 6))
     omnibus, combined, worth, kept = [], [], [], []
