@@ -10,6 +10,7 @@ moments ``moments_W1_half1.fits`` and ``moments_W1_half2.fits``: nside 128, a ye
 
 import argparse
 import os
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,9 @@ PARAMETERS: dict[str, dict[str, Any]] = {
     "excess_noise": {"amplitude": 0.001},
 }
 NOISE = ("noise_anisotropy", "noise_level")
+UNIFORM = dict.fromkeys(NOISE, "a change of the variance:\nno mean response") | {
+    "monopole_residual": "no power above ℓ = 0"
+}
 DIFFERENCING = ("transmission_imbalance", "mapmaking_convergence")
 
 Map = NDArray[np.float64]
@@ -187,7 +191,8 @@ def draw(found: dict[str, Map], path: Path, title: str) -> None:
         row, column = divmod(place, columns)
         above = figure.add_subplot(grid[2 * row, column], projection="mollweide")
         effect = systematics.build(name, PARAMETERS[name])
-        above.set_title(f"{effect.label()}\n{effect.format_amplitude(effect.amplitude)}", fontsize=9)
+        size = textwrap.fill(effect.format_amplitude(effect.amplitude), 36)
+        above.set_title(f"{effect.label()}\n{size}", fontsize=9)
         sky(above, name, maps)
         below = figure.add_subplot(grid[2 * row + 1, column])
         spectra(below, name, maps)
@@ -208,7 +213,7 @@ ROUTE = " Scans of another kind (no dots) are in the default route alone"
 
 def sky(axes: Any, name: str, maps: Map) -> None:
     shown = healpy.smoothing(maps[0], fwhm=np.deg2rad(1.5)) if len(maps) == 4 else maps[0]
-    reach = np.percentile(np.abs(shown - (0.0 if name in NOISE else shown.mean())), 99.0)
+    reach = np.percentile(np.abs(shown - (0.0 if name in UNIFORM else shown.mean())), 99.0)
     lon, lat = np.linspace(np.pi, -np.pi, 501), np.linspace(-np.pi / 2, np.pi / 2, 251)
     middle_lon, middle_lat = (lon[1:] + lon[:-1]) / 2, (lat[1:] + lat[:-1]) / 2
     pixels = healpy.ang2pix(healpy.npix2nside(shown.size), np.pi / 2 - middle_lat[:, None], middle_lon[None, :])
@@ -223,8 +228,8 @@ def sky(axes: Any, name: str, maps: Map) -> None:
 
 
 def spectra(axes: Any, name: str, maps: Map) -> None:
-    if name in NOISE:
-        axes.text(0.5, 0.5, "a change of the variance:\nno mean response", ha="center", va="center", fontsize=8)
+    if name in UNIFORM:
+        axes.text(0.5, 0.5, UNIFORM[name], ha="center", va="center", fontsize=8)
         axes.set_axis_off()
         return
     lmax = min(SHOWN_LMAX, 2 * healpy.npix2nside(maps.shape[1]))
