@@ -60,6 +60,7 @@ SLOW = {"integration", "statistical"}
 FIRST = {
     "test_challenge",
     "test_compare",
+    "test_compare_sides",
     "test_controls",
     "test_diagnosis",
     "test_faults",

@@ -12,6 +12,8 @@ from mcsim.bipolar import Mode, bennett_factor, parse_mode
 from mcsim.bipolar.modes import bin_factor
 from mcsim.ensemble import opening, store
 from mcsim.errors import InputError
+from mcsim.support.arrays import divided
+from mcsim.support.folders import user_path
 
 Kind = Literal["plain", "difference"]
 
@@ -146,7 +148,7 @@ def project(
         exists = np.isfinite(inside)
         count = exists.sum(axis=-1)
         total = np.where(exists, inside, 0.0).sum(axis=-1)
-        mean = np.divide(total, count, out=np.full(total.shape, np.nan + 0j), where=count > 0)
+        mean = divided(total, count, np.nan)
         columns.append(mean.imag if row.imaginary else mean.real)
     return np.stack(columns, axis=-1)
 
@@ -209,7 +211,7 @@ def realizations(path: str | Path, rows: Sequence[Row], scaling: Scaling, kind: 
 
     InputError if the store has another lmax or lacks the pair, a mode or the circular-beam controls.
     """
-    target = Path(path)
+    target = user_path(path)
     with opening.open_ensemble(target) as ensemble:
         labels = {str(name): number for number, name in enumerate(ensemble["mode"].values)}
         pairs = [str(name) for name in ensemble["pair"].values]

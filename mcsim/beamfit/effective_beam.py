@@ -18,6 +18,7 @@ from mcsim.config.preparation import frame_of
 from mcsim.ensemble import store
 from mcsim.ensemble.expectation import Source, survey_of
 from mcsim.errors import InputError
+from mcsim.support.folders import user_path
 
 NEGLIGIBLE = 0.1
 """Leading order suffices if the higher orders are below this size in sigma: no parameter shifts by more."""
@@ -241,7 +242,7 @@ def measurement(
     """
     if isinstance(data, Measurement):
         return data
-    path, frame = Path(data), survey_of(source).frame
+    path, frame = user_path(data), survey_of(source).frame
     if path.is_dir():
         measured = from_store(path, selection)
         check_frame(path, frame_of(store.attributes(path)["configuration"]), frame)

@@ -83,10 +83,9 @@ def report(fits: Sequence[Fit]) -> str:
     for one in fits:
         lines += _model(one)
     for small, large, test in comparisons(fits):
-        lines.append(
-            f"  {large} over {small}: chi2 falls by {test.drop:.3g} for {test.added} more parameter"
-            f"{'s' if test.added > 1 else ''}, p = {test.probability:.3g}"
-        )
+        falls = f"chi2 falls by {test.drop:.3g}" if data.simulations is None else f"F = {test.drop / test.added:.3g}"
+        more = f"{test.added} more parameter{'s' if test.added > 1 else ''}"
+        lines.append(f"  {large} over {small}: {falls} for {more}, p = {test.probability:.3g}")
     return "\n".join(lines)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mcsim.beamfit.data import EVERYTHING, SUMMARY, Measurement, Row, Scaling, Selection, parts
 from mcsim.bipolar import Mode
 from mcsim.errors import InputError
+from mcsim.support.folders import unreadable
 
 COLUMNS = ("L", "M", "d", "ell_min", "ell_max")
 """Columns that identify the content of a row."""
@@ -109,10 +110,8 @@ def identified(path: str | Path, table: Table) -> NDArray[np.int64]:
 
 def read_ecsv(path: str | Path) -> Table:
     """Read an ECSV table with rows and :data:`COLUMNS`; raise InputError for anything else."""
-    try:
+    with unreadable(path, "an ECSV table", "give a store or such a table"):
         table = Table.read(path, format="ascii.ecsv")
-    except Exception as error:  # libraries raise errors of any type for a broken file
-        raise InputError(f"{path} cannot be read as an ECSV table ({error}); give a store or such a table.") from None
     if len(table) == 0:
         raise InputError(f"{path} has no rows; give the measured bins.")
     missing = [name for name in COLUMNS if name not in table.colnames]

@@ -175,7 +175,7 @@ def diagnose_case(settings: Settings, folder: Path, case: str, without: tuple[st
         "maximum": found.test.maximum,
         "explanations": [
             {
-                "proposals": [model.candidates[member].label for member in one.candidates],
+                "proposals": [found.candidates[member].label for member in one.candidates],
                 "amplitudes": list(one.coordinates),
                 "errors": list(one.errors),
             }

@@ -75,12 +75,12 @@ class EffectsLibrary:
         size = float(np.linalg.norm(white))
         return np.sqrt(self.groups.delta_chi2(white)) / size if size > 0.0 else np.zeros(len(self.candidates))
 
-    def distances(self, response: Vector, largest: int = 3) -> tuple[float, ...]:
-        """Return the S/N that the best sets of 1, 2, ..., ``largest`` candidates leave of a response."""
+    def distances(self, response: Vector) -> tuple[float, ...]:
+        """Return the S/N that the best sets of one, two and three candidates leave of a response."""
         white = self.null.whiten_templates(response)
         search = Subsets(self.null, white, self.groups, self.candidates, self.calibration)
         found, best = [], search.total
-        for size in range(1, largest + 1):
+        for size in (1, 2, 3):
             left = [search.solve(rows).chi2.min() for rows in search.rows(size)]
             best = min([best, *left])
             found.append(float(np.sqrt(self.null.hartlap_factor * max(best, 0.0))))

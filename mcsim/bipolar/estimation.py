@@ -8,15 +8,15 @@ Stored at ell = l2 with d = l2 - l1, in the Hajian-Souradeep normalisation,
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.bipolar.modes import Mode, existing, modes
 from mcsim.errors import InputError
-from mcsim.sphere import alm as alm_
 from mcsim.sphere.checks import check_alm, check_finite, check_whole
 from mcsim.sphere.clebsch import Band, band
+from mcsim.support.arrays import Alm, Cl
+from mcsim.support.compiled import njit
 
 
 @dataclass(frozen=True)
@@ -114,17 +114,33 @@ def power_spectrum(alm_x: NDArray[np.complex128], alm_y: NDArray[np.complex128],
     """
     check_alm(alm_x, lmax, "alm_x")
     check_alm(alm_y, lmax, "alm_y")
-    product = alm_x.real * alm_y.real + alm_x.imag * alm_y.imag
-    product[lmax + 1 :] *= 2.0
-    total = np.bincount(alm_.degrees(lmax), weights=product, minlength=lmax + 1)
-    return total / (2.0 * np.arange(lmax + 1) + 1.0)
+    return by_degree(alm_x, alm_y, lmax) / (2.0 * np.arange(lmax + 1) + 1.0)
+
+
+def by_degree(a: Alm, b: Alm, lmax: int) -> Cl:
+    """Return the sum over all m of a_lm conj(b_lm) of two real fields, shape (lmax + 1,); sizes are not checked."""
+    found = np.zeros(lmax + 1)
+    _add_by_degree(a, b, found)
+    return found
+
+
+@njit(nogil=True)
+def _add_by_degree(a, b, found):  # type: ignore[no-untyped-def]
+    """Add the products of all orders m, twice for m > 0, in one pass over memory."""
+    place = 0
+    for m in range(found.size):
+        twice = 2.0 if m else 1.0
+        for ell in range(m, found.size):
+            product = a[place].real * b[place].real + a[place].imag * b[place].imag
+            found[ell] += twice * product
+            place += 1
 
 
 def _parts(alm: NDArray[np.complex128]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return np.ascontiguousarray(alm.real), np.ascontiguousarray(alm.imag)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _accumulate(x, y, lmax, tables, total):  # type: ignore[no-untyped-def]
     """Add sum_m2 G_L P to total[L - L_min, (real, imaginary), l2]; ``x`` and ``y`` are (real, imaginary) of a_lm."""
     M, d, _, _, norm, rising_a, rising_b, shift_a, shift_b, constant, slope, previous = tables
@@ -165,7 +181,7 @@ def _accumulate(x, y, lmax, tables, total):  # type: ignore[no-untyped-def]
 # The inner loops run along l2 over slices of unit stride, so that the compiler turns them into vector instructions.
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _products(first, second, signs, real, imag):  # type: ignore[no-untyped-def]
     """Compute (sign_x x + i sign_y y)(u + i sign_v v) of (x, y) and (u, v)."""
     (x, y), (u, v) = first, second
@@ -176,7 +192,7 @@ def _products(first, second, signs, real, imag):  # type: ignore[no-untyped-def]
         imag[i] = a * c + b * u[i]
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _bottom(norm, rising_a, rising_b, g, before):  # type: ignore[no-untyped-def]
     """Set G at the smallest L, and zero below it."""
     for i in range(g.size):
@@ -184,14 +200,14 @@ def _bottom(norm, rising_a, rising_b, g, before):  # type: ignore[no-untyped-def
         before[i] = 0.0
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _add(g, real, imag, total_real, total_imag):  # type: ignore[no-untyped-def]
     for i in range(g.size):
         total_real[i] += g[i] * real[i]
         total_imag[i] += g[i] * imag[i]
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _step(constant, slope, previous, m1, g, before):  # type: ignore[no-untyped-def]
     """Step G from L to L + 1."""
     for i in range(g.size):

@@ -7,6 +7,7 @@ import json
 import os
 import sys
 from dataclasses import fields, replace
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated
 
@@ -38,12 +39,21 @@ app = typer.Typer(
 
 
 def main() -> None:
-    """Run the command line; bad input ends in one sentence and exit code 2."""
+    """Run the command line; bad input ends in one sentence and exit code 2, a disk that fails in exit code 1."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # of a terminal that may lack ± and µ
+            stream.reconfigure(errors="replace")
     try:
         app()
     except (InputError, RunError) as error:
         print(f"mcsim: {error}", file=sys.stderr)
         sys.exit(2 if isinstance(error, InputError) else 1)
+    except OSError as error:
+        if error.errno is None:  # no word of the system's
+            raise
+        what = error.filename or "the output"
+        print(f"mcsim: {what}: {error.strerror}; check its permissions and the space on its disk.", file=sys.stderr)
+        sys.exit(1)
 
 
 def _version(asked: bool) -> None:

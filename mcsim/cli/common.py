@@ -8,6 +8,7 @@ from typing import Annotated
 from typer import Argument, Option
 
 from mcsim.errors import InputError
+from mcsim.support.folders import user_path
 
 Config = Annotated[str, Argument(metavar="CONFIG", help="TOML file, or a packaged workflow such as quickstart.")]
 Workers = Annotated[int | None, Option(min=0, help="Processes; 0: this one; default: the model's.")]
@@ -44,7 +45,7 @@ def interrupt_once() -> None:
 def save(figure, path: Path) -> None:  # type: ignore[no-untyped-def]
     """Save a figure and print its path; raise InputError if the file cannot be written."""
     try:
-        figure.savefig(path)
+        figure.savefig(user_path(path))
     except (OSError, ValueError) as error:
         raise InputError(f"{path} cannot be written ({error}); choose another file with -o.") from error
     print(f"wrote {path}")

@@ -103,8 +103,10 @@ def compare(
     if not 0.0 < accuracy < 1.0:
         raise InputError(f"accuracy = {accuracy:g} is no share of the sky; give a number between 0 and 1.")
     nthreads = os.cpu_count() or 1
+    a, b = (folders.user_path(side) if isinstance(side, str | Path) else side for side in (a, b))
     if output is not None:
-        folders.writable(Path(output))
+        output = folders.user_path(output)
+        folders.writable(output)
     if isinstance(a, str | Path) and isinstance(b, str | Path):
         sides = read(a, b, model, nthreads)
         case = Path(b).absolute().name
@@ -112,7 +114,9 @@ def compare(
         raise InputError("one side is a folder and the other arrays; give two folders or two lists of maps.")
     else:
         if model is None:
-            raise InputError("maps as arrays have no names; give the model whose maps they are.")
+            raise InputError(
+                "sides that are no paths are lists of maps without names; give the model whose maps they are."
+            )
         run = model if isinstance(model, config.RunConfig) else config.load(model)
         sides, case = given(a, b, run, nthreads), run.name
     found = []
@@ -154,7 +158,7 @@ def _explained(
 
     ``exchanged``: it is the other's side B.
     """
-    sky = _sky_rms(pair)
+    sky, _ = (_sky_rms(pair, side) for side in "AB")
     if _rms((pair.b - pair.a)[pair.seen]) <= ROUNDING * sky:
         return _result(pair, sides, "identical", exchanged), None
     pair = with_shown_sky(pair).where_different(ROUNDING * sky)
@@ -290,14 +294,14 @@ def _rms(values: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _sky_rms(pair: ChannelPair) -> float:
-    """Return the rms of side A over the pixels that are seen, monopole and dipole fitted and taken off."""
+def _sky_rms(pair: ChannelPair, side: str = "A") -> float:
+    """Return the rms of a side over the pixels that are seen, monopole and dipole fitted and taken off."""
     axes = np.array(healpy.pix2vec(pair.nside, np.arange(pair.a.shape[1])))
     left = []
-    for one, seen in zip(pair.a, pair.seen, strict=True):
+    for one, seen in zip(pair.a if side == "A" else pair.b, pair.seen, strict=True):
         t = np.vstack([np.ones(int(seen.sum())), axes[:, seen]]).T
         left.append(one[seen] - t @ np.linalg.lstsq(t, one[seen], rcond=None)[0])
     size = _rms(np.concatenate(left))
     if size <= PRECISION:
-        raise InputError(f"the maps of {pair.name} on side A are constant; give maps of a sky.")
+        raise InputError(f"the maps of {pair.name} on side {side} are constant; give maps of a sky.")
     return size

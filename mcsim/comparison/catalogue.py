@@ -5,6 +5,7 @@ from mcsim.comparison.map_differences import (
     Calibration,
     ChannelExchanged,
     Dipole,
+    FrameReversed,
     Monopole,
     NoiseShared,
     Ordering,
@@ -32,7 +33,8 @@ from mcsim.comparison.time_differences import FarTimeShift, Interpolation, MapMa
 def library(frame: str) -> tuple[Difference, ...]:
     """Return all differences of implementation, for skies in a frame."""
     return (
-        Unit(), Calibration(), Monopole(), Dipole(), Ordering(), SplitExchanged(), ChannelExchanged(), NoiseShared(),
+        Unit(), Calibration(), Monopole(), Dipole(), Ordering(), FrameReversed(), SplitExchanged(), ChannelExchanged(),
+        NoiseShared(),
         PsiOffset(), PsiSign(), BeamConjugated(), MmaxCut(), LmaxCut(), PixelWindow(), BeamWindow(), Smoothing(),
         PixelCentres(),
         TimeShift(), FrameRotated(frame), SpinSign(), PrecessionSign(),

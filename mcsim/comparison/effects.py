@@ -9,10 +9,10 @@ import numpy as np
 from mcsim import config
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair, quiet
-from mcsim.comparison.scene import Maps, Scene
+from mcsim.comparison.scene import EPSILON, Maps, Scene
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
-from mcsim.simulation.survey import survey
+from mcsim.simulation.survey import Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.support.arrays import Alm, Vector
 from mcsim.systematics import Effect
@@ -20,6 +20,9 @@ from mcsim.systematics.registry import basis_of, catalogue
 
 REDUNDANT = ("calibration", "monopole_residual", "pixelization", "spectrum")
 """calibration, monopole and pixel_centres are differences already; two sides have a sky, and its power, in common."""
+
+STAGES = ("sky", "beam", "pointing", "gain", "signal", "spread", "orientations")
+"""Where an effect must act to change a map without noise."""
 
 
 class EffectDifference(Difference):
@@ -46,7 +49,7 @@ class EffectDifference(Difference):
     def response(self, value: Vector, scene: Scene, pair: ChannelPair) -> Maps:
         """Return the effect's response on a scene."""
         bare, acting = (
-            simulate.maps(survey(run, scene.nthreads), 0, scene.nthreads, self._sky(scene, pair))
+            simulate.maps(_survey(run, scene), 0, scene.nthreads, self._sky(scene, pair))
             for run in self._runs(value, scene, pair)
         )
         return acting - bare
@@ -60,7 +63,7 @@ class EffectDifference(Difference):
         )
 
         def made(run: config.RunConfig) -> Maps:
-            return np.stack([m for _, m in sampled.maps(survey(run, scene.nthreads), 0, scene.nthreads)])
+            return np.stack([m for _, m in sampled.maps(_survey(run, scene), 0, scene.nthreads, EPSILON)])
 
         try:
             more = made(acting)
@@ -121,23 +124,32 @@ def effects_of(pair: ChannelPair, run: config.RunConfig) -> Iterator[EffectDiffe
     if pair.scene is None:
         return
     alone = quiet(run.of_channels(pair.name))
-    sky, nthreads = pair.scene.sky, pair.scene.nthreads
-    bare = simulate.maps(survey(alone, nthreads), 0, nthreads, sky)
+    scene = pair.scene
+
+    def made(acting: config.RunConfig) -> Maps:
+        return simulate.maps(_survey(acting, scene), 0, scene.nthreads, scene.sky)
+
+    bare = made(alone)
     sampled_bare: dict[bytes, Maps] = {}
     for name, kind in catalogue().items():
-        if kind.parametrization.stochastic or name in REDUNDANT or not kind.proposed:
+        acts = any(getattr(kind, stage) is not getattr(Effect, stage) for stage in STAGES)
+        if kind.parametrization.stochastic or name in REDUNDANT or not kind.proposed or not acts:
             continue
         templates = []
         try:
             for effect in basis_of(kind):
                 acting = replace(alone, effects=(_table(effect, pair.name),))
-                made = simulate.maps(survey(acting, nthreads), 0, nthreads, sky)
                 scale = float(np.max(np.abs(kind.parametrization.coordinates(effect))))
-                templates.append(np.where(pair.seen, (made - bare) / scale, 0.0))
+                templates.append(np.where(pair.seen, (made(acting) - bare) / scale, 0.0))
         except InputError:  # it depends on what the model does not say: a frequency, a pointing, a differencing scan
             continue
         if any(t.any() for t in templates):
             yield EffectDifference(kind, np.stack(templates), alone, sampled_bare)
+
+
+def _survey(run: config.RunConfig, scene: Scene) -> Survey:
+    """Return the survey of a run with all orders of the moments of a scene, which are known."""
+    return survey(run, scene.nthreads, orders=scene.moments[0].smax)
 
 
 def _table(effect: Effect, channel: str) -> config.Effect:

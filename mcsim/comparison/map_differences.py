@@ -9,11 +9,16 @@ import numpy as np
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.scene import Maps, Scene
+from mcsim.sphere import alm as alm_
 from mcsim.sphere import header
 from mcsim.support.arrays import Vector
 
 SCREENED = 50_000
 """Pixels on which orders of pixels are compared at most."""
+
+
+MORE_ALIKE = 0.2
+"""By how much mirrored maps must correlate more with side B: maps of different skies do so by chance, or a little."""
 
 
 class Calibration(Difference):
@@ -136,19 +141,8 @@ class Ordering(Difference):
 
     def starts(self, state: State) -> list[Vector]:
         """Return both ways, if side B is more like the prediction then, dipoles aside."""
-
-        def alike(maps: Maps) -> float:
-            some = np.arange(maps.shape[1]) % max(1, maps.shape[1] // SCREENED) == 0
-            seen = state.pair.seen & (maps != healpy.UNSEEN) & some
-            axes = np.hstack([_axes(state.pair.nside)[:, one] for one in seen])
-            known = np.vstack([np.ones(axes.shape[1]), axes]).T
-            one, other = (
-                v - known @ np.linalg.lstsq(known, v, rcond=None)[0] for v in (maps[seen], state.pair.b[seen])
-            )
-            return float(np.corrcoef(one, other)[0, 1])
-
         ways = [np.array([1.0]), np.array([-1.0])]
-        return [way for way in ways if alike(self.maps(state.maps, way, state)) > alike(state.maps)]
+        return [way for way in ways if _alike(self.maps(state.maps, way, state), state) > _alike(state.maps, state)]
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
         order = {"r2n": True} if value[0] > 0 else {"n2r": True}
@@ -160,6 +154,58 @@ class Ordering(Difference):
 
     def inverse(self, value: Vector) -> Vector:
         return -value
+
+
+def _alike(maps: Maps, state: State) -> float:
+    """Return the correlation of side B with maps, dipoles aside, in some of the pixels."""
+    some = np.arange(maps.shape[1]) % max(1, maps.shape[1] // SCREENED) == 0
+    seen = state.pair.seen & (maps != healpy.UNSEEN) & some
+    axes = np.hstack([_axes(state.pair.nside)[:, one] for one in seen])
+    known = np.vstack([np.ones(axes.shape[1]), axes]).T
+    one, other = (v - known @ np.linalg.lstsq(known, v, rcond=None)[0] for v in (maps[seen], state.pair.b[seen]))
+    return float(np.corrcoef(one, other)[0, 1])
+
+
+class FrameReversed(Difference):
+    """Longitudes, or latitudes, of side B have the other sign: of its sky, or of its pixels."""
+
+    name, unit = "frame_reversed", "1 = mirrored"
+    met = "longitudes that count to the west, or colatitudes taken for latitudes"
+    needs_scene = False
+    exchanges = True
+
+    def starts(self, state: State) -> list[Vector]:
+        """Return the mirrored coordinate (0 longitude, 1 latitude), and 1 for the sky alone, where B is more alike."""
+        bare = _alike(state.maps, state) + MORE_ALIKE
+        ways = [axis for axis in (0, 1) if _alike(_complete(_mirrored(state.maps, axis), state), state) > bare]
+        levels = [0] if state.scene is None or state.scene.preparations else [0, 1]
+        return [np.array([axis, level], dtype=float) for axis in ways for level in levels]
+
+    def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
+        if not value[1]:
+            return scene
+        signs = (-1.0) ** (alm_.degrees(scene.lmax) + alm_.orders(scene.lmax))
+        return replace(scene, sky=signs * scene.sky if value[0] else np.conj(scene.sky))
+
+    def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
+        return maps if value[1] else _complete(_mirrored(maps, int(value[0])), state)
+
+    def undone(self, maps: Maps, value: Vector) -> Maps | None:
+        return None if value[1] else _mirrored(maps, int(value[0]))
+
+    def amplitude(self, value: Vector) -> float:
+        return 1.0
+
+    def parameters(self, value: Vector) -> dict[str, float | str]:
+        return {"coordinate": ("longitude", "latitude")[int(value[0])], "of": "the sky" if value[1] else "the pixels"}
+
+
+def _mirrored(maps: Maps, axis: int) -> Maps:
+    """Return maps with longitudes (0) or latitudes (1) of the other sign."""
+    nside = healpy.npix2nside(maps.shape[1])
+    theta, phi = healpy.pix2ang(nside, np.arange(maps.shape[1]))
+    there = (np.pi - theta, phi) if axis else (theta, 2.0 * np.pi - phi)
+    return maps[:, healpy.ang2pix(nside, *there)]
 
 
 class SplitExchanged(Difference):

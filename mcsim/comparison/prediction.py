@@ -9,6 +9,7 @@ import numpy as np
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.scene import Maps, PointingFiles, Scene
+from mcsim.comparison.shown_sky import unshown
 from mcsim.support.arrays import Alm, Vector
 from mcsim.systematics.base import Pointing
 
@@ -169,12 +170,19 @@ class Prediction:
 
         That is what the set makes of a draw of the sky that the maps do not show.
         """
-        scene = self.pair.scene
-        if self.pair.doubt is None or scene is None or not found.members:
+        return 0.0 if self.pair.doubt is None else self.share_hidden(found, self.pair.doubt)
+
+    def share_hidden(self, found: Set, doubt: Alm) -> float:
+        """Return the share of the variance that a set makes of a draw of the sky that the maps do not show."""
+        if self.pair.scene is None or not found.members:
             return 0.0
         if found.key not in self._hidden:
-            self._hidden[found.key] = self._squares_hidden(found.members, scene, self.pair.doubt)
+            self._hidden[found.key] = self._squares_hidden(found.members, self.pair.scene, doubt)
         return self._hidden[found.key]
+
+    @cached_property
+    def _in_holes(self) -> Alm | None:
+        return unshown(self.pair)
 
     def _squares_hidden(self, members: Members, scene: Scene, doubt: Alm) -> float:
         made = []
@@ -206,6 +214,8 @@ class Prediction:
         if found.explains >= needed:
             return True
         hidden = self.hidden(found)
+        if hidden == 0.0 and found.explains >= EXPLAINED and self._in_holes is not None:
+            hidden = self.share_hidden(found, self._in_holes)
         return hidden <= MOST_HIDDEN and found.explains + TOLERATED * hidden >= needed
 
     def complete(self, found: Set) -> bool:

@@ -8,7 +8,7 @@ import healpy
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
 from mcsim.comparison.result import ChannelResult, ComparisonResult
@@ -19,6 +19,9 @@ from mcsim.support.numbers import number
 DOTS_PER_INCH = 110
 SHOWN = 64
 """nside of the maps in pictures."""
+
+_TICKS = (2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+"""Multipoles that an axis names."""
 
 
 def page(result: ComparisonResult) -> str:
@@ -70,17 +73,26 @@ def _draw_map(axes: Axes, values: NDArray[np.float64], title: str) -> None:
         vmin=middle - largest,
         vmax=middle + largest,
     )
-    axes.set_title(f"{title}: rms {number(float(np.nanstd(values)))} uK", fontsize=10)
+    axes.set_title(f"{title}: rms {number(float(np.nanstd(values)))} µK", fontsize=10)
     axes.axis("off")
-    axes.figure.colorbar(shown, ax=axes, orientation="horizontal", shrink=0.7, aspect=30, pad=0.02).set_label("uK")
+    axes.figure.colorbar(
+        shown, ax=axes, orientation="horizontal", shrink=0.7, aspect=30, pad=0.02, ticks=MaxNLocator(4)
+    ).set_label("µK")
+
+
+def _plain_ticks(axes: Axes) -> None:
+    """Write the ticks of a logarithmic x axis as numbers, and no others."""
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
+    axes.xaxis.set_minor_locator(NullLocator())
 
 
 def _draw_words(axes: Axes, channel: ChannelResult) -> None:
     """Say in words what was found, beside the maps."""
-    lines = [f"{d.name}: {number(d.amplitude)} {d.unit}" for d in channel.differences]
+    lines = [d.words for d in channel.differences]
     lines += [f"  {key}: {value if isinstance(value, str) else number(value)}" for d in channel.differences
               for key, value in d.parameters.items()]  # fmt: skip
     axes.axis("off")
+    lines += ["or " + " and ".join(d.words for d in one) for one in channel.alternatives]
     text = "\n".join([channel.verdict, *lines])
     axes.text(0.05, 0.9, text, va="top", fontsize=11, linespacing=1.5, transform=axes.transAxes)
 
@@ -101,7 +113,9 @@ def _draw_spectra(axes: Axes, channel: ChannelResult) -> None:
         power = healpy.alm2cl(alm)[2:]
         if power.max() > 0.0:
             axes.loglog(ell, ell * (ell + 1) / (2.0 * np.pi) * power, label=label, color=colour, ls=style, lw=1.2)
-    axes.set(xlabel="degree l", ylabel="l(l + 1) C_l / 2π  [uK²]", title="by degree")
+    axes.set_xticks([tick for tick in _TICKS if 2 <= tick <= lmax])
+    _plain_ticks(axes)
+    axes.set(xlabel="multipole $\\ell$", ylabel="$\\ell(\\ell + 1) C_\\ell / 2\\pi$  [µK²]", title="by degree")
     axes.legend(frameon=False, fontsize=9)
 
 
@@ -120,6 +134,7 @@ def _draw_depth(axes: Axes, channel: ChannelResult) -> None:
     for label, values, colour in (("B − A", difference, "#0072b2"), ("left", left, "#00785a")):
         rms = np.sqrt(np.bincount(bins, values**2, edges.size - 1) / count)
         axes.loglog(middle, rms, "o-", ms=4, label=label, color=colour)
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set(xlabel="samples in a pixel", ylabel="rms  [uK]", title="by hits")
+    axes.set_xticks([*middle[:: max(1, (middle.size - 1) // 3)]])
+    _plain_ticks(axes)
+    axes.set(xlabel="samples in a pixel", ylabel="rms  [µK]", title="by hits")
     axes.legend(frameon=False, fontsize=9)

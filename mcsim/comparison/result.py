@@ -27,6 +27,13 @@ class DifferenceResult:
     parameters: dict[str, float | str]
     met: str
 
+    @property
+    def words(self) -> str:
+        """Name and amplitude, or what an amplitude of 1 means where it can be nothing else."""
+        meaning = self.unit.removeprefix("1 = ")
+        alone = meaning != self.unit and self.amplitude == 1.0
+        return f"{self.name} ({meaning})" if alone else f"{self.name} = {number(self.amplitude)} {self.unit}"
+
     def to_dict(self) -> dict[str, Any]:
         """Return it as in ``compare.json``."""
         own = {key: getattr(self, key) for key in ("name", "channel", "amplitude", "unit", "explains")}
@@ -128,9 +135,9 @@ class ChannelResult:
             return (
                 f"{self.name}: different by {size}, in a way that no difference of the library explains{hint}.{looks}"
             )
-        named = " and ".join(f"{d.name} = {number(d.amplitude)} {d.unit}" for d in self.differences)
-        others = [" and ".join(d.name for d in one) for one in self.alternatives]
-        also = f"; {', '.join(others)} would do as well" if others else ""
+        named = " and ".join(d.words for d in self.differences)
+        others = [" and ".join(d.words for d in one) for one in self.alternatives]
+        also = f"; {' or '.join(others)} would do as well" if others else ""
         also += "; the model describes side B" if self.reversed else ""
         return (
             f"{self.name}: different by {size}, by {named}, which explains {100 * (1 - self.left):.2f} % and leaves "

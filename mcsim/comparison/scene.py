@@ -227,14 +227,24 @@ class Scene:
                 tod.Samples(0.0 * psi, theta, phi, psi, healpy.ang2pix(self.nside, theta, phi), 0.0 * psi)
                 for theta, phi, psi in blocks
             )
-        count = len(self.moments)
-        grid = MapGrid(self.nside, self.moments[0].frame, (split / count, (split + 1) / count))
-        model = self.motion or pointing.model
+        model, grid = self.motion or pointing.model, self._grid(split)
         here = tod.samples(model, pointing.line, grid)
         if not self.late:
             return here
         there = tod.samples(ahead(model, self.late * model.period_of_samples(pointing.line)), pointing.line, grid)
         return (replace(seen, pixel=binned.pixel) for binned, seen in zip(here, there, strict=True))
+
+    def pixels(self, pointing: Pointing | PointingFiles, split: int) -> Iterator[NDArray[np.int64]]:
+        """Yield the pixels of the samples of a split, in the order of time."""
+        if isinstance(pointing, PointingFiles):
+            yield from (healpy.ang2pix(self.nside, theta, phi) for theta, phi, _ in pointing.angles[split])
+        else:
+            model, grid = self.motion or pointing.model, self._grid(split)
+            yield from (chunk.pixel for chunk in tod.samples(model, pointing.line, grid, angles=False))
+
+    def _grid(self, split: int) -> MapGrid:
+        count = len(self.moments)
+        return MapGrid(self.nside, self.moments[0].frame, (split / count, (split + 1) / count))
 
     def sampled(
         self, pointing: Pointing | PointingFiles, window: NDArray[np.float64], signal: tod.Stage | None = None

@@ -97,14 +97,14 @@ class FrameRotated(Difference):
     def starts(self, state: State) -> list[Vector]:
         """Return the best angle about each frame's pole, and the rotations from one frame to another."""
         assert state.scene is not None
-        lmax = min(state.scene.lmax, 2 * state.pair.nside)
+        lmax, nthreads = min(state.scene.lmax, 2 * state.pair.nside), state.scene.nthreads
         shown = state.scene.preparations[0].frame if state.scene.preparations else self.frame
         to_sky = rotation_matrix(shown, self.frame)
-        a, b = (_turned(_mean_alm(side, state, lmax), lmax, to_sky) for side in (state.maps, state.pair.b))
+        a, b = (_turned(_mean_alm(side, state, lmax), lmax, to_sky, nthreads) for side in (state.maps, state.pair.b))
         found = []
         for frame in ("ecliptic", "galactic", "equatorial"):
             to_pole = rotation_matrix(self.frame, frame)
-            one, other = (_turned(alm, lmax, to_pole) for alm in (a, b))
+            one, other = (_turned(alm, lmax, to_pole, nthreads) for alm in (a, b))
             angle = _best_angle(one, other, lmax)
             pole = to_pole.T @ np.array([0.0, 0.0, 1.0])
             if abs(angle) > 1e-7:
@@ -113,12 +113,12 @@ class FrameRotated(Difference):
             for end in ("ecliptic", "galactic", "equatorial"):
                 if start != end:
                     found.append(np.rad2deg(Rotation.from_matrix(rotation_matrix(start, end)).as_rotvec()))
-        lost = [float(np.sum(np.abs(b - _turned(a, lmax, _matrix(value))) ** 2)) for value in found]
+        lost = [float(np.sum(np.abs(b - _turned(a, lmax, _matrix(value), nthreads)) ** 2)) for value in found]
         best = sorted(range(len(found)), key=lambda i: lost[i])[:1]
         return [found[i] for i in best if lost[i] < float(np.sum(np.abs(b - a) ** 2))]
 
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
-        return replace(scene, sky=_turned(scene.sky, scene.lmax, _matrix(value)))
+        return replace(scene, sky=_turned(scene.sky, scene.lmax, _matrix(value), scene.nthreads))
 
     def amplitude(self, value: Vector) -> float:
         return float(np.linalg.norm(value))
@@ -132,9 +132,11 @@ def _matrix(rotation_deg: Vector) -> Vector:
     return np.asarray(Rotation.from_rotvec(np.deg2rad(rotation_deg)).as_matrix())
 
 
-def _turned(alm: NDArray[np.complex128], lmax: int, matrix: Vector) -> NDArray[np.complex128]:
+def _turned(alm: NDArray[np.complex128], lmax: int, matrix: Vector, nthreads: int) -> NDArray[np.complex128]:
+    if np.array_equal(matrix, np.eye(3)):
+        return alm
     alpha, beta, gamma = euler_angles(matrix)
-    return np.asarray(ducc0.sht.rotate_alm(alm, lmax, gamma, beta, alpha))
+    return np.asarray(ducc0.sht.rotate_alm(alm, lmax, gamma, beta, alpha, nthreads=nthreads))
 
 
 def _mean_alm(maps: Maps, state: State, lmax: int) -> NDArray[np.complex128]:
@@ -153,9 +155,10 @@ def _best_angle(a: NDArray[np.complex128], b: NDArray[np.complex128], lmax: int)
     def lost(angle: float) -> float:
         return -float(np.sum(np.real(power * np.exp(1j * np.arange(lmax + 1) * angle))))
 
-    grid = np.linspace(-np.pi, np.pi, 16 * lmax, endpoint=False)
-    values = -np.real(np.exp(1j * np.outer(grid, np.arange(lmax + 1))) @ power)
-    start, step = grid[int(np.argmin(values))], grid[1] - grid[0]
+    number = 16 * lmax
+    step = 2.0 * np.pi / number
+    signs = np.where(np.arange(lmax + 1) % 2 == 1, -1.0, 1.0)  # angles from -pi on
+    start = step * int(np.argmax(np.fft.ifft(signs * power, number).real)) - np.pi
     return float(minimize_scalar(lost, bounds=(start - step, start + step), method="bounded").x)
 
 

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
-from mcsim.comparison.prediction import PRECISION, TOLERATED, UNSURE, Prediction, Set
+from mcsim.comparison.prediction import ENOUGH, EXPLAINED, PRECISION, TOLERATED, UNSURE, Prediction, Set
 from mcsim.support.arrays import Vector
 
 FURTHER = 0.7
@@ -44,8 +44,11 @@ LARGEST = 3
 MEASURED = 4
 """Sets of every size that are simulated sample by sample."""
 
-WORTH = 0.9
-"""Share of the variance that a set may leave at most to be simulated sample by sample."""
+WORTH, WORTH_IN_NOISE = 0.5, 0.9
+"""Share of the variance that a set may leave at most to be simulated sample by sample.
+
+Once one is found that leaves nothing, it is what moments alone may leave of the others.
+"""
 
 KEPT = 3
 """Sets of every size from which larger ones are built: the best, and as many that do best beside another."""
@@ -123,8 +126,12 @@ class Problem(Prediction):
     def _sorted(self, sets: Iterable[Set]) -> list[Set]:
         """Return sets with the best one first, the first ones measured sample by sample."""
         ranked = sorted(sets, key=lambda one: one.left)
-        promising = [one for one in ranked if one.left < WORTH][:MEASURED]
-        ranked[: len(promising)] = map(self.corrected, promising)
+        worth = WORTH if self.pair.doubt is None else WORTH_IN_NOISE
+        for index, one in enumerate(ranked[:MEASURED]):
+            if one.left < worth:
+                ranked[index] = self.corrected(one)
+                if self.complete(ranked[index]):
+                    worth = 1.0 - EXPLAINED
         return sorted(ranked, key=lambda one: one.left)
 
     def _bases(self, found: Sequence[Set]) -> list[Set]:
@@ -254,9 +261,14 @@ class Problem(Prediction):
         return sorted(found, key=lambda one: one.left)
 
     def preferred(self, sets: Sequence[Set]) -> list[Set]:
-        """Return sets with the best first; of those that are as good, the one with the fewest fitted values."""
+        """Return sets with the best first; of those that are as good, the one with the fewest fitted values.
+
+        As good are sets of one size too that leave no more than an interpolation, which a fitted value may take in.
+        """
         limit = EQUAL * sets[0].left + UNSURE * self.hidden(sets[0]) + PRECISION
-        equal = [one for one in sets if one.left <= limit and self.suffices(one)]
+        little, size = min(ENOUGH, self.floor**2 * self.pair.seen.sum() / self.total), len(sets[0].members)
+        close = [one for one in sets if one.left <= (max(limit, little) if len(one.members) == size else limit)]
+        equal = [one for one in close if self.suffices(one)]
         first = min(equal, key=lambda one: (len(one.members), one.fitted), default=sets[0])
         return [first, *(one for one in sets if one is not first)]
 

@@ -19,6 +19,15 @@ NOISY = 0.02
 UNSHOWN = 1e-3
 """The same where single samples are simulated: what is left then is noise, or of a sky that holes hide."""
 
+SHARP = 1e-4
+"""What a simulation leaves of side A, over the sky, from which on the sky is not corrected further.
+
+Orientation moments leave more of maps of single samples.
+"""
+
+WHOLE = 0.99
+"""Share of the pixels from which on holes hide nothing."""
+
 NEAR = 5
 """Degrees over which power is averaged."""
 
@@ -46,6 +55,11 @@ def _left(pair: ChannelPair, made: Maps) -> float:
     return float(np.sum((pair.a - made)[pair.seen] ** 2))
 
 
+def _sky(pair: ChannelPair) -> float:
+    """Return the squares of side A about its mean."""
+    return float(np.var(pair.a[pair.seen]) * pair.seen.sum())
+
+
 def _as_made(pair: ChannelPair, found: ChannelPair) -> ChannelPair:
     """Return a pair as side A was made: by single samples, orientation moments, or at the pixels' centres.
 
@@ -56,12 +70,14 @@ def _as_made(pair: ChannelPair, found: ChannelPair) -> ChannelPair:
     assert scene is not None
     assert found.scene is not None
     left = _left(found, _made(found, found.scene))
-    if left <= UNSHOWN**2 * np.var(pair.a[pair.seen]) * pair.seen.sum():
+    if left <= UNSHOWN**2 * _sky(pair):
         return found
-    centred = [scene.at_centres(), replace(scene.at_centres(), beam=scene.beam.truncated(0))]
-    if pair.sky_of_maps:
-        centred = [replace(one, sky=sky_in(pair.a, pair.seen, one)) for one in centred]
-    best = min([scene, *centred], key=lambda one: _left(pair, one.maps()))
+    best = scene
+    if _left(pair, scene.maps()) > SHARP**2 * _sky(pair):
+        centred = [scene.at_centres(), replace(scene.at_centres(), beam=scene.beam.truncated(0))]
+        if pair.sky_of_maps:
+            centred = [replace(one, sky=sky_in(pair.a, pair.seen, one)) for one in centred]
+        best = min([scene, *centred], key=lambda one: _left(pair, one.maps()))
     if _left(pair, best.maps()) > MADE * left:
         return found
     if best is scene and pair.pointing() is not None:
@@ -80,8 +96,13 @@ def _sharper(pair: ChannelPair) -> ChannelPair:
     scene = pair.scene
     if scene is None or (pair.pointing() is None and scene.offset_order < 2):
         return pair
+    limit = SHARP**2 * _sky(pair)
+    if _left(pair, scene.maps()) <= limit:
+        return pair
     for _ in range(ROUNDS):
         missing = np.where(pair.seen, pair.a - _made(pair, scene), 0.0)
+        if np.sum(missing**2) <= limit:
+            break
         empty = replace(scene.up_to_offsets(1), sky=np.zeros_like(scene.sky))
         scene = replace(scene, sky=scene.sky + sky_in(missing, pair.seen, empty, 1e-2))
     return replace(pair, scene=scene)
@@ -147,6 +168,16 @@ def _filtered(pair: ChannelPair, weight: Maps) -> ChannelPair:
     other = alm_.resize(alm_.multiply(other, inverse, lmax), lmax, scene.lmax)
     doubt = other - sky_of(values + np.sqrt(total) * draw.standard_normal(total.size))
     return replace(pair, scene=replace(scene, sky=sky), doubt=doubt)
+
+
+def unshown(pair: ChannelPair) -> Alm | None:
+    """Return a draw of what holes hide of the sky of side A, coefficients as the scene's; None if they hide nothing."""
+    scene, share = pair.scene, float(pair.seen.any(axis=0).mean())
+    if scene is None or not pair.sky_of_maps or scene.preparations or share > WHOLE:
+        return None
+    sky = _draw(healpy.alm2cl(scene.sky) / share, np.random.default_rng(0))
+    alone = replace(scene.up_to_offsets(1), sky=sky)
+    return sky - sky_in(np.where(pair.seen, alone.maps(), 0.0), pair.seen, replace(alone, sky=np.zeros_like(sky)))
 
 
 def _draw(power: NDArray[np.float64], draw: np.random.Generator) -> Alm:

@@ -6,8 +6,8 @@ from dataclasses import fields, replace
 import healpy
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.linalg import lsqr
+from scipy.sparse import csc_array, diags_array
+from scipy.sparse.linalg import aslinearoperator, lsqr
 
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
@@ -25,6 +25,9 @@ FEWEST = 16
 
 PREDICTED = 0.5
 """Share of half of the pixels' variance that baselines fitted to the other half must explain."""
+
+SCREENING, FITTED = 1e-3, 1e-6
+"""Accuracy of fits of baselines that are tried, and of those that are named: gradient over sizes of matrix and rest."""
 
 SAMPLES = 30_000_000
 """Samples of the longest survey whose single samples are fitted or looked up."""
@@ -63,7 +66,7 @@ class MapMaking(Difference):
         length = int(np.ceil(number * PIXELS_PER_BASELINE / pair.seen.sum()))
         shares = list(_shares(pair, pointing, length))
         # Longer baselines are sums of the shortest ones, which explain the most of the pixels that they are fitted to.
-        if np.sum((rest - _all_fitted(shares, rest, pair.seen)) ** 2) > (1.0 - PREDICTED) * total:
+        if np.sum((rest - _all_fitted(shares, rest, pair.seen, SCREENING)) ** 2) > (1.0 - PREDICTED) * total:
             return []
         tried = [(1.0, length, shares)]
         while number / length > FEWEST * len(rest):
@@ -74,7 +77,7 @@ class MapMaking(Difference):
         lost, length, shares = min(tried, key=lambda one: one[0])
         if lost > 1.0 - PREDICTED:
             return []
-        made = _all_fitted(shares, rest, pair.seen)
+        made = _all_fitted(shares, rest, pair.seen, FITTED)
         value = np.array([np.sqrt(np.mean(made[pair.seen] ** 2)), length])
         self._made[value.tobytes()] = made
         return [value]
@@ -86,46 +89,44 @@ class MapMaking(Difference):
         return {"baseline_samples": float(value[1])}
 
 
-def _shares(pair: ChannelPair, pointing: Pointing | PointingFiles, length: int) -> Iterator[csr_array]:
-    """Yield the share that every baseline has in the samples of every pixel, shape (npix, baseline), of each split."""
+def _shares(pair: ChannelPair, pointing: Pointing | PointingFiles, length: int) -> Iterator[csc_array]:
+    """Yield the share of every sample in its pixel, shape (npix, baseline), of each split."""
     assert pair.scene is not None
     for split, moments in enumerate(pair.scene.moments):
-        shape = (moments.npix, int(moments.hits.sum()) // length + 1)
-        hits, done = csr_array(shape), 0
-        for chunk in pair.scene.stream(pointing, split):
-            baseline = (done + np.arange(chunk.pixel.size)) // length
-            hits = hits + csr_array((np.ones(baseline.size), (chunk.pixel, baseline)), shape=shape)
-            done += baseline.size
-        yield csr_array(hits.multiply(1.0 / np.maximum(moments.hits, 1.0)[:, None]))
+        pixels = np.concatenate([one.astype(np.int32) for one in pair.scene.pixels(pointing, split)])
+        edges = np.append(np.arange(0, pixels.size, length), pixels.size).astype(np.int32)
+        yield csc_array((1.0 / moments.hits[pixels], pixels, edges), shape=(moments.npix, edges.size - 1))
 
 
-def _merged(share: csr_array) -> csr_array:
+def _merged(share: csc_array) -> csc_array:
     """Return the same with two baselines in place of one."""
-    coordinates = share.tocoo()
-    width = (share.shape[1] + 1) // 2
-    return csr_array((coordinates.data, (coordinates.row, coordinates.col // 2)), shape=(share.shape[0], width))
+    edges = np.append(share.indptr[:-1:2], share.indptr[-1])
+    return csc_array((share.data, share.indices, edges), shape=(share.shape[0], edges.size - 1))
 
 
-def _lost(share: csr_array, rest: NDArray[np.float64], seen: NDArray[np.bool_]) -> float:
+def _made_by_baselines(
+    share: csc_array, rest: NDArray[np.float64], fitted: NDArray[np.bool_], accuracy: float
+) -> NDArray[np.float64]:
+    """Return what baselines that are fitted to some pixels make of all, shape (npix,)."""
+    own = aslinearoperator(diags_array(fitted.astype(float))) @ aslinearoperator(share)
+    found = lsqr(own, np.where(fitted, rest, 0.0), atol=accuracy, btol=accuracy, iter_lim=100)[0]
+    return np.asarray(share @ found)
+
+
+def _lost(share: csc_array, rest: NDArray[np.float64], seen: NDArray[np.bool_]) -> float:
     """Return the squares that baselines fitted to either half of the pixels leave of the other."""
     half = np.random.default_rng(0).random(rest.size) < 0.5
     lost = 0.0
     for fitted in (seen & half, seen & ~half):
         held = seen & ~fitted
-        found = lsqr(share[fitted], rest[fitted], iter_lim=100)[0]
-        lost += float(np.sum((rest[held] - share[held] @ found) ** 2))
+        lost += float(np.sum((rest - _made_by_baselines(share, rest, fitted, SCREENING))[held] ** 2))
     return lost
 
 
-def _all_fitted(shares: Sequence[csr_array], rest: Maps, seen: NDArray[np.bool_]) -> Maps:
+def _all_fitted(shares: Sequence[csc_array], rest: Maps, seen: NDArray[np.bool_], accuracy: float) -> Maps:
     """Return what baselines that are fitted to all pixels make of them, 0 where they are not seen."""
-    made = np.zeros_like(rest)
-    for index, share in enumerate(shares):
-        if not seen[index].any():
-            continue
-        own = share[seen[index]]
-        made[index, seen[index]] = own @ lsqr(own, rest[index, seen[index]], iter_lim=100)[0]
-    return made
+    made = [_made_by_baselines(*one, accuracy) for one in zip(shares, rest, seen, strict=True)]
+    return np.where(seen, np.stack(made), 0.0)
 
 
 class Interpolation(Difference):

@@ -12,9 +12,11 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.support import folders
+from mcsim.support.arrays import numbers
 
 
 class Rule(NamedTuple):
@@ -79,7 +81,8 @@ def in_files(value: Any, key: str = "") -> Any:
         table = table_of(value)
         return table.popitem()[1] if key in _FILES else table
     if hasattr(value, "__array__") and np.ndim(value) > 0:
-        return _file_of(value, key) if key in _FILES else np.asarray(value).tolist()
+        array = numbers(value, f"the array {key}")
+        return _file_of(array, key) if key in _FILES else array.tolist()
     return value
 
 
@@ -91,14 +94,8 @@ def table_of(given: Tabled) -> dict[str, str]:
     return {**table, key: _path(folder / name, key)}
 
 
-def _file_of(given: Any, key: str) -> str:
+def _file_of(array: NDArray, key: str) -> str:
     """Write an array to the cache; return the path of its .npy file, named after the key."""
-    if getattr(given, "unit", None) is not None or isinstance(given, np.ma.MaskedArray):
-        own = "a mask of its own" if isinstance(given, np.ma.MaskedArray) else f"the unit {given.unit}"
-        raise InputError(f"the array {key} has {own}; give plain numbers, temperatures in uK and spectra in uK^2.")
-    array = np.asarray(given)
-    if array.dtype.kind not in "biufc":
-        raise InputError(f"the array {key} is of type {array.dtype}; give numbers.")
     folder = kept(lambda scratch: np.save(scratch / f"{key}.npy", array), key)
     return _path(folder / f"{key}.npy", key)
 

@@ -54,10 +54,9 @@ def check_filter(run: Any) -> None:
                 f'{key} does not go with biposh.filter = "inverse_covariance", which weights the pixels of maps as '
                 "they are made by the spectrum of the sky and their noise; change one of the two"
             )
-    for channel in run.channels:
-        for split in run.map.splits or (None,):
-            if is_noise_free(channel.noise_of(split)) or channel.scan.kind == "differencing":
-                raise ValueError(
-                    f'channel[{channel.name}] has no noise in its pixels, but biposh.filter = "inverse_covariance" '
-                    "needs it; give it noise and a scan of one beam, or remove the filter"
-                )
+    for channel, split in run.each_map:
+        if is_noise_free(channel.noise_of(split)) or channel.scan.kind == "differencing":
+            raise ValueError(
+                f'channel[{channel.name}] has no noise in its pixels, but biposh.filter = "inverse_covariance" '
+                "needs it; give it noise and a scan of one beam, or remove the filter"
+            )

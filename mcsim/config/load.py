@@ -16,11 +16,12 @@ from mcsim.config.preparation import grid_after
 from mcsim.config.schema import RunConfig, analysis_lmax, pixel_window
 from mcsim.errors import InputError
 from mcsim.support import resources
+from mcsim.support.folders import user_path
 
 _ADAPTER = TypeAdapter(RunConfig)
 
 
-def load(source: str | Path | Mapping[str, Any], base: str | Path | None = None) -> RunConfig:
+def load(source: str | Path | Mapping[str, Any] | RunConfig, base: str | Path | None = None) -> RunConfig:
     """Read and check a run.
 
     Parameters
@@ -30,7 +31,7 @@ def load(source: str | Path | Mapping[str, Any], base: str | Path | None = None)
         file exists; or a dict of the same structure. In a dict an array may stand in place of a file (``sky.spectrum``,
         ``sky.alm``, ``sky.map``, masks, ``map.pixel_window``, the ``path`` of a beam, the maps of ``noise``), a
         :class:`mcsim.Beam` in place of a beam, and :class:`mcsim.Moments` or a :class:`mcsim.ScanModel` in place of a
-        scan.
+        scan. A configuration that is loaded already is returned as it is.
     base
         Folder that the relative paths of a dict start from; default: the working folder. Relative paths in a file start
         from its folder.
@@ -38,8 +39,8 @@ def load(source: str | Path | Mapping[str, Any], base: str | Path | None = None)
     Returns
     -------
     RunConfig
-        Its paths are absolute; :func:`channel_path` and :func:`sky_path` fill {channel}, {split} and {realization}.
-        All its files exist.
+        Its paths are absolute, and all its files exist; :func:`mcsim.config.channel_path` and
+        :func:`mcsim.config.sky_path` fill {channel}, {split} and {realization}.
 
     Raises
     ------
@@ -68,11 +69,13 @@ def load(source: str | Path | Mapping[str, Any], base: str | Path | None = None)
     >>> run.channels[0].scan.kind
     'moments'
     """
+    if isinstance(source, RunConfig):
+        return source
     if isinstance(source, Mapping):
-        where, folder = "configuration", Path(base or ".")
+        where, folder = "configuration", user_path(base or ".")
         plain = _plain(arrays.in_files(source), where)
     else:
-        path = Path(source)
+        path = user_path(source)
         where = str(source)
         plain, folder = _read(path if os.path.isfile(path) else resources.workflow(source))
     paths.make_absolute(plain, folder, where)
@@ -134,7 +137,7 @@ def json_schema() -> dict[str, Any]:
 
 def _read(path: Path) -> tuple[dict[str, Any], Path]:
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}); check its permissions.") from None
     except UnicodeDecodeError:

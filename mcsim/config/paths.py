@@ -92,7 +92,7 @@ def _tables(plain: dict[str, Any], key: str) -> list[dict[str, Any]]:
 
 
 def make_absolute(plain: dict[str, Any], base: Path, where: str) -> None:
-    """Expand ${VAR} and make relative paths start from ``base``, in place; keep packaged names."""
+    """Expand ${VAR} and ~ and make relative paths start from ``base``, in place; keep packaged names."""
     for entry in entries(plain):
         if not _is_packaged(entry):
             entry.holder[entry.field] = _absolute(entry, base, where)
@@ -107,7 +107,7 @@ def _absolute(entry: Entry, base: Path, where: str) -> str:
             )
     escaped = literal if entry.rule.placeholders else str
     path = _VARIABLE.sub(lambda match: escaped(os.environ[match[1]]), entry.template)
-    return os.path.normpath(os.path.join(escaped(str(base.absolute())), path))
+    return os.path.normpath(os.path.join(escaped(str(base.absolute())), os.path.expanduser(path)))
 
 
 def find_descriptions(plain: dict[str, Any]) -> None:

@@ -5,9 +5,9 @@ Every key states the unit of its number. A failed check raises ValueError whose 
 """
 
 from dataclasses import replace
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import Annotated, Any, Literal, NamedTuple, Self, get_args
 
-from pydantic import AfterValidator, BeforeValidator, Field, GetCoreSchemaHandler, model_validator
+from pydantic import AfterValidator, Field, GetCoreSchemaHandler, model_validator
 from pydantic.dataclasses import dataclass
 from pydantic_core import core_schema
 
@@ -16,7 +16,7 @@ from mcsim.config.beams import BEAMS, AnyBeam
 from mcsim.config.consistency import check_filter, check_rings
 from mcsim.config.noise import AnyNoise, Noise, check_differences, check_splits
 from mcsim.config.preparation import Step, check_steps
-from mcsim.config.values import STRICT, Degree, Frame, Label, Nside, PathText, power_of_two, unique
+from mcsim.config.values import STRICT, Degree, Frame, Label, Nside, PathText, Width, Widths, power_of_two, unique
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -73,6 +73,11 @@ class Map:
     split_by: Literal["time", "rings", "sets"] = "time"
     pixel_window: PathText | None = None
     offset_order: Annotated[int, Field(ge=0, le=4)] | None = None
+
+    @property
+    def each_split(self) -> tuple[str | None, ...]:
+        """Names of the splits; (None,) of a survey that is not split."""
+        return self.splits or (None,)
 
     @property
     def resolution(self) -> int:
@@ -220,6 +225,18 @@ class Channel:
         return replace(self, noise=Noise(), split_noise={})
 
 
+class MapOf(NamedTuple):
+    """Say which map of a run one is: of which channel, and of which split; None: of the only one."""
+
+    channel: Channel
+    split: str | None
+
+    @property
+    def name(self) -> str:
+        """Return "channel", or "channel:split"."""
+        return self.channel.name if self.split is None else f"{self.channel.name}:{self.split}"
+
+
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Biposh:
     """Settings of the estimator; ``lmax``: by default the sky's; ``iterations``: Jacobi iterations of the analysis.
@@ -275,14 +292,6 @@ class Effect:
     parameters: dict[str, float | str | tuple[float, ...]] = Field(default_factory=dict)
 
 
-Width = Annotated[float, Field(gt=0.0)]
-"""Prior standard deviation."""
-
-
-def _listed(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list | tuple) else (value,)
-
-
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Nuisance:
     """Effect of unknown size that a diagnosis marginalises: normal about zero, with a prior width in its unit.
@@ -292,9 +301,7 @@ class Nuisance:
     """
 
     effect: PathText
-    width: Annotated[
-        tuple[Width, ...], Field(min_length=1), BeforeValidator(_listed, json_schema_input_type=float | list[float])
-    ]
+    width: Widths
     channel: Label | None = None
     parameters: dict[str, float | str | tuple[float, ...]] = Field(default_factory=dict)
     parameter_widths: dict[str, Width] = Field(default_factory=dict)
@@ -347,6 +354,11 @@ class RunConfig:
     biposh: Biposh = Biposh()
     ensemble: Ensemble = Ensemble()
     compute: Compute = Compute()
+
+    @property
+    def each_map(self) -> tuple[MapOf, ...]:
+        """Maps of one realization, channel by channel, split by split."""
+        return tuple(MapOf(channel, split) for channel in self.channels for split in self.map.each_split)
 
     def of_channels(self, *names: str) -> Self:
         """Return the run with these of its channels alone, and with what acts in them."""
@@ -427,7 +439,4 @@ def pixel_window(config: RunConfig, channel: Channel) -> str:
 
 def map_names(config: RunConfig) -> tuple[str, ...]:
     """Return the names of the maps of one realization: "channel", or "channel:split" for each split."""
-    splits: tuple[Any, ...] = config.map.splits or (None,)
-    return tuple(
-        channel.name if split is None else f"{channel.name}:{split}" for channel in config.channels for split in splits
-    )
+    return tuple(one.name for one in config.each_map)

@@ -53,6 +53,10 @@ def _in_file(value: Any, info: ValidationInfo) -> Any:
     return arrays.in_files(value, info.field_name or "")
 
 
+def _listed(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list | tuple) else (value,)
+
+
 Label = Annotated[str, AfterValidator(_label)]
 PathText = Annotated[str, BeforeValidator(_in_file), AfterValidator(_not_empty)]
 Nside = Annotated[int, Field(ge=1, le=NSIDE_MAX), AfterValidator(power_of_two)]
@@ -60,3 +64,8 @@ Degree = Annotated[int, Field(ge=2, le=LMAX_MAX)]
 BeamOrder = Annotated[int, Field(ge=0, le=LMAX_MAX)] | None
 Fwhm = Annotated[float, Field(gt=0.0, le=10800.0)]
 Frame = Literal["ecliptic", "galactic", "equatorial"]
+Width = Annotated[float, Field(gt=0.0)]
+Widths = Annotated[
+    tuple[Width, ...], Field(min_length=1), BeforeValidator(_listed, json_schema_input_type=float | list[float])
+]
+"""Prior standard deviations, or the only one."""

@@ -124,33 +124,42 @@ def analysis_of(
         )
     declared = [one.effect for one in run.nuisances]
     model = model_of(survey(run, nthreads=nthreads, orders=settings.beam_orders, library=dict(known)), settings)
-    frequencies = [c.site.frequency_ghz if c.site.foregrounds else None for c in model.survey.channels]
-    # A nuisance is fitted in the coordinates of its prior.
-    fits = {
-        name: kind.parametrization if name in declared else kind.parametrization.seen_at(frequencies)
-        for name, kind in known
-    }
-    candidates = numbered(
-        [
-            Candidate(
-                effect,
-                channel,
-                tuple(range(len(fits[name].basis()))),
-                dict(fixed),
-                step=_step(model, effect, channel),
-                fit=fits[name],
-            )
-            for name, effect in known
-            if name not in without and (effect.proposed or name in (*settings.including, *declared))
-            for channel in ((None,) if effect.scope == "common" else model.channels)
-            for fixed in effect.variants
-            if _applies(model, effect, channel, fixed)
-        ]
-    )
+    proposed = [
+        (name, effect)
+        for name, effect in known
+        if name not in without and (effect.proposed or name in (*settings.including, *declared))
+    ]
+    candidates = numbered(list(_candidates(model, proposed)))
     blocks = (*blocks_of(model), *_matched_blocks(model, candidates))
     for name in () if source is None else source.effects:
         systematics.get(name, dict(known))
     return Analysis(model, candidates, blocks, tuple(without), known, source=source)
+
+
+def on_request(analysis: Analysis) -> tuple[Candidate, ...]:
+    """Return what would be a candidate if it were asked for, with columns behind those of the candidates."""
+    model, listed = analysis.model, {candidate.name for candidate in analysis.candidates}
+    others = [
+        (name, effect)
+        for name, effect in analysis.library
+        if not effect.proposed and name not in listed and name not in analysis.without
+    ]
+    return numbered([*analysis.candidates, *_candidates(model, others)])[len(analysis.candidates) :]
+
+
+def _candidates(model: Model, kinds: Sequence[tuple[str, type[Effect]]]) -> Iterator[Candidate]:
+    """Yield the effects of some kinds wherever they apply."""
+    run = model.survey.config
+    frequencies = [c.site.frequency_ghz if c.site.foregrounds else None for c in model.survey.channels]
+    declared = [one.effect for one in run.nuisances]
+    for name, effect in kinds:
+        # A nuisance is fitted in the coordinates of its prior.
+        fit = effect.parametrization if name in declared else effect.parametrization.seen_at(frequencies)
+        for channel in (None,) if effect.scope == "common" else model.channels:
+            for fixed in effect.variants:
+                if _applies(model, effect, channel, fixed):
+                    columns = tuple(range(len(fit.basis())))
+                    yield Candidate(effect, channel, columns, dict(fixed), step=_step(model, effect, channel), fit=fit)
 
 
 def kinds_of(library: Library | None) -> Kinds:
@@ -178,11 +187,7 @@ def _applies(model: Model, kind: type[Effect], channel: str | None, settings: Ma
     effect = systematics.basis_of(kind, settings)[0]
     try:
         for owner in owners:
-            effect.gain(np.zeros(1), owner.site)
-            effect.noise(owner.site)
-            systematics.seen_through((effect,), owner.site)
-            systematics.looked_at((effect,), np.zeros_like(model.dipole), replace(owner.site, lmax=model.lmax), 0, 0)
-            systematics.check_added((effect,), owner.site)
+            systematics.tried((effect,), replace(owner.site, lmax=model.lmax))
             effect.orientations(owner.maps[0].moments, owner.site)
     except InputError:
         return False

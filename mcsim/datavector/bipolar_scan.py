@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 from mcsim import bipolar
 from mcsim.beamfit.data import parts
+from mcsim.bipolar import by_degree
 from mcsim.datavector.summaries import Element, bins, scales
-from mcsim.datavector.wiener_filter import FilteredMaps, Model, by_degree
+from mcsim.datavector.wiener_filter import FilteredMaps, Model
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.rotation import FRAMES, rotate_biposh
-from mcsim.support.arrays import Map, Vector
+from mcsim.support.arrays import Map, Vector, divided
 
 NSIDE = 16
 """Of residual maps, if the data are not coarser: finer pixels show noise and little else."""
@@ -134,5 +135,5 @@ def rms(drawn: Map) -> Map:
     if not drawn.size:
         return np.zeros(drawn.shape[:2])
     spread = drawn.std(axis=0, ddof=1)
-    z = np.divide(drawn - drawn.mean(axis=0), spread, out=np.full_like(drawn, np.nan), where=spread > 0.0)
+    z = divided(drawn - drawn.mean(axis=0), spread, np.nan)
     return np.asarray(np.sqrt(np.nanmean(z**2, axis=2)))

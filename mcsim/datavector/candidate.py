@@ -89,6 +89,11 @@ class Candidate:
         return found if self.step is None else tuple(replace(one, amplitude=self.step) for one in found)
 
     @property
+    def steps(self) -> Vector:
+        """Return the coordinate at which the response to each column is measured, shape (K,)."""
+        return np.array([self.parametrization.coordinates(one)[place] for place, one in enumerate(self.basis)])
+
+    @property
     def random_response(self) -> bool:
         """Return True if its templates are measured from random draws, not from an effect that is taken away."""
         return self.parametrization.stochastic and self.parametrization.sign >= 0
@@ -214,6 +219,19 @@ class TemplateBank:
         labels = tuple(self.labels[column] for column in columns)
         beside = self.slice_matrix[:, list(columns)] if len(self.slice_matrix) else self.slice_matrix
         return TemplateBank(self.matrix[cut], self.error[cut], self.curvature[cut], labels, beside)
+
+    def with_columns(self, labels: Sequence[Column], response: Matrix) -> "TemplateBank":
+        """Return the bank with further columns: linear responses without error of all elements, shape (p + E, K)."""
+        size, exact = len(self.matrix), np.zeros((len(self.matrix), len(labels)))
+        return TemplateBank(
+            np.concatenate([self.matrix, response[:size]], axis=1),
+            np.concatenate([self.error, exact], axis=1),
+            np.concatenate([self.curvature, exact], axis=1),
+            (*self.labels, *labels),
+            np.concatenate([self.slice_matrix, response[size:]], axis=1)
+            if len(self.slice_matrix)
+            else np.zeros((0, 0)),
+        )
 
     def _squares(self, spread: Vector) -> tuple[Vector, Vector]:
         """Return the squared norms of error and matrix over the spread of the data vector, shape (K,) each."""

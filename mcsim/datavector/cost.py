@@ -35,12 +35,11 @@ def lines(analysis: Analysis, jobs: Mapping[Purpose, Job]) -> list[str]:
     filtered = wiener_filter(analysis.model, list(simulate.maps(survey, 0)))
     scan = len(analysis.bipolar_scan.elements) + coarse_residuals(analysis.model, filtered).size
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1.0 if sys.platform == "darwin" else 1024.0)
-    maps = [m for channel in survey.channels for m in channel.maps]
-    own = [m for m in maps if not isinstance(m.moments.w, np.memmap)]
+    own = [m for m in survey.maps if not isinstance(m.moments.w, np.memmap)]
     moments = sum(m.moments.w.nbytes + 3.0 * m.moments.hits.nbytes for m in own)
     number = sum(job.count for job in jobs.values() if job.source is None)
     sampled = sum(job.count for job in jobs.values() if job.sample_by_sample)
-    samples_s = SAMPLE_S * float(sum(m.moments.hits.sum() for m in maps)) * sampled
+    samples_s = SAMPLE_S * float(sum(m.moments.hits.sum() for m in survey.maps)) * sampled
     row = len(analysis.elements) + len(analysis.slices)
     disk = 8.0 * sum(job.count * (row + scan * job.bipolar_scan) for job in jobs.values())
     run, workers = survey.config, survey.config.compute.workers

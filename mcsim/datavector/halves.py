@@ -54,9 +54,9 @@ class Halves:
         after = after.with_extra_covariance(*(one[self.second] for one in scatters))
         if scatters:
             draws = (t @ frozen.amplitudes)[:, None] + sum(np.sqrt(one.shape[1]) * one for one in scatters)
-            here, there = _squares(self.fresh, draws[self.second]), _squares(self.used, draws[self.first])
+            shares = _squares(self.fresh, draws[self.second]) / _squares(self.used, draws[self.first])
             noise = self.used.fit(x_used, t_used).covariance
-            fall = expected_fall_of_draw(after, t_fresh, noise, excess(self.used, x_used), here, there)
+            fall = expected_fall_of_draw(after, t_fresh, noise, excess(self.used, x_used), shares)
         else:
             fall = expected_fall(self.fresh, t_fresh, frozen.amplitudes, frozen.covariance)
         return held_out(self.fresh, after, x_fresh, fall, data)

@@ -1,15 +1,17 @@
 """Read observed maps, and refuse maps that a survey cannot have made."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import healpy
 import numpy as np
 
 from mcsim.datavector.wiener_filter import Model, Part, sky_variance
-from mcsim.ensemble.maps import file_names, first_realization, read_uk
+from mcsim.ensemble.maps import file_names, first_realization
 from mcsim.errors import InputError
-from mcsim.support.arrays import Map
+from mcsim.sphere.healpix import read_uk
+from mcsim.support.arrays import Map, reals
+from mcsim.support.folders import user_path
 
 
 def checked_map(model: Model, part: Part, map_: Map, name: str) -> Map:
@@ -54,19 +56,30 @@ def read_maps(model: Model, folder: str | Path) -> list[Map]:
     is raised if a file is missing or unreadable, has another nside, frame or unit, or values that are no map of this
     survey: not finite, constant, without what the fiducial scan hits, or far from the size of the model.
     """
-    folder, names = Path(folder), file_names(model.survey.config)
+    folder, names = user_path(folder), file_names(model.survey.config)
     if not folder.is_dir():
         first = names[model.parts[0].name]
         raise InputError(f"{folder} is no folder; give one with the observed maps, {first} and so on.")
     return [_read(model, part, folder / names[part.name]) for part in model.parts]
 
 
-def checked(model: Model, maps: Sequence[Map]) -> list[Map]:
-    """Check maps given as arrays, in the order of the model's, uK, like those of a folder."""
+def checked(model: Model, maps: Sequence[Map] | Mapping[str, Map]) -> list[Map]:
+    """Check maps given as arrays, uK, by name or in the order of the model's, like those of a folder."""
+    names = [part.name for part in model.parts]
+    if isinstance(maps, Mapping):
+        lacking = [name for name in names if name not in maps]
+        if lacking:
+            raise InputError(f"the maps lack {lacking[0]}; the model has {', '.join(names)}.")
+        maps = [maps[name] for name in names]
+    if not isinstance(maps, Sequence | np.ndarray):
+        raise InputError(f"the maps are a {type(maps).__name__}; give a folder, or arrays for {', '.join(names)}.")
     if len(maps) != len(model.parts):
         raise InputError(f"{len(maps)} maps were given, the model has {len(model.parts)}; give one for each.")
-    arrays = [np.asarray(map_, dtype=np.float64) for map_ in maps]
-    return [checked_map(model, part, map_, f"map {part.name}") for part, map_ in zip(model.parts, arrays, strict=True)]
+    named = [(part, f"map {part.name}") for part in model.parts]
+    return [
+        checked_map(model, part, reals(map_, name, healpy.UNSEEN), name)
+        for (part, name), map_ in zip(named, maps, strict=True)
+    ]
 
 
 def _read(model: Model, part: Part, path: Path) -> Map:

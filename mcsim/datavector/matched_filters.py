@@ -11,7 +11,8 @@ from functools import partial
 import numpy as np
 
 from mcsim import systematics
-from mcsim.datavector.wiener_filter import FilteredMaps, Model, by_degree
+from mcsim.bipolar import by_degree
+from mcsim.datavector.wiener_filter import FilteredMaps, Model
 from mcsim.simulation import differencing
 from mcsim.simulation.pixel_means import gain_of, signal_of
 from mcsim.simulation.survey import Channel, SurveyMap

@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 from mcsim.datavector.candidate import Column, TemplateBank
 from mcsim.datavector.summaries import Element
 from mcsim.stats.gaussian import SimulatedGaussian
-from mcsim.support.arrays import Matrix, Vector
+from mcsim.support.arrays import Matrix, Vector, divided
 
 QUADRATIC = 0.05
 """Share of an element's variance that may come from squares and products of nuisances."""
@@ -141,9 +141,7 @@ class NullEnsemble:
 
 
 def _standardised(rows: Matrix) -> Matrix:
-    centred = rows - rows.mean(axis=0)
-    spread = np.std(rows, axis=0)
-    return np.asarray(np.divide(centred, spread, out=np.zeros_like(centred), where=spread > 0.0))
+    return divided(rows - rows.mean(axis=0), np.std(rows, axis=0))
 
 
 def without_nuisances(simulations: Matrix, nuisances: Matrix | None) -> Matrix:

@@ -1,8 +1,9 @@
 """All levels, cuts, bins and numbers of simulations of a diagnosis, in one object."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
+from mcsim.support.settings import check_settings
 from mcsim.systematics import Library
 
 _FIRST = {
@@ -194,7 +195,7 @@ class DiagnosisSettings:
     noisy_skies: int = 24
     table_skies: int = 24
     constrained_skies: int = 8
-    scatter_skies: int = 24
+    scatter_skies: int = 48
     time_ordered_skies: int = 6
     scan_sims: int = 300
 
@@ -228,6 +229,11 @@ class DiagnosisSettings:
     agreement_level: float = 0.01
     small_chi2_pvalue: float = 1e-6
     correlated_sigma: float = 5.0
+
+    def __post_init__(self) -> None:
+        """Raise InputError for settings of another kind, negative numbers, and levels above 1."""
+        levels = [field.name for field in fields(self) if field.name.endswith(("_level", "_pvalue", "_share"))]
+        check_settings(self, ["alpha", "named_probability", *levels])
 
     @classmethod
     def quick(cls, **changes: Any) -> "DiagnosisSettings":

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 
-import ducc0
 import healpy
 import numpy as np
 
@@ -42,10 +41,8 @@ def values_of(model: Model, filtered: FilteredMaps) -> Vector:
     """Return real coefficients of every map's residual over its noise variance, and of that times the sky."""
     found = []
     low, top = (min(one, model.lmax) for one in DEGREES.values())
-    geometry = healpix.geometry(model.nside)
     for i in range(len(model.parts)):
-        product = filtered.residual[i] * filtered.expected[i]
-        gain = ducc0.sht.adjoint_synthesis(map=product[None], spin=0, lmax=top, nthreads=1, **geometry)[0]
+        gain = healpix.adjoint(filtered.residual[i] * filtered.expected[i], top)
         found += [real.coefficients(filtered.adjoint[i], model.lmax, low), real.coefficients(gain, top, top)]
     return np.concatenate(found)
 

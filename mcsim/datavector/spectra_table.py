@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations_with_replacement, product
+from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import NamedTuple
 
@@ -125,10 +125,11 @@ def read_spectra(path: str | Path, run: config.RunConfig) -> Spectra:
 
 def _pairs(run: config.RunConfig) -> dict[str, Pair]:
     """Return every pair of maps of a run by its label, the first map's own first."""
-    identities = product((channel.name for channel in run.channels), run.map.splits or (None,))
-    maps = zip(config.map_names(run), identities, strict=True)
-    pairs = combinations_with_replacement(maps, 2)
-    return {f"{x},{y}": Pair(f"{x},{y}", (one[0], two[0]), (one[1], two[1])) for (x, one), (y, two) in pairs}
+    found = {}
+    for x, y in combinations_with_replacement(run.each_map, 2):
+        label = f"{x.name},{y.name}"
+        found[label] = Pair(label, (x.channel.name, y.channel.name), (x.split, y.split))
+    return found
 
 
 def _check_row(path: str | Path, row: Row, pair: Pair, lmax: int) -> None:

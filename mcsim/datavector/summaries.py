@@ -7,12 +7,13 @@ from itertools import pairwise, product
 import healpy
 import numpy as np
 
+from mcsim.bipolar import by_degree
 from mcsim.datavector.matched_filters import normalised_difference
-from mcsim.datavector.wiener_filter import FilteredMaps, Model, by_degree
+from mcsim.datavector.wiener_filter import FilteredMaps, Model
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotation_matrix
-from mcsim.support.arrays import Map, Vector
+from mcsim.support.arrays import Map, Vector, divided
 
 
 @dataclass(frozen=True)
@@ -259,7 +260,7 @@ def _sky_block(model: Model) -> Block:
 
     def values(filtered: FilteredMaps) -> Vector:
         power = by_degree(filtered.sky, filtered.sky, lmax) / (2 * ell + 1)
-        ratio = np.divide(power, expected, out=np.ones(lmax + 1), where=expected > 0)
+        ratio = divided(power, expected, 1.0)
         return np.asarray(means @ (ratio - 1.0))
 
     return Block(tuple(elements), values)

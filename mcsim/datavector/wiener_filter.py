@@ -14,12 +14,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 
-import ducc0
 import healpy
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from mcsim.bipolar import by_degree
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.errors import InputError
 from mcsim.instrument.scan import Moments
@@ -29,7 +28,7 @@ from mcsim.simulation.survey import Channel, Survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
-from mcsim.support.arrays import Alm, Cl, Map
+from mcsim.support.arrays import Alm, Cl, Map, divided
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,7 @@ class Model:
     @cached_property
     def inverse_cl(self) -> Cl:
         """Return 1/C_l, zero where C_l is, uK^-2."""
-        return np.divide(1.0, self.cl, out=np.zeros(self.lmax + 1), where=self.cl > 0)
+        return divided(1.0, self.cl)
 
     def of(self, channel: int) -> tuple[int, ...]:
         """Return the indices of the channel's maps."""
@@ -107,7 +106,7 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
     parts = []
     for index, channel in enumerate(survey.channels):
         floor = settings.noise_floor * float(np.sqrt(sky_variance(cl, response[index])))
-        for m, split in zip(channel.maps, run.map.splits or (None,), strict=True):
+        for m, split in zip(channel.maps, run.map.each_split, strict=True):
             if isinstance(m.drawn, NoiseOfFiles):
                 raise InputError(
                     f"the noise of map {m.name} is read from files, of which a diagnosis would need thousands; "
@@ -149,7 +148,6 @@ def wiener_filter(model: Model, maps: Sequence[Map]) -> FilteredMaps:
     clean, seen = _clean(model, maps)
     sky = _sky(model, clean)
     looked_at = sky + model.dipole
-    transform = {"lmax": lmax, "nthreads": 1, **healpix.geometry(model.nside)}
     expected = np.empty((len(model.parts), seen[0].size))
     residual, adjoint = np.empty_like(expected), np.empty((len(model.parts), sky.size), dtype=np.complex128)
     orders = np.zeros((len(model.parts), top + 1, lmax + 1), dtype=np.complex128)
@@ -165,13 +163,13 @@ def wiener_filter(model: Model, maps: Sequence[Map]) -> FilteredMaps:
             if part.moments.dtheta is not None:
                 expected[i] += convolve.centroid_map(made.gradient(through), part.moments)
             residual[i] = np.where(seen[i], part.precision * (clean[i] - expected[i]), 0.0)
-            adjoint[i] = ducc0.sht.adjoint_synthesis(map=residual[i][None], spin=0, **transform)[0]
+            adjoint[i] = healpix.adjoint(residual[i], lmax)
             orders[i, 0] = window * k * by_degree(looked_at, adjoint[i], lmax)
         for i, s, together in _transforms(model, members):
             turned = np.zeros((2, residual.shape[1]))
             for j in together:
                 convolve.turned(residual[j], model.parts[j].moments, s, turned)
-            electric, magnetic = ducc0.sht.adjoint_synthesis(map=turned, spin=s, **transform)
+            electric, magnetic = healpix.adjoint(turned, lmax, spin=s)
             # ducc0's sign: S_s is minus the synthesis of E = Re(k b) a, B = Im(k b) a.
             both = by_degree(looked_at, electric, lmax) + 1j * by_degree(looked_at, magnetic, lmax)
             orders[i, s] = -2.0 * window * k * both
@@ -222,22 +220,3 @@ def _transforms(model: Model, members: tuple[int, ...]) -> Iterator[tuple[int, i
             yield from ((i, s, (i,)) for i in filtered)
         elif filtered:
             yield filtered[0], s, filtered
-
-
-def by_degree(a: Alm, b: Alm, lmax: int) -> Cl:
-    """Return the sum over all m of a_lm conj(b_lm) for two real fields."""
-    found = np.zeros(lmax + 1)
-    _add_by_degree(a, b, found)
-    return found
-
-
-@numba.njit(cache=True, nogil=True)
-def _add_by_degree(a, b, found):  # type: ignore[no-untyped-def]
-    """Add the products of all orders m, twice for m > 0, in one pass over memory."""
-    place = 0
-    for m in range(found.size):
-        twice = 2.0 if m else 1.0
-        for ell in range(m, found.size):
-            product = a[place].real * b[place].real + a[place].imag * b[place].imag
-            found[ell] += twice * product
-            place += 1

@@ -52,7 +52,7 @@ class Computing(TypedDict, total=False):
 
 def diagnose(
     model: str | Path | Mapping[str, Any] | config.RunConfig | ExternalModel,
-    data: str | Path | Sequence[NDArray[np.float64]],
+    data: str | Path | Sequence[NDArray[np.float64]] | Mapping[str, NDArray[np.float64]],
     output: str | Path | None = None,
     *,
     case: str | None = None,
@@ -67,8 +67,8 @@ def diagnose(
         Fiducial model of sky, beams, scan and noise: a run. With a simulator of another program, or its stored maps, in
         place of mcsim's: an :class:`mcsim.ExternalModel`, or a run with ``simulator`` or ``ensemble.maps``.
     data
-        Folder with ``{channel}.fits`` or ``{channel}_{split}.fits``, uK; or the maps themselves, shape (npix,) each, in
-        the order channel by channel, split by split; or a table of measured spectra
+        Folder with ``{channel}.fits`` or ``{channel}_{split}.fits``, uK; or the maps themselves, shape (npix,) each, by
+        name ("W1:half1") or channel by channel, split by split; or a table of measured spectra
         (:func:`mcsim.datavector.spectra_table.read_spectra`).
     output
         Folder for ``verdict.json``, ``diagnosis.zarr`` and ``report.html``; None: nothing is written.
@@ -99,7 +99,8 @@ def diagnose(
     settings = settings or DiagnosisSettings()
     wanted, (settings, library) = settings.controls, _with_library(settings)
     if output is not None:
-        folders.writable(Path(output))
+        output = folders.user_path(output)
+        folders.writable(output)
     run, analysis, table = _analysed(run, source, data, settings, library, wanted)
     task: Callable[[Job], NDArray[np.float64]] = data_vectors if table is None else table
     maps: Sequence[NDArray[np.float64]] = ()
@@ -131,7 +132,7 @@ def diagnose(
         diagnosis = replace(diagnosis, controls=drawn, warnings=first, settings=done)
     if output is not None:
         diagnosis.save(output)
-        report.write(diagnosis, Path(output) / "report.html")
+        report.write(diagnosis, output / "report.html")
     return diagnosis
 
 
@@ -182,7 +183,7 @@ def describe(
 def _analysed(
     run: config.RunConfig,
     source: Source | None,
-    data: str | Path | Sequence[NDArray[np.float64]] | None,
+    data: str | Path | Sequence[NDArray[np.float64]] | Mapping[str, NDArray[np.float64]] | None,
     settings: DiagnosisSettings,
     library: systematics.Library,
     wanted: int,

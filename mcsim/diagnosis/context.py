@@ -11,11 +11,12 @@ from mcsim import config
 from mcsim.datavector.analysis import Analysis
 from mcsim.datavector.campaign import Ask, after_jobs, skies
 from mcsim.datavector.candidate import Candidate, TemplateBank
+from mcsim.datavector.localisation import Place
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.diagnosis.localisation import Place
 from mcsim.diagnosis.nuisance import with_nuisances
 from mcsim.diagnosis.selection import Attribution
+from mcsim.errors import InputError
 from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration, calibrate, calibrate_in_folds, calibrate_on
 from mcsim.support.arrays import Matrix, Vector
@@ -128,6 +129,14 @@ class DataSet(ABC, Generic[Data]):
     def respond_extended(self, found: Sequence[config.Effect], skies: int) -> Matrix:
         """Return the changes of :meth:`respond` for :attr:`extended`."""
         return self.respond(found, skies)
+
+    def response(self, candidate: Candidate, skies: int) -> Matrix | None:
+        """Return the response to small effects over their coordinates, (p + E, K); None if it cannot be simulated."""
+        try:
+            changes = [self.respond_extended([candidate.table(one)], skies).mean(axis=0) for one in candidate.basis]
+        except InputError:
+            return None
+        return np.stack(changes, axis=1) / candidate.steps
 
     def scatter(self, changes: Matrix) -> Matrix:
         """Return deviations of changes by a stochastic effect, shape (draws, p), from their mean, (p, draws).

@@ -81,7 +81,7 @@ class Fidelity:
     @property
     def samples(self) -> int:
         """Return the number of samples of a control, 0 if it is not drawn sample by sample."""
-        hits = [m.moments.hits.sum() for channel in self.survey.making.channels for m in channel.maps]
+        hits = [m.moments.hits.sum() for m in self.survey.making.maps]
         return int(sum(hits)) if self.sample_by_sample else 0
 
 

@@ -68,7 +68,7 @@ def loaded(
     """Return the run that a model is or that describes it, and its source of maps; None: mcsim itself."""
     external = isinstance(model, ExternalModel)
     given = model.description if isinstance(model, ExternalModel) else model
-    run = given if isinstance(given, config.RunConfig) else config.load(given)
+    run = config.load(given)
     bare, named = named_source(run)
     if external and named is not None:
         raise InputError(f"{run.name} names the simulator {named!r} already; give the run or the simulator alone.")

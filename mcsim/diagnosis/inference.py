@@ -14,6 +14,7 @@ from mcsim.diagnosis.drawn import as_seen
 from mcsim.diagnosis.naming import agreeing, unconfirmed
 from mcsim.diagnosis.refine import Refined, Refiner
 from mcsim.diagnosis.result import DiagnosisResult
+from mcsim.diagnosis.rivals import with_rivals
 from mcsim.diagnosis.selection import Attribution
 from mcsim.errors import InputError
 from mcsim.stats.excess import HeldOut
@@ -25,8 +26,8 @@ from mcsim.support.numbers import measured
 def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
     """Diagnose observed maps or measured spectra; raise InputError if they cannot be what they claim to be."""
     context = data.context
-    refiner = Refiner(data)
-    refined = refiner.run(data.templates(), context.candidates)
+    data, refined = with_rivals(data, Refiner(data).run(data.templates(), context.candidates))
+    context, refiner = data.context, Refiner(data)
     found, partial, reduction = refined.attribution.if_named(context.settings), refined.partial, None
     exchanged = data.exchanged(found)
     notes, refusals = [*exchanged, *data.notes()], list[str]()

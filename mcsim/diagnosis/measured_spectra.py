@@ -7,10 +7,10 @@ import numpy as np
 
 from mcsim.beamfit.data import parts
 from mcsim.bipolar import Mode
+from mcsim.datavector.localisation import Place, places
 from mcsim.datavector.spectra_table import Spectra
 from mcsim.datavector.summaries import Element
 from mcsim.diagnosis.context import DataSet
-from mcsim.diagnosis.localisation import Place, places
 from mcsim.errors import InputError
 from mcsim.sphere.rotation import FRAMES, rotate_biposh
 from mcsim.support.arrays import Matrix, Vector

@@ -13,7 +13,7 @@ from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.simulation.nuisance import Nuisance
 from mcsim.stats.gaussian import SimulatedGaussian, orthonormal
-from mcsim.support.arrays import Matrix, Vector
+from mcsim.support.arrays import Matrix, Vector, divided
 
 MEASURED = 0.04
 """Share of the prior variance that the data leave at most of a nuisance whose response is that of the regression."""
@@ -87,7 +87,7 @@ class Regression:
         total = np.sum(drawn**2, axis=0) / n
         explained = np.sum(slopes**2, axis=1)
         left = np.minimum((total - explained) * n / (n - q), total)
-        shrinkage = np.divide(total - left, explained, out=np.zeros_like(left), where=explained > 0.0)
+        shrinkage = divided(total - left, explained)
         return cls(null, basis, slopes, left, shrinkage, chance)
 
     @property

@@ -9,19 +9,18 @@ import numpy as np
 
 from mcsim import config
 from mcsim.datavector.campaign import after_jobs, constrained_jobs
+from mcsim.datavector.localisation import Place, places, standardised
 from mcsim.datavector.wiener_filter import Part, shared_sky
 from mcsim.diagnosis.context import DataSet
-from mcsim.diagnosis.localisation import Place, places, standardised
 from mcsim.diagnosis.nuisance import half_given_other
 from mcsim.diagnosis.selection import Attribution
-from mcsim.errors import InputError
 from mcsim.stats.look_elsewhere import global_test
 from mcsim.support.arrays import Alm, Map, Matrix, Vector
 
 
 @dataclass(frozen=True, eq=False)
 class ObservedMaps(DataSet[Sequence[Map]]):
-    """Offer observed maps, from :func:`read_maps` or :func:`checked`, as a data set.
+    """Offer observed maps, as :mod:`mcsim.datavector.map_checks` reads them, as a data set.
 
     Responses to effects are simulated in skies that the filtered maps constrain.
     """
@@ -104,7 +103,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         return np.stack(before[:skies]), after
 
     def _is_typical(self, effect: config.Effect) -> bool:
-        kind = next(one.effect for one in self.context.candidates if one.name == effect.name)
+        kind = dict(self.context.analysis.library)[effect.name]
         return kind.parametrization.mean_response and not kind.parametrization.stochastic
 
     def templates(self) -> Matrix:
@@ -113,20 +112,12 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         if global_test(context.null, self.x, context.groups, context.calibration).pvalue > settings.alpha:
             return t
         for candidate, scatter in zip(context.candidates, context.sky_scatter, strict=True):
-            if (
-                scatter < settings.sky_scatter
-                or candidate.random_response
-                or candidate.nuisance
-                or candidate.parametrization.mean_response
-            ):
+            fixed = candidate.random_response or candidate.nuisance or candidate.parametrization.mean_response
+            if fixed or scatter < settings.sky_scatter:
                 continue
-            for place, (column, basis) in enumerate(zip(candidate.columns, candidate.basis, strict=True)):
-                try:
-                    response = self.respond([candidate.table(basis)], settings.constrained_skies).mean(axis=0)
-                except InputError:
-                    continue
-                step = candidate.parametrization.coordinates(basis)[place]
-                t[:, column] = response / step - context.bank.curvature[:, column] * step
+            response, columns = self.response(candidate, settings.constrained_skies), list(candidate.columns)
+            if response is not None:
+                t[:, columns] = response[: len(t)] - context.bank.curvature[:, columns] * candidate.steps
         return t
 
     def exchanged(self, found: Attribution) -> list[str]:

@@ -10,11 +10,11 @@ import numpy as np
 import xarray as xr
 from pydantic import TypeAdapter
 
+from mcsim.datavector.localisation import Place
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Element
 from mcsim.diagnosis.consistency import Comparison, MapCheck
 from mcsim.diagnosis.control_result import Controls
-from mcsim.diagnosis.localisation import Place
 from mcsim.diagnosis.nuisance import NuisanceResult
 from mcsim.diagnosis.selection import Contrast, Verdict
 from mcsim.errors import InputError

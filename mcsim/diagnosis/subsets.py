@@ -33,12 +33,17 @@ Rows = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Solved:
-    """Hold the fits of M subsets, shape (M,) each; ``allowance`` is the squared error of their templates."""
+    """Hold the fits of M subsets, shape (M,) each.
+
+    ``allowance`` is the squared error of their templates, ``scatter`` what their scatter adds to each of the directions
+    that are left.
+    """
 
     chi2: Vector
     pvalue: Vector
     evidence: Vector
     allowance: Vector
+    scatter: Vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +170,7 @@ class Subsets:
             pvalue=null.residual_test(self.total - delta_chi2, K, allowance + scatter),
             evidence=log_evidence(null, self.total, delta_chi2, K, self.settings.prior_snr) + prior,
             allowance=allowance,
+            scatter=scatter / (null.dimension - K),
         )
 
     def least_needed(self, subsets: Rows) -> Vector:
@@ -175,11 +181,11 @@ class Subsets:
         largest = np.zeros(len(subsets))
         for place in range(subsets.shape[1]):
             others = np.delete(subsets, place, axis=1)
+            rank = self.groups.sizes[subsets[:, place]]
             chi2, allowance = np.full(len(subsets), self.total), np.zeros(len(subsets))
             if others.shape[1]:
                 without = self.solve(others)
-                chi2, allowance = without.chi2, without.allowance
-            rank = self.groups.sizes[subsets[:, place]]
+                chi2, allowance = without.chi2, without.allowance + rank * without.scatter
             fitted = self.groups.sizes[subsets].sum(axis=1) - rank
             pvalues = self.null.nested_test(chi2 - whole.chi2, chi2, rank, fitted, allowance)
             largest = np.maximum(largest, self.calibration.global_pvalue(pvalues))
@@ -204,9 +210,9 @@ class Subsets:
             along = np.einsum("mcij,mci->mcj", vectors, left[:, index])
             kept = values > COLLINEAR
             delta_chi2 = np.sum(np.where(kept, along**2 / np.where(kept, values, 1.0), 0.0), axis=-1)
-            pvalues = self.null.nested_test(
-                delta_chi2, solved.chi2[:, None], kept.sum(axis=-1), K, solved.allowance[:, None]
-            )
+            added = kept.sum(axis=-1)
+            allowance = solved.allowance[:, None] + added * solved.scatter[:, None]
+            pvalues = self.null.nested_test(delta_chi2, solved.chi2[:, None], added, K, allowance)
             exclusive = np.any(self._identity[subsets][:, :, None] == self._identity[others], axis=1)
             found[:, others] = np.where(exclusive, 1.0, pvalues)
         return self.calibration.global_pvalue(found)

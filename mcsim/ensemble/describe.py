@@ -7,6 +7,7 @@ import xarray as xr
 
 from mcsim.ensemble import opening, store
 from mcsim.ensemble.tables import spectra, strongest
+from mcsim.support.folders import user_path
 
 NEGLIGIBLE = 1e-6
 """Fraction of its error, or of the largest signal to noise, below which a predicted value counts as zero."""
@@ -17,7 +18,7 @@ ROWS = 40
 
 def describe(path: str | Path) -> str:
     """Return a text about a store: configuration, progress, size, and the most significant spectra."""
-    target = Path(path)
+    target = user_path(path)
     attributes = store.attributes(target)
     done = store.done(target)
     files = [file for file in target.rglob("*") if file.is_file()]

@@ -48,8 +48,7 @@ def survey_of(source: Source, nthreads: int = 1) -> Survey:
     """Return the survey of a configuration in any form."""
     if isinstance(source, Survey):
         return source
-    run = source if isinstance(source, config.RunConfig) else config.load(source)
-    return survey_.survey(run, nthreads)
+    return survey_.survey(config.load(source), nthreads)
 
 
 def scanned_beams(survey: Survey, L_max: int, nthreads: int = 1) -> tuple[ScannedBeam, ...]:
@@ -139,7 +138,7 @@ def spectrum(survey: Survey) -> NDArray[np.float64]:
 
 def noise_mean(survey: Survey, number: int, modes: Sequence[Indices]) -> NDArray[np.complex128]:
     """Return the mean BipoSH of the noise of a map, uK^2, shape (mode, lmax + 1)."""
-    m = _weighted(survey, [m for channel in survey.channels for m in channel.maps][number])
+    m = _weighted(survey, survey.maps[number])
     L_max, lmax = max(L for L, _, _ in modes), survey.lmax
     if m.drawn is not None:
         raise InputError(

@@ -18,10 +18,11 @@ import xarray as xr
 
 from mcsim import config
 from mcsim.config import arrays
-from mcsim.ensemble.maps import read_uk
 from mcsim.errors import InputError
 from mcsim.sphere import header
-from mcsim.support.arrays import Alm, Map
+from mcsim.sphere.healpix import read_uk
+from mcsim.support.arrays import Alm, Map, reals
+from mcsim.support.folders import unreadable
 
 
 class Part(NamedTuple):
@@ -123,10 +124,7 @@ def _flat(given: Any, labels: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str,
 
 
 def _in_uk(one: Any, part: Part, where: str) -> Map:
-    try:
-        found = np.asarray(one, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{where} has a map {part.name} that is no array of numbers; give uK in RING order.") from None
+    found = reals(one, f"the map {part.name} of {where}", healpy.UNSEEN)
     unit = getattr(one, "attrs", {}).get("units")
     factor = header.to_uk(unit, Path(f"the map {part.name} of {where}"), part.frequency_ghz)
     return found if factor == 1.0 else np.where(found == healpy.UNSEEN, found, factor * found)
@@ -135,10 +133,8 @@ def _in_uk(one: Any, part: Part, where: str) -> Map:
 def parts_of(run: config.RunConfig) -> Iterator[Part]:
     """Yield the maps of a run, as they are analysed."""
     frame = config.prepared_grid(run)[1]
-    frequencies = {channel.name: channel.frequency_ghz for channel in run.channels}
-    for name in config.map_names(run):
-        channel, _, split = name.partition(":")
-        yield Part(name, channel, split or None, frequencies[channel], frame)
+    for one in run.each_map:
+        yield Part(one.name, one.channel.name, one.split, one.channel.frequency_ghz, frame)
 
 
 @dataclass(frozen=True)
@@ -242,10 +238,8 @@ def fits_maps(parts: tuple[Part, ...], template: str) -> FitsMaps:
 @lru_cache(maxsize=1)
 def _zarr(path: str, written_ns: int) -> Any:
     """Open a store once for all realizations, and again if it was written anew."""
-    try:
+    with unreadable(path, "a Zarr store", "give one of maps"):
         found = xr.open_zarr(path, chunks=None, consolidated=False)
-    except Exception as error:  # whatever is in the folder
-        raise InputError(f"{path} cannot be opened as a Zarr store ({error}); give one of maps.") from error
     return _checked_stack(found, path)
 
 

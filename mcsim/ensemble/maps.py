@@ -13,9 +13,8 @@ from mcsim.ensemble import plan
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
-from mcsim.sphere import header as header_
-from mcsim.sphere import healpix
-from mcsim.support.folders import appearing, unwritable, writable
+from mcsim.sphere.checks import check_whole
+from mcsim.support.folders import appearing, unwritable, user_path, writable
 from mcsim.support.progress import reporting
 
 _COORDINATES = {"ecliptic": "E", "galactic": "G", "equatorial": "C"}
@@ -72,15 +71,20 @@ def write_maps(
     >>> sorted(file.name for file in folder.iterdir())
     ['demo.fits']
     """
-    run = source if isinstance(source, config.RunConfig) else config.load(source)
+    run = config.load(source)
     if run.map.grid != "healpix":
         raise InputError(f'{run.name} has map.grid = "{run.map.grid}" and so no pixels; set map.grid = "healpix".')
     alone = not isinstance(realizations, slice | None)
-    part = realizations if isinstance(realizations, slice | None) else slice(int(realizations), int(realizations) + 1)
+    if isinstance(realizations, slice | None):
+        part = realizations
+    else:
+        check_whole(realizations, "realizations")
+        part = slice(int(realizations), int(realizations) + 1)
     wanted = plan.wanted(run, part)
     names = file_names(run)
-    targets = {r: Path(folder) if alone else Path(folder) / f"{r:05d}" for r in wanted}
-    if Path(folder).exists() and not Path(folder).is_dir():
+    whole = user_path(folder)
+    targets = {r: whole if alone else whole / f"{r:05d}" for r in wanted}
+    if whole.exists() and not whole.is_dir():
         raise InputError(f"{folder} is a file; choose a folder with -o.")
     for target in targets.values():
         if target.exists() and (not target.is_dir() or any(target.iterdir())):
@@ -93,7 +97,7 @@ def write_maps(
         for channel in shared.channels:
             sampled.check(channel)
     simulate.draw_sky(shared, wanted.start)  # finds bad sky files before a folder is made
-    writable(Path(folder) if not alone else Path(folder).absolute().parent)
+    writable(whole if not alone else whole.absolute().parent)
     ascii_name = run.name.encode("ascii", "backslashreplace").decode()  # as FITS headers require
     header = [("RUN", ascii_name), ("DIGEST", config.digest(run))]
     with reporting("maps", float(len(wanted)), "realizations", quiet) as report:
@@ -115,18 +119,6 @@ def write_map(path: Path, map_uk: NDArray[np.float64], frame: str, header: list[
         path, map_uk, dtype=np.float64, coord=_COORDINATES[frame], column_units="uK", column_names=["TEMPERATURE"],
         fits_IDL=False, extra_header=header or (),
     )  # fmt: skip
-
-
-def read_uk(path: Path, frame: str, frequency_ghz: float | None) -> NDArray[np.float64]:
-    """Read a map in RING order, uK; InputError if its header names another frame, or a unit that is none."""
-    map_, found, unit = healpix.read_map(path)
-    if found not in (None, frame):
-        raise InputError(
-            f'{path} is in {found} coordinates, the model in {frame}; set map.frame = "{found}" in the model, so '
-            "that its scan and noise are computed there."
-        )
-    factor = header_.to_uk(unit, path, frequency_ghz)
-    return np.where(map_ == healpy.UNSEEN, map_, factor * map_)
 
 
 def first_realization(folder: Path) -> Path:

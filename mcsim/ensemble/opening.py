@@ -6,6 +6,7 @@ import xarray as xr
 
 from mcsim.ensemble import store
 from mcsim.errors import InputError
+from mcsim.support.folders import user_path
 
 
 def open_ensemble(path: str | Path) -> xr.Dataset:
@@ -35,8 +36,9 @@ def open_ensemble(path: str | Path) -> xr.Dataset:
     >>> dict(ensemble.biposh.sel(mode="L2M0d0").sizes)
     {'realization': 32, 'pair': 1, 'ell': 33}
     """
-    store.attributes(Path(path))
-    return _opened(Path(path), None)
+    target = user_path(path)
+    store.attributes(target)
+    return _opened(target, None)
 
 
 def open_summary(path: str | Path) -> xr.Dataset:
@@ -67,12 +69,13 @@ def open_summary(path: str | Path) -> xr.Dataset:
     >>> bool((significance > 5.0).all())  # the beam makes a quadrupole
     True
     """
-    store.attributes(Path(path))
-    if not (Path(path) / "summary").is_dir():
+    target = user_path(path)
+    store.attributes(target)
+    if not (target / "summary").is_dir():
         raise InputError(
             f"{path} has no summary, because no run on it has ended yet; continue it with mcsim run --resume."
         )
-    return _opened(Path(path), "summary")
+    return _opened(target, "summary")
 
 
 def _opened(path: Path, group: str | None) -> xr.Dataset:

@@ -15,8 +15,7 @@ from mcsim.config.preparation import frame_of
 from mcsim.ensemble import opening, store
 from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError
-from mcsim.simulation import differencing, noise
-from mcsim.simulation import offsets as offsets_
+from mcsim.simulation import differencing, noise, offsets
 from mcsim.simulation.channels import check_effects, load_beam, refuse_external
 from mcsim.simulation.filtering import Bands, probes_of
 from mcsim.simulation.preparation import preparation
@@ -50,6 +49,8 @@ def wanted(run: config.RunConfig, part: slice | None) -> range:
     total = run.ensemble.realizations
     if part is None:
         return range(total)
+    if not isinstance(part, slice) or part.step not in (None, 1):
+        raise InputError(f"realizations = {part!r} is no slice of consecutive ones; give slice(A, B).")
     start, stop = part.start or 0, total if part.stop is None else part.stop
     if not 0 <= start < stop <= total:
         raise InputError(
@@ -164,25 +165,22 @@ def stored(path: Path, realizations: int) -> Layout:
 
 @dataclass(frozen=True)
 class Cost:
-    """Cost of a run: layout of its store, memory of a worker in bytes, processor time of a realization in seconds."""
+    """Cost of a run: layout of its store, memory of a worker in bytes, processor time of a realization in seconds.
+
+    ``parts``: what a part of the run adds, or what is known of its noise, in words.
+    """
 
     layout: Layout
     memory: float
     each_s: float
-    preparation: str  # what preparing the maps adds, in words
-    noise: tuple[str, ...] = ()  # what is known of noise that is estimated or drawn, in words
-    offsets: str = ""  # what powers of the samples' offsets add, in words
-    filter: str = ""  # what the inverse covariance costs, in words
+    parts: tuple[tuple[str, str], ...]
 
     def lines(self, number: int, workers: int) -> list[str]:
-        """Return lines on memory, preparation and time for a number of realizations."""
+        """Return lines on memory, parts and time for a number of realizations."""
         total_s = number * self.each_s
         return [
             f"  memory  {self.memory / 1e9:.2f} GB per worker, {workers} workers",
-            *([f"  prepare {self.preparation}"] if self.preparation else []),
-            *([f"  offsets {self.offsets}"] if self.offsets else []),
-            *([f"  filter  {self.filter}"] if self.filter else []),
-            *(f"  noise   {line}" for line in self.noise),
+            *(f"  {part:<7} {words}" for part, words in self.parts),
             f"  time    {duration(self.each_s)} per realization and core, {duration(total_s)} of processor time,"
             f" {duration(total_s / workers)} with {workers} workers on as many idle cores",
         ]
@@ -225,14 +223,21 @@ def cost(run: config.RunConfig) -> Cost:
         transforms = sum(2.0 * m for m in mmax)
     memory = 3e8 + 96.0 * nside**2 * (6 + 2 * max(mmax)) + 16.0 * alm_.size(run.sky.lmax) * (6 + len(names) * 2)
     memory += planned.chunk * planned.realization_bytes()
-    words = ""
+    parts = []
     if run.preparation:
-        steps = [preparation(run, channel, split) for channel in run.channels for split in run.map.splits or (None,)]
+        steps = [preparation(run, *one) for one in run.each_map]
         extra = (1 + run.ensemble.paired) * sum(each.transforms for each in steps if each is not None)
         transforms, memory = transforms + extra, memory + 480.0 * nside**2
         grid = f"nside {nside} to {config.prepared_grid(run)[0]}"
         words = f"{extra:g} further transforms per realization and {480e-9 * nside**2:.2g} GB per worker, {grid}"
-    filtering = ""
+        parts.append(("prepare", words))
+    order = run.map.offset_order or 0
+    if order > 1:
+        spread = [channel for channel in run.channels if not isinstance(channel.scan, config.ScanParallelTransport)]
+        extra = len(spread) * offsets.transforms(order)
+        transforms, memory = transforms + extra, memory + 96.0 * nside**2 * (4 + splits)
+        words = f"{extra} further transforms per realization for powers of the samples' offsets up to {order}"
+        parts.append(("offsets", words))
     if run.biposh.filtered:
         solutions = len(names) * (1.0 + NEAR * run.ensemble.paired)
         transforms += SOLUTION * solutions
@@ -241,19 +246,15 @@ def cost(run: config.RunConfig) -> Cost:
         ]
         probes = probes_of(bands, run.biposh.probes)
         once_s = probes * (SOLUTION * len(names) * transform + pairs * probes * estimation)
-        filtering = (
+        words = (
             f"about {SOLUTION * solutions:.0f} further transforms per realization; once, {probes} random maps of each "
             f"map, {duration(once_s)} of processor time (none if the noise is uniform on the full sky)"
         )
-    offsets, spreading = run.map.offset_order or 0, ""
-    if offsets > 1:
-        spread = [channel for channel in run.channels if not isinstance(channel.scan, config.ScanParallelTransport)]
-        extra = len(spread) * offsets_.transforms(offsets)
-        transforms, memory = transforms + extra, memory + 96.0 * nside**2 * (4 + splits)
-        spreading = f"{extra} further transforms per realization for powers of the samples' offsets up to {offsets}"
+        parts.append(("filter", words))
+    parts += [("noise", line) for line in noise.in_words(run)]
     estimates = pairs * (2 if run.ensemble.paired else 1)
     each_s = transform * transforms + estimation * estimates + differencing.seconds(run) + noise.seconds(run)
-    return Cost(planned, memory, each_s, words, tuple(noise.in_words(run)), spreading, filtering)
+    return Cost(planned, memory, each_s, tuple(parts))
 
 
 def _timed(nside: int, lmax_sky: int, lmax: int, L_max: int) -> tuple[float, float]:

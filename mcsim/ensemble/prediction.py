@@ -183,7 +183,7 @@ def _attributes(survey: Survey, L_moments: int | None) -> dict[str, Any]:
     mask = "full sky"
     if survey.filtering is not None:
         mask = "filtered by the inverse covariance: as on the full sky, but for the errors"
-    if survey.filtering is None and any(m.weight is not None for channel in survey.channels for m in channel.maps):
+    if survey.filtering is None and any(m.weight is not None for m in survey.maps):
         mask = "weights W act as w_s -> W^2 w_s and on the errors; their own mode coupling is left out"
     window, left_out = "none: rings without pixels", "nothing"
     if run.map.grid == "healpix":

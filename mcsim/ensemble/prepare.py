@@ -4,17 +4,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, overload
 
-import numpy as np
+import healpy
 from numpy.typing import ArrayLike
 
 from mcsim import config
+from mcsim.config.schema import MapOf
 from mcsim.ensemble.maps import file_names, write_map
 from mcsim.errors import InputError
 from mcsim.simulation.preparation import preparation
-from mcsim.sphere import header, healpix
-from mcsim.sphere.checks import UNSEEN_BELOW, check_map
-from mcsim.support.arrays import Map
-from mcsim.support.folders import appearing, unwritable, writable
+from mcsim.sphere.checks import check_map
+from mcsim.sphere.healpix import read_uk
+from mcsim.support.arrays import Map, reals
+from mcsim.support.folders import appearing, unwritable, user_path, writable
 
 Source = str | Path | Mapping[str, Any] | config.RunConfig
 
@@ -73,7 +74,7 @@ def prepare(maps: Mapping[str, ArrayLike] | Sequence[ArrayLike], source: Source)
     >>> prepared["W"].shape, bool(abs(prepared["W"]).max() < 0.1)
     ((768,), True)
     """
-    run = source if isinstance(source, config.RunConfig) else config.load(source)
+    run = config.load(source)
     if not run.preparation:
         raise InputError(f"{run.name} has no [[preparation]], so there is nothing to do; declare its steps.")
     names = config.map_names(run)
@@ -85,20 +86,19 @@ def prepare(maps: Mapping[str, ArrayLike] | Sequence[ArrayLike], source: Source)
 
 
 def _prepared(run: config.RunConfig, name: str, map_: ArrayLike) -> Map:
-    spec, split = _channel(run, name)
-    given = np.asarray(map_, dtype=np.float64)
+    spec, split = _map_called(run, name)
+    given = reals(map_, f"map {name}", healpy.UNSEEN)
     check_map(given, run.map.resolution, f"map {name}")
     steps = preparation(run, spec, split, observed=True)
     assert steps is not None  # the run has steps
     return steps.apply(given)
 
 
-def _channel(run: config.RunConfig, name: str) -> tuple[config.Channel, str | None]:
-    names = config.map_names(run)
-    if name not in names:
-        raise InputError(f"map {name!r} is no map of {run.name}; use one of {', '.join(names)}.")
-    channel, _, split = name.partition(":")
-    return next(one for one in run.channels if one.name == channel), split or None
+def _map_called(run: config.RunConfig, name: str) -> MapOf:
+    maps = {one.name: one for one in run.each_map}
+    if name not in maps:
+        raise InputError(f"map {name!r} is no map of {run.name}; use one of {', '.join(maps)}.")
+    return maps[name]
 
 
 def prepare_files(source: Source, files: Sequence[str], folder: str | Path) -> list[Path]:
@@ -107,8 +107,8 @@ def prepare_files(source: Source, files: Sequence[str], folder: str | Path) -> l
     Files are ``.../{channel}.fits`` or ``{channel}_{split}.fits``, or NAME=PATH with any path. Unit and frame are those
     of the header; without them uK and the frame of the run.
     """
-    run = source if isinstance(source, config.RunConfig) else config.load(source)
-    target, names = Path(folder), file_names(run)
+    run = config.load(source)
+    target, names = user_path(folder), file_names(run)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise InputError(f"{target} is not a new folder, and nothing is written over; choose another folder with -o.")
     done = prepare(dict(_read(run, names, file) for file in files), run)
@@ -129,10 +129,4 @@ def _read(run: config.RunConfig, names: Mapping[str, str], file: str) -> tuple[s
     if named not in names:
         known = ", ".join(names.values())
         raise InputError(f"{file} is none of {known}; rename it, or say which map it is: NAME={file}.")
-    map_, frame, unit = healpix.read_map(Path(path))
-    if frame not in (None, run.map.frame):
-        raise InputError(
-            f"{path} is in {frame} coordinates, map.frame is {run.map.frame}; set map.frame to that of the data."
-        )
-    factor = header.to_uk(unit, Path(path), _channel(run, named)[0].frequency_ghz)
-    return named, np.where(map_ > UNSEEN_BELOW, factor * map_, map_)
+    return named, read_uk(user_path(path), run.map.frame, _map_called(run, named).channel.frequency_ghz)

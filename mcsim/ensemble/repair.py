@@ -13,6 +13,7 @@ from mcsim.ensemble import store
 from mcsim.ensemble.layout import Layout, listed
 from mcsim.ensemble.store import Damage
 from mcsim.errors import RunError
+from mcsim.support.folders import user_path
 from mcsim.support.progress import reporting
 
 THREADS = 4
@@ -55,7 +56,7 @@ class Verdict:
 
 def verify(path: str | Path, quiet: bool = True) -> Verdict:
     """Read every chunk of every array and check its checksum."""
-    target = Path(path)
+    target = user_path(path)
     broken = broken_parts(target)
     if "done" in broken:
         return Verdict(target, 0, 0, (), broken)

@@ -14,6 +14,7 @@ from mcsim.config.preparation import frame_of
 from mcsim.ensemble.layout import Layout
 from mcsim.stats import streaming
 from mcsim.stats.streaming import Sums
+from mcsim.support.arrays import divided
 
 QML = "biposh_qml"
 """Start of the names of quadratic maximum-likelihood estimates."""
@@ -34,7 +35,7 @@ def binned(layout: Layout, values: NDArray, power: int = 1) -> NDArray:
     exists = np.isfinite(scaled)
     total = np.add.reduceat(np.where(exists, scaled, 0.0), layout.first_ells(), axis=-1)
     count = np.add.reduceat(exists, layout.first_ells(), axis=-1, dtype=np.int64)
-    return np.divide(total, count**power, out=np.full_like(total, np.nan), where=count > 0)
+    return divided(total, count**power, np.nan)
 
 
 def reduce_rows(layout: Layout, rows: Mapping[str, NDArray], first: int) -> Sums | None:

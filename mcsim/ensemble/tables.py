@@ -10,7 +10,7 @@ import xarray as xr
 from astropy.table import Table
 
 from mcsim.errors import InputError
-from mcsim.support.folders import unwritable
+from mcsim.support.folders import unreadable, unwritable, user_path
 
 
 def spectra(summary: xr.Dataset, kind: str) -> pd.DataFrame:
@@ -74,7 +74,7 @@ def check_ending(output: str | Path) -> None:
 def write(summary: xr.Dataset, output: str | Path) -> None:
     """Write a summary or a prediction as Zarr (``.zarr``) or NetCDF (``.nc``), or its binned spectra (``.ecsv``)."""
     check_ending(output)
-    target = Path(output)
+    target = user_path(output)
     with unwritable(target, "choose another file"):
         if target.suffix == ".zarr":
             if target.exists():
@@ -113,19 +113,14 @@ def read_prediction(path: str | Path) -> xr.Dataset:
 
     The coordinates are those of a summary; the attribute ``prediction`` states the method.
     """
-    source = Path(path)
+    source = user_path(path)
     if not source.exists():
         raise InputError(f"{source} does not exist; give what mcsim predict -o wrote, or a configuration.")
-    try:
+    with unreadable(source, "a prediction", "give what mcsim predict -o wrote"):
         found = xr.open_zarr(source) if source.is_dir() else _from_table(source)
         if "biposh_binned_mean" not in found:
             raise KeyError("biposh_binned_mean")
         found = found.load()
-    except Exception as error:  # libraries raise errors of any type for a foreign file
-        raise InputError(
-            f"{source} cannot be read as a prediction ({type(error).__name__}: {' '.join(str(error).split())}); give "
-            "what mcsim predict -o wrote."
-        ) from error
     return found.assign_attrs(prediction=found.attrs.get("prediction", f"from {source.name}"))
 
 

@@ -94,10 +94,11 @@ def limit(
     >>> found.effects[0].name, round(float(found.effects[0].sigma), 2)
     ('noise_level', 0.07)
     """
-    run = model if isinstance(model, config.RunConfig) else config.load(model)
+    run = config.load(model)
     settings = settings or LimitSettings()
     if output is not None:
-        folders.writable(Path(output))
+        output = folders.user_path(output)
+        folders.writable(output)
     nthreads = os.cpu_count() or 1
     run, settings = _with_declared(run, settings)
     analysis, candidates = _candidates(run, settings, nthreads)
@@ -123,7 +124,7 @@ def limit(
     found = limits_of(candidates, information, tests, method, run.name, settings)
     if output is not None:
         found.save(output)
-        figure.limit_figure(found).savefig(Path(output) / PICTURE)
+        figure.limit_figure(found).savefig(output / PICTURE)
     return found
 
 
@@ -230,8 +231,6 @@ def _candidates(
         raise InputError(f"probes = {settings.probes} are too few to tell an error; give 3 or more.")
     if not 0.0 <= settings.unknown_dipole_uk < np.inf:
         raise InputError(f"unknown_dipole_uk = {settings.unknown_dipole_uk:g} is no rms; give 0 or more.")
-    if settings.orders < 0:
-        raise InputError(f"orders = {settings.orders} is no azimuthal order; give 0 or more.")
     library = systematics.catalogue() if settings.library is None else systematics.checked(settings.library)
     for name in (*settings.only, *settings.without):
         systematics.get(name, library)

@@ -15,7 +15,7 @@ from mcsim.simulation import convolve, simulate
 from mcsim.simulation.survey import Channel, Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.sky import dipole_alm
-from mcsim.support.arrays import Alm, Vector
+from mcsim.support.arrays import Alm, Vector, divided
 from mcsim.systematics import Effect
 
 Maps = NDArray[np.float64]
@@ -123,7 +123,7 @@ def _looked_at(channel: Channel, sky: Alm, realization: int) -> Alm:
 
 def _maps(shared: Survey, sky: Alm, realization: int, with_dipole: bool) -> Maps:
     seen = shared if with_dipole else replace(shared, channels=tuple(_without_dipole(c) for c in shared.channels))
-    hit = np.stack([m.moments.hits > 0 for channel in shared.channels for m in channel.maps])
+    hit = np.stack([m.moments.hits > 0 for m in shared.maps])
     return np.where(hit, simulate.maps(seen, realization, sky=sky), 0.0)
 
 
@@ -205,7 +205,7 @@ def _noise_change(plus: Survey, minus: Survey, width: float) -> Maps | None:
     """Return the derivative of the variance of every pixel, None if there is none."""
     ends = []
     for shared in (plus, minus):
-        rows = [m.noise_uk for channel in shared.channels for m in channel.maps]
+        rows = [m.noise_uk for m in shared.maps]
         ends.append(np.stack([np.zeros(12 * shared.nside**2) if row is None else row**2 for row in rows]))
     change = np.asarray((ends[0] - ends[1]) / width)
     return change if change.any() else None
@@ -226,4 +226,4 @@ def _power_factor(fiducial: Survey, effect: Effect, coordinates: NDArray[np.floa
         weight[: lmax + 1] = 1.0
         power += np.bincount(alm_.degrees(lmax), weight * np.abs(drawn) ** 2, lmax + 1)
     power /= DRAWS * (2.0 * np.arange(lmax + 1) + 1.0) * float(np.linalg.norm(coordinates))
-    return np.divide(power, 2.0 * fiducial.cl, out=np.zeros(lmax + 1), where=fiducial.cl > 0.0)
+    return divided(power, 2.0 * fiducial.cl)

@@ -24,9 +24,7 @@ from numpy.typing import NDArray
 from mcsim.information.derivatives import Derivative
 from mcsim.simulation.inverse_covariance import InverseCovariance, product
 from mcsim.sphere import alm as alm_
-from mcsim.sphere import rng
-from mcsim.sphere.sky import gaussian_alm
-from mcsim.support.arrays import Alm, Cl, Matrix
+from mcsim.support.arrays import Alm, Cl, Matrix, divided
 from mcsim.support.progress import Reporter
 
 Maps = NDArray[np.float64]
@@ -91,18 +89,14 @@ def stochastic(
     total = np.mean(found, axis=0) + _filtered_products(filtered, derivatives, first_half, second_half)
     size = np.diag(total)
     error = np.sqrt(np.mean(variance, axis=0) / len(variance))
-    return Information((total + total.T) / 2.0, np.divide(error, size, out=np.zeros(K), where=size > 0.0))
+    return Information((total + total.T) / 2.0, divided(error, size))
 
 
 def _draw(filtered: InverseCovariance, cl: Cl, seed: int, number: int) -> tuple[Maps, Alm]:
     """Return x = C^-1 d of data that the model makes, and s^ of the sky of spectrum ``cl``."""
-    sky = gaussian_alm(filtered.cl, rng.generator(seed, number, "information/sky"))
-    noise = rng.generator(seed, number, "information/noise").standard_normal(filtered.precision.shape)
-    seen = filtered.precision > 0.0
-    scale = np.divide(1.0, np.sqrt(filtered.precision), out=np.zeros_like(noise), where=seen)
-    data = np.where(seen, filtered.observe(sky) + scale * noise, 0.0)
+    data = filtered.draw("information", number, seed)
     found = filtered.wiener(data)
-    share = np.divide(cl, filtered.cl, out=np.zeros_like(cl), where=filtered.cl > 0.0)
+    share = divided(cl, filtered.cl)
     return filtered.apply(data, found), alm_.multiply(found, share, filtered.lmax)
 
 

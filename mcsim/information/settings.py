@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from mcsim.errors import InputError
+from mcsim.support.settings import check_settings
 from mcsim.systematics import Library
 
 
@@ -63,3 +65,10 @@ class LimitSettings:
     dense: bool = False
     tolerance: float = 1e-8
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Raise InputError for settings of another kind, negative numbers, and levels outside 0 to 1."""
+        check_settings(self)
+        for name in ("alpha", "power", "separation"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise InputError(f"{name} = {getattr(self, name):g} is no probability; give one between 0 and 1.")

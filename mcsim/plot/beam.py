@@ -19,6 +19,7 @@ FLOOR_DB = 40.0
 _PIXELS = 361
 _CONTOURS = (0.1, 0.25, 0.5, 0.75, 0.9)
 _LARGEST_ORDER = 8
+_FLOOR = 1e-6  # of the coefficients drawn
 _ARCMIN = np.degrees(1.0) * 60
 # Negative blue, positive ochre, white at and below the floor: safe for colour-blind readers.
 _SIGNED = LinearSegmentedColormap.from_list(
@@ -110,11 +111,13 @@ def _draw_blm(axes: Axes, beam: Beam) -> None:
     scale = np.sqrt(4 * np.pi / (2 * ell + 1))
     drawn = [m for m in range(min(beam.mmax, _LARGEST_ORDER) + 1) if np.any(beam.blm[m])]
     colours = ["#222222", *colormaps["viridis"](np.linspace(0.1, 0.9, max(len(drawn) - 1, 1)))]
+    last = 1
     for m, colour in zip(drawn, colours, strict=False):
         size = scale[m:] * np.abs(beam.blm[m, m:])
         width, dashes = 2.0 if m in (0, 2) else 1.1, "--" if m % 2 else "-"
         axes.semilogy(ell[m:], size, dashes, color=colour, linewidth=width, label=f"{m}")
-    axes.set(xlim=(0, beam.lmax), ylim=(1e-6, 2), xlabel="multipole ℓ")
+        last = max([last, *ell[m:][size > _FLOOR]])
+    axes.set(xlim=(0, min(1.05 * last, beam.lmax)), ylim=(_FLOOR, 2), xlabel="multipole ℓ")
     axes.xaxis.set_major_locator(MaxNLocator(6))
     axes.grid(which="major", color="#dddddd", linewidth=0.6)
     axes.set_axisbelow(True)

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mcsim.beamfit import Fit
+from mcsim.support.numbers import measured
 
 _COLOURS = {"constant": "#c44e22", "linear": "#1f5fa8", "spline": "#3c8c3c", "orientation": "#7b4fa3"}
 
@@ -25,23 +26,24 @@ def fit_figure(fits: Sequence[Fit]) -> Figure:
         A column for every mode (and part), with the data and the best fits above their residuals in sigmas; the last
         column has f_l and its 68 % band.
     """
-    measured = fits[0].measured
-    columns = list(dict.fromkeys((row.mode, row.imaginary) for row in measured.rows))
+    data = fits[0].measured
+    columns = list(dict.fromkeys((row.mode, row.imaginary) for row in data.rows))
     figure = Figure(figsize=(4.4 * (len(columns) + 1), 5.4), layout="constrained")
-    figure.suptitle(f"{measured.origin}: {measured.kind} spectra", fontsize=11)
+    what = "spectra less those of the circular-beam control" if data.kind == "difference" else "spectra"
+    figure.suptitle(f"{data.origin}: {what}", fontsize=11)
     axes = figure.subplots(2, len(columns) + 1, height_ratios=(2.2, 1.0), squeeze=False)
-    errors, scaling = np.sqrt(np.diag(measured.covariance)), measured.scaling
+    errors, scaling = np.sqrt(np.diag(data.covariance)), data.scaling
     quantity = r"\ell(\ell+1)A/2\pi" if scaling.spectrum else "A"
-    centres = np.array([0.5 * (row.ell_min + row.ell_max) for row in measured.rows])
+    centres = np.array([0.5 * (row.ell_min + row.ell_max) for row in data.rows])
     for column, (mode, imaginary) in enumerate(columns):
-        here = [i for i, row in enumerate(measured.rows) if (row.mode, row.imaginary) == (mode, imaginary)]
+        here = [i for i, row in enumerate(data.rows) if (row.mode, row.imaginary) == (mode, imaginary)]
         x = centres[here]
         above, below = axes[0, column], axes[1, column]
-        above.errorbar(x, measured.value[here], errors[here], fmt="o", color="0.2", markersize=3.5, capsize=2)
+        above.errorbar(x, data.value[here], errors[here], fmt="o", color="0.2", markersize=3.5, capsize=2)
         for number, one in enumerate(fits):
             colour = _COLOURS[one.model.name]
             above.plot(x, one.best[here], color=colour, label=one.model.name)
-            pull = (measured.value - one.best)[here] / errors[here]
+            pull = (data.value - one.best)[here] / errors[here]
             shift = 0.12 * (number - 0.5 * (len(fits) - 1)) * (x[1] - x[0] if len(x) > 1 else 1.0)
             below.plot(x + shift, pull, "o", color=colour, markersize=3.5)
         part = (r"\mathrm{Im}\," if imaginary else r"\mathrm{Re}\,") if mode.M > 0 or imaginary else ""
@@ -79,7 +81,7 @@ def _words(axes: Axes, fits: Sequence[Fit]) -> None:
     for one in fits:
         found = one.solution
         values = zip(one.model.parameters, found.parameters, found.errors, strict=True)
-        shown = ", ".join(f"{name} = {value:.4g} ± {error:.2g}" for name, value, error in values)
+        shown = ", ".join(f"{name} = {measured(value, error)}" for name, value, error in values)
         lines += [
             f"{one.model.name}: {shown if len(found.parameters) <= 2 else f'{len(found.parameters)} parameters'}",
             rf"   $\chi^2$/dof = {found.chi2:.1f}/{found.dof} = {found.reduced_chi2:.2f}",

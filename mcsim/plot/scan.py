@@ -74,4 +74,4 @@ def _against_latitude(hits_axes: Axes, w_axes: Axes, moments: Moments, model: Sc
     w_axes.axhline(0.0, color="0.6", linewidth=0.6)
     for axes in (hits_axes, w_axes):
         axes.set(xlim=(-90.0, 90.0), xticks=range(-90, 91, 30), xlabel=f"{moments.frame} latitude [degrees]")
-        axes.legend(frameon=False)
+    hits_axes.legend(frameon=False)  # the colours and styles of both panels

@@ -93,15 +93,18 @@ def structures(scene: Scene) -> tuple[Structure, ...]:
     """Return every structure of the grammar for the maps of a survey."""
     found = [*_of_maps(scene), *_of_channels(scene)]
     ranges = range(len(scene.fine) - 1)
-    found.append(_plain(scene, "power", "", "", "power", None, [("power", b) for b in ranges]))
+    found.append(_plain(scene, "power", "", "power", None, [("power", b) for b in ranges]))
     return tuple(found)
 
 
-def _plain(
-    scene: Scene, stage: str, acts_on: str, frame: str, kind: str, channel: str | None, keys: list[Key]
-) -> Structure:
+def _plain(scene: Scene, stage: str, frame: str, kind: str, channel: str | None, keys: list[Key]) -> Structure:
     rows = np.array([[scene.place[key]] for key in keys])
-    return Structure(stage, acts_on, frame, kind, channel, ALIKE, None, rows, np.ones(1))
+    return Structure(stage, "", frame, kind, channel, ALIKE, None, rows, np.ones(1))
+
+
+def _rows(scene: Scene, keys: Sequence[Key], views: Sequence[int]) -> NDArray[np.int64]:
+    """Return the places of scores, named without the map, in each of some maps, shape (keys, views)."""
+    return np.array([[scene.place[(*key[:1], i, *key[1:])] for i in views] for key in keys])
 
 
 def _of_channels(scene: Scene) -> Iterator[Structure]:
@@ -115,8 +118,8 @@ def _of_channels(scene: Scene) -> Iterator[Structure]:
             yield Structure("noise", "", "", kind, name, ALIKE, None, rows, np.ones(1), mix)
         if len(scene.of(c)) > 1:
             ranges = range(len(scene.fine) - 1)
-            yield _plain(scene, "noise", "", "", "spectrum", name, [("difference", c, b) for b in ranges])
-            yield _plain(scene, "added", "", "sky", "power", name, [("common", c, b) for b in ranges])
+            yield _plain(scene, "noise", "", "spectrum", name, [("difference", c, b) for b in ranges])
+            yield _plain(scene, "added", "sky", "power", name, [("common", c, b) for b in ranges])
 
 
 def _of_maps(scene: Scene) -> Iterator[Structure]:
@@ -129,9 +132,9 @@ def _of_maps(scene: Scene) -> Iterator[Structure]:
             kept = [i for i in views if factors[scene.views[i].split] != 0.0]
             weights = np.array([factors[scene.views[i].split] for i in kept])
             for stage, acts_on, frame, kind, keys, mix in _forms(scene, split, kept):
-                rows = np.array([[scene.place[(*key[:1], i, *key[1:])] for i in kept] for key in keys])
                 if name is None and (frame == "sky" or stage == "square") and kind not in ALSO_COMMON:
                     continue  # what all channels see alike is the sky itself, which the model knows as random
+                rows = _rows(scene, keys, kept)
                 yield Structure(stage, acts_on, frame, kind, name, split, None, rows, weights, mix, tuple(kept))
         yield from _high_orders(scene, name, views)
     yield from _modulations(scene)
@@ -218,7 +221,7 @@ def _high_orders(scene: Scene, name: str | None, views: tuple[int, ...]) -> Iter
     """Yield the orders of a beam that are measured in the sum of a channel's maps, which stands in its first."""
     first = [i for i in views if i == scene.of(scene.views[i].channel)[0]]
     for s in range(scene.split_orders + 1, min(ORDERS, len(scene.views[views[0]].w)) + 1):
-        rows = np.array([[scene.place[(*key[:1], i, *key[1:])] for i in first] for key in _beam(scene, s)])
+        rows = _rows(scene, _beam(scene, s), first)
         for kind, mix in _profiles(scene, s):
             yield Structure("beam", "sky", "scan", kind, name, ALIKE, None, rows, np.ones(len(first)), mix)
 
@@ -227,8 +230,7 @@ def _modulations(scene: Scene) -> Iterator[Structure]:
     """Yield patterns that multiply the sky itself: in all channels alike, without the dipole, of one degree each."""
     views = tuple(range(len(scene.views)))
     for degree in range(1, min(GAIN, scene.lmax) + 1):
-        places = range(degree**2, (degree + 1) ** 2)
-        rows = np.array([[scene.place["gain of the sky", i, j] for i in views] for j in places])
+        rows = _rows(scene, [("gain of the sky", j) for j in range(degree**2, (degree + 1) ** 2)], views)
         ones = np.ones(len(views))
         yield Structure("modulation", "sky", "sky", f"degree {degree}", None, ALIKE, None, rows, ones, None, views)
 
@@ -240,5 +242,6 @@ def _scaled(scene: Scene) -> Iterator[Structure]:
     for index in INDICES:
         weights = (frequencies / REFERENCE_GHZ) ** index
         for stage, acts_on, frame, kind, keys, mix in _added(scene):
-            rows = np.array([[scene.place[(*key[:1], i, *key[1:])] for i in views] for key in keys])
-            yield Structure(stage, acts_on, frame, kind, None, ALIKE, index, rows, weights, mix, views)
+            yield Structure(
+                stage, acts_on, frame, kind, None, ALIKE, index, _rows(scene, keys, views), weights, mix, views
+            )

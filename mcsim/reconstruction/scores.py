@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
-import ducc0
 import healpy
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,7 @@ from mcsim.reconstruction.forms import rotations
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, real
 from mcsim.sphere.sky import dipole_alm
-from mcsim.support.arrays import Alm, Cl, Map, Vector
+from mcsim.support.arrays import Alm, Cl, Map, Vector, divided
 
 ADDED, GAIN = 8, 2
 """Highest degree of patterns that are added, and of those that multiply."""
@@ -166,7 +165,7 @@ class Scene:
             whole = sky + self.dipole
             found.append(real.coefficients(adjoint, self.lmax, self.degree))
             top = min(GAIN, self.lmax)
-            found += [self._without_dipole(r, sky, adjoint, top), self._low(r * whole, top)]
+            found += [self._without_dipole(r, sky, adjoint, top), _low(r * whole, top)]
             found.append(np.array([r @ self.dipole, r @ sky**2, r @ whole**2]))
             through = (alm_.multiply(one, view.response, self.lmax) for one in turned)
             found.append(np.array([_product(adjoint, one, self.lmax) for one in through]))
@@ -189,12 +188,7 @@ class Scene:
         patterns = self._patterns[: (top + 1) ** 2]
         area = 4.0 * np.pi / sky.size
         leaks = area * (patterns * sky) @ self._patterns[:4].T
-        return self._low(r * sky, top) - leaks @ real.coefficients(adjoint, self.lmax, 1)
-
-    def _low(self, product: Map, top: int) -> Vector:
-        geometry = healpix.geometry(self.nside)
-        alm = ducc0.sht.adjoint_synthesis(map=product[None], spin=0, lmax=top, nthreads=1, **geometry)[0]
-        return real.coefficients(alm, top, top)
+        return _low(r * sky, top) - leaks @ real.coefficients(adjoint, self.lmax, 1)
 
     def _orders(self, view: View, orders: NDArray[np.complex128], i: int) -> list[Vector]:
         ell, found = np.arange(self.lmax + 1), []
@@ -216,10 +210,13 @@ class Scene:
 
     def _of_sky(self, sky: Alm) -> Vector:
         """Return the scores of the sky's power."""
-        inverse = np.divide(1.0, self.cl, out=np.zeros(self.lmax + 1), where=self.cl > 0.0)
         weight = _twice(self.lmax) * np.abs(sky) ** 2
-        power = 0.5 * inverse * np.bincount(alm_.degrees(self.lmax), weight, self.lmax + 1)
+        power = 0.5 * divided(1.0, self.cl) * np.bincount(alm_.degrees(self.lmax), weight, self.lmax + 1)
         return np.array([power[low:high].sum() for low, high in pairwise(self.fine)])
+
+
+def _low(product: Map, top: int) -> Vector:
+    return real.coefficients(healpix.adjoint(product, top), top, top)
 
 
 def _twice(lmax: int) -> Vector:

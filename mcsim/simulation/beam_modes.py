@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-import ducc0
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,8 +22,7 @@ from mcsim.errors import InputError
 from mcsim.instrument.scan import Moments
 from mcsim.simulation import convolve
 from mcsim.simulation.filtering import LOWEST, MapFilter
-from mcsim.sphere import healpix, rng
-from mcsim.sphere.sky import gaussian_alm
+from mcsim.sphere import healpix
 from mcsim.support.arrays import Alm, Map, Matrix, Vector
 
 
@@ -101,10 +99,7 @@ class BeamModes:
         fields = []
         for s, pair in enumerate(turned, 1):
             convolve.turned(y, self.moments, s, pair)
-            geometry = healpix.geometry(inverse.nside)
-            fields.append(
-                ducc0.sht.adjoint_synthesis(map=pair, spin=s, lmax=inverse.lmax, nthreads=inverse.nthreads, **geometry)
-            )
+            fields.append(healpix.adjoint(pair, inverse.lmax, inverse.nthreads, spin=s))
         return Weighted(sky, np.stack(fields))
 
     def products(self, one: Weighted, other: Weighted) -> Vector:
@@ -137,12 +132,7 @@ class BeamModes:
 
     def probe(self, number: int) -> Weighted:
         """Return a random map of the filter's covariance, weighted."""
-        inverse, name = self.filter.inverse, self.filter.name
-        sky = gaussian_alm(inverse.cl, rng.generator(0, number, f"beam modes/{name}/sky"))
-        noise = rng.generator(0, number, f"beam modes/{name}/noise").standard_normal(inverse.npix)
-        precision = inverse.precision[0]
-        scale = np.divide(1.0, np.sqrt(precision), out=np.zeros(inverse.npix), where=precision > 0.0)
-        return self.weighted(inverse.observe(sky)[0] + scale * noise)
+        return self.weighted(self.filter.inverse.draw(f"beam modes/{self.filter.name}", number)[0])
 
     def spectra(self, numbers: Vector) -> NDArray[np.complex128]:
         """Return real numbers as beta, shape (order, bin), NaN where an order does not exist."""

@@ -11,7 +11,6 @@ from mcsim import config, systematics
 from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
 from mcsim.instrument.scan.offsets import HIGHEST
-from mcsim.sphere import alm as alm_
 from mcsim.sphere import rotation
 from mcsim.support import resources
 
@@ -85,13 +84,18 @@ def effects_on(
     acting = []
     for entry in run.effects:
         effect = systematics.build(entry.name, entry.parameters, library)
-        if effect.scope == "channel" and entry.channel is None:
-            raise InputError(f'effect {entry.name} acts in one channel; say which: channel = "{run.channels[0].name}".')
-        if effect.scope == "common" and entry.channel is not None:
-            raise InputError(f"effect {entry.name} is common to all channels; remove its channel = {entry.channel!r}.")
+        check_scope(f"effect {entry.name}", type(effect), entry.channel, run)
         if entry.channel in (None, channel):
             acting.append(effect)
     return tuple(acting)
+
+
+def check_scope(name: str, kind: type[systematics.Effect], channel: str | None, run: config.RunConfig) -> None:
+    """Raise InputError for an effect that names a channel and is common to all, or the other way round."""
+    if kind.scope == "channel" and channel is None:
+        raise InputError(f'{name} acts in one channel; say which: channel = "{run.channels[0].name}".')
+    if kind.scope == "common" and channel is not None:
+        raise InputError(f"{name} is common to all channels; remove its channel = {channel!r}.")
 
 
 def refuse_external(run: config.RunConfig) -> None:
@@ -114,12 +118,7 @@ def check_effects(run: config.RunConfig) -> None:
             refuse_pixel_effects(spec.name, acting)
         if isinstance(spec.scan, config.ScanDifferencing):
             refuse_excess(spec.name, acting)
-        site = site_of(run, spec)
-        systematics.seen_through(acting, site)
-        systematics.looked_at(acting, np.zeros(alm_.size(site.lmax), complex), site, run.ensemble.seed, 0)
-        for effect in acting:
-            effect.gain(np.zeros(1), site)
-        systematics.check_added(acting, site)
+        systematics.tried(acting, site_of(run, spec))
 
 
 def refuse_excess(channel: str, acting: tuple[systematics.Effect, ...]) -> None:
@@ -158,7 +157,7 @@ def known_offsets(run: config.RunConfig, spec: config.Channel) -> int:
     """Return the highest power of the samples' offsets that the moments of a channel can have."""
     match spec.scan:
         case config.ScanMoments():
-            paths = [config.channel_path(spec.scan.path, spec.name, split) for split in run.map.splits or (None,)]
+            paths = [config.channel_path(spec.scan.path, spec.name, split) for split in run.map.each_split]
             return min(scan.read_moments(path).offset_order for path in paths)
         case config.ScanDifferencing():
             return 1

@@ -9,7 +9,6 @@ One transform per kept s, whatever the number of samples in the survey (paper, S
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +19,7 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.checks import check_alm, check_cl, check_nside, check_shape
 from mcsim.support.arrays import Map
+from mcsim.support.compiled import njit
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def noncircular_map(maps: dict[int, NDArray[np.float64]], moments: Moments) -> M
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def add_twice_real_part(w, real, imag, total):  # type: ignore[no-untyped-def]
     """Add 2 Re(w (real + i imag)) to ``total`` in one pass over memory, which is what this costs."""
     for pixel in range(total.size):
@@ -146,7 +146,7 @@ def turned(map_: Map, moments: Moments, s: int, total: NDArray[np.float64]) -> N
     _add_turned(map_, moments.w[s - 1], total)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _add_turned(map_, w, total):  # type: ignore[no-untyped-def]
     """Add conj(w) times a map to ``total`` in one pass over memory."""
     for pixel in range(map_.size):
@@ -167,7 +167,7 @@ def centroid_map(gradient: NDArray[np.float64], moments: Moments) -> Map:
     return result
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _along(dtheta, down, dphi, east, result):  # type: ignore[no-untyped-def]
     """Fill ``result`` with d . grad in one pass over memory."""
     for pixel in range(result.size):

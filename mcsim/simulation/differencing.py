@@ -38,7 +38,7 @@ def sides(run: config.RunConfig) -> dict[str, str]:
 
 def seconds(run: config.RunConfig) -> float:
     """Estimate the time that one realization of all differencing channels takes one core."""
-    splits = run.map.splits or (None,)
+    splits = run.map.each_split
     models = [
         (scan_model(channel, channel.scan, splits[0]), channel.scan.pair)
         for channel in run.channels
@@ -105,30 +105,30 @@ def whole_maps(
             raise RunError(f"{error}.") from error
 
 
-def of_dipole(channel: Channel, imbalance: float, nthreads: int = 1) -> list[Map]:
+def of_dipole(channel: Channel, imbalance: float) -> list[Map]:
     """Return what the dipole leaves in the maps where the true imbalance is another, uK, shape (npix,) each."""
     side_b = _side_b(channel)
     other = replace(channel, side_b=replace(side_b, imbalance=imbalance, sigma0_uk=0.0, iterations_short=0))
     dipole = dipole_alm(channel.site.dipole_uk, channel.site.lmax)
-    return [map_uk for _, map_uk in whole_maps(other, dipole, dipole, 0, 0, nthreads)]
+    return [map_uk for _, map_uk in whole_maps(other, dipole, dipole, 0, 0)]
 
 
-def not_converged(channel: Channel, m: SurveyMap, sky_uk: Map, nthreads: int = 1) -> Map:
+def not_converged(channel: Channel, m: SurveyMap, sky_uk: Map) -> Map:
     """Return what the map of a sky, uK, shape (npix,), lacks after FEW iterations from zeros."""
     x, seen = _side_b(channel).scan.transmission_imbalance, m.moments.hits > 0.0
     map_uk = np.where(seen, sky_uk - (float(np.mean(sky_uk[seen])) if x == 0.0 else 0.0), 0.0)
     rule = mapmaking.StoppingRule(max_iterations=FEW)
-    rhs = mapmaking.rhs_of_map(_pairs(m), map_uk, x, nthreads)
-    return np.where(seen, mapmaking.solve(_pairs(m), rhs, x, rule, nthreads=nthreads)[0] - map_uk, 0.0)
+    rhs = mapmaking.rhs_of_map(_pairs(m), map_uk, x)
+    return np.where(seen, mapmaking.solve(_pairs(m), rhs, x, rule)[0] - map_uk, 0.0)
 
 
-def iterations_to_spare(channel: Channel, sky: NDArray[np.complex128], nthreads: int = 1) -> int:
+def iterations_to_spare(channel: Channel, sky: NDArray[np.complex128]) -> int:
     """Return how many iterations more than FEW the first map of a sky takes to converge, >= 1."""
     scan, m = _side_b(channel).scan, channel.maps[0]
     x, rule = scan.transmission_imbalance, mapmaking.StoppingRule(scan.tolerance, scan.max_iterations)
-    sky_uk = convolve.circular_map(sky, channel.response, channel.site.nside, nthreads)
-    rhs = mapmaking.rhs_of_map(_pairs(m), np.where(m.moments.hits > 0.0, sky_uk, 0.0), x, nthreads)
-    return max(mapmaking.solve(_pairs(m), rhs, x, rule, nthreads=nthreads)[1].iterations - FEW, 1)
+    sky_uk = convolve.circular_map(sky, channel.response, channel.site.nside)
+    rhs = mapmaking.rhs_of_map(_pairs(m), np.where(m.moments.hits > 0.0, sky_uk, 0.0), x)
+    return max(mapmaking.solve(_pairs(m), rhs, x, rule)[1].iterations - FEW, 1)
 
 
 def _side_b(channel: Channel) -> SideB:

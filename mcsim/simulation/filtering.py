@@ -22,7 +22,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import ducc0
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,10 +30,9 @@ from mcsim.bipolar.modes import Mode, bin_factor, existing
 from mcsim.errors import InputError
 from mcsim.simulation.inverse_covariance import InverseCovariance
 from mcsim.sphere import alm as alm_
-from mcsim.sphere import healpix, rng
-from mcsim.sphere.sky import gaussian_alm
+from mcsim.sphere import healpix
 from mcsim.support import folders
-from mcsim.support.arrays import Alm, Map, Matrix, Vector
+from mcsim.support.arrays import Alm, Map, Matrix, Vector, divided
 from mcsim.support.code import package_digest
 
 LOWEST = 2
@@ -102,26 +100,18 @@ class MapFilter:
         observed = np.where(self._precision > 0.0, map_uk, 0.0)[None]
         inverse = self.inverse
         sky = inverse.solve(inverse.adjoint(inverse.precision * observed), near)
-        geometry = healpix.geometry(inverse.nside)
-        found = ducc0.sht.adjoint_synthesis(
-            map=inverse.apply(observed, sky), spin=0, lmax=inverse.lmax, nthreads=inverse.nthreads, **geometry
-        )[0]
+        found = healpix.adjoint(inverse.apply(observed, sky)[0], inverse.lmax, inverse.nthreads)
         found = alm_.multiply(found, window, inverse.lmax)
         # Where the sky is far above the noise the difference of the two loses digits; s^ = S B x does not.
         power = inverse.cl * self._beam
         bright = alm_.degrees(inverse.lmax) <= np.max(np.flatnonzero(power * self._beam > self.total / 2.0), initial=-1)
         usable = bright & (power[alm_.degrees(inverse.lmax)] > 0.0)
-        scale = np.divide(1.0, power, out=np.zeros_like(power), where=power > 0.0)
-        found = np.where(usable, alm_.multiply(sky, scale, inverse.lmax), found)
+        found = np.where(usable, alm_.multiply(sky, divided(1.0, power), inverse.lmax), found)
         return alm_.resize(found, inverse.lmax, self.lmax), sky
 
     def probe(self, number: int) -> Alm:
         """Return filtered coefficients of random data of the filter's own covariance."""
-        inverse = self.inverse
-        sky = gaussian_alm(inverse.cl, rng.generator(0, number, f"filter/{self.name}/sky"))
-        noise = rng.generator(0, number, f"filter/{self.name}/noise").standard_normal(inverse.npix)
-        scale = np.divide(1.0, np.sqrt(self._precision), out=np.zeros(inverse.npix), where=self._precision > 0.0)
-        return self.apply(inverse.observe(sky)[0] + scale * noise)[0]
+        return self.apply(self.inverse.draw(f"filter/{self.name}", number)[0])[0]
 
     @property
     def _precision(self) -> Map:

@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import ducc0
 import healpy
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +23,10 @@ from mcsim.errors import InputError
 from mcsim.instrument.scan import Moments
 from mcsim.simulation import convolve
 from mcsim.sphere import alm as alm_
-from mcsim.sphere import healpix
+from mcsim.sphere import healpix, rng
 from mcsim.sphere.checks import check_cl
-from mcsim.support.arrays import Alm, Cl, Map, Vector
+from mcsim.sphere.sky import gaussian_alm
+from mcsim.support.arrays import Alm, Cl, Map, Vector, divided
 
 Maps = NDArray[np.float64]
 """Shape (map, npix), uK or uK^-1."""
@@ -125,10 +125,6 @@ class InverseCovariance:
         return alm_.size(self.lmax)
 
     @cached_property
-    def _geometry(self) -> dict[str, object]:
-        return {"lmax": self.lmax, "nthreads": self.nthreads, **healpix.geometry(self.nside)}
-
-    @cached_property
     def precision(self) -> Maps:
         """Return the inverse variance of all pixels, uK^-2, shape (map, npix)."""
         return np.stack([m.precision for m in self.maps])
@@ -168,14 +164,14 @@ class InverseCovariance:
             if not members:
                 continue
             response = self.maps[members[0]].response
-            added = np.sum([maps[at[i]] for i in members], axis=0)[None]
-            circular = ducc0.sht.adjoint_synthesis(map=added, spin=0, **self._geometry)[0]
+            added = np.sum([maps[at[i]] for i in members], axis=0)
+            circular = healpix.adjoint(added, self.lmax, self.nthreads)
             moved = self._moved(members)
             if moved:
                 along = [np.stack([maps[at[i]] * m.dtheta, maps[at[i]] * m.dphi]) for i, m in moved.items()]
                 both = np.sum(along, axis=0)
                 # The gradient of a_lm is the spin-1 synthesis of E = sqrt(l(l + 1)) a_lm, B = 0.
-                electric = ducc0.sht.adjoint_synthesis(map=both, spin=1, **self._geometry)[0]
+                electric, _ = healpix.adjoint(both, self.lmax, self.nthreads, spin=1)
                 ell = np.arange(self.lmax + 1.0)
                 circular = circular + alm_.multiply(electric, np.sqrt(ell * (ell + 1.0)), self.lmax)
             total += convolve.circular_alm(circular, response)
@@ -185,11 +181,18 @@ class InverseCovariance:
                     moments = self.maps[i].moments
                     if moments is not None and s in self.maps[i].spins:
                         convolve.turned(maps[at[i]], moments, s, turned)
-                electric, magnetic = ducc0.sht.adjoint_synthesis(map=turned, spin=s, **self._geometry)
+                electric, magnetic = healpix.adjoint(turned, self.lmax, self.nthreads, spin=s)
                 factor = response.factors[s]  # ducc0's sign: S_s is minus the synthesis
                 total -= 2.0 * alm_.multiply(electric, factor.real, self.lmax)
                 total -= 2.0 * alm_.multiply(magnetic, factor.imag, self.lmax)
         return total
+
+    def draw(self, name: str, number: int, seed: int = 0) -> Maps:
+        """Draw maps of this covariance, uK, 0 where nothing is observed; ``name`` is that of the random numbers."""
+        sky = gaussian_alm(self.cl, rng.generator(seed, number, f"{name}/sky"))
+        noise = rng.generator(seed, number, f"{name}/noise").standard_normal(self.precision.shape)
+        seen = self.precision > 0.0
+        return np.where(seen, self.observe(sky) + divided(1.0, np.sqrt(self.precision)) * noise, 0.0)
 
     def of_own(self, maps: Maps, part: slice) -> Alm:
         """Return P^t N^-1 applied to some maps, the others being zero; ``part`` says which they are."""
@@ -206,8 +209,7 @@ class InverseCovariance:
             return np.zeros_like(sky)
         begin = None
         if near is not None:
-            unscaled = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
-            begin = _packed(alm_.multiply(near, unscaled, self.lmax), self.lmax)
+            begin = _packed(alm_.multiply(near, divided(1.0, scale), self.lmax), self.lmax)
         found, used = conjugate_gradients(self._normal, known, self._precondition, (self.tolerance, ITERATIONS), begin)
         if used > ITERATIONS:
             raise InputError(

@@ -18,7 +18,7 @@ from mcsim.simulation.channels import scan_model
 from mcsim.sphere import header, healpix
 from mcsim.sphere.checks import UNSEEN_BELOW
 from mcsim.sphere.mask import read_mask
-from mcsim.support.arrays import Map
+from mcsim.support.arrays import Map, divided
 
 
 class DrawnNoise(Protocol):
@@ -104,7 +104,7 @@ def of_map(
     observed = moments.hits > 0
     match noise:
         case declared.Noise():
-            return moments, _per_hit(noise.sigma0_uk, moments.hits), None
+            return moments, divided(noise.sigma0_uk, np.sqrt(moments.hits)), None
         case declared.NoiseDepth():
             side = np.rad2deg(healpy.nside2resol(moments.nside)) * 60.0
             return moments, np.where(observed, noise.depth_uk_arcmin / side, 0.0), None
@@ -120,11 +120,11 @@ def of_map(
             together = np.sum(own, axis=0)
             own_hits = np.minimum(together, 1.0) * moments.hits if noise.isotropic else together
             moments = replace(moments, hits=np.where(observed, own_hits, 0.0))
-            return moments, np.where(moments.hits > 0, _per_hit(level.sigma_uk, together), 0.0), None
+            return moments, np.where(moments.hits > 0, divided(level.sigma_uk, np.sqrt(together)), 0.0), None
         case declared.NoiseRealizations():
             template = noise.files.replace("{channel}", spec.name).replace("{split}", str(split))
             first = _noise_map(Path(template.format(realization=0)), moments, spec.frequency_ghz)
-            level_uk = _per_hit(timestream.per_hit(first, moments.hits), moments.hits)
+            level_uk = divided(timestream.per_hit(first, moments.hits), np.sqrt(moments.hits))
             return moments, level_uk, NoiseOfFiles(template, moments, spec.frequency_ghz, level_uk)
         case declared.NoiseCorrelated():
             correlated = _correlated(run, spec, noise, split, moments)
@@ -156,32 +156,30 @@ def difference_level(run: config.RunConfig, channel: str, split: str | None = No
 def in_words(run: config.RunConfig) -> list[str]:
     """Return lines on noise whose level is estimated from data, and on noise that takes time to draw."""
     lines: dict[str, None] = {}  # splits that share a line have it once
-    for spec in run.channels:
-        for place, split in enumerate(run.map.splits or (None,)):
-            match spec.noise_of(split):
-                case declared.NoiseDifference():
-                    lines[f"{spec.name} {difference_level(run, spec.name, split)}"] = None
-                case declared.NoiseCorrelated() as noise:
-                    name, number = spec.name if split is None else f"{spec.name}:{split}", _samples(run, spec, place)
-                    lines[f"{name} 1/f, {number:.3g} samples for each realization, {noise.map_making}"] = None
+    for one in run.each_map:
+        match one.channel.noise_of(one.split):
+            case declared.NoiseDifference():
+                lines[f"{one.channel.name} {difference_level(run, one.channel.name, one.split)}"] = None
+            case declared.NoiseCorrelated() as noise:
+                number = _samples(run, *one)
+                lines[f"{one.name} 1/f, {number:.3g} samples for each realization, {noise.map_making}"] = None
     return list(lines)
 
 
 def seconds(run: config.RunConfig) -> float:
     """Return the time of a core, for a realization, that correlated noise takes."""
     return timestream.SECONDS_PER_SAMPLE * sum(
-        _samples(run, spec, place)
-        for spec in run.channels
-        for place, split in enumerate(run.map.splits or (None,))
+        _samples(run, spec, split)
+        for spec, split in run.each_map
         if isinstance(spec.noise_of(split), declared.NoiseCorrelated)
     )
 
 
-def _samples(run: config.RunConfig, spec: config.Channel, place: int) -> float:
+def _samples(run: config.RunConfig, spec: config.Channel, split: str | None) -> float:
     """Return the number of samples from which the noise of a split is made."""
     assert isinstance(spec.scan, config.ScanHitAveraged)  # the configuration refuses other scans
-    model = scan_model(spec, spec.scan, run.map.splits[place] if run.map.splits else None)
-    first, last = run.map.span(place)
+    model = scan_model(spec, spec.scan, split)
+    first, last = run.map.span(run.map.each_split.index(split))
     return (last - first) * sum(model.samples(line) for line in model.select())
 
 
@@ -234,10 +232,6 @@ def _correlated(
     return timestream.correlated_noise(noise, scan_model(spec, spec.scan, split), grid, f"noise/{name}", rings)
 
 
-def _per_hit(sigma0_uk: float, hits: Map) -> Map:
-    return np.divide(sigma0_uk, np.sqrt(hits), out=np.zeros(hits.size), where=hits > 0)
-
-
 def _noise_map(path: Path, moments: Moments, frequency_ghz: float | None) -> Map:
     """Return a noise map where the scan observes, 0 elsewhere."""
     found = _temperature(path, moments, frequency_ghz)
@@ -252,14 +246,15 @@ def _noise_map(path: Path, moments: Moments, frequency_ghz: float | None) -> Map
 
 def _temperature(path: Path, moments: Moments, frequency_ghz: float | None) -> Map:
     """Return a map in uK, NaN where nothing was observed."""
-    values, unit = _fitting(path, moments, ())
-    seen = np.isfinite(values) & (values > UNSEEN_BELOW)
-    return np.where(seen, header.to_uk(unit, path, frequency_ghz) * values, np.nan)
+    values = healpix.read_uk(path, moments.frame, frequency_ghz)
+    _check_nside(values, path, moments)
+    return np.where(np.isfinite(values) & (values > UNSEEN_BELOW), values, np.nan)
 
 
 def _positive(path: Path, moments: Moments, names: Sequence[str]) -> tuple[Map, str | None]:
     """Return a map of hits or variances, 0 where nothing was observed, and its unit."""
-    values, unit = _fitting(path, moments, tuple(names))
+    values, _, unit = healpix.read_map(path, tuple(names), moments.frame)
+    _check_nside(values, path, moments)
     values = np.where(np.isfinite(values) & (values > UNSEEN_BELOW), values, 0.0)
     if values.min() < 0.0 or not np.any((values > 0.0) & (moments.hits > 0)):
         raise InputError(
@@ -269,17 +264,10 @@ def _positive(path: Path, moments: Moments, names: Sequence[str]) -> tuple[Map, 
     return values, unit
 
 
-def _fitting(path: Path, moments: Moments, names: tuple[str, ...]) -> tuple[Map, str | None]:
-    """Return a map that has the pixels and the frame of the maps that are made, and its unit."""
-    values, frame, unit = healpix.read_map(path, names)
+def _check_nside(values: Map, path: Path, moments: Moments) -> None:
     nside = healpy.npix2nside(values.size)
     if nside != moments.nside:
         raise InputError(
             f"{path} has nside {nside}, but maps are made with map.nside = {moments.nside}; set map.nside to {nside} "
             "(a preparation can degrade the maps)."
         )
-    if frame not in (None, moments.frame):
-        raise InputError(
-            f'{path} is in {frame} coordinates, but maps are made in {moments.frame} ones; set map.frame = "{frame}".'
-        )
-    return values, unit

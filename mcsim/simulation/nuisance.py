@@ -11,13 +11,12 @@ import numpy as np
 from mcsim import config, systematics
 from mcsim.errors import InputError
 from mcsim.simulation import convolve
-from mcsim.simulation.channels import site_of
+from mcsim.simulation.channels import check_scope, site_of
 from mcsim.simulation.pixel_means import gain_of, signal_of
 from mcsim.simulation.survey import Channel, Survey, survey, with_effects
-from mcsim.sphere import alm as alm_
 from mcsim.sphere import rng
 from mcsim.support.arrays import Map, Vector
-from mcsim.systematics import Effect, Library, Site, basis_of, looked_at, seen_through, spread_of
+from mcsim.systematics import Effect, Library, basis_of, seen_through, spread_of, tried
 
 _OF_BEAMS = ("beam", "pointing", "spread")
 
@@ -121,10 +120,7 @@ def nuisances_of(run: config.RunConfig, library: Library | None = None) -> tuple
 
 def _nuisance(run: config.RunConfig, entry: config.Nuisance, library: Library | None) -> Nuisance:
     kind = systematics.get(entry.effect, library)
-    if kind.scope == "channel" and entry.channel is None:
-        raise InputError(f'nuisance {kind.name} acts in one channel; say which: channel = "{run.channels[0].name}".')
-    if kind.scope == "common" and entry.channel is not None:
-        raise InputError(f"nuisance {kind.name} is common to all channels; remove its channel = {entry.channel!r}.")
+    check_scope(f"nuisance {kind.name}", kind, entry.channel, run)
     k = len(kind.parametrization.basis())
     if len(entry.width) not in (1, k):
         numbers = "1 number" if k == 1 else f"1 or {k} numbers"
@@ -154,7 +150,7 @@ def check_nuisances(run: config.RunConfig, library: Library | None = None) -> in
         try:
             for effect, spec in product(one.extremes(), run.channels):
                 if one.channel in (None, spec.name):
-                    orders = max(orders, _try(effect, site_of(run, spec)))
+                    orders = max(orders, tried((effect,), site_of(run, spec)).mmax)
         except InputError as error:
             text = str(error).rstrip(".")
             raise InputError(
@@ -162,14 +158,6 @@ def check_nuisances(run: config.RunConfig, library: Library | None = None) -> in
                 "remove the nuisance."
             ) from None
     return orders
-
-
-def _try(effect: Effect, site: Site) -> int:
-    """Return the highest order of the beam with an effect; raise InputError if it cannot act."""
-    looked_at((effect,), np.zeros(alm_.size(site.lmax), dtype=np.complex128), site, 0, 0)
-    effect.gain(np.zeros(1), site)
-    effect.noise(site)
-    return seen_through((effect,), site).mmax
 
 
 def draws(nuisances: Sequence[Nuisance], seed: int, realization: int) -> tuple[Vector, Drawn]:

@@ -7,10 +7,12 @@ from numpy.typing import ArrayLike
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments
+from mcsim.instrument.scan.files import check_moments
 from mcsim.simulation import convolve
 from mcsim.simulation.offsets import expansion, offset_maps
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
+from mcsim.sphere.checks import check_whole
 from mcsim.support.arrays import Map
 
 
@@ -65,6 +67,14 @@ def observe(
     (3072,)
     """
     sky, lmax = alm_.whole(alm, "alm")
+    for given, kind, name in ((beam, Beam, "beam"), (moments, Moments, "moments")):
+        if not isinstance(given, kind):
+            raise InputError(f"{name} is a {type(given).__name__}; give a mcsim.{kind.__name__}.")
+    if not isinstance(pixel_window, bool | np.bool_ | None):
+        raise InputError(f"pixel_window is {pixel_window!r}; give True, False or None.")
+    check_whole(nthreads, "nthreads")
+    beam.check_normalised()
+    check_moments(moments, "the moments")
     if moments.smax < beam.mmax:
         raise InputError(
             f"the moments end at s = {moments.smax}, the beam at m = {beam.mmax}; compute moments with "

@@ -2,7 +2,6 @@
 
 import hashlib
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -54,13 +53,9 @@ def _mean_of_samples(
 
     ``angles`` False: the terms take times alone.
     """
-
-    def stream() -> Iterator[tod.Samples]:
-        grid = MapGrid(site.nside, site.frame, share)
-        for chunk in tod.samples(pointing.model, pointing.line, grid, angles=angles):
-            yield replace(chunk, signal_uk=sum(terms(chunk), start=chunk.signal_uk))
-
-    mean, hits = tod.bin_samples(stream(), site.nside)
+    samples = tod.samples(pointing.model, pointing.line, MapGrid(site.nside, site.frame, share), angles=angles)
+    summed = tod.with_signal(lambda chunk: sum(terms(chunk), start=chunk.signal_uk))
+    mean, hits = tod.bin_samples(summed(samples), site.nside)
     return np.where(hits > 0, mean, 0.0)
 
 

@@ -19,8 +19,8 @@ from mcsim.instrument.beams import Beam, read_window
 from mcsim.instrument.scan import Moments
 from mcsim.simulation.channels import load_beam
 from mcsim.simulation.steps import NEGLIGIBLE, Average, Filled, Filter, Regression, Rotated, Step, Weighted
-from mcsim.sphere import header, healpix, rotation
-from mcsim.sphere.checks import UNSEEN_BELOW, check_map
+from mcsim.sphere import healpix, rotation
+from mcsim.sphere.checks import UNSEEN_BELOW, check_complete, check_map
 from mcsim.sphere.mask import read_mask
 from mcsim.support.arrays import Map
 from mcsim.systematics import Site
@@ -194,13 +194,10 @@ def _harmonics(nside: int, monopole: bool, dipole: bool) -> NDArray[np.float64]:
 
 def _template(path: Path, nside: int, frame: str, spec: config.Channel) -> Map:
     """Read a template in uK, at the nside and in the frame of the maps that it is taken off."""
-    template, found, unit = healpix.read_map(path)
+    template = healpix.read_uk(path, frame, spec.frequency_ghz)
     check_map(template, nside, f"template {path}")
-    if found not in (None, frame):
-        raise InputError(f"template {path} is in {found} coordinates, the maps are in {frame}; give it in {frame}.")
-    if not np.all(np.isfinite(template) & (template > UNSEEN_BELOW)):
-        raise InputError(f"template {path} has pixels that are not finite or unseen; give a complete map.")
-    return header.to_uk(unit, path, spec.frequency_ghz) * template
+    check_complete(template, f"template {path}")
+    return template
 
 
 @lru_cache(maxsize=32)

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import ducc0
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh_tridiagonal
@@ -26,6 +25,7 @@ from mcsim.simulation.convolve import Response
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.checks import check_alm, check_angle
 from mcsim.support.arrays import Alm, Vector
+from mcsim.support.compiled import njit
 
 _ROUND_OFF = 1e8
 """Loss of digits that the division by sin^s(theta) on the ring next to the pole may cost."""
@@ -138,7 +138,7 @@ def _real_part(alm: Alm, factor: Alm, s: int, theta: Vector, nthreads: int) -> N
     return np.asarray(legendre)[0] / np.sin(theta)[:, np.newaxis] ** s
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _times_sine_power(alm, real, imag, s, start, result):  # type: ignore[no-untyped-def]
     """Return the coefficients of Re(sin^s(theta) S_s) by m: rows m..lmax + s, at start[m].
 
@@ -251,7 +251,7 @@ def _lanczos(x: Vector, weight: Vector, count: int) -> tuple[Vector, Vector]:
     return diagonal, squared
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _recurrence(x, weight, count):  # type: ignore[no-untyped-def]
     """Return the coefficients a_k, b_k of the monic orthogonal polynomials of a sum of points, added one by one."""
     diagonal, squared = np.zeros(count), np.zeros(count)

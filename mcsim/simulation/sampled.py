@@ -1,6 +1,6 @@
 """The whole survey sample by sample, effects and all: the time-ordered reference of each realization."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import healpy
@@ -56,7 +56,7 @@ def maps(
             if run.map.split_by == "rings":
                 stages.append(tod.every_ring(site.pointed("of rings").model.spin_period_s, len(channel.maps), index))
             draw = rng.generator(run.ensemble.seed, realization, f"noise/{m.name}")
-            given = spec.noise_of(run.map.splits[index] if run.map.splits else None)
+            given = spec.noise_of(run.map.each_split[index])
             of_samples = isinstance(given, config.Noise) and given.hits is None
             if isinstance(given, config.Noise) and of_samples and given.sigma0_uk > 0.0:
                 stages.append(tod.white_noise(given.sigma0_uk, draw, _noise_factor(channel)))
@@ -156,38 +156,31 @@ def _vector(chunk: tod.Samples) -> Map:
 def _gained(channel: Channel) -> tod.Stage:
     """Return a stage that multiplies the signal by one plus the errors of the gain."""
 
-    def stage(stream: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
-        for chunk in stream:
-            gain = np.ones(chunk.time_s.size)
-            for effect in channel.effects:
-                error = effect.gain(chunk.time_s, channel.site)
-                if error is not None:
-                    gain = gain + error
-            yield replace(chunk, signal_uk=gain * chunk.signal_uk)
+    def gained(chunk: tod.Samples) -> Map:
+        gain = np.ones(chunk.time_s.size)
+        for effect in channel.effects:
+            error = effect.gain(chunk.time_s, channel.site)
+            if error is not None:
+                gain = gain + error
+        return gain * chunk.signal_uk
 
-    return stage
+    return tod.with_signal(gained)
 
 
 def _added(channel: Channel) -> tod.Stage:
     """Return a stage that adds the signals of effects."""
     acting, site = systematics.adding(channel.effects), channel.site
 
-    def stage(stream: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
-        for chunk in stream:
-            signals = (effect.signal(chunk.time_s, chunk.theta, chunk.phi, chunk.psi, site) for effect in acting)
-            yield replace(chunk, signal_uk=sum(signals, start=chunk.signal_uk))
+    def added(chunk: tod.Samples) -> Map:
+        signals = (effect.signal(chunk.time_s, chunk.theta, chunk.phi, chunk.psi, site) for effect in acting)
+        return sum(signals, start=chunk.signal_uk)
 
-    return stage
+    return tod.with_signal(added)
 
 
 def _disturbed(effect: systematics.Effect, draw: np.random.Generator) -> tod.Stage:
     """Return a stage that adds an effect's noise to every sample."""
-
-    def stage(stream: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
-        for chunk in stream:
-            yield replace(chunk, signal_uk=chunk.signal_uk + effect.excess(np.ones(chunk.time_s.size), draw))
-
-    return stage
+    return tod.with_signal(lambda chunk: chunk.signal_uk + effect.excess(np.ones(chunk.time_s.size), draw))
 
 
 def _noise_factor(channel: Channel) -> Map | None:

@@ -15,7 +15,7 @@ from mcsim.simulation.survey import Channel, Survey, SurveyMap
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rng
 from mcsim.sphere.sky import dipole_alm, gaussian_alm
-from mcsim.support.arrays import Alm
+from mcsim.support.arrays import Alm, divided
 
 
 @dataclass(frozen=True)
@@ -49,10 +49,7 @@ def realize(survey: Survey, realization: int, nthreads: int = 1) -> dict[str, ND
     ensemble = survey.config.ensemble
     sky = draw_sky(survey, realization)
     made = _circular_maps(survey, nthreads)
-    observe = _observe if survey.source is None else _observe_prepared
-    if survey.filtering is not None:
-        observe = _observe_filtered
-    observed = [result for channel in survey.channels for result in observe(survey, channel, sky, realization, made)]
+    observed = [result for channel in survey.channels for result in _observe(survey, channel, sky, realization, made)]
     result = _spectra(survey, [o.alm for o in observed], "")
     if ensemble.paired:
         result |= _spectra(survey, [o.circular for o in observed if o.circular is not None], "_circular")
@@ -137,73 +134,70 @@ def _circular_maps(survey: Survey, nthreads: int) -> convolve.CircularMaps:
 
 def _observe(
     survey: Survey, channel: Channel, sky: Alm, realization: int, made: convolve.CircularMaps
-) -> list[Observed]:
-    """Return the analysed maps of a channel for one sky."""
-    ensemble = survey.config.ensemble
-    if channel.rings is not None:
-        return [_observe_on_rings(survey, channel, channel.rings, sky, realization, made.nthreads)]
-    known = None
-    smooth = ensemble.keep_maps or not all(_is_exact(survey, m) for m in channel.maps)
-    if channel.side_b is None:
-        seen, dipole = _seen(survey, channel, sky, realization)
-        known = _circular(survey, channel, seen, dipole)
-    results = []
-    for m, parts in _map_parts(survey, channel, sky, realization, made, smooth):
-        if known is not None and _is_exact(survey, m):
-            control = alm_.multiply(known, 1.0 / channel.window, survey.config.sky.lmax)
-            if parts.extra is not None:
-                control = control + _analyse(survey, channel, parts.extra, None, made.nthreads)
-        else:
-            assert parts.smooth is not None  # asked for above
-            circular = parts.smooth if parts.extra is None else parts.smooth + parts.extra
-            control = _analyse(survey, channel, circular, m.weight, made.nthreads)
-        alm = control
-        if parts.difference is not None:
-            alm = control + _analyse(survey, channel, parts.difference, m.weight, made.nthreads)
-        kept = np.where(m.moments.hits > 0, parts.total, healpy.UNSEEN) if ensemble.keep_maps else None
-        results.append(Observed(alm, control if ensemble.paired else None, kept))
-    return results
-
-
-def _observe_prepared(
-    survey: Survey, channel: Channel, sky: Alm, realization: int, made: convolve.CircularMaps
-) -> list[Observed]:
-    """Return the analysed maps of a channel for one sky, prepared: the map and its control each by itself."""
+) -> Iterator[Observed]:
+    """Yield the analysed maps of a channel for one sky."""
     ensemble, making = survey.config.ensemble, survey.making
+    if channel.rings is not None:
+        yield _observe_on_rings(survey, channel, channel.rings, sky, realization, made.nthreads)
+        return
     source = next(one for one in making.channels if one.name == channel.name)
-    results = []
-    parts_of_maps = _map_parts(making, source, sky, realization, made, smooth=True)
+    plain = survey.source is None and survey.filtering is None
+    smooth = ensemble.keep_maps or not (plain and all(_is_exact(survey, m) for m in channel.maps))
+    known = None
+    if plain and channel.side_b is None:
+        known = _circular(survey, channel, *_seen(survey, channel, sky, realization))
+    parts_of_maps = _map_parts(making, source, sky, realization, made, smooth)
     for m, (own, parts) in zip(channel.maps, parts_of_maps, strict=True):
-        total, control = _finished(own, parts.total), None
-        alm = _analyse(survey, channel, total, m.left_to_apply, made.nthreads)
-        if ensemble.paired and parts.difference is not None:
-            circular = _finished(own, replace(parts, difference=None).total)
-            control = _analyse(survey, channel, circular, m.left_to_apply, made.nthreads)
-        elif ensemble.paired:
-            control = alm
-        results.append(Observed(alm, control, total if ensemble.keep_maps else None))
-    return results
+        if survey.filtering is not None:
+            alm, control = _filtered(survey, m, parts)
+        elif survey.source is not None:
+            alm, control = _prepared(survey, channel, (m, own), parts, made.nthreads)
+        else:
+            alm, control = _analysed(survey, channel, m, parts, known if _is_exact(survey, m) else None, made.nthreads)
+        kept = _finished(own, parts.total) if ensemble.keep_maps else None
+        yield Observed(alm, control if ensemble.paired else None, kept)
 
 
-def _observe_filtered(
-    survey: Survey, channel: Channel, sky: Alm, realization: int, made: convolve.CircularMaps
-) -> list[Observed]:
-    """Return the maps of a channel for one sky, filtered by their inverse covariance; see :class:`MapFilter`."""
-    ensemble = survey.config.ensemble
+def _analysed(
+    survey: Survey, channel: Channel, m: SurveyMap, parts: MapParts, known: Alm | None, nthreads: int
+) -> tuple[Alm, Alm]:
+    """Return the a_lm of a map and of its control; ``known``: of the smooth part, where they follow without it."""
+    if known is not None:
+        control = alm_.multiply(known, 1.0 / channel.window, survey.config.sky.lmax)
+        if parts.extra is not None:
+            control = control + _analyse(survey, channel, parts.extra, None, nthreads)
+    else:
+        assert parts.smooth is not None  # asked for above
+        circular = parts.smooth if parts.extra is None else parts.smooth + parts.extra
+        control = _analyse(survey, channel, circular, m.weight, nthreads)
+    if parts.difference is None:
+        return control, control
+    return control + _analyse(survey, channel, parts.difference, m.weight, nthreads), control
+
+
+def _prepared(
+    survey: Survey, channel: Channel, maps: tuple[SurveyMap, SurveyMap], parts: MapParts, nthreads: int
+) -> tuple[Alm, Alm | None]:
+    """Return the a_lm of a map, and of its control where there is one: each prepared by itself.
+
+    ``maps``: what the analysis knows of the map, and the map before its preparation.
+    """
+    m, own = maps
+    alm = _analyse(survey, channel, _finished(own, parts.total), m.left_to_apply, nthreads)
+    if not survey.config.ensemble.paired or parts.difference is None:
+        return alm, alm
+    circular = _finished(own, replace(parts, difference=None).total)
+    return alm, _analyse(survey, channel, circular, m.left_to_apply, nthreads)
+
+
+def _filtered(survey: Survey, m: SurveyMap, parts: MapParts) -> tuple[Alm, Alm | None]:
+    """Return a map, and its control where there is one, as :class:`mcsim.simulation.filtering.MapFilter` has them."""
     assert survey.filtering is not None  # the caller looked
-    filters = {each.name: each for each in survey.filtering.filters}
-    results = []
-    for m, parts in _map_parts(survey, channel, sky, realization, made, smooth=True):
-        circular, near = None, None
-        if ensemble.paired:
-            circular, near = filters[m.name].apply(replace(parts, difference=None).total)
-        alm = circular
-        if circular is None or parts.difference is not None:
-            alm, _ = filters[m.name].apply(parts.total, near)
-        kept = np.where(m.moments.hits > 0, parts.total, healpy.UNSEEN) if ensemble.keep_maps else None
-        assert alm is not None  # one of the two is made
-        results.append(Observed(alm, circular, kept))
-    return results
+    apply = next(each.apply for each in survey.filtering.filters if each.name == m.name)
+    if not survey.config.ensemble.paired:
+        return apply(parts.total)[0], None
+    control, near = apply(replace(parts, difference=None).total)
+    return (control if parts.difference is None else apply(parts.total, near)[0]), control
 
 
 def _map_parts(
@@ -243,8 +237,7 @@ def _map_parts(
             extra.append(m.noise(seed, realization))
         for effect in systematics.disturbing(channel.effects):
             draw = rng.generator(seed, realization, f"effect/{effect.name}/noise/{m.name}")
-            hits = m.moments.hits
-            extra.append(np.divide(effect.excess(hits, draw), hits, out=np.zeros_like(hits), where=hits > 0.0))
+            extra.append(divided(effect.excess(m.moments.hits, draw), m.moments.hits))
         if m.gain is not None and whole is not None:
             extra.append(m.gain * whole)
         if m.signal_uk is not None:

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import header, healpix
+from mcsim.sphere.checks import UNSEEN_BELOW
 from mcsim.support.arrays import Alm
+from mcsim.support.folders import unreadable
 from mcsim.support.npy import read_npy
 
 LARGEST_UK = 1e12
@@ -27,7 +29,7 @@ def read_alm(path: Path, lmax: int, frame: str) -> Alm:
     temperature, or has values that are not finite or of no sky in uK.
     """
     if path.suffix == ".npy":
-        given = read_npy(path)
+        given = read_npy(path, "c")
         mmax, keywords = healpy.Alm.getlmax(given.size), fits.Header()
     else:
         given, mmax, keywords = _read_fits_alm(path)
@@ -37,9 +39,10 @@ def read_alm(path: Path, lmax: int, frame: str) -> Alm:
         raise InputError(f"{path} holds a_lm up to l = {found}, m = {mmax}; the sky needs both up to {lmax}.")
     if not np.all(np.isfinite(alm)):
         raise InputError(f"{path} holds a_lm that are not finite; repair the file.")
-    if np.abs(alm[: found + 1].imag).max() > 1e-6 * np.abs(alm).max():
-        raise InputError(f"{path} has complex a_l0, where a real sky has real ones; check the order of its a_lm.")
-    _check_frame(path, header.frame_named(keywords.get("COORDSYS"), str(path)), frame)
+    alm_.check_order(alm, found, str(path))
+    stated = header.frame_named(keywords.get("COORDSYS"), str(path))
+    if stated not in (None, frame):
+        raise InputError(f"{path} is in {stated} coordinates, the run's maps in {frame}; rotate the sky first.")
     factor = header.to_uk(str(keywords.get("TUNIT2", "")), path)
     alm = alm if factor == 1.0 else factor * alm
     _check_size(path, alm)
@@ -47,13 +50,9 @@ def read_alm(path: Path, lmax: int, frame: str) -> Alm:
 
 
 def _read_fits_alm(path: Path) -> tuple[Alm, int, fits.Header]:
-    try:
+    with unreadable(path, "a_lm", "give a FITS file as healpy.write_alm makes it"):
         alm, mmax = healpy.read_alm(path, return_mmax=True)
         return alm, int(mmax), fits.getheader(path, 1)
-    except Exception as error:  # libraries raise whatever a broken file makes of them
-        raise InputError(
-            f"{path} cannot be read as a_lm ({error}); give a FITS file as healpy.write_alm makes it."
-        ) from error
 
 
 def read_map(path: Path, lmax: int, frame: str, frequency_ghz: float | None = None) -> Alm:
@@ -62,23 +61,16 @@ def read_map(path: Path, lmax: int, frame: str, frequency_ghz: float | None = No
     ``frame`` is the run's, and the file's where it states one; ``frequency_ghz`` is what the run's channels have in
     common: antenna temperature and brightness need it. InputError if the file cannot be used so.
     """
-    map_, found, unit = healpix.read_map(path)
-    nside = healpy.npix2nside(map_.size)
+    map_uk = healpix.read_uk(path, frame, frequency_ghz)
+    nside = healpy.npix2nside(map_uk.size)
     if nside & (nside - 1):
         raise InputError(f"{path} has nside {nside}, which is not a power of two; bring the sky to one that is.")
-    _check_frame(path, found, frame)
-    if not np.all(np.isfinite(map_)) or np.any(map_ == healpy.UNSEEN):
+    if not np.all(np.isfinite(map_uk)) or np.any(map_uk < UNSEEN_BELOW):
         raise InputError(f"{path} has pixels that are not finite or unseen; a sky must be complete.")
     if lmax > 3 * nside - 1:
         raise InputError(f"{path} has nside {nside}, good to l = {3 * nside - 1}; the sky's lmax {lmax} is above it.")
-    map_uk = header.to_uk(unit, path, frequency_ghz) * map_
     _check_size(path, map_uk)
     return healpix.analysis(map_uk, lmax, iterations=3)
-
-
-def _check_frame(path: Path, found: str | None, frame: str) -> None:
-    if found not in (None, frame):
-        raise InputError(f"{path} is in {found} coordinates, the run's maps in {frame}; rotate the sky first.")
 
 
 def _check_size(path: Path, sky: NDArray[np.generic]) -> None:

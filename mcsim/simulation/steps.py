@@ -14,7 +14,7 @@ from mcsim.errors import InputError
 from mcsim.simulation import windows
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rotation
-from mcsim.support.arrays import Map
+from mcsim.support.arrays import Map, divided
 
 ITERATIONS = 1
 """Jacobi iterations of the analysis of maps that are smoothed or degraded in harmonics."""
@@ -83,7 +83,7 @@ class Average(Step):
         seen = np.isfinite(inside)
         count = seen.sum(axis=1)
         total = np.where(seen, inside, 0.0).sum(axis=1)
-        return np.divide(total, count, out=np.full(count.size, np.nan, dtype=total.dtype), where=count > 0)
+        return divided(total, count, np.nan)
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,6 +32,7 @@ from mcsim.simulation.rings import Rings, limit_rings, parallel_transport_rings
 from mcsim.simulation.survey_filter import filtering_of
 from mcsim.sphere import healpix, rng, spectra
 from mcsim.sphere.mask import read_mask
+from mcsim.support.arrays import divided
 from mcsim.systematics import Effect, Library, Site, seen_through, spread_of, variance_factor
 
 Progress = Callable[[float], None]
@@ -79,17 +80,13 @@ class SurveyMap:
         if self.drawn is None:
             draw = rng.generator(seed, realization, f"noise/{self.name}")
             return self.noise_uk * draw.standard_normal(self.noise_uk.size)
-        level = self.drawn.level_uk
-        changed = np.divide(self.noise_uk, level, out=np.zeros(level.size), where=level > 0.0)
-        return np.asarray(changed * self.drawn.draw(seed, realization))
+        return divided(self.noise_uk, self.drawn.level_uk) * self.drawn.draw(seed, realization)
 
     @property
     def left_to_apply(self) -> NDArray[np.float64] | None:
         """Return the part of the weight that the preparation has not multiplied the map with already."""
         done = None if self.preparation is None else self.preparation.weight()
-        if self.weight is None or done is None:
-            return self.weight
-        return np.divide(self.weight, done, out=np.zeros(done.size), where=done > 0.0)
+        return self.weight if self.weight is None or done is None else divided(self.weight, done)
 
     @property
     def sky_fraction(self) -> float:
@@ -190,9 +187,14 @@ class Survey:
         return config.prepared_grid(self.config)[1]
 
     @property
+    def maps(self) -> tuple[SurveyMap, ...]:
+        """Maps of all channels, in order."""
+        return tuple(m for channel in self.channels for m in channel.maps)
+
+    @property
     def map_names(self) -> tuple[str, ...]:
         """Names of the maps, in order."""
-        return tuple(m.name for channel in self.channels for m in channel.maps)
+        return tuple(m.name for m in self.maps)
 
     @property
     def pair_names(self) -> tuple[str, ...]:
@@ -203,7 +205,7 @@ class Survey:
     @property
     def sky_fractions(self) -> dict[str, float]:
         """Effective fraction of the sky of every map; see :attr:`SurveyMap.sky_fraction`."""
-        return {m.name: m.sky_fraction for channel in self.channels for m in channel.maps}
+        return {m.name: m.sky_fraction for m in self.maps}
 
 
 def survey(
@@ -249,8 +251,7 @@ def _channel(
         return _channel_on_rings(run, spec, site, acting)
     window = _window(run, spec)
     beam = seen_through(acting, site)
-    splits = run.map.splits or (None,)
-    maps = []
+    maps, splits = [], run.map.each_split
     for index, split in enumerate(splits):
         offsets = 1 if run.map.offset_order is None else run.map.offset_order
         grid = MapGrid(run.map.resolution, run.map.frame, run.map.span(index), max(offsets, 1))
@@ -292,8 +293,9 @@ def _channel(
 def _prepared(run: config.RunConfig, spec: config.Channel, channel: Channel) -> Channel:
     """Return what the analysis knows of a channel whose maps are prepared."""
     maps = []
-    for split, m in zip(run.map.splits or (None,), channel.maps, strict=True):
-        steps = _steps_of(m)
+    for split, m in zip(run.map.each_split, channel.maps, strict=True):
+        assert m.preparation is not None  # as of every map of a run that declares one
+        steps = m.preparation
         moments = steps.moments(m.moments)
         noise = None if m.noise_uk is None else steps.noise_uk(m.noise_uk, m.moments.hits)
         weight = _weight(run, spec, split, m.name, moments, steps.weight())
@@ -307,11 +309,6 @@ def _prepared(run: config.RunConfig, spec: config.Channel, channel: Channel) -> 
         maps=tuple(maps),
         site=steps.site(channel.site),
     )
-
-
-def _steps_of(m: SurveyMap) -> Preparation:
-    assert m.preparation is not None  # as of every map of a run that declares one
-    return m.preparation
 
 
 def _channel_on_rings(run: config.RunConfig, spec: config.Channel, site: Site, acting: tuple[Effect, ...]) -> Channel:

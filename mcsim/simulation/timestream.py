@@ -8,7 +8,7 @@ more than its sums over pixels, P^T y, and over baselines, F^T y.
 
 import hashlib
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from mcsim.instrument.scan import LineOfSight, MapGrid, ScanModel, scan_key
 from mcsim.simulation import tod
 from mcsim.sphere import rng
 from mcsim.support import folders
-from mcsim.support.arrays import Map
+from mcsim.support.arrays import Map, divided
 from mcsim.support.code import package_digest
 
 SECONDS_PER_SAMPLE = 1.2e-7
@@ -114,7 +114,7 @@ class CorrelatedNoise:
                     in_baselines[first + low : first + high] += np.bincount(baseline - low, weights=chunk.signal_uk)
             first += _number(self, line)
         if self.pairs is None:
-            return _over(in_pixels, self.hits)
+            return divided(in_pixels, self.hits)
         return destriped(in_pixels, in_baselines, self.pairs, self.hits)
 
 
@@ -126,14 +126,14 @@ def destriped(in_pixels: Map, in_baselines: Map, pairs: csr_matrix, hits: Map) -
     """
     length = np.asarray(pairs.sum(axis=1)).ravel()
     there = np.maximum(length, 1.0)  # a baseline without samples has the offset 0
-    system = LinearOperator(pairs.shape[:1] * 2, matvec=lambda a: length * a - pairs @ _over(pairs.T @ a, hits))
+    system = LinearOperator(pairs.shape[:1] * 2, matvec=lambda a: length * a - pairs @ divided(pairs.T @ a, hits))
     diagonal = LinearOperator(pairs.shape[:1] * 2, matvec=lambda a: a / there)
-    known = in_baselines - pairs @ _over(in_pixels, hits)
+    known = in_baselines - pairs @ divided(in_pixels, hits)
     rounding = 1e-13 * float(np.linalg.norm(in_baselines))
     offsets, failed = cg(system, known, rtol=TOLERANCE, atol=rounding, maxiter=ITERATIONS, M=diagonal)
     if failed:
         raise RuntimeError(f"the offsets of destriping do not converge in {ITERATIONS} iterations; lengthen baseline_s")
-    map_uk = _over(in_pixels - pairs.T @ offsets, hits)
+    map_uk = divided(in_pixels - pairs.T @ offsets, hits)
     return np.where(hits > 0, map_uk - np.sum(hits * map_uk) / hits.sum(), 0.0)
 
 
@@ -190,7 +190,7 @@ def _fill(folder: Path, empty: CorrelatedNoise) -> None:
     drawn = [made._drawn(0, r, f"level of {empty.streams}") for r in range(LEVEL_DRAWS)]
     level = math.sqrt(np.mean([per_hit(each, hits) ** 2 for each in drawn]))
     np.save(folder / "hits.npy", hits)
-    np.save(folder / "level.npy", np.sqrt(_over(np.full(hits.size, level**2), hits)))
+    np.save(folder / "level.npy", np.sqrt(divided(np.full(hits.size, level**2), hits)))
 
 
 def _check(noise: NoiseCorrelated, model: ScanModel) -> None:
@@ -223,11 +223,7 @@ def _timed(
 
 
 def _adding(following: Callable[[int], Map]) -> tod.Stage:
-    def stage(stream: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
-        for chunk in stream:
-            yield replace(chunk, signal_uk=chunk.signal_uk + following(chunk.time_s.size))
-
-    return stage
+    return tod.with_signal(lambda chunk: chunk.signal_uk + following(chunk.time_s.size))
 
 
 def _baseline_s(of: CorrelatedNoise) -> float:
@@ -238,7 +234,3 @@ def _number(of: CorrelatedNoise, line: LineOfSight) -> int:
     """Return the number of baselines of a line of sight."""
     first, last = of.grid.sample_range(of.model, line)
     return math.floor((last - 1 - first) * of.model.period_of_samples(line) / _baseline_s(of)) + 2
-
-
-def _over(total: Map, hits: Map) -> Map:
-    return np.divide(total, hits, out=np.zeros(hits.size), where=hits > 0)

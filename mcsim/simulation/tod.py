@@ -10,15 +10,15 @@ variables of its generator, since chunks come in the order of time.
 """
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import ducc0
 import healpy
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
@@ -26,7 +26,8 @@ from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import LineOfSight, MapGrid, ScanModel
 from mcsim.instrument.scan.pointing import PointingStream, fill_samples
 from mcsim.sphere.checks import check_alm, check_nside, check_shape
-from mcsim.support.arrays import Map
+from mcsim.support.arrays import Map, divided
+from mcsim.support.compiled import njit
 
 CHUNK = 1 << 18
 """Samples of a chunk: 12 MB of arrays, and enough of them that the interpolation does not wait for its set-up."""
@@ -74,18 +75,37 @@ def samples(
 
     ``at_pixel_centres``: move every sample to the centre of its pixel and keep its psi: what orientation moments
     assume. ``angles`` False: leave direction and orientation empty, for what depends on time and pixel alone; they take
-    most of the time.
+    most of the time. The next chunk is made, in a thread, while one is used.
     """
     stream = PointingStream(model, line, grid.frame)
     period = model.period_of_samples(line)
-    for low, high in chunks(*grid.sample_range(model, line)):
+
+    def chunk(low: int, high: int) -> Samples:
         where, pixel = np.empty((3, high - low if angles else 0)), np.empty(high - low, dtype=np.int64)
         fill_samples(stream.at(low), high - low, grid.nside, where if angles else None, pixel)
         theta, phi, psi = where
         if at_pixel_centres:
             theta, phi = healpy.pix2ang(grid.nside, pixel)
         time_s = period * np.arange(low, high, dtype=np.float64)
-        yield Samples(time_s, theta, phi, psi, pixel, np.zeros(high - low))
+        return Samples(time_s, theta, phi, psi, pixel, np.zeros(high - low))
+
+    made: deque[Future[Samples]] = deque()
+    with ThreadPoolExecutor(1) as ahead:
+        for span in chunks(*grid.sample_range(model, line)):
+            made.append(ahead.submit(chunk, *span))
+            if len(made) > 1:
+                yield made.popleft().result()
+        yield from (one.result() for one in made)
+
+
+def with_signal(signal: Callable[[Samples], Map]) -> Stage:
+    """Return a stage that gives every chunk the signal that a function returns for it, uK, shape (n,)."""
+
+    def stage(stream: Iterable[Samples]) -> Iterator[Samples]:
+        for chunk in stream:
+            yield replace(chunk, signal_uk=signal(chunk))
+
+    return stage
 
 
 def sky_signal(
@@ -137,13 +157,11 @@ def white_noise(sigma0_uk: float, rng: np.random.Generator, factor: Map | None =
     """
     check_noise(sigma0_uk)
 
-    def stage(stream: Iterable[Samples]) -> Iterator[Samples]:
-        for chunk in stream:
-            noise = sigma0_uk * rng.standard_normal(chunk.signal_uk.size)
-            noise = noise if factor is None else noise * factor[chunk.pixel]
-            yield replace(chunk, signal_uk=chunk.signal_uk + noise)
+    def noisy(chunk: Samples) -> Map:
+        noise = sigma0_uk * rng.standard_normal(chunk.signal_uk.size)
+        return chunk.signal_uk + (noise if factor is None else noise * factor[chunk.pixel])
 
-    return stage
+    return with_signal(noisy)
 
 
 def every_ring(spin_period_s: float, number: int, index: int) -> Stage:
@@ -182,7 +200,7 @@ def bin_samples(stream: Iterable[Samples], nside: int) -> tuple[Map, Map]:
                 f"a sample is in pixel {chunk.pixel.max()}, but nside {nside} has {hits.size}; give its own nside."
             )
         _add(chunk.pixel, chunk.signal_uk, sums)
-    return np.divide(total, hits, out=np.full(hits.size, healpy.UNSEEN), where=hits > 0.0), hits.copy()
+    return divided(total, hits, healpy.UNSEEN), hits.copy()
 
 
 def observe(
@@ -202,7 +220,7 @@ def observe(
     return bin_samples(through(samples(model, line, grid, at_pixel_centres), stages), grid.nside)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _add(pixel, signal, sums):  # type: ignore[no-untyped-def]
     for k in range(pixel.size):
         sums[pixel[k], 0] += signal[k]

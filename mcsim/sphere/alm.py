@@ -7,6 +7,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mcsim.errors import InputError
+from mcsim.support.arrays import numbers
+
+REALITY = 1e-6
+"""Largest imaginary part of a_l0 over the largest coefficient: single precision leaves 1e-7."""
 
 
 def size(lmax: int) -> int:
@@ -63,9 +67,9 @@ def resize(alm: NDArray[np.complex128], lmax: int, new_lmax: int) -> NDArray[np.
 def whole(given: ArrayLike, name: str) -> tuple[NDArray[np.complex128], int]:
     """Return given coefficients and their lmax; ``name`` names them in messages.
 
-    Raise InputError if they are not complex, not those of a map with every m up to lmax, or not finite.
+    Raise InputError if they are not complex, not those of a real map with every m up to lmax, or not finite.
     """
-    alm = np.asarray(given)
+    alm = numbers(given, name)
     lmax = lmax_of(alm.size) if alm.ndim == 1 and np.iscomplexobj(alm) else None
     if lmax is None:
         raise InputError(
@@ -74,7 +78,14 @@ def whole(given: ArrayLike, name: str) -> tuple[NDArray[np.complex128], int]:
         )
     if not np.all(np.isfinite(alm)):
         raise InputError(f"{name} has values that are not finite; give the coefficients of a whole map.")
+    check_order(alm, lmax, name)
     return alm.astype(np.complex128), lmax
+
+
+def check_order(alm: NDArray, lmax: int, name: str) -> None:
+    """Raise InputError if a_l0 are complex: those of real maps are real, so the order is not healpy's."""
+    if np.abs(alm[: lmax + 1].imag).max() > REALITY * np.abs(alm).max():
+        raise InputError(f"{name} has complex a_l0, where a real sky has real ones; give healpy's m-major order.")
 
 
 def _check_size(alm: NDArray[np.complex128], lmax: int) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
+from mcsim.support.arrays import numbers
 
 NSIDE_MAX = 8192
 
@@ -61,7 +62,8 @@ def check_finite(values: NDArray, name: str) -> None:
 
 
 def check_shape(values: Any, shape: tuple[int, ...], name: str) -> None:
-    """Raise InputError unless an array has this shape."""
+    """Raise InputError unless an array of plain numbers has this shape."""
+    numbers(values, name)
     if np.shape(values) != shape:
         raise InputError(f"{name} has shape {np.shape(values)}, but {shape} is needed.")
 

@@ -40,6 +40,14 @@ def opened(path: Path) -> Iterator[fits.HDUList]:
             yield hdus
 
 
+def first_table(hdus: fits.HDUList) -> fits.BinTableHDU:
+    """Return the first binary table of a FITS file; raise ValueError if there is none."""
+    for hdu in hdus:
+        if isinstance(hdu, fits.BinTableHDU):
+            return hdu
+    raise ValueError("it has no binary table")
+
+
 def frame_named(coordsys: object, where: str) -> str | None:
     """Return the frame that a COORDSYS keyword of a file, ``where``, names; None if it is missing or empty.
 

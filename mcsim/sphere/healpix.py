@@ -13,9 +13,10 @@ from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
-from mcsim.sphere.checks import check_alm, check_complete, check_map, check_nside, check_whole
-from mcsim.sphere.header import frame_named, opened
+from mcsim.sphere.checks import UNSEEN_BELOW, check_alm, check_complete, check_map, check_nside, check_whole, nside_of
+from mcsim.sphere.header import frame_named, opened, to_uk
 from mcsim.support.arrays import Alm, Map
+from mcsim.support.folders import unreadable
 from mcsim.support.npy import read_npy
 
 
@@ -57,11 +58,15 @@ def gradient(alm: Alm, nside: int, lmax: int, nthreads: int = 1) -> NDArray[np.f
     return np.asarray(maps)
 
 
-def adjoint(map_: Map, lmax: int, nthreads: int = 1) -> Alm:
-    """Return the adjoint of the spin-0 synthesis, shape (size,): the sum over pixels of the map times conj(Y_lm)."""
-    return np.asarray(
-        ducc0.sht.adjoint_synthesis(map=map_[None], spin=0, lmax=lmax, nthreads=nthreads, **geometry(check_map(map_)))
-    )[0]
+def adjoint(map_: NDArray[np.float64], lmax: int, nthreads: int = 1, spin: int = 0) -> Alm:
+    """Return the adjoint of the synthesis: the sum over pixels of the map times conj(Y_lm), shape (size,) at spin 0.
+
+    At other spins a map of shape (2, npix) gives E and B, shape (2, size).
+    """
+    maps = map_ if spin else map_[None]
+    nside = nside_of(map_.shape[-1], "the map") if spin else check_map(map_)
+    found = ducc0.sht.adjoint_synthesis(map=maps, spin=spin, lmax=lmax, nthreads=nthreads, **geometry(nside))
+    return np.asarray(found if spin else found[0])
 
 
 def analysis(map_: Map, lmax: int, iterations: int = 0, nthreads: int = 1) -> Alm:
@@ -210,28 +215,23 @@ VARIANCE = ("II_COV", "VARIANCE", "I_VAR", "COV_II", "VAR_I", "VAR")
 """Names of columns with the variance of the temperature."""
 
 
-def read_map(path: Path, names: tuple[str, ...] = ()) -> tuple[Map, str | None, str | None]:
+def read_map(path: Path, names: tuple[str, ...] = (), frame: str | None = None) -> tuple[Map, str | None, str | None]:
     """Read a map of a HEALPix FITS file in RING order, and its frame and unit if the header has them.
 
     It is the column that is called one of ``names``; without names the temperature, or else the first column. A file
     with a single column need not name it. A .npy file holds an array of shape (npix,) in RING order; its frame and unit
     are None. Raise InputError if the file cannot be read as a HEALPix map, does not say whether it is RING or NESTED,
-    or names an unknown frame.
+    or names an unknown frame, or another one than ``frame``.
     """
     if path.suffix == ".npy":
         array = read_npy(path, "biuf").astype(np.float64)
         if not healpy.isnpixok(array.size):
             raise InputError(f"{path} has {array.size} pixels, which is no HEALPix map; give all 12 nside^2 pixels.")
         return array, None, None
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", category=AstropyUserWarning)
-            field = _column_called(path, names)
-            map_, header = healpy.read_map(path, dtype=float, h=True, field=field)
-    except InputError:
-        raise
-    except Exception as error:  # libraries raise errors of any type for a broken file
-        raise InputError(f"{path} cannot be read as a HEALPix map ({error}); give a complete FITS map.") from error
+    with unreadable(path, "a HEALPix map", "give a complete FITS map"), warnings.catch_warnings():
+        warnings.simplefilter("error", category=AstropyUserWarning)
+        field = _column_called(path, names)
+        map_, header = healpy.read_map(path, dtype=float, h=True, field=field)
     keywords = dict(header)
     if str(keywords.get("ORDERING", "")).strip().upper() not in ("RING", "NESTED"):
         raise InputError(f"{path} does not say how its pixels are ordered; write ORDERING = RING or NESTED there.")
@@ -240,7 +240,22 @@ def read_map(path: Path, names: tuple[str, ...] = ()) -> tuple[Map, str | None, 
     unit = str(keywords.get(f"TUNIT{column}", "")).strip() or None
     if str(keywords.get("TEMPTYPE", "")).strip().upper().startswith("ANT"):
         unit = f"{unit or 'K'} antenna"
-    return np.asarray(map_), frame_named(keywords.get("COORDSYS"), str(path)), unit
+    found = frame_named(keywords.get("COORDSYS"), str(path))
+    if frame is not None and found not in (None, frame):
+        raise InputError(
+            f'{path} is in {found} coordinates, but it is needed in {frame} ones; set map.frame = "{found}", so that '
+            "the scan and the noise are computed there, or rotate it."
+        )
+    return np.asarray(map_), found, unit
+
+
+def read_uk(path: Path, frame: str, frequency_ghz: float | None) -> Map:
+    """Read a map of temperatures, uK, in RING order; what was not observed stays as it is.
+
+    Raise InputError as :func:`read_map` does, or if the header names a unit that cannot be converted.
+    """
+    map_, _, unit = read_map(path, frame=frame)
+    return np.where(map_ > UNSEEN_BELOW, to_uk(unit, path, frequency_ghz) * map_, map_)
 
 
 def _column_called(path: Path, names: tuple[str, ...]) -> int:
@@ -279,8 +294,5 @@ def read_pixel_window(path: Path, lmax: int, nside: int | None = None) -> NDArra
 
 
 def _fits_pixel_window(path: Path) -> tuple[NDArray, int | None]:
-    try:
-        with opened(path) as hdus:
-            return np.asarray(hdus[1].data.field(0), dtype=float).ravel(), hdus[1].header.get("NSIDE")
-    except Exception as error:  # libraries raise errors of any type for a broken file
-        raise InputError(f"{path} is not a FITS pixel window ({error}); give a HEALPix pixel_window file.") from error
+    with unreadable(path, "a pixel window", "give a HEALPix pixel_window file"), opened(path) as hdus:
+        return np.asarray(hdus[1].data.field(0), dtype=float).ravel(), hdus[1].header.get("NSIDE")

@@ -3,7 +3,6 @@
 import gzip
 import re
 import warnings
-import zlib
 from functools import lru_cache
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from mcsim.errors import InputError
 from mcsim.sphere.checks import check_whole
 from mcsim.sphere.header import opened
 from mcsim.support import resources
+from mcsim.support.folders import unreadable
 from mcsim.support.npy import read_npy
 
 # Names of D_l = l(l+1) C_l / 2 pi in headers: D_l, Dl, D_ell, D_{\ell}, DlTT, l(l+1)Cl.
@@ -168,13 +168,9 @@ def _refuse_d_l(path: Path, header: str) -> None:
 
 def _read_text(path: Path) -> tuple[NDArray[np.float64], str, bool]:
     """Read C_l in uK^2, the header lines, and True if they state a unit."""
-    try:
+    with unreadable(f"power spectrum {str(path)!r}", "text", "give a text table or a FITS file"):
         contents = path.read_bytes()
         lines = (gzip.decompress(contents) if path.suffix == ".gz" else contents).decode().splitlines()
-    except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
-        raise InputError(
-            f"power spectrum {str(path)!r} cannot be read as text ({error}); give a text table or a FITS file."
-        ) from None
     found: dict[int, float] = {}
     header = ""
     for number, line in enumerate(lines, start=1):
@@ -213,18 +209,13 @@ def _read_text(path: Path) -> tuple[NDArray[np.float64], str, bool]:
 
 def _read_fits(path: Path) -> tuple[NDArray[np.float64], str, bool]:
     """Read C_l in uK^2, the column's name, and True if it states a unit."""
-    try:
-        with opened(path) as hdus:
-            header = hdus[1].header
-            columns = [
-                np.ravel(np.ma.filled(hdus[1].data.field(i), np.nan)).astype(np.float64)
-                for i in range(min(2, len(hdus[1].columns)))
-            ]
-    except Exception as error:  # libraries raise errors of any type for a broken file
-        raise InputError(
-            f"power spectrum {str(path)!r} cannot be read as a FITS table ({error}); "
-            "give a file as healpy.write_cl writes it."
-        ) from None
+    remedy = "give a file as healpy.write_cl writes it"
+    with unreadable(f"power spectrum {str(path)!r}", "a FITS table", remedy), opened(path) as hdus:
+        header = hdus[1].header
+        columns = [
+            np.ravel(np.ma.filled(hdus[1].data.field(i), np.nan)).astype(np.float64)
+            for i in range(min(2, len(hdus[1].columns)))
+        ]
     # If the first column counts up, it is ell and the second is C_l.
     ell = columns[0]
     counts = len(columns) == 2 and len(ell) > 3 and np.array_equal(ell, ell[0] + np.arange(len(ell))) and ell[0] >= 0

@@ -1,8 +1,9 @@
 """Families of Wigner 3j and 6j symbols by the two-sided three-term recursion, compiled."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from mcsim.support.compiled import njit
 
 # Loops stand where numpy's operations on slices would be shorter: numba compiles each of those with its messages about
 # shapes, which takes seconds.
@@ -11,12 +12,12 @@ from numpy.typing import NDArray
 _HUGE = 1e100
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _root(j: float, sum_plus_one: float, difference: float) -> float:
     return np.sqrt(max((j * j - difference * difference) * (sum_plus_one * sum_plus_one - j * j), 0.0))
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _minimal_at_both_ends(
     upper: NDArray[np.float64],
     diagonal: NDArray[np.float64],
@@ -57,7 +58,7 @@ def _minimal_at_both_ends(
         out[k] *= ratio
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _normalise(jmin: int, n: int, factor: float, top_sign: float, out: NDArray[np.float64]) -> None:
     """Scale to factor sum_j (2j+1) f_j^2 = 1 with the given sign at the top."""
     largest, norm = 0.0, 0.0
@@ -72,7 +73,7 @@ def _normalise(jmin: int, n: int, factor: float, top_sign: float, out: NDArray[n
         out[i] *= scale
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def threej_family(j2: int, j3: int, m2: int, m3: int, out: NDArray[np.float64]) -> tuple[int, int]:
     """Write the 3j symbols (j j2 j3; -m2-m3 m2 m3) for every j to the start of ``out``, |m2| <= j2 and |m3| <= j3.
 
@@ -104,7 +105,7 @@ def threej_family(j2: int, j3: int, m2: int, m3: int, out: NDArray[np.float64]) 
     return jmin, n
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def sixj_family(j2: int, j3: int, j4: int, j5: int, j6: int, out: NDArray[np.float64]) -> tuple[int, int]:
     """Write the 6j symbols {j j2 j3; j4 j5 j6} for every j to the start of ``out``.
 

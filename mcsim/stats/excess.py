@@ -1,6 +1,6 @@
 """Excess chi^2 of data over what the simulations expect, and its reduction once an effect is in the simulator."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -109,25 +109,25 @@ def expected_fall(test: SimulatedGaussian, t: Matrix, amplitudes: Vector, covari
 
 
 def expected_fall_of_draw(
-    wide: SimulatedGaussian, t: Matrix, covariance: Matrix, seen: Measured, here: Vector, there: Vector
+    wide: SimulatedGaussian, t: Matrix, covariance: Matrix, seen: Measured, shares: Vector
 ) -> Measured:
     """Return the fall of chi^2 to expect for a stochastic effect: all data see the same draw.
 
     ``wide`` is the null distribution of the data that judge, with the scatter of the effect, and ``t`` are its
     templates, shape (p_test, K); ``covariance`` is that of the frozen amplitudes from noise alone, and ``seen`` the
-    excess chi^2 of the data that were fitted. ``here`` and ``there``, shape (draws,), are squared signal-to-noise
-    ratios of draws of the response in the data that judge, and in those that were fitted.
+    excess chi^2 of the data that were fitted. ``shares``, shape (draws,), are ratios of the squared signal-to-noise
+    ratio of draws of the response in the data that judge to that in those that were fitted.
 
     Notes
     -----
-    The fall is the excess of the fitted data times the ratio of the mean squares, less tr(F V) for the error of the
-    frozen amplitudes, F of the wide distribution. How closely the squares of a draw keep to that ratio is part of its
-    error.
+    The fall is the excess of the fitted data times the mean share, less tr(F V) for the error of the frozen amplitudes,
+    F of the wide distribution. The scatter of the shares is part of its error: the brightness of a draw is in both
+    squares.
     """
-    share = float(np.mean(here) / np.mean(there))
+    share = float(np.mean(shares))
     white = wide.whiten_templates(t)
     lost = wide.hartlap_factor * float(np.trace(white.T @ white @ covariance))
-    sigma = float(np.hypot(share * seen.sigma, np.std(here - share * there, ddof=1)))
+    sigma = float(np.hypot(share * seen.sigma, seen.value * np.std(shares, ddof=1)))
     return Measured(share * seen.value - lost, sigma)
 
 
@@ -140,7 +140,8 @@ def held_out(before: SimulatedGaussian, after: SimulatedGaussian, x: Vector, exp
     -----
     A = 1 - G1/G0. Both excesses have the same noise e of the data: with d = true mean - mean before and D = mean after
     - mean before, dA = (2 (D - A d).e - A (e'e - p))/G0, hence var A = (4 |D - A d|^2 + 2 p A^2)/G0^2, to which the
-    errors of the covariances add 2 ((p + G1)^2 + (1 - A)^2 (p + G0)^2)/(d2 - 4)/G0^2. Pulls: tests/statistical.
+    errors of the covariances add 2 ((p + G1)^2 + (1 - A)^2 (p + G0)^2)/(d2 - 4)/G0^2. Pulls: tests/statistical. A
+    covariance that a few draws of the effects tell scales chi^2 afterwards (:mod:`mcsim.stats.few_draws`).
     """
     first, last = excess(before, x), excess(after, x)
     share = expected.value / first.value
@@ -155,5 +156,7 @@ def held_out(before: SimulatedGaussian, after: SimulatedGaussian, x: Vector, exp
     mismatch = max(moved - 2.0 * fraction * along + fraction**2 * distance, 0.0)
     noise = (4.0 * mismatch + 2.0 * p * fraction**2) * (d2 - 2) / (d2 - 4)
     scatter = 2.0 * ((p + length) ** 2 + (1.0 - fraction) ** 2 * (p + distance) ** 2) / (d2 - 4)
+    scaled = (after.scale_variance - before.scale_variance) * p * (p + 2)
+    scatter, last = scatter + scaled, replace(last, sigma=float(np.hypot(last.sigma, np.sqrt(scaled))))
     sigma = float(np.sqrt(noise + scatter)) / abs(first.value)
     return HeldOut(forecast, Measured(fraction, sigma), first, last, after.pvalue(x), data)

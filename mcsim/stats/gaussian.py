@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from mcsim.errors import InputError
 from mcsim.stats.elliptical import f_tail, leave_one_out, scale_variance
+from mcsim.stats.few_draws import covariance_of_draws, without
 from mcsim.stats.shrinkage import Fold, shrunk
-from mcsim.support.arrays import Matrix, Vector
+from mcsim.support.arrays import Matrix, Vector, divided
 
 # A direction is empty if its variance, or its part outside a span, is below this fraction of its size.
 COLLINEAR = 1e-6
@@ -101,7 +102,8 @@ class SimulatedGaussian:
     folds
         Then the simulations in white coordinates of others; simulation i is in fold i modulo their number.
     scale_variance
-        Variance of a factor that scales the covariance of each realization; 0 if the data vector is Gaussian.
+        Variance of a factor that scales the covariance of each realization; 0 if the data vector is Gaussian and its
+        covariance known up to the error of the simulations.
     """
 
     mean: NDArray[np.float64]
@@ -290,17 +292,19 @@ class SimulatedGaussian:
 
         Notes
         -----
-        There are fewer draws than elements: R is shrunk towards its mean eigenvalue with the weight that minimises
-        the expected error (Ledoit & Wolf, J. Multivariate Anal. 88, 365, 2004). White coordinates are multiplied by
-        (1 + R)^(-1/2), so that all tests keep their form, and are exact if R is.
+        White coordinates are multiplied by (1 + R)^(-1/2), so that all tests keep their form, and are exact if R is. By
+        how much the errors of R scatter chi^2 adds to ``scale_variance``: :mod:`mcsim.stats.few_draws`.
         """
         wide = self
         for deviations in draws:
-            white = np.sqrt(self.hartlap_factor) * wide.whiten_templates(deviations)
-            values, vectors = np.linalg.eigh(np.eye(self.dimension) + ledoit_wolf(white))
-            turn = (vectors / np.sqrt(values)) @ vectors.T
-            volume = wide.log_jacobian - 0.5 * float(np.sum(np.log(values)))
-            wide = replace(wide, whitening=turn @ wide.whitening, log_jacobian=volume)
+            covariance, error = covariance_of_draws(np.sqrt(self.hartlap_factor) * wide.whiten_templates(deviations))
+            values, vectors = np.linalg.eigh(np.eye(self.dimension) + covariance)
+            wide = replace(
+                wide,
+                whitening=(vectors / np.sqrt(values)) @ vectors.T @ wide.whitening,
+                log_jacobian=wide.log_jacobian - 0.5 * float(np.sum(np.log(values))),
+                scale_variance=wide.scale_variance + error,
+            )
         return wide
 
 
@@ -323,7 +327,7 @@ def with_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, before: Matrix,
         for rows in (before, after, after - before)
     )
     own, added = np.diag(found.covariance), np.maximum(acting - without + change / len(before), 0.0)
-    factor = np.sqrt(1.0 + np.divide(added, own, out=np.zeros_like(own), where=own > 0.0))
+    factor = np.sqrt(1.0 + divided(added, own))
     return replace(found, covariance=factor[:, None] * found.covariance * factor)
 
 
@@ -350,12 +354,9 @@ def with_drawn_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, scatters:
     own = weights(scatters) @ white * np.sqrt(1.0 + 1.0 / null.n_sims)
     covariance = scale * own @ own.T
     for place, draws in enumerate(scatters):
-        count = draws.shape[1]
-        for k in range(count):
-            # The mean of the others, whose deviations from that of all add up to nothing with this one's.
-            others = np.delete(draws, k, axis=1) + draws[:, [k]] / (count - 1.0)
-            others *= np.sqrt((count - 1.0) / (count - 2.0))
-            added = weights([*scatters[:place], others, *scatters[place + 1 :]]) @ draws[:, k]
+        for k in range(draws.shape[1]):
+            others = [*scatters[:place], without(draws, k), *scatters[place + 1 :]]
+            added = weights(others) @ draws[:, k]
             covariance += np.outer(added, added)
     return replace(found, covariance=covariance)
 
@@ -364,25 +365,6 @@ def held_out_pvalues(simulations: Matrix, null: SimulatedGaussian) -> Vector:
     """Return the p-value of every simulation, shape (N, p_raw), against all others, shape (N,): uniform."""
     chi2, n = null.held_out(simulations)
     return residual_pvalue(chi2, null.dimension, n, scale=null.scale_variance)
-
-
-def ledoit_wolf(white: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the shrunk covariance of normalised deviations, shape (p, draws) to (p, p).
-
-    Notes
-    -----
-    Ledoit & Wolf, J. Multivariate Anal. 88, 365 (2004). One degree of freedom has gone into the mean, unlike
-    in ``sklearn.covariance.ledoit_wolf``.
-    """
-    p, draws = white.shape
-    found = white @ white.T
-    mean = float(np.trace(found)) / p
-    distance = float(np.sum(found**2)) - p * mean**2
-    # Sum over draws z of |z z' - R|^2, with z = sqrt(draws - 1) times a column.
-    sizes = np.sum(white**2, axis=0)
-    own = (draws - 1.0) ** 2 * float(np.sum(sizes**2)) - (draws - 2.0) * float(np.sum(found**2))
-    weight = min(max(own, 0.0) / draws**2 / distance, 1.0) if distance > 0.0 else 1.0
-    return (1.0 - weight) * found + weight * mean * np.eye(p)
 
 
 def residual_pvalue(
@@ -427,7 +409,7 @@ def nested_pvalue(
 def orthonormal(white: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return an orthonormal basis (p, r) of the columns (p, K), and the matrix (K, r) from it to amplitudes."""
     size = np.linalg.norm(white, axis=0)
-    inverse = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
+    inverse = divided(1.0, size)
     left, singular, right = np.linalg.svd(white * inverse, full_matrices=False)
     kept = singular > COLLINEAR
     return left[:, kept], inverse[:, None] * right[kept].T / singular[kept]

@@ -1,15 +1,58 @@
-"""Names of arrays by what they hold, shapes and units stand in docstrings; and arrays of texts."""
+"""Names of arrays by what they hold, shapes and units stand in docstrings; arrays that users give; quotients; texts."""
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from mcsim.errors import InputError
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 Map = NDArray[np.float64]
 Cl = NDArray[np.float64]
 Alm = NDArray[np.complex128]
+
+
+def divided(numerator: ArrayLike, denominator: ArrayLike, otherwise: float = 0.0) -> NDArray:
+    """Return a quotient where its denominator is above zero, and ``otherwise`` elsewhere."""
+    above, below = np.asarray(numerator), np.asarray(denominator)
+    shape, dtype = np.broadcast_shapes(above.shape, below.shape), np.result_type(above, below, np.float64)
+    return np.divide(above, below, out=np.full(shape, otherwise, dtype), where=below > 0)
+
+
+def numbers(given: Any, name: str, masked: float | None = None) -> NDArray:
+    """Return a list, or an array of numpy, pandas, xarray or Dask, as numbers; ``name`` names it in messages.
+
+    Masked elements become ``masked``. InputError for what a conversion would drop in silence: a unit, masked elements
+    without a value to take; and for what is no array of numbers.
+    """
+    unit = getattr(given, "unit", None) if hasattr(type(given), "to_value") else None
+    if unit is None and hasattr(type(given), "magnitude"):
+        unit = given.units
+    if unit is not None and str(unit):
+        raise InputError(f"{name} carries the unit {unit}; give plain numbers in the documented unit.")
+    if isinstance(given, np.ma.MaskedArray):
+        hidden = int(np.ma.count_masked(given))
+        if hidden and masked is None:
+            raise InputError(f"{name} has {hidden} masked elements; give plain numbers, all of them.")
+        given = np.ma.filled(given.astype(np.float64), masked) if hidden else given.data
+    try:
+        found = np.asarray(given)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} is no array of numbers ({error}); give one.") from None
+    if found.dtype.kind not in "biufc":
+        raise InputError(f"{name} is of type {found.dtype}, shape {found.shape}; give an array of numbers.")
+    return found
+
+
+def reals(given: Any, name: str, masked: float | None = None) -> NDArray[np.float64]:
+    """Return :func:`numbers` in double precision; InputError also for complex ones, whose imaginary part would go."""
+    found = numbers(given, name, masked)
+    if np.iscomplexobj(found):
+        raise InputError(f"{name} is complex ({found.dtype}); give real numbers.")
+    return np.asarray(found, dtype=np.float64)
 
 
 def texts(words: Iterable[str]) -> NDArray[np.object_]:

@@ -6,8 +6,17 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from mcsim.errors import InputError
+
+
+def user_path(given: Any) -> Path:
+    """Return a path that a user gives, with ~ for the home; InputError for what is no path."""
+    try:
+        return Path(given).expanduser()
+    except (TypeError, RuntimeError) as error:  # RuntimeError: no such home is known
+        raise InputError(f"{given!r} is no path of a file or folder ({error}); give one.") from None
 
 
 @contextmanager
@@ -39,6 +48,17 @@ def unwritable(name: str | Path, remedy: str) -> Iterator[None]:
         raise InputError(f"{name} cannot be written ({error.strerror or error}); {remedy}.") from error
 
 
+@contextmanager
+def unreadable(name: str | Path, what: str, remedy: str) -> Iterator[None]:
+    """Turn whatever a library raises for a broken file into an InputError."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # of any type
+        raise InputError(f"{name} cannot be read as {what} ({error}); {remedy}.") from error
+
+
 def write_whole(path: Path, text: str) -> None:
     """Write a file that appears complete or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -62,7 +82,7 @@ def writable(folder: Path) -> None:
 def default_cache_dir() -> Path:
     """Return $MCSIM_CACHE, or $XDG_CACHE_HOME/mcsim, or ~/.cache/mcsim."""
     if own := os.environ.get("MCSIM_CACHE"):
-        return Path(own)
+        return user_path(own)
     if xdg := os.environ.get("XDG_CACHE_HOME"):
         return Path(xdg) / "mcsim"
     return Path.home() / ".cache" / "mcsim"

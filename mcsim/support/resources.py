@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 
 from mcsim.errors import InputError
+from mcsim.support.folders import user_path
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -44,7 +45,7 @@ def _folder(kind: str) -> Path:
 def _find(noun: str, kind: str, suffix: str, name_or_path: str | Path) -> Path:
     if str(name_or_path) in names(kind):
         return _folder(kind) / f"{name_or_path}{suffix}"
-    path = Path(name_or_path)
+    path = user_path(name_or_path)
     if os.path.isfile(path):  # False also for a name that no file system takes
         return path.resolve()
     raise InputError(

@@ -1,4 +1,4 @@
-"""The library of effects: one file each, found by name; other packages add theirs by entry points."""
+"""The library of effects, found by name, in files by what they act on; other packages add theirs by entry points."""
 
 from mcsim.systematics.base import (
     Alm,
@@ -10,11 +10,11 @@ from mcsim.systematics.base import (
     Site,
     Wording,
     adding,
-    check_added,
     disturbing,
     looked_at,
     seen_through,
     spread_of,
+    tried,
     variance_factor,
 )
 from mcsim.systematics.parametrization import Parametrization
@@ -35,7 +35,6 @@ __all__ = [
     "basis_of",
     "build",
     "catalogue",
-    "check_added",
     "checked",
     "disturbing",
     "effects",
@@ -44,5 +43,6 @@ __all__ = [
     "looked_at",
     "seen_through",
     "spread_of",
+    "tried",
     "variance_factor",
 ]

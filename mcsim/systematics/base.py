@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import LineOfSight, Moments, ScanModel
+from mcsim.sphere import alm as alm_
 from mcsim.sphere import rng
 from mcsim.support.numbers import measured
 from mcsim.systematics.parametrization import Parametrization, Vector
@@ -159,7 +160,8 @@ class Effect:
     parametrization
         How a diagnosis fits it; left out: the amplitude alone, of either sign.
     proposed
-        False: a diagnosis proposes it only where it is asked for by name (``mcsim diagnose --with NAME``).
+        False: a diagnosis proposes it only where it is asked for by name (``mcsim diagnose --with NAME``), or where it
+        explains the data in the place of an effect that is about to be named.
 
     Examples
     --------
@@ -279,7 +281,7 @@ class Effect:
 
         Examples
         --------
-        >>> from mcsim.systematics.beam_ellipticity import BeamEllipticity
+        >>> from mcsim.systematics.beams import BeamEllipticity
         >>> BeamEllipticity.format_amplitude(0.159, 0.008)
         'axis ratio 1.159 ± 0.008'
         """
@@ -375,12 +377,17 @@ def disturbing(acting: Iterable[Effect]) -> list[Effect]:
     return [one for one in acting if one.amplitude != 0.0 and type(one).excess is not Effect.excess]
 
 
-def check_added(acting: Iterable[Effect], site: Site) -> None:
-    """Raise InputError for an effect that adds a signal to samples which it cannot know in this channel."""
+def tried(acting: Sequence[Effect], site: Site) -> Beam:
+    """Return the beam that effects make; raise InputError for one that cannot act in this channel."""
+    once = np.zeros(1)
+    looked_at(acting, np.zeros(alm_.size(site.lmax), dtype=np.complex128), site, 0, 0)
+    for effect in acting:
+        effect.gain(once, site)
+        effect.noise(site)
     for effect in adding(acting):
         site.pointed(effect.name)
-        once = np.zeros(1)
         effect.signal(once, once, once, once, site)
+    return seen_through(acting, site)
 
 
 def looked_at(acting: Iterable[Effect], sky: Alm, site: Site, seed: int, realization: int) -> Alm:

@@ -1,4 +1,4 @@
-"""Effects by name: the built-in ones, each in a file of this package, and those of other packages."""
+"""Effects by name: the built-in ones, in files of this package, and those of other packages."""
 
 import difflib
 import inspect
@@ -31,7 +31,7 @@ Library = Mapping[str, type[Effect]]
 
 @cache
 def catalogue() -> Library:
-    """Return every effect by name, read-only: built in, then registered by other packages.
+    """Return every effect by name, read-only: built in, in the order of their names, then those of other packages.
 
     Raise InputError if a registered effect cannot be loaded, is none, or bears a name that is taken.
     """
@@ -42,6 +42,7 @@ def catalogue() -> Library:
             own = kind.__module__ == f"{package}.{module.name}"
             if own and issubclass(kind, Effect) and hasattr(kind, "name"):  # a base of several effects has none
                 found[kind.name] = kind
+    found = dict(sorted(found.items()))
     for entry in entry_points(group=ENTRY_POINTS):
         try:
             kind = entry.load()
@@ -62,6 +63,8 @@ def catalogue() -> Library:
 
 def checked(library: Library) -> Library:
     """Return a library as it was given; raise InputError if one of its effects is none, or bears another name."""
+    if not isinstance(library, Mapping) or not library:
+        raise InputError(f"library = {library!r} has no effects by name; give some of mcsim.effects().")
     for name, kind in library.items():
         if not (isinstance(kind, type) and issubclass(kind, Effect)):
             raise InputError(f"effect {name} of the library is {kind!r}; give a class derived from mcsim.Effect.")

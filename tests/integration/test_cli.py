@@ -1,8 +1,10 @@
 """The command line as a user meets it: outputs, exit codes, one sentence for bad input, nothing left behind."""
 
+import errno
 import inspect
 import io
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -334,6 +336,26 @@ def test_options_of_fit_that_mean_nothing(
 def test_files_of_fit_that_are_none(words: tuple[str, str], mcsim: Command, small_store: Path, tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(SMALL)
     assert_refused(mcsim("fit", *(small_store if word == "STORE" else word for word in words)))
+
+
+def test_a_terminal_without_greek_letters(small_store: Path) -> None:
+    """What it cannot show is a question mark, and no UnicodeEncodeError."""
+    program = f"import sys, mcsim.cli\nsys.argv = ['mcsim', 'info', {str(small_store)!r} + 'µ']\nmcsim.cli.main()"
+    ascii_alone = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=ascii_alone, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "?" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_disk_that_fails_is_one_sentence(mcsim: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full() -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "picture.png")
+
+    monkeypatch.setattr(cli, "app", full)
+    code, _, err = mcsim("effects")
+    assert (code, err.count("\n")) == (1, 1)
+    assert unnamed(err, "picture.png") == []
 
 
 def test_version(mcsim: Command) -> None:

@@ -13,12 +13,12 @@ from scipy.stats import kstest
 import mcsim
 from instruments import data_of, two_channels
 from mcsim import config, systematics
-from mcsim.datavector import bipolar_scan, campaign
-from mcsim.datavector.analysis import analysis_of, data_vectors
+from mcsim.datavector import bipolar_scan, campaign, localisation
+from mcsim.datavector.analysis import analysis_of, data_vectors, on_request
 from mcsim.datavector.campaign import with_effects
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import shared_sky, wiener_filter
-from mcsim.diagnosis import api, localisation, report, unlisted, words
+from mcsim.diagnosis import api, report, unlisted, words
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
@@ -324,6 +324,22 @@ def test_effects_on_request_are_proposed_when_they_are_named(small):
         change = rows[1][matched] - rows[0][matched]
         assert change.shape == (2,)
         assert np.all(change > 0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "amplitude", "rivals"), [("noise_level", 0.3, ["louder"]), ("beam_ellipticity", 0.25, [])]
+)
+def test_an_effect_on_request_is_named_beside_what_it_cannot_be_told_from(small, name, amplitude, rivals):
+    """Unless it is asked for it is no candidate, and nothing else changes."""
+    library = (*small.analysis.library, ("louder", type("OnRequest", (Louder,), {"proposed": False})))
+    known = replace(small, analysis=replace(small.analysis, library=library))
+    assert [one.identity for one in on_request(known.analysis)] == [("louder", "V1"), ("louder", "W1")]
+    shared = data_of(small.run, name, "W1", amplitude=amplitude)
+    found = diagnose_data(ObservedMaps(known, list(simulate.maps(shared, 1)), ask), name)
+    named = [[(one.name, one.channel) for one in effects.effects] for effects in found.sets]
+    assert sorted(named) == sorted([(one, "W1")] for one in [name, *rivals])
+    assert found.kind == ("degenerate" if rivals else "effect")
+    assert len(found.candidates) == len(small.candidates) + len(rivals)
 
 
 def test_the_cost_of_a_diagnosis_counts_the_effects_on_request(small):

@@ -13,7 +13,7 @@ from mcsim.errors import RunError
 from mcsim.instrument.scan.pointing import pointing
 from mcsim.simulation import differencing, mapmaking, simulate
 from mcsim.simulation.survey import survey
-from mcsim.systematics.mapmaking_convergence import MapmakingConvergence
+from mcsim.systematics.mapmaking import MapmakingConvergence
 from refusals import refused
 
 NSIDE, LMAX, SIGMA0 = 8, 16, 40.0

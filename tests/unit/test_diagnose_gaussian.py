@@ -45,13 +45,15 @@ def test_offset_moves_the_mean(ensemble, evidence):
 
 
 def test_wider_null_is_that_of_both_scatters(ensemble):
-    """Against the covariance itself, where draws are so many that nothing is drawn towards anything."""
+    """Against the covariance itself, which is that of the draws, so many that nothing is drawn towards anything."""
     rng = np.random.default_rng(3)
     fiducial = SimulatedGaussian.from_simulations(ensemble)
     p = fiducial.dimension
     root = rng.normal(size=(p, p)) * np.sqrt(np.var(ensemble, axis=0))[:, None]
-    draws = root @ rng.normal(size=(p, 400_000))
-    wide = fiducial.with_extra_covariance((draws - draws.mean(axis=1, keepdims=True)) / np.sqrt(399_999.0))
+    draws = rng.normal(size=(p, 4000))
+    draws -= draws.mean(axis=1, keepdims=True)
+    draws = np.linalg.qr(draws.T)[0].T
+    wide = fiducial.with_extra_covariance(root @ draws)
     S = np.cov(ensemble.T)
     scale = 1.0 + 1.0 / fiducial.n_sims
     x = rng.normal(size=p) * ensemble.std(axis=0) + fiducial.mean

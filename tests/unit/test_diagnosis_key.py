@@ -58,9 +58,21 @@ def test_an_effect_with_other_code_is_learned_anew(plugin):
 @pytest.mark.parametrize("field", fields(DiagnosisSettings), ids=lambda field: field.name)
 def test_every_setting_has_a_part_in_the_key(plugin, field):
     effect = importlib.import_module("effects_of_a_user").Tilt
-    value = getattr(DiagnosisSettings(), field.name)
-    other = replace(DiagnosisSettings(), **{field.name: (1.0,) if isinstance(value, tuple) else (value or 0) + 1})
+    other = replace(DiagnosisSettings(), **{field.name: another(getattr(DiagnosisSettings(), field.name))})
     assert key(effect, other) != key(effect)
+
+
+def another(value):
+    """Return another value that a setting may have."""
+    match value:
+        case bool():
+            return not value
+        case tuple():
+            return (1.0,)
+        case float():
+            return value / 2
+        case _:
+            return (value or 0) + 1
 
 
 def test_name_seed_and_number_of_realizations_do_not_count(plugin):

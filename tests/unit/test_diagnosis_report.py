@@ -14,14 +14,14 @@ import pytest
 from scipy import stats
 
 from mcsim import config, systematics
-from mcsim.datavector import bipolar_scan
+from mcsim.datavector import bipolar_scan, localisation
 from mcsim.datavector.candidate import Candidate, numbered
+from mcsim.datavector.localisation import Place
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Element
 from mcsim.diagnosis import figures as plots
-from mcsim.diagnosis import localisation, report, words
+from mcsim.diagnosis import report, words
 from mcsim.diagnosis.assemble import result_of
-from mcsim.diagnosis.localisation import Place
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import attribute

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from mcsim.datavector.bipolar_scan import BipolarScan
+from mcsim.datavector.localisation import places
 from mcsim.datavector.summaries import Element
-from mcsim.diagnosis.localisation import places
 
 KINDS = [("V1", "ecliptic", 2), ("W1", "ecliptic", 2), ("W2", "ecliptic", 2), ("V1", "galactic", 1), ("W1", None, 0)]
 

@@ -15,7 +15,7 @@ from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotate_alm, rotate_pixels
 from mcsim.sphere.sky import dipole_alm, gaussian_alm
 from mcsim.sphere.spectra import load
-from mcsim.systematics import lensing
+from mcsim.systematics import sky as effects_on_sky
 from refusals import refused
 
 LMAX, NSIDE = 64, 16
@@ -100,7 +100,7 @@ def test_boost_keeps_the_power_and_is_undone_by_the_opposite_one(site, sky):
 def test_lensing_reads_the_sky_at_the_ends_of_arcs(site, sky, points):
     """A potential a AXIS . n draws every direction towards the axis, by a times the sine of their distance."""
     smooth = alm_.multiply(sky, (np.arange(LMAX + 1) <= LMAX // 3).astype(float), LMAX)
-    found = lensing.remapped(smooth, dipole_alm(0.2 * AXIS, LMAX), LMAX)
+    found = effects_on_sky.remapped(smooth, dipole_alm(0.2 * AXIS, LMAX), LMAX)
     seen = healpy.ang2vec(*points.T)
     distance = np.arccos(seen @ AXIS)
     across = AXIS - np.cos(distance)[:, None] * seen
@@ -114,7 +114,7 @@ def test_lensing_reads_the_sky_at_the_ends_of_arcs(site, sky, points):
 
 def test_lensing_has_the_deflections_of_the_fiducial_power(site, sky):
     ell = np.arange(2001.0)
-    power = lensing.potential(2000)
+    power = effects_on_sky.potential(2000)
     assert power[100] == pytest.approx(2.0 * np.pi * 1.0145e-7 / (100.0 * 101.0) ** 2, rel=0.01)
     deflection = np.sqrt(np.sum((2.0 * ell + 1.0) * ell * (ell + 1.0) * power) / (4.0 * np.pi))
     assert 60.0 * np.rad2deg(deflection) == pytest.approx(2.4, abs=0.06)

@@ -165,7 +165,7 @@ def test_what_is_added_to_samples_is_averaged_in_pixels_of_each_half(site):
     assert first[chosen] == pytest.approx(each.mean(), rel=1e-10)
     assert mean_signal((replace(effect, amplitude=0.0),), site, (0.0, 0.5)) is None
     with refused("orbital_dipole", "W1"):
-        systematics.check_added((effect,), replace(site, pointing=None))
+        systematics.tried((effect,), replace(site, pointing=None))
 
 
 def test_nonlinearity_is_a_gain_that_follows_the_dipole(site):

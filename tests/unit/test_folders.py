@@ -4,7 +4,7 @@ import errno
 
 import pytest
 
-from mcsim.support.folders import appearing, cached
+from mcsim.support.folders import appearing, cached, default_cache_dir, user_path
 from refusals import refused
 
 
@@ -58,3 +58,14 @@ def test_a_lost_connection_is_not_blamed_on_the_cache(tmp_path):
     with refused(7, by=TimeoutError):
         cached("name", lost, tmp_path)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_home_is_found_in_what_users_give(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert user_path("~/a b") == tmp_path / "a b"
+    assert user_path(tmp_path / "~").name == "~"
+    monkeypatch.setenv("MCSIM_CACHE", "~/cache")
+    assert default_cache_dir() == tmp_path / "cache"
+    for wrong in (None, 5, ["a"]):
+        with refused(wrong):
+            user_path(wrong)

@@ -1,14 +1,15 @@
 """Data in realistic company, with the company declared as nuisances and not: p-values, names, pulls.
 
     python workflows/nuisances/check.py [--draws 600] [--skies 120] [--strength 8] [--seed 2026]
-        [--workers 2] [--knee 0.003] [-o FILE]
+        [--workers 2] [--knee 0.003] [--folder FOLDER] [-o FILE]
 
 Two channels at nside 32 with two splits. The company is drawn anew for every data set: calibrations off by 0.3 %, beam
 widths by 0.5 %, noise levels by 3 % (standard deviations), and a foreground of known morphology with 2 uK rms at 94 GHz
 and a spectral index of -3.0 +- 0.3. First, data vectors without an effect: the p-value of the model that declares the
 company must be uniform; that of the model that does not cannot be. Then full skies, half of them with one effect of an
 expected S/N of ``strength`` against the model that declares; both models diagnose each. With ``--knee`` (in Hz)
-the noise is 1/f, of slope -1 down to 10 uHz, destriped in baselines of an hour, and modelled as such.
+the noise is 1/f, of slope -1 down to 10 uHz, destriped in baselines of an hour, and modelled as such. What is simulated
+and judged is kept in ``--folder``: with the same one a run that was killed goes on.
 """
 
 import argparse
@@ -27,7 +28,8 @@ from scipy import stats
 import mcsim
 from mcsim import config
 from mcsim.datavector.analysis import analysis_of, data_vectors
-from mcsim.datavector.campaign import Ask, asking, batch, seeded, with_effects
+from mcsim.datavector.campaign import PER_TASK, Ask, asking, batch, seeded, with_effects
+from mcsim.datavector.kept import Kept
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.api import prepared
 from mcsim.diagnosis.context import DiagnosisContext
@@ -147,10 +149,10 @@ def compressed(known: dict[str, DiagnosisContext], ask: Ask, draws: int, seed: i
 
 
 def cases(
-    known: DiagnosisContext, count: int, strength: float, seed: int
+    known: DiagnosisContext, numbers: range, strength: float, seed: int
 ) -> Iterator[tuple[str, Any, float, list[Any]]]:
     """Yield truth (name of effect and channel, None: no effect), amplitude and maps."""
-    for number in range(count):
+    for number in numbers:
         run = seeded(replace(known.run, nuisances=()), seed + number)
         acting = nuisance.tables(known.run, seed, number)
         truth, amplitude = None, 0.0
@@ -178,8 +180,8 @@ def score(outcomes: list[dict[str, Any]], company: set[tuple[str, str | None]]) 
     ):
         counts: Counter[str] = Counter()
         for one in chosen:
-            truth = {one["truth"]} if one["truth"] else set()
-            named = set(one["named"])
+            truth = {tuple(one["truth"])} if one["truth"] else set()
+            named = set(map(tuple, one["named"]))
             counts["gap"] += one["verdict"] != "none"
             counts["right set first"] += bool(truth) and named == truth
             counts["the effect among those named"] += bool(truth) and truth <= named
@@ -208,12 +210,16 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=2026)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--knee", type=float, metavar="HZ")
+    parser.add_argument("--folder", type=Path)
     parser.add_argument("-o", "--output", type=Path)
     chosen = parser.parse_args()
-    folder = Path(tempfile.mkdtemp())
+    folder = chosen.folder or Path(tempfile.mkdtemp())
+    folder.mkdir(parents=True, exist_ok=True)
+    done = folder / "cases.json"
     run = model(folder / "template.fits", chosen.knee)
+    kept = Kept.of(folder / "simulations", NSIDE, PER_TASK)
     company = {(one.effect, one.channel) for one in run.nuisances}
-    with batch(chosen.workers) as call, asking(call, False, data_vectors, "simulations") as ask:
+    with batch(chosen.workers) as call, asking(call, False, data_vectors, "simulations", kept) as ask:
         known = {"declared": learned(run, ask), "not declared": learned(replace(run, nuisances=()), ask)}
         result: dict[str, Any] = {
             "simulations": {name: len(one.ensemble.simulations) for name, one in known.items()},
@@ -222,9 +228,10 @@ def main() -> None:
         }
         print(json.dumps(result, indent=1), flush=True)
         outcomes: dict[str, list[dict[str, Any]]] = {name: [] for name in known}
-        for case, truth, amplitude, maps in cases(
-            known["declared"], chosen.skies, chosen.strength, chosen.seed + 10**6
-        ):
+        if done.exists():
+            outcomes = json.loads(done.read_text())
+        numbers = range(len(outcomes["declared"]), chosen.skies)
+        for case, truth, amplitude, maps in cases(known["declared"], numbers, chosen.strength, chosen.seed + 10**6):
             for name, context in known.items():
                 found = diagnose_data(ObservedMaps(context, maps, ask), case)
                 one = {
@@ -241,6 +248,7 @@ def main() -> None:
                 if found.held_out is not None and truth:
                     one |= {"achieved": found.held_out.achieved.value, "predicted": found.held_out.predicted.value}
                 outcomes[name].append(one)
+            done.write_text(json.dumps(outcomes))
             print(case, truth, {name: (o[-1]["verdict"], o[-1]["named"]) for name, o in outcomes.items()}, flush=True)
     result["full skies"] = {name: score(rows, company) for name, rows in outcomes.items()}
     print(json.dumps(result["full skies"], indent=1))

@@ -87,10 +87,10 @@ class Survey:
                 true = replace(channel, line=line, model=replace(channel.model, **{
                     key: factor * getattr(channel.model, key) for key, factor in self.motion.items()
                 }))  # fmt: skip
+                if self.motion:
+                    pixel = healpy.ang2pix(NSIDE, *inputs.pointing(true, samples, self.given.frame)[:2])
                 if self.motion or self.tilt_deg or self.late:
                     theta, phi, psi = inputs.pointing(true, samples, self.given.frame, self.late)
-                if self.motion:
-                    pixel = healpy.ang2pix(NSIDE, theta, phi)
                 if self.centred:
                     theta, phi = healpy.pix2ang(NSIDE, pixel)
                 tod = signal(theta, phi, self.psi(psi))

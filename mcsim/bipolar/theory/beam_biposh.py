@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.bipolar.modes import Indices, check_modes, existing
@@ -11,6 +10,7 @@ from mcsim.bipolar.theory.harmonics import negative_spin
 from mcsim.errors import InputError
 from mcsim.sphere.checks import check_finite, check_whole
 from mcsim.sphere.wigner import threej_family
+from mcsim.support.compiled import njit
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +107,7 @@ def beam_biposh(beam: ScannedBeam, mode: Indices, lmax: int) -> NDArray[np.compl
     return np.where(exists, (-1) ** d * norm * total, np.nan)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _spin_coupling(L: int, d: int, s: int, lmax: int) -> NDArray[np.float64]:
     """Return the 3j symbols (l1 L l2; 0 s -s), l1 = l2 - d, at l2 = 0..lmax; |s| <= L."""
     symbols, family = np.zeros(lmax + 1), np.zeros(2 * L + 1)

@@ -10,13 +10,13 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.bipolar.modes import Indices, bennett_factor, check_modes, existing
 from mcsim.bipolar.theory.beam_biposh import ScannedBeam, beam_biposh
 from mcsim.sphere.checks import check_cl, check_shape, check_whole
 from mcsim.sphere.wigner import sixj_family, threej_family
+from mcsim.support.compiled import njit
 
 _BLOCK = 32
 
@@ -212,7 +212,7 @@ def _moment_couplings(
             yield L1, L2, coupling
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _couple(
     mode: tuple[int, int],
     w_x: NDArray[np.complex128],
@@ -235,7 +235,7 @@ def _couple(
                 row[s, t] += clebsch * left[s] * right[t]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _spin_table(low: int, high: int, smax: int, L_max: int, response: NDArray[np.complex128]) -> NDArray[np.complex128]:
     """Return k_l b_ls (l1 L1 l; 0 s -s) at [l1 - low, L1, l - l1 + L_max, smax + s], zero if undefined."""
     lsky = response.shape[1] - 1
@@ -255,7 +255,7 @@ def _spin_table(low: int, high: int, smax: int, L_max: int, response: NDArray[np
     return table
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _contract(
     L: int, d: int, degrees: NDArray[np.int64], seen: _Seen, plan: _Plan, block: NDArray[np.complex128]
 ) -> None:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from mcsim.bipolar.modes import Indices, check_modes, existing
 from mcsim.errors import InputError
 from mcsim.sphere.checks import check_cl, check_shape
+from mcsim.support.arrays import divided
 
 
 class Spectra(NamedTuple):
@@ -76,7 +77,7 @@ def signal_to_noise(
     first, last = (0, biposh.shape[1] - 1) if ell_range is None else ell_range
     variance = isotropic_variance(modes, spectra)[:, first : last + 1]
     signal = abs(biposh[:, first : last + 1]) ** 2
-    ratio = np.divide(signal, variance, out=np.zeros_like(variance), where=variance > 0.0)
+    ratio = divided(signal, variance)
     weight = np.array([1.0 if M == 0 else 2.0 for _, M, _ in modes])
     return np.sqrt(f_sky * weight * ratio.sum(axis=1))
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix
 from mcsim.sphere.checks import check_angle, check_finite, check_whole, nside_of
-from mcsim.sphere.healpix import geometry
 
 
 def orientation_harmonics(w: NDArray[np.complex128], L_max: int, nthreads: int = 1) -> NDArray[np.complex128]:
@@ -32,15 +32,14 @@ def orientation_harmonics(w: NDArray[np.complex128], L_max: int, nthreads: int =
     if np.ndim(w) != 2:
         raise InputError(f"w has shape {np.shape(w)}, but moment maps are (smax, npix).")
     smax, npix = w.shape
-    nside = nside_of(npix, "a moment map")
+    nside_of(npix, "a moment map")
     check_whole(L_max, "L_max")
     check_finite(w, "w")
-    grid = geometry(nside)
     area = 4 * np.pi / npix
     result = _isotropic_zero(smax, L_max)
     for s in range(1, min(smax, L_max) + 1):
         conjugate = np.stack([w[s - 1].real, -w[s - 1].imag]) * area
-        gradient, curl = ducc0.sht.adjoint_synthesis(map=conjugate, spin=s, lmax=L_max, nthreads=nthreads, **grid)
+        gradient, curl = healpix.adjoint(conjugate, L_max, nthreads, spin=s)
         # w_{s,LM} = (-1)^{s+M} conj((conj w_s)_{L,-M}) from E and B of the spin-(+s) field conj(w_s).
         for M in range(L_max + 1):
             low, first = max(M, s), alm_.start(L_max, M)

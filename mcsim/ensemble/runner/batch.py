@@ -15,13 +15,14 @@ from mcsim import config
 from mcsim.ensemble import plan, repair, store, summary
 from mcsim.ensemble.layout import Layout, listed
 from mcsim.ensemble.lock import locked
-from mcsim.ensemble.runner.cluster import Roll, Workers, answers, connected, death
+from mcsim.ensemble.runner.cluster import Roll, Workers, answers, check_workers, connected, death
 from mcsim.ensemble.tasks import Failure, Job, packages, realize_chunk, summarise_node
 from mcsim.errors import InputError, RunError
 from mcsim.simulation import power, simulate
 from mcsim.simulation.survey import Survey, survey
 from mcsim.stats import streaming
 from mcsim.stats.streaming import Sums
+from mcsim.support.folders import user_path
 from mcsim.support.progress import Journal, reporting
 
 
@@ -59,7 +60,7 @@ def run(
     resume
         Require an existing store, check all of it first, and compute damaged realizations again.
     realizations
-        Compute only these; :func:`merge` joins such slices.
+        Compute only these; :func:`mcsim.merge` joins such slices.
     workers
         Number of processes of a local cluster; default: the configuration's. Or the address of a running scheduler,
         ``tcp://host:port`` (or ``tls://``, with the keys that Dask's configuration names), whose workers share the file
@@ -91,11 +92,11 @@ def run(
     >>> mcsim.run("tiny", "tiny.zarr").computed  # all is there already
     0
     """
-    if isinstance(workers, int) and workers < 1:
-        raise InputError(f"workers = {workers} is too small; give at least 1, or the address of a scheduler.")
-    loaded = source if isinstance(source, config.RunConfig) else config.load(source)
+    if workers is not None:
+        check_workers(workers)
+    loaded = config.load(source)
     wanted = plan.wanted(loaded, realizations)
-    target = Path(path) if path is not None else plan.default_store(loaded, realizations)
+    target = user_path(path) if path is not None else plan.default_store(loaded, realizations)
     exists = plan.exists(target)
     if resume and not exists:
         raise InputError(f"There is no store {target} to resume; leave out --resume to start it.")

@@ -99,9 +99,17 @@ def local_client(workers: int) -> Iterator[Client]:
         yield client
 
 
+def check_workers(workers: Workers) -> None:
+    """Raise InputError unless workers are a number of 1 or more, an address or a client."""
+    whole = isinstance(workers, int) and not isinstance(workers, bool)
+    if not isinstance(workers, str | Client) and (not whole or workers < 1):
+        raise InputError(f"workers = {workers!r} is no number of 1 or more; give one, or the address of a scheduler.")
+
+
 @contextmanager
 def connected(workers: Workers) -> Iterator[Client]:
     """Yield the client of so many local processes or of the scheduler at an address; or the given one, left open."""
+    check_workers(workers)
     if isinstance(workers, Client):
         _check_workers(workers)
         yield workers
@@ -114,7 +122,8 @@ def connected(workers: Workers) -> Iterator[Client]:
 def remote_client(scheduler: str) -> Iterator[Client]:
     """Yield the client of a running scheduler, whose workers have the driver's packages."""
     try:
-        client = Client(scheduler, timeout=ANSWER_S)
+        # No default client: one that fails would leave Dask without a scheduler for the rest of the session.
+        client = Client(scheduler, timeout=ANSWER_S, set_as_default=False)
     except (OSError, ValueError, TypeError, RuntimeError) as error:
         certificates = "certificates that Dask's configuration names in distributed.comm.tls"
         if scheduler.startswith("tls://") and isinstance(error, TypeError):  # from a call without an ssl_context

@@ -11,6 +11,7 @@ from mcsim.ensemble import plan, store, summary
 from mcsim.ensemble.runner.batch import Result
 from mcsim.ensemble.tasks import empty, summarise_node
 from mcsim.errors import InputError
+from mcsim.support.folders import user_path
 from mcsim.support.progress import reporting
 
 
@@ -20,7 +21,7 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
     Parameters
     ----------
     paths
-        Stores that :func:`run` made with ``realizations``.
+        Stores that :func:`mcsim.run` made with ``realizations``.
     path
         The new store.
     quiet
@@ -43,8 +44,8 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
     >>> mcsim.merge(parts, "merged.zarr").finished
     32
     """
-    sources = [Path(p) for p in paths]
-    target = Path(path)
+    sources = [user_path(p) for p in paths]
+    target = user_path(path)
     if not sources:
         raise InputError("There is nothing to merge; name the stores of the slices.")
     if target.exists():

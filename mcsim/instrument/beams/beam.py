@@ -15,8 +15,13 @@ from mcsim.instrument.beams.coefficients import check_mmax, choose_mmax, cut, po
 from mcsim.instrument.beams.files import checked_blm
 from mcsim.instrument.beams.gaussian import elliptical_blm
 from mcsim.instrument.beams.window import read_window
-from mcsim.sphere.checks import check_angle, check_finite
+from mcsim.sphere.checks import check_angle, check_finite, check_shape
+from mcsim.support.arrays import reals
+from mcsim.support.folders import unwritable, user_path
 from mcsim.support.npy import read_npz
+
+LEAST_NORMALISED = 1e-6
+"""Largest departure of B_0 from 1: that of coefficients in single precision is smaller."""
 
 DEFAULT_LMAX = 2048
 """Largest degree of a beam where none is asked for."""
@@ -57,7 +62,7 @@ class Beam:
     integral: float = 1.0
 
     def __post_init__(self) -> None:
-        """Raise InputError unless the coefficients are finite and stand at ``blm[m, l]``, zero for l < m."""
+        """Raise InputError unless finite coefficients stand at ``blm[m, l]``, zero for l < m."""
         blm = self.blm
         if not isinstance(blm, np.ndarray) or not np.iscomplexobj(blm) or blm.ndim != 2 or not blm.size:
             raise InputError(f"blm has shape {np.shape(blm)}, but it must be complex, (mmax + 1, lmax + 1).")
@@ -65,6 +70,11 @@ class Beam:
         check_finite(blm, "blm")
         if any(blm[m, :m].any() for m in range(1, len(blm))):
             raise InputError("blm has coefficients with l < m, which do not exist: give blm[m, l].")
+
+    def check_normalised(self) -> None:
+        """Raise InputError unless B_0 = 1, as of a beam that a user gives."""
+        if abs(self.blm[0, 0] * np.sqrt(4 * np.pi) - 1.0) > LEAST_NORMALISED:
+            raise InputError(f"the beam has b_00 = {self.blm[0, 0]:g}, not 1/sqrt(4 pi); use Beam.from_blm(blm).")
 
     @classmethod
     def gaussian(cls, fwhm_arcmin: float, lmax: int = DEFAULT_LMAX) -> Self:
@@ -184,7 +194,7 @@ class Beam:
         elif pixel_deg is None:
             raise InputError("pixel_deg is not given, but an array does not say it; give the side of a pixel in deg")
         else:
-            image = np.asarray(source, dtype=np.float64)
+            image = reals(source, "the beam map")
             beam_map = placed(image, pixel_deg, cut_deg=cut_deg, centre=centre)
         lmax = min(DEFAULT_LMAX, int(pi / beam_map.pixel_rad)) if lmax is None else lmax
         return cls.normalized(beam_map.blm(lmax, mmax), mmax, "the beam map")
@@ -282,7 +292,7 @@ class Beam:
 
     @classmethod
     def _saved(cls, path: str | Path, lmax: int | None, mmax: int | None) -> Self:
-        arrays = read_npz(path)
+        arrays = read_npz(user_path(path))
         try:
             beam = cls(arrays["blm"], float(arrays["neglected_power"]), float(arrays["integral"]))
         except (KeyError, TypeError) as error:
@@ -294,10 +304,12 @@ class Beam:
 
     def save(self, path: str | Path) -> None:
         """Write the beam as a .npz file, from which :meth:`from_blm` reads the same beam, bit for bit."""
-        np.savez(path, blm=self.blm, neglected_power=self.neglected_power, integral=self.integral)
+        with unwritable(path, "choose another file"):
+            np.savez(user_path(path), blm=self.blm, neglected_power=self.neglected_power, integral=self.integral)
 
     def as_table(self, folder: Path) -> dict[str, str]:
         """Write the beam into a folder; return the table that stands for it in a run."""
+        self.check_normalised()
         self.save(folder / "beam.npz")
         return {"kind": "blm", "path": "beam.npz"}
 
@@ -384,6 +396,8 @@ class Beam:
 
         ``theta``, ``phi``: angle from the beam's centre and azimuth from its x axis towards y, radians, of one shape.
         """
+        theta, phi = reals(theta, "theta"), reals(phi, "phi")
+        check_shape(phi, theta.shape, "phi")
         if np.any((theta < 0.0) | (theta > np.pi)):
             raise InputError("theta must lie between 0 and pi radians: give the angle from the centre of the beam.")
         direction = np.stack([np.ravel(theta), np.ravel(phi) % (2 * np.pi)], axis=1)

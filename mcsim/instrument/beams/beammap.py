@@ -15,6 +15,7 @@ from mcsim.errors import InputError
 from mcsim.instrument.beams.coefficients import check_lmax, check_mmax, unpacked
 from mcsim.sphere.checks import check_finite
 from mcsim.sphere.header import opened
+from mcsim.support.folders import unreadable, user_path
 from mcsim.support.npy import read_npy
 
 Projection = Literal["equidistant", "orthographic", "equal_area"]
@@ -58,14 +59,14 @@ class BeamMap:
             raise InputError(f"cut_rad = {self.cut_rad:g} of a beam map must be above 0 and at most pi/2: give radians")
         _check_centre(image, self.centre)
 
-    def blm(self, lmax: int, mmax: int | None = None, nthreads: int = 1) -> NDArray[np.complex128]:
+    def blm(self, lmax: int, mmax: int | None = None) -> NDArray[np.complex128]:
         """Return the coefficients up to the largest order that the cut can hold, in the map's unit times sr."""
         check_lmax(lmax)
         if mmax is not None:
             check_mmax(mmax, lmax)
         # No order above lmax sin(cut) fits inside the cut, so that this holds the beam's whole power up to lmax.
         holds_all = min(lmax, ceil(lmax * sin(min(self.cut_rad, pi / 2))) + 32)
-        return blm_of_map(self, lmax, max(holds_all, mmax or 0), nthreads)
+        return blm_of_map(self, lmax, max(holds_all, mmax or 0))
 
     def without_pixel_window(self) -> Self:
         """Return the map with the window of its pixels divided out, for values that are means over the pixels."""
@@ -116,7 +117,7 @@ def read_map(
     |b_l2| in V and W, 8e-5 and 4e-4 in K. The plane of projection is taken to touch the sphere at the beam's centre;
     that the WMAP maps have the optic axis there, up to 3 deg away, is of the same order.
     """
-    image, header = _read_image(Path(path), plane)
+    image, header = _read_image(user_path(path), plane)
     pixel_deg = _pixel_deg(header, path) if pixel_deg is None else pixel_deg
     return placed(image, pixel_deg, cut_deg=cut_deg, centre=centre, projection=projection, origin=str(path))
 
@@ -203,7 +204,7 @@ def find_centre(image: NDArray[np.float64], origin: str = "the beam map") -> tup
     return float(column + box.sum(axis=0) @ offset / total), float(row + box.sum(axis=1) @ offset / total)
 
 
-def blm_of_map(beam_map: BeamMap, lmax: int, mmax: int, nthreads: int = 1) -> NDArray[np.complex128]:
+def blm_of_map(beam_map: BeamMap, lmax: int, mmax: int) -> NDArray[np.complex128]:
     """Sum a beam map into its harmonic coefficients, in the map's unit times sr.
 
     Return b_lm, shape (mmax + 1, lmax + 1); raise InputError if the pixels are too coarse for lmax, or nothing but
@@ -228,7 +229,7 @@ def blm_of_map(beam_map: BeamMap, lmax: int, mmax: int, nthreads: int = 1) -> ND
         raise InputError(f"the beam map is zero within {cut_deg:g} deg of its centre: check centre and cut")
     where = np.stack([theta, phi], axis=1)
     alm = ducc0.sht.adjoint_synthesis_general(
-        map=value[None], lmax=lmax, mmax=mmax, spin=0, loc=where, epsilon=1e-12, nthreads=nthreads
+        map=value[None], lmax=lmax, mmax=mmax, spin=0, loc=where, epsilon=1e-12, nthreads=1
     )[0]
     return unpacked(alm, lmax, mmax)
 
@@ -263,11 +264,8 @@ _PROJECTIONS: dict[Projection, tuple[_Function, _Function, _Function]] = {
 
 def holds_image(path: str | Path) -> bool:
     """Return True if a FITS file holds an image, as beam maps do, and not just tables; InputError for no FITS."""
-    try:
-        with opened(Path(path)) as hdus:
-            return any(hdu.is_image and hdu.header.get("NAXIS", 0) >= 2 for hdu in hdus)
-    except Exception as error:  # libraries raise whatever a broken file makes of them
-        raise InputError(f"{path} cannot be read as a FITS file ({error}): give a beam map or b_lm") from error
+    with unreadable(path, "a FITS file", "give a beam map or b_lm"), opened(Path(path)) as hdus:
+        return any(hdu.is_image and hdu.header.get("NAXIS", 0) >= 2 for hdu in hdus)
 
 
 def _read_image(path: Path, plane: int) -> tuple[NDArray[np.float64], fits.Header]:
@@ -275,13 +273,10 @@ def _read_image(path: Path, plane: int) -> tuple[NDArray[np.float64], fits.Heade
         raise InputError(f"beam map {path} does not exist: give the path of a FITS image")
     if path.suffix == ".npy":
         return read_npy(path, "iuf", (2,)).astype(np.float64), fits.Header()
-    try:
-        with opened(path) as hdus:
-            images = [hdu for hdu in hdus if hdu.is_image and hdu.data is not None]
-            image = np.array(images[0].data, dtype=np.float64) if images else np.zeros(0)
-            header = images[0].header.copy() if images else fits.Header()
-    except Exception as error:  # libraries raise whatever a broken file makes of them
-        raise InputError(f"{path} cannot be read as a FITS image ({error}): it may be truncated") from error
+    with unreadable(path, "a FITS image", "it may be truncated"), opened(path) as hdus:
+        images = [hdu for hdu in hdus if hdu.is_image and hdu.data is not None]
+        image = np.array(images[0].data, dtype=np.float64) if images else np.zeros(0)
+        header = images[0].header.copy() if images else fits.Header()
     if not image.size:
         raise InputError(f"{path} holds no image: a beam map is a two-dimensional FITS image")
     if str(header.get("BUNIT", "")).strip().lower().startswith("db"):

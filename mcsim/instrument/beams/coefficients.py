@@ -53,10 +53,10 @@ def unpacked(packed: NDArray, lmax: int, mmax: int) -> NDArray[np.complex128]:
     return blm
 
 
-def choose_mmax(blm: NDArray[np.complex128], tolerance: float = MMAX_TOLERANCE) -> int:
+def choose_mmax(blm: NDArray[np.complex128]) -> int:
     """Choose the order above which a beam may be cut: 0 if it is circular to round-off, else 2 or more.
 
-    It is the smallest that neglects no more than the fraction ``tolerance`` of the power over the degrees of ``blm``,
+    It is the smallest that neglects no more than the fraction MMAX_TOLERANCE of the power over the degrees of ``blm``,
     shape (mmax + 1, lmax + 1), which has a larger order than can matter.
 
     Notes
@@ -72,5 +72,5 @@ def choose_mmax(blm: NDArray[np.complex128], tolerance: float = MMAX_TOLERANCE) 
     if power[1:].sum() <= CIRCULAR_POWER * power.sum():
         return 0
     beyond = np.append(np.cumsum(power[::-1])[::-1][1:], 0.0) / power.sum()
-    smallest = int(np.argmax(beyond <= tolerance))
+    smallest = int(np.argmax(beyond <= MMAX_TOLERANCE))
     return min(max(2, smallest), len(power) - 1)

@@ -10,6 +10,8 @@ from mcsim.errors import InputError
 from mcsim.instrument.beams.coefficients import cut, power_by_order, unpacked
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.header import opened
+from mcsim.support.arrays import numbers
+from mcsim.support.folders import unreadable, user_path
 from mcsim.support.npy import read_npy
 
 LEAST_CIRCULAR_POWER = 0.5
@@ -24,11 +26,11 @@ def checked_blm(source: str | Path | NDArray, lmax: int | None = None) -> tuple[
     What is read, and what is refused, says :meth:`mcsim.instrument.beams.Beam.from_blm`.
     """
     if isinstance(source, str | Path):
-        path, origin = Path(source), str(source)
+        path, origin = user_path(source), str(source)
         blm = _of_array(read_npy(path, ndims=(1, 2))) if path.suffix == ".npy" else _read(path)
     else:
         origin = "the array of b_lm"
-        blm = _of_array(np.asarray(source))
+        blm = _of_array(numbers(source, origin))
     blm = cut(blm, lmax, origin)
     if not np.all(np.isfinite(blm)):
         raise InputError(f"{origin} has coefficients that are not finite: repair it before use")
@@ -69,13 +71,12 @@ def _of_array(array: NDArray) -> NDArray[np.complex128]:
 def _read(path: Path) -> NDArray[np.complex128]:
     if not path.is_file():
         raise InputError(f"beam coefficients {path} do not exist: give the path of a FITS file of b_lm")
-    try:
-        # A file with infinities is refused later, by name; joining real and imaginary parts would warn of them.
-        with opened(path) as hdus, np.errstate(invalid="ignore"):
-            packed, mmax = healpy.read_alm(hdus, hdu=1, return_mmax=True)
+    # A file with infinities is refused later, by name; joining real and imaginary parts would warn of them.
+    with (
+        unreadable(path, "coefficients", "give FITS with the columns index, real, imaginary"),
+        opened(path) as hdus,
+        np.errstate(invalid="ignore"),
+    ):
+        packed, mmax = healpy.read_alm(hdus, hdu=1, return_mmax=True)
         lmax = healpy.Alm.getlmax(len(packed), mmax)
-    except Exception as error:  # libraries raise whatever a broken file makes of them
-        raise InputError(
-            f"{path} cannot be read as FITS coefficients with columns index, real, imaginary ({error})"
-        ) from error
     return unpacked(packed, lmax, mmax)

@@ -126,7 +126,7 @@ def format_summary(summary: BeamSummary) -> str:
     if summary.axis_ratio - 1 < CIRCULAR_AXIS_RATIO:
         orientation = "circular"
     else:
-        orientation = f"major axis {summary.angle_deg:+.1f} deg from x towards y"
+        orientation = f"major axis {round(summary.angle_deg, 1) + 0.0:+.1f} deg from x towards y"
     # Adding 0.0 turns a rounded -0.0 into 0.0.
     x, y = (round(offset, 3) + 0.0 for offset in summary.centroid_arcmin)
     beam, last = summary.beam, summary.beam.window[-1]
@@ -149,10 +149,16 @@ def format_summary(summary: BeamSummary) -> str:
     orders = [m for m in range(1, min(beam.mmax, _LISTED_ORDERS) + 1) if np.any(table[m] > 0)]
     lines += ["", "     l          B_l" + "".join(f"{f'|b_l{m}/b_l0|':>14}" for m in orders)]
     for i, ell in enumerate(summary.ells):
+        if abs(window[i]) < _LISTED_WINDOW and i > 1:
+            lines.append(f"     B_l is below {_LISTED_WINDOW:g} from there on")
+            break
         ratios = "".join(f"{table[m, i]:14.3e}" for m in orders)
         lines.append(f"{ell:6d} {window[i]:12.6f}{ratios}")
     return "\n".join(lines)
 
+
+_LISTED_WINDOW = 1e-9
+"""Smallest B_l that is listed: ratios to smaller ones are noise."""
 
 _Response = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 

@@ -1,5 +1,6 @@
 """Beam windows B_l: text tables such as WMAP's, FITS tables such as Planck's, .npy files, arrays."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,8 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.sphere.header import opened
+from mcsim.support.arrays import reals
+from mcsim.support.folders import unreadable, user_path
 from mcsim.support.npy import read_npy
 
 Window = NDArray[np.float64]
@@ -27,9 +30,9 @@ def read_window(
     What is read, and what is refused, says :meth:`mcsim.instrument.beams.Beam.from_window`.
     """
     if not isinstance(source, str | Path):
-        found, origin = np.asarray(source, dtype=np.float64), "the array of B_l"
+        found, origin = reals(source, "the array of B_l"), "the array of B_l"
     else:
-        path, origin = Path(source), str(source)
+        path, origin = user_path(source), str(source)
         if path.suffix == ".npy":
             found = read_npy(path, "iuf").astype(np.float64)
         elif _is_fits(path):
@@ -38,7 +41,7 @@ def read_window(
             if extension is not None or column is not None:
                 raise InputError(f"{path} is no FITS file, so it has no extension or named column; leave these out.")
             found = _of_text(path)
-    if found.ndim != 1 or not np.all(np.isfinite(found)):
+    if found.ndim != 1 or not found.size or not np.all(np.isfinite(found)):
         raise InputError(f"{origin} holds no finite B_l, one for each l; repair it.")
     if abs(found[0] - 1.0) > 0.01 or np.abs(found).max() > LARGEST:
         raise InputError(
@@ -55,10 +58,9 @@ def _is_fits(path: Path) -> bool:
 
 
 def _of_text(path: Path) -> Window:
-    try:
+    with unreadable(path, "a table of B_l", "give columns ell and B_l"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of an empty file, which is refused
         table = np.loadtxt(path, ndmin=2)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as a table of B_l ({error}); give columns ell and B_l.") from None
     if table.shape[1] == 1:
         return np.asarray(table[:, 0])
     if not np.array_equal(table[:, 0], np.arange(len(table))):
@@ -68,24 +70,15 @@ def _of_text(path: Path) -> Window:
 
 def _of_fits(path: Path, extension: str | None, column: str | None) -> tuple[Window, str]:
     """Return B_l and the name of their table."""
-    try:
-        with opened(path) as hdus:
-            tables = {
-                _name(number, hdu): hdu
-                for number, hdu in enumerate(hdus)
-                if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)
-            }
-            where, field = _chosen(path, tables, extension, column)
-            values = np.asarray(tables[where].data.field(field), dtype=np.float64).ravel()
-    except InputError:
-        raise
-    except Exception as error:  # libraries raise errors of any type for a broken file
-        raise InputError(f"{path} cannot be read as a FITS table of B_l ({error}); give another file.") from error
+    with unreadable(path, "a FITS table of B_l", "give another file"), opened(path) as hdus:
+        tables = {
+            str(hdu.name).strip() or str(number): hdu
+            for number, hdu in enumerate(hdus)
+            if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)
+        }
+        where, field = _chosen(path, tables, extension, column)
+        values = np.asarray(tables[where].data.field(field), dtype=np.float64).ravel()
     return values, f"{path} ({where}, {field})"
-
-
-def _name(number: int, hdu: fits.BinTableHDU) -> str:
-    return str(hdu.name).strip() or str(number)
 
 
 def _chosen(

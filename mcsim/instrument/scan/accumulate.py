@@ -6,7 +6,6 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import islice, pairwise
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.instrument.scan.geometry import MapGrid
@@ -14,6 +13,7 @@ from mcsim.instrument.scan.model import ScanModel
 from mcsim.instrument.scan.offsets import add_powers, centres, exponents
 from mcsim.instrument.scan.pointing import BLOCK, PointingStream, fill_block, fill_pixels
 from mcsim.sphere.checks import check_whole
+from mcsim.support.compiled import njit
 
 _RANGES = 16
 _CHUNK = 1 << 21
@@ -85,7 +85,7 @@ def pixel_sums(nside: int, smax: int, order: int = 1) -> NDArray[np.float64]:
     return memory[offset : offset + 12 * nside * nside * columns].reshape(-1, columns)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def add_sample(sums, pixel, x, y, z, cos_psi, sin_psi, smax):  # type: ignore[no-untyped-def]
     """Add one sample to the accumulator; powers of e^{-i psi} by multiplication."""
     sums[pixel, 0] += 1.0
@@ -99,7 +99,7 @@ def add_sample(sums, pixel, x, y, z, cos_psi, sin_psi, smax):  # type: ignore[no
         real, imag = real * cos_psi + imag * sin_psi, imag * cos_psi - real * sin_psi
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _add_samples(start, count, nside, smax, order, middle, sums):  # type: ignore[no-untyped-def]
     work = np.empty((6, BLOCK))
     pixels = np.empty(BLOCK, dtype=np.int64)

@@ -1,7 +1,6 @@
 """Files of moments: HEALPix tables in FITS, and the arrays of an object that a run was given in place of a file."""
 
 import re
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,9 @@ from mcsim.instrument.scan.geometry import check_frame
 from mcsim.instrument.scan.moments import Moments
 from mcsim.instrument.scan.offsets import HIGHEST, exponents
 from mcsim.sphere.checks import nside_of
-from mcsim.sphere.header import frame_named, radians
+from mcsim.sphere.header import first_table, frame_named, opened, radians
 from mcsim.sphere.rotation import FRAMES
+from mcsim.support.folders import unreadable
 from mcsim.support.npy import read_npz
 
 
@@ -37,6 +37,7 @@ def read_moments(
     if frame is not None:
         check_frame(frame)
     found = _from_npz(path, where) if Path(path).suffix == ".npz" else _from_fits(path, where, smax, frame)
+    check_moments(found, where)
     if nside not in (None, found.nside):
         raise InputError(f"{where} has nside {found.nside}, but the maps have nside {nside}; use moments of it.")
     if frame not in (None, found.frame):
@@ -89,25 +90,31 @@ def _from_fits(path: str | Path, where: str, smax: int | None, frame: str | None
         bad = ~np.isfinite(columns[name])
         if bad.any():
             raise InputError(f"{where}: column {name} is not finite in {bad.sum()} pixels, first {np.argmax(bad)}.")
-    if hits.min() < 0.0:
-        raise InputError(f"{where}: HITS is {hits.min():g} in pixel {hits.argmin()}, but it must be >= 0.")
     orders = [columns[f"RE_{s}"] + 1j * columns[f"IM_{s}"] for s in range(1, smax + 1)]
     w = np.array(orders, dtype=np.complex128).reshape(smax, hits.size)
-    # Single precision may exceed 1 by 6e-8.
-    largest = np.abs(w).max(initial=0.0)
-    if largest > 1.0 + 1e-6:
-        raise InputError(f"{where}: a moment has modulus {largest:g}, but means of e^(-i s psi) are <= 1.")
-    reach = [float(np.abs(columns[name]).max()) for name in offsets]
-    reach += [float(np.abs(columns[name]).max()) ** (1.0 / sum(powers[name])) for name in powers]
-    farthest = max(reach, default=0.0)
-    if farthest > 2.0 * healpy.max_pixrad(nside):
-        raise InputError(
-            f"{where}: samples lie {farthest:g} rad from their pixel's centre, but a pixel of nside {nside} "
-            f"reaches {healpy.max_pixrad(nside):.3g}; give DTHETA and DPHI in radians, or their unit in TUNIT."
-        )
     more = np.stack([columns[name] for name in powers]) if powers else None
     dtheta, dphi = (columns.get(name) for name in ("DTHETA", "DPHI"))
     return Moments(nside, stated, hits, w, dtheta, dphi, more)
+
+
+def check_moments(moments: Moments, where: str) -> None:
+    """Raise InputError for values that the samples of no pixel have; ``where`` names them in messages."""
+    hits, w = (array[..., : 1 if array.strides[-1] == 0 else None] for array in (moments.hits, moments.w))
+    if not hits.min() >= 0.0:
+        pixel = int(np.argmin(hits))  # that of a NaN, if there is one
+        raise InputError(f"{where}: HITS is {hits[pixel]:g} in pixel {pixel}; give 0 where nothing was observed.")
+    largest = np.max([np.abs(row).max() for row in w], initial=0.0)
+    if not largest <= 1.0 + 1e-6:  # single precision may exceed 1 by 6e-8
+        raise InputError(f"{where}: a moment has modulus {largest:g}, but means of e^(-i s psi) are <= 1.")
+    offsets = [(row, 1) for row in (moments.dtheta, moments.dphi) if row is not None]
+    if moments.offset_moments is not None:
+        offsets += [(row, sum(ab)) for row, ab in zip(moments.offset_moments, exponents(HIGHEST), strict=False)]
+    farthest = np.max([np.abs(row).max() ** (1.0 / degree) for row, degree in offsets], initial=0.0)
+    if not farthest <= 2.0 * healpy.max_pixrad(moments.nside):
+        raise InputError(
+            f"{where}: samples lie {farthest:g} rad from their pixel's centre, but a pixel of nside {moments.nside} "
+            f"reaches {healpy.max_pixrad(moments.nside):.3g}; give DTHETA and DPHI in radians, or their unit in TUNIT."
+        )
 
 
 def _named(order: int) -> dict[str, tuple[int, int]]:
@@ -134,23 +141,13 @@ def _to_radians(name: str, unit: str) -> float:
 
 def _read_table(path: str | Path, where: str) -> tuple[dict[str, NDArray[np.float64]], dict[str, Any]]:
     """Return columns (upper-case names, flattened, float64) and HEALPix keywords of a file's first binary table."""
-    try:
-        # A truncated file warns when opened and fails when read: one message is enough.
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with fits.open(path) as hdus:
-                table = next((hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU)), None)
-                if table is None:
-                    raise ValueError("it has no binary table")
-                columns = {
-                    name.upper(): np.array(table.data[name], dtype=np.float64).ravel() for name in table.columns.names
-                }
-                for column in table.columns:
-                    if column.unit and column.name.upper() in ("DTHETA", "DPHI", *_named(HIGHEST)):
-                        columns[column.name.upper()] *= _to_radians(column.name.upper(), column.unit)
-                header = {key: table.header.get(key) for key in ("NSIDE", "ORDERING", "COORDSYS")}
-    except Exception as error:  # libraries raise whatever a broken file makes of them
-        raise InputError(f"{where} cannot be read: {error}; give a complete FITS table.") from None
+    with unreadable(where, "a table of moments", "give a complete FITS table"), opened(Path(path)) as hdus:
+        table = first_table(hdus)
+        columns = {name.upper(): np.array(table.data[name], dtype=np.float64).ravel() for name in table.columns.names}
+        for column in table.columns:
+            if column.unit and column.name.upper() in ("DTHETA", "DPHI", *_named(HIGHEST)):
+                columns[column.name.upper()] *= _to_radians(column.name.upper(), column.unit)
+        header = {key: table.header.get(key) for key in ("NSIDE", "ORDERING", "COORDSYS")}
     sizes = {array.size for array in columns.values()}
     if len(sizes) != 1:
         raise InputError(f"{where} has columns of different sizes {sorted(sizes)}; write it again.")

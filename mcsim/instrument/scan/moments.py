@@ -20,6 +20,7 @@ from mcsim.instrument.scan.offsets import HIGHEST, exponents, order_of, spin_mom
 from mcsim.instrument.scan.user_pointing import blocks_of_files, checked_samples, sums_of_samples
 from mcsim.sphere.checks import check_nside, check_shape, check_whole
 from mcsim.support import folders
+from mcsim.support.arrays import divided, reals
 from mcsim.support.code import package_digest
 
 _META = "moments.json"
@@ -82,6 +83,10 @@ class Moments:
                 raise InputError("offset_moments are given without dtheta and dphi; give these as well.")
             rows = len(exponents(order_of(len(self.offset_moments)) or HIGHEST))
             check_shape(self.offset_moments, (rows, npix), f"offset_moments of nside {self.nside}")
+
+    def _arrays(self) -> dict[str, NDArray]:
+        """Return the arrays that there are, by name."""
+        return {name: value for name in _ARRAYS if (value := getattr(self, name)) is not None}
 
     @classmethod
     def from_model(
@@ -178,7 +183,8 @@ class Moments:
         (array([2.]), array([0.]))
         """
         check_frame(frame)
-        arrays = [np.atleast_1d(np.asarray(angle, dtype=np.float64)) for angle in (theta, phi, psi)]
+        given = {"theta": theta, "phi": phi, "psi": psi}
+        arrays = [np.atleast_1d(reals(angle, name)) for name, angle in given.items()]
         shapes = [array.shape for array in arrays]
         if len(set(shapes)) > 1 or arrays[0].ndim != 1 or not arrays[0].size:
             raise InputError(f"theta, phi and psi have the shapes {shapes}; give three arrays of one length, (n,).")
@@ -225,7 +231,7 @@ class Moments:
         first_power = sums.shape[1] - powers
         smax = first_power // 2 - 2
         hits = sums[:, 0].copy()
-        inverse = np.divide(1.0, hits, out=np.zeros_like(hits), where=hits > 0.0)
+        inverse = divided(1.0, hits)
         w = np.empty((smax, hits.size), dtype=np.complex128)
         for s in range(smax):
             w[s].real = sums[:, 4 + 2 * s] * inverse
@@ -364,18 +370,16 @@ class Moments:
 
     def as_table(self, folder: Path) -> dict[str, str]:
         """Write the moments into a folder; return the table that stands for them in a run."""
-        arrays = {name: value for name in _ARRAYS if (value := getattr(self, name)) is not None}
+        arrays: dict[str, Any] = self._arrays()
         np.savez(folder / "moments.npz", nside=self.nside, frame=self.frame, **arrays)
         return {"kind": "moments", "path": "moments.npz"}
 
     def save(self, folder: str | Path) -> None:
         """Write the arrays as .npy files into ``folder``, which is created."""
-        folder = Path(folder)
+        folder = folders.user_path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        for name in _ARRAYS:
-            array = getattr(self, name)
-            if array is not None:
-                np.save(folder / f"{name}.npy", array)
+        for name, array in self._arrays().items():
+            np.save(folder / f"{name}.npy", array)
         meta = {"nside": self.nside, "frame": self.frame, "offsets": self.offset_order}
         (folder / _META).write_text(json.dumps(meta))
 
@@ -395,7 +399,7 @@ class Moments:
         InputError
             If the folder does not hold complete moments.
         """
-        folder = Path(folder)
+        folder = folders.user_path(folder)
         mode: Any = "r" if mmap else None
         try:
             meta = json.loads((folder / _META).read_text())

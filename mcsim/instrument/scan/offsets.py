@@ -4,8 +4,9 @@ import math
 
 import healpy
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from mcsim.support.compiled import njit
 
 HIGHEST = 4
 """Degree of the highest moments."""
@@ -43,7 +44,7 @@ def centres(nside: int) -> NDArray[np.float64]:
     return found
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def add_powers(sums, column, order, centre, x, y, z):  # type: ignore[no-untyped-def]
     """Add the powers of a sample's offset to a pixel's sums from ``column`` on, in the order of :func:`exponents`.
 

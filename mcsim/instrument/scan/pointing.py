@@ -4,12 +4,12 @@ import math
 from fractions import Fraction
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
 from mcsim.sphere.checks import check_whole
 from mcsim.sphere.rotation import rotation_matrix
+from mcsim.support.compiled import njit
 
 BLOCK = 512
 """Samples whose trigonometry is done together: the work arrays of a block stay in the processor's first caches."""
@@ -79,7 +79,7 @@ def pointing(
     return tuple(angles)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def fill_samples(start, count, nside, angles, pixels):  # type: ignore[no-untyped-def]
     """Fill in theta, phi and psi, shape (3, count), and RING pixels, shape (count,), of samples; None: leave it out."""
     work = np.empty((6, BLOCK))
@@ -96,14 +96,14 @@ def fill_samples(start, count, nside, angles, pixels):  # type: ignore[no-untype
                 angles[2, first + k] = math.atan2(work[4, k], work[3, k])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def fill_pixels(nside, work, pixels):  # type: ignore[no-untyped-def]
     """Fill in the RING pixels of the first samples of a block that :func:`fill_block` left in ``work``."""
     for k in range(pixels.size):
         pixels[k] = ring_pixel(nside, work[5, k], work[0, k], work[1, k], work[2, k])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def quarter_turns(x, y):  # type: ignore[no-untyped-def]
     """Return the longitude of (x, y) in quarter turns, in [0, 4): atan2 without branches, for vector instructions."""
     width, height = abs(x), abs(y)
@@ -122,7 +122,7 @@ def quarter_turns(x, y):  # type: ignore[no-untyped-def]
     return 0.0 if turns >= 4.0 else turns
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def fill_block(start, first, count, work):  # type: ignore[no-untyped-def]
     """Fill ``work`` with directions and orientations of ``count`` <= BLOCK samples: the one loop that all scans share.
 
@@ -170,7 +170,7 @@ def fill_block(start, first, count, work):  # type: ignore[no-untyped-def]
         work[5, k] = quarter_turns(vx, vy)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def ring_pixel(nside, turns, x, y, z):  # type: ignore[no-untyped-def]
     """Return the RING pixel of a unit vector at longitude ``turns`` in quarter turns (Gorski et al. 2005, sect. 5)."""
     height = abs(z)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
@@ -17,7 +16,9 @@ from mcsim.instrument.scan.accumulate import add_sample, pixel_sums
 from mcsim.instrument.scan.offsets import add_powers, centres
 from mcsim.instrument.scan.pointing import quarter_turns, ring_pixel
 from mcsim.sphere.checks import LARGEST_ANGLE, check_nside, check_whole
-from mcsim.sphere.header import frame_named, radians
+from mcsim.sphere.header import first_table, frame_named, radians
+from mcsim.support.compiled import njit
+from mcsim.support.folders import unreadable, user_path
 
 _ROWS = 1 << 20
 _NAMES = ("theta", "phi", "psi")
@@ -43,12 +44,12 @@ def sums_of_samples(blocks: Iterable[Sequence[NDArray]], nside: int, smax: int, 
 def blocks_of_files(paths: str | Path | Sequence[str | Path], frame: str) -> Iterator[tuple[NDArray[np.float64], ...]]:
     """Read theta, phi, psi from one file or several, block by block; InputError where they cannot be used."""
     for path in [paths] if isinstance(paths, str | Path) else paths:
-        yield from _blocks(Path(path), frame)
+        yield from _blocks(user_path(path), frame)
 
 
 def _blocks(path: Path, frame: str) -> Iterator[tuple[NDArray[np.float64], ...]]:
     where = f"pointing file {str(path)!r}"
-    try:
+    with unreadable(where, "samples", "give theta, phi and psi as FITS, .npy, .npz or text"):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             columns, factors = _columns(path, frame)
@@ -58,12 +59,6 @@ def _blocks(path: Path, frame: str) -> Iterator[tuple[NDArray[np.float64], ...]]
         for first in range(0, size, _ROWS):
             block = [np.array(column[first : first + _ROWS], dtype=np.float64) for column in columns]
             yield checked_samples([f * column for f, column in zip(factors, block, strict=True)], where)
-    except InputError:
-        raise
-    except Exception as error:  # libraries raise whatever a broken file makes of them
-        raise InputError(
-            f"{where} cannot be read: {error}; give theta, phi and psi as FITS, .npy, .npz or text."
-        ) from None
     if size == 0:
         raise InputError(f"{where} has no samples; give at least one row.")
 
@@ -82,9 +77,7 @@ def _columns(path: Path, frame: str) -> tuple[list[Any], list[float]]:
         from astropy.io import fits
 
         with fits.open(path) as hdus:
-            table = next((hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU)), None)
-            if table is None:
-                raise ValueError("it has no binary table")
+            table = first_table(hdus)
             stated = frame_named(table.header.get("COORDSYS"), f"pointing file {str(path)!r}")
             if stated not in (None, frame):
                 raise InputError(
@@ -140,7 +133,7 @@ def checked_samples(columns: Sequence[NDArray[np.float64]], where: str) -> tuple
     return tuple(columns)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _add_angles(theta, phi, psi, nside, smax, order, middle, sums):  # type: ignore[no-untyped-def]
     for k in range(theta.size):
         sin_theta = math.sin(theta[k])

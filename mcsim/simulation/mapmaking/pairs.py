@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
@@ -19,6 +18,7 @@ from mcsim.instrument.scan.pointing import PointingStream, fill_samples
 from mcsim.simulation.tod import chunks
 from mcsim.support import folders
 from mcsim.support.code import package_digest
+from mcsim.support.compiled import njit
 
 PARTS = 16
 """Parts of the survey that threads share out; fixed, so that sums do not depend on the number of threads."""
@@ -225,7 +225,7 @@ def _band(
     return partner[:size], count[:size], lengths
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _collect(pixel_a, pixel_b, low, high, cursor, partner):  # type: ignore[no-untyped-def]
     """Write the partner of every sample to the rows low ... high - 1, in the order of time."""
     for k in range(pixel_a.size):
@@ -238,7 +238,7 @@ def _collect(pixel_a, pixel_b, low, high, cursor, partner):  # type: ignore[no-u
             cursor[b - low] += 1
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _merge(edges, seen, partner, count, lengths):  # type: ignore[no-untyped-def]
     """Merge equal partners of each row in place, in increasing order; return the number that is left."""
     out = 0

@@ -5,7 +5,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
@@ -15,6 +14,7 @@ from mcsim.simulation.mapmaking.pairs import DifferencingScan, parts
 from mcsim.simulation.mapmaking.solve import check_imbalance
 from mcsim.simulation.tod import check_noise, chunks
 from mcsim.support.arrays import Map
+from mcsim.support.compiled import njit
 
 SideMaps = NDArray[np.float64]
 """S_0, then 2 Re S_s and 2 Im S_s for s = 1 ... mmax of one beam at pixel centres, in uK, shape (npix, 1 + 2 mmax)."""
@@ -135,7 +135,7 @@ def _stacked(scan: DifferencingScan, maps: list[SideMaps]) -> NDArray[np.float64
     return stacked
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _add_chunk(side_of_a, side_of_b, nside, gains, noise, factor, rhs):  # type: ignore[no-untyped-def]
     """Add the differences of consecutive samples to ``rhs``; a side is where its stream starts, and its maps."""
     pixel_a, pixel_b = np.empty(BLOCK, dtype=np.int64), np.empty(BLOCK, dtype=np.int64)
@@ -158,7 +158,7 @@ def _add_chunk(side_of_a, side_of_b, nside, gains, noise, factor, rhs):  # type:
                 rhs[pixel_b[k], sky] += gains[3] * difference[sky, k]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _add_side(side, first, nside, gain, pixel, difference):  # type: ignore[no-untyped-def]
     """Add gain x (what one side sees) to the differences of one block and leave the samples' pixels in ``pixel``."""
     start, maps = side

@@ -6,11 +6,11 @@ from itertools import pairwise
 
 import healpy
 import numpy as np
-from numba import njit
 
 from mcsim.errors import InputError
 from mcsim.simulation.mapmaking.pairs import DifferencingScan
-from mcsim.support.arrays import Map
+from mcsim.support.arrays import Map, divided
+from mcsim.support.compiled import njit
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def solve(
         _check_map(scan, start, "starting map")
     weight = diagonal(scan, x)
     seen = weight > 0.0
-    inverse = np.divide(1.0, weight, out=np.zeros_like(weight), where=seen)
+    inverse = divided(1.0, weight)
     constant = 0.0 if x == 0.0 else 1.0 / (4.0 * x * x * scan.samples)
 
     def precondition(residual: Map) -> Map:
@@ -123,8 +123,7 @@ def level_uk(scan: DifferencingScan, sigma0_uk: float) -> Map | None:
     """
     if sigma0_uk == 0.0:
         return None
-    hits = scan.hits_a + scan.hits_b
-    return np.divide(sigma0_uk, np.sqrt(hits), out=np.zeros_like(hits), where=hits > 0.0)
+    return divided(sigma0_uk, np.sqrt(scan.hits_a + scan.hits_b))
 
 
 def rhs_of_map(scan: DifferencingScan, map_uk: Map, x: float = 0.0, nthreads: int = 1) -> Map:
@@ -170,7 +169,7 @@ def _norm(vector: Map) -> float:
     return float(np.sqrt(np.sum(vector * vector)))
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _rows(row_start, partner, count, weight, coupling, map_uk, low, high, result):  # type: ignore[no-untyped-def]
     for row in range(low, high):
         first, last = row_start[row], row_start[row + 1]

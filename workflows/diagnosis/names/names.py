@@ -1,6 +1,8 @@
 """Measure how often names are wrong for systematics of no library, and how often true names are refused.
 
 python names.py maps [CASES]       systematics that no library has, added to simulated maps
+python names.py true [NUMBER]      one effect of the library, added to data vectors: how often is it named alone?
+python names.py further [NUMBER]   beside a strong effect: how often is another one found that is not there?
 python names.py draws [NUMBER]     effects of the library, added to data vectors of simulations
 python names.py several [NUMBER]   one to five effects of the library at once, added to data vectors
 python names.py pairs [CASES]      two effects of the library at once, in simulated maps
@@ -234,6 +236,89 @@ def draws(number):
         print(f"{kind}: {len(rows)} tests, p <= 0.05 in {low:.3f}, odds of absence in {absent:.4f}")
 
 
+def true(number):
+    """Attribute draws of one effect, S/N 5 to 20, without and with effects on request as rivals of a single name."""
+    from mcsim.benchmark.case import Prior
+    from mcsim.benchmark.models import linear_model
+    from mcsim.benchmark.sampler import CaseSampler
+    from mcsim.datavector.analysis import on_request
+    from mcsim.diagnosis.refine import Refined
+    from mcsim.diagnosis.rivals import in_place, with_candidates
+    from mcsim.diagnosis.selection import attribute
+    from mcsim.stats.intervals import share
+
+    for model in (ONE, MODEL):
+        run, context = learned(model)
+        sky = ObservedMaps(context, list(simulate.maps(survey(run), 0)), ask)
+        skies = context.settings.channel_skies
+        rivals = [(one, sky.response(one, skies)) for one in on_request(context.analysis) if not one.random_response]
+        linear = linear_model(context)
+        own = {"null": linear.null, "calibration": linear.calibration, "templates": linear.templates}
+        known = replace(context, candidates=linear.candidates, groups=linear.groups, **own)
+        sampler, rows = CaseSampler(Prior(weakest=5.0, strongest=20.0), linear), []
+        for case in range(number // 2):
+            (member,) = sampler.members(np.random.default_rng([1, case]), 1)
+            x = linear.data[case % len(linear.data)] + linear.response([member])
+            found = attribute(known.null, x, known.templates, known.candidates, known.calibration).if_named(
+                known.settings
+            )
+            row = said(found, known, member.identity)
+            if len(found.explanations) == 1:
+                refined = Refined(found, known.templates, known.candidates)
+                if near := [rivals[index] for index in in_place(known, x, refined, rivals)]:
+                    wide = with_candidates(known, near)
+                    found = attribute(wide.null, x, wide.templates, wide.candidates, wide.calibration)
+                    row += said(found.if_named(wide.settings), wide, member.identity)
+            rows.append(row if len(row) > 4 else row + row)
+        words = ("the right name alone", "the truth in the set", "a wrong name alone", "no name")
+        for place, what in enumerate([*words, *(f"{one}, with rivals" for one in words)]):
+            print(run.name, worded(share(what, [row[place] for row in rows])), flush=True)
+
+
+def said(found, context, identity):
+    """Return whether the truth is named alone, or in a set, whether another name is given alone, or none."""
+    sets = [{context.candidates[index].identity for index in one.members} for one in found.explanations]
+    return [sets == [{identity}], {identity} in sets, len(sets) == 1 and sets != [{identity}], not sets]
+
+
+def further(number):
+    """Look beside a strong effect that acts alone, and print how often the global p-value of another is small."""
+    from mcsim.datavector.candidate import columns_of
+    from mcsim.diagnosis.subsets import Subsets
+    from mcsim.stats.excess import scatter_chi2
+    from mcsim.stats.intervals import share
+
+    run, context = learned(SMALL)
+    null, settings, skies = context.null, context.settings, context.settings.constrained_skies
+    tables = [("noise_level", "V1", 0.3), ("noise_level", "V1", 0.6), ("beam_ellipticity", "W1", 0.25)]
+    for name, channel, amplitude in (*tables, ("beam_ellipticity", "W1", 0.5), ("beam_ellipticity", "W1", 1.0)):
+        table = config.Effect(name=name, channel=channel, parameters={"amplitude": amplitude})
+        jobs = [context.analysis.job(seeded(one, 2028)) for one in (run, with_effects(run, [table]))]
+        before, after = (np.concatenate(ask([replace(one, count=number)])) for one in jobs)
+        change, t = (after - before).mean(axis=0), context.templates.copy()
+        (member,) = [k for k, one in enumerate(context.candidates) if one.identity == (name, channel)]
+        columns = columns_of(context.candidates, [member])
+        # Exact at this amplitude, as the template of an effect that was simulated at it.
+        theta = null.fit(null.mean + change, t[:, columns]).amplitudes
+        t[:, columns] += np.outer(change - t[:, columns] @ theta, theta / (theta @ theta))
+        groups = null.whiten_groups(t, [one.columns for one in context.candidates])
+        charged = [*context.candidates]
+        added = scatter_chi2(null, t[:, columns], before[:skies], after[:skies])
+        charged[member] = replace(charged[member], scatter_chi2=added)
+        rows = []
+        for x in after[skies:] + context.ensemble.offset:
+            y = null.whiten(x)
+            searches = (
+                Subsets(null, y, groups, c, context.calibration, settings) for c in (context.candidates, charged)
+            )
+            rows.append([one.beside(np.array([[member]])).min() for one in searches])
+        print(f"{name} of {channel}, {amplitude}: S/N {null.expected_snr(change):.0f}")
+        for place, what in enumerate(("its scatter ignored", "its scatter charged")):
+            for level in (0.05, 0.005):
+                small = [row[place] <= level for row in rows]
+                print("   ", worded(share(f"{what}, p <= {level}", small)), flush=True)
+
+
 def pairs(number):
     """Diagnose maps with two effects, each at S/N 5 to 20, and print how often both are named."""
     from mcsim.benchmark.case import Prior
@@ -317,6 +402,5 @@ def null(number):
 
 if __name__ == "__main__":
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    {"maps": maps, "draws": draws, "pairs": pairs, "several": several, "null": null}[sys.argv[1]](
-        int(sys.argv[2]) if len(sys.argv) > 2 else 42
-    )
+    commands = (maps, true, further, draws, pairs, several, null)
+    {one.__name__: one for one in commands}[sys.argv[1]](int(sys.argv[2]) if len(sys.argv) > 2 else 42)

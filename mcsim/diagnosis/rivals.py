@@ -1,0 +1,74 @@
+"""Try effects that are proposed on request alone in the place of those that are about to be named."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from mcsim.datavector.analysis import on_request
+from mcsim.datavector.candidate import Candidate, beyond, columns_of, numbered
+from mcsim.diagnosis.context import DataSet, DiagnosisContext
+from mcsim.diagnosis.refine import Refined, Refiner
+from mcsim.support.arrays import Matrix, Vector
+
+
+def with_rivals(data: DataSet[Any], refined: Refined) -> tuple[DataSet[Any], Refined]:
+    """Return data and attribution with the effects on request that explain the data like the only set that is named.
+
+    Notes
+    -----
+    As a candidate each of them would raise the bar for all. Here it becomes a candidate for these data alone, and only
+    if it can take the place of a member. Global p-values stay those of the candidates that are always proposed.
+    Patterns that are drawn are no rivals.
+    """
+    context, found = data.context, refined.attribution.if_named(data.context.settings)
+    if len(found.explanations) != 1:
+        return data, refined
+    channels = {context.candidates[member].channel for member in found.explanations[0].members}
+    near = [one for one in on_request(context.analysis) if one.channel in channels or None in (one.channel, *channels)]
+    pairs = [(one, data.response(one, context.settings.channel_skies)) for one in near if not one.random_response]
+    known = [(one, response) for one, response in pairs if response is not None]
+    rivals = [known[place] for place in in_place(context, data.x, replace(refined, attribution=found), known)]
+    if not rivals:
+        return data, refined
+    wide = replace(data, context=with_candidates(context, rivals))
+    added = wide.context.templates[:, context.templates.shape[1] :]
+    candidates = (*refined.candidates, *wide.context.candidates[len(context.candidates) :])
+    return wide, Refiner(wide).run(np.concatenate([refined.templates, added], axis=1), candidates)
+
+
+def in_place(
+    context: DiagnosisContext, x: Vector, refined: Refined, rivals: Sequence[tuple[Candidate, Matrix]]
+) -> Iterator[int]:
+    """Yield the indices of rivals, with their responses, that explain data in the place of a member of the only set.
+
+    Amplitudes are possible, and the likelihood is within ``odds_cut`` of that of the set.
+    """
+    null, candidates, members = context.null, refined.candidates, refined.attribution.explanations[0].members
+    whole = null.fit(x, refined.templates[:, columns_of(candidates, members)])
+    least = float(null.log_likelihood(whole.chi2)) - np.log(context.settings.odds_cut)
+    for index, (rival, response) in enumerate(rivals):
+        every = numbered([*candidates, rival])
+        t = np.concatenate([refined.templates, response[: len(x)]], axis=1)
+        for member in members:
+            changed = (*(one for one in members if one != member), len(candidates))
+            fit = null.fit(x, t[:, columns_of(every, changed)])
+            if null.log_likelihood(fit.chi2) >= least and np.isfinite(beyond(every, changed, fit)):
+                yield index
+                break
+
+
+def with_candidates(context: DiagnosisContext, more: Sequence[tuple[Candidate, Matrix]]) -> DiagnosisContext:
+    """Return what data are tested with, with further candidates and their responses, shape (p + E, K) each."""
+    candidates = numbered([*context.candidates, *(one for one, _ in more)])
+    added, response = candidates[len(context.candidates) :], np.concatenate([one for _, one in more], axis=1)
+    templates = np.concatenate([context.templates, response[: len(context.templates)]], axis=1)
+    return replace(
+        context,
+        bank=context.bank.with_columns([label for one in added for label in one.labels], response),
+        candidates=candidates,
+        sky_scatter=np.append(context.sky_scatter, np.zeros(len(added))),
+        templates=templates,
+        groups=context.null.whiten_groups(templates, [one.columns for one in candidates]),
+    )

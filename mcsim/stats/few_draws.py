@@ -1,0 +1,122 @@
+"""Estimate the covariance of a random pattern from a few draws of it, for data that hold one more draw beside noise."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from mcsim.errors import InputError
+from mcsim.support.arrays import Matrix, Vector
+
+LEAST = 4
+"""Draws that it needs at least."""
+
+_WEIGHTS = np.logspace(-4.0, 0.0, 13)
+_STEPS = 20
+_LOG_RANGE = 12.0
+
+
+def covariance_of_draws(deviations: Matrix) -> tuple[Matrix, float]:
+    """Return the covariance R of a pattern, shape (p, p), and the variance of a factor by which its errors scale chi^2.
+
+    ``deviations``, shape (p, draws), are those of the draws from their mean, in coordinates in which the noise beside
+    them has covariance one: S = deviations @ deviations.T is their sample covariance. Raise InputError if there are
+    fewer than four.
+
+    Notes
+    -----
+    There are fewer draws than elements. R = b [(1 - w) S + w tr(S)/p 1] is judged by data that it does not know: each
+    draw, with noise, by the covariance 1 + R of all others (leave-one-out cross-validation; Stone, JRSS B 36, 111,
+    1974). For every w, b is such that the mean chi^2 of the held-out draws is p; w maximises their likelihood (Hoffbeck
+    & Landgrebe, IEEE Trans. PAMI 18, 763, 1996). The weight of Ledoit & Wolf (2004) minimises the squared error of R
+    instead, which is that of its largest eigenvalues: it makes R far too wide in all other directions.
+
+    Directions in which R is too small or too large remain, so that chi^2 scatters by more than 2 p. The excess, also
+    that of the held-out draws, over p (p + 2) is the variance that is returned (:mod:`mcsim.stats.elliptical`).
+    P-values of further draws are uniform: tests/statistical/test_few_draws.py.
+    """
+    p, count = deviations.shape
+    if count < LEAST:
+        raise InputError(f"{count} draws of a pattern do not tell its covariance; give at least {LEAST}.")
+    total = float(np.sum(deviations**2))
+    if total == 0.0:
+        return np.zeros((p, p)), 0.0
+    held = _HeldOut.of(deviations)
+    low, high = np.full(len(_WEIGHTS), -_LOG_RANGE), np.full(len(_WEIGHTS), _LOG_RANGE)
+    for _ in range(_STEPS):
+        middle = 0.5 * (low + high)
+        narrow = held.judge(np.exp(middle)).chi2.mean(axis=1) > p
+        low, high = np.where(narrow, middle, low), np.where(narrow, high, middle)
+    found = held.judge(np.exp(high))
+    best = int(np.argmax(np.where(high < _LOG_RANGE, found.log_likelihood, -np.inf)))
+    variance = float(found.noise_variance[best] + np.var(found.chi2[best], ddof=1))
+    weight, scale = _WEIGHTS[best], np.exp(high[best])
+    covariance = scale * ((1.0 - weight) * deviations @ deviations.T + weight * total / p * np.eye(p))
+    return covariance, max(variance - 2.0 * p, 0.0) / (p * (p + 2.0))
+
+
+class _Judged(NamedTuple):
+    """Hold what held-out draws say of W covariances.
+
+    ``chi2`` is that of each of k draws, averaged over noise, shape (W, k), ``noise_variance`` the variance that noise
+    gives it, averaged over draws, and ``log_likelihood`` the mean of theirs, up to a constant, shape (W,) both.
+    """
+
+    chi2: Matrix
+    noise_variance: Vector
+    log_likelihood: Vector
+
+
+@dataclass(frozen=True)
+class _HeldOut:
+    """Judge covariances of p elements by draws that they do not know.
+
+    ``values``, shape (q,), are the eigenvalues of S, and ``squares``, shape (k, q), those of the deviations of k draws
+    along its eigenvectors.
+    """
+
+    p: int
+    values: Vector
+    squares: Matrix
+
+    @classmethod
+    def of(cls, deviations: Matrix) -> "_HeldOut":
+        """Take the draws' deviations from their mean, shape (p, k)."""
+        _, singular, right = np.linalg.svd(deviations, full_matrices=False)
+        return cls(len(deviations), singular**2, (singular[:, None] * right).T ** 2)
+
+    def judge(self, scale: Vector) -> _Judged:
+        """Judge the covariances of all weights, each with its scale, shape (W,).
+
+        Notes
+        -----
+        The covariance of all but the draw z is (k - 1)/(k - 2) (S - k/(k - 1) z z'). Inverse and determinant of a
+        matrix D - f z z' are those of Sherman & Morrison (Ann. Math. Stat. 21, 124, 1950).
+        """
+        count, rest = len(self.squares), self.p - len(self.values)
+        more, less = (count - 1.0) / (count - 2.0), count / (count - 1.0)
+        trace = more * (self.values.sum() - less * self.squares.sum(axis=1))
+        same, own = (scale * _WEIGHTS)[:, None] * trace / self.p, more * (scale * (1.0 - _WEIGHTS))[:, None]
+        inside, outside, f = 1.0 + same[..., None] + own[..., None] * self.values, 1.0 + same, own * less
+        inverse = 1.0 / inside
+        squared = inverse * inverse
+        first, second, third = (
+            np.einsum("kq,wkq->wk", self.squares, one) for one in (inverse, squared, squared * inverse)
+        )
+        left = 1.0 - f * first
+        # Traces of the inverse and of its square, which noise of variance one contributes.
+        trace_one = np.sum(inverse, axis=-1) + rest / outside + f * second / left
+        trace_two = np.sum(squared, axis=-1) + rest / outside**2
+        trace_two += 2.0 * f * third / left + (f * second / left) ** 2
+        chi2 = trace_one + count * first / left
+        volume = np.sum(np.log(inside), axis=-1) + rest * np.log(outside) + np.log(left)
+        noise = 2.0 * trace_two + 4.0 * count * second / left**2
+        return _Judged(chi2, noise.mean(axis=1), -0.5 * (volume + chi2).mean(axis=1))
+
+
+def without(deviations: Matrix, k: int) -> Matrix:
+    """Return the deviations of all draws but one from their own mean, shape (p, draws) to (p, draws - 1)."""
+    count = deviations.shape[1]
+    # The deviations of all draws add up to zero.
+    others = np.delete(deviations, k, axis=1) + deviations[:, [k]] / (count - 1.0)
+    return np.asarray(others * np.sqrt((count - 1.0) / (count - 2.0)))

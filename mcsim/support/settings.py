@@ -1,0 +1,33 @@
+"""Checks of the settings that users change by name."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import fields
+from typing import Any, get_args
+
+from mcsim.errors import InputError
+
+
+def check_settings(settings: Any, shares: Iterable[str] = ()) -> None:
+    """Raise InputError unless the fields of a dataclass are of the kind of their defaults, and numbers not negative.
+
+    Those named in ``shares`` lie between 0 and 1. An ``int | None`` is whole.
+    """
+    bounded = set(shares)
+    for field in fields(settings):
+        value, default = getattr(settings, field.name), field.default
+        if value is default:
+            continue
+        if default is None and int in get_args(field.type):
+            default = 1
+        if isinstance(default, tuple) and (isinstance(value, str) or not isinstance(value, tuple | list)):
+            raise InputError(f"{field.name} = {value!r} is no tuple; give one, such as ({value!r},).")
+        if isinstance(default, bool) and not isinstance(value, bool):
+            raise InputError(f"{field.name} = {value!r} is neither True nor False; give one of them.")
+        if isinstance(default, int | float) and not isinstance(default, bool):
+            largest = 1.0 if field.name in bounded else math.inf
+            number = isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= largest
+            if not number or (isinstance(default, int) and value != int(value)):
+                kind = "a whole number" if isinstance(default, int) else "a number"
+                limit = "from 0 to 1" if largest == 1.0 else "of 0 or more"
+                raise InputError(f"{field.name} = {value!r} is out of range; give {kind} {limit}.")

@@ -1,0 +1,163 @@
+"""Effects on the gain: constant, with the year, with the spin, with the signal."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mcsim.errors import InputError
+from mcsim.instrument.beams import Beam
+from mcsim.sphere.sky import dipole_alm
+from mcsim.systematics.base import Alm, Bound, Draw, Effect, Site, Wording
+from mcsim.systematics.parametrization import Angle, Vector
+from mcsim.systematics.product import multiplied
+from mcsim.systematics.spacecraft import spin_phase
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration(Effect):
+    """Gain 1 + amplitude of sky and dipole alike, at all times; the noise stays as it is.
+
+    Notes
+    -----
+    It acts as a beam of the integral 1 + amplitude. The dipole is subtracted with the fiducial gain, 1: amplitude times
+    the dipole is left.
+    """
+
+    name = "calibration"
+    scope = "channel"
+    unit = "fraction"
+    title = "calibration"
+    wording = Wording("{} of the gain", " %", 100.0)
+    cause = "Absolute calibration on a dipole that is known, or was measured, with an error."
+    signature = "L = 0 and the dipole: the same factor at all degrees and times, in this channel alone."
+    source = "Jarosik et al. 2011, ApJS 192, 14 (0.2 %); Planck 2015 results V, A&A 594, A5"
+    step = 1e-3
+    bounds = (Bound("amplitude", -0.5, 0.5, "a prior of this library: half of the dipole is seen by eye"),)
+
+    def beam(self, beam: Beam, site: Site) -> Beam:
+        """Scale the beam."""
+        if self.amplitude <= -1.0:
+            raise InputError(
+                f"effect {self.name}: amplitude = {self.amplitude:g} leaves no signal; choose one above -1."
+            )
+        return replace(beam, blm=(1.0 + self.amplitude) * beam.blm)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GainDrift(Effect):
+    """Gain 1 + amplitude cos(2 pi t / orbit period - phase), of sky and dipole alike.
+
+    Attributes
+    ----------
+    amplitude
+        Fraction.
+    phase_deg
+        Part of the year at which the gain is highest, as an angle from the start of the survey.
+
+    Notes
+    -----
+    The dipole is subtracted with the fiducial gain, 1: what is left of it is most of the effect.
+    """
+
+    name = "gain_drift"
+    scope = "channel"
+    unit = "fraction"
+    title = "annual gain drift"
+    wording = Wording("{} of the gain", " %", 100.0)
+    cause = "Temperature of the receiver over the year, followed imperfectly by the calibration."
+    signature = (
+        "Sky and dipole modulated with the year: additive at low l, ordered by the scan, opposite in the halves."
+    )
+    source = "Jarosik et al. 2007, ApJS 170, 263 (gain model)"
+    step = 2e-4
+    bounds = (Bound("amplitude", 0.0, 0.1, "a prior of this library: far beyond any radiometer in use"),)
+    parametrization = Angle(parameter="phase_deg")
+
+    phase_deg: float = 0.0
+
+    def gain(self, time_s: Vector, site: Site) -> Vector | None:
+        """Return a wave of the period of the orbit."""
+        if self.amplitude == 0.0:
+            return None
+        turns = time_s / site.pointed(self.name).model.orbit_period_s
+        return np.asarray(self.amplitude * np.cos(2.0 * np.pi * turns - np.deg2rad(self.phase_deg)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class GainSpin(Effect):
+    """Gain 1 + amplitude cos(spin phase - phase), of sky and dipole alike.
+
+    Attributes
+    ----------
+    amplitude
+        Fraction.
+    phase_deg
+        Spin phase at which the gain is highest: angle of the line of sight about the spin axis, from the Sun's side.
+
+    Notes
+    -----
+    Harmonics of the spin and gain noise without a phase average out faster than this term, which every spin repeats.
+    """
+
+    name = "gain_spin"
+    scope = "channel"
+    unit = "fraction"
+    title = "spin-synchronous gain"
+    wording = Wording("{} of the gain", " %", 100.0)
+    cause = "A receiver or its supply that is heated by the Sun once every spin, faster than calibration follows."
+    signature = "Sky and dipole times a pattern fixed to the Sun: additive at low l, in the frame of the scan."
+    source = "Hinshaw et al. 2003, ApJS 148, 63 (limits); Planck 2015 results III, A&A 594, A3 (thermal effects)"
+    step = 2e-4
+    bounds = (Bound("amplitude", 0.0, 0.1, "a prior of this library: far beyond any radiometer in use"),)
+    parametrization = Angle(parameter="phase_deg")
+    proposed = False
+
+    phase_deg: float = 0.0
+
+    def gain(self, time_s: Vector, site: Site) -> Vector | None:
+        """Return a wave of the period of the spin."""
+        if self.amplitude == 0.0:
+            return None
+        return np.asarray(
+            self.amplitude * np.cos(spin_phase(site.pointed(self.name), time_s) - np.deg2rad(self.phase_deg))
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Nonlinearity(Effect):
+    """The gain rises with the signal: sky and dipole times 1 + amplitude (dipole / largest dipole).
+
+    Attributes
+    ----------
+    amplitude
+        Relative change of the gain from no dipole to its maximum.
+
+    Notes
+    -----
+    The signal is a (T + D) with T the sky, D = d . n its dipole, d as long as ``sky.dipole_uk``, and a = 1 + amplitude
+    D / |d|: the sky is modulated, and a quadrupole amplitude D^2 / |d| appears. T in a, a fiftieth of D, is left out.
+    The beam acts afterwards, which is the same where the dipole hardly changes across it.
+    """
+
+    name = "nonlinearity"
+    scope = "channel"
+    unit = "fraction"
+    wording = Wording("{} of the gain at the dipole's maximum", " %", 100.0)
+    cause = "Analogue-to-digital converters or detectors whose response is curved over the range of the dipole."
+    signature = "A quadrupole aligned with the dipole, and the sky modulated along it, the same in both halves."
+    source = "Planck 2018 results III, A&A 641, A3 (nonlinearity of converters)"
+    step = 2e-4
+    bounds = (Bound("amplitude", -0.1, 0.1, "a prior of this library: far beyond any converter in use"),)
+    proposed = False
+
+    def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
+        """Multiply sky and dipole."""
+        largest = float(np.linalg.norm(site.dipole_uk))
+        if largest == 0.0:
+            raise InputError(f"effect {self.name} on channel {site.channel} follows the dipole; give sky.dipole_uk.")
+        x, y, z = self.amplitude * site.dipole_uk / largest
+
+        def relative(*where: Vector) -> Vector:
+            return x * where[0] + y * where[1] + z * where[2]
+
+        return sky + multiplied(sky + dipole_alm(site.dipole_uk, site.lmax), site.lmax, relative, 1)

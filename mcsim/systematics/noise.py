@@ -1,0 +1,136 @@
+"""Effects on the noise: its level, its pattern over the sky, and outliers among the samples."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import healpy
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.errors import InputError
+from mcsim.sphere import healpix
+from mcsim.sphere.checks import check_complete
+from mcsim.sphere.rotation import rotation_matrix
+from mcsim.systematics.base import Bound, Effect, Map, Site, Wording
+from mcsim.systematics.parametrization import Parametrization, Vector
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoiseLevel(Effect):
+    """Noise per sample sigma0 (1 + amplitude): a fraction of the standard deviation, not of the variance."""
+
+    name = "noise_level"
+    scope = "channel"
+    unit = "fraction of sigma0"
+    wording = Wording("{} more noise", " %", 100.0, negative="{} less noise")
+    cause = "Noise estimated on other data, or a gain that is not the fiducial one."
+    signature = "Autos only, flat in l, as the hits."
+    source = "Jarosik et al. 2011, ApJS 192, 14 (sigma0 per channel, and its error)"
+    step = 0.01
+    bounds = (Bound("amplitude", -0.9, 3.0, "a prior of this library: noise is known to a factor of four"),)
+    parametrization = Parametrization(matched_filter=False)
+
+    def noise(self, site: Site) -> Map | None:
+        """Return the same factor everywhere."""
+        if self.amplitude == 0.0:
+            return None
+        if self.amplitude <= -1.0:
+            raise InputError(
+                f"effect {self.name}: amplitude = {self.amplitude:g} leaves less than no noise; keep it above -1."
+            )
+        return np.full(12 * site.nside**2, (1.0 + self.amplitude) ** 2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoiseAnisotropy(Effect):
+    """Variance of the samples times 1 + amplitude t, t = 3 z^2 - 1 with z the sine of ecliptic latitude in every frame.
+
+    Attributes
+    ----------
+    amplitude
+        a.
+    template
+        Path of a HEALPix map to be taken for t; its frame is what its header says, or that of the maps.
+    """
+
+    name = "noise_anisotropy"
+    scope = "channel"
+    unit = "fraction of the variance"
+    wording = Wording("{} of the variance", " %", 100.0)
+    cause = "Hits that are not those of the survey, flagged or lost samples, or noise that varies through the year."
+    signature = "Autos only, L = 2, M = 0 of the ecliptic frame; the variance map of half differences."
+    source = "The pattern is the lowest one that a scan symmetric about the ecliptic makes"
+    step = 0.05
+    bounds = (Bound("amplitude", -0.5, 1.0, "no variance is negative, the pattern being from -1 to 2"),)
+
+    template: str = ""
+
+    def noise(self, site: Site) -> Map | None:
+        """Return 1 + a t."""
+        if self.amplitude == 0.0:
+            return None
+        centres = np.stack(healpy.pix2vec(site.nside, np.arange(12 * site.nside**2)))
+        if self.template:
+            pattern = _of_file(self.template, site.frame, centres)
+        else:
+            pattern = 3.0 * (rotation_matrix(site.frame, "ecliptic")[2] @ centres) ** 2 - 1.0
+        factor = 1.0 + self.amplitude * pattern
+        if factor.min() < 0.0:
+            raise InputError(
+                f"effect {self.name}: amplitude = {self.amplitude:g} makes a variance negative, with a pattern from "
+                f"{pattern.min():.3g} to {pattern.max():.3g}; choose a smaller one."
+            )
+        return np.asarray(factor)
+
+
+def _of_file(path: str, frame: str, centres: NDArray[np.float64]) -> Map:
+    """Return a template at these directions in ``frame``."""
+    values, found, _ = healpix.read_map(Path(path))
+    check_complete(values, path)
+    seen = rotation_matrix(frame, found or frame) @ centres
+    return np.asarray(values[healpy.vec2pix(healpy.npix2nside(values.size), *seen)])
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExcessNoise(Effect):
+    """A random fraction of the samples has a Gaussian of a larger size added, each by itself.
+
+    Attributes
+    ----------
+    amplitude
+        Fraction of the samples; a sample may be hit more than once.
+    glitch_uk
+        Root mean square of what one hit adds, uK.
+
+    Notes
+    -----
+    The number of hits is Poisson, so that their sum over h samples is sqrt(n) glitch_uk times a standard normal number,
+    n Poisson of mean amplitude h: exact in both routes. The variance of a sample grows by amplitude glitch_uk^2; the
+    sum's excess kurtosis is 3 / (amplitude h).
+    """
+
+    name = "excess_noise"
+    scope = "channel"
+    unit = "fraction of samples"
+    wording = Wording("{} of the samples", " %", 100.0)
+    cause = "Cosmic rays whose tails the flags do not cover, or electronics that spike."
+    signature = "Autos only, as more noise: degenerate with noise_level, for tails are not measured."
+    source = "Planck 2013 results X, A&A 571, A10 (glitches of HFI and what is left of them)"
+    step = 1e-3
+    bounds = (
+        Bound("amplitude", 0.0, 1.0, "a share of the samples"),
+        Bound("glitch_uk", 0.0, 1000000.0, "a size; fixed in a fit"),
+    )
+    parametrization = Parametrization(
+        sign=1, max_amplitude=1.0, stochastic=True, mean_response=True, matched_filter=False
+    )
+    proposed = False
+
+    glitch_uk: float = 500.0
+
+    def excess(self, count: Vector, rng: np.random.Generator) -> Vector:
+        """Return the sum of the hits."""
+        if self.amplitude < 0.0:
+            raise InputError(f"effect {self.name}: amplitude = {self.amplitude:g} is no fraction; give 0 or more.")
+        number = rng.poisson(self.amplitude * count)
+        return np.asarray(self.glitch_uk * np.sqrt(number) * rng.standard_normal(number.size))

@@ -1,0 +1,230 @@
+"""Comparisons of maps as people have them: files, holes, noise, prepared, made from moments, or of another kind."""
+
+import json
+from dataclasses import replace
+
+import healpy
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import mcsim
+from comparisons import CASES, LMAX, MODEL, NSIDE, ODD, PEAR, SMALL, Maps, Simulator, mcsim_window, names, scaled, small
+from mcsim.cli import app
+from mcsim.comparison import pairs
+from mcsim.comparison.prediction import Prediction, Set
+from mcsim.comparison.scene_differences import PsiSign
+from mcsim.comparison.shown_sky import with_shown_sky
+from mcsim.ensemble.maps import write_map
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import survey
+from pictures import quick_pictures
+from refusals import refused
+
+
+@pytest.fixture(scope="module")
+def simulator() -> Simulator:
+    return Simulator()
+
+
+@pytest.fixture(scope="module")
+def side_a(simulator: Simulator) -> Maps:
+    return simulator()
+
+
+def test_what_no_library_has_is_unknown(simulator, side_a):
+    side_b = [np.where(m > -1e20, m + 1e-4 * m**2, m) for m in side_a]
+    found = mcsim.compare(side_a, side_b, simulator.run)
+    assert found.verdict == "unknown"
+    assert names(found) == []
+
+
+def test_single_precision_and_interpolation_are_no_difference(simulator, side_a):
+    single = [m.astype(np.float32).astype(np.float64) for m in side_a]
+    assert mcsim.compare(side_a, single, simulator.run).verdict == "identical"
+    draw = np.random.default_rng(1)
+    coarse = [np.where(m > -1e20, m + 0.02 * draw.standard_normal(m.size), m) for m in side_a]
+    found = mcsim.compare(side_a, coarse, simulator.run)
+    assert found.verdict == "identical"
+    assert found.accuracy == pytest.approx(0.02 / found.channels[0].sky_rms_uk, rel=0.02)
+
+
+def test_a_unit_of_one_split_alone_is_named(simulator, side_a):
+    found = mcsim.compare(side_a, [side_a[0], *scaled(side_a[1:], 1e-6)], simulator.run)
+    assert names(found) == ["unit"]
+    assert found.to_dict()["maps"] == {"W1": ["W1:half2"]}
+    assert "W1:half2; the other maps are identical" in str(found)
+
+
+def test_zeros_that_stand_for_holes_hide_nothing(simulator, side_a):
+    hole = np.abs(healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2))[2]) < 0.3
+    filled = [[np.where(hole, 0.0, m) for m in side] for side in (side_a, CASES["pixel_window"][0](simulator, side_a))]
+    assert names(mcsim.compare(*filled, simulator.run)) == ["pixel_window"]
+
+
+def test_a_degree_at_which_the_sky_ends_is_named_beside_holes():
+    """What holes hide of the sky was cut as well, and that reaches into the pixels that are seen."""
+    simulator = Simulator(small("litebird", period_s=181.0))
+    factor, cut = simulator.site.beam.window * mcsim_window(), np.arange(LMAX + 1) <= 25
+    hole = np.abs(healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2))[2]) < 0.3
+    sides = [healpy.alm2map(healpy.almxfl(simulator.sky, f), NSIDE, lmax=LMAX) for f in (factor, cut * factor)]
+    found = mcsim.compare(*([np.where(hole, 0.0, side)] * 2 for side in sides), simulator.run)
+    assert names(found) == ["lmax_cut"]
+    assert found.channels[0].left > 0.05, "more than is left elsewhere"
+
+
+@pytest.mark.parametrize("both", [False, True])
+def test_a_side_that_was_made_from_orientation_moments_is_recognised(both, simulator, side_a):
+    """What single samples change in such maps is a per cent of the sky, and larger than this width."""
+    window = np.exp(-0.5 * np.arange(LMAX + 1) * np.arange(1, LMAX + 2) * np.deg2rad(0.35) ** 2)
+    narrow, wide = simulator.sky, healpy.almxfl(simulator.sky, window)
+    of_moments = [simulate.maps(survey(simulator.run), 0, sky=sky) for sky in (narrow, wide)]
+    side_b = list(of_moments[1]) if both else simulator(sky=wide)
+    found = mcsim.compare(list(of_moments[0]), side_b, simulator.run)
+    assert names(found) == ["beam_width"]
+    assert found.channels[0].left < 1e-4
+    assert (found.channels[0].spread_rms_uk > 0.0) == (not both)
+    if not both:
+        assert mcsim.compare(list(of_moments[0]), side_a, simulator.run).accuracy < 1e-5
+
+
+def test_maps_at_the_centres_of_pixels_are_recognised(simulator):
+    """Maps of a pipeline without a scan: one through the pixel window, one without it."""
+    run = replace(simulator.run, map=replace(simulator.run.map, splits=()))
+    smooth = healpy.almxfl(simulator.sky, simulator.site.beam.window)
+    without = healpy.alm2map(smooth, NSIDE, lmax=LMAX)
+    found = mcsim.compare([healpy.alm2map(healpy.almxfl(smooth, mcsim_window()), NSIDE, lmax=LMAX)], [without], run)
+    assert names(found) == ["pixel_window"]
+    assert found.channels[0].differences[0].amplitude == -1.0
+    assert found.channels[0].left < 1e-4
+
+
+def test_files_are_compared_from_the_command_line(tmp_path, simulator, side_a):
+    sides = {"a": side_a, "b": scaled(side_a, 1.01)}
+    for side, maps in sides.items():
+        # Side b as mcsim maps writes several realizations, of which the first is compared.
+        folder = tmp_path / side / ("00000" if side == "b" else "")
+        folder.mkdir(parents=True)
+        for split, map_ in zip(("half1", "half2"), maps, strict=True):
+            write_map(folder / f"W1_{split}.fits", map_, "ecliptic")
+    a, b, out = (str(tmp_path / name) for name in ("a", "b", "out"))
+    with quick_pictures():
+        found = CliRunner().invoke(app, ["compare", a, b, "-o", out, "--fail-above", "0.1"])
+    assert found.exit_code == 0, found.output
+    said = json.loads((tmp_path / "out" / "compare.json").read_text())
+    assert said["schema"] == 1
+    assert [(d["name"], d["channel"]) for d in said["differences"]] == [
+        ("calibration", "W1_half1"),
+        ("calibration", "W1_half2"),
+    ]
+    assert said["differences"][0]["amplitude"] == pytest.approx(0.01)
+    assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
+    with quick_pictures():
+        assert CliRunner().invoke(app, ["compare", a, b, "-o", out, "--fail-above", "1e-4"]).exit_code == 1
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "model"),
+    [([np.zeros(12)], [np.ones(12)], None), ([np.zeros(12)] * 2, [np.ones(12)] * 2, MODEL), ("nowhere", "x", None)],
+)
+def test_what_cannot_be_compared_is_refused(a, b, model):
+    with pytest.raises(mcsim.InputError):
+        mcsim.compare(a, b, model)
+
+
+def test_a_run_is_simulated_sample_by_sample_where_the_other_side_is(tmp_path):
+    """Samples spread over their pixels: the moments of the default simulation miss a few per cent of the sky."""
+    simulator = Simulator(small("litebird", mcsim.Beam.gaussian(380.0, 32)))
+    for split, map_ in zip(("half1", "half2"), simulator(), strict=True):
+        write_map(tmp_path / f"W1_{split}.fits", map_.astype(np.float32), "ecliptic")
+    model = tmp_path / "run.toml"
+    model.write_text(
+        'schema = 1\nname = "pair"\nsky = { spectrum = "wmap7", lmax = 32 }\nensemble = { seed = 3 }\n'
+        'map = { nside = 16, splits = ["half1", "half2"] }\n'
+        '[[channel]]\nname = "W1"\nbeam = { kind = "gaussian", fwhm_arcmin = 380.0 }\n'
+        'scan = { kind = "hit_averaged", model = "litebird", sample_period_s = 361.0 }\n'
+    )
+    found = mcsim.compare(model, tmp_path)
+    assert found.verdict == "identical"
+    assert found.accuracy < 1e-5
+
+
+def test_sloppy_maps_are_read(tmp_path, simulator, side_a):
+    """NaN, masked arrays, single precision with its own UNSEEN, zeros, and pixels that one side alone observed."""
+    rough = [m.astype(np.float32) for m in side_a]
+    rough[0][:100] = np.float32(healpy.UNSEEN)
+    rough[1] = np.ma.masked_where(np.arange(side_a[1].size) < 50, side_a[1])
+    given = [m.copy() for m in side_a]
+    given[0][200:250] = np.nan
+    given[1][300:320] = 0.0
+    found = mcsim.compare(given, rough, simulator.run)
+    assert found.verdict == "identical"
+    assert found.to_dict()["left"]["one_sided_pixels"] == 220
+    assert "220 pixels" in str(found)
+    with refused(100):
+        mcsim.compare([np.zeros(100)] * 2, side_a, simulator.run)
+
+
+def test_maps_with_holes_show_enough_of_the_sky():
+    """Many pixels without a sample: psi of the other sign, and fewer orders, with no sky in the model."""
+    simulator = Simulator(small("wmap", period_s=2503.0))
+    side_a = simulator()
+    holes = np.mean([m == healpy.UNSEEN for m in side_a])
+    assert 0.05 < holes < 0.4
+    for made, name in ((simulator(psi=lambda p: -p), "psi_sign"), (ODD["mmax_cut"](simulator), "mmax_cut")):
+        assert names(mcsim.compare(side_a, made, simulator.run)) == [name]
+
+
+def test_prepared_maps_are_compared():
+    """Both sides degraded, their dipoles taken off, turned: what side B does otherwise is still named."""
+    steps = [{"kind": "subtract_dipole"}, {"kind": "degrade", "nside": 16}, {"kind": "rotate", "frame": "galactic"}]
+    simulator = Simulator(small("litebird", period_s=181.0, preparation=steps, map=SMALL["map"] | {"nside": 32}))
+    whole = survey(simulator.run)
+
+    def prepared(maps: Maps) -> Maps:
+        return [m.preparation.apply(made) for m, made in zip(whole.making.channels[0].maps, maps, strict=True)]
+
+    side_a = prepared(simulator())
+    assert names(mcsim.compare(side_a, prepared(simulator(psi=lambda p: p + 1.0)), simulator.run)) == ["psi_offset"]
+    assert mcsim.compare(side_a, side_a, simulator.run).verdict == "identical"
+
+
+def test_what_has_no_name_is_described():
+    simulator = Simulator(small(beam=mcsim.Beam.gaussian(380.0, 32)))
+    side_a = simulator()
+    draw = np.random.default_rng(5)
+    white = [m + 5.0 * draw.standard_normal(m.size) for m in side_a]
+    source = np.exp(8.0 * (healpy.pix2vec(16, np.arange(3072))[0] - 1.0) * 20.0)
+    for made, words in (
+        (white, "white in pixels"),
+        ([m + 100.0 * source for m in side_a], "of the pixels, most at longitude"),
+    ):
+        found = mcsim.compare(side_a, made, simulator.run)
+        assert found.verdict == "unknown"
+        assert words in str(found)
+        assert words in " ".join(found.to_dict()["left"]["looks"]["W1"])
+
+
+def test_differencing_scans_are_refused():
+    channel = {
+        "name": "W1",
+        "beam": PEAR,
+        "scan": {"kind": "differencing", "model": "wmap", "pair": "WMAP", "sample_period_s": 601.0},
+    }
+    with refused("differencing", "W1"):
+        mcsim.compare([np.zeros(3072)] * 2, [np.ones(3072)] * 2, SMALL | {"channel": [channel]})
+
+
+def test_noise_in_common_hides_no_more_than_is_expected_of_it():
+    simulator = Simulator(small())
+    draw = np.random.default_rng(6)
+    hits = [m.moments.hits for m in survey(simulator.run).making.channels[0].maps]
+    noise = [60.0 * draw.standard_normal(h.size) / np.sqrt(np.maximum(h, 1.0)) for h in hits]
+    a, b = ([m + n for m, n in zip(made, noise, strict=True)] for made in (simulator(), ODD["psi_sign"](simulator)))
+    found = mcsim.compare(a, b, simulator.run)
+    assert names(found) == ["psi_sign"]
+    given = pairs.given(a, b, simulator.run)
+    problem = Prediction(with_shown_sky(given.pairs[0]), (), 0.0)
+    alone = problem.corrected(Set(((PsiSign(), np.ones(1)),), 1.0))
+    assert 0.02 < alone.left < 0.5
+    assert problem.hidden(alone) == pytest.approx(alone.left, rel=0.3)

@@ -1,0 +1,67 @@
+"""Effects on request take the place of a member of a named set only where the data cannot tell them apart."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mcsim.datavector.candidate import Candidate, TemplateBank, numbered
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.diagnosis.refine import Refined
+from mcsim.diagnosis.rivals import in_place
+from mcsim.diagnosis.selection import attribute
+from mcsim.stats.gaussian import SimulatedGaussian
+from mcsim.stats.look_elsewhere import calibrate
+from mcsim.systematics import Effect, Parametrization
+
+P, N, S = 40, 600, 12.0
+
+
+def candidate(name: str, channel: str | None, sign: int = 0) -> Candidate:
+    attributes = {"name": name, "unit": "", "step": 1.0, "parametrization": Parametrization(sign=sign)}
+    return Candidate(type(name, (Effect,), attributes), channel, (0,))
+
+
+@pytest.fixture(scope="module")
+def named() -> SimpleNamespace:
+    """Data with one effect of S/N 12, "b" of channel V1, named alone among three."""
+    rng = np.random.default_rng(5)
+    t = np.linalg.qr(rng.normal(size=(P, 5)))[0]
+    null = SimulatedGaussian.from_simulations(rng.normal(size=(N, P)))
+    candidates = numbered([candidate("a", "V1"), candidate("b", "V1"), candidate("c", None)])
+    groups = null.whiten_groups(t[:, :3], [one.columns for one in candidates])
+    x = S * t[:, 1] + rng.normal(size=P)
+    found = attribute(null, x, t[:, :3], candidates, calibrate(null, groups, draws=2000))
+    assert [one.members for one in found.explanations] == [(1,)]
+    context = SimpleNamespace(null=null, settings=DiagnosisSettings())
+    return SimpleNamespace(context=context, x=x, t=t, refined=Refined(found, t[:, :3], candidates))
+
+
+@pytest.mark.parametrize(
+    ("cosine", "channel", "sign", "is_rival"),
+    [
+        (1.0, "V1", 0, True),
+        (0.99, "V1", 0, True),
+        (0.7, "V1", 0, False),  # leaves half of 144
+        (1.0, None, 0, True),
+        (-1.0, "V1", 1, False),  # would need an amplitude of the wrong sign
+    ],
+)
+def test_what_leaves_as_little_is_a_rival(named, cosine, channel, sign, is_rival):
+    response = cosine * named.t[:, [1]] + np.sqrt(1.0 - cosine**2) * named.t[:, [4]]
+    rivals = [(candidate("other", channel, sign), response)]
+    assert list(in_place(named.context, named.x, named.refined, rivals)) == [0] * is_rival
+
+
+def test_columns_are_added_behind_those_of_a_bank():
+    rng, labels = np.random.default_rng(6), candidate("a", None).labels
+    matrix, more = rng.normal(size=(4, 1)), rng.normal(size=(6, 1))
+    bank = TemplateBank(matrix, 0.1 * matrix, 0.2 * matrix, labels, rng.normal(size=(2, 1)))
+    wide = bank.with_columns(candidate("b", None).labels, more)
+    np.testing.assert_array_equal(wide.matrix, np.hstack([matrix, more[:4]]))
+    np.testing.assert_array_equal(wide.slice_matrix, np.hstack([bank.slice_matrix, more[4:]]))
+    assert not np.any(wide.error[:, 1])
+    assert not np.any(wide.curvature[:, 1])
+    assert [one.effect for one in wide.labels] == ["a", "b"]
+    assert not replace(bank, slice_matrix=np.zeros((0, 0))).with_columns(labels, more[:4]).slice_matrix.size

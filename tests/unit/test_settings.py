@@ -1,0 +1,39 @@
+"""Settings that are changed by name: of another kind, negative or beyond a probability they are refused."""
+
+import pytest
+
+from mcsim import DiagnosisSettings, LimitSettings
+from refusals import refused
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "value"),
+    [
+        (DiagnosisSettings, "without", "beam_ellipticity"),
+        (DiagnosisSettings, "including", "beam_coma"),
+        (DiagnosisSettings, "simulations", -1),
+        (DiagnosisSettings, "simulations", "100"),
+        (DiagnosisSettings, "simulations", 100.5),
+        (DiagnosisSettings, "controls", -1),
+        (DiagnosisSettings, "alpha", 5),
+        (DiagnosisSettings, "residual_level", 2.0),
+        (DiagnosisSettings, "named_probability", 90),
+        (DiagnosisSettings, "shrunk", "no"),
+        (DiagnosisSettings, "slice_snr", float("nan")),
+        (LimitSettings, "only", "gain_drift"),
+        (LimitSettings, "alpha", 2),
+        (LimitSettings, "power", 90),
+        (LimitSettings, "separation", 1.0),
+        (LimitSettings, "probes", 3.5),
+        (LimitSettings, "unknown_dipole_uk", -1),
+    ],
+)
+def test_wrong_settings_are_refused(kind, name, value) -> None:
+    with refused(name, value):
+        kind(**{name: value})
+
+
+def test_usual_settings_are_taken() -> None:
+    assert DiagnosisSettings(alpha=1, simulations=300, without=["beam_coma"], beam_bins=(5, 2)).simulations == 300
+    assert DiagnosisSettings.quick(controls=3).shrunk
+    assert LimitSettings(nuisances={"beam_width": 0.01}, dense=True).dense
