@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
-from mcsim.comparison.prediction import EXPLAINED, PRECISION, TOLERATED, UNSURE, Prediction, Set
+from mcsim.comparison.prediction import ENOUGH, EXPLAINED, PRECISION, TOLERATED, UNSURE, Prediction, Set
 from mcsim.support.arrays import Vector
 
 FURTHER = 0.7
@@ -261,9 +261,14 @@ class Problem(Prediction):
         return sorted(found, key=lambda one: one.left)
 
     def preferred(self, sets: Sequence[Set]) -> list[Set]:
-        """Return sets with the best first; of those that are as good, the one with the fewest fitted values."""
+        """Return sets with the best first; of those that are as good, the one with the fewest fitted values.
+
+        As good are sets of one size too that leave no more than an interpolation, which a fitted value may take in.
+        """
         limit = EQUAL * sets[0].left + UNSURE * self.hidden(sets[0]) + PRECISION
-        equal = [one for one in sets if one.left <= limit and self.suffices(one)]
+        little, size = min(ENOUGH, self.floor**2 * self.pair.seen.sum() / self.total), len(sets[0].members)
+        close = [one for one in sets if one.left <= (max(limit, little) if len(one.members) == size else limit)]
+        equal = [one for one in close if self.suffices(one)]
         first = min(equal, key=lambda one: (len(one.members), one.fitted), default=sets[0])
         return [first, *(one for one in sets if one is not first)]
 

@@ -10,8 +10,12 @@ from numpy.typing import NDArray
 import mcsim
 from comparisons import CASES, LMAX, MODEL, NSIDE, ODD, PEAR, Maps, Simulator, names, scaled, small
 from mcsim import config
-from mcsim.comparison import scene
+from mcsim.comparison import pairs, scene
+from mcsim.comparison.map_differences import Calibration, Monopole
 from mcsim.comparison.pairs import with_known_offsets
+from mcsim.comparison.prediction import Set
+from mcsim.comparison.scene_differences import PixelWindow, Smoothing
+from mcsim.comparison.search import Problem
 from mcsim.instrument.scan import MapGrid, write_moments_fits
 from mcsim.simulation import simulate, tod
 from mcsim.simulation.survey import survey
@@ -45,6 +49,19 @@ def test_a_mirrored_beam_is_named_or_is_the_turn_that_makes_the_same_maps(simula
     said = {d.name for one in ((channel.differences), *channel.alternatives) for d in one}
     assert {"beam_conjugated", "psi_offset", "beam_turned"} <= said
     assert channel.left < 0.01
+
+
+def test_what_interpolation_leaves_does_not_choose_a_name():
+    """A width beside a calibration takes in what a look-up smooths, and would be named in place of a window."""
+    draw = np.random.default_rng(1)
+    a, seen = draw.standard_normal((1, 12 * NSIDE**2)), np.ones((1, 12 * NSIDE**2), bool)
+    pair = pairs.ChannelPair("T", ("T",), a, a + 0.04 * draw.standard_normal(a.shape), seen)
+    scale = (Calibration(), np.array([0.005, 0.0]))
+    window, width = ((difference, np.ones(1)) for difference in (PixelWindow(), Smoothing()))
+    larger = Set((window, scale, (Monopole(), np.ones(1))), 2e-5)
+    for left, first in ((1e-4, window), (2e-3, width)):
+        found = Problem(pair, (), 1e-3).preferred([Set((width, scale), 1e-5), larger, Set((window, scale), left)])
+        assert found[0].members == (first, scale)
 
 
 def test_a_turn_of_a_degree_is_not_taken_for_a_turn_of_half_a_circle_more(simulator, side_a):

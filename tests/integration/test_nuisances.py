@@ -45,9 +45,9 @@ def ask(jobs):
     return [data_vectors(job) for job in jobs]
 
 
-def learned(run):
+def learned(run, simulations):
     analysis = analysis_of(run, without=WITHOUT, settings=DiagnosisSettings(including=PROPOSED))
-    return context(analysis, *campaign.learned(analysis, ask, SIMULATIONS, time_ordered=False))
+    return context(analysis, *campaign.learned(analysis, ask, simulations, time_ordered=False))
 
 
 @pytest.fixture(scope="module")
@@ -57,12 +57,12 @@ def run():
 
 @pytest.fixture(scope="module")
 def declared(run):
-    return learned(run)
+    return learned(run, SIMULATIONS)
 
 
 @pytest.fixture(scope="module")
 def undeclared(run):
-    return learned(replace(run, nuisances=()))
+    return learned(replace(run, nuisances=()), 250)  # only to show that it fails
 
 
 def maps_of(run, *effects, seed=77):
