@@ -116,7 +116,7 @@ def fit(
     if each:
         fits = [beamfit.fit_each(one) for one in fits]
     if as_json:
-        print(json.dumps([one.to_dict() for one in fits], indent=2))
+        print(json.dumps([one.to_dict() for one in fits], indent=2, ensure_ascii=False))
     else:
         print(beamfit.report(fits))
     save(fit_figure(fits), output or Path("fit.png"))
@@ -389,6 +389,6 @@ def config(
         loaded = config_.load(name)
         check_effects(loaded)
         check_nuisances(loaded)
-        print(json.dumps({"digest": config_.digest(loaded), **config_.resolved(loaded)}, indent=2))
+        print(json.dumps({"digest": config_.digest(loaded), **config_.resolved(loaded)}, indent=2, ensure_ascii=False))
     else:
         raise InputError("Nothing was asked for; give a configuration to check, or --schema.")

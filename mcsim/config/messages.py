@@ -58,6 +58,9 @@ _BOUNDS = {
 }
 
 
+_TYPES = ("float", "int", "str", "bool")
+
+
 def sentence(error: ValidationError, plain: Any, where: str) -> str:
     """Return one sentence on the first error; unknown keys come first because they explain missing ones."""
     details = error.errors(include_url=False)
@@ -138,6 +141,11 @@ def _locate(loc: tuple[int | str, ...], plain: Any) -> tuple[str, tuple[str, ...
         # A table of noise may leave out that it is white.
         if isinstance(here, dict) and here.get("kind", "white") == part and not tag_passed:
             tag_passed = True
+            continue
+        if part in _TYPES and not (isinstance(here, dict) and part in here):
+            continue  # one of those that a value may have
+        if part == "parameters" and loc[0] == "effect":  # they stand beside its name
+            here = here.get(part) if isinstance(here, dict) else None
             continue
         readable = part if part.isprintable() else shown(part)
         key = f"{key}.{readable}" if key else readable

@@ -25,6 +25,7 @@ from mcsim.simulation.channels import refuse_external
 from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap
 from mcsim.simulation.nuisance import nuisances_of
 from mcsim.support import folders
+from mcsim.support.numbers import duration
 from mcsim.support.progress import reporting
 
 PICTURE = "limit.png"
@@ -154,7 +155,7 @@ def describe(run: config.RunConfig, settings: LimitSettings) -> str:
             f"  probes  {probes.number}: {columns * probes.number} responses, {solutions} solutions of the inverse "
             f"covariance of {solved_s:.3g} s each",
             f"  memory  {memory / 1e9:.2f} GB",
-            f"  time    about {total_s / 60.0:.3g} minutes with {nthreads} threads",
+            f"  time    about {duration(total_s)} with {nthreads} threads",
         ]
     )
 
@@ -252,7 +253,8 @@ def _candidates(
     ]
     if all(_is_nuisance(candidate, settings) for candidate in wanted):
         raise InputError(
-            "no effect is left to compute a limit of; ask for one that applies to the model and is no nuisance."
+            f"no effect is left to compute a limit of (asked for: {', '.join(settings.only) or 'all'}); ask for one "
+            f"that is no nuisance, of {', '.join(sorted({candidate.name for candidate in analysis.candidates}))}."
         )
     return analysis, numbered([replace(candidate) for candidate in wanted])
 

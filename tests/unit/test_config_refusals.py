@@ -18,6 +18,8 @@ WRONG = [
     ("nmae", "x", ("nmae", "name")),
     ("effect", [{"name": "gain_drift", "channel": "X"}], ("gain_drift", "channel", "'X'", "W1", "V1")),
     ("effect", [{"channel": "W1"}], ("effect[0].name",)),
+    ("effect", [{"name": "gain_drift", "amplitude": float("nan")}], ("effect[gain_drift].amplitude",)),
+    ("effect", [{"name": "gain_drift", "amplitude": {"a": 1}}], ("effect[gain_drift].amplitude",)),
     ("sky", REMOVED, ("sky",)),
     ("sky", 3, ("sky", 3)),
     ("sky.lmx", 3, ("sky.lmx", "lmax")),
