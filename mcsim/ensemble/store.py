@@ -12,10 +12,9 @@ from collections.abc import Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import xarray as xr
 import zarr
 from numpy.typing import NDArray
 from zarr.codecs import ZstdCodec
@@ -23,6 +22,9 @@ from zarr.codecs import ZstdCodec
 from mcsim.ensemble.layout import Layout, listed
 from mcsim.errors import InputError, RunError
 from mcsim.support.folders import unwritable
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 _CODECS: dict[str, Any] = {"compressors": (ZstdCodec(level=1, checksum=True),)}
 # Write chunks of fill values too, so that a missing file means damage.
@@ -225,7 +227,7 @@ def extend(path: Path, realizations: int, update: Mapping[str, Any]) -> None:
         _consolidate(path)
 
 
-def write_summary(path: Path, summary: xr.Dataset) -> None:
+def write_summary(path: Path, summary: "xr.Dataset") -> None:
     """Replace the summary group."""
     with faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
         with warnings.catch_warnings():
