@@ -1,9 +1,15 @@
-"""Errors where effects act, in Gaussian evidence whose scatter is known."""
+"""Errors and further effects where effects act, in Gaussian evidence whose scatter is known."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from mcsim.datavector.candidate import Candidate
+from mcsim.diagnosis.subsets import Subsets
 from mcsim.stats.gaussian import SimulatedGaussian, with_scatter
+from mcsim.stats.look_elsewhere import calibrate
+from mcsim.systematics import Effect
 
 P, SKIES = 12, 4000
 
@@ -34,6 +40,25 @@ def test_the_error_of_a_response_from_few_skies_adds() -> None:
         growth.append(with_scatter(model, t, found, before, after).covariance[0, 0] / found.covariance[0, 0] - 1.0)
     # Of 2000 means of few squares the standard error is 0.12. Errors are not made smaller: 0.15 at most are added.
     assert np.mean(growth) == pytest.approx(spread**2 * (1.0 + 1.0 / skies), abs=0.5)
+
+
+def test_further_effects_are_not_found_in_the_scatter_of_one() -> None:
+    """Beside an effect that makes the noise 1.3 times as large the p-values of all others stay those of no effect."""
+    rng, count, snr, draws, growth = np.random.default_rng(7), 60, 25.0, 400, 1.3
+    null, t = SimulatedGaussian.from_simulations(rng.normal(size=(800, count))), rng.normal(size=(count, 12))
+    t /= np.linalg.norm(t, axis=0)
+    effects = [type(f"effect{k}", (Effect,), {"name": f"effect{k}", "unit": "", "step": 1.0}) for k in range(12)]
+    quiet = [Candidate(effect, None, (k,)) for k, effect in enumerate(effects)]
+    loud = [replace(quiet[0], scatter_chi2=(growth**2 - 1.0) * (count - 1.0) / snr**2), *quiet[1:]]
+    groups = null.whiten_groups(t, [one.columns for one in quiet])
+    calibration, found = calibrate(null, groups), []
+    for _ in range(draws):
+        y = null.whiten(snr * t[:, 0] + growth * rng.normal(size=count))
+        searches = (Subsets(null, y, groups, own, calibration) for own in (quiet, loud))
+        found.append([one.beside(np.array([[0]])).min() <= 0.05 for one in searches])
+    ignored, charged = np.mean(found, axis=0)
+    assert abs(charged - 0.05) < 3.0 * np.sqrt(0.05 * 0.95 / draws)
+    assert ignored > 0.15
 
 
 def _correlation(covariance: np.ndarray) -> np.ndarray:
