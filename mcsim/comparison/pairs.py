@@ -92,6 +92,13 @@ class ChannelPair:
         return self.files if number <= min(longest, HELD) else None
 
     @property
+    def shown(self) -> NDArray[np.bool_]:
+        """Where side A shows its sky, whatever side B observed (prepared maps: where both do); shape (split, npix)."""
+        if self.hits is None or self.scene is None or self.scene.preparations:
+            return self.seen
+        return (self.a != healpy.UNSEEN) & (self.hits > 0)
+
+    @property
     def nside(self) -> int:
         """Of the maps."""
         return healpy.npix2nside(self.a.shape[1])
@@ -109,10 +116,14 @@ class ChannelPair:
 
     def exchanged(self) -> "ChannelPair":
         """Return the pair with side B as side A, and a sky that its maps show."""
-        scene = self.scene
-        if scene is not None and self.sky_of_maps:
-            scene = replace(scene, sky=sky_in(self.b, self.seen, scene.up_to_offsets(1)))
-        return replace(self, a=self.b, b=self.a, scene=scene)
+        turned = replace(self, a=self.b, b=self.a)
+        return turned.with_sky_of_maps() if self.sky_of_maps else turned
+
+    def with_sky_of_maps(self) -> "ChannelPair":
+        """Return the pair with the sky that side A shows, by orientation moments."""
+        assert self.scene is not None
+        sky = sky_in(self.a, self.shown, self.scene.up_to_offsets(1))
+        return replace(self, scene=replace(self.scene, sky=sky))
 
 
 @dataclass(frozen=True, eq=False)
@@ -376,12 +387,11 @@ def _pair(
     named = sky.alm is not None or sky.map is not None
     truth = simulate.draw_sky(whole, 0) if named else np.zeros(alm_.size(sky.lmax), complex)
     scene = scene_of(channel, truth, nthreads)
-    if not named:
-        scene = replace(scene, sky=sky_in(a, seen, scene.up_to_offsets(1)))
     files = None
     spec = next(c for c in whole.config.channels if c.name == name)
     if isinstance(spec.scan, config.ScanPointing):
         splits = whole.config.map.splits or (None,)
         paths = tuple(config.channel_path(spec.scan.path, name, split) for split in splits)
         files = PointingFiles(paths, channel.site.frame)
-    return ChannelPair(name, tuple(maps), a, b, seen, one_sided, scene, channel, hits, not named, files)
+    pair = ChannelPair(name, tuple(maps), a, b, seen, one_sided, scene, channel, hits, not named, files)
+    return pair if named else pair.with_sky_of_maps()

@@ -76,7 +76,7 @@ def _as_made(pair: ChannelPair, found: ChannelPair) -> ChannelPair:
     if _left(pair, scene.maps()) > SHARP**2 * _sky(pair):
         centred = [scene.at_centres(), replace(scene.at_centres(), beam=scene.beam.truncated(0))]
         if pair.sky_of_maps:
-            centred = [replace(one, sky=sky_in(pair.a, pair.seen, one)) for one in centred]
+            centred = [replace(one, sky=sky_in(pair.a, pair.shown, one)) for one in centred]
         best = min([scene, *centred], key=lambda one: _left(pair, one.maps()))
     if _left(pair, best.maps()) > MADE * left:
         return found
@@ -100,11 +100,11 @@ def _sharper(pair: ChannelPair) -> ChannelPair:
     if _left(pair, scene.maps()) <= limit:
         return pair
     for _ in range(ROUNDS):
-        missing = np.where(pair.seen, pair.a - _made(pair, scene), 0.0)
+        missing = np.where(pair.shown, pair.a - _made(pair, scene), 0.0)
         if np.sum(missing**2) <= limit:
             break
         empty = replace(scene.up_to_offsets(1), sky=np.zeros_like(scene.sky))
-        scene = replace(scene, sky=scene.sky + sky_in(missing, pair.seen, empty, 1e-2))
+        scene = replace(scene, sky=scene.sky + sky_in(missing, pair.shown, empty, 1e-2))
     return replace(pair, scene=scene)
 
 
@@ -172,12 +172,12 @@ def _filtered(pair: ChannelPair, weight: Maps) -> ChannelPair:
 
 def unshown(pair: ChannelPair) -> Alm | None:
     """Return a draw of what holes hide of the sky of side A, coefficients as the scene's; None if they hide nothing."""
-    scene, share = pair.scene, float(pair.seen.any(axis=0).mean())
+    scene, share = pair.scene, float(pair.shown.any(axis=0).mean())
     if scene is None or not pair.sky_of_maps or scene.preparations or share > WHOLE:
         return None
     sky = _draw(healpy.alm2cl(scene.sky) / share, np.random.default_rng(0))
     alone = replace(scene.up_to_offsets(1), sky=sky)
-    return sky - sky_in(np.where(pair.seen, alone.maps(), 0.0), pair.seen, replace(alone, sky=np.zeros_like(sky)))
+    return sky - sky_in(np.where(pair.shown, alone.maps(), 0.0), pair.shown, replace(alone, sky=np.zeros_like(sky)))
 
 
 def _draw(power: NDArray[np.float64], draw: np.random.Generator) -> Alm:

@@ -73,6 +73,15 @@ def test_a_degree_at_which_the_sky_ends_is_named_beside_holes():
     assert found.channels[0].left > 0.05, "more than is left elsewhere"
 
 
+def test_a_mask_of_side_b_hides_nothing_of_the_sky_of_side_a():
+    simulator = Simulator(small("litebird", period_s=181.0))
+    side_a, side_b = simulator(), simulator(psi=lambda psi: psi + np.deg2rad(0.5))
+    hole = np.abs(healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2))[2]) < 0.35
+    found = mcsim.compare(side_a, [np.where(hole, healpy.UNSEEN, map_) for map_ in side_b], simulator.run)
+    assert names(found) == ["psi_offset"]
+    assert found.channels[0].left < 1e-4
+
+
 @pytest.mark.parametrize("both", [False, True])
 def test_a_side_that_was_made_from_orientation_moments_is_recognised(both, simulator, side_a):
     """What single samples change in such maps is a per cent of the sky, and larger than this width."""
