@@ -363,6 +363,7 @@ def test_an_out_of_library_effect_is_called_unknown(linear):
 # The Bayes classifier
 
 
+@pytest.mark.slow
 def test_pairs_have_the_marginal_likelihood_of_brute_force():
     """Likelihood times prior of two amplitudes on a grid, against importance sampling; many simulations: Gaussian."""
     prior = Prior(none=0.2, one=0.5, two=0.3, left_out=0, invented=0, weakest=2.0, strongest=10.0)

@@ -98,7 +98,7 @@ def test_mixtures_are_minimal(bench, members):
     assert right[0].explanations[0].odds == 1.0
 
 
-@pytest.mark.parametrize("size", [4, 5, 6])
+@pytest.mark.parametrize("size", [4, *(pytest.param(size, marks=pytest.mark.slow) for size in (5, 6))])
 def test_up_to_six_effects_are_found_at_once(bench, size):
     members = tuple(range(size))
     found = verdicts(bench, bench.t[:, members] @ np.linspace(7.0, 14.0, size), 20)
@@ -168,6 +168,7 @@ def test_the_probability_of_a_name_is_the_rate_at_which_it_is_right(bench):
     assert np.mean(right) > np.mean(said) - 3.0 * error
 
 
+@pytest.mark.slow
 def test_what_is_not_in_the_library_is_unknown(bench):
     stranger = directions(1, 99)[:, 0] + 0.9 * bench.t[:, 5]
     found = verdicts(bench, 14.0 * stranger, 40)
@@ -244,6 +245,7 @@ def test_a_template_one_percent_wrong_is_forgiven(bench, where):
     assert sum(any(e.members == (3,) for e in one.explanations) for one in found) >= 20
 
 
+@pytest.mark.slow
 def test_a_wrong_template_is_not_forgiven(bench):
     stranger = directions(1, 14)[:, 0]
     t = bench.t[:, 3]
@@ -289,6 +291,7 @@ def drawing(bench: Bench, spread: np.ndarray) -> Bench:
     return wide
 
 
+@pytest.mark.slow
 def test_effect_that_draws_is_named_once_its_scatter_is_known(bench):
     spread = 6.0 * directions(5, 21)
     wide = drawing(bench, spread)

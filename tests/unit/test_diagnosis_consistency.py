@@ -102,6 +102,7 @@ def bench():
 THETA = np.array([2.0, 1.0])
 
 
+@pytest.mark.slow
 def test_a_true_effect_is_refused_as_seldom_as_the_levels_say(bench):
     found = [bench.findings(bench.t @ THETA, THETA, seed) for seed in range(300)]
     refused = sum(one.contradict(DiagnosisSettings()) for one in found)

@@ -361,6 +361,7 @@ def test_tables_of_spectra_have_no_map_pictures(diagnoses, tmp_path):
     assert DiagnosisResult.open(tmp_path).residual_maps is None
 
 
+@pytest.mark.slow
 def test_largest_picture_leaves_the_page_small(diagnoses):
     sky = np.random.default_rng(1).normal(size=(20, 12 * bipolar_scan.NSIDE**2))
     sky[3] *= 2.0

@@ -163,6 +163,7 @@ def test_random_probes_estimate_the_fisher_matrix(products, filters) -> None:
         assert np.abs(apart / np.sqrt(variance_of_probes(t, first, second, number, auto))).max() < 5.5
 
 
+@pytest.mark.slow
 def test_variance_is_the_inverse_of_the_fisher_matrix(products, filters) -> None:
     """Estimates from noisy masked maps of isotropic skies, within 4 errors of the sample variance."""
     draws = 400

@@ -169,6 +169,7 @@ def test_random_probes_agree_with_whole_matrices() -> None:
     assert np.sqrt(np.mean(departure**2)) < 0.05
 
 
+@pytest.mark.slow
 def test_one_map_has_the_information_of_its_bipolar_coefficients() -> None:
     """F = sum (2 - delta_M0) |dA|^2 / ((1 + delta_l1l2) C_l1 C_l2) over l1 <= l2, L, M; these effects end at L = 2."""
     run = one_map()
@@ -222,6 +223,7 @@ def test_additive_effect_has_its_signal_to_noise() -> None:
     assert found.effects[0].sigma == pytest.approx(1.0 / np.sqrt(found.fisher[2, 2]), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_unknown_dipole_hides_one_that_all_maps_share() -> None:
     """The variance of a residual dipole is that of the noise and that of the sky's: d.n of rms d has it d^2."""
     run = one_map()

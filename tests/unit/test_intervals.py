@@ -50,6 +50,7 @@ def test_intervals_cover_what_they_say():
     assert np.all(hits <= 199.5)
 
 
+@pytest.mark.slow
 def test_the_snr_at_a_power_is_that_of_the_probit():
     rng = np.random.default_rng(0)
     s = rng.uniform(1, 8, 3000)

@@ -97,6 +97,7 @@ def test_a_calibration_multiplies_sky_and_dipole_in_all_pixels():
         systematics.get("calibration")(amplitude=-1.5).beam(site.beam, site)
 
 
+@pytest.mark.slow
 def test_draws_have_the_widths_and_do_not_depend_on_each_other():
     run = model(*MANY)
     known = nuisances_of(run)
@@ -195,6 +196,7 @@ def linear(rng, p, count, t, widths):
     return root, drawn, rng.normal(size=(count, p)) @ root.T + drawn @ t.T
 
 
+@pytest.mark.slow
 def test_the_posterior_is_that_of_brute_force():
     """The product of likelihood and priors on a grid of two nuisances and an effect of any size."""
     rng = np.random.default_rng(1)

@@ -10,6 +10,7 @@ moments ``moments_W1_half1.fits`` and ``moments_W1_half2.fits``: nside 128, a ye
 
 import argparse
 import os
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib import ticker
 from numpy.typing import NDArray
 
 from mcsim import config, systematics
@@ -63,6 +65,9 @@ PARAMETERS: dict[str, dict[str, Any]] = {
     "excess_noise": {"amplitude": 0.001},
 }
 NOISE = ("noise_anisotropy", "noise_level")
+UNIFORM = dict.fromkeys(NOISE, "a change of the variance:\nno mean response") | {
+    "monopole_residual": "no power above ℓ = 0"
+}
 DIFFERENCING = ("transmission_imbalance", "mapmaking_convergence")
 
 Map = NDArray[np.float64]
@@ -88,7 +93,7 @@ def main() -> None:
     for proposed, picture in ((True, "effects.png"), (False, "effects-on-request.png")):
         shown = {name: maps for name, maps in found.items() if systematics.get(name).proposed is proposed}
         if shown:
-            draw(shown, arguments.output / picture, TITLE if proposed else TITLE.split(". The last three")[0])
+            draw(shown, arguments.output / picture, TITLE + ROUTE if proposed else TITLE)
 
 
 def response(name: str, arguments: argparse.Namespace, plain: dict[str | None, tuple[list[Map], list[Map]]]) -> Map:
@@ -177,50 +182,54 @@ def report(name: str, maps: Map) -> None:
 
 def draw(found: dict[str, Map], path: Path, title: str) -> None:
     """A map of the response of the first half and the spectra of both routes, for every effect."""
-    columns, rows = (7, 3) if len(found) > 10 else (5, 2)
-    wide, high = 7 / columns, 3 / rows
-    figure = plt.figure(figsize=(23 / wide, 12 / high))
+    columns = 6 if len(found) > 12 else 4
+    rows = -(-len(found) // columns)
+    figure = plt.figure(figsize=(2.8 * columns, 3.6 * rows), layout="constrained")
+    figure.suptitle(title, fontsize=12)
+    grid = figure.add_gridspec(2 * rows, columns, height_ratios=[1.0, 0.62] * rows)
     for place, (name, maps) in enumerate(found.items()):
-        column, row = place % columns, place // columns
-        left, bottom = 0.03 + column * 0.139 * wide, 1.0 - (0.33 + row * 0.304) * high
-        shown = healpy.smoothing(maps[0], fwhm=np.deg2rad(1.5)) if len(maps) == 4 else maps[0]
-        reach = np.percentile(np.abs(shown - (0.0 if name in NOISE else shown.mean())), 99.0)
-        colours = {"cmap": "RdBu_r", "min": -reach, "max": reach}
-        image = healpy.cartview(shown, return_projected_map=True, fig=99, xsize=500, **colours)
-        plt.close(99)
-        axes = figure.add_axes((left, bottom + 0.128 * high, 0.124 * wide, 0.122 * high), projection="mollweide")
-        lon, lat = (
-            np.linspace(-np.pi, np.pi, image.shape[1] + 1),
-            np.linspace(-np.pi / 2, np.pi / 2, image.shape[0] + 1),
-        )
-        axes.pcolormesh(lon, lat, np.asarray(image), cmap="RdBu_r", vmin=-reach, vmax=reach, rasterized=True)
-        axes.set_xticks([])
-        axes.set_yticks([])
-        effect = systematics.get(name)
-        unit = "of the variance" if name in NOISE else "uK"
-        axes.set_title(f"{name}\n{PARAMETERS[name]['amplitude']:g} {effect.unit}", fontsize=9)
-        axes.text(0.5, -0.07, f"±{reach:.2g} {unit}", transform=axes.transAxes, ha="center", va="top", fontsize=7.5)
-        below = figure.add_axes((left + 0.012 * wide, bottom, 0.112 * wide, 0.1 * high))
+        row, column = divmod(place, columns)
+        above = figure.add_subplot(grid[2 * row, column], projection="mollweide")
+        effect = systematics.build(name, PARAMETERS[name])
+        size = textwrap.fill(effect.format_amplitude(effect.amplitude), 36)
+        above.set_title(f"{effect.label()}\n{size}", fontsize=9)
+        sky(above, name, maps)
+        below = figure.add_subplot(grid[2 * row + 1, column])
         spectra(below, name, maps)
-        if row == rows - 1 or place + columns >= len(found):
-            below.set_xlabel("l", fontsize=8)
+        if place + columns >= len(found):
+            below.set_xlabel(r"multipole $\ell$", fontsize=8)
         if column == 0:
-            below.set_ylabel("l(l+1)C/2π, uK²", fontsize=8)
-    figure.text(0.5, 0.997, title, ha="center", va="top", fontsize=11)
-    figure.savefig(path, dpi=75)
+            below.set_ylabel(r"$\ell(\ell+1)C_\ell/2\pi$  [$\mu$K$^2$]", fontsize=8)
+    figure.savefig(path, dpi=80)
     plt.close(figure)
 
 
 TITLE = (
-    "Response of a channel to every effect: W1, 44', the first half of a year, ecliptic. Below each map its spectrum, "
-    "in the default route (line)\nand sample by sample (dots). The last three, without dots: scans of another kind, "
-    "in the default route alone"
+    "Response of a channel to every effect: W1, 44′, the first half of a year, ecliptic. Below each map its spectrum, "
+    "in the default route (line)\nand sample by sample (dots)."
 )
+ROUTE = " Scans of another kind (no dots) are in the default route alone"
+
+
+def sky(axes: Any, name: str, maps: Map) -> None:
+    shown = healpy.smoothing(maps[0], fwhm=np.deg2rad(1.5)) if len(maps) == 4 else maps[0]
+    reach = np.percentile(np.abs(shown - (0.0 if name in UNIFORM else shown.mean())), 99.0)
+    lon, lat = np.linspace(np.pi, -np.pi, 501), np.linspace(-np.pi / 2, np.pi / 2, 251)
+    middle_lon, middle_lat = (lon[1:] + lon[:-1]) / 2, (lat[1:] + lat[:-1]) / 2
+    pixels = healpy.ang2pix(healpy.npix2nside(shown.size), np.pi / 2 - middle_lat[:, None], middle_lon[None, :])
+    # Longitude grows to the left, as on the sky seen from inside.
+    image = axes.pcolormesh(-lon, lat, shown[pixels], cmap="RdBu_r", vmin=-reach, vmax=reach, rasterized=True)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    bar = axes.figure.colorbar(image, ax=axes, orientation="horizontal", shrink=0.7, aspect=30, pad=0.03)
+    bar.set_ticks([-reach, 0.0, reach], labels=[f"{value:.2g}" for value in (-reach, 0.0, reach)])
+    bar.set_label("relative change of the variance" if name in NOISE else r"$\mu$K", fontsize=7)
+    bar.ax.tick_params(labelsize=7)
 
 
 def spectra(axes: Any, name: str, maps: Map) -> None:
-    if name in NOISE:
-        axes.text(0.5, 0.5, "a change of the variance:\nno response but in autos", ha="center", va="center", fontsize=8)
+    if name in UNIFORM:
+        axes.text(0.5, 0.5, UNIFORM[name], ha="center", va="center", fontsize=8)
         axes.set_axis_off()
         return
     lmax = min(SHOWN_LMAX, 2 * healpy.npix2nside(maps.shape[1]))
@@ -231,6 +240,7 @@ def spectra(axes: Any, name: str, maps: Map) -> None:
     if len(power) > 1:
         axes.loglog(ell[::4], power[1][::4], ".", color="C3", ms=2.5)
     axes.set_ylim(power[0].max() * 1e-6, power[0].max() * 3.0)
+    axes.yaxis.set_major_locator(ticker.LogLocator(numticks=4))
     axes.tick_params(labelsize=7)
 
 

@@ -100,7 +100,7 @@ def draw_ratio(axes: Axes, store: Path, predicted: xr.Dataset, factors: ScanFact
     axes.set_xlabel(r"multipole $\ell$")
     axes.set_ylabel("scan over parallel transport")
     axes.margins(y=0.5)
-    axes.legend(frameon=False, fontsize=7, ncols=1)
+    axes.legend(framealpha=1.0, edgecolor="none", fontsize=7, ncols=1)
 
 
 def signal_to_noise(predicted: xr.Dataset, channel: str) -> dict[tuple[int, int], float]:
