@@ -4,6 +4,7 @@ import errno
 import shutil
 from pathlib import Path
 
+import dask
 import distributed
 import numpy as np
 import pytest
@@ -165,9 +166,11 @@ def test_foreign_folder_is_refused(client: Client, tmp_path: Path) -> None:
 
 def test_unreachable_scheduler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster, "ANSWER_S", 0.4)
+    before = dask.config.get("scheduler", None)
     with refused("tcp://127.0.0.1:1", "0.4 s"):
         runner.run(table(), tmp_path / "x.zarr", workers="tcp://127.0.0.1:1")
     assert list(tmp_path.iterdir()) == []
+    assert dask.config.get("scheduler", None) == before  # else no store could be opened in this session
 
 
 @pytest.mark.parametrize("workers", [0, -1])
