@@ -4,7 +4,10 @@ from pathlib import Path
 
 import xarray as xr
 
+from mcsim.bipolar import Mode
+from mcsim.config.preparation import frame_of
 from mcsim.ensemble import store
+from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError
 from mcsim.support.folders import user_path
 
@@ -85,3 +88,24 @@ def _opened(path: Path, group: str | None) -> xr.Dataset:
         for name in {*found.coords, "done"} & {*found.variables}:
             found.variables[name].load()
         return found
+
+
+def layout(path: Path, realizations: int) -> Layout:
+    """Return the layout of an existing store, with another number of realizations."""
+    with open_ensemble(path) as found:
+        attrs = found.attrs["configuration"]
+        kept = found.sizes.get("pixel")
+        indices = zip(*(found[name].values.tolist() for name in ("L", "M", "d")), strict=True)
+        return Layout(
+            realizations,
+            store.chunk(path),
+            tuple(found["map_name"].values.tolist()) if kept else (),
+            tuple(found["pair"].values.tolist()),
+            tuple(Mode(*each) for each in indices),
+            found.sizes["ell"] - 1,
+            "biposh_circular" in found,
+            kept,
+            frame=frame_of(attrs),
+            bin_width=attrs["biposh"]["summary_bin"],
+            filtered="biposh_qml" in found,
+        )
