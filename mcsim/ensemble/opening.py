@@ -1,8 +1,7 @@
 """Lazy opening of stored ensembles with xarray."""
 
 from pathlib import Path
-
-import xarray as xr
+from typing import TYPE_CHECKING
 
 from mcsim.bipolar import Mode
 from mcsim.config.preparation import frame_of
@@ -11,8 +10,11 @@ from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError
 from mcsim.support.folders import user_path
 
+if TYPE_CHECKING:
+    import xarray as xr
 
-def open_ensemble(path: str | Path) -> xr.Dataset:
+
+def open_ensemble(path: str | Path) -> "xr.Dataset":
     """Open the realizations of a store lazily.
 
     Parameters
@@ -44,7 +46,7 @@ def open_ensemble(path: str | Path) -> xr.Dataset:
     return _opened(target, None)
 
 
-def open_summary(path: str | Path) -> xr.Dataset:
+def open_summary(path: str | Path) -> "xr.Dataset":
     """Open the summary of a store: means, standard errors, standard deviations, binned spectra and covariances.
 
     Parameters
@@ -81,8 +83,10 @@ def open_summary(path: str | Path) -> xr.Dataset:
     return _opened(target, "summary")
 
 
-def _opened(path: Path, group: str | None) -> xr.Dataset:
+def _opened(path: Path, group: str | None) -> "xr.Dataset":
     """Open a group lazily; load its coordinates and ``done``, by which xarray selects rows."""
+    import xarray as xr  # here: workers start sooner without it
+
     with store.faults_named(path):
         found = xr.open_zarr(path, group=group)
         for name in {*found.coords, "done"} & {*found.variables}:
