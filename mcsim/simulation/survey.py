@@ -380,10 +380,13 @@ def _moments(
             return scan.Moments.from_pointing_files([path], grid.nside, smax, grid.frame, grid.offset_order)
         case config.ScanHitAveraged():
             model = scan_model(spec, spec.scan, split)
-            return scan.Moments.load(scan.cached_moments(model, grid, smax, nthreads, progress))
+            return _mapped(scan.cached_moments(model, grid, smax, nthreads, progress))
         case config.ScanMoments() | config.ScanDifferencing():
             raise TypeError("the caller reads files of moments, and a differencing scan has no moments")
 
+
+_mapped = lru_cache(maxsize=16)(scan.Moments.load)
+"""Moments of a folder of the cache, whose name says what is in it: mapped into memory once for all surveys."""
 
 @lru_cache(maxsize=16)
 def _moments_of_file(path: Path, nside: int, smax: int | None, frame: str) -> scan.Moments:
