@@ -15,6 +15,7 @@ from mcsim.comparison import pairs
 from mcsim.comparison.prediction import Prediction, Set
 from mcsim.comparison.scene_differences import PsiSign
 from mcsim.comparison.shown_sky import with_shown_sky
+from mcsim.comparison.time_differences import Interpolation
 from mcsim.ensemble.maps import write_map
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
@@ -224,11 +225,16 @@ def test_differencing_scans_are_refused():
         mcsim.compare([np.zeros(3072)] * 2, [np.ones(3072)] * 2, SMALL | {"channel": [channel]})
 
 
-def test_noise_in_common_hides_no_more_than_is_expected_of_it():
-    simulator = Simulator(small())
+def noise_of(simulator: Simulator) -> Maps:
+    """Return noise of 60 uK a sample for every map."""
     draw = np.random.default_rng(6)
     hits = [m.moments.hits for m in survey(simulator.run).making.channels[0].maps]
-    noise = [60.0 * draw.standard_normal(h.size) / np.sqrt(np.maximum(h, 1.0)) for h in hits]
+    return [60.0 * draw.standard_normal(h.size) / np.sqrt(np.maximum(h, 1.0)) for h in hits]
+
+
+def test_noise_in_common_hides_no_more_than_is_expected_of_it():
+    simulator = Simulator(small())
+    noise = noise_of(simulator)
     a, b = ([m + n for m, n in zip(made, noise, strict=True)] for made in (simulator(), ODD["psi_sign"](simulator)))
     found = mcsim.compare(a, b, simulator.run)
     assert names(found) == ["psi_sign"]
@@ -236,4 +242,19 @@ def test_noise_in_common_hides_no_more_than_is_expected_of_it():
     problem = Prediction(with_shown_sky(given.pairs[0]), (), 0.0)
     alone = problem.corrected(Set(((PsiSign(), np.ones(1)),), 1.0))
     assert 0.02 < alone.left < 0.5
+    assert problem.hidden(alone) == pytest.approx(alone.left, rel=0.3)
+
+
+def test_noise_hides_what_a_coarse_grid_makes_of_the_sky_too():
+    """Looked up between the pixels of a map of the same nside, of which noise hides the small scales."""
+    simulator = Simulator(small(beam=mcsim.Beam.gaussian(380.0, 32)))
+    smooth = healpy.alm2map(healpy.almxfl(simulator.sky, simulator.site.beam.window), 16, lmax=32)
+    made = simulator(), simulator(
+        sky=np.zeros_like(simulator.sky), added=lambda seen: healpy.get_interp_val(smooth, seen.theta, seen.phi)
+    )  # fmt: skip
+    a, b = ([m + n for m, n in zip(side, noise_of(simulator), strict=True)] for side in made)
+    problem = Prediction(with_shown_sky(pairs.given(a, b, simulator.run).pairs[0]), (), 0.0)
+    members = ((Interpolation(), np.array([16.0, 1.0])),)
+    alone = Set(members, problem.left(members))
+    assert 0.1 < alone.left < 0.5
     assert problem.hidden(alone) == pytest.approx(alone.left, rel=0.3)
