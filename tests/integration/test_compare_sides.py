@@ -109,6 +109,27 @@ def test_maps_at_the_centres_of_pixels_are_recognised(simulator):
     assert found.channels[0].left < 1e-4
 
 
+@pytest.mark.parametrize(("windowed", "factor"), [(False, 1.0), (False, 1.01), (True, 1.0)])
+def test_a_map_that_ud_grade_made_of_a_finer_one_is_recognised(windowed, factor, simulator):
+    """Its pixels are means of 16, whose window changes over the sky as the shapes of the pixels do."""
+    run = replace(simulator.run, map=replace(simulator.run.map, splits=()))
+    smooth = healpy.almxfl(simulator.sky, simulator.site.beam.window)
+    window = mcsim_window() if windowed else np.ones(LMAX + 1)
+    here = healpy.alm2map(healpy.almxfl(smooth, window), NSIDE, lmax=LMAX)
+    degraded = factor * healpy.ud_grade(healpy.alm2map(smooth, 4 * NSIDE, lmax=LMAX), NSIDE)
+    (found,) = mcsim.compare([here], [degraded], run).channels
+    assert {d.name for d in found.differences} == {"pixel_window"} | ({"calibration"} if factor > 1.0 else set())
+    window = next(d for d in found.differences if d.name == "pixel_window")
+    assert window.amplitude == 1.0
+    assert window.parameters["by"].startswith("the mean of 16 sub-pixels")
+    assert ("in place of" in window.parameters["by"]) == windowed
+    assert found.left < 1e-6
+    if factor == 1.0:
+        (found,) = mcsim.compare([degraded], [here], run).channels
+        assert [(d.name, d.amplitude) for d in found.differences] == [("pixel_window", -1.0)]
+        assert found.left < 0.02
+
+
 def test_files_are_compared_from_the_command_line(tmp_path, simulator, side_a):
     sides = {"a": side_a, "b": scaled(side_a, 1.01)}
     for side, maps in sides.items():
