@@ -388,6 +388,7 @@ def _moments(
 _mapped = lru_cache(maxsize=16)(scan.Moments.load)
 """Moments of a folder of the cache, whose name says what is in it: mapped into memory once for all surveys."""
 
+
 @lru_cache(maxsize=16)
 def _moments_of_file(path: Path, nside: int, smax: int | None, frame: str) -> scan.Moments:
     """Read moments once for all surveys of a process that differ in effects alone."""
