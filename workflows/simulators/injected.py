@@ -37,6 +37,8 @@ def changes(given: inputs.Inputs, scan: str) -> dict[str, tuple[dict[str, Any], 
     """Return the arguments of two sizes of every difference, by the name that is right."""
     window, beam = pixel_window(NSIDE, LMAX), given.channels[0].beam.window[: LMAX + 1]
     x, late = np.array(healpy.pix2vec(NSIDE, np.arange(NPIX))), 0.01 if scan == "litebird" else 0.0005
+    theta, phi = healpy.pix2ang(NSIDE, np.arange(NPIX))
+    mirrored = np.pi - theta, phi
     names = [name for c in given.channels for name, _ in inputs.parts(given, c)]
 
     def filtered(factor: Vector) -> dict[str, Any]:
@@ -71,6 +73,7 @@ def changes(given: inputs.Inputs, scan: str) -> dict[str, tuple[dict[str, Any], 
             {"sky": lambda sky: rotate_alm(sky, LMAX, "galactic", "ecliptic")},
             {"sky": lambda sky: turned(sky, 0.1)},
         ),
+        "frame_reversed": ({"sky": np.conj}, mapped(lambda m: m[healpy.ang2pix(NSIDE, *mirrored)])),
         "calibration": (filtered(np.full(LMAX + 1, 1.02)), filtered(np.full(LMAX + 1, 0.9996))),
         "unit": (mapped(lambda m: 1e-6 * m), mapped(lambda m: m / 1.2505)),
         "monopole": (mapped(lambda m: m + 5.0), mapped(lambda m: m - 0.3)),
