@@ -388,7 +388,6 @@ def _moments(
 _mapped = lru_cache(maxsize=16)(scan.Moments.load)  # once for all surveys: the folder's name says what is in it
 
 
-
 @lru_cache(maxsize=16)
 def _moments_of_file(path: Path, nside: int, smax: int | None, frame: str) -> scan.Moments:
     """Read moments once for all surveys of a process that differ in effects alone."""
