@@ -385,8 +385,7 @@ def _moments(
             raise TypeError("the caller reads files of moments, and a differencing scan has no moments")
 
 
-_mapped = lru_cache(maxsize=16)(scan.Moments.load)
-"""Moments of a folder of the cache, whose name says what is in it: mapped into memory once for all surveys."""
+_mapped = lru_cache(maxsize=16)(scan.Moments.load)  # once for all surveys: the folder's name says what is in it
 
 
 @lru_cache(maxsize=16)
