@@ -12,7 +12,7 @@ from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.slices import northern
 from mcsim.datavector.summaries import Element, bins
-from mcsim.stats.gaussian import SimulatedGaussian
+from mcsim.stats.gaussian import SimulatedGaussian, Tolerated
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.support.numbers import number, p_equals
 from mcsim.systematics import Effect
@@ -245,7 +245,9 @@ class Slices:
         if further < 1 or np.any(errors == 0.0):
             return None
         allowance = self._tolerated(null, whole.amplitudes[-1] * response[rows])
-        p = float(null.nested_test(max(whole.chi2 - apart.chi2, 0.0), whole.chi2, further, fitted, allowance))
+        p = float(
+            null.nested_test(max(whole.chi2 - apart.chi2, 0.0), whole.chi2, further, fitted, Tolerated(allowance))
+        )
         best = int(np.argmax(amplitudes / errors))
         found = null.fit(x, np.column_stack([beside, parts[best], sum(parts) - parts[best]]))
         variance = found.errors[-1] ** 2 + action.error**2 + self.settings.consistency_error**2

@@ -9,8 +9,8 @@ from mcsim.datavector.candidate import Candidate, beyond, columns_of, coordinate
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.errors import InputError
-from mcsim.stats.excess import scatter_chi2
-from mcsim.stats.gaussian import Fit, with_drawn_scatter
+from mcsim.stats.gaussian import Fit
+from mcsim.stats.scattered import Acting, with_drawn_scatter
 from mcsim.support.arrays import Matrix, Vector
 
 
@@ -61,7 +61,7 @@ class Refiner:
         -----
         A response that is simulated at its coordinates changes its templates to the secant, exact there. A candidate
         that can have neither the fitted amplitude nor half of it is taken out. Of a stochastic one the scatter of the
-        response is kept, of any other one the chi^2 that its scatter adds to a residual. Where the power of a
+        response is kept, of any other one by how much it scatters the data. Where the power of a
         stochastic one counts, which grows as the square of the amplitude, the secant at a_0 finds a^2/a_0 for a: the
         mean of this and a_0 is Newton's step.
         """
@@ -94,8 +94,8 @@ class Refiner:
                 if stochastic:
                     tried[index] = replace(tried[index], scatter=self.data.scatter(changes), shape_error=None)
                 elif pair is not None:
-                    added = scatter_chi2(self.context.null, t[:, columns], *pair)
-                    tried[index] = replace(tried[index], scatter_chi2=added)
+                    acting = Acting.of(self.context.null, t, [one.columns for one in tried], index, pair)
+                    tried[index] = replace(tried[index], acting=acting)
             if not changed:
                 break
             found = self._attribute(t, tried)

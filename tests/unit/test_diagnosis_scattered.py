@@ -7,8 +7,9 @@ import pytest
 
 from mcsim.datavector.candidate import Candidate
 from mcsim.diagnosis.subsets import Subsets
-from mcsim.stats.gaussian import SimulatedGaussian, with_scatter
+from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate
+from mcsim.stats.scattered import Acting, with_scatter
 from mcsim.systematics import Effect
 
 P, SKIES = 12, 4000
@@ -42,20 +43,32 @@ def test_the_error_of_a_response_from_few_skies_adds() -> None:
     assert np.mean(growth) == pytest.approx(spread**2 * (1.0 + 1.0 / skies), abs=0.5)
 
 
-def test_further_effects_are_not_found_in_the_scatter_of_one() -> None:
-    """Beside an effect that makes the noise 1.3 times as large the p-values of all others stay those of no effect."""
-    rng, count, snr, draws, growth = np.random.default_rng(7), 60, 25.0, 400, 1.3
-    null, t = SimulatedGaussian.from_simulations(rng.normal(size=(800, count))), rng.normal(size=(count, 12))
-    t /= np.linalg.norm(t, axis=0)
-    effects = [type(f"effect{k}", (Effect,), {"name": f"effect{k}", "unit": "", "step": 1.0}) for k in range(12)]
-    quiet = [Candidate(effect, None, (k,)) for k, effect in enumerate(effects)]
-    loud = [replace(quiet[0], scatter_chi2=(growth**2 - 1.0) * (count - 1.0) / snr**2), *quiet[1:]]
-    groups = null.whiten_groups(t, [one.columns for one in quiet])
+@pytest.mark.parametrize(
+    ("growth", "spread"), [(1.6, 0.0), (1.0, 2.0)], ids=["more noise in some elements", "a response that scatters"]
+)
+def test_further_effects_are_not_found_in_the_scatter_of_one(growth: float, spread: float) -> None:
+    """Beside an effect that makes some elements noisier the p-values of all others stay those of no effect.
+
+    Eight skies tell by how much.
+    """
+    rng, count, snr, draws, skies = np.random.default_rng(7), 30, 25.0, 200, 8
+    null, t = SimulatedGaussian.from_simulations(rng.normal(size=(800, count))), np.eye(count)[:, 7:14]
+    factor, wide = np.where(np.arange(count) < 10, growth, 1.0), np.where(np.arange(count) < 10, spread, 0.0)
+    columns = [(k,) for k in range(7)]
+    effects = [type(f"effect{k}", (Effect,), {"name": f"effect{k}", "unit": "", "step": 1.0}) for k in range(7)]
+    quiet = [Candidate(effect, None, own) for effect, own in zip(effects, columns, strict=True)]
+    groups = null.whiten_groups(t, columns)
     calibration, found = calibrate(null, groups), []
+
+    def with_effect(rows: np.ndarray) -> np.ndarray:
+        return factor * rows + snr * t[:, 6] + wide * rng.normal(size=rows.shape)
+
     for _ in range(draws):
-        y = null.whiten(snr * t[:, 0] + growth * rng.normal(size=count))
+        before = rng.normal(size=(skies, count))
+        loud = [*quiet[:6], replace(quiet[6], acting=Acting.of(null, t, columns, 6, (before, with_effect(before))))]
+        y = null.whiten(with_effect(rng.normal(size=(1, count)))[0])
         searches = (Subsets(null, y, groups, own, calibration) for own in (quiet, loud))
-        found.append([one.beside(np.array([[0]])).min() <= 0.05 for one in searches])
+        found.append([one.beside(np.array([[6]])).min() <= 0.05 for one in searches])
     ignored, charged = np.mean(found, axis=0)
     assert abs(charged - 0.05) < 3.0 * np.sqrt(0.05 * 0.95 / draws)
     assert ignored > 0.15

@@ -285,8 +285,8 @@ def further(number):
     """Look beside a strong effect that acts alone, and print how often the global p-value of another is small."""
     from mcsim.datavector.candidate import columns_of
     from mcsim.diagnosis.subsets import Subsets
-    from mcsim.stats.excess import scatter_chi2
     from mcsim.stats.intervals import share
+    from mcsim.stats.scattered import Acting
 
     run, context = learned(SMALL)
     null, settings, skies = context.null, context.settings, context.settings.constrained_skies
@@ -301,10 +301,10 @@ def further(number):
         # Exact at this amplitude, as the template of an effect that was simulated at it.
         theta = null.fit(null.mean + change, t[:, columns]).amplitudes
         t[:, columns] += np.outer(change - t[:, columns] @ theta, theta / (theta @ theta))
-        groups = null.whiten_groups(t, [one.columns for one in context.candidates])
-        charged = [*context.candidates]
-        added = scatter_chi2(null, t[:, columns], before[:skies], after[:skies])
-        charged[member] = replace(charged[member], scatter_chi2=added)
+        every, charged = [one.columns for one in context.candidates], [*context.candidates]
+        groups = null.whiten_groups(t, every)
+        acting = Acting.of(null, t, every, member, (before[:skies], after[:skies]))
+        charged[member] = replace(charged[member], acting=acting)
         rows = []
         for x in after[skies:] + context.ensemble.offset:
             y = null.whiten(x)
