@@ -1,7 +1,7 @@
 """Observed maps: read them, refuse what the model cannot describe, and prepare them for a diagnosis."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 from typing import Literal
@@ -9,15 +9,14 @@ from typing import Literal
 import numpy as np
 
 from mcsim import config
-from mcsim.datavector.analysis import Job
-from mcsim.datavector.campaign import after_jobs, constrained_jobs
 from mcsim.datavector.localisation import Place, places, standardised
-from mcsim.datavector.wiener_filter import Part, shared_sky
+from mcsim.datavector.same_skies import SameSkies
+from mcsim.datavector.wiener_filter import Part
 from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.nuisance import half_given_other
 from mcsim.diagnosis.selection import Attribution
 from mcsim.stats.look_elsewhere import global_test
-from mcsim.support.arrays import Alm, Map, Matrix, Vector
+from mcsim.support.arrays import Map, Matrix, Vector
 
 _Skies = Literal["reference", "typical", "constrained"]
 
@@ -49,17 +48,9 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         return np.concatenate([self.x, self._measured[3]])
 
     @cached_property
-    def observed_sky(self) -> Alm:
-        """Return the filtered sky of the maps, uK, shape (size,)."""
-        return shared_sky(self.context.analysis.model, self.data)
-
-    @cached_property
-    def _before(self) -> dict[tuple[bool, bool], list[Vector]]:
-        """Return data vectors of skies without any effect, as many as were needed so far.
-
-        Keys are True for constrained skies, and for an external simulator.
-        """
-        return {(constrained, external): [] for constrained in (False, True) for external in (False, True)}
+    def same_skies(self) -> SameSkies:
+        """Return what simulates responses."""
+        return SameSkies(self.context.analysis, self.ask, self.data)
 
     def respond(self, found: Sequence[config.Effect], skies: int) -> Matrix:
         """Return changes of the data vector in ``skies`` constrained skies, shape (rows, p).
@@ -76,11 +67,11 @@ class ObservedMaps(DataSet[Sequence[Map]]):
             kinds[self._skies_of(effect)].append(effect)
         shift = np.zeros((1, len(self.extended)))
         if own := kinds["reference"]:
-            changes = self._simulated(own) - self.context.extended_reference(own)
+            changes = self.same_skies.of_reference(own) - self.context.extended_reference(own)
             shift = changes.mean(axis=0) if len(own) < len(found) else changes
         for kind in ("typical", "constrained"):
             if own := kinds[kind]:
-                before, after = self._pair(own, skies, kind == "constrained")
+                before, after = self.same_skies.pair(own, skies, kind == "constrained")
                 shift = shift + after - before
         return shift
 
@@ -88,33 +79,9 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         """Return data vectors of the same skies without effects and with them, shape (rows, p) each."""
         size = len(self.x)
         if any(self._skies_of(effect) == "reference" for effect in found):
-            return self.context.reference(found), self._simulated(found)[:, :size]
-        before, after = self._pair(found, self.context.settings.constrained_skies, True)
+            return self.context.reference(found), self.same_skies.of_reference(found)[:, :size]
+        before, after = self.same_skies.pair(found, self.context.settings.constrained_skies, True)
         return before[:, :size], after[:, :size]
-
-    def _simulated(self, found: Sequence[config.Effect]) -> Matrix:
-        """Return extended data vectors of the skies of the reference with effects, shape (rows, p + E)."""
-        return self._extended(after_jobs(self.context.analysis, found))
-
-    def _pair(self, found: Sequence[config.Effect], skies: int, constrained: bool) -> tuple[Matrix, Matrix]:
-        """Return extended data vectors of the same skies without effects and with them, (skies, p + E) each."""
-        analysis = self.context.analysis
-        source = analysis.source_of(found, given_sky=constrained)
-
-        def simulated(found: Sequence[config.Effect], first: int) -> Matrix:
-            if constrained:
-                jobs = constrained_jobs(analysis, found, self.observed_sky, range(first, skies))
-            else:
-                jobs = after_jobs(analysis, found, skies)
-            return self._extended([replace(job, source=source) for job in jobs])
-
-        after, before = simulated(found, 0), self._before[constrained, source is not None]
-        if len(before) < skies:
-            before.extend(simulated((), len(before))[-(skies - len(before)) :])
-        return np.stack(before[:skies]), after
-
-    def _extended(self, jobs: Sequence[Job]) -> Matrix:
-        return np.concatenate(self.ask([replace(job, slices=True) for job in jobs]))
 
     def _skies_of(self, effect: config.Effect) -> _Skies:
         how = dict(self.context.analysis.library)[effect.name].parametrization

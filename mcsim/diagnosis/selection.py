@@ -283,12 +283,10 @@ class _Selection:
                 if len({self.candidates[index].identity for index in members}) < size:
                     continue
                 known, columns = [scatters[index] for index in members], [c.columns for c in self.candidates]
-                wide, variance = (
-                    self.null.with_extra_covariance(*known),
-                    variance_beside(self.null, self.t, columns, members, known),
-                )
+                wide = self.null.with_extra_covariance(*known)
+                beside = variance_beside(self.null, self.t, columns, members, known)
                 groups, y = wide.whiten_groups(self.t, columns), wide.whiten(self.x)
-                yield Subsets(wide, y, groups, self.candidates, self.calibration, self.settings, members, variance)
+                yield Subsets(wide, y, groups, self.candidates, self.calibration, self.settings, members, beside)
 
     def _possible(self, found: Iterable[_Accepted]) -> Iterator[_Accepted]:
         """Yield the sets whose fitted amplitudes are possible, with the evidence of the nearest ones within bounds."""

@@ -14,6 +14,7 @@ from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.stats.detection import log_evidence
 from mcsim.stats.gaussian import COLLINEAR, SimulatedGaussian, Tolerated, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration
+from mcsim.stats.scattered import Beside
 from mcsim.support.arrays import Vector
 
 # Relative to columns of norm one: keeps the normal equations of degenerate effects solvable, far below any noise.
@@ -58,7 +59,7 @@ class Subsets:
     settings: DiagnosisSettings = field(default_factory=DiagnosisSettings)
     # Candidates whose scatter is in ``null``: subsets contain these, and no other one whose scatter is known.
     scattered: tuple[int, ...] = ()
-    variance: Vector | float = 1.0  # of held-out draws of these along each candidate, over what ``null`` says, (C,)
+    variance: Vector | None = None  # of held-out draws of these along each candidate, over what ``null`` says, (C,)
 
     @cached_property
     def total(self) -> float:
@@ -88,15 +89,9 @@ class Subsets:
         return np.array([default if c.shape_error is None else c.shape_error for c in self.candidates])
 
     @cached_property
-    def _acting(self) -> tuple[Vector, Vector, Vector, Vector]:
-        """Return size and chi^2, (C,), and excess of variance and its error, (C, C), of what is known to act."""
-        none = np.zeros(len(self.candidates))
-        rows = [
-            (np.inf, 0.0, none, none) if (one := c.acting) is None else (one.size, one.chi2, one.excess, one.error)
-            for c in self.candidates
-        ]
-        size, chi2, excess, error = (np.array(column) for column in zip(*rows, strict=True))
-        return size, chi2, excess, error
+    def _beside(self) -> Beside:
+        """Return how much the candidates that act scatter the data."""
+        return Beside.of([candidate.acting for candidate in self.candidates], self.variance)
 
     @cached_property
     def _identity(self) -> Rows:
@@ -169,8 +164,8 @@ class Subsets:
         np.add.at(part.T, place, fitted.T**2)
         part = np.minimum(part, delta_chi2[:, None])
         allowance = np.sum(self._errors[subsets] ** 2 * part, axis=1)
-        size_at, added, _, _ = self._acting
-        scatter = np.sum((added / size_at)[subsets] * part, axis=1)
+        parts = part / self._beside.size[subsets]
+        scatter = np.sum(self._beside.chi2[subsets] * parts, axis=1)
         weights = np.array([candidate.prior for candidate in self.candidates])
         prior = special.gammaln(size + 1) + np.log(weights / weights.sum())[subsets].sum(axis=1)
         return Solved(
@@ -178,7 +173,7 @@ class Subsets:
             pvalue=null.residual_test(self.total - delta_chi2, K, allowance + scatter),
             evidence=log_evidence(null, self.total, delta_chi2, K, self.settings.prior_snr) + prior,
             allowance=allowance,
-            parts=np.minimum(part / size_at[subsets], 1.0),
+            parts=np.minimum(parts, 1.0),
         )
 
     def least_needed(self, subsets: Rows) -> Vector:
@@ -193,25 +188,12 @@ class Subsets:
             chi2, tolerated = np.full(len(subsets), self.total), Tolerated()
             if others.shape[1]:
                 without = self.solve(others)
-                chi2, tolerated = without.chi2, self._tolerated(without, others, subsets[:, place, None])
-                tolerated = Tolerated(*(np.asarray(one)[:, 0] for one in tolerated))
+                own = self._beside.tolerated(without.allowance, others, without.parts, subsets[:, place, None])
+                chi2, tolerated = without.chi2, Tolerated(*(np.asarray(one)[:, 0] for one in own))
             fitted = self.groups.sizes[subsets].sum(axis=1) - rank
             pvalues = self.null.nested_test(chi2 - whole.chi2, chi2, rank, fitted, tolerated)
             largest = np.maximum(largest, self.calibration.global_pvalue(pvalues))
         return largest
-
-    def _tolerated(self, solved: Solved, subsets: Rows, others: Rows) -> Tolerated:
-        """Return what tests of candidates ``others``, shape (M or 1, N), beside subsets tolerate, shape (M, N) each."""
-        _, _, excess, error = self._acting
-        shape = (len(subsets), others.shape[1])
-        variance = np.broadcast_to(self.variance, len(self.candidates))[others] + np.zeros(shape)
-        squared = np.zeros(shape)
-        for member, part in zip(subsets.T, solved.parts.T, strict=True):
-            variance += part[:, None] * excess[member[:, None], others]
-            squared += part[:, None] ** 2 * error[member[:, None], others]
-        variance = np.maximum(variance, 1.0)
-        dof = 2.0 * variance**2 / np.maximum(squared, 1e-12)
-        return Tolerated(np.broadcast_to(solved.allowance[:, None], shape), variance, dof)
 
     def beside(self, subsets: Rows) -> Vector:
         """Return the global p-value of each candidate beside each subset, shape (M, C); 1 if members exclude it."""
@@ -233,7 +215,7 @@ class Subsets:
             kept = values > COLLINEAR
             delta_chi2 = np.sum(np.where(kept, along**2 / np.where(kept, values, 1.0), 0.0), axis=-1)
             added = kept.sum(axis=-1)
-            tolerated = self._tolerated(solved, subsets, others[None, :])
+            tolerated = self._beside.tolerated(solved.allowance, subsets, solved.parts, others[None, :])
             pvalues = self.null.nested_test(delta_chi2, solved.chi2[:, None], added, K, tolerated)
             exclusive = np.any(self._identity[subsets][:, :, None] == self._identity[others], axis=1)
             found[:, others] = np.where(exclusive, 1.0, pvalues)

@@ -4,12 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mcsim.stats.excess import scatter_chi2
 from mcsim.stats.few_draws import scores_of_draws, without
-from mcsim.stats.gaussian import COLLINEAR, Fit, SimulatedGaussian, orthonormal
+from mcsim.stats.gaussian import COLLINEAR, Fit, SimulatedGaussian, Tolerated, orthonormal
 from mcsim.support.arrays import Matrix, Vector, divided
 
+Indices = NDArray[np.int64]
 Groups = Sequence[Sequence[int]]
 """Columns of the templates of each candidate."""
 
@@ -42,15 +44,12 @@ class Acting:
 
         Notes
         -----
-        Along a direction the data are x without the effect and x + c with it, and x has the variance one. With b the
-        regression of c on x, and r the variance that it leaves, the variance becomes v = (1 + b)^2 + r; (b^2 + r)/skies
-        are due to the response, which is a mean of as many skies. Noise that grows alike in all skies has r = 0, and
-        few skies tell it exactly. The error of b is r/nu, that of r 2 r^2/nu, nu the skies less one.
+        The variance along a group is that of :func:`_growth`, with the mean of the changes as response.
         """
         before, after = (null.whiten_templates(rows.T).T for rows in pair)
         change = after - before
         basis, _ = orthonormal(null.whiten_templates(t[:, list(groups[own])]))
-        size, skies = float(np.sum(change.mean(axis=0) ** 2)), len(change)
+        size = float(np.sum(change.mean(axis=0) ** 2))
         x, c = (np.sqrt(null.hartlap_factor) * (rows - rows.mean(axis=0)) for rows in (before, change))
         excess, error = np.zeros((2, len(groups)))
         for number, columns in enumerate(groups):
@@ -58,12 +57,72 @@ class Acting:
             beside, _ = orthonormal(white - basis @ (basis.T @ white))
             if number == own or not beside.shape[1]:
                 continue
-            along, moved, nu = x @ beside, c @ beside, (skies - 1.0) * beside.shape[1]
-            b = float(np.sum(along * moved) / max(np.sum(along**2), 1e-300))
-            r = float(np.sum((moved - b * along) ** 2)) / max(nu - 1.0, 1.0)
-            excess[number] = (1.0 + b) ** 2 + r + (b**2 + r) / skies - 1.0
-            error[number] = (4.0 * (1.0 + b) ** 2 * r + 2.0 * r**2) / nu
+            excess[number], error[number] = _growth(x @ beside, c @ beside)
         return cls(size, scatter_chi2(null, t[:, list(groups[own])], *pair) * size, excess, error)
+
+
+def _growth(x: Matrix, c: Matrix) -> tuple[float, float]:
+    """Return by how much the variance of x grows if c is added to it, and the squared standard error of this.
+
+    Both are deviations from their means, shape (skies, K), x of variance one.
+
+    Notes
+    -----
+    With b the regression of c on x, and r the variance that it leaves, the variance of x + c is (1 + b)^2 + r, and
+    (b^2 + r)/skies adds if the mean of c is taken for the response. Noise that grows alike everywhere has r = 0: few
+    skies tell it exactly, whereas variances before and after have the error of few skies. With nu degrees of freedom
+    the squared error of b is r/nu, by which b^2 is too large, that of r 2 r^2/nu.
+    """
+    skies, columns = x.shape
+    nu = (skies - 1.0) * columns
+    b = float(np.sum(x * c) / max(np.sum(x**2), 1e-300))
+    r = float(np.sum((c - b * x) ** 2)) / max(nu - 1.0, 1.0)
+    growth = (1.0 + b) ** 2 - 1.0 + r - r / nu + (b**2 + r) / skies
+    return growth, (4.0 * (1.0 + b) ** 2 * r + 2.0 * r**2) / nu
+
+
+@dataclass(frozen=True)
+class Beside:
+    """Combine what C candidates that act add to the scatter of the data beside them.
+
+    Attributes
+    ----------
+    size, chi2
+        Those of :class:`Acting`, infinite and 0 where none is known, shape (C,).
+    excess, error
+        The same, a row for each candidate that acts, shape (C, C).
+    variance
+        Along each candidate, by :func:`variance_beside` of those that draw their pattern, shape (C,).
+    """
+
+    size: Vector
+    chi2: Vector
+    excess: Matrix
+    error: Matrix
+    variance: Vector
+
+    @classmethod
+    def of(cls, acting: Sequence[Acting | None], variance: Vector | None) -> "Beside":
+        """Take what is known of each candidate; without a variance none draws its pattern."""
+        none = np.zeros(len(acting))
+        rows = [(np.inf, 0.0, none, none) if a is None else (a.size, a.chi2, a.excess, a.error) for a in acting]
+        size, chi2, excess, error = (np.array(column) for column in zip(*rows, strict=True))
+        return cls(size, chi2, excess, error, np.ones(len(acting)) if variance is None else variance)
+
+    def tolerated(self, allowance: Vector, members: Indices, parts: Matrix, others: Indices) -> Tolerated:
+        """Return what tests of candidates ``others``, shape (M or 1, N), beside M sets tolerate, shape (M, N) each.
+
+        ``allowance``, shape (M,), is that of :class:`~mcsim.stats.gaussian.Tolerated`, ``members`` are the sets, and
+        ``parts`` the squared amplitudes of the members over those at which they were simulated, shape (M, size).
+        """
+        shape = (len(members), others.shape[1])
+        variance, squared = np.broadcast_to(self.variance[others], shape).copy(), np.zeros(shape)
+        for member, part in zip(members.T, parts.T, strict=True):
+            variance += part[:, None] * self.excess[member[:, None], others]
+            squared += part[:, None] ** 2 * self.error[member[:, None], others]
+        variance = np.maximum(variance, 1.0)
+        dof = 2.0 * variance**2 / np.maximum(squared, 1e-12)
+        return Tolerated(np.broadcast_to(allowance[:, None], shape), variance, dof)
 
 
 def with_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, before: Matrix, after: Matrix) -> Fit:
@@ -74,18 +133,18 @@ def with_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, before: Matrix,
 
     Notes
     -----
-    A strong effect changes the scatter of the data. The fit is linear, so that it is applied to every sky. The variance
-    of each amplitude grows by its excess among the skies with the effects over that without them: the same skies, whose
-    common scatter cancels. The response that is fitted is a mean of as many skies: the variance of the amplitudes that
-    the changes of single skies have, over their number, adds. Correlations stay; errors are not made smaller.
+    A strong effect changes the scatter of the data. The fit is linear, so that it is applied to every sky: the variance
+    of each amplitude grows by :func:`_growth`. The error is the standard deviation of a Student t with the degrees of
+    freedom from which this is known. Correlations stay; errors are not made smaller.
     """
     basis, back = orthonormal(null.whiten_templates(t))
-    without, acting, change = (
-        np.var(back @ basis.T @ null.whiten_templates(rows.T), axis=1, ddof=1)
-        for rows in (before, after, after - before)
-    )
-    own, added = np.diag(found.covariance), np.maximum(acting - without + change / len(before), 0.0)
-    factor = np.sqrt(1.0 + divided(added, own))
+    own = np.sqrt(np.diag(found.covariance))
+    fits = (back @ basis.T @ null.whiten_templates((rows - rows.mean(axis=0)).T) for rows in (before, after - before))
+    x, c = (divided(rows, own[:, None]) for rows in fits)
+    growth, error = np.array([_growth(one[:, None], other[:, None]) for one, other in zip(x, c, strict=True)]).T
+    variance = 1.0 + np.maximum(growth, 0.0)
+    dof = 2.0 * variance**2 / np.maximum(error, 1e-12)
+    factor = np.sqrt(variance * dof / np.maximum(dof - 2.0, 1.0))
     return replace(found, covariance=factor[:, None] * found.covariance * factor)
 
 

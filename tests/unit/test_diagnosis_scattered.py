@@ -30,17 +30,28 @@ def test_errors_grow_with_the_scatter_and_never_shrink(growth: float) -> None:
     np.testing.assert_allclose(_correlation(wide.covariance), _correlation(found.covariance), rtol=1e-12)
 
 
-def test_the_error_of_a_response_from_few_skies_adds() -> None:
-    """A response that differs from sky to sky: once in the data, and once more over the number of skies."""
-    rng, skies, spread = np.random.default_rng(5), 4, 2.0
+def test_pulls_have_unit_width_where_few_skies_tell_the_scatter() -> None:
+    """A response that differs from sky to sky: once in the data, and once more in the mean over eight skies."""
+    rng, skies, spread = np.random.default_rng(5), 8, 2.0
     model, t = SimulatedGaussian(np.zeros(P), np.eye(P), 1_000_000), np.eye(P)[:, :1]
-    found, growth = model.fit(20.0 * t[:, 0], t), []
+    found, pulls = model.fit(20.0 * t[:, 0], t), []
     for _ in range(2000):
-        before = rng.normal(size=(skies, P))
-        after = before + 20.0 * t[:, 0] + spread * rng.normal(size=(skies, P))
-        growth.append(with_scatter(model, t, found, before, after).covariance[0, 0] / found.covariance[0, 0] - 1.0)
-    # Of 2000 means of few squares the standard error is 0.12. Errors are not made smaller: 0.15 at most are added.
-    assert np.mean(growth) == pytest.approx(spread**2 * (1.0 + 1.0 / skies), abs=0.5)
+        before, change = rng.normal(size=(skies, P)), spread * rng.normal(size=(skies, P))
+        wide = with_scatter(model, t, found, before, before + 20.0 * t[:, 0] + change)
+        pulls.append((rng.normal() + spread * rng.normal() - change[:, 0].mean()) / wide.errors[0])
+    # The error of a width of 2000 Gaussian pulls is 0.016; these have the tails of a Student t.
+    assert np.std(pulls) == pytest.approx(1.0, abs=0.06)
+
+
+def test_few_skies_tell_exactly_how_much_more_noise_there_is() -> None:
+    """Variances before and after, of eight skies, would have errors of a half."""
+    rng, growth = np.random.default_rng(6), 1.4
+    model, t = SimulatedGaussian(np.zeros(P), np.eye(P), 1_000_000), np.eye(P)[:, :1]
+    found, before = model.fit(20.0 * t[:, 0], t), rng.normal(size=(8, P))
+    wide = with_scatter(model, t, found, before, 20.0 * t[:, 0] + growth * before)
+    # The response, too, is measured in eight skies.
+    expected = np.sqrt(growth**2 + (growth - 1.0) ** 2 / 8.0)
+    np.testing.assert_allclose(wide.errors / found.errors, expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
