@@ -255,23 +255,35 @@ def true(number):
         linear = linear_model(context)
         own = {"null": linear.null, "calibration": linear.calibration, "templates": linear.templates}
         known = replace(context, candidates=linear.candidates, groups=linear.groups, **own)
+        kept = len(context.ensemble.simulations) - len(linear.data)
+        every, wide = context.ensemble.extended, context.ensemble.first(kept).extended.gaussian
+        data, whole = (
+            every.simulations[kept:] + every.offset,
+            np.concatenate([known.templates, context.bank.slice_matrix]),
+        )
         sampler, rows = CaseSampler(Prior(weakest=5.0, strongest=20.0), linear), []
         for case in range(number // 2):
             (member,) = sampler.members(np.random.default_rng([1, case]), 1)
-            x = linear.data[case % len(linear.data)] + linear.response([member])
+            z = data[case % len(data)] + whole[:, list(known.candidates[member.candidate].columns)] @ member.coordinates
+            x = z[: len(linear.null.mean)]
             found = attribute(known.null, x, known.templates, known.candidates, known.calibration).if_named(
                 known.settings
             )
-            row = said(found, known, member.identity)
-            if len(found.explanations) == 1:
-                refined = Refined(found, known.templates, known.candidates)
-                if near := [rivals[index] for index in in_place(known, x, refined, rivals)]:
-                    wide = with_candidates(known, near)
-                    found = attribute(wide.null, x, wide.templates, wide.candidates, wide.calibration)
-                    row += said(found.if_named(wide.settings), wide, member.identity)
-            rows.append(row if len(row) > 4 else row + row)
+            row, counted = said(found, known, member.identity), []
+            for null, seen, t in ((known.null, x, known.templates), (wide, z, whole)):
+                named, counted = found, [*counted, *row]
+                if len(found.explanations) == 1:
+                    refined = Refined(found, t, known.candidates)
+                    if near := [rivals[index] for index in in_place(null, seen, refined, rivals, known.settings)]:
+                        more = with_candidates(known, near)
+                        named = attribute(more.null, x, more.templates, more.candidates, more.calibration)
+                        counted[-4:] = said(named.if_named(more.settings), more, member.identity)
+                if named is not found and counted[-4:] != row:
+                    print(run.name, member.identity, round(member.strength, 1), len(seen), [c.label for c, _ in near])
+            rows.append([*row, *counted])
         words = ("the right name alone", "the truth in the set", "a wrong name alone", "no name")
-        for place, what in enumerate([*words, *(f"{one}, with rivals" for one in words)]):
+        rows_of = ("without rivals", "rivals by the data vector", "rivals by the numbers beside it too")
+        for place, what in enumerate(f"{one}, {how}" for how in rows_of for one in words):
             print(run.name, worded(share(what, [row[place] for row in rows])), flush=True)
 
 
