@@ -294,7 +294,10 @@ def said(found, context, identity):
 
 
 def further(number):
-    """Look beside a strong effect that acts alone, and print how often the global p-value of another is small."""
+    """Look beside a strong effect that acts alone: how often is the global p-value of another small?
+
+    Print the pulls of its amplitudes, too.
+    """
     from mcsim.datavector.candidate import columns_of
     from mcsim.diagnosis.subsets import Subsets
     from mcsim.stats.intervals import share
@@ -318,17 +321,36 @@ def further(number):
         acting = Acting.of(null, t, every, member, (before[:skies], after[:skies]))
         charged[member] = replace(charged[member], acting=acting)
         rows = []
-        for x in after[skies:] + context.ensemble.offset:
+        offset = context.ensemble.offset
+        for x in after[skies:] + offset:
             y = null.whiten(x)
             searches = (
                 Subsets(null, y, groups, c, context.calibration, settings) for c in (context.candidates, charged)
             )
             rows.append([one.beside(np.array([[member]])).min() for one in searches])
         print(f"{name} of {channel}, {amplitude}: S/N {null.expected_snr(change):.0f}")
+        pulls = pulls_of(null, t[:, columns], before + offset, after + offset, skies)
+        print("    pulls of the amplitudes: mean", pulls.mean(axis=0).round(2), "width", pulls.std(axis=0).round(2))
         for place, what in enumerate(("its scatter ignored", "its scatter charged")):
             for level in (0.05, 0.005):
                 small = [row[place] <= level for row in rows]
                 print("   ", worded(share(f"{what}, p <= {level}", small)), flush=True)
+
+
+def pulls_of(null, t, before, after, skies):
+    """Return pulls of the amplitudes of an effect, shape (data, K); every ``skies`` pairs tell those of the next."""
+    from mcsim.stats.scattered import with_scatter
+
+    change, found = (after - before).mean(axis=0), []
+    theta = null.fit(null.mean + change, t).amplitudes
+    for first in range(0, len(after) - 2 * skies + 1, skies):
+        own = slice(first, first + skies)
+        response = (after - before)[own].mean(axis=0)
+        exact = t + np.outer(response - change, theta / (theta @ theta))
+        for x in after[first + skies : first + 2 * skies]:
+            fit = with_scatter(null, exact, null.fit(x, exact), before[own], after[own])
+            found.append((fit.amplitudes - theta) / fit.errors)
+    return np.array(found)
 
 
 def pairs(number):
