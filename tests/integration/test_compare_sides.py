@@ -253,17 +253,20 @@ def noise_of(simulator: Simulator) -> Maps:
     return [60.0 * draw.standard_normal(h.size) / np.sqrt(np.maximum(h, 1.0)) for h in hits]
 
 
-def test_noise_in_common_hides_no_more_than_is_expected_of_it():
-    simulator = Simulator(small())
+@pytest.mark.parametrize("splits", [["half1", "half2"], []])
+def test_noise_in_common_hides_no_more_than_is_expected_of_it(splits):
+    """What the sky leaves of a single map says how large its noise is."""
+    simulator = Simulator(small(map=SMALL["map"] | {"splits": splits}))
     noise = noise_of(simulator)
     a, b = ([m + n for m, n in zip(made, noise, strict=True)] for made in (simulator(), ODD["psi_sign"](simulator)))
-    found = mcsim.compare(a, b, simulator.run)
-    assert names(found) == ["psi_sign"]
+    if splits:
+        assert names(mcsim.compare(a, b, simulator.run)) == ["psi_sign"]
     given = pairs.given(a, b, simulator.run)
     problem = Prediction(with_shown_sky(given.pairs[0]), (), 0.0)
     alone = problem.corrected(Set(((PsiSign(), np.ones(1)),), 1.0))
     assert 0.02 < alone.left < 0.5
     assert problem.hidden(alone) == pytest.approx(alone.left, rel=0.3)
+    assert problem.suffices(alone)
 
 
 def test_noise_hides_what_a_coarse_grid_makes_of_the_sky_too():
