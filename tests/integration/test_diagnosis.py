@@ -108,7 +108,6 @@ def test_an_unlisted_effect_is_described_written_and_shrinks(small, tmp_path, mo
     monkeypatch.setattr(simulated_scores, "SIMULATIONS", 200)
     monkeypatch.setattr("sys.path", list(sys.path))
     monkeypatch.setenv("PYTHONPATH", "")
-    monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / "cache"))
     shared = data_of(small.run, "gain_drift", "W1", amplitude=1.5e-3, phase_deg=40.0)
     data = ObservedMaps(small, list(simulate.maps(shared, 0)), ask)
     before = diagnose_data(data, "drift")
@@ -362,7 +361,6 @@ def test_the_cost_of_a_diagnosis_counts_the_effects_on_request(small):
 
 def test_a_diagnosis_knows_the_library_that_it_is_given(tmp_path, monkeypatch):
     """And names an effect that is in no catalogue; ``without`` is read in that library too."""
-    monkeypatch.setenv("MCSIM_CACHE", str(tmp_path))
     monkeypatch.setattr(api, "batch", lambda workers: campaign.batch(0))  # in this process
     run = config.load(two_channels("tiny", lmax=20, nside=8, fwhm_arcmin=700.0))
     louder = config.Effect(name="louder", channel="W1", parameters={"amplitude": 0.4})
