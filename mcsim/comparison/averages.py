@@ -92,6 +92,7 @@ def averaged(scene: Scene, level: int) -> Maps:
     fine = scene.nside * 2**level
     base = np.arange(12 * fine**2)
     parent = healpy.nest2ring(scene.nside, healpy.ring2nest(fine, base) >> 2 * level)
-    moments = tuple(Moments(fine, m.frame, m.hits[parent], m.w[:, parent]) for m in scene.moments)
+    w = [m.w[: scene.response.mmax].take(parent, axis=1) for m in scene.moments]
+    moments = tuple(Moments(fine, m.frame, m.hits[parent], one) for m, one in zip(scene.moments, w, strict=True))
     there = replace(scene, moments=moments, kept=OrderedDict())
     return np.stack([np.bincount(parent, one, 12 * scene.nside**2) / 4**level for one in there.maps()])
