@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mcsim.beamfit.data import parts
 from mcsim.bipolar import Mode
 from mcsim.datavector.localisation import Place, places
 from mcsim.datavector.spectra_table import Spectra
@@ -116,7 +115,7 @@ def _views(measured: Spectra) -> Iterator[tuple[Element, Vector]]:
         if mode.L == 0 or mode.M > 0:
             continue
         family = [Mode(mode.L, M, mode.d) for M in range(mode.L + 1)]
-        needed = [(m, part, at.get((pair, row._replace(mode=m, imaginary=part)))) for m in family for part in parts(m)]
+        needed = [(m, part, at.get((pair, row._replace(mode=m, imaginary=part)))) for m in family for part in m.parts]
         if any(i is None for _, _, i in needed):
             continue
         unit = np.zeros((len(measured.rows), len(family), 1), dtype=np.complex128)

@@ -150,7 +150,7 @@ def test_files_are_compared_from_the_command_line(tmp_path, simulator, side_a):
     ]
     assert said["differences"][0]["amplitude"] == pytest.approx(0.01)
     assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
-    with quick_pictures():
+    with quick_pictures(empty=True):
         assert CliRunner().invoke(app, ["compare", a, b, "-o", out, "--fail-above", "1e-4"]).exit_code == 1
 
 
