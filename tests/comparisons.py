@@ -46,7 +46,7 @@ class Simulator:
         whole = survey(self.run)
         self.site = whole.making.channels[channel].site
         self.sky = simulate.draw_sky(whole, 0)
-        self.halves = len(self.run.map.splits)
+        self.halves = len(self.run.map.splits) or 1
 
     def __call__(
         self,

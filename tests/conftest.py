@@ -23,9 +23,11 @@ settings.load_profile("reproducible")
 
 @pytest.fixture(scope="session", autouse=True)
 def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Moments that tests compute go to a temporary folder."""
+    """What tests compute and keep goes to a temporary folder, the same for all processes of a session."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(os.environ, "MCSIM_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setitem(os.environ, "MCSIM_CACHE", str(shared / "cache"))
         yield
 
 

@@ -132,11 +132,6 @@ class Measurement:
         return max(row.ell_max for row in self.rows)
 
 
-def parts(mode: Mode) -> tuple[bool, ...]:
-    """Return the nonzero parts of a mode: False for the real, True for the imaginary one."""
-    return (False, True) if mode.M > 0 else (mode.parity == "odd",)
-
-
 def project(
     rows: Sequence[Row], scaling: Scaling, spectra: Mapping[Mode, NDArray[np.complex128]]
 ) -> NDArray[np.float64]:
@@ -172,7 +167,7 @@ def from_store(path: str | Path, selection: Selection = EVERYTHING) -> Measureme
     rows = tuple(
         Row(mode, a, b, imaginary)
         for mode in selection.parsed
-        for imaginary in parts(mode)
+        for imaginary in mode.parts
         for a, b in bins
         if a >= first and b <= last
     )

@@ -9,7 +9,7 @@ from astropy import units
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from mcsim.beamfit.data import EVERYTHING, SUMMARY, Measurement, Row, Scaling, Selection, parts
+from mcsim.beamfit.data import EVERYTHING, SUMMARY, Measurement, Row, Scaling, Selection
 from mcsim.bipolar import Mode
 from mcsim.errors import InputError
 from mcsim.support.folders import unreadable
@@ -55,7 +55,7 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING) 
     for mode in selection.parsed:
         check_parity(path, mode, scaling)
         same = np.flatnonzero((L == mode.L) & (M == mode.M) & (d == mode.d) & (low >= first) & (high <= last))
-        for imaginary in parts(mode):
+        for imaginary in mode.parts:
             part = in_uk2(path, table, f"value_imag{suffix}") if imaginary else real
             rows += [Row(mode, int(low[i]), int(high[i]), imaginary) for i in same]
             values.append(part[same])

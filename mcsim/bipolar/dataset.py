@@ -5,11 +5,9 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from mcsim.bipolar.estimation import estimate, estimator, power_spectrum
+from mcsim.bipolar.modes import CONVENTION, NORMALISATION
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
-
-CONVENTION = "A^{LM}_{l1 l2} = sum a_{l1 m1} conj(a_{l2 m2}) (-1)^{m2} C^{LM}_{l1 m1 l2 -m2}, ell = l2, d = l2 - l1"
-NORMALISATION = "Hajian-Souradeep"
 
 
 def biposh(alm: ArrayLike, alm2: ArrayLike | None = None, L_max: int = 2) -> xr.Dataset:

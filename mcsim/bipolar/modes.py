@@ -13,6 +13,10 @@ Indices = tuple[int, int, int]
 """(L, M, d) of a mode, where M may be negative."""
 
 
+CONVENTION = "A^{LM}_{l1 l2} = sum a_{l1 m1} conj(a_{l2 m2}) (-1)^{m2} C^{LM}_{l1 m1 l2 -m2}, ell = l2, d = l2 - l1"
+NORMALISATION = "Hajian-Souradeep"
+
+
 class Mode(NamedTuple):
     """One BipoSH spectrum: L, M and d = l2 - l1."""
 
@@ -34,6 +38,11 @@ class Mode(NamedTuple):
     def in_auto(self) -> bool:
         """Return True if one map alone has this mode: d >= 0, and not the identically vanishing d = 0 of odd parity."""
         return self.d > 0 or (self.d == 0 and self.parity == "even")
+
+    @property
+    def parts(self) -> tuple[bool, ...]:
+        """Parts that are not identically zero: False for the real, True for the imaginary one."""
+        return (False, True) if self.M > 0 else (self.parity == "odd",)
 
 
 def modes(L_max: int, both_orders: bool) -> tuple[Mode, ...]:

@@ -21,7 +21,6 @@ from mcsim.comparison.result import ChannelResult, ComparisonResult, DifferenceR
 from mcsim.comparison.search import INTERPOLATING, Problem
 from mcsim.comparison.shown_sky import with_shown_sky
 from mcsim.errors import InputError
-from mcsim.simulation.noise import of_map
 from mcsim.support import folders
 from mcsim.support.progress import reporting
 
@@ -144,7 +143,7 @@ def _channel(pair: ChannelPair, sides: Comparison, accuracy: float) -> ChannelRe
     shown = turned_pair if problem.pair.doubt is None else with_shown_sky(turned_pair)
     if not problem.worse_alone_than(problem.of_pair(shown, turned_others)):
         return found
-    turned, _ = _explained(turned_pair, turned_others, sides, accuracy, True)
+    turned, _ = _explained(turned_pair, turned_others, sides, accuracy)
     worse = named and turned.left > CLEARLY * found.left
     if turned.verdict in ("unknown", "identical") or worse:
         return found
@@ -152,27 +151,24 @@ def _channel(pair: ChannelPair, sides: Comparison, accuracy: float) -> ChannelRe
 
 
 def _explained(
-    pair: ChannelPair, others: Sequence[ChannelPair], sides: Comparison, accuracy: float, exchanged: bool = False
+    pair: ChannelPair, others: Sequence[ChannelPair], sides: Comparison, accuracy: float
 ) -> tuple[ChannelResult, Problem | None]:
-    """Return what explains a pair whose side A is described by the model, and the problem that was solved, if any.
-
-    ``exchanged``: it is the other's side B.
-    """
+    """Return what explains a pair whose side A is described by the model, and the problem that was solved, if any."""
     sky, _ = (_sky_rms(pair, side) for side in "AB")
     if _rms((pair.b - pair.a)[pair.seen]) <= ROUNDING * sky:
-        return _result(pair, sides, "identical", exchanged), None
+        return _result(pair, "identical"), None
     pair = with_shown_sky(pair).where_different(ROUNDING * sky)
     rms = _rms((pair.b - pair.a)[pair.seen])
     if rms <= ROUNDING * sky:
-        return _result(pair, sides, "identical", exchanged), None
+        return _result(pair, "identical"), None
     problem = Problem(pair, others, accuracy * sky, library(sides.frame))
     sets = problem.best()
     if sides.run is not None and not (sets and problem.complete(sets[0])):
         # An effect of side A is one of side B with the other sign, and was found before sides are exchanged.
-        problem = replace(problem, library=(*problem.library, *(() if exchanged else effects_of(pair, sides.run))))
+        problem = replace(problem, library=(*problem.library, *(() if pair.turned else effects_of(pair, sides.run))))
         sets = problem.best(1)
-    if exchanged and not (sets and problem.suffices(sets[0])):
-        return _result(pair, sides, "unknown", exchanged), problem
+    if pair.turned and not (sets and problem.suffices(sets[0])):
+        return _result(pair, "unknown"), problem
     if not sets or not problem.suffices(sets[0]) or (sets[0].left > DOUBTFUL and not problem.complete(sets[0])):
         sets = sorted([*sets, *problem.best(2)], key=lambda one: one.left)
     swapped = bool(sets) and any(difference.exchanges for difference, _ in problem.preferred(sets)[0].members)
@@ -184,12 +180,12 @@ def _explained(
     small = small and ("interpolation" in sets[0].names or sets[0].left > INTERPOLATED)
     if not sets or not problem.suffices(sets[0]) or small:
         verdict: Verdict = "identical" if rms <= accuracy * sky else "unknown"
-        return _result(pair, sides, verdict, exchanged, [], problem, sets), problem
+        return _result(pair, verdict, (), problem, sets), problem
     sets = problem.preferred(sets)
     known = {equal[0] for difference, value in sets[0].members for equal in difference.equivalent(value)}
     others_too = [one for one in problem.alternatives(sets) if not known.intersection(d.name for d, _ in one.members)]
     chosen = [sets[0], *others_too]
-    return _result(pair, sides, _verdict(chosen), exchanged, chosen, problem, sets), problem
+    return _result(pair, _verdict(chosen), chosen, problem, sets), problem
 
 
 def _verdict(chosen: Sequence[Set]) -> Verdict:
@@ -200,9 +196,7 @@ def _verdict(chosen: Sequence[Set]) -> Verdict:
 
 def _result(
     pair: ChannelPair,
-    sides: Comparison,
     verdict: Verdict,
-    exchanged: bool,
     chosen: Sequence[Set] = (),
     problem: Problem | None = None,
     sets: Sequence[Set] = (),
@@ -210,12 +204,10 @@ def _result(
     seen, explained = pair.seen, np.zeros_like(pair.a)
     if chosen and problem is not None:
         explained = problem.of(chosen[0]).maps - pair.a
-    described = [_described(one, pair.name, problem, exchanged) for one in chosen if problem is not None]
-    same = [other for one, own in zip(chosen, described, strict=False) for other in _equivalent(one, own, exchanged)]
-    nearest = _described(sets[0], pair.name, problem, exchanged)[0] if sets and problem is not None else None
-    scene, noise = pair.scene, np.nan
-    if sides.run is not None and scene is not None:
-        noise = _noise_rms(sides.run, pair)
+    described = [_described(one, problem) for one in chosen if problem is not None]
+    same = [other for one, own in zip(chosen, described, strict=False) for other in _equivalent(one, own, pair.turned)]
+    nearest = _described(sets[0], problem)[0] if sets and problem is not None else None
+    scene, noise = pair.scene, pair.noise_uk
     return ChannelResult(
         name=pair.name,
         splits=pair.splits,
@@ -226,19 +218,19 @@ def _result(
         rms_uk=_rms((pair.b - pair.a)[seen]),
         sky_rms_uk=_sky_rms(pair),
         noncircular_rms_uk=np.nan if scene is None else _rms(scene.noncircular()[seen]),
-        noise_rms_uk=noise,
+        noise_rms_uk=np.nan if noise is None else _rms(noise[seen]),
         left_rms_uk=_rms((pair.b - pair.a - explained)[seen]),
         looks=_looks(pair, explained) if verdict in ("unknown", "identical") else (),
         unmade_rms_uk=problem.unmade if verdict == "unknown" and problem is not None else 0.0,
-        a=pair.b if exchanged else pair.a,
-        b=pair.a if exchanged else pair.b,
-        explained=-explained if exchanged else explained,
+        a=pair.b if pair.turned else pair.a,
+        b=pair.a if pair.turned else pair.b,
+        explained=-explained if pair.turned else explained,
         seen=seen,
         one_sided=pair.one_sided,
         differing=pair.differing,
         spread_rms_uk=0.0 if pair.spread is None else _rms(pair.spread[seen]),
         hits=pair.hits,
-        reversed=exchanged,
+        reversed=pair.turned,
     )
 
 
@@ -249,32 +241,15 @@ def _looks(pair: ChannelPair, explained: NDArray[np.float64]) -> tuple[str, ...]
     return look(left[most], pair.a[most], pair.seen[most], None if pair.hits is None else pair.hits[most])
 
 
-def _noise_rms(run: config.RunConfig, pair: ChannelPair) -> float:
-    """Return the rms of the noise that a run describes over the pixels of a channel that are seen, uK."""
-    assert pair.scene is not None  # the caller looked
-    spec = next(c for c in run.channels if c.name == pair.name)
-    found = [
-        of_map(run, spec, split, m)[1] for split, m in zip(run.map.splits or (None,), pair.scene.moments, strict=True)
-    ]
-    levels = np.stack(
-        [np.zeros(m.npix) if own is None else own for own, m in zip(found, pair.scene.moments, strict=True)]
-    )
-    steps = pair.scene.preparations
-    if steps:
-        hits = [m.hits for m in pair.scene.moments]
-        levels = np.stack([step.noise_uk(own, h) for step, own, h in zip(steps, levels, hits, strict=True)])
-    return _rms(levels[pair.seen])
-
-
-def _described(found: Set, channel: str, problem: Problem, exchanged: bool) -> tuple[DifferenceResult, ...]:
+def _described(found: Set, problem: Problem) -> tuple[DifferenceResult, ...]:
     described = []
     for index, (difference, made) in enumerate(found.members):
-        value = difference.inverse(made) if exchanged else made
+        value = difference.inverse(made) if problem.pair.turned else made
         rest = (*found.members[:index], *found.members[index + 1 :])
         without = problem.left(rest, found.correction) if rest else 1.0
         described.append(
             DifferenceResult(
-                difference.name, channel, difference.amplitude(value), difference.unit,
+                difference.name, problem.pair.name, difference.amplitude(value), difference.unit,
                 without - found.left, difference.parameters(value), difference.met,
             )
         )  # fmt: skip

@@ -1,5 +1,6 @@
 """The library of differences of implementation."""
 
+from mcsim.comparison.averages import PixelAverage
 from mcsim.comparison.differences import Difference
 from mcsim.comparison.map_differences import (
     Calibration,
@@ -36,7 +37,7 @@ def library(frame: str) -> tuple[Difference, ...]:
         Unit(), Calibration(), Monopole(), Dipole(), Ordering(), FrameReversed(), SplitExchanged(), ChannelExchanged(),
         NoiseShared(),
         PsiOffset(), PsiSign(), BeamConjugated(), MmaxCut(), LmaxCut(), PixelWindow(), BeamWindow(), Smoothing(),
-        PixelCentres(),
+        PixelCentres(), PixelAverage(),
         TimeShift(), FrameRotated(frame), SpinSign(), PrecessionSign(),
         FarTimeShift(), MapMaking(), Interpolation(),
     )  # fmt: skip

@@ -15,6 +15,7 @@ from mcsim.ensemble.maps import file_names, first_realization
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.channels import described, known_offsets
+from mcsim.simulation.noise import of_map
 from mcsim.simulation.survey import Channel, Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import header, healpix
@@ -61,6 +62,10 @@ class ChannelPair:
         A draw of what noise hides of the sky that side A shows, coefficients as the scene's; None if it hides nothing.
     spread
         What single samples change in side A, uK, if it was made from orientation moments and ``a`` has it since; None.
+    noise_uk
+        Of every pixel of the maps as the model has it, rms, shape (split, npix); None without one.
+    turned
+        True if the sides are exchanged: ``a`` is side B.
     by_moments
         True if side A was made from orientation moments or at the pixels' centres, so that no single sample has a say.
     """
@@ -79,6 +84,8 @@ class ChannelPair:
     files: PointingFiles | None = None
     doubt: Alm | None = None
     spread: Maps | None = None
+    noise_uk: Maps | None = None
+    turned: bool = False
     by_moments: bool = False
 
     def pointing(self, longest: float = SAMPLES) -> Pointing | PointingFiles | None:
@@ -116,7 +123,7 @@ class ChannelPair:
 
     def exchanged(self) -> "ChannelPair":
         """Return the pair with side B as side A, and a sky that its maps show."""
-        turned = replace(self, a=self.b, b=self.a)
+        turned = replace(self, a=self.b, b=self.a, turned=not self.turned)
         return turned.with_sky_of_maps() if self.sky_of_maps else turned
 
     def with_sky_of_maps(self) -> "ChannelPair":
@@ -173,8 +180,8 @@ def read(
             f"{a} and {b} have no channel in common; give both maps of the same names, CHANNEL.fits or "
             "CHANNEL_SPLIT.fits."
         )
-    pairs = [_pair(name, maps, sides, whole, nthreads) for name, maps in groups.items()]
-    return Comparison(tuple(pairs), run)
+    pairs = (_pair(name, maps, sides, whole, nthreads) for name, maps in groups.items())
+    return Comparison(tuple(pair if run is None else _with_noise(pair, run) for pair in pairs), run)
 
 
 def given(
@@ -191,10 +198,10 @@ def given(
     run = with_known_offsets(run)
     whole = survey(quiet(run), nthreads, orders=_orders(run))
     sides = [dict(zip(names, (np.ma.filled(m, healpy.UNSEEN) for m in side), strict=True)) for side in (a, b)]
-    pairs = [
+    pairs = (
         _pair(c.name, [n for n in names if n.partition(":")[0] == c.name], sides, whole, nthreads) for c in run.channels
-    ]
-    return Comparison(tuple(pairs), run)
+    )
+    return Comparison(tuple(_with_noise(pair, run) for pair in pairs), run)
 
 
 def _orders(run: config.RunConfig) -> int:
@@ -395,3 +402,16 @@ def _pair(
         files = PointingFiles(paths, channel.site.frame)
     pair = ChannelPair(name, tuple(maps), a, b, seen, one_sided, scene, channel, hits, not named, files)
     return pair if named else pair.with_sky_of_maps()
+
+
+def _with_noise(pair: ChannelPair, run: config.RunConfig) -> ChannelPair:
+    """Return the pair with the noise that a run describes in its maps."""
+    assert pair.scene is not None  # a run describes it
+    spec = next(c for c in run.channels if c.name == pair.name)
+    splits, moments = run.map.splits or (None,), pair.scene.moments
+    drawn = [of_map(run, spec, split, m)[1] for split, m in zip(splits, moments, strict=True)]
+    levels = [np.zeros(m.npix) if own is None else own for own, m in zip(drawn, moments, strict=True)]
+    if pair.scene.preparations:
+        prepared = zip(pair.scene.preparations, levels, moments, strict=True)
+        levels = [steps.noise_uk(own, m.hits) for steps, own, m in prepared]
+    return replace(pair, noise_uk=np.stack(levels))

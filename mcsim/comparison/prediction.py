@@ -44,7 +44,7 @@ STEP = 1e-3
 """Change of a value over which responses are linear, over the value or its natural size."""
 
 STEPS = 4
-"""Steps of a joint fit at most."""
+"""Steps of a joint fit at most, and simulations of single samples beside which values are fitted again."""
 
 NOTHING = 1e-8
 """Share of the variance below which values are not fitted again."""
@@ -288,12 +288,20 @@ class Prediction:
         return self._exact[found.key]
 
     def _refined(self, found: Set) -> Set:
+        """Return a set measured and fitted in turn: what its own values still take up must not be left to others."""
         found = self._measured(found)
-        if not found.fitted or found.left < NOTHING:
-            return found
-        moved = self.fitted(found)
-        if moved.left < WORTHWHILE * found.left:
-            found = min(found, self._measured(moved), key=lambda one: one.left)
+        for _ in range(STEPS):
+            if not found.fitted or found.left < NOTHING:
+                break
+            moved = self.fitted(found)
+            if moved.left >= WORTHWHILE * found.left:
+                break
+            better = self._measured(moved)
+            if better.left >= found.left:
+                break
+            found = better
+            if self.complete(found):
+                break
         return found
 
     def _measured(self, found: Set) -> Set:

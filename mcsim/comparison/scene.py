@@ -1,7 +1,7 @@
 """What one channel of a simulation is made of, so that a part can be exchanged and the maps be made again."""
 
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -94,6 +94,8 @@ class Scene:
         Scan model in place of the channel's; None: that.
     late, step
         Samples by which the signal of a pointing is attributed to an earlier one, and their distance in radians.
+    added
+        Makes of the scene without it what its maps have besides; None: nothing.
     kept, moved
         Transforms of scenes made from this one, and their displaced beams.
     """
@@ -109,6 +111,7 @@ class Scene:
     motion: ScanModel | None = None
     late: float = 0.0
     step: float = 0.0
+    added: "Callable[[Scene], Maps] | None" = None
     kept: OrderedDict[tuple[bytes, ...], Transforms] = field(default_factory=OrderedDict, repr=False)
     moved: OrderedDict[tuple[bytes, float], Beam] = field(default_factory=OrderedDict, repr=False)
     # By identity of a pointing, which is held so that no other one can have it.
@@ -199,9 +202,12 @@ class Scene:
         made = self._noncircular() + self._transforms.circular
         for own, added in zip(made, self._transforms.offsets, strict=False):
             own += added
-        made = self._prepared(made)
+        made = self._prepared(self._with_added(made))
         made.setflags(write=False)
         return made
+
+    def _with_added(self, made: Maps) -> Maps:
+        return made if self.added is None else made + self.added(replace(self, added=None))
 
     def turned(self, angle: float) -> "Scene":
         """Return the scene with all samples turned by an angle, in radians."""
@@ -267,7 +273,8 @@ class Scene:
         sky = alm_.multiply(self.sky, factor, self.lmax)
         signal = signal or tod.sky_signal(sky, self.lmax, self.beam, EPSILON, self.nthreads)
         streams = (self.stream(pointing, split) for split in range(len(self.moments)))
-        made = self._prepared(np.stack([tod.bin_samples(signal(self._pointed(s)), self.nside)[0] for s in streams]))
+        binned = np.stack([tod.bin_samples(signal(self._pointed(s)), self.nside)[0] for s in streams])
+        made = self._prepared(self._with_added(binned))
         made.setflags(write=False)
         if own:
             self._made[id(pointing)] = pointing, made

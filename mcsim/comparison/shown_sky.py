@@ -28,6 +28,9 @@ Orientation moments leave more of maps of single samples.
 WHOLE = 0.99
 """Share of the pixels from which on holes hide nothing."""
 
+FREE = 0.05
+"""Share of the pixels of a single map that its sky leaves free at least, if noise is told from it."""
+
 NEAR = 5
 """Degrees over which power is averaged."""
 
@@ -111,23 +114,36 @@ def _sharper(pair: ChannelPair) -> ChannelPair:
 def _weight(pair: ChannelPair) -> Maps | None:
     """Return the inverse variance of the noise of every pixel, 1/uK^2, shape (split, npix); None without noise.
 
-    It is that of the difference of two splits, shared out as 1 over samples or evenly, whichever is more likely.
+    It is that of the difference of two splits, or of what the sky that it shows leaves of a single map, which has the
+    degrees of freedom that the sky's coefficients leave; shared out as 1 over samples or evenly, whichever is more
+    likely.
     """
-    if pair.scene is None or pair.hits is None or len(pair.a) < 2 or pair.scene.preparations:
+    if pair.scene is None or pair.hits is None or pair.scene.preparations:
         return None
-    seen = pair.seen[0] & pair.seen[1]
+    whole = len(pair.a) > 1
+    seen = pair.seen[:2].all(axis=0)
     rest = (pair.a - _made(pair, pair.scene))[:2, seen]
-    mean = 0.5 * (pair.a[0] + pair.a[1])[seen]
+    mean = pair.a[:2, seen].mean(axis=0)
+    freedom = 1.0 if whole else 1.0 - _coefficients(pair.scene, pair.nside) / max(int(seen.sum()), 1)
+    if freedom < FREE:
+        return None
+    noise = (rest[0] - rest[1]) if whole else rest[0] / np.sqrt(freedom)
     least = NOISY if pair.pointing() is None else UNSHOWN
-    if not seen.any() or 0.5 * (rest[0] - rest[1]).std() < least * mean.std():
+    if (0.5 if whole else 1.0) * noise.std() < least * mean.std():
         return None
     found = []
     for power in (1.0, 0.0):
         shape = np.maximum(pair.hits, 1.0) ** power
         spread = np.sum(1.0 / shape[:2, seen], axis=0)
-        variance = float(np.mean((rest[0] - rest[1]) ** 2 / spread))
+        variance = float(np.mean(noise**2 / spread))
         found.append((float(np.mean(np.log(variance * spread))), np.where(pair.seen, shape / variance, 0.0)))
     return min(found, key=lambda one: one[0])[1]
+
+
+def _coefficients(scene: Scene, nside: int) -> int:
+    """Return the number of real coefficients of the sky that maps of a scene show."""
+    factor = scene.response.factors[0].real[: 3 * nside]
+    return int((2 * np.flatnonzero(factor > WEAKEST * factor.max()) + 1).sum())
 
 
 def _filtered(pair: ChannelPair, weight: Maps) -> ChannelPair:

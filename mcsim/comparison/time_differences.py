@@ -137,7 +137,7 @@ class Interpolation(Difference):
     stage = 2
 
     def __init__(self) -> None:
-        self._made: dict[tuple[float, ...], Maps] = {}
+        self._made: dict[tuple[float | bytes, ...], Maps] = {}
 
     def starts(self, state: State) -> list[Vector]:
         """Return nside, and 1 for an interpolation or 0 for the nearest pixel, of grids whose errors are large enough.
@@ -176,7 +176,8 @@ class Interpolation(Difference):
         assert scene is not None
         assert pointing is not None
         pixels = _band(pair) if narrow and not scene.preparations else slice(0, 12 * scene.nside**2)
-        key = (*value, pixels.start, pixels.stop)
+        # Also of a draw of the sky that noise hides: what a grid makes of that is not known either.
+        key = (*value, pixels.start, pixels.stop, scene.sky.tobytes())
         if key not in self._made:
             grid = looked_up(scene, int(value[0]), bool(value[1]), pixels)
             change = scene.sampled(pointing, scene.window, grid) - scene.sampled(pointing, scene.window)
@@ -238,7 +239,7 @@ class FarTimeShift(Difference):
     stage = 2
 
     def __init__(self) -> None:
-        self._made: dict[bytes, Maps] = {}
+        self._made: dict[tuple[bytes, bytes], Maps] = {}
 
     def starts(self, state: State) -> list[Vector]:
         """Return a sample more, and less, if what is left is as large as another part of the sky makes it."""
@@ -249,10 +250,11 @@ class FarTimeShift(Difference):
         return [np.array([way]) for way in (1.0, -1.0)] if far and pair.pointing(SAMPLES) is not None else []
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
-        key, scene, pointing = value.tobytes(), state.pair.scene, state.pair.pointing(SAMPLES)
+        scene, pointing = state.pair.scene, state.pair.pointing(SAMPLES)
+        assert scene is not None
+        assert pointing is not None
+        key = value.tobytes(), scene.sky.tobytes()
         if key not in self._made:
-            assert scene is not None
-            assert pointing is not None
             there = replace(scene, late=value[0]).sampled(pointing, scene.window)
             self._made[key] = there - scene.sampled(pointing, scene.window)
         return maps + self._made[key]

@@ -314,7 +314,7 @@ def _disturbed(simulated: str, kinds: Kinds) -> DisturbedSurvey:
     return DisturbedSurvey.of(config.from_json(simulated), dict(kinds))
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=48)  # as many as are drawn for the scatter of a stochastic effect, again and again
 def _constrained_sky(definition: tuple[Any, ...], observed: bytes, seed: int, realization: int) -> Alm:
     """Return a constrained realization: a sky s + (s^_data - s^_drawn), with s^_drawn filtered from maps of s.
 

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import bipolar
-from mcsim.beamfit.data import parts
 from mcsim.bipolar import by_degree
 from mcsim.datavector.summaries import Element, bins, scales
 from mcsim.datavector.wiener_filter import FilteredMaps, Model
@@ -82,7 +81,7 @@ class BipolarScan:
             if mode.L == 0 or turned or (channel is None and not mode.in_auto):
                 continue
             alike = replace(alike, L=mode.L, M=mode.M, parity=mode.parity, frame=frame)
-            for (number, (low, high)), imaginary in product(enumerate(self._bins), parts(mode)):
+            for (number, (low, high)), imaginary in product(enumerate(self._bins), mode.parts):
                 part = "im" if imaginary else "re"
                 name = f"biposh/{alike.name}/{frame}/{mode.name}{part}/{low}-{high}"
                 where = (source, view, row, number, int(imaginary))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mcsim import config
-from mcsim.beamfit.data import Row, Scaling, parts, project
+from mcsim.beamfit.data import Row, Scaling, project
 from mcsim.beamfit.table import check_frame, check_parity, identified, in_uk2, read_ecsv, scaling_of
 from mcsim.bipolar import Mode
 from mcsim.datavector.analysis import Analysis, Job, analysis_of, kinds_of, surveys
@@ -87,7 +87,7 @@ class Spectra:
                 continue
             family = [Mode(mode.L, M, mode.d) for M in range(mode.L + 1)]
             needed = [
-                (m, part, at.get((pair, row._replace(mode=m, imaginary=part)))) for m in family for part in parts(m)
+                (m, part, at.get((pair, row._replace(mode=m, imaginary=part)))) for m in family for part in m.parts
             ]
             if any(i is None for _, _, i in needed):
                 continue
@@ -124,7 +124,7 @@ def read_spectra(path: str | Path, run: config.RunConfig) -> Spectra:
         mode, pair = Mode(L, M, d), known[label]
         check_parity(path, mode, scaling)
         _check_row(path, Row(mode, low, high, False), pair, lmax)
-        for imaginary in parts(mode):
+        for imaginary in mode.parts:
             key, value = (Row(mode, low, high, imaginary), pair), float((imag if imaginary else real)[number])
             if imaginary and not np.isfinite(value):
                 continue

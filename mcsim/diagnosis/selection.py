@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import combinations
 from typing import Literal
 
@@ -148,14 +149,14 @@ def attribute(
     favourable direction. The prior of a set is k! times the product of its candidates' shares of the weight.
     """
     settings = settings or DiagnosisSettings()
-    groups = null.whiten_groups(t, [candidate.columns for candidate in candidates])
-    y = null.whiten(x)
+    selection = _Selection(null, x, t, candidates, calibration, settings)
+    first = selection.searches[0]
+    groups, y = first.groups, first.y
     found = global_test(null, x, groups, calibration)
     delta_chi2 = groups.delta_chi2(y)
     nearest = int(np.argmax(delta_chi2))
     signal = null.hartlap_factor * delta_chi2[nearest] - groups.sizes[nearest]
     excess = max(null.hartlap_factor * float(y @ y) - null.dimension, signal, 1e-300)
-    selection = _Selection(null, x, t, candidates, calibration, settings)
     accepted = selection.accepted() if found.pvalue <= settings.alpha else []
     explanations = tuple(selection.explanations(accepted))
     return Attribution(
@@ -164,7 +165,7 @@ def attribute(
         explanations=explanations,
         nearest=nearest,
         cosine=float(np.sqrt(max(signal, 0.0) / excess)),
-        singles=tuple(null.fit(x, t[:, list(candidate.columns)]) for candidate in candidates),
+        singles=tuple(selection.fit(first, (place,)) for place in range(len(candidates))),
         correlation=cosines(groups),
         contrasts=tuple(selection.contrasts(explanations)),
         probability=selection.probability(accepted) if accepted else 0.0,
@@ -181,13 +182,13 @@ def _verdict(agrees: bool, explanations: Sequence[Explanation]) -> Verdict:
 
 @dataclass(frozen=True, order=True)
 class _Accepted:
-    """Hold a minimal sufficient set and the distribution that it was tested with; ordered by evidence."""
+    """Hold a minimal sufficient set and the search that it was found in; ordered by evidence."""
 
     evidence: float
     members: tuple[int, ...]
     pvalue: float
     further: float
-    null: SimulatedGaussian = field(compare=False)
+    search: Subsets = field(compare=False)
 
 
 @dataclass(frozen=True)
@@ -210,7 +211,7 @@ class _Selection:
             lost = ranked[0].evidence - found.evidence
             if lost <= np.log(self.settings.odds_cut) and identity not in seen:
                 seen.add(identity)
-                best = self._fit(found.null, found.members)
+                best = self.fit(found.search, found.members)
                 yield Explanation(found.members, best, float(np.exp(-lost)), found.pvalue, found.further)
 
     def contrasts(self, explanations: Sequence[Explanation]) -> Iterator[Contrast]:
@@ -230,13 +231,13 @@ class _Selection:
 
         A part of an accepted set is no rival of the names in it.
         """
-        searches = list(self._searches())
+        searches = self.searches
         known = {found.members: found.evidence for found in accepted}
         for search in searches:
             for subsets in search.rows(1):
                 evidence = search.solve(subsets).evidence.tolist()
                 alone = (
-                    _Accepted(e, (int(k),), 0.0, 0.0, search.null)
+                    _Accepted(e, (int(k),), 0.0, 0.0, search)
                     for e, k in zip(evidence, subsets[:, 0], strict=True)
                     if not any(k in found.members for found in accepted)
                 )
@@ -252,7 +253,7 @@ class _Selection:
         first accepted set.
         """
         accepted: list[_Accepted] = []
-        searches = list(self._searches())
+        searches = self.searches
         subsets: list[list[Rows]] = [[] for _ in searches]
         best, unknown, cut = -np.inf, searches[0].unknown, np.log(self.settings.odds_cut)
         for size in range(1, self.settings.max_effects + 1):
@@ -271,6 +272,11 @@ class _Selection:
             accepted += fresh
             best = max([best, *(found.evidence for found in fresh)])
         return accepted
+
+    @cached_property
+    def searches(self) -> list[Subsets]:
+        """Return :meth:`_searches`, which share what is computed of each."""
+        return list(self._searches())
 
     def _searches(self) -> Iterator[Subsets]:
         """Yield a search of sets without a member whose scatter is known, and one for each combination of such members.
@@ -291,12 +297,20 @@ class _Selection:
     def _possible(self, found: Iterable[_Accepted]) -> Iterator[_Accepted]:
         """Yield the sets whose fitted amplitudes are possible, with the evidence of the nearest ones within bounds."""
         for one in found:
-            distance = beyond(self.candidates, one.members, self._fit(one.null, one.members))
+            distance = beyond(self.candidates, one.members, self.fit(one.search, one.members))
             if np.isfinite(distance):
                 yield replace(one, evidence=one.evidence - 0.5 * distance**2)
 
-    def _fit(self, null: SimulatedGaussian, members: tuple[int, ...]) -> Fit:
-        return null.fit(self.x, self.t[:, columns_of(self.candidates, members)])
+    def fit(self, search: Subsets, members: tuple[int, ...]) -> Fit:
+        """Return the fit of a set, with the distribution of a search; it is kept."""
+        if (search, members) not in self._fits:
+            found = search.null.fit(self.x, self.t[:, columns_of(self.candidates, members)])
+            self._fits[search, members] = found
+        return self._fits[search, members]
+
+    @cached_property
+    def _fits(self) -> dict[tuple[Subsets, tuple[int, ...]], Fit]:
+        return {}
 
 
 def _without(rows: Rows, accepted: Sequence[tuple[int, ...]]) -> Rows:
@@ -319,4 +333,4 @@ def _sufficient(search: Subsets, subsets: Rows, least: float, doubted: bool) -> 
         numbers = zip(solved.evidence[kept], solved.pvalue[kept], further, rows[kept].tolist(), strict=True)
         for evidence, pvalue, beside, members in numbers:
             if beside > settings.further_level:
-                yield _Accepted(float(evidence), tuple(members), float(pvalue), float(beside), search.null)
+                yield _Accepted(float(evidence), tuple(members), float(pvalue), float(beside), search)

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import healpy
 import numpy as np
-import xarray as xr
 
 from mcsim import config
 from mcsim.config import arrays
@@ -107,6 +106,8 @@ def in_order(given: Any, parts: Sequence[Part], where: str) -> list[Map]:
 
 def _flat(given: Any, labels: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
     """Yield arrays with the names of their channels and splits."""
+    import xarray as xr  # here and below: workers of mcsim's own simulator start without it
+
     if isinstance(given, xr.Dataset):
         whole = [one for one in given.data_vars.values() if {"map_name", "channel"} & set(one.dims)]
         given = whole[0] if whole else dict(given.data_vars)
@@ -238,6 +239,8 @@ def fits_maps(parts: tuple[Part, ...], template: str) -> FitsMaps:
 @lru_cache(maxsize=1)
 def _zarr(path: str, written_ns: int) -> Any:
     """Open a store once for all realizations, and again if it was written anew."""
+    import xarray as xr
+
     with unreadable(path, "a Zarr store", "give one of maps"):
         found = xr.open_zarr(path, chunks=None, consolidated=False)
     return _checked_stack(found, path)
@@ -251,6 +254,8 @@ def _checked_stack(found: Any, where: str) -> Any:
 
 def stacked(given: Any, parts: tuple[Part, ...]) -> str:
     """Write maps that are in memory once into the cache, and return the path of the file."""
+    import xarray as xr
+
     if isinstance(given, np.ndarray):
         if given.ndim != 3:
             raise InputError(f"the given maps have the shape {given.shape}; give (realization, map, pixel).")

@@ -1,15 +1,20 @@
 """Lazy opening of stored ensembles with xarray."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import xarray as xr
-
+from mcsim.bipolar import Mode
+from mcsim.config.preparation import frame_of
 from mcsim.ensemble import store
+from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError
 from mcsim.support.folders import user_path
 
+if TYPE_CHECKING:
+    import xarray as xr
 
-def open_ensemble(path: str | Path) -> xr.Dataset:
+
+def open_ensemble(path: str | Path) -> "xr.Dataset":
     """Open the realizations of a store lazily.
 
     Parameters
@@ -41,7 +46,7 @@ def open_ensemble(path: str | Path) -> xr.Dataset:
     return _opened(target, None)
 
 
-def open_summary(path: str | Path) -> xr.Dataset:
+def open_summary(path: str | Path) -> "xr.Dataset":
     """Open the summary of a store: means, standard errors, standard deviations, binned spectra and covariances.
 
     Parameters
@@ -78,10 +83,33 @@ def open_summary(path: str | Path) -> xr.Dataset:
     return _opened(target, "summary")
 
 
-def _opened(path: Path, group: str | None) -> xr.Dataset:
+def _opened(path: Path, group: str | None) -> "xr.Dataset":
     """Open a group lazily; load its coordinates and ``done``, by which xarray selects rows."""
+    import xarray as xr  # here: workers start sooner without it
+
     with store.faults_named(path):
         found = xr.open_zarr(path, group=group)
         for name in {*found.coords, "done"} & {*found.variables}:
             found.variables[name].load()
         return found
+
+
+def layout(path: Path, realizations: int) -> Layout:
+    """Return the layout of an existing store, with another number of realizations."""
+    with open_ensemble(path) as found:
+        attrs = found.attrs["configuration"]
+        kept = found.sizes.get("pixel")
+        indices = zip(*(found[name].values.tolist() for name in ("L", "M", "d")), strict=True)
+        return Layout(
+            realizations,
+            store.chunk(path),
+            tuple(found["map_name"].values.tolist()) if kept else (),
+            tuple(found["pair"].values.tolist()),
+            tuple(Mode(*each) for each in indices),
+            found.sizes["ell"] - 1,
+            "biposh_circular" in found,
+            kept,
+            frame=frame_of(attrs),
+            bin_width=attrs["biposh"]["summary_bin"],
+            filtered="biposh_qml" in found,
+        )

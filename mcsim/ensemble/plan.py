@@ -10,9 +10,8 @@ import numpy as np
 
 from mcsim import config
 from mcsim.bipolar import Mode, estimate, estimator, modes
-from mcsim.bipolar.dataset import CONVENTION, NORMALISATION
-from mcsim.config.preparation import frame_of
-from mcsim.ensemble import opening, store
+from mcsim.bipolar.modes import CONVENTION, NORMALISATION
+from mcsim.ensemble import store
 from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError
 from mcsim.simulation import differencing, noise, offsets
@@ -140,27 +139,6 @@ def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
         if before != after:
             changes.append(f"{key}: {before} -> {after}")
     return changes
-
-
-def stored(path: Path, realizations: int) -> Layout:
-    """Return the layout of an existing store, with another number of realizations."""
-    with opening.open_ensemble(path) as found:
-        attrs = found.attrs["configuration"]
-        kept = found.sizes.get("pixel")
-        indices = zip(*(found[name].values.tolist() for name in ("L", "M", "d")), strict=True)
-        return Layout(
-            realizations,
-            store.chunk(path),
-            tuple(found["map_name"].values.tolist()) if kept else (),
-            tuple(found["pair"].values.tolist()),
-            tuple(Mode(*each) for each in indices),
-            found.sizes["ell"] - 1,
-            "biposh_circular" in found,
-            kept,
-            frame=frame_of(attrs),
-            bin_width=attrs["biposh"]["summary_bin"],
-            filtered="biposh_qml" in found,
-        )
 
 
 @dataclass(frozen=True)

@@ -380,9 +380,12 @@ def _moments(
             return scan.Moments.from_pointing_files([path], grid.nside, smax, grid.frame, grid.offset_order)
         case config.ScanHitAveraged():
             model = scan_model(spec, spec.scan, split)
-            return scan.Moments.load(scan.cached_moments(model, grid, smax, nthreads, progress))
+            return _mapped(scan.cached_moments(model, grid, smax, nthreads, progress))
         case config.ScanMoments() | config.ScanDifferencing():
             raise TypeError("the caller reads files of moments, and a differencing scan has no moments")
+
+
+_mapped = lru_cache(maxsize=16)(scan.Moments.load)  # once for all surveys: the folder's name says what is in it
 
 
 @lru_cache(maxsize=16)

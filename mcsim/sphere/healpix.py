@@ -16,7 +16,8 @@ from mcsim.errors import InputError
 from mcsim.sphere.checks import UNSEEN_BELOW, check_alm, check_complete, check_map, check_nside, check_whole, nside_of
 from mcsim.sphere.header import frame_named, opened, to_uk
 from mcsim.support.arrays import Alm, Map
-from mcsim.support.folders import unreadable
+from mcsim.support.code import package_digest
+from mcsim.support.folders import cached, unreadable
 from mcsim.support.npy import read_npy
 
 
@@ -175,11 +176,29 @@ def distances_from_centres(nside: int, split: int = 16) -> tuple[NDArray[np.floa
 
 
 @lru_cache(maxsize=32)
-def _distances(face: int, nside: int, split: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the cosines between split x split sub-pixel centres of a face's pixels, by a histogram, and their shares.
+def _distances(face: int, nside: int, split: int) -> NDArray[np.float64]:
+    """Return the cosines between split x split sub-pixel centres of a face's pixels, and their shares; shape (2, n).
 
-    They serve windows up to any lmax.
+    They serve windows up to any lmax. Finding them takes longer than all else at the start of a small run: the cache
+    keeps them, if it can be written.
     """
+    code = package_digest([__name__], ["healpy", "numpy"])
+
+    def fill(scratch: Path) -> None:
+        np.save(scratch / "distances.npy", _histogram(face, nside, split))
+
+    try:
+        folder = cached(f"pixels-{face}-{nside}-{split}-{code[:32]}", fill)
+    except InputError:
+        found = _histogram(face, nside, split)
+    else:
+        found = np.load(folder / "distances.npy")
+    found.setflags(write=False)
+    return found
+
+
+def _histogram(face: int, nside: int, split: int) -> NDArray[np.float64]:
+    """Return cosines and shares of :func:`_distances` from a histogram of all distances within a pixel."""
     inside = _representatives(face, nside)[:, None] * split**2 + np.arange(split**2)
     centres = np.stack(healpy.pix2vec(split * nside, inside, nest=True), axis=-1)
     difference = centres[:, :, None, :] - centres[:, None, :, :]
@@ -187,11 +206,7 @@ def _distances(face: int, nside: int, split: int) -> tuple[NDArray[np.float64], 
     count, edges = np.histogram(chord, bins=4000, range=(0.0, chord.max() * (1.0 + 1e-12)))
     total, _ = np.histogram(chord, bins=edges, weights=chord)
     filled = count > 0
-    cosine = 1.0 - (total[filled] / count[filled]) ** 2 / 2.0
-    weight = count[filled] / count.sum()
-    cosine.setflags(write=False)
-    weight.setflags(write=False)
-    return cosine, weight
+    return np.stack([1.0 - (total[filled] / count[filled]) ** 2 / 2.0, count[filled] / count.sum()])
 
 
 def _mean_legendre(face: int, nside: int, split: int, lmax: int) -> NDArray[np.float64]:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.support.arrays import Matrix, Vector
@@ -85,6 +86,22 @@ class _Judged(NamedTuple):
     log_likelihood: Vector
 
 
+class _Solved(NamedTuple):
+    """Hold chi^2 of each of k held-out draws in W covariances, shape (W, k), and what it is made of.
+
+    ``inside`` are the covariances along the q eigenvectors of S, shape (W, k, q), and ``outside`` across them;
+    ``f`` z z' is what the held-out draw z takes from them, and ``left`` the determinant of the rest over theirs.
+    ``second`` is the square of z in the square of the inverse covariance.
+    """
+
+    chi2: Matrix
+    inside: NDArray[np.float64]
+    outside: Matrix
+    f: Matrix  # (W, 1)
+    left: Matrix
+    second: Matrix
+
+
 @dataclass(frozen=True)
 class _HeldOut:
     """Judge covariances of p elements by draws that they do not know.
@@ -109,7 +126,7 @@ class _HeldOut:
         low, high = np.full(len(_WEIGHTS), -_LOG_RANGE), np.full(len(_WEIGHTS), _LOG_RANGE)
         for _ in range(_STEPS):
             middle = 0.5 * (low + high)
-            narrow = self.judge(np.exp(middle)).chi2.mean(axis=1) > self.p
+            narrow = self.solve(np.exp(middle)).chi2.mean(axis=1) > self.p
             low, high = np.where(narrow, middle, low), np.where(narrow, high, middle)
         found = self.judge(np.exp(high))
         best = int(np.argmax(np.where(high < _LOG_RANGE, found.log_likelihood, -np.inf)))
@@ -127,8 +144,8 @@ class _HeldOut:
         trace = more * (self.values.sum() - count / (count - 1.0) * square)
         return scale * weight * trace / self.p, more * scale * (1.0 - weight)
 
-    def judge(self, scale: Vector) -> _Judged:
-        """Judge the covariances of all weights, each with its scale, shape (W,).
+    def solve(self, scale: Vector) -> _Solved:
+        """Return chi^2 in the covariances of all weights, each with its scale, shape (W,).
 
         Notes
         -----
@@ -137,24 +154,27 @@ class _HeldOut:
         """
         count, rest = len(self.squares), self.p - len(self.values)
         same, own = self.rest(self.squares.sum(axis=1), _WEIGHTS[:, None], scale[:, None])
-        inside, outside, f = (
-            1.0 + same[..., None] + own[..., None] * self.values,
-            1.0 + same,
-            own * count / (count - 1.0),
-        )
+        outside, f = 1.0 + same, own * count / (count - 1.0)
+        inside = outside[..., None] + own[..., None] * self.values
+        inverse = 1.0 / inside
+        first, second = (np.einsum("kq,wkq->wk", self.squares, one) for one in (inverse, inverse * inverse))
+        left = 1.0 - f * first
+        # The trace of the inverse, which noise of variance one contributes.
+        trace = np.sum(inverse, axis=-1) + rest / outside + f * second / left
+        return _Solved(trace + count * first / left, inside, outside, f, left, second)
+
+    def judge(self, scale: Vector) -> _Judged:
+        """Judge the covariances of all weights, each with its scale, shape (W,)."""
+        count, rest = len(self.squares), self.p - len(self.values)
+        chi2, inside, outside, f, left, second = self.solve(scale)
         inverse = 1.0 / inside
         squared = inverse * inverse
-        first, second, third = (
-            np.einsum("kq,wkq->wk", self.squares, one) for one in (inverse, squared, squared * inverse)
-        )
-        left = 1.0 - f * first
-        # Traces of the inverse and of its square, which noise of variance one contributes.
-        trace_one = np.sum(inverse, axis=-1) + rest / outside + f * second / left
-        trace_two = np.sum(squared, axis=-1) + rest / outside**2
-        trace_two += 2.0 * f * third / left + (f * second / left) ** 2
-        chi2 = trace_one + count * first / left
+        third = np.einsum("kq,wkq->wk", self.squares, squared * inverse)
+        # Of the trace of the square of the inverse.
+        square = np.sum(squared, axis=-1) + rest / outside**2
+        square += 2.0 * f * third / left + (f * second / left) ** 2
         volume = np.sum(np.log(inside), axis=-1) + rest * np.log(outside) + np.log(left)
-        noise = 2.0 * trace_two + 4.0 * count * second / left**2
+        noise = 2.0 * square + 4.0 * count * second / left**2
         return _Judged(chi2, noise.mean(axis=1), -0.5 * (volume + chi2).mean(axis=1))
 
 

@@ -380,6 +380,8 @@ def orthonormal(white: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
     """Return an orthonormal basis (p, r) of the columns (p, K), and the matrix (K, r) from it to amplitudes."""
     size = np.linalg.norm(white, axis=0)
     inverse = divided(1.0, size)
+    if len(size) == 1:  # most effects: no decomposition is needed
+        return (white * inverse)[:, size > 0.0], inverse[:, None][:, size > 0.0]
     left, singular, right = np.linalg.svd(white * inverse, full_matrices=False)
     kept = singular > COLLINEAR
     return left[:, kept], inverse[:, None] * right[kept].T / singular[kept]

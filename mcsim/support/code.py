@@ -19,9 +19,17 @@ def version(library: str) -> str:
 
 
 def package_digest(packages: Iterable[str], libraries: Iterable[str] = ()) -> str:
-    """Return the SHA-256 of the source files of packages or modules, and of the versions of libraries."""
-    files = [path for name in sorted(packages) for path in _files(name)]
-    return _digest(files, *(f"{name} {version(name)}" for name in sorted(libraries)))
+    """Return the SHA-256 of the source files of packages or modules, and of the versions of libraries.
+
+    Files are read once: they may change afterwards, but the code that is loaded does not.
+    """
+    return _package_digest(tuple(sorted(packages)), tuple(sorted(libraries)))
+
+
+@cache
+def _package_digest(packages: tuple[str, ...], libraries: tuple[str, ...]) -> str:
+    files = [path for name in packages for path in _files(name)]
+    return _digest(files, *(f"{name} {version(name)}" for name in libraries))
 
 
 def class_digest(kind: type | FunctionType) -> str:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
+import ducc0
 import healpy
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
-from mcsim.sphere.rotation import rotation_matrix
+from mcsim.sphere.rotation import rotate_alm
 from mcsim.sphere.sky import dipole_alm
 from mcsim.systematics.base import Alm, Bound, DirectedEffect, Draw, Effect, Site, Wording
 from mcsim.systematics.galaxy import template_alm
@@ -146,6 +147,7 @@ class SpinSynchronousOffset(Effect):
 NARROWEST_DEG = 3.0
 _NSIDE = 512
 _PLANE = 0.05
+_RINGS = 1024
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,6 +213,20 @@ class SidelobePickup(Effect):
         return np.asarray(self.amplitude * seen[healpy.vec2pix(_NSIDE, *centre)])
 
 
+def _plane_alm(lmax: int) -> Alm:
+    """Return (1 + x) / (1 + (z / _PLANE)^2) in Galactic coordinates, brightest towards the centre of the Galaxy.
+
+    It has orders 0 and 1 alone, so that four pixels on each of many Gauss-Legendre rings hold all of it.
+    """
+    z = np.cos(ducc0.misc.GL_thetas(_RINGS))
+    x = np.sqrt(1.0 - z**2)[:, None] * np.array([1.0, 0.0, -1.0, 0.0])
+    rings = (1.0 + x) / (1.0 + (z[:, None] / _PLANE) ** 2)
+    found = ducc0.sht.analysis_2d(map=rings[None], spin=0, lmax=lmax, mmax=1, geometry="GL")[0]
+    whole = np.zeros(alm_.size(lmax), dtype=np.complex128)
+    whole[: found.size] = found
+    return whole
+
+
 @lru_cache(maxsize=4)
 def _smoothed(lobe: SidelobePickup, dipole_uk: tuple[float, ...], frame: str) -> NDArray[np.float64]:
     """Return dipole and Galaxy as a lobe of unit response sees them, uK, at its direction in ``frame``."""
@@ -219,8 +235,7 @@ def _smoothed(lobe: SidelobePickup, dipole_uk: tuple[float, ...], frame: str) ->
     if lobe.template:
         galaxy = template_alm(lobe.template, lmax, frame)
     else:
-        x, _, z = rotation_matrix(frame, "galactic") @ np.stack(healpy.pix2vec(_NSIDE, np.arange(12 * _NSIDE**2)))
-        galaxy = healpix.analysis(lobe.galaxy_uk * (1.0 + x) / (1.0 + (z / _PLANE) ** 2), lmax)
+        galaxy = rotate_alm(lobe.galaxy_uk * _plane_alm(lmax), lmax, "galactic", frame)
     ell = np.arange(lmax + 1.0)
     window = np.exp(-0.5 * ell * (ell + 1.0) * sigma**2)
     sky = alm_.multiply(galaxy + dipole_alm(dipole_uk, lmax), window, lmax)

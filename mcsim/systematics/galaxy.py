@@ -1,5 +1,6 @@
 """Light of the Galaxy: a template of the user's, or a model that is drawn."""
 
+import json
 from functools import lru_cache
 from pathlib import Path
 
@@ -31,7 +32,7 @@ def morphology(template: str, site: Site, draw: Draw) -> Alm:
     """
     if template:
         return _unit_rms(template_alm(template, site.lmax, site.frame), site.lmax)
-    return rotate_alm(_drawn(site.lmax, draw("morphology")), site.lmax, "galactic", site.frame)
+    return _drawn(site.lmax, site.frame, json.dumps(draw("morphology").bit_generator.state))
 
 
 @lru_cache(maxsize=4)
@@ -46,8 +47,11 @@ def template_alm(path: str, lmax: int, frame: str) -> Alm:
     return rotate_alm(alm_.resize(alm, top, lmax), lmax, found or "galactic", frame)
 
 
-def _drawn(lmax: int, rng: np.random.Generator) -> Alm:
-    """Return coefficients of the model in the galactic frame, rms 1."""
+@lru_cache(maxsize=1)
+def _drawn(lmax: int, frame: str, state: str) -> Alm:
+    """Return coefficients of the model, rms 1, drawn by a generator in this state: the same for all channels."""
+    rng = np.random.default_rng()
+    rng.bit_generator.state = json.loads(state)
     ell = np.arange(1.0, lmax + 1)
     cl = np.append(0.0, ell**_SLOPE)
     cl /= np.sum((2.0 * ell + 1.0) * cl[1:]) / (4.0 * np.pi)
@@ -57,7 +61,9 @@ def _drawn(lmax: int, rng: np.random.Generator) -> Alm:
     def plane(x: Vector, y: Vector, z: Vector) -> Vector:
         return 1.0 / (1.0 + (z / _PLANE) ** 2)
 
-    return _unit_rms(multiplied(patches, lmax, plane, _PROFILE_DEGREE), lmax)
+    alm = rotate_alm(_unit_rms(multiplied(patches, lmax, plane, _PROFILE_DEGREE), lmax), lmax, "galactic", frame)
+    alm.setflags(write=False)
+    return alm
 
 
 def _unit_rms(alm: Alm, lmax: int) -> Alm:

@@ -136,8 +136,11 @@ def extended(beam: Beam) -> Beam:
     blm[0, lmax + 1 :] = np.sqrt((2 * ell[:size] + 1) / (4 * np.pi)) * beyond
     for m in range(1, beam.mmax + 1):
         if np.any(beam.blm[m]):
-            ratio = beam.blm[m, first:] / beam.blm[0, first:] / x ** (m / 2)
-            curve = np.polynomial.polynomial.polyfit(x - 1.0, np.stack([ratio.real, ratio.imag], axis=1), 2)
+            known = fitted[fitted >= m]  # there is no order m below l = m
+            own = x[-len(known) :]
+            ratio = beam.blm[m, known] / beam.blm[0, known] / own ** (m / 2)
+            degree = min(2, len(known) - 1)
+            curve = np.polynomial.polynomial.polyfit(own - 1.0, np.stack([ratio.real, ratio.imag], axis=1), degree)
             real, imaginary = np.polynomial.polynomial.polyval(x_beyond[:size] - 1.0, curve)
             continued = (real + 1j * imaginary) * x_beyond[:size] ** (m / 2)
             blm[m, lmax + 1 :] = continued * blm[0, lmax + 1 :]

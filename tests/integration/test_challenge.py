@@ -33,8 +33,8 @@ MODEL = {
             "name": "W1",
             "frequency_ghz": 94.0,
             "beam": {"kind": "gaussian", "fwhm_arcmin": 500.0},
-            "noise": {"sigma0_uk": 300.0},
-            "scan": {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 311.0},
+            "noise": {"sigma0_uk": 150.0},
+            "scan": {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 1244.0},
         }
     ],
 }
@@ -139,7 +139,7 @@ def test_a_damaged_verdict_is_refused(challenge):
         with refused("case-000"):
             score.score(folder, workers=0)
     path.write_text(text)
-    with quick_pictures():
+    with quick_pictures(empty=True):
         assert score.score(folder, workers=0).title == f"{CASES} full skies"
 
 

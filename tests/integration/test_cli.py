@@ -263,7 +263,7 @@ def test_config_checks_and_prints_the_schema(mcsim: Command) -> None:
 
 
 def test_beam_of_a_configuration_and_of_files(mcsim: Command, tmp_path: Path) -> None:
-    code, out, _ = mcsim("beam", "quickstart", "--lmax", 700)
+    code, out, _ = mcsim("beam", "quickstart", "--lmax", 300)
     assert code == 0
     assert "axis ratio" in out
     assert (tmp_path / "beam.png").exists()
@@ -293,7 +293,7 @@ def test_predict_plot_and_fit(mcsim: Command, small_store: Path, tmp_path: Path)
     assert "value" in Table.read(tmp_path / "expected.ecsv", format="ascii.ecsv").colnames
     for row in ("L2M0d0", "10-19"):
         assert row in out
-    assert mcsim("plot", small_store, "--predict", "small.toml", "-o", "both.png")[0] == 0
+    assert mcsim("plot", small_store, "--L", 2, "--M", 0, "--predict", "small.toml", "-o", "both.png")[0] == 0
     assert_refused(mcsim("fit", small_store, "small.toml"), "10 realizations")
     code, out, _ = mcsim("fit", small_store, "small.toml", "--model", "constant", "--ell-min", 10, "-o", "fit.png")
     assert code == 0
@@ -378,7 +378,7 @@ def test_plot_reads_what_predict_wrote(ending: str, mcsim: Command, small_store:
             np.testing.assert_allclose(found[name].values, expected[name].values, rtol=1e-12, atol=1e-12)
     for name in ("L", "M", "d", "parity", "bin", "bin_first", "bin_last"):
         assert found[name].values.tolist() == expected[name].values.tolist()
-    code, _, err = mcsim("plot", small_store, "--predict", f"expected.{ending}", "-o", "both.png")
+    code, _, err = mcsim("plot", small_store, "--L", 2, "--predict", f"expected.{ending}", "-o", "both.png")
     assert (code, err) == (0, "")
     assert (tmp_path / "both.png").stat().st_size > 10_000
     assert_refused(mcsim("plot", small_store, "--predict", f"expected.{ending}", "--exact"), "--exact")

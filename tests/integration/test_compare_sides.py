@@ -15,6 +15,7 @@ from mcsim.comparison import pairs
 from mcsim.comparison.prediction import Prediction, Set
 from mcsim.comparison.scene_differences import PsiSign
 from mcsim.comparison.shown_sky import with_shown_sky
+from mcsim.comparison.time_differences import Interpolation
 from mcsim.ensemble.maps import write_map
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
@@ -108,6 +109,27 @@ def test_maps_at_the_centres_of_pixels_are_recognised(simulator):
     assert found.channels[0].left < 1e-4
 
 
+@pytest.mark.parametrize(("windowed", "factor"), [(False, 1.0), (False, 1.01), (True, 1.0)])
+def test_a_map_that_ud_grade_made_of_a_finer_one_is_recognised(windowed, factor, simulator):
+    """Its pixels are means of 16, whose window changes over the sky as the shapes of the pixels do."""
+    run = replace(simulator.run, map=replace(simulator.run.map, splits=()))
+    smooth = healpy.almxfl(simulator.sky, simulator.site.beam.window)
+    window = mcsim_window() if windowed else np.ones(LMAX + 1)
+    here = healpy.alm2map(healpy.almxfl(smooth, window), NSIDE, lmax=LMAX)
+    degraded = factor * healpy.ud_grade(healpy.alm2map(smooth, 4 * NSIDE, lmax=LMAX), NSIDE)
+    (found,) = mcsim.compare([here], [degraded], run).channels
+    assert {d.name for d in found.differences} == {"pixel_window"} | ({"calibration"} if factor > 1.0 else set())
+    window = next(d for d in found.differences if d.name == "pixel_window")
+    assert window.amplitude == 1.0
+    assert window.parameters["by"].startswith("the mean of 16 sub-pixels")
+    assert ("in place of" in window.parameters["by"]) == windowed
+    assert found.left < 1e-6
+    if factor == 1.0:
+        (found,) = mcsim.compare([degraded], [here], run).channels
+        assert [(d.name, d.amplitude) for d in found.differences] == [("pixel_window", -1.0)]
+        assert found.left < 0.02
+
+
 def test_files_are_compared_from_the_command_line(tmp_path, simulator, side_a):
     sides = {"a": side_a, "b": scaled(side_a, 1.01)}
     for side, maps in sides.items():
@@ -128,7 +150,7 @@ def test_files_are_compared_from_the_command_line(tmp_path, simulator, side_a):
     ]
     assert said["differences"][0]["amplitude"] == pytest.approx(0.01)
     assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
-    with quick_pictures():
+    with quick_pictures(empty=True):
         assert CliRunner().invoke(app, ["compare", a, b, "-o", out, "--fail-above", "1e-4"]).exit_code == 1
 
 
@@ -224,16 +246,39 @@ def test_differencing_scans_are_refused():
         mcsim.compare([np.zeros(3072)] * 2, [np.ones(3072)] * 2, SMALL | {"channel": [channel]})
 
 
-def test_noise_in_common_hides_no_more_than_is_expected_of_it():
-    simulator = Simulator(small())
+def noise_of(simulator: Simulator) -> Maps:
+    """Return noise of 60 uK a sample for every map."""
     draw = np.random.default_rng(6)
     hits = [m.moments.hits for m in survey(simulator.run).making.channels[0].maps]
-    noise = [60.0 * draw.standard_normal(h.size) / np.sqrt(np.maximum(h, 1.0)) for h in hits]
+    return [60.0 * draw.standard_normal(h.size) / np.sqrt(np.maximum(h, 1.0)) for h in hits]
+
+
+@pytest.mark.parametrize("splits", [["half1", "half2"], []])
+def test_noise_in_common_hides_no_more_than_is_expected_of_it(splits):
+    """What the sky leaves of a single map says how large its noise is."""
+    simulator = Simulator(small(map=SMALL["map"] | {"splits": splits}))
+    noise = noise_of(simulator)
     a, b = ([m + n for m, n in zip(made, noise, strict=True)] for made in (simulator(), ODD["psi_sign"](simulator)))
-    found = mcsim.compare(a, b, simulator.run)
-    assert names(found) == ["psi_sign"]
+    if splits:
+        assert names(mcsim.compare(a, b, simulator.run)) == ["psi_sign"]
     given = pairs.given(a, b, simulator.run)
     problem = Prediction(with_shown_sky(given.pairs[0]), (), 0.0)
     alone = problem.corrected(Set(((PsiSign(), np.ones(1)),), 1.0))
     assert 0.02 < alone.left < 0.5
+    assert problem.hidden(alone) == pytest.approx(alone.left, rel=0.3)
+    assert problem.suffices(alone)
+
+
+def test_noise_hides_what_a_coarse_grid_makes_of_the_sky_too():
+    """Looked up between the pixels of a map of the same nside, of which noise hides the small scales."""
+    simulator = Simulator(small(beam=mcsim.Beam.gaussian(380.0, 32)))
+    smooth = healpy.alm2map(healpy.almxfl(simulator.sky, simulator.site.beam.window), 16, lmax=32)
+    made = simulator(), simulator(
+        sky=np.zeros_like(simulator.sky), added=lambda seen: healpy.get_interp_val(smooth, seen.theta, seen.phi)
+    )  # fmt: skip
+    a, b = ([m + n for m, n in zip(side, noise_of(simulator), strict=True)] for side in made)
+    problem = Prediction(with_shown_sky(pairs.given(a, b, simulator.run).pairs[0]), (), 0.0)
+    members = ((Interpolation(), np.array([16.0, 1.0])),)
+    alone = Set(members, problem.left(members))
+    assert 0.1 < alone.left < 0.5
     assert problem.hidden(alone) == pytest.approx(alone.left, rel=0.3)

@@ -25,7 +25,9 @@ COUNT = 6
 
 
 def settings(**changes):
-    return DiagnosisSettings(without=WITHOUT, simulations=200, **changes)
+    return DiagnosisSettings(
+        without=WITHOUT, simulations=160, scan_sims=40, beam_orders=1, split_beam_orders=1, **changes
+    )
 
 
 def model(lmax, fine=32, scan="parallel_transport"):
@@ -56,7 +58,7 @@ def data_of(run):
 
 
 def diagnosed(run, output, count, workers=0):
-    with quick_pictures():
+    with quick_pictures(empty=True):
         return mcsim.diagnose(run, data_of(run), output, settings=settings(controls=count), workers=workers)
 
 

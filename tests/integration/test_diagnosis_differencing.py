@@ -166,6 +166,7 @@ def test_an_imbalance_is_named():
         simulations=170,
         noisy_skies=6,
         scan_sims=40,
+        beam_orders=2,
         constrained_skies=3,
     )
     true = 0.02

@@ -46,6 +46,7 @@ MODEL = {
 EXAMPLE = Path(__file__).parents[2] / "docs" / "howto" / "own_simulator.toml"
 LIBRARY = {name: kind for name, kind in mcsim.effects().items() if name in ("beam_width", "noise_level")}
 SMALL = {"beam_orders": 1, "split_beam_orders": 1, "sky_bins": 4, "scan_L_max": 1, "scan_bins": 1, "scan_sims": 20}
+SMALL |= {"noisy_skies": 12, "constrained_skies": 4}
 SETTINGS = mcsim.DiagnosisSettings(library=LIBRARY, sims_per_element=5, **SMALL)
 
 FEW = replace(SETTINGS, simulations=80)
@@ -216,7 +217,7 @@ def test_agreement_of_a_right_description_is_no_rare_event(learned):
 
 def test_a_description_of_another_beam_is_said_first(tmp_path):
     data = arrays_of(Plain(wider=0.1).simulate(3))
-    with quick_pictures():
+    with quick_pictures(empty=True):
         found = mcsim.diagnose(mcsim.ExternalModel(MODEL, Plain(wider=0.1)), data, tmp_path / "out", settings=FEW)
     assert found.agreement.pvalue < 1e-4
     assert not found.agreement.agrees

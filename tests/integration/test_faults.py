@@ -449,9 +449,9 @@ def test_worker_that_dies_every_time_costs_its_realization_alone(
 def test_kills_lose_nothing() -> None:
     """The fault campaign in short; workflows/faults has the long one."""
     script = Path(__file__).parents[2] / "workflows" / "faults" / "campaign.py"
-    command = [sys.executable, script, "--kills", "5", "--clusters", "local", "--seed", "2"]
-    environment = os.environ | {"MCSIM_FAULTS_REALIZATIONS": "24"}
+    command = [sys.executable, script, "--kills", "3", "--clusters", "local", "--seed", "2"]
+    environment = os.environ | {"MCSIM_FAULTS_REALIZATIONS": "16"}
     found = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     assert found.returncode == 0, found.stdout + found.stderr
-    assert "5 kills, " in found.stdout
+    assert "3 kills, " in found.stdout
     assert "lost 0, doubled 0, differing 0, other trouble 0." in found.stdout

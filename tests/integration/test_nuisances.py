@@ -38,16 +38,16 @@ MODEL = two_channels("company", sigma0_uk=60.0) | {
         for effect, width in (("calibration", WIDTH), ("noise_level", NOISE))
     ],
 }
-SIMULATIONS = 400
+SIMULATIONS, SKIES = 400, 320
 
 
 def ask(jobs):
     return [data_vectors(job) for job in jobs]
 
 
-def learned(run, simulations):
-    analysis = analysis_of(run, without=WITHOUT, settings=DiagnosisSettings(including=PROPOSED))
-    return context(analysis, *campaign.learned(analysis, ask, simulations, time_ordered=False))
+def small_analysis(run):
+    settings = DiagnosisSettings(including=PROPOSED, scan_sims=60)
+    return analysis_of(run, without=WITHOUT, settings=settings)
 
 
 @pytest.fixture(scope="module")
@@ -57,12 +57,18 @@ def run():
 
 @pytest.fixture(scope="module")
 def declared(run):
-    return learned(run, SIMULATIONS)
+    analysis = small_analysis(run)
+    return context(analysis, *campaign.learned(analysis, ask, SIMULATIONS, time_ordered=False))
 
 
 @pytest.fixture(scope="module")
-def undeclared(run):
-    return learned(replace(run, nuisances=()), 250)  # only to show that it fails
+def undeclared(run, declared):
+    """Only to show that it fails; responses are those of the model with nuisances, which these do not change."""
+    analysis = small_analysis(replace(run, nuisances=()))
+    quiet = data_vectors(replace(analysis.job(seeded(analysis.run, 13)), count=200, slices=True))
+    vectors, slices = np.split(quiet, [len(analysis.elements)], axis=1)
+    ensemble = replace(declared.ensemble, simulations=vectors, slices=slices, nuisances=None)
+    return context(analysis, ensemble, declared.bank)
 
 
 def maps_of(run, *effects, seed=77):
@@ -77,7 +83,7 @@ ELLIPSE = config.Effect(name="beam_ellipticity", channel="W1", parameters={"ampl
 
 
 def test_p_is_uniform_over_the_prior_and_not_without_the_nuisances(declared, undeclared):
-    job = replace(declared.analysis.job(seeded(declared.run, 12)), nuisances=True, count=500)
+    job = replace(declared.analysis.job(seeded(declared.run, 12)), nuisances=True, count=SKIES)
     rows = data_vectors(job)
     p = {}
     for name, known in (("declared", declared), ("undeclared", undeclared)):
@@ -86,14 +92,16 @@ def test_p_is_uniform_over_the_prior_and_not_without_the_nuisances(declared, und
     assert ks_2samp(p["declared"], np.arange(1.0, SIMULATIONS + 1.0) / (SIMULATIONS + 1.0)).pvalue > 1e-3
     alarms = np.mean(np.array(p["declared"]) <= 0.05)
     # Binomial, of the data and of the ranks of the simulations.
-    assert abs(alarms - 0.05) < 4.0 * np.sqrt(0.05 * 0.95 * (1.0 / 500 + 1.0 / SIMULATIONS))
+    assert abs(alarms - 0.05) < 4.0 * np.sqrt(0.05 * 0.95 * (1.0 / SKIES + 1.0 / SIMULATIONS))
     assert np.mean(np.array(p["undeclared"]) <= 0.05) > 0.9
     # The posteriors have unit pulls: errors of the mean and width, and of the mean and covariance of the simulations.
     regression = Regression.of(declared.ensemble, declared.null)
     mean, sigma = (np.stack(one) for one in zip(*(regression.posterior(x, np.zeros(4)) for x in rows), strict=True))
-    true = np.stack([draws(declared.analysis.nuisances, 12, r)[0] for r in range(500)])
+    true = np.stack([draws(declared.analysis.nuisances, 12, r)[0] for r in range(SKIES)])
     pulls = (mean - true) / sigma
-    assert np.all(np.abs(pulls.mean(axis=0)) < 4.0 * np.sqrt(1.0 / 500 + (1.0 + declared.null.dimension) / SIMULATIONS))
+    assert np.all(
+        np.abs(pulls.mean(axis=0)) < 4.0 * np.sqrt(1.0 / SKIES + (1.0 + declared.null.dimension) / SIMULATIONS)
+    )
     assert np.all(np.abs(pulls.std(axis=0) - 1.0) < 0.15)
     assert np.all(sigma.mean(axis=0) < 0.6 * np.array([WIDTH, NOISE] * 2))
 
@@ -158,7 +166,7 @@ def test_the_command_lists_and_writes_nuisances(run, tmp_path, monkeypatch, caps
     code, said = mcsim_("diagnose", "model.toml", "data", "-o", "out", "--dry-run", *without)
     assert code == 0
     assert "nuisance: calibration of W1: 0.00 % ± 0.30 % of the gain" in said.out
-    with quick_pictures():
+    with quick_pictures(empty=True):
         code, said = mcsim_("diagnose", "model.toml", "data", "-o", "out", "--simulations", "150", *without)
     assert code == 0
     assert "nuisance      calibration of W1" in said.out
@@ -169,7 +177,7 @@ def test_the_command_lists_and_writes_nuisances(run, tmp_path, monkeypatch, caps
     assert two["name"] == "noise_level"
     found = mcsim.diagnosis.result.DiagnosisResult.open(tmp_path / "out")
     assert found.to_json() == verdict
-    with quick_pictures():
+    with quick_pictures(empty=True):
         assert "Known unknowns" in report.page(found)
     assert words.pulled(found.nuisances[0]).startswith("; pull ")
     assert mcsim_("config", "model.toml")[0] == 0

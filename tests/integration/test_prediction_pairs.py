@@ -11,7 +11,7 @@ import xarray as xr
 from scipy import stats
 
 from mcsim import beamfit, config
-from mcsim.beamfit.data import SUMMARY, Row, parts, project
+from mcsim.beamfit.data import SUMMARY, Row, project
 from mcsim.ensemble import describe, prediction, tables
 from mcsim.instrument import scan
 from mcsim.simulation import simulate
@@ -62,7 +62,7 @@ def two_channels(folder: Path, noise: float, **maps: Any) -> Survey:
 def vectors(shared: Survey, biposh: np.ndarray, pair: int, mode: int) -> np.ndarray:
     """Binned real and imaginary parts of one mode, shape (..., 4 or 8)."""
     one = shared.estimator.modes[mode]
-    rows = [Row(one, low, low + BIN - 1, part) for low in range(0, LMAX, BIN) for part in parts(one)]
+    rows = [Row(one, low, low + BIN - 1, part) for low in range(0, LMAX, BIN) for part in one.parts]
     return project(rows, SUMMARY, {one: biposh[..., pair, mode, :]})
 
 

@@ -20,7 +20,8 @@ from mcsim.simulation.survey import survey
 from pictures import quick_pictures
 
 PROPOSED = ("beam_ellipticity", "noise_level", "dipole_modulation")
-SETTINGS = DiagnosisSettings(without=tuple(name for name in mcsim.effects() if name not in PROPOSED))
+WITHOUT = tuple(name for name in mcsim.effects() if name not in PROPOSED)
+SETTINGS = DiagnosisSettings(without=WITHOUT, scan_sims=50, beam_orders=2)
 FINE, COARSE = 32, 8
 MASK = (np.abs(healpy.pix2vec(COARSE, np.arange(12 * COARSE**2))[2]) > 0.25).astype(float)
 
@@ -65,8 +66,8 @@ def data(run, *effects, seed=99):
     return mcsim.prepare(list(simulate.maps(survey(made), 0)), run)
 
 
-def diagnosed(run, maps, folder=None, simulations=300):
-    with quick_pictures():
+def diagnosed(run, maps, folder=None, simulations=240):
+    with quick_pictures(empty=True):
         return mcsim.diagnose(run, maps, folder, settings=replace(SETTINGS, simulations=simulations))
 
 
@@ -99,7 +100,7 @@ def test_a_model_that_lacks_power_of_the_sky_is_told_so(maps, tmp_path):
     assert "set sky.lmax to" in bare.warnings[0]
     assert json.loads((tmp_path / "verdict.json").read_text())["warnings"] == list(bare.warnings)
     assert words.summary(bare, tmp_path)[0].startswith("warning")
-    with quick_pictures():
+    with quick_pictures(empty=True):
         assert "Warning: sky.lmax = 20" in report.page(bare)
     assert mcsim.diagnosis.result.DiagnosisResult.open(tmp_path).warnings == bare.warnings
 

@@ -68,7 +68,7 @@ def test_amplitudes_are_student(few_simulations):
     assert np.all(np.abs(pulls.mean(axis=0)) < 0.14)
 
 
-@pytest.mark.parametrize(("p", "count", "draws"), [(20, 200, 800), (100, 1000, 500)])
+@pytest.mark.parametrize(("p", "count", "draws"), [(20, 200, 600), (100, 1000, 300)])
 def test_gap_is_uniform(p, count, draws):
     """Two dozen candidates of one to three columns, half of them alike; the calibration has a scatter of its own."""
     rng = np.random.default_rng(SEED + p)
@@ -223,7 +223,7 @@ def test_forecast_drop_of_what_draws_is_the_drop(brightness):
     sideways = rng.normal(size=(fitted + p, 2))
     root = 0.3 * np.column_stack([t, 15.0 * sideways / np.linalg.norm(sideways, axis=0)])
     differences, errors = [], []
-    for _ in range(200):
+    for _ in range(140):
         learning, before = drawn_null(rng, fitted, count), drawn_null(rng, p, count)
         bright = np.exp(brightness * rng.normal(size=draws + 1) - brightness**2 / 2.0)
         scatter = bright[1:] * (t[:, None] + root @ rng.normal(size=(3, draws)))

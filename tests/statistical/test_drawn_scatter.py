@@ -5,7 +5,7 @@ import numpy as np
 from mcsim.stats.gaussian import SimulatedGaussian, Tolerated
 from mcsim.stats.scattered import variance_beside, with_drawn_scatter
 
-P, SIMULATIONS, DRAWS, TRIALS = 40, 400, 16, 100
+P, SIMULATIONS, DRAWS, TRIALS = 40, 400, 16, 80
 
 
 def test_pulls_beside_drawn_patterns_have_unit_width() -> None:

@@ -8,7 +8,7 @@ from mcsim.stats.few_draws import _HeldOut, covariance_of_draws, scores_of_draws
 from mcsim.stats.gaussian import SimulatedGaussian
 from refusals import refused
 
-P, DRAWS, TRIALS, N = 100, 48, 200, 20_000
+P, DRAWS, TRIALS, N = 100, 48, 150, 20_000
 KS = 1e-3
 ORDER = np.arange(P)
 SPECTRA = {

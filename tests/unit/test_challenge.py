@@ -313,8 +313,8 @@ def test_power_of_one_template_is_the_known_one():
 @pytest.mark.slow
 def test_draws_are_judged(learned, linear, tmp_path):
     with batch(0) as call:
-        records = draws(learned, 120, 2, Prior(), call)
-    assert [record.case for record in records] == [f"draw-{number:05d}" for number in range(120)]
+        records = draws(learned, 80, 2, Prior(), call)
+    assert [record.case for record in records] == [f"draw-{number:05d}" for number in range(80)]
     found = Score("toy", records, powers(linear, 300, 2))
     strong = [record for record in records if record.kind == "one" and record.strength > 6]
     # Nearly orthogonal templates, far above the threshold: only the 5 % of true sets that are refused go wrong.

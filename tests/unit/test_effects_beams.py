@@ -264,6 +264,14 @@ def test_beams_without_a_falling_window_are_left_alone():
     assert extended(replace(beam, blm=rising)).lmax == 192
 
 
+def test_a_beam_of_few_degrees_is_continued_where_its_orders_exist():
+    beam = Beam.elliptical(1200.0, 900.0, lmax=7, mmax=2)
+    known = Beam.elliptical(1200.0, 900.0, lmax=16, mmax=2).blm
+    found = extended(beam).blm
+    assert np.all(np.isfinite(found))
+    np.testing.assert_allclose(found[:, :9], known[:, :9], atol=0.02 * abs(known[:, 8]).max())
+
+
 def test_what_is_no_beam_is_refused():
     beam = Beam.gaussian(FWHM, 48)
     site = site_of(beam)

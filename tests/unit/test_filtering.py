@@ -153,7 +153,7 @@ def variance_of_probes(t: np.ndarray, first: np.ndarray, second: np.ndarray, num
 @pytest.mark.slow
 def test_random_probes_estimate_the_fisher_matrix(products, filters) -> None:
     """Of one map and of two, element by element."""
-    number = 64
+    number = 40
     for pairs, auto in ((((0, 0),), True), (((0, 1),), False)):
         filtering = Filtering(tuple(filters), pairs, TABLES, WIDTH, number)
         found = filtering.response([tuple(each.probe(k) for each in filters) for k in range(number)], 0)
@@ -166,7 +166,7 @@ def test_random_probes_estimate_the_fisher_matrix(products, filters) -> None:
 @pytest.mark.slow
 def test_variance_is_the_inverse_of_the_fisher_matrix(products, filters) -> None:
     """Estimates from noisy masked maps of isotropic skies, within 4 errors of the sample variance."""
-    draws = 400
+    draws = 300
     bands = Bands(TABLES.modes, LMAX, WIDTH, True)
     covariance, _ = filtered_covariance(filters[0])
     inverse = np.linalg.inv(information(forms(bands, products), covariance, covariance, True))

@@ -10,7 +10,7 @@ from astropy.table import Table
 from mcsim import config
 from mcsim.beamfit import Measurement, comparisons, fit_each, orientation, report
 from mcsim.beamfit import fit as fit_to_any_order
-from mcsim.beamfit.data import SUMMARY, Row, parts, project
+from mcsim.beamfit.data import SUMMARY, Row, project
 from mcsim.bipolar import parse_mode
 from mcsim.bipolar.theory import ScannedBeam, cmb_biposh_leading
 from mcsim.ensemble import expectation, prediction
@@ -42,7 +42,7 @@ def shared() -> Survey:
 def expected(shared: Survey, blm: np.ndarray, names=("L2M0d0", "L2M0d2"), error=0.01) -> Measurement:
     """Leading-order data of a beam under the survey's scan."""
     modes = [parse_mode(name) for name in names]
-    rows = tuple(Row(mode, a, b, part) for mode in modes for part in parts(mode) for a, b in BINS)
+    rows = tuple(Row(mode, a, b, part) for mode in modes for part in mode.parts for a, b in BINS)
     w = expectation.scanned_beams(shared, 2)[0].w
     spectra = cmb_biposh_leading([(m.L, m.M, m.d) for m in modes], shared.cl, LMAX, ScannedBeam(blm, w))
     value = project(rows, SUMMARY, dict(zip(modes, spectra, strict=True)))

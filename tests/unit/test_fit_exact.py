@@ -8,7 +8,7 @@ from scipy import optimize, stats
 
 from mcsim import config
 from mcsim.beamfit import Measurement, Selection, fit, fit_models, report
-from mcsim.beamfit.data import SUMMARY, Row, parts, project
+from mcsim.beamfit.data import SUMMARY, Row, project
 from mcsim.beamfit.models import model
 from mcsim.beamfit.templates import Templates, templates
 from mcsim.bipolar import parse_mode
@@ -46,7 +46,7 @@ def shared() -> Survey:
 ROWS = tuple(
     Row(mode, a, a + 7, part)
     for mode in map(parse_mode, (*MODES, "L2M0d1"))
-    for part in parts(mode)
+    for part in mode.parts
     for a in range(8, 64, 8)
 )
 

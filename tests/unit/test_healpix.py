@@ -75,6 +75,23 @@ def test_pixel_window_against_the_power_of_pixels() -> None:
     np.testing.assert_allclose(found[5:], expected[5:], rtol=4e-4)
 
 
+def test_a_pixel_window_is_the_same_from_the_cache_and_without_one(tmp_path, monkeypatch) -> None:
+    def window() -> np.ndarray:
+        healpix.pixel_window.cache_clear()
+        healpix._distances.cache_clear()
+        return healpix.pixel_window(4, 12)
+
+    monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / "cache"))
+    first = window()
+    assert len(list((tmp_path / "cache").glob("pixels-*"))) == 4  # two faces, each with two sizes of sub-pixels
+    monkeypatch.setattr(healpix, "_histogram", None)  # nothing is computed again
+    np.testing.assert_array_equal(window(), first)
+    monkeypatch.undo()
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / "file"))
+    np.testing.assert_array_equal(window(), first)
+
+
 def test_read_pixel_window(tmp_path) -> None:
     path = tmp_path / "window.fits"
     column = fits.Column("TEMPERATURE", "D", array=np.linspace(1, 0.5, 11))

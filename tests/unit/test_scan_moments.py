@@ -123,7 +123,7 @@ def test_save_and_load(tmp_path, mmap):
     moments = Moments.from_model(MODEL, NSIDE, 2)
     moments.save(tmp_path / "m")
     loaded = Moments.load(tmp_path / "m", mmap=mmap)
-    assert isinstance(loaded.w, np.memmap) is mmap
+    assert isinstance(loaded.w.base, np.memmap) is mmap
     for name in ("hits", "w", "dtheta", "dphi"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(moments, name))
     (tmp_path / "m" / "w.npy").unlink()

@@ -1,6 +1,6 @@
 """Put differences into simulators, let ``mcsim compare`` explain them, and print what it says.
 
-    python workflows/simulators/differences.py [identical|single|pair ...] [--skies 3]
+    python workflows/simulators/differences.py [identical|single|pair ...] [--skies 3] [-o ROWS]
 
 Side A is totalconvolve.py, side B the simulator of the row; rows of litebird_sim and TOAST are left out where they are
 not installed. A row is right if the differences put in are the set named first, or one that is called as good.
@@ -10,8 +10,12 @@ import argparse
 import importlib
 import re
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from itertools import product
+from pathlib import Path
 from typing import Any
 
 import healpy
@@ -19,6 +23,7 @@ import inputs
 import numpy as np
 import totalconvolve
 from inputs import Inputs, Maps
+from rows import Rows
 
 import mcsim
 from mcsim import config
@@ -29,7 +34,7 @@ from mcsim.sphere.healpix import pixel_window
 from mcsim.sphere.rotation import rotate_alm
 
 NSIDE, LMAX = 64, 160
-SIMULATORS = ("totalconvolve", "litebird", "toast3", "healpy_pipeline")
+PAIRS = (("mcsim", "litebird"), ("mcsim", "toast3"), ("litebird", "toast3"), ("totalconvolve", "healpy_pipeline"))
 
 
 def run_of(scan: str, seed: int = 1, period_s: float = 31.0, circular: bool = False) -> config.RunConfig:
@@ -228,8 +233,8 @@ def compared(run: config.RunConfig, a: Maps, b: Maps) -> tuple[ComparisonResult,
     return found, time.process_time() - start
 
 
-def judged(case: Case) -> str:
-    """Return a row of the table."""
+def judged(case: Case) -> tuple[str, str]:
+    """Return whether the answer is right, and a row of the table."""
     run = run_of(case.scan, 1, case.period_s, case.circular)
     given = inputs.of(run)
     found, seconds = compared(run, totalconvolve.simulate(given), case.make(given))
@@ -243,33 +248,34 @@ def judged(case: Case) -> str:
     if channel.nearest is not None and not channel.differences:
         said += f" (nearest {channel.nearest.name} {channel.nearest.amplitude:.3g}: {channel.nearest.explains:.0%})"
     others = ", ".join("+".join(d.name for d in one) for one in channel.alternatives)
-    return (
+    return right, (
         f"| {case.scan} | {case.simulator} | {case.what} | {channel.accuracy:.1e} | {said} | "
         f"{100 * (1 - channel.left):.2f} | {others} | {right} | {seconds:.0f} |"
     )
 
 
-def identical(skies: int, only: str) -> Iterator[str]:
-    """Yield rows of pairs with nothing wrong: what they differ by, and what is said."""
-    pairs = (("mcsim", "litebird"), ("mcsim", "toast3"), ("litebird", "toast3"), ("totalconvolve", "healpy_pipeline"))
-    for scan in ("wmap", "planck", "litebird"):
-        wanted = [p for p in pairs if all(map(installed, p)) and re.search(only, f"{scan} {p[0]} {p[1]}")]
-        found: dict[tuple[str, str], list[ComparisonResult]] = {pair: [] for pair in wanted}
-        for seed in range(1, skies + 1):
-            made: dict[str, Maps] = {}
-            for pair in wanted:
-                run = run_of(scan, seed, circular="healpy_pipeline" in pair)
-                for name in set(pair) - made.keys():
-                    own = name == "mcsim"  # sample by sample
-                    made[name] = dict(sampled.maps(survey(run), 0)) if own else simulated(name, inputs.of(run))
-                found[pair].append(compared(run, made[pair[0]], made[pair[1]])[0])
-        for (a, b), said in found.items():
-            kinds = ", ".join(sorted({one.verdict for one in said}))
-            yield f"| {scan} | {a} | {b} | {max(one.accuracy for one in said):.1e} | {kinds} ({skies}) |"
+@lru_cache(maxsize=3)
+def with_nothing_wrong(name: str, scan: str, seed: int, circular: bool) -> Maps:
+    """Return the maps of a simulator, or of mcsim sample by sample."""
+    run = run_of(scan, seed, circular=circular)
+    return dict(sampled.maps(survey(run), 0)) if name == "mcsim" else simulated(name, inputs.of(run))
+
+
+def identical(scan: str, sides: tuple[str, str], seed: int) -> tuple[str, str]:
+    """Return the verdict on a pair with nothing wrong, and a row: what it differs by, and what is said."""
+    circular = "healpy_pipeline" in sides
+    a, b = (with_nothing_wrong(name, scan, seed, circular) for name in sides)
+    found, seconds = compared(run_of(scan, seed, circular=circular), a, b)
+    return (
+        found.verdict,
+        f"| {scan} | {' | '.join(sides)} | {seed} | {found.accuracy:.1e} | {found.verdict} | {seconds:.0f} |",
+    )
 
 
 def installed(name: str) -> bool:
     """Tell whether a simulator can be imported."""
+    if name == "mcsim":
+        return True
     try:
         importlib.import_module(name)
     except ImportError:
@@ -283,20 +289,21 @@ def main() -> None:
     parser.add_argument("tables", nargs="*", default=["identical", "single", "pair"])
     parser.add_argument("--skies", type=int, default=3)
     parser.add_argument("--only", default="", help="regular expression of the rows to make")
+    parser.add_argument("-o", "--output", type=Path, help="file of the rows; those that it holds are not made again")
     given = parser.parse_args()
+    rows, counts = Rows(given.output), Counter[str]()
     if "identical" in given.tables:
-        print(
-            "| scan | side A | side B | largest rms over the sky's | verdict |\n|---|---|---|---|---|",
-            flush=True,
-        )
-        for row in identical(given.skies, given.only):
-            print(row, flush=True)
+        print("| scan | side A | side B | sky | rms over the sky's | verdict | CPU s |\n|---|---|---|---|---|---|---|")
+    for seed, scan, sides in product(range(1, given.skies + 1), ("wmap", "planck", "litebird"), PAIRS):
+        if "identical" in given.tables and all(map(installed, sides)) and re.search(given.only, f"{scan} {sides}"):
+            counts[rows.made(f"{scan} {sides} {seed}", partial(identical, scan, sides, seed))] += 1
     print("\n| scan | side B | put in | rms / sky | named | explains % | as good | right | CPU s |")
     print("|---|---|---|---|---|---|---|---|---|")
     for table, cases in (("single", singles), ("pair", pairs)):
         for case in cases() if table in given.tables else ():
             if installed(case.simulator) and re.search(given.only, case.what):
-                print(judged(case), flush=True)
+                counts[rows.made(f"{case.scan} {case.simulator} {case.what}", partial(judged, case))] += 1
+    print(dict(counts))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Inject every difference that ``mcsim compare`` names into maps made by ducc0 and healpy, and count what it says.
 
     python workflows/simulators/injected.py [single|pair|identical ...] [--only REGEX] [--pairs 20] [--seed 1]
+        [-o ROWS]
 
 Side B, and side A but of identical pairs, is made by stranger.py. Small surveys (nside 32, lmax 64), so that many fit.
 """
@@ -13,11 +14,13 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import healpy
 import inputs
 import numpy as np
+from rows import Rows
 from stranger import ELL, LMAX, NPIX, NSIDE, SCANS, Survey, Vector, run_of
 
 import mcsim
@@ -37,6 +40,8 @@ def changes(given: inputs.Inputs, scan: str) -> dict[str, tuple[dict[str, Any], 
     """Return the arguments of two sizes of every difference, by the name that is right."""
     window, beam = pixel_window(NSIDE, LMAX), given.channels[0].beam.window[: LMAX + 1]
     x, late = np.array(healpy.pix2vec(NSIDE, np.arange(NPIX))), 0.01 if scan == "litebird" else 0.0005
+    theta, phi = healpy.pix2ang(NSIDE, np.arange(NPIX))
+    mirrored = np.pi - theta, phi
     names = [name for c in given.channels for name, _ in inputs.parts(given, c)]
 
     def filtered(factor: Vector) -> dict[str, Any]:
@@ -71,6 +76,7 @@ def changes(given: inputs.Inputs, scan: str) -> dict[str, tuple[dict[str, Any], 
             {"sky": lambda sky: rotate_alm(sky, LMAX, "galactic", "ecliptic")},
             {"sky": lambda sky: turned(sky, 0.1)},
         ),
+        "frame_reversed": ({"sky": np.conj}, mapped(lambda m: m[healpy.ang2pix(NSIDE, *mirrored)])),
         "calibration": (filtered(np.full(LMAX + 1, 1.02)), filtered(np.full(LMAX + 1, 0.9996))),
         "unit": (mapped(lambda m: 1e-6 * m), mapped(lambda m: m / 1.2505)),
         "monopole": (mapped(lambda m: m + 5.0), mapped(lambda m: m - 0.3)),
@@ -220,14 +226,15 @@ def main() -> None:
     parser.add_argument("--only", default="")
     parser.add_argument("--pairs", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("-o", "--output", type=Path, help="file of the rows; those that it holds are not made again")
     given = parser.parse_args()
     counts: Counter[str] = Counter()
+    rows = Rows(given.output)
     for number, case in enumerate(cases(given.tables, given.pairs, given.seed)):
         case = (*untimed(*case[:3]), *case[2:])
         if re.search(given.only, " ".join(case[2])):
-            right, row = judged(*case, seed=given.seed + number)
-            counts[right] += 1
-            print(row, flush=True)
+            seed = given.seed + number
+            counts[rows.made(f"{case} {seed}", lambda case=case, seed=seed: judged(*case, seed=seed))] += 1
     print(dict(counts))
 
 

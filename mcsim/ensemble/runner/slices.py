@@ -7,7 +7,7 @@ from pathlib import Path
 
 from numpy.typing import NDArray
 
-from mcsim.ensemble import plan, store, summary
+from mcsim.ensemble import opening, plan, store, summary
 from mcsim.ensemble.runner.batch import Result
 from mcsim.ensemble.tasks import empty, summarise_node
 from mcsim.errors import InputError
@@ -54,7 +54,7 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
     for other in sources[1:]:
         plan.check_mergeable(sources[0], first, other, store.attributes(other))
     size = max(store.size(source) for source in sources)
-    layout = plan.stored(sources[0], size)
+    layout = opening.layout(sources[0], size)
     first["configuration"]["ensemble"]["realizations"] = size
     with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=store.check_writable(target)) as folder:
         scratch = Path(folder) / "merged"

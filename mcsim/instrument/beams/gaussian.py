@@ -64,7 +64,7 @@ def elliptical_blm(
     highest = min(lmax, max(_LARGEST_ORDER, mmax or 0))
     blm = np.zeros((highest + 1, lmax + 1), dtype=np.complex128)
     sigma_major, sigma_minor = np.radians(np.array([fwhm_major_arcmin, fwhm_minor_arcmin]) / 60) * SIGMA_PER_FWHM
-    for m in range(0, highest + 1, 2):
+    for m in range(0, highest + 1 if fwhm_major_arcmin > fwhm_minor_arcmin else 1, 2):
         phase = np.exp(-1j * m * np.radians(angle_deg))
         blm[m, m:] = phase * _order(m, lmax, sigma_major, sigma_minor)
     return blm

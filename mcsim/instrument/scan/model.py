@@ -4,6 +4,7 @@ import json
 import math
 import tomllib
 from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -209,11 +210,17 @@ def read_described(path: Path) -> tuple[ScanModel, float | None]:
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_bytes().decode("utf-8"))
+        return _parsed(path.read_bytes().decode("utf-8"))
     except OSError as error:
         raise InputError(f"scan model {str(path)!r} cannot be read: {error.strerror}; give a TOML file.") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"scan model {str(path)!r} is not valid TOML: {error}.") from None
+
+
+@lru_cache(maxsize=16)
+def _parsed(text: str) -> dict[str, Any]:
+    """Return the table of a text, which nobody changes: surveys of runs with other effects read the same models."""
+    return tomllib.loads(text)
 
 
 def _toml(value: str | float | tuple[str, ...]) -> str:

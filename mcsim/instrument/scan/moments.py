@@ -404,7 +404,8 @@ class Moments:
         try:
             meta = json.loads((folder / _META).read_text())
             names = _ARRAYS[: (2, 4, 5)[min(meta["offsets"], 2)]]
-            arrays = {name: np.load(folder / f"{name}.npy", mmap_mode=mode) for name in names}
+            # As plain arrays: those of numpy's own class for mapped files are slow to slice.
+            arrays = {name: np.asarray(np.load(folder / f"{name}.npy", mmap_mode=mode)) for name in names}
             return cls(nside=meta["nside"], frame=meta["frame"], **arrays)
         except (OSError, ValueError, KeyError) as error:
             raise InputError(

@@ -1,0 +1,30 @@
+"""Values of differences, fitted beside what single samples change."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mcsim.comparison.prediction import Prediction, Set
+from mcsim.comparison.scene_differences import TimeShift
+
+
+class Slow(Prediction):
+    """A difference of value 1; what single samples change lets each fit come nine tenths of the way."""
+
+    _pointing = "known"
+    enough = 1e-6
+
+    def _measured(self, found: Set) -> Set:
+        return Set(found.members, float(found.members[0][1][0] - 1.0) ** 2)
+
+    def fitted(self, found: Set) -> Set:
+        ((difference, value),) = found.members
+        return Set(((difference, value + 0.9 * (1.0 - value)),), 0.0)
+
+
+def test_values_are_fitted_until_they_leave_nothing_that_others_could_take_up():
+    problem = Slow(SimpleNamespace(scene="known"), (), 0.0)
+    found = problem.corrected(Set(((TimeShift(), np.zeros(1)),), 1.0))
+    assert problem.complete(found)
+    assert found.members[0][1] == pytest.approx(0.9999, abs=1e-6)
