@@ -83,13 +83,13 @@ class Refiner:
             if not any(changed):
                 break
             found = self._attribute(now.t, now.candidates)
-        for index in [i for i, one in enumerate(now.candidates) if one.scatter is not None]:
-            if [one.members for one in found.explanations] != [(index,)]:
-                alone = self._alone(_Responses(t, t.copy(), list(candidates)), index)
-                own = self._attribute(alone.t, alone.candidates)
-                if (index,) in [one.members for one in own.explanations]:
-                    now, found = alone, own
-                    break
+        scattered = [i for i, one in enumerate(now.candidates) if one.scatter is not None]
+        for index in scattered if all(len(one.members) > 1 for one in found.explanations) else []:
+            alone = self._alone(now, t, index)
+            own = self._attribute(alone.t, alone.candidates)
+            if (index,) in [one.members for one in own.explanations]:
+                now, found = alone, own
+                break
         t, tried = now.t, now.candidates
         detected = None
         if found.verdict == "unknown":
@@ -127,9 +127,12 @@ class Refiner:
             now.candidates[index] = replace(candidate, acting=acting)
         return True
 
-    def _alone(self, now: "_Responses", index: int) -> "_Responses":
-        """Return responses with a stochastic candidate at the amplitude that it has alone."""
-        columns, null = list(now.candidates[index].columns), self.context.null
+    def _alone(self, now: "_Responses", linear: Matrix, index: int) -> "_Responses":
+        """Return the responses with a stochastic candidate at the amplitude that it has alone, from its linear one."""
+        null, columns = self.context.null, list(now.candidates[index].columns)
+        now = _Responses(linear, now.t.copy(), [*now.candidates])
+        now.t[:, columns] = linear[:, columns]
+        now.candidates[index] = replace(now.candidates[index], scatter=None)
         for _ in range(self.context.settings.refine_rounds):
             wide = null.with_extra_covariance(*scatters_of(now.candidates, [index]))
             fit = wide.fit(self.data.x, now.t[:, columns])

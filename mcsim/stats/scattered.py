@@ -74,7 +74,7 @@ def _growth(x: Matrix, c: Matrix) -> tuple[float, float]:
     the squared error of b is r/nu, by which b^2 is too large, that of r 2 r^2/nu.
     """
     skies, columns = x.shape
-    nu = (skies - 1.0) * columns
+    nu = max((skies - 1.0) * columns, 1.0)
     b = float(np.sum(x * c) / max(np.sum(x**2), 1e-300))
     r = float(np.sum((c - b * x) ** 2)) / max(nu - 1.0, 1.0)
     growth = (1.0 + b) ** 2 - 1.0 + r - r / nu + (b**2 + r) / skies
