@@ -51,7 +51,8 @@ def ask(jobs):
 @pytest.fixture(scope="module")
 def small():
     run = config.load(MODEL)
-    analysis = analysis_of(run, without=[name for name in systematics.catalogue() if name not in PROPOSED])
+    without = [name for name in systematics.catalogue() if name not in PROPOSED]
+    analysis = analysis_of(run, without=without, settings=DiagnosisSettings(beam_orders=2))
     return context(analysis, *campaign.learned(analysis, ask, 260, time_ordered=False))
 
 

@@ -46,7 +46,7 @@ def ask(jobs):
 
 
 def small_analysis(run):
-    settings = DiagnosisSettings(including=PROPOSED, scan_sims=60)
+    settings = DiagnosisSettings(including=PROPOSED, scan_sims=60, beam_orders=2, response_modes=1 << 12)
     return analysis_of(run, without=WITHOUT, settings=settings)
 
 
