@@ -11,6 +11,7 @@ from mcsim import config
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import Fit
+from mcsim.stats.scattered import Acting
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.systematics import Effect, Parametrization, basis_of
 
@@ -40,9 +41,8 @@ class Candidate:
     # Deviations of its response from the mean one if it is stochastic, shape (p, draws), as
     # SimulatedGaussian.with_extra_covariance takes them; None if they are not known.
     scatter: Matrix | None = field(default=None, compare=False)
-    # Otherwise the chi^2 that its effect adds to a residual by scattering the data, over the white norm of its response
-    # squared; 0 if it is not known.
-    scatter_chi2: float = 0.0
+    # Otherwise by how much its effect scatters the data; None if it is not known.
+    acting: Acting | None = field(default=None, compare=False)
     # It is a nuisance as well: its templates are those of the scatter that this makes, and are not refined.
     nuisance: bool = False
     step: float | None = None  # amplitude at which its response is measured; None: that of the effect

@@ -70,6 +70,15 @@ class Kept:
     def _stream(self, job: Job) -> Path:
         """Return the folder of all realizations of one kind."""
         run = json.loads(job.simulated)
-        kind = [job.sample_by_sample, job.bipolar_scan, job.slices, job.nuisances, job.source is not None]
+        kind: list[bool | str] = [
+            job.sample_by_sample,
+            job.bipolar_scan,
+            job.slices,
+            job.nuisances,
+            job.source is not None,
+        ]
+        if job.observed is not None:
+            # Skies that the data constrain are those of no other data.
+            kind.append(hashlib.sha256(job.observed.tobytes()).hexdigest())
         text = json.dumps([run["effect"], run["channel"], run["ensemble"]["seed"], kind])
         return self.folder / hashlib.sha256(text.encode()).hexdigest()[:32]

@@ -1,6 +1,6 @@
 """A table of measured spectra: read it, describe its numbers, and simulate them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 from pathlib import Path
@@ -17,6 +17,7 @@ from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Block, Element
 from mcsim.errors import InputError
 from mcsim.simulation import simulate
+from mcsim.sphere.rotation import FRAMES, rotate_biposh
 from mcsim.support.arrays import Vector
 from mcsim.systematics import Effect, Library
 
@@ -76,6 +77,29 @@ class Spectra:
             where = shared.pair_names.index(pair.label), shared.estimator.modes.index(row.mode)
             columns.append(project([row], self.scaling, {row.mode: biposh[:, *where]}))
         return np.concatenate(columns, axis=1)
+
+    def views(self) -> Iterator[tuple[Element, Vector]]:
+        """Yield M = 0 in other frames, if the table has every M: its description, and its weights of the values."""
+        at = {(pair, row): i for i, (pair, row) in enumerate(zip(self.pairs, self.rows, strict=True))}
+        for (pair, row), number in at.items():
+            mode = row.mode
+            if mode.L == 0 or mode.M > 0:
+                continue
+            family = [Mode(mode.L, M, mode.d) for M in range(mode.L + 1)]
+            needed = [
+                (m, part, at.get((pair, row._replace(mode=m, imaginary=part)))) for m in family for part in m.parts
+            ]
+            if any(i is None for _, _, i in needed):
+                continue
+            unit = np.zeros((len(self.rows), len(family), 1), dtype=np.complex128)
+            for m, part, i in needed:
+                unit[i, m.M, 0] = 1j if part else 1.0
+            for frame in FRAMES:
+                if frame != self.frame:
+                    turned = rotate_biposh(unit, [(m.L, m.M, m.d) for m in family], self.frame, frame)[:, 0, 0]
+                    own = self.elements[number]
+                    own = replace(own, name=f"{own.name} {frame}", frame=frame)
+                    yield own, turned.imag if row.imaginary else turned.real
 
 
 def read_spectra(path: str | Path, run: config.RunConfig) -> Spectra:

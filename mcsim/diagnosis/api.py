@@ -20,11 +20,12 @@ from mcsim.datavector.candidate import TemplateBank
 from mcsim.datavector.kept import Kept
 from mcsim.datavector.map_checks import checked, read_maps
 from mcsim.datavector.null_ensemble import NullEnsemble
+from mcsim.datavector.seeds import Checked
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.spectra_table import read_spectra
 from mcsim.diagnosis import controls, report, unlisted, words
 from mcsim.diagnosis.context import DataSet, DiagnosisContext, context
-from mcsim.diagnosis.external import Checked, ExternalModel, agreement, loaded
+from mcsim.diagnosis.external import ExternalModel, agreement, loaded
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.measured_spectra import MeasuredSpectra
 from mcsim.diagnosis.observed_maps import ObservedMaps

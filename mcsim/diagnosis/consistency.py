@@ -12,7 +12,7 @@ from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.slices import northern
 from mcsim.datavector.summaries import Element, bins
-from mcsim.stats.gaussian import SimulatedGaussian
+from mcsim.stats.gaussian import SimulatedGaussian, Tolerated
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.support.numbers import number, p_equals
 from mcsim.systematics import Effect
@@ -217,7 +217,7 @@ class Slices:
             rows = np.array([row for row, _ in beside])
             yield Division("hemispheres", words, rows, (north, np.eye(len(rows)) - north))
 
-    def _null(self, rows: Rows) -> SimulatedGaussian | None:
+    def null(self, rows: Rows) -> SimulatedGaussian | None:
         """Return the null distribution of some elements; None if there are too few simulations, or none of these."""
         spare = SPARE_SHRUNK if self.ensemble.shrunk else SPARE
         if not 0 < len(rows) <= len(self.ensemble.simulations) // spare:
@@ -232,7 +232,7 @@ class Slices:
         """Return the comparison of a division's parts; None if the effect does not show in two of them."""
         response = action.response
         division = self._clear(division, response)
-        null = self._null(division.rows)
+        null = self.null(division.rows)
         if null is None or len(division.keep) < 2:
             return None
         rows = division.rows
@@ -245,7 +245,9 @@ class Slices:
         if further < 1 or np.any(errors == 0.0):
             return None
         allowance = self._tolerated(null, whole.amplitudes[-1] * response[rows])
-        p = float(null.nested_test(max(whole.chi2 - apart.chi2, 0.0), whole.chi2, further, fitted, allowance))
+        p = float(
+            null.nested_test(max(whole.chi2 - apart.chi2, 0.0), whole.chi2, further, fitted, Tolerated(allowance))
+        )
         best = int(np.argmax(amplitudes / errors))
         found = null.fit(x, np.column_stack([beside, parts[best], sum(parts) - parts[best]]))
         variance = found.errors[-1] ** 2 + action.error**2 + self.settings.consistency_error**2
@@ -259,7 +261,7 @@ class Slices:
         rows = division.rows
         kept: list[Matrix] = []
         words: list[str] = []
-        null = self._null(rows)
+        null = self.null(rows)
         if null is None:
             return replace(division, keep=())
         pending, names = np.zeros((len(rows), len(rows))), list[str]()
@@ -291,7 +293,7 @@ class Slices:
         response = action.response
         for name, members in self._maps(channel).items():
             rows = np.array(members)
-            null = self._null(rows)
+            null = self.null(rows)
             if null is None or null.expected_snr(response[rows]) < self.settings.slice_snr:
                 continue
             found = null.fit(self.z[rows], np.column_stack([response[rows], action.directions[rows]]))
@@ -304,7 +306,7 @@ class Slices:
         """Return chi^2 of a channel's largest scales before and after effects are taken out; None if not known."""
         maps = self._maps(channel)
         rows = np.array([row for members in maps.values() for row in members], dtype=np.int64)
-        null = self._null(rows)
+        null = self.null(rows)
         if null is None:
             return None
         x = self.z[rows]

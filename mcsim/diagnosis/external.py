@@ -9,20 +9,14 @@ import numpy as np
 from scipy.stats import ks_2samp
 
 from mcsim import config
-from mcsim.datavector.analysis import Job, external_maps
-from mcsim.datavector.campaign import Task
 from mcsim.diagnosis.assemble import effects_of
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.result import Agreement
-from mcsim.ensemble.external import SEEDS, named_source, source_of
+from mcsim.ensemble.external import named_source, source_of
 from mcsim.ensemble.external_maps import Source
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import held_out_pvalues
 from mcsim.stats.look_elsewhere import global_test
-from mcsim.support.arrays import Map, Matrix
-
-REPEATS = 1e-6
-"""Rms difference over the rms up to which two maps of one seed are the same: threads add numbers in any order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,36 +69,6 @@ def loaded(
     if isinstance(model, ExternalModel):
         return bare, source_of(bare, model.simulator)
     return bare, None if named is None else source_of(bare, named)
-
-
-@dataclass(frozen=True)
-class Checked:
-    """A task that tests the seeds of an external simulator before the first of its simulations."""
-
-    task: Task
-
-    def __call__(self, job: Job) -> Matrix:
-        """Return the data vectors of a job."""
-        if job.source is not None and job.first == 0 and job.source.count is None:
-            _check_seeds(job)
-        return self.task(job)
-
-
-def _check_seeds(job: Job) -> None:
-    """Raise InputError unless one seed gives the same maps twice, and another seed others."""
-    one, other, again = (np.stack(external_maps(job, SEEDS - number)) for number in (1, 2, 1))
-    assert job.source is not None
-    if not _same(one, again):
-        raise InputError(
-            f"{job.source.label} gives other maps when it is called with the same seed again; draw every random number "
-            "from a generator that is made with the seed."
-        )
-    if _same(one, other):
-        raise InputError(f"{job.source.label} gives the same maps for every seed; draw sky and noise from the seed.")
-
-
-def _same(one: Map, other: Map) -> bool:
-    return bool(np.linalg.norm(one - other) <= REPEATS * np.linalg.norm(one))
 
 
 def agreement(known: DiagnosisContext) -> Agreement:

@@ -18,7 +18,8 @@ from mcsim.diagnosis.rivals import with_rivals
 from mcsim.diagnosis.selection import Attribution
 from mcsim.errors import InputError
 from mcsim.stats.excess import HeldOut
-from mcsim.stats.gaussian import Fit, with_drawn_scatter, with_scatter
+from mcsim.stats.gaussian import Fit
+from mcsim.stats.scattered import with_drawn_scatter, with_scatter
 from mcsim.support.arrays import Vector
 from mcsim.support.numbers import measured
 

@@ -1,17 +1,13 @@
 """Measured spectra as a data set: a table of binned BipoSH coefficients, or C_l, against simulations of the model."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from mcsim.bipolar import Mode
 from mcsim.datavector.localisation import Place, places
 from mcsim.datavector.spectra_table import Spectra
-from mcsim.datavector.summaries import Element
 from mcsim.diagnosis.context import DataSet
 from mcsim.errors import InputError
-from mcsim.sphere.rotation import FRAMES, rotate_biposh
 from mcsim.support.arrays import Matrix, Vector
 
 
@@ -95,7 +91,7 @@ class MeasuredSpectra(DataSet[Spectra]):
     def places(self) -> list[Place]:
         """Rank the numbers of the table, and their rotations to other frames."""
         measured, simulations = self.data, self.context.ensemble.simulations
-        views = list(_views(measured))
+        views = list(measured.views())
         matrix = np.stack([np.zeros(len(measured.rows)), *(row for _, row in views)])[1:]
         drawn = np.concatenate([simulations, simulations @ matrix.T], axis=1)
         elements = (*measured.elements, *(element for element, _ in views))
@@ -105,25 +101,3 @@ class MeasuredSpectra(DataSet[Spectra]):
     def provenance(self) -> dict[str, str | int]:
         """Return the file of the table, and the number of skies."""
         return {"table": self.data.path, "skies behind the mean": self.realizations}
-
-
-def _views(measured: Spectra) -> Iterator[tuple[Element, Vector]]:
-    """Yield M = 0 in other frames, if the table has every M: its description, and its weights of the values."""
-    at = {(pair, row): i for i, (pair, row) in enumerate(zip(measured.pairs, measured.rows, strict=True))}
-    for (pair, row), number in at.items():
-        mode = row.mode
-        if mode.L == 0 or mode.M > 0:
-            continue
-        family = [Mode(mode.L, M, mode.d) for M in range(mode.L + 1)]
-        needed = [(m, part, at.get((pair, row._replace(mode=m, imaginary=part)))) for m in family for part in m.parts]
-        if any(i is None for _, _, i in needed):
-            continue
-        unit = np.zeros((len(measured.rows), len(family), 1), dtype=np.complex128)
-        for m, part, i in needed:
-            unit[i, m.M, 0] = 1j if part else 1.0
-        for frame in FRAMES:
-            if frame != measured.frame:
-                turned = rotate_biposh(unit, [(m.L, m.M, m.d) for m in family], measured.frame, frame)[:, 0, 0]
-                own = measured.elements[number]
-                own = replace(own, name=f"{own.name} {frame}", frame=frame)
-                yield own, turned.imag if row.imaginary else turned.real

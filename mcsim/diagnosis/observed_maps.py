@@ -1,21 +1,24 @@
 """Observed maps: read them, refuse what the model cannot describe, and prepare them for a diagnosis."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
+from typing import Literal
 
 import numpy as np
 
 from mcsim import config
-from mcsim.datavector.campaign import after_jobs, constrained_jobs
 from mcsim.datavector.localisation import Place, places, standardised
-from mcsim.datavector.wiener_filter import Part, shared_sky
+from mcsim.datavector.same_skies import SameSkies
+from mcsim.datavector.wiener_filter import Part
 from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.nuisance import half_given_other
 from mcsim.diagnosis.selection import Attribution
 from mcsim.stats.look_elsewhere import global_test
-from mcsim.support.arrays import Alm, Map, Matrix, Vector
+from mcsim.support.arrays import Map, Matrix, Vector
+
+_Skies = Literal["reference", "typical", "constrained"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,66 +48,46 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         return np.concatenate([self.x, self._measured[3]])
 
     @cached_property
-    def observed_sky(self) -> Alm:
-        """Return the filtered sky of the maps, uK, shape (size,)."""
-        return shared_sky(self.context.analysis.model, self.data)
-
-    @cached_property
-    def _before(self) -> dict[bool, list[Vector]]:
-        """Return data vectors of constrained skies without any effect, as many as were needed so far.
-
-        The key is True for those of an external simulator.
-        """
-        return {False: [], True: []}
+    def same_skies(self) -> SameSkies:
+        """Return what simulates responses."""
+        return SameSkies(self.context.analysis, self.ask, self.data)
 
     def respond(self, found: Sequence[config.Effect], skies: int) -> Matrix:
         """Return changes of the data vector in ``skies`` constrained skies, shape (rows, p).
 
-        Effects with a mean response are simulated in typical skies instead: the observed sky has its power already.
+        Effects with a mean response, and those whose pattern is drawn, are simulated in typical skies instead: the
+        observed sky has their power, or the pattern of the data, already.
         """
         return self.respond_extended(found, skies)[:, : len(self.x)]
 
     def respond_extended(self, found: Sequence[config.Effect], skies: int) -> Matrix:
         """Return the changes of :meth:`respond` with those of the numbers beside the data vector, (rows, p + E)."""
-        typical = [effect for effect in found if self._is_typical(effect)]
-        others = [effect for effect in found if not self._is_typical(effect)]
+        kinds: dict[_Skies, list[config.Effect]] = {"reference": [], "typical": [], "constrained": []}
+        for effect in found:
+            kinds[self._skies_of(effect)].append(effect)
         shift = np.zeros((1, len(self.extended)))
-        if typical:
-            shift = self._simulated(typical) - self.context.extended_reference(typical)
-        if not others:
-            return shift
-        before, after = self._constrained(others, skies)
-        return shift.mean(axis=0) + after - before
+        if own := kinds["reference"]:
+            changes = self.same_skies.of_reference(own) - self.context.extended_reference(own)
+            shift = changes.mean(axis=0) if len(own) < len(found) else changes
+        for kind in ("typical", "constrained"):
+            if own := kinds[kind]:
+                before, after = self.same_skies.pair(own, skies, kind == "constrained")
+                shift = shift + after - before
+        return shift
 
     def pair(self, found: Sequence[config.Effect]) -> tuple[Matrix, Matrix]:
         """Return data vectors of the same skies without effects and with them, shape (rows, p) each."""
         size = len(self.x)
-        if any(self._is_typical(effect) for effect in found):
-            return self.context.reference(found), self._simulated(found)[:, :size]
-        before, after = self._constrained(found, self.context.settings.constrained_skies)
+        if any(self._skies_of(effect) == "reference" for effect in found):
+            return self.context.reference(found), self.same_skies.of_reference(found)[:, :size]
+        before, after = self.same_skies.pair(found, self.context.settings.constrained_skies, True)
         return before[:, :size], after[:, :size]
 
-    def _simulated(self, found: Sequence[config.Effect]) -> Matrix:
-        """Return extended data vectors of the skies of the reference with effects, shape (rows, p + E)."""
-        jobs = after_jobs(self.context.analysis, found)
-        return np.concatenate(self.ask([replace(job, slices=True) for job in jobs]))
-
-    def _constrained(self, found: Sequence[config.Effect], skies: int) -> tuple[Matrix, Matrix]:
-        """Return extended data vectors of constrained skies without effects and with them, (skies, p + E) each."""
-        source = self.context.analysis.source_of(found, given_sky=True)
-
-        def simulated(found: Sequence[config.Effect], first: int) -> Matrix:
-            jobs = constrained_jobs(self.context.analysis, found, self.observed_sky, range(first, skies))
-            return np.concatenate(self.ask([replace(job, slices=True, source=source) for job in jobs]))
-
-        after, before = simulated(found, 0), self._before[source is not None]
-        if len(before) < skies:
-            before.extend(simulated((), len(before)))
-        return np.stack(before[:skies]), after
-
-    def _is_typical(self, effect: config.Effect) -> bool:
-        kind = dict(self.context.analysis.library)[effect.name]
-        return kind.parametrization.mean_response and not kind.parametrization.stochastic
+    def _skies_of(self, effect: config.Effect) -> _Skies:
+        how = dict(self.context.analysis.library)[effect.name].parametrization
+        if how.mean_response == how.stochastic:
+            return "constrained"
+        return "reference" if how.mean_response else "typical"
 
     def templates(self) -> Matrix:
         """Return the templates; those that depend on the very sky are measured on the observed one if it departs."""

@@ -1,7 +1,7 @@
 """Simulate responses at the fitted amplitudes, where effects are too strong for a linear response."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -9,8 +9,8 @@ from mcsim.datavector.candidate import Candidate, beyond, columns_of, coordinate
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.selection import Attribution, attribute
 from mcsim.errors import InputError
-from mcsim.stats.excess import scatter_chi2
-from mcsim.stats.gaussian import Fit, with_drawn_scatter
+from mcsim.stats.gaussian import Fit
+from mcsim.stats.scattered import Acting, with_drawn_scatter
 from mcsim.support.arrays import Matrix, Vector
 
 
@@ -44,6 +44,16 @@ class Refined:
 
 
 @dataclass(frozen=True)
+class _Responses:
+    """Hold linear templates, those at the amplitudes that were simulated, candidates, and these amplitudes."""
+
+    linear: Matrix
+    t: Matrix
+    candidates: list[Candidate]
+    done: dict[int, Vector] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Refiner:
     """Attribute, simulate what was named at its amplitude, and attribute again until nothing changes."""
 
@@ -61,44 +71,26 @@ class Refiner:
         -----
         A response that is simulated at its coordinates changes its templates to the secant, exact there. A candidate
         that can have neither the fitted amplitude nor half of it is taken out. Of a stochastic one the scatter of the
-        response is kept, of any other one the chi^2 that its scatter adds to a residual. Where the power of a
-        stochastic one counts, which grows as the square of the amplitude, the secant at a_0 finds a^2/a_0 for a: the
-        mean of this and a_0 is Newton's step.
+        response is kept, of any other one by how much it scatters the data. Where the power of a stochastic one counts,
+        which grows as the square of the amplitude, the secant at a_0 finds a^2/a_0 for a: the mean of this and a_0 is
+        Newton's step. With the scatter that it has at the amplitude of a set, a stochastic one may not suffice though
+        it is all: it is tried at the amplitude that it has alone, too.
         """
-        linear, t, tried = t, t.copy(), list(candidates)
-        done: dict[int, Vector] = {}
-        found = self._attribute(t, tried)
+        now = _Responses(t, t.copy(), list(candidates))
+        found = self._attribute(now.t, now.candidates)
         for _ in range(self.context.settings.refine_rounds):
-            changed = False
-            for index, coordinates, covariance in self._to_try(found, tried):
-                if candidates[index].nuisance:
-                    continue
-                columns, how = list(candidates[index].columns), candidates[index].parametrization
-                nonlinear = how.nonlinear or self._is_nonlinear(columns, coordinates)
-                stochastic = how.stochastic and (how.sign == 0 or coordinates[0] > 0.0)
-                if self._has_settled(done.get(index), coordinates, covariance):
-                    continue
-                if stochastic and index in done:
-                    share = self._squared(linear[:, columns], t[:, columns], done[index])
-                    coordinates = done[index] + (coordinates - done[index]) / (1.0 + share)
-                done[index] = coordinates
-                answer = self._simulated(candidates[index], coordinates, covariance, stochastic)
-                changed = True
-                if answer is None:
-                    if nonlinear or stochastic:
-                        t[:, columns] = 0.0
-                    continue
-                at, changes, pair = answer
-                if nonlinear:
-                    t[:, columns] += self._beyond(t[:, columns], at, changes.mean(axis=0))
-                if stochastic:
-                    tried[index] = replace(tried[index], scatter=self.data.scatter(changes), shape_error=None)
-                elif pair is not None:
-                    added = scatter_chi2(self.context.null, t[:, columns], *pair)
-                    tried[index] = replace(tried[index], scatter_chi2=added)
-            if not changed:
+            changed = [self._simulate(now, *work) for work in self._to_try(found, now.candidates)]
+            if not any(changed):
                 break
-            found = self._attribute(t, tried)
+            found = self._attribute(now.t, now.candidates)
+        scattered = [i for i, one in enumerate(now.candidates) if one.scatter is not None]
+        for index in scattered if all(len(one.members) > 1 for one in found.explanations) else []:
+            alone = self._alone(now, t, index)
+            own = self._attribute(alone.t, alone.candidates)
+            if (index,) in [one.members for one in own.explanations]:
+                now, found = alone, own
+                break
+        t, tried = now.t, now.candidates
         detected = None
         if found.verdict == "unknown":
             detected = self.detected_in(t, tried)
@@ -107,6 +99,46 @@ class Refiner:
                 if together.explanations:
                     t, found, detected = detected.templates, together, None
         return Refined(found, t, tuple(tried), detected)
+
+    def _simulate(self, now: "_Responses", index: int, coordinates: Vector, covariance: Matrix) -> bool:
+        """Simulate a candidate at fitted coordinates, and return True, unless it has been there."""
+        candidate = now.candidates[index]
+        columns, how, done = list(candidate.columns), candidate.parametrization, now.done.get(index)
+        if candidate.nuisance or self._has_settled(done, coordinates, covariance):
+            return False
+        nonlinear = how.nonlinear or self._is_nonlinear(columns, coordinates)
+        stochastic = how.stochastic and (how.sign == 0 or coordinates[0] > 0.0)
+        if stochastic and done is not None:
+            share = self._squared(now.linear[:, columns], now.t[:, columns], done)
+            coordinates = done + (coordinates - done) / (1.0 + share)
+        now.done[index] = coordinates
+        answer = self._simulated(candidate, coordinates, covariance, stochastic)
+        if answer is None:
+            if nonlinear or stochastic:
+                now.t[:, columns] = 0.0
+            return True
+        at, changes, pair = answer
+        if nonlinear:
+            now.t[:, columns] += self._beyond(now.t[:, columns], at, changes.mean(axis=0))
+        if stochastic:
+            now.candidates[index] = replace(candidate, scatter=self.data.scatter(changes), shape_error=None)
+        elif pair is not None:
+            acting = Acting.of(self.context.null, now.t, [one.columns for one in now.candidates], index, pair)
+            now.candidates[index] = replace(candidate, acting=acting)
+        return True
+
+    def _alone(self, now: "_Responses", linear: Matrix, index: int) -> "_Responses":
+        """Return the responses with a stochastic candidate at the amplitude that it has alone, from its linear one."""
+        null, columns = self.context.null, list(now.candidates[index].columns)
+        now = _Responses(linear, now.t.copy(), [*now.candidates])
+        now.t[:, columns] = linear[:, columns]
+        now.candidates[index] = replace(now.candidates[index], scatter=None)
+        for _ in range(self.context.settings.refine_rounds):
+            wide = null.with_extra_covariance(*scatters_of(now.candidates, [index]))
+            fit = wide.fit(self.data.x, now.t[:, columns])
+            if not self._simulate(now, index, fit.amplitudes, fit.covariance):
+                break
+        return now
 
     def detected_in(self, t: Matrix, candidates: Sequence[Candidate]) -> PartialExplanation | None:
         """Add the most significant candidate beside those that are detected already, until none is significant.

@@ -7,9 +7,12 @@ from typing import Any
 import numpy as np
 
 from mcsim.datavector.analysis import on_request
-from mcsim.datavector.candidate import Candidate, beyond, columns_of, numbered
+from mcsim.datavector.candidate import Candidate, beyond, columns_of, numbered, scatters_of
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
+from mcsim.diagnosis.naming import slices_of
 from mcsim.diagnosis.refine import Refined, Refiner
+from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector
 
 
@@ -19,8 +22,8 @@ def with_rivals(data: DataSet[Any], refined: Refined) -> tuple[DataSet[Any], Ref
     Notes
     -----
     As a candidate each of them would raise the bar for all. Here it becomes a candidate for these data alone, and only
-    if it can take the place of a member. Global p-values stay those of the candidates that are always proposed.
-    Patterns that are drawn are no rivals.
+    if it can take the place of a member, in the data vector and in the numbers beside it. Global p-values stay those of
+    the candidates that are always proposed. Patterns that are drawn are no rivals.
     """
     context, found = data.context, refined.attribution.if_named(data.context.settings)
     if len(found.explanations) != 1:
@@ -29,32 +32,54 @@ def with_rivals(data: DataSet[Any], refined: Refined) -> tuple[DataSet[Any], Ref
     near = [one for one in on_request(context.analysis) if one.channel in channels or None in (one.channel, *channels)]
     pairs = [(one, data.response(one, context.settings.channel_skies)) for one in near if not one.random_response]
     known = [(one, response) for one, response in pairs if response is not None]
-    rivals = [known[place] for place in in_place(context, data.x, replace(refined, attribution=found), known)]
+    null, z, t = _widest(data, refined, found.explanations[0].members)
+    wide = replace(refined, attribution=found, templates=t)
+    rivals = [known[place] for place in in_place(null, z, wide, known, context.settings)]
     if not rivals:
         return data, refined
-    wide = replace(data, context=with_candidates(context, rivals))
-    added = wide.context.templates[:, context.templates.shape[1] :]
-    candidates = (*refined.candidates, *wide.context.candidates[len(context.candidates) :])
-    return wide, Refiner(wide).run(np.concatenate([refined.templates, added], axis=1), candidates)
+    data = replace(data, context=with_candidates(context, rivals))
+    added = data.context.templates[:, context.templates.shape[1] :]
+    candidates = (*refined.candidates, *data.context.candidates[len(context.candidates) :])
+    return data, Refiner(data).run(np.concatenate([refined.templates, added], axis=1), candidates)
+
+
+def _widest(data: DataSet[Any], refined: Refined, members: Sequence[int]) -> tuple[SimulatedGaussian, Vector, Matrix]:
+    """Return null distribution, data and templates, with the numbers beside the data vector if they can be added.
+
+    They cannot beside members whose scatter is known, and without simulations for so many elements.
+    """
+    slices, beside = slices_of(data), data.context.bank.slice_matrix
+    scattered = scatters_of(refined.candidates, members)
+    null = None if scattered or not len(beside) else slices.null(np.arange(len(slices.z)))
+    if null is None:
+        return data.context.null, data.x, refined.templates
+    return null, slices.z, np.concatenate([refined.templates, beside])
 
 
 def in_place(
-    context: DiagnosisContext, x: Vector, refined: Refined, rivals: Sequence[tuple[Candidate, Matrix]]
+    null: SimulatedGaussian,
+    z: Vector,
+    refined: Refined,
+    rivals: Sequence[tuple[Candidate, Matrix]],
+    settings: DiagnosisSettings,
 ) -> Iterator[int]:
     """Yield the indices of rivals, with their responses, that explain data in the place of a member of the only set.
 
-    Amplitudes are possible, and the likelihood is within ``odds_cut`` of that of the set.
+    Amplitudes are possible, and the likelihood is within ``odds_cut`` of that of the set, but for an error of the
+    response that is tolerated (``consistency_error``). Data and templates are those of ``null``.
     """
-    null, candidates, members = context.null, refined.candidates, refined.attribution.explanations[0].members
-    whole = null.fit(x, refined.templates[:, columns_of(candidates, members)])
-    least = float(null.log_likelihood(whole.chi2)) - np.log(context.settings.odds_cut)
+    candidates, members = refined.candidates, refined.attribution.explanations[0].members
+    whole = null.fit(z, refined.templates[:, columns_of(candidates, members)])
+    least = float(null.log_likelihood(whole.chi2)) - np.log(settings.odds_cut)
     for index, (rival, response) in enumerate(rivals):
         every = numbered([*candidates, rival])
-        t = np.concatenate([refined.templates, response[: len(x)]], axis=1)
+        t = np.concatenate([refined.templates, response[: len(z)]], axis=1)
         for member in members:
             changed = (*(one for one in members if one != member), len(candidates))
-            fit = null.fit(x, t[:, columns_of(every, changed)])
-            if null.log_likelihood(fit.chi2) >= least and np.isfinite(beyond(every, changed, fit)):
+            columns = columns_of(every, changed)
+            fit = null.fit(z, t[:, columns])
+            wrong = settings.consistency_error * null.expected_snr(t[:, columns] @ fit.amplitudes)
+            if null.log_likelihood(fit.chi2) + 0.5 * wrong**2 >= least and np.isfinite(beyond(every, changed, fit)):
                 yield index
                 break
 

@@ -16,6 +16,7 @@ from mcsim.diagnosis.subsets import EXHAUSTIVE, Rows, Subsets, chunks
 from mcsim.stats.detection import cosines
 from mcsim.stats.gaussian import Fit, SimulatedGaussian
 from mcsim.stats.look_elsewhere import Calibration, GlobalTest, global_test
+from mcsim.stats.scattered import variance_beside
 from mcsim.support.arrays import Matrix, Vector
 
 Verdict = Literal["none", "effect", "mixture", "degenerate", "unknown"]
@@ -287,10 +288,11 @@ class _Selection:
             for members in combinations(scatters, size):
                 if len({self.candidates[index].identity for index in members}) < size:
                     continue
-                wide = self.null.with_extra_covariance(*(scatters[index] for index in members))
-                groups = wide.whiten_groups(self.t, [c.columns for c in self.candidates])
-                y = wide.whiten(self.x)
-                yield Subsets(wide, y, groups, self.candidates, self.calibration, self.settings, members)
+                known, columns = [scatters[index] for index in members], [c.columns for c in self.candidates]
+                wide = self.null.with_extra_covariance(*known)
+                beside = variance_beside(self.null, self.t, columns, members, known)
+                groups, y = wide.whiten_groups(self.t, columns), wide.whiten(self.x)
+                yield Subsets(wide, y, groups, self.candidates, self.calibration, self.settings, members, beside)
 
     def _possible(self, found: Iterable[_Accepted]) -> Iterator[_Accepted]:
         """Yield the sets whose fitted amplitudes are possible, with the evidence of the nearest ones within bounds."""

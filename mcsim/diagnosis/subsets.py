@@ -12,8 +12,9 @@ from scipy import special
 from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.stats.detection import log_evidence
-from mcsim.stats.gaussian import COLLINEAR, SimulatedGaussian, WhitenedTemplates
+from mcsim.stats.gaussian import COLLINEAR, SimulatedGaussian, Tolerated, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration
+from mcsim.stats.scattered import Beside
 from mcsim.support.arrays import Vector
 
 # Relative to columns of norm one: keeps the normal equations of degenerate effects solvable, far below any noise.
@@ -35,15 +36,15 @@ Rows = NDArray[np.int64]
 class Solved:
     """Hold the fits of M subsets, shape (M,) each.
 
-    ``allowance`` is the squared error of their templates, ``scatter`` what their scatter adds to each of the directions
-    that are left.
+    ``allowance`` is the squared error of their templates, ``parts`` the squared amplitude of each member over that at
+    which it was simulated, at most 1, shape (M, size).
     """
 
     chi2: Vector
     pvalue: Vector
     evidence: Vector
     allowance: Vector
-    scatter: Vector
+    parts: Vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +59,7 @@ class Subsets:
     settings: DiagnosisSettings = field(default_factory=DiagnosisSettings)
     # Candidates whose scatter is in ``null``: subsets contain these, and no other one whose scatter is known.
     scattered: tuple[int, ...] = ()
+    variance: Vector | None = None  # of held-out draws of these along each candidate, over what ``null`` says, (C,)
 
     @cached_property
     def total(self) -> float:
@@ -87,9 +89,9 @@ class Subsets:
         return np.array([default if c.shape_error is None else c.shape_error for c in self.candidates])
 
     @cached_property
-    def _scatters(self) -> Vector:
-        """Return the chi^2 that each candidate's scatter adds to a residual, over its fitted part."""
-        return np.array([candidate.scatter_chi2 for candidate in self.candidates])
+    def _beside(self) -> Beside:
+        """Return how much the candidates that act scatter the data."""
+        return Beside.of([candidate.acting for candidate in self.candidates], self.variance)
 
     @cached_property
     def _identity(self) -> Rows:
@@ -162,7 +164,8 @@ class Subsets:
         np.add.at(part.T, place, fitted.T**2)
         part = np.minimum(part, delta_chi2[:, None])
         allowance = np.sum(self._errors[subsets] ** 2 * part, axis=1)
-        scatter = np.sum(self._scatters[subsets] * part, axis=1)
+        parts = part / self._beside.size[subsets]
+        scatter = np.sum(self._beside.chi2[subsets] * parts, axis=1)
         weights = np.array([candidate.prior for candidate in self.candidates])
         prior = special.gammaln(size + 1) + np.log(weights / weights.sum())[subsets].sum(axis=1)
         return Solved(
@@ -170,7 +173,7 @@ class Subsets:
             pvalue=null.residual_test(self.total - delta_chi2, K, allowance + scatter),
             evidence=log_evidence(null, self.total, delta_chi2, K, self.settings.prior_snr) + prior,
             allowance=allowance,
-            scatter=scatter / (null.dimension - K),
+            parts=np.minimum(parts, 1.0),
         )
 
     def least_needed(self, subsets: Rows) -> Vector:
@@ -182,12 +185,13 @@ class Subsets:
         for place in range(subsets.shape[1]):
             others = np.delete(subsets, place, axis=1)
             rank = self.groups.sizes[subsets[:, place]]
-            chi2, allowance = np.full(len(subsets), self.total), np.zeros(len(subsets))
+            chi2, tolerated = np.full(len(subsets), self.total), Tolerated()
             if others.shape[1]:
                 without = self.solve(others)
-                chi2, allowance = without.chi2, without.allowance + rank * without.scatter
+                own = self._beside.tolerated(without.allowance, others, without.parts, subsets[:, place, None])
+                chi2, tolerated = without.chi2, Tolerated(*(np.asarray(one)[:, 0] for one in own))
             fitted = self.groups.sizes[subsets].sum(axis=1) - rank
-            pvalues = self.null.nested_test(chi2 - whole.chi2, chi2, rank, fitted, allowance)
+            pvalues = self.null.nested_test(chi2 - whole.chi2, chi2, rank, fitted, tolerated)
             largest = np.maximum(largest, self.calibration.global_pvalue(pvalues))
         return largest
 
@@ -211,8 +215,8 @@ class Subsets:
             kept = values > COLLINEAR
             delta_chi2 = np.sum(np.where(kept, along**2 / np.where(kept, values, 1.0), 0.0), axis=-1)
             added = kept.sum(axis=-1)
-            allowance = solved.allowance[:, None] + added * solved.scatter[:, None]
-            pvalues = self.null.nested_test(delta_chi2, solved.chi2[:, None], added, K, allowance)
+            tolerated = self._beside.tolerated(solved.allowance, subsets, solved.parts, others[None, :])
+            pvalues = self.null.nested_test(delta_chi2, solved.chi2[:, None], added, K, tolerated)
             exclusive = np.any(self._identity[subsets][:, :, None] == self._identity[others], axis=1)
             found[:, others] = np.where(exclusive, 1.0, pvalues)
         return self.calibration.global_pvalue(found)

@@ -120,7 +120,7 @@ class Reconstruction:
             )
             for one, amplitude in zip(effects, given, strict=True)
         ]
-        (job,) = constrained_jobs(analysis, tables, self.data.observed_sky, range(SKIES))
+        (job,) = constrained_jobs(analysis, tables, self.data.same_skies.observed, range(SKIES))
         maps = list(simulated_maps(job, {**dict(analysis.library), **kinds}))
         scores_ = [scores_of_maps(analysis.model, self.scene, one) for one in maps]
         return Simulated(maps[0], np.mean(scores_, axis=0), np.mean([analysis.data_vector(m) for m in maps], axis=0))

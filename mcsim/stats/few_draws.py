@@ -1,7 +1,7 @@
 """Estimate the covariance of a random pattern from a few draws of it, for data that hold one more draw beside noise."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,18 +42,36 @@ def covariance_of_draws(deviations: Matrix) -> tuple[Matrix, float]:
     total = float(np.sum(deviations**2))
     if total == 0.0:
         return np.zeros((p, p)), 0.0
-    held = _HeldOut.of(deviations)
-    low, high = np.full(len(_WEIGHTS), -_LOG_RANGE), np.full(len(_WEIGHTS), _LOG_RANGE)
-    for _ in range(_STEPS):
-        middle = 0.5 * (low + high)
-        narrow = held.solve(np.exp(middle)).chi2.mean(axis=1) > p
-        low, high = np.where(narrow, middle, low), np.where(narrow, high, middle)
-    found = held.judge(np.exp(high))
-    best = int(np.argmax(np.where(high < _LOG_RANGE, found.log_likelihood, -np.inf)))
-    variance = float(found.noise_variance[best] + np.var(found.chi2[best], ddof=1))
-    weight, scale = _WEIGHTS[best], np.exp(high[best])
+    weight, scale, error = _HeldOut.of(deviations).best()
     covariance = scale * ((1.0 - weight) * deviations @ deviations.T + weight * total / p * np.eye(p))
-    return covariance, max(variance - 2.0 * p, 0.0) / (p * (p + 2.0))
+    return covariance, error
+
+
+def scores_of_draws(deviations: Matrix, t: Matrix) -> tuple[Matrix, Matrix]:
+    """Return the normal matrix of templates t, shape (p, K), and the covariance of its right-hand side, (K, K) both.
+
+    These are t'(1 + R)^-1 t, and the covariance of t'(1 + R)^-1 x for held-out draws x with noise: one and the same if
+    R were that of the pattern. Each draw is judged by the covariance of all others, with weight and scale of all; both
+    are means over draws. ``deviations`` are those of :func:`covariance_of_draws`.
+    """
+    count, gram = deviations.shape[1], t.T @ t
+    if not deviations.any():
+        return gram, gram
+    held, normal, covariance = _HeldOut.of(deviations), np.zeros_like(gram), np.zeros_like(gram)
+    weight, scale, _ = held.best()
+    along = held.vectors.T @ t
+    outside, less = gram - along.T @ along, count / (count - 1.0)
+    for z in (held.vectors.T @ deviations).T:
+        same, own = held.rest(float(z @ z), weight, scale)
+        f, inverse = own * less, 1.0 / (1.0 + same + own * held.values)
+        u = inverse * z
+        left = 1.0 - f * float(z @ u)
+        one, two = along.T @ u, along.T @ (inverse * u)
+        first, second = (along.T @ (part[:, None] * along) for part in (inverse, inverse**2))
+        normal += first + outside / (1.0 + same) + f / left * np.outer(one, one)
+        covariance += second + outside / (1.0 + same) ** 2 + f / left * (np.outer(one, two) + np.outer(two, one))
+        covariance += ((f / left) ** 2 * float(u @ u) + count / left**2) * np.outer(one, one)
+    return normal / count, covariance / count
 
 
 class _Judged(NamedTuple):
@@ -88,19 +106,43 @@ class _Solved(NamedTuple):
 class _HeldOut:
     """Judge covariances of p elements by draws that they do not know.
 
-    ``values``, shape (q,), are the eigenvalues of S, and ``squares``, shape (k, q), those of the deviations of k draws
-    along its eigenvectors.
+    ``vectors``, shape (p, q), and ``values`` are eigenvectors and eigenvalues of S, and ``squares``, shape (k, q),
+    those of the deviations of k draws along them.
     """
 
     p: int
+    vectors: Matrix
     values: Vector
     squares: Matrix
 
     @classmethod
     def of(cls, deviations: Matrix) -> "_HeldOut":
         """Take the draws' deviations from their mean, shape (p, k)."""
-        _, singular, right = np.linalg.svd(deviations, full_matrices=False)
-        return cls(len(deviations), singular**2, (singular[:, None] * right).T ** 2)
+        vectors, singular, right = np.linalg.svd(deviations, full_matrices=False)
+        return cls(len(deviations), vectors, singular**2, (singular[:, None] * right).T ** 2)
+
+    def best(self) -> tuple[float, float, float]:
+        """Return w and b of R, and the variance that :func:`covariance_of_draws` returns."""
+        low, high = np.full(len(_WEIGHTS), -_LOG_RANGE), np.full(len(_WEIGHTS), _LOG_RANGE)
+        for _ in range(_STEPS):
+            middle = 0.5 * (low + high)
+            narrow = self.solve(np.exp(middle)).chi2.mean(axis=1) > self.p
+            low, high = np.where(narrow, middle, low), np.where(narrow, high, middle)
+        found = self.judge(np.exp(high))
+        best = int(np.argmax(np.where(high < _LOG_RANGE, found.log_likelihood, -np.inf)))
+        variance = float(found.noise_variance[best] + np.var(found.chi2[best], ddof=1))
+        error = max(variance - 2.0 * self.p, 0.0) / (self.p * (self.p + 2.0))
+        return float(_WEIGHTS[best]), float(np.exp(high[best])), error
+
+    def rest(self, square: Any, weight: Any, scale: Any) -> tuple[Any, Any]:
+        """Return the factors of 1 and of S - k/(k - 1) z z' in the covariance R of all but the draw z of k.
+
+        ``square`` is z'z; broadcast over weights w and scales b.
+        """
+        count = len(self.squares)
+        more = (count - 1.0) / (count - 2.0)
+        trace = more * (self.values.sum() - count / (count - 1.0) * square)
+        return scale * weight * trace / self.p, more * scale * (1.0 - weight)
 
     def solve(self, scale: Vector) -> _Solved:
         """Return chi^2 in the covariances of all weights, each with its scale, shape (W,).
@@ -111,10 +153,8 @@ class _HeldOut:
         matrix D - f z z' are those of Sherman & Morrison (Ann. Math. Stat. 21, 124, 1950).
         """
         count, rest = len(self.squares), self.p - len(self.values)
-        more, less = (count - 1.0) / (count - 2.0), count / (count - 1.0)
-        total = more * (self.values.sum() - less * self.squares.sum(axis=1))
-        same, own = (scale * _WEIGHTS)[:, None] * total / self.p, more * (scale * (1.0 - _WEIGHTS))[:, None]
-        outside, f = 1.0 + same, own * less
+        same, own = self.rest(self.squares.sum(axis=1), _WEIGHTS[:, None], scale[:, None])
+        outside, f = 1.0 + same, own * count / (count - 1.0)
         inside = outside[..., None] + own[..., None] * self.values
         inverse = 1.0 / inside
         first, second = (np.einsum("kq,wkq->wk", self.squares, one) for one in (inverse, inverse * inverse))

@@ -7,13 +7,14 @@ allow for a factor that scales the covariance of each realization (:mod:`mcsim.s
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mcsim.errors import InputError
 from mcsim.stats.elliptical import f_tail, leave_one_out, scale_variance
-from mcsim.stats.few_draws import covariance_of_draws, without
+from mcsim.stats.few_draws import covariance_of_draws
 from mcsim.stats.shrinkage import Fold, shrunk
 from mcsim.support.arrays import Matrix, Vector, divided
 
@@ -210,10 +211,10 @@ class SimulatedGaussian:
         chi2: ArrayLike,
         columns: ArrayLike,
         fitted: ArrayLike = 0,
-        allowance: ArrayLike = 0.0,
+        tolerated: "Tolerated | None" = None,
     ) -> NDArray[np.float64]:
         """Return the p-value of ``columns`` further templates beside ``fitted`` ones; see :func:`nested_pvalue`."""
-        return nested_pvalue(delta_chi2, chi2, columns, self.dimension - np.asarray(fitted), self.dof, allowance)
+        return nested_pvalue(delta_chi2, chi2, columns, self.dimension - np.asarray(fitted), self.dof, tolerated)
 
     def delta_chi2(self, x: NDArray[np.float64], t: NDArray[np.float64]) -> float:
         """Return the fall of chi^2 if the templates ``t``, shape (p_raw, K), are fitted to ``x``."""
@@ -308,59 +309,6 @@ class SimulatedGaussian:
         return wide
 
 
-def with_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, before: Matrix, after: Matrix) -> Fit:
-    """Return a fit of templates, shape (p_raw, K), with the errors of its amplitudes with the effects in the data.
-
-    ``before`` and ``after`` are data vectors of the same skies without the effects and with them at their amplitudes,
-    shape (skies, p_raw).
-
-    Notes
-    -----
-    A strong effect changes the scatter of the data. The fit is linear, so that it is applied to every sky. The variance
-    of each amplitude grows by its excess among the skies with the effects over that without them: the same skies, whose
-    common scatter cancels. The response that is fitted is a mean of as many skies: the variance of the amplitudes that
-    the changes of single skies have, over their number, adds. Correlations stay; errors are not made smaller.
-    """
-    basis, back = orthonormal(null.whiten_templates(t))
-    without, acting, change = (
-        np.var(back @ basis.T @ null.whiten_templates(rows.T), axis=1, ddof=1)
-        for rows in (before, after, after - before)
-    )
-    own, added = np.diag(found.covariance), np.maximum(acting - without + change / len(before), 0.0)
-    factor = np.sqrt(1.0 + divided(added, own))
-    return replace(found, covariance=factor[:, None] * found.covariance * factor)
-
-
-def with_drawn_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, scatters: Sequence[Matrix]) -> Fit:
-    """Return a fit of templates, shape (p_raw, K), with the errors that patterns which are drawn give its amplitudes.
-
-    ``null`` is the distribution without them; ``scatters``, with which it was widened for the fit, are deviations as of
-    :meth:`SimulatedGaussian.with_extra_covariance`.
-
-    Notes
-    -----
-    The weights of the fit avoid the scatter of the very draws that it is known from: these would make errors too small.
-    Each draw is fitted with the scatter of all others, and the mean square of what it adds to the amplitudes stands in
-    place of the scatter (leave-one-out cross-validation; Stone, JRSS B 36, 111, 1974). Pulls:
-    tests/statistical/test_drawn_scatter.py.
-    """
-    white, scale = np.linalg.pinv(null.whitening), (null.dof + found.chi2) / (found.dof - 2)
-
-    def weights(extra: Sequence[Matrix]) -> Matrix:
-        wide = null.with_extra_covariance(*extra)
-        basis, back = orthonormal(wide.whiten_templates(t))
-        return np.asarray(back @ basis.T @ wide.whitening / np.sqrt(1.0 + 1.0 / null.n_sims))
-
-    own = weights(scatters) @ white * np.sqrt(1.0 + 1.0 / null.n_sims)
-    covariance = scale * own @ own.T
-    for place, draws in enumerate(scatters):
-        for k in range(draws.shape[1]):
-            others = [*scatters[:place], without(draws, k), *scatters[place + 1 :]]
-            added = weights(others) @ draws[:, k]
-            covariance += np.outer(added, added)
-    return replace(found, covariance=covariance)
-
-
 def held_out_pvalues(simulations: Matrix, null: SimulatedGaussian) -> Vector:
     """Return the p-value of every simulation, shape (N, p_raw), against all others, shape (N,): uniform."""
     chi2, n = null.held_out(simulations)
@@ -386,24 +334,46 @@ def residual_pvalue(
     return np.where(q > 0.0, f_tail(f, np.maximum(q, 1.0), n - q + 1.0, allowance, scale), 1.0)
 
 
+class Tolerated(NamedTuple):
+    """Say what a test of further templates has to tolerate.
+
+    ``allowance`` is the squared signal-to-noise ratio of an error of the model, ``variance`` that of the data along the
+    templates, with effects that act, over what it is without, and ``dof`` the degrees of freedom from which this is
+    known.
+    """
+
+    allowance: ArrayLike = 0.0
+    variance: ArrayLike = 1.0
+    dof: ArrayLike = np.inf
+
+
 def nested_pvalue(
-    delta_chi2: ArrayLike, chi2: ArrayLike, columns: ArrayLike, dimension: ArrayLike, n: int, allowance: ArrayLike = 0.0
+    delta_chi2: ArrayLike,
+    chi2: ArrayLike,
+    columns: ArrayLike,
+    dimension: ArrayLike,
+    n: int,
+    tolerated: Tolerated | None = None,
 ) -> NDArray[np.float64]:
     """Return the probability that templates absent from the data lower chi^2 by at least this much.
 
     chi^2 falls by ``delta_chi2`` from ``chi2`` when K further templates, ``columns``, are fitted; the probability is 1
     for none. ``dimension`` counts the degrees of freedom before: p, less the templates that have been fitted already.
-    ``n`` and ``allowance`` are those of :func:`residual_pvalue`.
+    ``n`` is that of :func:`residual_pvalue`.
 
     Notes
     -----
     (n - p + 1)/K delta/(n + chi^2 - delta) ~ F(K, n - p + 1): the residual acts as covariates (Rao, Biometrika 46, 49,
-    1959). Uniform: tests/statistical/test_diagnose_statistics.py.
+    1959). Uniform: tests/statistical/test_diagnose_statistics.py. A ``variance`` divides F; one that is estimated adds
+    its relative error to that of the covariance: the reciprocals of the degrees of freedom add (Satterthwaite,
+    Biometrics Bulletin 2, 110, 1946).
     """
+    known = tolerated or Tolerated()
     K, T = np.asarray(columns, dtype=float), np.asarray(delta_chi2)
     d2 = n - np.asarray(dimension, dtype=float) + 1.0
-    f = d2 / np.maximum(K, 1.0) * T / (n + np.maximum(np.asarray(chi2) - T, 0.0))
-    return np.where(K > 0.0, f_tail(f, np.maximum(K, 1.0), d2, allowance), 1.0)
+    f = d2 / np.maximum(K, 1.0) * T / (n + np.maximum(np.asarray(chi2) - T, 0.0)) / known.variance
+    d2 = 1.0 / (1.0 / d2 + 1.0 / np.asarray(known.dof, dtype=float))
+    return np.where(K > 0.0, f_tail(f, np.maximum(K, 1.0), d2, known.allowance), 1.0)
 
 
 def orthonormal(white: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -194,7 +194,7 @@ def test_stripes_of_a_binned_map_are_those_that_a_destriper_takes_off():
     drift -= drift.mean()
 
     def offsets(chunk: tod.Samples) -> NDArray[np.float64]:
-        return drift[(chunk.time_s / (256 * 361.0)).astype(int)]
+        return drift[(chunk.time_s / (256 * 601.0)).astype(int)]
 
     found = mcsim.compare(simulator(added=offsets), simulator(), simulator.run)
     assert names(found) == ["map_making"]
@@ -258,7 +258,7 @@ def test_the_model_may_describe_the_other_side(name, simulator, side_a):
 def test_time_stamps_a_whole_sample_off_are_named_however_far_that_is():
     simulator = Simulator(small())
     pointing = simulator.site.pointed("")
-    ahead = scene.ahead(pointing.model, 361.0)
+    ahead = scene.ahead(pointing.model, 601.0)
     observe = tod.sky_signal(simulator.sky, 32, PEAR, 1e-8, 1)
 
     def late(half: int) -> NDArray[np.float64]:

@@ -173,7 +173,7 @@ def test_a_run_is_simulated_sample_by_sample_where_the_other_side_is(tmp_path):
         'schema = 1\nname = "pair"\nsky = { spectrum = "wmap7", lmax = 32 }\nensemble = { seed = 3 }\n'
         'map = { nside = 16, splits = ["half1", "half2"] }\n'
         '[[channel]]\nname = "W1"\nbeam = { kind = "gaussian", fwhm_arcmin = 380.0 }\n'
-        'scan = { kind = "hit_averaged", model = "litebird", sample_period_s = 361.0 }\n'
+        'scan = { kind = "hit_averaged", model = "litebird", sample_period_s = 601.0 }\n'
     )
     found = mcsim.compare(model, tmp_path)
     assert found.verdict == "identical"

@@ -140,7 +140,7 @@ def test_pieces_are_of_realizations_that_are_missing_and_of_the_same_simulations
     for piece in kept.missing(job, kept.found(job)):
         kept.keep(piece, np.arange(piece.first, piece.first + piece.count, dtype=float)[:, None])
     assert {number: row[0] for number, row in kept.found(job).items()} == {n: float(n) for n in range(3, 12)}
-    # Another number of workers is the same simulation; another seed, effect or kind of row is not.
+    # Another number of workers is the same simulation; another seed, effect, kind of row or observed sky is not.
     busy = campaign.with_effects(run, [])
     same = api.analysis_of(run, library=LIBRARY).job(replace(busy, compute=replace(run.compute, workers=3)))
     assert missing(replace(same, first=3, count=9)) == []
@@ -152,6 +152,7 @@ def test_pieces_are_of_realizations_that_are_missing_and_of_the_same_simulations
         replace(job, slices=True),
         replace(job, nuisances=True),
         replace(job, sample_by_sample=True),
+        replace(job, observed=np.ones(325, dtype=complex)),
     ):
         assert sum(count for _, count in missing(changed)) == 9
 

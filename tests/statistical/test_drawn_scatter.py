@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from mcsim.stats.gaussian import SimulatedGaussian, with_drawn_scatter
+from mcsim.stats.gaussian import SimulatedGaussian, Tolerated
+from mcsim.stats.scattered import variance_beside, with_drawn_scatter
 
 P, SIMULATIONS, DRAWS, TRIALS = 40, 400, 16, 80
 
@@ -26,3 +27,35 @@ def test_pulls_beside_drawn_patterns_have_unit_width() -> None:
     # A width has an error of 1/sqrt(2 TRIALS), and that of 16 draws of about a sixth averages out: 3.5 sigma.
     widths = np.sqrt(np.mean(np.square(pulls), axis=0))
     np.testing.assert_allclose(widths, 1.0, atol=3.5 / np.sqrt(2.0 * TRIALS))
+
+
+def test_what_is_found_beside_a_drawn_pattern_is_as_rare_as_it_says() -> None:
+    """A power law of modes, of which 24 draws hardly tell the weaker ones, along which other templates lie."""
+    rng, draws, trials, beside, level = np.random.default_rng(20140317), 24, 200, 12, 0.01
+    noise, spectrum = SimulatedGaussian(np.zeros(P), np.eye(P), 100_000), 1000.0 / (1.0 + np.arange(P)) ** 2
+    t, columns = np.column_stack([rng.normal(size=P), np.eye(P)[:, 8 : 8 + beside]]), [(k,) for k in range(1 + beside)]
+    falls, variances = [], []
+    for _ in range(trials):
+        pattern = np.sqrt(spectrum)[:, None] * rng.normal(size=(P, draws))
+        pattern -= pattern.mean(axis=1, keepdims=True)
+        scatter = pattern * np.sqrt((1.0 + 1.0 / draws) / (draws - 1.0))
+        wide = noise.with_extra_covariance(scatter)
+        x = 30.0 * t[:, 0] + np.sqrt(spectrum * (1.0 + 1.0 / draws)) * rng.normal(size=P) + rng.normal(size=P)
+        alone = wide.fit(x, t[:, :1])
+        falls.append([alone.chi2 - wide.fit(x, t[:, [0, k]]).chi2 for k in range(1, 1 + beside)])
+        variances.append(variance_beside(noise, t, columns, [0], [scatter]))
+    variance = np.array(variances)
+    np.testing.assert_array_equal(variance[:, 0], 1.0)
+    ignored, charged = (
+        np.mean(noise.nested_test(np.array(falls), P, 1, 1, Tolerated(0.0, one)) < level)
+        for one in (1.0, variance[:, 1:])
+    )
+    # The templates of one data vector are independent.
+    assert abs(charged - level) < 4.0 * np.sqrt(level / np.size(falls))
+    assert ignored > 2.0 * level
+
+
+def test_a_pattern_without_scatter_leaves_the_variance_beside_it() -> None:
+    noise = SimulatedGaussian(np.zeros(P), np.eye(P), 1000)
+    found = variance_beside(noise, np.eye(P)[:, :3], [(0,), (1,), (2,)], [0], [np.zeros((P, DRAWS))])
+    np.testing.assert_array_equal(found, 1.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mcsim.stats.few_draws import covariance_of_draws, without
+from mcsim.stats.few_draws import _HeldOut, covariance_of_draws, scores_of_draws, without
 from mcsim.stats.gaussian import SimulatedGaussian
 from refusals import refused
 
@@ -58,6 +58,24 @@ def test_deviations_without_a_draw_are_those_of_the_others():
     others = np.delete(draws, 2, axis=1)
     expected = (others - others.mean(axis=1, keepdims=True)) / np.sqrt(5.0)
     np.testing.assert_allclose(without(deviations, 2), expected, rtol=1e-12)
+
+
+def test_scores_of_held_out_draws_are_those_of_explicit_covariances():
+    """With the weights of all other draws: the normal matrix, and what noise and the draw itself scatter."""
+    rng, p, count = np.random.default_rng(2), 9, 6
+    draws, t = 3.0 * rng.normal(size=(p, count)), rng.normal(size=(p, 3))
+    deviations = (draws - draws.mean(axis=1, keepdims=True)) * np.sqrt((1.0 + 1.0 / count) / (count - 1.0))
+    weight, scale, _ = _HeldOut.of(deviations).best()
+    normal, covariance = np.zeros((3, 3)), np.zeros((3, 3))
+    for k in range(count):
+        others = without(deviations, k)
+        R = scale * ((1.0 - weight) * others @ others.T + weight * np.sum(others**2) / p * np.eye(p))
+        filtered = np.linalg.solve(np.eye(p) + R, t)
+        score = filtered.T @ deviations[:, k] * np.sqrt(count)
+        normal += t.T @ filtered / count
+        covariance += (filtered.T @ filtered + np.outer(score, score)) / count
+    for found, expected in zip(scores_of_draws(deviations, t), (normal, covariance), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 def test_no_pattern_has_no_covariance_and_three_draws_are_refused():

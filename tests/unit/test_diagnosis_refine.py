@@ -1,6 +1,6 @@
 """Responses at the amplitudes that were found: bent ones, and two that change each other's."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -63,10 +63,14 @@ class Instrument:
         before = np.random.default_rng(22).normal(size=(8, P))
         return before, self.noise * before + self.respond(tables, 8)
 
+    def scatter(self, changes: np.ndarray) -> np.ndarray:
+        return (changes - changes.mean(axis=0)).T / np.sqrt(len(changes) - 1.0)
+
     def refined(self, x: np.ndarray):
         bank = SimpleNamespace(curvature=self.curvature)
         context = SimpleNamespace(null=self.null, calibration=self.calibration, bank=bank, settings=DiagnosisSettings())
-        data = SimpleNamespace(context=context, x=x, respond=self.respond, pair=self.pair, realizations=1)
+        own = {"respond": self.respond, "pair": self.pair, "scatter": self.scatter}
+        data = SimpleNamespace(context=context, x=x, realizations=1, **own)
         return Refiner(data).run(self.t, self.candidates)
 
 
@@ -129,3 +133,32 @@ def test_what_data_tell_nothing_of_is_neither_detected_nor_simulated(monkeypatch
     assert found.attribution.verdict == "unknown"
     assert found.partial is None
     assert instrument.analysis == []
+
+
+@pytest.mark.parametrize("enough", [3.0, 30.0], ids=["suffices alone", "does not"])
+def test_a_stochastic_effect_is_tried_at_the_amplitude_that_it_has_alone(monkeypatch, enough):
+    """Beside others its amplitude is 2, alone it is 14: that alone with the scatter of the latter suffices is found."""
+    instrument, rng = Instrument(bend=0.0, cross=0.0), np.random.default_rng(25)
+    kind = type("Draws", (Push,), {"parametrization": Parametrization(stochastic=True)})
+    instrument.candidates[0] = Candidate(kind, "A", (0,))
+    patterns = rng.normal(size=(48, P)) / np.sqrt(P)
+
+    def respond(tables, skies):
+        (table,) = tables
+        return float(table.parameters["amplitude"]) * (instrument.t[:, 0] + patterns[:skies])
+
+    x = 14.0 * instrument.t[:, 0]
+    pair = attribute(instrument.null, x, instrument.t, instrument.candidates, instrument.calibration)
+    (one,) = pair.explanations
+    set_fit = instrument.null.fit(x - 12.0 * instrument.t[:, 0], instrument.t[:, :2])
+
+    def attributed(self, t, candidates):
+        scatter = candidates[0].scatter
+        if scatter is not None and np.sqrt(np.sum(scatter**2)) > enough:
+            return pair
+        return replace(pair, explanations=(replace(one, members=(0, 1), fit=set_fit),), verdict="mixture")
+
+    monkeypatch.setattr(Refiner, "_attribute", attributed)
+    monkeypatch.setattr(instrument, "respond", respond)
+    found = instrument.refined(x)
+    assert [own.members for own in found.attribution.explanations] == ([(0,)] if enough < 10.0 else [(0, 1)])

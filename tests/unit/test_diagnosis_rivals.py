@@ -34,8 +34,7 @@ def named() -> SimpleNamespace:
     x = S * t[:, 1] + rng.normal(size=P)
     found = attribute(null, x, t[:, :3], candidates, calibrate(null, groups, draws=2000))
     assert [one.members for one in found.explanations] == [(1,)]
-    context = SimpleNamespace(null=null, settings=DiagnosisSettings())
-    return SimpleNamespace(context=context, x=x, t=t, refined=Refined(found, t[:, :3], candidates))
+    return SimpleNamespace(null=null, x=x, t=t, refined=Refined(found, t[:, :3], candidates))
 
 
 @pytest.mark.parametrize(
@@ -51,7 +50,21 @@ def named() -> SimpleNamespace:
 def test_what_leaves_as_little_is_a_rival(named, cosine, channel, sign, is_rival):
     response = cosine * named.t[:, [1]] + np.sqrt(1.0 - cosine**2) * named.t[:, [4]]
     rivals = [(candidate("other", channel, sign), response)]
-    assert list(in_place(named.context, named.x, named.refined, rivals)) == [0] * is_rival
+    assert list(in_place(named.null, named.x, named.refined, rivals, DiagnosisSettings())) == [0] * is_rival
+
+
+@pytest.mark.parametrize(("beside", "is_rival"), [(0.0, False), (1.0, True)])
+def test_numbers_beside_the_data_vector_tell_a_rival_from_a_member(named, beside, is_rival):
+    """In the data vector both are the same; ten numbers beside it hear the member alone, or both."""
+    rng = np.random.default_rng(7)
+    t = np.zeros((10, 3))
+    t[0, 1] = 0.5
+    null = SimulatedGaussian.from_simulations(rng.normal(size=(N, P + 10)))
+    z = np.concatenate([named.x, S * t[:, 1] + rng.normal(size=10)])
+    refined = replace(named.refined, templates=np.concatenate([named.refined.templates, t]))
+    response = np.concatenate([named.t[:, [1]], beside * t[:, [1]]])
+    rivals = [(candidate("other", "V1"), response)]
+    assert list(in_place(null, z, refined, rivals, DiagnosisSettings())) == [0] * is_rival
 
 
 def test_columns_are_added_behind_those_of_a_bank():

@@ -7,8 +7,9 @@ import pytest
 
 from mcsim.datavector.candidate import Candidate
 from mcsim.diagnosis.subsets import Subsets
-from mcsim.stats.gaussian import SimulatedGaussian, with_scatter
+from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate
+from mcsim.stats.scattered import Acting, with_scatter
 from mcsim.systematics import Effect
 
 P, SKIES = 12, 4000
@@ -29,33 +30,56 @@ def test_errors_grow_with_the_scatter_and_never_shrink(growth: float) -> None:
     np.testing.assert_allclose(_correlation(wide.covariance), _correlation(found.covariance), rtol=1e-12)
 
 
-def test_the_error_of_a_response_from_few_skies_adds() -> None:
-    """A response that differs from sky to sky: once in the data, and once more over the number of skies."""
-    rng, skies, spread = np.random.default_rng(5), 4, 2.0
+def test_pulls_have_unit_width_where_few_skies_tell_the_scatter() -> None:
+    """A response that differs from sky to sky: once in the data, and once more in the mean over eight skies."""
+    rng, skies, spread = np.random.default_rng(5), 8, 2.0
     model, t = SimulatedGaussian(np.zeros(P), np.eye(P), 1_000_000), np.eye(P)[:, :1]
-    found, growth = model.fit(20.0 * t[:, 0], t), []
+    found, pulls = model.fit(20.0 * t[:, 0], t), []
     for _ in range(2000):
-        before = rng.normal(size=(skies, P))
-        after = before + 20.0 * t[:, 0] + spread * rng.normal(size=(skies, P))
-        growth.append(with_scatter(model, t, found, before, after).covariance[0, 0] / found.covariance[0, 0] - 1.0)
-    # Of 2000 means of few squares the standard error is 0.12. Errors are not made smaller: 0.15 at most are added.
-    assert np.mean(growth) == pytest.approx(spread**2 * (1.0 + 1.0 / skies), abs=0.5)
+        before, change = rng.normal(size=(skies, P)), spread * rng.normal(size=(skies, P))
+        wide = with_scatter(model, t, found, before, before + 20.0 * t[:, 0] + change)
+        pulls.append((rng.normal() + spread * rng.normal() - change[:, 0].mean()) / wide.errors[0])
+    # The error of a width of 2000 Gaussian pulls is 0.016; these have the tails of a Student t.
+    assert np.std(pulls) == pytest.approx(1.0, abs=0.06)
 
 
-def test_further_effects_are_not_found_in_the_scatter_of_one() -> None:
-    """Beside an effect that makes the noise 1.3 times as large the p-values of all others stay those of no effect."""
-    rng, count, snr, draws, growth = np.random.default_rng(7), 60, 25.0, 400, 1.3
-    null, t = SimulatedGaussian.from_simulations(rng.normal(size=(800, count))), rng.normal(size=(count, 12))
-    t /= np.linalg.norm(t, axis=0)
-    effects = [type(f"effect{k}", (Effect,), {"name": f"effect{k}", "unit": "", "step": 1.0}) for k in range(12)]
-    quiet = [Candidate(effect, None, (k,)) for k, effect in enumerate(effects)]
-    loud = [replace(quiet[0], scatter_chi2=(growth**2 - 1.0) * (count - 1.0) / snr**2), *quiet[1:]]
-    groups = null.whiten_groups(t, [one.columns for one in quiet])
+def test_few_skies_tell_exactly_how_much_more_noise_there_is() -> None:
+    """Variances before and after, of eight skies, would have errors of a half."""
+    rng, growth = np.random.default_rng(6), 1.4
+    model, t = SimulatedGaussian(np.zeros(P), np.eye(P), 1_000_000), np.eye(P)[:, :1]
+    found, before = model.fit(20.0 * t[:, 0], t), rng.normal(size=(8, P))
+    wide = with_scatter(model, t, found, before, 20.0 * t[:, 0] + growth * before)
+    # The response, too, is measured in eight skies.
+    expected = np.sqrt(growth**2 + (growth - 1.0) ** 2 / 8.0)
+    np.testing.assert_allclose(wide.errors / found.errors, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("growth", "spread"), [(1.6, 0.0), (1.0, 2.0)], ids=["more noise in some elements", "a response that scatters"]
+)
+def test_further_effects_are_not_found_in_the_scatter_of_one(growth: float, spread: float) -> None:
+    """Beside an effect that makes some elements noisier the p-values of all others stay those of no effect.
+
+    Eight skies tell by how much.
+    """
+    rng, count, snr, draws, skies = np.random.default_rng(7), 30, 25.0, 200, 8
+    null, t = SimulatedGaussian.from_simulations(rng.normal(size=(800, count))), np.eye(count)[:, 7:14]
+    factor, wide = np.where(np.arange(count) < 10, growth, 1.0), np.where(np.arange(count) < 10, spread, 0.0)
+    columns = [(k,) for k in range(7)]
+    effects = [type(f"effect{k}", (Effect,), {"name": f"effect{k}", "unit": "", "step": 1.0}) for k in range(7)]
+    quiet = [Candidate(effect, None, own) for effect, own in zip(effects, columns, strict=True)]
+    groups = null.whiten_groups(t, columns)
     calibration, found = calibrate(null, groups), []
+
+    def with_effect(rows: np.ndarray) -> np.ndarray:
+        return factor * rows + snr * t[:, 6] + wide * rng.normal(size=rows.shape)
+
     for _ in range(draws):
-        y = null.whiten(snr * t[:, 0] + growth * rng.normal(size=count))
+        before = rng.normal(size=(skies, count))
+        loud = [*quiet[:6], replace(quiet[6], acting=Acting.of(null, t, columns, 6, (before, with_effect(before))))]
+        y = null.whiten(with_effect(rng.normal(size=(1, count)))[0])
         searches = (Subsets(null, y, groups, own, calibration) for own in (quiet, loud))
-        found.append([one.beside(np.array([[0]])).min() <= 0.05 for one in searches])
+        found.append([one.beside(np.array([[6]])).min() <= 0.05 for one in searches])
     ignored, charged = np.mean(found, axis=0)
     assert abs(charged - 0.05) < 3.0 * np.sqrt(0.05 * 0.95 / draws)
     assert ignored > 0.15

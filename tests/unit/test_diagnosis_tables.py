@@ -15,7 +15,7 @@ from mcsim.datavector.spectra_table import read_spectra
 from mcsim.diagnosis import report
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.inference import diagnose_data
-from mcsim.diagnosis.measured_spectra import MeasuredSpectra, _views
+from mcsim.diagnosis.measured_spectra import MeasuredSpectra
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere.rotation import rotate_biposh
@@ -133,7 +133,7 @@ def test_power_spectra_are_those_of_the_pair(tmp_path):
 
 def test_other_frames_are_those_of_rotated_coefficients(tmp_path):
     spectra = read(tmp_path, measured(RUN))
-    views = list(_views(spectra))
+    views = list(spectra.views())
     # d = 2 lacks M > 0 and is not turned.
     assert len(views) == 2 * len(BINS)
     at = {(row.mode, row.ell_min, row.imaginary): value for row, value in zip(spectra.rows, spectra.value, strict=True)}

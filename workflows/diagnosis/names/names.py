@@ -255,23 +255,35 @@ def true(number):
         linear = linear_model(context)
         own = {"null": linear.null, "calibration": linear.calibration, "templates": linear.templates}
         known = replace(context, candidates=linear.candidates, groups=linear.groups, **own)
+        kept = len(context.ensemble.simulations) - len(linear.data)
+        every, wide = context.ensemble.extended, context.ensemble.first(kept).extended.gaussian
+        data, whole = (
+            every.simulations[kept:] + every.offset,
+            np.concatenate([known.templates, context.bank.slice_matrix]),
+        )
         sampler, rows = CaseSampler(Prior(weakest=5.0, strongest=20.0), linear), []
         for case in range(number // 2):
             (member,) = sampler.members(np.random.default_rng([1, case]), 1)
-            x = linear.data[case % len(linear.data)] + linear.response([member])
+            z = data[case % len(data)] + whole[:, list(known.candidates[member.candidate].columns)] @ member.coordinates
+            x = z[: len(linear.null.mean)]
             found = attribute(known.null, x, known.templates, known.candidates, known.calibration).if_named(
                 known.settings
             )
-            row = said(found, known, member.identity)
-            if len(found.explanations) == 1:
-                refined = Refined(found, known.templates, known.candidates)
-                if near := [rivals[index] for index in in_place(known, x, refined, rivals)]:
-                    wide = with_candidates(known, near)
-                    found = attribute(wide.null, x, wide.templates, wide.candidates, wide.calibration)
-                    row += said(found.if_named(wide.settings), wide, member.identity)
-            rows.append(row if len(row) > 4 else row + row)
+            row, counted = said(found, known, member.identity), []
+            for null, seen, t in ((known.null, x, known.templates), (wide, z, whole)):
+                named, counted = found, [*counted, *row]
+                if len(found.explanations) == 1:
+                    refined = Refined(found, t, known.candidates)
+                    if near := [rivals[index] for index in in_place(null, seen, refined, rivals, known.settings)]:
+                        more = with_candidates(known, near)
+                        named = attribute(more.null, x, more.templates, more.candidates, more.calibration)
+                        counted[-4:] = said(named.if_named(more.settings), more, member.identity)
+                if named is not found and counted[-4:] != row:
+                    print(run.name, member.identity, round(member.strength, 1), len(seen), [c.label for c, _ in near])
+            rows.append([*row, *counted])
         words = ("the right name alone", "the truth in the set", "a wrong name alone", "no name")
-        for place, what in enumerate([*words, *(f"{one}, with rivals" for one in words)]):
+        rows_of = ("without rivals", "rivals by the data vector", "rivals by the numbers beside it too")
+        for place, what in enumerate(f"{one}, {how}" for how in rows_of for one in words):
             print(run.name, worded(share(what, [row[place] for row in rows])), flush=True)
 
 
@@ -282,11 +294,14 @@ def said(found, context, identity):
 
 
 def further(number):
-    """Look beside a strong effect that acts alone, and print how often the global p-value of another is small."""
+    """Look beside a strong effect that acts alone: how often is the global p-value of another small?
+
+    Print the pulls of its amplitudes, too.
+    """
     from mcsim.datavector.candidate import columns_of
     from mcsim.diagnosis.subsets import Subsets
-    from mcsim.stats.excess import scatter_chi2
     from mcsim.stats.intervals import share
+    from mcsim.stats.scattered import Acting
 
     run, context = learned(SMALL)
     null, settings, skies = context.null, context.settings, context.settings.constrained_skies
@@ -301,22 +316,41 @@ def further(number):
         # Exact at this amplitude, as the template of an effect that was simulated at it.
         theta = null.fit(null.mean + change, t[:, columns]).amplitudes
         t[:, columns] += np.outer(change - t[:, columns] @ theta, theta / (theta @ theta))
-        groups = null.whiten_groups(t, [one.columns for one in context.candidates])
-        charged = [*context.candidates]
-        added = scatter_chi2(null, t[:, columns], before[:skies], after[:skies])
-        charged[member] = replace(charged[member], scatter_chi2=added)
+        every, charged = [one.columns for one in context.candidates], [*context.candidates]
+        groups = null.whiten_groups(t, every)
+        acting = Acting.of(null, t, every, member, (before[:skies], after[:skies]))
+        charged[member] = replace(charged[member], acting=acting)
         rows = []
-        for x in after[skies:] + context.ensemble.offset:
+        offset = context.ensemble.offset
+        for x in after[skies:] + offset:
             y = null.whiten(x)
             searches = (
                 Subsets(null, y, groups, c, context.calibration, settings) for c in (context.candidates, charged)
             )
             rows.append([one.beside(np.array([[member]])).min() for one in searches])
         print(f"{name} of {channel}, {amplitude}: S/N {null.expected_snr(change):.0f}")
+        pulls = pulls_of(null, t[:, columns], before + offset, after + offset, skies)
+        print("    pulls of the amplitudes: mean", pulls.mean(axis=0).round(2), "width", pulls.std(axis=0).round(2))
         for place, what in enumerate(("its scatter ignored", "its scatter charged")):
             for level in (0.05, 0.005):
                 small = [row[place] <= level for row in rows]
                 print("   ", worded(share(f"{what}, p <= {level}", small)), flush=True)
+
+
+def pulls_of(null, t, before, after, skies):
+    """Return pulls of the amplitudes of an effect, shape (data, K); every ``skies`` pairs tell those of the next."""
+    from mcsim.stats.scattered import with_scatter
+
+    change, found = (after - before).mean(axis=0), []
+    theta = null.fit(null.mean + change, t).amplitudes
+    for first in range(0, len(after) - 2 * skies + 1, skies):
+        own = slice(first, first + skies)
+        response = (after - before)[own].mean(axis=0)
+        exact = t + np.outer(response - change, theta / (theta @ theta))
+        for x in after[first + skies : first + 2 * skies]:
+            fit = with_scatter(null, exact, null.fit(x, exact), before[own], after[own])
+            found.append((fit.amplitudes - theta) / fit.errors)
+    return np.array(found)
 
 
 def pairs(number):

@@ -1,0 +1,214 @@
+"""Fit and test where effects in the data scatter them: errors of amplitudes, and what is found beside these effects."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcsim.stats.excess import scatter_chi2
+from mcsim.stats.few_draws import scores_of_draws, without
+from mcsim.stats.gaussian import COLLINEAR, Fit, SimulatedGaussian, Tolerated, orthonormal
+from mcsim.support.arrays import Matrix, Vector, divided
+
+Indices = NDArray[np.int64]
+Groups = Sequence[Sequence[int]]
+"""Columns of the templates of each candidate."""
+
+
+@dataclass(frozen=True)
+class Acting:
+    """Hold by how much an effect that acts at some amplitude scatters the data more than they are without it.
+
+    Attributes
+    ----------
+    size
+        Squared white norm of its response.
+    chi2
+        What its scatter adds to chi^2 of a residual.
+    excess, error
+        What it adds to the variance of the data along each of C groups of templates beside its own, over what that is
+        without it, and the squared standard error of this; shape (C,).
+    """
+
+    size: float
+    chi2: float
+    excess: Vector
+    error: Vector
+
+    @classmethod
+    def of(cls, null: SimulatedGaussian, t: Matrix, groups: Groups, own: int, pair: tuple[Matrix, Matrix]) -> "Acting":
+        """Compare data vectors of the same skies without the effect and with it, shape (skies, p_raw) each.
+
+        ``t`` are templates, shape (p_raw, K), and ``groups`` their columns; ``own`` is the number of the effect's.
+
+        Notes
+        -----
+        The variance along a group is that of :func:`_growth`, with the mean of the changes as response.
+        """
+        before, after = (null.whiten_templates(rows.T).T for rows in pair)
+        change = after - before
+        basis, _ = orthonormal(null.whiten_templates(t[:, list(groups[own])]))
+        size = float(np.sum(change.mean(axis=0) ** 2))
+        x, c = (np.sqrt(null.hartlap_factor) * (rows - rows.mean(axis=0)) for rows in (before, change))
+        excess, error = np.zeros((2, len(groups)))
+        for number, columns in enumerate(groups):
+            white = null.whiten_templates(t[:, list(columns)])
+            beside, _ = orthonormal(white - basis @ (basis.T @ white))
+            if number == own or not beside.shape[1]:
+                continue
+            excess[number], error[number] = _growth(x @ beside, c @ beside)
+        return cls(size, scatter_chi2(null, t[:, list(groups[own])], *pair) * size, excess, error)
+
+
+def _growth(x: Matrix, c: Matrix) -> tuple[float, float]:
+    """Return by how much the variance of x grows if c is added to it, and the squared standard error of this.
+
+    Both are deviations from their means, shape (skies, K), x of variance one.
+
+    Notes
+    -----
+    With b the regression of c on x, and r the variance that it leaves, the variance of x + c is (1 + b)^2 + r, and
+    (b^2 + r)/skies adds if the mean of c is taken for the response. Noise that grows alike everywhere has r = 0: few
+    skies tell it exactly, whereas variances before and after have the error of few skies. With nu degrees of freedom
+    the squared error of b is r/nu, by which b^2 is too large, that of r 2 r^2/nu.
+    """
+    skies, columns = x.shape
+    nu = max((skies - 1.0) * columns, 1.0)
+    b = float(np.sum(x * c) / max(np.sum(x**2), 1e-300))
+    r = float(np.sum((c - b * x) ** 2)) / max(nu - 1.0, 1.0)
+    growth = (1.0 + b) ** 2 - 1.0 + r - r / nu + (b**2 + r) / skies
+    return growth, (4.0 * (1.0 + b) ** 2 * r + 2.0 * r**2) / nu
+
+
+@dataclass(frozen=True)
+class Beside:
+    """Combine what C candidates that act add to the scatter of the data beside them.
+
+    Attributes
+    ----------
+    size, chi2
+        Those of :class:`Acting`, infinite and 0 where none is known, shape (C,).
+    excess, error
+        The same, a row for each candidate that acts, shape (C, C).
+    variance
+        Along each candidate, by :func:`variance_beside` of those that draw their pattern, shape (C,).
+    """
+
+    size: Vector
+    chi2: Vector
+    excess: Matrix
+    error: Matrix
+    variance: Vector
+
+    @classmethod
+    def of(cls, acting: Sequence[Acting | None], variance: Vector | None) -> "Beside":
+        """Take what is known of each candidate; without a variance none draws its pattern."""
+        none = np.zeros(len(acting))
+        rows = [(np.inf, 0.0, none, none) if a is None else (a.size, a.chi2, a.excess, a.error) for a in acting]
+        size, chi2, excess, error = (np.array(column) for column in zip(*rows, strict=True))
+        return cls(size, chi2, excess, error, np.ones(len(acting)) if variance is None else variance)
+
+    def tolerated(self, allowance: Vector, members: Indices, parts: Matrix, others: Indices) -> Tolerated:
+        """Return what tests of candidates ``others``, shape (M or 1, N), beside M sets tolerate, shape (M, N) each.
+
+        ``allowance``, shape (M,), is that of :class:`~mcsim.stats.gaussian.Tolerated`, ``members`` are the sets, and
+        ``parts`` the squared amplitudes of the members over those at which they were simulated, shape (M, size).
+        """
+        shape = (len(members), others.shape[1])
+        variance, squared = np.broadcast_to(self.variance[others], shape).copy(), np.zeros(shape)
+        for member, part in zip(members.T, parts.T, strict=True):
+            variance += part[:, None] * self.excess[member[:, None], others]
+            squared += part[:, None] ** 2 * self.error[member[:, None], others]
+        variance = np.maximum(variance, 1.0)
+        dof = 2.0 * variance**2 / np.maximum(squared, 1e-12)
+        return Tolerated(np.broadcast_to(allowance[:, None], shape), variance, dof)
+
+
+def with_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, before: Matrix, after: Matrix) -> Fit:
+    """Return a fit of templates, shape (p_raw, K), with the errors of its amplitudes with the effects in the data.
+
+    ``before`` and ``after`` are data vectors of the same skies without the effects and with them at their amplitudes,
+    shape (skies, p_raw).
+
+    Notes
+    -----
+    A strong effect changes the scatter of the data. The fit is linear, so that it is applied to every sky: the variance
+    of each amplitude grows by :func:`_growth`. The error is the standard deviation of a Student t with the degrees of
+    freedom from which this is known. Correlations stay; errors are not made smaller.
+    """
+    basis, back = orthonormal(null.whiten_templates(t))
+    own = np.sqrt(np.diag(found.covariance))
+    fits = (back @ basis.T @ null.whiten_templates((rows - rows.mean(axis=0)).T) for rows in (before, after - before))
+    x, c = (divided(rows, own[:, None]) for rows in fits)
+    growth, error = np.array([_growth(one[:, None], other[:, None]) for one, other in zip(x, c, strict=True)]).T
+    variance = 1.0 + np.maximum(growth, 0.0)
+    dof = 2.0 * variance**2 / np.maximum(error, 1e-12)
+    factor = np.sqrt(variance * dof / np.maximum(dof - 2.0, 1.0))
+    return replace(found, covariance=factor[:, None] * found.covariance * factor)
+
+
+def with_drawn_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, scatters: Sequence[Matrix]) -> Fit:
+    """Return a fit of templates, shape (p_raw, K), with the errors that patterns which are drawn give its amplitudes.
+
+    ``null`` is the distribution without them; ``scatters``, with which it was widened for the fit, are deviations as of
+    :meth:`SimulatedGaussian.with_extra_covariance`.
+
+    Notes
+    -----
+    The weights of the fit avoid the scatter of the very draws that it is known from: these would make errors too small.
+    Each draw is fitted with the scatter of all others, and the mean square of what it adds to the amplitudes stands in
+    place of the scatter (leave-one-out cross-validation; Stone, JRSS B 36, 111, 1974). Pulls:
+    tests/statistical/test_drawn_scatter.py.
+    """
+    white, scale = np.linalg.pinv(null.whitening), (null.dof + found.chi2) / (found.dof - 2)
+
+    def weights(extra: Sequence[Matrix]) -> Matrix:
+        wide = null.with_extra_covariance(*extra)
+        basis, back = orthonormal(wide.whiten_templates(t))
+        return np.asarray(back @ basis.T @ wide.whitening / np.sqrt(1.0 + 1.0 / null.n_sims))
+
+    own = weights(scatters) @ white * np.sqrt(1.0 + 1.0 / null.n_sims)
+    covariance = scale * own @ own.T
+    for place, draws in enumerate(scatters):
+        for k in range(draws.shape[1]):
+            others = [*scatters[:place], without(draws, k), *scatters[place + 1 :]]
+            added = weights(others) @ draws[:, k]
+            covariance += np.outer(added, added)
+    return replace(found, covariance=covariance)
+
+
+def variance_beside(
+    null: SimulatedGaussian, t: Matrix, groups: Groups, members: Sequence[int], scatters: Sequence[Matrix]
+) -> Vector:
+    """Return by how much the fall of chi^2 by each group of templates is above its expectation, shape (groups,), >= 1.
+
+    ``t`` are templates, shape (p_raw, K), and ``groups`` their columns. Those of the ``members`` are fitted before.
+    ``scatters``, with which the null distribution is widened, are those of :func:`with_drawn_scatter`.
+
+    Notes
+    -----
+    A covariance that a few draws tell is too small by factors in single directions. Each draw, with noise, is fitted
+    with the weights that follow from all others. The excesses of several scatters add up. Levels that are met:
+    tests/statistical/test_drawn_scatter.py.
+    """
+    found = np.ones(len(groups))
+    fitted = [column for member in members for column in groups[member]]
+    for place, draws in enumerate(scatters):
+        wide = null.with_extra_covariance(*scatters[:place], *scatters[place + 1 :])
+        white, scale = wide.whiten_templates(t), np.sqrt(wide.hartlap_factor)
+        white *= divided(1.0, np.linalg.norm(white, axis=0))
+        gram, covariance = scores_of_draws(scale * wide.whiten_templates(draws), white)
+        beside = np.linalg.pinv(gram[np.ix_(fitted, fitted)], COLLINEAR) @ gram[fitted]
+        # Of t'(1 + R)^-1 x less what the members explain: the normal matrix, and the covariance of held-out draws.
+        left = np.eye(len(gram))
+        left[:, fitted] -= beside.T
+        normal, held_out = left @ gram @ left.T, left @ covariance @ left.T
+        for number, columns in enumerate(groups):
+            own = np.ix_(columns, columns)
+            values, vectors = np.linalg.eigh(normal[own])
+            kept = values > COLLINEAR
+            if kept.any() and number not in members:
+                share = np.diag(vectors.T @ held_out[own] @ vectors)[kept] / values[kept]
+                found[number] += share.mean() - 1.0
+    return np.maximum(found, 1.0)
