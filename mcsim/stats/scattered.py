@@ -103,11 +103,17 @@ class Beside:
 
     @classmethod
     def of(cls, acting: Sequence[Acting | None], variance: Vector | None) -> "Beside":
-        """Take what is known of each candidate; without a variance none draws its pattern."""
-        none = np.zeros(len(acting))
-        rows = [(np.inf, 0.0, none, none) if a is None else (a.size, a.chi2, a.excess, a.error) for a in acting]
-        size, chi2, excess, error = (np.array(column) for column in zip(*rows, strict=True))
-        return cls(size, chi2, excess, error, np.ones(len(acting)) if variance is None else variance)
+        """Take what is known of each candidate; without a variance none draws its pattern.
+
+        Candidates that were added since one was simulated, behind all others, are not scattered by it.
+        """
+        count = len(acting)
+        size, chi2, (excess, error) = np.full(count, np.inf), np.zeros(count), np.zeros((2, count, count))
+        for row, one in enumerate(acting):
+            if one is not None:
+                size[row], chi2[row], known = one.size, one.chi2, len(one.excess)
+                excess[row, :known], error[row, :known] = one.excess, one.error
+        return cls(size, chi2, excess, error, np.ones(count) if variance is None else variance)
 
     def tolerated(self, allowance: Vector, members: Indices, parts: Matrix, others: Indices) -> Tolerated:
         """Return what tests of candidates ``others``, shape (M or 1, N), beside M sets tolerate, shape (M, N) each.

@@ -109,6 +109,7 @@ def test_maps_at_the_centres_of_pixels_are_recognised(simulator):
     assert found.channels[0].left < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("windowed", "factor"), [(False, 1.0), (False, 1.01), (True, 1.0)])
 def test_a_map_that_ud_grade_made_of_a_finer_one_is_recognised(windowed, factor, simulator):
     """Its pixels are means of 16, whose window changes over the sky as the shapes of the pixels do."""

@@ -9,7 +9,7 @@ from mcsim.datavector.candidate import Candidate
 from mcsim.diagnosis.subsets import Subsets
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate
-from mcsim.stats.scattered import Acting, with_scatter
+from mcsim.stats.scattered import Acting, Beside, with_scatter
 from mcsim.systematics import Effect
 
 P, SKIES = 12, 4000
@@ -83,6 +83,14 @@ def test_further_effects_are_not_found_in_the_scatter_of_one(growth: float, spre
     ignored, charged = np.mean(found, axis=0)
     assert abs(charged - 0.05) < 3.0 * np.sqrt(0.05 * 0.95 / draws)
     assert ignored > 0.15
+
+
+def test_candidates_that_are_added_are_not_scattered_by_what_was_simulated_before() -> None:
+    acting = Acting(100.0, 3.0, np.array([0.0, 2.0]), np.array([0.0, 0.5]))
+    beside = Beside.of([acting, None, None], None)
+    found = beside.tolerated(np.zeros(1), np.array([[0]]), np.array([[0.5]]), np.array([[1, 2]]))
+    np.testing.assert_allclose(found.variance, [[2.0, 1.0]])
+    np.testing.assert_allclose(found.dof, [[2.0 * 4.0 / (0.25 * 0.5), 2e12]])
 
 
 def _correlation(covariance: np.ndarray) -> np.ndarray:
