@@ -12,6 +12,7 @@ from pydantic import TypeAdapter
 
 from mcsim.datavector.candidate import Column, TemplateBank
 from mcsim.datavector.summaries import Element
+from mcsim.ensemble.store import write_dataset
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector, divided
 
@@ -165,7 +166,7 @@ def save(path: Path, ensemble: NullEnsemble, bank: TemplateBank) -> None:
         "skies": ensemble.skies,
     }
     variables = {name: ([f"{name}_{axis}" for axis in range(array.ndim)], array) for name, array in arrays.items()}
-    xr.Dataset(variables, attrs=attributes).to_zarr(path, mode="w", consolidated=False)
+    write_dataset(xr.Dataset(variables, attrs=attributes), Path(path))
 
 
 def load(path: Path) -> tuple[NullEnsemble, TemplateBank]:

@@ -17,6 +17,7 @@ from mcsim.diagnosis.consistency import Comparison, MapCheck
 from mcsim.diagnosis.control_result import Controls
 from mcsim.diagnosis.nuisance import NuisanceResult
 from mcsim.diagnosis.selection import Contrast, Verdict
+from mcsim.ensemble.store import write_dataset
 from mcsim.errors import InputError
 from mcsim.reconstruction.result import Reconstructed
 from mcsim.stats.excess import HeldOut, Measured, excess_of
@@ -369,7 +370,7 @@ class DiagnosisResult:
         for one in self.unlisted or ():
             if one.file is not None:
                 (target / f"{one.name}.py").write_text(one.file, encoding="utf-8")
-        self.to_dataset().to_zarr(target / STORE, mode="w", consolidated=False)
+        write_dataset(self.to_dataset(), target / STORE)
 
     @classmethod
     def open(cls, folder: str | Path) -> "DiagnosisResult":

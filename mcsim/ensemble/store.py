@@ -18,6 +18,8 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 from zarr.codecs import ZstdCodec
+from zarr.core.buffer import Buffer
+from zarr.storage import MemoryStore
 
 from mcsim.ensemble.layout import Layout, listed
 from mcsim.errors import InputError, RunError
@@ -25,6 +27,9 @@ from mcsim.support.folders import unwritable
 
 if TYPE_CHECKING:
     import xarray as xr
+
+Files = dict[str, Buffer]
+"""Contents of the files of a store, by their paths in it."""
 
 _CODECS: dict[str, Any] = {"compressors": (ZstdCodec(level=1, checksum=True),)}
 # Write chunks of fill values too, so that a missing file means damage.
@@ -64,7 +69,8 @@ def create(path: Path, layout: Layout, attributes: Mapping[str, Any]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         scratch = tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent)
         stack.callback(shutil.rmtree, scratch, ignore_errors=True)
-        group = zarr.create_group(Path(scratch) / "new")
+        files: Files = {}
+        group = zarr.create_group(MemoryStore(files))
         group.attrs.update({**attributes, "coordinates": "L M d parity"})
         for name, (dim, values, attrs) in layout.coordinates().items():
             form: dict[str, Any] = {"dtype": str if values.dtype == object else values.dtype, **_WHOLE}
@@ -84,7 +90,8 @@ def create(path: Path, layout: Layout, attributes: Mapping[str, Any]) -> None:
             array.attrs.update({"units": unit, "long_name": text})
         if layout.kept_npix is not None:
             group[layout.kept_name].attrs.update(layout.kept_attributes())
-        _consolidate(Path(scratch) / "new")
+        _consolidate(MemoryStore(files))
+        _write_files(files, Path(scratch) / "new")
         os.replace(Path(scratch) / "new", path)
 
 
@@ -232,11 +239,27 @@ def write_summary(path: Path, summary: "xr.Dataset") -> None:
     with faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", category=UserWarning)
-            form: Any = {"zarr_format": 3, "consolidated": False, "write_empty_chunks": True}
-            summary.to_zarr(Path(scratch) / "summary", encoding=dict.fromkeys(summary.variables, _CODECS), **form)
+            form: Any = {"zarr_format": 3, "write_empty_chunks": True}
+            encoding = dict.fromkeys(summary.variables, _CODECS)
+            write_dataset(summary, Path(scratch) / "summary", encoding=encoding, **form)
         shutil.rmtree(path / "summary", ignore_errors=True)
         os.replace(Path(scratch) / "summary", path / "summary")
         _consolidate(path)
+
+
+def write_dataset(dataset: "xr.Dataset", folder: Path, **form: Any) -> None:
+    """Write a dataset that is in memory to a folder, in place of what is there, as :meth:`xarray.Dataset.to_zarr`."""
+    files: Files = {}
+    dataset.to_zarr(MemoryStore(files), consolidated=False, **form)
+    shutil.rmtree(folder, ignore_errors=True)
+    _write_files(files, folder)
+
+
+def _write_files(files: Files, folder: Path) -> None:
+    """Write what zarr made in memory: on a disk it hands every small file to a thread, several times."""
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content.to_bytes())
 
 
 def summarised(path: Path) -> tuple[int, list[int]]:
@@ -296,7 +319,7 @@ def _reason(error: BaseException) -> str:
     return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
-def _consolidate(path: Path) -> None:
+def _consolidate(path: Path | MemoryStore) -> None:
     """Write all metadata into one file, which xarray reads at once; silence zarr's warning about the format."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", category=UserWarning)

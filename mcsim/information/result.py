@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from mcsim.datavector.candidate import Candidate, columns_of, numbered
+from mcsim.ensemble.store import write_dataset
 from mcsim.information.fisher import Information
 from mcsim.information.settings import LimitSettings
 from mcsim.stats.detection import snr_needed, snr_to_separate
@@ -178,7 +179,7 @@ class Limits:
         target = Path(folder)
         with unwritable(target, "choose another folder"):
             target.mkdir(parents=True, exist_ok=True)
-            self.to_dataset().to_zarr(target / STORE, mode="w", consolidated=False)
+            write_dataset(self.to_dataset(), target / STORE)
             write_whole(target / TABLE, json.dumps(self.to_json(), indent=2, ensure_ascii=False) + "\n")
 
 
