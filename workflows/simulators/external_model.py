@@ -30,6 +30,7 @@ from mcsim.ensemble.external import source_of
 from mcsim.sphere import spectra
 from mcsim.stats.look_elsewhere import global_test
 
+PERIOD_S = 122.0
 MODEL = {
     "schema": 1,
     "name": "litebird-model",
@@ -42,7 +43,7 @@ MODEL = {
             "frequency_ghz": frequency,
             "beam": {"kind": "gaussian", "fwhm_arcmin": 350.0},
             "noise": {"sigma0_uk": 20.0},
-            "scan": {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 122.0, "line_of_sight": line},
+            "scan": {"kind": "hit_averaged", "model": "wmap", "sample_period_s": PERIOD_S, "line_of_sight": line},
         }
         for name, frequency, line in (("V1", 61.0, "A"), ("W1", 94.0, "B"))
     ],
@@ -56,8 +57,9 @@ class Litebird:
     """litebird_sim's scanning, pointing, beams, convolution and noise; binned here.
 
     ``flaws``: sizes of its systematics in W1, by name: ``ellipticity`` of its Gaussian beam (gauss_beam_to_alm), an
-    ``offset`` of the focal plane in arcmin (PointingSys), a ``drift`` of the gain over each half-year
-    (apply_gaindrift), ``quadratic`` response in 1/K (apply_quadratic_nonlin).
+    ``offset`` of the focal plane in arcmin (PointingSys), a ``drift`` of the gain over each half-year and a ``thermal``
+    one that follows a temperature, of which it is the scale in K (apply_gaindrift), ``quadratic`` response in 1/K
+    (apply_quadratic_nonlin), a ``knee`` of its noise in mHz (add_one_over_f_noise).
     """
 
     effects = ("beam_ellipticity", "beam_width", "noise_level")
@@ -108,7 +110,10 @@ class Litebird:
             if channel == "W1":
                 self._respond(tod)
             noise = np.sqrt(1.0 + own.get("noise_level", NONE)["amplitude"]) * self.sigma[channel]
-            lbs.add_white_noise(tod, noise, draw)
+            if channel == "W1" and "knee" in self.flaws:
+                lbs.add_one_over_f_noise(tod, self.flaws["knee"], 1e-6, 1.0, noise, 1.0 / PERIOD_S, draw)
+            else:
+                lbs.add_white_noise(tod, noise, draw)
             maps[part] = binned(self.inputs.nside, iter([(pixels, tod)]))
         return maps
 
@@ -123,6 +128,13 @@ class Litebird:
                 sampling_gaussian_scale=0.0,
             )
             lbs.apply_gaindrift_for_one_detector(tod, 1.0, drift_params=drift, random=draw)
+        if "thermal" in self.flaws:
+            drift = lbs.GainDriftParams(
+                drift_type=lbs.GainDriftType.THERMAL_GAIN,
+                thermal_fluctuation_amplitude_K=self.flaws["thermal"],
+                detector_mismatch=0.0,
+            )
+            lbs.apply_gaindrift_for_one_detector(tod, 1.0 / PERIOD_S, drift_params=drift, random=draw)
         if "quadratic" in self.flaws:
             bent = lbs.NonLinParams(self.flaws["quadratic"] * 1e-6, 0.0)
             lbs.apply_quadratic_nonlin_for_one_detector(tod, nl_params=bent, random=draw)
@@ -198,6 +210,10 @@ def main() -> None:
         {"drift": 0.03},
         {"quadratic": 40.0},
         {"quadratic": 120.0},
+        {"thermal": 0.3},
+        {"thermal": 1.0},
+        {"knee": 0.1},
+        {"knee": 0.5},
     ):
         other = Litebird(run, **flaw)
         maps = other.simulate(given.seed)
