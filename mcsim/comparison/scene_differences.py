@@ -23,6 +23,9 @@ _SMALL = 1e-3
 """Small angle in radians, share of a sample, or change of a variance, over which responses are linear."""
 
 
+WIDEST = 99.0
+"""Largest variance of a smoothing over the beam's: ten times its width; more would make any sky vanish."""
+
 FAINT = 0.1
 """Share of the rms below which a time shift that explains it is not looked for."""
 
@@ -311,7 +314,7 @@ class Smoothing(Difference):
     natural = 0.1
 
     def within(self, value: Vector) -> Vector:
-        return np.maximum(value, -0.99)
+        return np.clip(value, -0.99, WIDEST)
 
     def starts(self, state: State) -> list[Vector]:
         """Return the variance of the Gaussian over that of the beam."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mcsim.comparison.prediction import Prediction, Set
-from mcsim.comparison.scene_differences import TimeShift
+from mcsim.comparison.scene_differences import Smoothing, TimeShift
 
 
 class Slow(Prediction):
@@ -28,3 +28,8 @@ def test_values_are_fitted_until_they_leave_nothing_that_others_could_take_up():
     found = problem.corrected(Set(((TimeShift(), np.zeros(1)),), 1.0))
     assert problem.complete(found)
     assert found.members[0][1] == pytest.approx(0.9999, abs=1e-6)
+
+
+def test_no_smoothing_makes_the_sky_vanish():
+    """Without an end a smoothing explains maps in another unit, which are next to nothing in this one."""
+    assert Smoothing().amplitude(Smoothing().within(np.array([1e6]))) == pytest.approx(9.0)

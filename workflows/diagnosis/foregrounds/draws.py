@@ -25,7 +25,7 @@ from mcsim.simulation.survey import survey
 from mcsim.stats.gaussian import Tolerated
 from mcsim.stats.scattered import variance_beside, with_drawn_scatter
 
-INDEX, DRAWS, DATA, LAST = 0.4, 48, 1000, 400
+INDEX, DRAWS, DATA, LAST, PULLS = 0.4, 48, 1000, 400, 100
 
 
 def ask(jobs):
@@ -97,8 +97,9 @@ def further(trials=400):
             left.append(alone.pvalue)
         if last:
             print(f"{DATA} draws: p <= 0.05, 0.005 in", *(np.mean(np.array(every)[:, 0] <= p) for p in (0.05, 0.005)))
-        else:
-            found += every
+            break
+        found += every
+        if trial < PULLS:
             errors = with_drawn_scatter(null, t[:, list(columns[own.member])], alone, [known]).errors
             pulls.append((alone.amplitudes - own.truth) / errors)
     rows, p = np.array(found), np.array(pulls)

@@ -242,9 +242,11 @@ def true(number):
     from mcsim.benchmark.models import linear_model
     from mcsim.benchmark.sampler import CaseSampler
     from mcsim.datavector.analysis import on_request
+    from mcsim.datavector.candidate import numbered
     from mcsim.diagnosis.refine import Refined
     from mcsim.diagnosis.rivals import in_place, with_candidates
     from mcsim.diagnosis.selection import attribute
+    from mcsim.stats.detection import cosines
     from mcsim.stats.intervals import share
 
     for model in (ONE, MODEL):
@@ -261,6 +263,13 @@ def true(number):
             every.simulations[kept:] + every.offset,
             np.concatenate([known.templates, context.bank.slice_matrix]),
         )
+        for null, t in ((known.null, known.templates), (wide, whole)):
+            for rival, response in rivals:
+                groups = [one.columns for one in numbered([*known.candidates, rival])]
+                together = np.concatenate([t, response[: len(t)]], axis=1)
+                like = cosines(null.whiten_groups(together, groups))[-1, :-1]
+                near = {c.label: round(r, 3) for c, r in zip(known.candidates, like, strict=True) if r > 0.7}
+                print(run.name, f"{len(t)} numbers, cosines with {rival.label}:", near)
         sampler, rows = CaseSampler(Prior(weakest=5.0, strongest=20.0), linear), []
         for case in range(number // 2):
             (member,) = sampler.members(np.random.default_rng([1, case]), 1)
