@@ -29,7 +29,7 @@ MODEL = {
                 "kind": "elliptical_gaussian", "fwhm_major_arcmin": 400.0, "fwhm_minor_arcmin": 320.0,
                 "angle_deg": 20.0, "m_max": 4,
             },
-            "scan": {"kind": "hit_averaged", "model": "wmap", "line_of_sight": "A", "sample_period_s": 361.0},
+            "scan": {"kind": "hit_averaged", "model": "wmap", "line_of_sight": "A", "sample_period_s": 601.0},
         }
     ],
     "ensemble": {"seed": 3},
