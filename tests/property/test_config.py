@@ -3,6 +3,7 @@
 import copy
 import json
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -100,6 +101,7 @@ def test_hash_ignores_how_much_and_how_it_is_computed(plain, realizations, worke
     assert config.digest(config.load(plain)) == config.digest(config.load(other))
 
 
+@pytest.mark.slow
 @settings(max_examples=150)
 @given(st.data())
 def test_anything_put_anywhere_loads_or_is_refused_in_a_sentence(data):
@@ -124,6 +126,7 @@ def test_anything_put_anywhere_loads_or_is_refused_in_a_sentence(data):
     assert "\n" not in sentence
 
 
+@pytest.mark.slow
 @settings(max_examples=100)
 @given(st.dictionaries(WORDS | st.text(max_size=10), JSON, max_size=5))
 def test_arbitrary_dicts_are_refused_in_a_sentence(plain):

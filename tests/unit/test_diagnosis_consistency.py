@@ -115,7 +115,7 @@ def test_a_true_effect_is_refused_as_seldom_as_the_levels_say(bench):
     assert np.mean(np.array(halves) <= 0.05) <= 0.05 + 4 * np.sqrt(0.05 * 0.95 / 300)
 
 
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("known", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_the_scatter_of_draws_is_no_contradiction(bench, known):
     """A stochastic effect whose draws differ by three times the noise, in every element; 24 are known."""
     draw, refused = np.random.default_rng(5), 0

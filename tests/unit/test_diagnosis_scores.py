@@ -14,6 +14,7 @@ from mcsim.simulation.pixel_means import mean_gain
 HALVES = ((0.0, 0.5), (0.5, 1.0))
 
 
+@pytest.mark.slow
 def test_gain_of_every_half_is_kept_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     model = replace(ScanModel.load("wmap"), sample_period_s=61.0, duration_days=365.0)
     line = model.line_of_sight("A")

@@ -88,6 +88,7 @@ def made(shared: Survey) -> Templates:
     return templates(shared, measured(np.zeros(len(ROWS)), 1.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "theta"), [("constant", [0.6]), ("linear", [1.4, -0.01]), ("orientation", [0.7, 0.4])]
 )

@@ -69,6 +69,7 @@ def test_w2_by_latitude_is_the_reference(year):
     assert hits[4] > hits[3] > hits[2]
 
 
+@pytest.mark.slow
 def test_limit_by_latitude_is_the_reference():
     # Midpoints in cos(theta), at most 0.6 degrees apart at the pole.
     z = (np.arange(20_000) + 0.5) / 20_000
