@@ -29,7 +29,7 @@ MODEL = {
                 "kind": "elliptical_gaussian", "fwhm_major_arcmin": 400.0, "fwhm_minor_arcmin": 320.0,
                 "angle_deg": 20.0, "m_max": 4,
             },
-            "scan": {"kind": "hit_averaged", "model": "wmap", "line_of_sight": "A", "sample_period_s": 361.0},
+            "scan": {"kind": "hit_averaged", "model": "wmap", "line_of_sight": "A", "sample_period_s": 601.0},
         }
     ],
     "ensemble": {"seed": 3},
@@ -112,7 +112,7 @@ PEAR.blm[1] += 0.2 * np.exp(0.7j) * PEAR.blm[0] * (np.arange(33) / 32) ** 3
 PEAR.blm[3, 3:] += 0.1 * np.exp(-0.4j) * PEAR.blm[0, 3:] * (np.arange(3, 33) / 32) ** 3
 
 
-def small(model: str = "wmap", beam: mcsim.Beam = PEAR, period_s: float = 361.0, **more: object) -> dict:
+def small(model: str = "wmap", beam: mcsim.Beam = PEAR, period_s: float = 601.0, **more: object) -> dict:
     """Return a run of nside 16 with a beam of odd orders."""
     line = {"line_of_sight": "A"} if model == "wmap" else {}
     scan = {"kind": "hit_averaged", "model": model, "sample_period_s": period_s} | line

@@ -18,6 +18,7 @@ from mcsim.comparison.looks import look
 from mcsim.comparison.pairs import ChannelPair, Comparison, given, read
 from mcsim.comparison.prediction import PRECISION, Set
 from mcsim.comparison.result import ChannelResult, ComparisonResult, DifferenceResult, Verdict
+from mcsim.comparison.scene import Scene
 from mcsim.comparison.search import INTERPOLATING, Problem
 from mcsim.comparison.shown_sky import with_shown_sky
 from mcsim.errors import InputError
@@ -41,6 +42,9 @@ DOUBTFUL = 0.01
 
 DOUBTFUL_TOGETHER = 1e-5
 """The same of several differences, beyond which the model may rather describe side B."""
+
+SAME_SKY = 0.9
+"""Correlation with the sky of side A below which effects are simulated on the sky of side B again."""
 
 
 def compare(
@@ -165,8 +169,14 @@ def _explained(
     sets = problem.best()
     if sides.run is not None and not (sets and problem.complete(sets[0])):
         # An effect of side A is one of side B with the other sign, and was found before sides are exchanged.
-        problem = replace(problem, library=(*problem.library, *(() if pair.turned else effects_of(pair, sides.run))))
+        if not pair.turned:
+            problem = replace(problem, library=(*problem.library, *effects_of(pair, sides.run)))
         sets = problem.best(1)
+        there = problem.scene(sets[0].members) if sets and not pair.turned else None
+        if there is not None and not problem.complete(sets[0]) and _correlation(pair, there) < SAME_SKY:
+            seen_there = effects_of(replace(pair, scene=there), sides.run)
+            problem = replace(problem, library=(*problem.library, *seen_there))
+            sets = problem.best(1)
     if pair.turned and not (sets and problem.suffices(sets[0])):
         return _result(pair, "unknown"), problem
     if not sets or not problem.suffices(sets[0]) or (sets[0].left > DOUBTFUL and not problem.complete(sets[0])):
@@ -186,6 +196,13 @@ def _explained(
     others_too = [one for one in problem.alternatives(sets) if not known.intersection(d.name for d, _ in one.members)]
     chosen = [sets[0], *others_too]
     return _result(pair, _verdict(chosen), chosen, problem, sets), problem
+
+
+def _correlation(pair: ChannelPair, other: Scene) -> float:
+    """Return the correlation of the skies of a pair and of another scene."""
+    assert pair.scene is not None
+    one, there = pair.scene.sky, other.sky
+    return float(np.vdot(one, there).real / max(float(np.linalg.norm(one) * np.linalg.norm(there)), 1e-300))
 
 
 def _verdict(chosen: Sequence[Set]) -> Verdict:

@@ -89,9 +89,13 @@ def samples(
         time_s = period * np.arange(low, high, dtype=np.float64)
         return Samples(time_s, theta, phi, psi, pixel, np.zeros(high - low))
 
+    spans = chunks(*grid.sample_range(model, line))
+    if len(spans) == 1:
+        yield chunk(*spans[0])
+        return
     made: deque[Future[Samples]] = deque()
     with ThreadPoolExecutor(1) as ahead:
-        for span in chunks(*grid.sample_range(model, line)):
+        for span in spans:
             made.append(ahead.submit(chunk, *span))
             if len(made) > 1:
                 yield made.popleft().result()
@@ -143,7 +147,8 @@ def sky_signal(
             for chunk in stream:
                 where = np.stack([chunk.theta, chunk.phi, chunk.psi], axis=1)
                 pieces = np.array_split(where, len(interpolators))
-                seen = pool.map(lambda each, piece: each.interpol(piece)[0], interpolators, pieces)
+                each = pool.map if len(interpolators) > 1 else map  # a thread alone would only be waited for
+                seen = each(lambda own, piece: own.interpol(piece)[0], interpolators, pieces)
                 yield replace(chunk, signal_uk=chunk.signal_uk + np.concatenate(list(seen)))
 
     return stage

@@ -277,8 +277,7 @@ def test_beam_of_a_configuration_and_of_files(mcsim: Command, tmp_path: Path) ->
     assert (tmp_path / "map.png").exists()
 
 
-def test_scan(mcsim: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / "cache"))
+def test_scan(mcsim: Command, tmp_path: Path) -> None:
     code, out, _ = mcsim("scan", "wmap", "--nside", 32, "--sample-period-s", 30.7, "-o", "scan.png")
     assert code == 0
     assert "three factors" in out

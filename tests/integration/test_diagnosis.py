@@ -51,7 +51,8 @@ def ask(jobs):
 @pytest.fixture(scope="module")
 def small():
     run = config.load(MODEL)
-    analysis = analysis_of(run, without=[name for name in systematics.catalogue() if name not in PROPOSED])
+    without = [name for name in systematics.catalogue() if name not in PROPOSED]
+    analysis = analysis_of(run, without=without, settings=DiagnosisSettings(beam_orders=2))
     return context(analysis, *campaign.learned(analysis, ask, 260, time_ordered=False))
 
 
@@ -108,7 +109,6 @@ def test_an_unlisted_effect_is_described_written_and_shrinks(small, tmp_path, mo
     monkeypatch.setattr(simulated_scores, "SIMULATIONS", 200)
     monkeypatch.setattr("sys.path", list(sys.path))
     monkeypatch.setenv("PYTHONPATH", "")
-    monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / "cache"))
     shared = data_of(small.run, "gain_drift", "W1", amplitude=1.5e-3, phase_deg=40.0)
     data = ObservedMaps(small, list(simulate.maps(shared, 0)), ask)
     before = diagnose_data(data, "drift")
@@ -362,14 +362,12 @@ def test_the_cost_of_a_diagnosis_counts_the_effects_on_request(small):
 
 def test_a_diagnosis_knows_the_library_that_it_is_given(tmp_path, monkeypatch):
     """And names an effect that is in no catalogue; ``without`` is read in that library too."""
-    monkeypatch.setenv("MCSIM_CACHE", str(tmp_path))
     monkeypatch.setattr(api, "batch", lambda workers: campaign.batch(0))  # in this process
-    run = config.load(two_channels("tiny", lmax=20, nside=8, fwhm_arcmin=700.0, sigma0_uk=12.0, period_s=381.0))
+    run = config.load(two_channels("tiny", lmax=20, nside=8, fwhm_arcmin=700.0))
     louder = config.Effect(name="louder", channel="W1", parameters={"amplitude": 0.4})
     seeded = replace(run, ensemble=replace(run.ensemble, seed=77))
-    # The first sky leaves p = 0.015, below the level of a set that suffices: one in fifty does.
-    maps = list(simulate.maps(survey(with_effects(seeded, [louder]), library={"louder": Louder}), 1))
-    settings = DiagnosisSettings(library={"louder": Louder}, simulations=240)
+    maps = list(simulate.maps(survey(with_effects(seeded, [louder]), library={"louder": Louder}), 0))
+    settings = DiagnosisSettings(library={"louder": Louder}, simulations=240, scan_sims=40, time_ordered_skies=2)
     with quick_pictures(empty=True):
         found = mcsim.diagnose(run, maps, tmp_path / "out", settings=settings)
     assert {(one.name, one.channel) for one in found.candidates} == {("louder", "V1"), ("louder", "W1")}

@@ -123,13 +123,13 @@ def test_noise_effects_act_on_differences():
         noise = mapmaking.DifferenceNoise(1.0, np.random.default_rng(seed), own)
         return mapmaking.rhs_from_maps(pairs, nothing, noise=noise)[0]
 
-    draws = np.stack([rhs(seed, factor) for seed in range(400)])
+    draws = np.stack([rhs(seed, factor) for seed in range(240)])
     p = np.abs(weights(survey(run_of()).channels[0].maps[0]))
     expected = p.T @ (p @ factor / 2.0)
-    # A variance of 400 draws of a Gaussian is known to sqrt(2/400); the mean of 768 correlated ones to far better.
+    # A variance of 240 draws of a Gaussian is known to sqrt(2/240); the mean of 768 correlated ones to far better.
     ratio = draws.var(axis=0) / expected
-    assert abs(ratio.mean() - 1.0) < 5.0 * np.sqrt(2.0 / 400.0 / 300.0)
-    assert np.all(np.abs(ratio - 1.0) < 6.0 * np.sqrt(2.0 / 400.0))
+    assert abs(ratio.mean() - 1.0) < 5.0 * np.sqrt(2.0 / 240.0 / 300.0)
+    assert np.all(np.abs(ratio - 1.0) < 6.0 * np.sqrt(2.0 / 240.0))
     np.testing.assert_array_equal(rhs(3, np.ones(pairs.npix)), rhs(3, None))
     louder = survey(run_of([effect("noise_level", 0.1)])).channels[0].side_b
     np.testing.assert_allclose(louder.noise_factor, 1.21)
@@ -163,7 +163,7 @@ def test_an_imbalance_is_named():
     wanted = ("beam_ellipticity", "transmission_imbalance")
     settings = mcsim.DiagnosisSettings(
         library={name: kind for name, kind in mcsim.effects().items() if name in wanted},
-        simulations=170,
+        simulations=130,
         noisy_skies=6,
         scan_sims=40,
         beam_orders=2,

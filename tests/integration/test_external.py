@@ -53,9 +53,8 @@ FEW = replace(SETTINGS, simulations=80)
 
 
 @pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    """Simulate in this process, with a cache of its own."""
-    monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / "cache"))
+def here(monkeypatch):
+    """Simulate in this process."""
     original = campaign.batch
     monkeypatch.setattr(api, "batch", lambda workers: original(0))
 
@@ -162,14 +161,12 @@ def test_the_default_route_as_a_function_gives_the_statistics_of_the_run():
 
 
 @pytest.fixture(scope="module")
-def learned(tmp_path_factory):
+def learned():
     """The plain simulator that can widen its beam, learned once."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("MCSIM_CACHE", str(tmp_path_factory.mktemp("cache")))
-        run = config.load(MODEL)
-        source = source_of(run, Plain(effects=("beam_width",)))
-        analysis = api.analysis_of(run, library=LIBRARY, settings=replace(SETTINGS, library=None), source=source)
-        return api.context(analysis, *campaign.learned(analysis, lambda jobs: [api.data_vectors(job) for job in jobs]))
+    run = config.load(MODEL)
+    source = source_of(run, Plain(effects=("beam_width",)))
+    analysis = api.analysis_of(run, library=LIBRARY, settings=replace(SETTINGS, library=None), source=source)
+    return api.context(analysis, *campaign.learned(analysis, lambda jobs: [api.data_vectors(job) for job in jobs]))
 
 
 def test_null_skies_of_a_simulator_of_somebody_else_are_uniform(learned):
@@ -216,9 +213,9 @@ def test_agreement_of_a_right_description_is_no_rare_event(learned):
 
 
 def test_a_description_of_another_beam_is_said_first(tmp_path):
-    data = arrays_of(Plain(wider=0.1).simulate(3))
+    data, settings = arrays_of(Plain(wider=0.1).simulate(3)), replace(FEW, noisy_skies=24)
     with quick_pictures(empty=True):
-        found = mcsim.diagnose(mcsim.ExternalModel(MODEL, Plain(wider=0.1)), data, tmp_path / "out", settings=FEW)
+        found = mcsim.diagnose(mcsim.ExternalModel(MODEL, Plain(wider=0.1)), data, tmp_path / "out", settings=settings)
     assert found.agreement.pvalue < 1e-4
     assert not found.agreement.agrees
     assert "beam" in found.agreement.nearest
@@ -257,8 +254,9 @@ class Noisy:
 """
 
 
-def test_a_batch_that_was_interrupted_goes_on_with_the_same_maps(tmp_path):
+def test_a_batch_that_was_interrupted_goes_on_with_the_same_maps(tmp_path, monkeypatch):
     """A class named in the TOML; what was finished is not simulated again, and other code is."""
+    monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / "cache"))
     (tmp_path / "sim.py").write_text(SIMULATOR)
     (tmp_path / "stop").touch()
     model = dict(MODEL, simulator="sim.py:Noisy")
@@ -416,10 +414,9 @@ def test_the_command_line_says_what_a_simulator_is_asked_for(monkeypatch, capsys
     assert "own_simulator.py:HealpySurvey" in capsys.readouterr().out
 
 
-def test_the_example_of_the_documentation_runs_on_workers(tmp_path, monkeypatch):
+def test_the_example_of_the_documentation_runs_on_workers(monkeypatch):
     """With its own effect in the data."""
     monkeypatch.undo()
-    monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / "cache"))
     run = config.load(EXAMPLE)
     maps = source_of(replace(run, simulator=None), run.simulator).maps(0, 0, [effect("beam_width", -0.3)])
     found = mcsim.diagnose(replace(run, compute=replace(run.compute, workers=1)), maps, settings=FEW)

@@ -447,11 +447,12 @@ def test_worker_that_dies_every_time_costs_its_realization_alone(
 
 
 def test_kills_lose_nothing() -> None:
-    """The fault campaign in short; workflows/faults has the long one."""
+    """The fault campaign in short, of a worker and two drivers; workflows/faults has the long one."""
     script = Path(__file__).parents[2] / "workflows" / "faults" / "campaign.py"
-    command = [sys.executable, script, "--kills", "3", "--clusters", "local", "--seed", "2"]
+    command = [sys.executable, script, "--kills", "3", "--clusters", "local", "--seed", "6"]
     environment = os.environ | {"MCSIM_FAULTS_REALIZATIONS": "16"}
     found = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     assert found.returncode == 0, found.stdout + found.stderr
-    assert "3 kills, " in found.stdout
+    # A worker may be hit up to three times.
+    assert int(re.findall(r"^(\d+) kills, ", found.stdout, re.MULTILINE)[-1]) >= 3, found.stdout
     assert "lost 0, doubled 0, differing 0, other trouble 0." in found.stdout

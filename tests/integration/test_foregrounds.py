@@ -30,7 +30,9 @@ def small(clean: bool) -> Analysis:
     if clean:
         table["channel"].append({**table["channel"][0], "name": "CMB", "frequency_ghz": 143.0, "foregrounds": False})
     without = [name for name in systematics.catalogue() if name not in PROPOSED]
-    settings = DiagnosisSettings(scan_sims=60, beam_orders=1, split_beam_orders=1)  # nothing here is of a beam
+    settings = DiagnosisSettings(
+        scan_sims=60, beam_orders=1, split_beam_orders=1, response_modes=1 << 12
+    )  # nothing here is of a beam
     return analysis_of(config.load(table), without=without, settings=settings)
 
 

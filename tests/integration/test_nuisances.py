@@ -46,7 +46,7 @@ def ask(jobs):
 
 
 def small_analysis(run):
-    settings = DiagnosisSettings(including=PROPOSED, scan_sims=60)
+    settings = DiagnosisSettings(including=PROPOSED, scan_sims=60, beam_orders=2, response_modes=1 << 12)
     return analysis_of(run, without=WITHOUT, settings=settings)
 
 
@@ -139,7 +139,6 @@ def test_a_calibration_far_beyond_its_prior_is_named(run, declared):
 
 
 def test_the_command_lists_and_writes_nuisances(run, tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(api, "batch", lambda workers: campaign.batch(0))  # in this process
     monkeypatch.chdir(tmp_path)
     channel = MODEL["channel"][1]

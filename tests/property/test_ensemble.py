@@ -4,6 +4,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
@@ -49,6 +50,7 @@ def test_sums_do_not_depend_on_chunks(data, count, power):
         np.testing.assert_allclose(streaming.covariance(whole, "x"), covariance, rtol=1e-9, atol=1e-2)
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(st.data(), st.integers(1, 7), st.integers(1, 3), st.booleans(), st.sampled_from([None, 12]))
 def test_a_store_gives_back_what_was_written(data, realizations, chunk, paired, kept_npix):

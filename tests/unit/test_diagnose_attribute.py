@@ -69,23 +69,23 @@ def verdicts(bench: Bench, signal: np.ndarray, draws: int, **options) -> list[At
 
 
 def test_without_an_effect_one_in_twenty_is_named(bench):
-    found = [one.verdict != "none" for one in verdicts(bench, np.zeros(P), 160)]
-    low, high = stats.binom.interval(0.999, 160, ALPHA)
+    found = [one.verdict != "none" for one in verdicts(bench, np.zeros(P), 120)]
+    low, high = stats.binom.interval(0.999, 120, ALPHA)
     assert low <= sum(found) <= high
 
 
 @pytest.mark.parametrize(("member", "weights"), [(3, [12.0]), (12, [8.0, 8.0]), (13, [8.0, -8.0, 4.0])])
 def test_true_effect_is_accepted_as_often_as_promised(bench, member, weights):
     signal = bench.t[:, list(bench.candidates[member].columns)] @ weights
-    found = verdicts(bench, signal, 60)
+    found = verdicts(bench, signal, 40)
     accepted = sum(any(e.members == (member,) for e in one.explanations) for one in found)
     # At least 95 %: half of the level for either test.
-    assert accepted >= stats.binom.isf(0.999, 60, 1.0 - ALPHA)
+    assert accepted >= stats.binom.isf(0.999, 40, 1.0 - ALPHA)
     best = [one.explanations[0] for one in found if one.explanations and one.explanations[0].members == (member,)]
     pulls = np.concatenate([(e.fit.amplitudes - weights) / e.fit.errors for e in best])
-    # Of 60 pulls the standard errors are 0.13 and 0.09.
-    assert abs(pulls.mean()) < 0.45
-    assert abs(pulls.std() - 1.0) < 0.3
+    # Of 40 pulls the standard errors are 0.16 and 0.11.
+    assert abs(pulls.mean()) < 0.55
+    assert abs(pulls.std() - 1.0) < 0.38
 
 
 @pytest.mark.parametrize("members", [(2, 5), (1, 12), (0, 4, 9)])
@@ -155,7 +155,7 @@ def test_the_probability_of_a_name_is_the_rate_at_which_it_is_right():
     bench = Bench(directions(4, 8), singles(4))
     draw, settings = np.random.default_rng(11), DiagnosisSettings(alpha=1.0, prior_snr=(2.0, 4.0, 8.0))
     said, right = [], []
-    for _ in range(400):
+    for _ in range(250):
         member = int(draw.integers(-4, 4))
         size = draw.normal(scale=draw.choice(settings.prior_snr)) if member >= 0 else 0.0
         x = draw.normal(size=P) + (size * bench.t[:, member] if member >= 0 else 0.0)
@@ -163,7 +163,7 @@ def test_the_probability_of_a_name_is_the_rate_at_which_it_is_right():
         if found.explanations:
             said.append(found.probability)
             right.append(any(one.members == (member,) for one in found.explanations))
-    assert len(said) > 150
+    assert len(said) > 90
     # Sets that need two members take part of the probability, and the unknown effect is never drawn: it is a bound.
     error = np.sqrt(np.sum(np.multiply(said, 1.0 - np.array(said)))) / len(said)
     assert np.mean(right) > np.mean(said) - 3.0 * error
@@ -172,8 +172,8 @@ def test_the_probability_of_a_name_is_the_rate_at_which_it_is_right():
 @pytest.mark.slow
 def test_what_is_not_in_the_library_is_unknown(bench):
     stranger = directions(1, 99)[:, 0] + 0.9 * bench.t[:, 5]
-    found = verdicts(bench, 14.0 * stranger, 40)
-    assert sum(one.verdict == "unknown" for one in found) >= 38
+    found = verdicts(bench, 14.0 * stranger, 25)
+    assert sum(one.verdict == "unknown" for one in found) >= 23
     cosine = stranger @ bench.t[:, 5] / np.linalg.norm(stranger)
     assert all(one.nearest == 5 and not one.explanations for one in found)
     assert np.mean([one.cosine for one in found]) == pytest.approx(cosine, abs=0.05)
@@ -279,14 +279,14 @@ def test_effect_that_draws_is_named_once_its_scatter_is_known(bench):
     spread = 6.0 * directions(5, 21)
     wide = drawing(bench, spread)
     named = {"plain": 0, "wide": 0}
-    for seed in range(40):
+    for seed in range(28):
         signal = 12.0 * bench.t[:, 0] + spread @ np.random.default_rng(1000 + seed).normal(size=5)
         for kind, one in (("plain", bench), ("wide", wide)):
             found = one.diagnose_maps(signal, seed)
             named[kind] += bool(found.explanations) and found.explanations[0].members == (0,)
     # Levels of 2 and 0.5 %, and a scatter that is known by 24 draws.
-    assert named["wide"] >= 34
-    assert named["plain"] <= 4
+    assert named["wide"] >= 23
+    assert named["plain"] <= 3
 
 
 def test_a_wide_scatter_explains_nothing_by_itself(bench):
@@ -301,13 +301,13 @@ def test_amplitude_beside_a_scatter_is_honest(bench):
     spread = 6.0 * (directions(5, 21) + 0.5 * bench.t[:, :1])
     wide = drawing(bench, spread)
     pulls = []
-    for seed in range(60):
+    for seed in range(45):
         signal = 60.0 * bench.t[:, 0] + spread @ np.random.default_rng(1000 + seed).normal(size=5)
         found = wide.diagnose_maps(signal, seed).explanations
         if found and found[0].members == (0,):
             pulls.append((found[0].fit.amplitudes[0] - 60.0) / found[0].fit.errors[0])
-    # A width of one, known to 1 / sqrt(2 * 50) = 0.1 from the pulls, and no better from 24 draws in five directions.
-    assert len(pulls) > 50
+    # A width of one, known to 1 / sqrt(2 * 38) = 0.11 from the pulls, and no better from 24 draws in five directions.
+    assert len(pulls) > 37
     assert 0.6 < np.sqrt(np.mean(np.square(pulls))) < 1.4
 
 

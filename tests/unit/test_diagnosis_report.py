@@ -177,7 +177,7 @@ class Pages(dict[str, str]):
         self.diagnoses = diagnoses
 
     def __missing__(self, kind: str) -> str:
-        with quick_pictures():
+        with quick_pictures(empty=kind in ("none", "effect")):  # the others have all that these have
             self[kind] = report.page(self.diagnoses[kind])
         return self[kind]
 

@@ -138,7 +138,14 @@ def example_folder(tmp_path_factory):
     return tmp_path_factory.mktemp("examples")
 
 
-@pytest.mark.parametrize("name", [name for name in OBJECTS if name not in WITHOUT_EXAMPLE])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow) if name in ("fit", "merge") else name  # of whole ensembles
+        for name in OBJECTS
+        if name not in WITHOUT_EXAMPLE
+    ],
+)
 def test_examples_run(name, example_folder, monkeypatch) -> None:
     """Each alone and in any order: what one leaves in the folder another may find, as a user's would."""
     monkeypatch.chdir(example_folder)

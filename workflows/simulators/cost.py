@@ -1,6 +1,6 @@
 """Time comparisons of maps that exist, and measure their memory, each in a process of its own.
 
-    python workflows/simulators/cost.py [same|one|two|unknown ...] [--nside 256] [--moments]
+    python workflows/simulators/cost.py [same|one|two|unknown|masked|noisy ...] [--nside 256] [--moments]
 
 The survey is that of the packaged run "quickstart" with its beam and lmax, for nside 128, scaled to the nside: one year
 of WMAP's scan at 2 s, 15.8 million samples, as single samples or, with --moments, as a run of mcsim makes its maps.
@@ -47,15 +47,23 @@ def maps_of(run: config.RunConfig, moments: bool) -> Maps:
 
 
 def sides(kind: str, nside: int, moments: bool) -> tuple[Maps, Maps]:
-    """Return both sides: the same to 1e-4 of the sky, a beam turned by 2 degrees, that and a factor, or a square."""
-    a = maps_of(run_of(nside), moments)
+    """Return both sides: the same to 1e-4 of the sky, a beam turned by 2 degrees, that and a factor, or a square.
+
+    Turned as well are the beams of maps with a band of 30 % of the sky masked, and with noise of a tenth of it.
+    """
+    a, draw = maps_of(run_of(nside), moments), np.random.default_rng(1)
     if kind == "same":
-        draw = np.random.default_rng(1)
         b = [m + 1e-4 * m[m != healpy.UNSEEN].std() * draw.standard_normal(m.size) for m in a]
     elif kind == "unknown":
         b = [m + 1e-4 * m**2 for m in a]
     else:
         b = [(1.005 if kind == "two" else 1.0) * m for m in maps_of(run_of(nside, 2.0), moments)]
+    if kind == "masked":
+        hole = np.abs(healpy.pix2vec(nside, np.arange(12 * nside**2))[2]) < 0.3
+        a = [np.where(hole, healpy.UNSEEN, m) for m in a]
+    if kind == "noisy":
+        noise = 0.1 * a[0][a[0] != healpy.UNSEEN].std() * draw.standard_normal(a[0].size)
+        a, b = ([np.where(m == healpy.UNSEEN, m, m + noise) for m in side] for side in (a, b))
     return a, [np.where(m == healpy.UNSEEN, m, other) for m, other in zip(a, b, strict=True)]
 
 

@@ -153,6 +153,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--nulls", type=int, default=100)
     parser.add_argument("--per-element", type=int, default=5, help="simulations for each element of the data vector")
+    parser.add_argument("--seed", type=int, default=4242, help="of the sky and noise that all systematics share")
     given = parser.parse_args()
     run = config.load(MODEL)
     library = {name: kind for name, kind in mcsim.effects().items() if name in PROPOSED}
@@ -199,7 +200,7 @@ def main() -> None:
         {"quadratic": 120.0},
     ):
         other = Litebird(run, **flaw)
-        maps = other.simulate(4242)
+        maps = other.simulate(given.seed)
         data = [maps[name.replace(":", "_")] for name in config.map_names(run)]
         what = ", ".join(f"{name} {value:g}" for name, value in flaw.items()) or "none"
         answers = " | ".join(answer(diagnose_data(ObservedMaps(one, data, ask), "case")) for one in (known, plain))

@@ -109,7 +109,7 @@ def rhs_from_maps(
 
     total = np.zeros((scan.npix, len(skies)))
     with ThreadPoolExecutor(max(1, nthreads)) as pool:
-        for partial in pool.map(run, parts(pieces)):
+        for partial in (pool.map if nthreads > 1 else map)(run, parts(pieces)):
             total += partial
     return np.ascontiguousarray(total.T)
 

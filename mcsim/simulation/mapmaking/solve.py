@@ -2,6 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import healpy
@@ -140,14 +141,12 @@ def apply_normal(scan: DifferencingScan, x: float, map_uk: Map, pool: ThreadPool
     Threads share out the rows in ``parts`` pieces. Each row is summed by one of them: the same bits for any number.
     """
     result = np.empty(scan.npix)
+    rows = partial(_rows, scan.row_start, scan.partner, scan.count, diagonal(scan, x), 1.0 - x * x, map_uk, result)
+    if parts <= 1:  # a thread would take longer to start than small maps do
+        rows(0, scan.npix)
+        return result
     edges = np.searchsorted(scan.row_start, np.linspace(0, scan.partner.size, parts + 1)[1:-1])
-    edges = np.concatenate([[0], edges, [scan.npix]])
-    weight, coupling = diagonal(scan, x), 1.0 - x * x
-    jobs = [
-        pool.submit(_rows, scan.row_start, scan.partner, scan.count, weight, coupling, map_uk, low, high, result)
-        for low, high in pairwise(edges)
-    ]
-    for job in jobs:
+    for job in [pool.submit(rows, low, high) for low, high in pairwise([0, *edges, scan.npix])]:
         job.result()
     return result
 
@@ -170,7 +169,7 @@ def _norm(vector: Map) -> float:
 
 
 @njit(nogil=True)
-def _rows(row_start, partner, count, weight, coupling, map_uk, low, high, result):  # type: ignore[no-untyped-def]
+def _rows(row_start, partner, count, weight, coupling, map_uk, result, low, high):  # type: ignore[no-untyped-def]
     for row in range(low, high):
         first, last = row_start[row], row_start[row + 1]
         even, odd = 0.0, 0.0
