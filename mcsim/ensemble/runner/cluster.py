@@ -2,6 +2,7 @@
 
 import logging
 import multiprocessing
+import os
 import sys
 from asyncio import CancelledError
 from collections.abc import Callable, Iterable, Iterator
@@ -15,18 +16,19 @@ from uuid import uuid4
 import dask
 from distributed import Client, Future, KilledWorker, LocalCluster, wait
 from distributed.comm.core import CommClosedError, FatalCommClosedError
+from distributed.utils import get_mp_context
 
 from mcsim.ensemble.tasks import ATTEMPTS, check_same_packages, packages
 from mcsim.errors import InputError, RunError
 from mcsim.support.progress import Journal
 
-# Ctrl-C reaches all processes of a terminal. The driver ends the run; workers that lose the driver stay silent.
+# The process that a worker is a fork of may have variables that the driver's environment no longer has.
 _WORKER_SETUP = """
-import logging, signal
-from mcsim.support.loading import loaded
-signal.signal(signal.SIGINT, signal.SIG_IGN)
+import logging, os
+import mcsim.ensemble.preload
 logging.getLogger("distributed").setLevel(logging.CRITICAL)
-loaded("mcsim.ensemble.tasks")
+for name in set(os.environ) - {variables!r}:
+    del os.environ[name]
 """
 
 Workers = int | str | Client
@@ -62,6 +64,20 @@ def _script_left_alone() -> Iterator[None]:
         script.__spec__ = before
 
 
+def start_method() -> str:
+    """Return how worker processes start, and say what they have in common.
+
+    By "forkserver" one process loads the modules, and all workers of a session are its forks: two start at the cost of
+    one, and the next ones at next to none. What macOS calculates with does not survive a fork, and a process that was
+    itself forked cannot use the server of its parent.
+    """
+    if sys.platform != "linux" or multiprocessing.parent_process() is not None:
+        return "spawn"
+    with dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}):
+        get_mp_context().set_forkserver_preload(["mcsim.ensemble.preload"])
+    return "forkserver"
+
+
 @contextmanager
 def local_client(workers: int) -> Iterator[Client]:
     """Yield the client of a local cluster of single-threaded processes, with ports open to this machine alone."""
@@ -72,10 +88,12 @@ def local_client(workers: int) -> Iterator[Client]:
         )
     single = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "DUCC0", "NUMBA")}
     environment = dask.config.get("distributed.nanny.pre-spawn-environ") | single | _KEPT_MEMORY
+    whole = dict(os.environ) | environment
     settings = {
         "distributed.nanny.pre-spawn-environ": environment,
         "distributed.scheduler.allowed-failures": ATTEMPTS - 1,
-        "distributed.worker.preload": [_WORKER_SETUP],
+        "distributed.worker.multiprocessing-method": start_method(),
+        "distributed.worker.preload": [_WORKER_SETUP.format(variables=set(whole))],
     }
     with dask.config.set(settings), _script_left_alone(), ExitStack() as stack:
         try:
@@ -84,6 +102,7 @@ def local_client(workers: int) -> Iterator[Client]:
                     n_workers=workers,
                     threads_per_worker=1,
                     processes=True,
+                    env=whole,
                     host="127.0.0.1",
                     dashboard_address="127.0.0.1:0",
                     memory_limit=None,
