@@ -45,6 +45,14 @@ _KEPT_MEMORY = {f"MALLOC_{limit}_THRESHOLD_": str(2**28) for limit in ("TRIM", "
 """For glibc, in bytes. A worker makes maps of the same size repeatedly. distributed's default returns their memory to
 the system each time, and new pages cost nearly as much as the transforms."""
 
+QUIET = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.tick.cycle": "10s",
+    "distributed.admin.system-monitor.interval": "2s",
+}
+"""Settings of Dask without which each worker is asked a hundred times a second what it does: 4 % of a core."""
+
 
 @contextmanager
 def _script_left_alone() -> Iterator[None]:
@@ -89,7 +97,7 @@ def local_client(workers: int) -> Iterator[Client]:
     single = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "DUCC0", "NUMBA")}
     environment = dask.config.get("distributed.nanny.pre-spawn-environ") | single | _KEPT_MEMORY
     whole = dict(os.environ) | environment
-    settings = {
+    settings = QUIET | {
         "distributed.nanny.pre-spawn-environ": environment,
         "distributed.scheduler.allowed-failures": ATTEMPTS - 1,
         "distributed.worker.multiprocessing-method": start_method(),
