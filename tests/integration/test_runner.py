@@ -4,7 +4,9 @@ import errno
 import multiprocessing
 import os
 import shutil
+import signal
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import dask
@@ -256,3 +258,23 @@ def test_a_process_that_was_forked_starts_workers_afresh(monkeypatch: pytest.Mon
     """It cannot wait for the server of its parent (CPython, Lib/multiprocessing/forkserver.py)."""
     monkeypatch.setattr(multiprocessing, "parent_process", multiprocessing.current_process)
     assert cluster.start_method() == "spawn"
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_workers_start_before_an_interruption_ends_them(times: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C while they start is put off until they have; a second one is not."""
+    started = []
+
+    def interrupted(**settings: object) -> nullcontext[None]:
+        for _ in range(times):
+            signal.raise_signal(signal.SIGINT)
+        started.append(settings["n_workers"])
+        return nullcontext()
+
+    monkeypatch.setattr(cluster, "LocalCluster", interrupted)
+    monkeypatch.setattr(cluster, "Client", nullcontext)
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt), runner.local_client(3):
+        pytest.fail("The interruption is lost.")
+    assert started == ([3] if times == 1 else [])
+    assert signal.getsignal(signal.SIGINT) is before

@@ -3,13 +3,16 @@
 import logging
 import multiprocessing
 import os
+import signal
 import sys
+import threading
 from asyncio import CancelledError
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 from itertools import islice
+from types import FrameType
 from typing import Any
 from uuid import uuid4
 
@@ -72,6 +75,37 @@ def _script_left_alone() -> Iterator[None]:
         script.__spec__ = before
 
 
+@contextmanager
+def _interrupted_later() -> Iterator[None]:
+    """Put a first Ctrl-C or SIGTERM off to the end of this block; the next one acts at once.
+
+    What is interrupted while Dask starts workers leaves half a cluster, whose end prints the tracebacks of all of it.
+    """
+    found = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: handler for number, handler in found.items() if callable(handler)}
+    pending: list[int] = []
+
+    def handled_as_before() -> None:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+    def put_off(number: int, frame: FrameType | None) -> None:
+        pending.append(number)
+        handled_as_before()
+
+    if threading.current_thread() is not threading.main_thread():  # which alone may handle signals
+        yield
+        return
+    for number in handlers:
+        signal.signal(number, put_off)
+    try:
+        yield
+    finally:
+        handled_as_before()
+    for number in pending:
+        signal.raise_signal(number)
+
+
 def start_method() -> str:
     """Return how worker processes start, and say what they have in common.
 
@@ -105,19 +139,20 @@ def local_client(workers: int) -> Iterator[Client]:
     }
     with dask.config.set(settings), _script_left_alone(), ExitStack() as stack:
         try:
-            cluster = stack.enter_context(
-                LocalCluster(
-                    n_workers=workers,
-                    threads_per_worker=1,
-                    processes=True,
-                    env=whole,
-                    host="127.0.0.1",
-                    dashboard_address="127.0.0.1:0",
-                    memory_limit=None,
-                    silence_logs=logging.CRITICAL,
+            with _interrupted_later():
+                cluster = stack.enter_context(
+                    LocalCluster(
+                        n_workers=workers,
+                        threads_per_worker=1,
+                        processes=True,
+                        env=whole,
+                        host="127.0.0.1",
+                        dashboard_address="127.0.0.1:0",
+                        memory_limit=None,
+                        silence_logs=logging.CRITICAL,
+                    )
                 )
-            )
-            client = stack.enter_context(Client(cluster))
+                client = stack.enter_context(Client(cluster))
         except (OSError, RuntimeError) as error:  # distributed's errors for processes that are late or die at once
             raise RunError(
                 f"The worker processes did not start ({type(error).__name__}: {error}); run the same command again "
