@@ -102,8 +102,8 @@ def _interrupted_later() -> Iterator[None]:
         yield
     finally:
         handled_as_before()
-    for number in pending:
-        signal.raise_signal(number)
+    for one in pending:
+        signal.raise_signal(one)
 
 
 def start_method() -> str:
