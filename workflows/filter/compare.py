@@ -30,7 +30,7 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 
 HERE = Path(__file__).parent
-L_LEAK, L_MOMENTS, PROBES, DRAWN = 6, 32, 40, 100
+L_LEAK, L_MOMENTS, PROBES, DRAWN = 6, 32, 40, 70
 MODES = {"L2M0d0": r"$A^{20}_{\ell\ell}$", "L2M0d2": r"$A^{20}_{\ell-2,\ell}$"}
 
 
