@@ -13,6 +13,7 @@ from comparisons import CASES, LMAX, MODEL, NSIDE, ODD, PEAR, SMALL, Maps, Simul
 from mcsim.cli import app
 from mcsim.comparison import pairs
 from mcsim.comparison.prediction import Prediction, Set
+from mcsim.comparison.scene import Scene
 from mcsim.comparison.scene_differences import PsiSign
 from mcsim.comparison.shown_sky import with_shown_sky
 from mcsim.comparison.time_differences import Interpolation
@@ -260,14 +261,24 @@ def test_noise_in_common_hides_no_more_than_is_expected_of_it(splits):
     simulator = Simulator(small(map=SMALL["map"] | {"splits": splits}))
     noise = noise_of(simulator)
     a, b = ([m + n for m, n in zip(made, noise, strict=True)] for made in (simulator(), ODD["psi_sign"](simulator)))
-    if splits:
-        assert names(mcsim.compare(a, b, simulator.run)) == ["psi_sign"]
     given = pairs.given(a, b, simulator.run)
     problem = Prediction(with_shown_sky(given.pairs[0]), (), 0.0)
     alone = problem.corrected(Set(((PsiSign(), np.ones(1)),), 1.0))
     assert 0.02 < alone.left < 0.5
     assert problem.hidden(alone) == pytest.approx(alone.left, rel=0.3)
     assert problem.suffices(alone)
+
+
+@pytest.mark.slow
+def test_nothing_is_simulated_beside_a_set_whose_shortcomings_noise_hides(monkeypatch):
+    """Side A five times for its sky and once as it is, and the set that is named."""
+    simulator, passes = Simulator(small()), []
+    noise, made = noise_of(simulator), (simulator(), ODD["psi_sign"](simulator))
+    a, b = ([m + n for m, n in zip(side, noise, strict=True)] for side in made)
+    whole = Scene.sampled
+    monkeypatch.setattr(Scene, "sampled", lambda *given: passes.append(given) or whole(*given))
+    assert names(mcsim.compare(a, b, simulator.run)) == ["psi_sign"]
+    assert len(passes) <= 7
 
 
 def test_noise_hides_what_a_coarse_grid_makes_of_the_sky_too():
