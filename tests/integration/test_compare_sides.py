@@ -14,7 +14,7 @@ from mcsim.cli import app
 from mcsim.comparison import pairs
 from mcsim.comparison.prediction import Prediction, Set
 from mcsim.comparison.scene import Scene
-from mcsim.comparison.scene_differences import PsiSign
+from mcsim.comparison.scene_differences import PsiSign, SpinSign, TimeShift
 from mcsim.comparison.shown_sky import with_shown_sky
 from mcsim.comparison.time_differences import Interpolation
 from mcsim.ensemble.maps import write_map
@@ -253,6 +253,19 @@ def noise_of(simulator: Simulator) -> Maps:
     draw = np.random.default_rng(6)
     hits = [m.moments.hits for m in survey(simulator.run).making.channels[0].maps]
     return [60.0 * draw.standard_normal(h.size) / np.sqrt(np.maximum(h, 1.0)) for h in hits]
+
+
+@pytest.mark.parametrize("other", [PsiSign(), SpinSign()])
+def test_late_samples_move_along_the_scan_whatever_else_differs(other):
+    """By moments nearly as by samples; at 4.6 degrees they leave 2 % of the time shift alone."""
+    simulator = Simulator(small())
+    pair = pairs.given(simulator(), simulator(), simulator.run).pairs[0]
+    late, pointing = TimeShift().scene(pair.scene, np.array([0.003]), pair), pair.pointing()
+    changed = other.scene(late, np.ones(1), pair)
+    wanted, before = (one.sampled(pointing, pair.scene.window) for one in (changed, pair.scene))
+    seen = pair.seen & (wanted != healpy.UNSEEN)
+    left = (wanted - before - changed.maps() + pair.scene.maps())[seen]
+    assert np.sum(left**2) < 0.04 * np.sum((wanted - before)[seen] ** 2)
 
 
 @pytest.mark.parametrize("splits", [["half1", "half2"], []])
