@@ -86,6 +86,8 @@ class DiagnosisSettings:
     channel_skies, typical_skies, common_skies, noisy_skies
         Least number of skies over which a response is averaged: in one channel; of a sky with another mean response;
         of a sky whose response in one realization is mostly random; if the change itself is random or has one sign.
+    opposite_share
+        Share of these skies in which the opposite step is simulated too; the others take its curvature from these.
     table_skies
         Skies over which the response of measured spectra is averaged.
     constrained_skies, scatter_skies
@@ -193,6 +195,7 @@ class DiagnosisSettings:
     typical_skies: int = 6
     common_skies: int = 12
     noisy_skies: int = 24
+    opposite_share: float = 1.0 / 3.0
     table_skies: int = 24
     constrained_skies: int = 8
     scatter_skies: int = 48
@@ -255,4 +258,9 @@ class DiagnosisSettings:
     def of_a_simulation(self) -> "DiagnosisSettings":
         """Return the settings with the default numbers of simulations, on which no single simulation depends."""
         whole = DiagnosisSettings()
-        return replace(self, simulations=None, **{name: getattr(whole, name) for name in _FIRST})
+        return replace(
+            self,
+            simulations=None,
+            opposite_share=whole.opposite_share,
+            **{name: getattr(whole, name) for name in _FIRST},
+        )
