@@ -217,7 +217,7 @@ def learned(
         rest[:, :numbers],
         *residuals,
         redundant=analysis.settings.redundant,
-        shrunk=analysis.settings.shrunk,
+        shrunk=analysis.settings.shrinks(simulations),
         external_reference=None if analysis.source is None else references[True],
         own_offset=own_offset,
         nuisances=_nuisances(analysis, len(null)),
