@@ -203,7 +203,7 @@ class DiagnosisSettings:
     table_skies: int = 24
     constrained_skies: int = 8
     scatter_skies: int = 48
-    time_ordered_skies: int = 6
+    time_ordered_skies: int = 3
     scan_sims: int = 300
 
     refine_rounds: int = 4

@@ -170,7 +170,7 @@ def verdict(name: str, folder: Path, other: int | None = None) -> dict[str, Any]
     out = folder / f"out-{name}"
     settings = DiagnosisSettings(without=left_out, simulations=simulations)
     if simulations is not None:  # as they were frozen
-        settings = replace(settings, opposite_share=1.0)
+        settings = replace(settings, opposite_share=1.0, time_ordered_skies=6)
     mcsim.diagnose(MODEL, maps, out, case=name, settings=settings)
     found: dict[str, Any] = json.loads((out / "verdict.json").read_text())
     return found
