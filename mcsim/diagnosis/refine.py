@@ -157,11 +157,8 @@ class Refiner:
                 break
             together = (*members, best)
             exact = self._together(candidates, t, together, self._fit(t, candidates, together))
-            if (
-                exact is not None
-                and self._is_possible(exact, candidates, together)
-                and self._beside(exact, candidates, members)[best] <= settings.partial_level
-            ):
+            significant = exact is not None and self._beside(exact, candidates, members)[best] <= settings.partial_level
+            if exact is not None and significant and self._is_possible(exact, candidates, together):
                 members, t = together, exact
             else:
                 refused.add(best)

@@ -286,9 +286,8 @@ class Selection:
         scatters = [index for index, candidate in enumerate(self.candidates) if candidate.scatter is not None]
         for size in range(self.settings.max_effects + 1):
             for members in combinations(scatters, size):
-                if len({self.candidates[index].identity for index in members}) < size:
-                    continue
-                yield self.search(members)
+                if len({self.candidates[index].identity for index in members}) == size:
+                    yield self.search(members)
 
     def search(self, members: Sequence[int]) -> Subsets:
         """Return the search of sets with all of the members whose scatter is known."""
