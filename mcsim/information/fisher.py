@@ -32,6 +32,9 @@ Maps = NDArray[np.float64]
 PAIRED_BYTES = 1 << 30
 """Memory for probes that are paired with each other; more probes are done in groups."""
 
+TOGETHER = 16
+"""Responses that are multiplied with all probes at once: the products of one alone take as long as it does."""
+
 
 @dataclass(frozen=True)
 class Information:
@@ -73,13 +76,16 @@ def stochastic(
         members = range(first, min(first + group, probes.number))
         if len(members) < 3 and found:
             break
-        drawn = [_draw(filtered, cl, probes.seed, number) for number in members]
+        data = np.empty((len(members), *filtered.precision.shape))  # x_k
+        skies = [_draw(filtered, cl, probes.seed, number, x) for number, x in zip(members, data, strict=True)]
         table = np.zeros((K, len(members), len(members)))  # x_k . b_i(x_l)
-        for column, (x, sky) in enumerate(drawn):
-            for row, derivative in enumerate(derivatives):
-                response = _response(derivative, x, sky)
-                table[row, :, column] = [np.vdot(other[derivative.maps], response) for other, _ in drawn]
-                done += 1.0
+        for row, derivative in enumerate(derivatives):
+            own = data[:, derivative.maps].reshape(len(members), -1)
+            for start in range(0, len(members), TOGETHER):
+                part = slice(start, start + TOGETHER)
+                responses = [_response(derivative, *each) for each in zip(data[part], skies[part], strict=True)]
+                table[row, :, part] = own @ np.reshape(responses, (len(responses), -1)).T
+                done += len(responses)
                 report(done)
         both = (table + np.swapaxes(table, 1, 2)) * (1.0 - np.eye(len(members)))
         flat = both.reshape(K, -1)
@@ -92,12 +98,12 @@ def stochastic(
     return Information((total + total.T) / 2.0, divided(error, size))
 
 
-def _draw(filtered: InverseCovariance, cl: Cl, seed: int, number: int) -> tuple[Maps, Alm]:
-    """Return x = C^-1 d of data that the model makes, and s^ of the sky of spectrum ``cl``."""
+def _draw(filtered: InverseCovariance, cl: Cl, seed: int, number: int, x: Maps) -> Alm:
+    """Return s^ of the sky of spectrum ``cl`` from data that the model makes, and fill x = C^-1 d."""
     data = filtered.draw("information", number, seed)
     found = filtered.wiener(data)
-    share = divided(cl, filtered.cl)
-    return filtered.apply(data, found), alm_.multiply(found, share, filtered.lmax)
+    x[:] = filtered.apply(data, found)
+    return alm_.multiply(found, divided(cl, filtered.cl), filtered.lmax)
 
 
 def _response(derivative: Derivative, x: Maps, sky: Alm) -> Maps:

@@ -7,21 +7,21 @@ centroids), N_k its white noise, without weight in pixels that are not observed,
 
 The system has the size (lmax + 1)^2 of the sky, however many maps there are. It is solved for u = S^-1/2 s^, in which
 a sky without power at some l is no exception, by conjugate gradients (Wandelt, Larson & Lakshminarayanan 2004,
-Phys. Rev. D 70, 083511; Eriksen et al. 2004, ApJS 155, 227), preconditioned on coarser and coarser pixels (Smith, Zahn
-& Dore 2007, Phys. Rev. D 76, 043510).
+Phys. Rev. D 70, 083511; Eriksen et al. 2004, ApJS 155, 227), preconditioned in pixels
+(:mod:`mcsim.simulation.preconditioner`).
 """
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import healpy
 import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.instrument.scan import Moments
 from mcsim.simulation import convolve
+from mcsim.simulation.preconditioner import Preconditioner
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rng
 from mcsim.sphere.checks import check_cl
@@ -33,15 +33,6 @@ Maps = NDArray[np.float64]
 
 ITERATIONS = 2000
 """After so many the conjugate gradients are given up."""
-
-BRIGHT = 1.0
-"""Power of the sky over that of the noise below which degrees are preconditioned one by one."""
-
-BLOCK = 32
-"""Highest degree that the coarsest level solves exactly."""
-
-CYCLE = 2
-"""Iterations of each level between the finest and the coarsest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,11 +81,6 @@ class InverseCovariance:
 
     Notes
     -----
-    The preconditioner is diagonal in harmonics, 1/(1 + C_l sum_k (B_kl w_kl)^2 / N_k), with 1/N_k the mean precision of
-    the map's pixels over the whole sky, per sr. Where pixels are missing, the lower degrees in which the sky is above
-    the noise are those of a nearly solved system of half the degrees on coarser pixels, down to l = 32 (Smith, Zahn &
-    Dore 2007). At S/N = 440 for l = 2 and 1e-6, three channels of two halves at nside 128, lmax 384 take 16 iterations
-    on the full sky, 55 with the equator masked up to 15 degrees (155 with one exact block and the diagonal).
     Equal to a dense solve to 1e-6 with a mask, uneven noise, the orders of the beam and centroids
     (tests/unit/test_inverse_covariance.py).
     """
@@ -249,54 +235,16 @@ class InverseCovariance:
     @cached_property
     def _gain(self) -> Vector:
         """Power of the sky over that of the noise in one mode, if all pixels of a map counted alike; (lmax + 1,)."""
-        return np.asarray(self.cl * self._sensitivity / (4.0 * np.pi))
+        total = sum(m.response.factors[0].real ** 2 * m.precision.sum() for m in self.maps)
+        return np.asarray(self.cl * total / (4.0 * np.pi))
 
     @cached_property
-    def _sensitivity(self) -> Vector:
-        """Sum over maps of the squared circular response times the precision of all pixels, (lmax + 1,)."""
-        return np.asarray(sum(m.response.factors[0].real ** 2 * m.precision.sum() for m in self.maps))
-
-    @cached_property
-    def _diagonal(self) -> Vector:
-        return _spread(1.0 / (1.0 + self._gain), self.lmax)
-
-    @cached_property
-    def _coarser(self) -> "tuple[NDArray[np.int64], InverseCovariance] | None":
-        """Places of the lower degrees in a packed vector, and the same system for them; None: not needed."""
-        bright = np.flatnonzero(self._gain > BRIGHT)
-        if bright.size == 0 or self.lmax <= BLOCK or all(m.precision.all() for m in self.maps):
-            return None
-        top = min(int(bright[-1]), max(self.lmax // 2, BLOCK))
-        nside = self.nside
-        while nside > 8 and nside >= top:
-            nside //= 2
-        # One map with the mean response stands for all; where they are masked alike that is nearly exact.
-        total = self.precision.sum(axis=0)
-        mean = np.sqrt(self._sensitivity[: top + 1] / total.sum()).astype(np.complex128)
-        single = ObservedMap(convolve.Response(mean[None]), _summed(total, self.nside, nside))
-        # Both orders of packing are by m, so that degrees up to top keep their order.
-        places = np.flatnonzero(_spread(np.arange(self.lmax + 1), self.lmax) <= top)
-        return places, InverseCovariance(self.cl[: top + 1], [single], nthreads=self.nthreads)
+    def _preconditioner(self) -> Preconditioner:
+        # One map with the mean response stands for all.
+        return Preconditioner(self._gain, self.precision.sum(axis=0), self.nthreads)
 
     def _precondition(self, vector: Vector) -> Vector:
-        found = self._diagonal * vector
-        if self._coarser is not None:
-            places, coarser = self._coarser
-            found[places] = coarser._nearly(vector[places])
-        return found
-
-    def _nearly(self, vector: Vector) -> Vector:
-        """Return about the solution of a coarser level."""
-        if self.lmax <= BLOCK:
-            return np.asarray(self._inverse @ vector.astype(np.float32), dtype=np.float64)
-        return conjugate_gradients(self._normal, vector, self._precondition, (0.0, CYCLE))[0]
-
-    @cached_property
-    def _inverse(self) -> NDArray[np.float32]:
-        """Inverse of the whole matrix, as accurate as a preconditioner needs it."""
-        matrix = np.stack([self._normal(row) for row in np.eye((self.lmax + 1) ** 2)], axis=1)
-        inverse = np.linalg.inv((matrix + matrix.T) / 2.0)
-        return np.asarray((inverse + inverse.T) / 2.0, dtype=np.float32)
+        return _packed(self._preconditioner.apply(_unpacked(vector, self.lmax)), self.lmax)
 
 
 def conjugate_gradients(
@@ -306,33 +254,27 @@ def conjugate_gradients(
     until: tuple[float, int],
     start: Vector | None = None,
 ) -> tuple[Vector, int]:
-    """Solve a symmetric positive definite system with a preconditioner that may change from step to step.
+    """Solve a symmetric positive definite system by preconditioned conjugate gradients.
 
     ``until``: relative residual, and number of iterations, at which they end. Return the solution and the iterations,
     one more than allowed if they ended for their number.
-
-    Notes
-    -----
-    Polak-Ribiere steps (Golub & Ye 1999, SIAM J. Sci. Comput. 21, 1305), because a few iterations of a coarser level
-    are no linear operator.
     """
     tolerance, most = until
     size = np.sqrt(known @ known)
     found = np.zeros_like(known) if start is None else start.copy()
     left = known.copy() if start is None else known - apply(start)
-    direction, before = np.zeros_like(known), left
-    product_before = 1.0
+    direction, before = np.zeros_like(known), 1.0
     for iteration in range(most):
         if left @ left <= (tolerance * size) ** 2:
             return found, iteration
         near = precondition(left)
-        product_now = float(near @ left)
-        direction = near + (near @ (left - before) / product_before) * direction
+        now = float(near @ left)
+        direction = near + now / before * direction
         moved = apply(direction)
-        step = (direction @ left) / (direction @ moved)
+        step = now / (direction @ moved)
         found = found + step * direction
-        before, product_before = left, product_now
         left = left - step * moved
+        before = now
     return found, most if left @ left <= (tolerance * size) ** 2 else most + 1
 
 
@@ -362,8 +304,3 @@ def _spread(factor: NDArray, lmax: int) -> NDArray:
     """Return a function of l at the places of packed coefficients."""
     each = factor[alm_.degrees(lmax)]
     return np.concatenate([each, each[lmax + 1 :]])
-
-
-def _summed(precision: Map, fine: int, coarse: int) -> Map:
-    """Return the precision of the mean of the pixels inside coarse ones."""
-    return np.asarray(healpy.ud_grade(precision, coarse, power=-2)) if coarse < fine else precision

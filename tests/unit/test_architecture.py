@@ -49,7 +49,10 @@ RESERVED = {
 # Pure science: numbers in, numbers out. It imports nothing of the wiring, which reads configurations, stores and draws.
 SCIENCE = {
     f"mcsim.{name}" for name in ("errors", "support", "sphere", "stats", "instrument", "systematics", "bipolar")
-} | {f"mcsim.simulation.{name}" for name in ("convolve", "inverse_covariance", "mapmaking", "rings", "tod")}
+} | {
+    f"mcsim.simulation.{name}"
+    for name in ("convolve", "inverse_covariance", "mapmaking", "preconditioner", "rings", "tod")
+}
 
 PUBLIC = {
     "mcsim.config": [

@@ -136,6 +136,36 @@ def test_mean_is_what_a_covariance_was_given(products, filters, name: str, value
     np.testing.assert_allclose(result, expected, atol=1e-8)
 
 
+def test_an_estimate_without_a_filter_has_more_variance_for_the_same_numbers(products) -> None:
+    """What bins of the masked map's own A^{LM} measure is R, not 1: V alone can be below F^-1, R^-1 V R^-t cannot."""
+    one, bands = map_filter(0), Bands(TABLES.modes, LMAX, WIDTH, True)
+    degrees = np.array([ell for ell, _ in unit_skies(LMAX)])
+    seen = one.inverse.precision[0] > 0.0
+    field = np.stack([healpy.alm2map(sky, NSIDE, lmax=LMAX)[seen] for sky in UNITS], axis=1)
+    sky = field * one.inverse.maps[0].response.factors[0].real[degrees]
+    covariance = (sky * np.where(degrees < LOWEST, 0.0, CL[degrees])) @ sky.T
+    covariance += np.diag(1.0 / one.inverse.precision[0][seen])
+    window = one.window[degrees]
+    filtered = (field * window).T @ np.linalg.inv(covariance)
+    masked = field.T * (4.0 * np.pi / seen.size / np.sqrt(seen.mean())) / window[:, None]
+    used, (mode, place, part) = bands.count > 0.0, bands.numbers
+    factor = np.stack([bin_factor(each, LMAX) for each in bands.modes])
+    terms = np.add.reduceat(np.where(used, factor * np.where(used, products, 0.0), 0.0), bands.first, axis=-1)
+    count = np.add.reduceat(used, bands.first, axis=-1)[mode, place]
+    plain = np.where(part == 0, terms.real[..., mode, place], terms.imag[..., mode, place]) / count
+    plain = np.moveaxis(plain + np.swapaxes(plain, 0, 1), -1, 0) / 2.0
+    t, inside = forms(bands, products), masked @ (field * window)
+    fisher = information(t, *[filtered @ (field * window)] * 2, True)
+    response = 2.0 * np.einsum("pij,qij->pq", inside.T @ plain @ inside, t)
+    spread = masked @ covariance @ masked.T
+    variance = 2.0 * np.einsum("pij,qji->pq", plain @ spread, plain @ spread)
+    inverse, back = np.linalg.inv(fisher), np.linalg.inv(response)
+    assert (np.diag(inverse) > np.diag(variance)).mean() > 0.2
+    left = back @ variance @ back.T - inverse
+    assert np.linalg.eigvalsh(left).min() > -1e-6 * np.abs(left).max()
+    assert np.median(np.diag(inverse) / np.diag(inverse + left)) < 0.9
+
+
 def variance_of_probes(t: np.ndarray, first: np.ndarray, second: np.ndarray, number: int, auto: bool) -> np.ndarray:
     """Variance of F from all pairs of probes: of a U-statistic of (x' t_p y)(x' t_q y), and of as many pairs alone."""
     expected = information(t, first, second, auto)
