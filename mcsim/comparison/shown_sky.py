@@ -105,11 +105,13 @@ def _sharper(pair: ChannelPair) -> ChannelPair:
     limit = SHARP**2 * _sky(pair)
     if _left(pair, scene.maps()) <= limit:
         return pair
+    before = np.inf
     for _ in range(ROUNDS):
         missing = np.where(pair.shown, pair.a - _made(pair, scene), 0.0)
-        if np.sum(missing**2) <= limit:
+        left = float(np.sum(missing**2))
+        if left <= limit or left > SHARPER * before:
             break
-        limit = max(limit, SHARPER * np.sum(missing**2))
+        before = left
         empty = replace(scene.up_to_offsets(1), sky=np.zeros_like(scene.sky))
         scene = replace(scene, sky=scene.sky + sky_in(missing, pair.shown, empty, 1e-2))
     return replace(pair, scene=scene)

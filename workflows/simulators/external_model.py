@@ -133,7 +133,7 @@ class Litebird:
             lbs.add_convolved_sky_to_one_detector(tod, alm, beam, angles, None, None, how, 1)
             if channel == "W1":
                 self._respond(tod, part, angles)
-            noise = np.sqrt(1.0 + own.get("noise_level", NONE)["amplitude"]) * self.sigma[channel]
+            noise = (1.0 + own.get("noise_level", NONE)["amplitude"]) * self.sigma[channel]
             self._disturb(tod, channel, part, noise, draw)
             maps[part] = binned(self.inputs.nside, iter([(pixels, tod)]))
         return maps
