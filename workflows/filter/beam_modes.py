@@ -16,7 +16,7 @@ from mcsim.simulation.beam_modes import BeamModes
 from mcsim.simulation.survey import survey
 
 HERE = Path(__file__).parent
-CHANNEL, ORDERS, WIDTH, PROBES = "W1", 2, 30, 40
+CHANNEL, ORDERS, WIDTH, PROBES = "W1", 2, 50, 100
 
 
 def main() -> None:
@@ -41,8 +41,9 @@ def main() -> None:
     beta = channel.beam.blm[1 : ORDERS + 1, : lmax + 1] / channel.beam.blm[0, : lmax + 1]
     true = np.sum(np.nan_to_num(every.conj() * beta).real, axis=(1, 2))
     fisher = row.T @ row / (2.0 * len(pairs))
-    inverse = np.linalg.inv(fisher)
-    expected = inverse @ (row.T @ true) / (2.0 * len(pairs))
+    # Hartlap, Simon & Schneider 2007, A&A 464, 399, eq. 17
+    inverse = (len(pairs) - len(fisher) - 1) / len(pairs) * np.linalg.inv(fisher)
+    expected = np.linalg.solve(fisher, row.T @ true) / (2.0 * len(pairs))
     found, alone = [], []
     for r in range(arguments.realizations):
         one, other = (modes.score(simulate.maps(each, r)[0]) for each in (shared, control))

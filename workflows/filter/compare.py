@@ -173,7 +173,7 @@ def draw(result: dict, middle: np.ndarray) -> Figure:
     )
     left.axhline(0.0, color="0.7", lw=0.8)
     title = "one sky: as they stand (thin), of the same numbers (thick)"
-    right.set(xlabel=r"multipole $\ell$", ylabel="variance, filtered / plain", title=title, ylim=(0.0, 1.4))
+    right.set(xlabel=r"multipole $\ell$", ylabel="variance, filtered / plain", title=title, ylim=(0.0, 1.6))
     right.axhline(1.0, color="0.7", lw=0.8)
     for axes in (left, right):
         axes.legend(frameon=False, fontsize=9)
