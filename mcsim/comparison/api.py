@@ -138,16 +138,16 @@ def compare(
 
 def _channel(pair: ChannelPair, sides: Comparison, accuracy: float) -> ChannelResult:
     others = [other for other in sides.pairs if other.name != pair.name]
-    found, problem = _explained(pair, others, sides, accuracy)
+    found, problem, unexplained = _explained(pair, others, sides, accuracy)
     accepted = DOUBTFUL if len(found.differences) == 1 else DOUBTFUL_TOGETHER
     named = found.verdict != "unknown"
-    if problem is None or pair.scene is None or found.verdict == "identical" or (named and found.left < accepted):
+    if problem is None or pair.scene is None or found.verdict == "identical" or (named and unexplained < accepted):
         return found
     turned_pair, turned_others = pair.exchanged(), [other.exchanged() for other in others]
     shown = turned_pair if problem.pair.doubt is None else with_shown_sky(turned_pair)
     if not problem.worse_alone_than(problem.of_pair(shown, turned_others)):
         return found
-    turned, _ = _explained(turned_pair, turned_others, sides, accuracy)
+    turned, *_ = _explained(turned_pair, turned_others, sides, accuracy)
     worse = named and turned.left > CLEARLY * found.left
     if turned.verdict in ("unknown", "identical") or worse:
         return found
@@ -156,15 +156,18 @@ def _channel(pair: ChannelPair, sides: Comparison, accuracy: float) -> ChannelRe
 
 def _explained(
     pair: ChannelPair, others: Sequence[ChannelPair], sides: Comparison, accuracy: float
-) -> tuple[ChannelResult, Problem | None]:
-    """Return what explains a pair whose side A is described by the model, and the problem that was solved, if any."""
+) -> tuple[ChannelResult, Problem | None, float]:
+    """Return what explains a pair whose side A is described by the model, the problem that was solved, if any.
+
+    Last comes the share of the variance that is left beyond what noise may hide.
+    """
     sky, _ = (_sky_rms(pair, side) for side in "AB")
     if _rms((pair.b - pair.a)[pair.seen]) <= ROUNDING * sky:
-        return _result(pair, "identical"), None
+        return _result(pair, "identical"), None, 0.0
     pair = with_shown_sky(pair).where_different(ROUNDING * sky)
     rms = _rms((pair.b - pair.a)[pair.seen])
     if rms <= ROUNDING * sky:
-        return _result(pair, "identical"), None
+        return _result(pair, "identical"), None, 0.0
     problem = Problem(pair, others, accuracy * sky, library(sides.frame))
     sets = problem.best()
     if sides.run is not None and not (sets and problem.complete(sets[0])):
@@ -178,8 +181,8 @@ def _explained(
             problem = replace(problem, library=(*problem.library, *seen_there))
             sets = problem.best(1)
     if pair.turned and not (sets and problem.suffices(sets[0])):
-        return _result(pair, "unknown"), problem
-    if not sets or not problem.suffices(sets[0]) or (sets[0].left > DOUBTFUL and not problem.complete(sets[0])):
+        return _result(pair, "unknown"), problem, 1.0
+    if not sets or not problem.suffices(sets[0]) or problem.unexplained(sets[0]) > DOUBTFUL:
         sets = sorted([*sets, *problem.best(2)], key=lambda one: one.left)
     swapped = bool(sets) and any(difference.exchanges for difference, _ in problem.preferred(sets)[0].members)
     if rms > accuracy * sky and (not sets or not problem.suffices(sets[0]) or swapped):
@@ -190,12 +193,12 @@ def _explained(
     small = small and ("interpolation" in sets[0].names or sets[0].left > INTERPOLATED)
     if not sets or not problem.suffices(sets[0]) or small:
         verdict: Verdict = "identical" if rms <= accuracy * sky else "unknown"
-        return _result(pair, verdict, (), problem, sets), problem
+        return _result(pair, verdict, (), problem, sets), problem, 1.0
     sets = problem.preferred(sets)
     known = {equal[0] for difference, value in sets[0].members for equal in difference.equivalent(value)}
     others_too = [one for one in problem.alternatives(sets) if not known.intersection(d.name for d, _ in one.members)]
     chosen = [sets[0], *others_too]
-    return _result(pair, _verdict(chosen), chosen, problem, sets), problem
+    return _result(pair, _verdict(chosen), chosen, problem, sets), problem, problem.unexplained(sets[0])
 
 
 def _correlation(pair: ChannelPair, other: Scene) -> float:

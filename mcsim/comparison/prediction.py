@@ -208,6 +208,10 @@ class Prediction:
         hidden = self.hidden(found)
         return max(found.left - hidden, UNSURE * hidden)
 
+    def unexplained(self, found: Set) -> float:
+        """Return the share of the variance that a set leaves beyond what noise may hide."""
+        return max(found.left - (1.0 + UNSURE) * self.hidden(found), 0.0)
+
     def suffices(self, found: Set) -> bool:
         """Return True if a set explains enough to be named."""
         needed = min([self.needed(), *(difference.enough for difference, _ in found.members)])

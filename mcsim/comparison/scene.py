@@ -93,7 +93,8 @@ class Scene:
     motion
         Scan model in place of the channel's; None: that.
     late, step
-        Samples by which the signal of a pointing is attributed to an earlier one, and their distance in radians.
+        Samples by which the signal of a pointing is attributed to an earlier one, and their distance in radians, of the
+        sign of the spin.
     added
         Makes of the scene without it what its maps have besides; None: nothing.
     kept, moved
@@ -133,6 +134,8 @@ class Scene:
         beam = self.beam
         if self.late:
             way = self.late * self.step
+            if self.motion is not None:  # the beam's axes are those of the body, whichever way it spins
+                way = self.late * abs(self.step) * np.sign(self.motion.spin_period_s)
             key = (beam.blm.tobytes(), way)
             if key not in self.moved:
                 moved = displaced(beam, 0.0 if way >= 0.0 else np.pi, abs(way))
@@ -183,6 +186,11 @@ class Scene:
         return self._prepared(self._noncircular())
 
     def _noncircular(self) -> Maps:
+        if self.late and self.psi != (1, 0.0):
+            # Late samples move along the scan, however psi is counted; of the beam's shape that is left out.
+            along = self.turned(-self.psi[1])
+            along = replace(along if self.psi[0] > 0 else along.reversed(), beam=self.beam.truncated(0))
+            return along._noncircular() + replace(self, late=0.0)._noncircular()
         return np.stack([convolve.noncircular_map(self._transforms.spins, m) for m in self.moments])
 
     def _prepared(self, made: Maps) -> Maps:

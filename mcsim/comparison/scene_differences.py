@@ -191,7 +191,8 @@ class TimeShift(Difference):
         return [np.array([value])]
 
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
-        return replace(scene, late=float(value[0]), step=_radians_per_sample(pair))
+        spin = pair.channel.site.pointed(self.name).model.spin_period_s if pair.channel is not None else 1.0
+        return replace(scene, late=float(value[0]), step=float(np.sign(spin)) * _radians_per_sample(pair))
 
 
 def _radians_per_sample(pair: ChannelPair) -> float:

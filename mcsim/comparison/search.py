@@ -99,11 +99,12 @@ class Problem(Prediction):
         for _ in range(LARGEST - 1):
             if not found or self.complete(found[0]):
                 break
+            most = found[0].left - VISIBLE * self.hidden(found[0]) if self.pair.doubt is not None else 0.0
             larger = [
                 one
                 for smaller in self._bases(found)
                 for one in self._extended(smaller, library)
-                if self.pair.doubt is not None or one.left < (1.0 - FURTHER) * max(smaller.left, found[0].left)
+                if one.left < max(most, (1.0 - FURTHER) * max(smaller.left, found[0].left))
             ]
             found = self._sorted(self.fitted(one) for one in _different(larger, TRIED))
             if not found or not self.adds(found[0], chosen[0]):
@@ -129,9 +130,12 @@ class Problem(Prediction):
         worth = WORTH if self.pair.doubt is None else WORTH_IN_NOISE
         for index, one in enumerate(ranked[:MEASURED]):
             if one.left < worth:
-                ranked[index] = self.corrected(one)
-                if self.complete(ranked[index]):
+                ranked[index] = measured = self.corrected(one)
+                if self.complete(measured):
                     worth = 1.0 - EXPLAINED
+                elif self.unexplained(measured) == 0.0:
+                    # Noise leaves the rest. What single samples change of other sets counts if it does of this one.
+                    worth = min(worth, ALIKE * measured.left if one.left > EQUAL * measured.left else 0.0)
         return sorted(ranked, key=lambda one: one.left)
 
     def _bases(self, found: Sequence[Set]) -> list[Set]:

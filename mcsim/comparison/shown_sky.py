@@ -25,6 +25,9 @@ SHARP = 1e-4
 Orientation moments leave more of maps of single samples.
 """
 
+SHARPER = 0.5
+"""Share of the squares that a correction of the sky must leave at most to be followed by another one."""
+
 WHOLE = 0.99
 """Share of the pixels from which on holes hide nothing."""
 
@@ -102,10 +105,13 @@ def _sharper(pair: ChannelPair) -> ChannelPair:
     limit = SHARP**2 * _sky(pair)
     if _left(pair, scene.maps()) <= limit:
         return pair
+    before = np.inf
     for _ in range(ROUNDS):
         missing = np.where(pair.shown, pair.a - _made(pair, scene), 0.0)
-        if np.sum(missing**2) <= limit:
+        left = float(np.sum(missing**2))
+        if left <= limit or left > SHARPER * before:
             break
+        before = left
         empty = replace(scene.up_to_offsets(1), sky=np.zeros_like(scene.sky))
         scene = replace(scene, sky=scene.sky + sky_in(missing, pair.shown, empty, 1e-2))
     return replace(pair, scene=scene)
@@ -174,10 +180,8 @@ def _filtered(pair: ChannelPair, weight: Maps) -> ChannelPair:
         smooth = alm_.multiply(alm_.resize(sky, scene.lmax, lmax), factor, lmax)
         return healpix.synthesis(smooth[None], pair.nside, lmax, nthreads=scene.nthreads)[0]
 
-    sky = scene.sky
-    for _ in range(ROUNDS):
-        rest = np.where(pair.seen, pair.a - _made(pair, replace(scene, sky=sky)), 0.0)
-        sky = sky_of(np.sum(weight * rest, axis=0) + total * seen_by_circle(sky))
+    rest = np.where(pair.seen, pair.a - _made(pair, scene), 0.0)
+    sky = sky_of(np.sum(weight * rest, axis=0) + total * seen_by_circle(scene.sky))
     draw = np.random.default_rng(0)
     other = _draw(power, draw)
     values = total * healpix.synthesis(other[None], pair.nside, lmax, nthreads=scene.nthreads)[0]

@@ -115,6 +115,8 @@ def analysis_of(
     simulates in place of mcsim.
     """
     settings = settings or DiagnosisSettings()
+    if run.nuisances:
+        settings = settings.without_shrinkage()
     known = kinds_of(library)
     check_nuisances(run, dict(known))
     if source is not None and run.nuisances:

@@ -1,5 +1,6 @@
 """Plan and run the simulations that a diagnosis needs, and turn them into a null ensemble and templates."""
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -135,7 +136,7 @@ def plan(analysis: Analysis, simulations: int | None = None, time_ordered: bool 
     for candidate, column, sign, effect in _steps(analysis):
         table = candidate.table(effect)
         acting = replace(analysis.job(with_effects(base, [table])), source=analysis.source_of([table]))
-        jobs[Purpose("response", column, sign)] = replace(acting, count=skies(analysis, candidate))
+        jobs[Purpose("response", column, sign)] = replace(acting, count=skies(analysis, candidate, sign))
     return {purpose: replace(job, slices=analysis.of_maps) for purpose, job in jobs.items()}
 
 
@@ -154,8 +155,8 @@ def _steps(analysis: Analysis) -> Iterator[tuple[Candidate, int, int, Effect]]:
                     yield candidate, column, sign, effect.scaled(sign)
 
 
-def skies(analysis: Analysis, candidate: Candidate) -> int:
-    """Return the number of skies over which the response to a candidate is averaged."""
+def skies(analysis: Analysis, candidate: Candidate, sign: int = 1) -> int:
+    """Return the number of skies over which the response to a candidate is averaged, or those of one sign."""
     settings = analysis.settings
     if not analysis.of_maps:
         return settings.table_skies
@@ -164,7 +165,9 @@ def skies(analysis: Analysis, candidate: Candidate) -> int:
     fewest = settings.channel_skies
     if candidate.channel is None:
         fewest = settings.typical_skies if candidate.parametrization.mean_response else settings.common_skies
-    return min(max(fewest, -(-settings.response_modes // analysis.model.lmax**2)), settings.noisy_skies)
+    count = min(max(fewest, -(-settings.response_modes // analysis.model.lmax**2)), settings.noisy_skies)
+    opposite = sign < 0 and candidate.parametrization.sign == 0
+    return math.ceil(settings.opposite_share * count) if opposite else count
 
 
 def learned(
@@ -172,7 +175,6 @@ def learned(
 ) -> tuple[NullEnsemble, TemplateBank]:
     """Simulate the model, and the same skies with every candidate: return null ensemble and templates.
 
-    A template is [x(+step) - x(-step)]/(2 step), of the same skies; if the effect has one sign, [x(step) - x(0)]/step.
     Arguments are those of :func:`plan`; some elements are redundant, and by default the first simulations tell how
     many are independent, and so how many simulations are needed.
     """
@@ -194,11 +196,7 @@ def learned(
         here = results[Purpose("response", column, sign)]
         step = candidate.parametrization.coordinates(effect)[candidate.columns.index(column)]
         same = references[jobs[Purpose("response", column, sign)].source is not None][: len(here)]
-        if other is None:
-            each = (here - same) / step
-        else:
-            each = (here - other) / (2.0 * step)
-            curvature[:, column] = np.mean(here + other - 2.0 * same, axis=0) / (2.0 * step**2)
+        each, curvature[:, column] = responses(step, here, other, same)
         matrix[:, column] = each.mean(axis=0)
         error[:, column] = each.std(axis=0, ddof=1) / np.sqrt(len(each))
     offset = np.zeros(whole)
@@ -219,7 +217,7 @@ def learned(
         rest[:, :numbers],
         *residuals,
         redundant=analysis.settings.redundant,
-        shrunk=analysis.settings.shrunk,
+        shrunk=analysis.settings.shrinks(simulations),
         external_reference=None if analysis.source is None else references[True],
         own_offset=own_offset,
         nuisances=_nuisances(analysis, len(null)),
@@ -229,6 +227,23 @@ def learned(
         slice_elements=analysis.slices,
     )
     return ensemble, TemplateBank(matrix[:size], error[:size], curvature[:size], labels, matrix[size:])
+
+
+def responses(step: float, here: Rows, opposite: Rows | None, same: Rows) -> tuple[Rows, Rows]:
+    """Return the linear response in each sky, shape (skies, p), and the curvature of the mean, shape (p,).
+
+    Data vectors with a step and without are those of the same skies, those with the opposite step of the first of them.
+    They give [x(+step) - x(-step)]/(2 step); in the other skies, and of an effect of one sign, the response is
+    [x(step) - x(0)]/step less step times the curvature, which is zero if nothing tells it.
+    """
+    each = (here - same) / step
+    if opposite is None:
+        return each, np.zeros(here.shape[1])
+    both = len(opposite)
+    curvature = np.mean(here[:both] + opposite - 2.0 * same[:both], axis=0) / (2.0 * step**2)
+    each -= step * curvature
+    each[:both] = (here[:both] - opposite) / (2.0 * step)
+    return each, curvature
 
 
 def _results(analysis: Analysis, jobs: dict[Purpose, Job], ask: Ask, pilot: bool) -> dict[Purpose, Rows]:

@@ -42,8 +42,8 @@ def matched_filter(model: Model, effect: Effect, channel: int | None) -> Matched
         return _signal_filter(model, effect, channel)
     factor = effect.noise(owner.site)
     if factor is not None:
-        change, parts = np.asarray(factor) - 1.0, model.of(channel)
-        return lambda filtered: float(np.dot(normalised_difference(model, filtered, parts), change))
+        change = np.asarray(factor) - 1.0
+        return lambda filtered: float(np.dot(filtered.difference[channel], change))
     return None if effect.gain(np.zeros(1), owner.site) is None else _gain_filter(model, effect, channel)
 
 
@@ -140,21 +140,3 @@ def _along(part: int, map_uk: Map, filtered: FilteredMaps) -> float:
 
 def _unreached(owner: Channel, m: SurveyMap, part: int, filtered: FilteredMaps) -> float:
     return _along(part, differencing.not_converged(owner, m, filtered.expected[part]), filtered)
-
-
-def normalised_difference(model: Model, filtered: FilteredMaps, parts: tuple[int, ...]) -> Map:
-    """Return u^2 - 1 of every pixel seen by a channel's first two maps, u their difference over its noise; else 0.
-
-    Of a channel with one map, u is its residual over the noise.
-    """
-    # Residuals are zero where nothing was seen, and come times their precision: (r/a - s/b)^2 / (1/a + 1/b).
-    first, a = filtered.residual[parts[0]], model.parts[parts[0]].precision
-    seen = first != 0.0
-    if len(parts) == 1:
-        square, scale = first**2, a
-    else:
-        second, b = filtered.residual[parts[1]], model.parts[parts[1]].precision
-        seen &= second != 0.0
-        square, scale = (first * b - second * a) ** 2, a * b * (a + b)
-    found = np.divide(square, scale, out=np.zeros_like(square), where=seen)
-    return found - seen

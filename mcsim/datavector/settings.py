@@ -7,7 +7,6 @@ from mcsim.support.settings import check_settings
 from mcsim.systematics import Library
 
 _FIRST = {
-    "shrunk": True,
     "sims_per_element": 3,
     "pilot_sims_per_element": 2,
     "channel_skies": 2,
@@ -18,6 +17,9 @@ _FIRST = {
     "scan_sims": 100,
 }
 """Numbers of simulations of a first verdict."""
+
+_OF_A_SAMPLE: dict[str, Any] = {"sims_per_element": 10, "pilot_sims_per_element": 3}
+"""Numbers of simulations of a sample covariance."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,8 @@ class DiagnosisSettings:
         Names of effects that are candidates although they are proposed on request alone; those of a ``library`` that is
         given always are.
     simulations
-        Simulations for the covariance of the data vector; None: ``sims_per_element`` for each of its elements.
+        Simulations for the covariance of the data vector, which then is that of the sample; None: ``sims_per_element``
+        for each of its elements.
     controls
         Data sets that are drawn from the model at higher fidelity and diagnosed too: what they say tells if the verdict
         on the data can be trusted (:mod:`mcsim.diagnosis.controls`).
@@ -78,7 +81,8 @@ class DiagnosisSettings:
     sims_per_element, pilot_sims_per_element
         Simulations per independent element of the data vector; and per element, after which these are counted.
     shrunk
-        Take the covariance from few simulations: shrunk (:func:`mcsim.stats.shrinkage.shrunk`), not that of the sample.
+        Shrink the covariance (:func:`mcsim.stats.shrinkage.shrunk`), unless ``simulations`` is given. That of a sample
+        needs 10 per element.
     redundant
         Directions of the data vector with less than this fraction of the largest variance are dropped.
     response_modes
@@ -86,6 +90,8 @@ class DiagnosisSettings:
     channel_skies, typical_skies, common_skies, noisy_skies
         Least number of skies over which a response is averaged: in one channel; of a sky with another mean response;
         of a sky whose response in one realization is mostly random; if the change itself is random or has one sign.
+    opposite_share
+        Share of these skies in which the opposite step is simulated too; the others take its curvature from these.
     table_skies
         Skies over which the response of measured spectra is averaged.
     constrained_skies, scatter_skies
@@ -152,7 +158,7 @@ class DiagnosisSettings:
     >>> sorted(mcsim.DiagnosisSettings(library=library, simulations=500).library)
     ['beam_width', 'gain_drift']
 
-    Ask for a first verdict from a third of the simulations for the covariance:
+    Ask for a first verdict from fewer simulations:
 
     >>> mcsim.DiagnosisSettings.quick(without=("beam_ellipticity",)).sims_per_element
     3
@@ -184,19 +190,20 @@ class DiagnosisSettings:
     slice_snr: float = 2.0
     place_pvalue: float = 0.01
 
-    sims_per_element: int = 10
+    sims_per_element: int = 5
     pilot_sims_per_element: int = 3
-    shrunk: bool = False
+    shrunk: bool = True
     redundant: float = 1e-4
     response_modes: int = 1 << 14
     channel_skies: int = 3
     typical_skies: int = 6
     common_skies: int = 12
     noisy_skies: int = 24
+    opposite_share: float = 1.0 / 3.0
     table_skies: int = 24
     constrained_skies: int = 8
     scatter_skies: int = 48
-    time_ordered_skies: int = 6
+    time_ordered_skies: int = 3
     scan_sims: int = 300
 
     refine_rounds: int = 4
@@ -239,20 +246,23 @@ class DiagnosisSettings:
     def quick(cls, **changes: Any) -> "DiagnosisSettings":
         """Return the settings of a first verdict, with changes by name.
 
-        There are fewer simulations of everything: the covariance is shrunk, responses are averaged over fewer skies.
+        There are fewer simulations of everything, and responses are averaged over fewer skies.
         The same model diagnosed with the default settings goes on with these simulations. With nuisances, and for
         measured spectra, the covariance is that of as many simulations as otherwise.
         """
         return cls(**(_FIRST | changes))
 
+    def shrinks(self, simulations: int | None) -> bool:
+        """Return True if the covariance from so many simulations, None for the default number, is shrunk."""
+        return self.shrunk and simulations is None
+
     def without_shrinkage(self) -> "DiagnosisSettings":
         """Return the settings with as many simulations as a sample covariance needs."""
-        whole = DiagnosisSettings()
-        few = self.sims_per_element == _FIRST["sims_per_element"]
-        names = ("sims_per_element", "pilot_sims_per_element") if few else ()
-        return replace(self, shrunk=False, **{name: getattr(whole, name) for name in names})
+        few = self.sims_per_element in (_FIRST["sims_per_element"], DiagnosisSettings().sims_per_element)
+        return replace(self, shrunk=False, **(_OF_A_SAMPLE if few else {}))
 
     def of_a_simulation(self) -> "DiagnosisSettings":
         """Return the settings with the default numbers of simulations, on which no single simulation depends."""
         whole = DiagnosisSettings()
-        return replace(self, simulations=None, **{name: getattr(whole, name) for name in _FIRST})
+        names = ("simulations", "shrunk", "opposite_share", *_FIRST)
+        return replace(self, **{name: getattr(whole, name) for name in names})

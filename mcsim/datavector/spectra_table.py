@@ -200,5 +200,6 @@ def analysis_of_spectra(
         for name, kind in kinds_of(library)
         if all(getattr(kind, hook) is getattr(Effect, hook) for hook in _SPECTRAL_HOOKS)
     ]
+    settings = (settings or DiagnosisSettings()).without_shrinkage()
     analysis = analysis_of(run, (*without, *excluded), nthreads, settings, library)
     return replace(analysis, blocks=(Block(measured.elements, lambda filtered: measured.value),), of_maps=False)

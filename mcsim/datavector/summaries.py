@@ -8,7 +8,6 @@ import healpy
 import numpy as np
 
 from mcsim.bipolar import by_degree
-from mcsim.datavector.matched_filters import normalised_difference
 from mcsim.datavector.wiener_filter import FilteredMaps, Model
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
@@ -180,7 +179,7 @@ def _noise_block(model: Model, channel: int) -> Block:
         words = f"|sin β| {low:g}–{high:g}, {'odd' if half else 'even'} pixels"
         elements.append(replace(own, frame="ecliptic", component=words))
     bands = np.stack(rows)
-    return Block(tuple(elements), lambda filtered: np.asarray(bands @ normalised_difference(model, filtered, parts)))
+    return Block(tuple(elements), lambda filtered: np.asarray(bands @ filtered.difference[channel]))
 
 
 def _linearity_block(model: Model, channel: int) -> Block:

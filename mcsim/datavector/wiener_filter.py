@@ -88,6 +88,7 @@ class FilteredMaps:
     # D_s(l) of every map, (map, beam_orders + 1, lmax + 1); s = 0 is real. The sky in it has the dipole. Above
     # split_beam_orders the channel's sum stands in its first map.
     orders: NDArray[np.complex128]
+    difference: NDArray[np.float64]  # u^2 - 1 of every pixel, (channel, npix): _normalised_difference
 
 
 def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
@@ -173,7 +174,25 @@ def wiener_filter(model: Model, maps: Sequence[Map]) -> FilteredMaps:
             # ducc0's sign: S_s is minus the synthesis of E = Re(k b) a, B = Im(k b) a.
             both = by_degree(looked_at, electric, lmax) + 1j * by_degree(looked_at, magnetic, lmax)
             orders[i, s] = -2.0 * window * k * both
-    return FilteredMaps(sky, expected, residual, adjoint, orders)
+    difference = np.stack([_normalised_difference(model, residual, model.of(c)) for c in range(len(model.channels))])
+    return FilteredMaps(sky, expected, residual, adjoint, orders, difference)
+
+
+def _normalised_difference(model: Model, residual: NDArray[np.float64], parts: tuple[int, ...]) -> Map:
+    """Return u^2 - 1 of every pixel seen by a channel's first two maps, u their difference over its noise; else 0.
+
+    Of a channel with one map, u is its residual over the noise.
+    """
+    # Residuals are zero where nothing was seen, and come times their precision: (r/a - s/b)^2 / (1/a + 1/b).
+    first, a = residual[parts[0]], model.parts[parts[0]].precision
+    seen = first != 0.0
+    if len(parts) == 1:
+        square, scale = first**2, a
+    else:
+        second, b = residual[parts[1]], model.parts[parts[1]].precision
+        seen &= second != 0.0
+        square, scale = (first * b - second * a) ** 2, a * b * (a + b)
+    return np.divide(square, scale, out=np.zeros_like(square), where=seen) - seen
 
 
 def shared_sky(model: Model, maps: Sequence[Map]) -> Alm:

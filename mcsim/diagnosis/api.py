@@ -195,8 +195,6 @@ def _analysed(
     """
     threads = os.cpu_count() or 1
     table = read_spectra(data, run) if isinstance(data, str | Path) and Path(data).is_file() else None
-    if settings.shrunk and (run.nuisances or table is not None):
-        settings = settings.without_shrinkage()
     controls.check(wanted, of_maps=table is None, external=source is not None)
     if table is not None:
         if source is not None:
@@ -251,7 +249,7 @@ def _learned(
     if simulations is not None and simulations <= size:
         raise InputError(
             f"{simulations} simulations are too few for the {size} elements of the data vector; give at least "
-            f"{2 * size}, better {analysis.settings.sims_per_element * size}."
+            f"{2 * size}, better {analysis.settings.without_shrinkage().sims_per_element * size}."
         )
     stored = None if analysis.source is None else analysis.source.count
     if stored is not None and simulations is not None and stored < simulations:
@@ -262,7 +260,7 @@ def _learned(
         null_ensemble.save(scratch, *campaign.learned(analysis, ask, simulations))
 
     found = null_ensemble.load(folders.cached(name, fill))
-    if not analysis.settings.shrunk:
+    if analysis.settings.sims_per_element >= DiagnosisSettings().sims_per_element:
         shutil.rmtree(kept(run, analysis).folder, ignore_errors=True)
     return found
 

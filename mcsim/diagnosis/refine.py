@@ -7,7 +7,7 @@ import numpy as np
 
 from mcsim.datavector.candidate import Candidate, beyond, columns_of, coordinates_of, effects_at, parts_of, scatters_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
-from mcsim.diagnosis.selection import Attribution, attribute
+from mcsim.diagnosis.selection import Attribution, Selection, attribute
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import Fit
 from mcsim.stats.scattered import Acting, with_drawn_scatter
@@ -149,31 +149,26 @@ class Refiner:
         null, settings = self.context.null, self.context.settings
         members: tuple[int, ...] = ()
         refused: set[int] = set()
-        before = self._fit(t, candidates, members)
-        total = before.chi2
         while len(members) < settings.partial_effects and len(refused) < settings.partial_refusals:
-            taken = {candidates[member].identity for member in members}
-            free = [i for i, one in enumerate(candidates) if one.identity not in taken and i not in refused]
-            fits = {i: self._fit(t, candidates, (*members, i)) for i in free}
-            possible = [i for i, fit in fits.items() if np.isfinite(beyond(candidates, (*members, i), fit))]
-            best = min(possible, key=lambda i: self._pvalue(before, fits[i]), default=None)
-            if best is None or not self._is_significant(before, fits[best]):
+            pvalues = self._beside(t, candidates, members)
+            free = [int(i) for i in np.argsort(pvalues) if i not in refused and pvalues[i] <= settings.partial_level]
+            best = next((i for i in free if self._is_possible(t, candidates, (*members, i))), None)
+            if best is None:
                 break
             together = (*members, best)
-            exact = self._together(candidates, t, together, fits[best])
-            if exact is not None:
-                after = self._fit(exact, candidates, together)
-                if np.isfinite(beyond(candidates, together, after)) and self._is_significant(before, after):
-                    members, t, before = together, exact, after
-                    continue
-            refused.add(best)
+            exact = self._together(candidates, t, together, self._fit(t, candidates, together))
+            significant = exact is not None and self._beside(exact, candidates, members)[best] <= settings.partial_level
+            if exact is not None and significant and self._is_possible(exact, candidates, together):
+                members, t = together, exact
+            else:
+                refused.add(best)
         if not members:
             return None
-        excess = null.hartlap_factor * total - null.dimension
-        left = null.hartlap_factor * before.chi2 - before.dimension
-        own = t[:, columns_of(candidates, members)]
-        fit = before
+        fit = self._fit(t, candidates, members)
+        excess = null.hartlap_factor * null.chi2(self.data.x) - null.dimension
+        left = null.hartlap_factor * fit.chi2 - fit.dimension
         if scatters := scatters_of(candidates, members):
+            own = t[:, columns_of(candidates, members)]
             wide = null.with_extra_covariance(*scatters).fit(self.data.x, own)
             fit = with_drawn_scatter(null, own, wide, scatters)
         return PartialExplanation(members, fit, min(max(left / excess, 0.0), 1.0) if excess > 0.0 else 1.0, t)
@@ -181,13 +176,14 @@ class Refiner:
     def _fit(self, t: Matrix, candidates: Sequence[Candidate], members: tuple[int, ...]) -> Fit:
         return self.context.null.fit(self.data.x, t[:, columns_of(candidates, members)])
 
-    def _pvalue(self, before: Fit, after: Fit) -> float:
-        columns, fitted = before.dimension - after.dimension, self.context.null.dimension - before.dimension
-        return float(self.context.null.nested_test(before.chi2 - after.chi2, before.chi2, columns, fitted))
+    def _beside(self, t: Matrix, candidates: Sequence[Candidate], members: tuple[int, ...]) -> Vector:
+        """Return the global p-value of each candidate beside members, which scatter the data as in an attribution."""
+        known = self.context
+        selection = Selection(known.null, self.data.x, t, candidates, known.calibration, known.settings)
+        return selection.search(members).beside(np.array([members], dtype=np.int64))[0]
 
-    def _is_significant(self, before: Fit, after: Fit) -> bool:
-        pvalue = float(self.context.calibration.global_pvalue(self._pvalue(before, after)))
-        return pvalue <= self.context.settings.partial_level
+    def _is_possible(self, t: Matrix, candidates: Sequence[Candidate], members: tuple[int, ...]) -> bool:
+        return bool(np.isfinite(beyond(candidates, members, self._fit(t, candidates, members))))
 
     def _attribute(self, t: Matrix, candidates: Sequence[Candidate]) -> Attribution:
         known = self.context

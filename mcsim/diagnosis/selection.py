@@ -149,7 +149,7 @@ def attribute(
     favourable direction. The prior of a set is k! times the product of its candidates' shares of the weight.
     """
     settings = settings or DiagnosisSettings()
-    selection = _Selection(null, x, t, candidates, calibration, settings)
+    selection = Selection(null, x, t, candidates, calibration, settings)
     first = selection.searches[0]
     groups, y = first.groups, first.y
     found = global_test(null, x, groups, calibration)
@@ -192,7 +192,7 @@ class _Accepted:
 
 
 @dataclass(frozen=True)
-class _Selection:
+class Selection:
     """Select among sets of candidates; fields are the arguments of :func:`attribute`."""
 
     null: SimulatedGaussian
@@ -283,16 +283,20 @@ class _Selection:
 
         Combinations of candidates that exclude each other are left out.
         """
-        scatters = {index: c.scatter for index, c in enumerate(self.candidates) if c.scatter is not None}
+        scatters = [index for index, candidate in enumerate(self.candidates) if candidate.scatter is not None]
         for size in range(self.settings.max_effects + 1):
             for members in combinations(scatters, size):
-                if len({self.candidates[index].identity for index in members}) < size:
-                    continue
-                known, columns = [scatters[index] for index in members], [c.columns for c in self.candidates]
-                wide = self.null.with_extra_covariance(*known)
-                beside = variance_beside(self.null, self.t, columns, members, known)
-                groups, y = wide.whiten_groups(self.t, columns), wide.whiten(self.x)
-                yield Subsets(wide, y, groups, self.candidates, self.calibration, self.settings, members, beside)
+                if len({self.candidates[index].identity for index in members}) == size:
+                    yield self.search(members)
+
+    def search(self, members: Sequence[int]) -> Subsets:
+        """Return the search of sets with all of the members whose scatter is known."""
+        scatters = {member: one for member in members if (one := self.candidates[member].scatter) is not None}
+        columns, known = [candidate.columns for candidate in self.candidates], list(scatters.values())
+        wide = self.null.with_extra_covariance(*known)
+        beside = variance_beside(self.null, self.t, columns, list(scatters), known)
+        groups, y = wide.whiten_groups(self.t, columns), wide.whiten(self.x)
+        return Subsets(wide, y, groups, self.candidates, self.calibration, self.settings, tuple(scatters), beside)
 
     def _possible(self, found: Iterable[_Accepted]) -> Iterator[_Accepted]:
         """Yield the sets whose fitted amplitudes are possible, with the evidence of the nearest ones within bounds."""

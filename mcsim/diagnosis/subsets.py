@@ -147,7 +147,7 @@ class Subsets:
         """Return the columns of each subset, shape (M, K), and the member to which each belongs, shape (K,)."""
         ranks = self.groups.sizes[subsets[0]]
         parts = [self.groups.start[subsets[:, i], None] + np.arange(rank) for i, rank in enumerate(ranks)]
-        return np.concatenate(parts, axis=1), np.repeat(np.arange(len(ranks)), ranks)
+        return np.concatenate([subsets[:, :0], *parts], axis=1), np.repeat(np.arange(len(ranks)), ranks)
 
     def _matrix(self, columns: Rows) -> Vector:
         return self._gram[columns[:, :, None], columns[:, None, :]] + RIDGE * np.eye(columns.shape[1])

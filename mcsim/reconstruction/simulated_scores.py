@@ -12,7 +12,6 @@ import numpy as np
 from mcsim import config
 from mcsim.datavector.analysis import Analysis, Job, Kinds, analysis_for, simulated_maps
 from mcsim.datavector.campaign import Ask, seeded
-from mcsim.datavector.matched_filters import normalised_difference
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import Model, wiener_filter
 from mcsim.reconstruction.forms import AddedToSamples
@@ -89,8 +88,7 @@ def _wave(of: str, order: int, component: int) -> type[AddedToSamples]:
 def scores_of_maps(model: Model, scene: Scene, maps: Sequence[Map]) -> Vector:
     """Return the scores of the grammar, shape (P,)."""
     filtered = wiener_filter(model, maps)
-    channels = range(len(model.channels))
-    return scene.values(filtered, [normalised_difference(model, filtered, model.of(c)) for c in channels])
+    return scene.values(filtered, list(filtered.difference))
 
 
 def scores(job: Job) -> Matrix:

@@ -1,16 +1,13 @@
 """A small run that takes a fraction of a second, and workers to run it with: in this process, or quick to start."""
 
-import multiprocessing
 from collections.abc import Iterator
 from contextlib import nullcontext
-from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
 import dask
 import pytest
 from distributed import Client, LocalCluster
-from distributed.utils import get_mp_context
 
 from mcsim import config
 from mcsim.ensemble import runner
@@ -21,8 +18,9 @@ from mcsim.ensemble.runner import cluster
 def client() -> Iterator[Client]:
     """Two workers in this process, for runs; stores are read by threads instead, which is ten times as fast."""
     with (
-        LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0") as cluster,
-        Client(cluster) as connected,
+        dask.config.set(cluster.QUIET),
+        LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0") as threads,
+        Client(threads) as connected,
         dask.config.set(scheduler="threads"),
     ):
         yield connected
@@ -32,20 +30,6 @@ def client() -> Iterator[Client]:
 def in_this_process(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let commands run on ``client`` instead of processes, whose start takes seconds."""
     monkeypatch.setattr(cluster, "local_client", lambda workers: nullcontext(client))
-
-
-@pytest.fixture
-def forked_workers() -> Iterator[None]:
-    """Worker processes are forks of one that has loaded their libraries, once for all tests of this process.
-
-    For tests of what happens to processes; tests/integration/test_script.py has those of how mcsim starts them.
-    """
-    context = multiprocessing.get_context("forkserver")
-    with dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}):
-        get_mp_context()  # which names libraries of its own, once
-        context.set_forkserver_preload(["distributed.nanny", "mcsim.ensemble.tasks"])
-        forkserver.ensure_running()
-        yield
 
 
 def table(**changes: Any) -> dict[str, Any]:

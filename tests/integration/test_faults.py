@@ -410,7 +410,6 @@ def test_store_that_is_deleted_during_the_run(
     assert_same(path, small_store)
 
 
-@pytest.mark.usefixtures("forked_workers")
 def test_worker_that_dies_every_time_costs_its_realization_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -92,7 +92,6 @@ def test_prepared_maps_of_the_model_agree_with_it_and_an_effect_is_found(maps, t
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("forked_workers")
 def test_a_model_that_lacks_power_of_the_sky_is_told_so(maps, tmp_path):
     """Without the steps and the power above l = 20. Nothing of the verdict is asked, so few simulations will do."""
     bare = diagnosed(model(20, steps=False), maps, tmp_path, 200)

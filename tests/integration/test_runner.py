@@ -1,7 +1,12 @@
 """The batch from configuration to store: resumption, extension, slices, refusals, and the same bits every time."""
 
 import errno
+import multiprocessing
+import os
 import shutil
+import signal
+import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import dask
@@ -228,3 +233,48 @@ def test_merge_refuses_what_does_not_belong_together(small_store: Path, client: 
     assert not (tmp_path / "merged.zarr").exists()
     with refused("other.zarr"):
         runner.merge([small_store], other)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="workers are forks on Linux")
+def test_workers_are_forks_with_the_environment_of_their_driver(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One process loads the modules for all clusters; a variable that has changed since, has changed in workers too."""
+
+    def facts() -> tuple[int, str | None, str | None]:
+        return os.getppid(), os.environ.get("MCSIM_DATA"), os.environ.get("OMP_NUM_THREADS")
+
+    monkeypatch.setenv("MCSIM_DATA", "before")
+    with runner.local_client(2) as processes:
+        before = processes.run(facts)
+    monkeypatch.delenv("MCSIM_DATA")
+    with runner.local_client(1) as processes:
+        after = processes.run(facts)
+    (server,) = {parent for parent, *_ in (before | after).values()}
+    assert server != os.getpid()
+    assert set(before.values()) == {(server, "before", "1")}
+    assert set(after.values()) == {(server, None, "1")}
+
+
+def test_a_process_that_was_forked_starts_workers_afresh(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It cannot wait for the server of its parent (CPython, Lib/multiprocessing/forkserver.py)."""
+    monkeypatch.setattr(multiprocessing, "parent_process", multiprocessing.current_process)
+    assert cluster.start_method() == "spawn"
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_workers_start_before_an_interruption_ends_them(times: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C while they start is put off until they have; a second one is not."""
+    started = []
+
+    def interrupted(**settings: object) -> nullcontext[None]:
+        for _ in range(times):
+            signal.raise_signal(signal.SIGINT)
+        started.append(settings["n_workers"])
+        return nullcontext()
+
+    monkeypatch.setattr(cluster, "LocalCluster", interrupted)
+    monkeypatch.setattr(cluster, "Client", nullcontext)
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt), runner.local_client(3):
+        pytest.fail("The interruption is lost.")
+    assert started == ([3] if times == 1 else [])
+    assert signal.getsignal(signal.SIGINT) is before

@@ -20,6 +20,7 @@ from mcsim.stats.detection import cosines, detectable, log_evidence, posterior, 
 from mcsim.stats.excess import HeldOut, Measured
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate
+from mcsim.stats.scattered import Acting
 from mcsim.systematics import Effect, Parametrization
 
 P, N = 60, 800
@@ -410,34 +411,49 @@ def test_isolation_needs_more_of_closer_effects():
     assert close * np.sqrt(0.005) == pytest.approx(-special.ndtri(0.05), rel=1e-3)
 
 
+def detected(bench: Bench, x: np.ndarray, exact=lambda t, members: t, candidates=None) -> PartialExplanation | None:
+    """What is detected in data if ``exact`` gives the templates of effects that act together."""
+    context = SimpleNamespace(null=bench.null, calibration=bench.calibration, settings=DiagnosisSettings())
+
+    class Straight(Refiner):
+        def _together(self, candidates, t, members, fitted):
+            return exact(t, members)
+
+    return Straight(SimpleNamespace(context=context, x=x)).detected_in(bench.t, candidates or bench.candidates)
+
+
 def test_four_effects_are_detected_where_no_set_of_three_suffices(bench):
     """The four, the strongest first, and what is left is noise; without a gap there is nothing."""
     weights = np.array([30.0, 20.0, 14.0, 10.0])
-
-    def filtered(x: np.ndarray, exact=lambda t, members: t) -> PartialExplanation | None:
-        settings = DiagnosisSettings()
-        context = SimpleNamespace(null=bench.null, calibration=bench.calibration, settings=settings)
-
-        class Straight(Refiner):
-            def _together(self, candidates, t, members, fitted):
-                return exact(t, members)
-
-        return Straight(SimpleNamespace(context=context, x=x)).detected_in(bench.t, bench.candidates)
-
     signal = bench.t[:, :4] @ weights
-    found = [filtered(signal + np.random.default_rng(seed).normal(size=P)) for seed in range(10)]
+    found = [detected(bench, signal + np.random.default_rng(seed).normal(size=P)) for seed in range(10)]
     # A fifth joins them by chance once in 200.
     assert sum(one.members == (0, 1, 2, 3) for one in found) >= 9
     pulls = np.concatenate([(one.fit.amplitudes[:4] - weights) / one.fit.errors[:4] for one in found])
     assert np.mean(pulls**2) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 40))
     # The square of 56 numbers scatters by sqrt(2 56) about them, beside a gap of 1,596.
     assert max(one.left for one in found) < 4.0 * np.sqrt(2.0 * 56) / 1596
-    assert filtered(bench.null.mean) is None
+    assert detected(bench, bench.null.mean) is None
     # What cannot have its amplitude, or says something else there, is passed over.
-    assert 0 not in filtered(signal, lambda t, members: None if 0 in members else t).members
+    assert 0 not in detected(bench, signal, lambda t, members: None if 0 in members else t).members
     other = bench.t.copy()
     other[:, 0] -= signal * (signal @ other[:, 0]) / (signal @ signal)
-    assert 0 not in filtered(signal, lambda t, members: other if 0 in members else t).members
+    assert 0 not in detected(bench, signal, lambda t, members: other if 0 in members else t).members
+
+
+@pytest.mark.parametrize("drawn", [False, True])
+def test_what_is_detected_beside_an_effect_stands_out_of_the_scatter_that_it_adds(bench, drawn):
+    """Five standard deviations of the model along another template, two and a half of the data with the effect."""
+    x = bench.null.mean + bench.t[:, :2] @ [30.0, 5.0]
+    assert detected(bench, x).members == (0, 1)
+    if drawn:
+        draws = np.random.default_rng(6).normal(size=24)
+        own = {"scatter": np.outer(bench.t[:, 1], np.sqrt(3.0 / 24) * (draws - draws.mean()) / draws.std())}
+    else:
+        excess = np.where(np.arange(len(bench.candidates)) == 1, 3.0, 0.0)
+        own = {"acting": Acting(size=900.0, chi2=0.0, excess=excess, error=0.0 * excess)}
+    acting = [replace(bench.candidates[0], **own), *bench.candidates[1:]]
+    assert detected(bench, x, candidates=acting).members == (0,)
 
 
 UNSURE = Measured(0.0, 100.0)

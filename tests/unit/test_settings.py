@@ -35,5 +35,11 @@ def test_wrong_settings_are_refused(kind, name, value) -> None:
 
 def test_usual_settings_are_taken() -> None:
     assert DiagnosisSettings(alpha=1, simulations=300, without=["beam_coma"], beam_bins=(5, 2)).simulations == 300
-    assert DiagnosisSettings.quick(controls=3).shrunk
+    assert DiagnosisSettings.quick(controls=3).sims_per_element < DiagnosisSettings().sims_per_element
     assert LimitSettings(nuisances={"beam_width": 0.01}, dense=True).dense
+
+
+def test_a_number_of_simulations_that_is_given_is_that_of_a_sample_covariance() -> None:
+    assert DiagnosisSettings().shrinks(None)
+    assert not DiagnosisSettings(shrunk=False).shrinks(None)
+    assert not DiagnosisSettings.quick().shrinks(500)

@@ -16,6 +16,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -167,7 +168,10 @@ def verdict(name: str, folder: Path, other: int | None = None) -> dict[str, Any]
         maps = list(opened[next(str(key) for key in opened.data_vars if "map" in str(key))].values[0])
     left_out = tuple(effect for effect in mcsim.effects() if effect not in proposed)
     out = folder / f"out-{name}"
-    mcsim.diagnose(MODEL, maps, out, case=name, settings=DiagnosisSettings(without=left_out, simulations=simulations))
+    settings = DiagnosisSettings(without=left_out, simulations=simulations)
+    if simulations is not None:  # as they were frozen
+        settings = replace(settings, opposite_share=1.0, time_ordered_skies=6)
+    mcsim.diagnose(MODEL, maps, out, case=name, settings=settings)
     found: dict[str, Any] = json.loads((out / "verdict.json").read_text())
     return found
 

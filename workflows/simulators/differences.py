@@ -1,6 +1,7 @@
 """Put differences into simulators, let ``mcsim compare`` explain them, and print what it says.
 
-    python workflows/simulators/differences.py [identical|single|pair ...] [--skies 3] [-o ROWS]
+    python workflows/simulators/differences.py [identical|single|pair ...] [--skies 3] [--seed 1]
+        [-o ROWS]
 
 Side A is totalconvolve.py, side B the simulator of the row; rows of litebird_sim and TOAST are left out where they are
 not installed. A row is right if the differences put in are the set named first, or one that is called as good.
@@ -236,9 +237,9 @@ def compared(run: config.RunConfig, a: Maps, b: Maps) -> tuple[ComparisonResult,
     return found, time.process_time() - start
 
 
-def judged(case: Case) -> tuple[str, str]:
+def judged(case: Case, seed: int) -> tuple[str, str]:
     """Return whether the answer is right, and a row of the table."""
-    run = run_of(case.scan, 1, case.period_s, case.circular)
+    run = run_of(case.scan, seed, case.period_s, case.circular)
     given = inputs.of(run)
     found, seconds = compared(run, totalconvolve.simulate(given), case.make(given))
     (channel,) = found.channels
@@ -291,21 +292,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tables", nargs="*", default=["identical", "single", "pair"])
     parser.add_argument("--skies", type=int, default=3)
+    parser.add_argument("--seed", type=int, default=1, help="of the first sky")
     parser.add_argument("--only", default="", help="regular expression of the rows to make")
     parser.add_argument("-o", "--output", type=Path, help="file of the rows; those that it holds are not made again")
     given = parser.parse_args()
     rows, counts = Rows(given.output), Counter[str]()
     if "identical" in given.tables:
         print("| scan | side A | side B | sky | rms over the sky's | verdict | CPU s |\n|---|---|---|---|---|---|---|")
-    for seed, scan, sides in product(range(1, given.skies + 1), ("wmap", "planck", "litebird"), PAIRS):
+    for sky, scan, sides in product(range(given.skies), ("wmap", "planck", "litebird"), PAIRS):
         if "identical" in given.tables and all(map(installed, sides)) and re.search(given.only, f"{scan} {sides}"):
+            seed = given.seed + sky
             counts[rows.made(f"{scan} {sides} {seed}", partial(identical, scan, sides, seed))] += 1
     print("\n| scan | side B | put in | rms / sky | named | explains % | as good | right | CPU s |")
     print("|---|---|---|---|---|---|---|---|---|")
     for table, cases in (("single", singles), ("pair", pairs)):
         for case in cases() if table in given.tables else ():
             if installed(case.simulator) and re.search(given.only, case.what):
-                counts[rows.made(f"{case.scan} {case.simulator} {case.what}", partial(judged, case))] += 1
+                key = f"{case.scan} {case.simulator} {case.what} {given.seed}"
+                counts[rows.made(key, partial(judged, case, given.seed))] += 1
     print(dict(counts))
 
 

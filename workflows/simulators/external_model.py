@@ -50,6 +50,23 @@ MODEL = {
 }
 NONE = {"amplitude": 0.0}
 CALLS = 20
+FLAWS = (
+    {},
+    {"ellipticity": 0.1},
+    {"ellipticity": 0.2},
+    {"ellipticity": 0.35},
+    {"offset": 4.0},
+    {"offset": 8.0},
+    {"offset": 16.0},
+    {"drift": 0.01},
+    {"drift": 0.03},
+    {"quadratic": 40.0},
+    {"quadratic": 120.0},
+    {"thermal": 0.3},
+    {"thermal": 1.0},
+    {"knee": 0.1},
+    {"knee": 0.5},
+)
 PROPOSED = ("beam_ellipticity", "beam_width", "gain_drift", "noise_level", "pointing_offset")
 
 
@@ -73,19 +90,25 @@ class Litebird:
         for channel in self.inputs.channels:
             for name, samples in parts(self.inputs, channel):
                 told = _pointed(channel, samples, None, 0.0, float)
-                angles = self._angles(told)[: len(samples)]
-                if "offset" in flaws and channel.name == "W1":
-                    [seen] = told.observations
-                    told.detectors[0].orient, told.detectors[0].pol = "Q", "T"
-                    told.detectors[0].name = "000_one_horn"  # as its module for pointing wants it
-                    plane = lbs.PointingSys(told, seen, told.detectors).focalplane
-                    plane.add_offset(np.deg2rad(flaws["offset"] / 60.0), "x")
+                true = angles = self._angles(told)[: len(samples)]
+                if channel.name == "W1" and self._moved(told):
                     told.prepare_pointings(append_to_report=False)
                     true = self._angles(told)[: len(samples)]
-                else:
-                    true = angles
                 pixels = healpy.ang2pix(self.inputs.nside, angles[:, 0], angles[:, 1])
                 self.scans.append((channel.name, name, true, pixels))
+
+    def _moved(self, told):  # type: ignore[no-untyped-def]
+        """Move the pointing as its module does; return whether it was."""
+        if "offset" in self.flaws:
+            self._systems(told).focalplane.add_offset(np.deg2rad(self.flaws["offset"] / 60.0), "x")
+        return "offset" in self.flaws
+
+    @staticmethod
+    def _systems(told):  # type: ignore[no-untyped-def]
+        [seen] = told.observations
+        told.detectors[0].orient, told.detectors[0].pol = "Q", "T"
+        told.detectors[0].name = "000_one_horn"  # as its module for pointing wants it
+        return lbs.PointingSys(told, seen, told.detectors)
 
     @staticmethod
     def _angles(told):  # type: ignore[no-untyped-def]
@@ -98,7 +121,7 @@ class Litebird:
         """Return the maps of one seed, with effects of mcsim's library, on a given sky if there is one."""
         draw, lmax = np.random.default_rng(seed), self.inputs.lmax
         drawn = self._sky(draw)
-        alm = lbs.SphericalHarmonics((drawn if sky is None else sky)[None], lmax, lmax, coordinates=_ECLIPTIC)
+        sky = drawn if sky is None else sky
         added = {(e.name, e.channel): e.parameters for e in effects}
         maps = {}
         for channel, part, angles, pixels in self.scans:
@@ -106,18 +129,28 @@ class Litebird:
             beam, order = self._beam(channel, own)
             tod = np.zeros(len(pixels))
             how = lbs.BeamConvolutionParameters(lmax, order, False, 1e-6)
+            alm = lbs.SphericalHarmonics(self._light(sky, channel)[None], lmax, lmax, coordinates=_ECLIPTIC)
             lbs.add_convolved_sky_to_one_detector(tod, alm, beam, angles, None, None, how, 1)
             if channel == "W1":
-                self._respond(tod)
-            noise = np.sqrt(1.0 + own.get("noise_level", NONE)["amplitude"]) * self.sigma[channel]
-            if channel == "W1" and "knee" in self.flaws:
-                lbs.add_one_over_f_noise(tod, self.flaws["knee"], 1e-6, 1.0, noise, 1.0 / PERIOD_S, draw)
-            else:
-                lbs.add_white_noise(tod, noise, draw)
+                self._respond(tod, part, angles)
+            noise = (1.0 + own.get("noise_level", NONE)["amplitude"]) * self.sigma[channel]
+            self._disturb(tod, channel, part, noise, draw)
             maps[part] = binned(self.inputs.nside, iter([(pixels, tod)]))
         return maps
 
-    def _respond(self, tod):  # type: ignore[no-untyped-def]
+    def _light(self, sky, channel):  # type: ignore[no-untyped-def]
+        """Return a sky in the band of a channel."""
+        return sky
+
+    def _disturb(self, tod, channel, part, noise, draw):  # type: ignore[no-untyped-def]
+        """Add the noise of a part of a channel, uK rms."""
+        if channel == "W1" and "knee" in self.flaws:
+            lbs.add_one_over_f_noise(tod, self.flaws["knee"], 1e-6, 1.0, noise, 1.0 / PERIOD_S, draw)
+        else:
+            lbs.add_white_noise(tod, noise, draw)
+
+    def _respond(self, tod, part, angles):  # type: ignore[no-untyped-def]
+        """Change the time line of a part, seen at these angles."""
         draw = np.random.default_rng(0)
         if "drift" in self.flaws:
             drift = lbs.GainDriftParams(
@@ -196,30 +229,18 @@ def main() -> None:
         print(f"null cases, {name} as the model: {np.sum(p < 0.05)} of {len(p)} below 0.05, ", end="")
         print(f"KS p = {kstest(p, 'uniform').pvalue:.2g}")
     print(flush=True)
+    table(Litebird, run, FLAWS, (known, plain), given.seed)
+
+
+def table(simulator, run, flaws, models, seed):  # type: ignore[no-untyped-def]
+    """Print what diagnoses with two models say of data with each systematic."""
     print("| systematic of litebird_sim in W1 | p | litebird_sim as the model | p | mcsim as the model |")
     print("|---|---|---|---|---|")
-    for flaw in (
-        {},
-        {"ellipticity": 0.1},
-        {"ellipticity": 0.2},
-        {"ellipticity": 0.35},
-        {"offset": 4.0},
-        {"offset": 8.0},
-        {"offset": 16.0},
-        {"drift": 0.01},
-        {"drift": 0.03},
-        {"quadratic": 40.0},
-        {"quadratic": 120.0},
-        {"thermal": 0.3},
-        {"thermal": 1.0},
-        {"knee": 0.1},
-        {"knee": 0.5},
-    ):
-        other = Litebird(run, **flaw)
-        maps = other.simulate(given.seed)
+    for flaw in flaws:
+        maps = simulator(run, **flaw).simulate(seed)
         data = [maps[name.replace(":", "_")] for name in config.map_names(run)]
         what = ", ".join(f"{name} {value:g}" for name, value in flaw.items()) or "none"
-        answers = " | ".join(answer(diagnose_data(ObservedMaps(one, data, ask), "case")) for one in (known, plain))
+        answers = " | ".join(answer(diagnose_data(ObservedMaps(one, data, ask), "case")) for one in models)
         print(f"| {what} | {answers} |", flush=True)
 
 

@@ -2,31 +2,36 @@
 
 import logging
 import multiprocessing
+import os
+import signal
 import sys
+import threading
 from asyncio import CancelledError
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 from itertools import islice
+from types import FrameType
 from typing import Any
 from uuid import uuid4
 
 import dask
 from distributed import Client, Future, KilledWorker, LocalCluster, wait
 from distributed.comm.core import CommClosedError, FatalCommClosedError
+from distributed.utils import get_mp_context
 
 from mcsim.ensemble.tasks import ATTEMPTS, check_same_packages, packages
 from mcsim.errors import InputError, RunError
 from mcsim.support.progress import Journal
 
-# Ctrl-C reaches all processes of a terminal. The driver ends the run; workers that lose the driver stay silent.
+# The process that a worker is a fork of may have variables that the driver's environment no longer has.
 _WORKER_SETUP = """
-import logging, signal
-from mcsim.support.loading import loaded
-signal.signal(signal.SIGINT, signal.SIG_IGN)
+import logging, os
+import mcsim.ensemble.preload
 logging.getLogger("distributed").setLevel(logging.CRITICAL)
-loaded("mcsim.ensemble.tasks")
+for name in set(os.environ) - {variables!r}:
+    del os.environ[name]
 """
 
 Workers = int | str | Client
@@ -42,6 +47,14 @@ ALONE_S = 300.0
 _KEPT_MEMORY = {f"MALLOC_{limit}_THRESHOLD_": str(2**28) for limit in ("TRIM", "MMAP")}
 """For glibc, in bytes. A worker makes maps of the same size repeatedly. distributed's default returns their memory to
 the system each time, and new pages cost nearly as much as the transforms."""
+
+QUIET = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.tick.cycle": "10s",
+    "distributed.admin.system-monitor.interval": "2s",
+}
+"""Settings of Dask without which each worker is asked a hundred times a second what it does: 4 % of a core."""
 
 
 @contextmanager
@@ -63,6 +76,51 @@ def _script_left_alone() -> Iterator[None]:
 
 
 @contextmanager
+def _interrupted_later() -> Iterator[None]:
+    """Put a first Ctrl-C or SIGTERM off to the end of this block; the next one acts at once.
+
+    What is interrupted while Dask starts workers leaves half a cluster, whose end prints the tracebacks of all of it.
+    """
+    found = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: handler for number, handler in found.items() if callable(handler)}
+    pending: list[int] = []
+
+    def handled_as_before() -> None:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+    def put_off(number: int, frame: FrameType | None) -> None:
+        pending.append(number)
+        handled_as_before()
+
+    if threading.current_thread() is not threading.main_thread():  # which alone may handle signals
+        yield
+        return
+    for number in handlers:
+        signal.signal(number, put_off)
+    try:
+        yield
+    finally:
+        handled_as_before()
+    for one in pending:
+        signal.raise_signal(one)
+
+
+def start_method() -> str:
+    """Return how worker processes start, and say what they have in common.
+
+    By "forkserver" one process loads the modules, and all workers of a session are its forks: two start at the cost of
+    one, and the next ones at next to none. What macOS calculates with does not survive a fork, and a process that was
+    itself forked cannot use the server of its parent.
+    """
+    if sys.platform != "linux" or multiprocessing.parent_process() is not None:
+        return "spawn"
+    with dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}):
+        get_mp_context().set_forkserver_preload(["mcsim.ensemble.preload"])
+    return "forkserver"
+
+
+@contextmanager
 def local_client(workers: int) -> Iterator[Client]:
     """Yield the client of a local cluster of single-threaded processes, with ports open to this machine alone."""
     if multiprocessing.current_process().daemon:
@@ -72,25 +130,29 @@ def local_client(workers: int) -> Iterator[Client]:
         )
     single = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "DUCC0", "NUMBA")}
     environment = dask.config.get("distributed.nanny.pre-spawn-environ") | single | _KEPT_MEMORY
-    settings = {
+    whole = dict(os.environ) | environment
+    settings = QUIET | {
         "distributed.nanny.pre-spawn-environ": environment,
         "distributed.scheduler.allowed-failures": ATTEMPTS - 1,
-        "distributed.worker.preload": [_WORKER_SETUP],
+        "distributed.worker.multiprocessing-method": start_method(),
+        "distributed.worker.preload": [_WORKER_SETUP.format(variables=set(whole))],
     }
     with dask.config.set(settings), _script_left_alone(), ExitStack() as stack:
         try:
-            cluster = stack.enter_context(
-                LocalCluster(
-                    n_workers=workers,
-                    threads_per_worker=1,
-                    processes=True,
-                    host="127.0.0.1",
-                    dashboard_address="127.0.0.1:0",
-                    memory_limit=None,
-                    silence_logs=logging.CRITICAL,
+            with _interrupted_later():
+                cluster = stack.enter_context(
+                    LocalCluster(
+                        n_workers=workers,
+                        threads_per_worker=1,
+                        processes=True,
+                        env=whole,
+                        host="127.0.0.1",
+                        dashboard_address="127.0.0.1:0",
+                        memory_limit=None,
+                        silence_logs=logging.CRITICAL,
+                    )
                 )
-            )
-            client = stack.enter_context(Client(cluster))
+                client = stack.enter_context(Client(cluster))
         except (OSError, RuntimeError) as error:  # distributed's errors for processes that are late or die at once
             raise RunError(
                 f"The worker processes did not start ({type(error).__name__}: {error}); run the same command again "
