@@ -196,8 +196,14 @@ def _normalised_difference(model: Model, residual: NDArray[np.float64], parts: t
 
 
 def shared_sky(model: Model, maps: Sequence[Map]) -> Alm:
-    """Return the filtered sky s^ of a set of maps, up to the model's lmax, uK."""
-    return _sky(model, _clean(model, maps)[0])
+    """Return the filtered sky s^ of a set of maps, up to the model's lmax, uK.
+
+    Notes
+    -----
+    By quadrature alone what leaks between degrees adds power to s^. Skies that it constrains had 2 % too much at
+    l > 2.2 nside, and responses in them were 0.8 % too large. One iteration of the analysis takes most of it away.
+    """
+    return _sky(model, _clean(model, maps)[0], iterations=1)
 
 
 def _clean(model: Model, maps: Sequence[Map]) -> tuple[list[Map], list[NDArray[np.bool_]]]:
@@ -219,14 +225,14 @@ def _clean(model: Model, maps: Sequence[Map]) -> tuple[list[Map], list[NDArray[n
     return clean, seen
 
 
-def _sky(model: Model, clean: Sequence[Map]) -> Alm:
+def _sky(model: Model, clean: Sequence[Map], iterations: int = 0) -> Alm:
     lmax = model.lmax
     total = np.zeros(alm_.size(lmax), dtype=np.complex128)
     gain = np.zeros(lmax + 1)
     for channel, response in enumerate(model.response):
         members = model.of(channel)
         together = reduce(np.add, [clean[i] / model.parts[i].noise_power for i in members])
-        total += alm_.multiply(healpix.analysis(together, lmax), response, lmax)
+        total += alm_.multiply(healpix.analysis(together, lmax, iterations), response, lmax)
         gain += response**2 * sum(1.0 / model.parts[i].noise_power for i in members)
     return alm_.multiply(total, model.cl / (1.0 + model.cl * gain), lmax)
 
