@@ -176,7 +176,7 @@ def test_more_noise_is_more_in_all_degrees_and_in_pixels():
     elements.append(Element("residual", "map", ("W1",), ell=(0, 0), L=0, M=0, kind="residual", frame="ecliptic"))
     drawn, empty = np.random.default_rng(5).normal(size=(400, 5)), np.zeros((0, 5))
     ensemble = NullEnsemble(drawn, np.zeros(5), tuple(elements), empty, empty, empty, empty, empty)
-    white, XX
+    white, stripes = np.array([5.0, 15.0, 10.0, 10.0, 0.0]), np.array([0.0, 22.0, 10.0, 10.0, 0.0])
     candidate = Candidate(systematics.get("noise_level"), "W1", (0,))
 
     def refused(z, growth):
