@@ -66,9 +66,12 @@ class EffectDifference(Difference):
             self._there[key] = np.where(pair.seen, made, 0.0)
         return self._there[key]
 
-    def response(self, value: Vector, scene: Scene, pair: ChannelPair) -> Maps:
-        """Return the effect's response on a scene."""
-        return self._response(self._effect(value), scene, pair)
+    def response(self, value: Vector, scene: Scene, pair: ChannelPair) -> Maps | None:
+        """Return the effect's response on a scene; None if it cannot be so large."""
+        try:
+            return self._response(self._effect(value), scene, pair)
+        except InputError:
+            return None
 
     def _response(self, effect: Effect, scene: Scene, pair: ChannelPair) -> Maps:
         beam = scene.displaced_beam

@@ -104,11 +104,11 @@ class Problem(Prediction):
             larger = [
                 [
                     one
-                    for one in self._extended(smaller, library)
+                    for one in self._extended(smaller, further)
                     if one.left
                     < max(most, (1.0 - FURTHER) * max(smaller.left, found[0].left), self.unsure(one, smaller))
                 ]
-                for smaller in self._bases(found)
+                for smaller, further in self._bases(found, library)
             ]
             found = self._measured_first([self.fitted(one) for one in _in_turn(larger, TRIED)], MEASURED_LARGER)
             if not found or not self.adds(found[0], chosen[0]):
@@ -146,11 +146,14 @@ class Problem(Prediction):
                     worth = min(worth, ALIKE * measured.left if one.left > EQUAL * measured.left else 0.0)
         return sorted(ranked, key=lambda one: one.left)
 
-    def _bases(self, found: Sequence[Set]) -> list[Set]:
-        """Return the sets from which larger ones are built: the best, those that do best in pairs, and exchanges."""
+    def _bases(self, found: Sequence[Set], library: Sequence[Difference]) -> list[tuple[Set, Sequence[Difference]]]:
+        """Return the sets from which larger ones are built, with what is tried beside them.
+
+        They are the best, those that do best in pairs, exchanges, and turns beside other turns.
+        """
         bases = [one for one in found[:KEPT] if one.explains > LARGE]
         if len(found[0].members) > 1:
-            return bases
+            return [(one, library) for one in bases]
         lefts = self._left_by_two(found)
         pairs = sorted(
             (lefts[i, j], i)
@@ -162,7 +165,10 @@ class Problem(Prediction):
                 break
             if found[first] not in bases:
                 bases.append(found[first])
-        return bases + [one for one in found if one not in bases and one.members[0][0].exchanges]
+        bases += [one for one in found if one not in bases and one.members[0][0].exchanges]
+        turns = [difference for difference in library if difference.turns]
+        turning = [one for one in found if one not in bases and one.members[0][0].turns]
+        return [*((one, library) for one in bases), *((one, turns) for one in turning)]
 
     def _left_by_two(self, found: Sequence[Set]) -> NDArray[np.float64]:
         """Return the share that the responses of every two sets leave together, factors free where values are."""
