@@ -13,7 +13,6 @@ from mcsim.diagnosis.drawn import is_drawn
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.selection import Attribution, Explanation
 from mcsim.errors import InputError
-from mcsim.support.arrays import Vector
 from mcsim.systematics import Effect
 
 
@@ -85,8 +84,7 @@ def _actions(data: DataSet[Any], refined: Refined, one: Explanation) -> Iterator
             changes = data.respond_extended([candidate.table(effect)], skies)
             own = (effect.noise(one.site) for one in sites if candidate.channel in (None, one.site.channel))
             growth = max([1.0, *(float(np.mean(one)) for one in own if one is not None)])
-            response: Vector = changes.mean(axis=0)
-            scatter = data.scatter(changes) if draws else None
+            response, scatter = changes.mean(axis=0), data.scatter(changes) if draws else None
         except InputError:
             response = t @ theta
         yield replace(Action.of(response, t, theta, covariance, scatter), growth=growth)
