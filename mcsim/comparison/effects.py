@@ -35,9 +35,14 @@ class EffectDifference(Difference):
     stage = 1
 
     def __init__(
-        self, kind: type[Effect], templates: Maps, run: config.RunConfig, bare: dict[bytes, Maps] | None = None
+        self,
+        kind: type[Effect],
+        templates: Maps,
+        run: config.RunConfig,
+        sky: Alm,
+        bare: dict[bytes, Maps] | None = None,
     ) -> None:
-        self.kind, self.templates, self.run = kind, templates, run
+        self.kind, self.templates, self.run, self.sky = kind, templates, run, sky
         self._bare = {} if bare is None else bare
         self._there: dict[tuple[bytes | float, ...], Maps] = {}
 
@@ -50,13 +55,13 @@ class EffectDifference(Difference):
         return maps + np.tensordot(value, self._templates_in(state), 1)
 
     def _templates_in(self, state: State) -> Maps:
-        """Return the templates; those of samples that are late, or move otherwise, if the scene has such."""
+        """Return the templates of one sky, those of samples that are late, or move otherwise, if the scene has them."""
         scene, pair = state.scene, state.pair
         if scene is None or not (scene.late or scene.motion):
             return self.templates
         # A few per cent of a shift do not matter.
-        scene = replace(scene, late=float(f"{scene.late:.2g}"))
-        key = (scene.sky.tobytes(), scene.beam.blm.tobytes(), scene.late, *_periods(scene.motion))
+        scene = replace(scene, late=float(f"{scene.late:.2g}"), sky=self.sky)
+        key = (scene.beam.blm.tobytes(), scene.late, *_periods(scene.motion))
         if key not in self._there:
             basis = basis_of(self.kind)
             try:
@@ -176,7 +181,7 @@ def effects_of(pair: ChannelPair, run: config.RunConfig) -> Iterator[EffectDiffe
         except InputError:  # it depends on what the model does not say: a frequency, a pointing, a differencing scan
             continue
         if any(t.any() for t in templates):
-            yield EffectDifference(kind, np.stack(templates), alone, sampled_bare)
+            yield EffectDifference(kind, np.stack(templates), alone, scene.sky, sampled_bare)
 
 
 @dataclass(frozen=True, kw_only=True)
