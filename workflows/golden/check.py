@@ -6,7 +6,7 @@
     python workflows/golden/check.py --fresh 10 effect mixture    name the effects of ten other data sets instead, with
                                                   the default number of simulations
 
-Run it before and after a change that must not alter a result. It takes two minutes on two cores.
+Run it before and after a change that must not alter a result. It takes three minutes on two cores.
 """
 
 import argparse
