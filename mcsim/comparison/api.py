@@ -43,6 +43,9 @@ DOUBTFUL = 0.01
 DOUBTFUL_TOGETHER = 1e-5
 """The same of several differences, beyond which the model may rather describe side B."""
 
+UNLIKE = 0.2
+"""Correlation of two sides below which they show different skies."""
+
 SAME_SKY = 0.9
 """Correlation with the sky of side A below which effects are simulated on the sky of side B again."""
 
@@ -237,7 +240,7 @@ def _result(
         explained = problem.of(chosen[0]).maps - pair.a
     described = [_described(one, problem) for one in chosen if problem is not None]
     same = [other for one, own in zip(chosen, described, strict=False) for other in _equivalent(one, own, pair.turned)]
-    nearest = _described(sets[0], problem)[0] if sets and problem is not None else None
+    nearest = _described(sets[0], problem) if sets and problem is not None else ()
     scene, noise = pair.scene, pair.noise_uk
     return ChannelResult(
         name=pair.name,
@@ -246,6 +249,7 @@ def _result(
         differences=described[0] if described else (),
         alternatives=(*same, *described[1:]),
         nearest=nearest,
+        nearest_explains=sets[0].explains if nearest else 0.0,
         rms_uk=_rms((pair.b - pair.a)[seen]),
         sky_rms_uk=_sky_rms(pair),
         noncircular_rms_uk=np.nan if scene is None else _rms(scene.noncircular()[seen]),
@@ -269,6 +273,10 @@ def _looks(pair: ChannelPair, explained: NDArray[np.float64]) -> tuple[str, ...]
     """Return what is left looks like, in the map that has most of it."""
     left = np.where(pair.seen, pair.b - pair.a - explained, 0.0)
     most = int(np.argmax(np.sum(left**2, axis=1)))
+    here = pair.seen[most]
+    alike = float(np.corrcoef(pair.a[most, here], pair.b[most, here])[0, 1])
+    if abs(alike) < UNLIKE:
+        return (f"of another sky, or of pixels in another order: the sides correlate by {alike:.2f}",)
     return look(left[most], pair.a[most], pair.seen[most], None if pair.hits is None else pair.hits[most])
 
 

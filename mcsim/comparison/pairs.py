@@ -30,6 +30,12 @@ SAMPLES = 100_000_000
 HELD = 20_000_000
 """The same of samples in files, which are held in memory."""
 
+CLEARLY = 0.1
+"""Share of the squares that fewer orders of a beam must leave at most where the other program may have had all."""
+
+_STORED = (".fits", ".fit", ".gz", ".npy", ".npz", ".h5", ".hdf5", ".nc")
+"""What a file of maps is called."""
+
 EXTRA_ORDERS = 3
 """Moments beyond the beam's orders: a displaced beam has them."""
 
@@ -160,8 +166,7 @@ def read(
         If a side cannot be read, or the sides have no map in common.
     """
     for side in (a, b):
-        if not Path(side).exists() and Path(side).suffix != ".toml" and str(side) not in resources.names("workflows"):
-            raise InputError(f"{side} is neither a folder of maps nor a configuration; give the path of one.")
+        _check_kind(side)
     run = _model(a, b, model)
     whole: Survey | None = None
     orders: dict[str, int] = {}
@@ -170,7 +175,7 @@ def read(
         whole = survey(quiet(run), nthreads, orders=_orders(run))
     sides = [_side(side, run, nthreads) for side in (a, b)]
     for own, other, side in ((0, 1, a), (1, 0, b)):
-        if not Path(side).is_dir() and Path((b, a)[own]).is_dir():
+        if not Path(side).is_dir() and _made_elsewhere((b, a)[own]):
             sides[own] = _closer(sides[own], sides[other], config.load(side), nthreads)
     if run is None:
         names = [name for name in sides[0] if name in sides[1]]
@@ -189,6 +194,22 @@ def read(
     found = (_pair(name, maps, sides, whole, nthreads) for name, maps in groups.items())
     pairs = (replace(pair, orders=orders.get(pair.name)) for pair in found)
     return Comparison(tuple(pair if run is None else _with_noise(pair, run) for pair in pairs), run)
+
+
+def _check_kind(side: str | Path) -> None:
+    path = Path(side)
+    if (path.is_dir() and (path / "zarr.json").is_file()) or (path.is_file() and path.suffix in _STORED):
+        raise InputError(
+            f"{side} is no folder of FITS maps; give a configuration of the survey that names it, [ensemble] maps = "
+            '"PATH" (a Zarr store, .npy, or FITS files with {realization}), or write CHANNEL.fits into a folder.'
+        )
+    if not path.exists() and path.suffix != ".toml" and str(side) not in resources.names("workflows"):
+        raise InputError(f"{side} is neither a folder of maps nor a configuration; give the path of one.")
+
+
+def _made_elsewhere(side: str | Path) -> bool:
+    """Return True for maps that another program made, or may have made."""
+    return Path(side).is_dir() or named_source(config.load(side))[1] is not None
 
 
 def given(
@@ -311,21 +332,22 @@ def _external(own: config.RunConfig, given: str, nthreads: int) -> dict[str, NDA
 def _closer(
     made: dict[str, NDArray[np.float64]], wanted: dict[str, NDArray[np.float64]], run: config.RunConfig, nthreads: int
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the maps of a run as they were made, or sample by sample if those are closer to the other side's.
+    """Return the maps of a run as they were made, or those that are closer to the other side's.
 
-    Orientation moments spread samples over their pixels otherwise than another simulator does.
+    Orientation moments spread samples over their pixels otherwise than another simulator does, which may have all
+    orders of a beam too.
     """
     run, external = named_source(run)
     if external is not None:
         return made
-    whole = survey(run, nthreads)
-    pointings = [channel.site.pointing for channel in whole.making.channels]
-    if any(p is None or p.model.samples(p.line) > SAMPLES for p in pointings):
-        return made
-    try:
-        exact = dict(sampled.maps(whole, 0, nthreads))
-    except InputError:  # an effect on orientation moments, say
-        return made
+    full = with_all_orders(run)
+    tried = [[made], []]
+    for one, ways in zip((run, full) if full != run else (run,), tried, strict=False):
+        if one is full:
+            whole = survey(with_known_offsets(full), nthreads)
+            ways.append(dict(zip(whole.map_names, simulate.maps(whole, 0, nthreads), strict=True)))
+        exact = _by_samples(one, nthreads)
+        ways += [] if exact is None else [exact]
 
     def distance(maps: dict[str, NDArray[np.float64]]) -> float:
         total = 0.0
@@ -336,7 +358,20 @@ def _closer(
                 total += float(np.sum((maps[name] - there)[both] ** 2))
         return total
 
-    return min(made, exact, key=distance)
+    own, in_full = (min(ways, key=distance, default=made) for ways in tried)
+    return own if full == run or distance(own) < CLEARLY * distance(in_full) else in_full
+
+
+def _by_samples(run: config.RunConfig, nthreads: int) -> dict[str, NDArray[np.float64]] | None:
+    """Return the maps of a run sample by sample; None if samples are not known, too many, or not all."""
+    whole = survey(run, nthreads)
+    pointings = [channel.site.pointing for channel in whole.making.channels]
+    if any(p is None or p.model.samples(p.line) > SAMPLES for p in pointings):
+        return None
+    try:
+        return dict(sampled.maps(whole, 0, nthreads))
+    except InputError:  # an effect on orientation moments, say
+        return None
 
 
 def _folder(folder: Path, run: config.RunConfig | None) -> dict[str, NDArray[np.float64]]:
