@@ -181,6 +181,23 @@ def beyond(candidates: Sequence[Candidate], members: Sequence[int], found: Fit) 
     return float(np.sqrt(sum(candidates[member].beyond(*part) ** 2 for member, *part in parts)))
 
 
+def lost(candidates: Sequence[Candidate], members: Sequence[int], found: Fit, n: int) -> float:
+    """Return by how much less chi^2 falls if the last member has its nearest possible amplitude; inf if none can be.
+
+    ``n`` are the degrees of freedom of the covariance. All of a member that is impossible, or makes others so, is lost.
+
+    Notes
+    -----
+    At that amplitude chi^2 is larger than at the fitted one by the square of their distance in the metric of the fit,
+    without the scale that errors have from what is left: effects may be missing yet. Without the effect the fall that
+    stays is distributed as a mixture of chi^2 of up to K degrees of freedom (Chernoff, Ann. Math. Stat. 25, 573, 1954;
+    Self & Liang, JASA 82, 605, 1987), and never above that of the free fit: tests for K hold their level.
+    """
+    distances = [candidates[member].beyond(*part) for member, *part in parts_of(candidates, members, found)]
+    scale = (n + found.chi2) / (found.dof - 2.0)
+    return scale * distances[-1] ** 2 if np.isfinite(distances).all() else np.inf
+
+
 def scatters_of(candidates: Sequence[Candidate], members: Sequence[int]) -> list[Matrix]:
     """Return the scatter of the responses of members where it is known."""
     return [one for one in (candidates[member].scatter for member in members) if one is not None]

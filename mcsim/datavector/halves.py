@@ -1,10 +1,11 @@
 """Fit one half of the data vector, and measure in the other how far chi^2 falls with the effect in the simulator."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
 
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.stats.excess import HeldOut, excess, expected_fall, expected_fall_of_draw, held_out
@@ -17,7 +18,7 @@ class Halves:
     """Split the data vector x, shape (p,), into two parts with independent noise: one is fitted, the other one judges.
 
     ``used`` and ``fresh`` are the null distributions of the elements of fold 0, which are fitted, and of fold 1;
-    ``first`` and ``second`` are these elements.
+    ``first`` and ``second`` are these elements. Amplitudes are from 0 to ``largest`` if that is given.
     """
 
     x: Vector
@@ -25,6 +26,7 @@ class Halves:
     fresh: SimulatedGaussian
     first: NDArray[np.int64]
     second: NDArray[np.int64]
+    largest: float | None = None
 
     @classmethod
     def of(cls, ensemble: NullEnsemble, x: Vector) -> "Halves | None":
@@ -49,7 +51,11 @@ class Halves:
         """
         t_used, t_fresh = t[self.first], t[self.second]
         x_used, x_fresh = self.x[self.first], self.x[self.second]
-        frozen = self.used.with_extra_covariance(*(one[self.first] for one in scatters)).fit(x_used, t_used)
+        used = self.used.with_extra_covariance(*(one[self.first] for one in scatters))
+        frozen = used.fit(x_used, t_used)
+        if self.largest is not None:
+            nearest = lsq_linear(used.whiten_templates(t_used), used.whiten(x_used), (0.0, self.largest))
+            frozen = replace(frozen, amplitudes=nearest.x)
         after = self.fresh.shift(self.fresh.mean + respond(frozen)[self.second])
         after = after.with_extra_covariance(*(one[self.second] for one in scatters))
         if scatters:

@@ -60,13 +60,12 @@ def loaded(
     model: str | Path | Mapping[str, Any] | config.RunConfig | ExternalModel,
 ) -> tuple[config.RunConfig, Source | None]:
     """Return the run that a model is or that describes it, and its source of maps; None: mcsim itself."""
-    external = isinstance(model, ExternalModel)
     given = model.description if isinstance(model, ExternalModel) else model
     run = config.load(given)
     bare, named = named_source(run)
-    if external and named is not None:
-        raise InputError(f"{run.name} names the simulator {named!r} already; give the run or the simulator alone.")
     if isinstance(model, ExternalModel):
+        if named is not None:
+            raise InputError(f"{run.name} names the simulator {named!r} already; give the run or the simulator alone.")
         return bare, source_of(bare, model.simulator)
     return bare, None if named is None else source_of(bare, named)
 

@@ -16,6 +16,7 @@ from mcsim.diagnosis.refine import Refined, Refiner
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.rivals import with_rivals
 from mcsim.diagnosis.selection import Attribution
+from mcsim.diagnosis.words import refuted
 from mcsim.errors import InputError
 from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit
@@ -63,20 +64,12 @@ def confirmed(
     """
     if reduction is None:
         return found, None
-    limit = context.settings.reduction_sigma
-    before, fraction, expected = reduction.before, reduction.achieved, reduction.predicted
-    increased = fraction.value * before.value + limit * fraction.sigma * abs(before.value) < 0.0
-    short = expected.value - fraction.value > limit * np.hypot(expected.sigma, fraction.sigma)
-    if increased or (short and before.value > 0.0 and fraction.value < 0.5 * min(expected.value, 1.0)):
+    if reduction.refutes(context.settings.reduction_sigma):
         best = " and ".join(context.candidates[member].title for member in found.explanations[0].members)
-        does = f"raises the excess χ² of the other half from {before.value:.3g} to {reduction.after.value:.3g}"
-        if reduction.after.value < before.value:
-            removed, forecast = 100.0 * fraction.value, 100.0 * expected.value
-            does = f"removes {removed:.0f} % of the excess χ² of the other half, where {forecast:.0f} % were predicted"
-        notes.append(f"The best fit, {best}, is not named: simulated with its amplitude from one half, it {does}.")
+        notes.append(f"The best fit, {best}, is not named: {refuted(reduction)}.")
         return found.unexplained(), None
-    if before.value < before.sigma:
-        own = measured(before.value, before.sigma)
+    if reduction.before.value < reduction.before.sigma:
+        own = measured(reduction.before.value, reduction.before.sigma)
         notes.append(f"No reduction on held-out data is given: they show no excess χ² by themselves ({own}).")
         return found, None
     return found, reduction

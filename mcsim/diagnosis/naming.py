@@ -48,9 +48,8 @@ def agreeing(data: DataSet[Any], refined: Refined, found: Attribution) -> tuple[
 def slices_of(data: DataSet[Any]) -> Slices:
     """Return the parts of a data set, in which amplitudes are compared."""
     context, z = data.context, data.extended
-    model = context.analysis.model
-    beside = len(z) - len(data.x)
-    return Slices(context.ensemble.extended, z, beside, context.run.map.splits, model.lmax, context.settings)
+    beside, lmax = len(z) - len(data.x), context.analysis.model.lmax
+    return Slices(context.ensemble.extended, z, beside, context.run.map.splits, lmax, context.settings)
 
 
 def unconfirmed(context: DiagnosisContext, found: Attribution, reduced: bool) -> str:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mcsim.datavector.candidate import Candidate, beyond, columns_of, coordinates_of, effects_at, parts_of, scatters_of
+from mcsim.datavector.candidate import Candidate, columns_of, coordinates_of, effects_at, lost, parts_of, scatters_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.selection import Attribution, Selection, attribute
 from mcsim.errors import InputError
@@ -151,20 +151,18 @@ class Refiner:
         refused: set[int] = set()
         while len(members) < settings.partial_effects and len(refused) < settings.partial_refusals:
             pvalues = self._beside(t, candidates, members)
-            free = [int(i) for i in np.argsort(pvalues) if i not in refused and pvalues[i] <= settings.partial_level]
-            best = next((i for i in free if self._is_possible(t, candidates, (*members, i))), None)
-            if best is None:
+            best = next((int(i) for i in np.argsort(pvalues) if i not in refused), -1)
+            if best < 0 or pvalues[best] > settings.partial_level:
                 break
             together = (*members, best)
-            exact = self._together(candidates, t, together, self._fit(t, candidates, together))
-            significant = exact is not None and self._beside(exact, candidates, members)[best] <= settings.partial_level
-            if exact is not None and significant and self._is_possible(exact, candidates, together):
+            exact = self._together(candidates, t, together)
+            if exact is not None and self._beside(exact, candidates, members)[best] <= settings.partial_level:
                 members, t = together, exact
             else:
                 refused.add(best)
         if not members:
             return None
-        fit = self._fit(t, candidates, members)
+        fit = null.fit(self.data.x, t[:, columns_of(candidates, members)])
         excess = null.hartlap_factor * null.chi2(self.data.x) - null.dimension
         left = null.hartlap_factor * fit.chi2 - fit.dimension
         if scatters := scatters_of(candidates, members):
@@ -173,31 +171,33 @@ class Refiner:
             fit = with_drawn_scatter(null, own, wide, scatters)
         return PartialExplanation(members, fit, min(max(left / excess, 0.0), 1.0) if excess > 0.0 else 1.0, t)
 
-    def _fit(self, t: Matrix, candidates: Sequence[Candidate], members: tuple[int, ...]) -> Fit:
-        return self.context.null.fit(self.data.x, t[:, columns_of(candidates, members)])
-
     def _beside(self, t: Matrix, candidates: Sequence[Candidate], members: tuple[int, ...]) -> Vector:
-        """Return the global p-value of each candidate beside members, which scatter the data as in an attribution."""
-        known = self.context
-        selection = Selection(known.null, self.data.x, t, candidates, known.calibration, known.settings)
-        return selection.search(members).beside(np.array([members], dtype=np.int64))[0]
+        """Return the global p-value of each candidate beside members, which scatter the data as in an attribution.
 
-    def _is_possible(self, t: Matrix, candidates: Sequence[Candidate], members: tuple[int, ...]) -> bool:
-        return bool(np.isfinite(beyond(candidates, members, self._fit(t, candidates, members))))
+        A candidate counts for what its nearest possible amplitude explains, and not at all if it, or with it a member,
+        is impossible.
+        """
+        known = self.context
+        search = Selection(known.null, self.data.x, t, candidates, known.calibration, known.settings).search(members)
+        row, less = np.array([members], dtype=np.int64), np.zeros(len(candidates))
+        for new in np.flatnonzero(search.beside(row)[0] <= known.settings.partial_level):
+            together = (*members, int(new))
+            fit = search.null.fit(self.data.x, t[:, columns_of(candidates, together)])
+            less[new] = lost(candidates, together, fit, search.null.dof)
+        return search.beside(row, less)[0]
 
     def _attribute(self, t: Matrix, candidates: Sequence[Candidate]) -> Attribution:
         known = self.context
         return attribute(known.null, self.data.x, t, candidates, known.calibration, known.settings)
 
-    def _together(
-        self, candidates: Sequence[Candidate], t: Matrix, members: tuple[int, ...], fitted: Fit
-    ) -> Matrix | None:
+    def _together(self, candidates: Sequence[Candidate], t: Matrix, members: tuple[int, ...]) -> Matrix | None:
         """Return templates that are exact for effects that act together, at about their fitted amplitudes.
 
         Strong effects change their own responses and each other's. None if one can have no such amplitude, or the
         amplitudes diverge round by round.
         """
         columns, share = np.array(columns_of(candidates, members)), self.context.settings.settled_share
+        fitted = self.context.null.fit(self.data.x, t[:, columns])
         for _ in range(self.context.settings.joint_rounds):
             try:
                 effects = effects_at(candidates, members, fitted)

@@ -195,8 +195,11 @@ class Subsets:
             largest = np.maximum(largest, self.calibration.global_pvalue(pvalues))
         return largest
 
-    def beside(self, subsets: Rows) -> Vector:
-        """Return the global p-value of each candidate beside each subset, shape (M, C); 1 if members exclude it."""
+    def beside(self, subsets: Rows, lost: Vector | float = 0.0) -> Vector:
+        """Return the global p-value of each candidate beside each subset, shape (M, C); 1 if members exclude it.
+
+        ``lost``, shape (C,), is by how much less chi^2 falls than by the free fit of a candidate.
+        """
         solved = self.solve(subsets)
         columns, _ = self._columns(subsets)
         count, K = columns.shape
@@ -213,7 +216,8 @@ class Subsets:
             values, vectors = np.linalg.eigh(block)
             along = np.einsum("mcij,mci->mcj", vectors, left[:, index])
             kept = values > COLLINEAR
-            delta_chi2 = np.sum(np.where(kept, along**2 / np.where(kept, values, 1.0), 0.0), axis=-1)
+            free = np.sum(np.where(kept, along**2 / np.where(kept, values, 1.0), 0.0), axis=-1)
+            delta_chi2 = np.maximum(free - np.broadcast_to(lost, len(self.candidates))[others], 0.0)
             added = kept.sum(axis=-1)
             tolerated = self._beside.tolerated(solved.allowance, subsets, solved.parts, others[None, :])
             pvalues = self.null.nested_test(delta_chi2, solved.chi2[:, None], added, K, tolerated)

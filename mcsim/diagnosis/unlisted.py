@@ -13,6 +13,7 @@ from mcsim.datavector.campaign import Ask, constrained_jobs
 from mcsim.datavector.halves import Halves
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
+from mcsim.diagnosis.words import refuted
 from mcsim.reconstruction import words
 from mcsim.reconstruction.grammar import Structure, structures
 from mcsim.reconstruction.plugin import Plugin, plugin
@@ -33,6 +34,9 @@ SKIES = 4
 FREE = 5
 """Coordinates of a pattern on the sky whose responses are simulated one by one, at most."""
 
+LARGEST = 2.0
+"""Amplitude in a part of the data over that in all scores, at most; the least is none."""
+
 FEW = 0.1
 """Share of the largest rms below which a map does not have an effect."""
 
@@ -43,6 +47,10 @@ def reconstructed(result: DiagnosisResult, data: ObservedMaps, ask: Ask) -> Diag
     scene = scene_for(analysis.job(analysis.run))
     search = Search(structures(scene), null_scores(analysis, ask))
     found, reduction = structures_of(data, scene, search)
+    if reduction is not None and reduction.refutes(analysis.settings.reduction_sigma):
+        what = " and ".join(one.says for one in found)
+        note = f"What {what} fits best, and is not what is missing: {refuted(reduction)}."
+        return replace(result, unlisted=(), notes=(*result.notes, note))
     return replace(result, unlisted=found, unlisted_held_out=reduction)
 
 
@@ -107,19 +115,12 @@ class Reconstruction:
     _trial: dict[int, Matrix] = field(default_factory=dict, repr=False)
     _kept: dict[int, Vector] = field(default_factory=dict, repr=False)
 
-    def simulated(self, effects: Sequence[Plugin], amplitudes: Sequence[float] = ()) -> Simulated:
-        """Return maps, scores and data vectors of skies that the data constrain, with effects at amplitudes."""
+    def simulated(self, effects: Sequence[Plugin]) -> Simulated:
+        """Return maps, scores and data vectors of skies that the data constrain, with effects."""
         analysis = self.data.context.analysis
         kinds = {one.name: one.kind() for one in effects}
-        given = amplitudes or [1.0] * len(effects)
-        tables = [
-            config.Effect(
-                name=one.name,
-                channel=None if kinds[one.name].scope == "common" else one.channel,
-                parameters={"amplitude": float(amplitude)},
-            )
-            for one, amplitude in zip(effects, given, strict=True)
-        ]
+        acting = [(one.name, None if kinds[one.name].scope == "common" else one.channel) for one in effects]
+        tables = [config.Effect(name=name, channel=channel, parameters={"amplitude": 1.0}) for name, channel in acting]
         (job,) = constrained_jobs(analysis, tables, self.data.same_skies.observed, range(SKIES))
         maps = list(simulated_maps(job, {**dict(analysis.library), **kinds}))
         scores_ = [scores_of_maps(analysis.model, self.scene, one) for one in maps]
@@ -214,7 +215,8 @@ class Reconstruction:
 
         A structure that is measured map by map is fitted to those of the first fold alone; of others, and of patterns
         that act on few modes, the shape is that of all data. The amplitudes are those that fit the elements of the
-        first fold of the data vector.
+        first fold of the data vector, up to :data:`LARGEST` times that of the scores: what else these elements hold,
+        as a pattern's finer structure, would be put down to them, and powers grow faster than in proportion.
         """
         acting = [(w, one) for w, one in zip(chosen, plugins, strict=True) if one is not None]
         if not acting:
@@ -227,12 +229,9 @@ class Reconstruction:
                 half = structure.within(0, splits)
                 if not len(half.weights):
                     return None
-                (theta, _), = self.search.fit([half], self.x)  # fmt: skip
-                again = plugin(effect.name, structure, theta, self.scene)
-                assert again is not None
-                first.append(again)
-            else:
-                first.append(effect)
+                ((theta, _),) = self.search.fit([half], self.x)
+                effect = plugin(effect.name, structure, theta, self.scene) or effect
+            first.append(effect)
         matrix, told = self.data.halves()
         halves = Halves.of(context.ensemble.remix(matrix), matrix @ self.data.x)
         if halves is None:
@@ -243,10 +242,11 @@ class Reconstruction:
             return None
 
         def respond(frozen: Fit) -> Vector:
-            change: Vector = matrix @ (self.simulated(first, list(frozen.amplitudes)).x - self.before.x)
+            scaled = [one.scaled(float(a)) for one, a in zip(first, frozen.amplitudes, strict=True)]
+            change: Vector = matrix @ (self.simulated(scaled).x - self.before.x)
             return change
 
-        return halves.reduction(t, respond, (), told)
+        return replace(halves, largest=LARGEST).reduction(t, respond, (), told)
 
 
 def _by_coordinate(structure: Structure) -> bool:

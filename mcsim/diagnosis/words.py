@@ -6,7 +6,7 @@ from pathlib import Path
 from mcsim.diagnosis.nuisance import NuisanceResult
 from mcsim.diagnosis.result import Agreement, DiagnosisResult, EffectResult
 from mcsim.diagnosis.selection import Contrast
-from mcsim.stats.excess import Measured
+from mcsim.stats.excess import HeldOut, Measured
 from mcsim.support.numbers import measured, number, p_equals
 
 AGREES, DISAGREES = 0.05, 0.005
@@ -149,12 +149,21 @@ def held_out(result: DiagnosisResult) -> str:
     )
 
 
+def refuted(found: HeldOut) -> str:
+    """Return what effects that held-out data refute do to these."""
+    does = f"raises the excess χ² of the other half from {found.before.value:.3g} to {found.after.value:.3g}"
+    if found.after.value < found.before.value:
+        removed, forecast = 100.0 * found.achieved.value, 100.0 * found.predicted.value
+        does = f"removes {removed:.0f} % of the excess χ² of the other half, where {forecast:.0f} % were predicted"
+    return f"simulated with its amplitude from one half, it {does}"
+
+
 def unlisted(result: DiagnosisResult) -> list[str]:
     """Return what is missing after an unknown gap, in the words of the grammar; empty if it was not looked for."""
     if result.unlisted is None:
         return []
     if not result.unlisted:
-        return ["No structure that the grammar can say is significant: what is missing stays unknown."]
+        return ["No structure that the grammar can say describes it: what is missing stays unknown."]
     found = [one.sentence for one in result.unlisted]
     held = result.unlisted_held_out
     if all(one.file is None for one in result.unlisted):
@@ -251,7 +260,5 @@ def pulled(one: NuisanceResult) -> str:
 
 
 def _numbered(effects: Sequence[EffectResult]) -> str:
-    def strength(effect: EffectResult) -> str:
-        return f"; amplitude/error {number(effect.amplitude / effect.sigma, 2)}" if effect.sigma > 0.0 else ""
-
-    return "; ".join(f"{effect.label}: {effect.words}{strength(effect)}" for effect in effects)
+    ratios = (f"; amplitude/error {number(one.amplitude / one.sigma, 2)}" if one.sigma > 0.0 else "" for one in effects)
+    return "; ".join(f"{one.label}: {one.words}{ratio}" for one, ratio in zip(effects, ratios, strict=True))

@@ -32,6 +32,16 @@ class HeldOut:
     pvalue_after: float
     data: str
 
+    def refutes(self, sigma: float) -> bool:
+        """Return True if the excess grows, or falls by less than half of the prediction, both beyond errors.
+
+        ``sigma`` is the number of standard deviations.
+        """
+        before, fraction, expected = self.before.value, self.achieved, self.predicted
+        grows = fraction.value * before + sigma * fraction.sigma * abs(before) < 0.0
+        short = expected.value - fraction.value > sigma * np.hypot(expected.sigma, fraction.sigma)
+        return bool(grows or (short and before > 0.0 and fraction.value < 0.5 * min(expected.value, 1.0)))
+
     def to_json(self) -> dict[str, Any]:
         """Return the reduction as ``verdict.json`` has it."""
         return {

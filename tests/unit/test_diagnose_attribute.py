@@ -337,7 +337,7 @@ def detected(bench: Bench, x: np.ndarray, exact=lambda t, members: t, candidates
     context = SimpleNamespace(null=bench.null, calibration=bench.calibration, settings=DiagnosisSettings())
 
     class Straight(Refiner):
-        def _together(self, candidates, t, members, fitted):
+        def _together(self, candidates, t, members):
             return exact(t, members)
 
     return Straight(SimpleNamespace(context=context, x=x)).detected_in(bench.t, candidates or bench.candidates)

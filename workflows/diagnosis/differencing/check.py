@@ -1,13 +1,16 @@
 """Maps of differencing scans: are p-values uniform where nothing is wrong, and effects named where they are put in?
 
-    python workflows/diagnosis/differencing/check.py [--nside 64] [--skies 200] [--cases 4] [--parts FOLDER] [-o FILE]
+    python workflows/diagnosis/differencing/check.py [--nside 64] [--skies 200] [--cases 4] [--controls N] [--nuisances]
+        [--parts FOLDER] [-o FILE]
 
 With ``--parts`` every result of a simulation is kept, and a run that was stopped goes on where it was.
 
 Two channels, V1 and W1 of WMAP's focal plane, each the difference of its two sides, in two halves of a year. Data are
 the maps that ``mcsim run`` keeps, every difference of the survey by itself, with another seed than any simulation of
 the model. Effects are put into W1, with the amplitudes of an expected S/N of 6 and 10, or with six and four iterations
-of the map-making; and an ellipse into the beam of its side B alone.
+of the map-making; and an ellipse into the beam of its side B alone. With ``--controls`` as many perfect data sets are
+diagnosed as ``mcsim diagnose --controls`` does; with ``--nuisances`` beam width, noise level and imbalance of each
+channel are known to 0.5 %, 3 % and 0.001 alone, and drawn for every control.
 """
 
 import argparse
@@ -25,6 +28,7 @@ import mcsim
 from mcsim import config
 from mcsim.datavector.analysis import Analysis, Job, analysis_of, data_vectors
 from mcsim.datavector.campaign import asking, batch, with_effects
+from mcsim.diagnosis import controls
 from mcsim.diagnosis.api import prepared
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.inference import diagnose_data
@@ -48,11 +52,13 @@ PROPOSED = (
 PUT_IN = ("beam_ellipticity", "transmission_imbalance", "mapmaking_convergence")
 ONE_SIDE = "an ellipse as the beam of side B"
 SNR = (6.0, 10.0)
+KNOWN_TO = {"beam_width": 0.005, "noise_level": 0.03, "transmission_imbalance": 0.001}
 SEED = 20261122
 
 
-def model(nside: int) -> mcsim.RunConfig:
+def model(nside: int, nuisances: bool = False) -> mcsim.RunConfig:
     """Return a model of V1 and W1, S/N per pixel about that of some years of WMAP, at l up to 2 nside."""
+    widths = KNOWN_TO if nuisances else {}
     channels = [
         {
             "name": name,
@@ -75,6 +81,11 @@ def model(nside: int) -> mcsim.RunConfig:
             "sky": {"spectrum": "wmap7", "lmax": 2 * nside, "dipole_uk": 3364.5},
             "map": {"nside": nside, "splits": ["half1", "half2"]},
             "channel": channels,
+            "nuisance": [
+                {"effect": effect, "channel": channel["name"], "width": width}
+                for channel in channels
+                for effect, width in widths.items()
+            ],
             "biposh": {"L_max": 2},
             "ensemble": {"keep_maps": True, "paired": False, "seed": SEED},
         }
@@ -182,13 +193,15 @@ def main() -> None:
     parser.add_argument("--skies", type=int, default=200)
     parser.add_argument("--pulls", type=int, default=100, help="skies with each effect whose amplitude is fitted alone")
     parser.add_argument("--cases", type=int, default=4, help="skies of each effect and S/N")
+    parser.add_argument("--controls", type=int, default=0, help="perfect data sets that are diagnosed")
+    parser.add_argument("--nuisances", action="store_true", help="declare what is known of each channel")
     parser.add_argument("--simulations", type=int, help="of the model; default: ten for each element")
     parser.add_argument("--responses", type=int, help="skies of common and of noisy responses; default: as a diagnosis")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--parts", type=Path, help="folder for results of simulations, with which a run goes on")
     parser.add_argument("-o", "--output", type=Path)
     chosen = parser.parse_args()
-    run = model(chosen.nside)
+    run = model(chosen.nside, chosen.nuisances)
     library = {name: kind for name, kind in mcsim.effects().items() if name in PROPOSED}
     fewer = {} if chosen.responses is None else {"noisy_skies": chosen.responses, "common_skies": chosen.responses}
     settings = mcsim.DiagnosisSettings(simulations=chosen.simulations, **fewer)
@@ -211,6 +224,12 @@ def main() -> None:
             result["null"] = nulls(run, analysis, context, chosen.skies, chosen.parts)
         print({k: v for k, v in result.get("null", {}).items() if k != "p_values"}, flush=True)
         write()
+        if chosen.controls:
+            key = f"{package_digest(['mcsim'])} {run} {settings.simulations}"
+            drawn = controls.diagnose_controls(context, key, chosen.controls, call)
+            result["controls"] = drawn.to_json()
+            print(drawn.counted, "; drawn with", drawn.drawn, flush=True)
+            write()
         if chosen.pulls:
             result["pulls"] = pulls(run, analysis, context, chosen.pulls, chosen.parts)
             print(result["pulls"], flush=True)

@@ -1,0 +1,42 @@
+"""P-values beyond the ranks of held-out simulations: the rate of small ones in fresh data."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from mcsim.stats.look_elsewhere import Calibration
+
+ENSEMBLES, COUNT, DATA, LEVEL = 300, 1000, 2000, 1e-3
+
+
+def heavy(rng: np.random.Generator, count: int) -> np.ndarray:
+    """P-values whose rank is their square root: 30 times too many at 1e-6."""
+    return rng.random(count) ** 2
+
+
+def students(rng: np.random.Generator, count: int) -> np.ndarray:
+    """The smallest p-value, times their number, of 20 Student t of ten degrees of freedom that are taken for normal."""
+    largest = np.abs(rng.standard_t(10, size=(count, 20))).max(axis=1)
+    return np.minimum(40.0 * stats.norm.sf(np.sqrt(0.8) * largest), 1.0)
+
+
+@pytest.mark.parametrize(("drawn", "low", "high"), [(np.random.Generator.random, 0.5, 1.0), (heavy, 0.7, 1.2)])
+def test_small_pvalues_are_as_rare_as_they_say(drawn, low: float, high: float) -> None:
+    """Rarer with Gaussian data: an estimate of the power that is below one by chance counts, one above does not."""
+    rng = np.random.default_rng(28)
+    assert low * LEVEL < rate(drawn, rng) < high * LEVEL
+
+
+@pytest.mark.slow
+def test_small_pvalues_of_heavy_tails_are_rare() -> None:
+    """In proportion to the p-value at the lowest ten ranks they were four times too many."""
+    assert 0.6 * LEVEL < rate(students, np.random.default_rng(28)) < 1.5 * LEVEL
+
+
+def rate(drawn, rng: np.random.Generator) -> float:
+    """Return the share of p-values of data up to LEVEL, over ensembles of simulations."""
+    found = []
+    for _ in range(ENSEMBLES):
+        calibration = Calibration(1, np.empty(0), np.empty(0), np.sort(drawn(rng, COUNT)))
+        found.append(np.mean(calibration.global_pvalue(drawn(rng, DATA)) <= LEVEL))
+    return float(np.mean(found))

@@ -1,0 +1,68 @@
+"""What describes a gap is told only if held-out data bear it out, with an amplitude that a part of the data can ask."""
+
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mcsim.datavector.halves import Halves
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.diagnosis import unlisted
+from mcsim.stats.excess import HeldOut, Measured
+from mcsim.stats.gaussian import SimulatedGaussian
+
+
+def held_out(before: float, after: float, predicted: float) -> HeldOut:
+    share, error = 1.0 - after / before, 0.1
+    return HeldOut(
+        Measured(predicted, error), Measured(share, error), Measured(before, 40.0), Measured(after, 40.0), 0.5, "half2"
+    )
+
+
+@dataclass(frozen=True)
+class Result:
+    notes: tuple[str, ...] = ("first",)
+    unlisted: tuple[object, ...] | None = None
+    unlisted_held_out: HeldOut | None = None
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "predicted", "told"),
+    [(349.0, 180.0, 0.5, True), (349.0, 39_692.0, 0.8, False), (349.0, 349.0, 0.8, False), (349.0, 349.0, 0.1, True)],
+)
+def test_what_held_out_data_refute_is_not_told(monkeypatch, before, after, predicted, told) -> None:
+    """It raises the excess, or removes nothing where it should; where little is forecast nothing is refuted."""
+    found, reduction = (SimpleNamespace(says="is noise, W alone"),), held_out(before, after, predicted)
+    for name in ("scene_for", "structures", "null_scores", "Search"):
+        monkeypatch.setattr(unlisted, name, lambda *_: None)
+    monkeypatch.setattr(unlisted, "structures_of", lambda *_: (found, reduction))
+    analysis = SimpleNamespace(job=lambda _: None, run=None, settings=DiagnosisSettings())
+    data = SimpleNamespace(context=SimpleNamespace(analysis=analysis))
+    result = unlisted.reconstructed(Result(), data, None)
+    assert result.unlisted == (found if told else ())
+    assert result.unlisted_held_out is (reduction if told else None)
+    assert result.notes[0] == "first"
+    assert len(result.notes) == (1 if told else 2)
+    assert told or "is noise, W alone" in result.notes[1]
+
+
+def test_amplitudes_of_a_part_stay_between_none_and_the_largest() -> None:
+    """The nearest in the metric of the fit, together: what one may not explain, the other one does as far as it may."""
+    null = SimulatedGaussian(np.zeros(4), np.eye(4), 10_000)
+    first, second = np.arange(4), np.arange(4, 8)
+    part = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
+    t = np.concatenate([part, part])
+    x = t @ [9.6, 1.2, -1.5]
+    asked: list[np.ndarray] = []
+
+    def respond(frozen):
+        asked.append(frozen.amplitudes)
+        return t @ frozen.amplitudes
+
+    free = Halves(x, null, null, first, second)
+    free.reduction(t, respond)
+    replace(free, largest=2.0).reduction(t, respond)
+    np.testing.assert_allclose(asked[0], [9.6, 1.2, -1.5], atol=1e-9)
+    # With the third at zero the second is what the data have in its place.
+    np.testing.assert_allclose(asked[1], [2.0, 1.2 - 0.75, 0.0], atol=1e-6)
