@@ -105,7 +105,7 @@ def test_maps_from_orientation_moments_have_the_orders_of_a_run(whole):
 
 def test_psi_of_the_other_sign_and_from_the_other_end_is_named():
     """Codes of the COSMO and the IAU convention exchange psi and pi - psi: neither a sign nor half a turn alone."""
-    beam = mcsim.Beam.elliptical(400.0, 320.0, 0.0, 32, mmax=3)
+    beam = mcsim.Beam.elliptical(400.0, 320.0, lmax=32, mmax=3)
     beam.blm[1] += 0.05 * beam.blm[0] * (np.arange(33) / 32) ** 3
     beam.blm[3, 3:] += 0.03 * beam.blm[0, 3:] * (np.arange(3, 33) / 32) ** 3
     simulator = Simulator(small("litebird", beam))
@@ -148,7 +148,7 @@ def test_a_report_of_maps_that_are_the_same_draws_no_warning(factors):
 
 def test_the_nearest_set_is_said_as_a_whole():
     """A sign alone leaves more than there was; beside half a turn it leaves next to nothing."""
-    beam = mcsim.Beam.elliptical(400.0, 320.0, 0.0, 32, mmax=3)
+    beam = mcsim.Beam.elliptical(400.0, 320.0, lmax=32, mmax=3)
     beam.blm[1] += 0.05 * beam.blm[0] * (np.arange(33) / 32) ** 3
     simulator = Simulator(small("litebird", beam))
     draw = np.random.default_rng(1)
