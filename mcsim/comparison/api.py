@@ -15,7 +15,7 @@ from mcsim.comparison import report
 from mcsim.comparison.catalogue import library
 from mcsim.comparison.effects import effects_of
 from mcsim.comparison.looks import look
-from mcsim.comparison.pairs import ChannelPair, Comparison, given, read
+from mcsim.comparison.pairs import ChannelPair, Comparison, Given, given, read
 from mcsim.comparison.prediction import PRECISION, Set
 from mcsim.comparison.result import ChannelResult, ComparisonResult, DifferenceResult, Verdict
 from mcsim.comparison.scene import Scene
@@ -51,8 +51,8 @@ SAME_SKY = 0.9
 
 
 def compare(
-    a: str | Path | Sequence[NDArray[np.float64]],
-    b: str | Path | Sequence[NDArray[np.float64]],
+    a: str | Path | Given,
+    b: str | Path | Given,
     model: str | Path | config.RunConfig | None = None,
     output: str | Path | None = None,
     *,
@@ -66,8 +66,8 @@ def compare(
     a, b
         Two sides: folders with ``{channel}.fits`` or ``{channel}_{split}.fits``, HEALPix, uK or the unit of their
         headers, without noise or with the same noise, or with a subfolder of these for each realization, of which the
-        first is compared; configurations, of which realization 0 is simulated; or arrays, shape (npix,) each, in the
-        order of the model's maps.
+        first is compared; configurations, of which realization 0 is simulated; or arrays, shape (npix,) each, by name
+        ("channel" or "channel:split") or in the order of the model's maps.
     model
         Run that describes side A: beams, scans, nside, lmax; by default ``model.toml`` in the folders or beside them.
         Without one, only differences of the maps themselves are tried: units, calibration, monopole, dipole, order of
@@ -121,7 +121,7 @@ def compare(
     else:
         if model is None:
             raise InputError(
-                "sides that are no paths are lists of maps without names; give the model whose maps they are."
+                "sides that are no paths are maps of which nothing is known; give the model whose maps they are."
             )
         run = model if isinstance(model, config.RunConfig) else config.load(model)
         sides, case = given(a, b, run, nthreads), run.name

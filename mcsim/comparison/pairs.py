@@ -1,6 +1,6 @@
 """Two sets of maps of the same skies, read and brought into pairs."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,6 +23,9 @@ from mcsim.sphere.checks import UNSEEN_BELOW, check_map
 from mcsim.support import resources
 from mcsim.support.arrays import Alm
 from mcsim.systematics.base import Pointing
+
+Given = Sequence[NDArray[np.float64]] | Mapping[str, NDArray[np.float64]]
+"""Maps as arrays, in the order of a run's or by name."""
 
 SAMPLES = 100_000_000
 """Samples of the longest survey that is simulated sample by sample."""
@@ -212,17 +215,10 @@ def _made_elsewhere(side: str | Path) -> bool:
     return Path(side).is_dir() or named_source(config.load(side))[1] is not None
 
 
-def given(
-    a: Sequence[NDArray[np.float64]],
-    b: Sequence[NDArray[np.float64]],
-    run: config.RunConfig,
-    nthreads: int = 1,
-) -> Comparison:
-    """Compare maps given as arrays, in the order of the run's, uK."""
+def given(a: Given, b: Given, run: config.RunConfig, nthreads: int = 1) -> Comparison:
+    """Compare maps given as arrays, by name or in the order of the run's, uK."""
     names = config.map_names(run)
-    for side in (a, b):
-        if len(side) != len(names):
-            raise InputError(f"{len(side)} maps were given, the model has {len(names)}; give one for each.")
+    a, b = (_in_order(side, names) for side in (a, b))
     run, orders = _in_full(run)
     whole = survey(quiet(run), nthreads, orders=_orders(run))
     sides = [dict(zip(names, (np.ma.filled(m, healpy.UNSEEN) for m in side), strict=True)) for side in (a, b)]
@@ -231,6 +227,16 @@ def given(
     )
     pairs = (replace(pair, orders=orders.get(pair.name)) for pair in found)
     return Comparison(tuple(_with_noise(pair, run) for pair in pairs), run)
+
+
+def _in_order(side: Given, names: Sequence[str]) -> Sequence[NDArray[np.float64]]:
+    if not isinstance(side, Mapping):
+        if len(side) != len(names):
+            raise InputError(f"{len(side)} maps were given, the model has {len(names)}; give one for each.")
+        return side
+    if set(side) != set(names):
+        raise InputError(f"the maps {', '.join(map(str, side))} were given, the model has {', '.join(names)}.")
+    return [side[name] for name in names]
 
 
 def _in_full(run: config.RunConfig) -> tuple[config.RunConfig, dict[str, int]]:
