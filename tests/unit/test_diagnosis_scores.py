@@ -29,7 +29,7 @@ def test_gain_of_every_half_is_kept_apart(monkeypatch: pytest.MonkeyPatch) -> No
         frame="ecliptic",
         nside=8,
         lmax=8,
-        beam=Beam.elliptical(330.0, 300.0, 20.0, 8),
+        beam=Beam.elliptical(330.0, 300.0, angle_deg=20.0, lmax=8),
         pointing=systematics.Pointing(model, replace(line, sample_period_s=None)),
         dipole_uk=np.zeros(3),
     )

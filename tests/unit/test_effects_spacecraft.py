@@ -197,7 +197,7 @@ def test_bandpass_mismatch_has_its_rms_and_its_template(site, tmp_path):
     np.testing.assert_allclose(at(given, np.array([0.3]), np.zeros(1), LMAX), 3.0 * np.cos(0.3) ** 2 / rms, rtol=1e-3)
 
 
-@pytest.mark.parametrize("beam", [Beam.gaussian(400.0, LMAX), Beam.elliptical(500.0, 350.0, 20.0, LMAX)])
+@pytest.mark.parametrize("beam", [Beam.gaussian(400.0, LMAX), Beam.elliptical(500.0, 350.0, angle_deg=20.0, lmax=LMAX)])
 def test_jitter_is_the_mean_of_displaced_beams(beam, site):
     """Gauss-Hermite over both axes, nine displacements by the effect on pointing."""
     rms = np.deg2rad(1.0)
