@@ -20,7 +20,7 @@ from mcsim.comparison.prediction import PRECISION, Set
 from mcsim.comparison.result import ChannelResult, ComparisonResult, DifferenceResult, Verdict
 from mcsim.comparison.scene import Scene
 from mcsim.comparison.search import INTERPOLATING, Problem
-from mcsim.comparison.shown_sky import with_shown_sky
+from mcsim.comparison.shown_sky import with_fewer_orders, with_shown_sky
 from mcsim.errors import InputError
 from mcsim.support import folders
 from mcsim.support.progress import reporting
@@ -138,6 +138,17 @@ def compare(
 
 def _channel(pair: ChannelPair, sides: Comparison, accuracy: float) -> ChannelResult:
     others = [other for other in sides.pairs if other.name != pair.name]
+    same = _rms((pair.b - pair.a)[pair.seen]) <= ROUNDING * _sky_rms(pair)
+    cut = None if same else with_fewer_orders(pair)
+    if cut is None:
+        return _either_way(pair, others, sides, accuracy)
+    found = _either_way(cut, others, sides, accuracy)
+    whole = found if found.differences else _either_way(pair, others, sides, accuracy)
+    return whole if whole.differences else found
+
+
+def _either_way(pair: ChannelPair, others: Sequence[ChannelPair], sides: Comparison, accuracy: float) -> ChannelResult:
+    """Return what explains a pair, from side A or from side B."""
     found, problem, unexplained = _explained(pair, others, sides, accuracy)
     accepted = DOUBTFUL if len(found.differences) == 1 else DOUBTFUL_TOGETHER
     named = found.verdict != "unknown"

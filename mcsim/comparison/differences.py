@@ -80,6 +80,8 @@ class Difference:
         True if the response is the template of a small amplitude, and so no better than about a per mille.
     exchanges
         True if it exchanges pixels, files or units, which can be taken back before the rest is looked for.
+    turns
+        True if it turns or mirrors samples or beam: what two of these make together neither says by itself.
     """
 
     name: ClassVar[str]
@@ -93,6 +95,7 @@ class Difference:
     proportional: ClassVar[bool] = False
     linear: ClassVar[bool] = False
     exchanges: ClassVar[bool] = False
+    turns: ClassVar[bool] = False
 
     def starts(self, state: State) -> list[Vector]:
         """Return the values to try, shape (k,) each."""

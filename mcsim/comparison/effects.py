@@ -46,12 +46,15 @@ class EffectDifference(Difference):
         """Return the maps with the effect's response."""
         return maps + np.tensordot(value, self.templates, 1)
 
-    def response(self, value: Vector, scene: Scene, pair: ChannelPair) -> Maps:
-        """Return the effect's response on a scene."""
-        bare, acting = (
-            simulate.maps(_survey(run, scene), 0, scene.nthreads, self._sky(scene, pair))
-            for run in self._runs(value, scene, pair)
-        )
+    def response(self, value: Vector, scene: Scene, pair: ChannelPair) -> Maps | None:
+        """Return the effect's response on a scene; None if it cannot be so large."""
+        try:
+            bare, acting = (
+                simulate.maps(_survey(run, scene), 0, scene.nthreads, self._sky(scene, pair))
+                for run in self._runs(value, scene, pair)
+            )
+        except InputError:
+            return None
         return acting - bare
 
     def sampled(self, value: Vector, scene: Scene, pair: ChannelPair) -> Maps | None:

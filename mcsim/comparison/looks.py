@@ -49,7 +49,7 @@ def look(
         lon, lat = healpy.pix2ang(healpy.npix2nside(rest.size), worst, lonlat=True)
         where = f"longitude {lon:.0f}, latitude {lat:.0f} deg"
         words.append(f"half of it is in {100.0 * few:.2g} % of the pixels, most at {where}")
-    white = abs(_neighbours(rest, seen)) < WHITE
+    white = abs(neighbours(rest, seen)) < WHITE
     if white:
         words.append("white in pixels, as an interpolation error or noise that the sides do not share")
     else:
@@ -65,7 +65,7 @@ def look(
     return tuple(words)
 
 
-def _neighbours(rest: NDArray[np.float64], seen: NDArray[np.bool_]) -> float:
+def neighbours(rest: NDArray[np.float64], seen: NDArray[np.bool_]) -> float:
     """Return the correlation of pixels with their neighbours."""
     nside = healpy.npix2nside(rest.size)
     pixels = np.flatnonzero(seen)

@@ -7,6 +7,7 @@ import healpy
 import numpy as np
 
 from mcsim.comparison.differences import Difference, State
+from mcsim.comparison.looks import neighbours
 from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.scene import Maps, Scene
 from mcsim.sphere import alm as alm_
@@ -16,6 +17,9 @@ from mcsim.support.arrays import Vector
 SCREENED = 50_000
 """Pixels on which orders of pixels are compared at most."""
 
+
+ALIKE = 0.5
+"""Correlation of neighbouring pixels from which on maps are no noise."""
 
 MORE_ALIKE = 0.2
 """By how much mirrored maps must correlate more with side B: maps of different skies do so by chance, or a little."""
@@ -255,6 +259,14 @@ class ChannelExchanged(Difference):
         return 1.0
 
 
+def _is_noise(maps: Maps, state: State) -> bool:
+    """Return True unless neighbouring pixels are alike, as what a wrong beam leaves of a sky is and noise is not."""
+    if state.scene is not None and state.scene.preparations:
+        return True
+    alike = [neighbours(one, one != 0.0) for one in maps if one.any()]
+    return bool(alike) and min(alike) < ALIKE
+
+
 class NoiseShared(Difference):
     """One split of side B has noise in common with another one, or all have with another channel."""
 
@@ -277,8 +289,8 @@ class NoiseShared(Difference):
         simulated = [] if state.pair.scene is None else [(1, 0), (1, 1)]
         ways = [(*pair, *manner) for pair in splits for manner in [(0, 0), (0, 1), *simulated]]
         ways += [(*pair, *manner) for pair in channels for manner in simulated]  # as they are, they are exchanged
-        values = [np.array([0.0, *way]) for way in ways]
-        return [value + np.eye(5)[0] * state.fit([self._exchanged(value, state)]) for value in values]
+        made = [(np.array([0.0, *way]), self._exchanged(np.array([0.0, *way]), state)) for way in ways]
+        return [value + np.eye(5)[0] * state.fit([maps]) for value, maps in made if _is_noise(maps, state)]
 
     def _exchanged(self, way: Vector, state: State) -> Maps:
         """Return other noise less a map's own: the difference of the maps, less that of the sky in them."""

@@ -14,7 +14,7 @@ from mcsim.ensemble.external import named_source, source_of
 from mcsim.ensemble.maps import file_names, first_realization
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
-from mcsim.simulation.channels import described, known_offsets
+from mcsim.simulation.channels import described, known_offsets, load_beam, with_all_orders
 from mcsim.simulation.noise import of_map
 from mcsim.simulation.survey import Channel, Survey, survey
 from mcsim.sphere import alm as alm_
@@ -68,6 +68,8 @@ class ChannelPair:
         True if the sides are exchanged: ``a`` is side B.
     by_moments
         True if side A was made from orientation moments or at the pixels' centres, so that no single sample has a say.
+    orders
+        Highest order of the beam in a run of the model, if that is not said and less than the scene's; None.
     """
 
     name: str
@@ -87,6 +89,7 @@ class ChannelPair:
     noise_uk: Maps | None = None
     turned: bool = False
     by_moments: bool = False
+    orders: int | None = None
 
     def pointing(self, longest: float = SAMPLES) -> Pointing | PointingFiles | None:
         """Return the pointing, if it is known and has no more samples than the longest that is wanted."""
@@ -160,8 +163,11 @@ def read(
         if not Path(side).exists() and Path(side).suffix != ".toml" and str(side) not in resources.names("workflows"):
             raise InputError(f"{side} is neither a folder of maps nor a configuration; give the path of one.")
     run = _model(a, b, model)
-    run = None if run is None else with_known_offsets(run)
-    whole = None if run is None else survey(quiet(run), nthreads, orders=_orders(run))
+    whole: Survey | None = None
+    orders: dict[str, int] = {}
+    if run is not None:
+        run, orders = _in_full(run)
+        whole = survey(quiet(run), nthreads, orders=_orders(run))
     sides = [_side(side, run, nthreads) for side in (a, b)]
     for own, other, side in ((0, 1, a), (1, 0, b)):
         if not Path(side).is_dir() and Path((b, a)[own]).is_dir():
@@ -180,7 +186,8 @@ def read(
             f"{a} and {b} have no channel in common; give both maps of the same names, CHANNEL.fits or "
             "CHANNEL_SPLIT.fits."
         )
-    pairs = (_pair(name, maps, sides, whole, nthreads) for name, maps in groups.items())
+    found = (_pair(name, maps, sides, whole, nthreads) for name, maps in groups.items())
+    pairs = (replace(pair, orders=orders.get(pair.name)) for pair in found)
     return Comparison(tuple(pair if run is None else _with_noise(pair, run) for pair in pairs), run)
 
 
@@ -195,13 +202,21 @@ def given(
     for side in (a, b):
         if len(side) != len(names):
             raise InputError(f"{len(side)} maps were given, the model has {len(names)}; give one for each.")
-    run = with_known_offsets(run)
+    run, orders = _in_full(run)
     whole = survey(quiet(run), nthreads, orders=_orders(run))
     sides = [dict(zip(names, (np.ma.filled(m, healpy.UNSEEN) for m in side), strict=True)) for side in (a, b)]
-    pairs = (
+    found = (
         _pair(c.name, [n for n in names if n.partition(":")[0] == c.name], sides, whole, nthreads) for c in run.channels
     )
+    pairs = (replace(pair, orders=orders.get(pair.name)) for pair in found)
     return Comparison(tuple(_with_noise(pair, run) for pair in pairs), run)
+
+
+def _in_full(run: config.RunConfig) -> tuple[config.RunConfig, dict[str, int]]:
+    """Return a run with all that its files say of samples and beams, and by channel the fewer orders that it takes."""
+    full = with_all_orders(with_known_offsets(run))
+    pairs = zip(run.channels, full.channels, strict=True)
+    return full, {own.name: load_beam(own, run.sky.lmax).mmax for own, whole in pairs if own.beam != whole.beam}
 
 
 def _orders(run: config.RunConfig) -> int:

@@ -37,13 +37,14 @@ def page(result: ComparisonResult) -> str:
 
 
 def figure(channel: ChannelResult) -> Figure:
-    """Draw the first map of a channel on both sides, their difference and its parts, their spectra, and hits."""
+    """Draw the first map of a channel that differs: both sides, their difference and its parts, spectra, and hits."""
     made = Figure(figsize=(12.0, 7.4), layout="constrained")
     axes = made.subplot_mosaic("aabbcc;ddeeff;ggghhh", height_ratios=(1.0, 1.0, 1.15))
-    a, b, explained, seen = (one[0] for one in (channel.a, channel.b, channel.explained, channel.seen))
+    first = _first(channel)
+    a, b, explained, seen = (one[first] for one in (channel.a, channel.b, channel.explained, channel.seen))
     difference = b - a
     for key, title, values in (
-        ("a", f"A: {channel.splits[0]}", a),
+        ("a", f"A: {channel.splits[first]}", a),
         ("b", "B", b),
         ("c", "B − A", difference),
         ("d", "explained", explained),
@@ -54,6 +55,11 @@ def figure(channel: ChannelResult) -> Figure:
     _draw_spectra(axes["g"], channel)
     _draw_depth(axes["h"], channel)
     return made
+
+
+def _first(channel: ChannelResult) -> int:
+    """Return the number of the first map that is compared: those that are identical are left out."""
+    return int(np.argmax(channel.seen.any(axis=1)))
 
 
 def _draw_map(axes: Axes, values: NDArray[np.float64], title: str) -> None:
@@ -100,7 +106,7 @@ def _draw_words(axes: Axes, channel: ChannelResult) -> None:
 def _draw_spectra(axes: Axes, channel: ChannelResult) -> None:
     """Draw power by degree: side A, the difference, what is explained, and what is left."""
     nside = healpy.npix2nside(channel.a.shape[1])
-    lmax = 2 * nside
+    first, lmax = _first(channel), 2 * nside
     ell = np.arange(2, lmax + 1)
     difference = channel.b - channel.a
     for label, values, colour, style in (
@@ -109,7 +115,7 @@ def _draw_spectra(axes: Axes, channel: ChannelResult) -> None:
         ("explained", channel.explained, "#d55e00", "--"),
         ("left", difference - channel.explained, "#00785a", "-"),
     ):
-        alm = healpix.analysis(np.where(channel.seen[0], values[0], 0.0), lmax)
+        alm = healpix.analysis(np.where(channel.seen[first], values[first], 0.0), lmax)
         power = healpy.alm2cl(alm)[2:]
         if power.max() > 0.0:
             axes.loglog(ell, ell * (ell + 1) / (2.0 * np.pi) * power, label=label, color=colour, ls=style, lw=1.2)
@@ -133,7 +139,12 @@ def _draw_depth(axes: Axes, channel: ChannelResult) -> None:
     middle = np.bincount(bins, hits, edges.size - 1) / count
     for label, values, colour in (("B − A", difference, "#0072b2"), ("left", left, "#00785a")):
         rms = np.sqrt(np.bincount(bins, values**2, edges.size - 1) / count)
-        axes.loglog(middle, rms, "o-", ms=4, label=label, color=colour)
+        if rms.any():
+            axes.loglog(middle, rms, "o-", ms=4, label=label, color=colour)
+    if not axes.lines:
+        axes.text(0.5, 0.5, "no difference", ha="center", va="center", transform=axes.transAxes)
+        axes.axis("off")
+        return
     axes.set_xticks([*middle[:: max(1, (middle.size - 1) // 3)]])
     _plain_ticks(axes)
     axes.set(xlabel="samples in a pixel", ylabel="rms  [µK]", title="by hits")

@@ -12,8 +12,10 @@ from scipy.spatial.transform import Rotation
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.scene import WEAKEST, Maps, Scene, ahead
+from mcsim.instrument.beams.coefficients import power_by_order
 from mcsim.instrument.scan import Moments
 from mcsim.instrument.scan.pointing import pointing
+from mcsim.simulation.channels import NEGLECTED
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import euler_angles, rotation_matrix
@@ -35,7 +37,7 @@ class PsiOffset(Difference):
 
     name, unit = "psi_offset", "deg"
     met = "polarisation angle counted from another axis of the focal plane, or from the meridian instead of the scan"
-    smooth = True
+    smooth = turns = True
 
     def starts(self, state: State) -> list[Vector]:
         """Return the small angle that fits, and a grid; a beam of even orders is the same half a turn on."""
@@ -65,6 +67,7 @@ class PsiSign(Difference):
 
     name, unit = "psi_sign", "1 = reversed"
     met = "COSMO and IAU conventions, or a reflected focal plane"
+    turns = True
 
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
         return scene.reversed()
@@ -75,6 +78,7 @@ class BeamConjugated(Difference):
 
     name, unit = "beam_conjugated", "1 = opposite m"
     met = "beam coefficients of e^(im phi) where e^(-im phi) was meant"
+    turns = True
 
     def starts(self, state: State) -> list[Vector]:
         return [np.array([1.0]), np.array([-1.0])]
@@ -372,7 +376,8 @@ class MmaxCut(Difference):
 
     def starts(self, state: State) -> list[Vector]:
         assert state.scene is not None
-        orders = [m for m in range(state.scene.beam.mmax + 1) if state.scene.beam.blm[m].any()]
+        power = power_by_order(state.scene.beam.blm)
+        orders = np.flatnonzero(power > NEGLECTED * power.sum())
         return [np.array([float(m)]) for m in orders[:-1]]
 
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:

@@ -102,8 +102,8 @@ class Problem(Prediction):
             most = found[0].left - VISIBLE * self.hidden(found[0]) if self.pair.doubt is not None else 0.0
             larger = [
                 one
-                for smaller in self._bases(found)
-                for one in self._extended(smaller, library)
+                for smaller, further in self._bases(found, library)
+                for one in self._extended(smaller, further)
                 if one.left < max(most, (1.0 - FURTHER) * max(smaller.left, found[0].left))
             ]
             found = self._sorted(self.fitted(one) for one in _different(larger, TRIED))
@@ -138,11 +138,14 @@ class Problem(Prediction):
                     worth = min(worth, ALIKE * measured.left if one.left > EQUAL * measured.left else 0.0)
         return sorted(ranked, key=lambda one: one.left)
 
-    def _bases(self, found: Sequence[Set]) -> list[Set]:
-        """Return the sets from which larger ones are built: the best, those that do best in pairs, and exchanges."""
+    def _bases(self, found: Sequence[Set], library: Sequence[Difference]) -> list[tuple[Set, Sequence[Difference]]]:
+        """Return the sets from which larger ones are built, with what is tried beside them.
+
+        They are the best, those that do best in pairs, exchanges, and turns beside other turns.
+        """
         bases = [one for one in found[:KEPT] if one.explains > LARGE]
         if len(found[0].members) > 1:
-            return bases
+            return [(one, library) for one in bases]
         lefts = self._left_by_two(found)
         pairs = sorted(
             (lefts[i, j], i)
@@ -154,7 +157,10 @@ class Problem(Prediction):
                 break
             if found[first] not in bases:
                 bases.append(found[first])
-        return bases + [one for one in found if one not in bases and one.members[0][0].exchanges]
+        bases += [one for one in found if one not in bases and one.members[0][0].exchanges]
+        turns = [difference for difference in library if difference.turns]
+        turning = [one for one in found if one not in bases and one.members[0][0].turns]
+        return [*((one, library) for one in bases), *((one, turns) for one in turning)]
 
     def _left_by_two(self, found: Sequence[Set]) -> NDArray[np.float64]:
         """Return the share that the responses of every two sets leave together, factors free where values are."""

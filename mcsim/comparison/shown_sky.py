@@ -56,6 +56,26 @@ def with_shown_sky(pair: ChannelPair) -> ChannelPair:
     return found if weight is None else _filtered(found, weight)
 
 
+def with_fewer_orders(pair: ChannelPair) -> ChannelPair | None:
+    """Return the pair with the orders of the beam that a run takes, if side A was made with them; None if with all."""
+    if pair.scene is None or pair.orders is None or pair.orders >= pair.scene.beam.mmax:
+        return None
+    left = _left_of_side_a(pair)
+    if left <= SHARP**2 * _sky(pair):
+        return None
+    cut = replace(pair, scene=replace(pair.scene, beam=pair.scene.beam.truncated(pair.orders)))
+    cut = cut.with_sky_of_maps() if pair.sky_of_maps else cut
+    return cut if _left_of_side_a(cut) < MADE * left else None
+
+
+def _left_of_side_a(pair: ChannelPair) -> float:
+    """Return the squares that orientation moments or single samples leave of side A, whichever leave less."""
+    shown = _sharper(pair) if pair.sky_of_maps else pair
+    assert pair.scene is not None
+    assert shown.scene is not None
+    return min(_left(pair, pair.scene.maps()), _left(shown, _made(shown, shown.scene)))
+
+
 def _left(pair: ChannelPair, made: Maps) -> float:
     """Return the squares that a simulation leaves of side A."""
     return float(np.sum((pair.a - made)[pair.seen] ** 2))

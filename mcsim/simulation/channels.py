@@ -20,6 +20,12 @@ CIRCULAR = (config.BeamGaussian, config.BeamWindow)
 WHOLE = 4
 """Orders that a beam has at least without its m_max, where its source has them."""
 
+NEGLECTED = 1e-9
+"""Share of a beam's power that its orders may leave out where maps are told apart by less than a run's own accuracy."""
+
+MOST_ORDERS = 8
+"""Highest order that is added for it: every one is a transform more, and noise of a measured beam has them all."""
+
 
 def load_beam(channel: config.Channel, lmax: int) -> beams.Beam:
     """Return the beam of a channel, up to lmax; of a differencing scan that of side A."""
@@ -222,6 +228,23 @@ def _with_m_max(spec: config.Channel, m_max: int | None) -> config.Channel:
         for each in (spec.beam, spec.beam_b)
     )
     return replace(spec, beam=beam or spec.beam, beam_b=beam_b)
+
+
+def with_all_orders(run: config.RunConfig) -> config.RunConfig:
+    """Return a run whose beams, where no m_max is given, have all orders that a map without noise shows."""
+    return replace(run, channels=tuple(_with_all_orders(spec, run.sky.lmax) for spec in run.channels))
+
+
+def _with_all_orders(spec: config.Channel, lmax: int) -> config.Channel:
+    if isinstance(spec.beam, CIRCULAR) or spec.beam.m_max is not None:
+        return spec
+    beam = load_beam(spec, lmax)
+    while beam.neglected_power > NEGLECTED and beam.mmax < min(MOST_ORDERS, lmax):
+        try:
+            beam = load_beam(_with_m_max(spec, beam.mmax + 1), lmax)
+        except InputError:  # a file of fewer orders than its beam had
+            break
+    return _with_m_max(spec, beam.mmax)
 
 
 def described(spec: config.Channel) -> tuple[systematics.Pointing | None, float | None]:

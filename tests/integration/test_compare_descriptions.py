@@ -1,0 +1,117 @@
+"""Comparisons of another program's maps with a description that says as little as it may."""
+
+from dataclasses import replace
+
+import healpy
+import numpy as np
+import pytest
+
+import mcsim
+from comparisons import MODEL, PEAR, Simulator, names, small
+from mcsim import config
+from mcsim.comparison import report
+from mcsim.comparison.differences import State
+from mcsim.comparison.effects import effects_of
+from mcsim.comparison.map_differences import NoiseShared
+from mcsim.comparison.pairs import ChannelPair, given
+from mcsim.simulation import simulate
+from mcsim.simulation.channels import MOST_ORDERS, NEGLECTED, load_beam, with_all_orders
+from mcsim.simulation.survey import survey
+from mcsim.sphere.rotation import rotate_alm
+
+ELLIPSE = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 420.0, "fwhm_minor_arcmin": 320.0, "angle_deg": 20.0}
+PLAIN = MODEL | {"channel": [MODEL["channel"][0] | {"beam": ELLIPSE}]}
+"""The beam without its m_max, of which a run takes two orders."""
+
+
+@pytest.fixture(scope="module")
+def whole() -> Simulator:
+    """Return a simulator with more orders of the beam than a run takes."""
+    simulator = Simulator(PLAIN)
+    simulator.site = replace(simulator.site, beam=load_beam(with_all_orders(simulator.run).channels[0], 32))
+    return simulator
+
+
+def test_a_beam_without_m_max_has_all_orders_that_can_be_seen():
+    [spec] = config.load(PLAIN).channels
+    [full] = with_all_orders(config.load(PLAIN)).channels
+    cut, beam = load_beam(spec, 32), load_beam(full, 32)
+    assert cut.neglected_power > 1e3 * NEGLECTED
+    assert cut.mmax < beam.mmax <= MOST_ORDERS
+    assert beam.neglected_power <= NEGLECTED
+    assert with_all_orders(config.load(MODEL)) == config.load(MODEL)
+
+
+def test_a_beam_of_few_orders_stays_as_it_is():
+    run = config.load(small(beam=PEAR.truncated(2)))
+    assert load_beam(with_all_orders(run).channels[0], 32).mmax == 2
+
+
+def test_a_small_turn_of_a_beam_without_m_max_is_no_other_ellipse(whole):
+    found = mcsim.compare(whole(), whole(psi=lambda p: p + np.deg2rad(0.3)), whole.run)
+    assert names(found) == ["psi_offset"]
+    assert found.channels[0].left < 1e-5
+
+
+def test_orders_that_a_run_leaves_out_are_those_of_its_own_maps(whole):
+    """Maps of mcsim's own, which have fewer orders, are known for that on both sides, and told from maps with all."""
+    cut = Simulator(PLAIN)
+    side_a = cut()
+    found = mcsim.compare(side_a, cut(psi=lambda p: p + np.deg2rad(0.3)), cut.run)
+    assert names(found) == ["psi_offset"]
+    assert found.channels[0].left < 1e-5
+    for sides in ((whole(), side_a), (side_a, whole())):
+        found = mcsim.compare(*sides, whole.run, accuracy=1e-4)
+        assert names(found) == ["mmax_cut"]
+        assert found.channels[0].differences[0].amplitude == cut.site.beam.mmax
+
+
+def test_maps_from_orientation_moments_have_the_orders_of_a_run(whole):
+    run = whole.run
+    made = [simulate.maps(survey(run), 0, sky=sky) for sky in (whole.sky, 1.001 * whole.sky)]
+    found = mcsim.compare(*(list(one) for one in made), run)
+    assert names(found) == ["calibration"]
+    assert found.channels[0].left < 1e-6
+
+
+def test_psi_of_the_other_sign_and_from_the_other_end_is_named():
+    """Codes of the COSMO and the IAU convention exchange psi and pi - psi: neither a sign nor half a turn alone."""
+    beam = mcsim.Beam.elliptical(400.0, 320.0, 0.0, 32, mmax=3)
+    beam.blm[1] += 0.05 * beam.blm[0] * (np.arange(33) / 32) ** 3
+    beam.blm[3, 3:] += 0.03 * beam.blm[0, 3:] * (np.arange(3, 33) / 32) ** 3
+    simulator = Simulator(small("litebird", beam))
+    found = mcsim.compare(simulator(), simulator(psi=lambda p: np.pi - p), simulator.run)
+    (channel,) = found.channels
+    said = [{d.name for d in one} for one in (channel.differences, *channel.alternatives)]
+    assert {"psi_sign", "psi_offset"} in said
+    assert channel.left < 1e-3
+
+
+def test_what_a_wrong_beam_leaves_of_the_sky_is_no_noise():
+    draw = np.random.default_rng(1)
+    noise = draw.standard_normal((2, 12 * 16**2))
+    sky = [healpy.smoothing(one, np.deg2rad(10.0)) for one in noise]
+    for maps, expected in ((noise, 2), (np.stack(sky), 0)):
+        pair = ChannelPair("W", ("W:a", "W:b"), maps, maps[::-1], np.ones(maps.shape, bool))
+        assert len(NoiseShared().starts(State(pair, None, maps, ()))) == 2 * expected
+
+
+def test_an_effect_that_is_impossibly_large_has_no_response():
+    simulator = Simulator()
+    side_a = simulator()
+    side_b = simulator(sky=rotate_alm(simulator.sky, 32, "galactic", "ecliptic"))
+    [pair] = given(side_a, side_b, simulator.run).pairs
+    width = next(one for one in effects_of(pair, simulator.run) if one.name == "beam_width")
+    assert width.response(np.array([0.01]), pair.scene, pair) is not None
+    assert width.response(np.array([150.0]), pair.scene, pair) is None
+
+
+@pytest.mark.parametrize("factors", [(1.0, 1.0), (1.0, 1.01)])
+def test_a_report_of_maps_that_are_the_same_draws_no_warning(factors):
+    rng = np.random.default_rng(2)
+    side_a = [rng.standard_normal(12 * 16**2) for _ in factors]
+    side_a[1][:40] = healpy.UNSEEN
+    side_b = [np.where(m > -1e20, f * m, m) for m, f in zip(side_a, factors, strict=True)]
+    found = mcsim.compare(side_a, side_b, Simulator().run)
+    axes = report.figure(found.channels[0]).axes
+    assert any("W1:half1" in one.get_title() for one in axes) == (factors[1] == 1.0)
