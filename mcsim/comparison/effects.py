@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from mcsim import config
+from mcsim.comparison.description import quiet
 from mcsim.comparison.differences import Difference, State
-from mcsim.comparison.pairs import ChannelPair, quiet
+from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.scene import EPSILON, Maps, Scene
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
