@@ -133,6 +133,12 @@ class EffectDifference(Difference):
         """Return the effect's amplitude."""
         return float(self._effect(value).amplitude)
 
+    def said(self, value: Vector) -> str:
+        """Return the words of an effect whose negative amplitude has words of its own."""
+        amplitude, wording = self.amplitude(value), self.kind.wording
+        own = wording is not None and wording.negative is not None and amplitude < 0.0
+        return self.kind.format_amplitude(amplitude) if own else ""
+
     def parameters(self, value: Vector) -> dict[str, float | str]:
         """Return its other parameters."""
         return {k: v for k, v in self._effect(value).parameters().items() if isinstance(v, float | str)}
