@@ -238,14 +238,14 @@ def with_all_orders(run: config.RunConfig) -> config.RunConfig:
 def _with_all_orders(spec: config.Channel, lmax: int) -> config.Channel:
     if isinstance(spec.beam, CIRCULAR) or spec.beam.m_max is not None:
         return spec
-    beam = load_beam(spec, lmax)
-    for orders in range(min(MOST_ORDERS, lmax), beam.mmax, -1) if beam.neglected_power > NEGLECTED else ():
+    own = beam = load_beam(spec, lmax)
+    for orders in range(min(MOST_ORDERS, lmax), own.mmax, -1) if own.neglected_power > NEGLECTED else ():
         try:
             beam = load_beam(_with_m_max(spec, orders), lmax)
         except InputError:  # a file of fewer orders
             continue
         break
-    while beam.mmax > 0 and (cut := beam.truncated(beam.mmax - 1)).neglected_power <= NEGLECTED:
+    while beam.mmax > own.mmax and (cut := beam.truncated(beam.mmax - 1)).neglected_power <= NEGLECTED:
         beam = cut
     return _with_m_max(spec, beam.mmax)
 
