@@ -107,7 +107,7 @@ def scaled(maps: Maps, factor: float) -> Maps:
 
 
 SMALL = MODEL | {"sky": {"spectrum": "wmap7", "lmax": 32}, "map": {"nside": 16, "splits": ["half1", "half2"]}}
-PEAR = mcsim.Beam.elliptical(400.0, 320.0, 20.0, 32, mmax=3)
+PEAR = mcsim.Beam.elliptical(400.0, 320.0, angle_deg=20.0, lmax=32, mmax=3)
 PEAR.blm[1] += 0.2 * np.exp(0.7j) * PEAR.blm[0] * (np.arange(33) / 32) ** 3
 PEAR.blm[3, 3:] += 0.1 * np.exp(-0.4j) * PEAR.blm[0, 3:] * (np.arange(3, 33) / 32) ** 3
 

@@ -15,7 +15,7 @@ from mcsim.comparison import report
 from mcsim.comparison.catalogue import library
 from mcsim.comparison.effects import effects_of
 from mcsim.comparison.looks import look
-from mcsim.comparison.pairs import ChannelPair, Comparison, given, read
+from mcsim.comparison.pairs import ChannelPair, Comparison, Given, given, read
 from mcsim.comparison.prediction import PRECISION, Set
 from mcsim.comparison.result import ChannelResult, ComparisonResult, DifferenceResult, Verdict
 from mcsim.comparison.scene import Scene
@@ -43,13 +43,16 @@ DOUBTFUL = 0.01
 DOUBTFUL_TOGETHER = 1e-5
 """The same of several differences, beyond which the model may rather describe side B."""
 
+UNLIKE = 0.2
+"""Correlation of two sides below which they show different skies."""
+
 SAME_SKY = 0.9
 """Correlation with the sky of side A below which effects are simulated on the sky of side B again."""
 
 
 def compare(
-    a: str | Path | Sequence[NDArray[np.float64]],
-    b: str | Path | Sequence[NDArray[np.float64]],
+    a: str | Path | Given,
+    b: str | Path | Given,
     model: str | Path | config.RunConfig | None = None,
     output: str | Path | None = None,
     *,
@@ -63,8 +66,8 @@ def compare(
     a, b
         Two sides: folders with ``{channel}.fits`` or ``{channel}_{split}.fits``, HEALPix, uK or the unit of their
         headers, without noise or with the same noise, or with a subfolder of these for each realization, of which the
-        first is compared; configurations, of which realization 0 is simulated; or arrays, shape (npix,) each, in the
-        order of the model's maps.
+        first is compared; configurations, of which realization 0 is simulated; or arrays, shape (npix,) each, by name
+        ("channel" or "channel:split") or in the order of the model's maps.
     model
         Run that describes side A: beams, scans, nside, lmax; by default ``model.toml`` in the folders or beside them.
         Without one, only differences of the maps themselves are tried: units, calibration, monopole, dipole, order of
@@ -118,7 +121,7 @@ def compare(
     else:
         if model is None:
             raise InputError(
-                "sides that are no paths are lists of maps without names; give the model whose maps they are."
+                "sides that are no paths are maps of which nothing is known; give the model whose maps they are."
             )
         run = model if isinstance(model, config.RunConfig) else config.load(model)
         sides, case = given(a, b, run, nthreads), run.name
@@ -237,7 +240,7 @@ def _result(
         explained = problem.of(chosen[0]).maps - pair.a
     described = [_described(one, problem) for one in chosen if problem is not None]
     same = [other for one, own in zip(chosen, described, strict=False) for other in _equivalent(one, own, pair.turned)]
-    nearest = _described(sets[0], problem)[0] if sets and problem is not None else None
+    nearest = _described(sets[0], problem) if sets and problem is not None else ()
     scene, noise = pair.scene, pair.noise_uk
     return ChannelResult(
         name=pair.name,
@@ -246,6 +249,7 @@ def _result(
         differences=described[0] if described else (),
         alternatives=(*same, *described[1:]),
         nearest=nearest,
+        nearest_explains=sets[0].explains if nearest else 0.0,
         rms_uk=_rms((pair.b - pair.a)[seen]),
         sky_rms_uk=_sky_rms(pair),
         noncircular_rms_uk=np.nan if scene is None else _rms(scene.noncircular()[seen]),
@@ -269,6 +273,10 @@ def _looks(pair: ChannelPair, explained: NDArray[np.float64]) -> tuple[str, ...]
     """Return what is left looks like, in the map that has most of it."""
     left = np.where(pair.seen, pair.b - pair.a - explained, 0.0)
     most = int(np.argmax(np.sum(left**2, axis=1)))
+    here = pair.seen[most]
+    alike = float(np.corrcoef(pair.a[most, here], pair.b[most, here])[0, 1])
+    if abs(alike) < UNLIKE:
+        return (f"of another sky, or of pixels in another order: the sides correlate by {alike:.2f}",)
     return look(left[most], pair.a[most], pair.seen[most], None if pair.hits is None else pair.hits[most])
 
 

@@ -1,7 +1,7 @@
 """Effects of the library as differences between two simulations: side B has one that side A lacks."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,8 @@ from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair, quiet
 from mcsim.comparison.scene import EPSILON, Maps, Scene
 from mcsim.errors import InputError
+from mcsim.instrument.beams import Beam
+from mcsim.instrument.scan import ScanModel
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import Survey, survey
 from mcsim.sphere import alm as alm_
@@ -33,10 +35,16 @@ class EffectDifference(Difference):
     stage = 1
 
     def __init__(
-        self, kind: type[Effect], templates: Maps, run: config.RunConfig, bare: dict[bytes, Maps] | None = None
+        self,
+        kind: type[Effect],
+        templates: Maps,
+        run: config.RunConfig,
+        sky: Alm,
+        bare: dict[bytes, Maps] | None = None,
     ) -> None:
-        self.kind, self.templates, self.run = kind, templates, run
+        self.kind, self.templates, self.run, self.sky = kind, templates, run, sky
         self._bare = {} if bare is None else bare
+        self._there: dict[tuple[bytes | float, ...], Maps] = {}
 
     def starts(self, state: State) -> list[Vector]:
         """Return the coordinates that fit best."""
@@ -44,17 +52,40 @@ class EffectDifference(Difference):
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
         """Return the maps with the effect's response."""
-        return maps + np.tensordot(value, self.templates, 1)
+        return maps + np.tensordot(value, self._templates_in(state), 1)
+
+    def _templates_in(self, state: State) -> Maps:
+        """Return the templates of one sky, those of samples that are late, or move otherwise, if the scene has them."""
+        scene, pair = state.scene, state.pair
+        if scene is None or not (scene.late or scene.motion):
+            return self.templates
+        # A few per cent of a shift do not matter.
+        scene = replace(scene, late=float(f"{scene.late:.2g}"), sky=self.sky)
+        key = (scene.beam.blm.tobytes(), scene.late, *_periods(scene.motion))
+        if key not in self._there:
+            basis = basis_of(self.kind)
+            try:
+                made = np.stack([self._response(effect, scene, pair) / _scale(self.kind, effect) for effect in basis])
+            except InputError:  # more orders than moments of another motion have
+                made = self.templates
+            self._there[key] = np.where(pair.seen, made, 0.0)
+        return self._there[key]
 
     def response(self, value: Vector, scene: Scene, pair: ChannelPair) -> Maps | None:
         """Return the effect's response on a scene; None if it cannot be so large."""
         try:
-            bare, acting = (
-                simulate.maps(_survey(run, scene), 0, scene.nthreads, self._sky(scene, pair))
-                for run in self._runs(value, scene, pair)
-            )
+            return self._response(self._effect(value), scene, pair)
         except InputError:
             return None
+
+    def _response(self, effect: Effect, scene: Scene, pair: ChannelPair) -> Maps:
+        beam = scene.displaced_beam
+        if beam is not scene.beam:  # which the effect may displace further
+            beam = beam.truncated(min(beam.mmax, scene.moments[0].smax - 1))
+        bare, acting = (
+            simulate.maps(_with_moments_of(scene, _survey(run, scene)), 0, scene.nthreads, self._sky(scene, pair))
+            for run in self._runs(effect, scene, pair, beam)
+        )
         return acting - bare
 
     def sampled(self, value: Vector, scene: Scene, pair: ChannelPair) -> Maps | None:
@@ -62,17 +93,19 @@ class EffectDifference(Difference):
         sky: Any = self._sky(scene, pair)  # an array stands for a file
         bare, acting = (
             replace(run, sky=replace(run.sky, spectrum=None, map=None, alm=sky))
-            for run in self._runs(value, scene, pair)
+            for run in self._runs(self._effect(value), scene, pair, scene.beam)
         )
 
         def made(run: config.RunConfig) -> Maps:
-            return np.stack([m for _, m in sampled.maps(_survey(run, scene), 0, scene.nthreads, EPSILON)])
+            whole = _with_samples_of(scene, _survey(run, scene))
+            return np.stack([m for _, m in sampled.maps(whole, 0, scene.nthreads, EPSILON)])
 
         try:
             more = made(acting)
         except InputError:
             return None
-        key = sky.tobytes() + scene.beam.blm.tobytes() + np.float64(scene.psi[1]).tobytes()
+        numbers = np.array([*scene.psi, scene.late, *_periods(scene.motion), float(scene.centred)])
+        key = sky.tobytes() + scene.beam.blm.tobytes() + numbers.tobytes()
         if key not in self._bare:
             self._bare.clear()
             self._bare[key] = made(bare)
@@ -84,16 +117,18 @@ class EffectDifference(Difference):
         factor = np.ones_like(scene.window) if scene.centred else scene.window / pair.scene.window
         return alm_.multiply(scene.sky, factor, scene.lmax)
 
-    def _runs(self, value: Vector, scene: Scene, pair: ChannelPair) -> tuple[config.RunConfig, config.RunConfig]:
-        """Return the run through the beam of a scene, without the effect and with it."""
+    def _runs(
+        self, effect: Effect, scene: Scene, pair: ChannelPair, beam: Beam
+    ) -> tuple[config.RunConfig, config.RunConfig]:
+        """Return the run through a beam turned as in a scene, without the effect and with it."""
         assert pair.scene is not None
-        [channel], beam = self.run.channels, scene.beam
+        [channel] = self.run.channels
         if beam is not pair.scene.beam or scene.psi[1]:
             turn = np.exp(-1j * np.arange(beam.mmax + 1) * scene.psi[1])
             table: Any = replace(beam, blm=turn[:, None] * beam.blm)
             channel = replace(channel, beam=table)
         alone = replace(self.run, channels=(channel,))
-        return alone, replace(alone, effects=(_table(self._effect(value), pair.name),))
+        return alone, replace(alone, effects=(_table(effect, pair.name),))
 
     def _effect(self, value: Vector) -> Effect:
         return self.kind(**self.kind.parametrization.nearest(value, np.eye(value.size)))
@@ -142,12 +177,69 @@ def effects_of(pair: ChannelPair, run: config.RunConfig) -> Iterator[EffectDiffe
         try:
             for effect in basis_of(kind):
                 acting = replace(alone, effects=(_table(effect, pair.name),))
-                scale = float(np.max(np.abs(kind.parametrization.coordinates(effect))))
-                templates.append(np.where(pair.seen, (made(acting) - bare) / scale, 0.0))
+                templates.append(np.where(pair.seen, (made(acting) - bare) / _scale(kind, effect), 0.0))
         except InputError:  # it depends on what the model does not say: a frequency, a pointing, a differencing scan
             continue
         if any(t.any() for t in templates):
-            yield EffectDifference(kind, np.stack(templates), alone, sampled_bare)
+            yield EffectDifference(kind, np.stack(templates), alone, scene.sky, sampled_bare)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Seen(Effect):
+    """Samples as a scene has them: late by ``late_s`` seconds, orientations of a ``sign``, at the centres of pixels."""
+
+    name = "seen"
+    scope = "channel"
+    unit = ""
+    cause = signature = "Another implementation."
+    step = 1.0
+
+    late_s: float
+    sign: int
+    centred: bool
+
+    def lags(self) -> tuple[tuple[float, float], ...]:
+        """Return the one delay."""
+        return ((1.0, -self.late_s),)
+
+    def moved(self, theta: Vector, phi: Vector, psi: Vector) -> tuple[Vector, Vector, Vector]:
+        """Return samples with their orientation of this sign."""
+        return theta, phi, self.sign * psi
+
+    def spread(self) -> float:
+        """Return the factor of the samples' offsets from their pixels' centres."""
+        return 0.0 if self.centred else 1.0
+
+
+def _scale(kind: type[Effect], effect: Effect) -> float:
+    """Return the size of the coordinates of an effect."""
+    return float(np.max(np.abs(kind.parametrization.coordinates(effect))))
+
+
+def _with_moments_of(scene: Scene, whole: Survey) -> Survey:
+    """Return the survey of one channel with the moments of the motion of a scene, orientations counted as they were."""
+    if scene.motion is None or whole.source is not None:
+        return whole
+    own = scene.turned(-scene.psi[1])
+    own = own if scene.psi[0] > 0 else own.reversed()
+    [channel] = whole.channels
+    maps = tuple(replace(m, moments=moments) for m, moments in zip(channel.maps, own.moments, strict=True))
+    return replace(whole, channels=(replace(channel, maps=maps),))
+
+
+def _with_samples_of(scene: Scene, whole: Survey) -> Survey:
+    """Return the survey of one channel with the samples of a scene, beside its offset of psi, which its beam has."""
+    [channel], late = whole.making.channels, 0.0
+    site, known = channel.site, channel.site.pointing
+    if known is not None:
+        late = scene.late * known.model.period_of_samples(known.line)
+        site = replace(site, pointing=replace(known, model=scene.motion or known.model))
+    seen = _Seen(late_s=late, sign=scene.psi[0], centred=scene.centred)
+    return replace(whole.making, channels=(replace(channel, site=site, effects=(*channel.effects, seen)),))
+
+
+def _periods(motion: ScanModel | None) -> tuple[float, float]:
+    return (0.0, 0.0) if motion is None else (motion.spin_period_s, motion.precession_period_s)
 
 
 def _survey(run: config.RunConfig, scene: Scene) -> Survey:

@@ -1,6 +1,6 @@
 """Two sets of maps of the same skies, read and brought into pairs."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,11 +24,20 @@ from mcsim.support import resources
 from mcsim.support.arrays import Alm
 from mcsim.systematics.base import Pointing
 
+Given = Sequence[NDArray[np.float64]] | Mapping[str, NDArray[np.float64]]
+"""Maps as arrays, in the order of a run's or by name."""
+
 SAMPLES = 100_000_000
 """Samples of the longest survey that is simulated sample by sample."""
 
 HELD = 20_000_000
 """The same of samples in files, which are held in memory."""
+
+CLEARLY = 0.1
+"""Share of the squares that fewer orders of a beam must leave at most where the other program may have had all."""
+
+_STORED = (".fits", ".fit", ".gz", ".npy", ".npz", ".h5", ".hdf5", ".nc")
+"""What a file of maps is called."""
 
 EXTRA_ORDERS = 3
 """Moments beyond the beam's orders: a displaced beam has them."""
@@ -160,8 +169,7 @@ def read(
         If a side cannot be read, or the sides have no map in common.
     """
     for side in (a, b):
-        if not Path(side).exists() and Path(side).suffix != ".toml" and str(side) not in resources.names("workflows"):
-            raise InputError(f"{side} is neither a folder of maps nor a configuration; give the path of one.")
+        _check_kind(side)
     run = _model(a, b, model)
     whole: Survey | None = None
     orders: dict[str, int] = {}
@@ -170,7 +178,7 @@ def read(
         whole = survey(quiet(run), nthreads, orders=_orders(run))
     sides = [_side(side, run, nthreads) for side in (a, b)]
     for own, other, side in ((0, 1, a), (1, 0, b)):
-        if not Path(side).is_dir() and Path((b, a)[own]).is_dir():
+        if not Path(side).is_dir() and _made_elsewhere((b, a)[own]):
             sides[own] = _closer(sides[own], sides[other], config.load(side), nthreads)
     if run is None:
         names = [name for name in sides[0] if name in sides[1]]
@@ -191,17 +199,26 @@ def read(
     return Comparison(tuple(pair if run is None else _with_noise(pair, run) for pair in pairs), run)
 
 
-def given(
-    a: Sequence[NDArray[np.float64]],
-    b: Sequence[NDArray[np.float64]],
-    run: config.RunConfig,
-    nthreads: int = 1,
-) -> Comparison:
-    """Compare maps given as arrays, in the order of the run's, uK."""
+def _check_kind(side: str | Path) -> None:
+    path = Path(side)
+    if (path.is_dir() and (path / "zarr.json").is_file()) or (path.is_file() and path.suffix in _STORED):
+        raise InputError(
+            f"{side} is no folder of FITS maps; give a configuration of the survey that names it, [ensemble] maps = "
+            '"PATH" (a Zarr store, .npy, or FITS files with {realization}), or write CHANNEL.fits into a folder.'
+        )
+    if not path.exists() and path.suffix != ".toml" and str(side) not in resources.names("workflows"):
+        raise InputError(f"{side} is neither a folder of maps nor a configuration; give the path of one.")
+
+
+def _made_elsewhere(side: str | Path) -> bool:
+    """Return True for maps that another program made, or may have made."""
+    return Path(side).is_dir() or named_source(config.load(side))[1] is not None
+
+
+def given(a: Given, b: Given, run: config.RunConfig, nthreads: int = 1) -> Comparison:
+    """Compare maps given as arrays, by name or in the order of the run's, uK."""
     names = config.map_names(run)
-    for side in (a, b):
-        if len(side) != len(names):
-            raise InputError(f"{len(side)} maps were given, the model has {len(names)}; give one for each.")
+    a, b = (_in_order(side, names) for side in (a, b))
     run, orders = _in_full(run)
     whole = survey(quiet(run), nthreads, orders=_orders(run))
     sides = [dict(zip(names, (np.ma.filled(m, healpy.UNSEEN) for m in side), strict=True)) for side in (a, b)]
@@ -210,6 +227,16 @@ def given(
     )
     pairs = (replace(pair, orders=orders.get(pair.name)) for pair in found)
     return Comparison(tuple(_with_noise(pair, run) for pair in pairs), run)
+
+
+def _in_order(side: Given, names: Sequence[str]) -> Sequence[NDArray[np.float64]]:
+    if not isinstance(side, Mapping):
+        if len(side) != len(names):
+            raise InputError(f"{len(side)} maps were given, the model has {len(names)}; give one for each.")
+        return side
+    if set(side) != set(names):
+        raise InputError(f"the maps {', '.join(map(str, side))} were given, the model has {', '.join(names)}.")
+    return [side[name] for name in names]
 
 
 def _in_full(run: config.RunConfig) -> tuple[config.RunConfig, dict[str, int]]:
@@ -311,21 +338,22 @@ def _external(own: config.RunConfig, given: str, nthreads: int) -> dict[str, NDA
 def _closer(
     made: dict[str, NDArray[np.float64]], wanted: dict[str, NDArray[np.float64]], run: config.RunConfig, nthreads: int
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the maps of a run as they were made, or sample by sample if those are closer to the other side's.
+    """Return the maps of a run as they were made, or those that are closer to the other side's.
 
-    Orientation moments spread samples over their pixels otherwise than another simulator does.
+    Orientation moments spread samples over their pixels otherwise than another simulator does, which may have all
+    orders of a beam too.
     """
     run, external = named_source(run)
     if external is not None:
         return made
-    whole = survey(run, nthreads)
-    pointings = [channel.site.pointing for channel in whole.making.channels]
-    if any(p is None or p.model.samples(p.line) > SAMPLES for p in pointings):
-        return made
-    try:
-        exact = dict(sampled.maps(whole, 0, nthreads))
-    except InputError:  # an effect on orientation moments, say
-        return made
+    full = with_all_orders(run)
+    tried = [[made], []]
+    for one, ways in zip((run, full) if full != run else (run,), tried, strict=False):
+        if one is full:
+            whole = survey(with_known_offsets(full), nthreads)
+            ways.append(dict(zip(whole.map_names, simulate.maps(whole, 0, nthreads), strict=True)))
+        exact = _by_samples(one, nthreads)
+        ways += [] if exact is None else [exact]
 
     def distance(maps: dict[str, NDArray[np.float64]]) -> float:
         total = 0.0
@@ -336,7 +364,20 @@ def _closer(
                 total += float(np.sum((maps[name] - there)[both] ** 2))
         return total
 
-    return min(made, exact, key=distance)
+    own, in_full = (min(ways, key=distance, default=made) for ways in tried)
+    return own if full == run or distance(own) < CLEARLY * distance(in_full) else in_full
+
+
+def _by_samples(run: config.RunConfig, nthreads: int) -> dict[str, NDArray[np.float64]] | None:
+    """Return the maps of a run sample by sample; None if samples are not known, too many, or not all."""
+    whole = survey(run, nthreads)
+    pointings = [channel.site.pointing for channel in whole.making.channels]
+    if any(p is None or p.model.samples(p.line) > SAMPLES for p in pointings):
+        return None
+    try:
+        return dict(sampled.maps(whole, 0, nthreads))
+    except InputError:  # an effect on orientation moments, say
+        return None
 
 
 def _folder(folder: Path, run: config.RunConfig | None) -> dict[str, NDArray[np.float64]]:

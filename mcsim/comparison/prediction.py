@@ -198,6 +198,10 @@ class Prediction:
         made = [d.response(v, scene, self.pair) for d, v in members] if scene is not None else []
         return sum((one for one in made if one is not None), 0.0)
 
+    def moved(self, found: Set) -> float:
+        """Return the share of the variance that single samples change in a set, and may change in larger ones."""
+        return 0.0 if found.correction is None else float(np.sum(found.correction[self.pair.seen] ** 2)) / self.total
+
     def needed(self) -> float:
         """Return the share of the variance that a set must explain to be named."""
         simple = self.pair.scene is None or self.pair.by_moments or self._pointing is not None
@@ -316,10 +320,11 @@ class Prediction:
         assert scene is not None
         if scene is not base:
             correction += scene.sampled(pointing, base.window) - self._sampled - (scene.maps() - self._bare)
+        state = replace(self.state(()), scene=scene)
         for difference, value in found.members:
             exact = difference.sampled(value, scene, self.pair)
             if exact is not None:
-                correction += exact - (difference.maps(self.pair.a, value, self.state(())) - self.pair.a)
+                correction += exact - (difference.maps(self.pair.a, value, state) - self.pair.a)
         if not correction.any():
             return found
         correction = np.where(self.pair.seen, correction, 0.0)

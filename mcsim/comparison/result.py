@@ -51,7 +51,9 @@ class ChannelResult:
     verdict
         "identical", "difference" (one), "mixture" (several), "degenerate" (several sets do), or "unknown".
     differences, alternatives, nearest
-        The best set that is accepted, the other ones, and the best single difference whatever it explains.
+        The best set that is accepted, the other ones, and the best set whatever it explains.
+    nearest_explains
+        Share of the variance that this set explains.
     rms_uk, sky_rms_uk, noncircular_rms_uk, noise_rms_uk, left_rms_uk
         Of the difference; of the sky without monopole and dipole; of what the beam's shape adds; of the noise that the
         model has; and of what is left. NaN where no model says it.
@@ -78,7 +80,8 @@ class ChannelResult:
     verdict: Verdict
     differences: tuple[DifferenceResult, ...]
     alternatives: tuple[tuple[DifferenceResult, ...], ...]
-    nearest: DifferenceResult | None
+    nearest: tuple[DifferenceResult, ...]
+    nearest_explains: float
     rms_uk: float
     sky_rms_uk: float
     noncircular_rms_uk: float
@@ -120,17 +123,15 @@ class ChannelResult:
         if self.verdict == "identical":
             return f"{self.name}: identical to an accuracy of {number(self.accuracy)} ({number(self.rms_uk)} uK rms)."
         if self.verdict == "unknown":
-            near = self.nearest
-            hint = (
-                ""
-                if near is None or near.explains < 0.01
-                else f"; nearest is {near.name}, which explains {100 * near.explains:.0f} %"
-            )
+            near, share = " and ".join(d.name for d in self.nearest), self.nearest_explains
+            hint = f"; nearest is {near}, which explains {100 * share:.0f} %" if near and share >= 0.01 else ""
             if self.unmade_rms_uk > 0.2 * self.rms_uk:
                 hint += (
                     f". The model makes side A itself to {number(self.unmade_rms_uk)} uK rms only: "
                     "check it, or give it the sky (sky.alm), which maps with noise or many holes do not show"
                 )
+            if np.isnan(self.noncircular_rms_uk):
+                hint += ". Without a model only differences of the maps themselves are tried: give one"
             looks = f" What is left is {'; '.join(self.looks)}." if self.looks else ""
             return (
                 f"{self.name}: different by {size}, in a way that no difference of the library explains{hint}.{looks}"
@@ -207,7 +208,7 @@ class ComparisonResult:
             "model_describes": {c.name: "b" for c in self.channels if c.reversed},
             "differences": [d.to_dict() for c in self.channels for d in c.differences],
             "alternatives": [[d.to_dict() for d in one] for c in self.channels for one in c.alternatives],
-            "nearest": [c.nearest.to_dict() for c in self.channels if c.verdict == "unknown" and c.nearest],
+            "nearest": [d.to_dict() for c in self.channels if c.verdict == "unknown" for d in c.nearest],
             "left": {
                 "rms_uk": left,
                 "fraction": (left / rms) ** 2 if rms > 0.0 else 0.0,

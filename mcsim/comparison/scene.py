@@ -128,9 +128,9 @@ class Scene:
         """Of the maps, before any preparation."""
         return self.moments[0].nside
 
-    @cached_property
-    def response(self) -> convolve.Response:
-        """Beam times pixel window."""
+    @property
+    def displaced_beam(self) -> Beam:
+        """Return the beam about the pointing of samples that are not late."""
         beam = self.beam
         if self.late:
             way = self.late * self.step
@@ -141,7 +141,12 @@ class Scene:
                 moved = displaced(beam, 0.0 if way >= 0.0 else np.pi, abs(way))
                 _keep(self.moved, key, moved.truncated(min(moved.mmax, self.moments[0].smax)), KEPT_BEAMS)
             beam = self.moved[key]
-        return convolve.response(beam, self.lmax, self.window)
+        return beam
+
+    @cached_property
+    def response(self) -> convolve.Response:
+        """Beam times pixel window."""
+        return convolve.response(self.displaced_beam, self.lmax, self.window)
 
     @cached_property
     def _transforms(self) -> Transforms:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.scene import WEAKEST, Maps, Scene, ahead
+from mcsim.instrument.beams import Beam
 from mcsim.instrument.beams.coefficients import power_by_order
 from mcsim.instrument.scan import Moments
 from mcsim.instrument.scan.pointing import pointing
@@ -32,6 +33,12 @@ FAINT = 0.1
 """Share of the rms below which a time shift that explains it is not looked for."""
 
 
+def _orders(beam: Beam) -> NDArray[np.int64]:
+    """Return the orders of a beam that can be seen: quadrature leaves a little in all of them."""
+    power = power_by_order(beam.blm)
+    return np.flatnonzero(power > NEGLECTED * power.sum())
+
+
 class PsiOffset(Difference):
     """psi of side B is that of side A plus an angle."""
 
@@ -42,8 +49,8 @@ class PsiOffset(Difference):
     def starts(self, state: State) -> list[Vector]:
         """Return the small angle that fits, and a grid; a beam of even orders is the same half a turn on."""
         assert state.scene is not None
-        orders = np.flatnonzero(state.scene.beam.blm.any(axis=1))
-        if orders.max(initial=0) == 0:
+        orders = _orders(state.scene.beam)
+        if orders.max() == 0:
             return []
         slope = state.scene.turned(_SMALL).maps() - state.scene.maps()
         small = np.rad2deg(_SMALL * state.fit([slope])[0])
@@ -376,8 +383,7 @@ class MmaxCut(Difference):
 
     def starts(self, state: State) -> list[Vector]:
         assert state.scene is not None
-        power = power_by_order(state.scene.beam.blm)
-        orders = np.flatnonzero(power > NEGLECTED * power.sum())
+        orders = _orders(state.scene.beam)
         return [np.array([float(m)]) for m in orders[:-1]]
 
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:

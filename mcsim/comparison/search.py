@@ -1,8 +1,8 @@
 """Find the smallest set of differences that turns the maps of side A into those of side B."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations, permutations
+from itertools import combinations, permutations, zip_longest
 
 import healpy
 import numpy as np
@@ -41,8 +41,8 @@ NEARLY = 0.1
 LARGEST = 3
 """Differences that act together."""
 
-MEASURED = 4
-"""Sets of every size that are simulated sample by sample."""
+MEASURED, MEASURED_LARGER = 4, 6
+"""Differences, and sets of each larger size, that are simulated sample by sample."""
 
 WORTH, WORTH_IN_NOISE = 0.5, 0.9
 """Share of the variance that a set may leave at most to be simulated sample by sample.
@@ -86,7 +86,7 @@ class Problem(Prediction):
     """
 
     library: Sequence[Difference] = ()
-    _tried: dict[tuple[tuple[int, bytes], ...], Set | None] = field(default_factory=dict, repr=False)
+    _tried: dict[tuple[tuple[int, bytes], ...], list[Set]] = field(default_factory=dict, repr=False)
 
     def best(self, stage: int = 0) -> list[Set]:
         """Return sets of the smallest size that explains the difference, the best first; or of the best size tried.
@@ -94,19 +94,23 @@ class Problem(Prediction):
         A larger set is taken only if its last member explains :data:`FURTHER` of what the smaller one leaves.
         """
         library = [d for d in self.library if d.stage <= stage]
-        found = self._sorted(self._extended(Set((), 1.0), library))
+        alone = sorted(self._extended(Set((), 1.0), library), key=lambda one: one.left)
+        found = self._measured_first(alone, MEASURED)
         chosen = found
         for _ in range(LARGEST - 1):
             if not found or self.complete(found[0]):
                 break
             most = found[0].left - VISIBLE * self.hidden(found[0]) if self.pair.doubt is not None else 0.0
             larger = [
-                one
+                [
+                    one
+                    for one in self._extended(smaller, further)
+                    if one.left
+                    < max(most, (1.0 - FURTHER) * max(smaller.left, found[0].left), self.unsure(one, smaller))
+                ]
                 for smaller, further in self._bases(found, library)
-                for one in self._extended(smaller, further)
-                if one.left < max(most, (1.0 - FURTHER) * max(smaller.left, found[0].left))
             ]
-            found = self._sorted(self.fitted(one) for one in _different(larger, TRIED))
+            found = self._measured_first([self.fitted(one) for one in _in_turn(larger, TRIED)], MEASURED_LARGER)
             if not found or not self.adds(found[0], chosen[0]):
                 break
             chosen = found
@@ -124,11 +128,15 @@ class Problem(Prediction):
         share = FURTHER_BEYOND if self.suffices(found) else FURTHER
         return self.excess(larger) < (1.0 - share) * self.excess(found)
 
-    def _sorted(self, sets: Iterable[Set]) -> list[Set]:
-        """Return sets with the best one first, the first ones measured sample by sample."""
-        ranked = sorted(sets, key=lambda one: one.left)
+    def unsure(self, larger: Set, base: Set) -> float:
+        """Return the share that a larger set may leave because single samples were not simulated, as of its base."""
+        return 0.0 if larger.correction is not None else ALIKE * self.moved(base)
+
+    def _measured_first(self, sets: Sequence[Set], most: int) -> list[Set]:
+        """Return sets with the best one first, the first ones of those that are given measured sample by sample."""
+        ranked = list(sets)
         worth = WORTH if self.pair.doubt is None else WORTH_IN_NOISE
-        for index, one in enumerate(ranked[:MEASURED]):
+        for index, one in enumerate(ranked[:most]):
             if one.left < worth:
                 ranked[index] = measured = self.corrected(one)
                 if self.complete(measured):
@@ -184,7 +192,7 @@ class Problem(Prediction):
 
         What the values of the set may change is fitted besides, and so is not left.
         """
-        present, state, found = {difference.name for difference, _ in base.members}, None, []
+        present, state, found = {difference.name for difference, _ in base.members}, None, list[Set]()
         small = bool(base.members) and base.left * self.total <= self.floor**2 * self.pair.seen.sum()
         for difference in library:
             if difference.name in present or (difference.name in INTERPOLATING and small):
@@ -193,8 +201,8 @@ class Problem(Prediction):
             if key not in self._tried:
                 state = state or self._freed(base)
                 self._tried[key] = self._with(difference, base, state)
-            found.append(self._tried[key])
-        return [one for one in found if one is not None]
+            found += self._tried[key]
+        return found
 
     def _freed(self, base: Set) -> State:
         """Return the prediction of a set, with what its values may change to be fitted besides."""
@@ -204,10 +212,13 @@ class Problem(Prediction):
         changes = np.stack([one[self.pair.seen] for one in tangents])
         return replace(state, free=np.linalg.qr(changes.T / np.linalg.norm(changes, axis=1).clip(1e-300))[0].T)
 
-    def _with(self, difference: Difference, base: Set, state: State) -> Set | None:
-        """Return a set with one more difference, at its best value; None if it has no value."""
+    def _with(self, difference: Difference, base: Set, state: State) -> list[Set]:
+        """Return a set with one more difference, at its best value; others too that are as good and cannot be moved.
+
+        A difference without a value may reverse the sense of those that were fitted without it.
+        """
         if difference.needs_scene and state.scene is None:
-            return None
+            return []
 
         def rest(value: Vector) -> Vector:
             return state.rest(self.state((*base.members, (difference, value)), base.correction).maps)
@@ -220,13 +231,19 @@ class Problem(Prediction):
         for one in sets if base.fitted else ():
             if one.fitted == base.fitted and one.left < NEARLY:
                 sets = [*sets, self.fitted(one)]
+            elif one.fitted == base.fitted:
+                members = (*((d, -v if d.smooth else v) for d, v in base.members), one.members[-1])
+                sets = [*sets, Set(members, self.left(members))]
         best = min(sets, key=lambda one: one.left, default=None)
-        if best is None or not difference.smooth or best.left > (1.0 - SLIGHT) * base.left:
-            return best
+        if best is None:
+            return []
+        if not difference.smooth or best.left > (1.0 - SLIGHT) * base.left:
+            alike = [one for one in sets if one is not best and one.left < min(ALIKE * best.left, LARGE)]
+            return [best, *(() if base.members or difference.smooth else alike)]
         first = best.members[-1][1]
         scale = np.maximum(np.abs(first), 0.1 * difference.natural)
         fit = least_squares(rest, first, x_scale=scale, diff_step=1e-3, max_nfev=8, xtol=1e-7)
-        return min(best, set_of(difference.within(np.asarray(fit.x))), key=lambda one: one.left)
+        return [min(best, set_of(difference.within(np.asarray(fit.x))), key=lambda one: one.left)]
 
     def of_pair(self, pair: ChannelPair, others: Sequence[ChannelPair]) -> "Problem":
         """Return the problem of another pair."""
@@ -293,9 +310,13 @@ class Problem(Prediction):
         return list(found.values())[1:]
 
 
-def _different(sets: Iterable[Set], most: int) -> list[Set]:
-    """Return the best sets, one for all orders of the same differences."""
+def _in_turn(sets: Sequence[Sequence[Set]], most: int) -> list[Set]:
+    """Return the best sets of each base, then the second ones, ...: one for all orders of the same differences.
+
+    Moments alone do not say which of two bases is the better one.
+    """
+    ranked = zip_longest(*(sorted(own, key=lambda one: one.left) for own in sets))
     found: dict[frozenset[str], Set] = {}
-    for one in sorted(sets, key=lambda one: one.left):
+    for one in (one for each in ranked for one in each if one is not None):
         found.setdefault(one.names, one)
     return list(found.values())[:most]

@@ -8,6 +8,7 @@ import hashlib
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
+from numbers import Real
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -70,11 +71,13 @@ class Tabled(Protocol):
 def in_files(value: Any, key: str = "") -> Any:
     """Return a table, list or value of a run with its arrays and objects replaced by paths of files.
 
-    An array under a key that names a file is written; another becomes a list. An array of objects, or with a unit or
-    mask, is refused.
+    An array, or list of numbers, under a key that names a file is written; another becomes a list. An array of objects,
+    or with a unit or mask, is refused.
     """
     if isinstance(value, Mapping):
         return {name: in_files(item, name) for name, item in value.items()}
+    if isinstance(value, list | tuple) and key in _FILES and value and all(isinstance(v, Real) for v in value):
+        return _file_of(numbers(value, f"the list {key}"), key)
     if isinstance(value, list | tuple):
         return [in_files(item, key) for item in value]
     if isinstance(value, Tabled):

@@ -72,6 +72,13 @@ class Model:
         """Return 1/C_l, zero where C_l is, uK^-2."""
         return divided(1.0, self.cl)
 
+    @cached_property
+    def alike(self) -> tuple[tuple[Cl, tuple[int, ...]], ...]:
+        """Return the different responses, each with the indices of all maps that have it."""
+        rows, which = np.unique(self.response, axis=0, return_inverse=True)
+        groups = (np.flatnonzero(which.ravel() == row) for row in range(len(rows)))
+        return tuple((row, sum(map(self.of, group.tolist()), ())) for row, group in zip(rows, groups, strict=True))
+
     def of(self, channel: int) -> tuple[int, ...]:
         """Return the indices of the channel's maps."""
         return tuple(i for i, part in enumerate(self.parts) if part.channel == channel)
@@ -229,8 +236,8 @@ def _sky(model: Model, clean: Sequence[Map], iterations: int = 0) -> Alm:
     lmax = model.lmax
     total = np.zeros(alm_.size(lmax), dtype=np.complex128)
     gain = np.zeros(lmax + 1)
-    for channel, response in enumerate(model.response):
-        members = model.of(channel)
+    # Channels that see the sky alike are analysed together.
+    for response, members in model.alike:
         together = reduce(np.add, [clean[i] / model.parts[i].noise_power for i in members])
         total += alm_.multiply(healpix.analysis(together, lmax, iterations), response, lmax)
         gain += response**2 * sum(1.0 / model.parts[i].noise_power for i in members)

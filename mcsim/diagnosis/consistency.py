@@ -11,7 +11,7 @@ from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.slices import northern
-from mcsim.datavector.summaries import Element, bins
+from mcsim.datavector.summaries import Element, bins, scales
 from mcsim.stats.gaussian import SimulatedGaussian, Tolerated
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.support.numbers import number, p_equals
@@ -105,13 +105,15 @@ class Action:
 
     ``response`` is that at the fitted amplitude, shape (p + E,), and ``error`` the relative error of the amplitude;
     ``directions``, shape (p + E, K - 1), are the responses to changes of its parameters that leave the amplitude.
-    ``scatter``, shape (p + E, draws), has the deviations of the draws of a stochastic effect.
+    ``scatter``, shape (p + E, draws), has the deviations of the draws of a stochastic effect; ``growth`` is the factor
+    of the variance of noise, and so of the standard deviation of its power.
     """
 
     response: Vector
     directions: Matrix
     error: float
     scatter: Matrix | None = None
+    growth: float = 1.0
 
     @classmethod
     def of(
@@ -168,16 +170,13 @@ class Slices:
         if scatters and not self.scatters:
             return replace(self, scatters=scatters, _nulls={}).findings(candidates, actions)
         # More noise, or a pattern that is drawn, is more of chi^2: what is left in the maps then says nothing of it.
-        noisy = any(
-            candidate.effect.noise is not Effect.noise or candidate.parametrization.stochastic
-            for candidate in candidates
-        )
+        noisy = any(one.effect.noise is not Effect.noise or one.parametrization.stochastic for one in candidates)
         free = np.concatenate([action.directions for action in actions], axis=1)
         comparisons = []
         for place, (candidate, action) in enumerate(zip(candidates, actions, strict=True)):
             others = [other.response for k, other in enumerate(actions) if k != place]
             beside = np.column_stack([free, *others])
-            divisions = (self._compared(one, action, beside) for one in self._divisions(candidate.channel))
+            divisions = (self._compared(one, action, beside) for one in self._divisions(candidate))
             own = [one for one in divisions if one is not None]
             if len(candidates) == 1 and not noisy:
                 own += self._of_maps(candidate.channel, action)
@@ -196,20 +195,24 @@ class Slices:
             (row, e) for row, e in found if e.statistic != "score" and (channel is None or set(e.channels) == {channel})
         ]
 
-    def _divisions(self, channel: str | None) -> Iterator[Division]:
-        own, first = self._own(channel), len(self.z) - self.beside
+    def _divisions(self, candidate: Candidate) -> Iterator[Division]:
+        own, first = self._own(candidate.channel), len(self.z) - self.beside
         halves = [[row for row, e in own if e.fold == fold] for fold in (0, 1)]
         words = tuple(" and ".join(self.splits[fold::2]) for fold in (0, 1)) if len(self.splits) > 1 else _HALVES
         yield _of_rows("halves", words, halves)
-        middle = bins(2, self.lmax, 2)[0][1]
-        ranges = [(0, LARGE), (LARGE + 1, middle), (middle + 1, self.lmax)]
-        degrees: list[list[int]] = [[], [], []]
+        noisy = candidate.effect.noise is not Effect.noise  # it shows in differences of splits, and in pixels
+        edges = [e for _, e in scales(self.lmax)] if noisy else [LARGE, bins(2, self.lmax, 2)[0][1], self.lmax]
+        starts = (0, *(edge + 1 for edge in edges))
+        words = tuple(f"ℓ {low}–{high}" for low, high in zip(starts, edges, strict=False))
+        degrees: list[list[int]] = [[] for _ in edges]
         for row, e in own:
             if e.ell is not None:
-                place = 0 if e.ell[1] <= LARGE else 1 if e.ell[1] <= middle else 2
-                if place < 2 or e.ell[0] > middle:
+                place = sum(e.ell[1] > edge for edge in edges[:-1])
+                if place < len(edges) - 1 or e.ell[0] >= starts[place]:
                     degrees[place].append(row)
-        yield _of_rows("degrees", tuple(f"ℓ {low}–{high}" for low, high in ranges), degrees)
+        if noisy:
+            words, degrees = (*words, "single pixels"), [*degrees, [row for row, e in own if e.kind == "noise"]]
+        yield _of_rows("degrees", words, degrees)
         beside = [(row, e) for row, e in own if row >= first]
         for frame in FRAMES if beside else ():
             north = northern([e for _, e in beside], frame)
@@ -231,7 +234,7 @@ class Slices:
     def _compared(self, division: Division, action: Action, others: Matrix) -> Comparison | None:
         """Return the comparison of a division's parts; None if the effect does not show in two of them."""
         response = action.response
-        division = self._clear(division, response)
+        division = self._clear(division, response, action.growth > 1.0)
         null = self.null(division.rows)
         if null is None or len(division.keep) < 2:
             return None
@@ -245,20 +248,19 @@ class Slices:
         if further < 1 or np.any(errors == 0.0):
             return None
         allowance = self._tolerated(null, whole.amplitudes[-1] * response[rows])
-        p = float(
-            null.nested_test(max(whole.chi2 - apart.chi2, 0.0), whole.chi2, further, fitted, Tolerated(allowance))
-        )
+        more, chi2 = (max(one, 0.0) / action.growth**2 for one in (whole.chi2 - apart.chi2, whole.chi2))
+        p = float(null.nested_test(more, chi2, further, fitted, Tolerated(allowance)))
         best = int(np.argmax(amplitudes / errors))
         found = null.fit(x, np.column_stack([beside, parts[best], sum(parts) - parts[best]]))
         variance = found.errors[-1] ** 2 + action.error**2 + self.settings.consistency_error**2
-        odds = float(np.exp(min((0.5 - found.amplitudes[-1]) / variance, _LARGEST)))
+        odds = float(np.exp(min((0.5 - found.amplitudes[-1]) / variance, 100.0)))
         return Comparison(
             division.kind, division.words, tuple(map(float, amplitudes)), tuple(map(float, errors)), p, odds
         )
 
-    def _clear(self, division: Division, response: Vector) -> Division:
+    def _clear(self, division: Division, response: Vector, known: bool) -> Division:
         """Return a division without parts in which a response does not show; neighbours that do together are one."""
-        rows = division.rows
+        rows, least = division.rows, self.settings.slice_snr * (0.5 if known else 1.0)
         kept: list[Matrix] = []
         words: list[str] = []
         null = self.null(rows)
@@ -267,7 +269,7 @@ class Slices:
         pending, names = np.zeros((len(rows), len(rows))), list[str]()
         for keep, word in zip(division.keep, division.words, strict=True):
             pending, names = pending + keep, [*names, word]
-            if null.expected_snr(pending @ response[rows]) >= self.settings.slice_snr:
+            if null.expected_snr(pending @ response[rows]) >= least:
                 kept, words = [*kept, pending], [*words, " and ".join(names)]
                 pending, names = np.zeros_like(pending), []
         inside = np.flatnonzero(np.sum(kept, axis=0).any(axis=1)) if kept else np.arange(0)
@@ -318,9 +320,6 @@ class Slices:
         scale = null.hartlap_factor
         return MapCheck(tuple(maps), scale * null.chi2(x), scale * found.chi2, forecast, found.dimension, p)
 
-
-_LARGEST = 100.0
-"""Largest logarithm of odds."""
 
 _HALVES = ("even degrees and pixels", "odd degrees and pixels")
 

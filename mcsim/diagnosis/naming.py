@@ -13,7 +13,6 @@ from mcsim.diagnosis.drawn import is_drawn
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.selection import Attribution, Explanation
 from mcsim.errors import InputError
-from mcsim.support.arrays import Vector
 from mcsim.systematics import Effect
 
 
@@ -73,18 +72,19 @@ def _effects(context: DiagnosisContext, one: Explanation) -> list[Effect]:
 
 def _actions(data: DataSet[Any], refined: Refined, one: Explanation) -> Iterator[Action]:
     """Yield what each effect of a set does to the data, simulated at its amplitude if it can be."""
-    context, bank = data.context, data.context.bank
+    context, bank, sites = data.context, data.context.bank, data.context.analysis.model.survey.channels
     whole = np.concatenate([refined.templates, bank.slice_matrix]) if len(bank.slice_matrix) else refined.templates
     for member, theta, covariance in parts_of(context.candidates, one.members, one.fit):
         candidate = context.candidates[member]
         t = whole[:, list(candidate.columns)]
         draws, scatter = refined.candidates[member].scatter is not None, None
-        skies = context.settings.scatter_skies if draws else context.settings.constrained_skies
+        skies, growth = context.settings.scatter_skies if draws else context.settings.constrained_skies, 1.0
         try:
-            table = candidate.table(candidate.detected(theta, covariance))
-            changes = data.respond_extended([table], skies)
-            response: Vector = changes.mean(axis=0)
-            scatter = data.scatter(changes) if draws else None
+            effect = candidate.detected(theta, covariance)
+            changes = data.respond_extended([candidate.table(effect)], skies)
+            own = (effect.noise(one.site) for one in sites if candidate.channel in (None, one.site.channel))
+            growth = max([1.0, *(float(np.mean(one)) for one in own if one is not None)])
+            response, scatter = changes.mean(axis=0), data.scatter(changes) if draws else None
         except InputError:
             response = t @ theta
-        yield Action.of(response, t, theta, covariance, scatter)
+        yield replace(Action.of(response, t, theta, covariance, scatter), growth=growth)

@@ -108,7 +108,7 @@ class Refiner:
             return False
         nonlinear = how.nonlinear or self._is_nonlinear(columns, coordinates)
         stochastic = how.stochastic and (how.sign == 0 or coordinates[0] > 0.0)
-        if stochastic and done is not None:
+        if (stochastic or nonlinear) and done is not None:
             share = self._squared(now.linear[:, columns], now.t[:, columns], done)
             coordinates = done + (coordinates - done) / (1.0 + share)
         now.done[index] = coordinates

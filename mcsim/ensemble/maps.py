@@ -79,6 +79,11 @@ def write_maps(
         part = realizations
     else:
         check_whole(realizations, "realizations")
+        if realizations >= run.ensemble.realizations:
+            raise InputError(
+                f"realization {realizations} is not below {run.ensemble.realizations} (ensemble.realizations); choose "
+                "one of those, or raise it."
+            )
         part = slice(int(realizations), int(realizations) + 1)
     wanted = plan.wanted(run, part)
     names = file_names(run)

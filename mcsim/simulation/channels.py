@@ -45,7 +45,7 @@ def _beam(channel: str, spec: config.Beam, lmax: int) -> beams.Beam:
             return beams.Beam.gaussian(spec.fwhm_arcmin, lmax)
         case config.BeamEllipticalGaussian():
             major, minor = spec.fwhm_major_arcmin, spec.fwhm_minor_arcmin
-            return beams.Beam.elliptical(major, minor, spec.angle_deg, lmax, mmax=spec.m_max)
+            return beams.Beam.elliptical(major, minor, angle_deg=spec.angle_deg, lmax=lmax, mmax=spec.m_max)
         case config.BeamMap():
             beam = beams.Beam.from_map(load_beam_map(channel, spec), lmax, spec.m_max)
             return beam.rotated(np.deg2rad(spec.angle_deg))

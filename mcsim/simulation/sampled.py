@@ -116,6 +116,9 @@ def _seen(channel: Channel, grid: MapGrid, observe: tod.Stage) -> Iterator[tod.S
         more = effect.lags()
         if more is not None:
             lags = [(weight * w, delay + d) for weight, delay in lags for w, d in more]
+    if len(lags) == 1 and not any(map(_moves, channel.effects)) and systematics.spread_of(channel.effects) == 1.0:
+        yield from observe(_fiducial(channel, grid))
+        return
     streams = [observe(_true(channel, grid, delay)) for _, delay in lags]
     for chunk, *true in zip(_fiducial(channel, grid), *streams, strict=True):
         signal = sum((w * each.signal_uk for (w, _), each in zip(lags, true, strict=True)), start=0.0)

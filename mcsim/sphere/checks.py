@@ -4,6 +4,7 @@ The arrays come from users and other packages, and compiled loops do not check t
 """
 
 import math
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,12 @@ def check_whole(value: Any, name: str, least: int = 0) -> None:
     """Raise InputError unless ``value`` is a whole number of type int, ``least`` or more."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise InputError(f"{name} is {value!r}, but it must be a whole number (int) >= {least}.")
+
+
+def check_number(value: Any, name: str, unit: str) -> None:
+    """Raise InputError unless ``value`` is one plain number."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise InputError(f"{name} is {value!r}, but it must be one plain number, in {unit}.")
 
 
 def check_nside(nside: Any) -> None:

@@ -32,7 +32,7 @@ class Calibration:
     held_out_smallest, held_out_combined
         Sorted p-values, as these draws give them, of simulations against the others; None: Gaussian data are trusted.
     power
-        Of the global p-value of the candidates, below 1 if that of simulations against others is too often small.
+        Of the global p-value of the candidates: below 1 if that of simulations against others is too often small.
     """
 
     tests: int
@@ -110,8 +110,9 @@ def calibrate_in_folds(calibration: Calibration, null: SimulatedGaussian, candid
 
     Notes
     -----
-    Such a covariance is better for some templates than for others, so that the smallest p-value is too small. If p^a is
-    uniform, log p has the mean -1/a: the power is estimated by maximum likelihood, within a/sqrt(N).
+    Such a covariance is better for some templates than for others, so that the smallest p-value is too small; or for
+    all templates than for what is drawn like the data, so that it is too large. If p^a is uniform, log p has the mean
+    -1/a: the power is estimated by maximum likelihood, within a/sqrt(N).
     """
     chi2, falls = [], []
     for fold in null.folds:
@@ -123,7 +124,7 @@ def calibrate_in_folds(calibration: Calibration, null: SimulatedGaussian, candid
     total = np.concatenate(chi2)
     scores = null.nested_test(np.concatenate(falls), total[:, None], candidates.sizes)
     found = calibration.global_pvalue(scores.min(axis=1))
-    return replace(calibration, power=min(1.0, -1.0 / float(np.mean(np.log(np.maximum(found, 1e-300))))))
+    return replace(calibration, power=-1.0 / float(np.mean(np.log(np.maximum(found, 1e-300)))))
 
 
 def calibrate(

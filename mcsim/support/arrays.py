@@ -14,6 +14,9 @@ Map = NDArray[np.float64]
 Cl = NDArray[np.float64]
 Alm = NDArray[np.complex128]
 
+COUNTED = ("l", "ell", "multipole", "m", "pixel", "pix", "ipix")
+"""Names of labels, of xarray and pandas, that say an element's place."""
+
 
 def divided(numerator: ArrayLike, denominator: ArrayLike, otherwise: float = 0.0) -> NDArray:
     """Return a quotient where its denominator is above zero, and ``otherwise`` elsewhere."""
@@ -26,8 +29,9 @@ def numbers(given: Any, name: str, masked: float | None = None) -> NDArray:
     """Return a list, or an array of numpy, pandas, xarray or Dask, as numbers; ``name`` names it in messages.
 
     Masked elements become ``masked``. InputError for what a conversion would drop in silence: a unit, masked elements
-    without a value to take; and for what is no array of numbers.
+    without a value to take, labels that say another place than an element has; and for what is no array of numbers.
     """
+    _check_places(given, name)
     unit = getattr(given, "unit", None) if hasattr(type(given), "to_value") else None
     if unit is None and hasattr(type(given), "magnitude"):
         unit = given.units
@@ -45,6 +49,19 @@ def numbers(given: Any, name: str, masked: float | None = None) -> NDArray:
     if found.dtype.kind not in "biufc":
         raise InputError(f"{name} is of type {found.dtype}, shape {found.shape}; give an array of numbers.")
     return found
+
+
+def _check_places(given: Any, name: str) -> None:
+    """Raise InputError for an array of xarray or pandas whose labels of degree, order or pixel do not count from 0."""
+    labels = dict(given.indexes) if hasattr(given, "indexes") else {}
+    if hasattr(given, "iloc"):
+        labels = {given.index.name: given.index}
+    for key, places in labels.items():
+        if key in COUNTED and not np.array_equal(places, np.arange(len(places))):
+            raise InputError(
+                f"{name} has {key} = {places[0]} to {places[-1]} in its labels, but elements count from 0, one by one; "
+                "sort and fill it, or give plain numbers."
+            )
 
 
 def reals(given: Any, name: str, masked: float | None = None) -> NDArray[np.float64]:

@@ -80,8 +80,8 @@ class OrbitalDipole(Effect):
 
     Notes
     -----
-    A circular orbit in the ecliptic, with the anti-Sun direction of the scan. The rest of the dipole is not simulated:
-    it is taken to be subtracted.
+    The Earth's ellipse in the ecliptic, with the anti-Sun direction of the scan. The rest of the dipole is not
+    simulated: it is taken to be subtracted.
     """
 
     name = "orbital_dipole"

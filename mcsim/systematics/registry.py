@@ -12,6 +12,7 @@ from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from math import inf, isfinite
+from numbers import Real
 from pathlib import Path
 from sys import float_info
 from types import MappingProxyType
@@ -191,9 +192,12 @@ def _checked(what: str, value: Any, default: Any) -> Any:
             return tuple(float(_checked(what, item, 0.0)) for item in value)
         size = f"{len(default)} numbers" if default else "numbers"
         raise InputError(f"{what} = {value!r} must be a list of {size}.")
-    if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, Real) or not isfinite(value):
         raise InputError(f"{what} = {value!r} must be a finite number.")
-    return float(value)
+    number = float(value)
+    if what.endswith(": lat_deg") and abs(number) > 90.0:
+        raise InputError(f"{what} = {value!r} is no latitude; give -90 to 90, and the longitude as lon_deg.")
+    return number
 
 
 def basis_of(

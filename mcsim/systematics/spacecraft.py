@@ -22,10 +22,26 @@ def spin_phase(pointing: Pointing, time_s: Vector) -> Vector:
     return np.asarray(2.0 * np.pi * (time_s / model.spin_period_s % 1.0) + np.deg2rad(start_deg))
 
 
+ECCENTRICITY, PERIHELION_DEG = 0.0167, 102.9
+"""Of the Earth's orbit in this century, the ecliptic longitude as seen from the Sun."""
+
+
 def heading(model: ScanModel, time_s: Vector, frame: str, phase: float = 0.0) -> NDArray[np.float64]:
-    """Return the direction in which the Earth moves, turned by ``phase`` radians towards the Sun, shape (3, n)."""
-    orbit = 2.0 * np.pi * time_s / model.orbit_period_s + np.deg2rad(model.orbit_phase_deg) + phase
-    ecliptic = np.stack([-np.sin(orbit), np.cos(orbit), np.zeros_like(orbit)])
+    """Return the Earth's velocity over its mean, turned by ``phase`` radians towards the Sun, shape (3, n).
+
+    Notes
+    -----
+    The anti-Sun direction of the scan, which moves uniformly, is the Earth's mean longitude. On an ellipse the velocity
+    is one of constant size across the true longitude (the equation of the centre further on, to second order in the
+    eccentricity e), plus e times that across the perihelion (Murray & Dermott, Solar System Dynamics, 2.4): 2 % faster
+    and 2 degrees ahead at most. Velocities of ``astropy`` in 2026 are met to 1e-3.
+    """
+    mean = 2.0 * np.pi * time_s / model.orbit_period_s + np.deg2rad(model.orbit_phase_deg)
+    e, perihelion = ECCENTRICITY, np.deg2rad(PERIHELION_DEG)
+    anomaly = mean - perihelion
+    true = mean + 2.0 * e * np.sin(anomaly) + 1.25 * e**2 * np.sin(2.0 * anomaly) + phase
+    steady = perihelion + phase
+    ecliptic = np.stack([-np.sin(true) - e * np.sin(steady), np.cos(true) + e * np.cos(steady), np.zeros_like(true)])
     return np.asarray(rotation_matrix("ecliptic", frame) @ ecliptic)
 
 

@@ -11,11 +11,13 @@ import mcsim
 from comparisons import CASES, LMAX, MODEL, NSIDE, ODD, PEAR, Maps, Simulator, names, scaled, small
 from mcsim import config
 from mcsim.comparison import pairs, scene
+from mcsim.comparison.effects import effects_of
 from mcsim.comparison.map_differences import Calibration, Monopole
 from mcsim.comparison.pairs import with_known_offsets
 from mcsim.comparison.prediction import Set
-from mcsim.comparison.scene_differences import PixelWindow, Smoothing
+from mcsim.comparison.scene_differences import PixelWindow, Smoothing, TimeShift
 from mcsim.comparison.search import Problem
+from mcsim.comparison.shown_sky import with_shown_sky
 from mcsim.instrument.scan import MapGrid, write_moments_fits
 from mcsim.simulation import simulate, tod
 from mcsim.simulation.survey import survey
@@ -243,6 +245,42 @@ def test_an_effect_through_another_sky_is_measured_there(name, change):
     assert sorted(names(found)) == [name, "gain_drift"]
     drifting = next(d for d in found.channels[0].differences if d.name == "gain_drift")
     assert drifting.amplitude == pytest.approx(0.02, rel=0.01)
+
+
+@pytest.mark.slow
+def test_an_effect_beside_a_time_shift_is_that_of_late_samples():
+    """Otherwise a shift of the beam's size and an offset across it are better explained by one offset of the two."""
+    simulator = Simulator(small(), 0)
+    known = simulator.site.pointed("")
+    tilted = replace(known.line, boresight_angle_deg=known.line.boresight_angle_deg + 1.0)
+    later = scene.ahead(known.model, 601.0 * 0.003)
+    observe = tod.sky_signal(simulator.sky, 32, PEAR, 1e-8, 1)
+
+    def seen(half: int) -> NDArray[np.float64]:
+        grid = MapGrid(16, "ecliptic", (half / 2, (half + 1) / 2))
+        both = (tod.samples(model, line, grid) for model, line in ((known.model, known.line), (later, tilted)))
+        stream = (replace(there, pixel=here.pixel) for here, there in zip(*both, strict=True))
+        mean, hits = tod.bin_samples(observe(stream), 16)
+        return np.where(hits > 0, mean, healpy.UNSEEN)
+
+    pair = with_shown_sky(pairs.given(simulator(), [seen(0), seen(1)], simulator.run).pairs[0])
+    [offset] = [one for one in effects_of(pair, simulator.run) if one.name == "pointing_offset"]
+    problem = Problem(pair, (), 0.0)
+    members = ((TimeShift(), np.array([0.003])), (offset, np.array([0.0, -60.0])))
+    exact = problem._measured(Set(members, problem.left(members)))
+    assert exact.left < 1e-6
+    assert problem._measured(Set(members[:1], 1.0)).left > 0.01
+
+
+@pytest.mark.slow
+def test_both_ways_to_mirror_coordinates_are_tried_beside_others():
+    """Mirrored pixels explain nearly as much as a mirrored sky until the reversed precession is added."""
+    simulator = Simulator(small("planck", period_s=301.0))
+    found = mcsim.compare(
+        simulator(), simulator(sky=np.conj(simulator.sky), turning={"precession_period_s": -1.0}), simulator.run
+    )
+    assert sorted(names(found)) == ["frame_reversed", "precession_sign"]
+    assert found.channels[0].left < 1e-4
 
 
 @pytest.mark.parametrize("name", ["lmax_cut", "mmax_cut"])

@@ -18,10 +18,38 @@ from mcsim.simulation import simulate
 from mcsim.simulation.channels import MOST_ORDERS, NEGLECTED, load_beam, with_all_orders
 from mcsim.simulation.survey import survey
 from mcsim.sphere.rotation import rotate_alm
+from refusals import refused
 
 ELLIPSE = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 420.0, "fwhm_minor_arcmin": 320.0, "angle_deg": 20.0}
 PLAIN = MODEL | {"channel": [MODEL["channel"][0] | {"beam": ELLIPSE}]}
 """The beam without its m_max, of which a run takes two orders."""
+
+DESCRIPTION = """
+schema = 1
+name = "plain"
+[sky]
+spectrum = "wmap7"
+lmax = 32
+[map]
+nside = 16
+[[channel]]
+name = "W1"
+beam = { kind = "elliptical_gaussian", fwhm_major_arcmin = 420.0, fwhm_minor_arcmin = 320.0, angle_deg = 20.0 }
+scan = { kind = "hit_averaged", model = "wmap", line_of_sight = "A", sample_period_s = 601.0 }
+"""
+
+SIMULATOR = """
+import mcsim
+from comparisons import Simulator, small
+
+BEAM = mcsim.Beam.elliptical(420.0, 320.0, angle_deg=20.0, lmax=32, mmax=6)
+
+
+class Other:
+    def simulate(self, seed, effects=(), sky=None):
+        simulator = Simulator(small("wmap", BEAM, map={"nside": 16}))
+        return {"W1": simulator(sky=sky, psi=lambda p: p + 0.005)[0]}
+"""
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +81,7 @@ def test_a_small_turn_of_a_beam_without_m_max_is_no_other_ellipse(whole):
     assert found.channels[0].left < 1e-5
 
 
+@pytest.mark.slow
 def test_orders_that_a_run_leaves_out_are_those_of_its_own_maps(whole):
     """Maps of mcsim's own, which have fewer orders, are known for that on both sides, and told from maps with all."""
     cut = Simulator(PLAIN)
@@ -76,7 +105,7 @@ def test_maps_from_orientation_moments_have_the_orders_of_a_run(whole):
 
 def test_psi_of_the_other_sign_and_from_the_other_end_is_named():
     """Codes of the COSMO and the IAU convention exchange psi and pi - psi: neither a sign nor half a turn alone."""
-    beam = mcsim.Beam.elliptical(400.0, 320.0, 0.0, 32, mmax=3)
+    beam = mcsim.Beam.elliptical(400.0, 320.0, lmax=32, mmax=3)
     beam.blm[1] += 0.05 * beam.blm[0] * (np.arange(33) / 32) ** 3
     beam.blm[3, 3:] += 0.03 * beam.blm[0, 3:] * (np.arange(3, 33) / 32) ** 3
     simulator = Simulator(small("litebird", beam))
@@ -115,3 +144,53 @@ def test_a_report_of_maps_that_are_the_same_draws_no_warning(factors):
     found = mcsim.compare(side_a, side_b, Simulator().run)
     axes = report.figure(found.channels[0]).axes
     assert any("W1:half1" in one.get_title() for one in axes) == (factors[1] == 1.0)
+
+
+def test_the_nearest_set_is_said_as_a_whole():
+    """A sign alone leaves more than there was; beside half a turn it leaves next to nothing."""
+    beam = mcsim.Beam.elliptical(400.0, 320.0, lmax=32, mmax=3)
+    beam.blm[1] += 0.05 * beam.blm[0] * (np.arange(33) / 32) ** 3
+    simulator = Simulator(small("litebird", beam))
+    draw = np.random.default_rng(1)
+    side_b = [m + 0.5 * draw.standard_normal(m.size) for m in simulator(psi=lambda p: np.pi - p)]
+    [found] = mcsim.compare(simulator(), side_b, simulator.run).channels
+    assert found.verdict == "unknown"
+    assert 0.0 < found.nearest_explains < 1.0
+    assert f"{100 * found.nearest_explains:.0f} %" in found.sentence()
+    assert all(d.name in found.sentence() for d in found.nearest)
+
+
+def test_a_comparison_without_a_model_asks_for_one_and_knows_another_sky(tmp_path, whole):
+    turned, other = whole(psi=lambda p: p + 1.0), whole(sky=np.roll(whole.sky, 40))
+    for side, maps in (("a", whole()), ("b", turned), ("c", other)):
+        (tmp_path / side).mkdir()
+        for split, one in zip(MODEL["map"]["splits"], maps, strict=True):
+            healpy.write_map(tmp_path / side / f"W1_{split}.fits", one, dtype=np.float64, column_units="uK")
+    looks = []
+    for side in "bc":
+        found = mcsim.compare(tmp_path / "a", tmp_path / side)
+        assert found.verdict == "unknown"
+        assert "model" in str(found)
+        looks.append([look for channel in found.channels for look in channel.looks if "sides correlate" in look])
+    assert [len(one) for one in looks] == [0, 2]
+
+
+def test_a_configuration_beside_another_simulator_has_all_orders(tmp_path, whole):
+    (tmp_path / "other.py").write_text(SIMULATOR)
+    for name, more in (("plain", ""), ("other", 'simulator = "other.py:Other"\n')):
+        (tmp_path / f"{name}.toml").write_text(more + DESCRIPTION)
+    found = mcsim.compare(tmp_path / "plain.toml", tmp_path / "other.toml")
+    assert names(found) == ["psi_offset"]
+    assert found.channels[0].differences[0].amplitude == pytest.approx(np.rad2deg(0.005), rel=1e-3)
+    assert found.channels[0].left < 1e-3
+
+
+@pytest.mark.parametrize("name", ["maps.zarr", "W1.fits", "maps.npz"])
+def test_stored_maps_are_named_in_a_configuration(tmp_path, name):
+    if name.endswith(".zarr"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "zarr.json").write_text("{}")
+    else:
+        (tmp_path / name).write_bytes(b"\x93")
+    with refused(tmp_path / name, "maps", "CHANNEL.fits"):
+        mcsim.compare(tmp_path / name, tmp_path / name, config.load(MODEL))

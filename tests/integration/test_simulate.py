@@ -132,12 +132,12 @@ def test_mask_of_another_frame_and_resolution_with_a_soft_edge(tmp_path: Path) -
 
 
 def test_files_of_b_lm_may_be_turned(tmp_path: Path) -> None:
-    ellipse = beams.Beam.elliptical(300.0, 250.0, 10.0, 32, mmax=4)
+    ellipse = beams.Beam.elliptical(300.0, 250.0, angle_deg=10.0, lmax=32, mmax=4)
     packed = np.concatenate([ellipse.blm[m, m:] for m in range(5)])
     healpy.write_alm(tmp_path / "b.fits", packed, lmax=32, mmax=4, mmax_in=4, out_dtype=np.float64)
     turned = {"kind": "blm", "path": str(tmp_path / "b.fits"), "m_max": 4, "angle_deg": 25.0}
     (loaded,) = survey(config.load(table(channel=[channel(beam=turned)]))).channels
-    expected = beams.Beam.elliptical(300.0, 250.0, 35.0, 32, mmax=4).blm
+    expected = beams.Beam.elliptical(300.0, 250.0, angle_deg=35.0, lmax=32, mmax=4).blm
     np.testing.assert_allclose(loaded.beam.blm, expected, atol=1e-12)
 
 

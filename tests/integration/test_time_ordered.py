@@ -29,7 +29,7 @@ def sky() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def beam() -> Beam:
-    return Beam.elliptical(88.0 * 1.15**0.5, 88.0 / 1.15**0.5, 20.0, LMAX)
+    return Beam.elliptical(88.0 * 1.15**0.5, 88.0 / 1.15**0.5, angle_deg=20.0, lmax=LMAX)
 
 
 @pytest.fixture(scope="module")

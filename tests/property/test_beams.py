@@ -14,8 +14,8 @@ angles = st.floats(-180.0, 180.0)
 
 @given(widths, ratios, angles)
 def test_ellipse_turns_by_its_phases(minor: float, ratio: float, angle_deg: float) -> None:
-    upright = Beam.elliptical(minor * ratio, minor, 0.0, 150, 6).blm
-    turned = Beam.elliptical(minor * ratio, minor, angle_deg, 150, 6).blm
+    upright = Beam.elliptical(minor * ratio, minor, lmax=150, mmax=6).blm
+    turned = Beam.elliptical(minor * ratio, minor, angle_deg=angle_deg, lmax=150, mmax=6).blm
     phases = np.exp(-1j * np.arange(7) * np.radians(angle_deg))[:, None]
     np.testing.assert_allclose(turned, upright * phases, rtol=0, atol=1e-14 * np.abs(upright).max())
 
@@ -23,14 +23,14 @@ def test_ellipse_turns_by_its_phases(minor: float, ratio: float, angle_deg: floa
 @given(widths, ratios, angles)
 def test_no_coefficient_exceeds_that_of_a_point(minor: float, ratio: float, angle_deg: float) -> None:
     # A positive beam of unit integral has |b_lm| <= max |Y_lm| <= sqrt((2l+1)/4pi), reached at l = m = 0 only.
-    beam = Beam.elliptical(minor * ratio, minor, angle_deg, 150, 6)
+    beam = Beam.elliptical(minor * ratio, minor, angle_deg=angle_deg, lmax=150, mmax=6)
     bound = np.sqrt((2 * np.arange(151) + 1) / (4 * np.pi))
     assert np.all(np.abs(beam.blm) <= bound * (1 + 1e-14))
 
 
 @given(widths, ratios, st.integers(0, 12))
 def test_power_is_shared_between_what_is_kept_and_what_is_not(minor: float, ratio: float, mmax: int) -> None:
-    whole = Beam.elliptical(minor * ratio, minor, 0.0, 150, 20)
+    whole = Beam.elliptical(minor * ratio, minor, lmax=150, mmax=20)
     cut = whole.truncated(mmax)
     kept = power_by_order(cut.blm).sum() / power_by_order(whole.blm).sum() * (1 - whole.neglected_power)
     np.testing.assert_allclose(kept + cut.neglected_power, 1.0, rtol=1e-13)

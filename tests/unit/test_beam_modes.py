@@ -68,7 +68,7 @@ def test_score_is_the_derivative_of_the_likelihood(modes: BeamModes, matrices) -
 def test_mean_is_that_of_the_simulated_beam(modes: BeamModes, matrices) -> None:
     """Sign, phase and normalisation: exact mean for a slightly elliptical beam at 30 degrees, to second order."""
     response, inverse, changes = matrices
-    beam = Beam.elliptical(905.0, 895.0, 30.0, LMAX)
+    beam = Beam.elliptical(905.0, 895.0, angle_deg=30.0, lmax=LMAX)
     beta = np.zeros((ORDERS, LMAX + 1), dtype=complex)
     beta[1] = beam.blm[2] / beam.blm[0]
     seen = modes.filter.inverse.precision[0] > 0.0

@@ -33,7 +33,7 @@ def test_power_counts_both_signs_of_m() -> None:
 
 
 def test_circular_part() -> None:
-    beam = Beam.elliptical(30, 20, 40, 300, 4)
+    beam = Beam.elliptical(30, 20, angle_deg=40, lmax=300, mmax=4)
     circular = beam.circular()
     assert circular.mmax == 0
     np.testing.assert_array_equal(circular.window, beam.window)
@@ -68,15 +68,15 @@ def test_mmax_of_a_beam_known_only_up_to_a_lower_order() -> None:
 
 
 def test_chosen_mmax_of_mild_and_strong_ellipses() -> None:
-    assert Beam.elliptical(13.9, 12.7, 0, 1024).mmax == 2
-    assert Beam.elliptical(20, 12, 0, 1024).mmax == 4
-    assert Beam.elliptical(20, 12, 0, 1024).neglected_power < MMAX_TOLERANCE
+    assert Beam.elliptical(13.9, 12.7, lmax=1024).mmax == 2
+    assert Beam.elliptical(20, 12, lmax=1024).mmax == 4
+    assert Beam.elliptical(20, 12, lmax=1024).neglected_power < MMAX_TOLERANCE
 
 
 def test_values_are_the_elliptical_gaussian() -> None:
     sigma_major, sigma_minor = np.radians([1.0, 0.75]) / np.sqrt(8 * np.log(2))
     # At lmax 1500 and mmax 24 nothing of this beam is cut: what is left is the closed form's own error.
-    beam = Beam.elliptical(60, 45, 0, 1500, 24)
+    beam = Beam.elliptical(60, 45, lmax=1500, mmax=24)
     theta, phi = np.meshgrid(np.linspace(1e-3, 0.03, 12), np.arange(0, 6, 0.5))
     expected = np.exp(-((theta * np.cos(phi) / sigma_major) ** 2 + (theta * np.sin(phi) / sigma_minor) ** 2) / 2)
     expected /= 2 * np.pi * sigma_major * sigma_minor

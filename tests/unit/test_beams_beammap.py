@@ -82,7 +82,7 @@ def test_elliptical_gaussian_map_gives_the_closed_form(tmp_path, projection) -> 
     theta, phi = directions(200, (98.3, 101.6), projection)
     path = write(tmp_path / "beam.fits", ellipse(theta, phi))
     beam = Beam.from_map(read_map(path, projection=projection, centre=(98.3, 101.6)), 1024, 6)
-    expected = Beam.elliptical(13.9, 12.7, 25.0, 1024, 6)
+    expected = Beam.elliptical(13.9, 12.7, angle_deg=25.0, lmax=1024, mmax=6)
     # What is left is the closed form's error, 2e-11 of the order; no pixel effect at 5 pixels per FWHM.
     assert relative(beam.blm, expected.blm) < 1e-10
     for m in (2, 4):
@@ -110,7 +110,7 @@ def test_centre_is_column_and_row(tmp_path) -> None:
 def test_wrong_projection_is_seen_in_a_wide_beam(tmp_path) -> None:
     theta, phi = directions(240, (120, 120))
     path = write(tmp_path / "beam.fits", ellipse(theta, phi, 120, 90))
-    expected = Beam.elliptical(120, 90, 25.0, 200, 2).blm
+    expected = Beam.elliptical(120, 90, angle_deg=25.0, lmax=200, mmax=2).blm
     assert relative(Beam.from_map(path, 200, 2, cut_deg=4.5).blm, expected) < 1e-6
     assert relative(Beam.from_map(read_map(path, cut_deg=4.5, projection="orthographic"), 200, 2).blm, expected) > 1e-4
 
@@ -185,7 +185,8 @@ def test_beam_does_not_depend_on_where_it_lies_in_the_map(tmp_path, shift) -> No
     path = write(tmp_path / "beam.fits", ellipse(theta, phi, 6, 5.5))
     beam_map = read_map(path, cut_deg=2.0)
     assert beam_map.centre == pytest.approx((99 + shift[0], 98 + shift[1]), abs=1e-6)
-    assert relative(Beam.from_map(beam_map, 1024, 4).blm, Beam.elliptical(6, 5.5, 25, 1024, 4).blm) < 3e-7
+    expected = Beam.elliptical(6, 5.5, angle_deg=25, lmax=1024, mmax=4)
+    assert relative(Beam.from_map(beam_map, 1024, 4).blm, expected.blm) < 3e-7
 
 
 def test_centroid_is_over_fifteen_pixels() -> None:
@@ -217,7 +218,7 @@ def test_pixel_means_are_restored(tmp_path) -> None:
             theta, phi = directions(160, (79.3 - x, 80.1 - y))
             mean = mean + weight_y * weight_x * ellipse(theta, phi)
     path = write(tmp_path / "beam.fits", mean)
-    expected = Beam.elliptical(13.9, 12.7, 25.0, 1024, 4).blm
+    expected = Beam.elliptical(13.9, 12.7, angle_deg=25.0, lmax=1024, mmax=4).blm
     restored = read_map(path, centre=(79.3, 80.1)).without_pixel_window()
     assert relative(Beam.from_map(restored, 1024, 4).blm, expected) < 1e-6
     assert relative(Beam.from_map(path, 1024, 4, centre=(79.3, 80.1)).blm, expected) > 1e-3
@@ -226,7 +227,7 @@ def test_pixel_means_are_restored(tmp_path) -> None:
 def test_mmax_is_chosen_and_the_rest_reported(tmp_path) -> None:
     theta, phi = directions(160, (80, 80))
     path = write(tmp_path / "beam.fits", ellipse(theta, phi, 20, 12))
-    closed = Beam.elliptical(20, 12, 25, 1024)
+    closed = Beam.elliptical(20, 12, angle_deg=25, lmax=1024)
     beam = Beam.from_map(path, 1024)
     assert beam.mmax == closed.mmax == 4
     assert beam.neglected_power == pytest.approx(closed.neglected_power, rel=1e-6)
@@ -237,7 +238,7 @@ def test_plane_of_a_cube_and_given_pixel(tmp_path) -> None:
     cube = np.stack([ellipse(theta, phi), np.ones_like(theta), ellipse(theta, phi, 20, 12)])
     path = write(tmp_path / "cube.fits", cube, pixel_deg=None)
     beam = Beam.from_map(read_map(path, pixel_deg=PIXEL_DEG, plane=2), 500, 2)
-    assert relative(beam.blm, Beam.elliptical(20, 12, 25, 500, 2).blm) < 1e-6
+    assert relative(beam.blm, Beam.elliptical(20, 12, angle_deg=25, lmax=500, mmax=2).blm) < 1e-6
 
 
 def test_logarithmic_map_is_refused(tmp_path) -> None:

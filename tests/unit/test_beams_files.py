@@ -30,7 +30,7 @@ def write(path, beam: Beam, scale: float = 1.0):
 
 @pytest.fixture
 def beam() -> Beam:
-    return Beam.elliptical(60, 40, 30, 120, 6)
+    return Beam.elliptical(60, 40, angle_deg=30, lmax=120, mmax=6)
 
 
 def test_file_comes_back_normalised(tmp_path, beam) -> None:
@@ -42,7 +42,7 @@ def test_file_comes_back_normalised(tmp_path, beam) -> None:
 
 def test_lower_lmax_and_chosen_mmax(tmp_path, beam) -> None:
     read = Beam.from_blm(write(tmp_path / "beam.alm.fits", beam), 80)
-    expected = Beam.elliptical(60, 40, 30, 80)
+    expected = Beam.elliptical(60, 40, angle_deg=30, lmax=80)
     assert (read.lmax, read.mmax) == (80, expected.mmax)
     np.testing.assert_allclose(read.blm, expected.blm, rtol=0, atol=1e-15)
 

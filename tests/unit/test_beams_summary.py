@@ -24,7 +24,7 @@ def drawn(major, minor, angle_deg, size=151, centre=(74.6, 75.3), offset=(0.0, 0
 @pytest.mark.parametrize(("major", "minor", "angle_deg"), [(30.0, 24.0, 20.0), (40.0, 20.0, -65.0)])
 def test_ellipse_is_measured(known_as, major, minor, angle_deg) -> None:
     # At lmax 3000 and mmax 60 nothing of these beams is cut, so that no rings are measured as negative response.
-    beam = Beam.elliptical(major, minor, angle_deg, 3000, 60)
+    beam = Beam.elliptical(major, minor, angle_deg=angle_deg, lmax=3000, mmax=60)
     beam_map = drawn(major, minor, angle_deg) if known_as == "map" else None
     summary = summarize(beam, beam_map)
     sigma = np.radians(np.array([major, minor]) / 60) * SIGMA_PER_FWHM
@@ -46,7 +46,7 @@ def test_circular_beam() -> None:
 
 
 def test_coefficients_at_the_listed_degrees() -> None:
-    beam = Beam.elliptical(30, 24, 20, 600, 4)
+    beam = Beam.elliptical(30, 24, angle_deg=20, lmax=600, mmax=4)
     summary = summarize(beam, ells=(100, 400, 601))
     assert summary.ells == (100, 400)
     np.testing.assert_allclose(summary.window, beam.window[[100, 400]], rtol=1e-15)
@@ -88,7 +88,7 @@ def test_text_warns_of_a_beam_cut_at_lmax() -> None:
 @pytest.mark.parametrize("known_as", ["map", "blm", "circular"])
 def test_figure_has_its_panels(tmp_path, known_as) -> None:
     beam_map = drawn(30.0, 24.0, 20.0)
-    beam = Beam.gaussian(30, 800) if known_as == "circular" else Beam.elliptical(30, 24, 20, 800)
+    beam = Beam.gaussian(30, 800) if known_as == "circular" else Beam.elliptical(30, 24, angle_deg=20, lmax=800)
     figure = beam_figure(beam, beam_map if known_as == "map" else None, "a beam")
     assert isinstance(figure, Figure)
     panels = [axes for axes in figure.axes if axes.get_title()]

@@ -12,7 +12,7 @@ LMAX = 40
 def beam() -> Beam:
     """A beam with every order, odd and imaginary ones included, that no turn or mirror leaves alone."""
     rng = np.random.default_rng(3)
-    blm = Beam.elliptical(700.0, 500.0, 20.0, LMAX, mmax=4).blm.copy()
+    blm = Beam.elliptical(700.0, 500.0, angle_deg=20.0, lmax=LMAX, mmax=4).blm.copy()
     blm[1:] += 0.02 * (rng.standard_normal(blm[1:].shape) + 1j * rng.standard_normal(blm[1:].shape))
     blm[np.arange(5)[:, None] > np.arange(LMAX + 1)] = 0.0
     return Beam(blm)
@@ -23,10 +23,9 @@ THETA, PHI = (angles.ravel() for angles in np.meshgrid(np.linspace(0.01, 0.4, 7)
 
 def test_rotated_turns_from_x_towards_y(beam):
     np.testing.assert_allclose(beam.rotated(0.7).values(THETA, PHI + 0.7), beam.values(THETA, PHI), rtol=1e-10)
-    ellipse = Beam.elliptical(700.0, 500.0, 0.0, LMAX, mmax=4)
-    np.testing.assert_allclose(
-        ellipse.rotated(np.deg2rad(30.0)).blm, Beam.elliptical(700.0, 500.0, 30.0, LMAX, mmax=4).blm, atol=1e-12
-    )
+    ellipse = Beam.elliptical(700.0, 500.0, lmax=LMAX, mmax=4)
+    turned = Beam.elliptical(700.0, 500.0, angle_deg=30.0, lmax=LMAX, mmax=4)
+    np.testing.assert_allclose(ellipse.rotated(np.deg2rad(30.0)).blm, turned.blm, atol=1e-12)
 
 
 def test_mirrored_exchanges_x_and_minus_x(beam):

@@ -100,7 +100,7 @@ def written(folder: Path) -> dict[str, dict]:
 def unnormalised() -> np.ndarray:
     """Coefficients in healpy's order with every m up to lmax, in a unit of their own."""
     blm = np.zeros((LMAX + 1, LMAX + 1), complex)
-    blm[:5] = Beam.elliptical(300.0, 240.0, 20.0, LMAX, 4).blm
+    blm[:5] = Beam.elliptical(300.0, 240.0, angle_deg=20.0, lmax=LMAX, mmax=4).blm
     return 3.0 * np.concatenate([blm[m, m:] for m in range(LMAX + 1)])
 
 
@@ -124,7 +124,7 @@ def test_hash_is_of_the_content(tmp_path) -> None:
 
 
 def test_beam_survives_exactly() -> None:
-    beam = replace(Beam.elliptical(300.0, 200.0, 35.0, 60), integral=1.0 / 3.0)
+    beam = replace(Beam.elliptical(300.0, 200.0, angle_deg=35.0, lmax=60), integral=1.0 / 3.0)
     kept = channels.load_beam(config.load(table(beam=beam)).channels[0], 60)
     assert kept.blm.tobytes() == beam.blm.tobytes()
     assert (kept.neglected_power, kept.integral) == (beam.neglected_power, beam.integral)

@@ -166,6 +166,32 @@ def test_what_a_drawn_pattern_leaves_in_the_maps_is_its_own(bench):
     assert not any(one.kind == "map" for own in found.comparisons for one in own)
 
 
+def test_more_noise_is_more_in_all_degrees_and_in_pixels():
+    """Stripes raise the power of the difference of splits where they are; power scatters more where there is more."""
+    known = {"statistic": "cl", "channels": ("W1",), "L": 0}
+    elements = [
+        Element(f"difference/{low}", ell=(low, high), kind="difference", **known) for low, high in ((2, 12), (13, 24))
+    ]
+    elements += [Element(f"noise/{fold}", "noise", ("W1",), fold=fold, kind="noise") for fold in (0, 1)]
+    elements.append(Element("residual", "map", ("W1",), ell=(0, 0), L=0, M=0, kind="residual", frame="ecliptic"))
+    drawn, empty = np.random.default_rng(5).normal(size=(400, 5)), np.zeros((0, 5))
+    ensemble = NullEnsemble(drawn, np.zeros(5), tuple(elements), empty, empty, empty, empty, empty)
+    white, stripes = np.array([5.0, 15.0, 10.0, 10.0, 0.0]), np.array([0.0, 22.0, 10.0, 10.0, 0.0])
+    candidate = Candidate(systematics.get("noise_level"), "W1", (0,))
+
+    def refused(z, growth):
+        tested = Slices(ensemble, z, 1, ("half1", "half2"), 24, DiagnosisSettings())
+        action = Action(white, np.zeros((5, 0)), 0.05, growth=growth)
+        (own,) = (found := tested.findings([candidate], [action])).comparisons
+        (degrees,) = (one for one in own if one.kind == "degrees")
+        assert degrees.slices == ("ℓ 0–12", "ℓ 13–24", "single pixels")
+        return found.contradict(DiagnosisSettings())
+
+    assert not refused(white, 1.4)
+    assert refused(stripes, 1.4)
+    assert not refused(stripes, 5.0)
+
+
 def test_nothing_contradicts_an_effect_that_no_part_measures():
     """As an error of the noise level: neither parts nor the largest scales are compared."""
     assert not Findings(comparisons=((),)).contradict(DiagnosisSettings())

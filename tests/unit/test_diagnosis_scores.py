@@ -5,11 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mcsim import systematics
+from mcsim import config, systematics
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.wiener_filter import model_of, shared_sky
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import ScanModel
-from mcsim.simulation import pixel_means
+from mcsim.simulation import pixel_means, simulate
 from mcsim.simulation.pixel_means import mean_gain
+from mcsim.simulation.survey import survey
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix
 
 HALVES = ((0.0, 0.5), (0.5, 1.0))
 
@@ -24,7 +29,7 @@ def test_gain_of_every_half_is_kept_apart(monkeypatch: pytest.MonkeyPatch) -> No
         frame="ecliptic",
         nside=8,
         lmax=8,
-        beam=Beam.elliptical(330.0, 300.0, 20.0, 8),
+        beam=Beam.elliptical(330.0, 300.0, angle_deg=20.0, lmax=8),
         pointing=systematics.Pointing(model, replace(line, sample_period_s=None)),
         dipole_uk=np.zeros(3),
     )
@@ -40,3 +45,33 @@ def test_gain_of_every_half_is_kept_apart(monkeypatch: pytest.MonkeyPatch) -> No
     first, second = (pixel_means.gain_of(drifts[1], site, share).mean() for share in HALVES)
     assert first == pytest.approx(0.01 * 2 / np.pi, rel=0.1)
     assert second == pytest.approx(-first, rel=0.1)
+
+
+def test_channels_of_one_beam_are_filtered_as_each_by_itself() -> None:
+    """The filter is a sum over maps, whatever is analysed together."""
+    channels = [
+        {
+            "name": name,
+            "beam": {"kind": "gaussian", "fwhm_arcmin": fwhm_arcmin},
+            "noise": {"sigma0_uk": sigma0_uk},
+            "scan": {"kind": "parallel_transport", "psi0_deg": 20.0},
+        }
+        for name, fwhm_arcmin, sigma0_uk in (("W1", 700.0, 10.0), ("V1", 900.0, 30.0), ("W2", 700.0, 20.0))
+    ]
+    run = {
+        "schema": 1,
+        "name": "alike",
+        "sky": {"spectrum": "wmap7", "lmax": 16},
+        "map": {"nside": 8, "splits": ["half1", "half2"]},
+        "channel": channels,
+    }
+    model = model_of(survey(config.load(run)), DiagnosisSettings())
+    assert sorted(members for _, members in model.alike) == [(0, 1, 4, 5), (2, 3)]
+    maps = simulate.maps(model.survey, 0)
+    total, gain = np.zeros(alm_.size(16), dtype=np.complex128), np.zeros(17)
+    for map_uk, part in zip(maps, model.parts, strict=True):
+        response = model.response[part.channel]
+        total += alm_.multiply(healpix.analysis(map_uk, 16, 1), response / part.noise_power, 16)
+        gain += response**2 / part.noise_power
+    expected = alm_.multiply(total, model.cl / (1.0 + model.cl * gain), 16)
+    np.testing.assert_allclose(shared_sky(model, list(maps)), expected, rtol=1e-11, atol=1e-11)

@@ -41,9 +41,9 @@ def same(found: Beam, expected: Beam, tolerance: float) -> None:
 def test_a_round_gaussian_stretches_to_closed_forms(lmax):
     beam = Beam.gaussian(FWHM, lmax)
     ellipse = systematics.get("beam_ellipticity")(amplitude=0.1, angle_deg=20.0).beam(beam, site_of(beam))
-    same(ellipse, Beam.elliptical(FWHM * 1.1**0.5, FWHM / 1.1**0.5, 20.0, lmax, ellipse.mmax), 1e-9)
+    same(ellipse, Beam.elliptical(FWHM * 1.1**0.5, FWHM / 1.1**0.5, angle_deg=20.0, lmax=lmax, mmax=ellipse.mmax), 1e-9)
     turned = systematics.get("beam_ellipticity")(amplitude=-0.1, angle_deg=20.0).beam(beam, site_of(beam))
-    same(turned, Beam.elliptical(FWHM * 1.1**0.5, FWHM / 1.1**0.5, 110.0, lmax, turned.mmax), 1e-9)
+    same(turned, Beam.elliptical(FWHM * 1.1**0.5, FWHM / 1.1**0.5, angle_deg=110.0, lmax=lmax, mmax=turned.mmax), 1e-9)
     wide = systematics.get("beam_width")(amplitude=0.02).beam(beam, site_of(beam))
     same(wide, Beam.gaussian(FWHM * 1.02, lmax), 1e-9)
 
@@ -51,17 +51,17 @@ def test_a_round_gaussian_stretches_to_closed_forms(lmax):
 @pytest.mark.parametrize("lmax", [192, 512])
 def test_an_elliptical_beam_stretches_further(lmax):
     """What continues an ellipse beyond lmax is no closed form: 3e-7 there, 1e-8 where there is little to continue."""
-    beam = Beam.elliptical(FWHM * 1.1**0.5, FWHM / 1.1**0.5, 20.0, lmax, 8)
+    beam = Beam.elliptical(FWHM * 1.1**0.5, FWHM / 1.1**0.5, angle_deg=20.0, lmax=lmax, mmax=8)
     found = systematics.get("beam_ellipticity")(amplitude=0.05, angle_deg=20.0).beam(beam, site_of(beam))
     ratio = 1.1 * 1.05
-    expected = Beam.elliptical(FWHM * ratio**0.5, FWHM / ratio**0.5, 20.0, lmax, found.mmax)
+    expected = Beam.elliptical(FWHM * ratio**0.5, FWHM / ratio**0.5, angle_deg=20.0, lmax=lmax, mmax=found.mmax)
     same(found, expected, 1e-6 if lmax == 192 else 3e-8)
 
 
 def test_a_beam_map_stretches_as_its_values():
     """A lopsided beam, by its values at the points that the stretch sends to each other."""
     lmax = 400
-    beam = displaced(Beam.elliptical(150.0, 120.0, 0.0, lmax, 8), 0.4, np.deg2rad(0.5))
+    beam = displaced(Beam.elliptical(150.0, 120.0, lmax=lmax, mmax=8), 0.4, np.deg2rad(0.5))
     found = stretched(beam, 1.1, 0.95, 0.3, 24, 12)
     rng = np.random.default_rng(1)
     x, y = np.deg2rad(rng.uniform(-2.0, 2.0, (2, 40)))
@@ -147,7 +147,7 @@ def test_displaced_beam_is_a_rotated_one():
     ell = np.arange(1, lmax + 1)
     expected = np.sqrt(4 * np.pi / (2 * ell + 1)) * round_beam.blm[0, 1:] * sph_harm_y(ell, 1, distance, angle).conj()
     np.testing.assert_allclose(found.blm[1, 1:], expected, rtol=0.0, atol=1e-13)
-    ellipse = Beam.elliptical(100.0, 80.0, 20.0, lmax, 4)
+    ellipse = Beam.elliptical(100.0, 80.0, angle_deg=20.0, lmax=lmax, mmax=4)
     found = displaced(ellipse, angle, distance)
     rotated = ducc0.sht.rotate_alm(every_order(ellipse), lmax, -angle, distance, angle)
     np.testing.assert_allclose(found.blm, orders(rotated, lmax, found.mmax), rtol=0.0, atol=1e-12)
@@ -157,7 +157,7 @@ def test_displaced_beam_is_a_rotated_one():
 def test_smeared_beam_is_filtered_in_the_spin_frame():
     """e_phi is the direction of motion, beam x: from the pole to the circle by R_y(boresight) R_z(90 deg)."""
     lmax, boresight, lag = 192, np.deg2rad(70.5), 0.004
-    beam = Beam.elliptical(100.0, 80.0, 20.0, lmax, 4)
+    beam = Beam.elliptical(100.0, 80.0, angle_deg=20.0, lmax=lmax, mmax=4)
     for signed in (lag, -lag):
         found = smeared(beam, boresight, signed)
         spin = ducc0.sht.rotate_alm(every_order(beam), lmax, np.pi / 2, boresight, 0.0)
@@ -172,7 +172,7 @@ def test_smeared_beam_is_filtered_in_the_spin_frame():
 def test_time_constant_is_the_mean_of_the_past():
     """Quadrature over earlier positions of the beam on its circle, node by node, against the filter."""
     lmax = 96
-    beam = Beam.elliptical(200.0, 150.0, 20.0, lmax, 4)
+    beam = Beam.elliptical(200.0, 150.0, angle_deg=20.0, lmax=lmax, mmax=4)
     effect = systematics.get("time_constant")(amplitude=0.1)
     site = site_of(beam)
     found = effect.pointing(beam, site)
@@ -191,7 +191,7 @@ def test_time_constant_is_the_mean_of_the_past():
 def test_moved_samples_see_what_a_displaced_beam_sees():
     """Both hooks of the offset, by interpolated convolution at 200 directions and orientations."""
     lmax, rng = 96, np.random.default_rng(3)
-    beam = Beam.elliptical(200.0, 150.0, 20.0, lmax, 6)
+    beam = Beam.elliptical(200.0, 150.0, angle_deg=20.0, lmax=lmax, mmax=6)
     sky = gaussian_alm(load("wmap7", lmax), rng)
     theta, phi, psi = np.arccos(rng.uniform(-1, 1, 200)), rng.uniform(0, 2 * np.pi, 200), rng.uniform(-3, 3, 200)
     effect = systematics.get("pointing_offset")(amplitude=40.0, angle_deg=65.0)
@@ -218,7 +218,7 @@ def test_moved_samples_see_what_a_displaced_beam_sees():
 
 def test_orders_that_were_left_out_come_back():
     """Beside what other effects have made of the orders that were kept, and of orders that were not there."""
-    whole = Beam.elliptical(FWHM * 1.1**0.5, FWHM / 1.1**0.5, 20.0, 64, 6)
+    whole = Beam.elliptical(FWHM * 1.1**0.5, FWHM / 1.1**0.5, angle_deg=20.0, lmax=64, mmax=6)
     believed = whole.truncated(2)
     site = replace(site_of(believed), whole=lambda: whole)
     kind = systematics.get("beam_noncircularity")

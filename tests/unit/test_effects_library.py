@@ -68,7 +68,7 @@ def site() -> systematics.Site:
         frame="galactic",
         nside=NSIDE,
         lmax=LMAX,
-        beam=Beam.elliptical(330.0, 300.0, 20.0, LMAX),
+        beam=Beam.elliptical(330.0, 300.0, angle_deg=20.0, lmax=LMAX),
         pointing=systematics.Pointing(model, model.line_of_sight("A")),
         dipole_uk=np.array([1.0, 2.0, 3.0]),
     )

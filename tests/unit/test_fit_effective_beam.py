@@ -106,7 +106,7 @@ def test_what_other_orders_of_the_beam_do_is_no_part_of_the_factor(shared):
 
 def test_angle_between_two_sides_and_their_common_turn(shared):
     """Sides at 7 - 15 and 7 + 15 degrees, made by turning the Gaussian itself."""
-    sides = [Beam.elliptical(70.0, 60.0, angle, LMAX).blm for angle in (-8.0, 22.0)]
+    sides = [Beam.elliptical(70.0, 60.0, angle_deg=angle, lmax=LMAX).blm for angle in (-8.0, 22.0)]
     names = ("L2M0d0", "L2M0d1", "L2M0d2")
     angles = orientation(fit(expected(shared, 0.5 * (sides[0] + sides[1]), names), shared, "orientation"))
     assert angles.symmetric_deg == pytest.approx(30.0, abs=1e-4)
@@ -115,7 +115,7 @@ def test_angle_between_two_sides_and_their_common_turn(shared):
 
 
 def test_even_parity_alone_leaves_the_common_turn_open(shared):
-    sides = [Beam.elliptical(70.0, 60.0, angle, LMAX).blm for angle in (0.0, 30.0)]
+    sides = [Beam.elliptical(70.0, 60.0, angle_deg=angle, lmax=LMAX).blm for angle in (0.0, 30.0)]
     found = fit(expected(shared, 0.5 * (sides[0] + sides[1])), shared, "orientation")
     angles = orientation(found)
     assert found.model.parameters == ("real",)

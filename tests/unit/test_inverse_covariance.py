@@ -34,7 +34,7 @@ def maps_with_everything(rng: np.random.Generator) -> list[ObservedMap]:
     npix = 12 * NSIDE**2
     lat = np.arcsin(healpy.pix2vec(NSIDE, np.arange(npix))[2])
     mask = np.abs(np.rad2deg(lat)) > 12.0
-    elliptical = convolve.response(Beam.elliptical(900.0, 600.0, 20.0, LMAX), LMAX)
+    elliptical = convolve.response(Beam.elliptical(900.0, 600.0, angle_deg=20.0, lmax=LMAX), LMAX)
     round_beam = convolve.response(Beam.gaussian(500.0, LMAX), LMAX)
     size = elliptical.mmax
     w = rng.uniform(-0.6, 0.6, (size, npix)) + 1j * rng.uniform(-0.6, 0.6, (size, npix))

@@ -47,7 +47,8 @@ def sky() -> np.ndarray:
 @pytest.fixture(scope="module")
 def beams() -> tuple[Beam, Beam]:
     """Different widths, axes and numbers of orders on the two sides."""
-    return Beam.elliptical(700.0, 500.0, 20.0, LMAX, mmax=4), Beam.elliptical(600.0, 500.0, -50.0, LMAX, mmax=2)
+    right = Beam.elliptical(600.0, 500.0, angle_deg=-50.0, lmax=LMAX, mmax=2)
+    return Beam.elliptical(700.0, 500.0, angle_deg=20.0, lmax=LMAX, mmax=4), right
 
 
 def pointing_matrix(scan: mapmaking.DifferencingScan, x: float) -> np.ndarray:

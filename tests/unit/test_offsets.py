@@ -202,7 +202,7 @@ def table(moments: Moments, beam: Beam, sky: np.ndarray, **map_keys: object) -> 
 
 @pytest.fixture(scope="module")
 def beam() -> Beam:
-    return Beam.elliptical(900.0, 600.0, 30.0, LMAX, 2)
+    return Beam.elliptical(900.0, 600.0, angle_deg=30.0, lmax=LMAX, mmax=2)
 
 
 def test_a_run_takes_the_powers_it_asks_for(sky, beam, streamed) -> None:

@@ -172,7 +172,7 @@ def sky() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def beam() -> Beam:
-    blm = Beam.elliptical(900.0, 600.0, 30.0, LMAX, 4).blm
+    blm = Beam.elliptical(900.0, 600.0, angle_deg=30.0, lmax=LMAX, mmax=4).blm
     return Beam(blm + 0.1j * np.triu(np.abs(blm)) * (np.arange(5) > 0)[:, None])
 
 
@@ -193,7 +193,7 @@ def test_observed_map_is_the_mean_of_its_samples(sky, beam) -> None:
 
 def test_observed_map_is_that_of_a_run_bit_for_bit(sky) -> None:
     """Pixel window and centroids included."""
-    beam = Beam.elliptical(900.0, 600.0, 30.0, LMAX)
+    beam = Beam.elliptical(900.0, 600.0, angle_deg=30.0, lmax=LMAX)
     moments = Moments.from_model(ScanModel.load("wmap").with_sampling(600.0), NSIDE, beam.mmax)
     channel = {"name": "W1", "beam": beam, "scan": moments}
     table = {"name": "test", "sky": {"alm": sky, "lmax": LMAX}, "map": {"nside": NSIDE}, "channel": [channel]}
@@ -301,7 +301,7 @@ def test_constructors_check_their_input(make) -> None:
 
 def test_beam_of_an_array_is_that_of_its_file(tmp_path) -> None:
     whole = np.zeros((LMAX + 1, LMAX + 1), complex)
-    whole[:5] = Beam.elliptical(900.0, 600.0, 30.0, LMAX, 4).blm
+    whole[:5] = Beam.elliptical(900.0, 600.0, angle_deg=30.0, lmax=LMAX, mmax=4).blm
     packed = np.concatenate([whole[m, m:] for m in range(LMAX + 1)])
     healpy.write_alm(tmp_path / "blm.fits", packed, out_dtype=float)
     for given in (packed, whole):

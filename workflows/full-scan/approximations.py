@@ -37,7 +37,7 @@ def against_samples(nside: int, period_s: float) -> dict[str, float]:
     """Print the residual of the default route against the time-ordered reference, uK; return it over the effect."""
     lmax = 2 * nside + nside // 2
     model = scan.ScanModel.load("wmap").with_sampling(period_s).with_lines_of_sight("A")
-    beam = beams.Beam.elliptical(13.9, 12.7, 0.0, lmax, 2)
+    beam = beams.Beam.elliptical(13.9, 12.7, lmax=lmax, mmax=2)
     sky = gaussian_alm(spectra.load("wmap7", lmax), rng.generator(1, 0, "sky"))
     moments = scan.Moments.on_grid(model, MapGrid(nside, offset_order=4), 2, nthreads=THREADS)
     line, grid = model.line_of_sight("A"), MapGrid(nside)

@@ -21,7 +21,7 @@ def elliptical_blm() -> Figure:
     figure = Figure(figsize=(10.0, 4.0), layout="constrained")
     for axes, (name, (fwhm, eccentricity)) in zip(figure.subplots(1, 2, sharey=True), ELLIPSES.items(), strict=True):
         minor = fwhm * np.sqrt(1.0 - eccentricity**2)
-        blm = beams.Beam.elliptical(fwhm, minor, 0.0, LMAX, 4).blm
+        blm = beams.Beam.elliptical(fwhm, minor, lmax=LMAX, mmax=4).blm
         for m, colour in ((0, "#222222"), (2, "#1f5fa8"), (4, "#3c8c3c")):
             axes.semilogy(np.arange(m, LMAX + 1), np.abs(blm[m, m:]), color=colour, label=f"m = {m}")
         axes.set_ylim(1e-7, 20)

@@ -56,7 +56,7 @@ BORESIGHT_DEG = MODEL.line_of_sight("A").boresight_angle_deg
 def horn_sky() -> tuple[np.ndarray, Beam]:
     """The sky's a_lm in uK, and the beam."""
     alm = sky.gaussian_alm(spectra.load("planck2018", LMAX), np.random.default_rng(1))
-    return alm, Beam.elliptical(*FWHM_ARCMIN, 0.0, LMAX, M_MAX)
+    return alm, Beam.elliptical(*FWHM_ARCMIN, lmax=LMAX, mmax=M_MAX)
 
 
 def observation(days: float, quaternion_step_s: float, dtype: type) -> lbs.Simulation:

@@ -66,7 +66,8 @@ def focal_plane(path: Path, frequency: str, reading: str) -> list[Shape]:
 
 def mean_beam(radiometers: list[Shape]) -> NDArray[np.complex128]:
     """b_lm of the mean of elliptical Gaussians, m <= 2, shape (3, LMAX + 1)."""
-    return np.mean([beams.Beam.elliptical(*shape, LMAX, 2).blm for shape in radiometers], axis=0)
+    made = [beams.Beam.elliptical(*widths, angle_deg=angle, lmax=LMAX, mmax=2) for *widths, angle in radiometers]
+    return np.mean([beam.blm for beam in made], axis=0)
 
 
 def predicted(blm: NDArray[np.complex128], w: NDArray[np.complex128]) -> tuple[NDArray, NDArray]:

@@ -249,8 +249,9 @@ def judged(case: Case, seed: int) -> tuple[str, str]:
     first = (found.verdict,) if found.verdict == "unknown" else answers[0]
     right = "yes" if first == wanted else "among equals" if wanted in answers[1:] else "**no**"
     said = " + ".join(f"{d.name} {d.amplitude:.5g}" for d in channel.differences) or found.verdict
-    if channel.nearest is not None and not channel.differences:
-        said += f" (nearest {channel.nearest.name} {channel.nearest.amplitude:.3g}: {channel.nearest.explains:.0%})"
+    if channel.nearest and not channel.differences:
+        near = " and ".join(f"{d.name} {d.amplitude:.3g}" for d in channel.nearest)
+        said += f" (nearest {near}: {channel.nearest_explains:.0%})"
     others = ", ".join("+".join(d.name for d in one) for one in channel.alternatives)
     return right, (
         f"| {case.scan} | {case.simulator} | {case.what} | {channel.accuracy:.1e} | {said} | "

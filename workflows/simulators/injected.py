@@ -189,8 +189,8 @@ def judged(scan: str, shape: str, names: tuple[str, ...], sizes: tuple[int, ...]
     else:
         right = "yes" if answers[0] == wanted else "among equals" if wanted in answers else "wrong"
     said = " + ".join(f"{d.name} {d.amplitude:.4g}" for d in channel.differences) or found.verdict
-    if channel.nearest is not None and not channel.differences:
-        said += f" (nearest {channel.nearest.name}: {channel.nearest.explains:.0%})"
+    if channel.nearest and not channel.differences:
+        said += f" (nearest {' and '.join(d.name for d in channel.nearest)}: {channel.nearest_explains:.0%})"
     others = ", ".join("+".join(sorted(one)) for one in answers[1:])
     what = " + ".join(f"{name}/{size}" for name, size in zip(names, sizes, strict=True))
     return right, (

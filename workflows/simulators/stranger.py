@@ -26,7 +26,7 @@ Vector = np.ndarray
 
 def beam_of(shape: str) -> mcsim.Beam:
     """Return a beam: an ellipse at 20 degrees, or one with a coma and a pear's shape besides (m = 1 and 3)."""
-    beam = mcsim.Beam.elliptical(200.0, 160.0, 20.0, LMAX, mmax=0 if shape == "circular" else 4)
+    beam = mcsim.Beam.elliptical(200.0, 160.0, angle_deg=20.0, lmax=LMAX, mmax=0 if shape == "circular" else 4)
     if shape != "pear":
         return beam
     blm, size = beam.blm.copy(), np.deg2rad(76.0 / 60.0) * np.sqrt(ELL * (ELL + 1.0))
@@ -39,7 +39,9 @@ def run_of(scan: str, shape: str, channels: tuple[str, ...] = ("T",), seed: int 
     """Return the run that describes side A: two halves of a year of a packaged scan, decimated."""
     made = []
     for number, name in enumerate(channels):
-        beam = beam_of(shape) if number == 0 else mcsim.Beam.elliptical(180.0, 150.0, -10.0, LMAX, mmax=4)
+        beam = (
+            beam_of(shape) if number == 0 else mcsim.Beam.elliptical(180.0, 150.0, angle_deg=-10.0, lmax=LMAX, mmax=4)
+        )
         line = {"line_of_sight": "AB"[number % 2]} if scan == "wmap" else {}
         period = {"kind": "hit_averaged", "model": scan, "sample_period_s": SCANS[scan]}
         made.append({"name": name, "frequency_ghz": 94.0, "beam": beam, "scan": period | line})

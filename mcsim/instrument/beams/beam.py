@@ -15,7 +15,7 @@ from mcsim.instrument.beams.coefficients import check_mmax, choose_mmax, cut, po
 from mcsim.instrument.beams.files import checked_blm
 from mcsim.instrument.beams.gaussian import elliptical_blm
 from mcsim.instrument.beams.window import read_window
-from mcsim.sphere.checks import check_angle, check_finite, check_shape
+from mcsim.sphere.checks import check_angle, check_finite, check_number, check_shape
 from mcsim.support.arrays import reals
 from mcsim.support.folders import unwritable, user_path
 from mcsim.support.npy import read_npz
@@ -98,13 +98,15 @@ class Beam:
         >>> print(f"{Beam.gaussian(30.0, lmax=200).window[200]:.4f}")
         0.7588
         """
-        return cls.elliptical(fwhm_arcmin, fwhm_arcmin, 0.0, lmax, 0)
+        check_number(fwhm_arcmin, "fwhm_arcmin", "arcmin")
+        return cls.elliptical(fwhm_arcmin, fwhm_arcmin, lmax=lmax, mmax=0)
 
     @classmethod
     def elliptical(
         cls,
         fwhm_major_arcmin: float,
         fwhm_minor_arcmin: float,
+        *,
         angle_deg: float = 0.0,
         lmax: int = DEFAULT_LMAX,
         mmax: int | None = None,
@@ -194,6 +196,8 @@ class Beam:
         elif pixel_deg is None:
             raise InputError("pixel_deg is not given, but an array does not say it; give the side of a pixel in deg")
         else:
+            if tuple(getattr(source, "dims", ())) == ("x", "y"):
+                raise InputError("the beam map has the dimensions (x, y), but its rows are y; transpose it")
             image = reals(source, "the beam map")
             beam_map = placed(image, pixel_deg, cut_deg=cut_deg, centre=centre)
         lmax = min(DEFAULT_LMAX, int(pi / beam_map.pixel_rad)) if lmax is None else lmax

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.instrument.beams.coefficients import check_lmax, check_mmax, unpacked
-from mcsim.sphere.checks import check_finite
+from mcsim.sphere.checks import check_finite, check_number
 from mcsim.sphere.header import opened
 from mcsim.support.folders import unreadable, user_path
 from mcsim.support.npy import read_npy
@@ -139,6 +139,8 @@ def placed(
         raise InputError(f"projection = {projection!r} is not one of {', '.join(get_args(Projection))}")
     if image.ndim != 2:
         raise InputError(f"{origin} has {image.ndim} dimensions where a beam map has 2: rows along y, columns along x")
+    for name, value in (("pixel_deg", pixel_deg), ("cut_deg", cut_deg)):
+        check_number(value, name, "degrees")
     pixel = np.radians(pixel_deg)
     if not 0 < pixel < np.radians(10):
         raise InputError(f"the pixel of a beam map, {np.degrees(pixel):g} deg, must lie between 0 and 10 deg")
@@ -155,6 +157,8 @@ def placed(
         )
     if centre is None:
         centre = find_centre(image, origin)
+    elif np.shape(centre) != (2,):
+        raise InputError(f"centre = {centre!r} is no pair of numbers: give (column, row), counted from 0")
     return BeamMap(image, float(pixel), centre, float(np.radians(cut_deg)), projection)
 
 

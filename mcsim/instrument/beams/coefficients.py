@@ -9,14 +9,17 @@ from mcsim.sphere import alm as alm_
 MMAX_TOLERANCE = 4e-4
 """Largest fraction of a beam's power that :func:`choose_mmax` leaves beyond m_max."""
 
+LARGEST = 32768
+"""Highest degree that a run may have."""
+
 CIRCULAR_POWER = 1e-20
 """Fraction of a beam's power below which what is not m = 0 is round-off, and the beam circular."""
 
 
 def check_lmax(lmax: int) -> None:
     """Raise InputError unless ``lmax`` is a degree of a beam."""
-    if not isinstance(lmax, int | np.integer) or lmax < 1:
-        raise InputError(f"lmax = {lmax} must be a whole number of 1 or more for a beam")
+    if isinstance(lmax, bool) or not isinstance(lmax, int | np.integer) or not 1 <= lmax <= LARGEST:
+        raise InputError(f"lmax = {lmax!r} of a beam must be a whole number from 1 to {LARGEST}")
 
 
 def check_mmax(mmax: int, lmax: int) -> None:

@@ -6,6 +6,7 @@ from scipy.special import gammaln, ive
 
 from mcsim.errors import InputError
 from mcsim.instrument.beams.coefficients import check_lmax, check_mmax
+from mcsim.sphere.checks import check_number
 
 SIGMA_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
 MAX_FWHM_ARCMIN = 1200.0
@@ -50,6 +51,7 @@ def elliptical_blm(
     """
     check_lmax(lmax)
     for name, width in (("fwhm_major_arcmin", fwhm_major_arcmin), ("fwhm_minor_arcmin", fwhm_minor_arcmin)):
+        check_number(width, name, "arcmin")
         if not 0 < width <= MAX_FWHM_ARCMIN:
             raise InputError(f"{name} = {width} must be above 0 and at most {MAX_FWHM_ARCMIN:g} arcmin")
     if fwhm_major_arcmin < fwhm_minor_arcmin:
@@ -57,6 +59,7 @@ def elliptical_blm(
             f"fwhm_major_arcmin = {fwhm_major_arcmin} is less than fwhm_minor_arcmin = {fwhm_minor_arcmin}: "
             "exchange them and add 90 to angle_deg"
         )
+    check_number(angle_deg, "angle_deg", "degrees")
     if not np.isfinite(angle_deg):
         raise InputError(f"angle_deg = {angle_deg} must be a finite number of degrees")
     if mmax is not None:

@@ -43,6 +43,8 @@ def sums_of_samples(blocks: Iterable[Sequence[NDArray]], nside: int, smax: int, 
 
 def blocks_of_files(paths: str | Path | Sequence[str | Path], frame: str) -> Iterator[tuple[NDArray[np.float64], ...]]:
     """Read theta, phi, psi from one file or several, block by block; InputError where they cannot be used."""
+    if not isinstance(paths, str | Path) and not paths:
+        raise InputError("no pointing file is given; name one or several.")
     for path in [paths] if isinstance(paths, str | Path) else paths:
         yield from _blocks(user_path(path), frame)
 

@@ -104,7 +104,7 @@ def write_files(folder: Path) -> None:
     image.header["CDELT1"] = image.header["CDELT2"] = 0.5
     image.writeto(folder / "beam.fits", overwrite=True)
     packed = np.zeros(healpy.Alm.getsize(LMAX, LMAX), dtype=complex)
-    beam = beams.Beam.elliptical(600, 500, 0, LMAX, 4)
+    beam = beams.Beam.elliptical(600, 500, lmax=LMAX, mmax=4)
     for m in range(beam.mmax + 1):
         packed[healpy.Alm.getidx(LMAX, np.arange(m, LMAX + 1), m)] = beam.blm[m, m:]
     healpy.write_alm(folder / "blm.fits", packed, overwrite=True, out_dtype=np.float64)

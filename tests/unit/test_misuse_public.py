@@ -1,0 +1,124 @@
+"""What a newcomer gives by mistake to the public names: each ends in the right number or in a sentence."""
+
+import healpy
+import numpy as np
+import pandas
+import pytest
+import xarray as xr
+from astropy import units
+
+import mcsim
+from mcsim import Beam, Moments, config, systematics
+from mcsim.errors import InputError
+from refusals import refused
+
+LMAX, NSIDE = 12, 8
+ELL = np.arange(LMAX + 1)
+CL = 1000.0 / (ELL * (ELL + 1.0)).clip(6.0)
+CHANNEL = {"name": "W", "beam": {"kind": "gaussian", "fwhm_arcmin": 900.0}, "scan": {"kind": "parallel_transport"}}
+Y, X = np.mgrid[-20:21, -20:21] * 0.2
+IMAGE = np.exp(-(X**2 / 0.8 + Y**2))
+
+
+def run(**changed: object) -> dict:
+    return {
+        "name": "run",
+        "sky": {"spectrum": CL, "lmax": LMAX},
+        "map": {"nside": NSIDE},
+        "channel": [CHANNEL],
+    } | changed
+
+
+def test_a_third_width_or_degree_is_no_angle() -> None:
+    """Beam.elliptical(60, 50, 300) was a beam up to l = 2048 with its axis at 300 degrees."""
+    with pytest.raises(TypeError):
+        Beam.elliptical(60.0, 50.0, 300)
+    assert Beam.elliptical(60.0, 50.0, lmax=300).lmax == 300
+
+
+@pytest.mark.parametrize("width", ["60", None, True, np.array([60.0]), 1.0 * units.deg, [60.0, 50.0]])
+def test_a_width_is_one_plain_number(width) -> None:
+    with refused("fwhm_arcmin"):
+        Beam.gaussian(width, lmax=LMAX)
+    with refused("fwhm_minor_arcmin"):
+        Beam.elliptical(70.0, width, lmax=LMAX)
+
+
+def test_numbers_of_numpy_are_numbers() -> None:
+    assert Beam.gaussian(np.float32(600.0), lmax=np.int32(LMAX)).lmax == LMAX
+    assert systematics.build("calibration", {"amplitude": np.float32(0.5)}).amplitude == 0.5
+    assert systematics.build("calibration", {"amplitude": np.int64(1)}).amplitude == 1.0
+
+
+@pytest.mark.parametrize("lmax", ["12", 10**9, True, 0])
+def test_a_highest_degree_is_whole_and_possible(lmax) -> None:
+    with refused("lmax", repr(lmax), 32768):
+        Beam.gaussian(600.0, lmax=lmax)
+
+
+@pytest.mark.parametrize("more", [{"centre": (20, 20, 20)}, {"centre": 20}, {"pixel_deg": "0.2"}, {"cut_deg": None}])
+def test_the_place_of_a_beam_map_is_said_in_numbers(more) -> None:
+    with refused(next(iter(more))):
+        Beam.from_map(IMAGE, LMAX, **({"pixel_deg": 0.2} | more))
+
+
+def test_a_beam_map_with_named_axes_is_not_transposed() -> None:
+    image = xr.DataArray(IMAGE, dims=("y", "x"))
+    expected = Beam.from_map(IMAGE, LMAX, pixel_deg=0.2)
+    np.testing.assert_array_equal(Beam.from_map(image, LMAX, pixel_deg=0.2).blm, expected.blm)
+    with refused("(x, y)"):
+        Beam.from_map(image.T, LMAX, pixel_deg=0.2)
+
+
+@pytest.mark.parametrize(
+    "labelled",
+    [
+        xr.DataArray(CL[2:], dims="ell", coords={"ell": ELL[2:]}),
+        xr.DataArray(CL[::-1], dims="l", coords={"l": ELL[::-1]}),
+        pandas.Series(CL[::2], index=pandas.Index(ELL[::2], name="multipole")),
+    ],
+)
+def test_labels_that_say_another_place_are_not_dropped(labelled) -> None:
+    """A spectrum from l = 2 on was taken for one from l = 0 on."""
+    with refused(labelled.dims[0] if hasattr(labelled, "dims") else labelled.index.name):
+        mcsim.load_config(run(sky={"spectrum": labelled, "lmax": 4}))
+
+
+def test_labels_that_say_the_same_place_are_no_obstacle() -> None:
+    labelled = xr.DataArray(CL, dims="ell", coords={"ell": ELL})
+    assert config.digest(mcsim.load_config(run(sky={"spectrum": labelled, "lmax": LMAX}))) == config.digest(
+        mcsim.load_config(run())
+    )
+    later = pandas.Series([1.0, 2.0], index=[7, 8])  # rows of a table of samples
+    assert Moments.from_pointing(later, later, later, NSIDE).hits.sum() == 2
+
+
+def test_a_list_is_an_array() -> None:
+    listed = mcsim.load_config(run(sky={"spectrum": list(CL), "lmax": LMAX}))
+    assert config.digest(listed) == config.digest(mcsim.load_config(run()))
+    with refused("map.mask"):
+        mcsim.load_config(run(map={"nside": NSIDE, "mask": []}))
+
+
+@pytest.mark.parametrize("lat_deg", [264.0, -91.0])
+def test_a_longitude_is_no_latitude(lat_deg) -> None:
+    with refused("lat_deg", lat_deg):
+        systematics.build("dipole_modulation", {"amplitude": 0.1, "lon_deg": 48.0, "lat_deg": lat_deg})
+
+
+def test_no_pointing_file_is_no_survey() -> None:
+    with pytest.raises(InputError):
+        Moments.from_pointing_files([], NSIDE)
+
+
+def test_the_realization_that_is_not_there_is_named(tmp_path) -> None:
+    with refused(5, "ensemble.realizations"):
+        mcsim.write_maps(run(ensemble={"realizations": 2}), tmp_path / "maps", realizations=5)
+
+
+def test_sides_of_a_comparison_may_be_given_by_name() -> None:
+    sky = healpy.alm2map(np.arange(91) + 0j, NSIDE)
+    assert mcsim.compare({"W": sky}, {"W": sky}, mcsim.load_config(run())).verdict == "identical"
+    for wrong in ({"V": sky}, {}, {"W": sky, "V": sky}):
+        with refused("W"):
+            mcsim.compare({"W": sky}, wrong, mcsim.load_config(run()))
