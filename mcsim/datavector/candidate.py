@@ -220,6 +220,12 @@ def tables_at(candidates: Sequence[Candidate], members: Sequence[int], found: Fi
     return [candidates[member].table(effect) for member, effect in zip(members, effects, strict=True)]
 
 
+def tables_beside(candidates: Sequence[Candidate], members: Sequence[int], found: Fit) -> Iterator[list[config.Effect]]:
+    """Yield the tables of :func:`tables_at` with each coordinate in turn an error larger."""
+    for error in np.diag(found.errors):
+        yield tables_at(candidates, members, replace(found, amplitudes=found.amplitudes + error))
+
+
 @dataclass(frozen=True)
 class TemplateBank:
     """Hold the responses of the data vector to all linear components of all candidates, shape (p, K) each."""
