@@ -289,7 +289,7 @@ def _described(found: Set, problem: Problem) -> tuple[DifferenceResult, ...]:
         described.append(
             DifferenceResult(
                 difference.name, problem.pair.name, difference.amplitude(value), difference.unit,
-                without - found.left, difference.parameters(value), difference.met,
+                without - found.left, difference.parameters(value), difference.met, difference.said(value),
             )
         )  # fmt: skip
     return tuple(described)

@@ -137,6 +137,10 @@ class Difference:
         """Return the amplitude as it is reported."""
         return float(value[0])
 
+    def said(self, value: Vector) -> str:
+        """Return the amplitude in words, where its sign alone would mislead."""
+        return ""
+
     def parameters(self, value: Vector) -> dict[str, float | str]:
         """Return what else describes the value."""
         return {}

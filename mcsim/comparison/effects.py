@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from mcsim import config
+from mcsim.comparison.description import quiet
 from mcsim.comparison.differences import Difference, State
-from mcsim.comparison.pairs import ChannelPair, quiet
+from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.scene import EPSILON, Maps, Scene
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
@@ -136,6 +137,12 @@ class EffectDifference(Difference):
     def amplitude(self, value: Vector) -> float:
         """Return the effect's amplitude."""
         return float(self._effect(value).amplitude)
+
+    def said(self, value: Vector) -> str:
+        """Return the words of an effect whose negative amplitude has words of its own."""
+        amplitude, wording = self.amplitude(value), self.kind.wording
+        own = wording is not None and wording.negative is not None and amplitude < 0.0
+        return self.kind.format_amplitude(amplitude) if own else ""
 
     def parameters(self, value: Vector) -> dict[str, float | str]:
         """Return its other parameters."""

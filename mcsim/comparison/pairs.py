@@ -9,26 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
+from mcsim.comparison.description import SAMPLES, check_splits, in_full, orders_of, quiet, with_known_offsets
 from mcsim.comparison.scene import Maps, PointingFiles, Scene, scene_of, sky_in
 from mcsim.ensemble.external import named_source, source_of
 from mcsim.ensemble.maps import file_names, first_realization
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
-from mcsim.simulation.channels import described, known_offsets, load_beam, with_all_orders
+from mcsim.simulation.channels import with_all_orders
 from mcsim.simulation.noise import of_map
 from mcsim.simulation.survey import Channel, Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import header, healpix
 from mcsim.sphere.checks import UNSEEN_BELOW, check_map
 from mcsim.support import resources
-from mcsim.support.arrays import Alm
+from mcsim.support.arrays import Alm, reals
 from mcsim.systematics.base import Pointing
 
 Given = Sequence[NDArray[np.float64]] | Mapping[str, NDArray[np.float64]]
 """Maps as arrays, in the order of a run's or by name."""
-
-SAMPLES = 100_000_000
-"""Samples of the longest survey that is simulated sample by sample."""
 
 HELD = 20_000_000
 """The same of samples in files, which are held in memory."""
@@ -38,9 +36,6 @@ CLEARLY = 0.1
 
 _STORED = (".fits", ".fit", ".gz", ".npy", ".npz", ".h5", ".hdf5", ".nc")
 """What a file of maps is called."""
-
-EXTRA_ORDERS = 3
-"""Moments beyond the beam's orders: a displaced beam has them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,8 +169,8 @@ def read(
     whole: Survey | None = None
     orders: dict[str, int] = {}
     if run is not None:
-        run, orders = _in_full(run)
-        whole = survey(quiet(run), nthreads, orders=_orders(run))
+        run, orders = in_full(run)
+        whole = survey(quiet(run), nthreads, orders=orders_of(run))
     sides = [_side(side, run, nthreads) for side in (a, b)]
     for own, other, side in ((0, 1, a), (1, 0, b)):
         if not Path(side).is_dir() and _made_elsewhere((b, a)[own]):
@@ -219,9 +214,9 @@ def given(a: Given, b: Given, run: config.RunConfig, nthreads: int = 1) -> Compa
     """Compare maps given as arrays, by name or in the order of the run's, uK."""
     names = config.map_names(run)
     a, b = (_in_order(side, names) for side in (a, b))
-    run, orders = _in_full(run)
-    whole = survey(quiet(run), nthreads, orders=_orders(run))
-    sides = [dict(zip(names, (np.ma.filled(m, healpy.UNSEEN) for m in side), strict=True)) for side in (a, b)]
+    run, orders = in_full(run)
+    whole = survey(quiet(run), nthreads, orders=orders_of(run))
+    sides = [dict(zip(names, side, strict=True)) for side in (a, b)]
     found = (
         _pair(c.name, [n for n in names if n.partition(":")[0] == c.name], sides, whole, nthreads) for c in run.channels
     )
@@ -230,61 +225,14 @@ def given(a: Given, b: Given, run: config.RunConfig, nthreads: int = 1) -> Compa
 
 
 def _in_order(side: Given, names: Sequence[str]) -> Sequence[NDArray[np.float64]]:
-    if not isinstance(side, Mapping):
-        if len(side) != len(names):
-            raise InputError(f"{len(side)} maps were given, the model has {len(names)}; give one for each.")
-        return side
-    if set(side) != set(names):
-        raise InputError(f"the maps {', '.join(map(str, side))} were given, the model has {', '.join(names)}.")
-    return [side[name] for name in names]
-
-
-def _in_full(run: config.RunConfig) -> tuple[config.RunConfig, dict[str, int]]:
-    """Return a run with all that its files say of samples and beams, and by channel the fewer orders that it takes."""
-    full = with_all_orders(with_known_offsets(run))
-    pairs = zip(run.channels, full.channels, strict=True)
-    return full, {own.name: load_beam(own, run.sky.lmax).mmax for own, whole in pairs if own.beam != whole.beam}
-
-
-def _orders(run: config.RunConfig) -> int:
-    return max((getattr(c.beam, "m_max", None) or 2) for c in run.channels) + EXTRA_ORDERS
-
-
-def quiet(run: config.RunConfig) -> config.RunConfig:
-    """Return the run without noise and effects, and with nothing to estimate; InputError without times of splits."""
-    _check_splits(run)
-    run = named_source(run)[0]
-    channels = tuple(channel.without_noise() for channel in run.channels)
-    biposh = replace(run.biposh, L_max=0, pairs="auto", filter="none", probes=None)
-    return replace(run, channels=channels, effects=(), biposh=biposh)
-
-
-def with_known_offsets(run: config.RunConfig) -> config.RunConfig:
-    """Return a run with all powers of the samples' offsets that its scans know, unless it says how many.
-
-    Where every sample can be simulated by itself, that takes their place.
-    """
-    if run.map.offset_order is not None or run.map.grid != "healpix" or run.map.pixel_window == "none":
-        return run
-    known = [1 if _has_samples(spec) else known_offsets(run, spec) for spec in run.channels]
-    order = min((order for order in known if order > 1), default=1)
-    whole = [known_offsets(run, spec) >= order for spec in run.channels]
-    return replace(run, map=replace(run.map, offset_order=order)) if order > 1 and all(whole) else run
-
-
-def _has_samples(spec: config.Channel) -> bool:
-    if isinstance(spec.scan, config.ScanPointing):
-        return True
-    pointing = described(spec)[0]
-    return pointing is not None and pointing.model.samples(pointing.line) <= SAMPLES
-
-
-def _check_splits(run: config.RunConfig) -> None:
-    if run.map.split_by != "time":
-        raise InputError(
-            f'{run.name} has map.split_by = "{run.map.split_by}", but the samples of maps that are compared are found '
-            'by their time; use splits by "time", or none.'
-        )
+    """Return the maps of a side, plain numbers with UNSEEN for masked ones, in the order of the names."""
+    if isinstance(side, Mapping):
+        if set(side) != set(names):
+            raise InputError(f"the maps {', '.join(map(str, side))} were given, the model has {', '.join(names)}.")
+        side = [side[name] for name in names]
+    if len(side) != len(names):
+        raise InputError(f"{len(side)} maps were given, the model has {len(names)}; give one for each.")
+    return [reals(one, f"map {name}", healpy.UNSEEN) for name, one in zip(names, side, strict=True)]
 
 
 def _model(a: str | Path, b: str | Path, model: str | Path | config.RunConfig | None) -> config.RunConfig | None:
@@ -310,7 +258,7 @@ def _side(side: str | Path, run: config.RunConfig | None, nthreads: int) -> dict
     if path.is_dir():
         return _folder(path, run)
     own, external = named_source(config.load(side))
-    _check_splits(own)
+    check_splits(own)
     wanted = own_frame = config.prepared_grid(own)[1]
     if run is not None:
         wanted = config.prepared_grid(run)[1]

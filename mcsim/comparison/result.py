@@ -16,7 +16,7 @@ Maps = NDArray[np.float64]
 class DifferenceResult:
     """One difference: name, channel, amplitude with unit, share of the variance that it explains, what else is known.
 
-    ``explains`` is the share that the set loses without it.
+    ``explains`` is the share that the set loses without it; ``said`` the amplitude in words where its sign misleads.
     """
 
     name: str
@@ -26,13 +26,15 @@ class DifferenceResult:
     explains: float
     parameters: dict[str, float | str]
     met: str
+    said: str = ""
 
     @property
     def words(self) -> str:
         """Name and amplitude, or what an amplitude of 1 means where it can be nothing else."""
         meaning = self.unit.removeprefix("1 = ")
         alone = meaning != self.unit and self.amplitude == 1.0
-        return f"{self.name} ({meaning})" if alone else f"{self.name} = {number(self.amplitude)} {self.unit}"
+        also = f" ({self.said})" if self.said else ""
+        return f"{self.name} ({meaning})" if alone else f"{self.name} = {number(self.amplitude)} {self.unit}{also}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as in ``compare.json``."""

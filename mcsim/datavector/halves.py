@@ -18,7 +18,8 @@ class Halves:
     """Split the data vector x, shape (p,), into two parts with independent noise: one is fitted, the other one judges.
 
     ``used`` and ``fresh`` are the null distributions of the elements of fold 0, which are fitted, and of fold 1;
-    ``first`` and ``second`` are these elements. Amplitudes are from 0 to ``largest`` if that is given.
+    ``first`` and ``second`` are these elements. Amplitudes are from 0 to ``largest`` if that is given;
+    ``data`` tells them where one is the largest.
     """
 
     x: Vector
@@ -56,6 +57,8 @@ class Halves:
         if self.largest is not None:
             nearest = lsq_linear(used.whiten_templates(t_used), used.whiten(x_used), (0.0, self.largest))
             frozen = replace(frozen, amplitudes=nearest.x)
+            if max(nearest.x) > 0.99 * self.largest:
+                data += f", with {' and '.join(f'{a:.1f}' for a in nearest.x)} times its size, as the other half asks"
         after = self.fresh.shift(self.fresh.mean + respond(frozen)[self.second])
         after = after.with_extra_covariance(*(one[self.second] for one in scatters))
         if scatters:

@@ -37,6 +37,7 @@ from mcsim.reconstruction import simulated_scores
 from mcsim.simulation import power
 from mcsim.support import folders
 from mcsim.support.code import class_digest, package_digest
+from mcsim.support.settings import settings_of
 
 CODE = ("config", "sphere", "stats", "instrument", "systematics", "bipolar", "simulation", "beamfit", "datavector")
 EXTERNAL = ("external", "external_maps")
@@ -97,7 +98,7 @@ def diagnose(
     """
     quiet, workers = _computing(**computing)
     run, source = loaded(model)
-    settings = settings or DiagnosisSettings()
+    settings = settings_of(settings, DiagnosisSettings)
     wanted, (settings, library) = settings.controls, _with_library(settings)
     if output is not None:
         output = folders.user_path(output)

@@ -20,8 +20,8 @@ from mcsim.support.numbers import measured, p_equals
 # Okabe and Ito's palette: told apart with any colour vision.
 BLUE, RED, AMBER = "#0072b2", "#d55e00", "#e69f00"
 
-TOP, MAPS = 15, 12
-"""Candidates in the picture of those fitted alone, of which the table has all; and residual maps in theirs."""
+TOP, MAPS, LEAST = 15, 12, 1e-8
+"""Candidates that are drawn, residual maps, and the p-value where the scale of controls ends."""
 
 LIMIT = 8.0
 """Deviation at which the colours of the table of blocks end."""
@@ -222,13 +222,13 @@ def controls_figure(result: DiagnosisResult, controls: Controls) -> Figure:
     """Draw the p-values of the controls against their ranks, with that of the data."""
     figure = Figure(figsize=(5.4, 3.1), layout="constrained")
     axes, count = figure.subplots(), len(controls.members)
-    p, rank = np.maximum(controls.pvalues, 1e-30), np.arange(1, count + 1)
+    p, rank = np.maximum(controls.pvalues, LEAST), np.arange(1, count + 1)
     expected = rank / (count + 1.0)
     axes.fill_between(expected, *stats.beta.interval(0.95, rank, count + 1 - rank), color="0.88", zorder=0)
     axes.plot([expected[0] / 2.0, 1.0], [expected[0] / 2.0, 1.0], color="black", linewidth=0.8)
     axes.plot(expected, p, "o", color=BLUE, markersize=5, label="controls")
-    data = max(result.test.pvalue, 1e-30)
-    axes.axhline(data, color=RED, linewidth=1.4, label=f"data, {p_equals(result.test.pvalue)}")
+    data = f"data, {p_equals(result.test.pvalue)}" + " (off the scale)" * (result.test.pvalue < LEAST)
+    axes.axhline(max(result.test.pvalue, LEAST), color=RED, linewidth=1.4, label=data)
     axes.axhline(controls.alpha, color="black", linewidth=0.8, linestyle="--")
     axes.set(xscale="log", yscale="log", xlabel="expected p-value of this rank", ylabel="global p-value")
     axes.legend(frameon=False, fontsize=8, loc="lower right")

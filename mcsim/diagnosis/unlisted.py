@@ -237,8 +237,7 @@ class Reconstruction:
         if halves is None:
             return None
         t = np.stack([matrix @ (self.simulated([one]).x - self.before.x) for one in first], axis=1)
-        whole = context.null.expected_snr(t.sum(axis=1))
-        if halves.expected_snr(t.sum(axis=1)) < settings.half_snr_share * whole:
+        if halves.expected_snr(t.sum(axis=1)) < settings.half_snr_share * context.null.expected_snr(t.sum(axis=1)):
             return None
 
         def respond(frozen: Fit) -> Vector:

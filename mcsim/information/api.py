@@ -27,6 +27,7 @@ from mcsim.simulation.nuisance import nuisances_of
 from mcsim.support import folders
 from mcsim.support.numbers import duration
 from mcsim.support.progress import reporting
+from mcsim.support.settings import settings_of
 
 PICTURE = "limit.png"
 
@@ -96,7 +97,7 @@ def limit(
     ('noise_level', 0.07)
     """
     run = config.load(model)
-    settings = settings or LimitSettings()
+    settings = settings_of(settings, LimitSettings)
     if output is not None:
         output = folders.user_path(output)
         folders.writable(output)

@@ -238,12 +238,15 @@ def with_all_orders(run: config.RunConfig) -> config.RunConfig:
 def _with_all_orders(spec: config.Channel, lmax: int) -> config.Channel:
     if isinstance(spec.beam, CIRCULAR) or spec.beam.m_max is not None:
         return spec
-    beam = load_beam(spec, lmax)
-    while beam.neglected_power > NEGLECTED and beam.mmax < min(MOST_ORDERS, lmax):
+    own = beam = load_beam(spec, lmax)
+    for orders in range(min(MOST_ORDERS, lmax), own.mmax, -1) if own.neglected_power > NEGLECTED else ():
         try:
-            beam = load_beam(_with_m_max(spec, beam.mmax + 1), lmax)
-        except InputError:  # a file of fewer orders than its beam had
-            break
+            beam = load_beam(_with_m_max(spec, orders), lmax)
+        except InputError:  # a file of fewer orders
+            continue
+        break
+    while beam.mmax > own.mmax and (cut := beam.truncated(beam.mmax - 1)).neglected_power <= NEGLECTED:
+        beam = cut
     return _with_m_max(spec, beam.mmax)
 
 

@@ -3,9 +3,20 @@
 import math
 from collections.abc import Iterable
 from dataclasses import fields
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 from mcsim.errors import InputError
+
+Kind = TypeVar("Kind")
+
+
+def settings_of(given: Kind | None, kind: type[Kind]) -> Kind:
+    """Return settings as they are given, or the default ones for None; InputError for anything else."""
+    if given is None:
+        return kind()
+    if not isinstance(given, kind):
+        raise InputError(f"settings are a {type(given).__name__}; give mcsim.{kind.__name__}(name=value).")
+    return given
 
 
 def check_settings(settings: Any, shares: Iterable[str] = ()) -> None:

@@ -11,9 +11,9 @@ import mcsim
 from comparisons import CASES, LMAX, MODEL, NSIDE, ODD, PEAR, Maps, Simulator, names, scaled, small
 from mcsim import config
 from mcsim.comparison import pairs, scene
+from mcsim.comparison.description import with_known_offsets
 from mcsim.comparison.effects import effects_of
 from mcsim.comparison.map_differences import Calibration, Monopole
-from mcsim.comparison.pairs import with_known_offsets
 from mcsim.comparison.prediction import Set
 from mcsim.comparison.scene_differences import PixelWindow, Smoothing, TimeShift
 from mcsim.comparison.search import Problem

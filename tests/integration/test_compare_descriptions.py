@@ -103,6 +103,7 @@ def test_maps_from_orientation_moments_have_the_orders_of_a_run(whole):
     assert found.channels[0].left < 1e-6
 
 
+@pytest.mark.slow
 def test_psi_of_the_other_sign_and_from_the_other_end_is_named():
     """Codes of the COSMO and the IAU convention exchange psi and pi - psi: neither a sign nor half a turn alone."""
     beam = mcsim.Beam.elliptical(400.0, 320.0, lmax=32, mmax=3)
@@ -146,6 +147,7 @@ def test_a_report_of_maps_that_are_the_same_draws_no_warning(factors):
     assert any("W1:half1" in one.get_title() for one in axes) == (factors[1] == 1.0)
 
 
+@pytest.mark.slow
 def test_the_nearest_set_is_said_as_a_whole():
     """A sign alone leaves more than there was; beside half a turn it leaves next to nothing."""
     beam = mcsim.Beam.elliptical(400.0, 320.0, lmax=32, mmax=3)

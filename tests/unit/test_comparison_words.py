@@ -1,8 +1,11 @@
 """A comparison in words."""
 
+import numpy as np
 import pytest
 
+from mcsim.comparison.effects import EffectDifference
 from mcsim.comparison.result import DifferenceResult
+from mcsim.systematics.beams import BeamSidelobe
 
 
 @pytest.mark.parametrize(
@@ -15,3 +18,11 @@ from mcsim.comparison.result import DifferenceResult
 )
 def test_amplitude_that_can_be_one_alone_is_its_meaning(amplitude, unit, words) -> None:
     assert DifferenceResult("one", "W", amplitude, unit, 1.0, {}, "").words == words
+
+
+def test_sign_that_misleads_is_explained() -> None:
+    """A ring of the beam has a negative amplitude, and a negative ring a positive one."""
+    ring = EffectDifference(BeamSidelobe, np.zeros((2, 1, 12)), None)
+    assert "ring" in ring.said(np.array([-1e-3, 0.0]))
+    assert ring.said(np.array([1e-3, 0.0])) == ""
+    assert DifferenceResult("one", "W", -1.0, "K", 1.0, {}, "", "cold").words == "one = −1 K (cold)"

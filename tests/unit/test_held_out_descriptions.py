@@ -53,7 +53,7 @@ def test_amplitudes_of_a_part_stay_between_none_and_the_largest() -> None:
     first, second = np.arange(4), np.arange(4, 8)
     part = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
     t = np.concatenate([part, part])
-    x = t @ [9.6, 1.2, -1.5]
+    x = t @ [9.6, 1.2, -1.4]
     asked: list[np.ndarray] = []
 
     def respond(frozen):
@@ -61,8 +61,9 @@ def test_amplitudes_of_a_part_stay_between_none_and_the_largest() -> None:
         return t @ frozen.amplitudes
 
     free = Halves(x, null, null, first, second)
-    free.reduction(t, respond)
-    replace(free, largest=2.0).reduction(t, respond)
-    np.testing.assert_allclose(asked[0], [9.6, 1.2, -1.5], atol=1e-9)
+    assert free.reduction(t, respond, (), "half2").data == "half2"
+    told = replace(free, largest=2.0).reduction(t, respond, (), "half2").data
+    assert told == "half2, with 2.0 and 0.5 and 0.0 times its size, as the other half asks"
+    np.testing.assert_allclose(asked[0], [9.6, 1.2, -1.4], atol=1e-9)
     # With the third at zero the second is what the data have in its place.
-    np.testing.assert_allclose(asked[1], [2.0, 1.2 - 0.75, 0.0], atol=1e-6)
+    np.testing.assert_allclose(asked[1], [2.0, 1.2 - 0.7, 0.0], atol=1e-6)

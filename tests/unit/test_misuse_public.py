@@ -116,6 +116,24 @@ def test_the_realization_that_is_not_there_is_named(tmp_path) -> None:
         mcsim.write_maps(run(ensemble={"realizations": 2}), tmp_path / "maps", realizations=5)
 
 
+@pytest.mark.parametrize("settings", [{"alpha": 0.1}, {}, "quick", mcsim.LimitSettings])
+def test_settings_are_an_object_of_their_own(settings, tmp_path) -> None:
+    with refused("mcsim.DiagnosisSettings"):
+        mcsim.diagnose(run(), tmp_path, tmp_path / "out", settings=settings)
+    with refused("mcsim.LimitSettings"):
+        mcsim.limit(run(), settings=settings)
+
+
+def test_a_unit_or_labels_of_a_compared_map_are_not_dropped() -> None:
+    sky = np.sin(np.arange(12.0 * NSIDE**2))
+    turned = xr.DataArray(sky[::-1], dims="pixel", coords={"pixel": np.arange(sky.size)[::-1]})
+    for given, named in ((sky * units.mK, "mK"), (turned, "pixel"), (sky + 0j, "W")):
+        with refused(named):
+            mcsim.compare([given], [sky], mcsim.load_config(run()))
+    hidden = np.ma.masked_array(sky, np.arange(sky.size) < 20)
+    assert mcsim.compare([hidden], [1.01 * sky], mcsim.load_config(run())).channels[0].one_sided == 20
+
+
 def test_sides_of_a_comparison_may_be_given_by_name() -> None:
     sky = healpy.alm2map(np.arange(91) + 0j, NSIDE)
     assert mcsim.compare({"W": sky}, {"W": sky}, mcsim.load_config(run())).verdict == "identical"
