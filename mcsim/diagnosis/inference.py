@@ -87,11 +87,12 @@ def _with_errors(data: DataSet[Any], refined: Refined, found: Attribution) -> At
     with suppress(InputError):  # between what was fitted and what can be
         if pair := data.pair(tables_at(context.candidates, best.members, best.fit)):
             fit = with_scatter(context.null, t, fit, *pair)
-            bent = context.null.whiten_templates(t - context.templates[:, columns]) @ best.fit.amplitudes
-            if np.linalg.norm(bent) > context.settings.nonlinear_sigma:
-                beside = [data.pair(one) for one in tables_beside(context.candidates, best.members, best.fit)]
-                steps = [(one[1] - pair[1]).mean(axis=0) for one in beside if one is not None]
-                fit = with_tangents(context.null, t, fit, np.stack(steps, axis=1) / best.fit.errors)
+            bend = context.null.whiten_templates(t - context.templates[:, columns])
+            tables = tables_beside(context.candidates, best.members, best.fit, bend, context.settings.nonlinear_sigma)
+            pairs = (None if one is None else data.pair(one) for one in tables)
+            moved = zip(pairs, best.fit.errors, t.T, strict=True)
+            slopes = [(one[1] - pair[1]).mean(axis=0) / error if one else row for one, error, row in moved]
+            fit = with_tangents(context.null, t, fit, np.stack(slopes, axis=1))
     return replace(found, explanations=(replace(best, fit=fit), *found.explanations[1:]))
 
 
