@@ -134,6 +134,14 @@ def test_a_unit_or_labels_of_a_compared_map_are_not_dropped() -> None:
     assert mcsim.compare([hidden], [1.01 * sky], mcsim.load_config(run())).channels[0].one_sided == 20
 
 
+@pytest.mark.parametrize("side", ["A", "B"])
+def test_a_side_without_data_is_named(side) -> None:
+    sky = np.sin(np.arange(12.0 * NSIDE**2))
+    maps = [[np.nan * sky if side == own else sky] for own in "AB"]
+    with refused("W", f"side {side}"):
+        mcsim.compare(*maps, mcsim.load_config(run()))
+
+
 def test_sides_of_a_comparison_may_be_given_by_name() -> None:
     sky = healpy.alm2map(np.arange(91) + 0j, NSIDE)
     assert mcsim.compare({"W": sky}, {"W": sky}, mcsim.load_config(run())).verdict == "identical"
