@@ -376,14 +376,11 @@ class Moments:
 
     def save(self, folder: str | Path) -> None:
         """Write the arrays as .npy files into ``folder``, which is created."""
-        folder, meta = (
-            folders.user_path(folder),
-            {"nside": self.nside, "frame": self.frame, "offsets": self.offset_order},
-        )
-        with folders.unwritable(folder, "choose another folder"):
+        with folders.unwritable(folder := folders.user_path(folder), "choose another folder"):
             folder.mkdir(parents=True, exist_ok=True)
             for name, array in self._arrays().items():
                 np.save(folder / f"{name}.npy", array)
+            meta = {"nside": self.nside, "frame": self.frame, "offsets": self.offset_order}
             (folder / _META).write_text(json.dumps(meta))
 
     @classmethod
