@@ -220,6 +220,23 @@ def tables_at(candidates: Sequence[Candidate], members: Sequence[int], found: Fi
     return [candidates[member].table(effect) for member, effect in zip(members, effects, strict=True)]
 
 
+def tables_beside(
+    candidates: Sequence[Candidate], members: Sequence[int], found: Fit, bend: Matrix, least: float
+) -> Iterator[list[config.Effect] | None]:
+    """Yield the tables of :func:`tables_at` with each amplitude in turn an error larger.
+
+    ``bend`` are white departures of the templates from linear ones, shape (p, K). None is yielded for the amplitudes of
+    a member whose response departs by at most ``least``.
+    """
+    first = 0
+    for member in members:
+        own = range(first, first := first + len(candidates[member].columns))
+        straight = np.linalg.norm(bend[:, own] @ found.amplitudes[own]) <= least
+        for error in np.diag(found.errors)[own]:
+            moved = replace(found, amplitudes=found.amplitudes + error)
+            yield None if straight else tables_at(candidates, members, moved)
+
+
 @dataclass(frozen=True)
 class TemplateBank:
     """Hold the responses of the data vector to all linear components of all candidates, shape (p, K) each."""

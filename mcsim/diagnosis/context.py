@@ -115,10 +115,7 @@ class DataSet(ABC, Generic[Data]):
         """Return where the data depart from the model, the largest departure first."""
 
     def respond(self, found: Sequence[config.Effect], skies: int) -> Matrix:
-        """Return the changes of the data vector by effects, shape (rows, p), in ``skies`` skies.
-
-        By default they are those of the reference, whatever ``skies`` is.
-        """
+        """Return changes of the data vector by effects, (rows, p), in ``skies`` skies or those of the reference."""
         return self._simulated(found) - self.context.reference(found)
 
     @property

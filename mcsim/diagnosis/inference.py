@@ -1,12 +1,13 @@
 """Infer from one data set whether, where, by which effects and how far it departs from the model."""
 
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
 
-from mcsim.datavector.candidate import columns_of, parts_of, scatters_of, tables_at
+from mcsim.datavector.candidate import columns_of, parts_of, scatters_of, tables_at, tables_beside
 from mcsim.datavector.halves import Halves
 from mcsim.diagnosis.assemble import result_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
@@ -20,7 +21,7 @@ from mcsim.diagnosis.words import refuted
 from mcsim.errors import InputError
 from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit
-from mcsim.stats.scattered import with_drawn_scatter, with_scatter
+from mcsim.stats.scattered import with_drawn_scatter, with_scatter, with_tangents
 from mcsim.support.arrays import Vector
 from mcsim.support.numbers import measured
 
@@ -76,23 +77,23 @@ def confirmed(
 
 
 def _with_errors(data: DataSet[Any], refined: Refined, found: Attribution) -> Attribution:
-    """Return the attribution, the best set with the errors that its amplitudes have with its effects in the data.
-
-    Of stochastic effects it is the scatter of the draws with which the fit was made.
-    """
+    """Return the attribution, the best set with the errors that its amplitudes have with its effects in the data."""
     context, best = data.context, found.explanations[0]
-    t = refined.templates[:, columns_of(context.candidates, best.members)]
+    columns = columns_of(context.candidates, best.members)
+    t, fit = refined.templates[:, columns], best.fit
     if scatters := scatters_of(refined.candidates, best.members):
-        own = replace(best, fit=with_drawn_scatter(context.null, t, best.fit, scatters))
-        return replace(found, explanations=(own, *found.explanations[1:]))
-    try:
-        pair = data.pair(tables_at(context.candidates, best.members, best.fit))
-    except InputError:
-        pair = None  # between what was fitted and what can be
-    if pair is None:
-        return found
-    own = replace(best, fit=with_scatter(context.null, t, best.fit, *pair))
-    return replace(found, explanations=(own, *found.explanations[1:]))
+        fit = with_drawn_scatter(context.null, t, fit, scatters)  # those with which the fit was made
+        return replace(found, explanations=(replace(best, fit=fit), *found.explanations[1:]))
+    with suppress(InputError):  # between what was fitted and what can be
+        if pair := data.pair(tables_at(context.candidates, best.members, best.fit)):
+            fit = with_scatter(context.null, t, fit, *pair)
+            bend = context.null.whiten_templates(t - context.templates[:, columns])
+            tables = tables_beside(context.candidates, best.members, best.fit, bend, context.settings.nonlinear_sigma)
+            pairs = (None if one is None else data.pair(one) for one in tables)
+            moved = zip(pairs, best.fit.errors, t.T, strict=True)
+            slopes = [(one[1] - pair[1]).mean(axis=0) / error if one else row for one, error, row in moved]
+            fit = with_tangents(context.null, t, fit, np.stack(slopes, axis=1))
+    return replace(found, explanations=(replace(best, fit=fit), *found.explanations[1:]))
 
 
 def reduction_of(data: DataSet[Any], refined: Refined) -> HeldOut | None:

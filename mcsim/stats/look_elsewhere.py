@@ -32,7 +32,8 @@ class Calibration:
     held_out_smallest, held_out_combined
         Sorted p-values, as these draws give them, of simulations against the others; None: Gaussian data are trusted.
     power
-        Of the global p-value of the candidates: below 1 if that of simulations against others is too often small.
+        Of the global p-value of the candidates: below 1 if that of simulations against others is too often small,
+        above 1 if too seldom.
     """
 
     tests: int

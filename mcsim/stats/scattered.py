@@ -154,6 +154,22 @@ def with_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, before: Matrix,
     return replace(found, covariance=factor[:, None] * found.covariance * factor)
 
 
+def with_tangents(null: SimulatedGaussian, t: Matrix, found: Fit, tangents: Matrix) -> Fit:
+    """Return a fit of templates, shape (p_raw, K), with the errors of amplitudes at which responses are not straight.
+
+    ``tangents`` are the derivatives of the response in each amplitude, shape (p_raw, K).
+
+    Notes
+    -----
+    Templates are straight lines from zero that are exact at the fitted amplitudes: the fit solves R(theta) = x, and the
+    data move it by the inverse of the derivative of R, not of the lines. Correlations stay; errors are not made
+    smaller.
+    """
+    curved, straight = (np.sum(orthonormal(null.whiten_templates(one))[1] ** 2, axis=1) for one in (tangents, t))
+    factor = np.sqrt(np.maximum(divided(curved, straight, 1.0), 1.0))
+    return replace(found, covariance=factor[:, None] * found.covariance * factor)
+
+
 def with_drawn_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, scatters: Sequence[Matrix]) -> Fit:
     """Return a fit of templates, shape (p_raw, K), with the errors that patterns which are drawn give its amplitudes.
 

@@ -9,7 +9,7 @@ from mcsim.datavector.candidate import Candidate
 from mcsim.diagnosis.subsets import Subsets
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate
-from mcsim.stats.scattered import Acting, Beside, with_scatter
+from mcsim.stats.scattered import Acting, Beside, with_scatter, with_tangents
 from mcsim.systematics import Effect
 
 P, SKIES = 12, 4000
@@ -83,6 +83,29 @@ def test_further_effects_are_not_found_in_the_scatter_of_one(growth: float, spre
     ignored, charged = np.mean(found, axis=0)
     assert abs(charged - 0.05) < 3.0 * np.sqrt(0.05 * 0.95 / draws)
     assert ignored > 0.15
+
+
+def test_pulls_are_of_unit_width_where_responses_bend() -> None:
+    """The response to a and b is (a - a^2/100) t + (1 - a/100) b u: at a = 20 a tangent of 0.6 beside a line of 0.8."""
+    rng, a, b = np.random.default_rng(6), 20.0, 0.0
+    model = SimulatedGaussian.from_simulations(rng.normal(size=(20_000, P)))
+    t, u = np.eye(P)[:2]
+    pulls = []
+    for x in rng.normal(size=(1000, P)) + (a - 0.01 * a**2) * t + (1.0 - 0.01 * a) * b * u:
+        first = 50.0 - np.sqrt(2500.0 - 100.0 * x[0])  # what a fit and simulations at its amplitude converge to
+        second = x[1] / (1.0 - 0.01 * first)
+        lines = np.stack([(1.0 - 0.01 * first) * t - 0.01 * second * u, u], axis=1)
+        found = model.fit(x, lines)
+        np.testing.assert_allclose(found.amplitudes, [first, second], atol=0.2)
+        tangents = np.stack([(1.0 - 0.02 * first) * t - 0.01 * second * u, (1.0 - 0.01 * first) * u], axis=1)
+        pulls.append(
+            (found.amplitudes - [a, b]) / np.stack([found.errors, with_tangents(model, lines, found, tangents).errors])
+        )
+    straight, bent = np.std(pulls, axis=0)
+    np.testing.assert_allclose(straight, [0.8 / 0.6, 1.0 / 0.8], rtol=0.1)
+    np.testing.assert_allclose(bent, 1.0, atol=4.0 / np.sqrt(2000.0))
+    shorter = with_tangents(model, lines, found, 2.0 * lines)
+    np.testing.assert_array_equal(shorter.covariance, found.covariance)
 
 
 def test_candidates_that_are_added_are_not_scattered_by_what_was_simulated_before() -> None:

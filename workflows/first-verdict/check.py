@@ -1,7 +1,8 @@
 """Hold a covariance from few simulations against the sample covariance of many: p-values and power on held-out skies.
 
 STORE is a model that mcsim diagnose has learned, $MCSIM_CACHE/diagnose/KEY.zarr. Its simulations, full skies that went
-through maps and filter, are divided at random: few to learn from, the others, or eight of them, to be tested.
+through maps and filter, are divided at random: few to learn from, the others, or eight of them, to be tested. With
+--drawn both are Gaussian draws from the covariance that all of them give: is the reference distribution right?
 """
 
 import argparse
@@ -16,6 +17,9 @@ from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate, calibrate_in_folds
 
 TESTED, STRENGTH = 8, 4.5
+
+DRAWN = 100
+"""Data of each ensemble that is drawn."""
 
 
 class Judge:
@@ -43,11 +47,37 @@ class Judge:
         return signal / np.einsum("ik,ij,jk->k", weights, covariance, weights) / ideal
 
 
+def uniform(found):
+    """Print how uniform p-values are, each kind of them a list."""
+    for name, values in found.items():
+        each = np.array(values)
+        below = ", ".join(f"{np.sum(each <= level)} at {level}" for level in (0.05, 0.01))
+        test = kstest(each, "uniform")
+        distance = f"distance {test.statistic:.3f}, Kolmogorov-Smirnov {test.pvalue:.2g}"
+        print(f"p-values, {name}: {len(each)}, {distance}; {below}")
+
+
+def drawn(ensemble, templates, groups, few, rounds):
+    """Print p-values of data and simulations that are drawn from one covariance."""
+    spread, rng = ensemble.spread, np.random.default_rng(2)
+    root = spread[:, None] * np.linalg.pinv(ensemble.gaussian.whitening * spread)
+    found, powers = {"omnibus": [], "gap": []}, []
+    for _ in range(rounds):
+        simulations, tested = (rng.standard_normal((count, root.shape[1])) @ root.T for count in (few, DRAWN))
+        judge = Judge(simulations, templates, groups, ensemble.redundant, shrink=True)
+        powers.append(judge.calibration.power)
+        for name, values in zip(found, judge.pvalues(tested), strict=True):
+            found[name] += values.tolist()
+    print(f"{rounds} ensembles of {few}, {DRAWN} data each; power {np.mean(powers):.3f} +- {np.std(powers):.3f}")
+    uniform(found)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("store", type=Path)
     parser.add_argument("--rounds", type=int, default=130)
     parser.add_argument("--each", type=int, default=3, help="simulations per element")
+    parser.add_argument("--drawn", action="store_true", help="Gaussian draws in place of simulations")
     given = parser.parse_args()
     ensemble, bank = load(given.store)
     x, floor = ensemble.simulations, ensemble.redundant
@@ -61,6 +91,9 @@ def main():
     whole = SimulatedGaussian.from_simulations(x, floor=floor)
     p, rng = whole.dimension, np.random.default_rng(1)
     few = given.each * p
+    if given.drawn:
+        drawn(ensemble, templates, groups, few, given.rounds)
+        return
     print(f"{len(x)} simulations, {p} independent elements, {len(groups)} candidates; {few} to learn from")
     size = np.sqrt(whole.hartlap_factor) * np.linalg.norm(whole.whiten_templates(templates), axis=0)
     found, worth, kept = {"omnibus": [], "gap": []}, [], []
@@ -87,10 +120,7 @@ def main():
     mean = np.mean(kept, axis=0)
     print(f"share of (S/N)^2 that is kept: {mean.mean():.3f}, of the worst template {mean.min():.3f};", end=" ")
     print(f"sample covariance of ten per element: {1.0 - 1.0 / 10.0:.3f}, of as few {1.0 - p / (few - 1.0):.3f}")
-    for name, values in found.items():
-        each = np.array(values)
-        below = ", ".join(f"{np.sum(each <= level)} at {level}" for level in (0.05, 0.01))
-        print(f"p-values, {name}: {len(each)}, Kolmogorov-Smirnov {kstest(each, 'uniform').pvalue:.2g}; {below}")
+    uniform(found)
     for name, values in power.items():
         print(f"detected at S/N {STRENGTH} (p <= 0.05), {name}: {np.sum(values)} of {len(values)}")
 

@@ -3,6 +3,7 @@
 python names.py maps [CASES]       systematics that no library has, added to simulated maps
 python names.py true [NUMBER]      one effect of the library, added to data vectors: how often is it named alone?
 python names.py further [NUMBER]   beside a strong effect: how often is another one found that is not there?
+python names.py bent [CASES]       an ellipticity whose response bends, in simulated maps: pulls of its amplitudes
 python names.py draws [NUMBER]     effects of the library, added to data vectors of simulations
 python names.py several [NUMBER]   one to five effects of the library at once, added to data vectors
 python names.py pairs [CASES]      two effects of the library at once, in simulated maps
@@ -362,6 +363,25 @@ def pulls_of(null, t, before, after, skies):
     return np.array(found)
 
 
+def bent(number):
+    """Diagnose maps with an ellipticity of 0.25, S/N 22, and print the pulls of its two amplitudes."""
+    run, context = learned(SMALL)
+    table = config.Effect(name="beam_ellipticity", channel="W1", parameters={"amplitude": 0.25})
+    shared, found = survey(with_effects(seeded(run, 5000), [table])), []
+    for case in range(number):
+        maps_uk = list(simulate.maps(shared, case))
+        verdict = diagnose_data(ObservedMaps(context, maps_uk, ask), f"bent-{case}")
+        for one in verdict.sets[:1]:
+            if [(c.name, c.channel) for c in map(verdict.candidates.__getitem__, one.candidates)] == [
+                ("beam_ellipticity", "W1")
+            ]:
+                found.append((np.array(one.coordinates) - [0.25, 0.0]) / one.errors)
+    width = np.sqrt(np.mean(np.square(found)))
+    error = width / np.sqrt(4 * len(found))
+    print(f"{len(found)} of {number} are named first; rms of the pulls {width:.2f} +- {error:.2f}")
+    print("mean", np.mean(found, axis=0).round(2), "width", np.std(found, axis=0, ddof=1).round(2))
+
+
 def pairs(number):
     """Diagnose maps with two effects, each at S/N 5 to 20, and print how often both are named."""
     from mcsim.benchmark.case import Prior
@@ -445,5 +465,5 @@ def null(number):
 
 if __name__ == "__main__":
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    commands = (maps, true, further, draws, pairs, several, null)
+    commands = (maps, true, further, bent, draws, pairs, several, null)
     {one.__name__: one for one in commands}[sys.argv[1]](int(sys.argv[2]) if len(sys.argv) > 2 else 42)
