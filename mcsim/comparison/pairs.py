@@ -373,6 +373,11 @@ def _pair(
     whole_sides = (np.stack([side[m] for m in maps]).astype(np.float64) for side in sides)
     a, b = (np.stack([_without_holes(one) for one in side]) for side in whole_sides)
     observed = [side != healpy.UNSEEN for side in (a, b)]
+    for side, here in zip("AB", observed, strict=True):
+        if not here.any(axis=1).all():
+            raise InputError(
+                f"a map of {name} on side {side} has no data: all of it is NaN or UNSEEN; give its values."
+            )
     seen, one_sided = observed[0] & observed[1], int(np.sum(observed[0] != observed[1]))
     if whole is None:
         return ChannelPair(name, tuple(maps), a, b, seen, one_sided)

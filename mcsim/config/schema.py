@@ -199,7 +199,7 @@ class Channel:
     beam: Beam
     scan: Scan
     beam_b: Beam | None = None
-    frequency_ghz: Annotated[float, Field(gt=0.0)] | None = None
+    frequency_ghz: Annotated[float, Field(gt=0.0, le=10_000.0)] | None = None  # more is probably MHz or Hz
     noise: AnyNoise = Noise()
     split_noise: dict[Label, AnyNoise] = Field(default_factory=dict)
     mask: PathText | None = None

@@ -71,7 +71,7 @@ class Refiner:
         -----
         A response that is simulated at its coordinates changes its templates to the secant, exact there. A candidate
         that can have neither the fitted amplitude nor half of it is taken out. Of a stochastic one the scatter of the
-        response is kept, of any other one by how much it scatters the data. Where the power of a stochastic one counts,
+        response is kept, of any other one by how much it scatters the data. Where the power of an effect counts,
         which grows as the square of the amplitude, the secant at a_0 finds a^2/a_0 for a: the mean of this and a_0 is
         Newton's step. With the scatter that it has at the amplitude of a set, a stochastic one may not suffice though
         it is all: it is tried at the amplitude that it has alone, too.

@@ -34,7 +34,7 @@ def heading(model: ScanModel, time_s: Vector, frame: str, phase: float = 0.0) ->
     The anti-Sun direction of the scan, which moves uniformly, is the Earth's mean longitude. On an ellipse the velocity
     is one of constant size across the true longitude (the equation of the centre further on, to second order in the
     eccentricity e), plus e times that across the perihelion (Murray & Dermott, Solar System Dynamics, 2.4): 2 % faster
-    and 2 degrees ahead at most. Velocities of ``astropy`` in 2026 are met to 1e-3.
+    and 2 degrees ahead at most. Those of the ephemeris of SOFA in 2026 are met to 1.5e-3 of the speed.
     """
     mean = 2.0 * np.pi * time_s / model.orbit_period_s + np.deg2rad(model.orbit_phase_deg)
     e, perihelion = ECCENTRICITY, np.deg2rad(PERIHELION_DEG)

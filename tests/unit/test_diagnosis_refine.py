@@ -85,6 +85,14 @@ def test_a_bent_response_is_found_at_its_amplitude(amplitude):
     assert found.explanations[0].fit.amplitudes == pytest.approx([amplitude], abs=0.3)
 
 
+def test_secants_of_a_power_do_not_swing_about_the_amplitude():
+    """A response that is nearly all a square: each secant by itself would be as far on the other side."""
+    instrument = Instrument(bend=0.5, cross=0.0)
+    found = instrument.refined(instrument.response(40.0, 0.0)).attribution
+    assert [explanation.members for explanation in found.explanations] == [(0,)]
+    assert found.explanations[0].fit.amplitudes == pytest.approx([40.0], rel=1e-3)
+
+
 @pytest.mark.parametrize(("noise", "verdict"), [(None, "unknown"), (1.2, "effect")])
 def test_an_effect_may_leave_the_chi2_that_its_scatter_adds(noise, verdict):
     instrument = Instrument(bend=0.0, cross=0.0, noise=noise)

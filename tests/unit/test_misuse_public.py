@@ -106,6 +106,28 @@ def test_a_longitude_is_no_latitude(lat_deg) -> None:
         systematics.build("dipole_modulation", {"amplitude": 0.1, "lon_deg": 48.0, "lat_deg": lat_deg})
 
 
+def test_a_range_of_time_is_a_pair() -> None:
+    with refused("time_range", 0.5):
+        Moments.from_model("wmap", NSIDE, time_range=0.5)
+
+
+def test_moments_that_cannot_be_written_are_named(tmp_path) -> None:
+    (tmp_path / "file").touch()
+    with refused(tmp_path / "file" / "moments"):
+        Moments.parallel_transport(NSIDE).save(tmp_path / "file" / "moments")
+
+
+@pytest.mark.parametrize("frequency", [94e9, 94e3, -94.0])
+def test_a_frequency_is_in_ghz(frequency) -> None:
+    with refused("channel[W].frequency_ghz"):
+        mcsim.load_config(run(channel=[CHANNEL | {"frequency_ghz": frequency}]))
+
+
+def test_one_store_to_merge_is_a_path_too(tmp_path) -> None:
+    with refused(tmp_path / "a.zarr"):
+        mcsim.merge(str(tmp_path / "a.zarr"), tmp_path / "b.zarr")
+
+
 def test_no_pointing_file_is_no_survey() -> None:
     with pytest.raises(InputError):
         Moments.from_pointing_files([], NSIDE)
@@ -132,6 +154,14 @@ def test_a_unit_or_labels_of_a_compared_map_are_not_dropped() -> None:
             mcsim.compare([given], [sky], mcsim.load_config(run()))
     hidden = np.ma.masked_array(sky, np.arange(sky.size) < 20)
     assert mcsim.compare([hidden], [1.01 * sky], mcsim.load_config(run())).channels[0].one_sided == 20
+
+
+@pytest.mark.parametrize("side", ["A", "B"])
+def test_a_side_without_data_is_named(side) -> None:
+    sky = np.sin(np.arange(12.0 * NSIDE**2))
+    maps = [[np.nan * sky if side == own else sky] for own in "AB"]
+    with refused("W", f"side {side}"):
+        mcsim.compare(*maps, mcsim.load_config(run()))
 
 
 def test_sides_of_a_comparison_may_be_given_by_name() -> None:

@@ -44,7 +44,7 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
     >>> mcsim.merge(parts, "merged.zarr").finished
     32
     """
-    sources = [user_path(p) for p in paths]
+    sources = [user_path(p) for p in ([paths] if isinstance(paths, str | Path) else paths)]
     target = user_path(path)
     if not sources:
         raise InputError("There is nothing to merge; name the stores of the slices.")

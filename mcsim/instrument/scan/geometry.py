@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from mcsim.errors import InputError
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
 from mcsim.instrument.scan.offsets import HIGHEST
@@ -33,6 +35,8 @@ class MapGrid:
             raise InputError(f"offset_order is {self.offset_order}, but it must be a whole number from 1 to {HIGHEST}.")
         check_nside(self.nside)
         check_frame(self.frame)
+        if np.shape(self.time_range) != (2,):
+            raise InputError(f"time_range is {self.time_range!r}, but it must be an increasing pair within 0 and 1.")
         start, stop = self.time_range
         if not 0.0 <= start < stop <= 1.0:
             raise InputError(f"time_range is ({start:g}, {stop:g}), but it must be an increasing pair within 0 and 1.")

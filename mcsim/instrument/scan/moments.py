@@ -376,12 +376,12 @@ class Moments:
 
     def save(self, folder: str | Path) -> None:
         """Write the arrays as .npy files into ``folder``, which is created."""
-        folder = folders.user_path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, array in self._arrays().items():
-            np.save(folder / f"{name}.npy", array)
-        meta = {"nside": self.nside, "frame": self.frame, "offsets": self.offset_order}
-        (folder / _META).write_text(json.dumps(meta))
+        with folders.unwritable(folder := folders.user_path(folder), "choose another folder"):
+            folder.mkdir(parents=True, exist_ok=True)
+            for name, array in self._arrays().items():
+                np.save(folder / f"{name}.npy", array)
+            meta = {"nside": self.nside, "frame": self.frame, "offsets": self.offset_order}
+            (folder / _META).write_text(json.dumps(meta))
 
     @classmethod
     def load(cls, folder: str | Path, mmap: bool = True) -> Self:
