@@ -146,7 +146,9 @@ def _channel(pair: ChannelPair, sides: Comparison, accuracy: float) -> ChannelRe
     if cut is None:
         return _either_way(pair, others, sides, accuracy)
     found = _either_way(cut, others, sides, accuracy)
-    whole = found if found.differences else _either_way(pair, others, sides, accuracy)
+    if found.verdict != "unknown":
+        return found
+    whole = _either_way(pair, others, sides, accuracy)
     return whole if whole.differences else found
 
 

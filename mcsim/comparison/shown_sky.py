@@ -60,20 +60,21 @@ def with_fewer_orders(pair: ChannelPair) -> ChannelPair | None:
     """Return the pair with the orders of the beam that a run takes, if side A was made with them; None if with all."""
     if pair.scene is None or pair.orders is None or pair.orders >= pair.scene.beam.mmax:
         return None
-    left = _left_of_side_a(pair)
+    left, _ = _left_of_side_a(pair)
     if left <= SHARP**2 * _sky(pair):
         return None
     cut = replace(pair, scene=replace(pair.scene, beam=pair.scene.beam.truncated(pair.orders)))
-    cut = cut.with_sky_of_maps() if pair.sky_of_maps else cut
-    return cut if _left_of_side_a(cut) < MADE * left else None
+    less, cut = _left_of_side_a(cut.with_sky_of_maps() if pair.sky_of_maps else cut)
+    return cut if less < MADE * left else None
 
 
-def _left_of_side_a(pair: ChannelPair) -> float:
-    """Return the squares that orientation moments or single samples leave of side A, whichever leave less."""
+def _left_of_side_a(pair: ChannelPair) -> tuple[float, ChannelPair]:
+    """Return the squares that orientation moments or single samples leave of side A, and the sky that leaves less."""
     shown = _sharper(pair) if pair.sky_of_maps else pair
     assert pair.scene is not None
     assert shown.scene is not None
-    return min(_left(pair, pair.scene.maps()), _left(shown, _made(shown, shown.scene)))
+    found = (_left(pair, pair.scene.maps()), pair), (_left(shown, _made(shown, shown.scene)), shown)
+    return min(found, key=lambda one: one[0])
 
 
 def _left(pair: ChannelPair, made: Maps) -> float:
