@@ -20,7 +20,7 @@ from mcsim.comparison.prediction import PRECISION, Set
 from mcsim.comparison.result import ChannelResult, ComparisonResult, DifferenceResult, Verdict
 from mcsim.comparison.scene import Scene
 from mcsim.comparison.search import INTERPOLATING, Problem
-from mcsim.comparison.shown_sky import with_fewer_orders, with_shown_sky
+from mcsim.comparison.shown_sky import adds_orders, with_fewer_orders, with_shown_sky
 from mcsim.errors import InputError
 from mcsim.support import folders
 from mcsim.support.progress import reporting
@@ -146,7 +146,7 @@ def _channel(pair: ChannelPair, sides: Comparison, accuracy: float) -> ChannelRe
     if cut is None:
         return _either_way(pair, others, sides, accuracy)
     found = _either_way(cut, others, sides, accuracy)
-    if found.verdict != "unknown":
+    if found.differences or not adds_orders(cut, pair):
         return found
     whole = _either_way(pair, others, sides, accuracy)
     return whole if whole.differences else found

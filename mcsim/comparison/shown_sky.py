@@ -68,6 +68,15 @@ def with_fewer_orders(pair: ChannelPair) -> ChannelPair | None:
     return cut if less < MADE * left else None
 
 
+def adds_orders(cut: ChannelPair, pair: ChannelPair) -> bool:
+    """Return True if side B is like the orders of the beam that a pair has and side A lacks."""
+    assert cut.scene is not None
+    assert pair.scene is not None
+    more = (replace(cut.scene, beam=pair.scene.beam).maps() - cut.scene.maps())[pair.seen]
+    rest = (cut.b - cut.a)[pair.seen]
+    return float(more @ rest) ** 2 > MADE * float(more @ more) * float(rest @ rest)
+
+
 def _left_of_side_a(pair: ChannelPair) -> tuple[float, ChannelPair]:
     """Return the squares that orientation moments or single samples leave of side A, and the sky that leaves less."""
     shown = _sharper(pair) if pair.sky_of_maps else pair
