@@ -185,13 +185,20 @@ class TimeShift(Difference):
     smooth = True
     natural = 1e-3
 
+    def __init__(self) -> None:
+        self._largest = np.inf
+
+    def within(self, value: Vector) -> Vector:
+        """Return the shift, of at most two widths of the beam: farther on, the sky is another one."""
+        return np.clip(value, -self._largest, self._largest)
+
     def starts(self, state: State) -> list[Vector]:
-        """Return the shift that fits best, if it is small beside the beam: farther on, the sky is another one."""
+        """Return the shift that fits best."""
         scene, pair = state.scene, state.pair
         if scene is None or pair.channel is None or pair.channel.site.pointing is None:
             return []
         width = np.sqrt(-np.log(max(scene.beam.window[scene.lmax], 1e-12)) * 2.0) / scene.lmax
-        largest = 2.0 * width / _radians_per_sample(pair)
+        self._largest = largest = 2.0 * width / _radians_per_sample(pair)
         bare, value = scene.maps(), 0.05 * largest
         for _ in range(3):
             moved = self.scene(scene, np.array([value]), pair).maps() - bare
