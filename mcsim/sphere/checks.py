@@ -4,6 +4,7 @@ The arrays come from users and other packages, and compiled loops do not check t
 """
 
 import math
+import os
 from numbers import Real
 from typing import Any
 
@@ -27,6 +28,13 @@ def check_whole(value: Any, name: str, least: int = 0) -> None:
     """Raise InputError unless ``value`` is a whole number of type int, ``least`` or more."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise InputError(f"{name} is {value!r}, but it must be a whole number (int) >= {least}.")
+
+
+def check_memory(size: float, what: str, remedy: str) -> None:
+    """Raise InputError if ``size`` bytes are more than this machine's memory; ``what`` needs them."""
+    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if size > there:
+        raise InputError(f"{what} takes {size / 1e9:.3g} GB, but this machine has {there / 1e9:.3g} GB; {remedy}.")
 
 
 def check_number(value: Any, name: str, unit: str) -> None:
