@@ -36,37 +36,22 @@ _HOOKS = ("sky", "beam", "pointing", "gain", "noise", "spread", "orientations", 
 
 @dataclass(frozen=True, eq=False)
 class Derivative:
-    """Hold the derivative of maps with respect to one coordinate of an effect.
+    """Hold the derivative of maps with respect to one coordinate of an effect."""
 
-    Attributes
-    ----------
-    maps
-        Which maps of the survey change.
-    plus, minus, width
-        Surveys of these maps alone, without noise, and the difference of the coordinate between them;
-        ``minus`` None: ``plus`` is linear in the sky and is the derivative itself.
-    observe
-        Maps of all channels from a sky, for an effect on the sky alone: the response of the inverse covariance, of
-        which what such an effect changes must be no more and no less; None: the simulator's.
-    factor
-        What the sky is multiplied with at first, shape (lmax + 1,); None: nothing.
-    dipole
-        Coefficients of the dipole that the survey sees besides, uK.
-    noise
-        Derivative of the variance of every pixel, uK^2, shape (own maps, npix); None: it does not change.
-    stochastic
-        True if the shape of what is added is random.
-    """
-
-    maps: slice
+    maps: slice  #: which maps of the survey change
+    #: plus, minus, width: surveys of these maps alone, without noise, and the difference of the coordinate between
+    #: them; ``minus`` None: ``plus`` is linear in the sky and is the derivative itself
     plus: Survey
     minus: Survey | None
     width: float
+    #: maps of all channels from a sky, for an effect on the sky alone: the response of the inverse covariance, of which
+    #: what such an effect changes must be no more and no less; None: the simulator's
     observe: Observe | None
-    factor: Vector | None
-    dipole: Alm
+    factor: Vector | None  #: what the sky is multiplied with at first, shape (lmax + 1,); None: nothing
+    dipole: Alm  #: coefficients of the dipole that the survey sees besides, uK
+    #: derivative of the variance of every pixel, uK^2, shape (own maps, npix); None: it does not change
     noise: Maps | None
-    stochastic: bool
+    stochastic: bool  #: True if the shape of what is added is random
 
     def of_sky(self, sky: Alm) -> Maps:
         """Return the derivative of the maps of a sky, without what does not depend on it, uK per unit."""

@@ -161,23 +161,14 @@ class BeamOrder(Form):
 
 @dataclass(frozen=True, kw_only=True)
 class InTime(Form):
-    """Derive forms that depend on time from this class.
+    """Derive forms that depend on time from this class."""
 
-    Attributes
-    ----------
-    wave
-        "": constant; "spin": ``harmonic`` times the spin phase; "year"; "orientation": ``harmonic`` times psi; "sky":
-        a pattern.
-    coefficients
-        Of cosine and sine, or of the pattern, or the constant.
-    splits
-        Factor in each of as many equal parts of the survey's time.
-    """
-
+    #: "": constant; "spin": ``harmonic`` times the spin phase; "year"; "orientation": ``harmonic`` times psi; "sky": a
+    #: pattern
     wave: ClassVar[str] = ""
     harmonic: ClassVar[int] = 1
-    coefficients: ClassVar[tuple[float, ...]]
-    splits: ClassVar[tuple[float, ...]] = (1.0,)
+    coefficients: ClassVar[tuple[float, ...]]  #: of cosine and sine, or of the pattern, or the constant
+    splits: ClassVar[tuple[float, ...]] = (1.0,)  #: factor in each of as many equal parts of the survey's time
 
     def factor(self, time_s: Vector, site: Site) -> Vector:
         """Return the factor of the split that each time is in."""

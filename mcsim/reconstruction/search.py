@@ -59,26 +59,14 @@ class Sky(Protocol):
 
 @dataclass(frozen=True)
 class Found:
-    """A structure that is there.
+    """A structure that is there."""
 
-    Attributes
-    ----------
-    structure
-        Index in the grammar.
-    evidence
-        Logarithm of its odds against none, in what those found before it leave.
-    pvalue
-        Global p-value: probability that the best of all structures has as large an evidence in data of the model.
-    delta_chi2
-        Fall of chi^2, unbiased.
-    alternatives
-        Indices of structures less probable by ALTERNATIVES at most, the most probable first.
-    """
-
-    structure: int
-    evidence: float
+    structure: int  #: index in the grammar
+    evidence: float  #: logarithm of its odds against none, in what those found before it leave
+    #: global p-value: probability that the best of all structures has as large an evidence in data of the model
     pvalue: float
-    delta_chi2: float
+    delta_chi2: float  #: fall of chi^2, unbiased
+    #: indices of structures less probable by ALTERNATIVES at most, the most probable first
     alternatives: tuple[int, ...]
 
 

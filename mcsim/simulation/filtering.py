@@ -59,24 +59,12 @@ def unknown_dipole(cl: Vector) -> Vector:
 
 @dataclass(frozen=True, eq=False)
 class MapFilter:
-    """Filter of one map.
+    """Filter of one map."""
 
-    Attributes
-    ----------
-    name
-        Of the map.
-    inverse
-        Its inverse covariance, with circular beam and pixel window as response.
-    window
-        Pixel window that the analysis divides out, shape (>= lmax + 1,).
-    lmax
-        Highest degree of the result.
-    """
-
-    name: str
-    inverse: InverseCovariance
-    window: Vector
-    lmax: int
+    name: str  #: of the map
+    inverse: InverseCovariance  #: its inverse covariance, with circular beam and pixel window as response
+    window: Vector  #: pixel window that the analysis divides out, shape (>= lmax + 1,)
+    lmax: int  #: highest degree of the result
 
     @cached_property
     def total(self) -> Vector:
@@ -125,20 +113,13 @@ class MapFilter:
 
 @dataclass(frozen=True, eq=False)
 class Bands:
-    """Bins of all modes of one pair of maps, as a vector of real numbers: real and imaginary parts where they exist.
+    """Bins of all modes of one pair of maps, as a vector of real numbers: real and imaginary parts where they exist."""
 
-    Attributes
-    ----------
-    modes, lmax, width
-        Of the coefficients, and width of the bins in ell.
-    auto
-        True if both maps of the pair are the same.
-    """
-
+    #: modes, lmax, width: of the coefficients, and width of the bins in ell
     modes: tuple[Mode, ...]
     lmax: int
     width: int
-    auto: bool
+    auto: bool  #: True if both maps of the pair are the same
 
     @cached_property
     def first(self) -> NDArray[np.int64]:
@@ -228,27 +209,13 @@ def probes_of(bands: Sequence[Bands], asked: int | None) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Filtering:
-    """Filters of all maps of a survey, and the normalisation of what they measure.
+    """Filters of all maps of a survey, and the normalisation of what they measure."""
 
-    Attributes
-    ----------
-    filters
-        One for every map.
-    pairs
-        Indices of maps.
-    tables
-        Of the estimator.
-    width
-        Of the bins in ell.
-    probes
-        Random probes for the normalisation; None: as many as give 20 pairs for each number.
-    """
-
-    filters: tuple[MapFilter, ...]
-    pairs: tuple[tuple[int, int], ...]
-    tables: Estimator
-    width: int
-    probes: int | None = None
+    filters: tuple[MapFilter, ...]  #: one for every map
+    pairs: tuple[tuple[int, int], ...]  #: indices of maps
+    tables: Estimator  #: of the estimator
+    width: int  #: of the bins in ell
+    probes: int | None = None  #: random probes for the normalisation; None: as many as give 20 pairs for each number
 
     @cached_property
     def bands(self) -> tuple[Bands, ...]:

@@ -37,20 +37,12 @@ ITERATIONS = 2000
 
 @dataclass(frozen=True, eq=False)
 class ObservedMap:
-    """Describe one map.
+    """Describe one map."""
 
-    Attributes
-    ----------
-    response
-        Of the beam times the pixel window. Maps with equal ones share their transforms.
-    precision
-        Inverse variance of the noise in every pixel, uK^-2, shape (npix,); 0 where not observed or masked.
-    moments
-        Orientation moments and centroids of the samples; None: only the circular part of the beam, at pixel centres.
-    """
-
-    response: convolve.Response
+    response: convolve.Response  #: Of the beam times the pixel window. Maps with equal ones share their transforms.
+    #: inverse variance of the noise in every pixel, uK^-2, shape (npix,); 0 where not observed or masked
     precision: Map
+    #: orientation moments and centroids of the samples; None: only the circular part of the beam, at pixel centres
     moments: Moments | None = None
 
     @property

@@ -107,20 +107,13 @@ class MapParts:
     """The parts that add up to a map, uK, shape (npix,) each.
 
     They are analysed apart, so that the quadrature error of the circular-beam control cancels in the paired difference.
-
-    Attributes
-    ----------
-    smooth
-        The sky through the circular part of the beam at the pixels' centres; None where its a_lm stand for it.
-    extra
-        The rest of the circular-beam control: centroids, noise, gain, what effects add to samples. None: nothing.
-    difference
-        What the rest of the beam adds. None: nothing.
     """
 
+    #: the sky through the circular part of the beam at the pixels' centres; None where its a_lm stand for it
     smooth: NDArray[np.float64] | None
+    #: The rest of the circular-beam control: centroids, noise, gain, what effects add to samples. None: nothing.
     extra: NDArray[np.float64] | None
-    difference: NDArray[np.float64] | None
+    difference: NDArray[np.float64] | None  #: What the rest of the beam adds. None: nothing.
 
     @property
     def total(self) -> NDArray[np.float64]:
