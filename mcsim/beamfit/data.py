@@ -129,10 +129,7 @@ def project(
 def from_store(path: str | Path, selection: Selection = EVERYTHING) -> Measurement:
     """Read the mean of an ensemble, with the covariance of its data vector over all modes and bins of the summary.
 
-    Raises
-    ------
-    InputError
-        If the store lacks what is selected.
+    Raise InputError if the store lacks what is selected.
     """
     with opening.open_ensemble(path) as ensemble:
         width = int(ensemble.attrs["configuration"]["biposh"]["summary_bin"])

@@ -60,13 +60,8 @@ def solve(
 
     The design has rank K < p. With ``simulations`` the covariance, shape (p, p), is proportional to the sample
     covariance of so many independent draws, which subtracts their mean and is independent of the data; ``None``: it is
-    known.
-
-    Raises
-    ------
-    InputError
-        For arrays of other shapes, values that are not finite, fewer than p + 3 simulations, data without scatter, or
-        a design whose columns are not independent.
+    known. Raise InputError for arrays of other shapes, values that are not finite, fewer than p + 3 simulations, data
+    without scatter, or a design whose columns are not independent.
 
     Notes
     -----
@@ -151,10 +146,7 @@ class Comparison:
 def compare(small: Solution, large: Solution) -> Comparison:
     """Test a model against a smaller one that it contains, fitted to the same data.
 
-    Raises
-    ------
-    InputError
-        If ``large`` does not have more parameters than ``small``, or their covariances differ.
+    Raise InputError if ``large`` does not have more parameters than ``small``, or their covariances differ.
 
     Notes
     -----

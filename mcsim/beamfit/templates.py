@@ -122,10 +122,7 @@ class Templates:
 def templates(survey: Survey, measured: Measurement, nthreads: int = 1) -> Templates:
     """Build the templates of a survey for a measurement.
 
-    Raises
-    ------
-    InputError
-        For a survey without a spectrum, with another lmax or other maps, or with circular beams.
+    Raise InputError for a survey without a spectrum, with another lmax or other maps, or with circular beams.
     """
     expectation.spectrum(survey)
     if measured.lmax > survey.lmax:

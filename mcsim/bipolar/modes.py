@@ -81,12 +81,8 @@ def existing(L: int, d: int, lmax: int) -> NDArray[np.bool_]:
 def bennett_factor(mode: Indices, lmax: int) -> NDArray[np.float64]:
     """Return the factor from the Hajian-Souradeep to the Bennett (WMAP) normalisation at ell = l2, shape (lmax + 1,).
 
-    sqrt(2L+1) / (sqrt((2 l1 + 1)(2 l2 + 1)) C^{L0}_{l1 0 l2 0}); NaN where the coefficient does not exist.
-
-    Raises
-    ------
-    InputError
-        For odd parity, where C^{L0}_{l1 0 l2 0} vanishes, or a mode that cannot exist.
+    sqrt(2L+1) / (sqrt((2 l1 + 1)(2 l2 + 1)) C^{L0}_{l1 0 l2 0}); NaN where the coefficient does not exist. Raise
+    InputError for odd parity, where C^{L0}_{l1 0 l2 0} vanishes, or a mode that cannot exist.
 
     Notes
     -----

@@ -75,20 +75,11 @@ def named_source(run: config.RunConfig) -> tuple[config.RunConfig, str | None]:
 def source_of(run: config.RunConfig, given: Any) -> Source:
     """Return the source of maps of a survey that ``run`` describes.
 
-    Parameters
-    ----------
-    run
-        Description of sky, beams, scans and noise.
-    given
-        A function ``simulate(seed, effects=())``, or an object with such a method, or its class, which is made with the
-        run if it takes an argument; the same as text, ``package.module:name`` or ``file.py:name``. Or
-        stored maps: a template of FITS files with {realization}, {channel} and {split}; a Zarr store or .npy file; an
-        xarray object or array with the dimension ``realization`` first.
-
-    Raises
-    ------
-    InputError
-        If it cannot be loaded, has no such method, or lacks a map.
+    ``run``: description of sky, beams, scans and noise. ``given``: a function ``simulate(seed, effects=())``, or an
+    object with such a method, or its class, which is made with the run if it takes an argument; the same as text,
+    ``package.module:name`` or ``file.py:name``. Or stored maps: a template of FITS files with {realization}, {channel}
+    and {split}; a Zarr store or .npy file; an xarray object or array with the dimension ``realization`` first. Raise
+    InputError if it cannot be loaded, has no such method, or lacks a map.
     """
     parts = tuple(parts_of(run))
     if isinstance(given, xr.DataArray | xr.Dataset | np.ndarray):

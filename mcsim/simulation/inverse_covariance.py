@@ -55,21 +55,9 @@ class ObservedMap:
 class InverseCovariance:
     """Apply the inverse covariance of maps.
 
-    Parameters
-    ----------
-    cl
-        Spectrum of the sky, uK^2, shape (lmax + 1,).
-    maps
-        The maps in order, of one nside.
-    tolerance
-        Relative residual at which the conjugate gradients end.
-    nthreads
-        Threads of the transforms.
-
-    Raises
-    ------
-    InputError
-        If no map has an observed pixel, pixels differ in number, or a response does not reach lmax.
+    ``cl``: spectrum of the sky, uK^2, shape (lmax + 1,). ``maps``: the maps in order, of one nside. ``tolerance``:
+    relative residual at which the conjugate gradients end. ``nthreads``: threads of the transforms. Raise InputError if
+    no map has an observed pixel, pixels differ in number, or a response does not reach lmax.
 
     Notes
     -----

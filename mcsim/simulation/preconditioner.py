@@ -38,14 +38,9 @@ NEIGHBOURS = np.array([4.0, 1.0] * 4) / 6.0
 class Preconditioner:
     """Apply the approximate inverse to skies.
 
-    Parameters
-    ----------
-    gain
-        Power of the sky over that of the noise, shape (lmax + 1,), if all pixels had the mean precision.
-    precision
-        Inverse variance of the pixels, shape (npix,), of any unit; 0 where not observed.
-    nthreads
-        Threads of the transforms.
+    ``gain``: power of the sky over that of the noise, shape (lmax + 1,), if all pixels had the mean precision.
+    ``precision``: inverse variance of the pixels, shape (npix,), of any unit; 0 where not observed. ``nthreads``:
+    threads of the transforms.
 
     Notes
     -----

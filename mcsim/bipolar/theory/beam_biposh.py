@@ -71,12 +71,8 @@ class ScannedBeam:
 def beam_biposh(beam: ScannedBeam, mode: Indices, lmax: int) -> NDArray[np.complex128]:
     """Return B^{LM}_{l2-d, l2} of a beam under any scan at l2 = 0..lmax, complex, NaN where it does not exist.
 
-    The mode is (L, M, d), with d = l2 - l1 of either sign and any |M| <= L; lmax is the highest l1 and l2.
-
-    Raises
-    ------
-    InputError
-        If |M| or |d| exceeds L.
+    The mode is (L, M, d), with d = l2 - l1 of either sign and any |M| <= L; lmax is the highest l1 and l2. Raise
+    InputError if |M| or |d| exceeds L.
 
     Notes
     -----

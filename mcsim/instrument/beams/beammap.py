@@ -86,17 +86,10 @@ def read_map(
 ) -> BeamMap:
     """Read a beam map from the first image of a FITS file.
 
-    Parameters
-    ----------
-    path
-        FITS file (may be gzipped); column = beam x (in-scan), row = beam y.
-    pixel_deg, cut_deg, centre
-        As for :meth:`mcsim.instrument.beams.Beam.from_map`.
-    plane
-        Plane of a three-dimensional image (a WMAP beam file has side A, its noise, side B, its noise).
-    projection
-        See :class:`BeamMap`. Values are those at the pixel centres; of means over the pixels take
-        :meth:`BeamMap.without_pixel_window`.
+    ``path``: FITS file (may be gzipped); column = beam x (in-scan), row = beam y. ``pixel_deg``, ``cut_deg``,
+    ``centre``: as for :meth:`mcsim.instrument.beams.Beam.from_map`. ``plane``: plane of a three-dimensional image (a
+    WMAP beam file has side A, its noise, side B, its noise). ``projection``: see :class:`BeamMap`. Values are those at
+    the pixel centres; of means over the pixels take :meth:`BeamMap.without_pixel_window`.
 
     Notes
     -----
