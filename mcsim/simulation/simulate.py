@@ -30,9 +30,9 @@ class Observed:
 def realize(survey: Survey, realization: int, nthreads: int = 1) -> dict[str, NDArray]:
     """Return the spectra of one realization.
 
-    Its index, >= 0, fixes every random number with the run's seed. They are ``biposh`` (pair, mode, lmax + 1) complex and ``cl`` (pair, lmax +
-    1), uK^2; with a filter ``biposh_qml`` (pair, mode, bin); with pairing the same of the circular-beam control,
-    ``biposh_circular`` and so on; with kept maps ``observed_map`` (map, npix), uK.
+    Its index, >= 0, fixes every random number with the run's seed. They are ``biposh`` (pair, mode, lmax + 1) complex
+    and ``cl`` (pair, lmax + 1), uK^2; with a filter ``biposh_qml`` (pair, mode, bin); with pairing the same of the
+    circular-beam control, ``biposh_circular`` and so on; with kept maps ``observed_map`` (map, npix), uK.
     """
     ensemble = survey.config.ensemble
     sky = draw_sky(survey, realization)
