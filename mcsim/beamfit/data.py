@@ -17,8 +17,7 @@ from mcsim.support.folders import user_path
 
 Kind = Literal["plain", "difference"]
 
-QUADRUPOLE = ("L2M0d0", "L2M0d2")
-"""A^{20}_{l l} and A^{20}_{l-2,l}: the modes fitted by default."""
+QUADRUPOLE = ("L2M0d0", "L2M0d2")  #: A^{20}_{l l} and A^{20}_{l-2,l}: the modes fitted by default
 
 
 @dataclass(frozen=True)
@@ -45,8 +44,7 @@ class Selection:
         return tuple(parse_mode(name) for name in self.modes)
 
 
-EVERYTHING = Selection()
-"""The quadrupole modes at every ell."""
+EVERYTHING = Selection()  #: the quadrupole modes at every ell
 
 
 class Row(NamedTuple):

@@ -14,8 +14,7 @@ from mcsim.bipolar import Mode
 from mcsim.errors import InputError
 from mcsim.support.folders import unreadable
 
-COLUMNS = ("L", "M", "d", "ell_min", "ell_max")
-"""Columns that identify the content of a row."""
+COLUMNS = ("L", "M", "d", "ell_min", "ell_max")  #: columns that identify the content of a row
 
 
 def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING) -> Measurement:

@@ -17,8 +17,7 @@ Order = Literal["auto", "leading", "exact"]
 
 ORDERS: tuple[str, ...] = get_args(Order)
 
-TRIAL_MOMENTS = 16
-"""Degree of the orientation moments that gives the size of the higher orders to about 5 %."""
+TRIAL_MOMENTS = 16  #: degree of the orientation moments that gives the size of the higher orders to about 5 %
 
 
 @dataclass(frozen=True)

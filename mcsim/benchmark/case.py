@@ -12,14 +12,11 @@ from mcsim.support.arrays import Vector
 from mcsim.systematics.signatures import Place
 
 Kind = Literal["none", "one", "two", "left_out", "invented"]
-Identity = tuple[str, str | None]
-"""Name of an effect and of its channel; None: all channels."""
-Answer = frozenset[Identity]
-"""Effects that act together; the empty set: no effect."""
+Identity = tuple[str, str | None]  #: name of an effect and of its channel; None: all channels
+Answer = frozenset[Identity]  #: effects that act together; the empty set: no effect
 
 KINDS: tuple[Kind, ...] = get_args(Kind)
-IN_LIBRARY = ("none", "one", "two")
-"""Kinds of cases whose effects the diagnosis can name."""
+IN_LIBRARY = ("none", "one", "two")  #: kinds of cases whose effects the diagnosis can name
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.sphere.clebsch import band, evaluate
 
-Indices = tuple[int, int, int]
-"""(L, M, d) of a mode, where M may be negative."""
+Indices = tuple[int, int, int]  #: (L, M, d) of a mode, where M may be negative
 
 
 CONVENTION = "A^{LM}_{l1 l2} = sum a_{l1 m1} conj(a_{l2 m2}) (-1)^{m2} C^{LM}_{l1 m1 l2 -m2}, ell = l2, d = l2 - l1"

@@ -6,8 +6,7 @@ from typing import Any
 
 from mcsim.config.noise import in_words, is_noise_free
 
-NARROWEST = 0.03
-"""Width of a beam, radians, times lmax: a Gaussian of it has B_l > 0.9999 up to lmax."""
+NARROWEST = 0.03  #: width of a beam, radians, times lmax: a Gaussian of it has B_l > 0.9999 up to lmax
 
 
 def warn_of_units(run: Any) -> None:

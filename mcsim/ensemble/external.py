@@ -23,14 +23,12 @@ from mcsim.errors import InputError, RunError
 from mcsim.support.arrays import Alm
 from mcsim.support.code import class_digest
 
-SEEDS = 1 << 20
-"""Realizations of a stream of seeds."""
+SEEDS = 1 << 20  #: realizations of a stream of seeds
 
 LARGEST = 1 << 16
 """Bytes of a pickled simulator up to which it goes with every task; a larger one is a file in the cache."""
 
-_GOLDEN = 2654435769
-"""2^32 over the golden ratio, odd: multiples modulo 2^32 are all different, and far apart."""
+_GOLDEN = 2654435769  #: 2^32 over the golden ratio, odd: multiples modulo 2^32 are all different, and far apart
 
 
 @dataclass(frozen=True)

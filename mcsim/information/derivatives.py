@@ -19,17 +19,10 @@ from mcsim.support.arrays import Alm, Vector, divided
 from mcsim.systematics import Effect
 
 Maps = NDArray[np.float64]
-Observe = Callable[[Alm], Maps]
-"""Return the maps of all channels, shape (map, npix), of a sky."""
-
-DRAWS = 64
-"""Realizations that the mean of an effect of random shape is estimated from, in two halves."""
-
-STEP = 0.1
-"""Share of an effect's ``step``: an ellipticity of either sign bends the response by half of itself."""
-
-NEGLIGIBLE = 1e-12
-"""Orders whose derivative is below this share of the largest are rounding."""
+Observe = Callable[[Alm], Maps]  #: return the maps of all channels, shape (map, npix), of a sky
+DRAWS = 64  #: realizations that the mean of an effect of random shape is estimated from, in two halves
+STEP = 0.1  #: share of an effect's ``step``: an ellipticity of either sign bends the response by half of itself
+NEGLIGIBLE = 1e-12  #: orders whose derivative is below this share of the largest are rounding
 
 _HOOKS = ("sky", "beam", "pointing", "gain", "noise", "spread", "orientations", "differencing")
 

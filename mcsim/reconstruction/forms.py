@@ -27,8 +27,7 @@ from mcsim.systematics.product import multiplied
 from mcsim.systematics.spacecraft import spin_phase
 
 REFERENCE_GHZ = 94.0
-_NSIDE = 128
-"""Of the map that a pattern of low degree is looked up in."""
+_NSIDE = 128  #: of the map that a pattern of low degree is looked up in
 
 
 @dataclass(frozen=True, kw_only=True)

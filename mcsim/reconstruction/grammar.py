@@ -18,8 +18,7 @@ from mcsim.support.arrays import Matrix, Vector
 
 ALIKE, OPPOSITE = "alike", "opposite"
 
-ALSO_COMMON = ("monopole", "dipole")
-"""Patterns that all channels may have alike: skies of a model have none of them."""
+ALSO_COMMON = ("monopole", "dipole")  #: patterns that all channels may have alike: skies of a model have none of them
 
 INDICES = (-3.0, -2.0, 1.5)
 """Power of the frequency, in thermodynamic units, of signals of several channels: synchrotron, free-free, dust."""

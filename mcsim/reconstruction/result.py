@@ -5,8 +5,7 @@ from typing import Any
 
 from mcsim.support.numbers import measured, p_equals
 
-NSIDE = 16
-"""Of the pictures."""
+NSIDE = 16  #: of the pictures
 
 
 @dataclass(frozen=True)

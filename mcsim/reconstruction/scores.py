@@ -21,14 +21,9 @@ from mcsim.sphere import healpix, real
 from mcsim.sphere.sky import dipole_alm
 from mcsim.support.arrays import Alm, Cl, Map, Vector, divided
 
-ADDED, GAIN = 8, 2
-"""Highest degree of patterns that are added, and of those that multiply."""
-
-ORDERS = 4
-"""Highest order of a beam, and of what follows its orientation."""
-
-BINS = 4
-"""Ranges of degrees of a profile in l, equal in log l."""
+ADDED, GAIN = 8, 2  #: highest degree of patterns that are added, and of those that multiply
+ORDERS = 4  #: highest order of a beam, and of what follows its orientation
+BINS = 4  #: ranges of degrees of a profile in l, equal in log l
 
 Key = tuple[str | int, ...]
 

@@ -18,11 +18,8 @@ from mcsim.reconstruction.grammar import ALIKE, Structure
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector
 
-LEVEL = 0.01
-"""Global p-value, all of the grammar charged, up to which a structure is there."""
-
-MOST = 3
-"""Largest number of structures."""
+LEVEL = 0.01  #: global p-value, all of the grammar charged, up to which a structure is there
+MOST = 3  #: largest number of structures
 
 SECOND = 0.1
 """Least fall of chi^2 of a further structure over that of the first: below it may be the square of the first."""
@@ -34,14 +31,9 @@ the evidence those of one stage and frame, and simulations for each of their sco
 RARE = 3.0
 """Odds against a structure that is not alike in all splits, and against a gain or square of sky or dipole alone."""
 
-TAIL = 0.1
-"""Share of the simulations by which the tail of the largest evidence is described."""
-
-SMALL = 1e-6
-"""Variance, relative to the largest, of a direction in which scores are not inverted."""
-
-ALTERNATIVES = 20.0
-"""Odds up to which other structures are told beside the best."""
+TAIL = 0.1  #: share of the simulations by which the tail of the largest evidence is described
+SMALL = 1e-6  #: variance, relative to the largest, of a direction in which scores are not inverted
+ALTERNATIVES = 20.0  #: odds up to which other structures are told beside the best
 
 
 class Sky(Protocol):

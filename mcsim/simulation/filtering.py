@@ -35,14 +35,9 @@ from mcsim.support import folders
 from mcsim.support.arrays import Alm, Map, Matrix, Vector, divided
 from mcsim.support.code import package_digest
 
-LOWEST = 2
-"""Lowest degree in bins: the monopole and the dipole of a map are not those of its sky."""
-
-PAIRS = 20
-"""Pairs of random probes for each number whose Fisher matrix they estimate."""
-
-TOLERANCE = 1e-6
-"""Relative residual at which the inverse covariance of a map is found."""
+LOWEST = 2  #: lowest degree in bins: the monopole and the dipole of a map are not those of its sky
+PAIRS = 20  #: pairs of random probes for each number whose Fisher matrix they estimate
+TOLERANCE = 1e-6  #: relative residual at which the inverse covariance of a map is found
 
 DIPOLE_UK = 100.0
 """Rms of the monopole and of the dipole that maps may have besides their sky, so that nothing is learnt from them."""

@@ -28,11 +28,8 @@ from mcsim.sphere.checks import check_cl
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.support.arrays import Alm, Cl, Map, Vector, divided
 
-Maps = NDArray[np.float64]
-"""Shape (map, npix), uK or uK^-1."""
-
-ITERATIONS = 2000
-"""After so many the conjugate gradients are given up."""
+Maps = NDArray[np.float64]  #: shape (map, npix), uK or uK^-1
+ITERATIONS = 2000  #: after so many the conjugate gradients are given up
 
 
 @dataclass(frozen=True, eq=False)

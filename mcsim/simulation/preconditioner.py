@@ -25,11 +25,8 @@ from mcsim.sphere import healpix
 from mcsim.sphere.checks import nside_of
 from mcsim.support.arrays import Alm, Map, Vector, divided
 
-FAINT = 0.1
-"""Power of the sky over that of the noise below which degrees are taken one by one."""
-
-HOLE = 0.5
-"""Precision over its median below which pixels are missing, in part or altogether."""
+FAINT = 0.1  #: power of the sky over that of the noise below which degrees are taken one by one
+HOLE = 0.5  #: precision over its median below which pixels are missing, in part or altogether
 
 NEIGHBOURS = np.array([4.0, 1.0] * 4) / 6.0
 """Weights of the neighbours of a pixel in a Laplacian, of edges and corners in turn as healpy returns them."""

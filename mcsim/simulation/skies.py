@@ -14,8 +14,7 @@ from mcsim.sphere.checks import UNSEEN_BELOW
 from mcsim.support.arrays import Alm
 from mcsim.support.npy import read_npy
 
-LARGEST_UK = 1e12
-"""Of a user's sky."""
+LARGEST_UK = 1e12  #: of a user's sky
 
 SMALLEST_UK = 0.01
 """Of the largest value of a user's sky that is not zero: a CMB sky in K has 5e-4, and any in uK has more than 1."""

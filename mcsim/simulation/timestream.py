@@ -30,14 +30,12 @@ from mcsim.support.code import package_digest
 SECONDS_PER_SAMPLE = 1.2e-7
 """Time of one core for a sample of correlated noise: pointing, random numbers, filter, sums."""
 
-TOLERANCE, ITERATIONS = 1e-10, 2000
-"""Of the offsets: relative residual of the conjugate gradients."""
+TOLERANCE, ITERATIONS = 1e-10, 2000  #: of the offsets: relative residual of the conjugate gradients
 
 LARGEST = 150_000_000
 """Pairs of baseline and pixel: 12 bytes each on disk, which all workers share, and 24 while they are found."""
 
-LEVEL_DRAWS = 4
-"""Realizations from which the standard deviation of the noise of pixels is estimated."""
+LEVEL_DRAWS = 4  #: realizations from which the standard deviation of the noise of pixels is estimated
 
 
 def noise_samples(noise: NoiseCorrelated, sampling_hz: float, draw: np.random.Generator) -> Callable[[int], Map]:

@@ -32,8 +32,7 @@ from mcsim.support.compiled import njit
 CHUNK = 1 << 18
 """Samples of a chunk: 12 MB of arrays, and enough of them that the interpolation does not wait for its set-up."""
 
-EPSILON = 1e-10
-"""Accuracy asked of the interpolation, relative to the signal."""
+EPSILON = 1e-10  #: accuracy asked of the interpolation, relative to the signal
 
 
 @dataclass(frozen=True)

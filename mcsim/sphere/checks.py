@@ -17,11 +17,8 @@ from mcsim.support.arrays import numbers
 
 NSIDE_MAX = 8192
 
-UNSEEN_BELOW = -1e30
-"""Values below this are ``healpy.UNSEEN`` (-1.6375e30), exactly or in single precision."""
-
-LARGEST_ANGLE = 4.0 * math.pi
-"""Two turns: a larger angle in radians is probably one in degrees."""
+UNSEEN_BELOW = -1e30  #: values below this are ``healpy.UNSEEN`` (-1.6375e30), exactly or in single precision
+LARGEST_ANGLE = 4.0 * math.pi  #: two turns: a larger angle in radians is probably one in degrees
 
 
 def check_whole(value: Any, name: str, least: int = 0) -> None:

@@ -15,8 +15,7 @@ from mcsim.errors import InputError
 from mcsim.support.arrays import Alm
 from mcsim.support.folders import unreadable
 
-T_CMB_K = 2.7255
-"""Temperature of the CMB (Fixsen 2009, ApJ 707, 916)."""
+T_CMB_K = 2.7255  #: temperature of the CMB (Fixsen 2009, ApJ 707, 916)
 
 _PREFIXES = {"": 1e6, "m": 1e3, "milli": 1e3, "u": 1.0, "mu": 1.0, "micro": 1.0, "n": 1e-3, "nano": 1e-3}
 _CMB = r"cmb|thermo(?:dynamic)?"

@@ -14,8 +14,7 @@ from mcsim.stats.gaussian import COLLINEAR, SimulatedGaussian, WhitenedTemplates
 # Scatter matrices drawn for a calibration. Each serves many data vectors: it costs a thousand times as much.
 SCATTERS = 200
 
-TAIL = 10
-"""Held-out simulations beyond which their ranks say nothing."""
+TAIL = 10  #: held-out simulations beyond which their ranks say nothing
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,7 @@ from mcsim.stats.gaussian import COLLINEAR, Fit, SimulatedGaussian, Tolerated, o
 from mcsim.support.arrays import Matrix, Vector, divided
 
 Indices = NDArray[np.int64]
-Groups = Sequence[Sequence[int]]
-"""Columns of the templates of each candidate."""
+Groups = Sequence[Sequence[int]]  #: columns of the templates of each candidate
 
 
 @dataclass(frozen=True)

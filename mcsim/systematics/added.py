@@ -63,8 +63,7 @@ class MonopoleResidual(Effect):
         return changed
 
 
-ORBITAL_UK = 270.7
-"""29.78 km/s over the speed of light, times 2.7255 K."""
+ORBITAL_UK = 270.7  #: 29.78 km/s over the speed of light, times 2.7255 K
 
 
 @dataclass(frozen=True, kw_only=True)

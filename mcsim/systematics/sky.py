@@ -26,11 +26,8 @@ LEAST = -0.99
 """Smallest change of a band that is fitted: an error larger than the power itself asks for less than none."""
 
 
-KNOWN = 0.25
-"""Error of a band up to which the data constrain its power."""
-
-DETECTED = 3.0
-"""Standard errors by which a band that is constrained worse has to change to be fitted all the same."""
+KNOWN = 0.25  #: error of a band up to which the data constrain its power
+DETECTED = 3.0  #: standard errors by which a band that is constrained worse has to change to be fitted all the same
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,8 +96,7 @@ class Spectrum(Effect):
         return alm_.multiply(sky, factor, site.lmax)
 
 
-EPSILON = 1e-5
-"""Accuracy of the interpolation, relative to the sky."""
+EPSILON = 1e-5  #: accuracy of the interpolation, relative to the sky
 
 _ELL = (2, 3, 4, 5, 8, 10, 15, 20, 28, 40, 55, 77, 107, 149, 207, 289, 402, 560, 781, 1088, 1515, 2111, 2940, 4096)
 _POWER = (

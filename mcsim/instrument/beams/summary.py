@@ -151,8 +151,7 @@ def format_summary(summary: BeamSummary) -> str:
     return "\n".join(lines)
 
 
-_LISTED_WINDOW = 1e-9
-"""Smallest B_l that is listed: ratios to smaller ones are noise."""
+_LISTED_WINDOW = 1e-9  #: smallest B_l that is listed: ratios to smaller ones are noise
 
 _Response = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 

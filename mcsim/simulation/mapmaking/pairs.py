@@ -20,12 +20,10 @@ from mcsim.support import folders
 from mcsim.support.code import package_digest
 from mcsim.support.compiled import njit
 
-PARTS = 16
-"""Parts of the survey that threads share out; fixed, so that sums do not depend on the number of threads."""
+PARTS = 16  #: parts of the survey that threads share out; fixed, so that sums do not depend on the number of threads
 
 _BAND = 1 << 27
-COUNTED = 1 << 24
-"""Samples that are counted at once."""
+COUNTED = 1 << 24  #: samples that are counted at once
 
 _META = "pairs.json"
 
