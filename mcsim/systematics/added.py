@@ -124,14 +124,7 @@ class SpinSynchronousOffset(Effect):
     signature = "A pattern of the ecliptic frame at low l, the same in both halves: stripes are too regular to average."
     source = "Hinshaw et al. 2003, ApJS 148, 63 (limits on the response to the surroundings)"
     step = 0.5
-    bounds = (
-        Bound(
-            "amplitude",
-            0.0,
-            1000.0,
-            "a prior of this library: a mK is seen in the time stream by eye",
-        ),
-    )
+    bounds = (Bound("amplitude", 0.0, 1000.0, "a prior of this library: a mK is seen in the time stream by eye"),)
     parametrization = Angle(parameter="phase_deg")
     proposed = False
 

@@ -27,14 +27,7 @@ class BeamWidth(Effect):
     signature = "L = 0: the power falls off sooner, in this channel alone."
     source = "Huffenberger et al. 2010, A&A 513, A23 (errors of measured beams)"
     step = 0.005
-    bounds = (
-        Bound(
-            "amplitude",
-            -0.5,
-            0.5,
-            "a prior of this library: a measured width is known to a half",
-        ),
-    )
+    bounds = (Bound("amplitude", -0.5, 0.5, "a prior of this library: a measured width is known to a half"),)
 
     def beam(self, beam: Beam, site: Site) -> Beam:
         """Stretch the beam."""
@@ -114,14 +107,7 @@ class BeamNoncircularity(Effect):
     signature = "L of the orders left out: 2 and 4 of an ellipse, 1 and 3 of a lopsided beam, in the scan's frame."
     source = "Joshi et al. arXiv:1210.7318, Sec. IV"
     step = 0.05
-    bounds = (
-        Bound(
-            "amplitude",
-            -2.0,
-            2.0,
-            "1 is the beam as measured; a prior of this library: at most twice that",
-        ),
-    )
+    bounds = (Bound("amplitude", -2.0, 2.0, "1 is the beam as measured; a prior of this library: at most twice that"),)
 
     def beam(self, beam: Beam, site: Site) -> Beam:
         """Add a share of the orders that were left out."""
