@@ -36,7 +36,6 @@ class DipoleResidual(DirectedEffect):
     parametrization = SkyVector(matched_filter=False)
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Add the dipole."""
         return sky + dipole_alm(self.vector, site.lmax)
 
 
@@ -57,7 +56,6 @@ class MonopoleResidual(Effect):
     parametrization = Parametrization(matched_filter=False)
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Add the constant."""
         changed = sky.copy()
         changed[0] += np.sqrt(4.0 * np.pi) * self.amplitude
         return changed
@@ -99,7 +97,6 @@ class OrbitalDipole(Effect):
     phase_deg: float = 0.0
 
     def signal(self, time_s: Vector, theta: Vector, phi: Vector, psi: Vector, site: Site) -> Vector:
-        """Return what is left."""
         towards = heading(site.pointed(self.name).model, time_s, site.frame, np.deg2rad(self.phase_deg))
         return np.asarray(self.amplitude * ORBITAL_UK * np.sum(towards * axes(theta, phi)[0], axis=0))
 
@@ -131,7 +128,6 @@ class SpinSynchronousOffset(Effect):
     phase_deg: float = 0.0
 
     def signal(self, time_s: Vector, theta: Vector, phi: Vector, psi: Vector, site: Site) -> Vector:
-        """Return a wave of the period of the spin."""
         phase = spin_phase(site.pointed(self.name), time_s)
         return np.asarray(self.amplitude * np.cos(phase - np.deg2rad(self.phase_deg)))
 

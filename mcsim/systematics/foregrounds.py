@@ -103,7 +103,6 @@ class BandpassMismatch(Effect):
     template: str = ""
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Add the excess."""
         return sky + self.amplitude * morphology(self.template, site, draw)
 
 

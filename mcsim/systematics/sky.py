@@ -142,7 +142,6 @@ class Lensing(Effect):
     proposed = False
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Lens the sky."""
         if self.amplitude < 0.0:
             raise InputError(f"effect {self.name}: amplitude = {self.amplitude:g} is no power; give 0 or more.")
         return remapped(sky, gaussian_alm(self.amplitude * potential(site.lmax), draw("potential")), site.lmax)
@@ -208,7 +207,6 @@ class Boost(DirectedEffect):
     parametrization = SkyVector(max_amplitude=0.01, mean_response=True, matched_filter=False)
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Boost the sky."""
         if abs(self.amplitude) >= 1.0:
             raise InputError(
                 f"effect {self.name}: amplitude = {self.amplitude:g} is not slower than light; keep it within +-1."
@@ -244,7 +242,6 @@ class DipoleModulation(DirectedEffect):
     parametrization = SkyVector(matched_filter=False)
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Modulate the sky."""
         a, b, c = self.vector
         return sky + multiplied(sky, site.lmax, lambda x, y, z: a * x + b * y + c * z, 1)
 
@@ -277,7 +274,6 @@ class QuadrupoleModulation(Effect):
     components: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 0.0)
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Modulate the sky."""
         q = self.along("components")
 
         def field(x: Vector, y: Vector, z: Vector) -> Vector:
