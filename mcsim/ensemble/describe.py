@@ -12,8 +12,7 @@ from mcsim.support.folders import user_path
 NEGLIGIBLE = 1e-6
 """Fraction of its error, or of the largest signal to noise, below which a predicted value counts as zero."""
 
-ROWS = 40
-"""Number of bins of a prediction that are shown."""
+ROWS = 40  #: number of bins of a prediction that are shown
 
 
 def describe(path: str | Path) -> str:
