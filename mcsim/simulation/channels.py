@@ -111,6 +111,20 @@ def refuse_external(run: config.RunConfig) -> None:
         )
 
 
+def check_scans(run: config.RunConfig) -> None:
+    """Refuse a run whose scan models cannot be read, or lack what a channel names, as the run would."""
+    for spec in run.channels:
+        match spec.scan:
+            case config.ScanHitAveraged():
+                for split in run.map.each_split:
+                    scan_model(spec, spec.scan, split).select()
+            case config.ScanDifferencing():
+                for split in run.map.each_split:
+                    scan_model(spec, spec.scan, split).pair(spec.scan.pair)
+            case config.ScanMoments():
+                described(spec)
+
+
 def check_effects(run: config.RunConfig) -> None:
     """Refuse a run with an effect that is not known, or cannot act where it is put, as the run would; make no map."""
     for spec in run.channels:

@@ -418,13 +418,32 @@ def test_a_file_that_is_no_prediction_is_refused(name: str, mcsim: Command, smal
 )
 def test_config_refuses_effects_that_run_refuses(effect: str, key: str, mcsim: Command, tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(f"{SMALL}{effect}\n")
+    refused_by_config_and_run(mcsim, key)
+    assert [file.name for file in tmp_path.iterdir()] == ["small.toml"]
+
+
+def refused_by_config_and_run(mcsim: Command, key: str) -> None:
+    """Check that ``config``, ``run`` and ``run --dry-run`` refuse small.toml with one sentence that names the key."""
     answers = [
         mcsim(*words) for words in (("config", "small.toml"), ("run", "small.toml"), ("run", "small.toml", "--dry-run"))
     ]
     for answer in answers:
         assert_refused(answer, key)
     assert len({err for _, _, err in answers}) == 1
-    assert [file.name for file in tmp_path.iterdir()] == ["small.toml"]
+
+
+@pytest.mark.parametrize(
+    ("scan", "key"),
+    [
+        ('{ kind = "hit_averaged", model = "mine.toml" }', "spin_speed"),
+        ('{ kind = "hit_averaged", model = "wmap", line_of_sight = "left" }', "left"),
+        ('{ kind = "differencing", model = "wmap_focal_plane", pair = "W9" }', "W9"),
+    ],
+)
+def test_config_refuses_scans_that_run_refuses(scan: str, key: str, mcsim: Command, tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text('name = "mine"\nspin_speed = 3.0\n')
+    (tmp_path / "small.toml").write_text(SMALL.replace('{ kind = "parallel_transport", psi0_deg = 20.0 }', scan))
+    refused_by_config_and_run(mcsim, key)
 
 
 @pytest.mark.parametrize(
