@@ -19,6 +19,7 @@ import pytest
 import xarray as xr
 from astropy.io import fits
 from astropy.table import Table
+from matplotlib.figure import Figure
 
 from mcsim import cli, config, open_summary
 from mcsim.ensemble import tables
@@ -34,7 +35,17 @@ Command = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture
 def mcsim(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Command:
-    """Run a command in an empty folder: exit code, standard output, standard error."""
+    """Run a command in an empty folder: exit code, standard output, standard error.
+
+    Its figures are saved small and without a layout engine, which draws them twice; unit tests draw them whole.
+    """
+    savefig = Figure.savefig
+
+    def quick(figure: Figure, path: Path) -> None:
+        figure.set_layout_engine(None)
+        savefig(figure, path, dpi=50)
+
+    monkeypatch.setattr(Figure, "savefig", quick)
 
     def run(*words: object) -> tuple[int, str, str]:
         monkeypatch.chdir(tmp_path)
