@@ -24,25 +24,18 @@ COLLINEAR = 1e-6
 
 @dataclass(frozen=True)
 class Fit:
-    """Hold templates fitted to a data vector.
+    """Hold templates fitted to a data vector."""
 
-    Attributes
-    ----------
-    amplitudes, covariance
-        Shape (K,), (K, K). A combination to which the data do not respond has amplitude 0 and variance 0.
-    dof
-        Degrees of freedom of the Student t that (estimate - truth)/scale follows; ``covariance`` is that t's.
-    delta_chi2, nested_pvalue
-        Fall of chi^2 by the fit, and the probability of such a fall without the templates.
-    chi2, dimension, pvalue
-        Of the residual: its chi^2, its number of degrees of freedom, and the probability of a larger chi^2.
-    """
-
+    #: amplitudes, covariance: Shape (K,), (K, K). A combination to which the data do not respond has amplitude 0 and
+    #: variance 0.
     amplitudes: NDArray[np.float64]
     covariance: NDArray[np.float64]
-    dof: int
+    dof: int  #: degrees of freedom of the Student t that (estimate - truth)/scale follows; ``covariance`` is that t's
+    #: delta_chi2, nested_pvalue: fall of chi^2 by the fit, and the probability of such a fall without the templates
     delta_chi2: float
     nested_pvalue: float
+    #: chi2, dimension, pvalue: of the residual: its chi^2, its number of degrees of freedom, and the probability of a
+    #: larger chi^2
     chi2: float
     dimension: int
     pvalue: float
