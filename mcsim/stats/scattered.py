@@ -27,8 +27,8 @@ class Acting:
     ----------
     size
         Squared white norm of its response.
-    chi2
-        What its scatter adds to chi^2 of a residual.
+    chi2, spread
+        What its scatter adds to chi^2 of a residual, and to half of the variance of that beyond twice as much.
     excess, error
         What it adds to the variance of the data along each of C groups of templates beside its own, over what that is
         without it, and the squared standard error of this; shape (C,).
@@ -36,6 +36,7 @@ class Acting:
 
     size: float
     chi2: float
+    spread: float
     excess: Vector
     error: Vector
 
@@ -61,7 +62,8 @@ class Acting:
             if number == own or not beside.shape[1]:
                 continue
             excess[number], error[number] = _growth(x @ beside, c @ beside)
-        return cls(size, scatter_chi2(null, t[:, list(groups[own])], *pair) * size, excess, error)
+        added, spread = scatter_chi2(null, t[:, list(groups[own])], *pair)
+        return cls(size, added * size, spread * size**2, excess, error)
 
 
 def _growth(x: Matrix, c: Matrix) -> tuple[float, float]:
@@ -90,7 +92,7 @@ class Beside:
 
     Attributes
     ----------
-    size, chi2
+    size, chi2, spread
         Those of :class:`Acting`, infinite and 0 where none is known, shape (C,).
     excess, error
         The same, a row for each candidate that acts, shape (C, C).
@@ -100,6 +102,7 @@ class Beside:
 
     size: Vector
     chi2: Vector
+    spread: Vector
     excess: Matrix
     error: Matrix
     variance: Vector
@@ -111,12 +114,13 @@ class Beside:
         Candidates that were added since one was simulated, behind all others, are not scattered by it.
         """
         count = len(acting)
-        size, chi2, (excess, error) = np.full(count, np.inf), np.zeros(count), np.zeros((2, count, count))
+        size, (chi2, spread) = np.full(count, np.inf), np.zeros((2, count))
+        excess, error = np.zeros((2, count, count))
         for row, one in enumerate(acting):
             if one is not None:
-                size[row], chi2[row], known = one.size, one.chi2, len(one.excess)
+                size[row], chi2[row], spread[row], known = one.size, one.chi2, one.spread, len(one.excess)
                 excess[row, :known], error[row, :known] = one.excess, one.error
-        return cls(size, chi2, excess, error, np.ones(count) if variance is None else variance)
+        return cls(size, chi2, spread, excess, error, np.ones(count) if variance is None else variance)
 
     def tolerated(self, allowance: Vector, members: Indices, parts: Matrix, others: Indices) -> Tolerated:
         """Return what tests of candidates ``others``, shape (M or 1, N), beside M sets tolerate, shape (M, N) each.
