@@ -27,11 +27,8 @@ from mcsim.stats.gaussian import Fit, SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration
 from mcsim.support.arrays import Vector
 
-SKIES = 6
-"""Skies that an expected S/N is the mean of."""
-
-HELD_OUT = 0.25
-"""Share of the simulations that serve as data, and not for the covariance."""
+SKIES = 6  #: skies that an expected S/N is the mean of
+HELD_OUT = 0.25  #: share of the simulations that serve as data, and not for the covariance
 
 
 @dataclass(frozen=True, eq=False)

@@ -74,6 +74,8 @@ class ChannelPair:
         True if side A was made from orientation moments or at the pixels' centres, so that no single sample has a say.
     orders
         Highest order of the beam in a run of the model, if that is not said and less than the scene's; None.
+    rounds
+        How often the sky that was taken from side A was corrected for what single samples leave of it.
     """
 
     name: str
@@ -94,6 +96,7 @@ class ChannelPair:
     turned: bool = False
     by_moments: bool = False
     orders: int | None = None
+    rounds: int = 0
 
     def pointing(self, longest: float = SAMPLES) -> Pointing | PointingFiles | None:
         """Return the pointing, if it is known and has no more samples than the longest that is wanted."""
@@ -137,7 +140,7 @@ class ChannelPair:
         """Return the pair with the sky that side A shows, by orientation moments."""
         assert self.scene is not None
         sky = sky_in(self.a, self.shown, self.scene.up_to_offsets(1))
-        return replace(self, scene=replace(self.scene, sky=sky))
+        return replace(self, scene=replace(self.scene, sky=sky), rounds=0)
 
 
 @dataclass(frozen=True, eq=False)

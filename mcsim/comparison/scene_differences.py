@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
+from mcsim.comparison.description import EXTRA_ORDERS
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.scene import WEAKEST, Maps, Scene, ahead
@@ -223,7 +224,7 @@ class ReversedMotion(Difference):
 
     def __init__(self, motion: str) -> None:
         self.motion = motion
-        self._made: dict[tuple[float, float], tuple[Moments, ...]] = {}
+        self._made: dict[tuple[float, float, int], tuple[Moments, ...]] = {}
 
     def starts(self, state: State) -> list[Vector]:
         known = state.pair.channel is not None and state.pair.channel.site.pointing is not None
@@ -234,11 +235,13 @@ class ReversedMotion(Difference):
         pointing = pair.channel.site.pointed(self.name)
         model = scene.motion or pointing.model
         model = replace(model, **{self.motion: -getattr(model, self.motion)}).with_lines_of_sight(pointing.line.name)
-        count, key = len(scene.moments), (model.spin_period_s, model.precession_period_s)
+        whole = scene if pair.scene is None else pair.scene
+        count, smax = len(scene.moments), min(scene.moments[0].smax, whole.beam.mmax + EXTRA_ORDERS)
+        key = model.spin_period_s, model.precession_period_s, smax
         if key not in self._made:
             self._made[key] = tuple(
                 Moments.from_model(
-                    model, scene.nside, scene.moments[0].smax, pair.channel.site.frame, (i / count, (i + 1) / count),
+                    model, scene.nside, smax, pair.channel.site.frame, (i / count, (i + 1) / count),
                     scene.nthreads,
                 )
                 for i in range(count)

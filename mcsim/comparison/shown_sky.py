@@ -56,16 +56,23 @@ def with_shown_sky(pair: ChannelPair) -> ChannelPair:
     return found if weight is None else _filtered(found, weight)
 
 
-def with_fewer_orders(pair: ChannelPair) -> ChannelPair | None:
-    """Return the pair with the orders of the beam that a run takes, if side A was made with them; None if with all."""
-    if pair.scene is None or pair.orders is None or pair.orders >= pair.scene.beam.mmax:
-        return None
-    left, _ = _left_of_side_a(pair)
-    if left <= SHARP**2 * _sky(pair):
-        return None
-    cut = replace(pair, scene=replace(pair.scene, beam=pair.scene.beam.truncated(pair.orders)))
-    less, cut = _left_of_side_a(cut.with_sky_of_maps() if pair.sky_of_maps else cut)
-    return cut if less < MADE * left else None
+def with_fewer_orders(pair: ChannelPair) -> tuple[ChannelPair, ChannelPair | None]:
+    """Return a pair, and the same with the orders of the beam that a run takes; None if side A has all of them.
+
+    Both have the sky of single samples where those were simulated to tell.
+    """
+    scene = pair.scene
+    if scene is None or pair.orders is None or pair.orders >= scene.beam.mmax:
+        return pair, None
+    beam, limit = scene.beam.truncated(pair.orders), SHARP**2 * _sky(pair)
+    cut = replace(pair, scene=replace(scene, beam=beam))
+    cut = cut.with_sky_of_maps() if pair.sky_of_maps else cut
+    found = [_by_moments(one) for one in (pair, cut)]
+    if min(left for left, _ in found) > limit:
+        both = zip(found, _by_samples(pair, cut), strict=True)
+        found = [moments if moments[0] < MADE * samples[0] else samples for moments, samples in both]
+    (left, pair), (less, cut) = found
+    return pair, cut if left > limit and less < MADE * left else None
 
 
 def adds_orders(cut: ChannelPair, pair: ChannelPair) -> bool:
@@ -77,13 +84,46 @@ def adds_orders(cut: ChannelPair, pair: ChannelPair) -> bool:
     return float(more @ rest) ** 2 > MADE * float(more @ more) * float(rest @ rest)
 
 
-def _left_of_side_a(pair: ChannelPair) -> tuple[float, ChannelPair]:
-    """Return the squares that orientation moments or single samples leave of side A, and the sky that leaves less."""
-    shown = _sharper(pair) if pair.sky_of_maps else pair
+def _by_moments(pair: ChannelPair) -> tuple[float, ChannelPair]:
+    """Return the squares that orientation moments leave of side A, and the pair."""
     assert pair.scene is not None
-    assert shown.scene is not None
-    found = (_left(pair, pair.scene.maps()), pair), (_left(shown, _made(shown, shown.scene)), shown)
-    return min(found, key=lambda one: one[0])
+    return _left(pair, pair.scene.maps()), pair
+
+
+def _by_samples(pair: ChannelPair, cut: ChannelPair) -> list[tuple[float, ChannelPair]]:
+    """Return the squares that single samples leave of side A of a pair, and of it with a cut beam, with their skies.
+
+    The sky is corrected with the cut beam. What the whole one would leave then, orientation moments say.
+    """
+    if not pair.sky_of_maps:
+        return [(_left(one, _made(one, scene)), one) for one in (pair, cut) if (scene := one.scene) is not None]
+    assert pair.scene is not None
+    _, first = _corrected(cut, _missing(cut))
+    assert first.scene is not None
+    whole, missing = replace(pair, scene=replace(pair.scene, sky=first.scene.sky)), _missing(first)
+    assert whole.scene is not None
+    more = np.where(pair.shown, whole.scene.maps() - first.scene.maps(), 0.0)
+    (less, fewer), (left, whole) = _corrected(first, missing), _corrected(whole, missing - more)
+    if less < MADE * left:
+        assert fewer.scene is not None
+        less = _left(fewer, _made(fewer, fewer.scene))
+    return [(left, whole), (less, fewer)]
+
+
+def _missing(pair: ChannelPair) -> Maps:
+    """Return what its simulation by single samples leaves of side A, 0 where that shows nothing."""
+    assert pair.scene is not None
+    return np.where(pair.shown, pair.a - _made(pair, pair.scene), 0.0)
+
+
+def _corrected(pair: ChannelPair, missing: Maps) -> tuple[float, ChannelPair]:
+    """Return the pair whose sky makes what was missing as well, and first the squares that moments leave of that."""
+    scene = pair.scene
+    assert scene is not None
+    empty = replace(scene.up_to_offsets(1), sky=np.zeros_like(scene.sky))
+    more = replace(scene, sky=scene.sky + sky_in(missing, pair.shown, empty, 1e-2))
+    left = float(np.sum((missing - more.maps() + scene.maps())[pair.seen] ** 2))
+    return left, replace(pair, scene=more, rounds=pair.rounds + 1)
 
 
 def _left(pair: ChannelPair, made: Maps) -> float:
@@ -130,21 +170,19 @@ def _made(pair: ChannelPair, scene: Scene) -> Maps:
 
 def _sharper(pair: ChannelPair) -> ChannelPair:
     scene = pair.scene
-    if scene is None or (pair.pointing() is None and scene.offset_order < 2):
+    if scene is None or pair.rounds >= ROUNDS or (pair.pointing() is None and scene.offset_order < 2):
         return pair
     limit = SHARP**2 * _sky(pair)
     if _left(pair, scene.maps()) <= limit:
         return pair
     before = np.inf
-    for _ in range(ROUNDS):
-        missing = np.where(pair.shown, pair.a - _made(pair, scene), 0.0)
+    for _ in range(pair.rounds, ROUNDS):
+        missing = _missing(pair)
         left = float(np.sum(missing**2))
         if left <= limit or left > SHARPER * before:
             break
-        before = left
-        empty = replace(scene.up_to_offsets(1), sky=np.zeros_like(scene.sky))
-        scene = replace(scene, sky=scene.sky + sky_in(missing, pair.shown, empty, 1e-2))
-    return replace(pair, scene=scene)
+        before, (_, pair) = left, _corrected(pair, missing)
+    return pair
 
 
 def _weight(pair: ChannelPair) -> Maps | None:

@@ -15,8 +15,7 @@ NEGLIGIBLE = 1e-6
 ROUNDING = 1e-12
 """Fraction of a coefficient below which its real or imaginary part is an error of rounding."""
 
-ROWS = 40
-"""Number of bins of a prediction that are shown."""
+ROWS = 40  #: number of bins of a prediction that are shown
 
 
 def describe(path: str | Path) -> str:

@@ -28,8 +28,7 @@ from mcsim.support.folders import unwritable
 if TYPE_CHECKING:
     import xarray as xr
 
-Files = dict[str, Buffer]
-"""Contents of the files of a store, by their paths in it."""
+Files = dict[str, Buffer]  #: contents of the files of a store, by their paths in it
 
 _CODECS: dict[str, Any] = {"compressors": (ZstdCodec(level=1, checksum=True),)}
 # Write chunks of fill values too, so that a missing file means damage.

@@ -14,11 +14,8 @@ from mcsim.instrument.scan.offsets import HIGHEST
 from mcsim.sphere import rotation
 from mcsim.support import resources
 
-CIRCULAR = (config.BeamGaussian, config.BeamWindow)
-"""Beams that have no m_max."""
-
-WHOLE = 4
-"""Orders that a beam has at least without its m_max, where its source has them."""
+CIRCULAR = (config.BeamGaussian, config.BeamWindow)  #: beams that have no m_max
+WHOLE = 4  #: orders that a beam has at least without its m_max, where its source has them
 
 NEGLECTED = 1e-9
 """Share of a beam's power that its orders may leave out where maps are told apart by less than a run's own accuracy."""

@@ -88,16 +88,13 @@ class Angle(Parametrization):
     multiple: int = 1
 
     def basis(self) -> tuple[Mapping[str, Any], ...]:
-        """Return cosine and sine."""
         return {}, {self.parameter: 90.0 / self.multiple}
 
     def coordinates(self, effect: Any) -> Vector:
-        """Return the amplitudes of cosine and sine."""
         angle = self.multiple * np.deg2rad(getattr(effect, self.parameter))
         return effect.amplitude * np.array([np.cos(angle), np.sin(angle)])
 
     def nearest(self, coordinates: Vector, precision: NDArray[np.float64]) -> dict[str, Any]:
-        """Return norm and angle."""
         x, y = coordinates
         angle_deg = np.rad2deg(np.arctan2(y, x)) / self.multiple
         return {"amplitude": float(np.hypot(x, y)), self.parameter: float(angle_deg)}
@@ -119,11 +116,9 @@ class Components(Parametrization):
     count: int
 
     def basis(self) -> tuple[Mapping[str, Any], ...]:
-        """Return the components one by one."""
         return tuple({self.parameter: tuple(map(float, row))} for row in np.eye(self.count))
 
     def coordinates(self, effect: Any) -> Vector:
-        """Return the components."""
         return np.asarray(effect.along(self.parameter))
 
     def nearest(self, coordinates: Vector, precision: NDArray[np.float64]) -> dict[str, Any]:
@@ -175,7 +170,6 @@ class PowerLaw(Parametrization):
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """Return the index where it is fitted."""
         return (self.parameter,) if self.ratios else ()
 
     def seen_at(self, frequencies_ghz: Iterable[float | None]) -> Self:
@@ -185,11 +179,9 @@ class PowerLaw(Parametrization):
         return replace(self, ratios=ratios) if len(seen) > 2 else self
 
     def basis(self) -> tuple[Mapping[str, Any], ...]:
-        """Return the pivots of the index."""
         return tuple({self.parameter: float(index)} for index in _PIVOTS) if self.ratios else ({},)
 
     def coordinates(self, effect: Any) -> Vector:
-        """Return the amplitudes at the pivots."""
         if not self.ratios:
             return super().coordinates(effect)
         return np.asarray(effect.amplitude * self._unit(np.array([getattr(effect, self.parameter)]))[:, 0])
@@ -227,11 +219,9 @@ class SkyVector(Parametrization):
     """Fit amplitude, ``lon_deg`` and ``lat_deg`` of an effect as the components of its ``vector``."""
 
     def basis(self) -> tuple[Mapping[str, Any], ...]:
-        """Return the vectors along x, y and z."""
         return {}, {"lon_deg": 90.0}, {"lat_deg": 90.0}
 
     def coordinates(self, effect: Any) -> Vector:
-        """Return the components x, y, z."""
         return np.asarray(effect.vector)
 
     def nearest(self, coordinates: Vector, precision: NDArray[np.float64]) -> dict[str, Any]:

@@ -357,6 +357,16 @@ def test_a_disk_that_fails_is_one_sentence(mcsim: Command, monkeypatch: pytest.M
     assert unnamed(err, "picture.png") == []
 
 
+def test_too_little_memory_is_one_sentence(mcsim: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    def large() -> None:
+        raise MemoryError("Unable to allocate 49.2 TiB")
+
+    monkeypatch.setattr(cli, "app", large)
+    code, _, err = mcsim("effects")
+    assert (code, err.count("\n")) == (1, 1)
+    assert unnamed(err, "49.2", "nside", "lmax", "smax") == []
+
+
 def test_version(mcsim: Command) -> None:
     code, out, _ = mcsim("--version")
     assert code == 0

@@ -75,16 +75,10 @@ class BeamSummary:
 def summarize(beam: Beam, beam_map: BeamMap | None = None, ells: tuple[int, ...] = DEFAULT_ELLS) -> BeamSummary:
     """Measure a beam.
 
-    Parameters
-    ----------
-    beam
-        The beam.
-    beam_map
-        The map that it comes from; without it the pattern is synthesised from the coefficients, and a beam whose
-        window is not yet small at lmax is then measured broader than it is, with the rings of the cut among its
-        negative response.
-    ells
-        Degrees at which to list the coefficients; those above lmax are left out.
+    ``beam_map``: the map that it comes from; without it the pattern is synthesised from the
+    coefficients, and a beam whose window is not yet small at lmax is then measured broader than it is, with the rings
+    of the cut among its negative response. ``ells``: degrees at which to list the coefficients; those above lmax are
+    left out.
 
     Notes
     -----
@@ -157,8 +151,7 @@ def format_summary(summary: BeamSummary) -> str:
     return "\n".join(lines)
 
 
-_LISTED_WINDOW = 1e-9
-"""Smallest B_l that is listed: ratios to smaller ones are noise."""
+_LISTED_WINDOW = 1e-9  #: smallest B_l that is listed: ratios to smaller ones are noise
 
 _Response = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 
