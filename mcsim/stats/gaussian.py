@@ -301,7 +301,8 @@ def residual_pvalue(
 
     ``dimension`` is q = p - K, ``n`` the number of simulations less one, ``allowance`` the squared signal-to-noise
     ratio of an error of the model that is tolerated, or the trace of a covariance that effects add, ``spread`` the
-    trace of its square, and ``scale`` the variance of a factor of mean one that scales the covariance of each realization.
+    trace of its square, and ``scale`` the variance of a factor of mean one that scales the covariance of each
+    realization.
 
     Notes
     -----
