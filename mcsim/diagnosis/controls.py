@@ -235,9 +235,8 @@ def _verdict(folder: Path, number: int) -> Path:
 def describe(analysis: Analysis, count: int, workers: int) -> list[str]:
     """Return lines on the cost of controls: how they are drawn, memory, time, and disk for a moment."""
     drawn = fidelity(analysis, os.cpu_count() or 1)
-    found = cost(drawn.run)
+    found, dense = cost(drawn.run), f", {drawn.samples:.2g} samples each" if drawn.samples else ""
     each_s, size = found.each_s + SAMPLE_S * drawn.samples, 96.0 * drawn.survey.nside**2 * len(drawn.survey.map_names)
-    dense = f", {drawn.samples:.2g} samples each" if drawn.samples else ""
     return [
         f"  control {count} data sets with {drawn.words}{dense}; {found.memory / 1e9:.2f} GB per worker,"
         f" {duration(each_s)} each, {duration(each_s * count / workers)} on {workers} core{'s' if workers > 1 else ''},"

@@ -26,6 +26,7 @@ class Parametrization:
     #: True if a diagnosis uses the mean response over skies, not that of the observed sky: for a change of power alone,
     #: whose response in one sky depends on fluctuations that the spectra have anyway
     mean_response: bool = False
+    noise_alone: bool = False  #: True if noise alone changes: typical skies then say by how much the data scatter more
     #: True if the data vector of a diagnosis has a matched filter for it: not if a hook draws random numbers, nor if
     #: dipoles, variances, spectra and modulations, which are always measured, contain all of it
     matched_filter: bool = True

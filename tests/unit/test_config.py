@@ -1,6 +1,7 @@
 """The configuration: what it accepts, defaults, paths, and the forms that it can be written in."""
 
 import json
+import re
 import tomllib
 import warnings
 from pathlib import Path
@@ -174,3 +175,12 @@ def test_widths_that_may_be_in_radians_are_told(plain, folder):
         assert [unnamed(text, "channel[V1].beam.fwhm_arcmin", width, "arcmin", "rad") for text in texts] == [
             []
         ] * warned
+
+
+def test_the_pages_on_configurations_name_every_key() -> None:
+    pages = Path(__file__).parents[2] / "docs" / "howto"
+    text = "".join((pages / f"{page}.md").read_text("utf-8") for page in ("configuration", "survey", "real-maps"))
+    schema = config.json_schema()
+    tables = [schema, *schema["$defs"].values()]
+    missing = [key for table in tables for key in table.get("properties", {}) if not re.search(rf"\b{key}\b", text)]
+    assert missing == []
