@@ -15,8 +15,7 @@ from mcsim.stats.scattered import Acting
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.systematics import Effect, Parametrization, basis_of
 
-BEYOND = 3.0
-"""Standard deviations by which fits may be beyond the bounds of parameters: at a bound, half of them are."""
+BEYOND = 3.0  #: standard deviations by which fits may be beyond the bounds of parameters: at a bound, half of them are
 
 
 class Column(NamedTuple):

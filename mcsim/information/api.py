@@ -31,8 +31,7 @@ from mcsim.support.settings import settings_of
 
 PICTURE = "limit.png"
 
-RESPONSE = 3.0
-"""Cost of a response over that of the circular maps of a sky, on average over the library."""
+RESPONSE = 3.0  #: cost of a response over that of the circular maps of a sky, on average over the library
 
 
 def limit(

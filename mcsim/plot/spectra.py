@@ -24,21 +24,10 @@ def ensemble_figure(
 ) -> Figure:
     """Draw the binned BipoSH spectra of one pair of maps.
 
-    Parameters
-    ----------
-    path
-        Store with a summary.
-    L, M, d
-        Draw only these; by default one panel for every L > 0 and M (L = 0 if there is no other).
-    pair
-        Label of the pair; by default the first.
-    prediction
-        Prediction by :func:`mcsim.predict`, drawn as dashed lines.
-
-    Raises
-    ------
-    InputError
-        If the selection is empty, or the prediction lacks the pair or a mode.
+    ``path``: store with a summary. ``L``, ``M``, ``d``: draw only these; by default one panel for every L > 0 and M (L
+    = 0 if there is no other). ``pair``: label of the pair; by default the first. ``prediction``: prediction by
+    :func:`mcsim.predict`, drawn as dashed lines. Raise InputError if the selection is empty, or the prediction lacks
+    the pair or a mode.
     """
     with opening.open_summary(path) as summary:
         pairs = [str(label) for label in summary["pair"].values]

@@ -15,28 +15,18 @@ STEEPEST = 1e3
 """Condition number above which derivatives tell no errors."""
 
 Indices = NDArray[np.int64]
-Groups = Sequence[Sequence[int]]
-"""Columns of the templates of each candidate."""
+Groups = Sequence[Sequence[int]]  #: columns of the templates of each candidate
 
 
 @dataclass(frozen=True)
 class Acting:
-    """Hold by how much an effect that acts at some amplitude scatters the data more than they are without it.
+    """Hold by how much an effect that acts at some amplitude scatters the data more than they are without it."""
 
-    Attributes
-    ----------
-    size
-        Squared white norm of its response.
-    chi2, spread
-        What its scatter adds to chi^2 of a residual, and to half of the variance of that beyond twice as much.
-    excess, error
-        What it adds to the variance of the data along each of C groups of templates beside its own, over what that is
-        without it, and the squared standard error of this; shape (C,).
-    """
-
-    size: float
-    chi2: float
-    spread: float
+    size: float  #: squared white norm of its response
+    chi2: float  #: what its scatter adds to chi^2 of a residual
+    spread: float  #: what it adds to half of the variance of that beyond twice as much
+    #: excess, error: what it adds to the variance of the data along each of C groups of templates beside its own, over
+    #: what that is without it, and the squared standard error of this; shape (C,)
     excess: Vector
     error: Vector
 
@@ -88,24 +78,16 @@ def _growth(x: Matrix, c: Matrix) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Beside:
-    """Combine what C candidates that act add to the scatter of the data beside them.
+    """Combine what C candidates that act add to the scatter of the data beside them."""
 
-    Attributes
-    ----------
-    size, chi2, spread
-        Those of :class:`Acting`, infinite and 0 where none is known, shape (C,).
-    excess, error
-        The same, a row for each candidate that acts, shape (C, C).
-    variance
-        Along each candidate, by :func:`variance_beside` of those that draw their pattern, shape (C,).
-    """
-
+    #: size, chi2, spread: those of :class:`Acting`, infinite and 0 where none is known, shape (C,)
     size: Vector
     chi2: Vector
     spread: Vector
+    #: excess, error: the same, a row for each candidate that acts, shape (C, C)
     excess: Matrix
     error: Matrix
-    variance: Vector
+    variance: Vector  #: along each candidate, by :func:`variance_beside` of those that draw their pattern, shape (C,)
 
     @classmethod
     def of(cls, acting: Sequence[Acting | None], variance: Vector | None) -> "Beside":

@@ -31,7 +31,6 @@ class NoiseLevel(Effect):
     parametrization = Parametrization(noise_alone=True, matched_filter=False)
 
     def noise(self, site: Site) -> Map | None:
-        """Return the same factor everywhere."""
         if self.amplitude == 0.0:
             return None
         if self.amplitude <= -1.0:
@@ -67,7 +66,6 @@ class NoiseAnisotropy(Effect):
     template: str = ""
 
     def noise(self, site: Site) -> Map | None:
-        """Return 1 + a t."""
         if self.amplitude == 0.0:
             return None
         centres = np.stack(healpy.pix2vec(site.nside, np.arange(12 * site.nside**2)))
@@ -130,7 +128,6 @@ class ExcessNoise(Effect):
     glitch_uk: float = 500.0
 
     def excess(self, count: Vector, rng: np.random.Generator) -> Vector:
-        """Return the sum of the hits."""
         if self.amplitude < 0.0:
             raise InputError(f"effect {self.name}: amplitude = {self.amplitude:g} is no fraction; give 0 or more.")
         number = rng.poisson(self.amplitude * count)

@@ -25,8 +25,7 @@ from mcsim.support.code import package_digest
 
 _META = "moments.json"
 _ARRAYS = ("hits", "w", "dtheta", "dphi", "offset_moments")
-_PIXELS = 1 << 18
-"""Whose centroids are computed at once, to save memory."""
+_PIXELS = 1 << 18  #: whose centroids are computed at once, to save memory
 
 
 @dataclass(frozen=True)
