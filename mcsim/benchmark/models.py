@@ -12,7 +12,7 @@ from mcsim import config
 from mcsim.benchmark.case import Identity, Member
 from mcsim.benchmark.folder import Settings
 from mcsim.datavector.analysis import Analysis, Job, analysis_of, data_vectors
-from mcsim.datavector.campaign import Batch, after_jobs, asking, batch, seeded, with_effects
+from mcsim.datavector.campaign import PER_TASK, Ask, Batch, after_jobs, asking, batch, seeded, with_effects
 from mcsim.datavector.candidate import Candidate, TemplateBank, columns_of, coordinates_of, effects_at, numbered
 from mcsim.datavector.halves import Halves
 from mcsim.datavector.null_ensemble import NullEnsemble
@@ -22,13 +22,13 @@ from mcsim.diagnosis.context import DiagnosisContext, calibration_of, context
 from mcsim.diagnosis.subsets import Subsets
 from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError, RunError
+from mcsim.sphere import rng
 from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit, SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration
-from mcsim.support.arrays import Vector
+from mcsim.support.arrays import Matrix, Vector
 
 SKIES = 6  #: skies that an expected S/N is the mean of
-HELD_OUT = 0.25  #: share of the simulations that serve as data, and not for the covariance
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,19 +114,28 @@ class LinearModel(EffectsLibrary):
             return None
 
 
-def linear_model(known: DiagnosisContext, without: Sequence[str] = ()) -> LinearModel:
-    """Make the linear model of a diagnosis, without some effects; a quarter of its simulations become data.
+def linear_model(known: DiagnosisContext, without: Sequence[str] = (), fresh: Matrix | None = None) -> LinearModel:
+    """Make the linear model of a diagnosis, without some effects.
 
-    Templates are exact here: neither their errors nor the scatter of stochastic effects play a part.
+    Its data are ``fresh`` simulations (:func:`simulated`), shape (n, p_raw of the full library), or a quarter of its
+    own. Templates are exact here: neither their errors nor the scatter of stochastic effects play a part.
     """
     analysis, ensemble, bank, rows = reduced(known, without)
-    kept = len(ensemble.simulations) - int(HELD_OUT * len(ensemble.simulations))
-    seen = ensemble.first(kept)
+    kept = len(ensemble.simulations) - (len(ensemble.simulations) // 4 if fresh is None else 0)
+    seen, rest = ensemble.first(kept), ensemble.simulations[kept:] if fresh is None else fresh[:, rows]
     candidates = tuple(replace(candidate, shape_error=None) for candidate in analysis.candidates)
     null, templates = seen.gaussian, bank.significant(ensemble.spread, known.settings)
     groups = null.whiten_groups(templates, [candidate.columns for candidate in candidates])
-    halves, data = Halves.of(seen, np.zeros(len(templates))), ensemble.simulations[kept:] + ensemble.offset
+    halves, data = Halves.of(seen, np.zeros(len(templates))), rest + ensemble.offset
     return LinearModel(null, templates, candidates, calibration_of(seen, null, groups), rows, halves, data)
+
+
+def simulated(known: DiagnosisContext, number: int, seed: int, ask: Ask) -> Matrix:
+    """Simulate data vectors without effects that no covariance knows, shape (number, p_raw)."""
+    run = seeded(known.run, int(rng.generator(seed, 0, "challenge/draws").integers(2**40, 2**62)))
+    job = replace(known.analysis.job(run), nuisances=bool(run.nuisances))
+    starts = range(0, number, PER_TASK)
+    return np.concatenate(ask([replace(job, first=first, count=min(PER_TASK, number - first)) for first in starts]))
 
 
 def reduced(

@@ -95,11 +95,8 @@ class CaseSampler:
         channels = self._groups[name]
         group = channels[int(draw.integers(len(channels)))]
         index = group[int(draw.integers(len(group)))]
-        candidate, white, strength = (
-            self.effects_library.candidates[index],
-            self._white(index),
-            self.prior.strength(draw),
-        )
+        candidate, white = self.effects_library.candidates[index], self._white(index)
+        strength = self.prior.strength(draw)
         gram, fit = white.T @ white, candidate.parametrization
         values, vectors = np.linalg.eigh(gram)
         constrained = values > 1e-9 * values[-1]

@@ -11,10 +11,10 @@ from mcsim.benchmark import report
 from mcsim.benchmark.bayes import BayesClassifier, facts
 from mcsim.benchmark.case import Drawn, Prior, Record, Truth, pulls
 from mcsim.benchmark.folder import VERDICTS, Settings, finished_cases, open_key, read_json
-from mcsim.benchmark.models import EffectsLibrary, LinearModel, learned_model, linear_model, workers_of
+from mcsim.benchmark.models import EffectsLibrary, LinearModel, learned_model, linear_model, simulated, workers_of
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.benchmark.summary import ALPHA, Power, Score
-from mcsim.datavector.campaign import Batch
+from mcsim.datavector.campaign import Batch, asking
 from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.context import DiagnosisContext
@@ -24,7 +24,7 @@ from mcsim.errors import InputError
 from mcsim.sphere import rng
 from mcsim.stats.detection import power
 from mcsim.stats.look_elsewhere import GlobalTest, global_test
-from mcsim.support.arrays import Vector
+from mcsim.support.arrays import Matrix, Vector
 from mcsim.support.folders import writable
 
 CASES_PER_TASK = 20
@@ -77,8 +77,10 @@ def score_draws(
     writable(Path(folder))
     with workers_of(settings, workers, quiet) as call:
         context = learned_model(settings).context
-        records = draws(context, number, seed, settings.prior, call)
-    found = powers(linear_model(context), DETECTIONS, seed)
+        with asking(call, quiet) as ask:
+            fresh = simulated(context, number, seed, ask)
+        records = draws(context, number, seed, settings.prior, call, fresh)
+    found = powers(linear_model(context, fresh=fresh), DETECTIONS, seed)
     result = Score(f"{number} draws of the data vector", records, found)
     report.write(result, Path(folder))
     return result
@@ -149,15 +151,16 @@ class Draw:
     response: Vector
 
 
-def draws(context: DiagnosisContext, number: int, seed: int, prior: Prior, call: Batch) -> list[Record]:
+def draws(
+    context: DiagnosisContext, number: int, seed: int, prior: Prior, call: Batch, fresh: Matrix | None = None
+) -> list[Record]:
     """Draw data vectors and judge them by :func:`mcsim.diagnosis.selection.attribute`; one record for each draw.
 
-    x = data vector of a simulation without effects that is not in the covariance (the first one again when all have
-    been used), plus templates times coordinates: responses are straight lines here, and templates exact. What they are
-    not, and everything else that a map goes through, is tested by full skies. Out-of-library effects have no template
-    and are not drawn.
+    x = data vector of a simulation without effects that is not in the covariance (:func:`linear_model`), plus templates
+    times coordinates: responses are straight lines here, and templates exact. What they are not, and everything else
+    that a map goes through, is tested by full skies. Out-of-library effects have no template and are not drawn.
     """
-    full = linear_model(context)
+    full = linear_model(context, fresh=fresh)
     sampler = CaseSampler(prior, full)
     kinds = sampler.kinds(seed, number)
     by_library: dict[tuple[str, ...], list[Draw]] = {}
@@ -166,7 +169,7 @@ def draws(context: DiagnosisContext, number: int, seed: int, prior: Prior, call:
         by_library.setdefault(drawn.without, []).append(Draw(case, drawn, full.response(drawn.members)))
     tasks = []
     for names, cases in by_library.items():
-        model = linear_model(context, names) if names else full
+        model = linear_model(context, names, fresh) if names else full
         posed = [replace(draw, response=draw.response[model.rows]) for draw in cases]
         tasks += [(model, prior, seed, posed[i : i + CASES_PER_TASK]) for i in range(0, len(posed), CASES_PER_TASK)]
     return sorted((record for _, found in call(judge, tasks) for record in found), key=lambda record: record.case)
@@ -178,8 +181,8 @@ def judge(model: LinearModel, prior: Prior, seed: int, cases: Sequence[Draw]) ->
     found = []
     for draw in cases:
         x = model.data[draw.number % len(model.data)] + draw.response
-        tested = attribute(model.null, x, model.templates, model.candidates, model.calibration)
-        said = tested.if_named(DiagnosisSettings())
+        said = attribute(model.null, x, model.templates, model.candidates, model.calibration)
+        said = said.if_named(DiagnosisSettings())
         record = Record(
             case=f"draw-{draw.number:05d}",
             strength=model.null.expected_snr(draw.response),

@@ -386,10 +386,11 @@ def config(
     if schema:
         print(json.dumps(config_.json_schema(), indent=2))
     elif name is not None:
+        loaded = config_.load(name)
+        # They load slowly: what cannot be read is said before.
         from mcsim.simulation.channels import check_effects, check_scans
         from mcsim.simulation.nuisance import check_nuisances
 
-        loaded = config_.load(name)
         check_scans(loaded)
         check_effects(loaded)
         check_nuisances(loaded)

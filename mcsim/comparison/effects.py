@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
+import healpy
 import numpy as np
 
 from mcsim import config
@@ -29,7 +30,11 @@ STAGES = ("sky", "beam", "pointing", "gain", "signal", "spread", "orientations")
 
 
 class EffectDifference(Difference):
-    """An effect of the library, linear in its coordinates."""
+    """An effect of the library, linear in its coordinates.
+
+    The response of one that changes the sky is not larger than that: templates are those of small amplitudes. One that
+    adds a signal of its own is bounded as in a diagnosis.
+    """
 
     linear = proportional = True
     natural = 1e-9
@@ -46,10 +51,20 @@ class EffectDifference(Difference):
         self.kind, self.templates, self.run, self.sky = kind, templates, run, sky
         self._bare = {} if bare is None else bare
         self._there: dict[tuple[bytes | float, ...], Maps] = {}
+        self._products = np.tensordot(templates, templates, ((1, 2), (1, 2))) / templates[0].size
+        self._largest = float(np.sum((2 * np.arange(run.sky.lmax + 1) + 1) * healpy.alm2cl(sky)) / (4.0 * np.pi))
 
     def starts(self, state: State) -> list[Vector]:
         """Return the coordinates that fit best."""
-        return [state.fit(list(self.templates))]
+        return [self.within(state.fit(list(self.templates)))]
+
+    def within(self, value: Vector) -> Vector:
+        """Return the coordinates, or smaller ones in proportion whose response is possible."""
+        size = float(value @ self._products @ value) / max(self._largest, 1e-300)
+        if self.kind.signal is not Effect.signal:
+            highest = min([np.inf, *(max(-b.low, b.high) for b in self.kind.bounds if b.parameter == "amplitude")])
+            size = (self.amplitude(value) / highest) ** 2
+        return value / max(1.0, float(np.sqrt(size)))
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
         """Return the maps with the effect's response."""

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.comparison.description import SAMPLES, check_splits, in_full, orders_of, quiet, with_known_offsets
-from mcsim.comparison.scene import Maps, PointingFiles, Scene, scene_of, sky_in
+from mcsim.comparison.scene import Maps, PointingFiles, Scene, scene_of
+from mcsim.comparison.sky_of_maps import sky_in
 from mcsim.ensemble.external import named_source, source_of
 from mcsim.ensemble.maps import file_names, first_realization
 from mcsim.errors import InputError

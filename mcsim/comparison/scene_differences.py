@@ -17,6 +17,7 @@ from mcsim.instrument.beams import Beam
 from mcsim.instrument.beams.coefficients import power_by_order
 from mcsim.instrument.scan import Moments
 from mcsim.instrument.scan.pointing import pointing
+from mcsim.simulation import convolve
 from mcsim.simulation.channels import NEGLECTED
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
@@ -185,13 +186,20 @@ class TimeShift(Difference):
     smooth = True
     natural = 1e-3
 
+    def __init__(self) -> None:
+        self._largest = np.inf
+
+    def within(self, value: Vector) -> Vector:
+        """Return the shift, of at most two widths of the beam: farther on, the sky is another one."""
+        return np.clip(value, -self._largest, self._largest)
+
     def starts(self, state: State) -> list[Vector]:
-        """Return the shift that fits best, if it is small beside the beam: farther on, the sky is another one."""
+        """Return the shift that fits best."""
         scene, pair = state.scene, state.pair
         if scene is None or pair.channel is None or pair.channel.site.pointing is None:
             return []
         width = np.sqrt(-np.log(max(scene.beam.window[scene.lmax], 1e-12)) * 2.0) / scene.lmax
-        largest = 2.0 * width / _radians_per_sample(pair)
+        self._largest = largest = 2.0 * width / _radians_per_sample(pair)
         bare, value = scene.maps(), 0.05 * largest
         for _ in range(3):
             moved = self.scene(scene, np.array([value]), pair).maps() - bare
@@ -363,15 +371,19 @@ class LmaxCut(Difference):
     met = "b_lm of a lower lmax than the sky's, padded with zeros"
 
     def starts(self, state: State) -> list[Vector]:
+        """Return the degree from which on side B has least: of maps, and by what changes of the sky, without holes."""
         assert state.scene is not None
-        lmax = min(state.scene.lmax, 3 * state.pair.nside - 1)
-        a, b = (_mean_alm(side, state, lmax) for side in (state.maps, state.pair.b))
+        scene, lmax = state.scene, min(state.scene.lmax, 3 * state.pair.nside - 1)
+        a, change = (_mean_alm(maps, state, lmax) for maps in (state.maps, state.pair.b - state.maps))
+        whole = alm_.resize(convolve.circular_alm(scene.sky, scene.response), scene.lmax, lmax)
         degrees = alm_.degrees(lmax)
         weight = np.where(alm_.orders(lmax) == 0, 1.0, 2.0)
-        kept, gone = (np.bincount(degrees, weight * np.abs(x) ** 2, lmax + 1) for x in (b - a, b))
-        lost = np.cumsum(kept) + gone.sum() - np.cumsum(gone)
-        best = int(np.argmin(lost))
-        return [np.array([float(best)])] if 2 <= best < lmax else []
+        found = set()
+        for before in (a, whole):
+            kept, gone = (np.bincount(degrees, weight * np.abs(x) ** 2, lmax + 1) for x in (change, before + change))
+            lost = np.cumsum(kept) + gone.sum() - np.cumsum(gone)
+            found.add(int(np.argmin(lost)))
+        return [np.array([float(best)]) for best in sorted(found) if 2 <= best < lmax]
 
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
         kept = np.arange(scene.lmax + 1) <= value[0]

@@ -5,10 +5,10 @@ from dataclasses import replace
 import healpy
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.linalg import LinearOperator, cg
 
 from mcsim.comparison.pairs import ChannelPair
-from mcsim.comparison.scene import WEAKEST, Maps, Scene, sky_in
+from mcsim.comparison.scene import WEAKEST, Maps, Scene
+from mcsim.comparison.sky_of_maps import NEAR, WHOLE, sky_in, wiener
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.support.arrays import Alm
@@ -28,23 +28,14 @@ Orientation moments leave more of maps of single samples.
 SHARPER = 0.5
 """Share of the squares that a correction of the sky must leave at most to be followed by another one."""
 
-WHOLE = 0.99
-"""Share of the pixels from which on holes hide nothing."""
-
 FREE = 0.05
 """Share of the pixels of a single map that its sky leaves free at least, if noise is told from it."""
-
-NEAR = 5
-"""Degrees over which power is averaged."""
 
 MADE = 0.1
 """Share of what a simulation leaves of side A that another one leaves at most if side A was made that way."""
 
 ROUNDS = 2
 """How often the sky is corrected for what its simulation leaves of the maps."""
-
-ITERATIONS = 100
-"""Largest number of steps of the filter."""
 
 
 def with_shown_sky(pair: ChannelPair) -> ChannelPair:
@@ -121,7 +112,7 @@ def _corrected(pair: ChannelPair, missing: Maps) -> tuple[float, ChannelPair]:
     scene = pair.scene
     assert scene is not None
     empty = replace(scene.up_to_offsets(1), sky=np.zeros_like(scene.sky))
-    more = replace(scene, sky=scene.sky + sky_in(missing, pair.shown, empty, 1e-2))
+    more = replace(scene, sky=scene.sky + sky_in(missing, pair.shown, empty, 1e-2, scene.sky))
     left = float(np.sum((missing - more.maps() + scene.maps())[pair.seen] ** 2))
     return left, replace(pair, scene=more, rounds=pair.rounds + 1)
 
@@ -236,12 +227,11 @@ def _filtered(pair: ChannelPair, weight: Maps) -> ChannelPair:
     inverse = np.divide(1.0, factor, out=np.zeros_like(factor), where=known)
     total = weight.sum(axis=0)
     noise = healpy.nside2pixarea(pair.nside) / np.mean(total[total > 0.0])
-    near = np.ones(NEAR) / NEAR
     shown = healpy.alm2cl(alm_.multiply(alm_.resize(scene.sky, scene.lmax, lmax), factor, lmax))
-    power = np.maximum(np.convolve(shown, near, "same") - noise, 1e-3 * noise) * known
+    power = np.maximum(np.convolve(shown, np.ones(NEAR) / NEAR, "same") - noise, 1e-3 * noise) * known
 
     def sky_of(values: NDArray[np.float64]) -> Alm:
-        smooth = _wiener(values, total, power, scene.nthreads)
+        smooth = wiener(values, total, power, scene.nthreads)
         return alm_.resize(alm_.multiply(smooth, inverse, lmax), lmax, scene.lmax)
 
     def seen_by_circle(sky: Alm) -> NDArray[np.float64]:
@@ -274,37 +264,3 @@ def _draw(power: NDArray[np.float64], draw: np.random.Generator) -> Alm:
     real, imaginary = draw.standard_normal((2, alm_.size(lmax)))
     alm = np.where(alm_.orders(lmax) == 0, real, (real + 1j * imaginary) / np.sqrt(2.0))
     return alm_.multiply(alm, np.sqrt(power), lmax)
-
-
-def _wiener(
-    weighted: NDArray[np.float64], weight: NDArray[np.float64], power: NDArray[np.float64], nthreads: int
-) -> Alm:
-    """Return the mean of the coefficients whose map, times a weight, was ``weighted`` but for noise.
-
-    Parameters
-    ----------
-    weighted, weight
-        Map times inverse variance of the noise, and that; shape (npix,).
-    power
-        Of the sky, shape (lmax + 1,).
-    """
-    lmax, nside = power.size - 1, healpy.npix2nside(weight.size)
-    size = np.sqrt(np.where(alm_.orders(lmax) == 0, 1.0, 2.0))  # so that the product of vectors is that of maps
-
-    def of_map(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        alm = healpix.adjoint(values, lmax, nthreads)
-        return (size * alm_.multiply(alm, np.sqrt(power), lmax)).view(np.float64)
-
-    def to_alm(vector: NDArray[np.float64]) -> Alm:
-        return alm_.multiply(np.ascontiguousarray(vector).view(np.complex128) / size, np.sqrt(power), lmax)
-
-    def applied(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-        return vector + of_map(weight * healpix.synthesis(to_alm(vector)[None], nside, lmax, nthreads=nthreads)[0])
-
-    diagonal = 1.0 + np.repeat(power[alm_.degrees(lmax)], 2) * weight.sum() / (4.0 * np.pi)
-    shape = (diagonal.size, diagonal.size)
-    found, _ = cg(
-        LinearOperator(shape, matvec=applied, dtype=np.float64), of_map(weighted), rtol=1e-6, maxiter=ITERATIONS,
-        M=LinearOperator(shape, matvec=lambda v: v / diagonal, dtype=np.float64),
-    )  # fmt: skip
-    return to_alm(found)

@@ -24,25 +24,18 @@ COLLINEAR = 1e-6
 
 @dataclass(frozen=True)
 class Fit:
-    """Hold templates fitted to a data vector.
+    """Hold templates fitted to a data vector."""
 
-    Attributes
-    ----------
-    amplitudes, covariance
-        Shape (K,), (K, K). A combination to which the data do not respond has amplitude 0 and variance 0.
-    dof
-        Degrees of freedom of the Student t that (estimate - truth)/scale follows; ``covariance`` is that t's.
-    delta_chi2, nested_pvalue
-        Fall of chi^2 by the fit, and the probability of such a fall without the templates.
-    chi2, dimension, pvalue
-        Of the residual: its chi^2, its number of degrees of freedom, and the probability of a larger chi^2.
-    """
-
+    #: amplitudes, covariance: Shape (K,), (K, K). A combination to which the data do not respond has amplitude 0 and
+    #: variance 0.
     amplitudes: NDArray[np.float64]
     covariance: NDArray[np.float64]
-    dof: int
+    dof: int  #: degrees of freedom of the Student t that (estimate - truth)/scale follows; ``covariance`` is that t's
+    #: delta_chi2, nested_pvalue: fall of chi^2 by the fit, and the probability of such a fall without the templates
     delta_chi2: float
     nested_pvalue: float
+    #: chi2, dimension, pvalue: of the residual: its chi^2, its number of degrees of freedom, and the probability of a
+    #: larger chi^2
     chi2: float
     dimension: int
     pvalue: float
@@ -179,9 +172,12 @@ class SimulatedGaussian:
         """Return the probability of a larger chi^2 than that of data, shape (p_raw,): Hotelling's T^2 test."""
         return float(self.residual_test(self.chi2(x)))
 
-    def residual_test(self, chi2: ArrayLike, fitted: ArrayLike = 0, allowance: ArrayLike = 0.0) -> NDArray[np.float64]:
+    def residual_test(
+        self, chi2: ArrayLike, fitted: ArrayLike = 0, allowance: ArrayLike = 0.0, spread: ArrayLike = 0.0
+    ) -> NDArray[np.float64]:
         """Return the p-value of chi^2 after ``fitted`` columns have been fitted; see :func:`residual_pvalue`."""
-        return residual_pvalue(chi2, self.dimension - np.asarray(fitted), self.dof, allowance, self.scale_variance)
+        dimension = self.dimension - np.asarray(fitted)
+        return residual_pvalue(chi2, dimension, self.dof, allowance, self.scale_variance, spread)
 
     def nested_test(
         self,
@@ -294,13 +290,19 @@ def held_out_pvalues(simulations: Matrix, null: SimulatedGaussian) -> Vector:
 
 
 def residual_pvalue(
-    chi2: ArrayLike, dimension: ArrayLike, n: int, allowance: ArrayLike = 0.0, scale: float = 0.0
+    chi2: ArrayLike,
+    dimension: ArrayLike,
+    n: int,
+    allowance: ArrayLike = 0.0,
+    scale: float = 0.0,
+    spread: ArrayLike = 0.0,
 ) -> NDArray[np.float64]:
     """Return the probability of a larger chi^2 of the residual after K columns have been fitted, or of the data.
 
     ``dimension`` is q = p - K, ``n`` the number of simulations less one, ``allowance`` the squared signal-to-noise
-    ratio of an error of the model that is tolerated, and ``scale`` the variance of a factor of mean one that scales the
-    covariance of each realization.
+    ratio of an error of the model that is tolerated, or the trace of a covariance that effects add, ``spread`` the
+    trace of its square, and ``scale`` the variance of a factor of mean one that scales the covariance of each
+    realization.
 
     Notes
     -----
@@ -309,7 +311,7 @@ def residual_pvalue(
     """
     q = np.asarray(dimension, dtype=float)
     f = (n - q + 1.0) / np.maximum(q, 1.0) * np.asarray(chi2) / n
-    return np.where(q > 0.0, f_tail(f, np.maximum(q, 1.0), n - q + 1.0, allowance, scale), 1.0)
+    return np.where(q > 0.0, f_tail(f, np.maximum(q, 1.0), n - q + 1.0, allowance, scale, spread), 1.0)
 
 
 class Tolerated(NamedTuple):

@@ -24,6 +24,7 @@ class Acting:
 
     size: float  #: squared white norm of its response
     chi2: float  #: what its scatter adds to chi^2 of a residual
+    spread: float  #: what it adds to half of the variance of that beyond twice as much
     #: excess, error: what it adds to the variance of the data along each of C groups of templates beside its own, over
     #: what that is without it, and the squared standard error of this; shape (C,)
     excess: Vector
@@ -51,7 +52,8 @@ class Acting:
             if number == own or not beside.shape[1]:
                 continue
             excess[number], error[number] = _growth(x @ beside, c @ beside)
-        return cls(size, scatter_chi2(null, t[:, list(groups[own])], *pair) * size, excess, error)
+        added, spread = scatter_chi2(null, t[:, list(groups[own])], *pair)
+        return cls(size, added * size, spread * size**2, excess, error)
 
 
 def _growth(x: Matrix, c: Matrix) -> tuple[float, float]:
@@ -78,9 +80,10 @@ def _growth(x: Matrix, c: Matrix) -> tuple[float, float]:
 class Beside:
     """Combine what C candidates that act add to the scatter of the data beside them."""
 
-    #: size, chi2: those of :class:`Acting`, infinite and 0 where none is known, shape (C,)
+    #: size, chi2, spread: those of :class:`Acting`, infinite and 0 where none is known, shape (C,)
     size: Vector
     chi2: Vector
+    spread: Vector
     #: excess, error: the same, a row for each candidate that acts, shape (C, C)
     excess: Matrix
     error: Matrix
@@ -93,12 +96,13 @@ class Beside:
         Candidates that were added since one was simulated, behind all others, are not scattered by it.
         """
         count = len(acting)
-        size, chi2, (excess, error) = np.full(count, np.inf), np.zeros(count), np.zeros((2, count, count))
+        size, (chi2, spread) = np.full(count, np.inf), np.zeros((2, count))
+        excess, error = np.zeros((2, count, count))
         for row, one in enumerate(acting):
             if one is not None:
-                size[row], chi2[row], known = one.size, one.chi2, len(one.excess)
+                size[row], chi2[row], spread[row], known = one.size, one.chi2, one.spread, len(one.excess)
                 excess[row, :known], error[row, :known] = one.excess, one.error
-        return cls(size, chi2, excess, error, np.ones(count) if variance is None else variance)
+        return cls(size, chi2, spread, excess, error, np.ones(count) if variance is None else variance)
 
     def tolerated(self, allowance: Vector, members: Indices, parts: Matrix, others: Indices) -> Tolerated:
         """Return what tests of candidates ``others``, shape (M or 1, N), beside M sets tolerate, shape (M, N) each.

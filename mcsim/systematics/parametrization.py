@@ -16,32 +16,21 @@ class Parametrization:
 
     An effect has linear components, k in number: its response is the sum of its coordinates times the responses of the
     effects of the basis, each per unit of amplitude.
-
-    Attributes
-    ----------
-    sign
-        Sign of the amplitudes at which responses are measured; 0: both. If it is not 0, a negative amplitude is
-        unphysical, and a diagnosis does not name it.
-    max_amplitude
-        Largest physical amplitude, in absolute value; a diagnosis names no larger one.
-    stochastic
-        True if a hook draws random numbers, at positive amplitudes at least.
-    mean_response
-        True if a diagnosis uses the mean response over skies, not that of the observed sky: for a change of power
-        alone, whose response in one sky depends on fluctuations that the spectra have anyway.
-    matched_filter
-        True if the data vector of a diagnosis has a matched filter for it: not if a hook draws random numbers, nor if
-        dipoles, variances, spectra and modulations, which are always measured, contain all of it.
-    nonlinear
-        True if the response is simulated anew at whatever amplitude is fitted.
     """
 
+    #: Sign of the amplitudes at which responses are measured; 0: both. If it is not 0, a negative amplitude is
+    #: unphysical, and a diagnosis does not name it.
     sign: Literal[-1, 0, 1] = 0
-    max_amplitude: float = np.inf
-    stochastic: bool = False
+    max_amplitude: float = np.inf  #: largest physical amplitude, in absolute value; a diagnosis names no larger one
+    stochastic: bool = False  #: True if a hook draws random numbers, at positive amplitudes at least
+    #: True if a diagnosis uses the mean response over skies, not that of the observed sky: for a change of power alone,
+    #: whose response in one sky depends on fluctuations that the spectra have anyway
     mean_response: bool = False
+    noise_alone: bool = False  #: True if noise alone changes: typical skies then say by how much the data scatter more
+    #: True if the data vector of a diagnosis has a matched filter for it: not if a hook draws random numbers, nor if
+    #: dipoles, variances, spectra and modulations, which are always measured, contain all of it
     matched_filter: bool = True
-    nonlinear: bool = False
+    nonlinear: bool = False  #: True if the response is simulated anew at whatever amplitude is fitted
 
     @property
     def measured(self) -> tuple[str, ...]:
@@ -74,18 +63,10 @@ class Parametrization:
 
 @dataclass(frozen=True, kw_only=True)
 class Angle(Parametrization):
-    """Fit amplitude and angle as the coordinates amplitude cos(angle) and amplitude sin(angle).
+    """Fit amplitude and angle as the coordinates amplitude cos(angle) and amplitude sin(angle)."""
 
-    Attributes
-    ----------
-    parameter
-        Name of the angle, in degrees.
-    multiple
-        How often the angle counts: 2 for an axis, which is the same again after half a turn.
-    """
-
-    parameter: str = "angle_deg"
-    multiple: int = 1
+    parameter: str = "angle_deg"  #: name of the angle, in degrees
+    multiple: int = 1  #: how often the angle counts: 2 for an axis, which is the same again after half a turn
 
     def basis(self) -> tuple[Mapping[str, Any], ...]:
         return {}, {self.parameter: 90.0 / self.multiple}
@@ -102,18 +83,10 @@ class Angle(Parametrization):
 
 @dataclass(frozen=True, kw_only=True)
 class Components(Parametrization):
-    """Fit amplitude and direction of a vector as its components.
+    """Fit amplitude and direction of a vector as its components."""
 
-    Attributes
-    ----------
-    parameter
-        Name of the direction, a tuple of numbers whose length does not matter.
-    count
-        Number of components.
-    """
-
-    parameter: str
-    count: int
+    parameter: str  #: name of the direction, a tuple of numbers whose length does not matter
+    count: int  #: number of components
 
     def basis(self) -> tuple[Mapping[str, Any], ...]:
         return tuple({self.parameter: tuple(map(float, row))} for row in np.eye(self.count))
@@ -148,15 +121,6 @@ class Steps(Parametrization):
 class PowerLaw(Parametrization):
     """Fit a signal that grows as a power of frequency, and its index where the channels can tell it.
 
-    Attributes
-    ----------
-    parameter
-        Name of the index, which is that of the effect where it is not fitted.
-    reference_ghz
-        Frequency to which the amplitude belongs.
-    ratios
-        Frequencies of the channels over that of the reference; none: the index is not fitted.
-
     Notes
     -----
     With x the ratios, A x^index is fitted as c_1 x^2 + c_2 x^-2: exact at two frequencies, by least squares at more.
@@ -164,8 +128,9 @@ class PowerLaw(Parametrization):
     and a map without foregrounds.
     """
 
-    parameter: str
-    reference_ghz: float
+    parameter: str  #: name of the index, which is that of the effect where it is not fitted
+    reference_ghz: float  #: frequency to which the amplitude belongs
+    #: frequencies of the channels over that of the reference; none: the index is not fitted
     ratios: tuple[float, ...] = ()
 
     @property

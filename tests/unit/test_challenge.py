@@ -28,12 +28,12 @@ from mcsim.benchmark.folder import (
     read_key,
     write_key,
 )
-from mcsim.benchmark.models import linear_model, reduced
+from mcsim.benchmark.models import linear_model, reduced, simulated
 from mcsim.benchmark.report import lines, write
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.benchmark.score import Draw, _is_named, draws, judge, powers, score, score_draws
 from mcsim.benchmark.summary import Score, any_place_right, confusion
-from mcsim.datavector.analysis import Analysis
+from mcsim.datavector.analysis import Analysis, Job
 from mcsim.datavector.campaign import batch
 from mcsim.datavector.candidate import Candidate, TemplateBank, numbered
 from mcsim.datavector.null_ensemble import NullEnsemble
@@ -242,6 +242,28 @@ def test_more_effects_than_can_be_drawn_are_refused():
     sampler = CaseSampler(Prior(none=0, one=0, two=1, left_out=0), model)
     with refused(2, 1):
         sampler.draw(sampler.kinds(1, 1), 1, 0)
+
+
+def test_fresh_data_leave_all_simulations_to_the_covariance(learned):
+    fresh = np.random.default_rng(3).standard_normal((7, learned.ensemble.simulations.shape[1]))
+    for names in ((), ("beam_width",)):
+        model = linear_model(learned, names, fresh)
+        assert model.null.n_sims == len(learned.ensemble.simulations)
+        np.testing.assert_array_equal(model.data, fresh[:, model.rows])
+
+
+def test_the_data_of_draws_are_other_simulations_for_each_seed():
+    """None is made twice, nor with a seed that people choose."""
+    run, asked = config.load("quickstart"), []
+    known = SimpleNamespace(run=run, analysis=SimpleNamespace(job=lambda one: Job("", one.ensemble.seed, 0, 0)))
+
+    def ask(jobs):
+        asked.extend((job.simulated, n) for job in jobs for n in range(job.first, job.first + job.count))
+        return [np.zeros((job.count, 3)) for job in jobs]
+
+    assert [len(simulated(known, 25, seed, ask)) for seed in (1, 2)] == [25, 25]
+    assert len(set(asked)) == 50
+    assert min(seed for seed, _ in asked) >= 2**40
 
 
 def test_what_is_left_out_rotates(linear):

@@ -129,7 +129,7 @@ def test_slopes_that_few_skies_do_not_tell_leave_the_errors_of_a_line() -> None:
 
 
 def test_candidates_that_are_added_are_not_scattered_by_what_was_simulated_before() -> None:
-    acting = Acting(100.0, 3.0, np.array([0.0, 2.0]), np.array([0.0, 0.5]))
+    acting = Acting(100.0, 3.0, 0.1, np.array([0.0, 2.0]), np.array([0.0, 0.5]))
     beside = Beside.of([acting, None, None], None)
     found = beside.tolerated(np.zeros(1), np.array([[0]]), np.array([[0.5]]), np.array([[1, 2]]))
     np.testing.assert_allclose(found.variance, [[2.0, 1.0]])

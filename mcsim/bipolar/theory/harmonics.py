@@ -1,7 +1,7 @@
 """Spin-harmonic coefficients w_{s,LM} of the orientation moments w_s = <e^{-i s psi}>.
 
-Every function returns a complex array of shape (smax + 1, L_max + 1, 2 L_max + 1) with w_{s,LM} at ``[s, L, L_max +
-M]`` and zero where |M| > L or L < s: w_s = sum_LM w_{s,LM} (-s)Y_LM.
+Every function returns a complex array of shape (smax + 1, L_max + 1, 2 L_max + 1) with w_{s,LM} at
+``[s, L, L_max + M]`` and zero where |M| > L or L < s: w_s = sum_LM w_{s,LM} (-s)Y_LM.
 """
 
 import ducc0
