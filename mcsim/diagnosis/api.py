@@ -133,8 +133,9 @@ def diagnose(
         done = replace(diagnosis.settings, controls=wanted)
         diagnosis = replace(diagnosis, controls=drawn, warnings=first, settings=done)
     if output is not None:
-        diagnosis.save(output)
-        report.write(diagnosis, output / "report.html")
+        with folders.filling(output):
+            report.write(diagnosis, output / "report.html")
+            diagnosis.save(output)
     return diagnosis
 
 
