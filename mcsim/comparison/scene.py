@@ -134,9 +134,9 @@ class Scene:
                 way = self.late * abs(self.step) * np.sign(self.motion.spin_period_s)
             key = (beam.blm.tobytes(), way)
             if key not in self.moved:
-                moved = displaced(beam, 0.0 if way >= 0.0 else np.pi, abs(way))
-                _keep(self.moved, key, moved.truncated(min(moved.mmax, self.moments[0].smax)), KEPT_BEAMS)
-            beam = self.moved[key]
+                _keep(self.moved, key, displaced(beam, 0.0 if way >= 0.0 else np.pi, abs(way)), KEPT_BEAMS)
+            # Moments of another motion may end at a lower order.
+            beam = self.moved[key].truncated(min(self.moved[key].mmax, self.moments[0].smax))
         return beam
 
     @cached_property
