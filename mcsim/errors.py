@@ -1,5 +1,10 @@
 """The exceptions that users are meant to read."""
 
+import re
+
+_GIVEN = re.compile(r"""['"]?[^\s'"(]*/given-[0-9a-f]{64}/(\w+)(?:\.\w+)?['"]?""")
+"""File of the cache that holds what a user gave as an array or object; its name is that of the key or object."""
+
 
 class InputError(ValueError):
     """Input that mcsim cannot use.
@@ -18,8 +23,8 @@ class InputError(ValueError):
     """
 
     def __init__(self, message: str) -> None:
-        """Make one line of what a library said of a broken file."""
-        super().__init__(" ".join(message.split()) if "\n" in message else message)
+        """Make one line of what a library said of a broken file; name what was given as an array, not its file."""
+        super().__init__(_GIVEN.sub(r"the given \1", " ".join(message.split()) if "\n" in message else message))
 
 
 class RunError(RuntimeError):

@@ -17,30 +17,17 @@ from mcsim.support.folders import user_path
 
 Kind = Literal["plain", "difference"]
 
-QUADRUPOLE = ("L2M0d0", "L2M0d2")
-"""A^{20}_{l l} and A^{20}_{l-2,l}: the modes fitted by default."""
+QUADRUPOLE = ("L2M0d0", "L2M0d2")  #: A^{20}_{l l} and A^{20}_{l-2,l}: the modes fitted by default
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Selection of the fitted spectra of a store or table.
+    """Selection of the fitted spectra of a store or table."""
 
-    Attributes
-    ----------
-    modes
-        Labels of the modes, which are fitted jointly.
-    ell_range
-        First and last multipole; bins within them are used.
-    kind
-        "difference" to the circular-beam controls (default if they exist) or "plain".
-    pair
-        Label of the pair of maps; by default the first.
-    """
-
-    modes: Sequence[str] = QUADRUPOLE
-    ell_range: tuple[int, int] | None = None
-    kind: Kind | None = None
-    pair: str | None = None
+    modes: Sequence[str] = QUADRUPOLE  #: labels of the modes, which are fitted jointly
+    ell_range: tuple[int, int] | None = None  #: first and last multipole; bins within them are used
+    kind: Kind | None = None  #: "difference" to the circular-beam controls (default if they exist) or "plain"
+    pair: str | None = None  #: label of the pair of maps; by default the first
 
     def __post_init__(self) -> None:
         """Raise InputError for modes that cannot exist or repeat, an empty range, or another kind."""
@@ -57,8 +44,7 @@ class Selection:
         return tuple(parse_mode(name) for name in self.modes)
 
 
-EVERYTHING = Selection()
-"""The quadrupole modes at every ell."""
+EVERYTHING = Selection()  #: the quadrupole modes at every ell
 
 
 class Row(NamedTuple):
@@ -94,32 +80,22 @@ SUMMARY = Scaling(bennett=True, spectrum=True, summary=True)
 
 @dataclass(frozen=True)
 class Measurement:
-    """Data vector of a fit.
+    """Data vector of a fit."""
 
-    Attributes
-    ----------
-    origin, pair, kind
-        Source of the data, their pair of maps (``None``: the only map), and "plain" or "difference" to the
-        circular-beam controls.
-    rows, scaling
-        Mode, part and bin of each element, and the scaling of all.
-    value, covariance
-        Data vector and its covariance, uK^2 and uK^4, shape (p,) and (p, p).
-    simulations
-        Number of realizations that the covariance is estimated from; ``None``: the covariance is known.
-    realizations
-        Data vectors of the realizations, shape (N, p), if known.
-    """
-
+    #: origin, pair, kind: source of the data, their pair of maps (``None``: the only map), and "plain" or "difference"
+    #: to the circular-beam controls
     origin: str
     pair: str | None
     kind: str
+    #: rows, scaling: mode, part and bin of each element, and the scaling of all
     rows: tuple[Row, ...]
     scaling: Scaling
+    #: value, covariance: data vector and its covariance, uK^2 and uK^4, shape (p,) and (p, p)
     value: NDArray[np.float64]
     covariance: NDArray[np.float64]
+    #: number of realizations that the covariance is estimated from; ``None``: the covariance is known
     simulations: int | None
-    realizations: NDArray[np.float64] | None = None
+    realizations: NDArray[np.float64] | None = None  #: data vectors of the realizations, shape (N, p), if known
 
     @property
     def modes(self) -> tuple[Mode, ...]:
@@ -151,10 +127,7 @@ def project(
 def from_store(path: str | Path, selection: Selection = EVERYTHING) -> Measurement:
     """Read the mean of an ensemble, with the covariance of its data vector over all modes and bins of the summary.
 
-    Raises
-    ------
-    InputError
-        If the store lacks what is selected.
+    Raise InputError if the store lacks what is selected.
     """
     with opening.open_ensemble(path) as ensemble:
         width = int(ensemble.attrs["configuration"]["biposh"]["summary_bin"])

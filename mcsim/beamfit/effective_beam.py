@@ -119,12 +119,8 @@ def fit(
     """Fit one model of f_l; see :func:`mcsim.fit`, and :func:`mcsim.beamfit.models.model` for its name and knots.
 
     ``order`` is "leading" (in the beam's non-circular part), "exact" (all orders) or "auto": all orders if the higher
-    ones exceed :data:`NEGLIGIBLE` sigma of the data.
-
-    Raises
-    ------
-    InputError
-        For data that do not match the configuration or the model, or circular beams.
+    ones exceed :data:`NEGLIGIBLE` sigma of the data. Raise InputError for data that do not match the configuration or
+    the model, or circular beams.
 
     Notes
     -----
@@ -226,19 +222,11 @@ def measurement(
 ) -> Measurement:
     """Read the data vector of a fit.
 
-    Parameters
-    ----------
-    data
-        A store (a folder): its mean, with the covariance of its realizations over their number; or an ECSV table.
-    source, selection
-        Configuration, whose frame the data must have, and the modes, multipoles, kind and pair that are fitted.
-    covariance
-        Store that models the data: the covariance of one of its realizations replaces that of the data.
-
-    Raises
-    ------
-    InputError
-        For data that cannot be read, lack what is selected, or are in another frame than the configuration.
+    ``data``: a store (a folder): its mean, with the covariance of its realizations over their number; or an ECSV table.
+    ``source``, ``selection``: configuration, whose frame the data must have, and the modes, multipoles, kind and pair
+    that are fitted. ``covariance``: store that models the data: the covariance of one of its realizations replaces that
+    of the data. Raise InputError for data that cannot be read, lack what is selected, or are in another frame than the
+    configuration.
     """
     if isinstance(data, Measurement):
         return data

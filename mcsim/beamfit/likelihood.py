@@ -13,28 +13,18 @@ from mcsim.stats import gaussian
 
 @dataclass(frozen=True)
 class Solution:
-    """Best fit of data = design @ parameters.
+    """Best fit of data = design @ parameters."""
 
-    Attributes
-    ----------
-    parameters, covariance
-        Estimates and the covariance of their distribution about the truth, shape (K,) and (K, K).
-    square, dof, probability
-        r'C^-1 r of the residual r with the given covariance C, the number of data minus K, and the p-value: the
-        probability of a square at least as large if the model is true.
-    residual
-        Data minus best fit, shape (p,).
-    simulations
-        Number of simulations that C was estimated from; ``None``: C is known.
-    """
-
+    #: parameters, covariance: estimates and the covariance of their distribution about the truth, shape (K,) and (K, K)
     parameters: NDArray[np.float64]
     covariance: NDArray[np.float64]
+    #: square, dof, probability: r'C^-1 r of the residual r with the given covariance C, the number of data minus K, and
+    #: the p-value: the probability of a square at least as large if the model is true
     square: float
     dof: int
     probability: float
-    residual: NDArray[np.float64]
-    simulations: int | None
+    residual: NDArray[np.float64]  #: data minus best fit, shape (p,)
+    simulations: int | None  #: number of simulations that C was estimated from; ``None``: C is known
 
     @property
     def errors(self) -> NDArray[np.float64]:
@@ -70,13 +60,8 @@ def solve(
 
     The design has rank K < p. With ``simulations`` the covariance, shape (p, p), is proportional to the sample
     covariance of so many independent draws, which subtracts their mean and is independent of the data; ``None``: it is
-    known.
-
-    Raises
-    ------
-    InputError
-        For arrays of other shapes, values that are not finite, fewer than p + 3 simulations, data without scatter, or
-        a design whose columns are not independent.
+    known. Raise InputError for arrays of other shapes, values that are not finite, fewer than p + 3 simulations, data
+    without scatter, or a design whose columns are not independent.
 
     Notes
     -----
@@ -161,10 +146,7 @@ class Comparison:
 def compare(small: Solution, large: Solution) -> Comparison:
     """Test a model against a smaller one that it contains, fitted to the same data.
 
-    Raises
-    ------
-    InputError
-        If ``large`` does not have more parameters than ``small``, or their covariances differ.
+    Raise InputError if ``large`` does not have more parameters than ``small``, or their covariances differ.
 
     Notes
     -----

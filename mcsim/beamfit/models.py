@@ -29,12 +29,8 @@ def model(name: str, ell_range: tuple[int, int], knots: int = 4) -> Model:
 
     "constant": alpha. "linear": alpha + beta l. "spline": a natural cubic spline from the first to the last l of
     ``ell_range``, linear outside, whose parameters are its values at ``knots`` >= 3 equidistant multipoles.
-    "orientation": a complex constant, as :func:`mcsim.beamfit.orientation` reads it.
-
-    Raises
-    ------
-    InputError
-        For another name, or too few knots.
+    "orientation": a complex constant, as :func:`mcsim.beamfit.orientation` reads it. Raise InputError for another name,
+    or too few knots.
 
     Notes
     -----

@@ -12,22 +12,17 @@ from mcsim.support.numbers import measured
 
 @dataclass(frozen=True)
 class Orientation:
-    """Rotation angles of two copies of the configured beam whose mean gives the fitted map.
+    """Rotation angles of two copies of the configured beam whose mean gives the fitted map."""
 
-    Attributes
-    ----------
-    symmetric_deg, symmetric_error_deg
-        Angle between the sides if each is rotated by half of it, in opposite senses: arccos of the modulus of c.
-    one_sided_deg, one_sided_error_deg
-        Angle if only one side is rotated: arccos sqrt(Re c).
-    common_deg, common_error_deg
-        Rotation of both sides together, -arg(c)/2, modulo 180 degrees; None if the data do not constrain it.
-    """
-
+    #: symmetric_deg, symmetric_error_deg: angle between the sides if each is rotated by half of it, in opposite senses:
+    #: arccos of the modulus of c
     symmetric_deg: float
     symmetric_error_deg: float
+    #: one_sided_deg, one_sided_error_deg: angle if only one side is rotated: arccos sqrt(Re c)
     one_sided_deg: float
     one_sided_error_deg: float
+    #: common_deg, common_error_deg: rotation of both sides together, -arg(c)/2, modulo 180 degrees; None if the data do
+    #: not constrain it
     common_deg: float | None
     common_error_deg: float | None
 

@@ -14,8 +14,7 @@ from mcsim.bipolar import Mode
 from mcsim.errors import InputError
 from mcsim.support.folders import unreadable
 
-COLUMNS = ("L", "M", "d", "ell_min", "ell_max")
-"""Columns that identify the content of a row."""
+COLUMNS = ("L", "M", "d", "ell_min", "ell_max")  #: columns that identify the content of a row
 
 
 def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING) -> Measurement:
@@ -25,11 +24,7 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING) 
     over ell_min <= l2 <= ell_max, d = l2 - l1, with its unit. The header's ``meta`` holds ``normalisation`` ("Bennett",
     "WMAP" or "Hajian-Souradeep"), ``scaling`` ("l(l+1)/2pi" or "none") and optionally ``frame``. ``mcsim info
     --export`` writes such tables, with a column ``pair`` and, for paired ensembles, ``value_difference`` and so on.
-
-    Raises
-    ------
-    InputError
-        For a table that cannot be read, or does not define its numbers.
+    Raise InputError for a table that cannot be read, or does not define its numbers.
     """
     table = read_ecsv(path)
     suffix, chosen = _kind(path, table, selection.kind)

@@ -17,8 +17,7 @@ Order = Literal["auto", "leading", "exact"]
 
 ORDERS: tuple[str, ...] = get_args(Order)
 
-TRIAL_MOMENTS = 16
-"""Degree of the orientation moments that gives the size of the higher orders to about 5 %."""
+TRIAL_MOMENTS = 16  #: degree of the orientation moments that gives the size of the higher orders to about 5 %
 
 
 @dataclass(frozen=True)
@@ -122,10 +121,7 @@ class Templates:
 def templates(survey: Survey, measured: Measurement, nthreads: int = 1) -> Templates:
     """Build the templates of a survey for a measurement.
 
-    Raises
-    ------
-    InputError
-        For a survey without a spectrum, with another lmax or other maps, or with circular beams.
+    Raise InputError for a survey without a spectrum, with another lmax or other maps, or with circular beams.
     """
     expectation.spectrum(survey)
     if measured.lmax > survey.lmax:

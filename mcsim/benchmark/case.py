@@ -12,14 +12,11 @@ from mcsim.support.arrays import Vector
 from mcsim.systematics.signatures import Place
 
 Kind = Literal["none", "one", "two", "left_out", "invented"]
-Identity = tuple[str, str | None]
-"""Name of an effect and of its channel; None: all channels."""
-Answer = frozenset[Identity]
-"""Effects that act together; the empty set: no effect."""
+Identity = tuple[str, str | None]  #: name of an effect and of its channel; None: all channels
+Answer = frozenset[Identity]  #: effects that act together; the empty set: no effect
 
 KINDS: tuple[Kind, ...] = get_args(Kind)
-IN_LIBRARY = ("none", "one", "two")
-"""Kinds of cases whose effects the diagnosis can name."""
+IN_LIBRARY = ("none", "one", "two")  #: kinds of cases whose effects the diagnosis can name
 
 
 @dataclass(frozen=True)
@@ -123,55 +120,43 @@ class Truth(Drawn):
 
 @dataclass(frozen=True, kw_only=True)
 class Record:
-    """One case after its key is opened; the names are keys of ``score.json``.
+    """One case after its key is opened; the names are keys of ``score.json``."""
 
-    Attributes
-    ----------
-    case, kind, truth
-        Name and kind of the case, and the effects that act.
-    strength, columns
-        Expected S/N of all effects together, and number of linear components of a single one.
-    rival, distances
-        Largest cosine of the response with a candidate that does not act, and the S/N that the best one, two and three
-        candidates, none of them acting, leave of the response.
-    p_value, maximum, verdict, answers
-        p-value of the global test, and of the most significant candidate alone, look-elsewhere effect included; the
-        verdict, and the accepted sets of effects, the best first.
-    bayes, bayes_right
-        Most probable set of the Bayes-optimal classifier, and the probability that this gives it; None and NaN where
-        the truth is none of its hypotheses.
-    pulls, fitted
-        Fitted less true components over their errors, where the only effect was named; and named or not.
-    predicted, achieved, sigma
-        Fractional reduction of the excess chi^2 on held-out data, and the error of the measured one; None: not
-        measured.
-    gaps, absent
-        Excess chi^2 of held-out data before and after the named effects are added; after one that does not act.
-    places, sampled
-        (frame, L, parity) of the three most significant places, None: not looked for; True if the maps were made sample
-        by sample.
-    """
-
+    #: case, kind, truth: name and kind of the case, and the effects that act
     case: str
     kind: Kind
     truth: Answer
+    #: strength, columns: expected S/N of all effects together, and number of linear components of a single one
     strength: float
     columns: int
+    #: rival, distances: largest cosine of the response with a candidate that does not act, and the S/N that the best
+    #: one, two and three candidates, none of them acting, leave of the response
     rival: float
     distances: tuple[float, ...]
+    #: p_value, maximum, verdict, answers: p-value of the global test, and of the most significant candidate alone,
+    #: look-elsewhere effect included; the verdict, and the accepted sets of effects, the best first
     p_value: float
     maximum: float
     verdict: str
     answers: tuple[Answer, ...]
+    #: bayes, bayes_right: most probable set of the Bayes-optimal classifier, and the probability that this gives it;
+    #: None and NaN where the truth is none of its hypotheses
     bayes: Answer | None = None
     bayes_right: float = np.nan
+    #: pulls, fitted: fitted less true components over their errors, where the only effect was named; and named or not
     pulls: tuple[float, ...] = ()
     fitted: tuple[float, ...] = ()
+    #: predicted, achieved, sigma: fractional reduction of the excess chi^2 on held-out data, and the error of the
+    #: measured one; None: not measured
     predicted: float | None = None
     achieved: float | None = None
     sigma: float | None = None
+    #: gaps, absent: excess chi^2 of held-out data before and after the named effects are added; after one that does not
+    #: act
     gaps: tuple[float, float] | None = None
     absent: tuple[float, float] | None = None
+    #: places, sampled: (frame, L, parity) of the three most significant places, None: not looked for; True if the maps
+    #: were made sample by sample
     places: tuple[Place, ...] | None = None
     sampled: bool = False
 

@@ -30,15 +30,11 @@ from mcsim.support.arrays import Vector
 from mcsim.support.folders import appearing, writable
 from mcsim.support.progress import reporting
 
-EPSILON = 1e-7
-"""Error of the interpolation of samples, relative to the dipole: 0.3 nK."""
-
-SMALLER = 0.7
-"""Factor between one trial of an amplitude and the next."""
+EPSILON = 1e-7  #: error of the interpolation of samples, relative to the dipole: 0.3 nK
+SMALLER = 0.7  #: factor between one trial of an amplitude and the next
 
 ATTEMPTS = 16
-STRONGER = 1.5
-"""Largest ratio of the simulated to the drawn expected S/N."""
+STRONGER = 1.5  #: largest ratio of the simulated to the drawn expected S/N
 
 
 def make(

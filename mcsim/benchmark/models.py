@@ -28,8 +28,7 @@ from mcsim.stats.gaussian import Fit, SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration
 from mcsim.support.arrays import Matrix, Vector
 
-SKIES = 6
-"""Skies that an expected S/N is the mean of."""
+SKIES = 6  #: skies that an expected S/N is the mean of
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,7 @@ from mcsim.errors import InputError
 from mcsim.support.arrays import Vector
 from mcsim.systematics import Effect, Library
 
-SKIES = 2
-"""Skies that the response to an out-of-library effect is the mean of."""
+SKIES = 2  #: skies that the response to an out-of-library effect is the mean of
 
 
 @dataclass(frozen=True)

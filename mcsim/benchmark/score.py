@@ -28,14 +28,9 @@ from mcsim.support.arrays import Matrix, Vector
 from mcsim.support.folders import writable
 
 CASES_PER_TASK = 20
-DETECTIONS = 4000
-"""Draws of single effects that are tested for detection alone."""
-
-UNLIKE = 0.3
-"""Cosine below which an effect that does not act is unlike those that do."""
-
-STRONG = 8.0
-"""Expected S/N from which on an effect that does not act is added as well."""
+DETECTIONS = 4000  #: draws of single effects that are tested for detection alone
+UNLIKE = 0.3  #: cosine below which an effect that does not act is unlike those that do
+STRONG = 8.0  #: expected S/N from which on an effect that does not act is added as well
 
 
 def score(folder: str | Path, *, workers: Workers | None = None, quiet: bool = True) -> Score:

@@ -14,8 +14,7 @@ from mcsim.stats.intervals import Metric, mean, ratio, removed, share, snr_at_po
 from mcsim.support.arrays import Vector
 from mcsim.systematics.signatures import SIGNATURES, Place
 
-ALPHA = 0.05
-"""Level of the global test."""
+ALPHA = 0.05  #: level of the global test
 
 NAMED, PLACED, FAR, REDUCED = 5.0, 6.0, 8.0, 8.0
 """Expected S/N from which on effects are to be named, and to be placed; that a case must have beyond the library to be

@@ -47,10 +47,7 @@ def _range(exists: NDArray[np.bool_]) -> slice:
 def estimator(L_max: int, lmax: int, both_orders: bool = False) -> Estimator:
     """Return the Clebsch-Gordan tables for all modes up to L_max at l1, l2 <= lmax.
 
-    Raises
-    ------
-    InputError
-        If L_max is negative or exceeds lmax.
+    Raise InputError if L_max is negative or exceeds lmax.
     """
     check_whole(lmax, "lmax")
     check_whole(L_max, "L_max")
@@ -68,12 +65,8 @@ def estimate(
 
     The coefficients of the maps are in m-major order, shape (alm.size(lmax),). The result has shape (modes, lmax + 1)
     and the square of their unit; NaN where a coefficient does not exist (l1 < 0, l1 > lmax, the triangle of l1, l2, L),
-    and for one map in the modes that repeat others.
-
-    Raises
-    ------
-    InputError
-        If the coefficients are not complex, not finite, or not of the tables' lmax.
+    and for one map in the modes that repeat others. Raise InputError if the coefficients are not complex, not finite,
+    or not of the tables' lmax.
 
     Notes
     -----
@@ -107,10 +100,7 @@ def estimate(
 def power_spectrum(alm_x: NDArray[np.complex128], alm_y: NDArray[np.complex128], lmax: int) -> NDArray[np.float64]:
     """Return C_l = sum_m a_lm conj(b_lm) / (2 l + 1) of two real maps, shape (lmax + 1,).
 
-    Raises
-    ------
-    InputError
-        If the coefficients are not complex or not of ``lmax``.
+    Raise InputError if the coefficients are not complex or not of ``lmax``.
     """
     check_alm(alm_x, lmax, "alm_x")
     check_alm(alm_y, lmax, "alm_y")

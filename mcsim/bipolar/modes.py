@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.sphere.clebsch import band, evaluate
 
-Indices = tuple[int, int, int]
-"""(L, M, d) of a mode, where M may be negative."""
+Indices = tuple[int, int, int]  #: (L, M, d) of a mode, where M may be negative
 
 
 CONVENTION = "A^{LM}_{l1 l2} = sum a_{l1 m1} conj(a_{l2 m2}) (-1)^{m2} C^{LM}_{l1 m1 l2 -m2}, ell = l2, d = l2 - l1"
@@ -81,12 +80,8 @@ def existing(L: int, d: int, lmax: int) -> NDArray[np.bool_]:
 def bennett_factor(mode: Indices, lmax: int) -> NDArray[np.float64]:
     """Return the factor from the Hajian-Souradeep to the Bennett (WMAP) normalisation at ell = l2, shape (lmax + 1,).
 
-    sqrt(2L+1) / (sqrt((2 l1 + 1)(2 l2 + 1)) C^{L0}_{l1 0 l2 0}); NaN where the coefficient does not exist.
-
-    Raises
-    ------
-    InputError
-        For odd parity, where C^{L0}_{l1 0 l2 0} vanishes, or a mode that cannot exist.
+    sqrt(2L+1) / (sqrt((2 l1 + 1)(2 l2 + 1)) C^{L0}_{l1 0 l2 0}); NaN where the coefficient does not exist. Raise
+    InputError for odd parity, where C^{L0}_{l1 0 l2 0} vanishes, or a mode that cannot exist.
 
     Notes
     -----

@@ -39,7 +39,7 @@ app = typer.Typer(
 
 
 def main() -> None:
-    """Run the command line; bad input ends in one sentence and exit code 2, a disk that fails in exit code 1."""
+    """Run the command line; bad input ends in one sentence and exit code 2, a full disk or memory in exit code 1."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # of a terminal that may lack ± and µ
             stream.reconfigure(errors="replace")
@@ -48,6 +48,9 @@ def main() -> None:
     except (InputError, RunError) as error:
         print(f"mcsim: {error}", file=sys.stderr)
         sys.exit(2 if isinstance(error, InputError) else 1)
+    except MemoryError as error:
+        print(f"mcsim: not enough memory ({error}); lower nside, lmax, smax or the workers.", file=sys.stderr)
+        sys.exit(1)
     except OSError as error:
         if error.errno is None:  # no word of the system's
             raise
@@ -383,10 +386,12 @@ def config(
     if schema:
         print(json.dumps(config_.json_schema(), indent=2))
     elif name is not None:
-        from mcsim.simulation.channels import check_effects
+        loaded = config_.load(name)
+        # They load slowly: what cannot be read is said before.
+        from mcsim.simulation.channels import check_effects, check_scans
         from mcsim.simulation.nuisance import check_nuisances
 
-        loaded = config_.load(name)
+        check_scans(loaded)
         check_effects(loaded)
         check_nuisances(loaded)
         print(json.dumps({"digest": config_.digest(loaded), **config_.resolved(loaded)}, indent=2, ensure_ascii=False))

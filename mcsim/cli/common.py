@@ -47,5 +47,6 @@ def save(figure, path: Path) -> None:  # type: ignore[no-untyped-def]
     try:
         figure.savefig(user_path(path))
     except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be written ({error}); choose another file with -o.") from error
+        why = getattr(error, "strerror", None) or error
+        raise InputError(f"{path} cannot be written ({why}); choose another file with -o.") from error
     print(f"wrote {path}")

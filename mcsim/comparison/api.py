@@ -142,7 +142,7 @@ def compare(
 def _channel(pair: ChannelPair, sides: Comparison, accuracy: float) -> ChannelResult:
     others = [other for other in sides.pairs if other.name != pair.name]
     same = _rms((pair.b - pair.a)[pair.seen]) <= ROUNDING * _sky_rms(pair)
-    cut = None if same else with_fewer_orders(pair)
+    pair, cut = (pair, None) if same else with_fewer_orders(pair)
     if cut is None:
         return _either_way(pair, others, sides, accuracy)
     found = _either_way(cut, others, sides, accuracy)

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.comparison.description import SAMPLES, check_splits, in_full, orders_of, quiet, with_known_offsets
-from mcsim.comparison.scene import Maps, PointingFiles, Scene, scene_of, sky_in
+from mcsim.comparison.scene import Maps, PointingFiles, Scene, scene_of
+from mcsim.comparison.sky_of_maps import sky_in
 from mcsim.ensemble.external import named_source, source_of
 from mcsim.ensemble.maps import file_names, first_realization
 from mcsim.errors import InputError
@@ -74,6 +75,8 @@ class ChannelPair:
         True if side A was made from orientation moments or at the pixels' centres, so that no single sample has a say.
     orders
         Highest order of the beam in a run of the model, if that is not said and less than the scene's; None.
+    rounds
+        How often the sky that was taken from side A was corrected for what single samples leave of it.
     """
 
     name: str
@@ -94,6 +97,7 @@ class ChannelPair:
     turned: bool = False
     by_moments: bool = False
     orders: int | None = None
+    rounds: int = 0
 
     def pointing(self, longest: float = SAMPLES) -> Pointing | PointingFiles | None:
         """Return the pointing, if it is known and has no more samples than the longest that is wanted."""
@@ -137,7 +141,7 @@ class ChannelPair:
         """Return the pair with the sky that side A shows, by orientation moments."""
         assert self.scene is not None
         sky = sky_in(self.a, self.shown, self.scene.up_to_offsets(1))
-        return replace(self, scene=replace(self.scene, sky=sky))
+        return replace(self, scene=replace(self.scene, sky=sky), rounds=0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -172,6 +172,12 @@ class Prediction:
         """
         return 0.0 if self.pair.doubt is None else self.share_hidden(found, self.pair.doubt)
 
+    def out_of_sight(self, found: Set) -> float:
+        """Return the share of the variance that noise, or if there is none what holes hide, is expected to make."""
+        if self.pair.doubt is None and self._in_holes is not None:
+            return self.share_hidden(found, self._in_holes)
+        return self.hidden(found)
+
     def share_hidden(self, found: Set, doubt: Alm) -> float:
         """Return the share of the variance that a set makes of a draw of the sky that the maps do not show."""
         if self.pair.scene is None or not found.members:
@@ -221,9 +227,7 @@ class Prediction:
         needed = min([self.needed(), *(difference.enough for difference, _ in found.members)])
         if found.explains >= needed:
             return True
-        hidden = self.hidden(found)
-        if hidden == 0.0 and found.explains >= EXPLAINED and self._in_holes is not None:
-            hidden = self.share_hidden(found, self._in_holes)
+        hidden = self.out_of_sight(found) if found.explains >= EXPLAINED else self.hidden(found)
         return hidden <= MOST_HIDDEN and found.explains + TOLERATED * hidden >= needed
 
     def complete(self, found: Set) -> bool:

@@ -10,7 +10,6 @@ from typing import Any
 import healpy
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.linalg import LinearOperator, gmres
 
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments, ScanModel
@@ -37,9 +36,6 @@ KEPT_BEAMS = 64
 
 EPSILON = 1e-7
 """Accuracy of the interpolation of single samples."""
-
-ITERATIONS = 30
-"""Largest number of iterations for the sky that maps show; holes take more than whole maps."""
 
 WEAKEST = 1e-4
 """Share of its largest value below which a beam's window is not divided out."""
@@ -114,7 +110,7 @@ class Scene:
     step: float = 0.0
     added: "Callable[[Scene], Maps] | None" = None
     kept: OrderedDict[tuple[bytes, ...], Transforms] = field(default_factory=OrderedDict, repr=False)
-    moved: OrderedDict[tuple[bytes, float], Beam] = field(default_factory=OrderedDict, repr=False)
+    moved: OrderedDict[tuple[bytes, float, int], Beam] = field(default_factory=OrderedDict, repr=False)
     # By identity of a pointing, which is held so that no other one can have it.
     _made: dict[int, tuple[object, Maps]] = field(default_factory=dict, init=False, repr=False)
 
@@ -136,10 +132,11 @@ class Scene:
             way = self.late * self.step
             if self.motion is not None:  # the beam's axes are those of the body, whichever way it spins
                 way = self.late * abs(self.step) * np.sign(self.motion.spin_period_s)
-            key = (beam.blm.tobytes(), way)
+            orders = self.moments[0].smax
+            key = (beam.blm.tobytes(), way, orders)
             if key not in self.moved:
                 moved = displaced(beam, 0.0 if way >= 0.0 else np.pi, abs(way))
-                _keep(self.moved, key, moved.truncated(min(moved.mmax, self.moments[0].smax)), KEPT_BEAMS)
+                _keep(self.moved, key, moved.truncated(min(moved.mmax, orders)), KEPT_BEAMS)
             beam = self.moved[key]
         return beam
 
@@ -322,50 +319,3 @@ def scene_of(channel: Channel, sky: Alm, nthreads: int) -> Scene:
     moments = tuple(m.moments for m in channel.maps)
     preparations = tuple(m.preparation for m in channel.maps if m.preparation is not None)
     return Scene(sky, channel.site.beam, channel.window, moments, preparations, nthreads)
-
-
-def sky_in(maps: Maps, seen: NDArray[np.bool_], empty: Scene, tolerance: float = 1e-5) -> Alm:
-    """Return the sky whose simulation makes a channel's maps where they are seen.
-
-    What maps of that nside cannot hold, above l = 3 nside - 1, is zero, and so is what the beam suppresses.
-
-    Parameters
-    ----------
-    maps, seen
-        Shape (split, npix) each.
-    empty
-        Scene of the channel; its sky is not used.
-    tolerance
-        Residual at which iterations end, over the maps' own size.
-
-    Notes
-    -----
-    GMRES for the sky smoothed by beam and pixel window; the operator is the simulation, then the transform of its
-    mean map with 0 for what is not seen. Without holes that is the unit matrix but for the beam's shape and the
-    quadrature; with holes it has small eigenvalues, and iterations end before it is inverted for those.
-    """
-    factor = empty.response.factors[0].real
-    for steps in empty.preparations[:1]:
-        factor = factor * steps.beam_window(empty.lmax) * steps.pixel_window(empty.lmax)
-    nside = healpy.npix2nside(maps.shape[1])
-    shown = min(empty.lmax, 3 * nside - 1)
-    known = factor[: shown + 1] > WEAKEST * factor.max()
-    inverse = np.divide(1.0, factor[: shown + 1], out=np.zeros(shown + 1), where=known)
-    count = np.maximum(seen.sum(axis=0), 1)
-    affine = replace(empty, sky=np.zeros_like(empty.sky)).maps() if empty.preparations else np.zeros_like(maps)
-
-    def analysed(values: Maps) -> NDArray[np.float64]:
-        mean = np.where(seen, values, 0.0).sum(axis=0) / count  # with 0 for UNSEEN
-        found = healpix.analysis(mean, shown, nthreads=empty.nthreads)
-        return alm_.multiply(found, known.astype(float), shown).view(np.float64)
-
-    def sky(smooth: NDArray[np.float64]) -> Alm:
-        alm = alm_.multiply(np.ascontiguousarray(smooth).view(np.complex128), inverse, shown)
-        return alm_.resize(alm, shown, empty.lmax)
-
-    def simulated(smooth: NDArray[np.float64]) -> NDArray[np.float64]:
-        return analysed(replace(empty, sky=sky(smooth)).maps() - affine)
-
-    wanted = analysed(maps - affine)
-    operator = LinearOperator((wanted.size, wanted.size), matvec=simulated, dtype=np.float64)
-    return sky(gmres(operator, wanted, rtol=tolerance, restart=ITERATIONS, maxiter=1)[0])

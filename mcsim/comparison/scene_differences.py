@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
+from mcsim.comparison.description import EXTRA_ORDERS
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.scene import WEAKEST, Maps, Scene, ahead
@@ -16,6 +17,7 @@ from mcsim.instrument.beams import Beam
 from mcsim.instrument.beams.coefficients import power_by_order
 from mcsim.instrument.scan import Moments
 from mcsim.instrument.scan.pointing import pointing
+from mcsim.simulation import convolve
 from mcsim.simulation.channels import NEGLECTED
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
@@ -184,13 +186,21 @@ class TimeShift(Difference):
     smooth = True
     natural = 1e-3
 
+    def __init__(self) -> None:
+        self._largest = np.inf
+
+    def within(self, value: Vector) -> Vector:
+        """Return the shift, of at most ten widths of the beam: farther on, the sky is another one altogether."""
+        return np.clip(value, -self._largest, self._largest)
+
     def starts(self, state: State) -> list[Vector]:
-        """Return the shift that fits best, if it is small beside the beam: farther on, the sky is another one."""
+        """Return the shift that fits best, of at most two widths of the beam, from where others are looked for."""
         scene, pair = state.scene, state.pair
         if scene is None or pair.channel is None or pair.channel.site.pointing is None:
             return []
         width = np.sqrt(-np.log(max(scene.beam.window[scene.lmax], 1e-12)) * 2.0) / scene.lmax
         largest = 2.0 * width / _radians_per_sample(pair)
+        self._largest = 5.0 * largest
         bare, value = scene.maps(), 0.05 * largest
         for _ in range(3):
             moved = self.scene(scene, np.array([value]), pair).maps() - bare
@@ -223,7 +233,7 @@ class ReversedMotion(Difference):
 
     def __init__(self, motion: str) -> None:
         self.motion = motion
-        self._made: dict[tuple[float, float], tuple[Moments, ...]] = {}
+        self._made: dict[tuple[float, float, int], tuple[Moments, ...]] = {}
 
     def starts(self, state: State) -> list[Vector]:
         known = state.pair.channel is not None and state.pair.channel.site.pointing is not None
@@ -234,11 +244,13 @@ class ReversedMotion(Difference):
         pointing = pair.channel.site.pointed(self.name)
         model = scene.motion or pointing.model
         model = replace(model, **{self.motion: -getattr(model, self.motion)}).with_lines_of_sight(pointing.line.name)
-        count, key = len(scene.moments), (model.spin_period_s, model.precession_period_s)
+        whole = scene if pair.scene is None else pair.scene
+        count, smax = len(scene.moments), min(scene.moments[0].smax, whole.beam.mmax + EXTRA_ORDERS)
+        key = model.spin_period_s, model.precession_period_s, smax
         if key not in self._made:
             self._made[key] = tuple(
                 Moments.from_model(
-                    model, scene.nside, scene.moments[0].smax, pair.channel.site.frame, (i / count, (i + 1) / count),
+                    model, scene.nside, smax, pair.channel.site.frame, (i / count, (i + 1) / count),
                     scene.nthreads,
                 )
                 for i in range(count)
@@ -360,15 +372,19 @@ class LmaxCut(Difference):
     met = "b_lm of a lower lmax than the sky's, padded with zeros"
 
     def starts(self, state: State) -> list[Vector]:
+        """Return the degree from which on side B has least: of maps, and by what changes of the sky, without holes."""
         assert state.scene is not None
-        lmax = min(state.scene.lmax, 3 * state.pair.nside - 1)
-        a, b = (_mean_alm(side, state, lmax) for side in (state.maps, state.pair.b))
+        scene, lmax = state.scene, min(state.scene.lmax, 3 * state.pair.nside - 1)
+        a, change = (_mean_alm(maps, state, lmax) for maps in (state.maps, state.pair.b - state.maps))
+        whole = alm_.resize(convolve.circular_alm(scene.sky, scene.response), scene.lmax, lmax)
         degrees = alm_.degrees(lmax)
         weight = np.where(alm_.orders(lmax) == 0, 1.0, 2.0)
-        kept, gone = (np.bincount(degrees, weight * np.abs(x) ** 2, lmax + 1) for x in (b - a, b))
-        lost = np.cumsum(kept) + gone.sum() - np.cumsum(gone)
-        best = int(np.argmin(lost))
-        return [np.array([float(best)])] if 2 <= best < lmax else []
+        found = set()
+        for before in (a, whole):
+            kept, gone = (np.bincount(degrees, weight * np.abs(x) ** 2, lmax + 1) for x in (change, before + change))
+            lost = np.cumsum(kept) + gone.sum() - np.cumsum(gone)
+            found.add(int(np.argmin(lost)))
+        return [np.array([float(best)]) for best in sorted(found) if 2 <= best < lmax]
 
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
         kept = np.arange(scene.lmax + 1) <= value[0]

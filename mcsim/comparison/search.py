@@ -20,8 +20,11 @@ FURTHER = 0.7
 FURTHER_BEYOND = 0.85
 """The same where what there is explains enough to be named."""
 
-VISIBLE = 0.1
-"""Share of what noise hides that a further difference must explain beside it to be added."""
+VISIBLE, VISIBLE_IN_HOLES = 0.1, 1.0
+"""Share of what noise hides, or holes do, that a further difference must explain beside it to be added.
+
+What holes hide is no white noise: others are like it by chance.
+"""
 
 CHANCE = 100.0
 """The same for each of its values, over the share of one pixel."""
@@ -68,6 +71,9 @@ SCREENED = 200_000
 ALIKE = 2.0
 """Sets that leave at most so many times what the best one leaves are alternatives."""
 
+UNFITTED = 10.0
+"""The same of sets with fewer fitted values, which explain as much as they do without them."""
+
 EQUAL = 1.1
 """The same for sets of which the one with the fewest fitted values is named, and of what noise hides."""
 
@@ -100,7 +106,8 @@ class Problem(Prediction):
         for _ in range(LARGEST - 1):
             if not found or self.complete(found[0]):
                 break
-            most = found[0].left - VISIBLE * self.hidden(found[0]) if self.pair.doubt is not None else 0.0
+            hidden = self.out_of_sight(found[0]) if self.suffices(found[0]) else self.hidden(found[0])
+            most = found[0].left - self._visible * hidden if hidden > 0.0 else 0.0
             larger = [
                 [
                     one
@@ -119,14 +126,20 @@ class Problem(Prediction):
     def adds(self, larger: Set, found: Set) -> bool:
         """Return True if a larger set explains so much of what a set leaves that it is worth its further members.
 
-        What noise hides is left by both, but no template is like it: a part that it would not make by chance will do.
+        What noise or holes hide is left by both, but no template is like it: a part that it would not make by chance
+        will do.
         """
-        hidden, values = self.hidden(larger), max(larger.fitted - found.fitted, 1)
-        chance = hidden * max(VISIBLE, CHANCE * values / healpy.nside2npix(self.pair.nside))
+        hidden = self.out_of_sight(larger) if self.suffices(found) else self.hidden(larger)
+        values = max(larger.fitted - found.fitted, 1)
+        chance = hidden * max(self._visible, CHANCE * values / healpy.nside2npix(self.pair.nside))
         if larger.left < self.enough + TOLERATED * hidden and found.left - larger.left > chance > 0.0:
             return True
         share = FURTHER_BEYOND if self.suffices(found) else FURTHER
         return self.excess(larger) < (1.0 - share) * self.excess(found)
+
+    @property
+    def _visible(self) -> float:
+        return VISIBLE_IN_HOLES if self.pair.doubt is None else VISIBLE
 
     def unsure(self, larger: Set, base: Set) -> float:
         """Return the share that a larger set may leave because single samples were not simulated, as of its base."""
@@ -305,7 +318,8 @@ class Problem(Prediction):
         limit = max(ALIKE * (sets[0].left - hidden) + hidden, EQUAL * sets[0].left) + PRECISION
         found = {sets[0].names: sets[0]}
         for one in sets[1:]:
-            if one.left <= limit and self.suffices(one):
+            most = max(limit, UNFITTED * sets[0].left) if one.fitted < sets[0].fitted else limit
+            if one.left <= most and self.suffices(one):
                 found.setdefault(one.names, one)
         return list(found.values())[1:]
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import healpy
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.linalg import LinearOperator, cg
 
 from mcsim.comparison.pairs import ChannelPair
-from mcsim.comparison.scene import WEAKEST, Maps, Scene, sky_in
+from mcsim.comparison.scene import WEAKEST, Maps, Scene
+from mcsim.comparison.sky_of_maps import NEAR, WHOLE, sky_in, wiener
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.support.arrays import Alm
@@ -28,23 +28,14 @@ Orientation moments leave more of maps of single samples.
 SHARPER = 0.5
 """Share of the squares that a correction of the sky must leave at most to be followed by another one."""
 
-WHOLE = 0.99
-"""Share of the pixels from which on holes hide nothing."""
-
 FREE = 0.05
 """Share of the pixels of a single map that its sky leaves free at least, if noise is told from it."""
-
-NEAR = 5
-"""Degrees over which power is averaged."""
 
 MADE = 0.1
 """Share of what a simulation leaves of side A that another one leaves at most if side A was made that way."""
 
 ROUNDS = 2
 """How often the sky is corrected for what its simulation leaves of the maps."""
-
-ITERATIONS = 100
-"""Largest number of steps of the filter."""
 
 
 def with_shown_sky(pair: ChannelPair) -> ChannelPair:
@@ -56,16 +47,23 @@ def with_shown_sky(pair: ChannelPair) -> ChannelPair:
     return found if weight is None else _filtered(found, weight)
 
 
-def with_fewer_orders(pair: ChannelPair) -> ChannelPair | None:
-    """Return the pair with the orders of the beam that a run takes, if side A was made with them; None if with all."""
-    if pair.scene is None or pair.orders is None or pair.orders >= pair.scene.beam.mmax:
-        return None
-    left, _ = _left_of_side_a(pair)
-    if left <= SHARP**2 * _sky(pair):
-        return None
-    cut = replace(pair, scene=replace(pair.scene, beam=pair.scene.beam.truncated(pair.orders)))
-    less, cut = _left_of_side_a(cut.with_sky_of_maps() if pair.sky_of_maps else cut)
-    return cut if less < MADE * left else None
+def with_fewer_orders(pair: ChannelPair) -> tuple[ChannelPair, ChannelPair | None]:
+    """Return a pair, and the same with the orders of the beam that a run takes; None if side A has all of them.
+
+    Both have the sky of single samples where those were simulated to tell.
+    """
+    scene = pair.scene
+    if scene is None or pair.orders is None or pair.orders >= scene.beam.mmax:
+        return pair, None
+    beam, limit = scene.beam.truncated(pair.orders), SHARP**2 * _sky(pair)
+    cut = replace(pair, scene=replace(scene, beam=beam))
+    cut = cut.with_sky_of_maps() if pair.sky_of_maps else cut
+    found = [_by_moments(one) for one in (pair, cut)]
+    if min(left for left, _ in found) > limit:
+        both = zip(found, _by_samples(pair, cut), strict=True)
+        found = [moments if moments[0] < MADE * samples[0] else samples for moments, samples in both]
+    (left, pair), (less, cut) = found
+    return pair, cut if left > limit and less < MADE * left else None
 
 
 def adds_orders(cut: ChannelPair, pair: ChannelPair) -> bool:
@@ -77,13 +75,46 @@ def adds_orders(cut: ChannelPair, pair: ChannelPair) -> bool:
     return float(more @ rest) ** 2 > MADE * float(more @ more) * float(rest @ rest)
 
 
-def _left_of_side_a(pair: ChannelPair) -> tuple[float, ChannelPair]:
-    """Return the squares that orientation moments or single samples leave of side A, and the sky that leaves less."""
-    shown = _sharper(pair) if pair.sky_of_maps else pair
+def _by_moments(pair: ChannelPair) -> tuple[float, ChannelPair]:
+    """Return the squares that orientation moments leave of side A, and the pair."""
     assert pair.scene is not None
-    assert shown.scene is not None
-    found = (_left(pair, pair.scene.maps()), pair), (_left(shown, _made(shown, shown.scene)), shown)
-    return min(found, key=lambda one: one[0])
+    return _left(pair, pair.scene.maps()), pair
+
+
+def _by_samples(pair: ChannelPair, cut: ChannelPair) -> list[tuple[float, ChannelPair]]:
+    """Return the squares that single samples leave of side A of a pair, and of it with a cut beam, with their skies.
+
+    The sky is corrected with the cut beam. What the whole one would leave then, orientation moments say.
+    """
+    if not pair.sky_of_maps:
+        return [(_left(one, _made(one, scene)), one) for one in (pair, cut) if (scene := one.scene) is not None]
+    assert pair.scene is not None
+    _, first = _corrected(cut, _missing(cut))
+    assert first.scene is not None
+    whole, missing = replace(pair, scene=replace(pair.scene, sky=first.scene.sky)), _missing(first)
+    assert whole.scene is not None
+    more = np.where(pair.shown, whole.scene.maps() - first.scene.maps(), 0.0)
+    (less, fewer), (left, whole) = _corrected(first, missing), _corrected(whole, missing - more)
+    if less < MADE * left:
+        assert fewer.scene is not None
+        less = _left(fewer, _made(fewer, fewer.scene))
+    return [(left, whole), (less, fewer)]
+
+
+def _missing(pair: ChannelPair) -> Maps:
+    """Return what its simulation by single samples leaves of side A, 0 where that shows nothing."""
+    assert pair.scene is not None
+    return np.where(pair.shown, pair.a - _made(pair, pair.scene), 0.0)
+
+
+def _corrected(pair: ChannelPair, missing: Maps) -> tuple[float, ChannelPair]:
+    """Return the pair whose sky makes what was missing as well, and first the squares that moments leave of that."""
+    scene = pair.scene
+    assert scene is not None
+    empty = replace(scene.up_to_offsets(1), sky=np.zeros_like(scene.sky))
+    more = replace(scene, sky=scene.sky + sky_in(missing, pair.shown, empty, 1e-2, scene.sky))
+    left = float(np.sum((missing - more.maps() + scene.maps())[pair.seen] ** 2))
+    return left, replace(pair, scene=more, rounds=pair.rounds + 1)
 
 
 def _left(pair: ChannelPair, made: Maps) -> float:
@@ -130,21 +161,19 @@ def _made(pair: ChannelPair, scene: Scene) -> Maps:
 
 def _sharper(pair: ChannelPair) -> ChannelPair:
     scene = pair.scene
-    if scene is None or (pair.pointing() is None and scene.offset_order < 2):
+    if scene is None or pair.rounds >= ROUNDS or (pair.pointing() is None and scene.offset_order < 2):
         return pair
     limit = SHARP**2 * _sky(pair)
     if _left(pair, scene.maps()) <= limit:
         return pair
     before = np.inf
-    for _ in range(ROUNDS):
-        missing = np.where(pair.shown, pair.a - _made(pair, scene), 0.0)
+    for _ in range(pair.rounds, ROUNDS):
+        missing = _missing(pair)
         left = float(np.sum(missing**2))
         if left <= limit or left > SHARPER * before:
             break
-        before = left
-        empty = replace(scene.up_to_offsets(1), sky=np.zeros_like(scene.sky))
-        scene = replace(scene, sky=scene.sky + sky_in(missing, pair.shown, empty, 1e-2))
-    return replace(pair, scene=scene)
+        before, (_, pair) = left, _corrected(pair, missing)
+    return pair
 
 
 def _weight(pair: ChannelPair) -> Maps | None:
@@ -198,12 +227,11 @@ def _filtered(pair: ChannelPair, weight: Maps) -> ChannelPair:
     inverse = np.divide(1.0, factor, out=np.zeros_like(factor), where=known)
     total = weight.sum(axis=0)
     noise = healpy.nside2pixarea(pair.nside) / np.mean(total[total > 0.0])
-    near = np.ones(NEAR) / NEAR
     shown = healpy.alm2cl(alm_.multiply(alm_.resize(scene.sky, scene.lmax, lmax), factor, lmax))
-    power = np.maximum(np.convolve(shown, near, "same") - noise, 1e-3 * noise) * known
+    power = np.maximum(np.convolve(shown, np.ones(NEAR) / NEAR, "same") - noise, 1e-3 * noise) * known
 
     def sky_of(values: NDArray[np.float64]) -> Alm:
-        smooth = _wiener(values, total, power, scene.nthreads)
+        smooth = wiener(values, total, power, scene.nthreads)
         return alm_.resize(alm_.multiply(smooth, inverse, lmax), lmax, scene.lmax)
 
     def seen_by_circle(sky: Alm) -> NDArray[np.float64]:
@@ -236,37 +264,3 @@ def _draw(power: NDArray[np.float64], draw: np.random.Generator) -> Alm:
     real, imaginary = draw.standard_normal((2, alm_.size(lmax)))
     alm = np.where(alm_.orders(lmax) == 0, real, (real + 1j * imaginary) / np.sqrt(2.0))
     return alm_.multiply(alm, np.sqrt(power), lmax)
-
-
-def _wiener(
-    weighted: NDArray[np.float64], weight: NDArray[np.float64], power: NDArray[np.float64], nthreads: int
-) -> Alm:
-    """Return the mean of the coefficients whose map, times a weight, was ``weighted`` but for noise.
-
-    Parameters
-    ----------
-    weighted, weight
-        Map times inverse variance of the noise, and that; shape (npix,).
-    power
-        Of the sky, shape (lmax + 1,).
-    """
-    lmax, nside = power.size - 1, healpy.npix2nside(weight.size)
-    size = np.sqrt(np.where(alm_.orders(lmax) == 0, 1.0, 2.0))  # so that the product of vectors is that of maps
-
-    def of_map(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        alm = healpix.adjoint(values, lmax, nthreads)
-        return (size * alm_.multiply(alm, np.sqrt(power), lmax)).view(np.float64)
-
-    def to_alm(vector: NDArray[np.float64]) -> Alm:
-        return alm_.multiply(np.ascontiguousarray(vector).view(np.complex128) / size, np.sqrt(power), lmax)
-
-    def applied(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-        return vector + of_map(weight * healpix.synthesis(to_alm(vector)[None], nside, lmax, nthreads=nthreads)[0])
-
-    diagonal = 1.0 + np.repeat(power[alm_.degrees(lmax)], 2) * weight.sum() / (4.0 * np.pi)
-    shape = (diagonal.size, diagonal.size)
-    found, _ = cg(
-        LinearOperator(shape, matvec=applied, dtype=np.float64), of_map(weighted), rtol=1e-6, maxiter=ITERATIONS,
-        M=LinearOperator(shape, matvec=lambda v: v / diagonal, dtype=np.float64),
-    )  # fmt: skip
-    return to_alm(found)

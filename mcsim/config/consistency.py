@@ -1,8 +1,27 @@
-"""What settings of a run do not go together: rings without pixels, filtered maps."""
+"""What settings of a run do not go together: rings without pixels, filtered maps, widths in another unit."""
 
+import math
+import warnings
 from typing import Any
 
 from mcsim.config.noise import in_words, is_noise_free
+
+NARROWEST = 0.03  #: width of a beam, radians, times lmax: a Gaussian of it has B_l > 0.9999 up to lmax
+
+
+def warn_of_units(run: Any) -> None:
+    """Warn of beams that no map of the run shows: their widths may be in radians."""
+    for channel in run.channels:
+        for side in ("beam", "beam_b"):
+            for key in ("fwhm_arcmin", "fwhm_major_arcmin"):
+                width = getattr(getattr(channel, side), key, math.inf)
+                if math.radians(width / 60.0) * run.sky.lmax < NARROWEST:
+                    warnings.warn(
+                        f"channel[{channel.name}].{side}.{key} = {width:g} is narrower than any map of sky.lmax = "
+                        f"{run.sky.lmax} shows; the unit is arcmin, and {width:g} rad are "
+                        f"{60.0 * math.degrees(width):.4g} arcmin.",
+                        stacklevel=3,
+                    )
 
 
 def check_rings(run: Any) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from mcsim.config import arrays, paths
+from mcsim.config.consistency import warn_of_units
 from mcsim.config.messages import sentence, shown
 from mcsim.config.preparation import grid_after
 from mcsim.config.schema import RunConfig, analysis_lmax, pixel_window
@@ -82,6 +83,7 @@ def load(source: str | Path | Mapping[str, Any] | RunConfig, base: str | Path | 
     paths.find_descriptions(plain)
     config = _validate(plain, where)
     paths.check_files(config, plain, where)
+    warn_of_units(config)
     return config
 
 

@@ -13,8 +13,7 @@ from mcsim.config.schema import RunConfig
 from mcsim.errors import InputError
 from mcsim.support import resources
 
-DESCRIPTION = "scan.toml"
-"""Name of the file beside moments that describes the survey's pointing."""
+DESCRIPTION = "scan.toml"  #: name of the file beside moments that describes the survey's pointing
 
 _VARIABLE = re.compile(r"\$\{([A-Za-z_][A-Za-z0-9_]*)\}")
 _NUMBER_FORMAT = re.compile(r"(0?[1-9]?d)?")

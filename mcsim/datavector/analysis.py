@@ -25,8 +25,7 @@ from mcsim.sphere import alm as alm_
 from mcsim.support.arrays import Alm, Map, Vector
 from mcsim.systematics import Effect, Library
 
-Kinds = tuple[tuple[str, type[Effect]], ...]
-"""Effects of a library by name, as they are sent to workers."""
+Kinds = tuple[tuple[str, type[Effect]], ...]  #: effects of a library by name, as they are sent to workers
 
 _OTHER_NOISE = 1_000_000
 

@@ -22,8 +22,7 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere.rotation import FRAMES, rotate_biposh
 from mcsim.support.arrays import Map, Vector, divided
 
-NSIDE = 16
-"""Of residual maps, if the data are not coarser: finer pixels show noise and little else."""
+NSIDE = 16  #: of residual maps, if the data are not coarser: finer pixels show noise and little else
 
 
 @dataclass(frozen=True)

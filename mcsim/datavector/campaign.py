@@ -27,8 +27,7 @@ from mcsim.systematics import Effect
 
 Rows = NDArray[np.float64]
 Task = Callable[[Job], Rows]
-Ask = Callable[[Sequence[Job]], list[Rows]]
-"""Return the results of jobs, in order; in this process or on a cluster."""
+Ask = Callable[[Sequence[Job]], list[Rows]]  #: return the results of jobs, in order; in this process or on a cluster
 
 Batch = Callable[[Callable[..., Any], Iterable[tuple[Any, ...]]], Iterator[tuple[int, Any]]]
 """Call a function with tuples of arguments; yield (index, result) in the order of completion."""

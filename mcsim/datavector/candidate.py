@@ -15,8 +15,7 @@ from mcsim.stats.scattered import Acting
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.systematics import Effect, Parametrization, basis_of
 
-BEYOND = 3.0
-"""Standard deviations by which fits may be beyond the bounds of parameters: at a bound, half of them are."""
+BEYOND = 3.0  #: standard deviations by which fits may be beyond the bounds of parameters: at a bound, half of them are
 
 
 class Column(NamedTuple):
@@ -222,19 +221,22 @@ def tables_at(candidates: Sequence[Candidate], members: Sequence[int], found: Fi
 
 def tables_beside(
     candidates: Sequence[Candidate], members: Sequence[int], found: Fit, bend: Matrix, least: float
-) -> Iterator[list[config.Effect] | None]:
-    """Yield the tables of :func:`tables_at` with each amplitude in turn an error larger.
+) -> Iterator[tuple[float, list[config.Effect] | None]]:
+    """Yield a step, and the tables of :func:`tables_at` with each amplitude in turn moved by it.
 
-    ``bend`` are white departures of the templates from linear ones, shape (p, K). None is yielded for the amplitudes of
-    a member whose response departs by at most ``least``.
+    A step is the error of the amplitude, back from what would be impossible. ``bend`` are white departures of the
+    templates from linear ones, shape (p, K). None is yielded for the amplitudes of a member whose response departs by
+    at most ``least``.
     """
     first = 0
     for member in members:
         own = range(first, first := first + len(candidates[member].columns))
         straight = np.linalg.norm(bend[:, own] @ found.amplitudes[own]) <= least
         for error in np.diag(found.errors)[own]:
-            moved = replace(found, amplitudes=found.amplitudes + error)
-            yield None if straight else tables_at(candidates, members, moved)
+            ahead, back = (replace(found, amplitudes=found.amplitudes + sign * error) for sign in (1.0, -1.0))
+            inside = beyond(candidates, members, ahead) == 0.0
+            step = float(error.sum()) if inside else -float(error.sum())
+            yield step, None if straight else tables_at(candidates, members, ahead if inside else back)
 
 
 @dataclass(frozen=True)

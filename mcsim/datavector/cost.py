@@ -15,11 +15,8 @@ from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.ensemble.plan import cost
 from mcsim.simulation import simulate
 
-SURVEYS = 2
-"""Surveys with effects that a worker holds besides the model."""
-
-SAMPLE_S = 3e-7
-"""Seconds that one sample of the time-ordered reference takes on one core."""
+SURVEYS = 2  #: surveys with effects that a worker holds besides the model
+SAMPLE_S = 3e-7  #: seconds that one sample of the time-ordered reference takes on one core
 
 
 def lines(analysis: Analysis, jobs: Mapping[Purpose, Job]) -> list[str]:

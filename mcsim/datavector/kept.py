@@ -15,11 +15,8 @@ from mcsim.datavector.analysis import Job
 from mcsim.support import folders
 from mcsim.support.arrays import Matrix, Vector
 
-NSIDE = 128
-"""Up to this resolution a piece has as many realizations as a task, beyond it fewer, as each takes longer."""
-
-LEAST = 2
-"""Realizations of a piece at any resolution: a worker prepares the survey of each effect anew."""
+NSIDE = 128  #: up to this resolution a piece has as many realizations as a task, beyond it fewer, as each takes longer
+LEAST = 2  #: realizations of a piece at any resolution: a worker prepares the survey of each effect anew
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,8 @@ from mcsim.ensemble.store import write_dataset
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector, divided
 
-QUADRATIC = 0.05
-"""Share of an element's variance that may come from squares and products of nuisances."""
-
-ROUND_OFF = 1e-20
-"""Variance, relative to the largest, of a direction that is there only by round-off."""
+QUADRATIC = 0.05  #: share of an element's variance that may come from squares and products of nuisances
+ROUND_OFF = 1e-20  #: variance, relative to the largest, of a direction that is there only by round-off
 
 
 @dataclass(frozen=True)

@@ -37,9 +37,9 @@ class SameSkies:
         """
         return {(constrained, external): [] for constrained in (False, True) for external in (False, True)}
 
-    def of_reference(self, found: Sequence[config.Effect]) -> Matrix:
-        """Return data vectors with effects, of the skies with which responses are measured."""
-        return self._extended(after_jobs(self.analysis, found))
+    def of_reference(self, found: Sequence[config.Effect], skies: int | None = None) -> Matrix:
+        """Return data vectors with effects, of the first or all of the skies with which responses are measured."""
+        return self._extended(after_jobs(self.analysis, found, skies))
 
     def pair(self, found: Sequence[config.Effect], skies: int, constrained: bool) -> tuple[Matrix, Matrix]:
         """Return data vectors of the same skies without effects and with them."""

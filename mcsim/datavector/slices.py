@@ -19,8 +19,7 @@ from mcsim.support.arrays import Matrix, Vector
 DEGREES = {"residual": 4, "gain": 2}
 """Highest degree of the residual, and of residual times sky: a gain that depends on direction."""
 
-NSIDE = 32
-"""Of the pixels that real harmonics are integrated over."""
+NSIDE = 32  #: of the pixels that real harmonics are integrated over
 
 
 def elements_of(model: Model) -> tuple[Element, ...]:

@@ -110,8 +110,7 @@ def _nuisances(data: DataSet, refined: Refined) -> Iterator[NuisanceResult]:
 
 def _untested(context: DiagnosisContext) -> Iterator[str]:
     """Yield the elements that are not tested, in words."""
-    ensemble = context.ensemble
-    if ensemble.nuisances is not None:
+    if (ensemble := context.ensemble).nuisances is not None:
         yield from (one.words for one, kept in zip(ensemble.elements, ensemble.tested, strict=True) if not kept)
 
 
@@ -141,18 +140,20 @@ def _sigma(candidate: Candidate, theta: Vector, covariance: Vector, parameter: s
     """Return the standard error of a parameter, from its slopes in the coordinates over their own errors.
 
     A step of one error moves also a value at the edge of what is possible. What the data do not constrain is not
-    varied.
+    varied. The error of an amplitude is at least that with all else fixed, and just that where bounds fix the rest.
     """
-    scale = np.sqrt(np.diag(covariance))
+    scale, slopes = np.sqrt(np.diag(covariance)), np.zeros(len(theta))
     precision = np.asarray(np.linalg.pinv(covariance), dtype=np.float64)
     constrained = candidate.parametrization.constrained(theta, precision)
-    slopes: Vector = np.zeros(len(theta))
     for k in np.flatnonzero((scale > 0.0) & ((constrained != 0.0) | (theta == 0.0))):
         step = scale[k] * np.eye(len(theta))[k]
-        ends = (candidate.with_coordinates(constrained + sign, precision) for sign in (step, -step))
-        up, down = (getattr(one, parameter) for one in ends)
+        up, down = (getattr(candidate.with_coordinates(constrained + s, precision), parameter) for s in (step, -step))
         slopes[k] = (up - down) / (2.0 * scale[k])
-    return float(np.sqrt(max(float(slopes @ covariance @ slopes), 0.0)))
+    inside, variance = candidate.fitted(theta, covariance), max(float(slopes @ covariance @ slopes), 0.0)
+    unit = candidate.parametrization.coordinates(replace(inside, amplitude=1.0))
+    if parameter == "amplitude" and (known := float(unit @ precision @ unit)) > 0.0:
+        variance = max(variance * (inside == candidate.with_coordinates(constrained, precision)), 1.0 / known)
+    return float(np.sqrt(variance))
 
 
 def _candidates(context: DiagnosisContext, refined: Refined) -> Iterator[CandidateResult]:

@@ -243,7 +243,7 @@ class Slices:
         parts = [one @ response[rows] for one in division.keep]
         whole = null.fit(x, np.column_stack([beside, response[rows]]))
         apart = null.fit(x, np.column_stack([beside, *parts]))
-        amplitudes, errors = apart.amplitudes[count:], apart.errors[count:]
+        amplitudes, errors = apart.amplitudes[count:], action.growth * apart.errors[count:]
         fitted, further = null.dimension - whole.dimension, whole.dimension - apart.dimension
         if further < 1 or np.any(errors == 0.0):
             return None
@@ -252,7 +252,7 @@ class Slices:
         p = float(null.nested_test(more, chi2, further, fitted, Tolerated(allowance)))
         best = int(np.argmax(amplitudes / errors))
         found = null.fit(x, np.column_stack([beside, parts[best], sum(parts) - parts[best]]))
-        variance = found.errors[-1] ** 2 + action.error**2 + self.settings.consistency_error**2
+        variance = (action.growth * found.errors[-1]) ** 2 + action.error**2 + self.settings.consistency_error**2
         odds = float(np.exp(min((0.5 - found.amplitudes[-1]) / variance, 100.0)))
         return Comparison(
             division.kind, division.words, tuple(map(float, amplitudes)), tuple(map(float, errors)), p, odds

@@ -31,6 +31,7 @@ from mcsim.simulation.survey import Survey
 from mcsim.simulation.survey import survey as survey_
 from mcsim.support import folders
 from mcsim.support.npy import read_npy
+from mcsim.support.numbers import duration
 from mcsim.support.progress import reporting
 
 SEED = 0x6D63 * 1_000 + 3
@@ -234,12 +235,10 @@ def _verdict(folder: Path, number: int) -> Path:
 def describe(analysis: Analysis, count: int, workers: int) -> list[str]:
     """Return lines on the cost of controls: how they are drawn, memory, time, and disk for a moment."""
     drawn = fidelity(analysis, os.cpu_count() or 1)
-    found = cost(drawn.run)
-    each_s = found.each_s + SAMPLE_S * drawn.samples
-    size = 8.0 * 12 * drawn.survey.nside**2 * len(drawn.survey.map_names)
-    dense = f", {drawn.samples:.2g} samples each" if drawn.samples else ""
+    found, dense = cost(drawn.run), f", {drawn.samples:.2g} samples each" if drawn.samples else ""
+    each_s, size = found.each_s + SAMPLE_S * drawn.samples, 96.0 * drawn.survey.nside**2 * len(drawn.survey.map_names)
     return [
-        f"  control {count} data sets with {drawn.words}{dense}; {found.memory / 1e9:.2f} GB per worker, {each_s:.3g} s"
-        f" each, {each_s * count / 60.0 / workers:.3g} minutes with {workers} workers, {size / 1e6:.3g} MB of disk for"
-        " each in work; those that depart from the model cost a diagnosis each",
+        f"  control {count} data sets with {drawn.words}{dense}; {found.memory / 1e9:.2f} GB per worker,"
+        f" {duration(each_s)} each, {duration(each_s * count / workers)} on {workers} core{'s' if workers > 1 else ''},"
+        f" {size / 1e6:.2f} MB of disk for each in work; those that depart from the model cost a diagnosis each",
     ]

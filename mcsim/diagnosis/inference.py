@@ -89,10 +89,9 @@ def _with_errors(data: DataSet[Any], refined: Refined, found: Attribution) -> At
             fit = with_scatter(context.null, t, fit, *pair)
             bend = context.null.whiten_templates(t - context.templates[:, columns])
             tables = tables_beside(context.candidates, best.members, best.fit, bend, context.settings.nonlinear_sigma)
-            pairs = (None if one is None else data.pair(one) for one in tables)
-            moved = zip(pairs, best.fit.errors, t.T, strict=True)
-            slopes = [(one[1] - pair[1]).mean(axis=0) / error if one else row for one, error, row in moved]
-            fit = with_tangents(context.null, t, fit, np.stack(slopes, axis=1))
+            moved = [(step, None if one is None else data.pair(one)) for step, one in tables]
+            slopes = [None if one is None else (one[1] - pair[1]) / step for step, one in moved]
+            fit = with_tangents(context.null, t, fit, slopes)
     return replace(found, explanations=(replace(best, fit=fit), *found.explanations[1:]))
 
 

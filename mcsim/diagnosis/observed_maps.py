@@ -55,8 +55,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
     def respond(self, found: Sequence[config.Effect], skies: int) -> Matrix:
         """Return changes of the data vector in ``skies`` constrained skies, shape (rows, p).
 
-        Effects with a mean response, and those whose pattern is drawn, are simulated in typical skies instead: the
-        observed sky has their power, or the pattern of the data, already.
+        Those with a mean response, or a drawn pattern, are of typical skies: the observed sky has their power already.
         """
         return self.respond_extended(found, skies)[:, : len(self.x)]
 
@@ -76,11 +75,13 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         return shift
 
     def pair(self, found: Sequence[config.Effect]) -> tuple[Matrix, Matrix]:
-        """Return data vectors of the same skies without effects and with them, shape (rows, p) each."""
-        size = len(self.x)
-        if any(self._skies_of(effect) == "reference" for effect in found):
-            return self.context.reference(found), self.same_skies.of_reference(found)[:, :size]
-        before, after = self.same_skies.pair(found, self.context.settings.constrained_skies, True)
+        """Return data vectors of the same skies without effects and with them; for noise alone of typical skies."""
+        size, skies, library = len(self.x), self.context.settings.constrained_skies, dict(self.context.analysis.library)
+        alone = all(library[effect.name].parametrization.noise_alone for effect in found)
+        if alone or any(self._skies_of(effect) == "reference" for effect in found):
+            after = self.same_skies.of_reference(found, skies if alone else None)[:, :size]
+            return self.context.reference(found)[: len(after)], after
+        before, after = self.same_skies.pair(found, skies, True)
         return before[:, :size], after[:, :size]
 
     def _skies_of(self, effect: config.Effect) -> _Skies:

@@ -166,11 +166,12 @@ class Subsets:
         allowance = np.sum(self._errors[subsets] ** 2 * part, axis=1)
         parts = part / self._beside.size[subsets]
         scatter = np.sum(self._beside.chi2[subsets] * parts, axis=1)
+        spread = np.sum(self._beside.spread[subsets] * parts**2, axis=1)
         weights = np.array([candidate.prior for candidate in self.candidates])
         prior = special.gammaln(size + 1) + np.log(weights / weights.sum())[subsets].sum(axis=1)
         return Solved(
             chi2=self.total - delta_chi2,
-            pvalue=null.residual_test(self.total - delta_chi2, K, allowance + scatter),
+            pvalue=null.residual_test(self.total - delta_chi2, K, allowance + scatter, spread),
             evidence=log_evidence(null, self.total, delta_chi2, K, self.settings.prior_snr) + prior,
             allowance=allowance,
             parts=np.minimum(parts, 1.0),

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from mcsim.datavector.localisation import Place
 from mcsim.diagnosis.nuisance import NuisanceResult
 from mcsim.diagnosis.result import Agreement, DiagnosisResult, EffectResult
 from mcsim.diagnosis.selection import Contrast
@@ -26,7 +27,7 @@ def sentence(result: DiagnosisResult) -> str:
     """Return the verdict in one sentence."""
     p = p_equals(result.test.pvalue)
     if result.kind == "none":
-        return f"The model describes the data ({p})."
+        return f"The model describes the data ({p}){', but for one group of numbers' if _unnoticed(result) else ''}."
     start = f"The model does not describe the data ({p})"
     if result.faint:
         return f"{start}, but the departure is too faint to name its cause."
@@ -71,10 +72,11 @@ def tested(result: DiagnosisResult) -> str:
 def status(result: DiagnosisResult) -> str:
     """Return what the verdict means, in agreement with the p-values of what is left."""
     if result.kind == "none":
-        return (
-            "Neither χ² nor any candidate departs from the simulations. An effect below its detectable amplitude can "
-            "still be there."
-        )
+        rest = "An effect below its detectable amplitude can still be there."
+        if place := _unnoticed(result):
+            rest = f"But one group of numbers does by itself: {place.element.words} (z = {place.z:.1f}, "
+            rest += f"{p_equals(place.p)}, look-elsewhere effect included)."
+        return f"Neither χ² nor any candidate departs from the simulations. {rest}"
     near = result.candidates[result.nearest]
     if result.faint:
         return (
@@ -105,6 +107,11 @@ def status(result: DiagnosisResult) -> str:
         f"{start}: the residual of the fit {residual(best.pvalue)}, and {beside} beside {'them' if many else 'it'} "
         f"({p_equals(best.further)}, look-elsewhere effect included)."
     )
+
+
+def _unnoticed(result: DiagnosisResult) -> Place | None:
+    """Return the group of numbers that departs most, if it does and the global test finds nothing."""
+    return result.places[0] if result.kind == "none" and result.places[0].p <= result.settings.place_pvalue else None
 
 
 def agreement(found: Agreement) -> str:
@@ -218,31 +225,25 @@ def summary(result: DiagnosisResult, folder: Path) -> list[str]:
     """Return a summary for the command line, about ten lines."""
     rows = [("warning", warning) for warning in result.warnings]
     rows += [("case", result.case), ("tested", tested(result)), ("global test", chi2(result))]
-    if result.controls is not None:
-        rows.append(("controls", f"{result.controls.counted}; drawn with {result.controls.drawn}"))
+    rows += [("controls", f"{result.controls.counted}; drawn with {result.controls.drawn}")] if result.controls else []
     rows.append(("verdict", f"{result.kind}. {status(result)}"))
     shown = result.sets[: SETS + 1]
-    for one in shown:
-        rows += [("or" if one is not shown[0] else "effect", _numbered(one.effects))]
-    if result.partial:
-        rows += [("detected", _numbered(result.partial))]
+    rows += [("or" if one is not shown[0] else "effect", _numbered(one.effects)) for one in shown]
+    rows += [("detected", _numbered(result.partial))] if result.partial else []
     if result.sets:
-        tests = [one for effect in result.effects for one in effect.consistency]
-        least = min((one.pvalue for one in tests), default=1.0)
-        if tests:
-            rows.append(("parts agree", f"{len(tests)} comparisons of amplitudes, the least likely {p_equals(least)}"))
+        if tests := [one.pvalue for effect in result.effects for one in effect.consistency]:
+            least = p_equals(min(tests))
+            rows.append(("parts agree", f"{len(tests)} comparisons of amplitudes, the least likely {least}"))
         rows.append(("held-out data", held_out(result)))
     if result.kind != "none":
         first = result.places[0]
         rows.append(("where", f"{first.element.words}; z = {first.z:.1f}, {p_equals(first.p)}"))
     rows += [("nuisance", f"{one.label}: {one.words}{pulled(one)}") for one in result.nuisances]
     rows += [("note", note) for note in result.notes]
-    if result.untested:
-        rows.append(("note", f"{untested(result)} The report lists them."))
+    rows += [("note", f"{untested(result)} The report lists them.")] if result.untested else []
     rows += [("missing", line) for line in unlisted(result)]
-    files = ["verdict.json", "report.html", "diagnosis.zarr"]
-    files += [f"{one.name}.py" for one in result.unlisted or () if one.file is not None]
-    rows.append(("written", f"{folder}: {', '.join(files)}"))
+    files = [f"{one.name}.py" for one in result.unlisted or () if one.file is not None]
+    rows.append(("written", f"{folder}: {', '.join(['verdict.json', 'report.html', 'diagnosis.zarr', *files])}"))
     return [f"{name:<14}{text}" for name, text in rows]
 
 

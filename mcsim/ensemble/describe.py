@@ -12,8 +12,10 @@ from mcsim.support.folders import user_path
 NEGLIGIBLE = 1e-6
 """Fraction of its error, or of the largest signal to noise, below which a predicted value counts as zero."""
 
-ROWS = 40
-"""Number of bins of a prediction that are shown."""
+ROUNDING = 1e-12
+"""Fraction of a coefficient below which its real or imaginary part is an error of rounding."""
+
+ROWS = 40  #: number of bins of a prediction that are shown
 
 
 def describe(path: str | Path) -> str:
@@ -70,9 +72,9 @@ def describe_prediction(prediction: xr.Dataset) -> str:
 
 def _spectra(prediction: xr.Dataset) -> list[str]:
     """Return lines for the bins of the strongest spectra, whole spectra if there is room."""
-    text = ["  binned means in uK^2, errors of the mean of an isotropic ensemble:"]
-    text.append(f"    {'pair':<16} {'mode':<9} {'l':<11} {'value':>22} {'error':>10}")
-    rows = spectra(prediction, "")
+    text = ["  binned means in uK^2 (of the beam: no noise, no mask), errors of the mean of an isotropic ensemble:"]
+    text.append(f"    {'pair':<16} {'mode':<9} {'l':<11} {'mean':>22} {'error':>10} {'of the beam':>22}")
+    rows = spectra(prediction, "").assign(beam=spectra(prediction, "_difference")["value"])
     best = strongest(prediction, "")
     best = best[best["sigma"] > NEGLIGIBLE]
     if best.empty:
@@ -81,14 +83,15 @@ def _spectra(prediction: xr.Dataset) -> list[str]:
     for pair, mode in zip(best["pair"][:shown], best["mode"][:shown], strict=True):
         for row in rows[(rows["pair"] == pair) & (rows["mode"] == mode)].dropna().itertuples():
             bounds = f"{row.bin_first}-{row.bin_last}"
-            text.append(f"    {pair:<16} {mode:<9} {bounds:<11} {_value(row.value):>22} {row.error:>10.3g}")
+            mean, beam = _value(row.value), _value(row.beam)
+            text.append(f"    {pair:<16} {mode:<9} {bounds:<11} {mean:>22} {row.error:>10.3g} {beam:>22}")
     if len(best) > shown:
         text.append(f"    and {len(best) - shown} weaker spectra: write all with -o FILE.ecsv")
     return text
 
 
 def _value(value: complex) -> str:
-    """Return a coefficient with four digits, without the part that vanishes identically."""
-    if not value.imag:
+    """Return a coefficient with four digits, without the part that vanishes identically, but for rounding."""
+    if abs(value.imag) <= ROUNDING * abs(value):
         return f"{value.real:.4g}"
-    return f"{value:.4g}" if value.real else f"{value.imag:.4g}j"
+    return f"{value:.4g}" if abs(value.real) > ROUNDING * abs(value) else f"{value.imag:.4g}j"

@@ -28,8 +28,7 @@ from mcsim.sphere import healpix
 
 Source = str | Path | Mapping[str, Any] | config.RunConfig | Survey
 
-L_MOMENTS = 64
-"""Highest degree of the orientation moments in predictions to all orders in the beam."""
+L_MOMENTS = 64  #: highest degree of the orientation moments in predictions to all orders in the beam
 
 
 @dataclass(frozen=True)

@@ -23,14 +23,12 @@ from mcsim.errors import InputError, RunError
 from mcsim.support.arrays import Alm
 from mcsim.support.code import class_digest
 
-SEEDS = 1 << 20
-"""Realizations of a stream of seeds."""
+SEEDS = 1 << 20  #: realizations of a stream of seeds
 
 LARGEST = 1 << 16
 """Bytes of a pickled simulator up to which it goes with every task; a larger one is a file in the cache."""
 
-_GOLDEN = 2654435769
-"""2^32 over the golden ratio, odd: multiples modulo 2^32 are all different, and far apart."""
+_GOLDEN = 2654435769  #: 2^32 over the golden ratio, odd: multiples modulo 2^32 are all different, and far apart
 
 
 @dataclass(frozen=True)
@@ -75,20 +73,11 @@ def named_source(run: config.RunConfig) -> tuple[config.RunConfig, str | None]:
 def source_of(run: config.RunConfig, given: Any) -> Source:
     """Return the source of maps of a survey that ``run`` describes.
 
-    Parameters
-    ----------
-    run
-        Description of sky, beams, scans and noise.
-    given
-        A function ``simulate(seed, effects=())``, or an object with such a method, or its class, which is made with the
-        run if it takes an argument; the same as text, ``package.module:name`` or ``file.py:name``. Or
-        stored maps: a template of FITS files with {realization}, {channel} and {split}; a Zarr store or .npy file; an
-        xarray object or array with the dimension ``realization`` first.
-
-    Raises
-    ------
-    InputError
-        If it cannot be loaded, has no such method, or lacks a map.
+    ``run``: description of sky, beams, scans and noise. ``given``: a function ``simulate(seed, effects=())``, or an
+    object with such a method, or its class, which is made with the run if it takes an argument; the same as text,
+    ``package.module:name`` or ``file.py:name``. Or stored maps: a template of FITS files with {realization}, {channel}
+    and {split}; a Zarr store or .npy file; an xarray object or array with the dimension ``realization`` first. Raise
+    InputError if it cannot be loaded, has no such method, or lacks a map.
     """
     parts = tuple(parts_of(run))
     if isinstance(given, xr.DataArray | xr.Dataset | np.ndarray):

@@ -36,24 +36,12 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Source(ABC):
-    """Offer simulated maps of another program.
+    """Offer simulated maps of another program."""
 
-    Attributes
-    ----------
-    parts
-        The maps of one realization, in order.
-    label
-        The source in words.
-    effects
-        Names of the effects that it can add.
-    takes_sky
-        True if the sky can be given.
-    """
-
-    parts: tuple[Part, ...]
-    label: str
-    effects: tuple[str, ...] = ()
-    takes_sky: bool = False
+    parts: tuple[Part, ...]  #: the maps of one realization, in order
+    label: str  #: the source in words
+    effects: tuple[str, ...] = ()  #: names of the effects that it can add
+    takes_sky: bool = False  #: True if the sky can be given
 
     @property
     def count(self) -> int | None:

@@ -15,7 +15,7 @@ from mcsim.ensemble import store
 from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError
 from mcsim.simulation import differencing, noise, offsets
-from mcsim.simulation.channels import check_effects, load_beam, refuse_external
+from mcsim.simulation.channels import check_effects, check_scans, load_beam, refuse_external
 from mcsim.simulation.filtering import Bands, probes_of
 from mcsim.simulation.preparation import preparation
 from mcsim.simulation.survey import Survey
@@ -155,12 +155,12 @@ class Cost:
 
     def lines(self, number: int, workers: int) -> list[str]:
         """Return lines on memory, parts and time for a number of realizations."""
-        total_s = number * self.each_s
+        total_s, plural = number * self.each_s, "s" if workers > 1 else ""
         return [
-            f"  memory  {self.memory / 1e9:.2f} GB per worker, {workers} workers",
+            f"  memory  {self.memory / 1e9:.2f} GB per worker, {workers} worker{plural}",
             *(f"  {part:<7} {words}" for part, words in self.parts),
             f"  time    {duration(self.each_s)} per realization and core, {duration(total_s)} of processor time,"
-            f" {duration(total_s / workers)} with {workers} workers on as many idle cores",
+            f" {duration(total_s / workers)} with {workers} worker{plural} on as many idle cores",
         ]
 
 
@@ -168,6 +168,7 @@ def describe(source: str | Path, part: slice | None = None, workers: int | None 
     """Return a text on the cost of a run: realizations, tasks, memory, disk, files and time."""
     run = config.load(source)
     refuse_external(run)
+    check_scans(run)
     check_effects(run)
     number, found = len(wanted(run, part)), cost(run)
     memory, *rest = found.lines(number, workers or run.compute.workers)

@@ -28,8 +28,7 @@ from mcsim.support.folders import unwritable
 if TYPE_CHECKING:
     import xarray as xr
 
-Files = dict[str, Buffer]
-"""Contents of the files of a store, by their paths in it."""
+Files = dict[str, Buffer]  #: contents of the files of a store, by their paths in it
 
 _CODECS: dict[str, Any] = {"compressors": (ZstdCodec(level=1, checksum=True),)}
 # Write chunks of fill values too, so that a missing file means damage.
@@ -237,11 +236,9 @@ def extend(path: Path, realizations: int, update: Mapping[str, Any]) -> None:
 def write_summary(path: Path, summary: "xr.Dataset") -> None:
     """Replace the summary group."""
     with faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", category=UserWarning)
-            form: Any = {"zarr_format": 3, "write_empty_chunks": True}
-            encoding = dict.fromkeys(summary.variables, _CODECS)
-            write_dataset(summary, Path(scratch) / "summary", encoding=encoding, **form)
+        form: Any = {"zarr_format": 3, "write_empty_chunks": True, "consolidated": False}
+        encoding = dict.fromkeys(summary.variables, _CODECS)
+        write_dataset(summary, Path(scratch) / "summary", encoding=encoding, **form)
         shutil.rmtree(path / "summary", ignore_errors=True)
         os.replace(Path(scratch) / "summary", path / "summary")
         _consolidate(path)
@@ -250,7 +247,10 @@ def write_summary(path: Path, summary: "xr.Dataset") -> None:
 def write_dataset(dataset: "xr.Dataset", folder: Path, **form: Any) -> None:
     """Write a dataset that is in memory to a folder, in place of what is there, as :meth:`xarray.Dataset.to_zarr`."""
     files: Files = {}
-    dataset.to_zarr(MemoryStore(files), consolidated=False, **form)
+    with warnings.catch_warnings():
+        # Zarr warns that consolidated metadata, which xarray looks for, are not yet standard.
+        warnings.simplefilter("ignore", category=UserWarning)
+        dataset.to_zarr(MemoryStore(files), **({"consolidated": True} | form))
     shutil.rmtree(folder, ignore_errors=True)
     _write_files(files, folder)
 

@@ -18,8 +18,7 @@ from mcsim.support.arrays import divided
 if TYPE_CHECKING:
     import xarray as xr
 
-QML = "biposh_qml"
-"""Start of the names of quadratic maximum-likelihood estimates."""
+QML = "biposh_qml"  #: start of the names of quadratic maximum-likelihood estimates
 
 
 @lru_cache(maxsize=2)

@@ -31,8 +31,7 @@ from mcsim.support.settings import settings_of
 
 PICTURE = "limit.png"
 
-RESPONSE = 3.0
-"""Cost of a response over that of the circular maps of a sky, on average over the library."""
+RESPONSE = 3.0  #: cost of a response over that of the circular maps of a sky, on average over the library
 
 
 def limit(
@@ -135,8 +134,8 @@ def describe(run: config.RunConfig, settings: LimitSettings) -> str:
     run, settings = _with_declared(run, settings)
     analysis, candidates = _candidates(run, settings, nthreads := os.cpu_count() or 1)
     filtered = inverse_covariance(analysis, settings, nthreads)
-    columns = sum(len(candidate.columns) for candidate in candidates)
-    head = f"{run.name}: {len(candidates)} effects of {columns} components, {len(filtered.maps)} maps"
+    columns, count = sum(len(candidate.columns) for candidate in candidates), len(filtered.maps)
+    head = f"{run.name}: {len(candidates)} effects of {columns} components, {count} map{'s' if count > 1 else ''}"
     if settings.dense:
         size = size_of(filtered, columns)
         return f"{head}\n  memory  {size.bytes / 1e9:.3g} GB for {size.pixels} pixels and {size.modes} modes of the sky"

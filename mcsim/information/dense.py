@@ -20,8 +20,7 @@ from mcsim.simulation.inverse_covariance import InverseCovariance, unit_skies
 from mcsim.support.arrays import Cl, Vector
 from mcsim.support.progress import Reporter
 
-BYTES = 4 << 30
-"""Largest memory of the matrices."""
+BYTES = 4 << 30  #: largest memory of the matrices
 
 
 class Size(NamedTuple):

@@ -19,54 +19,32 @@ from mcsim.support.arrays import Alm, Vector, divided
 from mcsim.systematics import Effect
 
 Maps = NDArray[np.float64]
-Observe = Callable[[Alm], Maps]
-"""Return the maps of all channels, shape (map, npix), of a sky."""
-
-DRAWS = 64
-"""Realizations that the mean of an effect of random shape is estimated from, in two halves."""
-
-STEP = 0.1
-"""Share of an effect's ``step``: an ellipticity of either sign bends the response by half of itself."""
-
-NEGLIGIBLE = 1e-12
-"""Orders whose derivative is below this share of the largest are rounding."""
+Observe = Callable[[Alm], Maps]  #: return the maps of all channels, shape (map, npix), of a sky
+DRAWS = 64  #: realizations that the mean of an effect of random shape is estimated from, in two halves
+STEP = 0.1  #: share of an effect's ``step``: an ellipticity of either sign bends the response by half of itself
+NEGLIGIBLE = 1e-12  #: orders whose derivative is below this share of the largest are rounding
 
 _HOOKS = ("sky", "beam", "pointing", "gain", "noise", "spread", "orientations", "differencing")
 
 
 @dataclass(frozen=True, eq=False)
 class Derivative:
-    """Hold the derivative of maps with respect to one coordinate of an effect.
+    """Hold the derivative of maps with respect to one coordinate of an effect."""
 
-    Attributes
-    ----------
-    maps
-        Which maps of the survey change.
-    plus, minus, width
-        Surveys of these maps alone, without noise, and the difference of the coordinate between them;
-        ``minus`` None: ``plus`` is linear in the sky and is the derivative itself.
-    observe
-        Maps of all channels from a sky, for an effect on the sky alone: the response of the inverse covariance, of
-        which what such an effect changes must be no more and no less; None: the simulator's.
-    factor
-        What the sky is multiplied with at first, shape (lmax + 1,); None: nothing.
-    dipole
-        Coefficients of the dipole that the survey sees besides, uK.
-    noise
-        Derivative of the variance of every pixel, uK^2, shape (own maps, npix); None: it does not change.
-    stochastic
-        True if the shape of what is added is random.
-    """
-
-    maps: slice
+    maps: slice  #: which maps of the survey change
+    #: plus, minus, width: surveys of these maps alone, without noise, and the difference of the coordinate between
+    #: them; ``minus`` None: ``plus`` is linear in the sky and is the derivative itself
     plus: Survey
     minus: Survey | None
     width: float
+    #: maps of all channels from a sky, for an effect on the sky alone: the response of the inverse covariance, of which
+    #: what such an effect changes must be no more and no less; None: the simulator's
     observe: Observe | None
-    factor: Vector | None
-    dipole: Alm
+    factor: Vector | None  #: what the sky is multiplied with at first, shape (lmax + 1,); None: nothing
+    dipole: Alm  #: coefficients of the dipole that the survey sees besides, uK
+    #: derivative of the variance of every pixel, uK^2, shape (own maps, npix); None: it does not change
     noise: Maps | None
-    stochastic: bool
+    stochastic: bool  #: True if the shape of what is added is random
 
     def of_sky(self, sky: Alm) -> Maps:
         """Return the derivative of the maps of a sky, without what does not depend on it, uK per unit."""

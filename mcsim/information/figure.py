@@ -9,8 +9,7 @@ from matplotlib.figure import Figure
 from mcsim.information.result import Limits
 from mcsim.support.numbers import number
 
-REACH = 12.0
-"""Amplitude over sigma at which the bars end."""
+REACH = 12.0  #: amplitude over sigma at which the bars end
 
 BLUE, AMBER, GREY = "#0072b2", "#e69f00", "#b5b5b5"
 

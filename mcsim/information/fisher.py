@@ -29,8 +29,7 @@ from mcsim.support.progress import Reporter
 
 Maps = NDArray[np.float64]
 
-PAIRED_BYTES = 1 << 30
-"""Memory for probes that are paired with each other; more probes are done in groups."""
+PAIRED_BYTES = 1 << 30  #: memory for probes that are paired with each other; more probes are done in groups
 
 TOGETHER = 16
 """Responses that are multiplied with all probes at once: the products of one alone take as long as it does."""

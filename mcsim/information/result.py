@@ -20,8 +20,7 @@ from mcsim.support.numbers import number
 
 TABLE, STORE = "limit.json", "limit.zarr"
 
-RESOLVED = 1e-10
-"""Directions of an effect with less than this share of its largest information are unconstrained."""
+RESOLVED = 1e-10  #: directions of an effect with less than this share of its largest information are unconstrained
 
 
 @dataclass(frozen=True)

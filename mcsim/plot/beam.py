@@ -30,19 +30,7 @@ _SIGNED = LinearSegmentedColormap.from_list(
 def beam_figure(beam: Beam, beam_map: BeamMap | None = None, title: str = "") -> Figure:
     """Draw a beam's peak, its faint annulus in dB with the sign, and |b_lm|.
 
-    Parameters
-    ----------
-    beam
-        The beam.
-    beam_map
-        Map of the beam; without it the pattern is synthesised from the coefficients.
-    title
-        Heading of the figure.
-
-    Returns
-    -------
-    Figure
-        Independent of pyplot; save it with ``figure.savefig``.
+    Without a map of the beam the pattern is synthesised from the coefficients. The figure is independent of pyplot.
     """
     summary = summarize(beam, beam_map)
     figure = Figure(figsize=(15.0, 4.9), layout=ConstrainedLayoutEngine(wspace=0.06))

@@ -15,16 +15,8 @@ _COLOURS = {"constant": "#c44e22", "linear": "#1f5fa8", "spline": "#3c8c3c", "or
 def fit_figure(fits: Sequence[Fit]) -> Figure:
     """Draw fits of several models to the same data.
 
-    Parameters
-    ----------
-    fits
-        One or more fits.
-
-    Returns
-    -------
-    Figure
-        A column for every mode (and part), with the data and the best fits above their residuals in sigmas; the last
-        column has f_l and its 68 % band.
+    A column for every mode (and part) has the data and the best fits above their residuals in sigmas; the last column
+    has f_l and its 68 % band.
     """
     data = fits[0].measured
     columns = list(dict.fromkeys((row.mode, row.imaginary) for row in data.rows))

@@ -16,21 +16,10 @@ from mcsim.plot.sky import mollweide
 def scan_figure(moments: Moments, title: str = "", model: ScanModel | None = None) -> Figure:
     """Draw the orientation of the beam in a survey.
 
-    Parameters
-    ----------
-    moments
-        Orientation moments with smax >= 2.
-    title
-        Heading of the figure.
-    model
-        If given, its exact long-time limit is drawn beside the moments; omit it outside the ecliptic frame and for
-        models without such a limit.
-
-    Returns
-    -------
-    Figure
-        Four panels: psi-bar = -arg(w_2) / 2, the mean orientation of the beam's x axis from e_theta towards e_phi,
-        an axis and so defined up to 180 degrees; <cos 2 psi> = Re w_2; hits and Re w_2 against latitude.
+    The moments need smax >= 2. The exact long-time limit of a ``model`` is drawn beside them; omit it outside the
+    ecliptic frame and for models without such a limit. Four panels: psi-bar = -arg(w_2) / 2, the mean orientation of
+    the beam's x axis from e_theta towards e_phi, an axis and so defined up to 180 degrees; <cos 2 psi> = Re w_2; hits
+    and Re w_2 against latitude.
 
     Notes
     -----

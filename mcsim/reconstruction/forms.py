@@ -27,8 +27,7 @@ from mcsim.systematics.product import multiplied
 from mcsim.systematics.spacecraft import spin_phase
 
 REFERENCE_GHZ = 94.0
-_NSIDE = 128
-"""Of the map that a pattern of low degree is looked up in."""
+_NSIDE = 128  #: of the map that a pattern of low degree is looked up in
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +67,6 @@ class AddedPattern(Form):
     index: ClassVar[float] = 0.0
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Add the pattern."""
         self.check_frame(site)
         factor = self.amplitude
         if self.index:
@@ -85,7 +83,6 @@ class GainPattern(Form):
     on_dipole: ClassVar[bool] = True
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Add what the gain multiplies."""
         self.check_frame(site)
         seen = sky if self.on_sky else np.zeros_like(sky)
         if self.on_dipole:
@@ -101,7 +98,6 @@ class RotatedSky(Form):
     rotation: ClassVar[tuple[float, float, float]]
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Add the change of sky and dipole."""
         self.check_frame(site)
         whole = sky + dipole_alm(site.dipole_uk, site.lmax)
         changes = (w * turned for w, turned in zip(self.rotation, rotations(whole, site.lmax), strict=True))
@@ -130,7 +126,6 @@ class SkyPower(Form):
     values: ClassVar[tuple[float, ...]]
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Multiply the coefficients."""
         more = self.amplitude * steps(self.edges, self.values, site.lmax).real
         return alm_.multiply(sky, np.sqrt(np.maximum(1.0 + more, 0.0)), site.lmax)
 
@@ -148,7 +143,6 @@ class BeamOrder(Form):
     top: ClassVar[int]
 
     def beam(self, beam: Beam, site: Site) -> Beam:
-        """Add to one row of b_lm."""
         blm = np.zeros((max(beam.mmax, self.order) + 1, beam.lmax + 1), dtype=np.complex128)
         blm[: beam.mmax + 1] = beam.blm
         ell = np.arange(beam.lmax + 1.0)
@@ -161,23 +155,14 @@ class BeamOrder(Form):
 
 @dataclass(frozen=True, kw_only=True)
 class InTime(Form):
-    """Derive forms that depend on time from this class.
+    """Derive forms that depend on time from this class."""
 
-    Attributes
-    ----------
-    wave
-        "": constant; "spin": ``harmonic`` times the spin phase; "year"; "orientation": ``harmonic`` times psi; "sky":
-        a pattern.
-    coefficients
-        Of cosine and sine, or of the pattern, or the constant.
-    splits
-        Factor in each of as many equal parts of the survey's time.
-    """
-
+    #: "": constant; "spin": ``harmonic`` times the spin phase; "year"; "orientation": ``harmonic`` times psi; "sky": a
+    #: pattern
     wave: ClassVar[str] = ""
     harmonic: ClassVar[int] = 1
-    coefficients: ClassVar[tuple[float, ...]]
-    splits: ClassVar[tuple[float, ...]] = (1.0,)
+    coefficients: ClassVar[tuple[float, ...]]  #: of cosine and sine, or of the pattern, or the constant
+    splits: ClassVar[tuple[float, ...]] = (1.0,)  #: factor in each of as many equal parts of the survey's time
 
     def factor(self, time_s: Vector, site: Site) -> Vector:
         """Return the factor of the split that each time is in."""
@@ -206,7 +191,6 @@ class AddedToSamples(InTime):
     """Samples have a signal added, uK, whatever the sky: a wave, or a pattern in some splits."""
 
     def signal(self, time_s: Vector, theta: Vector, phi: Vector, psi: Vector, site: Site) -> Vector:
-        """Return the signal."""
         if self.wave == "sky":
             self.check_frame(site)
             value = _map_of(self.coefficients)[healpy.ang2pix(_NSIDE, theta, phi)]
@@ -220,7 +204,6 @@ class GainOverTime(InTime):
     """The gain of sky and dipole varies in time: a wave, or a constant in some splits."""
 
     def gain(self, time_s: Vector, site: Site) -> Vector | None:
-        """Return the error of the gain."""
         if self.amplitude == 0.0:
             return None
         return np.asarray(self.amplitude * self.factor(time_s, site) * self.over_time(time_s, None, site))

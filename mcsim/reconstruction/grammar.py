@@ -18,8 +18,7 @@ from mcsim.support.arrays import Matrix, Vector
 
 ALIKE, OPPOSITE = "alike", "opposite"
 
-ALSO_COMMON = ("monopole", "dipole")
-"""Patterns that all channels may have alike: skies of a model have none of them."""
+ALSO_COMMON = ("monopole", "dipole")  #: patterns that all channels may have alike: skies of a model have none of them
 
 INDICES = (-3.0, -2.0, 1.5)
 """Power of the frequency, in thermodynamic units, of signals of several channels: synchrotron, free-free, dust."""
@@ -27,44 +26,23 @@ INDICES = (-3.0, -2.0, 1.5)
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """One structure of the grammar.
+    """One structure of the grammar."""
 
-    Attributes
-    ----------
-    stage
-        "added", "gain", "beam", "square", "rotation", "noise", "power" or "modulation".
-    acts_on
-        What it multiplies: "sky", "dipole", "sky and dipole", or "" if nothing.
-    frame
-        "sky", "scan", "spacecraft", "time", or "" for noise and for the sky's own power.
-    kind
-        What varies: "monopole", "degrees 0-2", "latitude ecliptic", "order 2", "year", "spin 1", "constant", ...
-    channel
-        Name; None: all of them.
-    split
-        "alike", "opposite", or the name of the only split that has it.
-    index
-        Power of the frequency of what is added to all channels; None: it is not scaled.
-    rows, weights
-        Places of the scores, shape (K, maps), and the factor of each map, shape (maps,): a score of the structure is
-        their weighted sum over maps.
-    mix
-        Matrix from these sums to the coordinates, shape (coordinates, K); None: they are the coordinates.
-    views
-        Indices of the maps.
-    """
-
-    stage: str
-    acts_on: str
-    frame: str
+    stage: str  #: "added", "gain", "beam", "square", "rotation", "noise", "power" or "modulation"
+    acts_on: str  #: what it multiplies: "sky", "dipole", "sky and dipole", or "" if nothing
+    frame: str  #: "sky", "scan", "spacecraft", "time", or "" for noise and for the sky's own power
+    #: what varies: "monopole", "degrees 0-2", "latitude ecliptic", "order 2", "year", "spin 1", "constant", ...
     kind: str
-    channel: str | None
-    split: str
-    index: float | None
+    channel: str | None  #: name; None: all of them
+    split: str  #: "alike", "opposite", or the name of the only split that has it
+    index: float | None  #: power of the frequency of what is added to all channels; None: it is not scaled
+    #: rows, weights: places of the scores, shape (K, maps), and the factor of each map, shape (maps,): a score of the
+    #: structure is their weighted sum over maps
     rows: NDArray[np.int64] = field(repr=False)
     weights: Vector = field(repr=False)
+    #: matrix from these sums to the coordinates, shape (coordinates, K); None: they are the coordinates
     mix: Matrix | None = field(default=None, repr=False)
-    views: tuple[int, ...] = field(default=(), repr=False)
+    views: tuple[int, ...] = field(default=(), repr=False)  #: indices of the maps
 
     @property
     def size(self) -> int:

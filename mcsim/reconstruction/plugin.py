@@ -12,8 +12,7 @@ from mcsim.reconstruction.grammar import ALIKE, OPPOSITE, Structure
 from mcsim.reconstruction.scores import Scene
 from mcsim.support.arrays import Vector
 
-CONSTANT = float(np.sqrt(4.0 * np.pi))
-"""Real coefficient of degree 0 of a map that is one everywhere."""
+CONSTANT = float(np.sqrt(4.0 * np.pi))  #: real coefficient of degree 0 of a map that is one everywhere
 
 _FILE = '''"""{sentence}
 

@@ -5,40 +5,15 @@ from typing import Any
 
 from mcsim.support.numbers import measured, p_equals
 
-NSIDE = 16
-"""Of the pictures."""
+NSIDE = 16  #: of the pictures
 
 
 @dataclass(frozen=True)
 class Reconstructed:
-    """A structure that no effect of the library makes.
+    """A structure that no effect of the library makes."""
 
-    Attributes
-    ----------
-    stage, acts_on, frame, kind, channel, split, index
-        What it is, in the words of the grammar (:class:`mcsim.reconstruction.grammar.Structure`).
-    says
-        The same in plain words.
-    pvalue, delta_chi2
-        Global p-value, all of the grammar charged, and unbiased fall of chi^2.
-    coordinates
-        Number of numbers that describe it.
-    rms_uk
-        Of what it adds to the maps that it acts in, uK; None if no effect can be like it.
-    relative_error
-        Of its amplitude.
-    cause
-        A known effect that makes such structures, with its reference; "" if none.
-    alternatives
-        Structures that are less probable by a factor of 20 at most, in plain words.
-    profile
-        First and last degree, size and error of its profile in l; empty without one.
-    picture
-        What it adds to one map, uK, RING, nside 16, and the name of that map; empty if not known.
-    name, file
-        Of the effect, and the text of the Python file that defines it; None if no effect can be like it.
-    """
-
+    #: stage, acts_on, frame, kind, channel, split, index: what it is, in the words of the grammar
+    #: (:class:`mcsim.reconstruction.grammar.Structure`)
     stage: str
     acts_on: str
     frame: str
@@ -46,17 +21,21 @@ class Reconstructed:
     channel: str | None
     split: str
     index: float | None
-    says: str
+    says: str  #: the same in plain words
+    #: pvalue, delta_chi2: global p-value, all of the grammar charged, and unbiased fall of chi^2
     pvalue: float
     delta_chi2: float
-    coordinates: int
-    rms_uk: float | None
-    relative_error: float
-    cause: str
-    alternatives: tuple[str, ...]
+    coordinates: int  #: number of numbers that describe it
+    rms_uk: float | None  #: of what it adds to the maps that it acts in, uK; None if no effect can be like it
+    relative_error: float  #: of its amplitude
+    cause: str  #: A known effect that makes such structures, with its reference; "" if none
+    alternatives: tuple[str, ...]  #: structures that are less probable by a factor of 20 at most, in plain words
+    #: first and last degree, size and error of its profile in l; empty without one
     profile: tuple[tuple[int, int, float, float], ...]
+    #: what it adds to one map, uK, RING, nside 16, and the name of that map; empty if not known
     picture: tuple[float, ...]
     picture_of: str
+    #: name, file: of the effect, and the text of the Python file that defines it; None if no effect can be like it
     name: str | None
     file: str | None
 

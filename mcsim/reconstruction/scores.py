@@ -21,78 +21,46 @@ from mcsim.sphere import healpix, real
 from mcsim.sphere.sky import dipole_alm
 from mcsim.support.arrays import Alm, Cl, Map, Vector, divided
 
-ADDED, GAIN = 8, 2
-"""Highest degree of patterns that are added, and of those that multiply."""
-
-ORDERS = 4
-"""Highest order of a beam, and of what follows its orientation."""
-
-BINS = 4
-"""Ranges of degrees of a profile in l, equal in log l."""
+ADDED, GAIN = 8, 2  #: highest degree of patterns that are added, and of those that multiply
+ORDERS = 4  #: highest order of a beam, and of what follows its orientation
+BINS = 4  #: ranges of degrees of a profile in l, equal in log l
 
 Key = tuple[str | int, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Describe one map.
+    """Describe one map."""
 
-    Attributes
-    ----------
-    channel, split
-        Indices.
-    w
-        Orientation moments, shape (smax, npix).
-    waves
-        Means over the samples of every pixel of the cosine and sine of waves, by their names.
-    response
-        B_l w_l of the channel, shape (lmax + 1,).
-    kernel
-        b_l0 of its beam, shape (lmax + 1,).
-    """
-
+    #: channel, split: indices
     channel: int
     split: int
-    w: NDArray[np.complex128]
+    w: NDArray[np.complex128]  #: orientation moments, shape (smax, npix)
+    #: means over the samples of every pixel of the cosine and sine of waves, by their names
     waves: Mapping[str, tuple[Map, Map]]
-    response: Cl
-    kernel: Cl
+    response: Cl  #: B_l w_l of the channel, shape (lmax + 1,)
+    kernel: Cl  #: b_l0 of its beam, shape (lmax + 1,)
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Describe the maps of a survey, and name their scores.
+    """Describe the maps of a survey, and name their scores."""
 
-    Attributes
-    ----------
-    channels, frequencies, splits
-        Names, GHz or None, names ("" for the only one).
-    frame, nside, lmax
-        Of the maps and of the filtered sky.
-    dipole_uk
-        That the survey sees besides, shape (3,).
-    cl, sky_power
-        Spectrum of the sky, and that of the filtered sky over it, shape (lmax + 1,).
-    split_orders
-        Highest order of a beam that is measured in each map by itself.
-    views
-        Maps, channel by channel.
-    timed
-        True if it is known when and how every sample was pointed, and splits are spans of time.
-    """
-
+    #: channels, frequencies, splits: names, GHz or None, names ("" for the only one)
     channels: tuple[str, ...]
     frequencies: tuple[float | None, ...]
     splits: tuple[str, ...]
+    #: frame, nside, lmax: of the maps and of the filtered sky
     frame: str
     nside: int
     lmax: int
-    dipole_uk: Vector
+    dipole_uk: Vector  #: that the survey sees besides, shape (3,)
+    #: cl, sky_power: spectrum of the sky, and that of the filtered sky over it, shape (lmax + 1,)
     cl: Cl
     sky_power: Cl
-    split_orders: int
-    views: tuple[View, ...]
-    timed: bool
+    split_orders: int  #: highest order of a beam that is measured in each map by itself
+    views: tuple[View, ...]  #: maps, channel by channel
+    timed: bool  #: True if it is known when and how every sample was pointed, and splits are spans of time
 
     @property
     def degree(self) -> int:

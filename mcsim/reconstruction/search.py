@@ -18,11 +18,8 @@ from mcsim.reconstruction.grammar import ALIKE, Structure
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector
 
-LEVEL = 0.01
-"""Global p-value, all of the grammar charged, up to which a structure is there."""
-
-MOST = 3
-"""Largest number of structures."""
+LEVEL = 0.01  #: global p-value, all of the grammar charged, up to which a structure is there
+MOST = 3  #: largest number of structures
 
 SECOND = 0.1
 """Least fall of chi^2 of a further structure over that of the first: below it may be the square of the first."""
@@ -34,14 +31,9 @@ the evidence those of one stage and frame, and simulations for each of their sco
 RARE = 3.0
 """Odds against a structure that is not alike in all splits, and against a gain or square of sky or dipole alone."""
 
-TAIL = 0.1
-"""Share of the simulations by which the tail of the largest evidence is described."""
-
-SMALL = 1e-6
-"""Variance, relative to the largest, of a direction in which scores are not inverted."""
-
-ALTERNATIVES = 20.0
-"""Odds up to which other structures are told beside the best."""
+TAIL = 0.1  #: share of the simulations by which the tail of the largest evidence is described
+SMALL = 1e-6  #: variance, relative to the largest, of a direction in which scores are not inverted
+ALTERNATIVES = 20.0  #: odds up to which other structures are told beside the best
 
 
 class Sky(Protocol):
@@ -59,26 +51,14 @@ class Sky(Protocol):
 
 @dataclass(frozen=True)
 class Found:
-    """A structure that is there.
+    """A structure that is there."""
 
-    Attributes
-    ----------
-    structure
-        Index in the grammar.
-    evidence
-        Logarithm of its odds against none, in what those found before it leave.
-    pvalue
-        Global p-value: probability that the best of all structures has as large an evidence in data of the model.
-    delta_chi2
-        Fall of chi^2, unbiased.
-    alternatives
-        Indices of structures less probable by ALTERNATIVES at most, the most probable first.
-    """
-
-    structure: int
-    evidence: float
+    structure: int  #: index in the grammar
+    evidence: float  #: logarithm of its odds against none, in what those found before it leave
+    #: global p-value: probability that the best of all structures has as large an evidence in data of the model
     pvalue: float
-    delta_chi2: float
+    delta_chi2: float  #: fall of chi^2, unbiased
+    #: indices of structures less probable by ALTERNATIVES at most, the most probable first
     alternatives: tuple[int, ...]
 
 

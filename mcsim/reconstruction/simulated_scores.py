@@ -24,8 +24,7 @@ from mcsim.support.code import package_digest
 SIMULATIONS = 400
 """Of the model, for mean and covariance of the scores: as many realizations more, once for each model."""
 
-SEED = 0x6D63 * 1_000 + 4
-"""Of these simulations; those of the data vector and of the controls have others."""
+SEED = 0x6D63 * 1_000 + 4  #: of these simulations; those of the data vector and of the controls have others
 
 PER_TASK = 10
 

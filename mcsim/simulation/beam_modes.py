@@ -37,15 +37,6 @@ class Weighted(NamedTuple):
 class BeamModes:
     """Estimate b_ls / b_l0, s = 1 ... ``orders``, in bins of ``width`` degrees.
 
-    Attributes
-    ----------
-    filter
-        Of the map, with circular beam.
-    moments
-        Orientation moments of its samples.
-    orders, width
-        Highest order s, and width of the bins in ell, from 0.
-
     Raises
     ------
     InputError
@@ -57,8 +48,9 @@ class BeamModes:
     beam, sign and phase included (tests/unit/test_beam_modes.py).
     """
 
-    filter: MapFilter
-    moments: Moments
+    filter: MapFilter  #: of the map, with circular beam
+    moments: Moments  #: orientation moments of its samples
+    #: orders, width: highest order s, and width of the bins in ell, from 0
     orders: int
     width: int
 

@@ -14,11 +14,8 @@ from mcsim.instrument.scan.offsets import HIGHEST
 from mcsim.sphere import rotation
 from mcsim.support import resources
 
-CIRCULAR = (config.BeamGaussian, config.BeamWindow)
-"""Beams that have no m_max."""
-
-WHOLE = 4
-"""Orders that a beam has at least without its m_max, where its source has them."""
+CIRCULAR = (config.BeamGaussian, config.BeamWindow)  #: beams that have no m_max
+WHOLE = 4  #: orders that a beam has at least without its m_max, where its source has them
 
 NEGLECTED = 1e-9
 """Share of a beam's power that its orders may leave out where maps are told apart by less than a run's own accuracy."""
@@ -112,6 +109,20 @@ def refuse_external(run: config.RunConfig) -> None:
         raise InputError(
             f"{run.name} has {key} = {given!r}, which only a diagnosis of maps takes; remove it to simulate with mcsim."
         )
+
+
+def check_scans(run: config.RunConfig) -> None:
+    """Refuse a run whose scan models cannot be read, or lack what a channel names, as the run would."""
+    for spec in run.channels:
+        match spec.scan:
+            case config.ScanHitAveraged():
+                for split in run.map.each_split:
+                    scan_model(spec, spec.scan, split).select()
+            case config.ScanDifferencing():
+                for split in run.map.each_split:
+                    scan_model(spec, spec.scan, split).pair(spec.scan.pair)
+            case config.ScanMoments():
+                described(spec)
 
 
 def check_effects(run: config.RunConfig) -> None:

@@ -35,14 +35,9 @@ from mcsim.support import folders
 from mcsim.support.arrays import Alm, Map, Matrix, Vector, divided
 from mcsim.support.code import package_digest
 
-LOWEST = 2
-"""Lowest degree in bins: the monopole and the dipole of a map are not those of its sky."""
-
-PAIRS = 20
-"""Pairs of random probes for each number whose Fisher matrix they estimate."""
-
-TOLERANCE = 1e-6
-"""Relative residual at which the inverse covariance of a map is found."""
+LOWEST = 2  #: lowest degree in bins: the monopole and the dipole of a map are not those of its sky
+PAIRS = 20  #: pairs of random probes for each number whose Fisher matrix they estimate
+TOLERANCE = 1e-6  #: relative residual at which the inverse covariance of a map is found
 
 DIPOLE_UK = 100.0
 """Rms of the monopole and of the dipole that maps may have besides their sky, so that nothing is learnt from them."""
@@ -59,24 +54,12 @@ def unknown_dipole(cl: Vector) -> Vector:
 
 @dataclass(frozen=True, eq=False)
 class MapFilter:
-    """Filter of one map.
+    """Filter of one map."""
 
-    Attributes
-    ----------
-    name
-        Of the map.
-    inverse
-        Its inverse covariance, with circular beam and pixel window as response.
-    window
-        Pixel window that the analysis divides out, shape (>= lmax + 1,).
-    lmax
-        Highest degree of the result.
-    """
-
-    name: str
-    inverse: InverseCovariance
-    window: Vector
-    lmax: int
+    name: str  #: of the map
+    inverse: InverseCovariance  #: its inverse covariance, with circular beam and pixel window as response
+    window: Vector  #: pixel window that the analysis divides out, shape (>= lmax + 1,)
+    lmax: int  #: highest degree of the result
 
     @cached_property
     def total(self) -> Vector:
@@ -125,20 +108,13 @@ class MapFilter:
 
 @dataclass(frozen=True, eq=False)
 class Bands:
-    """Bins of all modes of one pair of maps, as a vector of real numbers: real and imaginary parts where they exist.
+    """Bins of all modes of one pair of maps, as a vector of real numbers: real and imaginary parts where they exist."""
 
-    Attributes
-    ----------
-    modes, lmax, width
-        Of the coefficients, and width of the bins in ell.
-    auto
-        True if both maps of the pair are the same.
-    """
-
+    #: modes, lmax, width: of the coefficients, and width of the bins in ell
     modes: tuple[Mode, ...]
     lmax: int
     width: int
-    auto: bool
+    auto: bool  #: True if both maps of the pair are the same
 
     @cached_property
     def first(self) -> NDArray[np.int64]:
@@ -228,27 +204,13 @@ def probes_of(bands: Sequence[Bands], asked: int | None) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Filtering:
-    """Filters of all maps of a survey, and the normalisation of what they measure.
+    """Filters of all maps of a survey, and the normalisation of what they measure."""
 
-    Attributes
-    ----------
-    filters
-        One for every map.
-    pairs
-        Indices of maps.
-    tables
-        Of the estimator.
-    width
-        Of the bins in ell.
-    probes
-        Random probes for the normalisation; None: as many as give 20 pairs for each number.
-    """
-
-    filters: tuple[MapFilter, ...]
-    pairs: tuple[tuple[int, int], ...]
-    tables: Estimator
-    width: int
-    probes: int | None = None
+    filters: tuple[MapFilter, ...]  #: one for every map
+    pairs: tuple[tuple[int, int], ...]  #: indices of maps
+    tables: Estimator  #: of the estimator
+    width: int  #: of the bins in ell
+    probes: int | None = None  #: random probes for the normalisation; None: as many as give 20 pairs for each number
 
     @cached_property
     def bands(self) -> tuple[Bands, ...]:

@@ -28,29 +28,18 @@ from mcsim.sphere.checks import check_cl
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.support.arrays import Alm, Cl, Map, Vector, divided
 
-Maps = NDArray[np.float64]
-"""Shape (map, npix), uK or uK^-1."""
-
-ITERATIONS = 2000
-"""After so many the conjugate gradients are given up."""
+Maps = NDArray[np.float64]  #: shape (map, npix), uK or uK^-1
+ITERATIONS = 2000  #: after so many the conjugate gradients are given up
 
 
 @dataclass(frozen=True, eq=False)
 class ObservedMap:
-    """Describe one map.
+    """Describe one map."""
 
-    Attributes
-    ----------
-    response
-        Of the beam times the pixel window. Maps with equal ones share their transforms.
-    precision
-        Inverse variance of the noise in every pixel, uK^-2, shape (npix,); 0 where not observed or masked.
-    moments
-        Orientation moments and centroids of the samples; None: only the circular part of the beam, at pixel centres.
-    """
-
-    response: convolve.Response
+    response: convolve.Response  #: Of the beam times the pixel window. Maps with equal ones share their transforms.
+    #: inverse variance of the noise in every pixel, uK^-2, shape (npix,); 0 where not observed or masked
     precision: Map
+    #: orientation moments and centroids of the samples; None: only the circular part of the beam, at pixel centres
     moments: Moments | None = None
 
     @property
@@ -63,21 +52,9 @@ class ObservedMap:
 class InverseCovariance:
     """Apply the inverse covariance of maps.
 
-    Parameters
-    ----------
-    cl
-        Spectrum of the sky, uK^2, shape (lmax + 1,).
-    maps
-        The maps in order, of one nside.
-    tolerance
-        Relative residual at which the conjugate gradients end.
-    nthreads
-        Threads of the transforms.
-
-    Raises
-    ------
-    InputError
-        If no map has an observed pixel, pixels differ in number, or a response does not reach lmax.
+    ``cl``: spectrum of the sky, uK^2, shape (lmax + 1,). ``maps``: the maps in order, of one nside. ``tolerance``:
+    relative residual at which the conjugate gradients end. ``nthreads``: threads of the transforms. Raise InputError if
+    no map has an observed pixel, pixels differ in number, or a response does not reach lmax.
 
     Notes
     -----

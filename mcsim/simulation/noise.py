@@ -34,23 +34,15 @@ class DrawnNoise(Protocol):
 
 @dataclass(frozen=True)
 class Level:
-    """Level of white noise from the differences of splits.
+    """Level of white noise from the differences of splits."""
 
-    Attributes
-    ----------
-    sigma_uk, error_uk
-        Noise per observation, or, isotropic, of a pixel of one split; its standard error.
-    pixels, splits
-        From how many.
-    isotropic
-        True if the noise was taken to be the same in all pixels.
-    """
-
+    #: sigma_uk, error_uk: noise per observation, or, isotropic, of a pixel of one split; its standard error
     sigma_uk: float
     error_uk: float
+    #: pixels, splits: from how many
     pixels: int
     splits: int
-    isotropic: bool
+    isotropic: bool  #: True if the noise was taken to be the same in all pixels
 
     def __str__(self) -> str:
         """Say it in words."""

@@ -20,8 +20,7 @@ from mcsim.systematics import Effect, Library, basis_of, seen_through, spread_of
 
 _OF_BEAMS = ("beam", "pointing", "spread")
 
-REACH = 4.0
-"""Largest draw in prior widths; a nuisance must be possible up to there."""
+REACH = 4.0  #: largest draw in prior widths; a nuisance must be possible up to there
 
 
 @dataclass(frozen=True)
@@ -98,8 +97,7 @@ class Nuisance:
         return float(self.settings.get(name, getattr(self.effect(), name)))
 
 
-Drawn = tuple[tuple[Nuisance, Effect], ...]
-"""Nuisances with the effects that are drawn from them."""
+Drawn = tuple[tuple[Nuisance, Effect], ...]  #: nuisances with the effects that are drawn from them
 
 
 def nuisances_of(run: config.RunConfig, library: Library | None = None) -> tuple[Nuisance, ...]:

@@ -14,8 +14,7 @@ from mcsim.support.arrays import Map
 from mcsim.support.code import class_digest, package_digest
 from mcsim.systematics import Effect, Pointing, Site, adding
 
-_TIMES = 4096
-"""At which a gain or a signal is evaluated for the key."""
+_TIMES = 4096  #: at which a gain or a signal is evaluated for the key
 
 
 def mean_gain(acting: tuple[Effect, ...], site: Site, share: tuple[float, float]) -> Map | None:

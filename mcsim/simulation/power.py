@@ -28,11 +28,8 @@ TOLERANCE = 0.5
 ENOUGH = 0.1
 """The same for the ``sky.lmax`` that is called enough; above it a diagnosis of prepared maps says what is left out."""
 
-SIGNAL_FLOOR = 1e-3
-"""Least noise over the rms of the sky, for maps without noise: that of the diagnosis."""
-
-REACH, HIGHEST = 24, 8192
-"""Degrees that are looked at: up to 24 nside of the prepared pixels, and this many."""
+SIGNAL_FLOOR = 1e-3  #: least noise over the rms of the sky, for maps without noise: that of the diagnosis
+REACH, HIGHEST = 24, 8192  #: degrees that are looked at: up to 24 nside of the prepared pixels, and this many
 
 
 @dataclass(frozen=True)

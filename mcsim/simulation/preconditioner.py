@@ -25,11 +25,8 @@ from mcsim.sphere import healpix
 from mcsim.sphere.checks import nside_of
 from mcsim.support.arrays import Alm, Map, Vector, divided
 
-FAINT = 0.1
-"""Power of the sky over that of the noise below which degrees are taken one by one."""
-
-HOLE = 0.5
-"""Precision over its median below which pixels are missing, in part or altogether."""
+FAINT = 0.1  #: power of the sky over that of the noise below which degrees are taken one by one
+HOLE = 0.5  #: precision over its median below which pixels are missing, in part or altogether
 
 NEIGHBOURS = np.array([4.0, 1.0] * 4) / 6.0
 """Weights of the neighbours of a pixel in a Laplacian, of edges and corners in turn as healpy returns them."""
@@ -38,14 +35,9 @@ NEIGHBOURS = np.array([4.0, 1.0] * 4) / 6.0
 class Preconditioner:
     """Apply the approximate inverse to skies.
 
-    Parameters
-    ----------
-    gain
-        Power of the sky over that of the noise, shape (lmax + 1,), if all pixels had the mean precision.
-    precision
-        Inverse variance of the pixels, shape (npix,), of any unit; 0 where not observed.
-    nthreads
-        Threads of the transforms.
+    ``gain``: power of the sky over that of the noise, shape (lmax + 1,), if all pixels had the mean precision.
+    ``precision``: inverse variance of the pixels, shape (npix,), of any unit; 0 where not observed. ``nthreads``:
+    threads of the transforms.
 
     Notes
     -----

@@ -25,8 +25,7 @@ from mcsim.sphere.mask import read_mask
 from mcsim.support.arrays import Map
 from mcsim.systematics import Site
 
-LARGEST_GAIN = 10.0
-"""Of B_l by a change of the beam: a target that asks for more is narrower than the beam."""
+LARGEST_GAIN = 10.0  #: of B_l by a change of the beam: a target that asks for more is narrower than the beam
 
 
 @dataclass(frozen=True)

@@ -27,12 +27,10 @@ from mcsim.sphere.checks import check_alm, check_angle
 from mcsim.support.arrays import Alm, Vector
 from mcsim.support.compiled import njit
 
-_ROUND_OFF = 1e8
-"""Loss of digits that the division by sin^s(theta) on the ring next to the pole may cost."""
+_ROUND_OFF = 1e8  #: loss of digits that the division by sin^s(theta) on the ring next to the pole may cost
 
 
-_FEW = 3e8
-"""Points times squared nodes up to which a rule is built by Lanczos steps: about a second."""
+_FEW = 3e8  #: points times squared nodes up to which a rule is built by Lanczos steps: about a second
 
 
 @dataclass(frozen=True)

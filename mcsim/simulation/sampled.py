@@ -16,8 +16,7 @@ from mcsim.sphere import rng
 from mcsim.sphere.sky import dipole_alm
 from mcsim.support.arrays import Map
 
-EPSILON = 1e-9
-"""Accuracy asked of the interpolation, relative to sky and dipole together."""
+EPSILON = 1e-9  #: accuracy asked of the interpolation, relative to sky and dipole together
 
 
 def maps(

@@ -30,21 +30,9 @@ class Observed:
 def realize(survey: Survey, realization: int, nthreads: int = 1) -> dict[str, NDArray]:
     """Return the spectra of one realization.
 
-    Parameters
-    ----------
-    survey
-        What all realizations share.
-    realization
-        Index, >= 0: with the run's seed it fixes every random number.
-    nthreads
-        Threads of the transforms.
-
-    Returns
-    -------
-    dict
-        ``biposh`` (pair, mode, lmax + 1) complex and ``cl`` (pair, lmax + 1), uK^2; with a filter ``biposh_qml`` (pair,
-        mode, bin); with pairing the same of the circular-beam control, ``biposh_circular`` and so on; with kept maps
-        ``observed_map`` (map, npix), uK.
+    Its index, >= 0, fixes every random number with the run's seed. They are ``biposh`` (pair, mode, lmax + 1) complex
+    and ``cl`` (pair, lmax + 1), uK^2; with a filter ``biposh_qml`` (pair, mode, bin); with pairing the same of the
+    circular-beam control, ``biposh_circular`` and so on; with kept maps ``observed_map`` (map, npix), uK.
     """
     ensemble = survey.config.ensemble
     sky = draw_sky(survey, realization)
@@ -107,20 +95,13 @@ class MapParts:
     """The parts that add up to a map, uK, shape (npix,) each.
 
     They are analysed apart, so that the quadrature error of the circular-beam control cancels in the paired difference.
-
-    Attributes
-    ----------
-    smooth
-        The sky through the circular part of the beam at the pixels' centres; None where its a_lm stand for it.
-    extra
-        The rest of the circular-beam control: centroids, noise, gain, what effects add to samples. None: nothing.
-    difference
-        What the rest of the beam adds. None: nothing.
     """
 
+    #: the sky through the circular part of the beam at the pixels' centres; None where its a_lm stand for it
     smooth: NDArray[np.float64] | None
+    #: The rest of the circular-beam control: centroids, noise, gain, what effects add to samples. None: nothing.
     extra: NDArray[np.float64] | None
-    difference: NDArray[np.float64] | None
+    difference: NDArray[np.float64] | None  #: What the rest of the beam adds. None: nothing.
 
     @property
     def total(self) -> NDArray[np.float64]:

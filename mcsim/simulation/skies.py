@@ -12,11 +12,9 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import header, healpix
 from mcsim.sphere.checks import UNSEEN_BELOW
 from mcsim.support.arrays import Alm
-from mcsim.support.folders import unreadable
 from mcsim.support.npy import read_npy
 
-LARGEST_UK = 1e12
-"""Of a user's sky."""
+LARGEST_UK = 1e12  #: of a user's sky
 
 SMALLEST_UK = 0.01
 """Of the largest value of a user's sky that is not zero: a CMB sky in K has 5e-4, and any in uK has more than 1."""
@@ -32,7 +30,7 @@ def read_alm(path: Path, lmax: int, frame: str) -> Alm:
         given = read_npy(path, "c")
         mmax, keywords = healpy.Alm.getlmax(given.size), fits.Header()
     else:
-        given, mmax, keywords = _read_fits_alm(path)
+        given, mmax, keywords = header.read_coefficients(path, "a_lm")
     alm = given.astype(np.complex128)
     found = healpy.Alm.getlmax(alm.size, mmax)
     if mmax != found or found < lmax:
@@ -47,12 +45,6 @@ def read_alm(path: Path, lmax: int, frame: str) -> Alm:
     alm = alm if factor == 1.0 else factor * alm
     _check_size(path, alm)
     return alm_.resize(alm, found, lmax)
-
-
-def _read_fits_alm(path: Path) -> tuple[Alm, int, fits.Header]:
-    with unreadable(path, "a_lm", "give a FITS file as healpy.write_alm makes it"):
-        alm, mmax = healpy.read_alm(path, return_mmax=True)
-        return alm, int(mmax), fits.getheader(path, 1)
 
 
 def read_map(path: Path, lmax: int, frame: str, frequency_ghz: float | None = None) -> Alm:

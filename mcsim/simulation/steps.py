@@ -16,21 +16,15 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rotation
 from mcsim.support.arrays import Map, divided
 
-ITERATIONS = 1
-"""Jacobi iterations of the analysis of maps that are smoothed or degraded in harmonics."""
-
-NEGLIGIBLE = 1e-6
-"""B_l below this is taken for zero."""
-
-FILL_TOLERANCE = 1e-10
-"""Relative residual of the diffuse filling."""
+ITERATIONS = 1  #: Jacobi iterations of the analysis of maps that are smoothed or degraded in harmonics
+NEGLIGIBLE = 1e-6  #: B_l below this is taken for zero
+FILL_TOLERANCE = 1e-10  #: relative residual of the diffuse filling
 
 
 class Step(ABC):
     """One step on the maps of a channel; a step that does not change something inherits it unchanged."""
 
-    transforms = 0
-    """Number of scalar transforms."""
+    transforms = 0  #: number of scalar transforms
 
     @abstractmethod
     def apply(self, map_uk: Map) -> Map:

@@ -40,38 +40,23 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True)
 class SurveyMap:
-    """One map of a realization, ``channel`` or ``channel:split``.
-
-    Attributes
-    ----------
-    moments
-        Orientation moments of its samples; of a differencing scan those of both sides, or, not asked for, hits and NaN.
-    weight
-        Weight before analysis, shape (npix,), mean square 1; ``None``: every pixel counts alike.
-    noise_uk
-        Standard deviation of the noise per pixel, shape (npix,), of a differencing scan about, where moments were asked
-        for; ``None``: no noise, or noise of differences.
-    pairs
-        Pairs of pixels of a differencing scan; ``None``: any other scan.
-    gain
-        Mean relative error of the gain over the samples of a pixel, shape (npix,); ``None``: no error.
-    signal_uk
-        Mean of what effects add to the samples of a pixel, shape (npix,); ``None``: nothing.
-    preparation
-        What is done to the map after it is made; ``None``: nothing.
-    drawn
-        How noise that is not white comes into the map, whose standard deviation noise_uk then describes; ``None``:
-        white.
-    """
+    """One map of a realization, ``channel`` or ``channel:split``."""
 
     name: str
+    #: orientation moments of its samples; of a differencing scan those of both sides, or, not asked for, hits and NaN
     moments: scan.Moments
+    #: weight before analysis, shape (npix,), mean square 1; ``None``: every pixel counts alike
     weight: NDArray[np.float64] | None
+    #: standard deviation of the noise per pixel, shape (npix,), of a differencing scan about, where moments were asked
+    #: for; ``None``: no noise, or noise of differences
     noise_uk: NDArray[np.float64] | None
-    pairs: mapmaking.DifferencingScan | None = None
+    pairs: mapmaking.DifferencingScan | None = None  #: pairs of pixels of a differencing scan; ``None``: any other scan
+    #: mean relative error of the gain over the samples of a pixel, shape (npix,); ``None``: no error
     gain: NDArray[np.float64] | None = None
+    #: mean of what effects add to the samples of a pixel, shape (npix,); ``None``: nothing
     signal_uk: NDArray[np.float64] | None = None
-    preparation: Preparation | None = None
+    preparation: Preparation | None = None  #: what is done to the map after it is made; ``None``: nothing
+    #: how noise that is not white comes into the map, whose standard deviation noise_uk then describes; ``None``: white
     drawn: DrawnNoise | None = None
 
     def noise(self, seed: int, realization: int) -> NDArray[np.float64]:
@@ -96,60 +81,36 @@ class SurveyMap:
 
 @dataclass(frozen=True)
 class SideB:
-    """What a differencing channel has besides its side A.
+    """What a differencing channel has besides its side A."""
 
-    Attributes
-    ----------
-    beam, response, fiducial
-        Beam of side B with effects, its response, and the beam without effects.
-    scan, imbalance
-        Fiducial transmission imbalance, which map-making uses, and its convergence; the true imbalance.
-    sigma0_uk, noise_factor
-        White noise per difference, and the factor of its variance in every pixel, shape (npix,); None: one.
-    iterations_short
-        How many iterations before convergence the map-making stops, which then starts from zeros.
-    """
-
+    #: beam, response, fiducial: beam of side B with effects, its response, and the beam without effects
     beam: beams.Beam
     response: convolve.Response
     fiducial: beams.Beam
+    #: scan, imbalance: fiducial transmission imbalance, which map-making uses, and its convergence; the true imbalance
     scan: config.ScanDifferencing
+    #: sigma0_uk, noise_factor: white noise per difference, and the factor of its variance in every pixel, shape
+    #: (npix,); None: one
     sigma0_uk: float
     noise_factor: NDArray[np.float64] | None
     imbalance: float
-    iterations_short: int
+    iterations_short: int  #: how many iterations before convergence the map-making stops, which then starts from zeros
 
 
 @dataclass(frozen=True)
 class Channel:
-    """A beam and the maps made with it.
-
-    Attributes
-    ----------
-    beam, response
-        What the sky is seen through, effects included.
-    window
-        Fiducial pixel window, shape (lmax + 1,), ones where there is none.
-    maps
-        One for every split.
-    site
-        What effects may know of the channel, its fiducial beam among it.
-    effects
-        Those that act in this channel, in the order of the configuration.
-    side_b
-        The other beam of a differencing scan, None for any other scan.
-    rings
-        The grid, where it is one of rings instead of pixels; the moments of the map then mean nothing and are NaN.
-    """
+    """A beam and the maps made with it."""
 
     name: str
+    #: beam, response: what the sky is seen through, effects included
     beam: beams.Beam
     response: convolve.Response
-    window: NDArray[np.float64]
-    maps: tuple[SurveyMap, ...]
-    site: Site
-    effects: tuple[Effect, ...] = ()
-    side_b: SideB | None = None
+    window: NDArray[np.float64]  #: fiducial pixel window, shape (lmax + 1,), ones where there is none
+    maps: tuple[SurveyMap, ...]  #: one for every split
+    site: Site  #: what effects may know of the channel, its fiducial beam among it
+    effects: tuple[Effect, ...] = ()  #: those that act in this channel, in the order of the configuration
+    side_b: SideB | None = None  #: the other beam of a differencing scan, None for any other scan
+    #: the grid, where it is one of rings instead of pixels; the moments of the map then mean nothing and are NaN
     rings: tuple[Rings, ...] | None = None
 
 

@@ -30,14 +30,12 @@ from mcsim.support.code import package_digest
 SECONDS_PER_SAMPLE = 1.2e-7
 """Time of one core for a sample of correlated noise: pointing, random numbers, filter, sums."""
 
-TOLERANCE, ITERATIONS = 1e-10, 2000
-"""Of the offsets: relative residual of the conjugate gradients."""
+TOLERANCE, ITERATIONS = 1e-10, 2000  #: of the offsets: relative residual of the conjugate gradients
 
 LARGEST = 150_000_000
 """Pairs of baseline and pixel: 12 bytes each on disk, which all workers share, and 24 while they are found."""
 
-LEVEL_DRAWS = 4
-"""Realizations from which the standard deviation of the noise of pixels is estimated."""
+LEVEL_DRAWS = 4  #: realizations from which the standard deviation of the noise of pixels is estimated
 
 
 def noise_samples(noise: NoiseCorrelated, sampling_hz: float, draw: np.random.Generator) -> Callable[[int], Map]:
@@ -72,29 +70,17 @@ def per_hit(map_uk: Map, hits: Map) -> float:
 
 @dataclass(frozen=True, eq=False)
 class CorrelatedNoise:
-    """Correlated noise of a map.
+    """Correlated noise of a map."""
 
-    Attributes
-    ----------
-    noise, model, grid
-        Spectrum and map-making, the scan, and the pixels and span of the map.
-    streams
-        Name of its random numbers; rings of one survey share them.
-    rings
-        Every how many rings belong to the map, and the first one; None: all.
-    hits, level_uk
-        Samples of every pixel; standard deviation of the noise, as 1 / sqrt(hits), shape (npix,).
-    pairs
-        Samples of every baseline in every pixel; None: the map is binned.
-    """
-
+    #: noise, model, grid: spectrum and map-making, the scan, and the pixels and span of the map
     noise: NoiseCorrelated
     model: ScanModel
     grid: MapGrid
-    streams: str
-    rings: tuple[int, int] | None
+    streams: str  #: name of its random numbers; rings of one survey share them
+    rings: tuple[int, int] | None  #: every how many rings belong to the map, and the first one; None: all
+    #: hits, level_uk: samples of every pixel; standard deviation of the noise, as 1 / sqrt(hits), shape (npix,)
     hits: Map
-    pairs: csr_matrix | None
+    pairs: csr_matrix | None  #: samples of every baseline in every pixel; None: the map is binned
     level_uk: Map
 
     def draw(self, seed: int, realization: int) -> Map:

@@ -32,32 +32,21 @@ from mcsim.support.compiled import njit
 CHUNK = 1 << 18
 """Samples of a chunk: 12 MB of arrays, and enough of them that the interpolation does not wait for its set-up."""
 
-EPSILON = 1e-10
-"""Accuracy asked of the interpolation, relative to the signal."""
+EPSILON = 1e-10  #: accuracy asked of the interpolation, relative to the signal
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Consecutive samples of one line of sight; every array has shape (n,).
+    """Consecutive samples of one line of sight; every array has shape (n,)."""
 
-    Attributes
-    ----------
-    time_s
-        Time since the start of the survey, in seconds.
-    theta, phi, psi
-        Direction and orientation of the beam's x axis (from e_theta towards e_phi), in radians, phi in [0, 2 pi).
-    pixel
-        RING pixel into which the sample is binned; stages that move the beam leave it alone.
-    signal_uk
-        What the detector gives, in uK; zero until a stage adds to it.
-    """
-
-    time_s: NDArray[np.float64]
+    time_s: NDArray[np.float64]  #: time since the start of the survey, in seconds
+    #: theta, phi, psi: direction and orientation of the beam's x axis (from e_theta towards e_phi), in radians, phi in
+    #: [0, 2 pi)
     theta: NDArray[np.float64]
     phi: NDArray[np.float64]
     psi: NDArray[np.float64]
-    pixel: NDArray[np.int64]
-    signal_uk: NDArray[np.float64]
+    pixel: NDArray[np.int64]  #: RING pixel into which the sample is binned; stages that move the beam leave it alone
+    signal_uk: NDArray[np.float64]  #: what the detector gives, in uK; zero until a stage adds to it
 
 
 Stage = Callable[[Iterable[Samples]], Iterator[Samples]]

@@ -10,8 +10,7 @@ from mcsim.sphere.checks import NSIDE_MAX
 
 Window = NDArray[np.float64]
 
-SUBPIXELS = 8
-"""Side of the grid inside a pixel that stands for it up to l = 24 nside."""
+SUBPIXELS = 8  #: side of the grid inside a pixel that stands for it up to l = 24 nside
 
 
 @lru_cache(maxsize=8)

@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from mcsim.errors import InputError
 from mcsim.support.arrays import numbers
 
-REALITY = 1e-6
-"""Largest imaginary part of a_l0 over the largest coefficient: single precision leaves 1e-7."""
+REALITY = 1e-6  #: largest imaginary part of a_l0 over the largest coefficient: single precision leaves 1e-7
 
 
 def size(lmax: int) -> int:

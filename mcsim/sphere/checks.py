@@ -4,6 +4,7 @@ The arrays come from users and other packages, and compiled loops do not check t
 """
 
 import math
+import os
 from numbers import Real
 from typing import Any
 
@@ -16,17 +17,21 @@ from mcsim.support.arrays import numbers
 
 NSIDE_MAX = 8192
 
-UNSEEN_BELOW = -1e30
-"""Values below this are ``healpy.UNSEEN`` (-1.6375e30), exactly or in single precision."""
-
-LARGEST_ANGLE = 4.0 * math.pi
-"""Two turns: a larger angle in radians is probably one in degrees."""
+UNSEEN_BELOW = -1e30  #: values below this are ``healpy.UNSEEN`` (-1.6375e30), exactly or in single precision
+LARGEST_ANGLE = 4.0 * math.pi  #: two turns: a larger angle in radians is probably one in degrees
 
 
 def check_whole(value: Any, name: str, least: int = 0) -> None:
     """Raise InputError unless ``value`` is a whole number of type int, ``least`` or more."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise InputError(f"{name} is {value!r}, but it must be a whole number (int) >= {least}.")
+
+
+def check_memory(size: float, what: str, remedy: str) -> None:
+    """Raise InputError if ``size`` bytes are more than this machine's memory; ``what`` needs them."""
+    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if size > there:
+        raise InputError(f"{what} takes {size / 1e9:.3g} GB, but this machine has {there / 1e9:.3g} GB; {remedy}.")
 
 
 def check_number(value: Any, name: str, unit: str) -> None:

@@ -18,32 +18,22 @@ class Band(NamedTuple):
 
     ``G_{L_min} = norm[l2] * rising_a[x] * rising_b[y]`` and
     ``G_{L+1} = (constant[L] + slope[L] m1) G_L + previous[L] G_{L-1}`` with tables in l2.
-
-    Attributes
-    ----------
-    M, d
-        Order of the bipolar coefficient, >= 0, and l2 - l1.
-    L_min, L_max
-        First and last L; L_min = max(|d|, M).
-    norm
-        Shape (lmax + 1,).
-    rising_a, rising_b
-        sqrt((x + k)! / x!) for x >= 0, shape (2 lmax + M + |d| + 1,).
-    shift_a, shift_b
-        x = l2 - m1 + shift_a and y = l2 + m1 + shift_b.
-    constant, slope, previous
-        Shape (L_max - L_min, lmax + 1); row i leads to L_min + i + 1.
     """
 
+    #: M, d: order of the bipolar coefficient, >= 0, and l2 - l1
     M: int
     d: int
+    #: L_min, L_max: first and last L; L_min = max(|d|, M)
     L_min: int
     L_max: int
-    norm: Table
+    norm: Table  #: shape (lmax + 1,)
+    #: rising_a, rising_b: sqrt((x + k)! / x!) for x >= 0, shape (2 lmax + M + |d| + 1,)
     rising_a: Table
     rising_b: Table
+    #: shift_a, shift_b: x = l2 - m1 + shift_a and y = l2 + m1 + shift_b
     shift_a: int
     shift_b: int
+    #: constant, slope, previous: shape (L_max - L_min, lmax + 1); row i leads to L_min + i + 1
     constant: Table
     slope: Table
     previous: Table

@@ -6,13 +6,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import healpy
+import numpy as np
 from astropy.io import fits
 from astropy.utils.exceptions import AstropyUserWarning
 
 from mcsim.errors import InputError
+from mcsim.support.arrays import Alm
+from mcsim.support.folders import unreadable
 
-T_CMB_K = 2.7255
-"""Temperature of the CMB (Fixsen 2009, ApJ 707, 916)."""
+T_CMB_K = 2.7255  #: temperature of the CMB (Fixsen 2009, ApJ 707, 916)
 
 _PREFIXES = {"": 1e6, "m": 1e3, "milli": 1e3, "u": 1.0, "mu": 1.0, "micro": 1.0, "n": 1e-3, "nano": 1e-3}
 _CMB = r"cmb|thermo(?:dynamic)?"
@@ -40,12 +43,29 @@ def opened(path: Path) -> Iterator[fits.HDUList]:
             yield hdus
 
 
-def first_table(hdus: fits.HDUList) -> fits.BinTableHDU:
-    """Return the first binary table of a FITS file; raise ValueError if there is none."""
-    for hdu in hdus:
-        if isinstance(hdu, fits.BinTableHDU):
-            return hdu
-    raise ValueError("it has no binary table")
+def first_table(hdus: fits.HDUList, columns: int = 1) -> fits.BinTableHDU | fits.TableHDU:
+    """Return the first table of a FITS file; raise ValueError if there is none, or it has fewer ``columns``."""
+    table = next((hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)), None)
+    if table is None:
+        raise ValueError("it has no table")
+    if len(table.columns) < columns:
+        raise ValueError(f"its table has {len(table.columns)} of {columns} columns")
+    return table
+
+
+def read_coefficients(path: Path, what: str) -> tuple[Alm, int, fits.Header]:
+    """Return coefficients from a file of ``healpy.write_alm``, their mmax and header; InputError for any other file."""
+    # A file with infinities is refused later, by name; joining real and imaginary parts would warn of them.
+    with (
+        unreadable(path, what, "give FITS with the columns index, real, imaginary"),
+        opened(path) as hdus,
+        np.errstate(invalid="ignore"),
+    ):
+        table = first_table(hdus, 3)
+        if str(table.header.get("PIXTYPE", "")).strip().upper() == "HEALPIX" or not len(table.data):
+            raise ValueError("it is a map" if len(table.data) else "its table has no rows")
+        packed, mmax = healpy.read_alm(table, return_mmax=True)
+        return packed, int(mmax), table.header
 
 
 def frame_named(coordsys: object, where: str) -> str | None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.sphere.checks import UNSEEN_BELOW, check_alm, check_complete, check_map, check_nside, check_whole, nside_of
-from mcsim.sphere.header import frame_named, opened, to_uk
+from mcsim.sphere.header import first_table, frame_named, opened, to_uk
 from mcsim.support.arrays import Alm, Map
 from mcsim.support.code import package_digest
 from mcsim.support.folders import cached, unreadable
@@ -276,8 +276,9 @@ def read_uk(path: Path, frame: str, frequency_ghz: float | None) -> Map:
 def _column_called(path: Path, names: tuple[str, ...]) -> int:
     """Return the number of the map called one of ``names`` (none: of temperature), not counting pixel indices."""
     with opened(path) as hdus:
-        columns = [name.upper() for name in hdus[1].columns.names]
-        explicit = str(hdus[1].header.get("INDXSCHM", "")).strip().upper() == "EXPLICIT"
+        table = first_table(hdus)
+        columns = [name.upper() for name in table.columns.names]
+        explicit = str(table.header.get("INDXSCHM", "")).strip().upper() == "EXPLICIT"
     columns = columns[1:] if explicit else columns
     for name in names or TEMPERATURE:
         if name in columns:
@@ -310,4 +311,5 @@ def read_pixel_window(path: Path, lmax: int, nside: int | None = None) -> NDArra
 
 def _fits_pixel_window(path: Path) -> tuple[NDArray, int | None]:
     with unreadable(path, "a pixel window", "give a HEALPix pixel_window file"), opened(path) as hdus:
-        return np.asarray(hdus[1].data.field(0), dtype=float).ravel(), hdus[1].header.get("NSIDE")
+        table = first_table(hdus)
+        return np.asarray(table.data.field(0), dtype=float).ravel(), table.header.get("NSIDE")

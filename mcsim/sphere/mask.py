@@ -19,22 +19,11 @@ def read_mask(
 ) -> Mask:
     """Read the weights of the pixels, shape (12 nside^2,) in RING order, from a HEALPix FITS file.
 
-    Parameters
-    ----------
-    path
-        HEALPix map of weights between 0 and 1 (1 where the sky is used), of any nside; the header states the ordering.
-    nside, frame
-        Those of the maps.
-    mask_frame
-        Frame of the mask; None: that of the file's COORDSYS, else that of the maps.
-    apodisation_deg
-        Width of the soft edge (:func:`apodise`), >= 0.
-
-    Raises
-    ------
-    InputError
-        If the file is not a HEALPix map, its nside is not a power of two, a value is outside 0 ... 1, or its frame
-        is not the given one.
+    ``path``: HEALPix map of weights between 0 and 1 (1 where the sky is used), of any nside; the header states the
+    ordering. ``nside``, ``frame``: those of the maps. ``mask_frame``: frame of the mask; None: that of the file's
+    COORDSYS, else that of the maps. ``apodisation_deg``: width of the soft edge (:func:`apodise`), >= 0. Raise
+    InputError if the file is not a HEALPix map, its nside is not a power of two, a value is outside 0 ... 1, or its
+    frame is not the given one.
 
     Notes
     -----

@@ -78,12 +78,9 @@ def rotate_biposh(
 ) -> NDArray[np.complex128]:
     """Return A^{LM}_{l1 l2} in another frame, the same modes in the same order.
 
-    Parameters
-    ----------
-    biposh
-        Shape (..., n_mode, lmax + 1), of one map or of an ordered pair, at ell = l2 with d = l2 - l1.
-    modes
-        (L, M, d) along the next-to-last axis: every M = 0..L of each (L, d), no M < 0; InputError if one is missing.
+    ``biposh``: shape (..., n_mode, lmax + 1), of one map or of an ordered pair, at ell = l2 with d = l2 - l1.
+    ``modes``: (L, M, d) along the next-to-last axis: every M = 0..L of each (L, d), no M < 0; InputError if one is
+    missing.
 
     Notes
     -----

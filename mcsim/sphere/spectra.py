@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.sphere.checks import check_whole
-from mcsim.sphere.header import opened
+from mcsim.sphere.header import first_table, opened
 from mcsim.support import resources
 from mcsim.support.folders import unreadable
 from mcsim.support.npy import read_npy
@@ -211,10 +211,11 @@ def _read_fits(path: Path) -> tuple[NDArray[np.float64], str, bool]:
     """Read C_l in uK^2, the column's name, and True if it states a unit."""
     remedy = "give a file as healpy.write_cl writes it"
     with unreadable(f"power spectrum {str(path)!r}", "a FITS table", remedy), opened(path) as hdus:
-        header = hdus[1].header
+        table = first_table(hdus)
+        header = table.header
         columns = [
-            np.ravel(np.ma.filled(hdus[1].data.field(i), np.nan)).astype(np.float64)
-            for i in range(min(2, len(hdus[1].columns)))
+            np.ravel(np.ma.filled(table.data.field(i), np.nan)).astype(np.float64)
+            for i in range(min(2, len(table.columns)))
         ]
     # If the first column counts up, it is ell and the second is C_l.
     ell = columns[0]

@@ -148,16 +148,10 @@ def posterior(
 ) -> NDArray[np.float64]:
     """Return the posterior probability of none and of each candidate: the Bayes-optimal classifier of a prior.
 
-    Parameters
-    ----------
-    null, x
-        Distribution of the data vector without an effect, and data, shape (..., p_raw); the result is (..., 1 + C).
-    candidates
-        Bases of C hypotheses; a mixture is one whose group has the columns of all its effects.
-    strengths
-        Signal-to-noise ratios that the prior allows, equally, for all candidates, in steps of less than 1.
-    prior
-        Of none and each candidate, shape (1 + C,), >= 0, any scale.
+    ``null``, ``x``: distribution of the data vector without an effect, and data, shape (..., p_raw); the result is
+    (..., 1 + C). ``candidates``: bases of C hypotheses; a mixture is one whose group has the columns of all its
+    effects. ``strengths``: signal-to-noise ratios that the prior allows, equally, for all candidates, in steps of less
+    than 1. ``prior``: of none and each candidate, shape (1 + C,), >= 0, any scale.
 
     Notes
     -----

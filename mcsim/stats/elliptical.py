@@ -46,28 +46,36 @@ def scale_variance(chi2: Vector, n: int, dimension: int) -> float:
 
 
 def f_tail(
-    f: ArrayLike, d1: ArrayLike, d2: ArrayLike, noncentrality: ArrayLike = 0.0, scale: float = 0.0
+    f: ArrayLike,
+    d1: ArrayLike,
+    d2: ArrayLike,
+    noncentrality: ArrayLike = 0.0,
+    scale: float = 0.0,
+    spread: ArrayLike = 0.0,
 ) -> NDArray[np.float64]:
     """Return the probability of a larger f than that of a ratio of mean squares with ``d1`` and ``d2`` > 4 dof.
 
     ``noncentrality`` is that of the first, ``scale`` the variance of a factor u of mean one that multiplies what it is
-    without.
+    without, and ``spread`` half of what the variance of the first sum of squares has beyond that of the noncentrality.
 
     Notes
     -----
     A noncentrality l makes the first a central one, with (d1 + l)^2/(d1 + 2 l) degrees of freedom and (d1 + l)/d1 times
-    the mean (Patnaik, Biometrika 36, 202, 1949). A factor u multiplies the mean square of f by
-    1 + var(u) d1 (d1 + 2)/((d1 + l)^2 + 2 d1 + 4 l); f is then taken to have another d2, that with the same mean square
-    over squared mean, and a scale that keeps the mean. Exact without both, and for a known covariance (d2 -> infinity)
-    if 1/u is a chi^2 over its degrees of freedom: the data are then a multivariate Student t (Muirhead, Aspects of
-    Multivariate Statistical Theory, 1982, section 1.5). Tests: tests/statistical/test_elliptical.py.
+    the mean (Patnaik, Biometrika 36, 202, 1949). If a further covariance of trace l makes it, the trace q of its
+    square, the spread, adds to the variance: (d1 + l)^2/(d1 + 2 l + q) degrees of freedom. A factor u multiplies the
+    mean square of f by 1 + var(u) d1 (d1 + 2)/((d1 + l)^2 + 2 (d1 + 2 l + q)); f is then taken to have another d2, that
+    with the same mean square over squared mean, and a scale that keeps the mean. Exact without these, and for a known
+    covariance (d2 -> infinity) if 1/u is a chi^2 over its degrees of freedom: the data are then a multivariate Student
+    t (Muirhead, Aspects of Multivariate Statistical Theory, 1982, section 1.5). Tests:
+    tests/statistical/test_elliptical.py.
     """
     d1, d2, extra = np.asarray(d1, dtype=float), np.asarray(d2, dtype=float), np.asarray(noncentrality, dtype=float)
-    first = (d1 + extra) ** 2 / (d1 + 2.0 * extra)
+    half = d1 + 2.0 * extra + np.asarray(spread, dtype=float)
+    first = (d1 + extra) ** 2 / half
     x = np.maximum(np.asarray(f, dtype=float), 0.0) * d1 / (d1 + extra)
     if scale > 0.0:
         # Of Fisher's F the relative variance is 2 (d1 + d2 - 2)/(d1 (d2 - 4)).
-        more = 1.0 + scale * d1 * (d1 + 2.0) / ((d1 + extra) ** 2 + 2.0 * d1 + 4.0 * extra)
+        more = 1.0 + scale * d1 * (d1 + 2.0) / ((d1 + extra) ** 2 + 2.0 * half)
         variance = more * (1.0 + 2.0 * (first + d2 - 2.0) / (first * (d2 - 4.0))) - 1.0
         wide = (2.0 * first - 4.0 + 4.0 * variance * first) / (variance * first - 2.0)
         x, d2 = x * (d2 - 2.0) / d2 * wide / (wide - 2.0), wide

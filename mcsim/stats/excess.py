@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.linalg import helmert
 
 from mcsim.stats.gaussian import SimulatedGaussian, orthonormal
 from mcsim.support.arrays import Matrix, Vector
@@ -77,26 +78,39 @@ def excess_of(chi2: float, p: int, n: int) -> Measured:
     return Measured(value, float(np.sqrt(2.0 * ((p + length) ** 2 + (p + 2.0 * length) * (d - 2)) / (d - 4))))
 
 
-def scatter_chi2(null: SimulatedGaussian, t: Matrix, before: Matrix, after: Matrix) -> float:
-    """Return the chi^2 that effects add to a residual by their scatter, over their squared white response, >= 0.
+def scatter_chi2(null: SimulatedGaussian, t: Matrix, before: Matrix, after: Matrix) -> tuple[float, float]:
+    """Return what effects add to chi^2 of a residual by their scatter, and to half of its variance beyond twice that.
 
-    ``before`` and ``after`` are data vectors of the same skies without the effects and with them, shape
-    (skies, p_raw), ``t`` the templates that are fitted, shape (p_raw, K).
+    They are divided by the squared white response, and by its square. ``before`` and ``after`` are data vectors of the
+    same skies without the effects and with them, shape (skies, p_raw), ``t`` the templates that are fitted, shape
+    (p_raw, K).
 
     Notes
     -----
-    With P the projection off the templates, in white coordinates, chi^2 of the residual grows by
-    tr P (C_after - C_before) on average, and by tr P C_change/skies because the response is a mean of as many skies.
-    The common scatter of the same skies cancels. As a noncentrality this has the variance of such a scatter, but for
-    2 tr (P (C_after - C_before))^2. Tests: tests/statistical/test_elliptical.py.
+    With P the projection off the templates, in white coordinates, and D = P (C_after - C_before + C_change/skies) P,
+    the last because the response is a mean of as many skies, chi^2 of the residual has the mean q + tr D, q = tr P, and
+    the variance 2 (q + 2 tr D + tr D^2). Orthonormal contrasts of the skies (Helmert's) are independent, D_k each, and
+    their common scatter cancels: tr D is the mean of tr D_k, and tr D^2 that of tr D_k D_l, k != l (Bai & Saranadasa,
+    Statistica Sinica 6, 311, 1996), or (tr D)^2/q, the least that it can be. Half of the squared error of tr D is added
+    to it. Tests: tests/statistical/test_elliptical.py.
     """
     change = after - before
-    basis, _ = orthonormal(null.whiten_templates(t))
-    without, acting, own = (null.whiten_templates((rows - rows.mean(axis=0)).T) for rows in (before, after, change))
-    squares = [float(np.sum((one - basis @ (basis.T @ one)) ** 2)) for one in (without, acting, own)]
-    added = (squares[1] - squares[0] + squares[2] / len(change)) / (len(change) - 1.0)
     size = float(np.sum(null.whiten_templates(change.mean(axis=0)[:, None]) ** 2))
-    return max(null.hartlap_factor * added / size, 0.0) if size > 0.0 else 0.0
+    if size == 0.0:
+        return 0.0, 0.0
+    basis, _ = orthonormal(null.whiten_templates(t))
+    contrasts = np.sqrt(null.hartlap_factor) * helmert(len(change))
+    white = (contrasts @ null.whiten_templates(rows.T).T for rows in (after, before, change))
+    parts = [
+        (rows - rows @ basis @ basis.T, sign) for rows, sign in zip(white, (1.0, -1.0, 1 / len(change)), strict=True)
+    ]
+    product = sum(i * j * (x @ y.T) ** 2 for x, i in parts for y, j in parts)
+    each, count = sum(i * np.sum(x**2, axis=1) for x, i in parts), len(change) - 1
+    added, pairs = max(float(np.mean(each)), 0.0), count * (count - 1.0)
+    square = (float(np.sum(product)) - float(np.trace(product))) / max(pairs, 1.0)
+    square = max(square, added**2 / max(null.dimension - basis.shape[1], 1))
+    square += 0.5 * float(np.sum((each - np.mean(each)) ** 2)) / max(pairs, 1.0)
+    return added / size, square / size**2
 
 
 def expected_fall(test: SimulatedGaussian, t: Matrix, amplitudes: Vector, covariance: Matrix) -> Measured:

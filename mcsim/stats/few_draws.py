@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.support.arrays import Matrix, Vector
 
-LEAST = 4
-"""Draws that it needs at least."""
+LEAST = 4  #: draws that it needs at least
 
 _WEIGHTS = np.logspace(-4.0, 0.0, 13)
 _STEPS = 20

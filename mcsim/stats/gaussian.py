@@ -24,25 +24,18 @@ COLLINEAR = 1e-6
 
 @dataclass(frozen=True)
 class Fit:
-    """Hold templates fitted to a data vector.
+    """Hold templates fitted to a data vector."""
 
-    Attributes
-    ----------
-    amplitudes, covariance
-        Shape (K,), (K, K). A combination to which the data do not respond has amplitude 0 and variance 0.
-    dof
-        Degrees of freedom of the Student t that (estimate - truth)/scale follows; ``covariance`` is that t's.
-    delta_chi2, nested_pvalue
-        Fall of chi^2 by the fit, and the probability of such a fall without the templates.
-    chi2, dimension, pvalue
-        Of the residual: its chi^2, its number of degrees of freedom, and the probability of a larger chi^2.
-    """
-
+    #: amplitudes, covariance: Shape (K,), (K, K). A combination to which the data do not respond has amplitude 0 and
+    #: variance 0.
     amplitudes: NDArray[np.float64]
     covariance: NDArray[np.float64]
-    dof: int
+    dof: int  #: degrees of freedom of the Student t that (estimate - truth)/scale follows; ``covariance`` is that t's
+    #: delta_chi2, nested_pvalue: fall of chi^2 by the fit, and the probability of such a fall without the templates
     delta_chi2: float
     nested_pvalue: float
+    #: chi2, dimension, pvalue: of the residual: its chi^2, its number of degrees of freedom, and the probability of a
+    #: larger chi^2
     chi2: float
     dimension: int
     pvalue: float
@@ -55,20 +48,11 @@ class Fit:
 
 @dataclass(frozen=True)
 class WhitenedTemplates:
-    """Hold orthonormal bases of groups of templates in white coordinates, side by side.
+    """Hold orthonormal bases of groups of templates in white coordinates, side by side."""
 
-    Attributes
-    ----------
-    basis
-        Shape (p, r_1 + r_2 + ...).
-    start
-        First column of each group, and the end of the last.
-    back
-        Matrix of each group from basis coordinates to amplitudes, shape (K_c, r_c).
-    """
-
-    basis: NDArray[np.float64]
-    start: NDArray[np.int64]
+    basis: NDArray[np.float64]  #: shape (p, r_1 + r_2 + ...)
+    start: NDArray[np.int64]  #: first column of each group, and the end of the last
+    #: matrix of each group from basis coordinates to amplitudes, shape (K_c, r_c)
     back: tuple[NDArray[np.float64], ...]
 
     @property
@@ -85,34 +69,21 @@ class WhitenedTemplates:
 
 @dataclass(frozen=True)
 class SimulatedGaussian:
-    """Describe a Gaussian data vector by the sample mean and sample covariance of simulations.
+    """Describe a Gaussian data vector by the sample mean and sample covariance of simulations."""
 
-    Attributes
-    ----------
-    mean
-        Shape (p_raw,).
-    whitening
-        Shape (p, p_raw), p <= p_raw: coordinates in which the sample covariance is one. Redundant elements are
-        compressed.
-    n_sims
-        Number N of simulations.
-    log_jacobian
-        Logarithm of the factor by which :meth:`with_extra_covariance` has shrunk volumes in white coordinates.
-    covariance_dof
-        Degrees of freedom n of the covariance if it is no sample covariance; None: N - 1.
-    folds
-        Then the simulations in white coordinates of others; simulation i is in fold i modulo their number.
-    scale_variance
-        Variance of a factor that scales the covariance of each realization; 0 if the data vector is Gaussian and its
-        covariance known up to the error of the simulations.
-    """
-
-    mean: NDArray[np.float64]
+    mean: NDArray[np.float64]  #: shape (p_raw,)
+    #: Shape (p, p_raw), p <= p_raw: coordinates in which the sample covariance is one. Redundant elements are
+    #: compressed.
     whitening: NDArray[np.float64]
-    n_sims: int
+    n_sims: int  #: number N of simulations
+    #: logarithm of the factor by which :meth:`with_extra_covariance` has shrunk volumes in white coordinates
     log_jacobian: float = 0.0
+    #: degrees of freedom n of the covariance if it is no sample covariance; None: N - 1
     covariance_dof: int | None = None
+    #: then the simulations in white coordinates of others; simulation i is in fold i modulo their number
     folds: tuple[Fold, ...] = ()
+    #: variance of a factor that scales the covariance of each realization; 0 if the data vector is Gaussian and its
+    #: covariance known up to the error of the simulations
     scale_variance: float = 0.0
 
     @classmethod
@@ -201,9 +172,12 @@ class SimulatedGaussian:
         """Return the probability of a larger chi^2 than that of data, shape (p_raw,): Hotelling's T^2 test."""
         return float(self.residual_test(self.chi2(x)))
 
-    def residual_test(self, chi2: ArrayLike, fitted: ArrayLike = 0, allowance: ArrayLike = 0.0) -> NDArray[np.float64]:
+    def residual_test(
+        self, chi2: ArrayLike, fitted: ArrayLike = 0, allowance: ArrayLike = 0.0, spread: ArrayLike = 0.0
+    ) -> NDArray[np.float64]:
         """Return the p-value of chi^2 after ``fitted`` columns have been fitted; see :func:`residual_pvalue`."""
-        return residual_pvalue(chi2, self.dimension - np.asarray(fitted), self.dof, allowance, self.scale_variance)
+        dimension = self.dimension - np.asarray(fitted)
+        return residual_pvalue(chi2, dimension, self.dof, allowance, self.scale_variance, spread)
 
     def nested_test(
         self,
@@ -316,13 +290,19 @@ def held_out_pvalues(simulations: Matrix, null: SimulatedGaussian) -> Vector:
 
 
 def residual_pvalue(
-    chi2: ArrayLike, dimension: ArrayLike, n: int, allowance: ArrayLike = 0.0, scale: float = 0.0
+    chi2: ArrayLike,
+    dimension: ArrayLike,
+    n: int,
+    allowance: ArrayLike = 0.0,
+    scale: float = 0.0,
+    spread: ArrayLike = 0.0,
 ) -> NDArray[np.float64]:
     """Return the probability of a larger chi^2 of the residual after K columns have been fitted, or of the data.
 
     ``dimension`` is q = p - K, ``n`` the number of simulations less one, ``allowance`` the squared signal-to-noise
-    ratio of an error of the model that is tolerated, and ``scale`` the variance of a factor of mean one that scales the
-    covariance of each realization.
+    ratio of an error of the model that is tolerated, or the trace of a covariance that effects add, ``spread`` the
+    trace of its square, and ``scale`` the variance of a factor of mean one that scales the covariance of each
+    realization.
 
     Notes
     -----
@@ -331,7 +311,7 @@ def residual_pvalue(
     """
     q = np.asarray(dimension, dtype=float)
     f = (n - q + 1.0) / np.maximum(q, 1.0) * np.asarray(chi2) / n
-    return np.where(q > 0.0, f_tail(f, np.maximum(q, 1.0), n - q + 1.0, allowance, scale), 1.0)
+    return np.where(q > 0.0, f_tail(f, np.maximum(q, 1.0), n - q + 1.0, allowance, scale, spread), 1.0)
 
 
 class Tolerated(NamedTuple):

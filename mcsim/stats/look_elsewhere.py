@@ -14,33 +14,24 @@ from mcsim.stats.gaussian import COLLINEAR, SimulatedGaussian, WhitenedTemplates
 # Scatter matrices drawn for a calibration. Each serves many data vectors: it costs a thousand times as much.
 SCATTERS = 200
 
-TAIL = 10
-"""Held-out simulations beyond which their ranks say nothing."""
+TAIL = 10  #: held-out simulations beyond which their ranks say nothing
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Hold the joint null distribution of the omnibus p-value and the smallest p-value of the candidates.
+    """Hold the joint null distribution of the omnibus p-value and the smallest p-value of the candidates."""
 
-    Attributes
-    ----------
-    tests
-        Number of candidates to which the data respond.
-    smallest, combined
-        Sorted draws of the smallest p-value of the candidates, and of the smaller one of the omnibus p-value and the
-        global p-value of the candidates.
-    held_out_smallest, held_out_combined
-        Sorted p-values, as these draws give them, of simulations against the others; None: Gaussian data are trusted.
-    power
-        Of the global p-value of the candidates: below 1 if that of simulations against others is too often small,
-        above 1 if too seldom.
-    """
-
-    tests: int
+    tests: int  #: number of candidates to which the data respond
+    #: smallest, combined: sorted draws of the smallest p-value of the candidates, and of the smaller one of the omnibus
+    #: p-value and the global p-value of the candidates
     smallest: NDArray[np.float64]
     combined: NDArray[np.float64]
+    #: held_out_smallest, held_out_combined: sorted p-values, as these draws give them, of simulations against the
+    #: others; None: Gaussian data are trusted
     held_out_smallest: NDArray[np.float64] | None = None
     held_out_combined: NDArray[np.float64] | None = None
+    #: of the global p-value of the candidates: below 1 if that of simulations against others is too often small, above
+    #: 1 if too seldom
     power: float = 1.0
 
     def global_pvalue(self, smallest: ArrayLike) -> NDArray[np.float64]:
@@ -167,22 +158,14 @@ def calibrate(
 
 @dataclass(frozen=True)
 class GlobalTest:
-    """Hold the global p-value, its two parts, and the most significant candidate.
+    """Hold the global p-value, its two parts, and the most significant candidate."""
 
-    Attributes
-    ----------
-    pvalue
-        Uniform if the model is right.
-    chi2, dimension, omnibus
-        chi^2 of the data, its degrees of freedom, and its p-value.
-    maximum, best
-        Global p-value of the most significant candidate, and its index.
-    """
-
-    pvalue: float
+    pvalue: float  #: uniform if the model is right
+    #: chi2, dimension, omnibus: chi^2 of the data, its degrees of freedom, and its p-value
     chi2: float
     dimension: int
     omnibus: float
+    #: maximum, best: global p-value of the most significant candidate, and its index
     maximum: float
     best: int
 

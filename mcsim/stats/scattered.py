@@ -11,28 +11,22 @@ from mcsim.stats.few_draws import scores_of_draws, without
 from mcsim.stats.gaussian import COLLINEAR, Fit, SimulatedGaussian, Tolerated, orthonormal
 from mcsim.support.arrays import Matrix, Vector, divided
 
+STEEPEST = 1e3
+"""Condition number above which derivatives tell no errors."""
+
 Indices = NDArray[np.int64]
-Groups = Sequence[Sequence[int]]
-"""Columns of the templates of each candidate."""
+Groups = Sequence[Sequence[int]]  #: columns of the templates of each candidate
 
 
 @dataclass(frozen=True)
 class Acting:
-    """Hold by how much an effect that acts at some amplitude scatters the data more than they are without it.
+    """Hold by how much an effect that acts at some amplitude scatters the data more than they are without it."""
 
-    Attributes
-    ----------
-    size
-        Squared white norm of its response.
-    chi2
-        What its scatter adds to chi^2 of a residual.
-    excess, error
-        What it adds to the variance of the data along each of C groups of templates beside its own, over what that is
-        without it, and the squared standard error of this; shape (C,).
-    """
-
-    size: float
-    chi2: float
+    size: float  #: squared white norm of its response
+    chi2: float  #: what its scatter adds to chi^2 of a residual
+    spread: float  #: what it adds to half of the variance of that beyond twice as much
+    #: excess, error: what it adds to the variance of the data along each of C groups of templates beside its own, over
+    #: what that is without it, and the squared standard error of this; shape (C,)
     excess: Vector
     error: Vector
 
@@ -58,7 +52,8 @@ class Acting:
             if number == own or not beside.shape[1]:
                 continue
             excess[number], error[number] = _growth(x @ beside, c @ beside)
-        return cls(size, scatter_chi2(null, t[:, list(groups[own])], *pair) * size, excess, error)
+        added, spread = scatter_chi2(null, t[:, list(groups[own])], *pair)
+        return cls(size, added * size, spread * size**2, excess, error)
 
 
 def _growth(x: Matrix, c: Matrix) -> tuple[float, float]:
@@ -83,23 +78,16 @@ def _growth(x: Matrix, c: Matrix) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Beside:
-    """Combine what C candidates that act add to the scatter of the data beside them.
+    """Combine what C candidates that act add to the scatter of the data beside them."""
 
-    Attributes
-    ----------
-    size, chi2
-        Those of :class:`Acting`, infinite and 0 where none is known, shape (C,).
-    excess, error
-        The same, a row for each candidate that acts, shape (C, C).
-    variance
-        Along each candidate, by :func:`variance_beside` of those that draw their pattern, shape (C,).
-    """
-
+    #: size, chi2, spread: those of :class:`Acting`, infinite and 0 where none is known, shape (C,)
     size: Vector
     chi2: Vector
+    spread: Vector
+    #: excess, error: the same, a row for each candidate that acts, shape (C, C)
     excess: Matrix
     error: Matrix
-    variance: Vector
+    variance: Vector  #: along each candidate, by :func:`variance_beside` of those that draw their pattern, shape (C,)
 
     @classmethod
     def of(cls, acting: Sequence[Acting | None], variance: Vector | None) -> "Beside":
@@ -108,12 +96,13 @@ class Beside:
         Candidates that were added since one was simulated, behind all others, are not scattered by it.
         """
         count = len(acting)
-        size, chi2, (excess, error) = np.full(count, np.inf), np.zeros(count), np.zeros((2, count, count))
+        size, (chi2, spread) = np.full(count, np.inf), np.zeros((2, count))
+        excess, error = np.zeros((2, count, count))
         for row, one in enumerate(acting):
             if one is not None:
-                size[row], chi2[row], known = one.size, one.chi2, len(one.excess)
+                size[row], chi2[row], spread[row], known = one.size, one.chi2, one.spread, len(one.excess)
                 excess[row, :known], error[row, :known] = one.excess, one.error
-        return cls(size, chi2, excess, error, np.ones(count) if variance is None else variance)
+        return cls(size, chi2, spread, excess, error, np.ones(count) if variance is None else variance)
 
     def tolerated(self, allowance: Vector, members: Indices, parts: Matrix, others: Indices) -> Tolerated:
         """Return what tests of candidates ``others``, shape (M or 1, N), beside M sets tolerate, shape (M, N) each.
@@ -140,34 +129,51 @@ def with_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, before: Matrix,
     Notes
     -----
     A strong effect changes the scatter of the data. The fit is linear, so that it is applied to every sky: the variance
-    of each amplitude grows by :func:`_growth`. The error is the standard deviation of a Student t with the degrees of
-    freedom from which this is known. Correlations stay; errors are not made smaller.
+    of each amplitude grows by :func:`_growth`. Where it shrinks, as that of what a wider beam lets through, only the
+    part of the variance does so that skies which the data constrain have: the sum over white elements, as few skies
+    tell the variance along one direction badly. The error is the standard deviation of a Student t with the degrees of
+    freedom from which the growth is known. Correlations stay.
     """
     basis, back = orthonormal(null.whiten_templates(t))
-    own = np.sqrt(np.diag(found.covariance))
-    fits = (back @ basis.T @ null.whiten_templates((rows - rows.mean(axis=0)).T) for rows in (before, after - before))
-    x, c = (divided(rows, own[:, None]) for rows in fits)
-    growth, error = np.array([_growth(one[:, None], other[:, None]) for one, other in zip(x, c, strict=True)]).T
-    variance = 1.0 + np.maximum(growth, 0.0)
+    own, weights = np.sqrt(np.diag(found.covariance)), back @ basis.T
+    x, c = (null.whiten_templates((rows - rows.mean(axis=0)).T) for rows in (before, after - before))
+    pairs = zip(*(divided(weights @ rows, own[:, None]) for rows in (x, c)), strict=True)
+    growth, error = np.array([_growth(one[:, None], other[:, None]) for one, other in pairs]).T
+    seen = null.hartlap_factor * np.sum(x**2, axis=1) / max(len(before) - 1, 1)
+    share = np.minimum(divided(weights**2 @ seen, np.sum(weights**2, axis=1), 1.0), 1.0)
+    variance = 1.0 + np.where(growth < 0.0, share, 1.0) * growth
     dof = 2.0 * variance**2 / np.maximum(error, 1e-12)
     factor = np.sqrt(variance * dof / np.maximum(dof - 2.0, 1.0))
     return replace(found, covariance=factor[:, None] * found.covariance * factor)
 
 
-def with_tangents(null: SimulatedGaussian, t: Matrix, found: Fit, tangents: Matrix) -> Fit:
+def with_tangents(null: SimulatedGaussian, t: Matrix, found: Fit, tangents: Sequence[Matrix | None]) -> Fit:
     """Return a fit of templates, shape (p_raw, K), with the errors of amplitudes at which responses are not straight.
 
-    ``tangents`` are the derivatives of the response in each amplitude, shape (p_raw, K).
+    ``tangents`` are the derivatives of the response in each amplitude, shape (skies, p_raw); None of one that is
+    straight.
 
     Notes
     -----
-    Templates are straight lines from zero that are exact at the fitted amplitudes: the fit solves R(theta) = x, and the
-    data move it by the inverse of the derivative of R, not of the lines. Correlations stay; errors are not made
-    smaller.
+    Templates are straight lines T from zero that are exact at the fitted amplitudes: the fit solves
+    T'C^-1 (x - R(theta)) = 0, and the data move it by the inverse of G = (T'C^-1 T)^-1 T'C^-1 dR/dtheta, which is one
+    for straight responses. The covariance V of the lines becomes G^-1 V G'^-1. Each element of G - 1 is measured in
+    few skies, d +- s, and of a normal prior of mean zero whose variance is estimated as d^2 - s^2 >= 0: its posterior
+    mean is d (1 - s^2/d^2) (empirical Bayes; Efron & Morris, JASA 68, 117, 1973). Pulls:
+    tests/unit/test_diagnosis_scattered.py.
     """
-    curved, straight = (np.sum(orthonormal(null.whiten_templates(one))[1] ** 2, axis=1) for one in (tangents, t))
-    factor = np.sqrt(np.maximum(divided(curved, straight, 1.0), 1.0))
-    return replace(found, covariance=factor[:, None] * found.covariance * factor)
+    basis, back = orthonormal(null.whiten_templates(t))
+    slopes = np.eye(len(back))
+    for k, rows in enumerate(tangents):
+        if rows is not None:
+            each = back @ basis.T @ null.whiten_templates(rows.T) - slopes[:, k, None]
+            d = each.mean(axis=1)
+            s = each.std(axis=1, ddof=1) / np.sqrt(len(rows)) if len(rows) > 1 else np.zeros(len(d))
+            slopes[:, k] += d * np.maximum(1.0 - divided(s**2, d**2), 0.0)
+    if np.linalg.cond(slopes) > STEEPEST:
+        return found
+    move = np.linalg.inv(slopes)
+    return replace(found, covariance=move @ found.covariance @ move.T)
 
 
 def with_drawn_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, scatters: Sequence[Matrix]) -> Fit:

@@ -6,15 +6,13 @@ import numpy as np
 
 from mcsim.support.arrays import Matrix, Vector
 
-SIGNIFICANT = 4.0
-"""Standard errors of a correlation from which on it is a part of the target."""
+SIGNIFICANT = 4.0  #: standard errors of a correlation from which on it is a part of the target
 
 LEAST = 0.5
 """Smallest eigenvalue of the target over that of the sample correlation: a target cut to zeros may have none."""
 
 FOLDS = 10
-LARGEST = 1_000_000
-"""Degrees of freedom of a covariance that is as good as known."""
+LARGEST = 1_000_000  #: degrees of freedom of a covariance that is as good as known
 
 
 class Fold(NamedTuple):

@@ -16,23 +16,12 @@ Array = NDArray[np.complex128] | NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sums:
-    """Sufficient statistics of ``count`` realizations.
+    """Sufficient statistics of ``count`` realizations."""
 
-    Attributes
-    ----------
-    count
-        Number of realizations.
-    mean
-        Mean of each variable.
-    square
-        Sum of |x - mean|^2 of each variable, real.
-    comoment
-        Sum of (x - mean) conj(x - mean)^T over the last axis of the variables for which it was asked.
-    """
-
-    count: int
-    mean: dict[str, Array]
-    square: dict[str, NDArray[np.float64]]
+    count: int  #: number of realizations
+    mean: dict[str, Array]  #: mean of each variable
+    square: dict[str, NDArray[np.float64]]  #: sum of |x - mean|^2 of each variable, real
+    #: sum of (x - mean) conj(x - mean)^T over the last axis of the variables for which it was asked
     comoment: dict[str, Array]
 
 

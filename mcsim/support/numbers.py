@@ -10,12 +10,8 @@ def measured(value: float, sigma: float = 0.0, symbol: str = "") -> str:
 
     The error has two digits where they are below 36, else one.
 
-    Parameters
-    ----------
-    value, sigma
-        In the unit; without a positive, finite error the value has three digits.
-    symbol
-        Of the unit, with the space before it where one belongs there.
+    ``value``, ``sigma``: in the unit; without a positive, finite error the value has three digits. ``symbol``: of the
+    unit, with the space before it where one belongs there.
     """
     if not (math.isfinite(value) and math.isfinite(sigma)) or sigma <= 0.0:
         return number(value) + symbol

@@ -36,7 +36,6 @@ class DipoleResidual(DirectedEffect):
     parametrization = SkyVector(matched_filter=False)
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Add the dipole."""
         return sky + dipole_alm(self.vector, site.lmax)
 
 
@@ -57,14 +56,12 @@ class MonopoleResidual(Effect):
     parametrization = Parametrization(matched_filter=False)
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Add the constant."""
         changed = sky.copy()
         changed[0] += np.sqrt(4.0 * np.pi) * self.amplitude
         return changed
 
 
-ORBITAL_UK = 270.7
-"""29.78 km/s over the speed of light, times 2.7255 K."""
+ORBITAL_UK = 270.7  #: 29.78 km/s over the speed of light, times 2.7255 K
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +97,6 @@ class OrbitalDipole(Effect):
     phase_deg: float = 0.0
 
     def signal(self, time_s: Vector, theta: Vector, phi: Vector, psi: Vector, site: Site) -> Vector:
-        """Return what is left."""
         towards = heading(site.pointed(self.name).model, time_s, site.frame, np.deg2rad(self.phase_deg))
         return np.asarray(self.amplitude * ORBITAL_UK * np.sum(towards * axes(theta, phi)[0], axis=0))
 
@@ -125,21 +121,13 @@ class SpinSynchronousOffset(Effect):
     signature = "A pattern of the ecliptic frame at low l, the same in both halves: stripes are too regular to average."
     source = "Hinshaw et al. 2003, ApJS 148, 63 (limits on the response to the surroundings)"
     step = 0.5
-    bounds = (
-        Bound(
-            "amplitude",
-            0.0,
-            1000.0,
-            "a prior of this library: a mK is seen in the time stream by eye",
-        ),
-    )
+    bounds = (Bound("amplitude", 0.0, 1000.0, "a prior of this library: a mK is seen in the time stream by eye"),)
     parametrization = Angle(parameter="phase_deg")
     proposed = False
 
     phase_deg: float = 0.0
 
     def signal(self, time_s: Vector, theta: Vector, phi: Vector, psi: Vector, site: Site) -> Vector:
-        """Return a wave of the period of the spin."""
         phase = spin_phase(site.pointed(self.name), time_s)
         return np.asarray(self.amplitude * np.cos(phase - np.deg2rad(self.phase_deg)))
 

@@ -37,35 +37,22 @@ class Pointing:
 
 @dataclass(frozen=True)
 class Site:
-    """Describe the channel of a survey in which an effect acts.
+    """Describe the channel of a survey in which an effect acts."""
 
-    Attributes
-    ----------
-    channel, frequency_ghz
-        Name and frequency; None where the configuration gives none.
-    frame, nside, lmax
-        Of the maps (nside 0: rings without pixels), and the highest degree of the sky.
-    beam
-        Fiducial beam, before any effect.
-    pointing
-        Of the whole survey; None if only moments are known.
-    dipole_uk
-        Dipole that the survey sees and subtracts with the fiducial gain: a vector in the frame of the maps.
-    whole
-        Returns the beam with the orders that it has without an m_max; None if they are not known.
-    foregrounds
-        False: the map is one of a component separation, in which foregrounds are not looked for.
-    """
-
+    #: channel, frequency_ghz: name and frequency; None where the configuration gives none
     channel: str
     frequency_ghz: float | None
+    #: frame, nside, lmax: of the maps (nside 0: rings without pixels), and the highest degree of the sky
     frame: str
     nside: int
     lmax: int
-    beam: Beam
-    pointing: Pointing | None = None
+    beam: Beam  #: fiducial beam, before any effect
+    pointing: Pointing | None = None  #: of the whole survey; None if only moments are known
+    #: dipole that the survey sees and subtracts with the fiducial gain: a vector in the frame of the maps
     dipole_uk: Vector = field(default_factory=lambda: np.zeros(3))
+    #: returns the beam with the orders that it has without an m_max; None if they are not known
     whole: Callable[[], Beam] | None = None
+    #: False: the map is one of a component separation, in which foregrounds are not looked for
     foregrounds: bool = True
 
     def pointed(self, effect: str) -> Pointing:
@@ -99,22 +86,13 @@ class Site:
 
 @dataclass(frozen=True)
 class Wording:
-    """How an amplitude is printed.
+    """How an amplitude is printed."""
 
-    Attributes
-    ----------
-    text
-        Sentence with {} for scale * amplitude + offset, its error and symbol.
-    symbol
-        Of the unit in which it is printed.
-    negative
-        Sentence for the absolute value of a negative amplitude; None: ``text``, with the sign.
-    """
-
-    text: str = "{}"
-    symbol: str = ""
+    text: str = "{}"  #: sentence with {} for scale * amplitude + offset, its error and symbol
+    symbol: str = ""  #: of the unit in which it is printed
     scale: float = 1.0
     offset: float = 0.0
+    #: sentence for the absolute value of a negative amplitude; None: ``text``, with the sign
     negative: str | None = None
 
 

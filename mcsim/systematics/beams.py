@@ -27,17 +27,9 @@ class BeamWidth(Effect):
     signature = "L = 0: the power falls off sooner, in this channel alone."
     source = "Huffenberger et al. 2010, A&A 513, A23 (errors of measured beams)"
     step = 0.005
-    bounds = (
-        Bound(
-            "amplitude",
-            -0.5,
-            0.5,
-            "a prior of this library: a measured width is known to a half",
-        ),
-    )
+    bounds = (Bound("amplitude", -0.5, 0.5, "a prior of this library: a measured width is known to a half"),)
 
     def beam(self, beam: Beam, site: Site) -> Beam:
-        """Stretch the beam."""
         if not -0.9 <= self.amplitude <= 9.0:
             raise InputError(
                 f"effect {self.name}: amplitude = {self.amplitude:g} leaves no beam to speak of; "
@@ -90,7 +82,6 @@ class BeamEllipticity(Effect):
         return stretched(beam, np.sqrt(ratio), 1.0 / np.sqrt(ratio), angle, 32, 2)
 
     def direction(self) -> str:
-        """Return the direction in the frame of the beam."""
         return "with the major axis " + scan_direction(self.angle_deg, 180.0)
 
 
@@ -114,17 +105,9 @@ class BeamNoncircularity(Effect):
     signature = "L of the orders left out: 2 and 4 of an ellipse, 1 and 3 of a lopsided beam, in the scan's frame."
     source = "Joshi et al. arXiv:1210.7318, Sec. IV"
     step = 0.05
-    bounds = (
-        Bound(
-            "amplitude",
-            -2.0,
-            2.0,
-            "1 is the beam as measured; a prior of this library: at most twice that",
-        ),
-    )
+    bounds = (Bound("amplitude", -2.0, 2.0, "1 is the beam as measured; a prior of this library: at most twice that"),)
 
     def beam(self, beam: Beam, site: Site) -> Beam:
-        """Add a share of the orders that were left out."""
         whole, kept = site.whole_beam(self.name), site.beam.mmax + 1
         blm = np.zeros((max(beam.mmax, whole.mmax) + 1, beam.lmax + 1), dtype=np.complex128)
         blm[: beam.mmax + 1] = beam.blm
@@ -141,7 +124,6 @@ class _FourAngles(Parametrization):
     """Fit k and angle by the responses at 0, 45, 90 and 135 degrees."""
 
     def basis(self) -> tuple[Mapping[str, Any], ...]:
-        """Return the four angles."""
         return tuple({"angle_deg": angle} for angle in (0.0, 45.0, 90.0, 135.0))
 
     def coordinates(self, effect: Any) -> Vector:
@@ -208,7 +190,6 @@ class BeamComa(Effect):
     angle_deg: float = 0.0
 
     def beam(self, beam: Beam, site: Site) -> Beam:
-        """Return the beam times the cubic polynomial."""
         form = shape(beam, 4)
         radius = form.theta / form.sigma
         u = radius * np.cos(form.phi - np.deg2rad(self.angle_deg))
@@ -225,11 +206,9 @@ class _RoundAndQuadrupole(Parametrization):
     """Fit a ring as a mixture of a round one and one with all of its quadrupole, q = 1."""
 
     def basis(self) -> tuple[Mapping[str, Any], ...]:
-        """Return both rings."""
         return {}, {"quadrupole": 1.0}
 
     def coordinates(self, effect: Any) -> Vector:
-        """Return (a - a q, a q)."""
         return np.array([1.0 - effect.quadrupole, effect.quadrupole]) * effect.amplitude
 
     def nearest(self, coordinates: Vector, precision: NDArray[np.float64]) -> dict[str, Any]:
@@ -278,7 +257,6 @@ class BeamSidelobe(Effect):
     calibrated: str = "none"
 
     def beam(self, beam: Beam, site: Site) -> Beam:
-        """Take the ring off."""
         if self.calibrated not in CALIBRATIONS:
             raise InputError(
                 f"effect {self.name}: calibrated = {self.calibrated!r} must be one of {', '.join(CALIBRATIONS)}."

@@ -103,7 +103,6 @@ class BandpassMismatch(Effect):
     template: str = ""
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Add the excess."""
         return sky + self.amplitude * morphology(self.template, site, draw)
 
 
@@ -129,14 +128,7 @@ class PointSources(Effect):
     signature = "Flat C_l, in autos and crosses of all channels alike."
     source = "Tegmark & Efstathiou 1996, MNRAS 281, 1297; Wright et al. 2009, ApJS 180, 283"
     step = 1e-4
-    bounds = (
-        Bound(
-            "amplitude",
-            0.0,
-            10.0,
-            "no power is negative; far beyond that of unresolved sources",
-        ),
-    )
+    bounds = (Bound("amplitude", 0.0, 10.0, "no power is negative; far beyond that of unresolved sources"),)
     parametrization = Parametrization(sign=-1, stochastic=True, mean_response=True, matched_filter=False)
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:

@@ -35,7 +35,6 @@ class Calibration(Effect):
     bounds = (Bound("amplitude", -0.5, 0.5, "a prior of this library: half of the dipole is seen by eye"),)
 
     def beam(self, beam: Beam, site: Site) -> Beam:
-        """Scale the beam."""
         if self.amplitude <= -1.0:
             raise InputError(
                 f"effect {self.name}: amplitude = {self.amplitude:g} leaves no signal; choose one above -1."
@@ -76,7 +75,6 @@ class GainDrift(Effect):
     phase_deg: float = 0.0
 
     def gain(self, time_s: Vector, site: Site) -> Vector | None:
-        """Return a wave of the period of the orbit."""
         if self.amplitude == 0.0:
             return None
         turns = time_s / site.pointed(self.name).model.orbit_period_s
@@ -115,7 +113,6 @@ class GainSpin(Effect):
     phase_deg: float = 0.0
 
     def gain(self, time_s: Vector, site: Site) -> Vector | None:
-        """Return a wave of the period of the spin."""
         if self.amplitude == 0.0:
             return None
         return np.asarray(
@@ -151,7 +148,6 @@ class Nonlinearity(Effect):
     proposed = False
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Multiply sky and dipole."""
         largest = float(np.linalg.norm(site.dipole_uk))
         if largest == 0.0:
             raise InputError(f"effect {self.name} on channel {site.channel} follows the dipole; give sky.dipole_uk.")

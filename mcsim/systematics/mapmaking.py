@@ -28,7 +28,6 @@ class TransmissionImbalance(Effect):
     )
 
     def differencing(self, imbalance: float, iterations_short: int) -> tuple[float, int]:
-        """Add to the imbalance."""
         return imbalance + self.amplitude, iterations_short
 
 
@@ -53,5 +52,4 @@ class MapmakingConvergence(Effect):
     parametrization = Steps(sign=1, factor=1.5)
 
     def differencing(self, imbalance: float, iterations_short: int) -> tuple[float, int]:
-        """Add to the missing iterations."""
         return imbalance, iterations_short + round(self.amplitude)

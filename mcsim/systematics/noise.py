@@ -28,10 +28,9 @@ class NoiseLevel(Effect):
     source = "Jarosik et al. 2011, ApJS 192, 14 (sigma0 per channel, and its error)"
     step = 0.01
     bounds = (Bound("amplitude", -0.9, 3.0, "a prior of this library: noise is known to a factor of four"),)
-    parametrization = Parametrization(matched_filter=False)
+    parametrization = Parametrization(noise_alone=True, matched_filter=False)
 
     def noise(self, site: Site) -> Map | None:
-        """Return the same factor everywhere."""
         if self.amplitude == 0.0:
             return None
         if self.amplitude <= -1.0:
@@ -62,11 +61,11 @@ class NoiseAnisotropy(Effect):
     source = "The pattern is the lowest one that a scan symmetric about the ecliptic makes"
     step = 0.05
     bounds = (Bound("amplitude", -0.5, 1.0, "no variance is negative, the pattern being from -1 to 2"),)
+    parametrization = Parametrization(noise_alone=True)
 
     template: str = ""
 
     def noise(self, site: Site) -> Map | None:
-        """Return 1 + a t."""
         if self.amplitude == 0.0:
             return None
         centres = np.stack(healpy.pix2vec(site.nside, np.arange(12 * site.nside**2)))
@@ -129,7 +128,6 @@ class ExcessNoise(Effect):
     glitch_uk: float = 500.0
 
     def excess(self, count: Vector, rng: np.random.Generator) -> Vector:
-        """Return the sum of the hits."""
         if self.amplitude < 0.0:
             raise InputError(f"effect {self.name}: amplitude = {self.amplitude:g} is no fraction; give 0 or more.")
         number = rng.poisson(self.amplitude * count)

@@ -16,32 +16,21 @@ class Parametrization:
 
     An effect has linear components, k in number: its response is the sum of its coordinates times the responses of the
     effects of the basis, each per unit of amplitude.
-
-    Attributes
-    ----------
-    sign
-        Sign of the amplitudes at which responses are measured; 0: both. If it is not 0, a negative amplitude is
-        unphysical, and a diagnosis does not name it.
-    max_amplitude
-        Largest physical amplitude, in absolute value; a diagnosis names no larger one.
-    stochastic
-        True if a hook draws random numbers, at positive amplitudes at least.
-    mean_response
-        True if a diagnosis uses the mean response over skies, not that of the observed sky: for a change of power
-        alone, whose response in one sky depends on fluctuations that the spectra have anyway.
-    matched_filter
-        True if the data vector of a diagnosis has a matched filter for it: not if a hook draws random numbers, nor if
-        dipoles, variances, spectra and modulations, which are always measured, contain all of it.
-    nonlinear
-        True if the response is simulated anew at whatever amplitude is fitted.
     """
 
+    #: Sign of the amplitudes at which responses are measured; 0: both. If it is not 0, a negative amplitude is
+    #: unphysical, and a diagnosis does not name it.
     sign: Literal[-1, 0, 1] = 0
-    max_amplitude: float = np.inf
-    stochastic: bool = False
+    max_amplitude: float = np.inf  #: largest physical amplitude, in absolute value; a diagnosis names no larger one
+    stochastic: bool = False  #: True if a hook draws random numbers, at positive amplitudes at least
+    #: True if a diagnosis uses the mean response over skies, not that of the observed sky: for a change of power alone,
+    #: whose response in one sky depends on fluctuations that the spectra have anyway
     mean_response: bool = False
+    noise_alone: bool = False  #: True if noise alone changes: typical skies then say by how much the data scatter more
+    #: True if the data vector of a diagnosis has a matched filter for it: not if a hook draws random numbers, nor if
+    #: dipoles, variances, spectra and modulations, which are always measured, contain all of it
     matched_filter: bool = True
-    nonlinear: bool = False
+    nonlinear: bool = False  #: True if the response is simulated anew at whatever amplitude is fitted
 
     @property
     def measured(self) -> tuple[str, ...]:
@@ -74,30 +63,19 @@ class Parametrization:
 
 @dataclass(frozen=True, kw_only=True)
 class Angle(Parametrization):
-    """Fit amplitude and angle as the coordinates amplitude cos(angle) and amplitude sin(angle).
+    """Fit amplitude and angle as the coordinates amplitude cos(angle) and amplitude sin(angle)."""
 
-    Attributes
-    ----------
-    parameter
-        Name of the angle, in degrees.
-    multiple
-        How often the angle counts: 2 for an axis, which is the same again after half a turn.
-    """
-
-    parameter: str = "angle_deg"
-    multiple: int = 1
+    parameter: str = "angle_deg"  #: name of the angle, in degrees
+    multiple: int = 1  #: how often the angle counts: 2 for an axis, which is the same again after half a turn
 
     def basis(self) -> tuple[Mapping[str, Any], ...]:
-        """Return cosine and sine."""
         return {}, {self.parameter: 90.0 / self.multiple}
 
     def coordinates(self, effect: Any) -> Vector:
-        """Return the amplitudes of cosine and sine."""
         angle = self.multiple * np.deg2rad(getattr(effect, self.parameter))
         return effect.amplitude * np.array([np.cos(angle), np.sin(angle)])
 
     def nearest(self, coordinates: Vector, precision: NDArray[np.float64]) -> dict[str, Any]:
-        """Return norm and angle."""
         x, y = coordinates
         angle_deg = np.rad2deg(np.arctan2(y, x)) / self.multiple
         return {"amplitude": float(np.hypot(x, y)), self.parameter: float(angle_deg)}
@@ -105,25 +83,15 @@ class Angle(Parametrization):
 
 @dataclass(frozen=True, kw_only=True)
 class Components(Parametrization):
-    """Fit amplitude and direction of a vector as its components.
+    """Fit amplitude and direction of a vector as its components."""
 
-    Attributes
-    ----------
-    parameter
-        Name of the direction, a tuple of numbers whose length does not matter.
-    count
-        Number of components.
-    """
-
-    parameter: str
-    count: int
+    parameter: str  #: name of the direction, a tuple of numbers whose length does not matter
+    count: int  #: number of components
 
     def basis(self) -> tuple[Mapping[str, Any], ...]:
-        """Return the components one by one."""
         return tuple({self.parameter: tuple(map(float, row))} for row in np.eye(self.count))
 
     def coordinates(self, effect: Any) -> Vector:
-        """Return the components."""
         return np.asarray(effect.along(self.parameter))
 
     def nearest(self, coordinates: Vector, precision: NDArray[np.float64]) -> dict[str, Any]:
@@ -153,15 +121,6 @@ class Steps(Parametrization):
 class PowerLaw(Parametrization):
     """Fit a signal that grows as a power of frequency, and its index where the channels can tell it.
 
-    Attributes
-    ----------
-    parameter
-        Name of the index, which is that of the effect where it is not fitted.
-    reference_ghz
-        Frequency to which the amplitude belongs.
-    ratios
-        Frequencies of the channels over that of the reference; none: the index is not fitted.
-
     Notes
     -----
     With x the ratios, A x^index is fitted as c_1 x^2 + c_2 x^-2: exact at two frequencies, by least squares at more.
@@ -169,13 +128,13 @@ class PowerLaw(Parametrization):
     and a map without foregrounds.
     """
 
-    parameter: str
-    reference_ghz: float
+    parameter: str  #: name of the index, which is that of the effect where it is not fitted
+    reference_ghz: float  #: frequency to which the amplitude belongs
+    #: frequencies of the channels over that of the reference; none: the index is not fitted
     ratios: tuple[float, ...] = ()
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """Return the index where it is fitted."""
         return (self.parameter,) if self.ratios else ()
 
     def seen_at(self, frequencies_ghz: Iterable[float | None]) -> Self:
@@ -185,11 +144,9 @@ class PowerLaw(Parametrization):
         return replace(self, ratios=ratios) if len(seen) > 2 else self
 
     def basis(self) -> tuple[Mapping[str, Any], ...]:
-        """Return the pivots of the index."""
         return tuple({self.parameter: float(index)} for index in _PIVOTS) if self.ratios else ({},)
 
     def coordinates(self, effect: Any) -> Vector:
-        """Return the amplitudes at the pivots."""
         if not self.ratios:
             return super().coordinates(effect)
         return np.asarray(effect.amplitude * self._unit(np.array([getattr(effect, self.parameter)]))[:, 0])
@@ -227,11 +184,9 @@ class SkyVector(Parametrization):
     """Fit amplitude, ``lon_deg`` and ``lat_deg`` of an effect as the components of its ``vector``."""
 
     def basis(self) -> tuple[Mapping[str, Any], ...]:
-        """Return the vectors along x, y and z."""
         return {}, {"lon_deg": 90.0}, {"lat_deg": 90.0}
 
     def coordinates(self, effect: Any) -> Vector:
-        """Return the components x, y, z."""
         return np.asarray(effect.vector)
 
     def nearest(self, coordinates: Vector, precision: NDArray[np.float64]) -> dict[str, Any]:

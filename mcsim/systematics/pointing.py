@@ -45,11 +45,9 @@ class PointingOffset(Effect):
     angle_deg: float = 0.0
 
     def pointing(self, beam: Beam, site: Site) -> Beam:
-        """Displace the beam."""
         return displaced(beam, np.deg2rad(self.angle_deg), np.deg2rad(self.amplitude / 60.0))
 
     def moved(self, theta: Vector, phi: Vector, psi: Vector) -> tuple[Vector, Vector, Vector] | None:
-        """Rotate every sample's direction and axes in the same way."""
         if self.amplitude == 0.0:
             return theta, phi, psi
         distance, angle = np.deg2rad(self.amplitude / 60.0), np.deg2rad(self.angle_deg)
@@ -66,7 +64,6 @@ class PointingOffset(Effect):
         return np.arctan2(width, line[2]), np.arctan2(line[1], line[0]) % (2.0 * np.pi), turned
 
     def direction(self) -> str:
-        """Return the direction in the frame of the beam."""
         return scan_direction(self.angle_deg)
 
 
@@ -99,7 +96,6 @@ class PointingJitter(Effect):
     proposed = False
 
     def beam(self, beam: Beam, site: Site) -> Beam:
-        """Smear the beam."""
         ell, m = np.arange(beam.lmax + 1.0), np.arange(beam.mmax + 1.0)[:, None]
         reach = np.maximum(ell * (ell + 1.0) - m**2, 0.0) * 0.5 * self.amplitude * np.deg2rad(1.0 / 60.0) ** 2
         if reach.min() < -1.0:
@@ -143,7 +139,6 @@ class TimeConstant(Effect):
     )
 
     def pointing(self, beam: Beam, site: Site) -> Beam:
-        """Trail the beam along the circle of the spin."""
         pointed = site.pointed(self.name)
         model = pointed.model
         turns = 1.0 / model.spin_period_s + np.cos(np.deg2rad(model.precession_angle_deg)) / model.precession_period_s
@@ -226,5 +221,4 @@ class Pixelization(Effect):
     parametrization = Parametrization(max_amplitude=2.0)
 
     def spread(self) -> float:
-        """Return 1 - amplitude."""
         return 1.0 - self.amplitude

@@ -23,11 +23,8 @@ from mcsim.systematics import base
 from mcsim.systematics.base import Bound, Effect
 from mcsim.systematics.parametrization import Parametrization
 
-ENTRY_POINTS = "mcsim.effects"
-"""Group of entry points under which a package names its effects."""
-
-Library = Mapping[str, type[Effect]]
-"""Effects by name."""
+ENTRY_POINTS = "mcsim.effects"  #: group of entry points under which a package names its effects
+Library = Mapping[str, type[Effect]]  #: effects by name
 
 
 @cache

@@ -15,8 +15,7 @@ from mcsim.instrument.beams.coefficients import unpacked
 Blm = NDArray[np.complex128]
 Values = NDArray[np.float64]
 
-NEGLECTED = 1e-8
-"""Largest fraction of a beam's power that is cut off beyond m_max when an effect is done with it."""
+NEGLECTED = 1e-8  #: largest fraction of a beam's power that is cut off beyond m_max when an effect is done with it
 
 _TAIL = 1e-12
 _HIGHEST = 20000

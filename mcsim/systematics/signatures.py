@@ -2,8 +2,7 @@
 
 from typing import NamedTuple
 
-Place = tuple[str | None, int | None, str | None]
-"""Frame, L and parity of a coefficient; None where it has none."""
+Place = tuple[str | None, int | None, str | None]  #: frame, L and parity of a coefficient; None where it has none
 
 
 class Signature(NamedTuple):

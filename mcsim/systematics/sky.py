@@ -26,11 +26,8 @@ LEAST = -0.99
 """Smallest change of a band that is fitted: an error larger than the power itself asks for less than none."""
 
 
-KNOWN = 0.25
-"""Error of a band up to which the data constrain its power."""
-
-DETECTED = 3.0
-"""Standard errors by which a band that is constrained worse has to change to be fitted all the same."""
+KNOWN = 0.25  #: error of a band up to which the data constrain its power
+DETECTED = 3.0  #: standard errors by which a band that is constrained worse has to change to be fitted all the same
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,8 +96,7 @@ class Spectrum(Effect):
         return alm_.multiply(sky, factor, site.lmax)
 
 
-EPSILON = 1e-5
-"""Accuracy of the interpolation, relative to the sky."""
+EPSILON = 1e-5  #: accuracy of the interpolation, relative to the sky
 
 _ELL = (2, 3, 4, 5, 8, 10, 15, 20, 28, 40, 55, 77, 107, 149, 207, 289, 402, 560, 781, 1088, 1515, 2111, 2940, 4096)
 _POWER = (
@@ -146,7 +142,6 @@ class Lensing(Effect):
     proposed = False
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Lens the sky."""
         if self.amplitude < 0.0:
             raise InputError(f"effect {self.name}: amplitude = {self.amplitude:g} is no power; give 0 or more.")
         return remapped(sky, gaussian_alm(self.amplitude * potential(site.lmax), draw("potential")), site.lmax)
@@ -212,7 +207,6 @@ class Boost(DirectedEffect):
     parametrization = SkyVector(max_amplitude=0.01, mean_response=True, matched_filter=False)
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Boost the sky."""
         if abs(self.amplitude) >= 1.0:
             raise InputError(
                 f"effect {self.name}: amplitude = {self.amplitude:g} is not slower than light; keep it within +-1."
@@ -248,7 +242,6 @@ class DipoleModulation(DirectedEffect):
     parametrization = SkyVector(matched_filter=False)
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Modulate the sky."""
         a, b, c = self.vector
         return sky + multiplied(sky, site.lmax, lambda x, y, z: a * x + b * y + c * z, 1)
 
@@ -281,7 +274,6 @@ class QuadrupoleModulation(Effect):
     components: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 0.0)
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Modulate the sky."""
         q = self.along("components")
 
         def field(x: Vector, y: Vector, z: Vector) -> Vector:

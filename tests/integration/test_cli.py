@@ -17,8 +17,10 @@ from typing import get_args, get_type_hints
 import numpy as np
 import pytest
 import xarray as xr
+import zarr
 from astropy.io import fits
 from astropy.table import Table
+from matplotlib.figure import Figure
 
 from mcsim import cli, config, open_summary
 from mcsim.ensemble import tables
@@ -34,7 +36,17 @@ Command = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture
 def mcsim(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Command:
-    """Run a command in an empty folder: exit code, standard output, standard error."""
+    """Run a command in an empty folder: exit code, standard output, standard error.
+
+    Its figures are saved small and without a layout engine, which draws them twice; unit tests draw them whole.
+    """
+    savefig = Figure.savefig
+
+    def quick(figure: Figure, path: Path) -> None:
+        figure.set_layout_engine(None)
+        savefig(figure, path, dpi=50)
+
+    monkeypatch.setattr(Figure, "savefig", quick)
 
     def run(*words: object) -> tuple[int, str, str]:
         monkeypatch.chdir(tmp_path)
@@ -145,6 +157,16 @@ def test_notes_of_a_wide_and_a_narrow_figure_are_whole(small_store: Path, chosen
     box, whole = figure.get_tightbbox(), figure.bbox_inches
     assert box.x0 >= 0.0
     assert box.x1 <= whole.x1
+
+
+def test_a_signal_is_not_hidden_by_the_mean_field_of_noise(small_store: Path, tmp_path: Path) -> None:
+    shutil.copytree(small_store, tmp_path / "small.zarr")
+    group = zarr.open_group(tmp_path / "small.zarr" / "summary", mode="r+", use_consolidated=False)
+    mean, error = (np.asarray(group[f"biposh_{name}"][...]) for name in ("difference_binned_mean", "binned_mean"))
+    group["biposh_binned_mean"][...] = error + 1000.0 * np.abs(mean).max()
+    [axes] = ensemble_figure(tmp_path / "small.zarr", L=2, M=0).axes
+    points = [line.get_ydata() for line in axes.lines]
+    assert np.ptp(axes.get_ylim()) < 3.0 * np.ptp(np.concatenate([np.asarray(one, float) for one in points]))
 
 
 def test_dry_run_says_the_cost_and_computes_nothing(mcsim: Command, tmp_path: Path) -> None:
@@ -337,9 +359,9 @@ def test_files_of_fit_that_are_none(words: tuple[str, str], mcsim: Command, smal
     assert_refused(mcsim("fit", *(small_store if word == "STORE" else word for word in words)))
 
 
-def test_a_terminal_without_greek_letters(small_store: Path) -> None:
+def test_a_terminal_without_greek_letters() -> None:
     """What it cannot show is a question mark, and no UnicodeEncodeError."""
-    program = f"import sys, mcsim.cli\nsys.argv = ['mcsim', 'info', {str(small_store)!r} + 'µ']\nmcsim.cli.main()"
+    program = "import sys, mcsim.cli\nsys.argv = ['mcsim', 'config', 'µ']\nmcsim.cli.main()"
     ascii_alone = {**os.environ, "PYTHONIOENCODING": "ascii"}
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=ascii_alone, check=False)
     assert (done.returncode, done.stdout) == (2, "")
@@ -355,6 +377,16 @@ def test_a_disk_that_fails_is_one_sentence(mcsim: Command, monkeypatch: pytest.M
     code, _, err = mcsim("effects")
     assert (code, err.count("\n")) == (1, 1)
     assert unnamed(err, "picture.png") == []
+
+
+def test_too_little_memory_is_one_sentence(mcsim: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    def large() -> None:
+        raise MemoryError("Unable to allocate 49.2 TiB")
+
+    monkeypatch.setattr(cli, "app", large)
+    code, _, err = mcsim("effects")
+    assert (code, err.count("\n")) == (1, 1)
+    assert unnamed(err, "49.2", "nside", "lmax", "smax") == []
 
 
 def test_version(mcsim: Command) -> None:
@@ -408,13 +440,32 @@ def test_a_file_that_is_no_prediction_is_refused(name: str, mcsim: Command, smal
 )
 def test_config_refuses_effects_that_run_refuses(effect: str, key: str, mcsim: Command, tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(f"{SMALL}{effect}\n")
+    refused_by_config_and_run(mcsim, key)
+    assert [file.name for file in tmp_path.iterdir()] == ["small.toml"]
+
+
+def refused_by_config_and_run(mcsim: Command, key: str) -> None:
+    """Check that ``config``, ``run`` and ``run --dry-run`` refuse small.toml with one sentence that names the key."""
     answers = [
         mcsim(*words) for words in (("config", "small.toml"), ("run", "small.toml"), ("run", "small.toml", "--dry-run"))
     ]
     for answer in answers:
         assert_refused(answer, key)
     assert len({err for _, _, err in answers}) == 1
-    assert [file.name for file in tmp_path.iterdir()] == ["small.toml"]
+
+
+@pytest.mark.parametrize(
+    ("scan", "key"),
+    [
+        ('{ kind = "hit_averaged", model = "mine.toml" }', "spin_speed"),
+        ('{ kind = "hit_averaged", model = "wmap", line_of_sight = "left" }', "left"),
+        ('{ kind = "differencing", model = "wmap_focal_plane", pair = "W9" }', "W9"),
+    ],
+)
+def test_config_refuses_scans_that_run_refuses(scan: str, key: str, mcsim: Command, tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text('name = "mine"\nspin_speed = 3.0\n')
+    (tmp_path / "small.toml").write_text(SMALL.replace('{ kind = "parallel_transport", psi0_deg = 20.0 }', scan))
+    refused_by_config_and_run(mcsim, key)
 
 
 @pytest.mark.parametrize(

@@ -75,7 +75,7 @@ def test_a_turn_of_a_degree_is_not_taken_for_a_turn_of_half_a_circle_more(simula
 
 def test_time_stamps_of_half_a_sample_are_named():
     beam = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 660.0, "fwhm_minor_arcmin": 540.0}
-    scan = {"kind": "hit_averaged", "model": "litebird", "sample_period_s": 31.0}
+    scan = {"kind": "hit_averaged", "model": "litebird", "sample_period_s": 93.0}
     channel = {"name": "T", "beam": beam, "scan": scan}
     run = config.load(MODEL | {"sky": {"spectrum": "wmap7", "lmax": 30}, "map": {"nside": 16}, "channel": [channel]})
     whole = survey(run)
@@ -84,9 +84,9 @@ def test_time_stamps_of_half_a_sample_are_named():
     model = pointing.model
     later = replace(
         model,
-        spin_phase_deg=180.0 * 31.0 / model.spin_period_s,
-        precession_phase_deg=180.0 * 31.0 / model.precession_period_s,
-        orbit_phase_deg=180.0 * 31.0 / model.orbit_period_s,
+        spin_phase_deg=180.0 * 93.0 / model.spin_period_s,
+        precession_phase_deg=180.0 * 93.0 / model.precession_period_s,
+        orbit_phase_deg=180.0 * 93.0 / model.orbit_period_s,
     )
 
     def made(seen: mcsim.ScanModel) -> NDArray[np.float64]:

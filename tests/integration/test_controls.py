@@ -1,6 +1,7 @@
 """Controls of a diagnosis: perfect data at higher fidelity, which a right model describes and a wrong one does not."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -128,7 +129,9 @@ def test_finer_pixels_keep_the_noise_of_coarse_ones():
     assert found.run.sky.lmax > 45
     own, fine = (one.channels[0].maps[0].noise_uk for one in (analysis.model.survey, found.survey))
     np.testing.assert_allclose(fine, own, rtol=1e-12)
-    assert "control 2 data sets with" in describe(model(45), settings(controls=2))
+    text = describe(model(45), settings(controls=2))
+    assert "control 2 data sets with" in text
+    assert re.search(r" m?s each, [0-9.]+ m?s on \d cores?,", text)
 
 
 def test_a_known_scan_is_drawn_sample_by_sample(tmp_path):

@@ -184,8 +184,8 @@ def test_its_effect_is_named_with_the_amplitude_that_was_put_in(learned):
     assert found.kind == "effect"
     assert found.effects[0].name == "beam_width"
     assert abs(found.effects[0].amplitude - truth) < 4 * found.effects[0].sigma
-    # Fitted amplitudes scatter by 0.058; the noisy slope of so few skies makes errors 0.06 to 0.14.
-    assert 0.058 < found.effects[0].sigma < truth / 2
+    # In 200 skies fitted amplitudes scatter by 0.077, with errors of 0.077 in the mean: larger for larger amplitudes.
+    assert 0.05 < found.effects[0].sigma < found.effects[0].amplitude / 3
 
 
 def test_responses_come_from_who_can_add_the_effect(learned):

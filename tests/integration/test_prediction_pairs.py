@@ -131,7 +131,12 @@ def test_joint_signal_to_noise_is_at_least_that_of_every_mode_and_less_than_infi
     assert float(each.max()) < float(autos) < total < np.inf
     bins = np.sqrt((expected["signal_to_noise_binned"] ** 2).sum("bin"))
     xr.testing.assert_allclose(bins.where(np.isfinite(each)), each, rtol=1e-10)
-    assert "jointly" in describe.describe_prediction(expected)
+    text = describe.describe_prediction(expected)
+    assert "jointly" in text
+    # What the beam alone makes stands beside the mean, and errors of rounding are no imaginary parts.
+    first = expected.biposh_difference_binned_mean.sel(pair="A,A", mode="L2M0d0").isel(bin=0).real.item()
+    assert f" {first:.4g}\n" in text
+    assert "e-17j" not in text
     # What all maps say together does not depend on which pairs the ensemble keeps.
     run = shared.config
     autos = prediction.predict(survey(replace(run, biposh=replace(run.biposh, pairs="auto"))), snr=True)

@@ -11,6 +11,9 @@ from mcsim import config
 from mcsim.errors import InputError
 from refusals import refused
 
+# Most draws are narrower than what so few degrees show.
+pytestmark = pytest.mark.filterwarnings("ignore:channel.* is narrower than any map:UserWarning")
+
 LABELS = st.text(st.characters(categories=("L", "N", "P", "S"), exclude_characters="/\\:,{}"), min_size=1, max_size=8)
 POSITIVE = st.floats(1e-6, 1e4)
 ANGLES = st.floats(-1e3, 1e3)

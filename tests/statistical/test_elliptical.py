@@ -75,32 +75,42 @@ def test_simulations_against_others_are_uniform() -> None:
     assert stats.kstest(held_out_pvalues(simulations, null), "uniform").pvalue > 1e-3
 
 
-@pytest.mark.parametrize("growth", [1.0, 1.2])
+@pytest.mark.parametrize("growth", [1.0, 1.2, 2.0])
 def test_scatter_that_effects_add(growth: float) -> None:
-    """More noise, and a response that differs from sky to sky: the chi^2 of residuals grows by what is forecast."""
+    """More noise, and a response that differs from sky to sky: chi^2 of residuals grows and scatters as forecast."""
     rng, p, skies = np.random.default_rng(SEED), 60, 8
     null = SimulatedGaussian(np.zeros(p), np.eye(p), 1_000_000)
-    t, spread = np.eye(p)[:, :1], 0.2
+    t, spread, noisy = np.eye(p)[:, :1], 0.2, np.where(np.arange(p) < 20, growth, 1.0)
     forecasts = []
     for _ in range(400):
         before = rng.normal(size=(skies, p))
-        after = growth * before + 10.0 * t[:, 0] + spread * rng.normal(size=(skies, p))
+        after = noisy * before + 10.0 * t[:, 0] + spread * rng.normal(size=(skies, p))
         size = np.sum((after - before).mean(axis=0) ** 2)
-        forecasts.append(scatter_chi2(null, t, before, after) * size)
-    q = p - 1
-    expected = q * (growth**2 - 1.0 + spread**2 + ((growth - 1.0) ** 2 + spread**2) / skies)
-    error = 4.0 * np.std(forecasts) / np.sqrt(len(forecasts))
-    assert abs(np.mean(forecasts) - expected) < error
-    # A noncentrality of this size gives residuals the p-values that they should have.
-    x = growth * rng.normal(size=(20_000, p)) + spread * rng.normal(size=(20_000, p))
-    x -= np.sqrt(((growth - 1.0) ** 2 + spread**2) / skies) * rng.normal(size=x.shape)
-    pvalues = residual_pvalue(np.sum(x[:, 1:] ** 2, axis=1), q, null.dof, expected)
-    for level in (0.05, 0.02):
-        assert abs(np.mean(pvalues < level) - level) < 4.0 * np.sqrt(level / len(x)) + 0.1 * level
+        forecasts.append(np.array(scatter_chi2(null, t, before, after)) * [size, size**2])
+    added = (noisy**2 - 1.0 + spread**2 + ((noisy - 1.0) ** 2 + spread**2) / skies)[1:]
+    q, (trace, square) = p - 1, np.mean(forecasts, axis=0)
+    errors = 4.0 * np.std(forecasts, axis=0) / np.sqrt(len(forecasts))
+    assert abs(trace - added.sum()) < errors[0]
+    # The second has half of the squared error of the first, and is never below the least that is possible.
+    assert (
+        -errors[1]
+        < square - np.sum(added**2)
+        < errors[1] + np.var([one[0] for one in forecasts]) + added.sum() ** 2 / q
+    )
+    # Residuals have the p-values that they should have, with the two known, or from eight skies each time.
+    x = noisy * rng.normal(size=(20_000, p)) + spread * rng.normal(size=(20_000, p))
+    x -= np.sqrt(((noisy - 1.0) ** 2 + spread**2) / skies) * rng.normal(size=x.shape)
+    chi2, few = np.sum(x[:, 1:] ** 2, axis=1), np.array(forecasts)[np.arange(len(x)) % len(forecasts)].T
+    for one in ((added.sum(), np.sum(added**2)), few):
+        pvalues = residual_pvalue(chi2, q, null.dof, one[0], 0.0, one[1])
+        for level in (0.05, 0.02):
+            assert abs(np.mean(pvalues < level) - level) < 4.0 * np.sqrt(level / len(x)) + 0.25 * level
+    plain = residual_pvalue(chi2, q, null.dof, added.sum())
+    assert growth < 2.0 or np.mean(plain < 0.02) > 0.06
 
 
 def test_a_response_without_scatter_adds_nothing() -> None:
     rng = np.random.default_rng(SEED)
     null, t = SimulatedGaussian(np.zeros(9), np.eye(9), 1000), np.eye(9)[:, :1]
     before = rng.normal(size=(8, 9))
-    assert scatter_chi2(null, t, before, before + 5.0 * t[:, 0]) == pytest.approx(0.0, abs=1e-12)
+    assert scatter_chi2(null, t, before, before + 5.0 * t[:, 0]) == pytest.approx((0.0, 0.0), abs=1e-12)

@@ -100,3 +100,16 @@ def test_unreadable_files_are_refused(tmp_path, beam) -> None:
             Beam.from_blm(tmp_path / f"{name}.fits", 100)
     with refused("absent.fits"):
         Beam.from_blm(tmp_path / "absent.fits", 100)
+
+
+@pytest.mark.parametrize("columns", [0, 1, 2, 3])
+def test_tables_that_hold_no_coefficients_say_what_they_lack(tmp_path, columns) -> None:
+    """Maps and spectra have fewer columns, a polarised map as many."""
+    path = tmp_path / "map.fits"
+    healpy.write_map(path, np.ones((max(columns, 1), 12 * 4**2)), dtype=float)
+    if not columns:
+        fits.PrimaryHDU().writeto(path, overwrite=True)
+    with refused("map.fits", "index", "real", "imaginary") as refusal:
+        Beam.from_blm(path, 5)
+    assert "list index" not in str(refusal.value)
+    assert ({1: "1 of 3", 2: "2 of 3"}.get(columns, "")) in str(refusal.value)

@@ -76,6 +76,7 @@ def test_text_names_what_matters() -> None:
         "+20.0 deg",
         "|b_l2/b_l0|",
         "beyond mmax",
+        "negative response    0 of",
     ):
         assert fragment in text
     assert "note" not in text

@@ -1,14 +1,16 @@
 """The configuration: what it accepts, defaults, paths, and the forms that it can be written in."""
 
 import json
+import re
 import tomllib
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mcsim import config
-from refusals import refused
+from refusals import refused, unnamed
 
 from .conftest import DIFFERENCING, changed
 
@@ -161,3 +163,24 @@ def test_json_schema_names_every_table(plain):
     tables = {"schema", "name", "sky", "map", "channel", "effect", "preparation", "nuisance", "biposh", "ensemble"}
     assert set(schema["properties"]) == tables | {"simulator", "compute"}
     assert schema["additionalProperties"] is False
+
+
+def test_widths_that_may_be_in_radians_are_told(plain, folder):
+    for width, warned in ((0.01, True), (1.0, False)):
+        plain["channel"][1]["beam"]["fwhm_arcmin"] = width
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            config.load(plain)
+        texts = [str(each.message) for each in told]
+        assert [unnamed(text, "channel[V1].beam.fwhm_arcmin", width, "arcmin", "rad") for text in texts] == [
+            []
+        ] * warned
+
+
+def test_the_pages_on_configurations_name_every_key() -> None:
+    pages = Path(__file__).parents[2] / "docs" / "howto"
+    text = "".join((pages / f"{page}.md").read_text("utf-8") for page in ("configuration", "survey", "real-maps"))
+    schema = config.json_schema()
+    tables = [schema, *schema["$defs"].values()]
+    missing = [key for table in tables for key in table.get("properties", {}) if not re.search(rf"\b{key}\b", text)]
+    assert missing == []

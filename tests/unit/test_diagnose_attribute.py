@@ -372,7 +372,7 @@ def test_what_is_detected_beside_an_effect_stands_out_of_the_scatter_that_it_add
         own = {"scatter": np.outer(bench.t[:, 1], np.sqrt(3.0 / 24) * (draws - draws.mean()) / draws.std())}
     else:
         excess = np.where(np.arange(len(bench.candidates)) == 1, 3.0, 0.0)
-        own = {"acting": Acting(size=900.0, chi2=0.0, excess=excess, error=0.0 * excess)}
+        own = {"acting": Acting(size=900.0, chi2=0.0, spread=0.0, excess=excess, error=0.0 * excess)}
     acting = [replace(bench.candidates[0], **own), *bench.candidates[1:]]
     assert detected(bench, x, candidates=acting).members == (0,)
 

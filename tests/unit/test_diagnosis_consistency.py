@@ -190,6 +190,8 @@ def test_more_noise_is_more_in_all_degrees_and_in_pixels():
     assert not refused(white, 1.4)
     assert refused(stripes, 1.4)
     assert not refused(stripes, 5.0)
+    # A part that shows half of it by chance is no sign that it is absent, if its power scatters as much more.
+    assert not refused(np.array([0.0, 15.0, 10.0, 10.0, 0.0]), 4.0)
 
 
 def test_nothing_contradicts_an_effect_that_no_part_measures():

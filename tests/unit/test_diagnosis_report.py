@@ -235,6 +235,15 @@ def test_a_marginal_departure_without_a_cause_may_be_chance(diagnoses, pvalue, s
     assert ("3 % of cases" in words.status(result)) == said
 
 
+@pytest.mark.parametrize(("pvalue", "said"), [(1e-8, True), (0.2, False)])
+def test_a_group_that_departs_by_itself_is_told_where_the_global_test_finds_nothing(diagnoses, pvalue, said):
+    known = diagnoses["none"]
+    result = replace(known, places=(replace(known.places[0], p=pvalue), *known.places[1:]))
+    assert ("one group of numbers" in words.sentence(result)) == said
+    assert (known.places[0].element.words in words.status(result)) == said
+    assert ("detectable amplitude" in words.status(result)) != said
+
+
 def test_global_chi2_is_near_its_degrees_of_freedom_where_the_model_is_right(diagnoses):
     test, excess = diagnoses["none"].test, diagnoses["none"].excess
     # The raw statistic is larger by (N - 1)/(N - 2 - p).

@@ -15,17 +15,20 @@ from mcsim.systematics import Effect
 P, SKIES = 12, 4000
 
 
-@pytest.mark.parametrize("growth", [1.0, 0.5, 2.0])
-def test_errors_grow_with_the_scatter_and_never_shrink(growth: float) -> None:
+@pytest.mark.parametrize(
+    ("growth", "share", "variance"), [(1.0, 1.0, 1.0), (0.5, 1.0, 0.25), (2.0, 1.0, 4.0), (0.5, 0.6, 0.55), (2, 0.6, 4)]
+)
+def test_errors_follow_the_scatter(growth: float, share: float, variance: float) -> None:
+    """Where it shrinks, only the share of it that skies which the data constrain have does so."""
     rng = np.random.default_rng(3)
     mixing = rng.normal(size=(P, P))
     model = SimulatedGaussian.from_simulations(rng.normal(size=(2000, P)) @ mixing)
     t = rng.normal(size=(P, 2))
     found = model.fit(30.0 * t[:, 0], t)
-    before = rng.normal(size=(SKIES, P)) @ mixing
+    before = np.sqrt(share) * rng.normal(size=(SKIES, P)) @ mixing
     # The response itself, the same in every sky, is no scatter.
     wide = with_scatter(model, t, found, before, 30.0 * t[:, 0] + growth * before)
-    np.testing.assert_allclose(wide.errors / found.errors, np.sqrt(1.0 + max(growth**2 - 1.0, 0.0)), rtol=0.05)
+    np.testing.assert_allclose(wide.errors / found.errors, np.sqrt(variance), rtol=0.05)
     np.testing.assert_array_equal(wide.amplitudes, found.amplitudes)
     np.testing.assert_allclose(_correlation(wide.covariance), _correlation(found.covariance), rtol=1e-12)
 
@@ -97,19 +100,36 @@ def test_pulls_are_of_unit_width_where_responses_bend() -> None:
         lines = np.stack([(1.0 - 0.01 * first) * t - 0.01 * second * u, u], axis=1)
         found = model.fit(x, lines)
         np.testing.assert_allclose(found.amplitudes, [first, second], atol=0.2)
-        tangents = np.stack([(1.0 - 0.02 * first) * t - 0.01 * second * u, (1.0 - 0.01 * first) * u], axis=1)
+        exact = np.stack([(1.0 - 0.02 * first) * t - 0.01 * second * u, (1.0 - 0.01 * first) * u])
+        tangents = exact[:, None] + 0.1 * rng.normal(size=(2, 4, P))  # of four skies
         pulls.append(
             (found.amplitudes - [a, b]) / np.stack([found.errors, with_tangents(model, lines, found, tangents).errors])
         )
     straight, bent = np.std(pulls, axis=0)
     np.testing.assert_allclose(straight, [0.8 / 0.6, 1.0 / 0.8], rtol=0.1)
     np.testing.assert_allclose(bent, 1.0, atol=4.0 / np.sqrt(2000.0))
-    shorter = with_tangents(model, lines, found, 2.0 * lines)
-    np.testing.assert_array_equal(shorter.covariance, found.covariance)
+    steeper = with_tangents(model, lines, found, [2.0 * lines[:, :1].T, None])
+    np.testing.assert_allclose(steeper.errors / found.errors, [0.5, 1.0])
+    flat = with_tangents(model, lines, found, [0.0 * lines[:, :1].T, None])
+    np.testing.assert_array_equal(flat.covariance, found.covariance)
+
+
+def test_slopes_that_few_skies_do_not_tell_leave_the_errors_of_a_line() -> None:
+    """A straight response whose slope four skies tell to 30 %: raw slopes would make errors wrong by that much."""
+    rng, skies, noise = np.random.default_rng(7), 4, 0.6
+    model, t = SimulatedGaussian(np.zeros(P), np.eye(P), 1_000_000), np.eye(P)[:, :1]
+    found, raw, shrunk = model.fit(20.0 * t[:, 0], t), [], []
+    for _ in range(2000):
+        slopes = t.T + noise * rng.normal(size=(skies, P))
+        raw.append(1.0 / slopes[:, 0].mean())
+        shrunk.append(with_tangents(model, t, found, [slopes]).errors[0] / found.errors[0])
+    wrong = [np.mean(np.log(np.abs(one)) ** 2) for one in (raw, shrunk)]
+    assert wrong[1] < 0.6 * wrong[0]
+    assert abs(np.median(shrunk) - 1.0) < 0.01
 
 
 def test_candidates_that_are_added_are_not_scattered_by_what_was_simulated_before() -> None:
-    acting = Acting(100.0, 3.0, np.array([0.0, 2.0]), np.array([0.0, 0.5]))
+    acting = Acting(100.0, 3.0, 0.1, np.array([0.0, 2.0]), np.array([0.0, 0.5]))
     beside = Beside.of([acting, None, None], None)
     found = beside.tolerated(np.zeros(1), np.array([[0]]), np.array([[0.5]]), np.array([[1, 2]]))
     np.testing.assert_allclose(found.variance, [[2.0, 1.0]])

@@ -96,3 +96,20 @@ def test_real_coefficients_of_a_file_are_refused(tmp_path) -> None:
     run = RUN | {"sky": {"alm": str(tmp_path / "alm.npy"), "lmax": LMAX}, "ensemble": {"realizations": 1}}
     with refused("float64"):
         mcsim.write_maps(run, tmp_path / "maps", 0)
+
+
+@pytest.mark.parametrize(
+    ("key", "changes"),
+    [
+        ("alm", {"sky": {"alm": np.nan * ALM, "lmax": LMAX}}),
+        ("spectrum", {"sky": {"spectrum": np.ones(LMAX), "lmax": LMAX}}),
+        ("mask", {"map": {"nside": NSIDE, "mask": np.ones(14)}}),
+        ("path", {"channel": [CHANNEL | {"beam": {"kind": "blm", "path": np.ones((1, LMAX))}}]}),
+        ("beam", {"channel": [CHANNEL | {"beam": mcsim.Beam.gaussian(900.0, lmax=LMAX - 1)}]}),
+        ("moments", {"channel": [CHANNEL | {"scan": mcsim.Moments.parallel_transport(2 * NSIDE)}]}),
+    ],
+)
+def test_messages_name_what_was_given_and_not_its_file_in_the_cache(tmp_path, key, changes) -> None:
+    with refused(key) as refusal:
+        mcsim.write_maps(RUN | {"ensemble": {"realizations": 1}} | changes, tmp_path / "maps", 0)
+    assert "given-" not in str(refusal.value)

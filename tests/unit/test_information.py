@@ -326,7 +326,7 @@ def test_limits_are_written_and_say_what_they_are(tmp_path) -> None:
     written = json.loads((tmp_path / "out" / "limit.json").read_text())
     assert written["effects"][0]["sigma"] == found.effects[0].sigma
     assert written["effects"][0]["similar"]["channel"] == "W1"
-    with xr.open_zarr(tmp_path / "out" / "limit.zarr", consolidated=False) as stored:
+    with xr.open_zarr(tmp_path / "out" / "limit.zarr") as stored:
         np.testing.assert_array_equal(stored.fisher, found.fisher)
     assert (tmp_path / "out" / "limit.png").stat().st_size > 10_000
     assert any(line.startswith("noise_level (V1)") for line in found.lines())

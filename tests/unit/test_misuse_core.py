@@ -370,3 +370,8 @@ def test_pixel_windows(tmp_path):
     ):
         with refused("window.fits"):
             healpix.read_pixel_window(written(bad, nside), LMAX, NSIDE)
+
+
+def test_moments_that_no_memory_holds_are_refused() -> None:
+    with refused("smax", 10**9, NSIDE, "nside", "GB"):
+        scan.Moments.on_grid(MODEL, MapGrid(NSIDE), 10**9)

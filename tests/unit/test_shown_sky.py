@@ -3,7 +3,7 @@
 import healpy
 import numpy as np
 
-from mcsim.comparison.shown_sky import _wiener
+from mcsim.comparison.sky_of_maps import wiener
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 
@@ -40,5 +40,5 @@ def test_the_filter_solves_the_normal_equations_with_weights_of_every_pixel():
     of_l = alm_.degrees(LMAX)
     prior = np.concatenate([power[of_l], power[of_l[alm_.orders(LMAX) > 0]]])
     wanted = np.linalg.solve(synthesis.T @ (weight[:, None] * synthesis) + np.diag(1.0 / prior), synthesis.T @ weighted)
-    found = real(_wiener(weighted, weight, power, 1))
+    found = real(wiener(weighted, weight, power, 1))
     assert np.allclose(found, wanted, atol=1e-5 * np.abs(wanted).max())

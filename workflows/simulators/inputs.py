@@ -1,8 +1,11 @@
 """What every simulator is given: the sky, the beams and the scans of a run, and folders for its maps."""
 
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import wraps
 from pathlib import Path
+from typing import Any
 
 import healpy
 import numpy as np
@@ -21,6 +24,31 @@ Maps = dict[str, Vector]
 
 BLOCK = 1 << 18
 """Samples that are simulated at once."""
+
+CALLS: list[float] = []
+"""Processor time of every call of a method that is :func:`timed`, seconds."""
+
+
+def processor_seconds() -> float:
+    """Return the processor time of this process and of its children that have ended, user and system."""
+    return sum(os.times()[:4])
+
+
+def timed(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a method that adds the processor time of each of its calls to ``CALLS``."""
+
+    @wraps(method)
+    def own(*given: Any, **named: Any) -> Any:
+        start = processor_seconds()
+        found = method(*given, **named)
+        _add(processor_seconds() - start)  # by name: a class of a script is copied with what its methods hold
+        return found
+
+    return own
+
+
+def _add(seconds: float) -> None:
+    CALLS.append(seconds)
 
 
 @dataclass(frozen=True)

@@ -17,20 +17,14 @@ from mcsim.support.compiled import njit
 class ScannedBeam:
     """A beam and the moments of the orientations in which it observed the sky.
 
-    Attributes
-    ----------
-    blm
-        b_lm of the beam at the pole, complex, shape (mmax + 1, lmax + 1), ``blm[m, l]``.
-    w
-        w_{s,LM}, shape (smax + 1, L_max + 1, 2 L_max + 1), as :mod:`mcsim.bipolar.theory.harmonics` makes them.
-
     Raises
     ------
     InputError
         If an array has another shape or is not finite.
     """
 
-    blm: NDArray[np.complex128]
+    blm: NDArray[np.complex128]  #: b_lm of the beam at the pole, complex, shape (mmax + 1, lmax + 1), ``blm[m, l]``
+    #: w_{s,LM}, shape (smax + 1, L_max + 1, 2 L_max + 1), as :mod:`mcsim.bipolar.theory.harmonics` makes them
     w: NDArray[np.complex128]
 
     def __post_init__(self) -> None:
@@ -77,12 +71,8 @@ class ScannedBeam:
 def beam_biposh(beam: ScannedBeam, mode: Indices, lmax: int) -> NDArray[np.complex128]:
     """Return B^{LM}_{l2-d, l2} of a beam under any scan at l2 = 0..lmax, complex, NaN where it does not exist.
 
-    The mode is (L, M, d), with d = l2 - l1 of either sign and any |M| <= L; lmax is the highest l1 and l2.
-
-    Raises
-    ------
-    InputError
-        If |M| or |d| exceeds L.
+    The mode is (L, M, d), with d = l2 - l1 of either sign and any |M| <= L; lmax is the highest l1 and l2. Raise
+    InputError if |M| or |d| exceeds L.
 
     Notes
     -----

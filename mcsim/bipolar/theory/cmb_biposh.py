@@ -33,10 +33,7 @@ def cmb_biposh_leading(
 ) -> NDArray[np.complex128]:
     """Return the mean A^{LM}_{l1 l2} of modes (L, M, d), with |M|, |d| <= L, to leading order.
 
-    Raises
-    ------
-    InputError
-        If a mode cannot exist, or spectrum or beam end below lmax.
+    Raise InputError if a mode cannot exist, or spectrum or beam end below lmax.
 
     Notes
     -----
@@ -76,11 +73,7 @@ def cmb_biposh_exact(
 
     L = 0 gives (-1)^l sqrt(2l+1) C_l with the second order of the beam. Include any power above ``lmax`` in ``cl``: it
     leaks down. The sums over L1, L2 end at the L_max of the moments of the beams; threads share the blocks of ell.
-
-    Raises
-    ------
-    InputError
-        If a mode cannot exist, or spectrum or beam end below lmax.
+    Raise InputError if a mode cannot exist, or spectrum or beam end below lmax.
 
     Notes
     -----

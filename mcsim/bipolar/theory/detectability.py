@@ -94,12 +94,7 @@ def fisher_information(
     ordered pair of maps per unit of the parameter, uK^2, shape (n_map, n_map, n_mode, lmax + 1); the modes (L, M, d)
     have M >= 0 and d >= 0: d < 0 belongs to the exchanged pair, L = 0 is the part of C_l. ``cl_total`` are the total
     spectra and cross-spectra of the maps, uK^2, shape (n_map, n_map, lmax + 1); degrees where this is singular (such as
-    l = 0, 1 without power) are left out.
-
-    Raises
-    ------
-    InputError
-        If f_sky is outside (0, 1], or a mode has M < 0 or d < 0.
+    l = 0, 1 without power) are left out. Raise InputError if f_sky is outside (0, 1], or a mode has M < 0 or d < 0.
 
     Notes
     -----

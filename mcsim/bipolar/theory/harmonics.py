@@ -1,7 +1,7 @@
 """Spin-harmonic coefficients w_{s,LM} of the orientation moments w_s = <e^{-i s psi}>.
 
-Every function returns a complex array of shape (smax + 1, L_max + 1, 2 L_max + 1) with w_{s,LM} at ``[s, L, L_max +
-M]`` and zero where |M| > L or L < s: w_s = sum_LM w_{s,LM} (-s)Y_LM.
+Every function returns a complex array of shape (smax + 1, L_max + 1, 2 L_max + 1) with w_{s,LM} at
+``[s, L, L_max + M]`` and zero where |M| > L or L < s: w_s = sum_LM w_{s,LM} (-s)Y_LM.
 """
 
 import ducc0
@@ -17,12 +17,7 @@ from mcsim.sphere.checks import check_angle, check_finite, check_whole, nside_of
 def orientation_harmonics(w: NDArray[np.complex128], L_max: int, nthreads: int = 1) -> NDArray[np.complex128]:
     """Return w_{s,LM} of moment maps, w_s(n) = <e^{-i s psi}> for s = 1..smax, HEALPix RING, shape (smax, npix).
 
-    The moment w_0 is 1 everywhere.
-
-    Raises
-    ------
-    InputError
-        If a map is not finite or does not have 12 nside^2 pixels.
+    The moment w_0 is 1 everywhere. Raise InputError if a map is not finite or does not have 12 nside^2 pixels.
 
     Notes
     -----

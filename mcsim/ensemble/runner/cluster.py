@@ -37,12 +37,10 @@ for name in set(os.environ) - {variables!r}:
 Workers = int | str | Client
 """Number of local processes, the address of a running scheduler, or a client, which is left open."""
 
-ANSWER_S = 5.0
-"""Time in which the scheduler at an address answers."""
+ANSWER_S = 5.0  #: time in which the scheduler at an address answers
 
 TURN_S = 30.0
-ALONE_S = 300.0
-"""Time that a run waits for a worker if all are lost."""
+ALONE_S = 300.0  #: time that a run waits for a worker if all are lost
 
 _KEPT_MEMORY = {f"MALLOC_{limit}_THRESHOLD_": str(2**28) for limit in ("TRIM", "MMAP")}
 """For glibc, in bytes. A worker makes maps of the same size repeatedly. distributed's default returns their memory to

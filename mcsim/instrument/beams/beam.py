@@ -20,11 +20,8 @@ from mcsim.support.arrays import reals
 from mcsim.support.folders import unwritable, user_path
 from mcsim.support.npy import read_npz
 
-LEAST_NORMALISED = 1e-6
-"""Largest departure of B_0 from 1: that of coefficients in single precision is smaller."""
-
-DEFAULT_LMAX = 2048
-"""Largest degree of a beam where none is asked for."""
+LEAST_NORMALISED = 1e-6  #: largest departure of B_0 from 1: that of coefficients in single precision is smaller
+DEFAULT_LMAX = 2048  #: largest degree of a beam where none is asked for
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,27 +26,15 @@ SMALLEST_CUT_PIXELS = 2
 
 @dataclass(frozen=True, eq=False)
 class BeamMap:
-    """A beam map with what is needed to place it on the sky.
+    """A beam map with what is needed to place it on the sky."""
 
-    Parameters
-    ----------
-    image
-        Response at the pixel centres in any unit; column = beam x (in-scan), row = beam y.
-    pixel_rad
-        Side of a pixel in radians.
-    centre
-        Column and row of the beam's centre, from 0 (fractions allowed; pixel centres are at integers).
-    cut_rad
-        Angle from the centre beyond which the map is not used, radians.
-    projection
-        What a distance rho from the centre in the map is on the sky: theta = rho (``equidistant``), sin theta = rho
-        (``orthographic``: the u, v grids of optics codes), 2 sin(theta/2) = rho (``equal_area``).
-    """
-
-    image: NDArray[np.float64]
-    pixel_rad: float
+    image: NDArray[np.float64]  #: response at the pixel centres in any unit; column = beam x (in-scan), row = beam y
+    pixel_rad: float  #: side of a pixel in radians
+    #: column and row of the beam's centre, from 0 (fractions allowed; pixel centres are at integers)
     centre: tuple[float, float]
-    cut_rad: float
+    cut_rad: float  #: angle from the centre beyond which the map is not used, radians
+    #: what a distance rho from the centre in the map is on the sky: theta = rho (``equidistant``), sin theta = rho
+    #: (``orthographic``: the u, v grids of optics codes), 2 sin(theta/2) = rho (``equal_area``)
     projection: Projection = "equidistant"
 
     def __post_init__(self) -> None:
@@ -98,17 +86,10 @@ def read_map(
 ) -> BeamMap:
     """Read a beam map from the first image of a FITS file.
 
-    Parameters
-    ----------
-    path
-        FITS file (may be gzipped); column = beam x (in-scan), row = beam y.
-    pixel_deg, cut_deg, centre
-        As for :meth:`mcsim.instrument.beams.Beam.from_map`.
-    plane
-        Plane of a three-dimensional image (a WMAP beam file has side A, its noise, side B, its noise).
-    projection
-        See :class:`BeamMap`. Values are those at the pixel centres; of means over the pixels take
-        :meth:`BeamMap.without_pixel_window`.
+    ``path``: FITS file (may be gzipped); column = beam x (in-scan), row = beam y. ``pixel_deg``, ``cut_deg``,
+    ``centre``: as for :meth:`mcsim.instrument.beams.Beam.from_map`. ``plane``: plane of a three-dimensional image (a
+    WMAP beam file has side A, its noise, side B, its noise). ``projection``: see :class:`BeamMap`. Values are those at
+    the pixel centres; of means over the pixels take :meth:`BeamMap.without_pixel_window`.
 
     Notes
     -----

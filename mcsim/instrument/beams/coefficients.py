@@ -6,14 +6,9 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
 
-MMAX_TOLERANCE = 4e-4
-"""Largest fraction of a beam's power that :func:`choose_mmax` leaves beyond m_max."""
-
-LARGEST = 32768
-"""Highest degree that a run may have."""
-
-CIRCULAR_POWER = 1e-20
-"""Fraction of a beam's power below which what is not m = 0 is round-off, and the beam circular."""
+MMAX_TOLERANCE = 4e-4  #: largest fraction of a beam's power that :func:`choose_mmax` leaves beyond m_max
+LARGEST = 32768  #: highest degree that a run may have
+CIRCULAR_POWER = 1e-20  #: fraction of a beam's power below which what is not m = 0 is round-off, and the beam circular
 
 
 def check_lmax(lmax: int) -> None:

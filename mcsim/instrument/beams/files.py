@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.instrument.beams.coefficients import cut, power_by_order, unpacked
 from mcsim.sphere import alm as alm_
-from mcsim.sphere.header import opened
+from mcsim.sphere.header import read_coefficients
 from mcsim.support.arrays import numbers
-from mcsim.support.folders import unreadable, user_path
+from mcsim.support.folders import user_path
 from mcsim.support.npy import read_npy
 
 LEAST_CIRCULAR_POWER = 0.5
@@ -71,12 +71,5 @@ def _of_array(array: NDArray) -> NDArray[np.complex128]:
 def _read(path: Path) -> NDArray[np.complex128]:
     if not path.is_file():
         raise InputError(f"beam coefficients {path} do not exist: give the path of a FITS file of b_lm")
-    # A file with infinities is refused later, by name; joining real and imaginary parts would warn of them.
-    with (
-        unreadable(path, "coefficients", "give FITS with the columns index, real, imaginary"),
-        opened(path) as hdus,
-        np.errstate(invalid="ignore"),
-    ):
-        packed, mmax = healpy.read_alm(hdus, hdu=1, return_mmax=True)
-        lmax = healpy.Alm.getlmax(len(packed), mmax)
-    return unpacked(packed, lmax, mmax)
+    packed, mmax, _ = read_coefficients(path, "beam coefficients")
+    return unpacked(packed, healpy.Alm.getlmax(len(packed), mmax), mmax)

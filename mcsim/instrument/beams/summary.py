@@ -75,16 +75,10 @@ class BeamSummary:
 def summarize(beam: Beam, beam_map: BeamMap | None = None, ells: tuple[int, ...] = DEFAULT_ELLS) -> BeamSummary:
     """Measure a beam.
 
-    Parameters
-    ----------
-    beam
-        The beam.
-    beam_map
-        The map that it comes from; without it the pattern is synthesised from the coefficients, and a beam whose
-        window is not yet small at lmax is then measured broader than it is, with the rings of the cut among its
-        negative response.
-    ells
-        Degrees at which to list the coefficients; those above lmax are left out.
+    ``beam_map``: the map that it comes from; without it the pattern is synthesised from the
+    coefficients, and a beam whose window is not yet small at lmax is then measured broader than it is, with the rings
+    of the cut among its negative response. ``ells``: degrees at which to list the coefficients; those above lmax are
+    left out.
 
     Notes
     -----
@@ -115,7 +109,7 @@ def summarize(beam: Beam, beam_map: BeamMap | None = None, ells: tuple[int, ...]
         fwhm_major_arcmin=2 * major * _ARCMIN,
         fwhm_minor_arcmin=2 * minor * _ARCMIN,
         angle_deg=angle_deg,
-        negative_over_positive=float(-value[value < 0].sum() / value[value > 0].sum()),
+        negative_over_positive=float(abs(value[value < 0].sum()) / value[value > 0].sum()),
         centroid_arcmin=(float(offset.real) * _ARCMIN, -float(offset.imag) * _ARCMIN),
         ells=tuple(ell for ell in ells if ell <= beam.lmax),
     )
@@ -136,7 +130,7 @@ def format_summary(summary: BeamSummary) -> str:
         f"FWHM, major x minor  {summary.fwhm_major_arcmin:.2f} x {summary.fwhm_minor_arcmin:.2f} arcmin",
         f"axis ratio           {summary.axis_ratio:.4f}, {orientation}",
         f"mean offset          ({x:+.3f}, {y:+.3f}) arcmin in (x, y)",
-        f"negative response    {summary.negative_over_positive:.2e} of the positive",
+        f"negative response    {summary.negative_over_positive:.2g} of the positive",
         f"integral             {beam.integral:.6g} (unit of the source x sr), divided out so that B_0 = 1",
         f"lmax, mmax           {beam.lmax}, {beam.mmax}: {beam.neglected_power:.1e} of the power beyond mmax",
     ]
@@ -157,8 +151,7 @@ def format_summary(summary: BeamSummary) -> str:
     return "\n".join(lines)
 
 
-_LISTED_WINDOW = 1e-9
-"""Smallest B_l that is listed: ratios to smaller ones are noise."""
+_LISTED_WINDOW = 1e-9  #: smallest B_l that is listed: ratios to smaller ones are noise
 
 _Response = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 

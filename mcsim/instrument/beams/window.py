@@ -18,8 +18,7 @@ Window = NDArray[np.float64]
 COLUMNS = ("BL", "B_L", "INT_BEAM", "NOMINAL", "TEMPERATURE", "T", "BEAM")
 """Names of columns of B_l, the surest first: LFI's instrument model, Planck's CMB maps, HFI's model and windows."""
 
-LARGEST = 1.05
-"""Of |B_l| over B_0: more is no beam."""
+LARGEST = 1.05  #: of |B_l| over B_0: more is no beam
 
 
 def read_window(

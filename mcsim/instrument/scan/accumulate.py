@@ -12,7 +12,7 @@ from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.model import ScanModel
 from mcsim.instrument.scan.offsets import add_powers, centres, exponents
 from mcsim.instrument.scan.pointing import BLOCK, PointingStream, fill_block, fill_pixels
-from mcsim.sphere.checks import check_whole
+from mcsim.sphere.checks import check_memory, check_whole
 from mcsim.support.compiled import njit
 
 _RANGES = 16
@@ -79,6 +79,7 @@ def pixel_sums(nside: int, smax: int, order: int = 1) -> NDArray[np.float64]:
     The last p are sums of the powers of the offsets of degree 2 to ``order``.
     """
     columns = 4 + 2 * smax + len(exponents(order))
+    check_memory(96.0 * nside**2 * columns, f"smax = {smax} at nside {nside}", "lower smax or nside")
     memory = np.zeros(12 * nside * nside * columns + _CACHE_LINE // 8)
     # At smax 2 each pixel is one cache line, if the first one starts at its boundary.
     offset = (-memory.ctypes.data % _CACHE_LINE) // 8

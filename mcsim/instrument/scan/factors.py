@@ -22,21 +22,13 @@ ELLS = (50, 100, 200, 400)
 
 @dataclass(frozen=True)
 class ScanFactors:
-    """Three answers to how much of the parallel-transport effect of m = 2 a scan leaves.
+    """Three answers to how much of the parallel-transport effect of m = 2 a scan leaves."""
 
-    Attributes
-    ----------
-    quadrupole_ratio
-        L = 2, M = 0 BipoSH of the hit average over that of parallel transport with psi = 0, at every l (leading
-        order, real b_l2): int w_2 sin^2(theta) / int sin^2(theta) over the sphere.
-    sky_mean
-        Mean of Re w_2 over the sky: the factor that a least-squares fit over isotropic skies finds.
-    ell, f_ell
-        The paper's f_l = (2l+1)/2 int (d^l_22)^2 Re w_2 dcos(theta), shape (n,).
-    """
-
+    #: L = 2, M = 0 BipoSH of the hit average over that of parallel transport with psi = 0, at every l (leading order,
+    #: real b_l2): int w_2 sin^2(theta) / int sin^2(theta) over the sphere
     quadrupole_ratio: float
-    sky_mean: float
+    sky_mean: float  #: mean of Re w_2 over the sky: the factor that a least-squares fit over isotropic skies finds
+    #: ell, f_ell: the paper's f_l = (2l+1)/2 int (d^l_22)^2 Re w_2 dcos(theta), shape (n,)
     ell: NDArray[np.int64]
     f_ell: Vector
 

@@ -14,8 +14,7 @@ from mcsim.support import resources
 
 SECONDS_PER_DAY = 86400.0
 
-LONGEST_DAYS = 36525.0
-"""Of a survey: a century."""
+LONGEST_DAYS = 36525.0  #: of a survey: a century
 
 
 @dataclass(frozen=True)

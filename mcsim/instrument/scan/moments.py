@@ -25,8 +25,7 @@ from mcsim.support.code import package_digest
 
 _META = "moments.json"
 _ARRAYS = ("hits", "w", "dtheta", "dphi", "offset_moments")
-_PIXELS = 1 << 18
-"""Whose centroids are computed at once, to save memory."""
+_PIXELS = 1 << 18  #: whose centroids are computed at once, to save memory
 
 
 @dataclass(frozen=True)
@@ -376,7 +375,8 @@ class Moments:
 
     def save(self, folder: str | Path) -> None:
         """Write the arrays as .npy files into ``folder``, which is created."""
-        with folders.unwritable(folder := folders.user_path(folder), "choose another folder"):
+        remedy = "make room there, or choose another folder (MCSIM_CACHE for the cache)"
+        with folders.unwritable(folder := folders.user_path(folder), remedy):
             folder.mkdir(parents=True, exist_ok=True)
             for name, array in self._arrays().items():
                 np.save(folder / f"{name}.npy", array)

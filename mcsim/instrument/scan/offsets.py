@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from mcsim.support.compiled import njit
 
-HIGHEST = 4
-"""Degree of the highest moments."""
+HIGHEST = 4  #: degree of the highest moments
 
 
 def exponents(order: int) -> list[tuple[int, int]]:

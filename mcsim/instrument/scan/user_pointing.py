@@ -22,8 +22,7 @@ from mcsim.support.folders import unreadable, user_path
 
 _ROWS = 1 << 20
 _NAMES = ("theta", "phi", "psi")
-_ENOUGH_ROWS = 10
-"""To tell a column of time from angles."""
+_ENOUGH_ROWS = 10  #: to tell a column of time from angles
 
 
 def sums_of_samples(blocks: Iterable[Sequence[NDArray]], nside: int, smax: int, order: int = 1) -> NDArray[np.float64]:

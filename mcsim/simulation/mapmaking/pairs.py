@@ -20,38 +20,29 @@ from mcsim.support import folders
 from mcsim.support.code import package_digest
 from mcsim.support.compiled import njit
 
-PARTS = 16
-"""Parts of the survey that threads share out; fixed, so that sums do not depend on the number of threads."""
+PARTS = 16  #: parts of the survey that threads share out; fixed, so that sums do not depend on the number of threads
 
 _BAND = 1 << 27
-COUNTED = 1 << 24
-"""Samples that are counted at once."""
+COUNTED = 1 << 24  #: samples that are counted at once
 
 _META = "pairs.json"
 
 
 @dataclass(frozen=True)
 class DifferencingScan:
-    """What map-making needs to know about the pointing of two beams of one sampling rate that are read as a difference.
-
-    Attributes
-    ----------
-    hits_a, hits_b
-        Samples with side A, side B in a pixel, shape (npix,).
-    row_start
-        Pixel i is seen together with the pixels ``partner[row_start[i]:row_start[i + 1]]``; shape (npix + 1,).
-    partner, count
-        Partners of every pixel in increasing order, and how often the two were seen at once with whichever side on
-        whichever pixel: the off-diagonal part of the normal matrix, symmetric, compressed by rows.
-    """
+    """The pointing of two beams of one sampling rate that are read as a difference, as map-making needs it."""
 
     model: ScanModel
     side_a: LineOfSight
     side_b: LineOfSight
     grid: MapGrid
+    #: hits_a, hits_b: samples with side A, side B in a pixel, shape (npix,)
     hits_a: NDArray[np.float64]
     hits_b: NDArray[np.float64]
+    #: pixel i is seen together with the pixels ``partner[row_start[i]:row_start[i + 1]]``; shape (npix + 1,)
     row_start: NDArray[np.int64]
+    #: partner, count: partners of every pixel in increasing order, and how often the two were seen at once with
+    #: whichever side on whichever pixel: the off-diagonal part of the normal matrix, symmetric, compressed by rows
     partner: NDArray[np.int32]
     count: NDArray[np.unsignedinteger]
 

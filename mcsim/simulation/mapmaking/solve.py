@@ -59,12 +59,8 @@ def solve(
     ``rhs`` is P^T d in uK, shape (npix,), as :mod:`mcsim.simulation.mapmaking.rhs` makes it for the same fiducial
     imbalance ``x``, -1 < x < 1; ``start`` is a map to start from (None: zero). The map is ``healpy.UNSEEN`` where no
     sample fell. With x = 0 differences say nothing about the monopole: the mean of the observed pixels is zero then.
-    The result does not depend on the threads, bit for bit.
-
-    Raises
-    ------
-    InputError
-        If x is out of range, or the right-hand side or the start does not fit the scan.
+    The result does not depend on the threads, bit for bit. Raise InputError if x is out of range, or the right-hand
+    side or the start does not fit the scan.
 
     Notes
     -----

@@ -1,0 +1,35 @@
+"""Errors of fitted effects."""
+
+import numpy as np
+import pytest
+
+from mcsim import systematics
+from mcsim.datavector.candidate import Candidate
+from mcsim.diagnosis.assemble import effects_of
+from mcsim.stats.gaussian import Fit
+
+
+@pytest.mark.parametrize("name", ["beam_coma", "beam_ellipticity", "dipole_residual", "calibration"])
+def test_an_amplitude_is_no_more_errors_from_zero_than_chi2_falls(name: str) -> None:
+    rng = np.random.default_rng(1)
+    effect = systematics.get(name)
+    size = len(Candidate(effect, "W1", ()).basis)
+    candidate = Candidate(effect, "W1", tuple(range(size)))
+    mixing = np.eye(size) - 0.3
+    covariance = 1e-6 * mixing @ mixing.T
+    for theta in rng.multivariate_normal(np.zeros(size), covariance, 50):
+        fall = float(theta @ np.linalg.solve(covariance, theta))
+        [found] = effects_of([candidate], [0], Fit(theta, covariance, 1000, fall, 1.0, 0.0, 1, 1.0))
+        assert (found.amplitude / found.sigma) ** 2 <= fall * (1.0 + 1e-9)
+
+
+def test_an_error_where_a_bound_fixes_a_parameter_is_that_along_the_bound() -> None:
+    """Round part and quadrupole of a ring are fitted with strongly correlated errors; |quadrupole| is at most 1."""
+    effect = systematics.get("beam_sidelobe")
+    candidate = Candidate(effect, "W1", (0, 1))
+    unit = effect.parametrization.coordinates(effect(amplitude=1.0, quadrupole=-1.0))
+    covariance = np.diag([1e-5, 1e-6]) ** 2
+    theta = 2e-5 * unit - np.array([1.8e-5, 0.0])  # two errors off: the quadrupole would be -10
+    [found] = effects_of([candidate], [0], Fit(theta, covariance, 1000, 400.0, 1.0, 0.0, 1, 1.0))
+    assert found.parameters["quadrupole"] == -1.0
+    assert found.sigma == pytest.approx(float(unit @ np.linalg.solve(covariance, unit)) ** -0.5, rel=1e-9)
