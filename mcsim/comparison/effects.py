@@ -28,12 +28,15 @@ REDUNDANT = ("calibration", "monopole_residual", "pixelization", "spectrum")
 STAGES = ("sky", "beam", "pointing", "gain", "signal", "spread", "orientations")
 """Where an effect must act to change a map without noise."""
 
+BEAM_STAGES = ("beam", "pointing", "spread", "orientations")
+"""Where an effect acts on how the sky is seen."""
+
 
 class EffectDifference(Difference):
     """An effect of the library, linear in its coordinates.
 
-    The response of one that changes the sky is not larger than that: templates are those of small amplitudes. One that
-    adds a signal of its own is bounded as in a diagnosis.
+    The response of one that acts on beam or pointing is not larger than the sky: templates are those of small
+    amplitudes. Others are bounded as in a diagnosis.
     """
 
     linear = proportional = True
@@ -52,7 +55,8 @@ class EffectDifference(Difference):
         self._bare = {} if bare is None else bare
         self._there: dict[tuple[bytes | float, ...], Maps] = {}
         self._products = np.tensordot(templates, templates, ((1, 2), (1, 2))) / templates[0].size
-        self._largest = float(np.sum((2 * np.arange(run.sky.lmax + 1) + 1) * healpy.alm2cl(sky)) / (4.0 * np.pi))
+        power = healpy.alm2cl(sky)
+        self._largest = float((2 * np.arange(power.size) + 1) @ power) / (4.0 * np.pi)
 
     def starts(self, state: State) -> list[Vector]:
         """Return the coordinates that fit best."""
@@ -61,7 +65,7 @@ class EffectDifference(Difference):
     def within(self, value: Vector) -> Vector:
         """Return the coordinates, or smaller ones in proportion whose response is possible."""
         size = float(value @ self._products @ value) / max(self._largest, 1e-300)
-        if self.kind.signal is not Effect.signal:
+        if not any(getattr(self.kind, stage) is not getattr(Effect, stage) for stage in BEAM_STAGES):
             highest = min([np.inf, *(max(-b.low, b.high) for b in self.kind.bounds if b.parameter == "amplitude")])
             size = (self.amplitude(value) / highest) ** 2
         return value / max(1.0, float(np.sqrt(size)))

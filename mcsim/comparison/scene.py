@@ -110,7 +110,7 @@ class Scene:
     step: float = 0.0
     added: "Callable[[Scene], Maps] | None" = None
     kept: OrderedDict[tuple[bytes, ...], Transforms] = field(default_factory=OrderedDict, repr=False)
-    moved: OrderedDict[tuple[bytes, float], Beam] = field(default_factory=OrderedDict, repr=False)
+    moved: OrderedDict[tuple[bytes, float, int], Beam] = field(default_factory=OrderedDict, repr=False)
     # By identity of a pointing, which is held so that no other one can have it.
     _made: dict[int, tuple[object, Maps]] = field(default_factory=dict, init=False, repr=False)
 
@@ -132,11 +132,12 @@ class Scene:
             way = self.late * self.step
             if self.motion is not None:  # the beam's axes are those of the body, whichever way it spins
                 way = self.late * abs(self.step) * np.sign(self.motion.spin_period_s)
-            key = (beam.blm.tobytes(), way)
+            orders = self.moments[0].smax
+            key = (beam.blm.tobytes(), way, orders)
             if key not in self.moved:
-                _keep(self.moved, key, displaced(beam, 0.0 if way >= 0.0 else np.pi, abs(way)), KEPT_BEAMS)
-            # Moments of another motion may end at a lower order.
-            beam = self.moved[key].truncated(min(self.moved[key].mmax, self.moments[0].smax))
+                moved = displaced(beam, 0.0 if way >= 0.0 else np.pi, abs(way))
+                _keep(self.moved, key, moved.truncated(min(moved.mmax, orders)), KEPT_BEAMS)
+            beam = self.moved[key]
         return beam
 
     @cached_property

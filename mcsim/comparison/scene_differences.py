@@ -190,16 +190,17 @@ class TimeShift(Difference):
         self._largest = np.inf
 
     def within(self, value: Vector) -> Vector:
-        """Return the shift, of at most two widths of the beam: farther on, the sky is another one."""
+        """Return the shift, of at most ten widths of the beam: farther on, the sky is another one altogether."""
         return np.clip(value, -self._largest, self._largest)
 
     def starts(self, state: State) -> list[Vector]:
-        """Return the shift that fits best."""
+        """Return the shift that fits best, of at most two widths of the beam, from where others are looked for."""
         scene, pair = state.scene, state.pair
         if scene is None or pair.channel is None or pair.channel.site.pointing is None:
             return []
         width = np.sqrt(-np.log(max(scene.beam.window[scene.lmax], 1e-12)) * 2.0) / scene.lmax
-        self._largest = largest = 2.0 * width / _radians_per_sample(pair)
+        largest = 2.0 * width / _radians_per_sample(pair)
+        self._largest = 5.0 * largest
         bare, value = scene.maps(), 0.05 * largest
         for _ in range(3):
             moved = self.scene(scene, np.array([value]), pair).maps() - bare

@@ -84,6 +84,18 @@ def test_a_mask_of_side_b_hides_nothing_of_the_sky_of_side_a():
     assert found.channels[0].left < 1e-4
 
 
+@pytest.mark.slow
+def test_two_differences_are_named_beside_holes():
+    """Samples move at the edges of holes: what is hidden there must be as small as the sky that is seen."""
+    simulator = Simulator(small("litebird", period_s=181.0))
+    hole = np.abs(healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2))[2]) < 0.3
+    moved = simulator(psi=lambda psi: psi + np.deg2rad(45.0), centred=True)
+    sides = ([np.where(hole, healpy.UNSEEN, map_) for map_ in side] for side in (simulator(), moved))
+    found = mcsim.compare(*sides, simulator.run)
+    assert sorted(names(found)) == ["pixel_centres", "psi_offset"]
+    assert found.channels[0].left < 0.01
+
+
 @pytest.mark.parametrize("both", [False, True])
 def test_a_side_that_was_made_from_orientation_moments_is_recognised(both, simulator, side_a):
     """What single samples change in such maps is a per cent of the sky, and larger than this width."""

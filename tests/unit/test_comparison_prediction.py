@@ -2,11 +2,15 @@
 
 from types import SimpleNamespace
 
+import healpy
 import numpy as np
 import pytest
 
+import mcsim
+from mcsim.comparison.effects import EffectDifference
 from mcsim.comparison.prediction import Prediction, Set
 from mcsim.comparison.scene_differences import Smoothing, TimeShift
+from mcsim.systematics.registry import catalogue
 
 
 class Slow(Prediction):
@@ -33,3 +37,14 @@ def test_values_are_fitted_until_they_leave_nothing_that_others_could_take_up():
 def test_no_smoothing_makes_the_sky_vanish():
     """Without an end a smoothing explains maps in another unit, which are next to nothing in this one."""
     assert Smoothing().amplitude(Smoothing().within(np.array([1e6]))) == pytest.approx(9.0)
+
+
+def test_no_response_to_an_effect_is_larger_than_the_sky():
+    """Two effects that make nearly the same maps may cancel each other at any amplitude but for this."""
+    run, sky = mcsim.load_config("tiny"), np.zeros(healpy.Alm.getsize(47), complex)
+    sky[2] = np.sqrt(4.0 * np.pi)
+    lag = EffectDifference(catalogue()["time_constant"], np.full((1, 1, 12), 0.5), run, sky)
+    assert lag.within(np.array([1.0])) == pytest.approx(1.0)
+    assert lag.within(np.array([-1e6])) == pytest.approx(-2.0)
+    dipole = EffectDifference(catalogue()["dipole_residual"], np.ones((3, 1, 12)), run, sky)
+    assert np.linalg.norm(dipole.within(np.array([0.0, 3e6, 4e6]))) == pytest.approx(340.0)
