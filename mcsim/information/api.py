@@ -236,6 +236,12 @@ def _candidates(
     for name in (*settings.only, *settings.without):
         systematics.get(name, library)
     named = dict.fromkeys((*settings.only, *(name.partition(":")[0] for name in settings.nuisances)))
+    for name in named:
+        if name in library and library[name].excess is not systematics.Effect.excess:
+            raise InputError(
+                f"{name} adds noise at random to samples, of which the limit knows nothing; ask for noise_level, whose "
+                "response is nearly the same."
+            )
     orders = max(DiagnosisSettings().beam_orders, settings.orders)
     fits = DiagnosisSettings(beam_orders=orders, including=tuple(name for name in named if name in library))
     analysis = analysis_of(run, settings.without, nthreads, fits, library)
