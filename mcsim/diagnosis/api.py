@@ -129,12 +129,12 @@ def diagnose(
     elif table is None:
         diagnosis = replace(diagnosis, warnings=_warnings(analysis))
     if drawn is not None:
-        first = (*drawn.warnings, *diagnosis.warnings)
-        done = replace(diagnosis.settings, controls=wanted)
+        first, done = (*drawn.warnings, *diagnosis.warnings), replace(diagnosis.settings, controls=wanted)
         diagnosis = replace(diagnosis, controls=drawn, warnings=first, settings=done)
     if output is not None:
-        diagnosis.save(output)
-        report.write(diagnosis, output / "report.html")
+        with folders.filling(output):
+            report.write(diagnosis, output / "report.html")
+            diagnosis.save(output)
     return diagnosis
 
 

@@ -366,11 +366,11 @@ class DiagnosisResult:
         """
         target = Path(folder)
         target.mkdir(parents=True, exist_ok=True)
-        (target / "verdict.json").write_text(json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n")
         for one in self.unlisted or ():
             if one.file is not None:
                 (target / f"{one.name}.py").write_text(one.file, encoding="utf-8")
         write_dataset(self.to_dataset(), target / STORE)
+        (target / "verdict.json").write_text(json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n")
 
     @classmethod
     def open(cls, folder: str | Path) -> "DiagnosisResult":

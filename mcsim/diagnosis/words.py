@@ -231,10 +231,9 @@ def summary(result: DiagnosisResult, folder: Path) -> list[str]:
     rows += [("or" if one is not shown[0] else "effect", _numbered(one.effects)) for one in shown]
     rows += [("detected", _numbered(result.partial))] if result.partial else []
     if result.sets:
-        tests = [one for effect in result.effects for one in effect.consistency]
-        least = min((one.pvalue for one in tests), default=1.0)
-        if tests:
-            rows.append(("parts agree", f"{len(tests)} comparisons of amplitudes, the least likely {p_equals(least)}"))
+        if tests := [one.pvalue for effect in result.effects for one in effect.consistency]:
+            least = p_equals(min(tests))
+            rows.append(("parts agree", f"{len(tests)} comparisons of amplitudes, the least likely {least}"))
         rows.append(("held-out data", held_out(result)))
     if result.kind != "none":
         first = result.places[0]

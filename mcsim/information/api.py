@@ -134,8 +134,8 @@ def describe(run: config.RunConfig, settings: LimitSettings) -> str:
     run, settings = _with_declared(run, settings)
     analysis, candidates = _candidates(run, settings, nthreads := os.cpu_count() or 1)
     filtered = inverse_covariance(analysis, settings, nthreads)
-    columns = sum(len(candidate.columns) for candidate in candidates)
-    head = f"{run.name}: {len(candidates)} effects of {columns} components, {len(filtered.maps)} maps"
+    columns, count = sum(len(candidate.columns) for candidate in candidates), len(filtered.maps)
+    head = f"{run.name}: {len(candidates)} effects of {columns} components, {count} map{'s' if count > 1 else ''}"
     if settings.dense:
         size = size_of(filtered, columns)
         return f"{head}\n  memory  {size.bytes / 1e9:.3g} GB for {size.pixels} pixels and {size.modes} modes of the sky"
@@ -236,6 +236,12 @@ def _candidates(
     for name in (*settings.only, *settings.without):
         systematics.get(name, library)
     named = dict.fromkeys((*settings.only, *(name.partition(":")[0] for name in settings.nuisances)))
+    for name in named:
+        if name in library and library[name].excess is not systematics.Effect.excess:
+            raise InputError(
+                f"{name} adds noise at random to samples, of which the limit knows nothing; ask for noise_level, whose "
+                "response is nearly the same."
+            )
     orders = max(DiagnosisSettings().beam_orders, settings.orders)
     fits = DiagnosisSettings(beam_orders=orders, including=tuple(name for name in named if name in library))
     analysis = analysis_of(run, settings.without, nthreads, fits, library)

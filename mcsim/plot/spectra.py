@@ -13,6 +13,9 @@ from mcsim.errors import InputError
 
 _COLOURS = ("#1f5fa8", "#c44e22", "#3c8c3c", "#7b4fa3", "#8c6d1f", "#1f8f94")
 
+SIGNAL, DWARFED = 5.0, 5.0
+"""Errors from zero that make a signal of a point; height of axes, over that of the points, that hides it."""
+
 
 def ensemble_figure(
     path: str | Path,
@@ -76,19 +79,33 @@ def _draw(modes: xr.Dataset, title: str, expected: xr.Dataset | None) -> Figure:
             _spectrum(axes, modes.isel(mode=index), colour, paired)
             if expected is not None:
                 _expected(axes, expected.isel(mode=index), colour, paired)
+        if paired and M == 0:
+            _frame(axes, modes.isel(mode=np.flatnonzero(inside)))
         axes.axhline(0.0, color="0.6", linewidth=0.8, zorder=0)
         axes.set_title(f"L = {L}, M = {M}", fontsize=10)
         quantity = rf"$\ell(\ell+1)\hat{{A}}^{{{L}{M}}}/2\pi$  [$\mu$K$^2$]"
-        axes.set(xlabel=r"multipole $\ell = l_2$", ylabel=quantity)
+        axes.set(xlabel=r"multipole $\ell = \ell_2$", ylabel=quantity)
         axes.legend(fontsize=8, frameon=False)
     notes = [r"$\hat{A}$: Bennett normalisation (odd parity: Hajian-Souradeep, rescaled alike)"]
     if paired:
-        notes += ["points: non-circular minus circular-beam control", "band (M = 0): plain mean and its standard error"]
+        notes += ["points: non-circular minus circular-beam control"]
+        notes += ["band (M = 0, may leave the panel): plain mean and its standard error"]
     if expected is not None:
         notes.append(f"dashed: prediction, {expected.attrs['prediction']}")
     # Some 15 letters of this size fill an inch: longer lines would be cut off at both ends.
     figure.supxlabel(textwrap.fill(";  ".join(notes), round(14 * figure.get_figwidth())), fontsize=9)
     return figure
+
+
+def _frame(axes: Axes, modes: xr.Dataset) -> None:
+    """Let the axes show the points where these differ from zero and the bands would dwarf them."""
+    values = modes["biposh_difference_binned_mean"].values
+    error = modes["biposh_difference_binned_standard_error"].values
+    parts = np.stack([values.real, values.imag])
+    low, high = min(0.0, float(np.nanmin(parts - error))), max(0.0, float(np.nanmax(parts + error)))
+    bottom, top = axes.get_ylim()
+    if np.any(np.abs(values) > SIGNAL * error) and top - bottom > DWARFED * (high - low):
+        axes.set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
 
 
 def _abscissa(one: xr.Dataset) -> np.ndarray:

@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from mcsim.errors import InputError
+from mcsim.errors import InputError, RunError
 
 
 def user_path(given: Any) -> Path:
@@ -46,6 +46,17 @@ def unwritable(name: str | Path, remedy: str) -> Iterator[None]:
         yield
     except OSError as error:
         raise InputError(f"{name} cannot be written ({error.strerror or error}); {remedy}.") from error
+
+
+@contextmanager
+def filling(folder: Path) -> Iterator[None]:
+    """Make a folder for what a command has computed; name it in a RunError where its disk is full or fails."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
+    except OSError as error:
+        why = error.strerror or error
+        raise RunError(f"{folder} cannot be written ({why}); make room there, and run the command again.") from error
 
 
 @contextmanager

@@ -17,6 +17,7 @@ from typing import get_args, get_type_hints
 import numpy as np
 import pytest
 import xarray as xr
+import zarr
 from astropy.io import fits
 from astropy.table import Table
 from matplotlib.figure import Figure
@@ -156,6 +157,16 @@ def test_notes_of_a_wide_and_a_narrow_figure_are_whole(small_store: Path, chosen
     box, whole = figure.get_tightbbox(), figure.bbox_inches
     assert box.x0 >= 0.0
     assert box.x1 <= whole.x1
+
+
+def test_a_signal_is_not_hidden_by_the_mean_field_of_noise(small_store: Path, tmp_path: Path) -> None:
+    shutil.copytree(small_store, tmp_path / "small.zarr")
+    group = zarr.open_group(tmp_path / "small.zarr" / "summary", mode="r+", use_consolidated=False)
+    mean, error = (np.asarray(group[f"biposh_{name}"][...]) for name in ("difference_binned_mean", "binned_mean"))
+    group["biposh_binned_mean"][...] = error + 1000.0 * np.abs(mean).max()
+    [axes] = ensemble_figure(tmp_path / "small.zarr", L=2, M=0).axes
+    points = [line.get_ydata() for line in axes.lines]
+    assert np.ptp(axes.get_ylim()) < 3.0 * np.ptp(np.concatenate([np.asarray(one, float) for one in points]))
 
 
 def test_dry_run_says_the_cost_and_computes_nothing(mcsim: Command, tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from distributed import Client
 from mcsim.ensemble import repair, runner, store
 from mcsim.errors import RunError
 from mcsim.simulation import simulate
+from mcsim.support.folders import filling
 from refusals import refused
 
 from .conftest import table
@@ -43,6 +44,12 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 def remount(place: Path, *options: str) -> bool:
     command = ["mount", "-o", ",".join(("remount", *options)), place]
     return subprocess.run(command, capture_output=True).returncode == 0
+
+
+def test_a_full_disk_of_a_report_is_named(disk: Path) -> None:
+    assert remount(disk, "size=4096")
+    with refused(disk / "out", by=RunError, errno=errno.ENOSPC), filling(disk / "out"):
+        (disk / "out" / "report.html").write_bytes(bytes(100_000))
 
 
 def test_full_disk(small_store: Path, client: Client, disk: Path) -> None:

@@ -22,7 +22,7 @@ def test_amplitude_that_can_be_one_alone_is_its_meaning(amplitude, unit, words) 
 
 def test_sign_that_misleads_is_explained() -> None:
     """A ring of the beam has a negative amplitude, and a negative ring a positive one."""
-    ring = EffectDifference(BeamSidelobe, np.zeros((2, 1, 12)), None, np.zeros(1))
+    ring = EffectDifference(BeamSidelobe, np.zeros((2, 1, 12)), None, np.zeros(1, dtype=complex))
     assert "ring" in ring.said(np.array([-1e-3, 0.0]))
     assert ring.said(np.array([1e-3, 0.0])) == ""
     assert DifferenceResult("one", "W", -1.0, "K", 1.0, {}, "", "cold").words == "one = −1 K (cold)"

@@ -13,7 +13,7 @@ from scipy.linalg import cho_factor, cho_solve
 from typer.testing import CliRunner
 
 import mcsim
-from mcsim import config
+from mcsim import config, systematics
 from mcsim.bipolar import estimate, estimator
 from mcsim.bipolar.theory import fisher_information
 from mcsim.cli import app
@@ -109,6 +109,27 @@ def moments_of(run: config.RunConfig) -> tuple[np.ndarray, np.ndarray]:
 
 def effect(name: str, channel: str | None, amplitude: float, **parameters: Any) -> config.Effect:
     return config.Effect(name=name, channel=channel, parameters={"amplitude": amplitude, **parameters})
+
+
+@pytest.mark.parametrize("name", ["spin_synchronous_offset", "orbital_dipole", "sidelobe_pickup"])
+def test_signals_of_samples_change_the_mean(name: str) -> None:
+    """Two maps of the sky tell what is added to one of them: at least an eighth of what noise alone would allow."""
+    run, settings = model(), mcsim.LimitSettings(only=(name,), dense=True)
+    found = next(one for one in mcsim.limit(run, settings=settings).effects if one.channel == "V1")
+    step = systematics.get(name).step
+    maps = [
+        simulate.maps(survey(with_effects(run, [effect(name, "V1", amplitude)])), 0)[:2] for amplitude in (step, 0.0)
+    ]
+    noise = np.array([m.noise_uk for m in survey(run).channels[0].maps])
+    seen = np.array([m.weight > 0 for m in survey(run).channels[0].maps])
+    best = np.sqrt(np.sum(((maps[0] - maps[1])[seen] / step / noise[seen]) ** 2))
+    assert 1.0 / best < found.sigma * np.sqrt(2.0)
+    assert found.sigma < 8.0 / best
+
+
+def test_noise_that_hits_samples_at_random_has_no_limit() -> None:
+    with refused("excess_noise", "noise_level"):
+        mcsim.limit(model(), settings=mcsim.LimitSettings(only=("excess_noise",)))
 
 
 @pytest.mark.slow

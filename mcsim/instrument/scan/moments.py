@@ -375,7 +375,8 @@ class Moments:
 
     def save(self, folder: str | Path) -> None:
         """Write the arrays as .npy files into ``folder``, which is created."""
-        with folders.unwritable(folder := folders.user_path(folder), "choose another folder"):
+        remedy = "make room there, or choose another folder (MCSIM_CACHE for the cache)"
+        with folders.unwritable(folder := folders.user_path(folder), remedy):
             folder.mkdir(parents=True, exist_ok=True)
             for name, array in self._arrays().items():
                 np.save(folder / f"{name}.npy", array)

@@ -4,6 +4,7 @@ python names.py maps [CASES]       systematics that no library has, added to sim
 python names.py true [NUMBER]      one effect of the library, added to data vectors: how often is it named alone?
 python names.py further [NUMBER]   beside a strong effect: how often is another one found that is not there?
 python names.py bent [CASES]       an ellipticity whose response bends, in simulated maps: pulls of its amplitudes
+python names.py noisy [CASES]      20 to 100 % more noise in one channel, in simulated maps: is that named?
 python names.py draws [NUMBER]     effects of the library, added to data vectors of simulations
 python names.py several [NUMBER]   one to five effects of the library at once, added to data vectors
 python names.py pairs [CASES]      two effects of the library at once, in simulated maps
@@ -382,6 +383,22 @@ def bent(number):
     print("mean", np.mean(found, axis=0).round(2), "width", np.std(found, axis=0, ddof=1).round(2))
 
 
+def noisy(number):
+    """Diagnose maps with more noise in one channel; print how often that is named, pulls, and p-values of the rest."""
+    run, context = learned(SMALL)
+    for amplitude in (0.2, 0.5, 1.0):
+        table = config.Effect(name="noise_level", channel="W1", parameters={"amplitude": amplitude})
+        shared, found = survey(with_effects(seeded(run, 6000), [table])), []
+        for case in range(number):
+            verdict = diagnose_data(ObservedMaps(context, list(simulate.maps(shared, case)), ask), f"noisy-{case}")
+            if verdict.kind == "effect" and verdict.effects[0].name == "noise_level":
+                one = verdict.sets[0]
+                found.append((one.pvalue, (one.coordinates[0] - amplitude) / one.errors[0]))
+        p, pulls = np.array(found).reshape(-1, 2).T
+        print(f"{amplitude}: {len(found)} of {number} are named; p-values of the rest {np.sort(p).round(3).tolist()}")
+        print(f"    pulls {np.mean(pulls):.2f} in the mean, rms {np.sqrt(np.mean(pulls**2)):.2f}", flush=True)
+
+
 def pairs(number):
     """Diagnose maps with two effects, each at S/N 5 to 20, and print how often both are named."""
     from mcsim.benchmark.case import Prior
@@ -465,5 +482,5 @@ def null(number):
 
 if __name__ == "__main__":
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    commands = (maps, true, further, bent, draws, pairs, several, null)
+    commands = (maps, true, further, bent, noisy, draws, pairs, several, null)
     {one.__name__: one for one in commands}[sys.argv[1]](int(sys.argv[2]) if len(sys.argv) > 2 else 42)
