@@ -74,8 +74,7 @@ class Refiner:
         response is kept, of any other one by how much it scatters the data. Where the power of an effect counts,
         which grows as the square of the amplitude, the secant at a_0 finds a^2/a_0 for a: the mean of this and a_0 is
         Newton's step. With the scatter that it has at the amplitude of a set, a stochastic one may not suffice though
-        it is all: it is tried at the amplitude that it has alone, too. No set is named by linear templates alone: they
-        may fit where the responses of its members do not.
+        it is all: it is tried at the amplitude that it has alone, too. Members of the best sets are always simulated.
         """
         now = _Responses(t, t.copy(), list(candidates))
         found = self._attribute(now.t, now.candidates)
@@ -92,17 +91,14 @@ class Refiner:
             if (index,) in [one.members for one in own.explanations]:
                 now, found = alone, own
                 break
-        t, tried = now.t, now.candidates
-        detected = None
-        if found.verdict == "unknown":
-            detected = self.detected_in(t, tried)
-            if detected is not None and len(detected.members) <= self.context.settings.max_effects:
-                done = {member: now.done.get(member) for member in detected.members}
-                now = _Responses(now.linear, detected.templates.copy(), [*tried], done)
-                together = self._completed(now, self._attribute(now.t, tried))
-                if together.explanations:
-                    t, tried, found, detected = now.t, now.candidates, together, None
-        return Refined(found, t, tuple(tried), detected)
+        detected = self.detected_in(now.t, now.candidates) if found.verdict == "unknown" else None
+        if detected is not None and len(detected.members) <= self.context.settings.max_effects:
+            done = {member: now.done.get(member) for member in detected.members}
+            beside = _Responses(now.linear, detected.templates.copy(), [*now.candidates], done)
+            together = self._completed(beside, self._attribute(beside.t, beside.candidates))
+            if together.explanations:
+                now, found, detected = beside, together, None
+        return Refined(found, now.t, tuple(now.candidates), detected)
 
     def _completed(self, now: "_Responses", found: Attribution) -> Attribution:
         """Return the attribution once each member of its best sets has been simulated, at the fitted amplitude."""
