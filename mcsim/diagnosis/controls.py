@@ -134,31 +134,20 @@ def _refined(run: config.RunConfig, finer: int, lmax: int) -> config.RunConfig:
         return replace(noise, sigma0_uk=finer * noise.sigma0_uk) if isinstance(noise, config.Noise) else noise
 
     channels = tuple(
-        replace(
-            spec,
-            noise=noisier(spec.noise),
-            split_noise={split: noisier(noise) for split, noise in spec.split_noise.items()},
-        )
+        replace(spec, noise=noisier(spec.noise), split_noise={k: noisier(one) for k, one in spec.split_noise.items()})
         for spec in run.channels
     )
-    return replace(
-        run,
-        sky=replace(run.sky, lmax=lmax),
-        map=replace(run.map, nside=finer * run.map.resolution),
-        channels=channels,
-        biposh=replace(run.biposh, lmax=config.analysis_lmax(run)),
-    )
+    sky, biposh = replace(run.sky, lmax=lmax), replace(run.biposh, lmax=config.analysis_lmax(run))
+    pixels = replace(run.map, nside=finer * run.map.resolution)
+    return replace(run, sky=sky, map=pixels, channels=channels, biposh=biposh)
 
 
 def draw(run: str, library: Kinds, sample_by_sample: bool, realization: int, folder: str) -> None:
     """Draw the maps of a control into a folder that appears complete or not at all; the task of a worker."""
     with folders.appearing(Path(folder)) as scratch:
         shared = _survey(run, library).at(realization)
-        if sample_by_sample:
-            maps = np.stack([map_uk for _, map_uk in sampled.maps(shared, realization)])
-        else:
-            maps = simulate.maps(shared, realization)
-        np.save(scratch / "maps.npy", maps)
+        dense = [map_uk for _, map_uk in sampled.maps(shared, realization)] if sample_by_sample else None
+        np.save(scratch / "maps.npy", simulate.maps(shared, realization) if dense is None else np.stack(dense))
 
 
 @lru_cache(maxsize=1)

@@ -50,7 +50,7 @@ class _Responses:
     linear: Matrix
     t: Matrix
     candidates: list[Candidate]
-    done: dict[int, Vector] = field(default_factory=dict)
+    done: dict[int, Vector | None] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Refiner:
         response is kept, of any other one by how much it scatters the data. Where the power of an effect counts,
         which grows as the square of the amplitude, the secant at a_0 finds a^2/a_0 for a: the mean of this and a_0 is
         Newton's step. With the scatter that it has at the amplitude of a set, a stochastic one may not suffice though
-        it is all: it is tried at the amplitude that it has alone, too.
+        it is all: it is tried at the amplitude that it has alone, too. Members of the best sets are always simulated.
         """
         now = _Responses(t, t.copy(), list(candidates))
         found = self._attribute(now.t, now.candidates)
@@ -83,6 +83,7 @@ class Refiner:
             if not any(changed):
                 break
             found = self._attribute(now.t, now.candidates)
+        found = self._completed(now, found)
         scattered = [i for i, one in enumerate(now.candidates) if one.scatter is not None]
         for index in scattered if all(len(one.members) > 1 for one in found.explanations) else []:
             alone = self._alone(now, t, index)
@@ -90,15 +91,25 @@ class Refiner:
             if (index,) in [one.members for one in own.explanations]:
                 now, found = alone, own
                 break
-        t, tried = now.t, now.candidates
-        detected = None
-        if found.verdict == "unknown":
-            detected = self.detected_in(t, tried)
-            if detected is not None and len(detected.members) <= self.context.settings.max_effects:
-                together = self._attribute(detected.templates, tried)
-                if together.explanations:
-                    t, found, detected = detected.templates, together, None
-        return Refined(found, t, tuple(tried), detected)
+        detected = self.detected_in(now.t, now.candidates) if found.verdict == "unknown" else None
+        if detected is not None and len(detected.members) <= self.context.settings.max_effects:
+            done = {member: now.done.get(member) for member in detected.members}
+            beside = _Responses(now.linear, detected.templates.copy(), [*now.candidates], done)
+            together = self._completed(beside, self._attribute(beside.t, beside.candidates))
+            if together.explanations:
+                now, found, detected = beside, together, None
+        return Refined(found, now.t, tuple(now.candidates), detected)
+
+    def _completed(self, now: "_Responses", found: Attribution) -> Attribution:
+        """Return the attribution once each member of its best sets has been simulated, at the fitted amplitude."""
+        while best := found.explanations[:2]:
+            parts = [part for one in best for part in parts_of(now.candidates, one.members, one.fit)]
+            untried = {part[0]: part for part in parts if part[0] not in now.done}
+            changed = [self._simulate(now, *part) for part in untried.values()]
+            if not any(changed):
+                break
+            found = self._attribute(now.t, now.candidates)
+        return found
 
     def _simulate(self, now: "_Responses", index: int, coordinates: Vector, covariance: Matrix) -> bool:
         """Simulate a candidate at fitted coordinates, and return True, unless it has been there."""

@@ -113,6 +113,19 @@ def test_effects_that_change_each_other_are_simulated_together():
     assert found.explanations[0].fit.amplitudes == pytest.approx([12.0, 14.0], abs=0.5)
 
 
+@pytest.mark.parametrize(
+    ("cross", "last"), [(0.0, {"B"}), (0.06, {"C"})], ids=["at the end", "beside what is detected"]
+)
+def test_no_set_is_named_before_each_member_is_simulated(monkeypatch, cross, last):
+    instrument, detected_in = Instrument(bend=0.0, cross=cross), Refiner.detected_in
+    x = instrument.response(12.0, 14.0) + (8.0 * instrument.t[:, 2] if cross else 0.0)
+    monkeypatch.setattr(Refiner, "_to_try", lambda *_: [])
+    monkeypatch.setattr(Refiner, "detected_in", lambda *own: replace(detected_in(*own), members=(0, 1)))
+    found = instrument.refined(x).attribution
+    assert found.explanations[0].members == ((0, 1, 2) if cross else (0, 1))
+    assert instrument.analysis[-1].keys() == last
+
+
 def test_what_is_none_of_the_library_stays_unknown_beside_two_that_are():
     instrument = Instrument(bend=0.0, cross=0.0)
     x = instrument.response(12.0, 14.0) + 10.0 * instrument.sideways[1]
