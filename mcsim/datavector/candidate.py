@@ -226,8 +226,12 @@ def tables_beside(
 
     A step is the error of the amplitude, back from what would be impossible. ``bend`` are white departures of the
     templates from linear ones, shape (p, K). None is yielded for the amplitudes of a member whose response departs by
-    at most ``least``.
+    at most ``least``, and for one that its effect cannot follow alone: the four of a coma have two parameters.
     """
+
+    def place(fit: Fit) -> Vector:
+        return coordinates_of(candidates, members, effects_at(candidates, members, fit))
+
     first = 0
     for member in members:
         own = range(first, first := first + len(candidates[member].columns))
@@ -236,7 +240,11 @@ def tables_beside(
             ahead, back = (replace(found, amplitudes=found.amplitudes + sign * error) for sign in (1.0, -1.0))
             inside = beyond(candidates, members, ahead) == 0.0
             step = float(error.sum()) if inside else -float(error.sum())
-            yield step, None if straight else tables_at(candidates, members, ahead if inside else back)
+            moved = ahead if inside else back
+            follows = not straight and np.allclose(
+                place(moved) - place(found), moved.amplitudes - found.amplitudes, 0.0, 1e-3 * abs(step)
+            )
+            yield step, tables_at(candidates, members, moved) if follows else None
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mcsim import systematics
-from mcsim.datavector.candidate import Candidate
+from mcsim.datavector.candidate import Candidate, tables_beside
 from mcsim.diagnosis.assemble import effects_of
 from mcsim.stats.gaussian import Fit
 
@@ -33,3 +33,15 @@ def test_an_error_where_a_bound_fixes_a_parameter_is_that_along_the_bound() -> N
     [found] = effects_of([candidate], [0], Fit(theta, covariance, 1000, 400.0, 1.0, 0.0, 1, 1.0))
     assert found.parameters["quadrupole"] == -1.0
     assert found.sigma == pytest.approx(float(unit @ np.linalg.solve(covariance, unit)) ** -0.5, rel=1e-9)
+
+
+@pytest.mark.parametrize(("name", "followed"), [("beam_coma", False), ("beam_ellipticity", True)])
+def test_no_slope_is_taken_along_an_amplitude_that_the_effect_cannot_follow(name: str, followed: bool) -> None:
+    """The four amplitudes of a coma have two parameters: slopes along each would make a singular matrix."""
+    effect = systematics.get(name)
+    size = len(Candidate(effect, "W1", ()).basis)
+    candidate = Candidate(effect, "W1", tuple(range(size)))
+    theta = effect.parametrization.coordinates(effect(amplitude=0.02, angle_deg=20.0))
+    found = Fit(theta, 1e-6 * np.eye(size), 1000, 400.0, 1.0, 0.0, 1, 1.0)
+    tables = [table for _, table in tables_beside([candidate], [0], found, np.full((1, size), 1e9), 0.3)]
+    assert [table is not None for table in tables] == size * [followed]

@@ -58,8 +58,8 @@ def test_an_amplitude_at_the_edge_of_the_possible_has_an_error():
     less_than_nothing = SimpleNamespace(amplitudes=np.array([-1.1, 0, 0, 0, 0, 0]), covariance=np.diag(errors**2))
     (found,) = effects_of([Candidate(kind, None, tuple(range(6)))], (0,), less_than_nothing)
     assert found.amplitude == pytest.approx(0.99)
-    # One error up is -0.9.
-    assert found.sigma == pytest.approx((0.99 - 0.9) / 2.0, rel=1e-3)
+    # That of the fit: the data are 5.5 errors from none, whatever is possible.
+    assert found.sigma == pytest.approx(0.2, rel=1e-3)
 
 
 def test_what_data_do_not_tell_is_no_part_of_an_error():
