@@ -146,8 +146,8 @@ def draw(run: str, library: Kinds, sample_by_sample: bool, realization: int, fol
     """Draw the maps of a control into a folder that appears complete or not at all; the task of a worker."""
     with folders.appearing(Path(folder)) as scratch:
         shared = _survey(run, library).at(realization)
-        dense = [map_uk for _, map_uk in sampled.maps(shared, realization)] if sample_by_sample else None
-        np.save(scratch / "maps.npy", simulate.maps(shared, realization) if dense is None else np.stack(dense))
+        every = sampled.maps(shared, realization) if sample_by_sample else enumerate(simulate.maps(shared, realization))
+        np.save(scratch / "maps.npy", np.stack([map_uk for _, map_uk in every]))
 
 
 @lru_cache(maxsize=1)

@@ -111,7 +111,8 @@ def status(result: DiagnosisResult) -> str:
 
 def _unnoticed(result: DiagnosisResult) -> Place | None:
     """Return the group of numbers that departs most, if it does and the global test finds nothing."""
-    return result.places[0] if result.kind == "none" and result.places[0].p <= result.settings.place_pvalue else None
+    first = next(iter(result.places), None) if result.kind == "none" else None
+    return first if first and first.p <= result.settings.place_pvalue else None
 
 
 def agreement(found: Agreement) -> str:
