@@ -96,6 +96,7 @@ class FilteredMaps:
     # split_beam_orders the channel's sum stands in its first map.
     orders: NDArray[np.complex128]
     difference: NDArray[np.float64]  # u^2 - 1 of every pixel, (channel, npix): _normalised_difference
+    squares: NDArray[np.float64]  # N_i r_i^2 summed over maps, (channel, npix): _squares
 
 
 def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
@@ -181,8 +182,10 @@ def wiener_filter(model: Model, maps: Sequence[Map]) -> FilteredMaps:
             # ducc0's sign: S_s is minus the synthesis of E = Re(k b) a, B = Im(k b) a.
             both = by_degree(looked_at, electric, lmax) + 1j * by_degree(looked_at, magnetic, lmax)
             orders[i, s] = -2.0 * window * k * both
-    difference = np.stack([_normalised_difference(model, residual, model.of(c)) for c in range(len(model.channels))])
-    return FilteredMaps(sky, expected, residual, adjoint, orders, difference)
+    groups = [model.of(channel) for channel in range(len(model.channels))]
+    difference = np.stack([_normalised_difference(model, residual, alike) for alike in groups])
+    squares = np.stack([_squares(model, residual, alike) for alike in groups])
+    return FilteredMaps(sky, expected, residual, adjoint, orders, difference, squares)
 
 
 def _normalised_difference(model: Model, residual: NDArray[np.float64], parts: tuple[int, ...]) -> Map:
@@ -200,6 +203,20 @@ def _normalised_difference(model: Model, residual: NDArray[np.float64], parts: t
         seen &= second != 0.0
         square, scale = (first * b - second * a) ** 2, a * b * (a + b)
     return np.divide(square, scale, out=np.zeros_like(square), where=seen) - seen
+
+
+def _squares(model: Model, residual: NDArray[np.float64], parts: tuple[int, ...]) -> Map:
+    """Return N_i r_i^2 of every pixel, summed over maps: twice the derivative of ln L in ln N, but for a constant.
+
+    All modes take part that know of the noise: those of the difference of splits, and those of their sum that the sky
+    does not fill. A pixel that the data lack counts like the map's mean.
+    """
+    total = np.zeros(residual.shape[1])
+    for i in parts:
+        precision, seen = model.parts[i].precision, residual[i] != 0.0
+        square = divided(residual[i] ** 2, precision)
+        total += np.where(seen, square, square.sum() / max(np.count_nonzero(seen), 1) * (precision > 0.0))
+    return total
 
 
 def shared_sky(model: Model, maps: Sequence[Map]) -> Alm:
