@@ -149,9 +149,11 @@ class Problem(Prediction):
         """Return sets with the best one first, the first ones of those that are given measured sample by sample."""
         ranked = list(sets)
         worth = WORTH if self.pair.doubt is None else WORTH_IN_NOISE
-        for index, one in enumerate(ranked[:most]):
+        # Beside noise those that are measured already say what others are worth.
+        known = [one for one in ranked if self.pair.doubt is not None and one.key in self._exact]
+        for one in (*known, *(other for other in ranked[:most] if other not in known)):
             if one.left < worth:
-                ranked[index] = measured = self.corrected(one)
+                ranked[ranked.index(one)] = measured = self.corrected(one)
                 if self.complete(measured):
                     worth = 1.0 - EXPLAINED
                 elif self.unexplained(measured) == 0.0:
@@ -162,8 +164,11 @@ class Problem(Prediction):
     def _bases(self, found: Sequence[Set], library: Sequence[Difference]) -> list[tuple[Set, Sequence[Difference]]]:
         """Return the sets from which larger ones are built, with what is tried beside them.
 
-        They are the best, those that do best in pairs, exchanges, and turns beside other turns.
+        They are the best, those that do best in pairs, exchanges, and turns beside other turns; beside noise that hides
+        all that the best one leaves, that one alone.
         """
+        if self.pair.doubt is not None and self.suffices(found[0]) and self.unexplained(found[0]) == 0.0:
+            return [(self.preferred(found)[0], library)]
         bases = [one for one in found[:KEPT] if one.explains > LARGE]
         if len(found[0].members) > 1:
             return [(one, library) for one in bases]
