@@ -43,13 +43,7 @@ class EffectDifference(Difference):
     natural = 1e-9
     stage = 1
 
-    def __init__(
-        self,
-        kind: type[Effect],
-        templates: Maps,
-        run: config.RunConfig,
-        sky: Alm,
-    ) -> None:
+    def __init__(self, kind: type[Effect], templates: Maps, run: config.RunConfig, sky: Alm) -> None:
         self.kind, self.templates, self.run, self.sky = kind, templates, run, sky
         self._there: dict[tuple[bytes | float, ...], Maps] = {}
         self._products = np.tensordot(templates, templates, ((1, 2), (1, 2))) / templates[0].size

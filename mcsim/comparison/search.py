@@ -305,6 +305,15 @@ class Problem(Prediction):
                     found.append(Set(members, self.left(members, one.correction), one.correction))
         return sorted(found, key=lambda one: one.left)
 
+    def pruned(self, found: Set) -> Set:
+        """Return a set without members that add nothing to the others, which may have come before these."""
+        for index in range(len(found.members) if len(found.members) > 2 else 0):
+            rest = (*found.members[:index], *found.members[index + 1 :])
+            fewer = self.fitted(Set(rest, 1.0, found.correction))
+            if self.suffices(fewer) and not self.adds(found, fewer):
+                return self.pruned(self.corrected(fewer))
+        return found
+
     def preferred(self, sets: Sequence[Set]) -> list[Set]:
         """Return sets with the best first; of those that are as good, the one with the fewest fitted values.
 
@@ -324,7 +333,7 @@ class Problem(Prediction):
         found = {sets[0].names: sets[0]}
         for one in sets[1:]:
             most = max(limit, UNFITTED * sets[0].left) if one.fitted < sets[0].fitted else limit
-            if one.left <= most and self.suffices(one):
+            if one.left <= most and self.suffices(one) and not one.names > sets[0].names:
                 found.setdefault(one.names, one)
         return list(found.values())[1:]
 
@@ -335,7 +344,7 @@ def _in_turn(sets: Sequence[Sequence[Set]], most: int) -> list[Set]:
     Moments alone do not say which of two bases is the better one.
     """
     ranked = zip_longest(*(sorted(own, key=lambda one: one.left) for own in sets))
-    found: dict[frozenset[str], Set] = {}
+    found: dict[frozenset[tuple[str, bytes]], Set] = {}
     for one in (one for each in ranked for one in each if one is not None):
-        found.setdefault(one.names, one)
+        found.setdefault(one.kind, one)
     return list(found.values())[:most]

@@ -58,7 +58,7 @@ def with_fewer_orders(pair: ChannelPair) -> tuple[ChannelPair, ChannelPair | Non
     beam, limit = scene.beam.truncated(pair.orders), SHARP**2 * _sky(pair)
     cut = replace(pair, scene=replace(scene, beam=beam))
     cut = cut.with_sky_of_maps() if pair.sky_of_maps else cut
-    found = [_by_moments(one) for one in (pair, cut)]
+    found = [(_left(one, one.scene.maps()), one) for one in (pair, cut) if one.scene is not None]
     if min(left for left, _ in found) > limit:
         both = zip(found, _by_samples(pair, cut), strict=True)
         found = [moments if moments[0] < MADE * samples[0] else samples for moments, samples in both]
@@ -73,12 +73,6 @@ def adds_orders(cut: ChannelPair, pair: ChannelPair) -> bool:
     more = (replace(cut.scene, beam=pair.scene.beam).maps() - cut.scene.maps())[pair.seen]
     rest = (cut.b - cut.a)[pair.seen]
     return float(more @ rest) ** 2 > MADE * float(more @ more) * float(rest @ rest)
-
-
-def _by_moments(pair: ChannelPair) -> tuple[float, ChannelPair]:
-    """Return the squares that orientation moments leave of side A, and the pair."""
-    assert pair.scene is not None
-    return _left(pair, pair.scene.maps()), pair
 
 
 def _by_samples(pair: ChannelPair, cut: ChannelPair) -> list[tuple[float, ChannelPair]]:
@@ -108,9 +102,7 @@ def _by_samples(pair: ChannelPair, cut: ChannelPair) -> list[tuple[float, Channe
 def _missing(pair: ChannelPair) -> Maps:
     """Return what its simulation by single samples leaves of side A, 0 where that shows nothing."""
     assert pair.scene is not None
-    if pair.unmade is not None:
-        return pair.unmade
-    return np.where(pair.shown, pair.a - _made(pair, pair.scene), 0.0)
+    return np.where(pair.shown, pair.a - _made(pair, pair.scene), 0.0) if pair.unmade is None else pair.unmade
 
 
 def _corrected(pair: ChannelPair, missing: Maps) -> tuple[float, ChannelPair]:
