@@ -106,15 +106,21 @@ class EffectDifference(Difference):
         assert pair.scene is not None
         assert pointing is not None
         sky: Any = scene.sky_of_samples(pair.scene.window)  # an array stands for a file
-        _, acting = self._runs(self._effect(value), scene, pair, scene.beam)
-        acting = replace(acting, sky=replace(acting.sky, spectrum=None, map=None, alm=sky))
+
+        def made(run: config.RunConfig) -> Maps:
+            run = replace(run, sky=replace(run.sky, spectrum=None, map=None, alm=sky))
+            whole = _with_samples_of(scene, _survey(run, scene))
+            return np.stack([m for _, m in sampled.maps(whole, 0, scene.nthreads, EPSILON)])
+
+        alone, acting = self._runs(self._effect(value), scene, pair, scene.beam)
         try:
-            whole = _with_samples_of(scene, _survey(acting, scene))
-            made = np.stack([m for _, m in sampled.maps(whole, 0, scene.nthreads, EPSILON)])
+            more = made(acting)
         except InputError:
             return None
+        if alone.sky.dipole_uk:  # which a scene has not, and late samples see elsewhere
+            return more - made(alone)
         bare = scene if scene.added is None else replace(scene, added=None)
-        return made - bare.sampled(pointing, pair.scene.window)
+        return more - bare.sampled(pointing, pair.scene.window)
 
     def _sky(self, scene: Scene, pair: ChannelPair) -> Alm:
         """Return the sky of a scene, with what its pixel window has more than the samples' spread makes."""

@@ -91,7 +91,6 @@ class ChannelPair:
     channel: Channel | None = None
     hits: Maps | None = None
     sky_of_maps: bool = False
-
     files: PointingFiles | None = None
     doubt: Alm | None = None
     spread: Maps | None = None
