@@ -200,7 +200,7 @@ def test_stored_maps_are_named_in_a_configuration(tmp_path, name):
 
 
 def test_late_samples_add_no_dipole_to_an_effect():
-    """A response to an ellipse has 0.1 uK of a dipole; late samples see 770 uK of it elsewhere, which is no response."""
+    """A response to an ellipse has 0.1 uK of a dipole, and not the 770 uK by which late samples see it elsewhere."""
     made, dipole = [], {"dipole_uk": 3000.0, "dipole_lon_deg": 264.0, "dipole_lat_deg": 48.0}
     for sky in (SMALL["sky"], SMALL["sky"] | dipole):
         simulator = Simulator(small(sky=sky))
