@@ -180,6 +180,8 @@ def diagnose(
     dry_run: Annotated[bool, Option("--dry-run", help="Read DATA; say what it takes; simulate none.")] = False,
 ) -> None:
     """Test maps against a model, and find the effect that the model lacks: where, how large, and if adding it helps."""
+    # Threads that share small matrices wait for each other, while workers want their cores.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from mcsim import config
     from mcsim.datavector.settings import DiagnosisSettings
     from mcsim.diagnosis.api import describe
