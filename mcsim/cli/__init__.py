@@ -28,6 +28,7 @@ from mcsim.cli.common import (
     save,
 )
 from mcsim.errors import InputError, RunError
+from mcsim.support.loading import loaded
 
 app = typer.Typer(
     name="mcsim",
@@ -180,6 +181,9 @@ def diagnose(
     dry_run: Annotated[bool, Option("--dry-run", help="Read DATA; say what it takes; simulate none.")] = False,
 ) -> None:
     """Test maps against a model, and find the effect that the model lacks: where, how large, and if adding it helps."""
+    # Threads that share small matrices wait for each other, while workers want their cores.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    loaded("mcsim.diagnosis.api")
     from mcsim import config
     from mcsim.datavector.settings import DiagnosisSettings
     from mcsim.diagnosis.api import describe

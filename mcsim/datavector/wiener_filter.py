@@ -29,6 +29,7 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
 from mcsim.support.arrays import Alm, Cl, Map, divided
+from mcsim.support.compiled import njit
 
 
 @dataclass(frozen=True)
@@ -175,9 +176,7 @@ def wiener_filter(model: Model, maps: Sequence[Map]) -> FilteredMaps:
             adjoint[i] = healpix.adjoint(residual[i], lmax)
             orders[i, 0] = window * k * by_degree(looked_at, adjoint[i], lmax)
         for i, s, together in _transforms(model, members):
-            turned = np.zeros((2, residual.shape[1]))
-            for j in together:
-                convolve.turned(residual[j], model.parts[j].moments, s, turned)
+            turned = convolve.turned([(residual[j], model.parts[j].moments) for j in together], s)
             electric, magnetic = healpix.adjoint(turned, lmax, spin=s)
             # ducc0's sign: S_s is minus the synthesis of E = Re(k b) a, B = Im(k b) a.
             both = by_degree(looked_at, electric, lmax) + 1j * by_degree(looked_at, magnetic, lmax)
@@ -195,14 +194,21 @@ def _normalised_difference(model: Model, residual: NDArray[np.float64], parts: t
     """
     # Residuals are zero where nothing was seen, and come times their precision: (r/a - s/b)^2 / (1/a + 1/b).
     first, a = residual[parts[0]], model.parts[parts[0]].precision
-    seen = first != 0.0
     if len(parts) == 1:
-        square, scale = first**2, a
-    else:
-        second, b = residual[parts[1]], model.parts[parts[1]].precision
-        seen &= second != 0.0
-        square, scale = (first * b - second * a) ** 2, a * b * (a + b)
-    return np.divide(square, scale, out=np.zeros_like(square), where=seen) - seen
+        seen = first != 0.0
+        return np.asarray(divided(first**2, np.where(seen, a, 0.0)) - seen)
+    found = np.zeros_like(first)
+    _difference(first, a, residual[parts[1]], model.parts[parts[1]].precision, found)
+    return found
+
+
+@njit(nogil=True)
+def _difference(first, a, second, b, found):  # type: ignore[no-untyped-def]
+    """Fill ``found`` where both are seen, in one pass over memory."""
+    for pixel in range(found.size):
+        if first[pixel] != 0.0 and second[pixel] != 0.0:
+            square = (first[pixel] * b[pixel] - second[pixel] * a[pixel]) ** 2
+            found[pixel] = square / (a[pixel] * b[pixel] * (a[pixel] + b[pixel])) - 1.0
 
 
 def _squares(model: Model, residual: NDArray[np.float64], parts: tuple[int, ...]) -> Map:
