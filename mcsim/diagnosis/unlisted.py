@@ -17,7 +17,7 @@ from mcsim.diagnosis.words import refuted
 from mcsim.reconstruction import words
 from mcsim.reconstruction.grammar import Structure, structures
 from mcsim.reconstruction.plugin import Plugin, plugin
-from mcsim.reconstruction.result import NSIDE, Reconstructed
+from mcsim.reconstruction.result import NSIDE, WORDS, Reconstructed
 from mcsim.reconstruction.scores import Scene
 from mcsim.reconstruction.search import Search
 from mcsim.reconstruction.simulated_scores import null_scores, scene_for, scores_of_maps
@@ -69,7 +69,8 @@ def structures_of(data: ObservedMaps, scene: Scene, search: Search) -> tuple[tup
         size, where, picture = (None, "", np.zeros(0)) if effect is None else made.picture(structure, effect)
         says = words.says(structure, theta, scene)
         others = [search.grammar[k] for k in one.alternatives[:ALTERNATIVES]]
-        told = (words.says(other, search.fit([other], x)[0][0], scene) for other in others)
+        told = tuple(words.says(other, search.fit([other], x)[0][0], scene) for other in others)
+        rival = None if one.rival is None else dict(zip(WORDS, (*others[0].says, told[0]), strict=True))
         rows.append(
             Reconstructed(
                 *structure.says,
@@ -80,7 +81,8 @@ def structures_of(data: ObservedMaps, scene: Scene, search: Search) -> tuple[tup
                 size,
                 1.0 / np.sqrt(one.delta_chi2),
                 words.cause(structure, dict(analysis.library)),
-                tuple(told),
+                told,
+                rival,
                 words.profile(structure, theta, covariance, scene),
                 tuple(map(float, picture)),
                 where,
@@ -233,8 +235,7 @@ class Reconstruction:
                 effect = plugin(effect.name, structure, theta, self.scene) or effect
             first.append(effect)
         matrix, told = self.data.halves()
-        halves = Halves.of(context.ensemble.remix(matrix), matrix @ self.data.x)
-        if halves is None:
+        if (halves := Halves.of(context.ensemble.remix(matrix), matrix @ self.data.x)) is None:
             return None
         t = np.stack([matrix @ (self.simulated([one]).x - self.before.x) for one in first], axis=1)
         if halves.expected_snr(t.sum(axis=1)) < settings.half_snr_share * context.null.expected_snr(t.sum(axis=1)):
@@ -242,8 +243,7 @@ class Reconstruction:
 
         def respond(frozen: Fit) -> Vector:
             scaled = [one.scaled(float(a)) for one, a in zip(first, frozen.amplitudes, strict=True)]
-            change: Vector = matrix @ (self.simulated(scaled).x - self.before.x)
-            return change
+            return np.asarray(matrix @ (self.simulated(scaled).x - self.before.x))
 
         return replace(halves, largest=LARGEST).reduction(t, respond, (), told)
 

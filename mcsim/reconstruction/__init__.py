@@ -8,8 +8,8 @@ from mcsim.reconstruction.forms import (
     GainPattern,
     NoisePattern,
     RotatedSky,
+    SignalPower,
     SkyPower,
-    SquaredSignal,
 )
 
 __all__ = [
@@ -20,6 +20,6 @@ __all__ = [
     "GainPattern",
     "NoisePattern",
     "RotatedSky",
+    "SignalPower",
     "SkyPower",
-    "SquaredSignal",
 ]
