@@ -106,6 +106,19 @@ class RotatedSky(Form):
 
 
 @dataclass(frozen=True, kw_only=True)
+class BoostedSky(Form):
+    """The sky is seen by an observer with a small velocity, in units of light's, to first order."""
+
+    scope = "common"
+    velocity: ClassVar[tuple[float, float, float]]
+
+    def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
+        self.check_frame(site)
+        changes = (v * moved for v, moved in zip(self.velocity, boosts(sky, site.lmax), strict=True))
+        return sky + self.amplitude * sum(changes, start=np.zeros_like(sky))
+
+
+@dataclass(frozen=True, kw_only=True)
 class SignalPower(Form):
     """The signal has its square or cube added, times ``factor``: that of sky and dipole, or of the sky alone."""
 
@@ -283,6 +296,23 @@ def rotations(alm: Alm, lmax: int) -> tuple[Alm, Alm, Alm]:
     return -0.5j * (up + down), -0.5 * (up - down), -1j * order * alm
 
 
+def boosts(alm: Alm, lmax: int) -> list[Alm]:
+    """Return the changes of a sky by a motion along x, y and z, per unit of velocity.
+
+    Notes
+    -----
+    f T - grad f . grad T with f = axis . n (:class:`mcsim.systematics.sky.Boost`) is (L f T - f L T)/2, L = l (l + 1):
+    f takes l to l + 1 and l - 1, where L differs by 2 (l + 1) and -2 l.
+    """
+    ell = np.arange(lmax + 1.0)
+    laplace = ell * (ell + 1.0)
+    scaled, found = alm_.multiply(alm, laplace, lmax), []
+    for axis in range(3):
+        first, second = (multiplied(one, lmax, lambda *n, k=axis: n[k], 1) for one in (alm, scaled))
+        found.append(0.5 * (alm_.multiply(first, laplace, lmax) - second))
+    return found
+
+
 def raised(alm: Alm, lmax: int, power: int) -> Alm:
     """Return the coefficients, up to ``lmax``, of a power of a map, on Gauss-Legendre rings that hold it."""
     options = {"lmax": lmax, "spin": 0, "geometry": "GL", "nthreads": 1}
@@ -319,8 +349,8 @@ def _map_of(coefficients: tuple[float, ...]) -> Map:
 FORMS: dict[str, type[Form]] = {
     kind.__name__: kind
     for kind in (
-        AddedPattern, GainPattern, RotatedSky, SignalPower, SkyPower, BeamOrder, AddedToSamples, GainOverTime,
-        NoisePattern,
+        AddedPattern, GainPattern, RotatedSky, BoostedSky, SignalPower, SkyPower, BeamOrder, AddedToSamples,
+        GainOverTime, NoisePattern,
     )
 }  # fmt: skip
 """The forms by the name of their class."""

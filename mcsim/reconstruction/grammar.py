@@ -6,9 +6,11 @@ frame (sky, scan, spacecraft, time), in one channel or all, and in the splits al
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import poch
 
 from mcsim.reconstruction.forms import REFERENCE_GHZ
 from mcsim.reconstruction.scores import ELONGATION, GAIN, GAIN_WAVES, ORDERS, Key, Scene
@@ -224,12 +226,14 @@ def _beam(scene: Scene, s: int) -> list[Key]:
 def _profiles(scene: Scene, s: int) -> list[tuple[str, Matrix | None]]:
     """Return the profiles of a change of a beam at order s, by what they are called: free in ranges, or a power of l.
 
-    The power is s, as for the derivatives of a Gaussian, and 2 for s = 0, as for its width. A halo about the beam is a
-    constant at low l.
+    The power is s, as for the derivatives of a Gaussian, sqrt((l + s)! / (l - s)!), and 2 for s = 0, l (l + 1), as for
+    its width: the dipole, at l = 1, tells that from l^s. A halo about the beam is a constant at low l.
     """
-    edges = np.array(scene.edges(max(s, 1)), dtype=float)
-    middle = np.sqrt(edges[:-1] * (edges[1:] - 1.0))
-    shape = np.ones(len(middle)) if s else middle / scene.lmax
+    spans = [np.arange(low, high) for low, high in pairwise(scene.edges(max(s, 1)))]
+    middle = np.array([np.sqrt(ell[0] * ell[-1]) for ell in spans])
+    shape = np.array([np.mean(np.sqrt(poch(ell - s + 1.0, 2 * s)) / ell**s) for ell in spans])
+    if s == 0:
+        shape = (middle + 1.0) / scene.lmax
     mix: Matrix = np.kron(shape, np.eye(2 if s else 1)).astype(np.float64)
     found: list[tuple[str, Matrix | None]] = [(f"order {s} as l^{s or 2}", mix), (f"order {s}", None)]
     if s == 0:
@@ -250,10 +254,13 @@ def _high_orders(scene: Scene, name: str | None, views: tuple[int, ...]) -> Iter
 def _modulations(scene: Scene) -> Iterator[Structure]:
     """Yield patterns that multiply the sky itself: in all channels alike, without the dipole, of one degree each."""
     views = tuple(range(len(scene.views)))
-    for degree in (1, 2):
-        rows = _rows(scene, [("gain of the sky", j) for j in range(degree**2, (degree + 1) ** 2)], views)
-        ones = np.ones(len(views))
-        yield Structure("modulation", "sky", "sky", f"degree {degree}", None, ALIKE, None, rows, ones, None, views)
+    keys: dict[str, list[Key]] = {
+        **{f"degree {k}": [("gain of the sky", j) for j in range(k**2, (k + 1) ** 2)] for k in (1, 2)},
+        "degree 1 as a boost": [("boost", axis) for axis in range(3)],
+    }
+    for kind, own in keys.items():
+        rows, ones = _rows(scene, own, views), np.ones(len(views))
+        yield Structure("modulation", "sky", "sky", kind, None, ALIKE, None, rows, ones, None, views)
 
 
 def _scaled(scene: Scene) -> Iterator[Structure]:

@@ -55,7 +55,7 @@ class Plugin:
 
     def scaled(self, factor: float) -> "Plugin":
         """Return the effect with ``factor`` times the numbers that its amplitude multiplies."""
-        key = next(k for k in ("coefficients", "values", "rotation", "factor") if k in self.values)
+        key = next(k for k in ("coefficients", "values", "rotation", "velocity", "factor") if k in self.values)
         old = self.values[key]
         new = factor * old if isinstance(old, float) else tuple(factor * one for one in old)
         return replace(self, values={**self.values, key: new})
@@ -88,7 +88,10 @@ def plugin(name: str, structure: Structure, theta: Vector, scene: Scene) -> Plug
         return None
     common = structure.channel is None and len(scene.channels) > 1
     scope = {"scope": "common"} if common or base == "SkyPower" else {}
-    on_sky = base in ("AddedPattern", "GainPattern", "RotatedSky", "NoisePattern") or values.get("wave") == "sky"
+    on_sky = (
+        base in ("AddedPattern", "GainPattern", "RotatedSky", "BoostedSky", "NoisePattern")
+        or values.get("wave") == "sky"
+    )
     frame = {"frame": scene.frame} if on_sky else {}
     return Plugin(name, base, structure.channel or scene.channels[0], {**scope, **frame, **values})
 
@@ -135,6 +138,8 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
             return "AddedPattern", {"coefficients": pattern}
         case "power", _:
             return "SkyPower", {"edges": scene.fine, "values": tuple(map(float, theta))}
+        case "modulation", _ if structure.kind.endswith("boost"):
+            return "BoostedSky", {"velocity": pattern}
         case "modulation", _:
             degree = int(structure.kind.split()[1])
             pattern = (*(0.0,) * degree**2, *pattern)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.datavector.wiener_filter import FilteredMaps
-from mcsim.reconstruction.forms import rotations
+from mcsim.reconstruction.forms import boosts, rotations
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, real
 from mcsim.sphere.sky import dipole_alm
@@ -112,7 +112,7 @@ class Scene:
                 ("lobe", i, 0),
                 ("lobe", i, 1),
             ]
-            found += [("rotation", i, axis) for axis in range(3)]
+            found += [(kind, i, axis) for kind in ("rotation", "boost") for axis in range(3)]
             found += [("orientation", i, s, c) for s in range(1, len(view.w[:ORDERS]) + 1) for c in (0, 1)]
             found += [("wave", i, name, c) for name, maps in view.waves.items() for c in range(len(maps))]
             found += [("gain wave", i, name, c) for name in GAIN_WAVES if name in view.waves for c in (0, 1)]
@@ -145,7 +145,9 @@ class Scene:
         """
         found: list[NDArray[np.float64]] = []
         looked_at = filtered.sky + dipole_alm(self.dipole_uk, self.lmax)
-        turned = rotations(looked_at, self.lmax)
+        beyond = np.where(np.arange(self.lmax + 1) > 1, 1.0, 0.0)  # skies of the model have no monopole and dipole
+        moved = [alm_.multiply(one, beyond, self.lmax) for one in boosts(filtered.sky, self.lmax)]
+        turned = [*rotations(looked_at, self.lmax), *moved]
         for i, view in enumerate(self.views):
             r, sky, adjoint = filtered.residual[i], filtered.expected[i], filtered.adjoint[i]
             whole = sky + self.dipole

@@ -137,9 +137,10 @@ class Search:
             best = int(order[0])
             if found and falls[best] < SECOND * found[0].delta_chi2:
                 break
-            odds = {members[k]: np.exp(judged[best] - judged[k]) for k in map(int, order[1:])}
-            near = [k for k, one in odds.items() if one < ALTERNATIVES]
-            rivals = (k for k in near if odds[k] < RIVAL and not self.grammar[members[best]].like(self.grammar[k]))
+            less = {members[k]: judged[best] - judged[k] for k in map(int, order[1:])}
+            near = [k for k, one in less.items() if one < np.log(ALTERNATIVES)]
+            own = self.grammar[members[best]]
+            rivals = (k for k in near if less[k] < np.log(RIVAL) and not own.like(self.grammar[k]))
             if (rival := next(rivals, None)) is not None:  # is told first
                 near.insert(0, near.pop(near.index(rival)))
             found.append(Found(members[best], float(values.max()), p, float(falls[best]), tuple(near), rival))

@@ -32,6 +32,7 @@ _LIKE: tuple[tuple[tuple[str, str, str], str], ...] = (
     (("noise", "", "latitude"), "noise_anisotropy"),
     (("noise", "", "level"), "noise_level"),
     (("power", "", ""), "point_sources"),
+    (("modulation", "sky", "degree 1 as a boost"), "boost"),
     (("modulation", "sky", "degree 1"), "dipole_modulation"),
     (("modulation", "sky", "degree 2"), "quadrupole_modulation"),
 )
@@ -95,6 +96,8 @@ def _what(structure: Structure, theta: Vector) -> str:
         case "power", _:
             which = "" if kind == "power" else f", where the model's has none ({_pattern(kind)})"
             return f"is power of the sky itself{which}"
+    if kind.endswith("boost"):
+        return "modulates and moves the sky itself, as a velocity does"
     return f"modulates the sky itself ({_pattern(kind)})"
 
 

@@ -138,6 +138,15 @@ def test_a_rotation_moves_the_map():
         np.testing.assert_allclose(found, moved, atol=1e-3 * np.abs(moved).max())
 
 
+def test_a_boost_is_that_of_the_library_for_small_velocities():
+    alm, beta = random_alm(3, 6), 1e-5
+    sky = systematics.get("boost")(amplitude=beta, lon_deg=30.0, lat_deg=40.0)
+    site = systematics.Site("W1", 94.0, "ecliptic", NSIDE, 6, Beam.gaussian(300.0, 6))
+    change = (sky.sky(alm, site, None) - alm) / beta
+    linear = sum(v * one for v, one in zip(sky.vector / beta, forms.boosts(alm, 6), strict=True))
+    np.testing.assert_allclose(linear, change, atol=1e-3)
+
+
 def test_a_power_is_that_of_the_map():
     alm = random_alm(4, 8)
     map_ = healpix.synthesis(alm[None], 32, 8)[0]
