@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
-from mcsim.instrument.scan.model import SECONDS_PER_DAY, ScanModel
+from mcsim.instrument.scan.model import SECONDS_PER_DAY
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, real
-from mcsim.sphere.rotation import rotation_matrix
 from mcsim.sphere.sky import dipole_alm
 from mcsim.systematics.base import Alm, Draw, Effect, Map, Site
 from mcsim.systematics.parametrization import Parametrization, Vector
@@ -209,21 +208,17 @@ class InTime(Form):
 class AddedToSamples(InTime):
     """Samples have a signal added, uK, whatever the sky: a wave, a pattern in some splits, or a dipole that turns."""
 
-    line: ClassVar[tuple[float, float]] = (0.0, 0.0)  #: boresight angle and azimuth of another line of sight, degrees
-
     def components(self, time_s: Vector, theta: Vector, phi: Vector, psi: Vector, site: Site) -> list[Vector]:
         """Return what the coefficients of a wave multiply that is a dipole, shape (n,) each.
 
         "Sun": the line of sight along the Earth's motion, and towards the Sun; "lobe": the dipole along the beam's x
-        and y and the line of sight, uK; "line": the dipole as another line of sight sees it, uK.
+        and y and the line of sight, uK.
         """
         outward, south, east = axes(theta, phi)
         pointing = site.pointed(self.name)
         if self.wave == "Sun":
             towards = (heading(pointing.model, time_s, site.frame, phase) for phase in (0.0, 0.5 * np.pi))
             return [np.sum(one * outward, axis=0) for one in towards]
-        if self.wave == "line":
-            return [site.dipole_uk @ direction(pointing.model, self.line, time_s, site.frame)]
         c, s, (a, b) = np.cos(psi), np.sin(psi), (site.dipole_uk @ south, site.dipole_uk @ east)
         return [c * a + s * b, c * b - s * a, site.dipole_uk @ outward]
 
@@ -231,7 +226,7 @@ class AddedToSamples(InTime):
         if self.wave == "sky":
             self.check_frame(site)
             value = _map_of(self.coefficients)[healpy.ang2pix(_NSIDE, theta, phi)]
-        elif self.wave in ("Sun", "lobe", "line"):
+        elif self.wave in ("Sun", "lobe"):
             value = np.array(self.coefficients) @ np.array(self.components(time_s, theta, phi, psi, site))
         else:
             value = self.over_time(time_s, psi, site)
@@ -319,25 +314,6 @@ def raised(alm: Alm, lmax: int, power: int) -> Alm:
     rings = ((power + 1) * lmax) // 2 + 2
     values = ducc0.sht.synthesis_2d(alm=alm[None], ntheta=rings, nphi=2 * rings, **options)
     return np.asarray(ducc0.sht.analysis_2d(map=values**power, **options))[0]
-
-
-def direction(model: ScanModel, line: tuple[float, float], time_s: Vector, frame: str) -> NDArray[np.float64]:
-    """Return where a line of sight points, shape (3, n); ``line``: its boresight angle and azimuth, degrees.
-
-    Notes
-    -----
-    The turns of :class:`mcsim.instrument.scan.ScanModel`, for any times.
-    """
-    away, azimuth = np.deg2rad(line)
-    spin = 2.0 * np.pi * (time_s / model.spin_period_s % 1.0) + np.deg2rad(model.spin_phase_deg) + azimuth
-    precession = 2.0 * np.pi * (time_s / model.precession_period_s % 1.0) + np.deg2rad(model.precession_phase_deg)
-    orbit = 2.0 * np.pi * (time_s / model.orbit_period_s % 1.0) + np.deg2rad(model.orbit_phase_deg)
-    n = np.stack([np.sin(away) * np.cos(spin), np.sin(away) * np.sin(spin), np.full_like(spin, np.cos(away))])
-    tilt = np.full_like(spin, np.deg2rad(model.precession_angle_deg))
-    for axis, angle in ((1, tilt), (2, precession), (1, np.full_like(spin, 0.5 * np.pi)), (2, orbit)):
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        n[i], n[j] = n[i] * np.cos(angle) - n[j] * np.sin(angle), n[i] * np.sin(angle) + n[j] * np.cos(angle)
-    return np.asarray(rotation_matrix("ecliptic", frame) @ n)
 
 
 @lru_cache(maxsize=4)

@@ -17,6 +17,7 @@ from mcsim.reconstruction.scores import ELONGATION, GAIN, GAIN_WAVES, ORDERS, Ke
 from mcsim.sphere import real
 from mcsim.sphere.rotation import rotation_matrix
 from mcsim.support.arrays import Matrix, Vector
+from mcsim.systematics.spacecraft import axes
 
 ALIKE, OPPOSITE = "alike", "opposite"
 
@@ -154,8 +155,11 @@ def _forms(scene: Scene, split: str, kept: list[int]) -> Iterator[_Form]:
     yield from _added(scene)
     for s in range(1, len(view.w[:ORDERS]) + 1):
         yield "added", "", "spacecraft", f"orientation {s}", [("orientation", s, c) for c in (0, 1)], None
-    yield "added", "dipole", "spacecraft", "lobe", [("lobe", 0), ("lobe", 1), ("dipole",)], None
-    yield from _timed(scene, kept)
+    lobe: list[Key] = [("lobe", 0), ("lobe", 1), ("dipole",)]
+    yield "added", "dipole", "spacecraft", "lobe", lobe, None
+    for name, line in _other_lines(scene, kept):
+        yield "added", "dipole", "spacecraft", f"line {name}", lobe, line
+    yield from _timed(scene)
     yield "gain", "sky and dipole", "", "constant", [("gain", 0)], None
     for s in range(min(scene.split_orders, len(view.w)) + 1):
         for kind, mix in _profiles(scene, s):
@@ -180,14 +184,13 @@ def _forms(scene: Scene, split: str, kept: list[int]) -> Iterator[_Form]:
     yield "rotation", "sky and dipole", "sky", "rotation", [("rotation", axis) for axis in range(3)], None
 
 
-def _timed(scene: Scene, kept: list[int]) -> Iterator[_Form]:
+def _timed(scene: Scene) -> Iterator[_Form]:
     """Yield what is added to samples and depends on time, where the pointing is known.
 
     The Sun is at azimuth 0 about the spin axis, and at a fixed distance from it: its distance from the line of sight is
     an even function of the spin phase.
     """
-    waves = [scene.views[i].waves for i in kept]
-    if not waves[0]:
+    if not scene.timed:
         return
     spins: list[Key] = [("wave", f"spin {k}", c) for k in range(1, SPIN + 1) for c in (0, 1)]
     for k in range(SPIN):
@@ -196,9 +199,18 @@ def _timed(scene: Scene, kept: list[int]) -> Iterator[_Form]:
     yield "added", "", "time", "year", [("wave", "year", c) for c in (0, 1)], None
     yield "added", "", "Sun", "dipole", [("wave", "Sun", c) for c in (0, 1)], None
     yield "added", "", "Sun", "elongation", [("wave", f"spin {k}", 0) for k in range(1, ELONGATION + 1)], None
-    for name in waves[0]:
-        if name.startswith("line ") and all(name in one for one in waves):
-            yield "added", "dipole", "time", name, [("wave", name, 0)], None
+
+
+def _other_lines(scene: Scene, kept: list[int]) -> Iterator[tuple[str, Matrix]]:
+    """Yield the other channels with their lines of sight in the frame of the beam of one channel, shape (1, 3)."""
+    channels = {scene.views[i].channel for i in kept}
+    if len(channels) > 1 or not scene.timed:
+        return
+    (own,) = channels
+    outward, south, east = (one[:, 0] for one in axes(*np.deg2rad(scene.lines[own])[:, None]))
+    for name, line in zip(scene.channels, scene.lines, strict=True):
+        if line != scene.lines[own]:
+            yield name, (np.stack([east, -south, outward]) @ axes(*np.deg2rad(line)[:, None])[0]).T
 
 
 def _added(scene: Scene) -> Iterator[_Form]:

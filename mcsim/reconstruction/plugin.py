@@ -102,7 +102,7 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
     splits = {} if alike else {"splits": _factors(structure.split, scene.splits)}
     timed: dict[str, Any] = {"coefficients": pattern, **splits}
     if structure.frame in ("spacecraft", "time", "Sun"):
-        timed |= _wave(structure, scene)
+        timed |= _wave(structure)
     match structure.stage, structure.frame:
         case "added", "sky" if structure.kind != "power":
             if alike:
@@ -147,13 +147,13 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
     return None
 
 
-def _wave(structure: Structure, scene: Scene) -> dict[str, Any]:
+def _wave(structure: Structure) -> dict[str, Any]:
     """Return the class variables that say which function of time and orientation a structure follows."""
     wave, _, rest = structure.kind.partition(" ")
     if structure.frame == "Sun":
         return {"wave": "Sun"} if wave == "dipole" else {"wave": "spin"}
-    if wave == "line":
-        return {"wave": wave, "line": scene.lines[scene.channels.index(rest)]}
+    if structure.acts_on == "dipole":
+        return {"wave": "lobe"}
     return {"wave": wave, "harmonic": int(rest[0])} if rest else {"wave": wave}
 
 

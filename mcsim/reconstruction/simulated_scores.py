@@ -51,17 +51,13 @@ def scene_of(model: Model) -> Scene:
     timed = run.map.split_by == "time" and all(site.pointing is not None for site in sites)
     pointed = [site.pointed("a wave").line for site in sites] if timed else []
     lines = tuple((line.boresight_angle_deg, line.azimuth_deg) for line in pointed)
-    others = {f"line {name}": {"wave": "line", "line": line} for name, line in zip(model.channels, lines, strict=False)}
     views = []
     for i, part in enumerate(model.parts):
         channel = model.survey.channels[part.channel]
         split = model.of(part.channel).index(i)
         waves: dict[str, tuple[Map, ...]] = {}
-        for name, values in (WAVES | others).items() if timed else ():
-            count = 1 if values["wave"] == "line" else 2
-            if values.get("line") == lines[part.channel]:
-                continue
-            acting = [_wave(*values.items(), unit=(c, count))(amplitude=1.0) for c in range(count)]
+        for name, values in WAVES.items() if timed else ():
+            acting = [_wave(*values.items(), component=c)(amplitude=1.0) for c in (0, 1)]
             means = (signal_of(one, channel.site, run.map.span(split)) for one in acting)
             waves[name] = tuple(np.where(part.precision > 0, one, 0.0) for one in means)
         kernel = channel.site.beam.blm[0, : model.lmax + 1].real
@@ -84,11 +80,11 @@ def scene_of(model: Model) -> Scene:
 
 
 @lru_cache(maxsize=64)
-def _wave(*values: tuple[str, Any], unit: tuple[int, int]) -> type[AddedToSamples]:
-    """Return the effect with these class variables that adds one of its components; ``unit``: which, and how many."""
-    own = {**dict(values), "coefficients": tuple(np.eye(unit[1])[unit[0]].tolist())}
-    own["name"] = "_".join(["wave", *(str(value) for _, value in values), str(unit[0])])
-    return dataclass(frozen=True, kw_only=True)(type("Wave", (AddedToSamples,), {"__module__": __name__, **own}))
+def _wave(*values: tuple[str, Any], component: int) -> type[AddedToSamples]:
+    """Return the effect with these class variables that adds one of its two components."""
+    name = "_".join(["wave", *(str(value) for _, value in values), str(component)])
+    own = {"__module__": __name__, "name": name, "coefficients": (1.0 - component, 0.0 + component), **dict(values)}
+    return dataclass(frozen=True, kw_only=True)(type("Wave", (AddedToSamples,), own))
 
 
 def scores_of_maps(model: Model, scene: Scene, maps: Sequence[Map]) -> Vector:

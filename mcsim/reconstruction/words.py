@@ -70,7 +70,7 @@ def _what(structure: Structure, theta: Vector) -> str:
             return f"is the dipole as a lobe fixed to the spacecraft sees it, {_lobe(theta)}"
         case "added", "Sun":
             return f"is added to the signal and depends on {SUN[kind]}"
-        case "added", "time" if kind.startswith("line"):
+        case "added", "spacecraft" if kind.startswith("line"):
             return f"is the dipole as the line of sight of {number} sees it at the same time"
         case "added", "spacecraft":
             return f"is added to the signal, fixed to the spacecraft (order {number} in the orientation of the beam)"

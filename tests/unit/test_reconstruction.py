@@ -15,6 +15,7 @@ from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import model_of, wiener_filter
 from mcsim.diagnosis import api
 from mcsim.instrument.beams import Beam
+from mcsim.instrument.scan.pointing import pointing
 from mcsim.reconstruction import forms, simulated_scores, words
 from mcsim.reconstruction.figure import structure_figure
 from mcsim.reconstruction.grammar import ALIKE, Structure, structures
@@ -90,7 +91,7 @@ TOLERANCE = {
         ("square", "", "square", ALIKE),
         ("cube", "", "cube", ALIKE),
         ("added", "time", "spin 1-4", ALIKE),
-        ("added", "time", "line V1", ALIKE),
+        ("added", "spacecraft", "line V1", ALIKE),
         ("added", "Sun", "dipole", "half1"),
         ("added", "Sun", "elongation", ALIKE),
         ("added", "spacecraft", "lobe", ALIKE),
@@ -136,6 +137,18 @@ def test_a_rotation_moves_the_map():
         moved = (real.field(values, *(back / np.linalg.norm(back, axis=0))) - real.field(values, *n)) / angle
         found = healpix.synthesis(change[None], 8, 6)[0]
         np.testing.assert_allclose(found, moved, atol=1e-3 * np.abs(moved).max())
+
+
+def test_another_channel_sees_the_dipole_where_its_line_of_sight_points():
+    """The dipole in the frame of one beam, seen along the line of another, is the dipole of that line's pointing."""
+    run, scene, _, _ = seen()
+    sites = [channel.site for channel in survey(run).channels]
+    structure = next(w for w in grammar() if (w.kind, w.channel, w.split) == ("line V1", "W1", ALIKE))
+    effect = plugin("unlisted_1", structure, np.ones(1), scene).kind()(amplitude=1.0)
+    own, other = (pointing(site.pointing.model, site.pointing.line, 1000, 50) for site in sites[::-1])
+    time_s = sites[1].pointing.model.period_of_samples(sites[1].pointing.line) * np.arange(1000, 1050)
+    expected = sites[1].dipole_uk @ healpy.ang2vec(*other[:2]).T
+    np.testing.assert_allclose(effect.signal(time_s, *own, sites[1]), expected, atol=1e-6)
 
 
 def test_a_boost_is_that_of_the_library_for_small_velocities():
