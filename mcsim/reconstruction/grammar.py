@@ -65,6 +65,11 @@ class Structure:
         mine, theirs = ((*one.says[:3], *_briefly(one.kind), *one.says[4:6]) for one in (self, other))
         return mine == theirs
 
+    def elsewhere(self, other: "Structure") -> bool:
+        """Return True if another is the same in another channel or split."""
+        mine, theirs = ((*one.says[:4], one.index) for one in (self, other))
+        return mine == theirs and (self.channel == other.channel) != (self.split == other.split)
+
     def of(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the scores of the structure, shape (..., size), from all, shape (..., P)."""
         found = (scores[..., self.rows] * self.weights).sum(axis=-1)

@@ -24,7 +24,7 @@ MOST = 3  #: largest number of structures
 SECOND = 0.1
 """Least fall of chi^2 of a further structure over that of the first: below it may be the square of the first."""
 
-FINALISTS, NEAR, SPARE = 14, 5.0, 2
+FINALISTS, NEAR, SPARE = 16, 5.0, 2
 """Structures that are compared by their responses on the sky of the data: how many at most, within which difference of
 the evidence those of one stage and frame, and simulations for each of their scores."""
 
@@ -159,13 +159,16 @@ class Search:
         return np.array(found)
 
     def finalists(self, values: Vector) -> list[int]:
-        """Return the most evident structure, the best of every other stage, those near it, and the best of every frame.
+        """Return structures to compare: the most evident one, and those that may be it on this sky.
 
+        These are the best of every other stage, the same in other channels or splits, whose own scores do not tell all
+        that they do to the others, those near it, and the best of every frame.
         All their scores together have as many elements as a fraction 1/SPARE of the simulations at most.
         """
         order = [k for k in map(int, np.argsort(-values)) if values[k] > 0.0]
         each = [self.grammar[k] for k in order]
         wanted = _firsts(order, [one.stage for one in each])
+        wanted += [k for k in order if each[0].elsewhere(self.grammar[k])]
         wanted += [k for k in order if values[order[0]] - values[k] < NEAR]
         wanted += _firsts(order, [(one.stage, one.acts_on, one.frame) for one in each])
         chosen, rows = list[int](), 0
