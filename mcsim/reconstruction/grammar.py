@@ -21,6 +21,8 @@ from mcsim.systematics.spacecraft import axes
 
 ALIKE, OPPOSITE = "alike", "opposite"
 
+FREE = 5  #: coordinates of a pattern on the sky whose responses are simulated one by one, at most
+
 SPIN = 4  #: highest harmonic of the spin phase that is said by itself
 
 ALSO_COMMON = ("monopole", "dipole", "degrees 0-1")
@@ -64,6 +66,11 @@ class Structure:
         """Return True if another says the same, but for a profile, the highest degree or the power of the frequency."""
         mine, theirs = ((*one.says[:3], *_briefly(one.kind), *one.says[4:6]) for one in (self, other))
         return mine == theirs
+
+    @property
+    def by_coordinate(self) -> bool:
+        """Return True for a pattern of few coordinates that multiplies the sky: each has a response of its own."""
+        return self.frame == "sky" and bool(self.acts_on) and self.size <= FREE
 
     def elsewhere(self, other: "Structure") -> bool:
         """Return True if another is the same in another channel or split."""
@@ -131,7 +138,7 @@ def _of_maps(scene: Scene) -> Iterator[Structure]:
             weights = np.array([factors[scene.views[i].split] for i in kept])
             for stage, acts_on, frame, kind, keys, mix in _forms(scene, split, kept):
                 if name is None and (frame == "sky" or stage in ("square", "cube")):
-                    if kind not in ALSO_COMMON:
+                    if stage != "added" or kind not in ALSO_COMMON:
                         continue  # what all channels see alike is the sky itself, which the model knows as random
                     stage, frame = ("power", "") if split == ALIKE else (stage, frame)
                 rows = _rows(scene, keys, kept)
@@ -200,10 +207,11 @@ def _timed(scene: Scene) -> Iterator[_Form]:
     spins: list[Key] = [("wave", f"spin {k}", c) for k in range(1, SPIN + 1) for c in (0, 1)]
     for k in range(SPIN):
         yield "added", "", "time", f"spin {k + 1}", spins[2 * k : 2 * k + 2], None
-    yield "added", "", "time", f"spin 1-{SPIN}", spins, None
+    yield "added", "", "time", f"spin 1-{SPIN}", [("added", 0), *spins], None
     yield "added", "", "time", "year", [("wave", "year", c) for c in (0, 1)], None
     yield "added", "", "Sun", "dipole", [("wave", "Sun", c) for c in (0, 1)], None
-    yield "added", "", "Sun", "elongation", [("wave", f"spin {k}", 0) for k in range(1, ELONGATION + 1)], None
+    cosines: list[Key] = [("wave", f"spin {k}", 0) for k in range(1, ELONGATION + 1)]
+    yield "added", "", "Sun", "elongation", [("added", 0), *cosines], None
 
 
 def _other_lines(scene: Scene, kept: list[int]) -> Iterator[tuple[str, Matrix]]:

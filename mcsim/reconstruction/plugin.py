@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mcsim.reconstruction.forms import FORMS, Form
-from mcsim.reconstruction.grammar import ALIKE, OPPOSITE, Structure
+from mcsim.reconstruction.grammar import ALIKE, OPPOSITE, SPIN, Structure
 from mcsim.reconstruction.scores import Scene
 from mcsim.support.arrays import Vector
 
@@ -151,16 +151,20 @@ def _wave(structure: Structure) -> dict[str, Any]:
     """Return the class variables that say which function of time and orientation a structure follows."""
     wave, _, rest = structure.kind.partition(" ")
     if structure.frame == "Sun":
-        return {"wave": "Sun"} if wave == "dipole" else {"wave": "spin"}
+        return {"wave": "Sun"} if wave == "dipole" else {"wave": "spin", "harmonic": 0}
     if structure.acts_on == "dipole":
         return {"wave": "lobe"}
-    return {"wave": wave, "harmonic": int(rest[0])} if rest else {"wave": wave}
+    if not rest:
+        return {"wave": wave}
+    return {"wave": wave, "harmonic": 0 if "-" in rest else int(rest)}
 
 
 def _numbers(structure: Structure, theta: Vector) -> tuple[float, ...]:
     """Return the real coefficients of a pattern."""
-    if structure.kind == "elongation":  # of the cosines alone
-        return tuple(map(float, np.stack([theta, np.zeros_like(theta)], axis=1).ravel()))
+    if structure.kind in ("elongation", f"spin 1-{SPIN}"):  # from the constant on, which has no sine
+        cosines = np.stack([theta, np.zeros_like(theta)], axis=1).ravel()
+        waves = cosines if structure.kind == "elongation" else np.insert(theta, 1, 0.0)
+        return (float(waves[0]) / CONSTANT, *map(float, waves[1:]))
     found = theta if structure.mix is None else structure.mix.T @ theta
     return tuple(
         map(float, np.append(0.0, found) if structure.frame != "Sun" and structure.kind == "dipole" else found)

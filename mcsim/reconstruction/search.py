@@ -24,12 +24,12 @@ MOST = 3  #: largest number of structures
 SECOND = 0.1
 """Least fall of chi^2 of a further structure over that of the first: below it may be the square of the first."""
 
-FINALISTS, NEAR, SPARE = 16, 5.0, 2
+FINALISTS, NEAR, SPARE = 14, 5.0, 2
 """Structures that are compared by their responses on the sky of the data: how many at most, within which difference of
 the evidence those of one stage and frame, and simulations for each of their scores."""
 
 RARE = 3.0
-"""Odds against a structure that is not alike in all splits, and against a gain or square of sky or dipole alone."""
+"""Odds against a structure that is not alike in all splits, a gain or square of sky or dipole alone, and a cube."""
 
 TAIL = 0.1  #: share of the simulations by which the tail of the largest evidence is described
 SMALL = 1e-6  #: variance, relative to the largest, of a direction in which scores are not inverted
@@ -161,14 +161,14 @@ class Search:
     def finalists(self, values: Vector) -> list[int]:
         """Return structures to compare: the most evident one, and those that may be it on this sky.
 
-        These are the best of every other stage, the same in other channels or splits, whose own scores do not tell all
-        that they do to the others, those near it, and the best of every frame.
+        These are the best of every other stage, the same in other channels, splits or profiles, whose own scores do not
+        tell all that they do to the others, those near it, and the best of every frame.
         All their scores together have as many elements as a fraction 1/SPARE of the simulations at most.
         """
         order = [k for k in map(int, np.argsort(-values)) if values[k] > 0.0]
         each = [self.grammar[k] for k in order]
         wanted = _firsts(order, [one.stage for one in each])
-        wanted += [k for k in order if each[0].elsewhere(self.grammar[k])]
+        wanted += [k for k in order if each[0].elsewhere(self.grammar[k]) or each[0].like(self.grammar[k])]
         wanted += [k for k in order if values[order[0]] - values[k] < NEAR]
         wanted += _firsts(order, [(one.stage, one.acts_on, one.frame) for one in each])
         chosen, rows = list[int](), 0
@@ -246,7 +246,7 @@ def _firsts(order: Sequence[int], labels: Sequence[Hashable]) -> list[int]:
 def _rarity(structure: Structure) -> float:
     """Return the logarithm of the prior odds against a structure, beside one of the common kind."""
     part = structure.stage in ("gain", "square") and structure.acts_on != "sky and dipole"
-    rare = (structure.split != ALIKE) + part
+    rare = (structure.split != ALIKE) + (part or structure.stage == "cube")
     return rare * float(np.log(RARE))
 
 
