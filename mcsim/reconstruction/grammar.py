@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.special import poch
 
 from mcsim.reconstruction.forms import REFERENCE_GHZ
-from mcsim.reconstruction.scores import ELONGATION, GAIN, GAIN_WAVES, ORDERS, Key, Scene
+from mcsim.reconstruction.scores import ELONGATION, GAIN, GAIN_WAVES, MODULATION, ORDERS, Key, Scene
 from mcsim.sphere import real
 from mcsim.sphere.rotation import rotation_matrix
 from mcsim.support.arrays import Matrix, Vector
@@ -278,14 +278,13 @@ def _high_orders(scene: Scene, name: str | None, views: tuple[int, ...]) -> Iter
 
 def _modulations(scene: Scene) -> Iterator[Structure]:
     """Yield patterns that multiply the sky itself: in all channels alike, without the dipole, of one degree each."""
-    views = tuple(range(len(scene.views)))
     keys: dict[str, list[Key]] = {
-        **{f"degree {k}": [("gain of the sky", j) for j in range(k**2, (k + 1) ** 2)] for k in (1, 2)},
+        **{f"degree {k}": [("modulation", j) for j in range(k**2, (k + 1) ** 2)] for k in range(1, MODULATION + 1)},
         "degree 1 as a boost": [("boost", axis) for axis in range(3)],
     }
     for kind, own in keys.items():
-        rows, ones = _rows(scene, own, views), np.ones(len(views))
-        yield Structure("modulation", "sky", "sky", kind, None, ALIKE, None, rows, ones, None, views)
+        rows = np.array([[scene.place[key]] for key in own])
+        yield Structure("modulation", "sky", "sky", kind, None, ALIKE, None, rows, np.ones(1))
 
 
 def _scaled(scene: Scene) -> Iterator[Structure]:

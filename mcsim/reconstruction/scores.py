@@ -24,6 +24,7 @@ from mcsim.systematics.spacecraft import axes
 
 ADDED, GAIN = 8, 4  #: highest degree of patterns that are added, and of those that multiply
 ORDERS = 4  #: highest order of a beam, and of what follows its orientation
+MODULATION = 2  #: highest degree of patterns that multiply the sky itself
 ELONGATION = 6  #: highest harmonic of the spin phase in what depends on the distance from the Sun
 GAIN_WAVES = ("spin 1", "spin 2", "year")  #: waves that a gain may follow
 BINS = 4  #: ranges of degrees of a profile in l, equal in log l
@@ -112,7 +113,7 @@ class Scene:
                 ("lobe", i, 0),
                 ("lobe", i, 1),
             ]
-            found += [(kind, i, axis) for kind in ("rotation", "boost") for axis in range(3)]
+            found += [("rotation", i, axis) for axis in range(3)]
             found += [("orientation", i, s, c) for s in range(1, len(view.w[:ORDERS]) + 1) for c in (0, 1)]
             found += [("wave", i, name, c) for name, maps in view.waves.items() for c in range(len(maps))]
             found += [("gain wave", i, name, c) for name in GAIN_WAVES if name in view.waves for c in (0, 1)]
@@ -125,6 +126,7 @@ class Scene:
             if len(self.of(channel)) > 1:
                 found += [(kind, channel, b) for kind in ("difference", "common") for b in range(len(self.fine) - 1)]
         found += [("power", b) for b in range(len(self.fine) - 1)]
+        found += [("modulation", j) for j in range((MODULATION + 1) ** 2)] + [("boost", axis) for axis in range(3)]
         return tuple(found)
 
     @cached_property
@@ -145,9 +147,7 @@ class Scene:
         """
         found: list[NDArray[np.float64]] = []
         looked_at = filtered.sky + dipole_alm(self.dipole_uk, self.lmax)
-        beyond = np.where(np.arange(self.lmax + 1) > 1, 1.0, 0.0)  # skies of the model have no monopole and dipole
-        moved = [alm_.multiply(one, beyond, self.lmax) for one in boosts(filtered.sky, self.lmax)]
-        turned = [*rotations(looked_at, self.lmax), *moved]
+        turned = rotations(looked_at, self.lmax)
         for i, view in enumerate(self.views):
             r, sky, adjoint = filtered.residual[i], filtered.expected[i], filtered.adjoint[i]
             whole = sky + self.dipole
@@ -210,10 +210,23 @@ class Scene:
         return np.array([power[low:high].sum() for low, high in pairwise(edges)])
 
     def _of_sky(self, sky: Alm) -> Vector:
-        """Return the scores of the sky's power."""
+        """Return the scores of the sky's power, of patterns that multiply it, and of its motion.
+
+        For what acts on the sky itself the residuals of all maps together are S^-1 s^: the uneven noise that the
+        isotropic filter leaves in them would drown it.
+        """
         weight = _twice(self.lmax) * np.abs(sky) ** 2
         power = 0.5 * divided(1.0, self.cl) * np.bincount(alm_.degrees(self.lmax), weight, self.lmax + 1)
-        return np.array([power[low:high].sum() for low, high in pairwise(self.fine)])
+        expected = alm_.multiply(sky, divided(1.0, self.cl), self.lmax)
+        first, second = (healpix.synthesis(one[None], self.nside, self.lmax)[0] for one in (sky, expected))
+        area = 4.0 * np.pi / first.size
+        return np.concatenate(
+            [
+                [power[low:high].sum() for low, high in pairwise(self.fine)],
+                area * _low(first * second, MODULATION),
+                [_product(expected, moved, self.lmax) for moved in boosts(sky, self.lmax)],
+            ]
+        )
 
 
 def _low(product: Map, top: int) -> Vector:
