@@ -24,6 +24,7 @@ from mcsim.sphere.sky import dipole_alm
 from mcsim.systematics.base import Alm, Draw, Effect, Map, Site
 from mcsim.systematics.parametrization import Parametrization, Vector
 from mcsim.systematics.product import multiplied
+from mcsim.systematics.sky import Boost
 from mcsim.systematics.spacecraft import axes, heading, spin_phase
 
 REFERENCE_GHZ = 94.0
@@ -106,15 +107,17 @@ class RotatedSky(Form):
 
 @dataclass(frozen=True, kw_only=True)
 class BoostedSky(Form):
-    """The sky is seen by an observer with a small velocity, in units of light's, to first order."""
+    """The sky is seen by an observer with a velocity, in units of light's."""
 
     scope = "common"
     velocity: ClassVar[tuple[float, float, float]]
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
         self.check_frame(site)
-        changes = (v * moved for v, moved in zip(self.velocity, boosts(sky, site.lmax), strict=True))
-        return sky + self.amplitude * sum(changes, start=np.zeros_like(sky))
+        x, y, z = self.velocity
+        lon_deg, lat_deg = np.rad2deg([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))])
+        speed = self.amplitude * float(np.linalg.norm(self.velocity))
+        return Boost(amplitude=speed, lon_deg=lon_deg, lat_deg=lat_deg).sky(sky, site, draw)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -167,7 +167,13 @@ class Search:
         """
         order = [k for k in map(int, np.argsort(-values)) if values[k] > 0.0]
         each = [self.grammar[k] for k in order]
-        wanted = _firsts(order, [one.stage for one in each])
+        if not order:
+            return [int(np.argmax(values))]
+        wanted = order[:1]
+        if each[0].stage == "power":  # a monopole or dipole may be made of the rest of the sky
+            made = (k for k, one in enumerate(self.grammar) if one.stage == "modulation")
+            wanted += [k for k in made if self.nulls[k] is not None]
+        wanted += _firsts(order, [one.stage for one in each])
         wanted += [k for k in order if each[0].elsewhere(self.grammar[k]) or each[0].like(self.grammar[k])]
         wanted += [k for k in order if values[order[0]] - values[k] < NEAR]
         wanted += _firsts(order, [(one.stage, one.acts_on, one.frame) for one in each])
@@ -176,7 +182,7 @@ class Search:
             if len(chosen) < FINALISTS and rows + self.grammar[k].size <= len(self.simulations) // SPARE:
                 chosen.append(k)
                 rows += self.grammar[k].size
-        return chosen or [int(np.argmax(values))]
+        return chosen
 
     def judged(
         self, members: Sequence[int], scores: Vector, responses: Sequence[Matrix]
