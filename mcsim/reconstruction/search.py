@@ -29,12 +29,12 @@ FINALISTS, NEAR, SPARE = 14, 5.0, 2
 the evidence those of one stage and frame, and simulations for each of their scores."""
 
 RARE = 3.0
-"""Odds against a structure that is not alike in all splits, a gain or square of sky or dipole alone, and a cube."""
+"""Odds against a structure that differs between splits, a gain or square of sky or dipole alone, a cube, a halo."""
 
 TAIL = 0.1  #: share of the simulations by which the tail of the largest evidence is described
 SMALL = 1e-6  #: variance, relative to the largest, of a direction in which scores are not inverted
 ALTERNATIVES = 20.0  #: odds up to which other structures are told beside the best
-RIVAL = 3.0  #: odds up to which the next one, if it is of other words, is as good a description as the best
+RIVAL = 4.0  #: odds up to which the next one, if it is of other words, is as good a description as the best
 
 
 class Sky(Protocol):
@@ -252,7 +252,7 @@ def _firsts(order: Sequence[int], labels: Sequence[Hashable]) -> list[int]:
 def _rarity(structure: Structure) -> float:
     """Return the logarithm of the prior odds against a structure, beside one of the common kind."""
     part = structure.stage in ("gain", "square") and structure.acts_on != "sky and dipole"
-    rare = (structure.split != ALIKE) + (part or structure.stage == "cube")
+    rare = (structure.split != ALIKE) + (part or structure.stage == "cube" or structure.kind.endswith("low l"))
     return rare * float(np.log(RARE))
 
 

@@ -248,6 +248,8 @@ def summary(files):
             report(group, own)
     panels[0].set_ylabel("share that is right")
     figure.savefig(PICTURE, dpi=120)
+    if own := [one for one in rows if one[0] == "further"]:
+        report("further", own)
 
 
 def report(group, own):
