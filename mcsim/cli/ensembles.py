@@ -119,7 +119,7 @@ def predict(
 
     where = chosen(workers, scheduler)
     if output is not None:
-        tables.check_ending(output)
+        tables.check_output(output)
     expected = prediction.predict(config, exact=exact, snr=snr, nthreads=os.cpu_count() or 1, workers=where)
     print(describe.describe_prediction(expected))
     if output is not None:
