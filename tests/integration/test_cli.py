@@ -288,7 +288,7 @@ def test_beam_of_a_configuration_and_of_files(mcsim: Command, tmp_path: Path) ->
     code, out, _ = mcsim("beam", "quickstart", "--lmax", 300)
     assert code == 0
     assert "axis ratio" in out
-    assert (tmp_path / "beam.png").exists()
+    assert (tmp_path / "quickstart-beam.png").exists()
     y, x = np.mgrid[-40:41, -40:41] * 0.1
     image = np.exp(-(x**2) / 2 / 0.5**2 - y**2 / 2 / 0.4**2)
     header = fits.Header({"CDELT1": 0.1, "CDELT2": 0.1, "CUNIT1": "deg", "CUNIT2": "deg"})

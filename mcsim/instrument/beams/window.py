@@ -71,6 +71,13 @@ def _of_text(path: Path) -> Window:
     return np.asarray(table[:, 1])
 
 
+def holds_window(path: Path) -> bool:
+    """Return True if the first table of a FITS file has a single column, and is no map."""
+    with unreadable(path, "a FITS file", "give a beam map, b_lm or B_l"), opened(path) as hdus:
+        tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)]
+        return bool(tables) and len(tables[0].columns) == 1 and "PIXTYPE" not in tables[0].header
+
+
 def _of_fits(path: Path, extension: str | None, column: str | None) -> tuple[Window, str]:
     """Return B_l and the name of their table."""
     with unreadable(path, "a FITS table of B_l", "give another file"), opened(path) as hdus:
