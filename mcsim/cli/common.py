@@ -76,7 +76,7 @@ def picture(asked: Path | None, shown: str | Path, end: str = "") -> Path:
     into: that is said before anything is computed.
     """
     source = user_path(shown)
-    folder = source.absolute().parent if source.exists() and source.name in ("", "..") else source.parent
+    folder = source.absolute().parent if source.name in ("", "..") else source.parent
     target = folder / f"{source.absolute().stem}{end}.png" if asked is None else user_path(asked)
     with unwritable(target, "choose another file with -o"), TemporaryFile(dir=target.absolute().parent):
         pass
