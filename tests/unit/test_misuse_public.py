@@ -189,6 +189,7 @@ def test_a_column_of_the_square_is_no_beam(column, tmp_path) -> None:
         (lambda: mcsim.predict(run(), L_moments=2.5), ("L_moments", 2.5)),
         (lambda: mcsim.predict(run(), nthreads="2"), ("nthreads", "'2'")),
         (lambda: fit_models(None, None, "constant"), ("models", "'constant'")),
+        (lambda: mcsim.ScanModel.load("wmap").with_sampling(1e-9), ("1e-09", "3.16e+16", "sample_period_s")),
         (lambda: mcsim.merge(None, "x.zarr"), ("paths", None)),
         (lambda: mcsim.run(run(), realizations=slice("0", "3")), ("realizations",)),
         (lambda: mcsim.LimitSettings(nuisances=["calibration"]), ("nuisances",)),
