@@ -71,6 +71,12 @@ def diagnosed(run, maps, folder=None, simulations=240):
         return mcsim.diagnose(run, maps, folder, settings=replace(SETTINGS, simulations=simulations))
 
 
+@pytest.fixture(autouse=True)
+def here(monkeypatch):
+    """Simulate in this process."""
+    monkeypatch.setattr(api, "batch", lambda workers: campaign.batch(0))
+
+
 @pytest.fixture(scope="module")
 def maps():
     """Prepared maps without an effect."""
@@ -78,8 +84,7 @@ def maps():
 
 
 @pytest.mark.slow
-def test_prepared_maps_of_the_model_agree_with_it_and_an_effect_is_found(maps, tmp_path, monkeypatch):
-    monkeypatch.setattr(api, "batch", lambda workers: campaign.batch(0))  # in this process
+def test_prepared_maps_of_the_model_agree_with_it_and_an_effect_is_found(maps, tmp_path):
     run = model()
     found = diagnosed(run, maps, tmp_path)
     assert found.test.pvalue > 0.01
