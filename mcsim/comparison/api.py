@@ -211,6 +211,7 @@ def _explained(
         verdict: Verdict = "identical" if rms <= accuracy * sky else "unknown"
         return _result(pair, verdict, (), problem, sets), problem, 1.0
     sets = problem.preferred(sets)
+    sets[0] = problem.pruned(sets[0])
     known = {equal[0] for difference, value in sets[0].members for equal in difference.equivalent(value)}
     others_too = [one for one in problem.alternatives(sets) if not known.intersection(d.name for d, _ in one.members)]
     chosen = [sets[0], *others_too]

@@ -43,16 +43,8 @@ class EffectDifference(Difference):
     natural = 1e-9
     stage = 1
 
-    def __init__(
-        self,
-        kind: type[Effect],
-        templates: Maps,
-        run: config.RunConfig,
-        sky: Alm,
-        bare: dict[bytes, Maps] | None = None,
-    ) -> None:
+    def __init__(self, kind: type[Effect], templates: Maps, run: config.RunConfig, sky: Alm) -> None:
         self.kind, self.templates, self.run, self.sky = kind, templates, run, sky
-        self._bare = {} if bare is None else bare
         self._there: dict[tuple[bytes | float, ...], Maps] = {}
         self._products = np.tensordot(templates, templates, ((1, 2), (1, 2))) / templates[0].size
         power = healpy.alm2cl(sky)
@@ -110,26 +102,25 @@ class EffectDifference(Difference):
 
     def sampled(self, value: Vector, scene: Scene, pair: ChannelPair) -> Maps | None:
         """Return the response of the time-ordered reference; None if the effect does not act on samples."""
-        sky: Any = self._sky(scene, pair)  # an array stands for a file
-        bare, acting = (
-            replace(run, sky=replace(run.sky, spectrum=None, map=None, alm=sky))
-            for run in self._runs(self._effect(value), scene, pair, scene.beam)
-        )
+        pointing = pair.pointing()
+        assert pair.scene is not None
+        assert pointing is not None
+        sky: Any = scene.sky_of_samples(pair.scene.window)  # an array stands for a file
 
         def made(run: config.RunConfig) -> Maps:
+            run = replace(run, sky=replace(run.sky, spectrum=None, map=None, alm=sky))
             whole = _with_samples_of(scene, _survey(run, scene))
             return np.stack([m for _, m in sampled.maps(whole, 0, scene.nthreads, EPSILON)])
 
+        alone, acting = self._runs(self._effect(value), scene, pair, scene.beam)
         try:
             more = made(acting)
         except InputError:
             return None
-        numbers = np.array([*scene.psi, scene.late, *_periods(scene.motion), float(scene.centred)])
-        key = sky.tobytes() + scene.beam.blm.tobytes() + numbers.tobytes()
-        if key not in self._bare:
-            self._bare.clear()
-            self._bare[key] = made(bare)
-        return more - self._bare[key]
+        if alone.sky.dipole_uk:  # which a scene has not, and late samples see elsewhere
+            return more - made(alone)
+        bare = scene if scene.added is None else replace(scene, added=None)
+        return more - bare.sampled(pointing, pair.scene.window)
 
     def _sky(self, scene: Scene, pair: ChannelPair) -> Alm:
         """Return the sky of a scene, with what its pixel window has more than the samples' spread makes."""
@@ -141,9 +132,9 @@ class EffectDifference(Difference):
         self, effect: Effect, scene: Scene, pair: ChannelPair, beam: Beam
     ) -> tuple[config.RunConfig, config.RunConfig]:
         """Return the run through a beam turned as in a scene, without the effect and with it."""
-        assert pair.scene is not None
+        assert pair.channel is not None
         [channel] = self.run.channels
-        if beam is not pair.scene.beam or scene.psi[1]:
+        if beam is not pair.channel.site.beam or scene.psi[1]:
             turn = np.exp(-1j * np.arange(beam.mmax + 1) * scene.psi[1])
             table: Any = replace(beam, blm=turn[:, None] * beam.blm)
             channel = replace(channel, beam=table)
@@ -194,7 +185,6 @@ def effects_of(pair: ChannelPair, run: config.RunConfig) -> Iterator[EffectDiffe
         return simulate.maps(_survey(acting, scene), 0, scene.nthreads, scene.sky)
 
     bare = made(alone)
-    sampled_bare: dict[bytes, Maps] = {}
     for name, kind in catalogue().items():
         acts = any(getattr(kind, stage) is not getattr(Effect, stage) for stage in STAGES)
         if kind.parametrization.stochastic or name in REDUNDANT or not kind.proposed or not acts:
@@ -207,7 +197,7 @@ def effects_of(pair: ChannelPair, run: config.RunConfig) -> Iterator[EffectDiffe
         except InputError:  # it depends on what the model does not say: a frequency, a pointing, a differencing scan
             continue
         if any(t.any() for t in templates):
-            yield EffectDifference(kind, np.stack(templates), alone, scene.sky, sampled_bare)
+            yield EffectDifference(kind, np.stack(templates), alone, scene.sky)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -260,8 +250,9 @@ def _with_samples_of(scene: Scene, whole: Survey) -> Survey:
     if known is not None:
         late = scene.late * known.model.period_of_samples(known.line)
         site = replace(site, pointing=replace(known, model=scene.motion or known.model))
-    seen = _Seen(late_s=late, sign=scene.psi[0], centred=scene.centred)
-    return replace(whole.making, channels=(replace(channel, site=site, effects=(*channel.effects, seen)),))
+    otherwise = bool(late) or scene.psi[0] < 0 or scene.centred
+    seen = (_Seen(late_s=late, sign=scene.psi[0], centred=scene.centred),) if otherwise else ()
+    return replace(whole.making, channels=(replace(channel, site=site, effects=(*channel.effects, *seen)),))
 
 
 def _periods(motion: ScanModel | None) -> tuple[float, float]:

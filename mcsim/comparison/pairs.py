@@ -77,6 +77,8 @@ class ChannelPair:
         Highest order of the beam in a run of the model, if that is not said and less than the scene's; None.
     rounds
         How often the sky that was taken from side A was corrected for what single samples leave of it.
+    unmade
+        What they leave of side A, uK, as the last correction of its sky has it, if that is noise; None: to be made.
     """
 
     name: str
@@ -89,7 +91,6 @@ class ChannelPair:
     channel: Channel | None = None
     hits: Maps | None = None
     sky_of_maps: bool = False
-
     files: PointingFiles | None = None
     doubt: Alm | None = None
     spread: Maps | None = None
@@ -98,6 +99,7 @@ class ChannelPair:
     by_moments: bool = False
     orders: int | None = None
     rounds: int = 0
+    unmade: Maps | None = None
 
     def pointing(self, longest: float = SAMPLES) -> Pointing | PointingFiles | None:
         """Return the pointing, if it is known and has no more samples than the longest that is wanted."""
@@ -141,7 +143,7 @@ class ChannelPair:
         """Return the pair with the sky that side A shows, by orientation moments."""
         assert self.scene is not None
         sky = sky_in(self.a, self.shown, self.scene.up_to_offsets(1))
-        return replace(self, scene=replace(self.scene, sky=sky), rounds=0)
+        return replace(self, scene=replace(self.scene, sky=sky), rounds=0, unmade=None)
 
 
 @dataclass(frozen=True, eq=False)

@@ -82,6 +82,11 @@ class Set:
         return frozenset(difference.name for difference, _ in self.members)
 
     @property
+    def kind(self) -> frozenset[tuple[str, bytes]]:
+        """The same, with the values of those that cannot be moved: coordinates of the sky, or of the pixels."""
+        return frozenset((d.name, b"" if len(d.axes(value)) else value.tobytes()) for d, value in self.members)
+
+    @property
     def key(self) -> tuple[tuple[int, bytes], ...]:
         """The differences and their values, to look the set up by."""
         return tuple((id(difference), value.tobytes()) for difference, value in self.members)

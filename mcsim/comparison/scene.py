@@ -111,8 +111,8 @@ class Scene:
     added: "Callable[[Scene], Maps] | None" = None
     kept: OrderedDict[tuple[bytes, ...], Transforms] = field(default_factory=OrderedDict, repr=False)
     moved: OrderedDict[tuple[bytes, float, int], Beam] = field(default_factory=OrderedDict, repr=False)
-    # By identity of a pointing, which is held so that no other one can have it.
-    _made: dict[int, tuple[object, Maps]] = field(default_factory=dict, init=False, repr=False)
+    # By window and identity of a pointing, which is held so that no other one can have it.
+    _made: dict[tuple[int, bytes], tuple[object, Maps]] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def lmax(self) -> int:
@@ -276,19 +276,22 @@ class Scene:
         signal
             How samples see the sky, in place of the beam's convolution.
         """
-        own = signal is None and window is self.window
-        if own and id(pointing) in self._made:
-            return self._made[id(pointing)][1]
-        factor = self.window if self.centred else self.window / window
-        sky = alm_.multiply(self.sky, factor, self.lmax)
+        own, key = signal is None, (id(pointing), window.tobytes())
+        if own and key in self._made:
+            return self._made[key][1]
+        sky = self.sky_of_samples(window)
         signal = signal or tod.sky_signal(sky, self.lmax, self.beam, EPSILON, self.nthreads)
         streams = (self.stream(pointing, split) for split in range(len(self.moments)))
         binned = np.stack([tod.bin_samples(signal(self._pointed(s)), self.nside)[0] for s in streams])
         made = self._prepared(self._with_added(binned))
         made.setflags(write=False)
         if own:
-            self._made[id(pointing)] = pointing, made
+            self._made[key] = pointing, made
         return made
+
+    def sky_of_samples(self, window: NDArray[np.float64]) -> Alm:
+        """Return the sky with what its pixel window has more than the samples' spread makes by itself."""
+        return alm_.multiply(self.sky, self.window if self.centred else self.window / window, self.lmax)
 
     def _pointed(self, samples: Iterable[tod.Samples]) -> Iterator[tod.Samples]:
         sign, offset = self.psi

@@ -27,7 +27,6 @@ from mcsim.support.arrays import Vector
 _SMALL = 1e-3
 """Small angle in radians, share of a sample, or change of a variance, over which responses are linear."""
 
-
 WIDEST = 99.0
 """Largest variance of a smoothing over the beam's: ten times its width; more would make any sky vanish."""
 

@@ -149,9 +149,11 @@ class Problem(Prediction):
         """Return sets with the best one first, the first ones of those that are given measured sample by sample."""
         ranked = list(sets)
         worth = WORTH if self.pair.doubt is None else WORTH_IN_NOISE
-        for index, one in enumerate(ranked[:most]):
+        # Beside noise those that are measured already say what others are worth.
+        known = [one for one in ranked if self.pair.doubt is not None and one.key in self._exact]
+        for one in (*known, *(other for other in ranked[:most] if other not in known)):
             if one.left < worth:
-                ranked[index] = measured = self.corrected(one)
+                ranked[ranked.index(one)] = measured = self.corrected(one)
                 if self.complete(measured):
                     worth = 1.0 - EXPLAINED
                 elif self.unexplained(measured) == 0.0:
@@ -162,8 +164,11 @@ class Problem(Prediction):
     def _bases(self, found: Sequence[Set], library: Sequence[Difference]) -> list[tuple[Set, Sequence[Difference]]]:
         """Return the sets from which larger ones are built, with what is tried beside them.
 
-        They are the best, those that do best in pairs, exchanges, and turns beside other turns.
+        They are the best, those that do best in pairs, exchanges, and turns beside other turns; beside noise that hides
+        all that the best one leaves, that one alone.
         """
+        if self.pair.doubt is not None and self.suffices(found[0]) and self.unexplained(found[0]) == 0.0:
+            return [(self.preferred(found)[0], library)]
         bases = [one for one in found[:KEPT] if one.explains > LARGE]
         if len(found[0].members) > 1:
             return [(one, library) for one in bases]
@@ -300,6 +305,15 @@ class Problem(Prediction):
                     found.append(Set(members, self.left(members, one.correction), one.correction))
         return sorted(found, key=lambda one: one.left)
 
+    def pruned(self, found: Set) -> Set:
+        """Return a set without members that add nothing to the others, which may have come before these."""
+        for index in range(len(found.members) if len(found.members) > 2 else 0):
+            rest = (*found.members[:index], *found.members[index + 1 :])
+            fewer = self.fitted(Set(rest, 1.0, found.correction))
+            if self.suffices(fewer) and not self.adds(found, fewer):
+                return self.pruned(self.corrected(fewer))
+        return found
+
     def preferred(self, sets: Sequence[Set]) -> list[Set]:
         """Return sets with the best first; of those that are as good, the one with the fewest fitted values.
 
@@ -319,7 +333,7 @@ class Problem(Prediction):
         found = {sets[0].names: sets[0]}
         for one in sets[1:]:
             most = max(limit, UNFITTED * sets[0].left) if one.fitted < sets[0].fitted else limit
-            if one.left <= most and self.suffices(one):
+            if one.left <= most and self.suffices(one) and not one.names > sets[0].names:
                 found.setdefault(one.names, one)
         return list(found.values())[1:]
 
@@ -330,7 +344,7 @@ def _in_turn(sets: Sequence[Sequence[Set]], most: int) -> list[Set]:
     Moments alone do not say which of two bases is the better one.
     """
     ranked = zip_longest(*(sorted(own, key=lambda one: one.left) for own in sets))
-    found: dict[frozenset[str], Set] = {}
+    found: dict[frozenset[tuple[str, bytes]], Set] = {}
     for one in (one for each in ranked for one in each if one is not None):
-        found.setdefault(one.names, one)
+        found.setdefault(one.kind, one)
     return list(found.values())[:most]

@@ -58,7 +58,7 @@ def with_fewer_orders(pair: ChannelPair) -> tuple[ChannelPair, ChannelPair | Non
     beam, limit = scene.beam.truncated(pair.orders), SHARP**2 * _sky(pair)
     cut = replace(pair, scene=replace(scene, beam=beam))
     cut = cut.with_sky_of_maps() if pair.sky_of_maps else cut
-    found = [_by_moments(one) for one in (pair, cut)]
+    found = [(_left(one, one.scene.maps()), one) for one in (pair, cut) if one.scene is not None]
     if min(left for left, _ in found) > limit:
         both = zip(found, _by_samples(pair, cut), strict=True)
         found = [moments if moments[0] < MADE * samples[0] else samples for moments, samples in both]
@@ -75,12 +75,6 @@ def adds_orders(cut: ChannelPair, pair: ChannelPair) -> bool:
     return float(more @ rest) ** 2 > MADE * float(more @ more) * float(rest @ rest)
 
 
-def _by_moments(pair: ChannelPair) -> tuple[float, ChannelPair]:
-    """Return the squares that orientation moments leave of side A, and the pair."""
-    assert pair.scene is not None
-    return _left(pair, pair.scene.maps()), pair
-
-
 def _by_samples(pair: ChannelPair, cut: ChannelPair) -> list[tuple[float, ChannelPair]]:
     """Return the squares that single samples leave of side A of a pair, and of it with a cut beam, with their skies.
 
@@ -88,13 +82,17 @@ def _by_samples(pair: ChannelPair, cut: ChannelPair) -> list[tuple[float, Channe
     """
     if not pair.sky_of_maps:
         return [(_left(one, _made(one, scene)), one) for one in (pair, cut) if (scene := one.scene) is not None]
-    assert pair.scene is not None
-    _, first = _corrected(cut, _missing(cut))
-    assert first.scene is not None
-    whole, missing = replace(pair, scene=replace(pair.scene, sky=first.scene.sky)), _missing(first)
-    assert whole.scene is not None
-    more = np.where(pair.shown, whole.scene.maps() - first.scene.maps(), 0.0)
-    (less, fewer), (left, whole) = _corrected(first, missing), _corrected(whole, missing - more)
+    for last in (False, True):
+        assert pair.scene is not None
+        assert cut.scene is not None
+        scene, missing = replace(pair.scene, sky=cut.scene.sky), _missing(cut)
+        less, fewer = _corrected(cut, missing)
+        if last or fewer.unmade is not None:
+            more = np.where(pair.shown, scene.maps() - cut.scene.maps(), 0.0)
+            left, whole = _corrected(replace(pair, scene=scene), missing - more)
+            if last or whole.unmade is not None:  # noise leaves so much of both that no more can be told
+                break
+        cut = replace(fewer, unmade=None)
     if less < MADE * left:
         assert fewer.scene is not None
         less = _left(fewer, _made(fewer, fewer.scene))
@@ -104,7 +102,7 @@ def _by_samples(pair: ChannelPair, cut: ChannelPair) -> list[tuple[float, Channe
 def _missing(pair: ChannelPair) -> Maps:
     """Return what its simulation by single samples leaves of side A, 0 where that shows nothing."""
     assert pair.scene is not None
-    return np.where(pair.shown, pair.a - _made(pair, pair.scene), 0.0)
+    return np.where(pair.shown, pair.a - _made(pair, pair.scene), 0.0) if pair.unmade is None else pair.unmade
 
 
 def _corrected(pair: ChannelPair, missing: Maps) -> tuple[float, ChannelPair]:
@@ -113,7 +111,10 @@ def _corrected(pair: ChannelPair, missing: Maps) -> tuple[float, ChannelPair]:
     assert scene is not None
     empty = replace(scene.up_to_offsets(1), sky=np.zeros_like(scene.sky))
     more = replace(scene, sky=scene.sky + sky_in(missing, pair.shown, empty, 1e-2, scene.sky))
-    left = float(np.sum((missing - more.maps() + scene.maps())[pair.seen] ** 2))
+    rest = np.where(pair.shown, missing - more.maps() + scene.maps(), 0.0)
+    left = float(np.sum(rest[pair.seen] ** 2))
+    if left > SHARPER * np.sum(missing[pair.seen] ** 2):
+        return left, replace(pair, scene=more, rounds=ROUNDS, unmade=rest)
     return left, replace(pair, scene=more, rounds=pair.rounds + 1)
 
 
@@ -136,7 +137,7 @@ def _as_made(pair: ChannelPair, found: ChannelPair) -> ChannelPair:
     scene = pair.scene
     assert scene is not None
     assert found.scene is not None
-    left = _left(found, _made(found, found.scene))
+    left = float(np.sum(_missing(found)[found.seen] ** 2))
     if left <= UNSHOWN**2 * _sky(pair):
         return found
     best = scene
@@ -150,8 +151,8 @@ def _as_made(pair: ChannelPair, found: ChannelPair) -> ChannelPair:
     if best is scene and pair.pointing() is not None:
         spread = np.where(pair.seen, _made(pair, scene) - scene.maps(), 0.0)
         if np.sum(spread * np.where(pair.seen, pair.b - pair.a, 0.0)) > 0.5 * np.sum(spread**2):
-            return replace(pair, a=pair.a + spread, spread=spread)
-    return replace(pair, scene=best, by_moments=True)
+            return replace(pair, a=pair.a + spread, spread=spread, unmade=None)
+    return replace(pair, scene=best, by_moments=True, unmade=None)
 
 
 def _made(pair: ChannelPair, scene: Scene) -> Maps:
@@ -187,7 +188,7 @@ def _weight(pair: ChannelPair) -> Maps | None:
         return None
     whole = len(pair.a) > 1
     seen = pair.seen[:2].all(axis=0)
-    rest = (pair.a - _made(pair, pair.scene))[:2, seen]
+    rest = _missing(pair)[:2, seen]
     mean = pair.a[:2, seen].mean(axis=0)
     freedom = 1.0 if whole else 1.0 - _coefficients(pair.scene, pair.nside) / max(int(seen.sum()), 1)
     if freedom < FREE:
@@ -238,14 +239,13 @@ def _filtered(pair: ChannelPair, weight: Maps) -> ChannelPair:
         smooth = alm_.multiply(alm_.resize(sky, scene.lmax, lmax), factor, lmax)
         return healpix.synthesis(smooth[None], pair.nside, lmax, nthreads=scene.nthreads)[0]
 
-    rest = np.where(pair.seen, pair.a - _made(pair, scene), 0.0)
-    sky = sky_of(np.sum(weight * rest, axis=0) + total * seen_by_circle(scene.sky))
+    sky = sky_of(np.sum(weight * _missing(pair), axis=0) + total * seen_by_circle(scene.sky))
     draw = np.random.default_rng(0)
     other = _draw(power, draw)
     values = total * healpix.synthesis(other[None], pair.nside, lmax, nthreads=scene.nthreads)[0]
     other = alm_.resize(alm_.multiply(other, inverse, lmax), lmax, scene.lmax)
     doubt = other - sky_of(values + np.sqrt(total) * draw.standard_normal(total.size))
-    return replace(pair, scene=replace(scene, sky=sky), doubt=doubt)
+    return replace(pair, scene=replace(scene, sky=sky), doubt=doubt, unmade=None)
 
 
 def unshown(pair: ChannelPair) -> Alm | None:

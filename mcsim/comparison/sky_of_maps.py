@@ -10,7 +10,7 @@ from scipy.sparse.linalg import LinearOperator, cg, gmres
 from mcsim.comparison.scene import WEAKEST, Maps, Scene
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
-from mcsim.support.arrays import Alm
+from mcsim.support.arrays import Alm, Vector
 
 ITERATIONS = 30
 """Largest number of iterations for the sky that whole maps show, and of each filter for what holes leave of it."""
@@ -113,27 +113,12 @@ def _behind_holes(maps: Maps, seen: NDArray[np.bool_], empty: Scene, beside: Alm
 
 
 def wiener(
-    weighted: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    power: NDArray[np.float64],
-    nthreads: int,
-    start: Alm | None = None,
-    iterations: int = 100,
+    weighted: Vector, weight: Vector, power: Vector, nthreads: int, start: Alm | None = None, iterations: int = 100
 ) -> Alm:
     """Return the mean of the coefficients whose map, times a weight, was ``weighted`` but for noise.
 
-    Parameters
-    ----------
-    weighted, weight
-        Map times inverse variance of the noise, and that; shape (npix,).
-    power
-        Of the sky, shape (lmax + 1,).
-    nthreads
-        Of the transforms.
-    start
-        Coefficients near the answer; None: zeros.
-    iterations
-        Steps at most.
+    ``weighted``, ``weight``: map times inverse variance of the noise, and that, shape (npix,). ``power``: of the sky,
+    shape (lmax + 1,). ``start``: coefficients near the answer; None: zeros. ``iterations``: steps at most.
     """
     lmax, nside = power.size - 1, healpy.npix2nside(weight.size)
     size = np.sqrt(np.where(alm_.orders(lmax) == 0, 1.0, 2.0))  # so that the product of vectors is that of maps

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 import mcsim
-from comparisons import MODEL, PEAR, Simulator, names, small
+from comparisons import MODEL, PEAR, SMALL, Simulator, names, small
 from mcsim import config
 from mcsim.comparison import report
 from mcsim.comparison.differences import State
 from mcsim.comparison.effects import effects_of
 from mcsim.comparison.map_differences import NoiseShared
 from mcsim.comparison.pairs import ChannelPair, given
+from mcsim.comparison.scene_differences import TimeShift
 from mcsim.simulation import simulate
 from mcsim.simulation.channels import MOST_ORDERS, NEGLECTED, load_beam, with_all_orders
 from mcsim.simulation.survey import survey
@@ -196,3 +197,16 @@ def test_stored_maps_are_named_in_a_configuration(tmp_path, name):
         (tmp_path / name).write_bytes(b"\x93")
     with refused(tmp_path / name, "maps", "CHANNEL.fits"):
         mcsim.compare(tmp_path / name, tmp_path / name, config.load(MODEL))
+
+
+def test_late_samples_add_no_dipole_to_an_effect():
+    """A response to an ellipse has 0.1 uK of a dipole, and not the 770 uK by which late samples see it elsewhere."""
+    made, dipole = [], {"dipole_uk": 3000.0, "dipole_lon_deg": 264.0, "dipole_lat_deg": 48.0}
+    for sky in (SMALL["sky"], SMALL["sky"] | dipole):
+        simulator = Simulator(small(sky=sky))
+        [pair] = given(simulator(), simulator(), simulator.run).pairs
+        ellipse = next(one for one in effects_of(pair, simulator.run) if one.name == "beam_ellipticity")
+        late = TimeShift().scene(replace(pair.scene, sky=simulator.sky), np.array([0.01]), pair)
+        made.append(np.where(pair.seen, ellipse.sampled(np.array([0.1, 0.0]), late, pair), 0.0))
+    assert made[0].std() > 0.1
+    assert np.abs(made[1] - made[0]).max() < 1.0

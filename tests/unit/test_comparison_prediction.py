@@ -8,8 +8,11 @@ import pytest
 
 import mcsim
 from mcsim.comparison.effects import EffectDifference
+from mcsim.comparison.map_differences import Calibration, Dipole, FrameReversed, Monopole
+from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.prediction import Prediction, Set
 from mcsim.comparison.scene_differences import Smoothing, TimeShift
+from mcsim.comparison.search import Problem, _in_turn
 from mcsim.systematics.registry import catalogue
 
 
@@ -48,3 +51,26 @@ def test_no_response_to_an_effect_is_larger_than_the_sky():
     assert lag.within(np.array([-1e6])) == pytest.approx(-2.0)
     dipole = EffectDifference(catalogue()["dipole_residual"], np.ones((3, 1, 12)), run, sky)
     assert np.linalg.norm(dipole.within(np.array([0.0, 3e6, 4e6]))) == pytest.approx(340.0)
+
+
+def test_a_mirrored_sky_is_not_taken_for_mirrored_pixels():
+    """They have one name, and side B of single samples may tell what orientation moments do not."""
+    of_sky, of_pixels = ((FrameReversed(), np.array([0.0, level])) for level in (1.0, 0.0))
+    scale, other = ((Calibration(), np.array([value, 0.0])) for value in (0.01, 0.02))
+    sets = [Set((of_pixels, scale), 0.1), Set((of_sky, scale), 0.2), Set((other, of_sky), 0.3)]
+    assert _in_turn([sets], 3) == sets[:2]
+
+
+def test_a_member_that_adds_nothing_to_the_others_is_taken_out():
+    """A factor that came first leaves the set if a dipole and a monopole, found beside it, explain as much alone."""
+    draw = np.random.default_rng(1)
+    a, axis = draw.standard_normal((1, 768)), np.array(healpy.pix2vec(8, np.arange(768)))[2]
+    b = a + 2.0 * axis + 1.0 + 1e-3 * draw.standard_normal(a.shape)
+    problem = Problem(ChannelPair("T", ("T",), a, b, np.ones(a.shape, bool)), (), 1e-3)
+    dipole, mean = (Dipole(), np.array([0.0, 0.0, 1.9])), (Monopole(), np.array([0.9]))
+    found = problem.pruned(Set(((Calibration(), np.array([0.1, 0.0])), dipole, mean), 1e-2))
+    assert found.names == {"dipole", "monopole"}
+    assert found.left < 1e-5
+    whole = Set(((Calibration(), np.array([0.5, 0.0])), dipole, mean), 0.0)
+    other = Problem(ChannelPair("T", ("T",), a, b + 0.5 * a, np.ones(a.shape, bool)), (), 1e-3)
+    assert other.pruned(other.fitted(whole)).names == whole.names
