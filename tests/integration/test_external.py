@@ -265,19 +265,19 @@ def test_a_batch_that_was_interrupted_goes_on_with_the_same_maps(tmp_path, monke
     assert run.simulator == str(tmp_path / "sim.py:Noisy")
     data = list(native(5, 1)[0])
     with refused("sim.py:Noisy", "OSError", by=RunError):
-        mcsim.diagnose(run, data, settings=SETTINGS)
+        mcsim.diagnose(run, data, settings=FEW)
     first = (tmp_path / "calls").read_text().split()
     (tmp_path / "stop").unlink()
-    found = mcsim.diagnose(replace(run, compute=replace(run.compute, workers=7)), data, settings=SETTINGS)
+    found = mcsim.diagnose(replace(run, compute=replace(run.compute, workers=7)), data, settings=FEW)
     calls = (tmp_path / "calls").read_text().split()
     again = set(first) & set(calls[len(first) :])
     assert len(again) <= 10  # those of the task that was interrupted
     assert len(set(calls)) == found.simulations + 2  # and two that the seeds were tested with
-    assert mcsim.diagnose(run, data, settings=SETTINGS).test.pvalue == found.test.pvalue
+    assert mcsim.diagnose(run, data, settings=FEW).test.pvalue == found.test.pvalue
     assert (tmp_path / "calls").read_text().split() == calls
     assert not list((tmp_path / "cache").glob("diagnose/*.parts"))
     (tmp_path / "sim.py").write_text(SIMULATOR.replace("scale=300.0", "scale=320.0"))
-    other = mcsim.diagnose(run, data, settings=SETTINGS)
+    other = mcsim.diagnose(run, data, settings=FEW)
     assert len((tmp_path / "calls").read_text().split()) == len(calls) + other.simulations + 3
     assert other.test.pvalue != found.test.pvalue
 
