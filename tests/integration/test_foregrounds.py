@@ -72,7 +72,7 @@ def test_no_gap_where_there_is_none(three: DiagnosisContext) -> None:
 def test_amplitude_and_index_of_drawn_patterns_are_found(three: DiagnosisContext) -> None:
     truth = 3.0  # 34 of 40 are named alone; twice as bright, half are: single patterns leave more than 48 draws tell
     shared = data_of(three.run, "foreground_residual", amplitude=truth, spectral_index=INDEX)
-    pulls, named, cases = [], 0, 3
+    pulls, named, cases = [], 0, 4
     for number in range(cases):
         found = diagnose_data(ObservedMaps(three, list(simulate.maps(shared, number)), ask), str(number))
         if [one.name for one in found.effects] != ["foreground_residual"]:

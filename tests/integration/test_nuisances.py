@@ -38,7 +38,7 @@ MODEL = two_channels("company", sigma0_uk=60.0) | {
         for effect, width in (("calibration", WIDTH), ("noise_level", NOISE))
     ],
 }
-SIMULATIONS, SKIES = 400, 240
+SIMULATIONS, SKIES = 400, 320
 
 
 def ask(jobs):
