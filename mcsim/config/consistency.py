@@ -10,10 +10,7 @@ NARROWEST = 0.03  #: width of a beam, radians, times lmax: a Gaussian of it has 
 
 
 def warn_of_units(run: Any) -> None:
-    """Warn of beams that no map of the run shows, whose widths may be in radians, and of effects without amplitude."""
-    for effect in run.effects:
-        if "amplitude" not in effect.parameters:
-            warnings.warn(f"effect {effect.name} has no amplitude, so that it does nothing; give one.", stacklevel=3)
+    """Warn of beams that no map of the run shows: their widths may be in radians."""
     for channel in run.channels:
         for side in ("beam", "beam_b"):
             for key in ("fwhm_arcmin", "fwhm_major_arcmin"):

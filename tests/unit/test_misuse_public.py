@@ -12,6 +12,7 @@ import mcsim
 from mcsim import Beam, Moments, config, systematics
 from mcsim.beamfit.effective_beam import fit_models
 from mcsim.errors import InputError
+from mcsim.simulation.channels import check_effects
 from refusals import refused
 
 LMAX, NSIDE = 12, 8
@@ -207,7 +208,7 @@ def test_arguments_of_another_kind_are_named(wrong, named) -> None:
 
 def test_an_effect_without_amplitude_is_warned_of() -> None:
     with pytest.warns(UserWarning, match="calibration has no amplitude"):
-        mcsim.load_config(run(effect=[{"name": "calibration", "channel": "W"}]))
+        check_effects(mcsim.load_config(run(effect=[{"name": "calibration", "channel": "W"}])))
 
 
 def test_variances_in_k2_are_no_noise() -> None:
