@@ -2,7 +2,9 @@
 
 import re
 
-_GIVEN = re.compile(r"""['"]?[^\s'"(]*/given-[0-9a-f]{64}/(\w+)(?:\.\w+)?['"]?""")
+_GIVEN = re.compile(
+    r"""(?:(?:power spectrum|moments file|pointing file) )?['"]?[^\s'"(]*/given-[0-9a-f]{64}/(\w+)(?:\.\w+)?['"]?"""
+)
 """File of the cache that holds what a user gave as an array or object; its name is that of the key or object."""
 
 

@@ -175,6 +175,8 @@ def fit_models(
 
     InputError as well for no model or a repeated one.
     """
+    if isinstance(names, str):
+        raise InputError(f"models = {names!r} is no list of models; give one, such as [{names!r}].")
     if not names or len(set(names)) < len(names):
         raise InputError(f"the models {', '.join(names) or '(none)'} are not different ones; name each model once.")
     made = templates(survey_of(source, nthreads), measured, nthreads)

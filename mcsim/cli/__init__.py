@@ -16,7 +16,9 @@ from typer import Argument, Option
 
 from mcsim.cli import ensembles
 from mcsim.cli.common import (
+    Command,
     Config,
+    Group,
     Including,
     Png,
     Processes,
@@ -25,12 +27,15 @@ from mcsim.cli.common import (
     Workers,
     chosen,
     interrupt_once,
+    picture,
     save,
 )
 from mcsim.errors import InputError, RunError
+from mcsim.support.loading import loaded
 
 app = typer.Typer(
     name="mcsim",
+    cls=Group,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -84,10 +89,10 @@ for _command in (
     ensembles.maps,
     ensembles.prepare,
 ):
-    app.command()(_command)
+    app.command(cls=Command)(_command)
 
 
-@app.command()
+@app.command(cls=Command)
 def fit(
     data: Annotated[str, Argument(metavar="DATA", help="Store, or ECSV table of binned spectra.")],
     config: Config,
@@ -109,7 +114,7 @@ def fit(
     from mcsim.ensemble.expectation import survey_of
     from mcsim.plot.fit import fit_figure
 
-    nthreads = os.cpu_count() or 1
+    target, nthreads = picture(output, data, "-fit"), os.cpu_count() or 1
     span = None if ell_max is None and ell_min == 2 else (ell_min, ell_max if ell_max is not None else 1 << 30)
     selection = beamfit.Selection(tuple(mode or beamfit.QUADRUPOLE), span, kind, pair)  # type: ignore[arg-type]
     survey = survey_of(config, nthreads)
@@ -122,13 +127,13 @@ def fit(
         print(json.dumps([one.to_dict() for one in fits], indent=2, ensure_ascii=False))
     else:
         print(beamfit.report(fits))
-    save(fit_figure(fits), output or Path("fit.png"))
+    save(fit_figure(fits), target)
 
 
-@app.command()
+@app.command(cls=Command)
 def beam(
-    source: Annotated[str, Argument(metavar="BEAM", help="Beam map or b_lm (FITS), B_l (text), or a CONFIG.")],
-    lmax: Annotated[int, Option(min=2, max=8192, help="Degree of the coefficients.")] = 2048,
+    source: Annotated[str, Argument(metavar="BEAM", help="Beam map, b_lm or B_l (FITS), B_l (text), or a CONFIG.")],
+    lmax: Annotated[int | None, Option(min=2, max=8192, help="Default: 2048, or all that the file has.")] = None,
     m_max: Annotated[int | None, Option(min=0, help="Order; default: chosen from the beam.")] = None,
     pixel_deg: Annotated[float | None, Option(help="Side of a pixel of a beam map; default: its header's.")] = None,
     output: Png = None,
@@ -136,13 +141,13 @@ def beam(
     """Print a beam's solid angle, widths, B_l and b_lm; draw it."""
     from mcsim.plot.look import look_at_beams
 
+    target = picture(output, source, "-beam")
     for number, look in enumerate(look_at_beams(source, lmax, m_max, pixel_deg)):
         print(look.text)
-        target = output or Path("beam.png")
         save(look.figure, target if number == 0 else target.with_stem(f"{target.stem}-{look.name}"))
 
 
-@app.command()
+@app.command(cls=Command)
 def scan(
     model: Annotated[str, Argument(metavar="MODEL", help="Scan model: a packaged name such as wmap, or TOML.")],
     nside: Annotated[int, Option(help="Resolution of the moments.")] = 256,
@@ -155,12 +160,13 @@ def scan(
     """Print the hits, the orientation moments and the three factors of a scan; draw them."""
     from mcsim.plot.look import look_at_scan
 
+    target = picture(output, model, "-scan")
     look = look_at_scan(model, nside, smax, frame, sample_period_s, line_of_sight)
     print(look.text)
-    save(look.figure, output or Path(f"scan-{look.name}.png"))
+    save(look.figure, target)
 
 
-@app.command()
+@app.command(cls=Command)
 def diagnose(
     model: Config,
     data: Annotated[
@@ -180,6 +186,9 @@ def diagnose(
     dry_run: Annotated[bool, Option("--dry-run", help="Read DATA; say what it takes; simulate none.")] = False,
 ) -> None:
     """Test maps against a model, and find the effect that the model lacks: where, how large, and if adding it helps."""
+    # Threads that share small matrices wait for each other, while workers want their cores.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    loaded("mcsim.diagnosis.api")
     from mcsim import config
     from mcsim.datavector.settings import DiagnosisSettings
     from mcsim.diagnosis.api import describe
@@ -205,7 +214,7 @@ def diagnose(
     print("\n".join(summary(found, output)))
 
 
-@app.command()
+@app.command(cls=Command)
 def limit(
     model: Config,
     output: Annotated[
@@ -247,7 +256,7 @@ def limit(
         print(f"written: {output / 'limit.json'}, {output / 'limit.zarr'}, {output / 'limit.png'}")
 
 
-@app.command()
+@app.command(cls=Command)
 def compare(
     a: Annotated[Path, typer.Argument(metavar="A", help="Folder of maps, or a configuration.")],
     b: Annotated[Path, typer.Argument(metavar="B", help="The same skies from another simulation.")],
@@ -270,14 +279,16 @@ def compare(
         raise typer.Exit(1)
 
 
-challenge = typer.Typer(help="Benchmark the diagnosis on effects that are drawn and sealed.", no_args_is_help=True)
+challenge = typer.Typer(
+    cls=Group, help="Benchmark the diagnosis on effects that are drawn and sealed.", no_args_is_help=True
+)
 app.add_typer(challenge, name="challenge")
 
 Folder = Annotated[Path, Argument(metavar="DIR", help="Folder of the challenge.")]
 Target = Annotated[Path, Option("-o", "--output", metavar="DIR", help="Folder to fill.")]
 
 
-@challenge.command("make")
+@challenge.command("make", cls=Command)
 def challenge_make(
     model: Config,
     output: Target,
@@ -307,7 +318,7 @@ def challenge_make(
     make(shared, output, cases, seed, workers=chosen(workers, scheduler), quiet=False)
 
 
-@challenge.command("run")
+@challenge.command("run", cls=Command)
 def challenge_run(folder: Folder, workers: Workers = None, scheduler: Scheduler = None) -> None:
     """Diagnose all cases that have no verdict."""
     from mcsim.benchmark.challenge import run as diagnose_all
@@ -316,7 +327,7 @@ def challenge_run(folder: Folder, workers: Workers = None, scheduler: Scheduler 
     print(f"{diagnose_all(folder, workers=chosen(workers, scheduler), quiet=False)} cases diagnosed")
 
 
-@challenge.command("score")
+@challenge.command("score", cls=Command)
 def challenge_score(folder: Folder, workers: Workers = None, scheduler: Scheduler = None) -> None:
     """Open the keys and score the verdicts."""
     from mcsim.benchmark import report, score
@@ -324,7 +335,7 @@ def challenge_score(folder: Folder, workers: Workers = None, scheduler: Schedule
     print("\n".join(report.lines(score.score(folder, workers=chosen(workers, scheduler), quiet=False))))
 
 
-@challenge.command("draws")
+@challenge.command("draws", cls=Command)
 def challenge_draws(
     model: Config,
     output: Target,
@@ -345,7 +356,7 @@ def challenge_draws(
     print("\n".join(report.lines(found)))
 
 
-@app.command()
+@app.command(cls=Command)
 def effects(name: Annotated[str | None, Argument(metavar="EFFECT", help="Only this one.")] = None) -> None:
     """List the library of effects: what a run can add and a diagnosis can find."""
     from mcsim import systematics as library
@@ -362,7 +373,7 @@ def effects(name: Annotated[str | None, Argument(metavar="EFFECT", help="Only th
             print(f"  {key:<11} {getattr(kind, key)}")
 
 
-@app.command()
+@app.command(cls=Command)
 def bench(
     nside: Annotated[int, Option(help="Resolution of the maps.")] = 512,
     lmax: Annotated[int, Option(min=2, help="Degree of the analysis.")] = 1024,
@@ -375,7 +386,7 @@ def bench(
         print(line)
 
 
-@app.command()
+@app.command(cls=Command)
 def config(
     name: Annotated[str | None, Argument(metavar="CONFIG", help="Check it and print it resolved.")] = None,
     schema: Annotated[bool, Option("--schema", help="Print the JSON schema of the TOML file.")] = False,
@@ -394,6 +405,8 @@ def config(
         check_scans(loaded)
         check_effects(loaded)
         check_nuisances(loaded)
-        print(json.dumps({"digest": config_.digest(loaded), **config_.resolved(loaded)}, indent=2, ensure_ascii=False))
+        plain = config_.resolved(loaded)
+        plain["map"].setdefault("offset_order", 1)
+        print(json.dumps({"digest": config_.digest(loaded), **plain}, indent=2, ensure_ascii=False))
     else:
         raise InputError("Nothing was asked for; give a configuration to check, or --schema.")

@@ -2,13 +2,40 @@
 
 import signal
 from pathlib import Path
+from tempfile import TemporaryFile
 from types import FrameType
-from typing import Annotated
+from typing import Annotated, Any
 
 from typer import Argument, Option
+from typer.core import TyperCommand, TyperGroup
 
 from mcsim.errors import InputError
-from mcsim.support.folders import user_path
+from mcsim.support.folders import unwritable, user_path
+
+
+def _without_types(options: list[Any]) -> list[Any]:
+    """Return options whose flags, which take no value, show no type in --help."""
+    for option in options:
+        if getattr(option, "is_bool_flag", False):
+            option.metavar = ""
+    return options
+
+
+class Command(TyperCommand):
+    """A command whose flags show no type in --help."""
+
+    def get_params(self, ctx: Any) -> Any:
+        """Return the parameters of the command."""
+        return _without_types(super().get_params(ctx))
+
+
+class Group(TyperGroup):
+    """A group of commands whose flags show no type in --help."""
+
+    def get_params(self, ctx: Any) -> Any:
+        """Return the parameters of the group."""
+        return _without_types(super().get_params(ctx))
+
 
 Config = Annotated[str, Argument(metavar="CONFIG", help="TOML file, or a packaged workflow such as quickstart.")]
 Workers = Annotated[int | None, Option(min=0, help="Processes; 0: this one; default: the model's.")]
@@ -20,7 +47,7 @@ Simulations = Annotated[int | None, Option(min=50, help="For a sample covariance
 Processes = Annotated[int | None, Option(min=1, help="Local processes; default: the configuration's.")]
 Scheduler = Annotated[str | None, Option(metavar="ADDRESS", help="Running Dask scheduler, tcp://host:port.")]
 Part = Annotated[str | None, Option(metavar="A:B", help="Only realizations A to B - 1; default: all.")]
-Png = Annotated[Path | None, Option("-o", "--output", metavar="PNG", help="Picture to write.")]
+Png = Annotated[Path | None, Option("-o", "--output", metavar="PNG", help="Default: beside what it shows.")]
 
 
 def chosen(workers: int | None, scheduler: str | None) -> int | str | None:
@@ -42,10 +69,24 @@ def interrupt_once() -> None:
         signal.signal(name, interrupt)
 
 
+def picture(asked: Path | None, shown: str | Path, end: str = "") -> Path:
+    """Return the path of a picture: the one asked for, or a name with ``end`` beside the file or folder it shows.
+
+    The picture of something packaged comes into the working folder. Raise InputError if the folder cannot be written
+    into: that is said before anything is computed.
+    """
+    source = user_path(shown)
+    folder = source.absolute().parent if source.name in ("", "..") else source.parent
+    target = folder / f"{source.absolute().stem}{end}.png" if asked is None else user_path(asked)
+    with unwritable(target, "choose another file with -o"), TemporaryFile(dir=target.absolute().parent):
+        pass
+    return target
+
+
 def save(figure, path: Path) -> None:  # type: ignore[no-untyped-def]
     """Save a figure and print its path; raise InputError if the file cannot be written."""
     try:
-        figure.savefig(user_path(path))
+        figure.savefig(path)
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
         raise InputError(f"{path} cannot be written ({why}); choose another file with -o.") from error

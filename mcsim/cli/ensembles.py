@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from mcsim.cli.common import Config, Part, Png, Processes, Scheduler, chosen, interrupt_once, save
+from mcsim.cli.common import Config, Part, Png, Processes, Scheduler, chosen, interrupt_once, picture, save
 from mcsim.errors import InputError
 from mcsim.support.loading import loaded
 
@@ -95,6 +95,7 @@ def plot(
     from mcsim.plot.spectra import ensemble_figure
 
     stores.attributes(store)
+    target = picture(output, store)
     expected = None
     if predict is not None and predict.endswith((".zarr", ".ecsv")):
         if exact:
@@ -103,7 +104,7 @@ def plot(
     elif predict is not None:
         expected = prediction.predict(predict, exact=exact, nthreads=os.cpu_count() or 1)
     figure = ensemble_figure(store, L=L, M=M, d=d, pair=pair, prediction=expected)
-    save(figure, output or store.with_suffix(".png"))
+    save(figure, target)
 
 
 def predict(
@@ -119,7 +120,7 @@ def predict(
 
     where = chosen(workers, scheduler)
     if output is not None:
-        tables.check_ending(output)
+        tables.check_output(output)
     expected = prediction.predict(config, exact=exact, snr=snr, nthreads=os.cpu_count() or 1, workers=where)
     print(describe.describe_prediction(expected))
     if output is not None:

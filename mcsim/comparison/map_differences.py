@@ -36,10 +36,12 @@ class Calibration(Difference):
     def starts(self, state: State) -> list[Vector]:
         """Return the fraction, and 0 for maps with their noise or 1 for the sky alone, where they have noise.
 
-        Maps that share less than half of their variance are not each other's times a factor.
+        Maps that share less than half of their variance are not each other's times a factor, and ten is a unit's.
         """
         found, seen = [np.array([*state.fit([state.maps]), 0.0])], state.pair.seen
-        if 2.0 * np.sum(((1.0 + found[0][0]) * state.maps[seen]) ** 2) < np.sum(state.pair.b[seen] ** 2):
+        if not 0.1 < 1.0 + found[0][0] < 10.0 or 2.0 * np.sum(((1.0 + found[0][0]) * state.maps[seen]) ** 2) < np.sum(
+            state.pair.b[seen] ** 2
+        ):
             return []
         if state.scene is not None and state.pair.doubt is not None:
             found.append(np.array([*state.fit([state.scene.maps()]), 1.0]))
@@ -91,7 +93,8 @@ class Unit(Difference):
         return 1.0 / value
 
     def equivalent(self, value: Vector) -> list[tuple[str, float, str]]:
-        return [("calibration", float(value[0]) - 1.0, "fraction")]
+        """Return the calibration that does the same, if it could be one."""
+        return [("calibration", float(value[0]) - 1.0, "fraction")] if 0.1 < value[0] < 10.0 else []
 
 
 class Monopole(Difference):

@@ -228,7 +228,9 @@ class Prediction:
         return max(found.left - (1.0 + UNSURE) * self.hidden(found), 0.0)
 
     def suffices(self, found: Set) -> bool:
-        """Return True if a set explains enough to be named."""
+        """Return True if a set explains enough to be named, and its maps share half of their variance with side B."""
+        if 2.0 * found.left * self.total > float(np.sum(self.pair.b[self.pair.seen] ** 2)):
+            return False  # side A alone is large, as with a pixel gone wrong: any factor explains the difference
         needed = min([self.needed(), *(difference.enough for difference, _ in found.members)])
         if found.explains >= needed:
             return True

@@ -197,6 +197,7 @@ def _existing(entry: Entry, values: dict[str, Any], where: str) -> Path:
         return path
     names = resources.names(entry.rule.packaged) if entry.rule.packaged else ()
     packaged = f" or one of the packaged names {', '.join(names)}" if names else ""
+    what = "is a folder" if os.path.isdir(path) else "does not exist"
     raise InputError(
-        f"{where}: {entry.key} names the file {str(path)!r}, which does not exist; give an existing one{packaged}."
+        f"{where}: {entry.key} names the file {str(path)!r}, which {what}; give an existing one{packaged}."
     )

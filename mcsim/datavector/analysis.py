@@ -15,6 +15,7 @@ from mcsim.datavector.map_checks import checked_map
 from mcsim.datavector.matched_filters import differencing_filters, matched_filter
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Block, Element, blocks_of, of_map
+from mcsim.datavector.untouched_maps import UntouchedMaps, without_effects
 from mcsim.datavector.wiener_filter import Model, model_of, shared_sky, wiener_filter
 from mcsim.ensemble.external_maps import Source
 from mcsim.errors import InputError
@@ -275,14 +276,26 @@ def simulated_maps(job: Job, library: Library | None = None) -> Iterator[list[Ma
         if job.sample_by_sample:
             yield [map_uk for _, map_uk in sampled.maps(shared, realization)]
             continue
-        sky = None
-        if job.observed is not None:
+        sky, observed = None, b"" if job.observed is None else job.observed.tobytes()
+        if observed:
             seed, _ = _seed_and_added(job.simulated, job.fiducial)
-            sky = _constrained_sky(job.definition, job.observed.tobytes(), seed, realization)
+            sky = _constrained_sky(job.definition, observed, seed, realization)
         if job.source is not None:
             yield external_maps(job, realization, sky)
-        else:
+        elif job.nuisances:
             yield list(simulate.maps(shared, realization, sky=sky))
+        else:
+            which = (
+                without_effects(job.simulated),
+                job.library if library is None else kinds_of(library),
+                hash(observed),
+            )
+            yield _untouched().maps(shared, realization, sky, which)
+
+
+@lru_cache(maxsize=1)
+def _untouched() -> UntouchedMaps:
+    return UntouchedMaps()
 
 
 def external_maps(job: Job, realization: int, sky: Alm | None = None) -> list[Map]:

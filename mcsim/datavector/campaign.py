@@ -257,8 +257,9 @@ def _results(analysis: Analysis, jobs: dict[Purpose, Job], ask: Ask, pilot: bool
     few, source = settings.pilot_sims_per_element * size, analysis.source
     if source is not None and source.count is not None and source.count <= size:
         raise _too_few(source, size, settings.sims_per_element)
-    first = run([one for one in jobs if one.kind == "null" and one.number < few])
-    drawn = np.concatenate([result[:, :size] for result in first.values()])
+    # What is needed in any case keeps workers busy to the end of the pilot; external simulations wait for its verdict.
+    first = run([one for one in jobs if (one.number < few if one.kind == "null" else source is None)])
+    drawn = np.concatenate([result[:, :size] for purpose, result in first.items() if purpose.kind == "null"])
     quiet = without_nuisances(drawn, _nuisances(analysis, len(drawn)))
     independent = SimulatedGaussian.from_simulations(quiet, floor=settings.redundant).dimension
     enough = settings.sims_per_element * independent

@@ -1,6 +1,7 @@
 """Read observed maps, and refuse maps that a survey cannot have made."""
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 
 import healpy
@@ -35,6 +36,12 @@ def checked_map(model: Model, part: Part, map_: Map, name: str) -> Map:
             f"{100 * limits.missing_share:.0f} % may be; give the model a mask (map.mask) that leaves them out too."
         )
     seen = map_[fiducial & ~unseen]
+    zeros = int(np.sum(seen == 0.0))
+    if zeros > limits.missing_share * seen.size and not model.survey.config.preparation:
+        raise InputError(
+            f"{name} is exactly 0 in {zeros} pixels that the model observes; mark what was not observed as UNSEEN, and "
+            "give the model a mask (map.mask) that leaves it out too."
+        )
     rms = float(np.std(seen))
     if rms == 0.0:
         raise InputError(f"{name} is constant; give an observed map.")
@@ -60,7 +67,9 @@ def read_maps(model: Model, folder: str | Path) -> list[Map]:
     if not folder.is_dir():
         first = names[model.parts[0].name]
         raise InputError(f"{folder} is no folder; give one with the observed maps, {first} and so on.")
-    return [_read(model, part, folder / names[part.name]) for part in model.parts]
+    maps = [_read(model, part, folder / names[part.name]) for part in model.parts]
+    _check_differ(maps, [str(folder / names[part.name]) for part in model.parts])
+    return maps
 
 
 def checked(model: Model, maps: Sequence[Map] | Mapping[str, Map]) -> list[Map]:
@@ -76,10 +85,19 @@ def checked(model: Model, maps: Sequence[Map] | Mapping[str, Map]) -> list[Map]:
     if len(maps) != len(model.parts):
         raise InputError(f"{len(maps)} maps were given, the model has {len(model.parts)}; give one for each.")
     named = [(part, f"map {part.name}") for part in model.parts]
-    return [
+    found = [
         checked_map(model, part, reals(map_, name, healpy.UNSEEN), name)
         for (part, name), map_ in zip(named, maps, strict=True)
     ]
+    _check_differ(found, [name for _, name in named])
+    return found
+
+
+def _check_differ(maps: Sequence[Map], names: Sequence[str]) -> None:
+    """Raise InputError for two maps that are the same: their noise differs, so that one is a copy."""
+    for (one, name), (other, twin) in combinations(zip(maps, names, strict=True), 2):
+        if np.array_equal(one, other):
+            raise InputError(f"{twin} is the same map as {name}; give each channel and split its own.")
 
 
 def _read(model: Model, part: Part, path: Path) -> Map:

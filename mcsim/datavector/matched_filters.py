@@ -43,7 +43,7 @@ def matched_filter(model: Model, effect: Effect, channel: int | None) -> Matched
     factor = effect.noise(owner.site)
     if factor is not None:
         change = np.asarray(factor) - 1.0
-        return lambda filtered: float(np.dot(filtered.difference[channel], change))
+        return lambda filtered: float(np.dot(filtered.squares[channel], change))
     return None if effect.gain(np.zeros(1), owner.site) is None else _gain_filter(model, effect, channel)
 
 

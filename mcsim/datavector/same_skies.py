@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from mcsim.datavector.analysis import Analysis, Job
 from mcsim.datavector.campaign import Ask, after_jobs, constrained_jobs
 from mcsim.datavector.wiener_filter import shared_sky
 from mcsim.support.arrays import Alm, Map, Matrix, Vector
+
+Skies = Literal["reference", "typical", "constrained"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,25 +40,60 @@ class SameSkies:
         """
         return {(constrained, external): [] for constrained in (False, True) for external in (False, True)}
 
+    @cached_property
+    def _ahead(self) -> dict[tuple[str, int, int, bool], Matrix]:
+        """Return what was simulated ahead, by all that tells such jobs apart."""
+        return {}
+
+    def skies_of(self, effect: config.Effect) -> Skies:
+        """Return in which skies the response to an effect is measured.
+
+        One with a mean response, or a drawn pattern, is of typical skies: the observed sky has its power already.
+        """
+        how = dict(self.analysis.library)[effect.name].parametrization
+        if how.mean_response == how.stochastic:
+            return "constrained"
+        return "reference" if how.mean_response else "typical"
+
+    def ahead(self, each: Sequence[config.Effect], skies: int) -> None:
+        """Simulate single effects at once that :meth:`of_reference` or :meth:`pair` will be asked for one by one.
+
+        One by one they would leave workers waiting. InputError if one of them cannot be simulated.
+        """
+        kinds = [(effect, self.skies_of(effect)) for effect in each]
+        sets = [([effect], kind == "constrained", None if kind == "reference" else skies) for effect, kind in kinds]
+        jobs = [job for one in sets for job in self._jobs(*one)]
+        self._ahead.update(zip(map(_key, jobs), self.ask(jobs) if jobs else [], strict=True))
+
     def of_reference(self, found: Sequence[config.Effect], skies: int | None = None) -> Matrix:
         """Return data vectors with effects, of the first or all of the skies with which responses are measured."""
-        return self._extended(after_jobs(self.analysis, found, skies))
+        return self._simulated(self._jobs(found, False, skies))
 
     def pair(self, found: Sequence[config.Effect], skies: int, constrained: bool) -> tuple[Matrix, Matrix]:
         """Return data vectors of the same skies without effects and with them."""
-        source = self.analysis.source_of(found, given_sky=constrained)
-
-        def simulated(found: Sequence[config.Effect], first: int) -> Matrix:
-            if constrained:
-                jobs = constrained_jobs(self.analysis, found, self.observed, range(first, skies))
-            else:
-                jobs = after_jobs(self.analysis, found, skies)
-            return self._extended([replace(job, source=source) for job in jobs])[first - skies :]
-
-        after, before = simulated(found, 0), self._before[constrained, source is not None]
-        if len(before) < skies:
-            before.extend(simulated((), len(before)))
+        jobs = self._jobs(found, constrained, skies)
+        after, source = self._simulated(jobs), jobs[0].source
+        before = self._before[constrained, source is not None]
+        if (first := len(before)) < skies:
+            same = [replace(job, source=source) for job in self._jobs((), constrained, skies, first)]
+            before.extend(self._simulated(same)[first - skies :])
         return np.stack(before[:skies]), after
 
-    def _extended(self, jobs: Sequence[Job]) -> Matrix:
-        return np.concatenate(self.ask([replace(job, slices=True) for job in jobs]))
+    def _jobs(self, found: Sequence[config.Effect], constrained: bool, skies: int | None, first: int = 0) -> list[Job]:
+        """List the jobs that simulate effects; of skies that are not constrained, always from the first one on."""
+        if not constrained or skies is None:
+            jobs = after_jobs(self.analysis, found, skies)
+        else:
+            jobs = constrained_jobs(self.analysis, found, self.observed, range(first, skies))
+        source = self.analysis.source_of(found, given_sky=constrained)
+        return [replace(job, slices=True, source=source) for job in jobs]
+
+    def _simulated(self, jobs: Sequence[Job]) -> Matrix:
+        known = {_key(job): self._ahead.pop(_key(job), None) for job in jobs}
+        missing = [job for job in jobs if known[_key(job)] is None]
+        known.update(zip(map(_key, missing), self.ask(missing) if missing else [], strict=True))
+        return np.concatenate([rows for rows in known.values() if rows is not None])
+
+
+def _key(job: Job) -> tuple[str, int, int, bool]:
+    return job.simulated, job.first, job.count, job.observed is not None

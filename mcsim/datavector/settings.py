@@ -13,7 +13,7 @@ _FIRST = {
     "typical_skies": 3,
     "common_skies": 6,
     "noisy_skies": 12,
-    "time_ordered_skies": 2,
+    "time_ordered_skies": 1,
     "scan_sims": 100,
 }
 """Numbers of simulations of a first verdict."""

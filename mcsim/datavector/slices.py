@@ -40,10 +40,17 @@ def values_of(model: Model, filtered: FilteredMaps) -> Vector:
     """Return real coefficients of every map's residual over its noise variance, and of that times the sky."""
     found = []
     low, top = (min(one, model.lmax) for one in DEGREES.values())
+    harmonics = _harmonics(model.nside, top)
     for i in range(len(model.parts)):
-        gain = healpix.adjoint(filtered.residual[i] * filtered.expected[i], top)
-        found += [real.coefficients(filtered.adjoint[i], model.lmax, low), real.coefficients(gain, top, top)]
+        gain = harmonics @ (filtered.residual[i] * filtered.expected[i])
+        found += [real.coefficients(filtered.adjoint[i], model.lmax, low), gain]
     return np.concatenate(found)
+
+
+@lru_cache(maxsize=2)
+def _harmonics(nside: int, top: int) -> Matrix:
+    """Return the real harmonics at pixel centres, shape ((top + 1)^2, npix)."""
+    return np.stack([healpix.synthesis(real.to_alm(unit, top)[None], nside, top)[0] for unit in np.eye((top + 1) ** 2)])
 
 
 def northern(elements: Sequence[Element], frame: str) -> Matrix:
@@ -64,9 +71,7 @@ def northern(elements: Sequence[Element], frame: str) -> Matrix:
 @lru_cache(maxsize=16)
 def _overlap(frame: str, to: str, top: int) -> Matrix:
     """Return the integrals of products of real harmonics over a hemisphere."""
-    npix = 12 * NSIDE**2
-    units = [healpix.synthesis(real.to_alm(unit, top)[None], NSIDE, top)[0] for unit in np.eye((top + 1) ** 2)]
-    harmonics = np.stack(units)
+    npix, harmonics = 12 * NSIDE**2, _harmonics(NSIDE, top)
     height = rotation_matrix(frame, to)[2] @ np.stack(healpy.pix2vec(NSIDE, np.arange(npix)))
     weight = np.where(np.abs(height) < 1e-9, 0.5, height > 0.0) * 4.0 * np.pi / npix
     return np.asarray((harmonics * weight) @ harmonics.T)

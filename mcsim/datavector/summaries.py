@@ -250,7 +250,7 @@ def _sky_block(model: Model) -> Block:
     ell = np.arange(lmax + 1)
     rows, elements = [], []
     for (fold, parity), (low, high) in product(enumerate(("even", "odd")), ranges):
-        weight = np.where((ell >= low) & (ell <= high) & (ell % 2 == fold), 2.0 * ell + 1.0, 0.0)
+        weight = np.where((ell >= low) & (ell <= high) & (ell % 2 == fold), (2.0 * ell + 1.0) * model.sky_power, 0.0)
         if weight.any():
             rows.append(weight / weight.sum())
             own = Element(f"sky/{low}-{high}/{parity}", "cl", model.channels, fold=fold, ell=(low, high), L=0)

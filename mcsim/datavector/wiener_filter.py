@@ -29,6 +29,7 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
 from mcsim.support.arrays import Alm, Cl, Map, divided
+from mcsim.support.compiled import njit
 
 
 @dataclass(frozen=True)
@@ -96,6 +97,7 @@ class FilteredMaps:
     # split_beam_orders the channel's sum stands in its first map.
     orders: NDArray[np.complex128]
     difference: NDArray[np.float64]  # u^2 - 1 of every pixel, (channel, npix): _normalised_difference
+    squares: NDArray[np.float64]  # N_i r_i^2 summed over maps, (channel, npix): _squares
 
 
 def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
@@ -174,15 +176,15 @@ def wiener_filter(model: Model, maps: Sequence[Map]) -> FilteredMaps:
             adjoint[i] = healpix.adjoint(residual[i], lmax)
             orders[i, 0] = window * k * by_degree(looked_at, adjoint[i], lmax)
         for i, s, together in _transforms(model, members):
-            turned = np.zeros((2, residual.shape[1]))
-            for j in together:
-                convolve.turned(residual[j], model.parts[j].moments, s, turned)
+            turned = convolve.turned([(residual[j], model.parts[j].moments) for j in together], s)
             electric, magnetic = healpix.adjoint(turned, lmax, spin=s)
             # ducc0's sign: S_s is minus the synthesis of E = Re(k b) a, B = Im(k b) a.
             both = by_degree(looked_at, electric, lmax) + 1j * by_degree(looked_at, magnetic, lmax)
             orders[i, s] = -2.0 * window * k * both
-    difference = np.stack([_normalised_difference(model, residual, model.of(c)) for c in range(len(model.channels))])
-    return FilteredMaps(sky, expected, residual, adjoint, orders, difference)
+    groups = [model.of(channel) for channel in range(len(model.channels))]
+    difference = np.stack([_normalised_difference(model, residual, alike) for alike in groups])
+    squares = np.stack([_squares(model, residual, alike) for alike in groups])
+    return FilteredMaps(sky, expected, residual, adjoint, orders, difference, squares)
 
 
 def _normalised_difference(model: Model, residual: NDArray[np.float64], parts: tuple[int, ...]) -> Map:
@@ -192,14 +194,35 @@ def _normalised_difference(model: Model, residual: NDArray[np.float64], parts: t
     """
     # Residuals are zero where nothing was seen, and come times their precision: (r/a - s/b)^2 / (1/a + 1/b).
     first, a = residual[parts[0]], model.parts[parts[0]].precision
-    seen = first != 0.0
     if len(parts) == 1:
-        square, scale = first**2, a
-    else:
-        second, b = residual[parts[1]], model.parts[parts[1]].precision
-        seen &= second != 0.0
-        square, scale = (first * b - second * a) ** 2, a * b * (a + b)
-    return np.divide(square, scale, out=np.zeros_like(square), where=seen) - seen
+        seen = first != 0.0
+        return np.asarray(divided(first**2, np.where(seen, a, 0.0)) - seen)
+    found = np.zeros_like(first)
+    _difference(first, a, residual[parts[1]], model.parts[parts[1]].precision, found)
+    return found
+
+
+@njit(nogil=True)
+def _difference(first, a, second, b, found):  # type: ignore[no-untyped-def]
+    """Fill ``found`` where both are seen, in one pass over memory."""
+    for pixel in range(found.size):
+        if first[pixel] != 0.0 and second[pixel] != 0.0:
+            square = (first[pixel] * b[pixel] - second[pixel] * a[pixel]) ** 2
+            found[pixel] = square / (a[pixel] * b[pixel] * (a[pixel] + b[pixel])) - 1.0
+
+
+def _squares(model: Model, residual: NDArray[np.float64], parts: tuple[int, ...]) -> Map:
+    """Return N_i r_i^2 of every pixel, summed over maps: twice the derivative of ln L in ln N, but for a constant.
+
+    All modes take part that know of the noise: those of the difference of splits, and those of their sum that the sky
+    does not fill. A pixel that the data lack counts like the map's mean.
+    """
+    total = np.zeros(residual.shape[1])
+    for i in parts:
+        precision, seen = model.parts[i].precision, residual[i] != 0.0
+        square = divided(residual[i] ** 2, precision)
+        total += np.where(seen, square, square.sum() / max(np.count_nonzero(seen), 1) * (precision > 0.0))
+    return total
 
 
 def shared_sky(model: Model, maps: Sequence[Map]) -> Alm:

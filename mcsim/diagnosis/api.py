@@ -31,7 +31,7 @@ from mcsim.diagnosis.measured_spectra import MeasuredSpectra
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import Agreement, DiagnosisResult
 from mcsim.ensemble.external_maps import Source
-from mcsim.ensemble.runner import Workers
+from mcsim.ensemble.runner import Workers, load_ahead
 from mcsim.errors import InputError
 from mcsim.reconstruction import simulated_scores
 from mcsim.simulation import power
@@ -103,13 +103,15 @@ def diagnose(
     if output is not None:
         output = folders.user_path(output)
         folders.writable(output)
+    processes = run.compute.workers if workers is None else workers
+    load_ahead(processes)
     run, analysis, table = _analysed(run, source, data, settings, library, wanted)
     task: Callable[[Job], NDArray[np.float64]] = data_vectors if table is None else table
     maps: Sequence[NDArray[np.float64]] = ()
     if table is None:
         maps = read_maps(analysis.model, data) if isinstance(data, str | Path) else checked(analysis.model, data)
     key = _key(run, analysis)
-    with batch(run.compute.workers if workers is None else workers) as call:
+    with batch(processes) as call:
         whole = task if source is None else Checked(task)
         stage = "simulations of the model and of each effect"
         with asking(call, quiet, whole, stage, kept(run, analysis)) as ask:
@@ -176,7 +178,7 @@ def describe(
     lines = [head, *priors, *cost.lines(analysis, planned)]
     if source is None:
         more = simulated_scores.SIMULATIONS
-        lines.append(f"after a first verdict unknown: {more} simulations more, once for the model")
+        lines.append(f"if the verdict is unknown: {more} simulations more, once for the model")
     if count:
         lines += controls.describe(analysis, count, run.compute.workers)
     return "\n".join(lines)

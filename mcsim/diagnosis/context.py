@@ -1,7 +1,8 @@
 """What all data sets of a model are tested with, and what a data set has to offer to be diagnosed."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
@@ -127,13 +128,13 @@ class DataSet(ABC, Generic[Data]):
         """Return the changes of :meth:`respond` for :attr:`extended`."""
         return self.respond(found, skies)
 
-    def response(self, candidate: Candidate, skies: int) -> Matrix | None:
-        """Return the response to small effects over their coordinates, (p + E, K); None if it cannot be simulated."""
-        try:
-            changes = [self.respond_extended([candidate.table(one)], skies).mean(axis=0) for one in candidate.basis]
-        except InputError:
-            return None
-        return np.stack(changes, axis=1) / candidate.steps
+    def responses(self, candidates: Sequence[Candidate], skies: int) -> Iterator[tuple[Candidate, Matrix]]:
+        """Yield those that can be simulated with their responses to small effects over coordinates, (p + E, K)."""
+        for one in candidates:
+            with suppress(InputError):
+                tables = [one.table(effect) for effect in one.basis]
+                changes = [self.respond_extended([table], skies).mean(axis=0) for table in tables]
+                yield one, np.stack(changes, axis=1) / one.steps
 
     def scatter(self, changes: Matrix) -> Matrix:
         """Return deviations of changes by a stochastic effect, shape (draws, p), from their mean, (p, draws).

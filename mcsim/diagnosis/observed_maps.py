@@ -1,24 +1,24 @@
 """Observed maps: read them, refuse what the model cannot describe, and prepare them for a diagnosis."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
-from typing import Literal
 
 import numpy as np
 
 from mcsim import config
+from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.localisation import Place, places, standardised
-from mcsim.datavector.same_skies import SameSkies
+from mcsim.datavector.same_skies import SameSkies, Skies
 from mcsim.datavector.wiener_filter import Part
 from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.nuisance import half_given_other
 from mcsim.diagnosis.selection import Attribution
+from mcsim.errors import InputError
 from mcsim.stats.look_elsewhere import global_test
 from mcsim.support.arrays import Map, Matrix, Vector
-
-_Skies = Literal["reference", "typical", "constrained"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,17 +53,14 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         return SameSkies(self.context.analysis, self.ask, self.data)
 
     def respond(self, found: Sequence[config.Effect], skies: int) -> Matrix:
-        """Return changes of the data vector in ``skies`` constrained skies, shape (rows, p).
-
-        Those with a mean response, or a drawn pattern, are of typical skies: the observed sky has their power already.
-        """
+        """Return changes of the data vector in ``skies`` skies, shape (rows, p)."""
         return self.respond_extended(found, skies)[:, : len(self.x)]
 
     def respond_extended(self, found: Sequence[config.Effect], skies: int) -> Matrix:
         """Return the changes of :meth:`respond` with those of the numbers beside the data vector, (rows, p + E)."""
-        kinds: dict[_Skies, list[config.Effect]] = {"reference": [], "typical": [], "constrained": []}
+        kinds: dict[Skies, list[config.Effect]] = {"reference": [], "typical": [], "constrained": []}
         for effect in found:
-            kinds[self._skies_of(effect)].append(effect)
+            kinds[self.same_skies.skies_of(effect)].append(effect)
         shift = np.zeros((1, len(self.extended)))
         if own := kinds["reference"]:
             changes = self.same_skies.of_reference(own) - self.context.extended_reference(own)
@@ -74,34 +71,33 @@ class ObservedMaps(DataSet[Sequence[Map]]):
                 shift = shift + after - before
         return shift
 
+    def responses(self, candidates: Sequence[Candidate], skies: int) -> Iterator[tuple[Candidate, Matrix]]:
+        """Yield candidates with their responses, all of which are simulated at once if all can be."""
+        with suppress(InputError):
+            self.same_skies.ahead([one.table(effect) for one in candidates for effect in one.basis], skies)
+        yield from super().responses(candidates, skies)
+
     def pair(self, found: Sequence[config.Effect]) -> tuple[Matrix, Matrix]:
         """Return data vectors of the same skies without effects and with them; for noise alone of typical skies."""
         size, skies, library = len(self.x), self.context.settings.constrained_skies, dict(self.context.analysis.library)
         alone = all(library[effect.name].parametrization.noise_alone for effect in found)
-        if alone or any(self._skies_of(effect) == "reference" for effect in found):
+        if alone or any(self.same_skies.skies_of(effect) == "reference" for effect in found):
             after = self.same_skies.of_reference(found, skies if alone else None)[:, :size]
             return self.context.reference(found)[: len(after)], after
         before, after = self.same_skies.pair(found, skies, True)
         return before[:, :size], after[:, :size]
-
-    def _skies_of(self, effect: config.Effect) -> _Skies:
-        how = dict(self.context.analysis.library)[effect.name].parametrization
-        if how.mean_response == how.stochastic:
-            return "constrained"
-        return "reference" if how.mean_response else "typical"
 
     def templates(self) -> Matrix:
         """Return the templates; those that depend on the very sky are measured on the observed one if it departs."""
         context, t, settings = self.context, self.context.templates.copy(), self.context.settings
         if global_test(context.null, self.x, context.groups, context.calibration).pvalue > settings.alpha:
             return t
-        for candidate, scatter in zip(context.candidates, context.sky_scatter, strict=True):
-            fixed = candidate.random_response or candidate.nuisance or candidate.parametrization.mean_response
-            if fixed or scatter < settings.sky_scatter:
-                continue
-            response, columns = self.response(candidate, settings.constrained_skies), list(candidate.columns)
-            if response is not None:
-                t[:, columns] = response[: len(t)] - context.bank.curvature[:, columns] * candidate.steps
+        fixed = [c.random_response or c.nuisance or c.parametrization.mean_response for c in context.candidates]
+        depends = ~np.array(fixed) & (context.sky_scatter >= settings.sky_scatter)
+        own = [context.candidates[index] for index in np.flatnonzero(depends)]
+        for candidate, response in self.responses(own, settings.constrained_skies):
+            columns = list(candidate.columns)
+            t[:, columns] = response[: len(t)] - context.bank.curvature[:, columns] * candidate.steps
         return t
 
     def exchanged(self, found: Attribution) -> list[str]:

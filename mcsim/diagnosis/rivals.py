@@ -29,9 +29,9 @@ def with_rivals(data: DataSet[Any], refined: Refined) -> tuple[DataSet[Any], Ref
     if len(found.explanations) != 1:
         return data, refined
     channels = {context.candidates[member].channel for member in found.explanations[0].members}
-    near = [one for one in on_request(context.analysis) if one.channel in channels or None in (one.channel, *channels)]
-    pairs = [(one, data.response(one, context.settings.channel_skies)) for one in near if not one.random_response]
-    known = [(one, response) for one, response in pairs if response is not None]
+    others = [one for one in on_request(context.analysis) if not one.random_response]
+    near = [one for one in others if one.channel in channels or None in (one.channel, *channels)]
+    known = list(data.responses(near, context.settings.channel_skies))
     null, z, t = _widest(data, refined, found.explanations[0].members)
     wide = replace(refined, attribution=found, templates=t)
     rivals = [known[place] for place in in_place(null, z, wide, known, context.settings)]

@@ -15,9 +15,9 @@ from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.words import refuted
 from mcsim.reconstruction import words
-from mcsim.reconstruction.grammar import Structure, structures
+from mcsim.reconstruction.grammar import ALIKE, Structure, structures
 from mcsim.reconstruction.plugin import Plugin, plugin
-from mcsim.reconstruction.result import NSIDE, Reconstructed
+from mcsim.reconstruction.result import NSIDE, WORDS, Reconstructed
 from mcsim.reconstruction.scores import Scene
 from mcsim.reconstruction.search import Search
 from mcsim.reconstruction.simulated_scores import null_scores, scene_for, scores_of_maps
@@ -31,14 +31,10 @@ ALTERNATIVES = 3
 SKIES = 4
 """Skies, constrained by the data, on which a reconstructed effect is simulated."""
 
-FREE = 5
-"""Coordinates of a pattern on the sky whose responses are simulated one by one, at most."""
-
 LARGEST = 2.0
 """Amplitude in a part of the data over that in all scores, at most; the least is none."""
 
-FEW = 0.1
-"""Share of the largest rms below which a map does not have an effect."""
+FEW = 0.1  #: share of the largest rms below which a map does not have an effect
 
 
 def reconstructed(result: DiagnosisResult, data: ObservedMaps, ask: Ask) -> DiagnosisResult:
@@ -69,7 +65,8 @@ def structures_of(data: ObservedMaps, scene: Scene, search: Search) -> tuple[tup
         size, where, picture = (None, "", np.zeros(0)) if effect is None else made.picture(structure, effect)
         says = words.says(structure, theta, scene)
         others = [search.grammar[k] for k in one.alternatives[:ALTERNATIVES]]
-        told = (words.says(other, search.fit([other], x)[0][0], scene) for other in others)
+        told = tuple(words.says(other, search.fit([other], x)[0][0], scene) for other in others)
+        rival = None if one.rival is None else dict(zip(WORDS, (*others[0].says, told[0]), strict=True))
         rows.append(
             Reconstructed(
                 *structure.says,
@@ -80,7 +77,8 @@ def structures_of(data: ObservedMaps, scene: Scene, search: Search) -> tuple[tup
                 size,
                 1.0 / np.sqrt(one.delta_chi2),
                 words.cause(structure, dict(analysis.library)),
-                tuple(told),
+                told,
+                rival,
                 words.profile(structure, theta, covariance, scene),
                 tuple(map(float, picture)),
                 where,
@@ -112,17 +110,22 @@ class Reconstruction:
     search: Search
     x: Vector
     _fitted: dict[tuple[int, ...], Fitted] = field(default_factory=dict, repr=False)
-    _trial: dict[int, Matrix] = field(default_factory=dict, repr=False)
-    _kept: dict[int, Vector] = field(default_factory=dict, repr=False)
+    _trial: dict[int, tuple[Matrix, Matrix]] = field(default_factory=dict, repr=False)
+    _kept: dict[int, tuple[Vector, Vector]] = field(default_factory=dict, repr=False)
 
-    def simulated(self, effects: Sequence[Plugin]) -> Simulated:
-        """Return maps, scores and data vectors of skies that the data constrain, with effects."""
+    def simulated(self, effects: Sequence[Plugin], share: Vector | None = None) -> Simulated:
+        """Return maps, scores and data vectors of skies that the data constrain, with effects or shares of them."""
         analysis = self.data.context.analysis
         kinds = {one.name: one.kind() for one in effects}
         acting = [(one.name, None if kinds[one.name].scope == "common" else one.channel) for one in effects]
         tables = [config.Effect(name=name, channel=channel, parameters={"amplitude": 1.0}) for name, channel in acting]
-        (job,) = constrained_jobs(analysis, tables, self.data.same_skies.observed, range(SKIES))
+        job, plain = (
+            constrained_jobs(analysis, t, self.data.same_skies.observed, range(SKIES))[0] for t in (tables, [])
+        )
         maps = list(simulated_maps(job, {**dict(analysis.library), **kinds}))
+        if share is not None:
+            pairs = zip(maps, simulated_maps(plain), strict=True)
+            maps = [[a + f * (b - a) for f, a, b in zip(share, one, made, strict=True)] for made, one in pairs]
         scores_ = [scores_of_maps(analysis.model, self.scene, one) for one in maps]
         return Simulated(maps[0], np.mean(scores_, axis=0), np.mean([analysis.data_vector(m) for m in maps], axis=0))
 
@@ -142,7 +145,7 @@ class Reconstruction:
             fits, plugins, rest = self.fitted(chosen[:-1])
             structure = self.search.grammar[chosen[-1]]
             ((theta, covariance),) = self.search.fit([structure], rest)
-            fit = self._kept.get(chosen[-1], theta), covariance
+            fit = self._kept.get(chosen[-1], (theta,))[0], covariance
             made = plugin(f"unlisted_{len(chosen)}", structure, fit[0], self.scene)
             self._fitted[key] = ([*fits, fit], *self._calibrated(chosen, [*plugins, made]))
         return self._fitted[key]
@@ -158,23 +161,28 @@ class Reconstruction:
             structure = self.search.grammar[k]
             ((theta, _),) = self.search.fit([structure], rest)
             each = theta[None]
-            if _by_coordinate(structure):
+            if structure.by_coordinate:
                 each = float(np.linalg.norm(theta)) * np.eye(structure.size)
-            self._trial[k] = each
-            effects = [plugin("unlisted", structure, one, self.scene) for one in each]
+            shape, share = structure, None
+            if structure.stage == "beam" and structure.split != ALIKE:  # no effect, but that of all splits in some maps
+                shape, share = replace(structure, split=ALIKE), np.zeros(len(self.scene.views))
+                share[list(structure.views)] = structure.weights
+            effects = [plugin("unlisted", shape, one, self.scene) for one in each]
             if None not in effects:
-                rows = [self.simulated([one]).scores for one in effects if one is not None]
+                rows = [self.simulated([one], share).scores for one in effects if one is not None]
                 found[row] = np.stack(rows) - self.before.scores
+            self._trial[k] = each, found[row]
         return found
 
     def keep(self, member: int, amplitudes: Vector) -> None:
-        """Keep the coordinates that these amplitudes of the responses mean."""
-        self._kept[member] = amplitudes @ self._trial[member]
+        """Keep the coordinates that these amplitudes of the responses mean, and what they make of the scores."""
+        each, responses = self._trial[member]
+        self._kept[member] = amplitudes @ each, amplitudes @ responses
 
     def left(self, chosen: list[int]) -> Vector:
         """Return the scores without what the effects of structures make of them on this sky."""
         _, plugins, rest = self.fitted(chosen)
-        return self.search.regressed(chosen, self.x) if None in plugins else rest
+        return self.x - sum(self._kept[k][1] for k in chosen) if None in plugins else rest
 
     def _calibrated(
         self, chosen: Sequence[int], plugins: Sequence[Plugin | None]
@@ -225,16 +233,14 @@ class Reconstruction:
         splits = [view.split for view in self.scene.views]
         first = []
         for structure, effect in acting:
-            if structure.views and len(self.scene.splits) > 1 and not _by_coordinate(structure):
-                half = structure.within(0, splits)
-                if not len(half.weights):
+            if structure.views and len(self.scene.splits) > 1 and not structure.by_coordinate:
+                if not len((half := structure.within(0, splits)).weights):
                     return None
                 ((theta, _),) = self.search.fit([half], self.x)
                 effect = plugin(effect.name, structure, theta, self.scene) or effect
             first.append(effect)
         matrix, told = self.data.halves()
-        halves = Halves.of(context.ensemble.remix(matrix), matrix @ self.data.x)
-        if halves is None:
+        if (halves := Halves.of(context.ensemble.remix(matrix), matrix @ self.data.x)) is None:
             return None
         t = np.stack([matrix @ (self.simulated([one]).x - self.before.x) for one in first], axis=1)
         if halves.expected_snr(t.sum(axis=1)) < settings.half_snr_share * context.null.expected_snr(t.sum(axis=1)):
@@ -242,12 +248,6 @@ class Reconstruction:
 
         def respond(frozen: Fit) -> Vector:
             scaled = [one.scaled(float(a)) for one, a in zip(first, frozen.amplitudes, strict=True)]
-            change: Vector = matrix @ (self.simulated(scaled).x - self.before.x)
-            return change
+            return np.asarray(matrix @ (self.simulated(scaled).x - self.before.x))
 
         return replace(halves, largest=LARGEST).reduction(t, respond, (), told)
-
-
-def _by_coordinate(structure: Structure) -> bool:
-    """Return True for a pattern of few coordinates that multiplies the sky."""
-    return structure.frame == "sky" and bool(structure.acts_on) and structure.size <= FREE

@@ -258,7 +258,7 @@ def untested(result: DiagnosisResult) -> str:
 
 def pulled(one: NuisanceResult) -> str:
     """Return the pull of a nuisance, or that the data do not constrain it."""
-    return "; not constrained by the data" if one.pull is None else f"; pull {one.pull:.1f}".replace("-", "−")
+    return "; not constrained by the data" if one.pull is None else f"; pull {one.pull:z.1f}".replace("-", "−")
 
 
 def _numbered(effects: Sequence[EffectResult]) -> str:

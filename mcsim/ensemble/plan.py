@@ -48,7 +48,8 @@ def wanted(run: config.RunConfig, part: slice | None) -> range:
     total = run.ensemble.realizations
     if part is None:
         return range(total)
-    if not isinstance(part, slice) or part.step not in (None, 1):
+    ends = [end for end in (part.start, part.stop) if end is not None] if isinstance(part, slice) else [None]
+    if not all(isinstance(end, int | np.integer) for end in ends) or part.step not in (None, 1):
         raise InputError(f"realizations = {part!r} is no slice of consecutive ones; give slice(A, B).")
     start, stop = part.start or 0, total if part.stop is None else part.stop
     if not 0 <= start < stop <= total:

@@ -17,6 +17,7 @@ from mcsim.ensemble.expectation import L_MOMENTS, Means, Source, means, scanned_
 from mcsim.ensemble.tasks import packages, shared_survey
 from mcsim.simulation import power
 from mcsim.simulation.survey import Survey
+from mcsim.sphere.checks import check_whole
 from mcsim.stats.streaming import Sums
 
 if TYPE_CHECKING:
@@ -82,6 +83,8 @@ def predict(
     >>> float(expected.biposh_mean.sel(mode="L2M0d0", pair="demo,demo", ell=20).real) > 0.0
     True
     """
+    check_whole(L_moments, "L_moments", 1)
+    check_whole(nthreads, "nthreads", 1)
     survey = survey_of(source, nthreads)
     power.check(survey)
     beams = scanned_beams(survey, L_moments if exact else survey.config.biposh.L_max, nthreads)

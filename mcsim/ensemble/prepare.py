@@ -111,7 +111,13 @@ def prepare_files(source: Source, files: Sequence[str], folder: str | Path) -> l
     target, names = user_path(folder), file_names(run)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise InputError(f"{target} is not a new folder, and nothing is written over; choose another folder with -o.")
-    done = prepare(dict(_read(run, names, file) for file in files), run)
+    read: dict[str, Map] = {}
+    for file in files:
+        name, map_uk = _read(run, names, file)
+        if name in read:
+            raise InputError(f"map {name} is given twice, the second time as {file}; give each map once.")
+        read[name] = map_uk
+    done = prepare(read, run)
     writable(target.absolute().parent)
     keywords = [("RUN", run.name.encode("ascii", "backslashreplace").decode()), ("DIGEST", config.digest(run))]
     with unwritable(target, "choose another folder with -o"), appearing(target) as scratch:
@@ -128,5 +134,7 @@ def _read(run: config.RunConfig, names: Mapping[str, str], file: str) -> tuple[s
         named = next((name for name, own in names.items() if own == Path(file).name), "")
     if named not in names:
         known = ", ".join(names.values())
+        if equals:
+            raise InputError(f"{named} of {file} is no map of {run.name}; use one of {', '.join(names)}.")
         raise InputError(f"{file} is none of {known}; rename it, or say which map it is: NAME={file}.")
     return named, read_uk(user_path(path), run.map.frame, _map_called(run, named).channel.frequency_ghz)

@@ -10,7 +10,7 @@ import xarray as xr
 from astropy.table import Table
 
 from mcsim.errors import InputError
-from mcsim.support.folders import unreadable, unwritable, user_path
+from mcsim.support.folders import unreadable, unwritable, user_path, writable
 
 
 def spectra(summary: xr.Dataset, kind: str) -> pd.DataFrame:
@@ -62,23 +62,25 @@ def table(summary: xr.Dataset) -> Table:
     return result
 
 
-def check_ending(output: str | Path) -> None:
-    """Raise InputError unless :func:`write` knows the kind of file that the name asks for."""
+def check_output(output: str | Path) -> None:
+    """Raise InputError unless :func:`write` can write a file of this name, and knows the kind that it asks for."""
     ending = Path(output).suffix
     if ending not in (".zarr", ".nc", ".ecsv"):
         raise InputError(
             f"{output} ends in {ending or 'nothing'}; choose .zarr, .nc (NetCDF) or .ecsv (table of bins)."
         )
+    target = user_path(output)
+    if target.suffix == ".zarr" and target.exists():
+        raise InputError(f"{target} exists already; choose another output, or delete it.")
+    writable(target.absolute().parent)
 
 
 def write(summary: xr.Dataset, output: str | Path) -> None:
     """Write a summary or a prediction as Zarr (``.zarr``) or NetCDF (``.nc``), or its binned spectra (``.ecsv``)."""
-    check_ending(output)
+    check_output(output)
     target = user_path(output)
     with unwritable(target, "choose another file"):
         if target.suffix == ".zarr":
-            if target.exists():
-                raise InputError(f"{target} exists already; choose another output, or delete it.")
             with warnings.catch_warnings():
                 # Zarr warns that its consolidated metadata and strings are not yet standard.
                 warnings.simplefilter("ignore", category=UserWarning)

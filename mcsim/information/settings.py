@@ -70,6 +70,10 @@ class LimitSettings:
     def __post_init__(self) -> None:
         """Raise InputError for settings of another kind, negative numbers, and levels outside 0 to 1."""
         check_settings(self)
+        if not isinstance(self.nuisances, Mapping):
+            raise InputError(f"nuisances = {self.nuisances!r} is no dict; give widths, as {{'calibration': 0.01}}.")
+        if self.tolerance == 0.0:
+            raise InputError("tolerance = 0 is never reached; give a relative residual above 0, such as 1e-7.")
         for name in ("alpha", "power", "separation"):
             if not 0.0 < getattr(self, name) < 1.0:
                 raise InputError(f"{name} = {getattr(self, name):g} is no probability; give one between 0 and 1.")

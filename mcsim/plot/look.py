@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from mcsim import config
@@ -14,6 +15,8 @@ from mcsim.plot.beam import beam_figure
 from mcsim.plot.scan import scan_figure
 from mcsim.simulation import channels
 from mcsim.support.progress import reporting
+
+LMAX = 2048  #: of the coefficients that are shown, by default
 
 
 @dataclass(frozen=True)
@@ -26,13 +29,14 @@ class Look:
 
 
 def look_at_beams(
-    source: str | Path, lmax: int = 2048, m_max: int | None = None, pixel_deg: float | None = None
+    source: str | Path, lmax: int | None = None, m_max: int | None = None, pixel_deg: float | None = None
 ) -> Iterator[Look]:
     """Yield the text and figure of the beams of a run configuration, of a beam map, or of a file of b_lm or B_l.
 
     ``source`` is a TOML configuration or packaged workflow (every channel is shown), or a file: a FITS image is a beam
-    map, a FITS table holds b_lm, a text (.txt, .dat) B_l. ``m_max`` is by default chosen from the
-    beam, and ``pixel_deg``, the side of a pixel of a beam map in degrees, read from its header.
+    map, a FITS table holds b_lm or, in a single column, B_l, a text (.txt, .dat) B_l. ``lmax`` is by default 2048, or
+    what the file holds or its pixels resolve, ``m_max`` chosen from the beam, and ``pixel_deg``, the side of a pixel of
+    a beam map in degrees, read from its header.
     """
     path = Path(source)
     if path.is_dir() or (not path.exists() and path.suffix not in ("", ".toml")):
@@ -45,13 +49,14 @@ def look_at_beams(
         for channel in run.channels:
             spec = channel.beam
             image = channels.load_beam_map(channel.name, spec) if isinstance(spec, config.BeamMap) else None
-            yield _look_at(channel.name, channels.load_beam(channel, lmax), image)
+            yield _look_at(channel.name, channels.load_beam(channel, lmax or LMAX), image)
     elif path.suffix not in (".txt", ".dat") and beams.holds_image(path):
         image = beams.read_map(path, pixel_deg=pixel_deg)
-        yield _look_at(path.name, beams.Beam.from_map(image, lmax, m_max), image)
-    elif path.suffix in (".txt", ".dat"):
+        degree = min(LMAX, int(np.pi / image.pixel_rad)) if lmax is None else lmax
+        yield _look_at(path.name, beams.Beam.from_map(image, degree, m_max), image)
+    elif path.suffix in (".txt", ".dat") or beams.holds_window(path):
         window = beams.read_window(path)
-        yield _look_at(path.name, beams.Beam.from_window(window, min(lmax, window.size - 1)), None)
+        yield _look_at(path.name, beams.Beam.from_window(window, min(lmax or LMAX, window.size - 1)), None)
     else:
         yield _look_at(path.name, beams.Beam.from_blm(path, lmax, m_max), None)
 

@@ -4,22 +4,24 @@ from mcsim.reconstruction.forms import (
     AddedPattern,
     AddedToSamples,
     BeamOrder,
+    BoostedSky,
     GainOverTime,
     GainPattern,
     NoisePattern,
     RotatedSky,
+    SignalPower,
     SkyPower,
-    SquaredSignal,
 )
 
 __all__ = [
     "AddedPattern",
     "AddedToSamples",
     "BeamOrder",
+    "BoostedSky",
     "GainOverTime",
     "GainPattern",
     "NoisePattern",
     "RotatedSky",
+    "SignalPower",
     "SkyPower",
-    "SquaredSignal",
 ]

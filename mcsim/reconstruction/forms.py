@@ -24,7 +24,8 @@ from mcsim.sphere.sky import dipole_alm
 from mcsim.systematics.base import Alm, Draw, Effect, Map, Site
 from mcsim.systematics.parametrization import Parametrization, Vector
 from mcsim.systematics.product import multiplied
-from mcsim.systematics.spacecraft import spin_phase
+from mcsim.systematics.sky import Boost
+from mcsim.systematics.spacecraft import axes, heading, spin_phase
 
 REFERENCE_GHZ = 94.0
 _NSIDE = 128  #: of the map that a pattern of low degree is looked up in
@@ -105,16 +106,32 @@ class RotatedSky(Form):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SquaredSignal(Form):
-    """The signal has its square added, times ``per_uk``: that of sky and dipole, or of the sky alone."""
+class BoostedSky(Form):
+    """The sky is seen by an observer with a velocity, in units of light's."""
 
-    per_uk: ClassVar[float]
+    scope = "common"
+    velocity: ClassVar[tuple[float, float, float]]
+
+    def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
+        self.check_frame(site)
+        x, y, z = self.velocity
+        lon_deg, lat_deg = np.rad2deg([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))])
+        speed = self.amplitude * float(np.linalg.norm(self.velocity))
+        return Boost(amplitude=speed, lon_deg=lon_deg, lat_deg=lat_deg).sky(sky, site, draw)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SignalPower(Form):
+    """The signal has its square or cube added, times ``factor``: that of sky and dipole, or of the sky alone."""
+
+    factor: ClassVar[float]  #: uK^(1 - power)
+    power: ClassVar[int] = 2
     on_dipole: ClassVar[bool] = True
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        """Add the square, up to the sky's own degree."""
+        """Add the power, up to the sky's own degree."""
         whole = sky + dipole_alm(site.dipole_uk, site.lmax) if self.on_dipole else sky
-        return sky + self.amplitude * self.per_uk * squared(whole, site.lmax)
+        return sky + self.amplitude * self.factor * raised(whole, site.lmax, self.power)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,11 +174,12 @@ class BeamOrder(Form):
 class InTime(Form):
     """Derive forms that depend on time from this class."""
 
-    #: "": constant; "spin": ``harmonic`` times the spin phase; "year"; "orientation": ``harmonic`` times psi; "sky": a
-    #: pattern
+    #: "": constant; "spin": ``harmonic`` times the spin phase; "year"; "orientation": ``harmonic`` times psi; of what
+    #: is added also "sky": a pattern, and those of :meth:`AddedToSamples.components`
     wave: ClassVar[str] = ""
     harmonic: ClassVar[int] = 1
-    coefficients: ClassVar[tuple[float, ...]]  #: of cosine and sine, or of the pattern, or the constant
+    #: of cosine and sine, of this and of each further harmonic, or of the pattern, or of components, or the constant
+    coefficients: ClassVar[tuple[float, ...]]
     splits: ClassVar[tuple[float, ...]] = (1.0,)  #: factor in each of as many equal parts of the survey's time
 
     def factor(self, time_s: Vector, site: Site) -> Vector:
@@ -177,23 +195,42 @@ class InTime(Form):
         if not self.wave:
             return np.full(len(time_s), self.coefficients[0])
         if self.wave == "spin":
-            phase = self.harmonic * spin_phase(site.pointed(self.name), time_s)
+            phase, order = spin_phase(site.pointed(self.name), time_s), self.harmonic
         elif self.wave == "year":
-            phase = 2.0 * np.pi * time_s / site.pointed(self.name).model.orbit_period_s
+            phase, order = 2.0 * np.pi * time_s / site.pointed(self.name).model.orbit_period_s, 1
         else:
             assert psi is not None
-            phase = self.harmonic * psi
-        return np.asarray(self.coefficients[0] * np.cos(phase) + self.coefficients[1] * np.sin(phase))
+            phase, order = psi, self.harmonic
+        found = np.zeros(len(time_s))
+        for k, (cosine, sine) in enumerate(zip(self.coefficients[::2], self.coefficients[1::2], strict=True)):
+            found += cosine * np.cos((order + k) * phase) + sine * np.sin((order + k) * phase)
+        return found
 
 
 @dataclass(frozen=True, kw_only=True)
 class AddedToSamples(InTime):
-    """Samples have a signal added, uK, whatever the sky: a wave, or a pattern in some splits."""
+    """Samples have a signal added, uK, whatever the sky: a wave, a pattern in some splits, or a dipole that turns."""
+
+    def components(self, time_s: Vector, theta: Vector, phi: Vector, psi: Vector, site: Site) -> list[Vector]:
+        """Return what the coefficients of a wave multiply that is a dipole, shape (n,) each.
+
+        "Sun": the line of sight along the Earth's motion, and towards the Sun; "lobe": the dipole along the beam's x
+        and y and the line of sight, uK.
+        """
+        outward, south, east = axes(theta, phi)
+        pointing = site.pointed(self.name)
+        if self.wave == "Sun":
+            towards = (heading(pointing.model, time_s, site.frame, phase) for phase in (0.0, 0.5 * np.pi))
+            return [np.sum(one * outward, axis=0) for one in towards]
+        c, s, (a, b) = np.cos(psi), np.sin(psi), (site.dipole_uk @ south, site.dipole_uk @ east)
+        return [c * a + s * b, c * b - s * a, site.dipole_uk @ outward]
 
     def signal(self, time_s: Vector, theta: Vector, phi: Vector, psi: Vector, site: Site) -> Vector:
         if self.wave == "sky":
             self.check_frame(site)
             value = _map_of(self.coefficients)[healpy.ang2pix(_NSIDE, theta, phi)]
+        elif self.wave in ("Sun", "lobe"):
+            value = np.array(self.coefficients) @ np.array(self.components(time_s, theta, phi, psi, site))
         else:
             value = self.over_time(time_s, psi, site)
         return np.asarray(self.amplitude * self.factor(time_s, site) * value)
@@ -257,12 +294,29 @@ def rotations(alm: Alm, lmax: int) -> tuple[Alm, Alm, Alm]:
     return -0.5j * (up + down), -0.5 * (up - down), -1j * order * alm
 
 
-def squared(alm: Alm, lmax: int) -> Alm:
-    """Return the coefficients, up to ``lmax``, of the square of a map, on Gauss-Legendre rings that hold it."""
+def boosts(alm: Alm, lmax: int) -> list[Alm]:
+    """Return the changes of a sky by a motion along x, y and z, per unit of velocity.
+
+    Notes
+    -----
+    f T - grad f . grad T with f = axis . n (:class:`mcsim.systematics.sky.Boost`) is (L f T - f L T)/2, L = l (l + 1):
+    f takes l to l + 1 and l - 1, where L differs by 2 (l + 1) and -2 l.
+    """
+    ell = np.arange(lmax + 1.0)
+    laplace = ell * (ell + 1.0)
+    scaled, found = alm_.multiply(alm, laplace, lmax), []
+    for axis in range(3):
+        first, second = (multiplied(one, lmax, lambda *n, k=axis: n[k], 1) for one in (alm, scaled))
+        found.append(0.5 * (alm_.multiply(first, laplace, lmax) - second))
+    return found
+
+
+def raised(alm: Alm, lmax: int, power: int) -> Alm:
+    """Return the coefficients, up to ``lmax``, of a power of a map, on Gauss-Legendre rings that hold it."""
     options = {"lmax": lmax, "spin": 0, "geometry": "GL", "nthreads": 1}
-    rings = (3 * lmax) // 2 + 2
+    rings = ((power + 1) * lmax) // 2 + 2
     values = ducc0.sht.synthesis_2d(alm=alm[None], ntheta=rings, nphi=2 * rings, **options)
-    return np.asarray(ducc0.sht.analysis_2d(map=values**2, **options))[0]
+    return np.asarray(ducc0.sht.analysis_2d(map=values**power, **options))[0]
 
 
 @lru_cache(maxsize=4)
@@ -274,8 +328,8 @@ def _map_of(coefficients: tuple[float, ...]) -> Map:
 FORMS: dict[str, type[Form]] = {
     kind.__name__: kind
     for kind in (
-        AddedPattern, GainPattern, RotatedSky, SquaredSignal, SkyPower, BeamOrder, AddedToSamples, GainOverTime,
-        NoisePattern,
+        AddedPattern, GainPattern, RotatedSky, BoostedSky, SignalPower, SkyPower, BeamOrder, AddedToSamples,
+        GainOverTime, NoisePattern,
     )
 }  # fmt: skip
 """The forms by the name of their class."""

@@ -6,19 +6,27 @@ frame (sky, scan, spacecraft, time), in one channel or all, and in the splits al
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import poch
 
 from mcsim.reconstruction.forms import REFERENCE_GHZ
-from mcsim.reconstruction.scores import GAIN, ORDERS, Key, Scene
+from mcsim.reconstruction.scores import ELONGATION, GAIN, GAIN_WAVES, MODULATION, ORDERS, Key, Scene
 from mcsim.sphere import real
 from mcsim.sphere.rotation import rotation_matrix
 from mcsim.support.arrays import Matrix, Vector
+from mcsim.systematics.spacecraft import axes
 
 ALIKE, OPPOSITE = "alike", "opposite"
 
-ALSO_COMMON = ("monopole", "dipole")  #: patterns that all channels may have alike: skies of a model have none of them
+FREE = 5  #: coordinates of a pattern on the sky whose responses are simulated one by one, at most
+
+SPIN = 4  #: highest harmonic of the spin phase that is said by itself
+
+ALSO_COMMON = ("monopole", "dipole", "degrees 0-1")
+"""Patterns that all channels may have alike: in the sky itself, but skies of a model have none of them."""
 
 INDICES = (-3.0, -2.0, 1.5)
 """Power of the frequency, in thermodynamic units, of signals of several channels: synchrotron, free-free, dust."""
@@ -54,6 +62,21 @@ class Structure:
         """Return all that it says, without its scores."""
         return self.stage, self.acts_on, self.frame, self.kind, self.channel, self.split, self.index
 
+    def like(self, other: "Structure") -> bool:
+        """Return True if another says the same, but for a profile, the highest degree or the power of the frequency."""
+        mine, theirs = ((*one.says[:3], *_briefly(one.kind), *one.says[4:6]) for one in (self, other))
+        return mine == theirs
+
+    @property
+    def by_coordinate(self) -> bool:
+        """Return True for a pattern of few coordinates that multiplies the sky: each has a response of its own."""
+        return self.frame == "sky" and bool(self.acts_on) and self.size <= FREE
+
+    def elsewhere(self, other: "Structure") -> bool:
+        """Return True if another is the same in another channel or split."""
+        mine, theirs = ((*one.says[:4], one.index) for one in (self, other))
+        return mine == theirs and (self.channel == other.channel) != (self.split == other.split)
+
     def of(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the scores of the structure, shape (..., size), from all, shape (..., P)."""
         found = (scores[..., self.rows] * self.weights).sum(axis=-1)
@@ -65,6 +88,10 @@ class Structure:
         return Structure(
             *self.says, self.rows[:, kept], self.weights[kept], self.mix, tuple(self.views[k] for k in kept)
         )
+
+
+def _briefly(kind: str) -> list[str]:
+    return kind.split()[: 1 if kind.startswith("degrees") else 2]
 
 
 def structures(scene: Scene) -> tuple[Structure, ...]:
@@ -110,8 +137,10 @@ def _of_maps(scene: Scene) -> Iterator[Structure]:
             kept = [i for i in views if factors[scene.views[i].split] != 0.0]
             weights = np.array([factors[scene.views[i].split] for i in kept])
             for stage, acts_on, frame, kind, keys, mix in _forms(scene, split, kept):
-                if name is None and (frame == "sky" or stage == "square") and kind not in ALSO_COMMON:
-                    continue  # what all channels see alike is the sky itself, which the model knows as random
+                if name is None and (frame == "sky" or stage in ("square", "cube")):
+                    if stage != "added" or kind not in ALSO_COMMON:
+                        continue  # what all channels see alike is the sky itself, which the model knows as random
+                    stage, frame = ("power", "") if split == ALIKE else (stage, frame)
                 rows = _rows(scene, keys, kept)
                 yield Structure(stage, acts_on, frame, kind, name, split, None, rows, weights, mix, tuple(kept))
         yield from _high_orders(scene, name, views)
@@ -138,8 +167,11 @@ def _forms(scene: Scene, split: str, kept: list[int]) -> Iterator[_Form]:
     yield from _added(scene)
     for s in range(1, len(view.w[:ORDERS]) + 1):
         yield "added", "", "spacecraft", f"orientation {s}", [("orientation", s, c) for c in (0, 1)], None
-    for name in view.waves:
-        yield "added", "", "time", name, [("wave", name, c) for c in (0, 1)], None
+    lobe: list[Key] = [("lobe", 0), ("lobe", 1), ("dipole",)]
+    yield "added", "dipole", "spacecraft", "lobe", lobe, None
+    for name, line in _other_lines(scene, kept):
+        yield "added", "dipole", "spacecraft", f"line {name}", lobe, line
+    yield from _timed(scene)
     yield "gain", "sky and dipole", "", "constant", [("gain", 0)], None
     for s in range(min(scene.split_orders, len(view.w)) + 1):
         for kind, mix in _profiles(scene, s):
@@ -150,22 +182,55 @@ def _forms(scene: Scene, split: str, kept: list[int]) -> Iterator[_Form]:
     for acts_on, key in (("sky and dipole", "gain"), ("sky", "gain of the sky")):
         if key != "gain":
             yield "gain", acts_on, "", "constant", [(key, 0)], None
-        for degree in range(1, top + 1):
+        for degree in sorted({min(degree, top) for degree in (1, 2, top)}):
             rows: list[Key] = [(key, j) for j in range((degree + 1) ** 2)]
             yield "gain", acts_on, "sky", f"degrees 0-{degree}", rows, None
+        for kind, zonal in _latitudes(scene.frame, top):
+            yield "gain", acts_on, "sky", kind, [(key, j) for j in range((top + 1) ** 2)], zonal
     yield "gain", "dipole", "", "constant", [("dipole",)], None
-    for name in view.waves:
+    for name in GAIN_WAVES if view.waves else ():
         yield "gain", "sky and dipole", "time", name, [("gain wave", name, c) for c in (0, 1)], None
     yield "square", "sky and dipole", "", "square", [("square",)], None
     yield "square", "sky", "", "square", [("square of the sky",)], None
+    yield "cube", "sky and dipole", "", "cube", [("cube",)], None
     yield "rotation", "sky and dipole", "sky", "rotation", [("rotation", axis) for axis in range(3)], None
+
+
+def _timed(scene: Scene) -> Iterator[_Form]:
+    """Yield what is added to samples and depends on time, where the pointing is known.
+
+    The Sun is at azimuth 0 about the spin axis, and at a fixed distance from it: its distance from the line of sight is
+    an even function of the spin phase.
+    """
+    if not scene.timed:
+        return
+    spins: list[Key] = [("wave", f"spin {k}", c) for k in range(1, SPIN + 1) for c in (0, 1)]
+    for k in range(SPIN):
+        yield "added", "", "time", f"spin {k + 1}", spins[2 * k : 2 * k + 2], None
+    yield "added", "", "time", f"spin 1-{SPIN}", [("added", 0), *spins], None
+    yield "added", "", "time", "year", [("wave", "year", c) for c in (0, 1)], None
+    yield "added", "", "Sun", "dipole", [("wave", "Sun", c) for c in (0, 1)], None
+    cosines: list[Key] = [("wave", f"spin {k}", 0) for k in range(1, ELONGATION + 1)]
+    yield "added", "", "Sun", "elongation", [("added", 0), *cosines], None
+
+
+def _other_lines(scene: Scene, kept: list[int]) -> Iterator[tuple[str, Matrix]]:
+    """Yield the other channels with their lines of sight in the frame of the beam of one channel, shape (1, 3)."""
+    channels = {scene.views[i].channel for i in kept}
+    if len(channels) > 1 or not scene.timed:
+        return
+    (own,) = channels
+    outward, south, east = (one[:, 0] for one in axes(*np.deg2rad(scene.lines[own])[:, None]))
+    for name, line in zip(scene.channels, scene.lines, strict=True):
+        if line != scene.lines[own]:
+            yield name, (np.stack([east, -south, outward]) @ axes(*np.deg2rad(line)[:, None])[0]).T
 
 
 def _added(scene: Scene) -> Iterator[_Form]:
     """Yield patterns on the sky that are added: of few degrees, and zonal ones."""
     yield "added", "", "sky", "monopole", [("added", 0)], None
     yield "added", "", "sky", "dipole", [("added", j) for j in (1, 2, 3)], None
-    for degree in sorted({min(top, scene.degree) for top in (2, 4, scene.degree)}):
+    for degree in sorted({min(top, scene.degree) for top in (1, 2, 4, scene.degree)}):
         yield "added", "", "sky", f"degrees 0-{degree}", [("added", j) for j in range((degree + 1) ** 2)], None
     keys: list[Key] = [("added", j) for j in range((scene.degree + 1) ** 2)]
     for kind, zonal in _latitudes(scene.frame, scene.degree):
@@ -186,13 +251,20 @@ def _beam(scene: Scene, s: int) -> list[Key]:
 def _profiles(scene: Scene, s: int) -> list[tuple[str, Matrix | None]]:
     """Return the profiles of a change of a beam at order s, by what they are called: free in ranges, or a power of l.
 
-    The power is s, as for the derivatives of a Gaussian, and 2 for s = 0, as for its width.
+    The power is s, as for the derivatives of a Gaussian, sqrt((l + s)! / (l - s)!), and 2 for s = 0, l (l + 1), as for
+    its width: the dipole, at l = 1, tells that from l^s. A halo about the beam is a constant at low l.
     """
-    edges = np.array(scene.edges(max(s, 1)), dtype=float)
-    middle = np.sqrt(edges[:-1] * (edges[1:] - 1.0))
-    shape = np.ones(len(middle)) if s else middle / scene.lmax
+    spans = [np.arange(low, high) for low, high in pairwise(scene.edges(max(s, 1)))]
+    middle = np.array([np.sqrt(ell[0] * ell[-1]) for ell in spans])
+    shape = np.array([np.mean(np.sqrt(poch(ell - s + 1.0, 2 * s)) / ell**s) for ell in spans])
+    if s == 0:
+        shape = (middle + 1.0) / scene.lmax
     mix: Matrix = np.kron(shape, np.eye(2 if s else 1)).astype(np.float64)
-    return [(f"order {s} as l^{s or 2}", mix), (f"order {s}", None)]
+    found: list[tuple[str, Matrix | None]] = [(f"order {s} as l^{s or 2}", mix), (f"order {s}", None)]
+    if s == 0:
+        low = np.where(np.arange(len(middle)) <= len(middle) // 2, scene.lmax / middle, 0.0)
+        found.append(("order 0 at low l", low[None]))
+    return found
 
 
 def _high_orders(scene: Scene, name: str | None, views: tuple[int, ...]) -> Iterator[Structure]:
@@ -206,11 +278,13 @@ def _high_orders(scene: Scene, name: str | None, views: tuple[int, ...]) -> Iter
 
 def _modulations(scene: Scene) -> Iterator[Structure]:
     """Yield patterns that multiply the sky itself: in all channels alike, without the dipole, of one degree each."""
-    views = tuple(range(len(scene.views)))
-    for degree in range(1, min(GAIN, scene.lmax) + 1):
-        rows = _rows(scene, [("gain of the sky", j) for j in range(degree**2, (degree + 1) ** 2)], views)
-        ones = np.ones(len(views))
-        yield Structure("modulation", "sky", "sky", f"degree {degree}", None, ALIKE, None, rows, ones, None, views)
+    keys: dict[str, list[Key]] = {
+        **{f"degree {k}": [("modulation", j) for j in range(k**2, (k + 1) ** 2)] for k in range(1, MODULATION + 1)},
+        "degree 1 as a boost": [("boost", axis) for axis in range(3)],
+    }
+    for kind, own in keys.items():
+        rows = np.array([[scene.place[key]] for key in own])
+        yield Structure("modulation", "sky", "sky", kind, None, ALIKE, None, rows, np.ones(1))
 
 
 def _scaled(scene: Scene) -> Iterator[Structure]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mcsim.reconstruction.forms import FORMS, Form
-from mcsim.reconstruction.grammar import ALIKE, OPPOSITE, Structure
+from mcsim.reconstruction.grammar import ALIKE, OPPOSITE, SPIN, Structure
 from mcsim.reconstruction.scores import Scene
 from mcsim.support.arrays import Vector
 
@@ -55,7 +55,7 @@ class Plugin:
 
     def scaled(self, factor: float) -> "Plugin":
         """Return the effect with ``factor`` times the numbers that its amplitude multiplies."""
-        key = next(k for k in ("coefficients", "values", "rotation", "per_uk") if k in self.values)
+        key = next(k for k in ("coefficients", "values", "rotation", "velocity", "factor") if k in self.values)
         old = self.values[key]
         new = factor * old if isinstance(old, float) else tuple(factor * one for one in old)
         return replace(self, values={**self.values, key: new})
@@ -88,7 +88,10 @@ def plugin(name: str, structure: Structure, theta: Vector, scene: Scene) -> Plug
         return None
     common = structure.channel is None and len(scene.channels) > 1
     scope = {"scope": "common"} if common or base == "SkyPower" else {}
-    on_sky = base in ("AddedPattern", "GainPattern", "RotatedSky", "NoisePattern") or values.get("wave") == "sky"
+    on_sky = (
+        base in ("AddedPattern", "GainPattern", "RotatedSky", "BoostedSky", "NoisePattern")
+        or values.get("wave") == "sky"
+    )
     frame = {"frame": scene.frame} if on_sky else {}
     return Plugin(name, base, structure.channel or scene.channels[0], {**scope, **frame, **values})
 
@@ -97,16 +100,15 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
     """Return the name of the form, and its class variables."""
     pattern, alike = _numbers(structure, theta), structure.split == ALIKE
     splits = {} if alike else {"splits": _factors(structure.split, scene.splits)}
-    wave, _, harmonic = structure.kind.partition(" ")
-    timed: dict[str, Any] = {"wave": wave, "coefficients": tuple(map(float, theta)), **splits}
-    if structure.frame in ("spacecraft", "time"):
-        timed["harmonic"] = int(harmonic or 1)
+    timed: dict[str, Any] = {"coefficients": pattern, **splits}
+    if structure.frame in ("spacecraft", "time", "Sun"):
+        timed |= _wave(structure)
     match structure.stage, structure.frame:
         case "added", "sky" if structure.kind != "power":
             if alike:
                 return "AddedPattern", {"coefficients": pattern, "index": structure.index or 0.0}
             return "AddedToSamples", {"wave": "sky", "coefficients": pattern, **splits}
-        case "added", "spacecraft" | "time":
+        case "added", "spacecraft" | "time" | "Sun":
             return "AddedToSamples", timed
         case "gain", "time":
             return "GainOverTime", timed
@@ -121,14 +123,23 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
             values = tuple(map(complex, np.reshape(pattern, (-1, 2)) @ [1.0, 1j])) if order else pattern
             edges = scene.edges(max(order, 1))
             return "BeamOrder", {"order": order, "edges": edges, "top": scene.lmax, "values": values}
-        case "square", _:
-            return "SquaredSignal", {"per_uk": float(theta[0]), "on_dipole": "dipole" in structure.acts_on}
+        case "square" | "cube", _:
+            power = 2 if structure.stage == "square" else 3
+            return "SignalPower", {
+                "factor": float(theta[0]),
+                "power": power,
+                "on_dipole": "dipole" in structure.acts_on,
+            }
         case "rotation", _:
             return "RotatedSky", {"rotation": tuple(map(float, theta))}
         case "noise", _ if structure.kind != "spectrum":
             return "NoisePattern", {"coefficients": pattern}
+        case "power", _ if structure.kind != "power":
+            return "AddedPattern", {"coefficients": pattern}
         case "power", _:
             return "SkyPower", {"edges": scene.fine, "values": tuple(map(float, theta))}
+        case "modulation", _ if structure.kind.endswith("boost"):
+            return "BoostedSky", {"velocity": pattern}
         case "modulation", _:
             degree = int(structure.kind.split()[1])
             pattern = (*(0.0,) * degree**2, *pattern)
@@ -136,10 +147,28 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
     return None
 
 
+def _wave(structure: Structure) -> dict[str, Any]:
+    """Return the class variables that say which function of time and orientation a structure follows."""
+    wave, _, rest = structure.kind.partition(" ")
+    if structure.frame == "Sun":
+        return {"wave": "Sun"} if wave == "dipole" else {"wave": "spin", "harmonic": 0}
+    if structure.acts_on == "dipole":
+        return {"wave": "lobe"}
+    if not rest:
+        return {"wave": wave}
+    return {"wave": wave, "harmonic": 0 if "-" in rest else int(rest)}
+
+
 def _numbers(structure: Structure, theta: Vector) -> tuple[float, ...]:
     """Return the real coefficients of a pattern."""
+    if structure.kind in ("elongation", f"spin 1-{SPIN}"):  # from the constant on, which has no sine
+        cosines = np.stack([theta, np.zeros_like(theta)], axis=1).ravel()
+        waves = cosines if structure.kind == "elongation" else np.insert(theta, 1, 0.0)
+        return (float(waves[0]) / CONSTANT, *map(float, waves[1:]))
     found = theta if structure.mix is None else structure.mix.T @ theta
-    return tuple(map(float, np.append(0.0, found) if structure.kind == "dipole" else found))
+    return tuple(
+        map(float, np.append(0.0, found) if structure.frame != "Sun" and structure.kind == "dipole" else found)
+    )
 
 
 def _factors(split: str, splits: Sequence[str]) -> tuple[float, ...]:

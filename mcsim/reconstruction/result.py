@@ -7,6 +7,8 @@ from mcsim.support.numbers import measured, p_equals
 
 NSIDE = 16  #: of the pictures
 
+WORDS = ("stage", "acts_on", "frame", "kind", "channel", "split", "index", "says")  #: what a structure says
+
 
 @dataclass(frozen=True)
 class Reconstructed:
@@ -30,6 +32,7 @@ class Reconstructed:
     relative_error: float  #: of its amplitude
     cause: str  #: A known effect that makes such structures, with its reference; "" if none
     alternatives: tuple[str, ...]  #: structures that are less probable by a factor of 20 at most, in plain words
+    rival: dict[str, Any] | None  #: WORDS of another description, less probable by a factor of 4 at most
     #: first and last degree, size and error of its profile in l; empty without one
     profile: tuple[tuple[int, int, float, float], ...]
     #: what it adds to one map, uK, RING, nside 16, and the name of that map; empty if not known
@@ -44,7 +47,8 @@ class Reconstructed:
         """Return what is missing, how large it is and how significant."""
         text = self.says[:1].upper() + self.says[1:]
         size = "" if self.rms_uk is None else f": {measured(self.rms_uk, self.rms_uk * self.relative_error, ' µK')} rms"
-        return f"{text}{size} ({p_equals(self.pvalue)})."
+        other = "" if self.rival is None else f"; or, as probable within a factor of 4, it {self.rival['says']}"
+        return f"{text}{other}{size} ({p_equals(self.pvalue)})."
 
     def to_json(self) -> dict[str, Any]:
         """Return its entry of ``verdict.json``."""

@@ -15,14 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.datavector.wiener_filter import FilteredMaps
-from mcsim.reconstruction.forms import rotations
+from mcsim.reconstruction.forms import boosts, rotations
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, real
 from mcsim.sphere.sky import dipole_alm
 from mcsim.support.arrays import Alm, Cl, Map, Vector, divided
+from mcsim.systematics.spacecraft import axes
 
-ADDED, GAIN = 8, 2  #: highest degree of patterns that are added, and of those that multiply
+ADDED, GAIN = 8, 4  #: highest degree of patterns that are added, and of those that multiply
 ORDERS = 4  #: highest order of a beam, and of what follows its orientation
+MODULATION = 2  #: highest degree of patterns that multiply the sky itself
+ELONGATION = 6  #: highest harmonic of the spin phase in what depends on the distance from the Sun
+GAIN_WAVES = ("spin 1", "spin 2", "year")  #: waves that a gain may follow
 BINS = 4  #: ranges of degrees of a profile in l, equal in log l
 
 Key = tuple[str | int, ...]
@@ -36,8 +40,8 @@ class View:
     channel: int
     split: int
     w: NDArray[np.complex128]  #: orientation moments, shape (smax, npix)
-    #: means over the samples of every pixel of the cosine and sine of waves, by their names
-    waves: Mapping[str, tuple[Map, Map]]
+    #: means over the samples of every pixel of what follows time: cosine and sine of waves, and so on, by their names
+    waves: Mapping[str, tuple[Map, ...]]
     response: Cl  #: B_l w_l of the channel, shape (lmax + 1,)
     kernel: Cl  #: b_l0 of its beam, shape (lmax + 1,)
 
@@ -60,7 +64,14 @@ class Scene:
     sky_power: Cl
     split_orders: int  #: highest order of a beam that is measured in each map by itself
     views: tuple[View, ...]  #: maps, channel by channel
-    timed: bool  #: True if it is known when and how every sample was pointed, and splits are spans of time
+    #: boresight angle and azimuth of each channel, degrees, if it is known when and how every sample was pointed, and
+    #: splits are spans of time; else none
+    lines: tuple[tuple[float, float], ...]
+
+    @property
+    def timed(self) -> bool:
+        """Return True if the pointing of every sample is known."""
+        return bool(self.lines)
 
     @property
     def degree(self) -> int:
@@ -94,10 +105,18 @@ class Scene:
             found += [("added", i, j) for j in range((self.degree + 1) ** 2)]
             for kind in ("gain of the sky", "gain"):
                 found += [(kind, i, j) for j in range((min(GAIN, self.lmax) + 1) ** 2)]
-            found += [("dipole", i), ("square of the sky", i), ("square", i)]
+            found += [
+                ("dipole", i),
+                ("square of the sky", i),
+                ("square", i),
+                ("cube", i),
+                ("lobe", i, 0),
+                ("lobe", i, 1),
+            ]
             found += [("rotation", i, axis) for axis in range(3)]
             found += [("orientation", i, s, c) for s in range(1, len(view.w[:ORDERS]) + 1) for c in (0, 1)]
-            found += [(kind, i, name, c) for kind in ("wave", "gain wave") for name in view.waves for c in (0, 1)]
+            found += [("wave", i, name, c) for name, maps in view.waves.items() for c in range(len(maps))]
+            found += [("gain wave", i, name, c) for name in GAIN_WAVES if name in view.waves for c in (0, 1)]
             for s in range(min(ORDERS, len(view.w)) + 1):
                 if s <= self.split_orders or i == self.of(view.channel)[0]:
                     ranges = range(len(self.edges(max(s, 1))) - 1)
@@ -107,6 +126,7 @@ class Scene:
             if len(self.of(channel)) > 1:
                 found += [(kind, channel, b) for kind in ("difference", "common") for b in range(len(self.fine) - 1)]
         found += [("power", b) for b in range(len(self.fine) - 1)]
+        found += [("modulation", j) for j in range((MODULATION + 1) ** 2)] + [("boost", axis) for axis in range(3)]
         return tuple(found)
 
     @cached_property
@@ -116,9 +136,9 @@ class Scene:
 
     @cached_property
     def _patterns(self) -> NDArray[np.float64]:
-        """Return the real harmonics up to degree 2 in every pixel, shape (9, npix)."""
+        """Return the real harmonics up to degree GAIN in every pixel, shape ((GAIN + 1)^2, npix)."""
         n = healpy.pix2vec(self.nside, np.arange(12 * self.nside**2))
-        return np.stack([real.field(unit, *n) for unit in np.eye(9)])
+        return np.stack([real.field(unit, *n) for unit in np.eye((GAIN + 1) ** 2)])
 
     def values(self, filtered: FilteredMaps, differences: Sequence[Map]) -> Vector:
         """Return the scores, shape (len(keys),).
@@ -134,19 +154,32 @@ class Scene:
             found.append(real.coefficients(adjoint, self.lmax, self.degree))
             top = min(GAIN, self.lmax)
             found += [self._without_dipole(r, sky, adjoint, top), _low(r * whole, top)]
-            found.append(np.array([r @ self.dipole, r @ sky**2, r @ whole**2]))
+            found.append(np.array([r @ self.dipole, r @ sky**2, r @ whole**2, r @ whole**3, *self._lobe(r, view)]))
             through = (alm_.multiply(one, view.response, self.lmax) for one in turned)
             found.append(np.array([_product(adjoint, one, self.lmax) for one in through]))
             found += [np.array([r @ w.real, -(r @ w.imag)]) for w in view.w[:ORDERS]]
-            for factor in (1.0, whole):
-                found += [np.array([(r * factor) @ wave for wave in pair]) for pair in view.waves.values()]
+            found += [np.array([r @ one for one in maps]) for maps in view.waves.values()]
+            gained = (view.waves[name] for name in GAIN_WAVES if name in view.waves)
+            found += [np.array([(r * whole) @ one for one in maps]) for maps in gained]
             found += list(self._orders(view, filtered.orders[i], i))
         for channel, difference in enumerate(differences):
-            found.append(0.5 * self._patterns @ difference)
+            found.append(0.5 * self._patterns[:9] @ difference)
             if len(own := self.of(channel)) > 1:
                 a, b = filtered.adjoint[own[0]], filtered.adjoint[own[1]]
                 found += [self._powers(a - b, a - b), self._powers(a, b)]
         return np.concatenate([*found, self._of_sky(filtered.sky)])
+
+    def _lobe(self, r: Map, view: View) -> tuple[float, float]:
+        """Return the scores of the dipole along the beam's x and y, as a lobe far from the beam sees it."""
+        south, east = self._tangent
+        c, s = view.w[0].real, -view.w[0].imag  # means of cos psi and sin psi
+        return float(r @ (c * south + s * east)), float(r @ (c * east - s * south))
+
+    @cached_property
+    def _tangent(self) -> tuple[Map, Map]:
+        """Return the dipole's vector along e_theta and e_phi in every pixel, uK."""
+        _, south, east = axes(*healpy.pix2ang(self.nside, np.arange(12 * self.nside**2)))
+        return self.dipole_uk @ south, self.dipole_uk @ east
 
     def _without_dipole(self, r: Map, sky: Map, adjoint: Alm, top: int) -> Vector:
         """Return the scores of patterns times the sky, without what these products have of monopole and dipole.
@@ -177,10 +210,23 @@ class Scene:
         return np.array([power[low:high].sum() for low, high in pairwise(edges)])
 
     def _of_sky(self, sky: Alm) -> Vector:
-        """Return the scores of the sky's power."""
+        """Return the scores of the sky's power, of patterns that multiply it, and of its motion.
+
+        For what acts on the sky itself the residuals of all maps together are S^-1 s^: the uneven noise that the
+        isotropic filter leaves in them would drown it.
+        """
         weight = _twice(self.lmax) * np.abs(sky) ** 2
         power = 0.5 * divided(1.0, self.cl) * np.bincount(alm_.degrees(self.lmax), weight, self.lmax + 1)
-        return np.array([power[low:high].sum() for low, high in pairwise(self.fine)])
+        expected = alm_.multiply(sky, divided(1.0, self.cl), self.lmax)
+        first, second = (healpix.synthesis(one[None], self.nside, self.lmax)[0] for one in (sky, expected))
+        area = 4.0 * np.pi / first.size
+        return np.concatenate(
+            [
+                [power[low:high].sum() for low, high in pairwise(self.fine)],
+                area * _low(first * second, MODULATION),
+                [_product(expected, moved, self.lmax) for moved in boosts(sky, self.lmax)],
+            ]
+        )
 
 
 def _low(product: Map, top: int) -> Vector:

@@ -5,7 +5,7 @@ coordinates, so that a fit needs no templates: theta = C^-1 u, and the fall of c
 from simulations; the tests are exact for their number (:mod:`mcsim.stats.gaussian`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -24,16 +24,17 @@ MOST = 3  #: largest number of structures
 SECOND = 0.1
 """Least fall of chi^2 of a further structure over that of the first: below it may be the square of the first."""
 
-FINALISTS, NEAR, SPARE = 10, 5.0, 2
+FINALISTS, NEAR, SPARE = 14, 5.0, 2
 """Structures that are compared by their responses on the sky of the data: how many at most, within which difference of
 the evidence those of one stage and frame, and simulations for each of their scores."""
 
 RARE = 3.0
-"""Odds against a structure that is not alike in all splits, and against a gain or square of sky or dipole alone."""
+"""Odds against a structure that differs between splits, a gain or square of sky or dipole alone, a cube, a halo."""
 
 TAIL = 0.1  #: share of the simulations by which the tail of the largest evidence is described
 SMALL = 1e-6  #: variance, relative to the largest, of a direction in which scores are not inverted
 ALTERNATIVES = 20.0  #: odds up to which other structures are told beside the best
+RIVAL = 4.0  #: odds up to which the next one, if it is of other words, is as good a description as the best
 
 
 class Sky(Protocol):
@@ -58,8 +59,9 @@ class Found:
     #: global p-value: probability that the best of all structures has as large an evidence in data of the model
     pvalue: float
     delta_chi2: float  #: fall of chi^2, unbiased
-    #: indices of structures less probable by ALTERNATIVES at most, the most probable first
+    #: indices of structures less probable by ALTERNATIVES at most, the rival and then the most probable first
     alternatives: tuple[int, ...]
+    rival: int | None  #: the most probable of other words than the best, if less so by RIVAL at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,8 +137,13 @@ class Search:
             best = int(order[0])
             if found and falls[best] < SECOND * found[0].delta_chi2:
                 break
-            near = [members[k] for k in order[1:] if judged[best] - judged[k] < np.log(ALTERNATIVES)]
-            found.append(Found(members[best], float(values.max()), p, float(falls[best]), tuple(near)))
+            less = {members[k]: judged[best] - judged[k] for k in map(int, order[1:])}
+            near = [k for k, one in less.items() if one < np.log(ALTERNATIVES)]
+            own = self.grammar[members[best]]
+            rivals = (k for k in near if less[k] < np.log(RIVAL) and not own.like(self.grammar[k]))
+            if (rival := next(rivals, None)) is not None:  # is told first
+                near.insert(0, near.pop(near.index(rival)))
+            found.append(Found(members[best], float(values.max()), p, float(falls[best]), tuple(near), rival))
             chosen = [one.structure for one in found]
             if sky is not None:
                 sky.keep(members[best], amplitudes[best])
@@ -152,21 +159,30 @@ class Search:
         return np.array(found)
 
     def finalists(self, values: Vector) -> list[int]:
-        """Return the most evident structure, those near it, and the best of every other stage and frame.
+        """Return structures to compare: the most evident one, and those that may be it on this sky.
 
+        These are the best of every other stage, the same in other channels, splits or profiles, whose own scores do not
+        tell all that they do to the others, those near it, and the best of every frame.
         All their scores together have as many elements as a fraction 1/SPARE of the simulations at most.
         """
-        best, seen, chosen, rows = float(values.max()), set[tuple[str, str, str]](), list[int](), 0
-        for k in map(int, np.argsort(-values)):
-            one = self.grammar[k]
-            if len(chosen) == FINALISTS or values[k] <= 0.0:
-                break
-            new = (one.stage, one.acts_on, one.frame) not in seen
-            if (new or best - values[k] < NEAR) and rows + one.size <= len(self.simulations) // SPARE:
+        order = [k for k in map(int, np.argsort(-values)) if values[k] > 0.0]
+        each = [self.grammar[k] for k in order]
+        if not order:
+            return [int(np.argmax(values))]
+        wanted = order[:1]
+        if each[0].stage == "power":  # a monopole or dipole may be made of the rest of the sky
+            made = (k for k, one in enumerate(self.grammar) if one.stage == "modulation")
+            wanted += [k for k in made if self.nulls[k] is not None]
+        wanted += _firsts(order, [one.stage for one in each])
+        wanted += [k for k in order if each[0].elsewhere(self.grammar[k]) or each[0].like(self.grammar[k])]
+        wanted += [k for k in order if values[order[0]] - values[k] < NEAR]
+        wanted += _firsts(order, [(one.stage, one.acts_on, one.frame) for one in each])
+        chosen, rows = list[int](), 0
+        for k in dict.fromkeys(wanted):
+            if len(chosen) < FINALISTS and rows + self.grammar[k].size <= len(self.simulations) // SPARE:
                 chosen.append(k)
-                seen.add((one.stage, one.acts_on, one.frame))
-                rows += one.size
-        return chosen or [int(np.argmax(values))]
+                rows += self.grammar[k].size
+        return chosen
 
     def judged(
         self, members: Sequence[int], scores: Vector, responses: Sequence[Matrix]
@@ -225,10 +241,18 @@ class Search:
         return null.fit(x, t.T).amplitudes
 
 
+def _firsts(order: Sequence[int], labels: Sequence[Hashable]) -> list[int]:
+    """Return the first of every label."""
+    found: dict[Hashable, int] = {}
+    for k, label in zip(order, labels, strict=True):
+        found.setdefault(label, k)
+    return list(found.values())
+
+
 def _rarity(structure: Structure) -> float:
     """Return the logarithm of the prior odds against a structure, beside one of the common kind."""
     part = structure.stage in ("gain", "square") and structure.acts_on != "sky and dipole"
-    rare = (structure.split != ALIKE) + part
+    rare = (structure.split != ALIKE) + (part or structure.stage == "cube" or structure.kind.endswith("low l"))
     return rare * float(np.log(RARE))
 
 

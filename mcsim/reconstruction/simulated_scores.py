@@ -3,9 +3,10 @@
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from mcsim.datavector.campaign import Ask, seeded
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import Model, wiener_filter
 from mcsim.reconstruction.forms import AddedToSamples
-from mcsim.reconstruction.scores import Scene, View
+from mcsim.reconstruction.scores import ELONGATION, Scene, View
 from mcsim.simulation.pixel_means import signal_of
 from mcsim.support import folders
 from mcsim.support.arrays import Map, Matrix, Vector
@@ -28,8 +29,12 @@ SEED = 0x6D63 * 1_000 + 4  #: of these simulations; those of the data vector and
 
 PER_TASK = 10
 
-WAVES = {"spin 1": ("spin", 1), "spin 2": ("spin", 2), "year": ("year", 1)}
-"""Waves in time by name: of what, and which harmonic."""
+WAVES: dict[str, dict[str, Any]] = {
+    **{f"spin {k}": {"wave": "spin", "harmonic": k} for k in range(1, ELONGATION + 1)},
+    "year": {"wave": "year"},
+    "Sun": {"wave": "Sun"},
+}
+"""What follows time, of two components each, by name: class variables of a form."""
 
 CODE = (
     *("config", "sphere", "instrument", "systematics", "simulation", "reconstruction.forms", "reconstruction.scores"),
@@ -42,18 +47,19 @@ def scene_of(model: Model) -> Scene:
     """Return the maps of a model as the grammar needs them."""
     run = model.survey.config
     splits = run.map.splits or ("",)
-    timed = run.map.split_by == "time" and all(c.site.pointing is not None for c in model.survey.channels)
+    sites = [channel.site for channel in model.survey.channels]
+    timed = run.map.split_by == "time" and all(site.pointing is not None for site in sites)
+    pointed = [site.pointed("a wave").line for site in sites] if timed else []
+    lines = tuple((line.boresight_angle_deg, line.azimuth_deg) for line in pointed)
     views = []
     for i, part in enumerate(model.parts):
         channel = model.survey.channels[part.channel]
         split = model.of(part.channel).index(i)
-        waves: dict[str, tuple[Map, Map]] = {}
-        if timed:
-            span = run.map.span(split)
-            for name, (wave, harmonic) in WAVES.items():
-                pair = [signal_of(_wave(wave, harmonic, c)(amplitude=1.0), channel.site, span) for c in (0, 1)]
-                seen = part.precision > 0
-                waves[name] = (np.where(seen, pair[0], 0.0), np.where(seen, pair[1], 0.0))
+        waves: dict[str, tuple[Map, ...]] = {}
+        for name, values in WAVES.items() if timed else ():
+            acting = [_wave(*values.items(), component=c)(amplitude=1.0) for c in (0, 1)]
+            means = (signal_of(one, channel.site, run.map.span(split)) for one in acting)
+            waves[name] = tuple(np.where(part.precision > 0, one, 0.0) for one in means)
         kernel = channel.site.beam.blm[0, : model.lmax + 1].real
         moments = np.where(np.isfinite(part.moments.w), part.moments.w, 0.0)
         views.append(View(part.channel, split, moments, waves, model.response[part.channel], kernel))
@@ -69,19 +75,16 @@ def scene_of(model: Model) -> Scene:
         sky_power=model.sky_power,
         split_orders=model.settings.split_beam_orders,
         views=tuple(views),
-        timed=timed,
+        lines=lines,
     )
 
 
-@lru_cache(maxsize=16)
-def _wave(of: str, order: int, component: int) -> type[AddedToSamples]:
-    """Return the effect that adds the cosine (component 0) or sine of a wave."""
-
-    class Wave(AddedToSamples):
-        name = f"wave_{of}_{order}_{component}"
-        wave, harmonic, coefficients = of, order, (1.0 - component, 0.0 + component)
-
-    return Wave
+@lru_cache(maxsize=64)
+def _wave(*values: tuple[str, Any], component: int) -> type[AddedToSamples]:
+    """Return the effect with these class variables that adds one of its two components."""
+    name = "_".join(["wave", *(str(value) for _, value in values), str(component)])
+    own = {"__module__": __name__, "name": name, "coefficients": (1.0 - component, 0.0 + component), **dict(values)}
+    return dataclass(frozen=True, kw_only=True)(type("Wave", (AddedToSamples,), own))
 
 
 def scores_of_maps(model: Model, scene: Scene, maps: Sequence[Map]) -> Vector:

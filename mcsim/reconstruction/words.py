@@ -13,6 +13,7 @@ from mcsim.systematics.base import scan_direction
 _DERIVATIVES = {2: "second derivative", 3: "third derivative", 4: "fourth derivative"}
 
 _LIKE: tuple[tuple[tuple[str, str, str], str], ...] = (
+    (("beam", "scan", "order 0 at low l"), "beam_sidelobe"),
     (("beam", "scan", "order 0"), "beam_width"),
     (("beam", "scan", "order 1"), "pointing_offset"),
     (("beam", "scan", "order 2"), "beam_ellipticity"),
@@ -22,13 +23,18 @@ _LIKE: tuple[tuple[tuple[str, str, str], str], ...] = (
     (("gain", "", "constant"), "calibration"),
     (("added", "time", "spin"), "spin_synchronous_offset"),
     (("added", "spacecraft", ""), "sidelobe_pickup"),
+    (("added", "Sun", "dipole"), "orbital_dipole"),
     (("added", "sky", "dipole"), "dipole_residual"),
     (("added", "sky", "monopole"), "monopole_residual"),
     (("added", "sky", "latitude galactic"), "foreground_residual"),
     (("square", "", ""), "nonlinearity"),
+    (("cube", "", ""), "nonlinearity"),
     (("noise", "", "latitude"), "noise_anisotropy"),
     (("noise", "", "level"), "noise_level"),
-    (("power", "", ""), "point_sources"),
+    (("power", "", "monopole"), "monopole_residual"),
+    (("power", "", "dipole"), "dipole_residual"),
+    (("power", "", "power"), "point_sources"),
+    (("modulation", "sky", "degree 1 as a boost"), "boost"),
     (("modulation", "sky", "degree 1"), "dipole_modulation"),
     (("modulation", "sky", "degree 2"), "quadrupole_modulation"),
 )
@@ -62,6 +68,12 @@ def _what(structure: Structure, theta: Vector) -> str:
     match structure.stage, structure.frame:
         case "added", "sky":
             return f"is added to the signal, fixed to the sky ({_pattern(kind)})"
+        case "added", "spacecraft" if kind == "lobe":
+            return f"is the dipole as a lobe fixed to the spacecraft sees it, {_lobe(theta)}"
+        case "added", "Sun":
+            return f"is added to the signal and depends on {SUN[kind]}"
+        case "added", "spacecraft" if kind.startswith("line"):
+            return f"is the dipole as the line of sight of {number} sees it at the same time"
         case "added", "spacecraft":
             return f"is added to the signal, fixed to the spacecraft (order {number} in the orientation of the beam)"
         case "added", _:
@@ -76,13 +88,18 @@ def _what(structure: Structure, theta: Vector) -> str:
             return _order(int(kind.split()[1]), theta)
         case "square", _:
             return f"follows the square of {structure.acts_on}"
+        case "cube", _:
+            return f"follows the cube of {structure.acts_on}"
         case "rotation", _:
             return "follows the gradient of the sky along a rotation fixed to the sky"
         case "noise", _:
             shape = {"level": "everywhere alike", "spectrum": "at some degrees more than at others"}
             return f"is noise ({shape.get(kind) or _pattern(kind)})"
         case "power", _:
-            return "is power of the sky itself"
+            which = "" if kind == "power" else f", where the model's has none ({_pattern(kind)})"
+            return f"is power of the sky itself{which}"
+    if kind.endswith("boost"):
+        return "modulates and moves the sky itself, as a velocity does"
     return f"modulates the sky itself ({_pattern(kind)})"
 
 
@@ -106,13 +123,41 @@ def _pattern(kind: str) -> str:
 
 
 def _wave(kind: str) -> str:
-    return "year" if kind == "year" else "spin phase" if kind.endswith("1") else "spin phase, twice a spin"
+    wave, _, harmonic = kind.partition(" ")
+    return "year" if wave == "year" else f"spin phase{_HARMONIC[harmonic]}"
+
+
+_HARMONIC = {
+    "1": "",
+    "2": ", twice a spin",
+    "3": ", three times a spin",
+    "4": ", four times a spin",
+    "1-4": ", in any way",
+}
+
+SUN = {
+    "dipole": "the angles of the line of sight to the directions of the Sun and of the Earth's motion, as a dipole",
+    "elongation": "the distance from the Sun alone",
+}
+"""What a signal depends on in the frame of the Sun."""
+
+
+def _lobe(theta: Vector) -> str:
+    """Return where a lobe points that sees the dipole like this, as a sentence goes on."""
+    x, y, z = (float(one) for one in theta)
+    away = np.rad2deg(np.arctan2(np.hypot(x, y), z))
+    return f"{away:.0f}° from the line of sight" + (
+        f", {scan_direction(np.rad2deg(np.arctan2(y, x)))}" if 5.0 < away < 175.0 else ""
+    )
 
 
 def _degrees(structure: Structure, theta: Vector, scene: Scene) -> str:
     """Return the degrees with most of a profile, for a profile."""
     if (spans := profile_ranges(structure, scene)) is None:
         return ""
+    if structure.kind.endswith("low l"):
+        low = (structure.mix[0] > 0).sum() if structure.mix is not None else 1
+        return f"as a halo about the beam does, up to ℓ {spans[low - 1][1]}"
     if structure.mix is not None:
         return f"growing as ℓ{SUPERSCRIPT[structure.kind[-1]]}"
     sizes = np.abs(theta.reshape(len(spans), -1)).sum(axis=1)

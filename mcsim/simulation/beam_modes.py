@@ -87,11 +87,8 @@ class BeamModes:
         observed = np.where(inverse.precision[0] > 0.0, map_uk, 0.0)[None]
         sky = inverse.wiener(observed)
         y = inverse.apply(observed, sky)[0]
-        turned = np.zeros((self.orders, 2, inverse.npix))
-        fields = []
-        for s, pair in enumerate(turned, 1):
-            convolve.turned(y, self.moments, s, pair)
-            fields.append(healpix.adjoint(pair, inverse.lmax, inverse.nthreads, spin=s))
+        turned = [convolve.turned([(y, self.moments)], s) for s in range(1, self.orders + 1)]
+        fields = [healpix.adjoint(pair, inverse.lmax, inverse.nthreads, spin=s) for s, pair in enumerate(turned, 1)]
         return Weighted(sky, np.stack(fields))
 
     def products(self, one: Weighted, other: Weighted) -> Vector:

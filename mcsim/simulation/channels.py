@@ -1,5 +1,6 @@
 """What the channels of a configuration stand for: beams, scan models, pointing, and the effects that act in them."""
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -88,6 +89,8 @@ def effects_on(
     for entry in run.effects:
         effect = systematics.build(entry.name, entry.parameters, library)
         check_scope(f"effect {entry.name}", type(effect), entry.channel, run)
+        if "amplitude" not in entry.parameters:
+            warnings.warn(f"effect {entry.name} has no amplitude, so that it does nothing; give one.", stacklevel=2)
         if entry.channel in (None, channel):
             acting.append(effect)
     return tuple(acting)

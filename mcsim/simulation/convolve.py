@@ -6,7 +6,7 @@ r"""From a sky to the map of a survey: spin transforms of the beam's components,
 One transform per kept s, whatever the number of samples in the survey (paper, Sec. III and App. C).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -139,19 +139,22 @@ def add_twice_real_part(w, real, imag, total):  # type: ignore[no-untyped-def]
         total[pixel] += 2.0 * (w[pixel].real * real[pixel] - w[pixel].imag * imag[pixel])
 
 
-def turned(map_: Map, moments: Moments, s: int, total: NDArray[np.float64]) -> None:
-    """Add conj(w_s) times a map to ``total``, real and imaginary part, shape (2, npix): adjoint to w_s S_s."""
-    check_shape(map_, (moments.npix,), f"the map beside moments of nside {moments.nside}")
-    check_shape(total, (2, moments.npix), f"the sum beside moments of nside {moments.nside}")
-    _add_turned(map_, moments.w[s - 1], total)
+def turned(each: Sequence[tuple[Map, Moments]], s: int) -> NDArray[np.float64]:
+    """Return the sum of conj(w_s) times maps, real and imaginary part, shape (2, npix): adjoint to w_s S_s."""
+    total = np.empty((2, each[0][0].size))
+    for place, (map_, moments) in enumerate(each):
+        check_shape(map_, (moments.npix,), f"the map beside moments of nside {moments.nside}")
+        _turn(map_, moments.w[s - 1], total, place == 0)
+    return total
 
 
 @njit(nogil=True)
-def _add_turned(map_, w, total):  # type: ignore[no-untyped-def]
-    """Add conj(w) times a map to ``total`` in one pass over memory."""
+def _turn(map_, w, total, first):  # type: ignore[no-untyped-def]
+    """Add conj(w) times a map to ``total``, or begin with the ``first`` one, in one pass over memory."""
     for pixel in range(map_.size):
-        total[0, pixel] += map_[pixel] * w[pixel].real
-        total[1, pixel] -= map_[pixel] * w[pixel].imag
+        real, imag = map_[pixel] * w[pixel].real, map_[pixel] * w[pixel].imag
+        total[0, pixel] = real if first else total[0, pixel] + real
+        total[1, pixel] = -imag if first else total[1, pixel] - imag
 
 
 def centroid_map(gradient: NDArray[np.float64], moments: Moments) -> Map:

@@ -139,11 +139,8 @@ class InverseCovariance:
                 circular = circular + alm_.multiply(electric, np.sqrt(ell * (ell + 1.0)), self.lmax)
             total += convolve.circular_alm(circular, response)
             for s in sorted({s for i in members for s in self.maps[i].spins}):
-                turned = np.zeros((2, self.npix))
-                for i in members:
-                    moments = self.maps[i].moments
-                    if moments is not None and s in self.maps[i].spins:
-                        convolve.turned(maps[at[i]], moments, s, turned)
+                own = [(maps[at[i]], self.maps[i].moments) for i in members if s in self.maps[i].spins]
+                turned = convolve.turned([(map_, moments) for map_, moments in own if moments is not None], s)
                 electric, magnetic = healpix.adjoint(turned, self.lmax, self.nthreads, spin=s)
                 factor = response.factors[s]  # ducc0's sign: S_s is minus the synthesis
                 total -= 2.0 * alm_.multiply(electric, factor.real, self.lmax)

@@ -20,6 +20,9 @@ from mcsim.sphere.checks import UNSEEN_BELOW
 from mcsim.sphere.mask import read_mask
 from mcsim.support.arrays import Map, divided
 
+SMALLEST_UK2 = 1e-8
+"""Largest variance of a map of noise at least: 1 uK^2 is 1e-12 K^2, and the best surveys have 1e-4 uK^2 a pixel."""
+
 
 class DrawnNoise(Protocol):
     """Noise of a map that is not white."""
@@ -248,6 +251,11 @@ def _positive(path: Path, moments: Moments, names: Sequence[str]) -> tuple[Map, 
     values, _, unit = healpix.read_map(path, tuple(names), moments.frame)
     _check_nside(values, path, moments)
     values = np.where(np.isfinite(values) & (values > UNSEEN_BELOW), values, 0.0)
+    if unit is None and names is healpix.VARIANCE and 0.0 < values.max() < SMALLEST_UK2:
+        raise InputError(
+            f"{path} has variances of at most {values.max():.3g} uK^2, less than any map's ({SMALLEST_UK2:g} uK^2); "
+            "are they in K^2? Say the unit in its header (TUNIT), or give them in uK^2."
+        )
     if values.min() < 0.0 or not np.any((values > 0.0) & (moments.hits > 0)):
         raise InputError(
             f"{path} has values between {values.min():g} and {values.max():g} for {names[0]} where the scan observes; "

@@ -36,7 +36,7 @@ def realize(survey: Survey, realization: int, nthreads: int = 1) -> dict[str, ND
     """
     ensemble = survey.config.ensemble
     sky = draw_sky(survey, realization)
-    made = _circular_maps(survey, nthreads)
+    made = circular_maps(survey, nthreads)
     observed = [result for channel in survey.channels for result in _observe(survey, channel, sky, realization, made)]
     result = _spectra(survey, [o.alm for o in observed], "")
     if ensemble.paired:
@@ -70,18 +70,21 @@ def maps(survey: Survey, realization: int, nthreads: int = 1, sky: Alm | None = 
     """
     if sky is None:
         sky = draw_sky(survey, realization)
-    found = []
-    made = _circular_maps(survey, nthreads)
-    for channel in survey.making.channels:
-        if channel.side_b is not None:
-            run = survey.config
-            seen, dipole = _seen(survey.making, channel, sky, realization)
-            made_at_once = differencing.whole_maps(channel, seen, dipole, run.ensemble.seed, realization, nthreads)
-            found += [_finished(m, map_uk) for m, map_uk in made_at_once]
-            continue
-        for m, parts in _map_parts(survey.making, channel, sky, realization, made, smooth=True):
-            found.append(_finished(m, parts.total))
-    return np.stack(found)
+    made = circular_maps(survey, nthreads)
+    return np.stack([m for one in survey.making.channels for m in maps_of(survey, one, sky, realization, made)])
+
+
+def maps_of(
+    survey: Survey, channel: Channel, sky: Alm, realization: int, made: convolve.CircularMaps
+) -> list[NDArray[np.float64]]:
+    """Return the maps of one channel of :attr:`Survey.making`, as :func:`maps` does; ``made``: of other channels."""
+    if channel.side_b is not None:
+        seen, dipole = _seen(survey.making, channel, sky, realization)
+        seed = survey.config.ensemble.seed
+        made_at_once = differencing.whole_maps(channel, seen, dipole, seed, realization, made.nthreads)
+        return [_finished(m, map_uk) for m, map_uk in made_at_once]
+    parts = _map_parts(survey.making, channel, sky, realization, made, smooth=True)
+    return [_finished(m, own.total) for m, own in parts]
 
 
 def _finished(m: SurveyMap, map_uk: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -109,7 +112,8 @@ class MapParts:
         return reduce(np.add, [part for part in (self.smooth, self.extra, self.difference) if part is not None])
 
 
-def _circular_maps(survey: Survey, nthreads: int) -> convolve.CircularMaps:
+def circular_maps(survey: Survey, nthreads: int = 1) -> convolve.CircularMaps:
+    """Return what makes the maps of circular beams of a survey."""
     return convolve.CircularMaps(survey.config.map.resolution, survey.config.sky.lmax, nthreads)
 
 

@@ -14,7 +14,7 @@ from mcsim.sphere.checks import UNSEEN_BELOW
 from mcsim.support.arrays import Alm
 from mcsim.support.npy import read_npy
 
-LARGEST_UK = 1e12  #: of a user's sky
+LARGEST_UK = 1e7  #: of a user's sky: 10 K, more than the Galaxy has in any band of a CMB survey
 
 SMALLEST_UK = 0.01
 """Of the largest value of a user's sky that is not zero: a CMB sky in K has 5e-4, and any in uK has more than 1."""
@@ -69,7 +69,7 @@ def _check_size(path: Path, sky: NDArray[np.generic]) -> None:
     """Refuse what a flipped bit or another unit makes of a sky."""
     largest = float(np.max(np.abs(sky)))
     if largest > LARGEST_UK:
-        raise InputError(f"{path} holds {largest:.3g} uK, more than any sky ({LARGEST_UK:g} uK); repair the file.")
+        raise InputError(f"{path} holds {largest:.3g} uK, more than any sky ({LARGEST_UK:g} uK); correct its unit.")
     if 0.0 < largest < SMALLEST_UK:
         raise InputError(
             f"{path} holds at most {largest:.3g} uK, less than any sky ({SMALLEST_UK:g} uK); is it in K? Say the unit "

@@ -44,11 +44,12 @@ def check_nside(nside: Any) -> None:
     """Raise InputError unless ``nside`` is a power of two between 1 and NSIDE_MAX."""
     whole = isinstance(nside, int | np.integer) and not isinstance(nside, bool)
     if not whole or nside < 1 or nside > NSIDE_MAX or nside & (nside - 1):
-        raise InputError(f"nside is {nside}, but it must be a power of two between 1 and {NSIDE_MAX}.")
+        raise InputError(f"nside is {nside!r}, but it must be a power of two between 1 and {NSIDE_MAX}.")
 
 
 def check_angle(angle: float, name: str) -> None:
     """Raise InputError unless an angle in radians is finite and at most two turns."""
+    check_number(angle, name, "radians")
     if not abs(angle) <= LARGEST_ANGLE:
         raise InputError(f"{name} is {angle:g} rad, but angles go up to 4 pi; convert degrees to radians.")
 

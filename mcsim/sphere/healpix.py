@@ -1,5 +1,6 @@
 """HEALPix maps and their harmonic coefficients: transforms, quadrature weights, pixel window."""
 
+import os
 import warnings
 from functools import lru_cache
 from pathlib import Path
@@ -243,6 +244,8 @@ def read_map(path: Path, names: tuple[str, ...] = (), frame: str | None = None) 
         if not healpy.isnpixok(array.size):
             raise InputError(f"{path} has {array.size} pixels, which is no HEALPix map; give all 12 nside^2 pixels.")
         return array, None, None
+    if not os.path.exists(path):
+        raise InputError(f"{path} does not exist; give a HEALPix map in FITS.")
     with unreadable(path, "a HEALPix map", "give a complete FITS map"), warnings.catch_warnings():
         warnings.simplefilter("error", category=AstropyUserWarning)
         field = _column_called(path, names)

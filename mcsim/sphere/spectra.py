@@ -75,6 +75,8 @@ def load(spec: str | Path, lmax: int) -> NDArray[np.float64]:
     """
     check_whole(lmax, "lmax")
     cl, names, stated = _read(spec)
+    if not len(cl):
+        raise InputError(f"power spectrum {str(spec)!r} is empty; give C_l from l = 0 to {lmax}.")
     if len(cl) <= lmax:
         raise InputError(
             f"power spectrum {str(spec)!r} ends at l = {len(cl) - 1}, but lmax = {lmax} is wanted; "
@@ -154,7 +156,7 @@ def _check_shape(where: str, cl: NDArray[np.float64], named: bool) -> None:
     )
     if not (white or named):
         raise InputError(message)
-    warnings.warn(message, stacklevel=3)
+    warnings.warn(str(InputError(message)), stacklevel=3)  # which names what was given as an array
 
 
 def _refuse_d_l(path: Path, header: str) -> None:

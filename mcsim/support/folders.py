@@ -16,7 +16,8 @@ def user_path(given: Any) -> Path:
     try:
         return Path(given).expanduser()
     except (TypeError, RuntimeError) as error:  # RuntimeError: no such home is known
-        raise InputError(f"{given!r} is no path of a file or folder ({error}); give one.") from None
+        shown = repr(given) if len(repr(given)) <= 60 else f"a {type(given).__name__}"
+        raise InputError(f"{shown} is no path of a file or folder ({error}); give one.") from None
 
 
 @contextmanager

@@ -15,7 +15,8 @@ def read_npy(path: str | Path, kind: str = "biufc", ndims: tuple[int, ...] = (1,
         array = np.load(path, allow_pickle=False)
     if array.ndim not in ndims or array.dtype.kind not in kind:
         kinds = {"c": "complex numbers", "biufc": "numbers"}
-        wanted = f"{kinds.get(kind, 'real numbers')} in {' or '.join(map(str, ndims))} dimensions"
+        plural = "" if ndims == (1,) else "s"
+        wanted = f"{kinds.get(kind, 'real numbers')} in {' or '.join(map(str, ndims))} dimension{plural}"
         raise InputError(f"{path} holds {array.dtype} of shape {array.shape}; give {wanted}.")
     return array
 

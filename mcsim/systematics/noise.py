@@ -28,7 +28,7 @@ class NoiseLevel(Effect):
     source = "Jarosik et al. 2011, ApJS 192, 14 (sigma0 per channel, and its error)"
     step = 0.01
     bounds = (Bound("amplitude", -0.9, 3.0, "a prior of this library: noise is known to a factor of four"),)
-    parametrization = Parametrization(noise_alone=True, matched_filter=False)
+    parametrization = Parametrization(noise_alone=True)
 
     def noise(self, site: Site) -> Map | None:
         if self.amplitude == 0.0:

@@ -288,7 +288,7 @@ def test_beam_of_a_configuration_and_of_files(mcsim: Command, tmp_path: Path) ->
     code, out, _ = mcsim("beam", "quickstart", "--lmax", 300)
     assert code == 0
     assert "axis ratio" in out
-    assert (tmp_path / "beam.png").exists()
+    assert (tmp_path / "quickstart-beam.png").exists()
     y, x = np.mgrid[-40:41, -40:41] * 0.1
     image = np.exp(-(x**2) / 2 / 0.5**2 - y**2 / 2 / 0.4**2)
     header = fits.Header({"CDELT1": 0.1, "CDELT2": 0.1, "CUNIT1": "deg", "CUNIT2": "deg"})
@@ -485,3 +485,29 @@ def test_a_challenge_refuses_wrong_options(mcsim: Command, tmp_path: Path, words
     assert code == 2
     assert named in error
     assert not list((tmp_path / "made").rglob("*.json"))
+
+
+def test_pictures_come_beside_what_they_show(mcsim: Command, tmp_path: Path) -> None:
+    """And what cannot be written is said before anything is computed."""
+    (tmp_path / "sub").mkdir()
+    hdu = fits.BinTableHDU.from_columns([fits.Column("B_L", "D", array=np.exp(-(np.arange(40.0) ** 2) / 2e3))])
+    hdu.writeto(tmp_path / "sub" / "bl.fits")
+    code, out, _ = mcsim("beam", "sub/bl.fits")
+    assert code == 0
+    assert (tmp_path / "sub" / "bl-beam.png").exists()
+    assert "sub/bl-beam.png" in out
+    assert_refused(mcsim("scan", "wmap", "-o", "nowhere/scan.png"), "nowhere/scan.png")
+    assert_refused(mcsim("fit", "nix.zarr", "tiny", "-o", "nowhere/fit.png"), "nowhere/fit.png")
+    (tmp_path / "p.zarr").mkdir()
+    code, out, err = mcsim("predict", "tiny", "-o", "p.zarr")
+    assert code == 2
+    assert not out
+    assert "p.zarr" in err
+
+
+def test_help_shows_no_type_of_flags_and_config_every_default(mcsim: Command) -> None:
+    for command in ("run", "diagnose", "challenge"):
+        _, out, _ = mcsim(command, "--help")
+        assert "bool" not in out
+        assert "--help" in out
+    assert json.loads(mcsim("config", "tiny")[1])["map"]["offset_order"] == 1

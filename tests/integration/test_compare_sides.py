@@ -223,7 +223,7 @@ def test_maps_with_holes_show_enough_of_the_sky():
 def test_prepared_maps_are_compared():
     """Both sides degraded, their dipoles taken off, turned: what side B does otherwise is still named."""
     steps = [{"kind": "subtract_dipole"}, {"kind": "degrade", "nside": 16}, {"kind": "rotate", "frame": "galactic"}]
-    simulator = Simulator(small("litebird", period_s=181.0, preparation=steps, map=SMALL["map"] | {"nside": 32}))
+    simulator = Simulator(small("litebird", period_s=181.0, preparation=steps, map={"nside": 32}))
     whole = survey(simulator.run)
 
     def prepared(maps: Maps) -> Maps:

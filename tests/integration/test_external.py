@@ -265,19 +265,19 @@ def test_a_batch_that_was_interrupted_goes_on_with_the_same_maps(tmp_path, monke
     assert run.simulator == str(tmp_path / "sim.py:Noisy")
     data = list(native(5, 1)[0])
     with refused("sim.py:Noisy", "OSError", by=RunError):
-        mcsim.diagnose(run, data, settings=SETTINGS)
+        mcsim.diagnose(run, data, settings=FEW)
     first = (tmp_path / "calls").read_text().split()
     (tmp_path / "stop").unlink()
-    found = mcsim.diagnose(replace(run, compute=replace(run.compute, workers=7)), data, settings=SETTINGS)
+    found = mcsim.diagnose(replace(run, compute=replace(run.compute, workers=7)), data, settings=FEW)
     calls = (tmp_path / "calls").read_text().split()
     again = set(first) & set(calls[len(first) :])
     assert len(again) <= 10  # those of the task that was interrupted
     assert len(set(calls)) == found.simulations + 2  # and two that the seeds were tested with
-    assert mcsim.diagnose(run, data, settings=SETTINGS).test.pvalue == found.test.pvalue
+    assert mcsim.diagnose(run, data, settings=FEW).test.pvalue == found.test.pvalue
     assert (tmp_path / "calls").read_text().split() == calls
     assert not list((tmp_path / "cache").glob("diagnose/*.parts"))
     (tmp_path / "sim.py").write_text(SIMULATOR.replace("scale=300.0", "scale=320.0"))
-    other = mcsim.diagnose(run, data, settings=SETTINGS)
+    other = mcsim.diagnose(run, data, settings=FEW)
     assert len((tmp_path / "calls").read_text().split()) == len(calls) + other.simulations + 3
     assert other.test.pvalue != found.test.pvalue
 
@@ -378,7 +378,7 @@ def test_what_cannot_be_a_simulator(tmp_path, monkeypatch):
 
 def test_small_ensembles_are_refused_with_the_number_that_is_needed(tmp_path):
     stack = native(1, 60)
-    with refused("60", "300", "5", "--without"):
+    with refused("60", "305", "5", "--without"):
         mcsim.diagnose(mcsim.ExternalModel(MODEL, stack), list(stack[0]), settings=SETTINGS)
     with refused("200", "60"):
         few = replace(SETTINGS, simulations=200)
@@ -404,10 +404,10 @@ def test_only_a_diagnosis_takes_a_simulator(tmp_path):
 
 
 def test_the_command_line_says_what_a_simulator_is_asked_for(monkeypatch, capsys, tmp_path):
-    run = config.load(EXAMPLE)
+    run, draw = config.load(EXAMPLE), np.random.default_rng(1)
     for split in run.map.splits:
         name = tmp_path / f"{run.channels[0].name}_{split}.fits"
-        write_map(name, 60.0 * np.random.default_rng(1).standard_normal(12 * run.map.nside**2), run.map.frame)
+        write_map(name, 60.0 * draw.standard_normal(12 * run.map.nside**2), run.map.frame)
     monkeypatch.setattr(sys, "argv", ["mcsim", "diagnose", str(EXAMPLE), str(tmp_path), "-o", "out", "--dry-run"])
     with pytest.raises(SystemExit) as stop:
         cli.main()

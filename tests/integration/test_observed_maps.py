@@ -1,5 +1,7 @@
 """Files of observed maps: what is read as it was meant, and what is refused, before anything is simulated."""
 
+import shutil
+
 import healpy
 import numpy as np
 import pytest
@@ -53,7 +55,7 @@ def test_what_cannot_be_done_is_said_before_anything_is_learned(small, folder):
         ({"settings": DiagnosisSettings(without=("beam_elipticity",))}, ("beam_elipticity", "beam_ellipticity")),
         ({"data": [np.zeros(3072)]}, ("1 maps", 4)),
         ({"data": [np.zeros(48)] * 4}, ("V1:half1", "nside 2", 16)),
-        ({"settings": DiagnosisSettings(simulations=20)}, ("20 simulations", 167, 334)),
+        ({"settings": DiagnosisSettings(simulations=20)}, ("20 simulations", 169, 338)),
     ):
         with refused(*named):
             mcsim.diagnose(**({"model": small.run, "data": folder, "output": folder / "new" / "verdict"} | changes))
@@ -81,12 +83,23 @@ def test_a_nested_map_with_an_honest_header_is_read(small, folder):
         (lambda m: np.where(np.arange(m.size) < m.size // 2, healpy.UNSEEN, m), {}, ("50 %", "1 %", "map.mask")),
         (lambda m: m, {"coord": "G"}, ("galactic", "ecliptic")),
         (lambda m: healpy.ud_grade(m, 8), {}, ("nside 8", 16)),
+        (
+            lambda m: np.where(np.arange(m.size) < 900, 0.0, m),
+            {},
+            ("V1_half1.fits", "900 pixels", "UNSEEN"),
+        ),
     ],
 )
 def test_hostile_data_end_in_a_sentence(small, folder, change, options, named):
     map_uk = simulate.maps(data_of(small.run), 0)[0]
     write(folder, "V1:half1", change(map_uk), **options)
     with refused(*named):
+        read_maps(small.model, folder)
+
+
+def test_one_map_under_two_names_is_refused(small, folder):
+    shutil.copy(folder / "V1_half1.fits", folder / "V1_half2.fits")
+    with refused("V1_half1.fits", "V1_half2.fits"):
         read_maps(small.model, folder)
 
 

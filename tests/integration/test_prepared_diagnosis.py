@@ -22,16 +22,16 @@ from pictures import quick_pictures
 PROPOSED = ("beam_ellipticity", "noise_level", "dipole_modulation")
 WITHOUT = tuple(name for name in mcsim.effects() if name not in PROPOSED)
 SETTINGS = DiagnosisSettings(without=WITHOUT, scan_sims=50, beam_orders=2)
-FINE, COARSE = 32, 8
+FINE, COARSE = 16, 8
 MASK = (np.abs(healpy.pix2vec(COARSE, np.arange(12 * COARSE**2))[2]) > 0.25).astype(float)
 
 
-def model(lmax=75, steps=True):
+def model(lmax=44, steps=True):
     channels = [
         {
             "name": name,
             "frequency_ghz": frequency,
-            "beam": {"kind": "gaussian", "fwhm_arcmin": 300.0},
+            "beam": {"kind": "gaussian", "fwhm_arcmin": 450.0},
             "noise": {"sigma0_uk": 300.0},
             "scan": {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 121.0, "line_of_sight": line},
         }
@@ -71,6 +71,12 @@ def diagnosed(run, maps, folder=None, simulations=240):
         return mcsim.diagnose(run, maps, folder, settings=replace(SETTINGS, simulations=simulations))
 
 
+@pytest.fixture(autouse=True)
+def here(monkeypatch):
+    """Simulate in this process."""
+    monkeypatch.setattr(api, "batch", lambda workers: campaign.batch(0))
+
+
 @pytest.fixture(scope="module")
 def maps():
     """Prepared maps without an effect."""
@@ -78,8 +84,7 @@ def maps():
 
 
 @pytest.mark.slow
-def test_prepared_maps_of_the_model_agree_with_it_and_an_effect_is_found(maps, tmp_path, monkeypatch):
-    monkeypatch.setattr(api, "batch", lambda workers: campaign.batch(0))  # in this process
+def test_prepared_maps_of_the_model_agree_with_it_and_an_effect_is_found(maps, tmp_path):
     run = model()
     found = diagnosed(run, maps, tmp_path)
     assert found.test.pvalue > 0.01

@@ -8,7 +8,7 @@ import pytest
 
 import mcsim
 from mcsim.comparison.effects import EffectDifference
-from mcsim.comparison.map_differences import Calibration, Dipole, FrameReversed, Monopole
+from mcsim.comparison.map_differences import Calibration, Dipole, FrameReversed, Monopole, Unit
 from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.prediction import Prediction, Set
 from mcsim.comparison.scene_differences import Smoothing, TimeShift
@@ -74,3 +74,20 @@ def test_a_member_that_adds_nothing_to_the_others_is_taken_out():
     whole = Set(((Calibration(), np.array([0.5, 0.0])), dipole, mean), 0.0)
     other = Problem(ChannelPair("T", ("T",), a, b + 0.5 * a, np.ones(a.shape, bool)), (), 1e-3)
     assert other.pruned(other.fitted(whole)).names == whole.names
+
+
+def test_a_pixel_gone_wrong_is_no_unit():
+    """Any small factor takes it to next to nothing, whatever the other side is."""
+    sky = np.random.default_rng(1).normal(size=(1, 12 * 4**2))
+    wrong = np.where(np.arange(sky.size) == 5, 1e9, sky)
+    member, seen = (Unit(), np.array([1e-6])), np.ones(sky.shape, bool)
+    for a, b, suffices in ((wrong, sky, False), (sky, 1e-6 * sky, True)):
+        problem = Problem(ChannelPair("T", ("T",), a, b, seen), (), 1e-3)
+        found = Set((member,), problem.left((member,)))
+        assert found.left < 1e-10
+        assert problem.suffices(found) is suffices
+
+
+def test_a_factor_beyond_ten_is_a_unit_and_no_calibration():
+    assert Unit().equivalent(np.array([1e-6])) == []
+    assert Unit().equivalent(np.array([0.8]))[0][1] == pytest.approx(-0.2)

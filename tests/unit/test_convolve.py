@@ -121,11 +121,10 @@ def test_adjoint_of_the_turned_map(beam: Beam, sky: np.ndarray, psi: np.ndarray)
     weight = np.random.default_rng(5).normal(size=12 * NSIDE**2)
     response, scanned = convolve.response(beam, LMAX), moments(psi, MMAX)
     maps = convolve.spin_maps(sky, response, NSIDE)
-    parts = {s: np.zeros((2, weight.size)) for s in maps}
-    for s, part in parts.items():
-        convolve.turned(weight, scanned, s, part)
-    found = sum(2.0 * np.sum(part * maps[s]) for s, part in parts.items())
+    found = sum(2.0 * np.sum(convolve.turned([(weight, scanned)], s) * map_) for s, map_ in maps.items())
     assert found == pytest.approx(weight @ convolve.noncircular_map(maps, scanned), rel=1e-12)
+    both = convolve.turned([(weight, scanned), (weight**2, scanned)], 2)
+    assert both == pytest.approx(convolve.turned([(weight + weight**2, scanned)], 2), abs=1e-12)
 
 
 def test_channels_with_equal_beams_share_their_transforms(sky: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:

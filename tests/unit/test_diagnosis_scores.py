@@ -2,12 +2,13 @@
 
 from dataclasses import replace
 
+import healpy
 import numpy as np
 import pytest
 
 from mcsim import config, systematics
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.datavector.wiener_filter import model_of, shared_sky
+from mcsim.datavector.wiener_filter import model_of, shared_sky, wiener_filter
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import ScanModel
 from mcsim.simulation import pixel_means, simulate
@@ -75,3 +76,34 @@ def test_channels_of_one_beam_are_filtered_as_each_by_itself() -> None:
         gain += response**2 / part.noise_power
     expected = alm_.multiply(total, model.cl / (1.0 + model.cl * gain), 16)
     np.testing.assert_allclose(shared_sky(model, list(maps)), expected, rtol=1e-11, atol=1e-11)
+
+
+def test_squares_of_residuals_have_all_modes_that_the_sky_does_not_fill() -> None:
+    """Of two maps of n pixels the filtered sky takes sum (2l + 1) C_l / (C_l + N_l) of the 2n."""
+    channel = {
+        "name": "W1",
+        "beam": {"kind": "gaussian", "fwhm_arcmin": 900.0},
+        "noise": {"sigma0_uk": 20.0},
+        "scan": {"kind": "parallel_transport", "psi0_deg": 20.0},
+    }
+    run = config.load(
+        {
+            "schema": 1, "name": "modes", "sky": {"spectrum": "wmap7", "lmax": 24}, "ensemble": {"seed": 4},
+            "map": {"nside": 16, "splits": ["a", "b"]}, "channel": [channel],
+        }
+    )  # fmt: skip
+    whole = survey(run)
+    model = model_of(whole, DiagnosisSettings())
+    skies, pixels = 10, 12 * 16**2
+    found, holed = [], []
+    for number in range(skies):
+        maps = [np.array(one) for one in simulate.maps(whole, number)]
+        found.append(wiener_filter(model, maps).squares.sum())
+        for one in maps:
+            one[: pixels // 10] = healpy.UNSEEN
+        holed.append(wiener_filter(model, maps).squares.sum())
+    taken = np.sum((2.0 * np.arange(model.lmax + 1) + 1.0) * model.sky_power)
+    assert taken > 100.0
+    sigma = np.sqrt(2.0 * (2.0 * pixels - taken) / skies)
+    assert abs(np.mean(found) - (2.0 * pixels - taken)) < 4.0 * sigma
+    assert abs(np.mean(np.subtract(holed, found))) < 4.0 * sigma * np.sqrt(0.1 / 0.9)

@@ -108,7 +108,7 @@ WRONG = {
     "noncircular_map: coarser moments": lambda: convolve.noncircular_map(SPINS, moments(NSIDE // 2)),
     "noncircular_map: finer moments": lambda: convolve.noncircular_map(SPINS, moments(2 * NSIDE)),
     "noncircular_map: too few orders": lambda: convolve.noncircular_map(SPINS, moments(smax=1)),
-    "turned: coarser moments": lambda: convolve.turned(MAP, moments(4), 1, np.zeros((2, MAP.size))),
+    "turned: coarser moments": lambda: convolve.turned([(MAP, moments(4))], 1),
     "centroid_map: none": lambda: convolve.centroid_map(np.zeros((2, MAP.size)), moments()),
     "centroid_map: coarser moments": lambda: convolve.centroid_map(np.zeros((2, MAP.size)), centred(4)),
     "rings: another lmax": lambda: rings.noncircular_alm(BIGGER, RESPONSE, (), LMAX),

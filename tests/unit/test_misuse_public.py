@@ -6,10 +6,13 @@ import pandas
 import pytest
 import xarray as xr
 from astropy import units
+from astropy.io import fits
 
 import mcsim
 from mcsim import Beam, Moments, config, systematics
+from mcsim.beamfit.effective_beam import fit_models
 from mcsim.errors import InputError
+from mcsim.simulation.channels import check_effects
 from refusals import refused
 
 LMAX, NSIDE = 12, 8
@@ -170,3 +173,45 @@ def test_sides_of_a_comparison_may_be_given_by_name() -> None:
     for wrong in ({"V": sky}, {}, {"W": sky, "V": sky}):
         with refused("W"):
             mcsim.compare({"W": sky}, wrong, mcsim.load_config(run()))
+
+
+@pytest.mark.parametrize("column", ["W_L", "wl", "BL2", "B_l_sq", "INT_2_BEAM"])
+def test_a_column_of_the_square_is_no_beam(column, tmp_path) -> None:
+    hdu = fits.BinTableHDU.from_columns([fits.Column(column, "D", array=np.exp(-(ELL**2) / 500.0))])
+    hdu.writeto(tmp_path / "w.fits")
+    with refused("w.fits", column):
+        Beam.from_window(tmp_path / "w.fits")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        (lambda: mcsim.predict(run(), L_moments=-1), ("L_moments", -1)),
+        (lambda: mcsim.predict(run(), L_moments=2.5), ("L_moments", 2.5)),
+        (lambda: mcsim.predict(run(), nthreads="2"), ("nthreads", "'2'")),
+        (lambda: fit_models(None, None, "constant"), ("models", "'constant'")),
+        (lambda: mcsim.ScanModel.load("wmap").with_sampling(1e-9), ("1e-09", "3.16e+16", "sample_period_s")),
+        (lambda: mcsim.merge(None, "x.zarr"), ("paths", None)),
+        (lambda: mcsim.run(run(), realizations=slice("0", "3")), ("realizations",)),
+        (lambda: mcsim.LimitSettings(nuisances=["calibration"]), ("nuisances",)),
+        (lambda: mcsim.LimitSettings(tolerance=0.0), ("tolerance",)),
+        (lambda: Moments.parallel_transport(nside=NSIDE, psi0_deg="x"), ("psi0_deg", "'x'")),
+        (lambda: Beam.gaussian(600.0, lmax=LMAX).rotated("x"), ("'x'",)),
+        (lambda: Moments.parallel_transport(nside="8"), ("nside", "'8'")),
+        (lambda: mcsim.predict(run(sky={"spectrum": np.zeros(0), "lmax": LMAX})), ("spectrum",)),
+    ],
+)
+def test_arguments_of_another_kind_are_named(wrong, named) -> None:
+    with refused(*named):
+        wrong()
+
+
+def test_an_effect_without_amplitude_is_warned_of() -> None:
+    with pytest.warns(UserWarning, match="calibration has no amplitude"):
+        check_effects(mcsim.load_config(run(effect=[{"name": "calibration", "channel": "W"}])))
+
+
+def test_variances_in_k2_are_no_noise() -> None:
+    noise = {"kind": "variance", "variance": np.full(12 * NSIDE**2, 1e-10)}
+    with refused("1e-10", "uK^2", "K^2"):
+        mcsim.write_maps(run(channel=[CHANNEL | {"noise": noise}]), "maps", realizations=0)

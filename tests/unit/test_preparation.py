@@ -387,6 +387,10 @@ def test_files_are_prepared(tmp_path, rng):
         prepare_files(run, [f"V={tmp_path / 'raw.fits'}"], tmp_path / "out")
     with refused(tmp_path / "raw.fits", "V.fits"):
         prepare_files(run, [str(tmp_path / "raw.fits")], tmp_path / "other")
+    with refused("V", "twice"):
+        prepare_files(run, [f"V={tmp_path / 'raw.fits'}"] * 2, tmp_path / "other")
+    with refused("Q", "prepared"):
+        prepare_files(run, [f"Q={tmp_path / 'raw.fits'}"], tmp_path / "other")
     healpy.write_map(tmp_path / "V.fits", map_uk, coord="G", dtype=np.float64)
     with refused(tmp_path / "V.fits", "map.frame", "galactic", "ecliptic"):
         prepare_files(run, [str(tmp_path / "V.fits")], tmp_path / "other")

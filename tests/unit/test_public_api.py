@@ -149,7 +149,6 @@ def example_folder(tmp_path_factory):
 def test_examples_run(name, example_folder, monkeypatch) -> None:
     """Each alone and in any order: what one leaves in the folder another may find, as a user's would."""
     monkeypatch.chdir(example_folder)
-    monkeypatch.setenv("MCSIM_CACHE", str(example_folder / "cache"))
     monkeypatch.setattr(cluster, "local_client", in_this_process)
     one = getattr(mcsim, name)
     module = importlib.import_module(one.__module__)

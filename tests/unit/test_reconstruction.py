@@ -15,6 +15,7 @@ from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import model_of, wiener_filter
 from mcsim.diagnosis import api
 from mcsim.instrument.beams import Beam
+from mcsim.instrument.scan.pointing import pointing
 from mcsim.reconstruction import forms, simulated_scores, words
 from mcsim.reconstruction.figure import structure_figure
 from mcsim.reconstruction.grammar import ALIKE, Structure, structures
@@ -55,7 +56,15 @@ def random_alm(seed, lmax):
 
 # In the simulator patterns are added to the sky, or multiply it, before the beam, and behind it in the scores. The
 # round part of the beam acts on the samples' offsets in their pixels as well.
-TOLERANCE = {"order 0": 0.1, "order 0 as l^2": 0.1, "added": 0.05, "rotation": 0.05, "gain": 0.1, "square": 0.3}
+TOLERANCE = {
+    "order 0": 0.1,
+    "order 0 as l^2": 0.1,
+    "added": 0.05,
+    "rotation": 0.05,
+    "gain": 0.1,
+    "square": 0.3,
+    "cube": 0.3,
+}
 
 
 @pytest.mark.parametrize(
@@ -80,6 +89,13 @@ TOLERANCE = {"order 0": 0.1, "order 0 as l^2": 0.1, "added": 0.05, "rotation": 0
         ("beam", "scan", "order 0 as l^2", ALIKE),
         ("beam", "scan", "order 4", ALIKE),
         ("square", "", "square", ALIKE),
+        ("cube", "", "cube", ALIKE),
+        ("added", "time", "spin 1-4", ALIKE),
+        ("added", "spacecraft", "line V1", ALIKE),
+        ("added", "Sun", "dipole", "half1"),
+        ("added", "Sun", "elongation", ALIKE),
+        ("added", "spacecraft", "lobe", ALIKE),
+        ("beam", "scan", "order 0 at low l", ALIKE),
         ("rotation", "sky", "rotation", ALIKE),
     ],
 )
@@ -123,10 +139,33 @@ def test_a_rotation_moves_the_map():
         np.testing.assert_allclose(found, moved, atol=1e-3 * np.abs(moved).max())
 
 
-def test_a_square_is_that_of_the_map():
+def test_another_channel_sees_the_dipole_where_its_line_of_sight_points():
+    """The dipole in the frame of one beam, seen along the line of another, is the dipole of that line's pointing."""
+    run, scene, _, _ = seen()
+    sites = [channel.site for channel in survey(run).channels]
+    structure = next(w for w in grammar() if (w.kind, w.channel, w.split) == ("line V1", "W1", ALIKE))
+    effect = plugin("unlisted_1", structure, np.ones(1), scene).kind()(amplitude=1.0)
+    own, other = (pointing(site.pointing.model, site.pointing.line, 1000, 50) for site in sites[::-1])
+    time_s = sites[1].pointing.model.period_of_samples(sites[1].pointing.line) * np.arange(1000, 1050)
+    expected = sites[1].dipole_uk @ healpy.ang2vec(*other[:2]).T
+    np.testing.assert_allclose(effect.signal(time_s, *own, sites[1]), expected, atol=1e-6)
+
+
+def test_a_boost_is_that_of_the_library_for_small_velocities():
+    alm, beta = random_alm(3, 6), 1e-5
+    sky = systematics.get("boost")(amplitude=beta, lon_deg=30.0, lat_deg=40.0)
+    site = systematics.Site("W1", 94.0, "ecliptic", NSIDE, 6, Beam.gaussian(300.0, 6))
+    change = (sky.sky(alm, site, None) - alm) / beta
+    linear = sum(v * one for v, one in zip(sky.vector / beta, forms.boosts(alm, 6), strict=True))
+    np.testing.assert_allclose(linear, change, atol=1e-3)
+
+
+def test_a_power_is_that_of_the_map():
     alm = random_alm(4, 8)
-    square = healpix.synthesis(alm[None], 32, 8)[0] ** 2
-    np.testing.assert_allclose(forms.squared(alm, 8), healpix.analysis(square, 8, 5), atol=1e-4)
+    map_ = healpix.synthesis(alm[None], 32, 8)[0]
+    for power in (2, 3):
+        expected = healpix.analysis(map_**power, 8, 5)
+        np.testing.assert_allclose(forms.raised(alm, 8, power), expected, atol=1e-4 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize(
@@ -259,6 +298,7 @@ def test_every_structure_has_words_and_a_picture():
         0.1,
         "",
         (),
+        None,
         ((2, 8, 1.0, 0.1),),
         (1.0,) * 192,
         "W1",

@@ -5,7 +5,7 @@
 INSTRUMENT is a folder with ``scan.toml`` (how the survey was pointed), ``cl_tt.txt`` (the sky's spectrum) and the
 moments ``moments_W1_half1.fits`` and ``moments_W1_half2.fits``: nside 128, a year at 2 s. FOLDER takes the responses
 (``responses.npz``), so that the pictures can be drawn again without them: ``effects.png``, and
-``effects-on-request.png`` of those that a diagnosis proposes on request. About 6 and 3 minutes on two cores.
+``effects-on-request.png`` of those that a diagnosis proposes on request. About 6 minutes on two cores, and 70 s of one.
 """
 
 import argparse
@@ -182,7 +182,7 @@ def report(name: str, maps: Map) -> None:
 
 def draw(found: dict[str, Map], path: Path, title: str) -> None:
     """A map of the response of the first half and the spectra of both routes, for every effect."""
-    columns = 6 if len(found) > 12 else 4
+    columns = 6 if len(found) > 12 else 5
     rows = -(-len(found) // columns)
     figure = plt.figure(figsize=(2.8 * columns, 3.6 * rows), layout="constrained")
     figure.suptitle(title, fontsize=12)

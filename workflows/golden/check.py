@@ -125,9 +125,9 @@ VERDICTS: dict[str, tuple[list[dict[str, Any]], int, tuple[str, ...]]] = {
         FOUR,
     ),
     "degenerate": (
-        [{"name": "noise_level", "channel": "V1", "amplitude": 0.04}],
+        [{"name": "time_constant", "channel": "W1", "amplitude": 0.01}],
         91,
-        ("noise_level", "noise_anisotropy", "beam_ellipticity"),
+        ("time_constant", "pointing_offset", "beam_ellipticity"),
     ),
     "unknown": (
         [{"name": "quadrupole_modulation", "amplitude": 0.35}],

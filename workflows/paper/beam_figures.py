@@ -88,9 +88,8 @@ def beam_maps(maps: dict[str, beams.BeamMap]) -> Figure:
             cmap="RdBu_r",
             norm=SymLogNorm(3e-4, vmin=-1, vmax=1),
         )
-        figure.colorbar(
-            drawn, ax=flat, shrink=0.85, label=f"response / peak, smoothed with sigma = {SMOOTHING_ARCMIN:g}′"
-        )
+        label = f"response / peak, smoothed, $\\sigma$ = {SMOOTHING_ARCMIN:g}′"
+        figure.colorbar(drawn, ax=flat, shrink=0.85, label=label, ticks=[-1, -0.1, -0.01, 0, 0.01, 0.1, 1])
         flat.set_title(f"{name}: negative response is {negative_share(beam_map):.1%} of the positive", fontsize=10)
         flat.set_xlabel("x, in-scan [arcmin]")
         flat.set_ylabel("y, cross-scan [arcmin]")

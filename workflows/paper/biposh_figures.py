@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mcsim.beamfit import Fit
+from mcsim.support.numbers import measured as with_error
 
 SPECTRUM = {0: r"A^{20}_{\ell\ell}", 2: r"A^{20}_{\ell-2,\ell}"}
 ENSEMBLE, EXACT, LEADING = "#c44e22", "#1f5fa8", "#3c8c3c"
@@ -47,7 +48,7 @@ def against_simulations(
             below.plot(x, (approximate - expected) / error, color=LEADING, label="leading order")
             below.axhline(0, color=EXACT, lw=1)
             below.set_ylim(-6.5, 6.5)
-            below.set_ylabel("(… − exact) / error")
+            below.set_ylabel("residual / error")
             below.legend(frameon=False, fontsize=8, loc="lower right")
             above.set_title(title, fontsize=10)
             above.set_ylabel(rf"$\ell(\ell+1){SPECTRUM[d]}/2\pi$  [$\mu$K$^2$]")
@@ -124,14 +125,15 @@ def effective_beams(fits: Mapping[str, Sequence[Fit]], expected: float) -> Figur
         for one, colour in zip(models, (ENSEMBLE, EXACT), strict=True):
             solution, (factor, width) = one.solution, one.factor()
             values = ", ".join(
-                f"{name} = {value:.3g} ± {error:.2g}"
+                f"$\\{name}$ = {with_error(value, error)}"
                 for name, value, error in zip(one.model.parameters, solution.parameters, solution.errors, strict=True)
             )
             text = f"{values}\n$\\chi^2$/dof {solution.reduced_chi2:.2f}, probability {solution.probability:.2g}"
             left.plot(one.ell, factor, color=colour, label=text)
             left.fill_between(one.ell, factor - width, factor + width, color=colour, alpha=0.2, lw=0)
         left.axhline(expected, color="black", ls="--", lw=1, label=f"scan: {expected:.4f}")
-        left.set_title(f"{title}: $f_\\ell = b^\\mathrm{{eff}}_{{\\ell 2}}/b_{{\\ell 2}}$", fontsize=10)
+        left.set_title(title, fontsize=10)
+        left.set_ylabel(r"$f_\ell = b^\mathrm{eff}_{\ell 2}/b_{\ell 2}$")
         left.set_xlabel(r"multipole $\ell$")
         left.legend(frameon=False, fontsize=8, loc="upper right")
         low, high = left.get_ylim()

@@ -1,6 +1,6 @@
 """Hold a prediction against the L = 2 BipoSH of Planck's FEBeCoP simulations at 30, 44 and 70 GHz.
 
-    python workflows/planck/febecop.py [-o febecop.png]
+    python workflows/planck/febecop.py [-o planck.png]
 
 MCSIM_DATA names a folder with
 

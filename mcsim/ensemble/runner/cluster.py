@@ -12,6 +12,7 @@ from contextlib import ExitStack, contextmanager
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 from itertools import islice
+from multiprocessing import forkserver
 from types import FrameType
 from typing import Any
 from uuid import uuid4
@@ -118,6 +119,27 @@ def start_method() -> str:
     return "forkserver"
 
 
+def load_ahead(workers: Workers) -> None:
+    """Let the process that local workers are forks of load its modules while the caller goes on."""
+    if not isinstance(workers, int) or workers < 1 or start_method() != "forkserver":
+        return
+    os.environ.update(_environment())  # as distributed does for good when it starts workers
+    alone = threading.current_thread() is threading.main_thread()
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if alone else None  # Ctrl-C is for the driver
+    try:
+        forkserver.ensure_running()
+    finally:
+        if alone:
+            signal.signal(signal.SIGINT, handler)
+
+
+def _environment() -> dict[str, str]:
+    """Return the variables that count when a worker starts, or the process that it is a fork of."""
+    single = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "DUCC0", "NUMBA")}
+    given = {name: str(value) for name, value in dask.config.get("distributed.nanny.pre-spawn-environ").items()}
+    return {"PYTHONHASHSEED": "6640"} | given | single | _KEPT_MEMORY  # the first as distributed has it
+
+
 @contextmanager
 def local_client(workers: int) -> Iterator[Client]:
     """Yield the client of a local cluster of single-threaded processes, with ports open to this machine alone."""
@@ -126,8 +148,7 @@ def local_client(workers: int) -> Iterator[Client]:
             "A worker of multiprocessing.Pool can start no workers of its own; call mcsim from the main process, or "
             "from a concurrent.futures.ProcessPoolExecutor."
         )
-    single = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "DUCC0", "NUMBA")}
-    environment = dask.config.get("distributed.nanny.pre-spawn-environ") | single | _KEPT_MEMORY
+    environment = _environment()
     whole = dict(os.environ) | environment
     settings = QUIET | {
         "distributed.nanny.pre-spawn-environ": environment,

@@ -44,6 +44,8 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
     >>> mcsim.merge(parts, "merged.zarr").finished
     32
     """
+    if not isinstance(paths, str | Path | Iterable):
+        raise InputError(f"paths is {paths!r}, but it must be a list of stores.")
     sources = [user_path(p) for p in ([paths] if isinstance(paths, str | Path) else paths)]
     target = user_path(path)
     if not sources:

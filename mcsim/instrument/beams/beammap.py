@@ -179,12 +179,14 @@ def find_centre(image: NDArray[np.float64], origin: str = "the beam map") -> tup
     if min(row, column, image.shape[0] - 1 - row, image.shape[1] - 1 - column) < reach:
         raise InputError(
             f"the peak of {origin} at row {row}, column {column} is less than {PEAK_BOX} pixels from an edge of its "
-            f"{image.shape} pixels: give centre = (column, row), or a larger map"
+            f"{image.shape} pixels: give centre_pixel (centre) as (column, row), or a larger map"
         )
     box = image[row - reach : row + reach + 1, column - reach : column + reach + 1]
     total = box.sum()
     if not total > 0:
-        raise InputError(f"{origin} sums to {total:.3g} around its peak, where it must be positive: give its centre")
+        raise InputError(
+            f"{origin} sums to {total:.3g} around its peak, where it must be positive: give centre_pixel (centre)"
+        )
     offset = np.arange(-reach, reach + 1)
     return float(column + box.sum(axis=0) @ offset / total), float(row + box.sum(axis=1) @ offset / total)
 

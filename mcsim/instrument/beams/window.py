@@ -1,5 +1,6 @@
 """Beam windows B_l: text tables such as WMAP's, FITS tables such as Planck's, .npy files, arrays."""
 
+import re
 import warnings
 from pathlib import Path
 
@@ -17,6 +18,9 @@ Window = NDArray[np.float64]
 
 COLUMNS = ("BL", "B_L", "INT_BEAM", "NOMINAL", "TEMPERATURE", "T", "BEAM")
 """Names of columns of B_l, the surest first: LFI's instrument model, Planck's CMB maps, HFI's model and windows."""
+
+SQUARED = re.compile(r"(?i)^w_?(l|ell)$|^b_?(l|ell)_?\^?(2|sq|squared)$|_2_")
+"""Names of columns of W_l = B_l^2; those of Planck's HFI have _2_ in them."""
 
 LARGEST = 1.05  #: of |B_l| over B_0: more is no beam
 
@@ -67,6 +71,13 @@ def _of_text(path: Path) -> Window:
     return np.asarray(table[:, 1])
 
 
+def holds_window(path: Path) -> bool:
+    """Return True if the first table of a FITS file has a single column, and is no map."""
+    with unreadable(path, "a FITS file", "give a beam map, b_lm or B_l"), opened(path) as hdus:
+        tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)]
+        return bool(tables) and len(tables[0].columns) == 1 and "PIXTYPE" not in tables[0].header
+
+
 def _of_fits(path: Path, extension: str | None, column: str | None) -> tuple[Window, str]:
     """Return B_l and the name of their table."""
     with unreadable(path, "a FITS table of B_l", "give another file"), opened(path) as hdus:
@@ -106,6 +117,6 @@ def _chosen(
             f"{path} has {len(found)} columns that may be B_l ({columns or known}); say which with extension and "
             "column."
         )
-    if "_2_" in found[0][1]:
+    if SQUARED.search(found[0][1]):
         raise InputError(f"{path} holds W_l = B_l^2 in {found[0][1]}; give the file of B_l.")
     return found[0]

@@ -15,6 +15,7 @@ from mcsim.support import resources
 SECONDS_PER_DAY = 86400.0
 
 LONGEST_DAYS = 36525.0  #: of a survey: a century
+MOST_SAMPLES = 10**13  #: of a line of sight: a century at 3 kHz
 
 
 @dataclass(frozen=True)
@@ -350,4 +351,9 @@ def _check(model: ScanModel) -> None:
             raise InputError(
                 f"{inside}: a survey of {model.duration_days:g} days has no sample every "
                 f"{model.period_of_samples(line):g} s; lengthen duration_days."
+            )
+        if model.samples(line) > MOST_SAMPLES:
+            raise InputError(
+                f"{inside}: a sample every {model.period_of_samples(line):g} s makes {model.samples(line):.3g} of "
+                f"them, at most {MOST_SAMPLES:g} may be; raise sample_period_s."
             )

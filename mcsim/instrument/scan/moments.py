@@ -18,7 +18,7 @@ from mcsim.instrument.scan.limit import limit_moments
 from mcsim.instrument.scan.model import NUMBERS, ScanModel
 from mcsim.instrument.scan.offsets import HIGHEST, exponents, order_of, spin_moment
 from mcsim.instrument.scan.user_pointing import blocks_of_files, checked_samples, sums_of_samples
-from mcsim.sphere.checks import check_nside, check_shape, check_whole
+from mcsim.sphere.checks import check_finite, check_nside, check_number, check_shape, check_whole
 from mcsim.support import folders
 from mcsim.support.arrays import divided, reals
 from mcsim.support.code import package_digest
@@ -279,8 +279,8 @@ class Moments:
         check_nside(nside)
         check_frame(frame)
         check_whole(smax, "smax", 1)
-        if not np.isfinite(psi0_deg):
-            raise InputError(f"psi0_deg is {psi0_deg}, but it must be a finite angle in degrees.")
+        check_number(psi0_deg, "psi0_deg", "degrees")
+        check_finite(np.asarray(psi0_deg), "psi0_deg")
         npix = 12 * nside * nside
         w = np.exp(-1j * np.deg2rad(psi0_deg) * np.arange(1, smax + 1))[:, np.newaxis]
         return cls(nside, frame, np.broadcast_to(np.float64(1.0), npix), np.broadcast_to(w, (smax, npix)))

@@ -9,6 +9,7 @@ python unlisted.py summary FILE...   the figures and the picture of what these h
 import json
 import os
 import sys
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 
@@ -48,7 +49,7 @@ TRUTH = {
     "dipole_residual": ("added", "sky", ("dipole",)),
     "foreground_residual": ("added", "sky", ANY),
     "monopole_residual": ("added", "sky", ("monopole",)),
-    "orbital_dipole": ("added", "time", ANY),
+    "orbital_dipole": ("added", "Sun", ("dipole",)),
     "sidelobe_pickup": ("added", "spacecraft", ANY),
     "spin_synchronous_offset": ("added", "time", ("spin 1",)),
     "calibration": ("gain", "", ("constant",)),
@@ -90,17 +91,21 @@ def known(which):
 def row(kind, name, truth, channel, split, strength, verdict, found, reduction):
     """Print what is found beside what is there, as a line of JSON."""
     stage, frame, kinds = truth
-    first = found[0] if found else None
-    right = {}
-    if first is not None:
-        right = {
-            "stage": first.stage == stage,
-            "frame": first.frame == frame,
-            "kind": kinds is ANY or any(first.kind.startswith(kind) for kind in kinds),
-            "channel": first.channel == channel,
-            "split": split is None or first.split == split,
-        }
-    shown = [[one.says, one.pvalue, one.rms_uk, list(one.alternatives)] for one in found]
+    right = []
+    for told in [asdict(found[0]), found[0].rival] if found else []:
+        if told is not None:
+            right.append(
+                {
+                    "stage": told["stage"] == stage,
+                    "frame": told["frame"] == frame,
+                    "kind": kinds is ANY or any(told["kind"].startswith(kind) for kind in kinds),
+                    "channel": told["channel"] == channel,
+                    "split": split is None or told["split"] == split,
+                }
+            )
+    shown = [
+        [one.says, one.pvalue, one.rms_uk, one.rival and one.rival["says"], list(one.alternatives)] for one in found
+    ]
     held = None
     if reduction is not None:
         held = [reduction.achieved.value, reduction.achieved.sigma, reduction.before.value, reduction.before.sigma]
@@ -196,6 +201,21 @@ def told(metric):
 WORDS = ("stage", "frame", "kind", "channel", "split")
 
 
+def right(one, word="all", place=0):
+    """Return True if the first description of a case, or another one, is right in a word, or in all of them."""
+    said = one[5][place] if place < len(one[5]) else {}
+    return bool(said) and (all(said.values()) if word == "all" else said[word])
+
+
+def credit(own):
+    """Print what descriptions are worth: one of a pair counts half, so that saying two gains nothing by itself."""
+    worth = np.array([sum(right(one, place=k) for k in range(2)) / max(len(one[5]), 1) for one in own])
+    error = np.std(worth) / np.sqrt(len(worth))
+    print(f"   all right, one of a pair half: {worth.mean():.3f} +- {error:.3f} of {len(worth)}")
+    print("  ", told(share("all right in one of what is said", [right(one) or right(one, place=1) for one in own])))
+    print("  ", told(share("a pair", [len(one[5]) > 1 for one in own])))
+
+
 def summary(files):
     """Print the figures of lines, and draw them."""
     rows = [json.loads(line) for file in files for line in Path(file).read_text().splitlines() if line[:1] == "["]
@@ -213,8 +233,7 @@ def summary(files):
         own = [one for one in rows if one[0] == group]
         for place, strength in enumerate(sorted({one[3] for one in own})):
             cases = [one for one in own if one[3] == strength]
-            shares = [share(word, [one[5].get(word, False) for one in cases]) for word in WORDS]
-            shares.append(share("all", [bool(one[5]) and all(one[5].values()) for one in cases]))
+            shares = [share(word, [right(one, word) for one in cases]) for word in (*WORDS, "all")]
             values = np.array([[one.value, one.value - one.low, one.high - one.value] for one in shares]).T
             where = np.arange(len(shares)) + 0.2 * (place - 1)
             label = f"S/N {strength:.0f} ({len(cases)})"
@@ -229,14 +248,15 @@ def summary(files):
             report(group, own)
     panels[0].set_ylabel("share that is right")
     figure.savefig(PICTURE, dpi=120)
+    if own := [one for one in rows if one[0] == "further"]:
+        report("further", own)
 
 
 def report(group, own):
     """Print the figures of a group."""
     print(group)
     shares = [share("a structure", [bool(one[6]) for one in own])]
-    shares += [share(f"right {word}", [one[5].get(word, False) for one in own]) for word in WORDS]
-    shares.append(share("all right", [bool(one[5]) and all(one[5].values()) for one in own]))
+    shares += [share(f"right {word}", [right(one, word) for one in own]) for word in (*WORDS, "all")]
     held = [one[7] for one in own if one[7] is not None and one[7][2] > 0.0]
     if len(held) > 2:
         pairs = [(one[2], one[2] * (1.0 - one[0])) for one in held]
@@ -245,8 +265,9 @@ def report(group, own):
         shares.append(share("reduction of 0.7 or more, where its error is below 0.3", precise))
     for one in shares:
         print("  ", told(one))
+    credit(own)
     for one in own:
-        if not (one[5] and all(one[5].values())):
+        if not right(one):
             print("   not right:", one[1], one[2], one[3], one[5], [row[0] for row in one[6]])
 
 
