@@ -1,7 +1,7 @@
 """Read observed maps, and refuse maps that a survey cannot have made."""
 
 from collections.abc import Mapping, Sequence
-from itertools import combinations
+from itertools import combinations, compress
 from pathlib import Path
 
 import healpy
@@ -68,7 +68,7 @@ def read_maps(model: Model, folder: str | Path) -> list[Map]:
         first = names[model.parts[0].name]
         raise InputError(f"{folder} is no folder; give one with the observed maps, {first} and so on.")
     maps = [_read(model, part, folder / names[part.name]) for part in model.parts]
-    _check_differ(maps, [str(folder / names[part.name]) for part in model.parts])
+    _check_differ(model, maps, [str(folder / names[part.name]) for part in model.parts])
     return maps
 
 
@@ -89,13 +89,14 @@ def checked(model: Model, maps: Sequence[Map] | Mapping[str, Map]) -> list[Map]:
         checked_map(model, part, reals(map_, name, healpy.UNSEEN), name)
         for (part, name), map_ in zip(named, maps, strict=True)
     ]
-    _check_differ(found, [name for _, name in named])
+    _check_differ(model, found, [name for _, name in named])
     return found
 
 
-def _check_differ(maps: Sequence[Map], names: Sequence[str]) -> None:
-    """Raise InputError for two maps that are the same: their noise differs, so that one is a copy."""
-    for (one, name), (other, twin) in combinations(zip(maps, names, strict=True), 2):
+def _check_differ(model: Model, maps: Sequence[Map], names: Sequence[str]) -> None:
+    """Raise InputError for two maps that are the same although both have noise of their own: one is a copy."""
+    noisy = [m.noise_uk is not None for channel in model.survey.channels for m in channel.maps]
+    for (one, name), (other, twin) in combinations(compress(zip(maps, names, strict=True), noisy), 2):
         if np.array_equal(one, other):
             raise InputError(f"{twin} is the same map as {name}; give each channel and split its own.")
 
