@@ -96,9 +96,9 @@ def checked(model: Model, maps: Sequence[Map] | Mapping[str, Map]) -> list[Map]:
 def _check_differ(model: Model, maps: Sequence[Map], names: Sequence[str]) -> None:
     """Raise InputError for two maps that are the same although both have noise of their own: one is a copy."""
     noisy = [m.noise_uk is not None for channel in model.survey.channels for m in channel.maps]
-    for (one, name), (other, twin) in combinations(compress(zip(maps, names, strict=True), noisy), 2):
+    for (one, name), (other, copied) in combinations(compress(zip(maps, names, strict=True), noisy), 2):
         if np.array_equal(one, other):
-            raise InputError(f"{twin} is the same map as {name}; give each channel and split its own.")
+            raise InputError(f"{copied} is the same map as {name}; give each channel and split its own.")
 
 
 def _read(model: Model, part: Part, path: Path) -> Map:
