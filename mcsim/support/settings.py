@@ -19,12 +19,13 @@ def settings_of(given: Kind | None, kind: type[Kind]) -> Kind:
     return given
 
 
-def check_settings(settings: Any, shares: Iterable[str] = ()) -> None:
+def check_settings(settings: Any, shares: Iterable[str] = (), counts: Iterable[str] = ()) -> None:
     """Raise InputError unless the fields of a dataclass are of the kind of their defaults, and numbers not negative.
 
-    Those named in ``shares`` lie between 0 and 1. An ``int | None`` is whole.
+    Those named in ``shares`` lie between 0 and 1, those in ``counts``, of which a scatter is taken, are 2 or more. An
+    ``int | None`` is whole.
     """
-    bounded = set(shares)
+    bounded, least = set(shares), dict.fromkeys(counts, 2)
     for field in fields(settings):
         value, default = getattr(settings, field.name), field.default
         if value is default:
@@ -36,9 +37,9 @@ def check_settings(settings: Any, shares: Iterable[str] = ()) -> None:
         if isinstance(default, bool) and not isinstance(value, bool):
             raise InputError(f"{field.name} = {value!r} is neither True nor False; give one of them.")
         if isinstance(default, int | float) and not isinstance(default, bool):
-            largest = 1.0 if field.name in bounded else math.inf
-            number = isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= largest
+            smallest, largest = least.get(field.name, 0), 1.0 if field.name in bounded else math.inf
+            number = isinstance(value, int | float) and not isinstance(value, bool) and smallest <= value <= largest
             if not number or (isinstance(default, int) and value != int(value)):
                 kind = "a whole number" if isinstance(default, int) else "a number"
-                limit = "from 0 to 1" if largest == 1.0 else "of 0 or more"
+                limit = "from 0 to 1" if largest == 1.0 else f"of {smallest} or more"
                 raise InputError(f"{field.name} = {value!r} is out of range; give {kind} {limit}.")
