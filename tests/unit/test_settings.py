@@ -37,7 +37,7 @@ def test_wrong_settings_are_refused(kind, name, value) -> None:
 
 
 def test_usual_settings_are_taken() -> None:
-    assert DiagnosisSettings(alpha=1, simulations=300, without=["beam_coma"], beam_bins=(5, 2, 1, 1, 1)).simulations == 300
+    assert DiagnosisSettings(alpha=1, simulations=300, without=["x"], beam_bins=(5, 2, 1, 1, 1)).simulations == 300
     assert DiagnosisSettings.quick(controls=3).sims_per_element < DiagnosisSettings().sims_per_element
     assert LimitSettings(nuisances={"beam_width": 0.01}, dense=True).dense
 
