@@ -243,7 +243,8 @@ class DiagnosisSettings:
         levels = [field.name for field in fields(self) if field.name.endswith(("_level", "_pvalue", "_share"))]
         skies = ("channel_skies", "typical_skies", "common_skies", "noisy_skies", "table_skies")
         sims = ("sims_per_element", "pilot_sims_per_element")
-        check_settings(self, ["alpha", "named_probability", *levels], (*skies, *sims))
+        least = {**dict.fromkeys((*skies, *sims), 2), "beam_orders": 1}
+        check_settings(self, ["alpha", "named_probability", *levels], least)
         orders = max(self.beam_orders, self.split_beam_orders)
         if len(self.beam_bins) <= orders:
             raise InputError(

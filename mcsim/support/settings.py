@@ -1,7 +1,7 @@
 """Checks of the settings that users change by name."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from typing import Any, TypeVar, get_args
 
@@ -19,13 +19,13 @@ def settings_of(given: Kind | None, kind: type[Kind]) -> Kind:
     return given
 
 
-def check_settings(settings: Any, shares: Iterable[str] = (), counts: Iterable[str] = ()) -> None:
+def check_settings(settings: Any, shares: Iterable[str] = (), least: Mapping[str, int] | None = None) -> None:
     """Raise InputError unless the fields of a dataclass are of the kind of their defaults, and numbers not negative.
 
-    Those named in ``shares`` lie between 0 and 1, those in ``counts``, of which a scatter is taken, are 2 or more. An
-    ``int | None`` is whole.
+    Those named in ``shares`` lie between 0 and 1, and what is in ``least`` is no less than that. An ``int | None`` is
+    whole.
     """
-    bounded, least = set(shares), dict.fromkeys(counts, 2)
+    bounded, least = set(shares), least or {}
     for field in fields(settings):
         value, default = getattr(settings, field.name), field.default
         if value is default:

@@ -23,6 +23,7 @@ from refusals import refused
         (DiagnosisSettings, "channel_skies", 1),
         (DiagnosisSettings, "sims_per_element", 1),
         (DiagnosisSettings, "beam_bins", (4, 2)),
+        (DiagnosisSettings, "beam_orders", 0),
         (LimitSettings, "only", "gain_drift"),
         (LimitSettings, "alpha", 2),
         (LimitSettings, "power", 90),
