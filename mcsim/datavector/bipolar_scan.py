@@ -35,8 +35,13 @@ class BipolarScan:
     def tables(self) -> bipolar.Estimator:
         """Return the estimator, up to the L of the settings, or of the configuration if that is less."""
         model = self.model
-        L_max = min(max(model.survey.config.biposh.L_max, 1), model.settings.scan_L_max, model.lmax)
-        return bipolar.estimator(L_max, model.lmax, both_orders=True)
+        L_max = min(max(model.survey.config.biposh.L_max, 1), model.settings.scan_L_max, self.lmax)
+        return bipolar.estimator(L_max, self.lmax, both_orders=True)
+
+    @property
+    def lmax(self) -> int:
+        """Return the highest degree of the coefficients and powers, that of the configuration."""
+        return self.model.survey.lmax
 
     @cached_property
     def elements(self) -> tuple[Element, ...]:
@@ -48,11 +53,11 @@ class BipolarScan:
         sums = self._sums(filtered)
         binned = np.stack([sums.real, sums.imag], axis=-1)[tuple(np.transpose([where for _, where in self._binned]))]
         powers = [by_degree(a, b, self.model.lmax) for a, b in combinations_with_replacement(filtered.adjoint, 2)]
-        return np.array([*binned, *(p[low : high + 1].sum() for p in powers for low, high in scales(self.model.lmax))])
+        return np.array([*binned, *(p[low : high + 1].sum() for p in powers for low, high in scales(self.lmax))])
 
     @property
     def _bins(self) -> list[tuple[int, int]]:
-        return bins(2, self.model.lmax, self.model.settings.scan_bins)
+        return bins(2, self.lmax, self.model.settings.scan_bins)
 
     @cached_property
     def _sources(self) -> list[tuple[Element, int | None, float]]:
@@ -94,23 +99,24 @@ class BipolarScan:
             channels = tuple(dict.fromkeys(model.channels[part.channel] for part in (one, two)))
             split = one.split if one.split == two.split else None
             alike = Element(f"cl/{one.name},{two.name}", "cl", channels, split, L=0, M=0, parity="even", kind="cross")
-            for low, high in scales(model.lmax):
+            for low, high in scales(self.lmax):
                 yield replace(alike, name=f"{alike.name}/{low}-{high}", ell=(low, high), frame=model.frame)
 
     def _sums(self, filtered: FilteredMaps) -> NDArray[np.complex128]:
         """Return the sums of coefficients over bins, shape (sources, frames, modes, bins)."""
-        model, lmax = self.model, self.model.lmax
+        model, lmax = self.model, self.lmax
+        sky, *adjoint = (alm_.resize(alm, model.lmax, lmax) for alm in (filtered.sky, *filtered.adjoint))
         modes = [(mode.L, mode.M, mode.d) for mode in self.tables.modes]
         found = []
         for _, channel, sign in self._sources:
             if channel is None:
-                left = alm_.multiply(filtered.sky, model.inverse_cl, lmax)
+                left = alm_.multiply(sky, model.inverse_cl, lmax)
             else:
-                total = sum(sign**place * filtered.adjoint[i] for place, i in enumerate(model.of(channel)))
+                total = sum(sign**place * adjoint[i] for place, i in enumerate(model.of(channel)))
                 # A dipole beside the sky's quadrupole would look like L = 3; it has a place of its own.
-                response = np.where(np.arange(lmax + 1) >= 2, model.response[channel], 0.0)
+                response = np.where(np.arange(model.lmax + 1) >= 2, model.response[channel], 0.0)
                 left = alm_.multiply(np.asarray(total), response, lmax)
-            own = np.nan_to_num(bipolar.estimate(self.tables, left, filtered.sky))
+            own = np.nan_to_num(bipolar.estimate(self.tables, left, sky))
             found.append(np.stack([own[:, low : high + 1].sum(axis=1) for low, high in self._bins], axis=1))
         sums = np.stack(found)  # a rotation mixes modes of the same degrees: it may come after the sums
         views = [sums if to == model.frame else rotate_biposh(sums, modes, model.frame, to) for to in FRAMES]

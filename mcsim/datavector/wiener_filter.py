@@ -31,6 +31,9 @@ from mcsim.sphere.sky import dipole_alm
 from mcsim.support.arrays import Alm, Cl, Map, divided
 from mcsim.support.compiled import njit
 
+FAINT = 0.1
+"""Power of the sky over that of the noise at the last degree of the filters; what is above adds below 1 % to sigmas."""
+
 
 @dataclass(frozen=True)
 class Part:
@@ -49,7 +52,7 @@ class Model:
     """Describe the fiducial survey for the filter."""
 
     survey: Survey  # without effects, with moments up to the orders that are measured
-    lmax: int  # highest degree of the sky and the matched filters
+    lmax: int  # highest degree of the sky and the matched filters: _highest_degree
     nside: int
     cl: Cl  # spectrum of the sky, uK^2
     response: NDArray[np.float64]  # B_l w_l of every channel, (channel, lmax + 1)
@@ -107,15 +110,14 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
     """
     if survey.cl is None:
         raise InputError("a diagnosis needs the spectrum of the sky; give sky.spectrum.")
-    run, lmax = survey.config, survey.lmax
+    run = survey.config
     if run.map.grid == "gl":
         raise InputError('a diagnosis compares maps of pixels; give the model map.grid = "healpix" and map.nside.')
-    cl = survey.cl[: lmax + 1]
     both = zip(survey.channels, survey.making.channels, strict=True)
-    response = np.stack([_circular(channel, made)[: lmax + 1] for channel, made in both])
+    response = np.stack([_circular(channel, made) for channel, made in both])
     parts = []
     for index, channel in enumerate(survey.channels):
-        floor = settings.noise_floor * float(np.sqrt(sky_variance(cl, response[index])))
+        floor = settings.noise_floor * float(np.sqrt(sky_variance(survey.cl, response[index])))
         for m, split in zip(channel.maps, run.map.each_split, strict=True):
             if isinstance(m.drawn, NoiseOfFiles):
                 raise InputError(
@@ -129,10 +131,27 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
             precision = np.where(seen, 1.0 / np.broadcast_to(variance, seen.shape), 0.0)
             noise_power = 4 * np.pi / seen.size * float(np.mean(1.0 / precision[seen]))
             parts.append(Part(index, m.name, split, m.moments, precision, noise_power))
-    gain = sum(response[part.channel] ** 2 / part.noise_power for part in parts)
-    sky_power = cl * gain / (1.0 + cl * gain)
+    snr = survey.cl * sum(response[part.channel] ** 2 / part.noise_power for part in parts)
+    lmax = _highest_degree(survey, snr)
+    cl, response, snr = survey.cl[: lmax + 1], response[:, : lmax + 1], snr[: lmax + 1]
     dipole = dipole_alm(survey.channels[0].site.dipole_uk, lmax)
-    return Model(survey, lmax, survey.nside, cl, response, tuple(parts), dipole, sky_power, settings)
+    return Model(survey, lmax, survey.nside, cl, response, tuple(parts), dipole, snr / (1.0 + snr), settings)
+
+
+def _highest_degree(survey: Survey, snr: Cl) -> int:
+    """Return the highest degree of the filters from the sky's power over the noise's in all maps, (sky.lmax + 1,).
+
+    Notes
+    -----
+    It is ``biposh.lmax``, or on to where the maps no longer show the sky if their pixels hold it so far. From 2.2 nside
+    on quadrature leaks 2 % of the power, and pixels average the sky in ways that no single window tells: little beside
+    noise. A sky that is above the noise beyond 2.5 nside is filtered up to the degree that the run chooses, and so are
+    prepared maps, whose noise is not white and whose pixels may be degraded.
+    """
+    last = min(snr.size - 1, 5 * survey.nside // 2)
+    if survey.config.preparation or np.any(snr[last + 1 :] > 1.0):
+        return survey.lmax
+    return max(survey.lmax, int(np.flatnonzero(snr[: last + 1] >= FAINT).max(initial=0)))
 
 
 def _circular(channel: Channel, made: Channel) -> Cl:

@@ -6,7 +6,8 @@ import healpy
 import numpy as np
 import pytest
 
-from mcsim import config, systematics
+from mcsim import bipolar, config, systematics
+from mcsim.datavector.analysis import analysis_of
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import model_of, shared_sky, wiener_filter
 from mcsim.instrument.beams import Beam
@@ -16,6 +17,7 @@ from mcsim.simulation.pixel_means import mean_gain
 from mcsim.simulation.survey import survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
+from mcsim.sphere.rotation import FRAMES
 
 HALVES = ((0.0, 0.5), (0.5, 1.0))
 
@@ -107,3 +109,48 @@ def test_squares_of_residuals_have_all_modes_that_the_sky_does_not_fill() -> Non
     sigma = np.sqrt(2.0 * (2.0 * pixels - taken) / skies)
     assert abs(np.mean(found) - (2.0 * pixels - taken)) < 4.0 * sigma
     assert abs(np.mean(np.subtract(holed, found))) < 4.0 * sigma * np.sqrt(0.1 / 0.9)
+
+
+def _shown(sky_lmax: int, sigma0_uk: float, **changes: object) -> config.RunConfig:
+    """A run at nside 8 of which BipoSH coefficients are wanted up to l = 12."""
+    channel = {
+        "name": "W1",
+        "beam": {"kind": "gaussian", "fwhm_arcmin": 300.0},
+        "noise": {"sigma0_uk": sigma0_uk},
+        "scan": {"kind": "parallel_transport", "psi0_deg": 20.0},
+    }
+    base = {
+        "schema": 1, "name": "shown", "sky": {"spectrum": "wmap7", "lmax": sky_lmax}, "map": {"nside": 8},
+        "biposh": {"lmax": 12, "L_max": 2}, "channel": [channel],
+    }  # fmt: skip
+    return config.load(base | changes)
+
+
+def test_maps_are_filtered_as_far_as_they_show_the_sky_and_pixels_hold_it() -> None:
+    def highest(run: config.RunConfig) -> int:
+        return model_of(survey(run), DiagnosisSettings()).lmax
+
+    assert highest(_shown(18, 10.0)) == 18  # the sky ends
+    assert highest(_shown(40, 50.0)) == 20  # it is in the noise at 2.5 nside
+    assert highest(_shown(40, 5.0)) == 12  # it is not, and pixels no longer hold it
+    assert highest(_shown(18, 10.0, preparation=[{"kind": "subtract_dipole"}])) == 12
+    faint = model_of(survey(_shown(18, 100.0)), DiagnosisSettings())
+    assert faint.lmax == 14
+    snr = faint.sky_power / (1.0 - faint.sky_power)
+    assert 0.1 <= snr[-1] < 0.1 * snr[-2] / snr[-1]
+
+
+def test_biposh_lmax_is_that_of_the_scan_alone() -> None:
+    """The data vector does not depend on it; the scan is that of the degrees that the run names."""
+    shorter, whole = (analysis_of(one) for one in (_shown(18, 10.0), _shown(18, 10.0, biposh={"L_max": 2})))
+    maps = list(simulate.maps(whole.model.survey, 0))
+    assert shorter.elements == whole.elements
+    assert np.array_equal(shorter.data_vector(maps, slices=True), whole.data_vector(maps, slices=True))
+    ends = [max(one.ell[1] for one in run.bipolar_scan.elements) for run in (shorter, whole)]
+    assert ends == [12, 18]
+    filtered = wiener_filter(whole.model, maps)
+    found, reference = shorter.bipolar_scan, bipolar.estimator(2, 12, both_orders=True)
+    sky = alm_.resize(filtered.sky, 18, 12)
+    expected = bipolar.estimate(reference, alm_.multiply(sky, whole.model.inverse_cl, 12), sky)
+    sums = found._sums(filtered)[0, list(FRAMES).index(whole.model.frame)]
+    np.testing.assert_allclose(sums.sum(axis=1), np.nan_to_num(expected)[:, 2:].sum(axis=1), rtol=1e-12)
