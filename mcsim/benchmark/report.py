@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 from scipy import stats
 
+from mcsim import systematics
 from mcsim.benchmark.summary import ALPHA, FAR, NAMED, REDUCED, Confusion, Score, confusion
 from mcsim.stats.intervals import Metric, binomial_interval
 from mcsim.support import page
@@ -42,7 +43,7 @@ def write(score: Score, folder: Path) -> None:
     (folder / "score.png").write_bytes(picture)
     text = page.render(
         Path(__file__).with_name("report.html.j2"),
-        {"value": _value, "interval": _interval, "mark": _mark},
+        {"value": _value, "interval": _interval, "mark": _mark, "words": _words},
         score=score,
         metrics=_ordered(score),
         short=[metric.name for metric in score.metrics if metric.met is False],
@@ -96,6 +97,13 @@ def _value(metric: Metric) -> str:
 
 def _interval(metric: Metric) -> str:
     return f"{metric.low:.3g}, {metric.high:.3g}" if np.isfinite(metric.low) else ""
+
+
+def _words(column: str) -> str:
+    """Return a row or column of a confusion matrix as people read it: effects of the library by their titles."""
+    name, *rest = column.split(", ")
+    library = systematics.catalogue()
+    return ", ".join((library[name].label() if name in library else name.replace("_", " "), *rest))
 
 
 def score_figure(score: Score, answers: Confusion, bayes: Confusion) -> Figure:
@@ -215,6 +223,6 @@ def _matrix(axes: Axes, matrix: Confusion, title: str) -> None:
         if count:
             colour = "w" if shares[i, j] > 0.5 else "k"
             axes.text(j, i, str(count), ha="center", va="center", fontsize=8, color=colour)
-    axes.set_xticks(range(len(matrix.answers)), matrix.answers, rotation=90, fontsize=8)
-    axes.set_yticks(range(len(matrix.truths)), matrix.truths, fontsize=8)
+    axes.set_xticks(range(len(matrix.answers)), map(_words, matrix.answers), rotation=90, fontsize=8)
+    axes.set_yticks(range(len(matrix.truths)), map(_words, matrix.truths), fontsize=8)
     axes.set(xlabel="Answer", ylabel="Truth")

@@ -70,16 +70,14 @@ class Candidate:
     @property
     def label(self) -> str:
         """Return name, channel and settings as text."""
-        return f"{self.name} ({', '.join((self.channel or 'all', *self._settings()))})"
+        settings = (f"{key} = {value}" for key, value in self.settings.items())
+        return f"{self.name} ({', '.join((self.channel or 'all', *settings))})"
 
     @property
     def title(self) -> str:
         """Return the effect in words, with channel and the settings that are not the effect's own."""
-        usual = self.effect()
-        return ", ".join((self.effect.label(self.channel), *self._settings(vars(usual))))
-
-    def _settings(self, but: Mapping[str, Any] | None = None) -> Iterator[str]:
-        return (f"{key} = {value}" for key, value in self.settings.items() if but is None or but[key] != value)
+        usual = vars(self.effect())
+        return self.effect.label(self.channel, {key: own for key, own in self.settings.items() if usual[key] != own})
 
     @property
     def basis(self) -> tuple[Effect, ...]:

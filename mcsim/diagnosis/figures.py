@@ -107,7 +107,7 @@ def blocks_figure(result: DiagnosisResult) -> Figure:
                 axes.text(column, row, f"{value:+.1f}", ha="center", va="center", fontsize=7, color=colour)
         labels = [_label(name, 22) for name in names]
         axes.set_xticks(range(len(names)), labels, rotation=45, ha="right", fontsize=8)
-        axes.set_yticks(range(len(kinds)), [_label(kind, 60) for kind in kinds], fontsize=8)
+        axes.set_yticks(range(len(kinds)), [_label(kind, 80) for kind in kinds], fontsize=8)
         axes.set_title(title, fontsize=10)
     label = "largest deviation [standard deviations]\ngrey: not measured"
     figure.colorbar(shown, ax=list(grid), label=label, extend="both", location="bottom", shrink=0.6, aspect=40)

@@ -37,7 +37,7 @@ def limit_figure(found: Limits) -> Figure:
         unit = "" if one.unit.startswith("1") else f" ({one.unit})"
         shown = f"{number(one.sigma)} | {number(one.amplitude_90)}{unit}"
         left.annotate(shown, (1.0, row), (4, 0), ("axes fraction", "data"), "offset points", va="center", fontsize=7)
-    left.set_yticks(rows, [one.label for one in effects], fontsize=8)
+    left.set_yticks(rows, [one.title for one in effects], fontsize=8)
     left.set_ylim(count - 0.4, -0.6)
     left.set_xlim(0.0, REACH)
     left.set_xlabel("amplitude / sigma;  at the right: sigma | detected among all", fontsize=9)
@@ -47,7 +47,7 @@ def limit_figure(found: Limits) -> Figure:
     steps = np.digitize(np.minimum(found.correlation, 0.999999), levels) - 0.5
     image = right.imshow(steps, cmap=shades, vmin=0, vmax=6, aspect="auto")
     right.set_ylim(left.get_ylim())
-    right.set_xticks(rows, [one.label for one in effects], fontsize=7, rotation=90)
+    right.set_xticks(rows, [one.title for one in effects], fontsize=7, rotation=90)
     right.set_yticks(rows, [""] * count)
     right.set_title("canonical correlation |ρ| of the responses", fontsize=10)
     bar = figure.colorbar(image, ax=right, ticks=range(7), shrink=0.7, aspect=40)

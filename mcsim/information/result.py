@@ -29,8 +29,8 @@ class EffectLimit:
 
     Attributes
     ----------
-    name, channel, settings, unit, label
-        Of the effect; ``channel`` None: acts in all.
+    name, channel, settings, unit, label, title
+        Of the effect; ``channel`` None: acts in all. The label is made of these names, the title of a person's words.
     components
         Number of its linear components.
     sigma, error
@@ -51,6 +51,7 @@ class EffectLimit:
     settings: dict[str, Any]
     unit: str
     label: str
+    title: str
     components: int
     sigma: float
     error: float
@@ -251,6 +252,7 @@ def limits_of(
                 dict(candidate.settings),
                 candidate.effect.unit,
                 candidate.label,
+                candidate.title,
                 len(own),
                 sigma,
                 float(0.5 * np.sqrt(np.sum((share * error[own]) ** 2))),

@@ -51,7 +51,7 @@ def ensemble_figure(
         asked = ", ".join(f"{name} = {value}" for name, value in wanted.items())
         raise InputError(f"{path} has no mode with {asked or 'finite values'}; mcsim info names what it holds.")
     expected = None if prediction is None else _matching(prediction, label, modes)
-    return _draw(modes, f"{Path(path).name}: {label}, {int(modes['count'])} realizations", expected)
+    return _draw(modes, f"{Path(path).name}: {label.replace(',', ' × ')}, {int(modes['count'])} realizations", expected)
 
 
 def _matching(prediction: xr.Dataset, pair: str, modes: xr.Dataset) -> xr.Dataset:

@@ -40,8 +40,7 @@ class Nuisance:
     def title(self) -> str:
         """Return the effect in words, with channel and settings."""
         drawn = [f"{key} ± {width:g}" for key, width in self.parameter_widths.items()]
-        words = [f"{key} = {value}" for key, value in self.settings.items()]
-        return ", ".join((self.effect.label(self.channel), *words, *drawn))
+        return ", ".join((self.effect.label(self.channel, self.settings), *drawn))
 
     @property
     def mean(self) -> Vector:

@@ -114,6 +114,7 @@ class SpinSynchronousOffset(Effect):
     """
 
     name = "spin_synchronous_offset"
+    title = "spin-synchronous offset"
     scope = "channel"
     unit = "uK"
     wording = Wording("{}", " µK")

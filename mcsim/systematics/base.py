@@ -127,6 +127,8 @@ class Effect:
         Of the amplitude.
     title, wording
         Name and amplitude as people read them; left out: the name with spaces, and the amplitude with its unit.
+    setting_words
+        "parameter = value" of a fixed parameter -> the same as people read it; left out: name and value with spaces.
     cause, signature, source
         What makes it, how it shows, and where that is from: one sentence each, for people.
     step
@@ -168,6 +170,7 @@ class Effect:
     scope: ClassVar[Literal["channel", "common"]]
     unit: ClassVar[str]
     title: ClassVar[str] = ""
+    setting_words: ClassVar[Mapping[str, str]] = {}
     wording: ClassVar[Wording | None] = None
     cause: ClassVar[str]
     signature: ClassVar[str]
@@ -249,9 +252,11 @@ class Effect:
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "amplitude"}
 
     @classmethod
-    def label(cls, channel: str | None = None) -> str:
-        """Return the effect's name as people read it, with the channel that it acts in."""
-        return (cls.title or cls.name.replace("_", " ")) + (f" of {channel}" if channel else "")
+    def label(cls, channel: str | None = None, settings: Mapping[str, Any] | None = None) -> str:
+        """Return the effect's name as people read it, with the channel that it acts in and fixed parameters."""
+        name = (cls.title or cls.name.replace("_", " ")) + (f" of {channel}" if channel else "")
+        pairs = [(f"{key} = {value}", f"{key.replace('_', ' ')} {value}") for key, value in (settings or {}).items()]
+        return ", ".join((name, *(cls.setting_words.get(text, words) for text, words in pairs)))
 
     @classmethod
     def format_amplitude(cls, amplitude: float, sigma: float = 0.0) -> str:

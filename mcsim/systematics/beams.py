@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -249,6 +249,10 @@ class BeamSidelobe(Effect):
         Bound("width_sigmas", 0.5, 20.0, "narrower rings are none that the beam's coefficients hold; fixed in a fit"),
     )
     parametrization = _RoundAndQuadrupole()
+    setting_words: ClassVar[Mapping[str, str]] = {
+        "calibrated = none": "calibrated on its peak",
+        "calibrated = dipole": "calibrated on the dipole",
+    }
     variants = ({"calibrated": "none"}, {"calibrated": "dipole"})
 
     quadrupole: float = 0.0

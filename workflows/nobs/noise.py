@@ -198,13 +198,15 @@ def draw(data: dict, by_hits: list, control: np.ndarray) -> Figure:
         value, error = data["KQ85"][place]
         right.hist(control[:, place] / 1e3, bins=20, histtype="step", color=f"C{place}", label=f"simulated, {label}")
         right.axvline(value / 1e3, color=f"C{place}", ls="--")
-    left.set(xlabel="Galactic latitude [deg]", ylabel="sigma0 [mK]", yscale="log")
+    left.set(xlabel="Galactic latitude  [degrees]", ylabel=r"$\sigma_0$  [mK]", yscale="log")
     left.set_yticks([6, 7, 8, 10], labels=["6", "7", "8", "10"])
     left.minorticks_off()
     hits, value, error = np.array([(h, *own) for h, own in by_hits]).T
     middle.errorbar(hits, value / 1e3, error / 1e3, fmt="o", color="C1")
-    middle.set(xlabel="N_OBS outside KQ85", ylabel="sigma0, likelihood [mK]")
-    right.set(xlabel="sigma0 [mK]", ylabel="patches; dashed: data outside KQ85")
+    middle.set(xlabel=r"$N_\mathrm{obs}$ outside KQ85", ylabel=r"$\sigma_0$, likelihood  [mK]")
+    right.set(xlabel=r"$\sigma_0$  [mK]", ylabel="number of simulated patches")
+    left.set_title("line: what the model asks for", fontsize=10)
+    right.set_title("dashed: data outside KQ85", fontsize=10)
     for axes in (left, middle):
         axes.axhline(ASKED_UK / 1e3, color="k", lw=0.8)
     right.axvline(ASKED_UK / 1e3, color="k", lw=0.8)

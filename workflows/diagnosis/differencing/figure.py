@@ -15,6 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from check import PUT_IN, model
 
+from mcsim import systematics
 from mcsim.simulation import convolve, differencing, simulate
 from mcsim.simulation.survey import survey
 
@@ -57,9 +58,11 @@ def main() -> None:
             ratio = [one["found"][0]["amplitude"] / one["amplitude"] for one in own]
             error = [one["found"][0]["sigma"] / one["amplitude"] for one in own]
             right.errorbar(at, ratio, error, fmt=marker, ms=3, lw=0.8, color=f"C{place}")
+        right.plot([], [], marker, ms=4, color="0.3", label=f"one map, nside {result['nside']}")
+    right.legend(frameon=False, loc="upper right")
     right.axhline(1.0, color="k", lw=0.8, ls=":")
-    right.set_xticks(range(len(PUT_IN)), [name.replace("_", "\n") for name in PUT_IN])
-    right.set_ylabel("amplitude found / put in")
+    right.set_xticks(range(len(PUT_IN)), [systematics.get(name).label().replace(" ", "\n") for name in PUT_IN])
+    right.set_ylabel("fitted amplitude / amplitude put in")
     figure.savefig(chosen.output, dpi=110)
 
 

@@ -236,7 +236,7 @@ def summary(files):
             shares = [share(word, [right(one, word) for one in cases]) for word in (*WORDS, "all")]
             values = np.array([[one.value, one.value - one.low, one.high - one.value] for one in shares]).T
             where = np.arange(len(shares)) + 0.2 * (place - 1)
-            label = f"S/N {strength:.0f} ({len(cases)})"
+            label = f"S/N {strength:.0f}, {len(cases)} cases"
             axes.errorbar(where, values[0], np.maximum(values[1:], 0.0), fmt="o", markersize=4, capsize=2, label=label)
             print(group, f"S/N {strength:.0f}", *map(told, shares), sep="\n    ")
         axes.axhline(0.8, color="black", linestyle=":", linewidth=0.8)
@@ -246,7 +246,7 @@ def summary(files):
         if own:
             axes.legend(frameon=False, fontsize=8, loc="lower left")
             report(group, own)
-    panels[0].set_ylabel("share that is right")
+    panels[0].set_ylabel("share of cases that are right")
     figure.savefig(PICTURE, dpi=120)
     if own := [one for one in rows if one[0] == "further"]:
         report("further", own)
