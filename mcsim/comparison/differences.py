@@ -18,24 +18,14 @@ from mcsim.support.arrays import Vector
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What is predicted for side B so far.
+    """What is predicted for side B so far."""
 
-    Attributes
-    ----------
-    pair
-        The channel on both sides; its ``b`` is to be reached.
-    scene, maps
-        Of the prediction; no scene without a model.
-    others
-        The other channels.
-    free
-        Orthonormal changes of the prediction that are fitted besides, over the pixels that are seen, shape (k, n).
-    """
-
-    pair: ChannelPair
+    pair: ChannelPair  #: the channel on both sides; its ``b`` is to be reached
+    #: scene, maps: of the prediction; no scene without a model
     scene: Scene | None
     maps: Maps
-    others: Sequence[ChannelPair]
+    others: Sequence[ChannelPair]  #: the other channels
+    #: orthonormal changes of the prediction that are fitted besides, over the pixels that are seen, shape (k, n)
     free: NDArray[np.float64] | None = None
 
     def fit(self, templates: Sequence[Maps]) -> Vector:
@@ -56,45 +46,26 @@ class State:
 
 
 class Difference:
-    """A difference of implementation.
+    """A difference of implementation."""
 
-    Attributes
-    ----------
-    name, unit
-        As in ``compare.json``.
-    met
-        Where such a difference was met.
-    needs_scene
-        True if it cannot be described without a model.
-    smooth
-        True if the value is refined by least squares.
-    natural
-        Size of a value that is neither small nor large.
-    stage
-        When it is tried: 0 at once, 1 where those leave something, 2 where nothing else explains the maps.
-    enough
-        Share of the variance that a set with it must explain at most to be named; 1: as all sets.
-    proportional
-        True if the response is proportional to the value, which is then fitted at once.
-    linear
-        True if the response is the template of a small amplitude, and so no better than about a per mille.
-    exchanges
-        True if it exchanges pixels, files or units, which can be taken back before the rest is looked for.
-    turns
-        True if it turns or mirrors samples or beam: what two of these make together neither says by itself.
-    """
-
+    #: name, unit: as in ``compare.json``
     name: ClassVar[str]
     unit: ClassVar[str]
-    met: ClassVar[str]
-    needs_scene: ClassVar[bool] = True
-    smooth: ClassVar[bool] = False
-    natural: ClassVar[float] = 1.0
+    met: ClassVar[str]  #: where such a difference was met
+    needs_scene: ClassVar[bool] = True  #: True if it cannot be described without a model
+    smooth: ClassVar[bool] = False  #: True if the value is refined by least squares
+    natural: ClassVar[float] = 1.0  #: size of a value that is neither small nor large
+    #: when it is tried: 0 at once, 1 where those leave something, 2 where nothing else explains the maps
     stage: ClassVar[int] = 0
+    #: share of the variance that a set with it must explain at most to be named; 1: as all sets
     enough: ClassVar[float] = 1.0
+    #: True if the response is proportional to the value, which is then fitted at once
     proportional: ClassVar[bool] = False
+    #: True if the response is the template of a small amplitude, and so no better than about a per mille
     linear: ClassVar[bool] = False
+    #: True if it exchanges pixels, files or units, which can be taken back before the rest is looked for
     exchanges: ClassVar[bool] = False
+    #: True if it turns or mirrors samples or beam: what two of these make together neither says by itself
     turns: ClassVar[bool] = False
 
     def starts(self, state: State) -> list[Vector]:

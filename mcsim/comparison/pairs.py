@@ -41,64 +41,35 @@ _STORED = (".fits", ".fit", ".gz", ".npy", ".npz", ".h5", ".hdf5", ".nc")
 
 @dataclass(frozen=True, eq=False)
 class ChannelPair:
-    """The maps of one channel on both sides.
+    """The maps of one channel on both sides."""
 
-    Attributes
-    ----------
-    name, splits
-        Of the channel and of its maps.
-    a, b
-        Maps, uK, shape (split, npix).
-    seen
-        What both sides observed, shape (split, npix).
-    one_sided
-        Number of pixels that one side alone observed.
-    scene
-        What the model says of side A; None without a model.
-    channel
-        The same with everything that effects need, before any preparation; None without a model.
-    hits
-        Samples per pixel of the maps, of the model; None without one.
-    sky_of_maps
-        True if the scene's sky was taken from side A, and not from the model.
-    files
-        Samples of the channel, if the model has them in files.
-    doubt
-        A draw of what noise hides of the sky that side A shows, coefficients as the scene's; None if it hides nothing.
-    spread
-        What single samples change in side A, uK, if it was made from orientation moments and ``a`` has it since; None.
-    noise_uk
-        Of every pixel of the maps as the model has it, rms, shape (split, npix); None without one.
-    turned
-        True if the sides are exchanged: ``a`` is side B.
-    by_moments
-        True if side A was made from orientation moments or at the pixels' centres, so that no single sample has a say.
-    orders
-        Highest order of the beam in a run of the model, if that is not said and less than the scene's; None.
-    rounds
-        How often the sky that was taken from side A was corrected for what single samples leave of it.
-    unmade
-        What they leave of side A, uK, as the last correction of its sky has it, if that is noise; None: to be made.
-    """
-
+    #: name, splits: of the channel and of its maps
     name: str
     splits: tuple[str, ...]
+    #: a, b: maps, uK, shape (split, npix)
     a: Maps
     b: Maps
-    seen: NDArray[np.bool_]
-    one_sided: int = 0
-    scene: Scene | None = None
+    seen: NDArray[np.bool_]  #: what both sides observed, shape (split, npix)
+    one_sided: int = 0  #: number of pixels that one side alone observed
+    scene: Scene | None = None  #: what the model says of side A; None without a model
+    #: the same with everything that effects need, before any preparation; None without a model
     channel: Channel | None = None
-    hits: Maps | None = None
-    sky_of_maps: bool = False
-    files: PointingFiles | None = None
+    hits: Maps | None = None  #: samples per pixel of the maps, of the model; None without one
+    sky_of_maps: bool = False  #: True if the scene's sky was taken from side A, and not from the model
+    files: PointingFiles | None = None  #: samples of the channel, if the model has them in files
+    #: a draw of what noise hides of the sky that side A shows, coefficients as the scene's; None if it hides nothing
     doubt: Alm | None = None
+    #: what single samples change in side A, uK, if it was made from orientation moments and ``a`` has it since; None
     spread: Maps | None = None
+    #: of every pixel of the maps as the model has it, rms, shape (split, npix); None without one
     noise_uk: Maps | None = None
-    turned: bool = False
+    turned: bool = False  #: True if the sides are exchanged: ``a`` is side B
+    #: True if side A was made from orientation moments or at the pixels' centres, so that no single sample has a say
     by_moments: bool = False
+    #: highest order of the beam in a run of the model, if that is not said and less than the scene's; None
     orders: int | None = None
-    rounds: int = 0
+    rounds: int = 0  #: how often the sky that was taken from side A was corrected for what single samples leave of it
+    #: what they leave of side A, uK, as the last correction of its sky has it, if that is noise; None: to be made
     unmade: Maps | None = None
 
     def pointing(self, longest: float = SAMPLES) -> Pointing | PointingFiles | None:

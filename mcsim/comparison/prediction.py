@@ -55,20 +55,11 @@ WORTHWHILE = 0.98
 
 @dataclass(frozen=True, eq=False)
 class Set:
-    """Differences with their values.
+    """Differences with their values."""
 
-    Attributes
-    ----------
-    members
-        Differences with their values.
-    left
-        Share of the variance that they leave.
-    correction
-        What single samples change in their prediction, uK, shape (split, npix); None: not measured.
-    """
-
-    members: Members
-    left: float
+    members: Members  #: differences with their values
+    left: float  #: share of the variance that they leave
+    #: what single samples change in their prediction, uK, shape (split, npix); None: not measured
     correction: Maps | None = None
 
     @property
@@ -108,20 +99,11 @@ class Prediction:
 
     Sets are predicted with orientation moments; those that come first are simulated sample by sample as well, if the
     pointing is known and not too long, and what that changes is added to their predictions.
-
-    Attributes
-    ----------
-    pair
-        The channel on both sides.
-    others
-        The other channels.
-    floor
-        Rms in uK up to which maps are called identical.
     """
 
-    pair: ChannelPair
-    others: Sequence[ChannelPair]
-    floor: float
+    pair: ChannelPair  #: the channel on both sides
+    others: Sequence[ChannelPair]  #: the other channels
+    floor: float  #: rms in uK up to which maps are called identical
     _hidden: dict[tuple[tuple[int, bytes], ...], float] = field(default_factory=dict, repr=False, kw_only=True)
     _exact: dict[tuple[tuple[int, bytes], ...], Set] = field(default_factory=dict, repr=False, kw_only=True)
 

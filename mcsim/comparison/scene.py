@@ -68,47 +68,27 @@ class PointingFiles:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Sky, beam, pixel window and scan of a channel.
+    """Sky, beam, pixel window and scan of a channel."""
 
-    Attributes
-    ----------
-    sky
-        Coefficients of the sky, uK, up to ``lmax``.
-    beam, window
-        Beam, and pixel window of shape (lmax + 1,).
-    moments
-        Orientation moments of every split.
-    preparations
-        What is done to the map of every split after it is made; empty: nothing.
-    nthreads
-        Threads of the transforms.
-    psi
-        Sign and offset in radians of the samples' orientation, beside that of the model.
-    centred
-        True if samples stand at their pixels' centres.
-    motion
-        Scan model in place of the channel's; None: that.
-    late, step
-        Samples by which the signal of a pointing is attributed to an earlier one, and their distance in radians, of the
-        sign of the spin.
-    added
-        Makes of the scene without it what its maps have besides; None: nothing.
-    kept, moved
-        Transforms of scenes made from this one, and their displaced beams.
-    """
-
-    sky: Alm
+    sky: Alm  #: coefficients of the sky, uK, up to ``lmax``
+    #: beam, window: beam, and pixel window of shape (lmax + 1,)
     beam: Beam
     window: NDArray[np.float64]
-    moments: tuple[Moments, ...]
+    moments: tuple[Moments, ...]  #: orientation moments of every split
+    #: what is done to the map of every split after it is made; empty: nothing
     preparations: tuple[Preparation, ...] = ()
-    nthreads: int = 1
+    nthreads: int = 1  #: threads of the transforms
+    #: sign and offset in radians of the samples' orientation, beside that of the model
     psi: tuple[int, float] = (1, 0.0)
-    centred: bool = False
-    motion: ScanModel | None = None
+    centred: bool = False  #: True if samples stand at their pixels' centres
+    motion: ScanModel | None = None  #: scan model in place of the channel's; None: that
+    #: late, step: samples by which the signal of a pointing is attributed to an earlier one, and their distance in
+    #: radians, of the sign of the spin
     late: float = 0.0
     step: float = 0.0
+    #: makes of the scene without it what its maps have besides; None: nothing
     added: "Callable[[Scene], Maps] | None" = None
+    #: kept, moved: transforms of scenes made from this one, and their displaced beams
     kept: OrderedDict[tuple[bytes, ...], Transforms] = field(default_factory=OrderedDict, repr=False)
     moved: OrderedDict[tuple[bytes, float, int], Beam] = field(default_factory=OrderedDict, repr=False)
     # By window and identity of a pointing, which is held so that no other one can have it.

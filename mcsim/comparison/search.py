@@ -83,15 +83,9 @@ INTERPOLATING = frozenset({"beam_width", "interpolation"})
 
 @dataclass(frozen=True, eq=False)
 class Problem(Prediction):
-    """One channel, and what may differ in it.
+    """One channel, and what may differ in it."""
 
-    Attributes
-    ----------
-    library
-        Differences of implementation and effects.
-    """
-
-    library: Sequence[Difference] = ()
+    library: Sequence[Difference] = ()  #: differences of implementation and effects
     _tried: dict[tuple[tuple[int, bytes], ...], list[Set]] = field(default_factory=dict, repr=False)
 
     def best(self, stage: int = 0) -> list[Set]:
