@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
-from mcsim.comparison.scene import Maps, Scene
+from mcsim.comparison.scene import Maps, Scene, keep
 from mcsim.simulation import convolve
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
@@ -72,9 +72,7 @@ class PixelAverage(Difference):
                 healpix.synthesis(alm[None], n, lmax, nthreads=scene.nthreads)[0]
                 for alm, n in ((sky, 2**level * nside), (here, nside))
             )
-            self._made[key] = sign * (healpy.ud_grade(fine, nside) - there)
-            while len(self._made) > KEPT:
-                self._made.popitem(last=False)
+            keep(self._made, key, sign * (healpy.ud_grade(fine, nside) - there), KEPT)
         return np.stack([self._made[key]] * len(scene.moments))
 
     def inverse(self, value: Vector) -> Vector:

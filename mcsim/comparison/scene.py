@@ -116,7 +116,7 @@ class Scene:
             key = (beam.blm.tobytes(), way, orders)
             if key not in self.moved:
                 moved = displaced(beam, 0.0 if way >= 0.0 else np.pi, abs(way))
-                _keep(self.moved, key, moved.truncated(min(moved.mmax, orders)), KEPT_BEAMS)
+                keep(self.moved, key, moved.truncated(min(moved.mmax, orders)), KEPT_BEAMS)
             beam = self.moved[key]
         return beam
 
@@ -132,7 +132,7 @@ class Scene:
         if key not in self.kept:
             circular, offsets = self._circular()
             spins = convolve.spin_maps(self.sky, self.response, self.nside, self.nthreads)
-            _keep(self.kept, key, Transforms(circular, spins, offsets), KEPT)
+            keep(self.kept, key, Transforms(circular, spins, offsets), KEPT)
         self.kept.move_to_end(key)
         return self.kept[key]
 
@@ -227,7 +227,7 @@ class Scene:
         here = tod.samples(model, pointing.line, grid)
         if not self.late:
             return here
-        there = tod.samples(ahead(model, self.late * model.period_of_samples(pointing.line)), pointing.line, grid)
+        there = tod.samples(model.ahead(self.late * model.period_of_samples(pointing.line)), pointing.line, grid)
         return (replace(seen, pixel=binned.pixel) for binned, seen in zip(here, there, strict=True))
 
     def pixels(self, pointing: Pointing | PointingFiles, split: int) -> Iterator[NDArray[np.int64]]:
@@ -280,21 +280,11 @@ class Scene:
             yield replace(chunk, theta=theta, phi=phi, psi=sign * chunk.psi + offset)
 
 
-def _keep(kept: OrderedDict[Any, Any], key: object, value: object, most: int) -> None:
+def keep(kept: OrderedDict[Any, Any], key: object, value: object, most: int) -> None:
     """Keep a value, and forget the ones that were longest without use."""
     kept[key] = value
     while len(kept) > most:
         kept.popitem(last=False)
-
-
-def ahead(model: ScanModel, seconds: float) -> ScanModel:
-    """Return a scan model that is ``seconds`` further on its way at t = 0."""
-    ways = ("spin", "precession", "orbit")
-    phases = {
-        f"{way}_phase_deg": getattr(model, f"{way}_phase_deg") + 360.0 * seconds / getattr(model, f"{way}_period_s")
-        for way in ways
-    }
-    return replace(model, **phases)
 
 
 def scene_of(channel: Channel, sky: Alm, nthreads: int) -> Scene:
