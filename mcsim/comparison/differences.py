@@ -48,10 +48,10 @@ class State:
 class Difference:
     """A difference of implementation."""
 
-    #: name, unit: as in ``compare.json``
-    name: ClassVar[str]
-    unit: ClassVar[str]
-    met: ClassVar[str]  #: where such a difference was met
+    #: name, unit, met: as in ``compare.json``; ``met`` says where such a difference was met
+    name: str
+    unit: str
+    met: str
     needs_scene: ClassVar[bool] = True  #: True if it cannot be described without a model
     smooth: ClassVar[bool] = False  #: True if the value is refined by least squares
     natural: ClassVar[float] = 1.0  #: size of a value that is neither small nor large
@@ -67,10 +67,15 @@ class Difference:
     exchanges: ClassVar[bool] = False
     #: True if it turns or mirrors samples or beam: what two of these make together neither says by itself
     turns: ClassVar[bool] = False
+    #: ways, mutual: values to try where only some are possible; True if the other side's has the other sign
+    ways: ClassVar[tuple[float, ...]] = (1.0,)
+    mutual: ClassVar[bool] = False
+    moved: ClassVar[int | None] = None  #: how many numbers of the value are moved, the first ones; None: all
+    counted: ClassVar[bool] = True  #: False: there is no amount of it, and the amplitude is 1
 
     def starts(self, state: State) -> list[Vector]:
         """Return the values to try, shape (k,) each."""
-        return [np.ones(1)]
+        return [np.array([way]) for way in self.ways]
 
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
         """Return the scene of side B."""
@@ -86,7 +91,7 @@ class Difference:
 
     def axes(self, value: Vector) -> Vector:
         """Return unit vectors along which the value may be moved, shape (any, k)."""
-        return np.eye(value.size) if self.smooth or self.proportional else np.zeros((0, value.size))
+        return np.eye(value.size)[: self.moved if self.smooth or self.proportional or self.moved else 0]
 
     def within(self, value: Vector) -> Vector:
         """Return the nearest value that is possible."""
@@ -94,7 +99,7 @@ class Difference:
 
     def inverse(self, value: Vector) -> Vector:
         """Return the value that says what side A does otherwise than side B."""
-        return -value if self.smooth or self.proportional else value
+        return -value if self.smooth or self.proportional or self.mutual else value
 
     def response(self, value: Vector, scene: Scene, pair: ChannelPair) -> Maps | None:
         """Return what it makes of a scene whose sky is not that of ``maps``; None: what scene and maps say."""
@@ -106,7 +111,7 @@ class Difference:
 
     def amplitude(self, value: Vector) -> float:
         """Return the amplitude as it is reported."""
-        return float(value[0])
+        return float(value[0]) if self.counted else 1.0
 
     def said(self, value: Vector) -> str:
         """Return the amplitude in words, where its sign alone would mislead."""

@@ -45,6 +45,7 @@ class EffectDifference(Difference):
 
     def __init__(self, kind: type[Effect], templates: Maps, run: config.RunConfig, sky: Alm) -> None:
         self.kind, self.templates, self.run, self.sky = kind, templates, run, sky
+        self.name, self.unit, self.met = kind.name, kind.unit, kind.cause
         self._there: dict[tuple[bytes | float, ...], Maps] = {}
         self._products = np.tensordot(templates, templates, ((1, 2), (1, 2))) / templates[0].size
         power = healpy.alm2cl(sky)
@@ -157,21 +158,6 @@ class EffectDifference(Difference):
     def parameters(self, value: Vector) -> dict[str, float | str]:
         """Return its other parameters."""
         return {k: v for k, v in self._effect(value).parameters().items() if isinstance(v, float | str)}
-
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        """Of the effect."""
-        return self.kind.name
-
-    @property
-    def unit(self) -> str:  # type: ignore[override]
-        """Of its amplitude."""
-        return self.kind.unit
-
-    @property
-    def met(self) -> str:  # type: ignore[override]
-        """Its cause."""
-        return self.kind.cause
 
 
 def effects_of(pair: ChannelPair, run: config.RunConfig) -> Iterator[EffectDifference]:

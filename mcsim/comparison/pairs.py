@@ -153,14 +153,9 @@ def read(
         if not Path(side).is_dir() and _made_elsewhere((b, a)[own]):
             sides[own] = _closer(sides[own], sides[other], config.load(side), nthreads)
     if run is None:
-        names = [name for name in sides[0] if name in sides[1]]
-        groups = {name: [name] for name in names}
+        groups = {name: [name] for name in sides[0] if name in sides[1]}
     else:
-        groups = {
-            channel.name: [n for n in config.map_names(run) if n.partition(":")[0] == channel.name]
-            for channel in run.channels
-        }
-        groups = {c: names for c, names in groups.items() if all(n in side for n in names for side in sides)}
+        groups = {c: names for c, names in _groups(run).items() if all(n in side for n in names for side in sides)}
     if not groups:
         raise InputError(
             f"{a} and {b} have no channel in common; give both maps of the same names, CHANNEL.fits or "
@@ -194,11 +189,14 @@ def given(a: Given, b: Given, run: config.RunConfig, nthreads: int = 1) -> Compa
     run, orders = in_full(run)
     whole = survey(quiet(run), nthreads, orders=orders_of(run))
     sides = [dict(zip(names, side, strict=True)) for side in (a, b)]
-    found = (
-        _pair(c.name, [n for n in names if n.partition(":")[0] == c.name], sides, whole, nthreads) for c in run.channels
-    )
+    found = (_pair(name, maps, sides, whole, nthreads) for name, maps in _groups(run).items())
     pairs = (replace(pair, orders=orders.get(pair.name)) for pair in found)
     return Comparison(tuple(_with_noise(pair, run) for pair in pairs), run)
+
+
+def _groups(run: config.RunConfig) -> dict[str, list[str]]:
+    """Return the names of the maps of each channel."""
+    return {channel.name: [one.name for one in run.each_map if one.channel is channel] for channel in run.channels}
 
 
 def _in_order(side: Given, names: Sequence[str]) -> Sequence[NDArray[np.float64]]:
@@ -312,7 +310,7 @@ def _folder(folder: Path, run: config.RunConfig | None) -> dict[str, NDArray[np.
     if run is not None:
         own = file_names(run)
         names = {name: folder / file for name, file in own.items() if (folder / file).is_file()}
-        frequencies = {n: c.frequency_ghz for n in own for c in run.channels if n.partition(":")[0] == c.name}
+        frequencies = {one.name: one.channel.frequency_ghz for one in run.each_map}
     if not names:
         expected = "any FITS map" if run is None else ", ".join(file_names(run).values())
         raise InputError(f"{folder} holds no map to compare; give {expected}.")

@@ -237,6 +237,8 @@ class FarTimeShift(Difference):
     name, unit = "time_shift", "samples"
     met = "time stamps, or a file of pointings, off by one"
     stage = 2
+    ways = (1.0, -1.0)
+    mutual = True
 
     def __init__(self) -> None:
         self._made: dict[tuple[bytes, bytes], Maps] = {}
@@ -247,7 +249,7 @@ class FarTimeShift(Difference):
         if state.scene is None or pair.channel is None or pair.channel.site.pointing is None:
             return []
         far = np.std((pair.b - state.maps)[seen]) > FAR * np.std(pair.a[seen])
-        return [np.array([way]) for way in (1.0, -1.0)] if far and pair.pointing(SAMPLES) is not None else []
+        return super().starts(state) if far and pair.pointing(SAMPLES) is not None else []
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
         scene, pointing = state.pair.scene, state.pair.pointing(SAMPLES)
@@ -258,6 +260,3 @@ class FarTimeShift(Difference):
             there = replace(scene, late=value[0]).sampled(pointing, scene.window)
             self._made[key] = there - scene.sampled(pointing, scene.window)
         return maps + self._made[key]
-
-    def inverse(self, value: Vector) -> Vector:
-        return -value
