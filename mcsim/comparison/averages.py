@@ -15,17 +15,10 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.support.arrays import Vector
 
-FINEST = 2048
-"""Largest nside of the sub-pixels that are tried, but for the first two powers of two."""
-
-LEVELS = 4
-"""Powers of two by which they are finer."""
-
-TELLING = 0.5
-"""Correlation with what is left that the mean of 4 sub-pixels has at least, if others are tried."""
-
-KEPT = 12
-"""Responses that are kept."""
+FINEST = 2048  #: largest nside of the sub-pixels that are tried, but for the first two powers of two
+LEVELS = 4  #: powers of two by which they are finer
+TELLING = 0.5  #: correlation with what is left that the mean of 4 sub-pixels has at least, if others are tried
+KEPT = 12  #: responses that are kept
 
 
 class PixelAverage(Difference):

@@ -28,8 +28,7 @@ REDUNDANT = ("calibration", "monopole_residual", "pixelization", "spectrum")
 STAGES = ("sky", "beam", "pointing", "gain", "signal", "spread", "orientations")
 """Where an effect must act to change a map without noise."""
 
-BEAM_STAGES = ("beam", "pointing", "spread", "orientations")
-"""Where an effect acts on how the sky is seen."""
+BEAM_STAGES = ("beam", "pointing", "spread", "orientations")  #: where an effect acts on how the sky is seen
 
 
 class EffectDifference(Difference):

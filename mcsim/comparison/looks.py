@@ -8,18 +8,14 @@ from numpy.typing import NDArray
 
 from mcsim.sphere import healpix
 
-WHITE = 0.15
-"""Largest correlation of neighbouring pixels of a white map."""
-
-STEEP = 1.0
-"""Power of l from which on the ratio of two amplitudes is called steep."""
+WHITE = 0.15  #: largest correlation of neighbouring pixels of a white map
+STEEP = 1.0  #: power of l from which on the ratio of two amplitudes is called steep
 
 HALF = 0.5
 FEW = 0.1
 """Share of the pixels, or of the degrees, that is few for half of the variance; half a sky's is at least as much."""
 
-ALIKE = 0.3
-"""Correlation with the sky, or its size, or hits, that is worth telling."""
+ALIKE = 0.3  #: correlation with the sky, or its size, or hits, that is worth telling
 
 _BANDS = 6
 

@@ -14,12 +14,8 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import header
 from mcsim.support.arrays import Vector
 
-SCREENED = 50_000
-"""Pixels on which orders of pixels are compared at most."""
-
-
-ALIKE = 0.5
-"""Correlation of neighbouring pixels from which on maps are no noise."""
+SCREENED = 50_000  #: pixels on which orders of pixels are compared at most
+ALIKE = 0.5  #: correlation of neighbouring pixels from which on maps are no noise
 
 MORE_ALIKE = 0.2
 """By how much mirrored maps must correlate more with side B: maps of different skies do so by chance, or a little."""

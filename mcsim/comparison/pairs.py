@@ -29,14 +29,12 @@ from mcsim.systematics.base import Pointing
 Given = Sequence[NDArray[np.float64]] | Mapping[str, NDArray[np.float64]]
 """Maps as arrays, in the order of a run's or by name."""
 
-HELD = 20_000_000
-"""The same of samples in files, which are held in memory."""
+HELD = 20_000_000  #: the same of samples in files, which are held in memory
 
 CLEARLY = 0.1
 """Share of the squares that fewer orders of a beam must leave at most where the other program may have had all."""
 
-_STORED = (".fits", ".fit", ".gz", ".npy", ".npz", ".h5", ".hdf5", ".nc")
-"""What a file of maps is called."""
+_STORED = (".fits", ".fit", ".gz", ".npy", ".npz", ".h5", ".hdf5", ".nc")  #: what a file of maps is called
 
 
 @dataclass(frozen=True, eq=False)

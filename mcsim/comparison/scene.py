@@ -25,20 +25,11 @@ from mcsim.support.arrays import Alm
 from mcsim.systematics.base import Pointing
 from mcsim.systematics.shape import displaced
 
-Maps = NDArray[np.float64]
-"""Maps of one channel, uK, shape (split, npix)."""
-
-KEPT = 4
-"""Transforms that are kept: scenes with the same sky and beam differ in their moments alone."""
-
-KEPT_BEAMS = 64
-"""Displaced beams that are kept: one for every time shift that is tried."""
-
-EPSILON = 1e-7
-"""Accuracy of the interpolation of single samples."""
-
-WEAKEST = 1e-4
-"""Share of its largest value below which a beam's window is not divided out."""
+Maps = NDArray[np.float64]  #: maps of one channel, uK, shape (split, npix)
+KEPT = 4  #: transforms that are kept: scenes with the same sky and beam differ in their moments alone
+KEPT_BEAMS = 64  #: displaced beams that are kept: one for every time shift that is tried
+EPSILON = 1e-7  #: accuracy of the interpolation of single samples
+WEAKEST = 1e-4  #: share of its largest value below which a beam's window is not divided out
 
 
 @dataclass(frozen=True, eq=False)

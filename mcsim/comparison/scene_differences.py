@@ -25,14 +25,9 @@ from mcsim.sphere import healpix
 from mcsim.sphere.rotation import euler_angles, rotation_matrix
 from mcsim.support.arrays import Vector
 
-_SMALL = 1e-3
-"""Small angle in radians, share of a sample, or change of a variance, over which responses are linear."""
-
-WIDEST = 99.0
-"""Largest variance of a smoothing over the beam's: ten times its width; more would make any sky vanish."""
-
-FAINT = 0.1
-"""Share of the rms below which a time shift that explains it is not looked for."""
+_SMALL = 1e-3  #: small angle in radians, share of a sample, or change of a variance, over which responses are linear
+WIDEST = 99.0  #: largest variance of a smoothing over the beam's: ten times its width; more would make any sky vanish
+FAINT = 0.1  #: share of the rms below which a time shift that explains it is not looked for
 
 
 def _orders(beam: Beam) -> NDArray[np.int64]:

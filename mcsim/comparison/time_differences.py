@@ -17,32 +17,18 @@ from mcsim.sphere import healpix
 from mcsim.support.arrays import Vector
 from mcsim.systematics.base import Pointing
 
-PIXELS_PER_BASELINE = 4
-"""Pixels that are seen for every baseline at least: with fewer, baselines make any map."""
-
-FEWEST = 16
-"""Baselines at least."""
-
-PREDICTED = 0.5
-"""Share of half of the pixels' variance that baselines fitted to the other half must explain."""
+PIXELS_PER_BASELINE = 4  #: pixels that are seen for every baseline at least: with fewer, baselines make any map
+FEWEST = 16  #: baselines at least
+PREDICTED = 0.5  #: share of half of the pixels' variance that baselines fitted to the other half must explain
 
 SCREENING, FITTED = 1e-3, 1e-6
 """Accuracy of fits of baselines that are tried, and of those that are named: gradient over sizes of matrix and rest."""
 
-SAMPLES = 30_000_000
-"""Samples of the longest survey whose single samples are fitted or looked up."""
-
-FINEST = 4
-"""Largest power of two by which a grid's nside may exceed that of the maps."""
-
-BAND = 0.02
-"""Share of the sky in which grids are tried."""
-
-TELLING = 0.1
-"""Share of the rms there that a grid's errors must explain."""
-
-FAR = 0.1
-"""Rms over the sky's of what is left from which on time stamps of another part of the sky may make it."""
+SAMPLES = 30_000_000  #: samples of the longest survey whose single samples are fitted or looked up
+FINEST = 4  #: largest power of two by which a grid's nside may exceed that of the maps
+BAND = 0.02  #: share of the sky in which grids are tried
+TELLING = 0.1  #: share of the rms there that a grid's errors must explain
+FAR = 0.1  #: rms over the sky's of what is left from which on time stamps of another part of the sky may make it
 
 
 class MapMaking(Difference):

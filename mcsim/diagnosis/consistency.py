@@ -19,13 +19,11 @@ from mcsim.systematics import Effect
 
 Rows = NDArray[np.int64]
 
-LARGE = 12
-"""Highest degree of the largest scales."""
+LARGE = 12  #: highest degree of the largest scales
 
 FRAMES = ("ecliptic", "galactic", "equatorial")
 
-SPARE, SPARE_SHRUNK = 2.0, 1.5
-"""Simulations per element that a comparison needs; with a shrunk covariance."""
+SPARE, SPARE_SHRUNK = 2.0, 1.5  #: simulations per element that a comparison needs; with a shrunk covariance
 
 
 @dataclass(frozen=True)

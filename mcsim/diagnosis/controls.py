@@ -34,18 +34,14 @@ from mcsim.support.npy import read_npy
 from mcsim.support.numbers import duration
 from mcsim.support.progress import reporting
 
-SEED = 0x6D63 * 1_000 + 3
-"""Seed of the controls; the simulations that a diagnosis learns with have two others."""
+SEED = 0x6D63 * 1_000 + 3  #: seed of the controls; the simulations that a diagnosis learns with have two others
 
 FINER, FINEST = (4, 2), 2048
 """Factors by which the pixels that are made are refined before they are degraded, the first that is possible; and the
 largest nside."""
 
-REST = 0.01
-"""Standard deviations by which sky power that controls lack may move the variance of the pixels of a map."""
-
-SAMPLE_S = 1e-6
-"""Seconds that one sample takes on one core, for estimates."""
+REST = 0.01  #: standard deviations by which sky power that controls lack may move the variance of the pixels of a map
+SAMPLE_S = 1e-6  #: seconds that one sample takes on one core, for estimates
 
 
 def check(count: int, of_maps: bool, external: bool = False) -> None:

@@ -18,8 +18,7 @@ from mcsim.support.arrays import Matrix, Vector, divided
 MEASURED = 0.04
 """Share of the prior variance that the data leave at most of a nuisance whose response is that of the regression."""
 
-LEAST = 0.1
-"""Share of the prior variance that the data have to remove for a pull to be given."""
+LEAST = 0.1  #: share of the prior variance that the data have to remove for a pull to be given
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,7 @@ from mcsim.stats.look_elsewhere import GlobalTest
 from mcsim.support.arrays import Vector, texts
 
 STORE = "diagnosis.zarr"
-PLACES = 12
-"""Groups in the localisation table of ``verdict.json`` and of the report."""
+PLACES = 12  #: groups in the localisation table of ``verdict.json`` and of the report
 
 
 @dataclass(frozen=True)
