@@ -25,14 +25,8 @@ def look(
 ) -> tuple[str, ...]:
     """Return what one map that is left looks like, in words, the most telling first.
 
-    Parameters
-    ----------
-    left, a
-        What is left, and side A, uK, shape (npix,).
-    seen
-        Where they are known, shape (npix,).
-    hits
-        Samples per pixel, shape (npix,); None if they are not known.
+    ``left``, ``a``: what is left, and side A, uK; ``seen``: where they are known; ``hits``: samples per pixel, None if
+    they are not known; shape (npix,) each.
     """
     rest = np.where(seen, left, 0.0)
     if not rest.any():

@@ -238,14 +238,8 @@ class Scene:
     ) -> Maps:
         """Return the maps sample by sample, without the approximations of :meth:`maps`.
 
-        Parameters
-        ----------
-        pointing
-            Of the channel.
-        window
-            Pixel window that the spread of the samples makes by itself, shape (lmax + 1,).
-        signal
-            How samples see the sky, in place of the beam's convolution.
+        ``window``: pixel window that the spread of the samples makes by itself, shape (lmax + 1,); ``signal``: how
+        samples see the sky, in place of the beam's convolution.
         """
         own, key = signal is None, (id(pointing), window.tobytes())
         if own and key in self._made:

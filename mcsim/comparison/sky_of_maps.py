@@ -33,16 +33,8 @@ def sky_in(
 
     What maps of that nside cannot hold, above l = 3 nside - 1, is zero, and so is what the beam suppresses.
 
-    Parameters
-    ----------
-    maps, seen
-        Shape (split, npix) each.
-    empty
-        Scene of the channel; its sky is not used.
-    tolerance
-        Residual at which iterations end, over the maps' own size.
-    beside
-        Sky whose maps are taken off already; None: none.
+    ``maps``, ``seen``: shape (split, npix) each; ``empty``: scene of the channel, whose sky is not used; ``tolerance``:
+    residual at which iterations end, over the maps' own size; ``beside``: sky whose maps are taken off already.
 
     Notes
     -----

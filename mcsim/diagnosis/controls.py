@@ -155,23 +155,9 @@ def _survey(run: str, library: Kinds) -> DisturbedSurvey:
 def diagnose_controls(known: DiagnosisContext, key: str, count: int, call: Batch, quiet: bool = True) -> Controls:
     """Draw and diagnose controls, each once: their verdicts are kept in the cache.
 
-    Parameters
-    ----------
-    known
-        What the data are tested with.
-    key
-        Hash of all that this follows from.
-    count
-        Number of controls; more than before go on where those ended.
-    call
-        Runs the draws, and the simulations of effects that are fitted to controls.
-    quiet
-        Report no progress.
-
-    Raises
-    ------
-    RunError
-        If workers have another cache than this process.
+    ``key`` is the hash of all that ``known``, what the data are tested with, follows from. More controls than before go
+    on where those ended. ``call`` runs the draws, and the simulations of effects that are fitted to controls. RunError
+    if workers have another cache than this process.
     """
     with reporting("orientation moments of the controls", 1.0, "", quiet) as report:
         drawn = fidelity(known.analysis, os.cpu_count() or 1)
