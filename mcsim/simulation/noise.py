@@ -75,9 +75,9 @@ def of_map(
 ) -> tuple[Moments, Map | None, DrawnNoise | None]:
     """Return moments of a map, standard deviation of its noise, and how it is drawn where it is not white.
 
-    The deviation has shape (npix,) and is None without noise. A map of hits takes the place of the scan's hits, and what is not observed in a map of hits or variances is not
-    observed. InputError if a file of the run cannot be used; its pixels and frame must be those of the maps that are
-    made.
+    The deviation has shape (npix,) and is None without noise. A map of hits takes the place of the scan's hits, and
+    what is not observed in a map of hits or variances is not observed. InputError if a file of the run cannot be used;
+    its pixels and frame must be those of the maps that are made.
     """
     noise = spec.noise_of(split)
     if isinstance(noise, declared.Noise) and noise.hits is not None:
