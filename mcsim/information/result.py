@@ -25,28 +25,40 @@ RESOLVED = 1e-10  #: directions of an effect with less than this share of its la
 
 @dataclass(frozen=True)
 class EffectLimit:
-    """The limit of one effect."""
+    """The limit of one effect.
 
-    #: name, channel, settings, unit, label: of the effect; ``channel`` None: acts in all
+    Attributes
+    ----------
+    name, channel, settings, unit, label
+        Of the effect; ``channel`` None: acts in all.
+    components
+        Number of its linear components.
+    sigma, error
+        Standard error of its amplitude, for the root mean square response over its components, in ``unit``; and the
+        relative error of that from random probes, 0 if there are none. Infinite where the maps do not respond.
+    amplitude_90_known
+        Amplitude that is detected with the power asked for if this effect is the only one that is tested.
+    amplitude_90
+        The same if all effects of the library are tested (Bonferroni).
+    similar, correlation
+        Index of the other effect with the most similar response, None without one, and their canonical correlation.
+    separable
+        Amplitude at which the right one of the two is chosen with the probability asked for.
+    """
+
     name: str
     channel: str | None
     settings: dict[str, Any]
     unit: str
     label: str
-    components: int  #: number of its linear components
-    #: sigma, error: standard error of its amplitude, for the root mean square response over its components, in
-    #: ``unit``; and the relative error of that from random probes, 0 if there are none. Infinite where the maps do not
-    #: respond.
+    components: int
     sigma: float
     error: float
-    #: amplitude that is detected with the power asked for if this effect is the only one that is tested
     amplitude_90_known: float
-    amplitude_90: float  #: the same if all effects of the library are tested (Bonferroni)
-    #: similar, correlation: index of the other effect with the most similar response, None without one, and their
-    #: canonical correlation
+    amplitude_90: float
     similar: int | None
     correlation: float
-    separable: float  #: amplitude at which the right one of the two is chosen with the probability asked for
+    separable: float
 
 
 @dataclass(frozen=True, eq=False)
