@@ -26,33 +26,22 @@ NEGLIGIBLE = 0.1
 
 @dataclass(frozen=True)
 class Fit:
-    """A model of f_l fitted to measured BipoSH.
+    """A model of f_l fitted to measured BipoSH."""
 
-    Attributes
-    ----------
-    measured, model
-        Data vector, and model of f_l without a parameter that the data do not constrain (the imaginary part of
-        ``orientation``).
-    order, beyond_leading
-        "leading", or "exact" to all orders in the beam; and the size in sigma of the higher ones at the best fit,
-        ``None`` if leading order was requested.
-    offset, design
-        The expected data are offset + design @ parameters, uK^2: shapes (p,), (p, K); if ``order`` is "exact",
-        this is their tangent at the best fit.
-    solution
-        Parameters, their covariance, chi2, its degrees of freedom and probability.
-    each
-        Fits of every realization, if made by :func:`fit_each`.
-    """
-
+    #: measured, model: data vector, and model of f_l without a parameter that the data do not constrain (the imaginary
+    #: part of ``orientation``)
     measured: Measurement
     model: Model
+    #: order, beyond_leading: "leading", or "exact" to all orders in the beam; and the size in sigma of the higher ones
+    #: at the best fit, ``None`` if leading order was requested
     order: str
+    #: offset, design: the expected data are offset + design @ parameters, uK^2: shapes (p,), (p, K); if ``order`` is
+    #: "exact", this is their tangent at the best fit
     offset: NDArray[np.float64]
     design: NDArray[np.float64]
-    solution: Solution
+    solution: Solution  #: parameters, their covariance, chi2, its degrees of freedom and probability
     beyond_leading: float | None = None
-    each: tuple[Solution, ...] = ()
+    each: tuple[Solution, ...] = ()  #: fits of every realization, if made by :func:`fit_each`
 
     @property
     def best(self) -> NDArray[np.float64]:

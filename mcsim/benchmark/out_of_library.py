@@ -6,6 +6,7 @@ from mcsim import config, systematics
 from mcsim.datavector.analysis import Job, data_vectors
 from mcsim.datavector.campaign import Batch, with_effects
 from mcsim.errors import InputError
+from mcsim.simulation.channels import table_of
 from mcsim.support.arrays import Vector
 from mcsim.systematics import Effect, Library
 
@@ -49,10 +50,7 @@ def responses(run: config.RunConfig, file: str, call: Batch) -> dict[str, list[O
     ]
     # An effect of no strength: the dipole is seen and subtracted only where there is some effect.
     idle = [config.Effect(name="beam_width", channel=name, parameters={"amplitude": 0.0}) for name in channels]
-    added = [
-        config.Effect(name=one.name, channel=channel, parameters={"amplitude": one.amplitude, **one.parameters()})
-        for channel, one in units
-    ]
+    added = [table_of(one, channel) for channel, one in units]
     quiet = replace(run.unfiltered(), channels=tuple(channel.without_noise() for channel in run.channels))
     runs = [with_effects(quiet, [*idle, *more]) for more in ((), *([one] for one in added))]
     jobs = [(Job(config.to_json(run), config.to_json(one), 0, SKIES, True), file) for one in runs]

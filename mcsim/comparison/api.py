@@ -25,14 +25,9 @@ from mcsim.errors import InputError
 from mcsim.support import folders
 from mcsim.support.progress import reporting
 
-ROUNDING = 1e-6
-"""Rms of a difference over that of the sky that single precision makes."""
-
-INTERPOLATION = 1e-3
-"""The same for the interpolation of a sky between pixels or grid points."""
-
-INTERPOLATED = 0.02
-"""Share of the variance that a width of the beam leaves at least of such an interpolation's error."""
+ROUNDING = 1e-6  #: rms of a difference over that of the sky that single precision makes
+INTERPOLATION = 1e-3  #: the same for the interpolation of a sky between pixels or grid points
+INTERPOLATED = 0.02  #: share of the variance that a width of the beam leaves at least of such an interpolation's error
 
 CLEARLY = 0.1
 """Share of what a named set leaves that one of exchanged sides must leave at most to be named in its place."""
@@ -40,14 +35,9 @@ CLEARLY = 0.1
 DOUBTFUL = 0.01
 """Share that a set that is named may leave, beyond which differences of the last stage are tried all the same."""
 
-DOUBTFUL_TOGETHER = 1e-5
-"""The same of several differences, beyond which the model may rather describe side B."""
-
-UNLIKE = 0.2
-"""Correlation of two sides below which they show different skies."""
-
-SAME_SKY = 0.9
-"""Correlation with the sky of side A below which effects are simulated on the sky of side B again."""
+DOUBTFUL_TOGETHER = 1e-5  #: the same of several differences, beyond which the model may rather describe side B
+UNLIKE = 0.2  #: correlation of two sides below which they show different skies
+SAME_SKY = 0.9  #: correlation with the sky of side A below which effects are simulated on the sky of side B again
 
 
 def compare(

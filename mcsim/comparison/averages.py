@@ -9,23 +9,16 @@ from numpy.typing import NDArray
 
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
-from mcsim.comparison.scene import Maps, Scene
+from mcsim.comparison.scene import Maps, Scene, keep
 from mcsim.simulation import convolve
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.support.arrays import Vector
 
-FINEST = 2048
-"""Largest nside of the sub-pixels that are tried, but for the first two powers of two."""
-
-LEVELS = 4
-"""Powers of two by which they are finer."""
-
-TELLING = 0.5
-"""Correlation with what is left that the mean of 4 sub-pixels has at least, if others are tried."""
-
-KEPT = 12
-"""Responses that are kept."""
+FINEST = 2048  #: largest nside of the sub-pixels that are tried, but for the first two powers of two
+LEVELS = 4  #: powers of two by which they are finer
+TELLING = 0.5  #: correlation with what is left that the mean of 4 sub-pixels has at least, if others are tried
+KEPT = 12  #: responses that are kept
 
 
 class PixelAverage(Difference):
@@ -72,9 +65,7 @@ class PixelAverage(Difference):
                 healpix.synthesis(alm[None], n, lmax, nthreads=scene.nthreads)[0]
                 for alm, n in ((sky, 2**level * nside), (here, nside))
             )
-            self._made[key] = sign * (healpy.ud_grade(fine, nside) - there)
-            while len(self._made) > KEPT:
-                self._made.popitem(last=False)
+            keep(self._made, key, sign * (healpy.ud_grade(fine, nside) - there), KEPT)
         return np.stack([self._made[key]] * len(scene.moments))
 
     def inverse(self, value: Vector) -> Vector:

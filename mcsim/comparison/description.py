@@ -7,11 +7,8 @@ from mcsim.ensemble.external import named_source
 from mcsim.errors import InputError
 from mcsim.simulation.channels import described, known_offsets, load_beam, with_all_orders
 
-SAMPLES = 100_000_000
-"""Samples of the longest survey that is simulated sample by sample."""
-
-EXTRA_ORDERS = 3
-"""Moments beyond the beam's orders: a displaced beam has them."""
+SAMPLES = 100_000_000  #: samples of the longest survey that is simulated sample by sample
+EXTRA_ORDERS = 3  #: moments beyond the beam's orders: a displaced beam has them
 
 
 def quiet(run: config.RunConfig) -> config.RunConfig:

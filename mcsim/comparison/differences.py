@@ -18,24 +18,14 @@ from mcsim.support.arrays import Vector
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What is predicted for side B so far.
+    """What is predicted for side B so far."""
 
-    Attributes
-    ----------
-    pair
-        The channel on both sides; its ``b`` is to be reached.
-    scene, maps
-        Of the prediction; no scene without a model.
-    others
-        The other channels.
-    free
-        Orthonormal changes of the prediction that are fitted besides, over the pixels that are seen, shape (k, n).
-    """
-
-    pair: ChannelPair
+    pair: ChannelPair  #: the channel on both sides; its ``b`` is to be reached
+    #: scene, maps: of the prediction; no scene without a model
     scene: Scene | None
     maps: Maps
-    others: Sequence[ChannelPair]
+    others: Sequence[ChannelPair]  #: the other channels
+    #: orthonormal changes of the prediction that are fitted besides, over the pixels that are seen, shape (k, n)
     free: NDArray[np.float64] | None = None
 
     def fit(self, templates: Sequence[Maps]) -> Vector:
@@ -56,50 +46,36 @@ class State:
 
 
 class Difference:
-    """A difference of implementation.
+    """A difference of implementation."""
 
-    Attributes
-    ----------
-    name, unit
-        As in ``compare.json``.
-    met
-        Where such a difference was met.
-    needs_scene
-        True if it cannot be described without a model.
-    smooth
-        True if the value is refined by least squares.
-    natural
-        Size of a value that is neither small nor large.
-    stage
-        When it is tried: 0 at once, 1 where those leave something, 2 where nothing else explains the maps.
-    enough
-        Share of the variance that a set with it must explain at most to be named; 1: as all sets.
-    proportional
-        True if the response is proportional to the value, which is then fitted at once.
-    linear
-        True if the response is the template of a small amplitude, and so no better than about a per mille.
-    exchanges
-        True if it exchanges pixels, files or units, which can be taken back before the rest is looked for.
-    turns
-        True if it turns or mirrors samples or beam: what two of these make together neither says by itself.
-    """
-
-    name: ClassVar[str]
-    unit: ClassVar[str]
-    met: ClassVar[str]
-    needs_scene: ClassVar[bool] = True
-    smooth: ClassVar[bool] = False
-    natural: ClassVar[float] = 1.0
+    #: name, unit, met: as in ``compare.json``; ``met`` says where such a difference was met
+    name: str
+    unit: str
+    met: str
+    needs_scene: ClassVar[bool] = True  #: True if it cannot be described without a model
+    smooth: ClassVar[bool] = False  #: True if the value is refined by least squares
+    natural: ClassVar[float] = 1.0  #: size of a value that is neither small nor large
+    #: when it is tried: 0 at once, 1 where those leave something, 2 where nothing else explains the maps
     stage: ClassVar[int] = 0
+    #: share of the variance that a set with it must explain at most to be named; 1: as all sets
     enough: ClassVar[float] = 1.0
+    #: True if the response is proportional to the value, which is then fitted at once
     proportional: ClassVar[bool] = False
+    #: True if the response is the template of a small amplitude, and so no better than about a per mille
     linear: ClassVar[bool] = False
+    #: True if it exchanges pixels, files or units, which can be taken back before the rest is looked for
     exchanges: ClassVar[bool] = False
+    #: True if it turns or mirrors samples or beam: what two of these make together neither says by itself
     turns: ClassVar[bool] = False
+    #: ways, mutual: values to try where only some are possible; True if the other side's has the other sign
+    ways: ClassVar[tuple[float, ...]] = (1.0,)
+    mutual: ClassVar[bool] = False
+    moved: ClassVar[int | None] = None  #: how many numbers of the value are moved, the first ones; None: all
+    counted: ClassVar[bool] = True  #: False: there is no amount of it, and the amplitude is 1
 
     def starts(self, state: State) -> list[Vector]:
         """Return the values to try, shape (k,) each."""
-        return [np.ones(1)]
+        return [np.array([way]) for way in self.ways]
 
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
         """Return the scene of side B."""
@@ -115,7 +91,7 @@ class Difference:
 
     def axes(self, value: Vector) -> Vector:
         """Return unit vectors along which the value may be moved, shape (any, k)."""
-        return np.eye(value.size) if self.smooth or self.proportional else np.zeros((0, value.size))
+        return np.eye(value.size)[: self.moved if self.smooth or self.proportional or self.moved else 0]
 
     def within(self, value: Vector) -> Vector:
         """Return the nearest value that is possible."""
@@ -123,7 +99,7 @@ class Difference:
 
     def inverse(self, value: Vector) -> Vector:
         """Return the value that says what side A does otherwise than side B."""
-        return -value if self.smooth or self.proportional else value
+        return -value if self.smooth or self.proportional or self.mutual else value
 
     def response(self, value: Vector, scene: Scene, pair: ChannelPair) -> Maps | None:
         """Return what it makes of a scene whose sky is not that of ``maps``; None: what scene and maps say."""
@@ -135,7 +111,7 @@ class Difference:
 
     def amplitude(self, value: Vector) -> float:
         """Return the amplitude as it is reported."""
-        return float(value[0])
+        return float(value[0]) if self.counted else 1.0
 
     def said(self, value: Vector) -> str:
         """Return the amplitude in words, where its sign alone would mislead."""

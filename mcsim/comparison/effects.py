@@ -16,6 +16,7 @@ from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import ScanModel
 from mcsim.simulation import sampled, simulate
+from mcsim.simulation.channels import table_of
 from mcsim.simulation.survey import Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.support.arrays import Alm, Vector
@@ -28,8 +29,7 @@ REDUNDANT = ("calibration", "monopole_residual", "pixelization", "spectrum")
 STAGES = ("sky", "beam", "pointing", "gain", "signal", "spread", "orientations")
 """Where an effect must act to change a map without noise."""
 
-BEAM_STAGES = ("beam", "pointing", "spread", "orientations")
-"""Where an effect acts on how the sky is seen."""
+BEAM_STAGES = ("beam", "pointing", "spread", "orientations")  #: where an effect acts on how the sky is seen
 
 
 class EffectDifference(Difference):
@@ -45,13 +45,13 @@ class EffectDifference(Difference):
 
     def __init__(self, kind: type[Effect], templates: Maps, run: config.RunConfig, sky: Alm) -> None:
         self.kind, self.templates, self.run, self.sky = kind, templates, run, sky
+        self.name, self.unit, self.met = kind.name, kind.unit, kind.cause
         self._there: dict[tuple[bytes | float, ...], Maps] = {}
         self._products = np.tensordot(templates, templates, ((1, 2), (1, 2))) / templates[0].size
         power = healpy.alm2cl(sky)
         self._largest = float((2 * np.arange(power.size) + 1) @ power) / (4.0 * np.pi)
 
     def starts(self, state: State) -> list[Vector]:
-        """Return the coordinates that fit best."""
         return [self.within(state.fit(list(self.templates)))]
 
     def within(self, value: Vector) -> Vector:
@@ -63,7 +63,6 @@ class EffectDifference(Difference):
         return value / max(1.0, float(np.sqrt(size)))
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
-        """Return the maps with the effect's response."""
         return maps + np.tensordot(value, self._templates_in(state), 1)
 
     def _templates_in(self, state: State) -> Maps:
@@ -139,13 +138,12 @@ class EffectDifference(Difference):
             table: Any = replace(beam, blm=turn[:, None] * beam.blm)
             channel = replace(channel, beam=table)
         alone = replace(self.run, channels=(channel,))
-        return alone, replace(alone, effects=(_table(effect, pair.name),))
+        return alone, replace(alone, effects=(table_of(effect, pair.name if effect.scope == "channel" else None),))
 
     def _effect(self, value: Vector) -> Effect:
         return self.kind(**self.kind.parametrization.nearest(value, np.eye(value.size)))
 
     def amplitude(self, value: Vector) -> float:
-        """Return the effect's amplitude."""
         return float(self._effect(value).amplitude)
 
     def said(self, value: Vector) -> str:
@@ -155,23 +153,7 @@ class EffectDifference(Difference):
         return self.kind.format_amplitude(amplitude) if own else ""
 
     def parameters(self, value: Vector) -> dict[str, float | str]:
-        """Return its other parameters."""
         return {k: v for k, v in self._effect(value).parameters().items() if isinstance(v, float | str)}
-
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        """Of the effect."""
-        return self.kind.name
-
-    @property
-    def unit(self) -> str:  # type: ignore[override]
-        """Of its amplitude."""
-        return self.kind.unit
-
-    @property
-    def met(self) -> str:  # type: ignore[override]
-        """Its cause."""
-        return self.kind.cause
 
 
 def effects_of(pair: ChannelPair, run: config.RunConfig) -> Iterator[EffectDifference]:
@@ -192,7 +174,7 @@ def effects_of(pair: ChannelPair, run: config.RunConfig) -> Iterator[EffectDiffe
         templates = []
         try:
             for effect in basis_of(kind):
-                acting = replace(alone, effects=(_table(effect, pair.name),))
+                acting = replace(alone, effects=(table_of(effect, pair.name if effect.scope == "channel" else None),))
                 templates.append(np.where(pair.seen, (made(acting) - bare) / _scale(kind, effect), 0.0))
         except InputError:  # it depends on what the model does not say: a frequency, a pointing, a differencing scan
             continue
@@ -262,11 +244,3 @@ def _periods(motion: ScanModel | None) -> tuple[float, float]:
 def _survey(run: config.RunConfig, scene: Scene) -> Survey:
     """Return the survey of a run with all orders of the moments of a scene, which are known."""
     return survey(run, scene.nthreads, orders=scene.moments[0].smax)
-
-
-def _table(effect: Effect, channel: str) -> config.Effect:
-    """Return an effect as a run names it."""
-    parameters = {"amplitude": effect.amplitude, **effect.parameters()}
-    return config.Effect(
-        name=effect.name, channel=channel if effect.scope == "channel" else None, parameters=parameters
-    )

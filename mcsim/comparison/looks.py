@@ -8,18 +8,14 @@ from numpy.typing import NDArray
 
 from mcsim.sphere import healpix
 
-WHITE = 0.15
-"""Largest correlation of neighbouring pixels of a white map."""
-
-STEEP = 1.0
-"""Power of l from which on the ratio of two amplitudes is called steep."""
+WHITE = 0.15  #: largest correlation of neighbouring pixels of a white map
+STEEP = 1.0  #: power of l from which on the ratio of two amplitudes is called steep
 
 HALF = 0.5
 FEW = 0.1
 """Share of the pixels, or of the degrees, that is few for half of the variance; half a sky's is at least as much."""
 
-ALIKE = 0.3
-"""Correlation with the sky, or its size, or hits, that is worth telling."""
+ALIKE = 0.3  #: correlation with the sky, or its size, or hits, that is worth telling
 
 _BANDS = 6
 
@@ -29,14 +25,8 @@ def look(
 ) -> tuple[str, ...]:
     """Return what one map that is left looks like, in words, the most telling first.
 
-    Parameters
-    ----------
-    left, a
-        What is left, and side A, uK, shape (npix,).
-    seen
-        Where they are known, shape (npix,).
-    hits
-        Samples per pixel, shape (npix,); None if they are not known.
+    ``left``, ``a``: what is left, and side A, uK; ``seen``: where they are known; ``hits``: samples per pixel, None if
+    they are not known; shape (npix,) each.
     """
     rest = np.where(seen, left, 0.0)
     if not rest.any():

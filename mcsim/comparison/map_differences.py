@@ -14,12 +14,8 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import header
 from mcsim.support.arrays import Vector
 
-SCREENED = 50_000
-"""Pixels on which orders of pixels are compared at most."""
-
-
-ALIKE = 0.5
-"""Correlation of neighbouring pixels from which on maps are no noise."""
+SCREENED = 50_000  #: pixels on which orders of pixels are compared at most
+ALIKE = 0.5  #: correlation of neighbouring pixels from which on maps are no noise
 
 MORE_ALIKE = 0.2
 """By how much mirrored maps must correlate more with side B: maps of different skies do so by chance, or a little."""
@@ -32,6 +28,7 @@ class Calibration(Difference):
     met = "a beam that is not normalised, or another calibration"
     needs_scene = False
     proportional = True
+    moved = 1
 
     def starts(self, state: State) -> list[Vector]:
         """Return the fraction, and 0 for maps with their noise or 1 for the sky alone, where they have noise.
@@ -46,9 +43,6 @@ class Calibration(Difference):
         if state.scene is not None and state.pair.doubt is not None:
             found.append(np.array([*state.fit([state.scene.maps()]), 1.0]))
         return found
-
-    def axes(self, value: Vector) -> Vector:
-        return np.eye(2)[:1]
 
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
         return replace(scene, sky=(1.0 + value[0]) * scene.sky) if value[1] else scene
@@ -144,23 +138,20 @@ class Ordering(Difference):
     name, unit = "ordering", "1 = NESTED for RING"
     met = "a header that does not say what the pixels are"
     needs_scene = False
-    exchanges = True
+    exchanges = mutual = True
+    ways = (1.0, -1.0)
 
     def starts(self, state: State) -> list[Vector]:
         """Return both ways, if side B is more like the prediction then, dipoles aside."""
-        ways = [np.array([1.0]), np.array([-1.0])]
-        return [way for way in ways if _alike(self.maps(state.maps, way, state), state) > _alike(state.maps, state)]
+        bare = _alike(state.maps, state)
+        return [way for way in super().starts(state) if _alike(self.maps(state.maps, way, state), state) > bare]
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
-        order = {"r2n": True} if value[0] > 0 else {"n2r": True}
-        return _complete(np.stack([healpy.reorder(one, **order) for one in maps]), state)
+        return _complete(self.undone(maps, -value), state)
 
     def undone(self, maps: Maps, value: Vector) -> Maps:
         order = {"n2r": True} if value[0] > 0 else {"r2n": True}
         return np.stack([healpy.reorder(one, **order) for one in maps])
-
-    def inverse(self, value: Vector) -> Vector:
-        return -value
 
 
 def _alike(maps: Maps, state: State) -> float:
@@ -178,7 +169,7 @@ class FrameReversed(Difference):
 
     name, unit = "frame_reversed", "1 = mirrored"
     met = "longitudes that count to the west, or colatitudes taken for latitudes"
-    needs_scene = False
+    needs_scene = counted = False
     exchanges = True
 
     def starts(self, state: State) -> list[Vector]:
@@ -200,9 +191,6 @@ class FrameReversed(Difference):
     def undone(self, maps: Maps, value: Vector) -> Maps | None:
         return None if value[1] else _mirrored(maps, int(value[0]))
 
-    def amplitude(self, value: Vector) -> float:
-        return 1.0
-
     def parameters(self, value: Vector) -> dict[str, float | str]:
         return {"coordinate": ("longitude", "latitude")[int(value[0])], "of": "the sky" if value[1] else "the pixels"}
 
@@ -220,7 +208,7 @@ class SplitExchanged(Difference):
 
     name, unit = "split_exchanged", "1 = exchanged"
     met = "files of halves that were renamed"
-    needs_scene = False
+    needs_scene = counted = False
     exchanges = True
 
     def starts(self, state: State) -> list[Vector]:
@@ -236,9 +224,6 @@ class SplitExchanged(Difference):
         order[i], order[j] = order[j], order[i]
         return maps[order]
 
-    def amplitude(self, value: Vector) -> float:
-        return 1.0
-
 
 def _complete(exchanged: Maps, state: State) -> Maps:
     """Return exchanged maps, and side B where they have no data and so nothing to say."""
@@ -250,16 +235,13 @@ class ChannelExchanged(Difference):
 
     name, unit = "channel_exchanged", "1 = exchanged"
     met = "detectors listed in another order"
-    needs_scene = False
+    needs_scene = counted = False
 
     def starts(self, state: State) -> list[Vector]:
         return [np.array([float(i)]) for i, other in enumerate(state.others) if other.a.shape == state.maps.shape]
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
         return _complete(state.others[int(value[0])].a, state)
-
-    def amplitude(self, value: Vector) -> float:
-        return 1.0
 
 
 def _is_noise(maps: Maps, state: State) -> bool:
@@ -277,9 +259,7 @@ class NoiseShared(Difference):
     met = "random seeds that do not depend on the detector or the split"
     needs_scene = False
     enough = 0.8  # the sky is known no better than the noise lets it be
-
-    def axes(self, value: Vector) -> Vector:
-        return np.eye(value.size)[:1]
+    moved = 1
 
     def starts(self, state: State) -> list[Vector]:
         """Return correlation, split that is changed (-1: all), split or channel that it is shared with, and how.

@@ -29,76 +29,45 @@ from mcsim.systematics.base import Pointing
 Given = Sequence[NDArray[np.float64]] | Mapping[str, NDArray[np.float64]]
 """Maps as arrays, in the order of a run's or by name."""
 
-HELD = 20_000_000
-"""The same of samples in files, which are held in memory."""
+HELD = 20_000_000  #: the same of samples in files, which are held in memory
 
 CLEARLY = 0.1
 """Share of the squares that fewer orders of a beam must leave at most where the other program may have had all."""
 
-_STORED = (".fits", ".fit", ".gz", ".npy", ".npz", ".h5", ".hdf5", ".nc")
-"""What a file of maps is called."""
+_STORED = (".fits", ".fit", ".gz", ".npy", ".npz", ".h5", ".hdf5", ".nc")  #: what a file of maps is called
 
 
 @dataclass(frozen=True, eq=False)
 class ChannelPair:
-    """The maps of one channel on both sides.
+    """The maps of one channel on both sides."""
 
-    Attributes
-    ----------
-    name, splits
-        Of the channel and of its maps.
-    a, b
-        Maps, uK, shape (split, npix).
-    seen
-        What both sides observed, shape (split, npix).
-    one_sided
-        Number of pixels that one side alone observed.
-    scene
-        What the model says of side A; None without a model.
-    channel
-        The same with everything that effects need, before any preparation; None without a model.
-    hits
-        Samples per pixel of the maps, of the model; None without one.
-    sky_of_maps
-        True if the scene's sky was taken from side A, and not from the model.
-    files
-        Samples of the channel, if the model has them in files.
-    doubt
-        A draw of what noise hides of the sky that side A shows, coefficients as the scene's; None if it hides nothing.
-    spread
-        What single samples change in side A, uK, if it was made from orientation moments and ``a`` has it since; None.
-    noise_uk
-        Of every pixel of the maps as the model has it, rms, shape (split, npix); None without one.
-    turned
-        True if the sides are exchanged: ``a`` is side B.
-    by_moments
-        True if side A was made from orientation moments or at the pixels' centres, so that no single sample has a say.
-    orders
-        Highest order of the beam in a run of the model, if that is not said and less than the scene's; None.
-    rounds
-        How often the sky that was taken from side A was corrected for what single samples leave of it.
-    unmade
-        What they leave of side A, uK, as the last correction of its sky has it, if that is noise; None: to be made.
-    """
-
+    #: name, splits: of the channel and of its maps
     name: str
     splits: tuple[str, ...]
+    #: a, b: maps, uK, shape (split, npix)
     a: Maps
     b: Maps
-    seen: NDArray[np.bool_]
-    one_sided: int = 0
-    scene: Scene | None = None
+    seen: NDArray[np.bool_]  #: what both sides observed, shape (split, npix)
+    one_sided: int = 0  #: number of pixels that one side alone observed
+    scene: Scene | None = None  #: what the model says of side A; None without a model
+    #: the same with everything that effects need, before any preparation; None without a model
     channel: Channel | None = None
-    hits: Maps | None = None
-    sky_of_maps: bool = False
-    files: PointingFiles | None = None
+    hits: Maps | None = None  #: samples per pixel of the maps, of the model; None without one
+    sky_of_maps: bool = False  #: True if the scene's sky was taken from side A, and not from the model
+    files: PointingFiles | None = None  #: samples of the channel, if the model has them in files
+    #: a draw of what noise hides of the sky that side A shows, coefficients as the scene's; None if it hides nothing
     doubt: Alm | None = None
+    #: what single samples change in side A, uK, if it was made from orientation moments and ``a`` has it since; None
     spread: Maps | None = None
+    #: of every pixel of the maps as the model has it, rms, shape (split, npix); None without one
     noise_uk: Maps | None = None
-    turned: bool = False
+    turned: bool = False  #: True if the sides are exchanged: ``a`` is side B
+    #: True if side A was made from orientation moments or at the pixels' centres, so that no single sample has a say
     by_moments: bool = False
+    #: highest order of the beam in a run of the model, if that is not said and less than the scene's; None
     orders: int | None = None
-    rounds: int = 0
+    rounds: int = 0  #: how often the sky that was taken from side A was corrected for what single samples leave of it
+    #: what they leave of side A, uK, as the last correction of its sky has it, if that is noise; None: to be made
     unmade: Maps | None = None
 
     def pointing(self, longest: float = SAMPLES) -> Pointing | PointingFiles | None:
@@ -182,14 +151,9 @@ def read(
         if not Path(side).is_dir() and _made_elsewhere((b, a)[own]):
             sides[own] = _closer(sides[own], sides[other], config.load(side), nthreads)
     if run is None:
-        names = [name for name in sides[0] if name in sides[1]]
-        groups = {name: [name] for name in names}
+        groups = {name: [name] for name in sides[0] if name in sides[1]}
     else:
-        groups = {
-            channel.name: [n for n in config.map_names(run) if n.partition(":")[0] == channel.name]
-            for channel in run.channels
-        }
-        groups = {c: names for c, names in groups.items() if all(n in side for n in names for side in sides)}
+        groups = {c: names for c, names in _groups(run).items() if all(n in side for n in names for side in sides)}
     if not groups:
         raise InputError(
             f"{a} and {b} have no channel in common; give both maps of the same names, CHANNEL.fits or "
@@ -223,11 +187,14 @@ def given(a: Given, b: Given, run: config.RunConfig, nthreads: int = 1) -> Compa
     run, orders = in_full(run)
     whole = survey(quiet(run), nthreads, orders=orders_of(run))
     sides = [dict(zip(names, side, strict=True)) for side in (a, b)]
-    found = (
-        _pair(c.name, [n for n in names if n.partition(":")[0] == c.name], sides, whole, nthreads) for c in run.channels
-    )
+    found = (_pair(name, maps, sides, whole, nthreads) for name, maps in _groups(run).items())
     pairs = (replace(pair, orders=orders.get(pair.name)) for pair in found)
     return Comparison(tuple(_with_noise(pair, run) for pair in pairs), run)
+
+
+def _groups(run: config.RunConfig) -> dict[str, list[str]]:
+    """Return the names of the maps of each channel."""
+    return {channel.name: [one.name for one in run.each_map if one.channel is channel] for channel in run.channels}
 
 
 def _in_order(side: Given, names: Sequence[str]) -> Sequence[NDArray[np.float64]]:
@@ -341,7 +308,7 @@ def _folder(folder: Path, run: config.RunConfig | None) -> dict[str, NDArray[np.
     if run is not None:
         own = file_names(run)
         names = {name: folder / file for name, file in own.items() if (folder / file).is_file()}
-        frequencies = {n: c.frequency_ghz for n in own for c in run.channels if n.partition(":")[0] == c.name}
+        frequencies = {one.name: one.channel.frequency_ghz for one in run.each_map}
     if not names:
         expected = "any FITS map" if run is None else ", ".join(file_names(run).values())
         raise InputError(f"{folder} holds no map to compare; give {expected}.")

@@ -13,62 +13,31 @@ from mcsim.comparison.shown_sky import unshown
 from mcsim.support.arrays import Alm, Vector
 from mcsim.systematics.base import Pointing
 
-Members = tuple[tuple[Difference, Vector], ...]
-"""Differences with their values."""
-
-EXPLAINED = 0.8
-"""Share of a difference map's variance that a set must explain to be named, with orientation moments."""
-
-EXPLAINED_BY_SAMPLES = 0.95
-"""The same where single samples are simulated, or no simulation is needed."""
-
-ENOUGH = 1e-3
-"""Share of the variance below which nothing further is looked for: templates are no better."""
+Members = tuple[tuple[Difference, Vector], ...]  #: differences with their values
+EXPLAINED = 0.8  #: share of a difference map's variance that a set must explain to be named, with orientation moments
+EXPLAINED_BY_SAMPLES = 0.95  #: the same where single samples are simulated, or no simulation is needed
+ENOUGH = 1e-3  #: share of the variance below which nothing further is looked for: templates are no better
 
 SMALLEST = 0.1
 """Rms of what is left below which nothing further is looked for either, over that of maps that are called identical."""
 
-TOLERATED = 1.5
-"""A set that is named may leave so many times what noise is expected to hide from its prediction."""
-
-UNSURE = 0.25
-"""Share of what noise is expected to hide by which that is uncertain."""
-
-MOST_HIDDEN = 0.5
-"""Share of the variance that noise may hide at most from the prediction of a set that is named."""
-
-PRECISION = 1e-6
-"""Share of the variance that no comparison resolves: single precision of maps with a dipole."""
-
-STEP = 1e-3
-"""Change of a value over which responses are linear, over the value or its natural size."""
-
-STEPS = 4
-"""Steps of a joint fit at most, and simulations of single samples beside which values are fitted again."""
-
-NOTHING = 1e-8
-"""Share of the variance below which values are not fitted again."""
-
-WORTHWHILE = 0.98
-"""Share of what was left before that a step must leave at most to be followed by another one."""
+TOLERATED = 1.5  #: a set that is named may leave so many times what noise is expected to hide from its prediction
+UNSURE = 0.25  #: share of what noise is expected to hide by which that is uncertain
+MOST_HIDDEN = 0.5  #: share of the variance that noise may hide at most from the prediction of a set that is named
+PRECISION = 1e-6  #: share of the variance that no comparison resolves: single precision of maps with a dipole
+STEP = 1e-3  #: change of a value over which responses are linear, over the value or its natural size
+STEPS = 4  #: steps of a joint fit at most, and simulations of single samples beside which values are fitted again
+NOTHING = 1e-8  #: share of the variance below which values are not fitted again
+WORTHWHILE = 0.98  #: share of what was left before that a step must leave at most to be followed by another one
 
 
 @dataclass(frozen=True, eq=False)
 class Set:
-    """Differences with their values.
+    """Differences with their values."""
 
-    Attributes
-    ----------
-    members
-        Differences with their values.
-    left
-        Share of the variance that they leave.
-    correction
-        What single samples change in their prediction, uK, shape (split, npix); None: not measured.
-    """
-
-    members: Members
-    left: float
+    members: Members  #: differences with their values
+    left: float  #: share of the variance that they leave
+    #: what single samples change in their prediction, uK, shape (split, npix); None: not measured
     correction: Maps | None = None
 
     @property
@@ -108,20 +77,11 @@ class Prediction:
 
     Sets are predicted with orientation moments; those that come first are simulated sample by sample as well, if the
     pointing is known and not too long, and what that changes is added to their predictions.
-
-    Attributes
-    ----------
-    pair
-        The channel on both sides.
-    others
-        The other channels.
-    floor
-        Rms in uK up to which maps are called identical.
     """
 
-    pair: ChannelPair
-    others: Sequence[ChannelPair]
-    floor: float
+    pair: ChannelPair  #: the channel on both sides
+    others: Sequence[ChannelPair]  #: the other channels
+    floor: float  #: rms in uK up to which maps are called identical
     _hidden: dict[tuple[tuple[int, bytes], ...], float] = field(default_factory=dict, repr=False, kw_only=True)
     _exact: dict[tuple[tuple[int, bytes], ...], Set] = field(default_factory=dict, repr=False, kw_only=True)
 

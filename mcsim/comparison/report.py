@@ -17,11 +17,8 @@ from mcsim.support import page as page_
 from mcsim.support.numbers import number
 
 DOTS_PER_INCH = 110
-SHOWN = 64
-"""nside of the maps in pictures."""
-
-_TICKS = (2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
-"""Multipoles that an axis names."""
+SHOWN = 64  #: nside of the maps in pictures
+_TICKS = (2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)  #: multipoles that an axis names
 
 
 def page(result: ComparisonResult) -> str:

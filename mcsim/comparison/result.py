@@ -44,61 +44,40 @@ class DifferenceResult:
 
 @dataclass(frozen=True, eq=False)
 class ChannelResult:
-    """The comparison of one channel.
+    """The comparison of one channel."""
 
-    Attributes
-    ----------
-    name, splits
-        Of the channel and of its maps.
-    verdict
-        "identical", "difference" (one), "mixture" (several), "degenerate" (several sets do), or "unknown".
-    differences, alternatives, nearest
-        The best set that is accepted, the other ones, and the best set whatever it explains.
-    nearest_explains
-        Share of the variance that this set explains.
-    rms_uk, sky_rms_uk, noncircular_rms_uk, noise_rms_uk, left_rms_uk
-        Of the difference; of the sky without monopole and dipole; of what the beam's shape adds; of the noise that the
-        model has; and of what is left. NaN where no model says it.
-    looks
-        What is left looks like, in words, if nothing is named.
-    unmade_rms_uk
-        Of what the simulation of side A leaves of its maps, if the verdict is "unknown"; else 0.
-    a, b, explained, seen
-        Maps, uK, shape (split, npix), ``explained`` the part of b - a that the set makes.
-    one_sided
-        Number of pixels that one side alone observed, and that are left out.
-    hits
-        Samples per pixel, of the model; None without one.
-    differing
-        Names of the maps that differ at all, of which the rest is said.
-    spread_rms_uk
-        Of what single samples change in side A, if that was made from orientation moments; it is taken off first.
-    reversed
-        True if the model describes side B, and the differences were found in side A; they say B relative to A.
-    """
-
+    #: name, splits: of the channel and of its maps
     name: str
     splits: tuple[str, ...]
+    #: "identical", "difference" (one), "mixture" (several), "degenerate" (several sets do), or "unknown"
     verdict: Verdict
+    #: differences, alternatives, nearest: the best set that is accepted, the other ones, and the best set whatever it
+    #: explains
     differences: tuple[DifferenceResult, ...]
     alternatives: tuple[tuple[DifferenceResult, ...], ...]
     nearest: tuple[DifferenceResult, ...]
-    nearest_explains: float
+    nearest_explains: float  #: share of the variance that this set explains
+    #: rms_uk, sky_rms_uk, noncircular_rms_uk, noise_rms_uk, left_rms_uk: of the difference; of the sky without monopole
+    #: and dipole; of what the beam's shape adds; of the noise that the model has; and of what is left. NaN where no
+    #: model says it.
     rms_uk: float
     sky_rms_uk: float
     noncircular_rms_uk: float
     noise_rms_uk: float
     left_rms_uk: float
-    looks: tuple[str, ...]
-    unmade_rms_uk: float
+    looks: tuple[str, ...]  #: what is left looks like, in words, if nothing is named
+    unmade_rms_uk: float  #: of what the simulation of side A leaves of its maps, if the verdict is "unknown"; else 0
+    #: a, b, explained, seen: maps, uK, shape (split, npix), ``explained`` the part of b - a that the set makes
     a: Maps
     b: Maps
     explained: Maps
     seen: NDArray[np.bool_]
-    one_sided: int
-    hits: Maps | None
-    differing: tuple[str, ...] = ()
+    one_sided: int  #: number of pixels that one side alone observed, and that are left out
+    hits: Maps | None  #: samples per pixel, of the model; None without one
+    differing: tuple[str, ...] = ()  #: names of the maps that differ at all, of which the rest is said
+    #: of what single samples change in side A, if that was made from orientation moments; it is taken off first
     spread_rms_uk: float = 0.0
+    #: True if the model describes side B, and the differences were found in side A; they say B relative to A
     reversed: bool = False
 
     @property

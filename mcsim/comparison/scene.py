@@ -25,20 +25,11 @@ from mcsim.support.arrays import Alm
 from mcsim.systematics.base import Pointing
 from mcsim.systematics.shape import displaced
 
-Maps = NDArray[np.float64]
-"""Maps of one channel, uK, shape (split, npix)."""
-
-KEPT = 4
-"""Transforms that are kept: scenes with the same sky and beam differ in their moments alone."""
-
-KEPT_BEAMS = 64
-"""Displaced beams that are kept: one for every time shift that is tried."""
-
-EPSILON = 1e-7
-"""Accuracy of the interpolation of single samples."""
-
-WEAKEST = 1e-4
-"""Share of its largest value below which a beam's window is not divided out."""
+Maps = NDArray[np.float64]  #: maps of one channel, uK, shape (split, npix)
+KEPT = 4  #: transforms that are kept: scenes with the same sky and beam differ in their moments alone
+KEPT_BEAMS = 64  #: displaced beams that are kept: one for every time shift that is tried
+EPSILON = 1e-7  #: accuracy of the interpolation of single samples
+WEAKEST = 1e-4  #: share of its largest value below which a beam's window is not divided out
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,47 +59,27 @@ class PointingFiles:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Sky, beam, pixel window and scan of a channel.
+    """Sky, beam, pixel window and scan of a channel."""
 
-    Attributes
-    ----------
-    sky
-        Coefficients of the sky, uK, up to ``lmax``.
-    beam, window
-        Beam, and pixel window of shape (lmax + 1,).
-    moments
-        Orientation moments of every split.
-    preparations
-        What is done to the map of every split after it is made; empty: nothing.
-    nthreads
-        Threads of the transforms.
-    psi
-        Sign and offset in radians of the samples' orientation, beside that of the model.
-    centred
-        True if samples stand at their pixels' centres.
-    motion
-        Scan model in place of the channel's; None: that.
-    late, step
-        Samples by which the signal of a pointing is attributed to an earlier one, and their distance in radians, of the
-        sign of the spin.
-    added
-        Makes of the scene without it what its maps have besides; None: nothing.
-    kept, moved
-        Transforms of scenes made from this one, and their displaced beams.
-    """
-
-    sky: Alm
+    sky: Alm  #: coefficients of the sky, uK, up to ``lmax``
+    #: beam, window: beam, and pixel window of shape (lmax + 1,)
     beam: Beam
     window: NDArray[np.float64]
-    moments: tuple[Moments, ...]
+    moments: tuple[Moments, ...]  #: orientation moments of every split
+    #: what is done to the map of every split after it is made; empty: nothing
     preparations: tuple[Preparation, ...] = ()
-    nthreads: int = 1
+    nthreads: int = 1  #: threads of the transforms
+    #: sign and offset in radians of the samples' orientation, beside that of the model
     psi: tuple[int, float] = (1, 0.0)
-    centred: bool = False
-    motion: ScanModel | None = None
+    centred: bool = False  #: True if samples stand at their pixels' centres
+    motion: ScanModel | None = None  #: scan model in place of the channel's; None: that
+    #: late, step: samples by which the signal of a pointing is attributed to an earlier one, and their distance in
+    #: radians, of the sign of the spin
     late: float = 0.0
     step: float = 0.0
+    #: makes of the scene without it what its maps have besides; None: nothing
     added: "Callable[[Scene], Maps] | None" = None
+    #: kept, moved: transforms of scenes made from this one, and their displaced beams
     kept: OrderedDict[tuple[bytes, ...], Transforms] = field(default_factory=OrderedDict, repr=False)
     moved: OrderedDict[tuple[bytes, float, int], Beam] = field(default_factory=OrderedDict, repr=False)
     # By window and identity of a pointing, which is held so that no other one can have it.
@@ -136,7 +107,7 @@ class Scene:
             key = (beam.blm.tobytes(), way, orders)
             if key not in self.moved:
                 moved = displaced(beam, 0.0 if way >= 0.0 else np.pi, abs(way))
-                _keep(self.moved, key, moved.truncated(min(moved.mmax, orders)), KEPT_BEAMS)
+                keep(self.moved, key, moved.truncated(min(moved.mmax, orders)), KEPT_BEAMS)
             beam = self.moved[key]
         return beam
 
@@ -152,7 +123,7 @@ class Scene:
         if key not in self.kept:
             circular, offsets = self._circular()
             spins = convolve.spin_maps(self.sky, self.response, self.nside, self.nthreads)
-            _keep(self.kept, key, Transforms(circular, spins, offsets), KEPT)
+            keep(self.kept, key, Transforms(circular, spins, offsets), KEPT)
         self.kept.move_to_end(key)
         return self.kept[key]
 
@@ -247,7 +218,7 @@ class Scene:
         here = tod.samples(model, pointing.line, grid)
         if not self.late:
             return here
-        there = tod.samples(ahead(model, self.late * model.period_of_samples(pointing.line)), pointing.line, grid)
+        there = tod.samples(model.ahead(self.late * model.period_of_samples(pointing.line)), pointing.line, grid)
         return (replace(seen, pixel=binned.pixel) for binned, seen in zip(here, there, strict=True))
 
     def pixels(self, pointing: Pointing | PointingFiles, split: int) -> Iterator[NDArray[np.int64]]:
@@ -267,14 +238,8 @@ class Scene:
     ) -> Maps:
         """Return the maps sample by sample, without the approximations of :meth:`maps`.
 
-        Parameters
-        ----------
-        pointing
-            Of the channel.
-        window
-            Pixel window that the spread of the samples makes by itself, shape (lmax + 1,).
-        signal
-            How samples see the sky, in place of the beam's convolution.
+        ``window``: pixel window that the spread of the samples makes by itself, shape (lmax + 1,); ``signal``: how
+        samples see the sky, in place of the beam's convolution.
         """
         own, key = signal is None, (id(pointing), window.tobytes())
         if own and key in self._made:
@@ -300,21 +265,11 @@ class Scene:
             yield replace(chunk, theta=theta, phi=phi, psi=sign * chunk.psi + offset)
 
 
-def _keep(kept: OrderedDict[Any, Any], key: object, value: object, most: int) -> None:
+def keep(kept: OrderedDict[Any, Any], key: object, value: object, most: int) -> None:
     """Keep a value, and forget the ones that were longest without use."""
     kept[key] = value
     while len(kept) > most:
         kept.popitem(last=False)
-
-
-def ahead(model: ScanModel, seconds: float) -> ScanModel:
-    """Return a scan model that is ``seconds`` further on its way at t = 0."""
-    ways = ("spin", "precession", "orbit")
-    phases = {
-        f"{way}_phase_deg": getattr(model, f"{way}_phase_deg") + 360.0 * seconds / getattr(model, f"{way}_period_s")
-        for way in ways
-    }
-    return replace(model, **phases)
 
 
 def scene_of(channel: Channel, sky: Alm, nthreads: int) -> Scene:

@@ -1,6 +1,7 @@
 """Differences of beam, scan, sky and pixels: what side B simulates otherwise than side A."""
 
 from dataclasses import replace
+from typing import ClassVar
 
 import ducc0
 import healpy
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from mcsim.comparison.description import EXTRA_ORDERS
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
-from mcsim.comparison.scene import WEAKEST, Maps, Scene, ahead
+from mcsim.comparison.scene import WEAKEST, Maps, Scene
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.beams.coefficients import power_by_order
 from mcsim.instrument.scan import Moments
@@ -24,14 +25,9 @@ from mcsim.sphere import healpix
 from mcsim.sphere.rotation import euler_angles, rotation_matrix
 from mcsim.support.arrays import Vector
 
-_SMALL = 1e-3
-"""Small angle in radians, share of a sample, or change of a variance, over which responses are linear."""
-
-WIDEST = 99.0
-"""Largest variance of a smoothing over the beam's: ten times its width; more would make any sky vanish."""
-
-FAINT = 0.1
-"""Share of the rms below which a time shift that explains it is not looked for."""
+_SMALL = 1e-3  #: small angle in radians, share of a sample, or change of a variance, over which responses are linear
+WIDEST = 99.0  #: largest variance of a smoothing over the beam's: ten times its width; more would make any sky vanish
+FAINT = 0.1  #: share of the rms below which a time shift that explains it is not looked for
 
 
 def _orders(beam: Beam) -> NDArray[np.int64]:
@@ -87,16 +83,12 @@ class BeamConjugated(Difference):
     name, unit = "beam_conjugated", "1 = opposite m"
     met = "beam coefficients of e^(im phi) where e^(-im phi) was meant"
     turns = True
-
-    def starts(self, state: State) -> list[Vector]:
-        return [np.array([1.0]), np.array([-1.0])]
+    ways = (1.0, -1.0)
+    counted = False
 
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
         signs = np.where(np.arange(scene.beam.mmax + 1) % 2 == 1, value[0], 1.0)
         return replace(scene, beam=replace(scene.beam, blm=signs[:, None] * scene.beam.blm.conj()))
-
-    def amplitude(self, value: Vector) -> float:
-        return 1.0
 
 
 class FrameRotated(Difference):
@@ -219,7 +211,7 @@ def _radians_per_sample(pair: ChannelPair) -> float:
     """Return the median way of a channel's line of sight in the time of a sample, which may be more than a turn."""
     assert pair.channel is not None
     pointed = pair.channel.site.pointed("time_shift")
-    later = ahead(pointed.model, _SMALL * pointed.model.period_of_samples(pointed.line))
+    later = pointed.model.ahead(_SMALL * pointed.model.period_of_samples(pointed.line))
     here, there = (healpy.ang2vec(*pointing(m, pointed.line, 0, 4096)[:2]) for m in (pointed.model, later))
     return float(np.median(np.linalg.norm(there - here, axis=1))) / _SMALL
 
@@ -229,14 +221,14 @@ class ReversedMotion(Difference):
 
     unit = "1 = reversed"
     stage = 1
+    motion: ClassVar[str]
 
-    def __init__(self, motion: str) -> None:
-        self.motion = motion
+    def __init__(self) -> None:
         self._made: dict[tuple[float, float, int], tuple[Moments, ...]] = {}
 
     def starts(self, state: State) -> list[Vector]:
         known = state.pair.channel is not None and state.pair.channel.site.pointing is not None
-        return [np.ones(1)] if known else []
+        return super().starts(state) if known else []
 
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
         assert pair.channel is not None
@@ -262,21 +254,15 @@ class ReversedMotion(Difference):
 class SpinSign(ReversedMotion):
     """The spin of side B turns the other way round."""
 
-    name = "spin_sign"
+    name, motion = "spin_sign", "spin_period_s"
     met = "a left-handed spin in one of two scan generators"
-
-    def __init__(self) -> None:
-        super().__init__("spin_period_s")
 
 
 class PrecessionSign(ReversedMotion):
     """The precession of side B turns the other way round."""
 
-    name = "precession_sign"
+    name, motion = "precession_sign", "precession_period_s"
     met = "precession rates of opposite sign in two scan generators"
-
-    def __init__(self) -> None:
-        super().__init__("precession_period_s")
 
 
 class PixelCentres(Difference):
@@ -287,7 +273,7 @@ class PixelCentres(Difference):
 
     def starts(self, state: State) -> list[Vector]:
         known = state.scene is not None and state.scene.moments[0].dtheta is not None
-        return [np.ones(1)] if known else []
+        return super().starts(state) if known else []
 
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
         return replace(scene.at_centres(), window=np.ones_like(scene.window))
@@ -298,16 +284,12 @@ class PixelWindow(Difference):
 
     name, unit = "pixel_window", "times too often"
     met = "a window applied to the sky and again by the samples' spread, or forgotten for a map made at centres"
-
-    def starts(self, state: State) -> list[Vector]:
-        return [np.array([1.0]), np.array([-1.0])]
+    ways = (1.0, -1.0)
+    mutual = True
 
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
         own = healpix.pixel_window(scene.nside, scene.lmax)
         return replace(scene, window=scene.window * own ** value[0])
-
-    def inverse(self, value: Vector) -> Vector:
-        return -value
 
 
 class BeamWindow(Difference):
@@ -315,17 +297,13 @@ class BeamWindow(Difference):
 
     name, unit = "beam_window", "times too often"
     met = "an input map that is smoothed already, or an unsmoothed one taken for smoothed"
-
-    def starts(self, state: State) -> list[Vector]:
-        return [np.array([1.0]), np.array([-1.0])]
+    ways = (1.0, -1.0)
+    mutual = True
 
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
         window = scene.beam.window[: scene.lmax + 1]
         factor = np.where(window > WEAKEST, np.maximum(window, WEAKEST) ** value[0], 1.0 if value[0] < 0 else 0.0)
         return replace(scene, sky=alm_.multiply(scene.sky, factor, scene.lmax))
-
-    def inverse(self, value: Vector) -> Vector:
-        return -value
 
 
 class Smoothing(Difference):
@@ -376,11 +354,9 @@ class LmaxCut(Difference):
         scene, lmax = state.scene, min(state.scene.lmax, 3 * state.pair.nside - 1)
         a, change = (_mean_alm(maps, state, lmax) for maps in (state.maps, state.pair.b - state.maps))
         whole = alm_.resize(convolve.circular_alm(scene.sky, scene.response), scene.lmax, lmax)
-        degrees = alm_.degrees(lmax)
-        weight = np.where(alm_.orders(lmax) == 0, 1.0, 2.0)
         found = set()
         for before in (a, whole):
-            kept, gone = (np.bincount(degrees, weight * np.abs(x) ** 2, lmax + 1) for x in (change, before + change))
+            kept, gone = (alm_.power(x, lmax) for x in (change, before + change))
             lost = np.cumsum(kept) + gone.sum() - np.cumsum(gone)
             found.add(int(np.argmin(lost)))
         return [np.array([float(best)]) for best in sorted(found) if 2 <= best < lmax]

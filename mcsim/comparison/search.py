@@ -14,11 +14,8 @@ from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.prediction import ENOUGH, EXPLAINED, PRECISION, TOLERATED, UNSURE, Prediction, Set
 from mcsim.support.arrays import Vector
 
-FURTHER = 0.7
-"""Share of what is left that a further difference must explain to be added."""
-
-FURTHER_BEYOND = 0.85
-"""The same where what there is explains enough to be named."""
+FURTHER = 0.7  #: share of what is left that a further difference must explain to be added
+FURTHER_BEYOND = 0.85  #: the same where what there is explains enough to be named
 
 VISIBLE, VISIBLE_IN_HOLES = 0.1, 1.0
 """Share of what noise hides, or holes do, that a further difference must explain beside it to be added.
@@ -26,26 +23,16 @@ VISIBLE, VISIBLE_IN_HOLES = 0.1, 1.0
 What holes hide is no white noise: others are like it by chance.
 """
 
-CHANCE = 100.0
-"""The same for each of its values, over the share of one pixel."""
-
-SLIGHT = 0.1
-"""Share that a difference must explain to be fitted further."""
-
-LARGE = 0.3
-"""Share that a difference must explain by itself to have others tried beside it."""
+CHANCE = 100.0  #: the same for each of its values, over the share of one pixel
+SLIGHT = 0.1  #: share that a difference must explain to be fitted further
+LARGE = 0.3  #: share that a difference must explain by itself to have others tried beside it
 
 PROMISING = 0.6
 """The same of two together: share that they may leave, each times a factor, of what the best one leaves."""
 
-NEARLY = 0.1
-"""Share that a set may leave at most to have its values fitted beside one more without a value."""
-
-LARGEST = 3
-"""Differences that act together."""
-
-MEASURED, MEASURED_LARGER = 4, 6
-"""Differences, and sets of each larger size, that are simulated sample by sample."""
+NEARLY = 0.1  #: share that a set may leave at most to have its values fitted beside one more without a value
+LARGEST = 3  #: differences that act together
+MEASURED, MEASURED_LARGER = 4, 6  #: differences, and sets of each larger size, that are simulated sample by sample
 
 WORTH, WORTH_IN_NOISE = 0.5, 0.9
 """Share of the variance that a set may leave at most to be simulated sample by sample.
@@ -53,29 +40,17 @@ WORTH, WORTH_IN_NOISE = 0.5, 0.9
 Once one is found that leaves nothing, it is what moments alone may leave of the others.
 """
 
-KEPT = 3
-"""Sets of every size from which larger ones are built: the best, and as many that do best beside another."""
-
-TRIED = 8
-"""Larger sets whose values are fitted together."""
+KEPT = 3  #: sets of every size from which larger ones are built: the best, and as many that do best beside another
+TRIED = 8  #: larger sets whose values are fitted together
 
 HARDER = 4.0
 """Share of the variance that an exchange may leave at most by itself, if what was there before it is looked for."""
 
-SOONER = 0.8
-"""Times what it leaves of side B that a difference may leave of side A to have the sides exchanged."""
-
-SCREENED = 200_000
-"""Pixels on which pairs are compared at most."""
-
-ALIKE = 2.0
-"""Sets that leave at most so many times what the best one leaves are alternatives."""
-
-UNFITTED = 10.0
-"""The same of sets with fewer fitted values, which explain as much as they do without them."""
-
-EQUAL = 1.1
-"""The same for sets of which the one with the fewest fitted values is named, and of what noise hides."""
+SOONER = 0.8  #: times what it leaves of side B that a difference may leave of side A to have the sides exchanged
+SCREENED = 200_000  #: pixels on which pairs are compared at most
+ALIKE = 2.0  #: sets that leave at most so many times what the best one leaves are alternatives
+UNFITTED = 10.0  #: the same of sets with fewer fitted values, which explain as much as they do without them
+EQUAL = 1.1  #: the same for sets of which the one with the fewest fitted values is named, and of what noise hides
 
 INTERPOLATING = frozenset({"beam_width", "interpolation"})
 """What the interpolation of a sky does too: not named below the accuracy at which maps are called identical."""
@@ -83,15 +58,9 @@ INTERPOLATING = frozenset({"beam_width", "interpolation"})
 
 @dataclass(frozen=True, eq=False)
 class Problem(Prediction):
-    """One channel, and what may differ in it.
+    """One channel, and what may differ in it."""
 
-    Attributes
-    ----------
-    library
-        Differences of implementation and effects.
-    """
-
-    library: Sequence[Difference] = ()
+    library: Sequence[Difference] = ()  #: differences of implementation and effects
     _tried: dict[tuple[tuple[int, bytes], ...], list[Set]] = field(default_factory=dict, repr=False)
 
     def best(self, stage: int = 0) -> list[Set]:

@@ -13,11 +13,8 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.support.arrays import Alm
 
-NOISY = 0.02
-"""Noise over the sky from which on it is filtered out of the sky that maps show."""
-
-UNSHOWN = 1e-3
-"""The same where single samples are simulated: what is left then is noise, or of a sky that holes hide."""
+NOISY = 0.02  #: noise over the sky from which on it is filtered out of the sky that maps show
+UNSHOWN = 1e-3  #: the same where single samples are simulated: what is left then is noise, or of a sky that holes hide
 
 SHARP = 1e-4
 """What a simulation leaves of side A, over the sky, from which on the sky is not corrected further.
@@ -25,17 +22,10 @@ SHARP = 1e-4
 Orientation moments leave more of maps of single samples.
 """
 
-SHARPER = 0.5
-"""Share of the squares that a correction of the sky must leave at most to be followed by another one."""
-
-FREE = 0.05
-"""Share of the pixels of a single map that its sky leaves free at least, if noise is told from it."""
-
-MADE = 0.1
-"""Share of what a simulation leaves of side A that another one leaves at most if side A was made that way."""
-
-ROUNDS = 2
-"""How often the sky is corrected for what its simulation leaves of the maps."""
+SHARPER = 0.5  #: share of the squares that a correction of the sky must leave at most to be followed by another one
+FREE = 0.05  #: share of the pixels of a single map that its sky leaves free at least, if noise is told from it
+MADE = 0.1  #: share of what a simulation leaves of side A that another one leaves at most if side A was made that way
+ROUNDS = 2  #: how often the sky is corrected for what its simulation leaves of the maps
 
 
 def with_shown_sky(pair: ChannelPair) -> ChannelPair:

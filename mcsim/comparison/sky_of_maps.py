@@ -15,8 +15,7 @@ from mcsim.support.arrays import Alm, Vector
 ITERATIONS = 30
 """Largest number of iterations for the sky that whole maps show, and of each filter for what holes leave of it."""
 
-WHOLE = 0.99
-"""Share of the pixels from which on holes hide nothing."""
+WHOLE = 0.99  #: share of the pixels from which on holes hide nothing
 
 TRUSTED = 0.02
 """Noise over the sky at which maps with holes are filtered: what orientation moments leave of single samples."""
@@ -24,8 +23,7 @@ TRUSTED = 0.02
 FILTERS, FILTERS_AGAIN = 4, 2
 """How often maps with holes are filtered, each time less what the beam's shape made of the sky before."""
 
-NEAR = 5
-"""Degrees over which power is averaged."""
+NEAR = 5  #: degrees over which power is averaged
 
 
 def sky_in(
@@ -35,16 +33,8 @@ def sky_in(
 
     What maps of that nside cannot hold, above l = 3 nside - 1, is zero, and so is what the beam suppresses.
 
-    Parameters
-    ----------
-    maps, seen
-        Shape (split, npix) each.
-    empty
-        Scene of the channel; its sky is not used.
-    tolerance
-        Residual at which iterations end, over the maps' own size.
-    beside
-        Sky whose maps are taken off already; None: none.
+    ``maps``, ``seen``: shape (split, npix) each; ``empty``: scene of the channel, whose sky is not used; ``tolerance``:
+    residual at which iterations end, over the maps' own size; ``beside``: sky whose maps are taken off already.
 
     Notes
     -----

@@ -17,32 +17,18 @@ from mcsim.sphere import healpix
 from mcsim.support.arrays import Vector
 from mcsim.systematics.base import Pointing
 
-PIXELS_PER_BASELINE = 4
-"""Pixels that are seen for every baseline at least: with fewer, baselines make any map."""
-
-FEWEST = 16
-"""Baselines at least."""
-
-PREDICTED = 0.5
-"""Share of half of the pixels' variance that baselines fitted to the other half must explain."""
+PIXELS_PER_BASELINE = 4  #: pixels that are seen for every baseline at least: with fewer, baselines make any map
+FEWEST = 16  #: baselines at least
+PREDICTED = 0.5  #: share of half of the pixels' variance that baselines fitted to the other half must explain
 
 SCREENING, FITTED = 1e-3, 1e-6
 """Accuracy of fits of baselines that are tried, and of those that are named: gradient over sizes of matrix and rest."""
 
-SAMPLES = 30_000_000
-"""Samples of the longest survey whose single samples are fitted or looked up."""
-
-FINEST = 4
-"""Largest power of two by which a grid's nside may exceed that of the maps."""
-
-BAND = 0.02
-"""Share of the sky in which grids are tried."""
-
-TELLING = 0.1
-"""Share of the rms there that a grid's errors must explain."""
-
-FAR = 0.1
-"""Rms over the sky's of what is left from which on time stamps of another part of the sky may make it."""
+SAMPLES = 30_000_000  #: samples of the longest survey whose single samples are fitted or looked up
+FINEST = 4  #: largest power of two by which a grid's nside may exceed that of the maps
+BAND = 0.02  #: share of the sky in which grids are tried
+TELLING = 0.1  #: share of the rms there that a grid's errors must explain
+FAR = 0.1  #: rms over the sky's of what is left from which on time stamps of another part of the sky may make it
 
 
 class MapMaking(Difference):
@@ -237,6 +223,8 @@ class FarTimeShift(Difference):
     name, unit = "time_shift", "samples"
     met = "time stamps, or a file of pointings, off by one"
     stage = 2
+    ways = (1.0, -1.0)
+    mutual = True
 
     def __init__(self) -> None:
         self._made: dict[tuple[bytes, bytes], Maps] = {}
@@ -247,7 +235,7 @@ class FarTimeShift(Difference):
         if state.scene is None or pair.channel is None or pair.channel.site.pointing is None:
             return []
         far = np.std((pair.b - state.maps)[seen]) > FAR * np.std(pair.a[seen])
-        return [np.array([way]) for way in (1.0, -1.0)] if far and pair.pointing(SAMPLES) is not None else []
+        return super().starts(state) if far and pair.pointing(SAMPLES) is not None else []
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
         scene, pointing = state.pair.scene, state.pair.pointing(SAMPLES)
@@ -258,6 +246,3 @@ class FarTimeShift(Difference):
             there = replace(scene, late=value[0]).sampled(pointing, scene.window)
             self._made[key] = there - scene.sampled(pointing, scene.window)
         return maps + self._made[key]
-
-    def inverse(self, value: Vector) -> Vector:
-        return -value

@@ -19,8 +19,7 @@ from mcsim.stats.excess import HeldOut, excess_of
 from mcsim.stats.gaussian import Fit, held_out_pvalues
 from mcsim.support.arrays import Vector
 
-TELLING = 12
-"""Elements that are named where two sets differ."""
+TELLING = 12  #: elements that are named where two sets differ
 
 
 def result_of(

@@ -19,38 +19,26 @@ from mcsim.systematics import Effect
 
 Rows = NDArray[np.int64]
 
-LARGE = 12
-"""Highest degree of the largest scales."""
+LARGE = 12  #: highest degree of the largest scales
 
 FRAMES = ("ecliptic", "galactic", "equatorial")
 
-SPARE, SPARE_SHRUNK = 2.0, 1.5
-"""Simulations per element that a comparison needs; with a shrunk covariance."""
+SPARE, SPARE_SHRUNK = 2.0, 1.5  #: simulations per element that a comparison needs; with a shrunk covariance
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Hold the amplitudes of one effect in independent parts of the data, beside the other effects of its set.
+    """Hold the amplitudes of one effect in independent parts of the data, beside the other effects of its set."""
 
-    Attributes
-    ----------
-    kind, slices
-        What the data are divided by ("halves", "degrees", "hemispheres", "map": the largest scales of one map, against
-        all of the data), and the parts in words.
-    amplitudes, errors
-        Of each part, over the amplitude of the fit.
-    pvalue
-        Probability that amplitudes are so different if the effect acts.
-    odds
-        Odds of no effect against this one in the data without the part that supports it most.
-    """
-
+    #: kind, slices: what the data are divided by ("halves", "degrees", "hemispheres", "map": the largest scales of one
+    #: map, against all of the data), and the parts in words
     kind: str
     slices: tuple[str, ...]
+    #: amplitudes, errors: of each part, over the amplitude of the fit
     amplitudes: tuple[float, ...]
     errors: tuple[float, ...]
-    pvalue: float
-    odds: float = 1.0
+    pvalue: float  #: probability that amplitudes are so different if the effect acts
+    odds: float = 1.0  #: odds of no effect against this one in the data without the part that supports it most
 
 
 @dataclass(frozen=True)

@@ -26,24 +26,15 @@ class Control:
 class Controls:
     """Diagnoses of perfect data, drawn at higher fidelity than the model simulates.
 
-    Attributes
-    ----------
-    members
-        One for each control.
-    drawn
-        How they were drawn, in words.
-    alpha
-        Global p-value up to which a control counts as a false alarm.
-
     Notes
     -----
     Controls of a right model have uniform p-values. They fail if the smallest of N, times N (Bonferroni), or the
     p-value of the Kolmogorov-Smirnov test against uniformity is below ``LEVEL``: those of at most 2 % of right models.
     """
 
-    members: tuple[Control, ...]
-    drawn: str
-    alpha: float
+    members: tuple[Control, ...]  #: one for each control
+    drawn: str  #: how they were drawn, in words
+    alpha: float  #: global p-value up to which a control counts as a false alarm
 
     @property
     def pvalues(self) -> tuple[float, ...]:

@@ -34,18 +34,14 @@ from mcsim.support.npy import read_npy
 from mcsim.support.numbers import duration
 from mcsim.support.progress import reporting
 
-SEED = 0x6D63 * 1_000 + 3
-"""Seed of the controls; the simulations that a diagnosis learns with have two others."""
+SEED = 0x6D63 * 1_000 + 3  #: seed of the controls; the simulations that a diagnosis learns with have two others
 
 FINER, FINEST = (4, 2), 2048
 """Factors by which the pixels that are made are refined before they are degraded, the first that is possible; and the
 largest nside."""
 
-REST = 0.01
-"""Standard deviations by which sky power that controls lack may move the variance of the pixels of a map."""
-
-SAMPLE_S = 1e-6
-"""Seconds that one sample takes on one core, for estimates."""
+REST = 0.01  #: standard deviations by which sky power that controls lack may move the variance of the pixels of a map
+SAMPLE_S = 1e-6  #: seconds that one sample takes on one core, for estimates
 
 
 def check(count: int, of_maps: bool, external: bool = False) -> None:
@@ -159,23 +155,9 @@ def _survey(run: str, library: Kinds) -> DisturbedSurvey:
 def diagnose_controls(known: DiagnosisContext, key: str, count: int, call: Batch, quiet: bool = True) -> Controls:
     """Draw and diagnose controls, each once: their verdicts are kept in the cache.
 
-    Parameters
-    ----------
-    known
-        What the data are tested with.
-    key
-        Hash of all that this follows from.
-    count
-        Number of controls; more than before go on where those ended.
-    call
-        Runs the draws, and the simulations of effects that are fitted to controls.
-    quiet
-        Report no progress.
-
-    Raises
-    ------
-    RunError
-        If workers have another cache than this process.
+    ``key`` is the hash of all that ``known``, what the data are tested with, follows from. More controls than before go
+    on where those ended. ``call`` runs the draws, and the simulations of effects that are fitted to controls. RunError
+    if workers have another cache than this process.
     """
     with reporting("orientation moments of the controls", 1.0, "", quiet) as report:
         drawn = fidelity(known.analysis, os.cpu_count() or 1)

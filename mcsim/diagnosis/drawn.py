@@ -13,8 +13,7 @@ from mcsim.simulation.survey import survey
 from mcsim.stats.gaussian import Fit
 from mcsim.support.numbers import measured
 
-PATTERNS = 12
-"""Patterns that are drawn to measure it."""
+PATTERNS = 12  #: patterns that are drawn to measure it
 
 
 def is_drawn(candidate: Candidate) -> bool:

@@ -18,39 +18,30 @@ from mcsim.support.arrays import Matrix, Vector, divided
 MEASURED = 0.04
 """Share of the prior variance that the data leave at most of a nuisance whose response is that of the regression."""
 
-LEAST = 0.1
-"""Share of the prior variance that the data have to remove for a pull to be given."""
+LEAST = 0.1  #: share of the prior variance that the data have to remove for a pull to be given
 
 
 @dataclass(frozen=True)
 class NuisanceResult:
-    """One linear component of a nuisance: its prior, and what the data make of it.
+    """One linear component of a nuisance: its prior, and what the data make of it."""
 
-    Attributes
-    ----------
-    name, channel, component, parameters, unit, label
-        Of the effect; ``channel`` None: all; ``component`` counts from 1, None for an effect of one.
-    prior_mean, prior_width, amplitude, sigma
-        Mean and standard deviation before and after the data.
-    pull
-        Shift of the mean over the standard deviation that it has if the prior is right; None if the data do not
-        constrain the component.
-    words
-        Posterior and prior as people read them.
-    """
-
+    #: name, channel, component, parameters, unit, label: of the effect; ``channel`` None: all; ``component`` counts
+    #: from 1, None for an effect of one
     name: str
     channel: str | None
     component: int | None
     parameters: dict[str, float | str | tuple[float, ...]]
     unit: str
     label: str
+    #: prior_mean, prior_width, amplitude, sigma: mean and standard deviation before and after the data
     prior_mean: float
     prior_width: float
     amplitude: float
     sigma: float
+    #: shift of the mean over the standard deviation that it has if the prior is right; None if the data do not
+    #: constrain the component
     pull: float | None
-    words: str
+    words: str  #: posterior and prior as people read them
 
 
 @dataclass(frozen=True)

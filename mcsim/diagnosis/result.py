@@ -25,8 +25,7 @@ from mcsim.stats.look_elsewhere import GlobalTest
 from mcsim.support.arrays import Vector, texts
 
 STORE = "diagnosis.zarr"
-PLACES = 12
-"""Groups in the localisation table of ``verdict.json`` and of the report."""
+PLACES = 12  #: groups in the localisation table of ``verdict.json`` and of the report
 
 
 @dataclass(frozen=True)
@@ -52,33 +51,20 @@ class EffectResult:
 
 @dataclass(frozen=True)
 class EffectSet:
-    """A smallest set of effects that describes the data.
+    """A smallest set of effects that describes the data."""
 
-    Attributes
-    ----------
-    effects, candidates
-        The effects, and their indices among the candidates.
-    coordinates, errors
-        Fitted linear coordinates, those of one effect after the other, and standard errors.
-    odds
-        Posterior odds against the best set.
-    pvalue, excess
-        Of the residual that the fit leaves: p-value, and excess chi^2.
-    further
-        p-value of the most significant further candidate, with the look-elsewhere effect.
-    maps
-        Largest scales of the maps before and after the effects are taken out.
-    """
-
+    #: effects, candidates: the effects, and their indices among the candidates
     effects: tuple[EffectResult, ...]
     candidates: tuple[int, ...]
+    #: coordinates, errors: fitted linear coordinates, those of one effect after the other, and standard errors
     coordinates: tuple[float, ...]
     errors: tuple[float, ...]
-    odds: float
+    odds: float  #: posterior odds against the best set
+    #: pvalue, excess: of the residual that the fit leaves: p-value, and excess chi^2
     pvalue: float
-    further: float
+    further: float  #: p-value of the most significant further candidate, with the look-elsewhere effect
     excess: Measured
-    maps: tuple[MapCheck, ...] = ()
+    maps: tuple[MapCheck, ...] = ()  #: largest scales of the maps before and after the effects are taken out
 
     @property
     def label(self) -> str:
@@ -88,39 +74,33 @@ class EffectSet:
 
 @dataclass(frozen=True)
 class CandidateResult:
-    """A candidate effect: its fit alone, the amplitude that would be detected, and the candidate most like it.
+    """A candidate effect: its fit alone, the amplitude that would be detected, and the candidate most like it."""
 
-    Attributes
-    ----------
-    name, channel, settings, unit, label, columns
-        Of the effect; ``channel`` None: acts in all; and its columns of the templates.
-    amplitude, sigma, words
-        Fitted alone, NaN where no effect has such an amplitude; and as people read it.
-    delta_chi2, pvalue
-        Unbiased fall of chi^2, and its p-value over all candidates (Bonferroni).
-    detectable, detectable_words
-        Amplitude that is found with 90 % power at 5 % false alarms; None where the data vector does not respond.
-    similar, correlation
-        Index of the other effect with the most similar response, None without one, and their canonical correlation.
-    strength, separable, separable_words
-        Amplitude over its error, and amplitude, at which the right one of the two is chosen in 95 cases of 100.
-    """
-
+    #: name, channel, settings, unit, label, columns: of the effect; ``channel`` None: acts in all; and its columns of
+    #: the templates
     name: str
     channel: str | None
     settings: dict[str, Any]
     unit: str
     label: str
     columns: tuple[int, ...]
+    #: amplitude, sigma, words: fitted alone, NaN where no effect has such an amplitude; and as people read it
     amplitude: float
     sigma: float
     words: str
+    #: delta_chi2, pvalue: unbiased fall of chi^2, and its p-value over all candidates (Bonferroni)
     delta_chi2: float
     pvalue: float
+    #: detectable, detectable_words: amplitude that is found with 90 % power at 5 % false alarms; None where the data
+    #: vector does not respond
     detectable: float | None
     detectable_words: str
+    #: similar, correlation: index of the other effect with the most similar response, None without one, and their
+    #: canonical correlation
     similar: int | None
     correlation: float
+    #: strength, separable, separable_words: amplitude over its error, and amplitude, at which the right one of the two
+    #: is chosen in 95 cases of 100
     strength: float
     separable: float
     separable_words: str
@@ -133,26 +113,17 @@ class CandidateResult:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Say which simulator an external model is, and if mcsim's own simulation of its description agrees with it.
+    """Say which simulator an external model is, and if mcsim's own simulation of its description agrees with it."""
 
-    Attributes
-    ----------
-    simulator
-        In words.
-    pvalue, agrees, skies
-        Of the test with so many of mcsim's skies.
-    nearest
-        What the external simulations look like, seen from mcsim's: the effect, with its amplitude, nearest to the
-        difference.
-    effects
-        Names of the effects whose responses the external simulator makes; those of all others are mcsim's.
-    """
-
-    simulator: str
+    simulator: str  #: in words
+    #: pvalue, agrees, skies: of the test with so many of mcsim's skies
     pvalue: float
     agrees: bool
     skies: int
+    #: what the external simulations look like, seen from mcsim's: the effect, with its amplitude, nearest to the
+    #: difference
     nearest: str | None
+    #: names of the effects whose responses the external simulator makes; those of all others are mcsim's
     effects: tuple[str, ...]
 
 

@@ -58,45 +58,28 @@ class Contrast:
 
 @dataclass(frozen=True)
 class Attribution:
-    """Hold the verdict on a data vector.
+    """Hold the verdict on a data vector."""
 
-    Attributes
-    ----------
-    verdict
-        "none" if the model describes the data, "unknown" if no set is accepted, "degenerate" if several are, else
-        "effect" or "mixture".
-    gap
-        Global test of the data against the model.
-    explanations, contrasts
-        Minimal accepted sets, the most probable first, and each pair of them; empty for "none" and "unknown".
-    nearest, cosine
-        Candidate that lowers chi^2 most, and the cosine between its best fit and the departure from the model, without
-        noise.
-    singles
-        Fit of each candidate alone.
-    correlation
-        Largest canonical correlation of each pair of candidates, shape (C, C).
-    probability
-        Posterior probability of the accepted sets beside no effect, an unknown effect and every effect alone that is
-        in none of them; the three kinds (no effect, known, unknown) are equally probable before, and look-elsewhere is
-        charged for.
-    faint
-        True if that is too small for a name.
-    contradicted
-        Sets that parts of the data contradict.
-    """
-
+    #: "none" if the model describes the data, "unknown" if no set is accepted, "degenerate" if several are, else
+    #: "effect" or "mixture"
     verdict: Verdict
-    gap: GlobalTest
+    gap: GlobalTest  #: global test of the data against the model
+    #: explanations, contrasts: minimal accepted sets, the most probable first, and each pair of them; empty for "none"
+    #: and "unknown"
     explanations: tuple[Explanation, ...]
+    #: nearest, cosine: candidate that lowers chi^2 most, and the cosine between its best fit and the departure from the
+    #: model, without noise
     nearest: int
     cosine: float
-    singles: tuple[Fit, ...]
-    correlation: Matrix
+    singles: tuple[Fit, ...]  #: fit of each candidate alone
+    correlation: Matrix  #: largest canonical correlation of each pair of candidates, shape (C, C)
     contrasts: tuple[Contrast, ...]
+    #: posterior probability of the accepted sets beside no effect, an unknown effect and every effect alone that is in
+    #: none of them; the three kinds (no effect, known, unknown) are equally probable before, and look-elsewhere is
+    #: charged for
     probability: float = 1.0
-    faint: bool = False
-    contradicted: tuple[Explanation, ...] = ()
+    faint: bool = False  #: True if that is too small for a name
+    contradicted: tuple[Explanation, ...] = ()  #: sets that parts of the data contradict
 
     def if_named(self, settings: DiagnosisSettings) -> "Attribution":
         """Return the attribution without its explanations if these are less probable than all else together."""

@@ -23,11 +23,8 @@ RIDGE = 1e-9
 # Subsets that are solved at once; bounds the memory to some 100 MB.
 CHUNK = 1000
 
-EXHAUSTIVE = 2
-"""Largest number of members, beside those whose scatter is known, of which all subsets are tried."""
-
-KEPT = 300
-"""Larger subsets of one size that are tried, the most probable ones."""
+EXHAUSTIVE = 2  #: largest number of members, beside those whose scatter is known, of which all subsets are tried
+KEPT = 300  #: larger subsets of one size that are tried, the most probable ones
 
 Rows = NDArray[np.int64]
 

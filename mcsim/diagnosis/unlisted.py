@@ -25,14 +25,9 @@ from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit
 from mcsim.support.arrays import Map, Matrix, Vector
 
-ALTERNATIVES = 3
-"""Structures that are told beside the best at most."""
-
-SKIES = 4
-"""Skies, constrained by the data, on which a reconstructed effect is simulated."""
-
-LARGEST = 2.0
-"""Amplitude in a part of the data over that in all scores, at most; the least is none."""
+ALTERNATIVES = 3  #: structures that are told beside the best at most
+SKIES = 4  #: skies, constrained by the data, on which a reconstructed effect is simulated
+LARGEST = 2.0  #: amplitude in a part of the data over that in all scores, at most; the least is none
 
 FEW = 0.1  #: share of the largest rms below which a map does not have an effect
 

@@ -16,11 +16,8 @@ AGREES, DISAGREES = 0.05, 0.005
 SEPARATION = 3.29
 """Distance in standard deviations at which the nearer of two predictions is the right one in 95 cases of 100."""
 
-LARGEST_ERROR = 0.3
-"""Error of a fractional reduction above which it is not quoted."""
-
-SETS = 2
-"""Alternatives that a sentence has room for."""
+LARGEST_ERROR = 0.3  #: error of a fractional reduction above which it is not quoted
+SETS = 2  #: alternatives that a sentence has room for
 
 
 def sentence(result: DiagnosisResult) -> str:

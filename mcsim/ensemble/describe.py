@@ -12,8 +12,7 @@ from mcsim.support.folders import user_path
 NEGLIGIBLE = 1e-6
 """Fraction of its error, or of the largest signal to noise, below which a predicted value counts as zero."""
 
-ROUNDING = 1e-12
-"""Fraction of a coefficient below which its real or imaginary part is an error of rounding."""
+ROUNDING = 1e-12  #: fraction of a coefficient below which its real or imaginary part is an error of rounding
 
 ROWS = 40  #: number of bins of a prediction that are shown
 

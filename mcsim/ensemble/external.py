@@ -39,7 +39,6 @@ class Code(Source):
     held: str = ""
 
     def words(self, seed: int, realization: int) -> str:
-        """Return which maps these are, for messages."""
         return f"{self.label} with seed {seed_of(seed, realization)}"
 
     def identity(self) -> str:

@@ -135,15 +135,12 @@ class FitsMaps(Source):
 
     @property
     def count(self) -> int:
-        """Return the number of realizations."""
         return len(self.realizations)
 
     def words(self, seed: int, realization: int) -> str:
-        """Return which maps these are, for messages."""
         return f"realization {self.realizations[realization]} of {self.label}"
 
     def identity(self) -> str:
-        """Return a hash of names, sizes and contents of the files."""
         files = [self._path(part, r) for r in self.realizations for part in self.parts]
         return hash_of(*map(_of_file, files))
 
@@ -175,12 +172,10 @@ class StoredMaps(Source):
 
     @property
     def count(self) -> int:
-        """Return the number of realizations."""
         found = self._opened()
         return len(found) if isinstance(found, np.ndarray) else int(found.sizes["realization"])
 
     def identity(self) -> str:
-        """Return a hash of names, sizes and contents of the files."""
         path = Path(self.path)
         files = sorted(one for one in path.rglob("*") if one.is_file()) if path.is_dir() else [path]
         return hash_of(*((str(one.relative_to(path)), *_of_file(one)[1:]) for one in files))

@@ -22,6 +22,7 @@ from mcsim.information.result import Limits, limits_of
 from mcsim.information.settings import LimitSettings
 from mcsim.simulation import convolve
 from mcsim.simulation.channels import refuse_external
+from mcsim.simulation.filtering import unknown_dipole
 from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap
 from mcsim.simulation.nuisance import nuisances_of
 from mcsim.support import folders
@@ -200,8 +201,7 @@ def inverse_covariance(analysis: Analysis, settings: LimitSettings, nthreads: in
             precision = np.divide(1.0, m.noise_uk**2, out=np.zeros(seen.size), where=seen)
             maps.append(ObservedMap(response, precision, m.moments if settings.orders else None))
     assert shared.cl is not None  # a model of the analysis has one
-    cl = shared.cl.copy()
-    cl[:2] += 4.0 * np.pi * settings.unknown_dipole_uk**2 / np.array([1.0, 3.0])
+    cl = unknown_dipole(shared.cl, settings.unknown_dipole_uk)
     return InverseCovariance(cl, maps, settings.tolerance, nthreads)
 
 

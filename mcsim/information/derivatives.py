@@ -200,8 +200,6 @@ def _power_factor(fiducial: Survey, effect: Effect, coordinates: NDArray[np.floa
     power = np.zeros(lmax + 1)
     for realization in range(DRAWS):
         drawn = systematics.looked_at((effect,), empty, site, fiducial.config.ensemble.seed, realization)
-        weight = np.full(drawn.size, 2.0)
-        weight[: lmax + 1] = 1.0
-        power += np.bincount(alm_.degrees(lmax), weight * np.abs(drawn) ** 2, lmax + 1)
+        power += alm_.power(drawn, lmax)
     power /= DRAWS * (2.0 * np.arange(lmax + 1) + 1.0) * float(np.linalg.norm(coordinates))
     return divided(power, 2.0 * fiducial.cl)

@@ -104,6 +104,12 @@ def check_scope(name: str, kind: type[systematics.Effect], channel: str | None, 
         raise InputError(f"{name} is common to all channels; remove its channel = {channel!r}.")
 
 
+def table_of(effect: systematics.Effect, channel: str | None) -> config.Effect:
+    """Return an effect as an ``[[effect]]`` of a run; ``channel`` None: it acts in all."""
+    parameters = {"amplitude": effect.amplitude, **effect.parameters()}
+    return config.Effect(name=effect.name, channel=channel, parameters=parameters)
+
+
 def refuse_external(run: config.RunConfig) -> None:
     """Raise InputError for a run whose maps another simulator makes."""
     if run.simulator is not None or run.ensemble.maps is not None:

@@ -45,10 +45,10 @@ DIPOLE_UK = 100.0
 Progress = Callable[[float], None]
 
 
-def unknown_dipole(cl: Vector) -> Vector:
-    """Return the spectrum with an unknown monopole and dipole, uK^2."""
+def unknown_dipole(cl: Vector, rms_uk: float = DIPOLE_UK) -> Vector:
+    """Return the spectrum with an unknown monopole and dipole of this rms, uK^2."""
     found = cl.copy()
-    found[:2] += (4.0 * np.pi * DIPOLE_UK**2 / np.array([1.0, 3.0]))[: cl.size]
+    found[:2] += (4.0 * np.pi * rms_uk**2 / np.array([1.0, 3.0]))[: cl.size]
     return found
 
 

@@ -73,22 +73,11 @@ class NoiseOfFiles:
 def of_map(
     run: config.RunConfig, spec: config.Channel, split: str | None, moments: Moments
 ) -> tuple[Moments, Map | None, DrawnNoise | None]:
-    """Return what is known of the noise of a map.
+    """Return moments of a map, standard deviation of its noise, and how it is drawn where it is not white.
 
-    Returns
-    -------
-    moments
-        Those of the map: a map of hits takes the place of the scan's hits, and what is not observed in a map of hits or
-        variances is not observed.
-    level_uk
-        Standard deviation of the noise, shape (npix,), None: no noise.
-    drawn
-        How noise that is not white is drawn.
-
-    Raises
-    ------
-    InputError
-        If a file of the run cannot be used; its pixels and frame must be those of the maps that are made.
+    The deviation has shape (npix,) and is None without noise. A map of hits takes the place of the scan's hits, and
+    what is not observed in a map of hits or variances is not observed. InputError if a file of the run cannot be used;
+    its pixels and frame must be those of the maps that are made.
     """
     noise = spec.noise_of(split)
     if isinstance(noise, declared.Noise) and noise.hits is not None:

@@ -11,7 +11,7 @@ import numpy as np
 from mcsim import config, systematics
 from mcsim.errors import InputError
 from mcsim.simulation import convolve
-from mcsim.simulation.channels import check_scope, site_of
+from mcsim.simulation.channels import check_scope, site_of, table_of
 from mcsim.simulation.pixel_means import gain_of, signal_of
 from mcsim.simulation.survey import Channel, Survey, survey, with_effects
 from mcsim.sphere import rng
@@ -171,12 +171,7 @@ def draws(nuisances: Sequence[Nuisance], seed: int, realization: int) -> tuple[V
 def tables(run: config.RunConfig, seed: int, realization: int, library: Library | None = None) -> list[config.Effect]:
     """Return one draw of the nuisances of a run as its ``[[effect]]``, to simulate data with."""
     drawn = draws(nuisances_of(run, library), seed, realization)[1]
-    return [
-        config.Effect(
-            name=effect.name, channel=one.channel, parameters={"amplitude": effect.amplitude, **effect.parameters()}
-        )
-        for one, effect in drawn
-    ]
+    return [table_of(effect, one.channel) for one, effect in drawn]
 
 
 @dataclass(frozen=True, eq=False)

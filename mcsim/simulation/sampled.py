@@ -97,15 +97,7 @@ def _moves(effect: systematics.Effect) -> bool:
 def _fiducial(channel: Channel, grid: MapGrid, delay_s: float = 0.0) -> Iterator[tod.Samples]:
     """Yield the channel's samples at their fiducial pointing, or at that of ``delay_s`` before."""
     pointing = channel.site.pointed("of sampled maps")
-    model = pointing.model
-    # The same survey with all its angles as they were then.
-    earlier = replace(
-        model,
-        spin_phase_deg=model.spin_phase_deg - 360.0 * delay_s / model.spin_period_s,
-        precession_phase_deg=model.precession_phase_deg - 360.0 * delay_s / model.precession_period_s,
-        orbit_phase_deg=model.orbit_phase_deg - 360.0 * delay_s / model.orbit_period_s,
-    )
-    return tod.samples(earlier, pointing.line, grid)
+    return tod.samples(pointing.model.ahead(-delay_s), pointing.line, grid)
 
 
 def _seen(channel: Channel, grid: MapGrid, observe: tod.Stage) -> Iterator[tod.Samples]:

@@ -59,7 +59,6 @@ class Average(Step):
     coarse: int
 
     def apply(self, map_uk: Map) -> Map:
-        """Return the coarse map."""
         return np.asarray(self.local(map_uk))
 
     def pixel_window(self, lmax: int) -> NDArray[np.float64]:
@@ -72,7 +71,6 @@ class Average(Step):
         return np.asarray(self.local(power) / np.where(share > 0.0, share, np.nan))
 
     def local(self, values: NDArray) -> NDArray:
-        """Return the means."""
         inside = _blocks(values, self.fine, self.coarse)
         seen = np.isfinite(inside)
         count = seen.sum(axis=1)
@@ -93,7 +91,6 @@ class Filter(Step):
     transforms = 2 + 2 * ITERATIONS
 
     def apply(self, map_uk: Map) -> Map:
-        """Return the filtered map."""
         lmax = self.beam.size - 1
         alm = healpix.analysis(_complete(map_uk, self.name), lmax, ITERATIONS)
         return healpix.synthesis(alm_.multiply(alm, self.beam * self.pixels, lmax)[None], self.coarse, lmax)[0]
@@ -107,7 +104,6 @@ class Filter(Step):
         return _resized(self.pixels, lmax, 1.0)
 
     def local(self, values: NDArray) -> NDArray:
-        """Return the means inside the coarse pixels."""
         return values if self.fine == self.coarse else Average(self.fine, self.coarse).local(values)
 
 
@@ -120,7 +116,6 @@ class Regression(Step):
     coefficients: NDArray[np.float64] | None = None
 
     def apply(self, map_uk: Map) -> Map:
-        """Return what the templates leave."""
         if self.coefficients is not None:
             return map_uk - self.coefficients @ self.columns
         used = np.flatnonzero((self.weight > 0.0) & np.isfinite(map_uk))
@@ -150,7 +145,6 @@ class Filled(Step):
     value_uk: float | None
 
     def apply(self, map_uk: Map) -> Map:
-        """Return the map without holes."""
         hole = self.masked | ~np.isfinite(map_uk)
         if self.value_uk is not None:
             return np.where(hole, self.value_uk, map_uk)
@@ -200,7 +194,6 @@ class Rotated(Step):
     transforms = 8
 
     def apply(self, map_uk: Map) -> Map:
-        """Return the rotated map."""
         lmax = 2 * self.nside
         alm = healpix.analysis(_complete(map_uk, "rotate"), lmax, iterations=3)
         return healpix.synthesis(rotation.rotate_alm(alm, lmax, self.before, self.after)[None], self.nside, lmax)[0]

@@ -52,6 +52,13 @@ def multiply(alm: NDArray[np.complex128], factor: NDArray, lmax: int) -> NDArray
     return alm * factor[degrees(lmax)]
 
 
+def power(alm: NDArray[np.complex128], lmax: int) -> NDArray[np.float64]:
+    """Return the sum of |a_lm|^2 over all m of every degree, shape (lmax + 1,); InputError for other sizes."""
+    _check_size(alm, lmax)
+    weight = np.where(orders(lmax) == 0, 1.0, 2.0)
+    return np.asarray(np.bincount(degrees(lmax), weight * np.abs(alm) ** 2, lmax + 1), dtype=np.float64)
+
+
 def resize(alm: NDArray[np.complex128], lmax: int, new_lmax: int) -> NDArray[np.complex128]:
     """Return the coefficients cut or zero-padded to ``new_lmax``; raise InputError if they are not of ``lmax``."""
     _check_size(alm, lmax)

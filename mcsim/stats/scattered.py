@@ -11,8 +11,7 @@ from mcsim.stats.few_draws import scores_of_draws, without
 from mcsim.stats.gaussian import COLLINEAR, Fit, SimulatedGaussian, Tolerated, orthonormal
 from mcsim.support.arrays import Matrix, Vector, divided
 
-STEEPEST = 1e3
-"""Condition number above which derivatives tell no errors."""
+STEEPEST = 1e3  #: condition number above which derivatives tell no errors
 
 Indices = NDArray[np.int64]
 Groups = Sequence[Sequence[int]]  #: columns of the templates of each candidate

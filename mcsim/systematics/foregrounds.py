@@ -141,11 +141,8 @@ class PointSources(Effect):
 
 def _power_around(alm: Alm, lmax: int) -> np.ndarray:
     """Mean |a_lm|^2 over all m of the degrees around each l, shape (lmax + 1,)."""
-    weight = np.full(alm.size, 2.0)
-    weight[: lmax + 1] = 1.0
-    summed = np.bincount(alm_.degrees(lmax), weight * np.abs(alm) ** 2, lmax + 1)
     ell = np.arange(lmax + 1)
     reach = np.maximum(_NARROWEST, ell // 10)
     first, last = np.maximum(ell - reach, min(2, lmax)), np.minimum(ell + reach, lmax) + 1
-    modes, total = np.append(0.0, np.cumsum(2.0 * ell + 1.0)), np.append(0.0, np.cumsum(summed))
+    modes, total = np.append(0.0, np.cumsum(2.0 * ell + 1.0)), np.append(0.0, np.cumsum(alm_.power(alm, lmax)))
     return np.asarray((total[last] - total[first]) / (modes[last] - modes[first]))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 import mcsim
 from comparisons import CASES, LMAX, MODEL, NSIDE, ODD, PEAR, Maps, Simulator, names, scaled, small
 from mcsim import config
-from mcsim.comparison import pairs, scene
+from mcsim.comparison import pairs
 from mcsim.comparison.description import with_known_offsets
 from mcsim.comparison.effects import effects_of
 from mcsim.comparison.map_differences import Calibration, Monopole
@@ -253,7 +253,7 @@ def test_an_effect_beside_a_time_shift_is_that_of_late_samples():
     simulator = Simulator(small(), 0)
     known = simulator.site.pointed("")
     tilted = replace(known.line, boresight_angle_deg=known.line.boresight_angle_deg + 1.0)
-    later = scene.ahead(known.model, 601.0 * 0.003)
+    later = known.model.ahead(601.0 * 0.003)
     observe = tod.sky_signal(simulator.sky, 32, PEAR, 1e-8, 1)
 
     def seen(half: int) -> NDArray[np.float64]:
@@ -296,7 +296,7 @@ def test_the_model_may_describe_the_other_side(name, simulator, side_a):
 def test_time_stamps_a_whole_sample_off_are_named_however_far_that_is():
     simulator = Simulator(small())
     pointing = simulator.site.pointed("")
-    ahead = scene.ahead(pointing.model, 601.0)
+    ahead = pointing.model.ahead(601.0)
     observe = tod.sky_signal(simulator.sky, 32, PEAR, 1e-8, 1)
 
     def late(half: int) -> NDArray[np.float64]:

@@ -25,3 +25,10 @@ def test_resize_keeps_what_both_have() -> None:
 def test_multiply_scales_by_degree() -> None:
     factor = np.array([1.0, 2j, 3.0])
     np.testing.assert_array_equal(alm.multiply(np.ones(6, complex), factor, 2), [1, 2j, 3, 2j, 3, 3])
+
+
+def test_power_is_the_spectrum_times_the_orders() -> None:
+    rng = np.random.default_rng(2)
+    found = rng.normal(size=alm.size(6)) + 1j * rng.normal(size=alm.size(6))
+    found[:7] = found[:7].real
+    np.testing.assert_allclose(alm.power(found, 6), (2 * np.arange(7) + 1) * healpy.alm2cl(found), rtol=1e-13)

@@ -80,6 +80,14 @@ def test_phase_error_over_a_chunk_is_below_a_hundred_picoradians():
         assert np.abs(run[-5:] - start).max() < 1e-11
 
 
+def test_a_survey_that_is_ahead_sees_what_the_other_sees_later():
+    ahead = pointing(MODEL.ahead(1000 * MODEL.sample_period_s), LINE, 0, 50)
+    np.testing.assert_allclose(
+        healpy.ang2vec(*ahead[:2]), healpy.ang2vec(*pointing(MODEL, LINE, 1000, 50)[:2]), atol=1e-9
+    )
+    assert MODEL.ahead(0.0) == MODEL
+
+
 def test_in_scan_direction_is_that_of_the_spin_alone():
     # Without precession and with a slow orbit successive pointings differ along the beam's x axis.
     line = LineOfSight("A", 60.0)

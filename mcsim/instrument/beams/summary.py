@@ -20,39 +20,20 @@ _ARCMIN = np.degrees(1.0) * 60
 
 @dataclass(frozen=True, eq=False)
 class BeamSummary:
-    """Figures of a beam; from its map where there is one, else from its coefficients.
+    """Figures of a beam; from its map where there is one, else from its coefficients."""
 
-    Parameters
-    ----------
-    source
-        ``"map"`` or ``"blm"``.
-    beam
-        The beam.
-    solid_angle_sr
-        Integral of the response over its peak, steradian.
-    fwhm_circular_arcmin
-        Full width at half maximum of the mean over azimuth.
-    fwhm_major_arcmin, fwhm_minor_arcmin, angle_deg
-        Axes of the ellipse that fits the half-power contour about the centre, and the direction of the major one, in
-        degrees from the beam's x axis towards y, -90 to 90.
-    negative_over_positive
-        Integral of the negative response over that of the positive (a number >= 0).
-    centroid_arcmin
-        Mean offset of the response from the centre along x and y, from b_11.
-    ells
-        Degrees at which the coefficients are listed.
-    """
-
-    source: str
+    source: str  #: ``"map"`` or ``"blm"``
     beam: Beam
-    solid_angle_sr: float
-    fwhm_circular_arcmin: float
+    solid_angle_sr: float  #: integral of the response over its peak, steradian
+    fwhm_circular_arcmin: float  #: full width at half maximum of the mean over azimuth
+    #: fwhm_major_arcmin, fwhm_minor_arcmin, angle_deg: axes of the ellipse that fits the half-power contour about the
+    #: centre, and the direction of the major one, in degrees from the beam's x axis towards y, -90 to 90
     fwhm_major_arcmin: float
     fwhm_minor_arcmin: float
     angle_deg: float
-    negative_over_positive: float
-    centroid_arcmin: tuple[float, float]
-    ells: tuple[int, ...]
+    negative_over_positive: float  #: integral of the negative response over that of the positive (a number >= 0)
+    centroid_arcmin: tuple[float, float]  #: mean offset of the response from the centre along x and y, from b_11
+    ells: tuple[int, ...]  #: degrees at which the coefficients are listed
 
     @property
     def axis_ratio(self) -> float:

@@ -180,6 +180,14 @@ class ScanModel:
         """Return the same survey with these lines of sight as the default ones; InputError if one is unknown."""
         return replace(self, default_lines=tuple(line.name for line in self.select(names)))
 
+    def ahead(self, seconds: float) -> "ScanModel":
+        """Return the same survey, ``seconds`` further on its way at t = 0."""
+        phases = {
+            f"{way}_phase_deg": getattr(self, f"{way}_phase_deg") + 360.0 * seconds / getattr(self, f"{way}_period_s")
+            for way in ("spin", "precession", "orbit")
+        }
+        return replace(self, **phases)
+
 
 def read_described(path: Path) -> tuple[ScanModel, float | None]:
     """Return how a survey was pointed, and the amplitude of the dipole that it saw, uK; None if nothing is said of it.
