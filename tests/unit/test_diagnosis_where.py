@@ -41,7 +41,8 @@ def test_power_at_high_degrees_keeps_its_split(split):
         for c, name in enumerate(("V1", "W1"))
         for half in ("half1", "half2")
     ]
-    model: Any = SimpleNamespace(parts=parts, channels=("V1", "W1"), lmax=60, frame="ecliptic")
+    survey = SimpleNamespace(lmax=60)
+    model: Any = SimpleNamespace(parts=parts, channels=("V1", "W1"), survey=survey, frame="ecliptic")
     powers = list(BipolarScan(model)._powers())
     here = [one.name.startswith(f"cl/W1:{split},W1:{split}/") and one.ell != (2, 12) for one in powers]
     assert sum(here) == 2
