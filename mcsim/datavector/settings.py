@@ -3,6 +3,7 @@
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+from mcsim.errors import InputError
 from mcsim.support.settings import check_settings
 from mcsim.systematics import Library
 
@@ -238,9 +239,18 @@ class DiagnosisSettings:
     correlated_sigma: float = 5.0
 
     def __post_init__(self) -> None:
-        """Raise InputError for settings of another kind, negative numbers, and levels above 1."""
+        """Raise InputError for settings of another kind, negative numbers, levels above 1, and counts too small."""
         levels = [field.name for field in fields(self) if field.name.endswith(("_level", "_pvalue", "_share"))]
-        check_settings(self, ["alpha", "named_probability", *levels])
+        skies = ("channel_skies", "typical_skies", "common_skies", "noisy_skies", "table_skies")
+        sims = ("sims_per_element", "pilot_sims_per_element")
+        least = {**dict.fromkeys((*skies, *sims), 2), "beam_orders": 1}
+        check_settings(self, ["alpha", "named_probability", *levels], least)
+        orders = max(self.beam_orders, self.split_beam_orders)
+        if len(self.beam_bins) <= orders:
+            raise InputError(
+                f"beam_bins = {self.beam_bins} has bins for {len(self.beam_bins)} orders of a beam, but orders 0 to "
+                f"{orders} are measured; give {orders + 1} numbers, or a lower beam_orders."
+            )
 
     @classmethod
     def quick(cls, **changes: Any) -> "DiagnosisSettings":

@@ -61,7 +61,8 @@ def scene_of(model: Model) -> Scene:
             means = (signal_of(one, channel.site, run.map.span(split)) for one in acting)
             waves[name] = tuple(np.where(part.precision > 0, one, 0.0) for one in means)
         kernel = channel.site.beam.blm[0, : model.lmax + 1].real
-        moments = np.where(np.isfinite(part.moments.w), part.moments.w, 0.0)
+        measured = part.moments.w[: model.settings.beam_orders]
+        moments = np.where(np.isfinite(measured), measured, 0.0)
         views.append(View(part.channel, split, moments, waves, model.response[part.channel], kernel))
     return Scene(
         channels=model.channels,

@@ -1,7 +1,7 @@
 """Checks of the settings that users change by name."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from typing import Any, TypeVar, get_args
 
@@ -19,12 +19,13 @@ def settings_of(given: Kind | None, kind: type[Kind]) -> Kind:
     return given
 
 
-def check_settings(settings: Any, shares: Iterable[str] = ()) -> None:
+def check_settings(settings: Any, shares: Iterable[str] = (), least: Mapping[str, int] | None = None) -> None:
     """Raise InputError unless the fields of a dataclass are of the kind of their defaults, and numbers not negative.
 
-    Those named in ``shares`` lie between 0 and 1. An ``int | None`` is whole.
+    Those named in ``shares`` lie between 0 and 1, and what is in ``least`` is no less than that. An ``int | None`` is
+    whole.
     """
-    bounded = set(shares)
+    bounded, least = set(shares), least or {}
     for field in fields(settings):
         value, default = getattr(settings, field.name), field.default
         if value is default:
@@ -36,9 +37,9 @@ def check_settings(settings: Any, shares: Iterable[str] = ()) -> None:
         if isinstance(default, bool) and not isinstance(value, bool):
             raise InputError(f"{field.name} = {value!r} is neither True nor False; give one of them.")
         if isinstance(default, int | float) and not isinstance(default, bool):
-            largest = 1.0 if field.name in bounded else math.inf
-            number = isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= largest
+            smallest, largest = least.get(field.name, 0), 1.0 if field.name in bounded else math.inf
+            number = isinstance(value, int | float) and not isinstance(value, bool) and smallest <= value <= largest
             if not number or (isinstance(default, int) and value != int(value)):
                 kind = "a whole number" if isinstance(default, int) else "a number"
-                limit = "from 0 to 1" if largest == 1.0 else "of 0 or more"
+                limit = "from 0 to 1" if largest == 1.0 else f"of {smallest} or more"
                 raise InputError(f"{field.name} = {value!r} is out of range; give {kind} {limit}.")

@@ -20,6 +20,10 @@ from refusals import refused
         (DiagnosisSettings, "named_probability", 90),
         (DiagnosisSettings, "shrunk", "no"),
         (DiagnosisSettings, "slice_snr", float("nan")),
+        (DiagnosisSettings, "channel_skies", 1),
+        (DiagnosisSettings, "sims_per_element", 1),
+        (DiagnosisSettings, "beam_bins", (4, 2)),
+        (DiagnosisSettings, "beam_orders", 0),
         (LimitSettings, "only", "gain_drift"),
         (LimitSettings, "alpha", 2),
         (LimitSettings, "power", 90),
@@ -34,7 +38,7 @@ def test_wrong_settings_are_refused(kind, name, value) -> None:
 
 
 def test_usual_settings_are_taken() -> None:
-    assert DiagnosisSettings(alpha=1, simulations=300, without=["beam_coma"], beam_bins=(5, 2)).simulations == 300
+    assert DiagnosisSettings(alpha=1, simulations=300, without=["x"], beam_bins=(5, 2, 1, 1, 1)).simulations == 300
     assert DiagnosisSettings.quick(controls=3).sims_per_element < DiagnosisSettings().sims_per_element
     assert LimitSettings(nuisances={"beam_width": 0.01}, dense=True).dense
 
