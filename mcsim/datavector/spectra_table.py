@@ -60,12 +60,13 @@ class Spectra:
         scale = f"{normalisation} times {'l(l+1)/2pi' if self.scaling.spectrum else '1'}"
         found = []
         for (mode, low, high, imaginary), pair in zip(self.rows, self.pairs, strict=True):
-            what = f"BipoSH {mode.name}, {'imaginary' if imaginary else 'real'}" if mode.L else "spectrum"
+            part, words = "imaginary" if imaginary else "real", f"L = {mode.L}, M = {mode.M}, d = {mode.d}"
+            what = f"BipoSH {mode.name}, {part}" if mode.L else "spectrum"
             name, statistic = f"{what}/{pair.label}/{low}-{high}, {scale}", "biposh" if mode.L else "cl"
             split = pair.splits[0] if pair.splits[0] == pair.splits[1] else None
             own = Element(name, statistic, tuple(dict.fromkeys(pair.channels)), split, bins.index((low, high)) % 2)
             own = replace(own, ell=(low, high), L=mode.L, M=mode.M, parity=mode.parity, frame=self.frame)
-            found.append(replace(own, kind="table", component=f"{what}, {scale}"))
+            found.append(replace(own, kind="table", component=f"BipoSH {words}, {part}" if mode.L else "C_ℓ"))
         return tuple(found)
 
     def __call__(self, job: Job) -> Vector:

@@ -116,8 +116,9 @@ def blocks_figure(result: DiagnosisResult) -> Figure:
 
 def elements_figure(result: DiagnosisResult) -> Figure:
     """Draw the deviation of every element before and after the fit, kind by kind."""
-    kinds = list(dict.fromkeys(element.kind for element in result.elements))
-    order = sorted(range(len(result.elements)), key=lambda k: kinds.index(result.elements[k].kind))
+    shown = [(e.component if e.kind == "table" else None) or KINDS.get(e.kind, e.kind) for e in result.elements]
+    kinds = list(dict.fromkeys(shown))
+    order = sorted(range(len(shown)), key=lambda k: kinds.index(shown[k]))
     figure = Figure(figsize=(10.5, 4.4), layout="constrained")
     axes = figure.subplots()
     axes.axhspan(-2.0, 2.0, color="#e9e9e9", zorder=0)
@@ -125,16 +126,15 @@ def elements_figure(result: DiagnosisResult) -> Figure:
     axes.plot(place, result.z[order], "o", markersize=3.2, color=RED, label="before")
     if result.z_after is not None:
         axes.plot(place, result.z_after[order], "o", markersize=3.2, color=BLUE, label="after the best fit")
-    sorted_kinds = [result.elements[k].kind for k in order]
     grey: dict[str, Any] = {"color": "0.6", "linewidth": 0.6}
     line = {"arrowstyle": "-", "shrinkA": 0.0, "shrinkB": 0.0, "relpos": (0.0, 0.0), **grey}
     tilted: dict[str, Any] = {"rotation": 35, "rotation_mode": "anchor", "fontsize": 8, "arrowprops": line}
     coordinates: dict[str, Any] = {"xycoords": axes.get_xaxis_transform(), "textcoords": "axes fraction"}
     for number, kind in enumerate(kinds):
-        own = place[[one == kind for one in sorted_kinds]]
+        own = place[[shown[k] == kind for k in order]]
         axes.axvline(own[0] - 0.5, **grey)
         # Names stand apart from each other, whatever the number of elements of each kind.
-        name, beyond = _label(KINDS.get(kind, kind), 60), ((number + 0.3) / len(kinds), 1.09)
+        name, beyond = _label(kind, 60), ((number + 0.3) / len(kinds), 1.09)
         axes.annotate(name, (own.mean(), 1.0), beyond, **coordinates, **tilted)
     axes.set_yscale("symlog", linthresh=5.0)
     largest = max(float(np.max(np.abs(result.z))), 5.0)

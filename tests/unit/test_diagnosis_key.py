@@ -1,8 +1,10 @@
 """The cache of a model's simulations: what changes them changes its key."""
 
 import importlib
+import re
 import sys
 from dataclasses import fields, replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -24,6 +26,8 @@ class Tilt(Effect):
         return sky * (1.0 + self.amplitude)
 """
 RUN = config.load(resources.workflow("quickstart"))
+NOTHING_COMPUTED = {"ensemble", "errors", "support"}
+"""What is imported and no number depends on; what reads a user's simulator is in the key where there is one."""
 
 
 def key(effect, settings=None, run=RUN):
@@ -53,6 +57,17 @@ def test_an_effect_with_other_code_is_learned_anew(plugin):
     assert key(effect) == before
     plugin.write_text(SOURCE.replace("1.0 + self", "1.0 - self"))
     assert key(effect) != before
+
+
+def test_a_constant_of_any_package_that_computes_is_learned_anew(plugin, monkeypatch):
+    effect = importlib.import_module("effects_of_a_user").Tilt
+    before, read = key(effect), set()
+    monkeypatch.setattr(api, "package_digest", lambda packages, *_: read.update(packages) or "of other constants")
+    assert key(effect) != before
+    folder = Path(api.__file__).parents[1]
+    text = "".join(path.read_text() for name in api.CODE for path in (folder / name).rglob("*.py"))
+    used = set(re.findall(r"^ *from mcsim(?:\.| import )(\w+)", text, re.MULTILINE))
+    assert {f"mcsim.{name}" for name in used - NOTHING_COMPUTED} <= read
 
 
 @pytest.mark.parametrize("field", fields(DiagnosisSettings), ids=lambda field: field.name)
