@@ -94,10 +94,11 @@ def _prepared(run: config.RunConfig, name: str, map_: ArrayLike) -> Map:
     spec, split = _map_called(run, name)
     given = reals(map_, f"map {name}", healpy.UNSEEN)
     check_map(given, run.map.resolution, f"map {name}")
-    _check_rms(run, given[given > UNSEEN_BELOW], f"map {name}")
     steps = preparation(run, spec, split, observed=True)
     assert steps is not None  # the run has steps
-    return steps.apply(given)
+    prepared = steps.apply(given)
+    _check_rms(run, given[given > UNSEEN_BELOW], f"map {name}")
+    return prepared
 
 
 def _check_rms(run: config.RunConfig, seen: Map, name: str) -> None:
