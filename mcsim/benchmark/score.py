@@ -25,7 +25,7 @@ from mcsim.sphere import rng
 from mcsim.stats.detection import power
 from mcsim.stats.look_elsewhere import GlobalTest, global_test
 from mcsim.support.arrays import Matrix, Vector
-from mcsim.support.folders import writable
+from mcsim.support.folders import user_path, writable
 
 CASES_PER_TASK = 20
 DETECTIONS = 4000  #: draws of single effects that are tested for detection alone
@@ -74,7 +74,10 @@ def score_draws(
     """
     if number < 1:
         raise InputError(f"a score of {number} draws is none; ask for at least 1.")
-    writable(Path(folder))
+    target = user_path(folder)
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise InputError(f"{target} is not a new folder, and nothing is written over; choose another folder with -o.")
+    writable(target)
     with workers_of(settings, workers, quiet) as call:
         context = learned_model(settings).context
         with asking(call, quiet) as ask:
@@ -82,7 +85,7 @@ def score_draws(
         records = draws(context, number, seed, settings.prior, call, fresh)
     found = powers(linear_model(context, fresh=fresh), DETECTIONS, seed)
     result = Score(f"{number} draws of the data vector", records, found)
-    report.write(result, Path(folder))
+    report.write(result, target)
     return result
 
 

@@ -399,9 +399,10 @@ def config(
     elif name is not None:
         loaded = config_.load(name)
         # They load slowly: what cannot be read is said before.
-        from mcsim.simulation.channels import check_effects, check_scans
+        from mcsim.simulation.channels import check_beams, check_effects, check_scans
         from mcsim.simulation.nuisance import check_nuisances
 
+        check_beams(loaded)
         check_scans(loaded)
         check_effects(loaded)
         check_nuisances(loaded)

@@ -72,6 +72,8 @@ def info(
         raise typer.Exit(0 if verdict.intact else 1)
     from mcsim.ensemble import describe, opening, tables
 
+    if export is not None:
+        tables.check_output(export)
     print(describe.describe(store))
     if export is not None:
         with opening.open_summary(store) as summary:

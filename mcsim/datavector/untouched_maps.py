@@ -20,6 +20,7 @@ class UntouchedMaps:
 
     def __init__(self) -> None:
         self._kept: dict[Hashable, list[Map]] = {}
+        self._bytes = 0
 
     def maps(self, survey: Survey, realization: int, sky: Alm | None, which: Hashable) -> list[Map]:
         """Return what :func:`mcsim.simulation.simulate.maps` does; ``which`` tells the run and the given sky apart."""
@@ -30,14 +31,20 @@ class UntouchedMaps:
         for channel in channels:
             key = (which, realization, channel.name, repr(channel.effects))
             own = self._kept.pop(key, None)
+            self._bytes -= _size(own or [])
             if own is None:
                 own = simulate.maps_of(survey, channel, sky, realization, made)
             if len(channel.effects) < most:
                 self._kept[key] = own
+                self._bytes += _size(own)
             found += own
-        while sum(map_uk.nbytes for own in self._kept.values() for map_uk in own) > MEMORY:
-            self._kept.pop(next(iter(self._kept)))
+        while self._bytes > MEMORY:
+            self._bytes -= _size(self._kept.pop(next(iter(self._kept))))
         return found
+
+
+def _size(maps: list[Map]) -> int:
+    return sum(map_uk.nbytes for map_uk in maps)
 
 
 @lru_cache(maxsize=2)

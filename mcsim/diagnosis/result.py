@@ -355,7 +355,7 @@ class DiagnosisResult:
         path = Path(folder) / STORE
         if not path.is_dir():
             raise InputError(f"{path} does not exist; give the output folder of mcsim diagnose.")
-        with xr.open_zarr(path, consolidated=False) as stored:
+        with xr.open_zarr(path, chunks=None, consolidated=False) as stored:
             arrays: dict[str, Any] = {name: np.asarray(stored[name]) if name in stored else None for name in _ARRAYS}
             rest = json.loads(stored.attrs["result"])
         hints = get_type_hints(cls)

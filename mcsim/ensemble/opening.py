@@ -89,8 +89,7 @@ def _opened(path: Path, group: str | None) -> "xr.Dataset":
 
     with store.faults_named(path):
         found = xr.open_zarr(path, group=group)
-        for name in {*found.coords, "done"} & {*found.variables}:
-            found.variables[name].load()
+        found[[*({*found.coords, "done"} & {*found.variables})]].load()
         return found
 
 

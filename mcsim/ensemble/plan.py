@@ -14,11 +14,13 @@ from mcsim.bipolar.modes import CONVENTION, NORMALISATION
 from mcsim.ensemble import store
 from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError
+from mcsim.instrument.scan.accumulate import SECONDS_PER_SAMPLE
 from mcsim.simulation import differencing, noise, offsets
-from mcsim.simulation.channels import check_effects, check_scans, load_beam, refuse_external
+from mcsim.simulation.channels import check_effects, check_scans, load_beam, refuse_external, scan_model
 from mcsim.simulation.filtering import Bands, probes_of
 from mcsim.simulation.preparation import preparation
 from mcsim.simulation.survey import Survey
+from mcsim.simulation.timestream import LEVEL_DRAWS
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rng, spectra
 from mcsim.sphere.sky import gaussian_alm
@@ -153,10 +155,11 @@ class Cost:
     memory: float
     each_s: float
     parts: tuple[tuple[str, str], ...]
+    once_s: float = 0.0  #: processor time of what all realizations share
 
     def lines(self, number: int, workers: int) -> list[str]:
         """Return lines on memory, parts and time for a number of realizations."""
-        total_s, plural = number * self.each_s, "s" if workers > 1 else ""
+        total_s, plural = number * self.each_s + self.once_s, "s" if workers > 1 else ""
         return [
             f"  memory  {self.memory / 1e9:.2f} GB per worker, {workers} worker{plural}",
             *(f"  {part:<7} {words}" for part, words in self.parts),
@@ -171,7 +174,7 @@ def describe(source: str | Path, part: slice | None = None, workers: int | None 
     refuse_external(run)
     check_scans(run)
     check_effects(run)
-    number, found = len(wanted(run, part)), cost(run)
+    number, found = len(wanted(run, part)), with_scans(cost(run), run)
     memory, *rest = found.lines(number, workers or run.compute.workers)
     disk = float(found.layout.realization_bytes()) * number
     return "\n".join(
@@ -235,6 +238,24 @@ def cost(run: config.RunConfig) -> Cost:
     estimates = pairs * (2 if run.ensemble.paired else 1)
     each_s = transform * transforms + estimation * estimates + differencing.seconds(run) + noise.seconds(run)
     return Cost(planned, memory, each_s, tuple(parts))
+
+
+def with_scans(found: Cost, run: config.RunConfig) -> Cost:
+    """Return a cost with the passes over the samples of scan models that come before the first realization."""
+    passes: dict[str, tuple[float, float]] = {}  # by what the cache keeps: samples, processor seconds
+    for spec, split in run.each_map if run.map.grid == "healpix" else ():
+        if isinstance(chosen := spec.scan, config.ScanHitAveraged | config.ScanDifferencing):
+            model = scan_model(spec, chosen, split)
+            low, high = run.map.span(run.map.each_split.index(split))
+            pair = chosen.pair if isinstance(chosen, config.ScanDifferencing) else None
+            lines = model.select() if pair is None else model.pair(pair)
+            number = (high - low) * sum(map(model.samples, lines))
+            each_s = SECONDS_PER_SAMPLE if pair is None else differencing.SECONDS_OF_PAIRS
+            passes[repr((model, lines, low, high))] = number, number * each_s
+    samples, once_s = (sum(column) for column in zip((0.0, 0.0), *passes.values(), strict=True))
+    once_s += (1.0 + LEVEL_DRAWS) * noise.seconds(run)
+    words = f"{samples:.3g} samples, once, {duration(once_s)} of processor time (none if the cache has what they give)"
+    return replace(found, once_s=once_s, parts=(("scan", words), *found.parts)) if samples else found
 
 
 def _timed(nside: int, lmax_sky: int, lmax: int, L_max: int) -> tuple[float, float]:

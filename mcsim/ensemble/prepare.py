@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, overload
 
 import healpy
+import numpy as np
 from numpy.typing import ArrayLike
 
 from mcsim import config
@@ -12,10 +13,14 @@ from mcsim.config.schema import MapOf
 from mcsim.ensemble.maps import file_names, write_map
 from mcsim.errors import InputError
 from mcsim.simulation.preparation import preparation
-from mcsim.sphere.checks import check_map
+from mcsim.sphere import spectra
+from mcsim.sphere.checks import UNSEEN_BELOW, check_map
 from mcsim.sphere.healpix import read_uk
 from mcsim.support.arrays import Map, reals
 from mcsim.support.folders import appearing, unwritable, user_path, writable
+
+SMALLEST_RMS = 2e-3
+"""Rms of an observed map over that of the sky of the run, at least: above a map in mK or K that is taken for uK."""
 
 Source = str | Path | Mapping[str, Any] | config.RunConfig
 
@@ -91,7 +96,23 @@ def _prepared(run: config.RunConfig, name: str, map_: ArrayLike) -> Map:
     check_map(given, run.map.resolution, f"map {name}")
     steps = preparation(run, spec, split, observed=True)
     assert steps is not None  # the run has steps
-    return steps.apply(given)
+    prepared = steps.apply(given)
+    _check_rms(run, given[given > UNSEEN_BELOW], f"map {name}")
+    return prepared
+
+
+def _check_rms(run: config.RunConfig, seen: Map, name: str) -> None:
+    """Raise InputError for a map that varies far less than its sky: in K it would have 1e-6 of the rms."""
+    rms, sky = float(np.nanstd(seen)) if seen.size else 0.0, 0.0
+    if run.sky.spectrum is not None:
+        ell = np.arange(run.sky.lmax + 1)
+        cl = spectra.load(run.sky.spectrum, run.sky.lmax)
+        sky = float(np.sqrt(np.sum((2 * ell + 1) * cl) / (4.0 * np.pi)))
+    if rms <= SMALLEST_RMS * sky:
+        raise InputError(
+            f"{name} has an rms of {rms:.3g} uK where the sky of {run.name} has {sky:.3g} uK; is it in another unit? "
+            "Say the unit in its header (TUNIT1), or give it in uK."
+        )
 
 
 def _map_called(run: config.RunConfig, name: str) -> MapOf:

@@ -151,6 +151,21 @@ def discard(path: Path, damage: Damage) -> None:
             (path / name / key).unlink(missing_ok=True)
 
 
+def absent_files(path: Path) -> list[str]:
+    """Return the files of finished realizations, coordinates and summary that are not there; read none of them."""
+    with faults_named(path):
+        finished, wanted = done(path), []
+        for name, metadata in _remembered(path).items():
+            wanted.append(f"{name}/zarr.json")
+            if (shape := getattr(metadata, "shape", None)) is None:
+                continue  # a group
+            long = metadata.chunk_grid.chunk_shape[0] if shape else 1
+            for row in range(0, shape[0] if shape else 1, long):
+                if not _over_realizations(metadata) or name == "realization" or finished[row : row + long].any():
+                    wanted.append(f"{name}/{metadata.encode_chunk_key((row // long, 0, 0, 0, 0)[: len(shape)])}")
+    return [file for file in wanted if not (path / file).is_file()]
+
+
 def broken_parts(path: Path) -> dict[str, str]:
     """Return the faults of metadata, coordinates and summary, by name; empty without faults."""
     with faults_named(path):

@@ -70,7 +70,7 @@ def check_output(output: str | Path) -> None:
             f"{output} ends in {ending or 'nothing'}; choose .zarr, .nc (NetCDF) or .ecsv (table of bins)."
         )
     target = user_path(output)
-    if target.suffix == ".zarr" and target.exists():
+    if target.exists():
         raise InputError(f"{target} exists already; choose another output, or delete it.")
     writable(target.absolute().parent)
 

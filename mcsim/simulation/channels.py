@@ -120,6 +120,14 @@ def refuse_external(run: config.RunConfig) -> None:
         )
 
 
+def check_beams(run: config.RunConfig) -> None:
+    """Refuse a run with a beam in closed form that cannot be computed, as the run would."""
+    for channel in run.channels:
+        for beam in (channel.beam, channel.beam_b):
+            if isinstance(beam, config.BeamGaussian | config.BeamEllipticalGaussian):
+                _beam(channel.name, beam, run.sky.lmax)
+
+
 def check_scans(run: config.RunConfig) -> None:
     """Refuse a run whose scan models cannot be read, or lack what a channel names, as the run would."""
     for spec in run.channels:

@@ -20,6 +20,8 @@ Sides = tuple[mapmaking.SideMaps, mapmaking.SideMaps]
 SECONDS_PER_SAMPLE = 1.5e-7
 """Time of one core for a difference: 100 ns for two right-hand sides, the rest for 26 iterations (W1, nside 128)."""
 
+SECONDS_OF_PAIRS = 1.3e-7
+"""Time of one core for a sample of one side when the pairs of pixels are made, once (:func:`mapmaking.prepare`)."""
 
 FEW = 8
 """Iterations after which a map lacks some uK at the largest scales: where responses to stopping early are measured."""

@@ -31,6 +31,7 @@ from mcsim.simulation.preparation import Preparation, preparation
 from mcsim.simulation.rings import Rings, limit_rings, parallel_transport_rings
 from mcsim.simulation.survey_filter import filtering_of
 from mcsim.sphere import healpix, rng, spectra
+from mcsim.sphere.checks import check_whole
 from mcsim.sphere.mask import read_mask
 from mcsim.support.arrays import divided
 from mcsim.systematics import Effect, Library, Site, seen_through, spread_of, variance_factor
@@ -182,6 +183,7 @@ def survey(
     ``orders``: moments up to this order even where the beam needs fewer (of a file of moments, all that it has).
     ``library``: the effects that the run may name; default: the catalogue.
     """
+    check_whole(nthreads, "nthreads", 1)
     refuse_external(run)
     cl = None if run.sky.spectrum is None else spectra.load(run.sky.spectrum, run.sky.lmax)
     made = tuple(_channel(run, channel, nthreads, progress, orders, library) for channel in run.channels)

@@ -1,7 +1,7 @@
 """Rotations of a_lm, maps and BipoSH between ecliptic, galactic and equatorial frames (J2000)."""
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import ducc0
 import healpy as hp
@@ -25,6 +25,11 @@ def rotation_matrix(frame_from: str, frame_to: str) -> NDArray[np.float64]:
             raise InputError(f"frame {frame!r} is not known; use one of {', '.join(FRAMES)}.")
     if frame_from == frame_to:
         return np.eye(3)
+    return _between(frame_from, frame_to).copy()
+
+
+@cache
+def _between(frame_from: str, frame_to: str) -> NDArray[np.float64]:
     return np.array(hp.Rotator(coord=[FRAMES[frame_from], FRAMES[frame_to]]).mat)
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+from scipy import special, stats
 from scipy.optimize import minimize
 
 from mcsim.support.arrays import Vector
@@ -109,9 +109,9 @@ def snr_at_power(
         sign = np.where(hit, 1.0, -1.0)
 
         def loss(parameters: Vector) -> float:
-            return -float(np.sum(stats.norm.logcdf(sign * (np.exp(parameters[1]) * (s - parameters[0])))))
+            return -float(np.sum(special.log_ndtr(sign * (np.exp(parameters[1]) * (s - parameters[0])))))
 
         best = minimize(loss, np.array([np.median(s[hit == 0]) + 1.0, 0.0]), method="Nelder-Mead").x
-        return float(best[0] + stats.norm.ppf(power) * np.exp(-best[1])) / unit
+        return float(best[0] + special.ndtri(power) * np.exp(-best[1])) / unit
 
     return _bootstrapped(name, solved, strengths, found, resampled=100)

@@ -5,6 +5,7 @@ An installed wheel has them inside the package; a source checkout (or an editabl
 """
 
 import os
+from functools import cache
 from pathlib import Path
 
 from mcsim.errors import InputError
@@ -33,13 +34,19 @@ def spectrum(name_or_path: str | Path) -> Path:
 
 def names(kind: str) -> tuple[str, ...]:
     """Return the packaged names, sorted; ``kind``: ``"scan_models"``, ``"workflows"``, ``"data"`` (spectra)."""
-    suffix = ".txt" if kind == "data" else ".toml"
-    return tuple(sorted(path.stem for path in _folder(kind).glob(f"*{suffix}")))
+    return _found(_PACKAGE, kind)[1]
 
 
 def _folder(kind: str) -> Path:
-    inside = _PACKAGE / kind
-    return inside if inside.is_dir() else _PACKAGE.parent / kind
+    return _found(_PACKAGE, kind)[0]
+
+
+@cache
+def _found(package: Path, kind: str) -> tuple[Path, tuple[str, ...]]:
+    """Return the folder of a kind and the names in it: looked up once, as every survey asks for them."""
+    inside, suffix = package / kind, ".txt" if kind == "data" else ".toml"
+    folder = inside if inside.is_dir() else package.parent / kind
+    return folder, tuple(sorted(path.stem for path in folder.glob(f"*{suffix}")))
 
 
 def _find(noun: str, kind: str, suffix: str, name_or_path: str | Path) -> Path:

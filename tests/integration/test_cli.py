@@ -115,6 +115,7 @@ def test_info_and_exports(mcsim: Command, small_store: Path, tmp_path: Path) -> 
     assert set(rows.colnames) >= {"pair", "L", "M", "d", "ell_min", "ell_max", "value", "error"}
     assert str(rows["value"].unit) == "uK2"
     assert "Bennett" in rows.meta["normalisation"]
+    assert_refused(mcsim("info", small_store, "--export", "summary.ecsv"), "summary.ecsv", "another")
 
 
 def test_plot_chooses_modes(mcsim: Command, small_store: Path, tmp_path: Path) -> None:
@@ -442,6 +443,11 @@ def test_config_refuses_effects_that_run_refuses(effect: str, key: str, mcsim: C
     (tmp_path / "small.toml").write_text(f"{SMALL}{effect}\n")
     refused_by_config_and_run(mcsim, key)
     assert [file.name for file in tmp_path.iterdir()] == ["small.toml"]
+
+
+def test_config_refuses_a_beam_that_run_refuses(mcsim: Command, tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(SMALL.replace("major_arcmin = 300.0", "major_arcmin = 6000.0"))
+    refused_by_config_and_run(mcsim, "6000.0")
 
 
 def refused_by_config_and_run(mcsim: Command, key: str) -> None:

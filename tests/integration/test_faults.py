@@ -108,6 +108,14 @@ def test_metadata_coordinates_and_summary_are_made_again(
     assert repair.verify(copy).intact
 
 
+@pytest.mark.parametrize("part", ["biposh/c/1", "cl", "ell/c/0", "summary/cl_mean"])
+def test_a_finished_store_that_lacks_files_is_not_finished(part: str, copy: Path) -> None:
+    assert runner.run(table(), copy).computed == 0
+    (shutil.rmtree if (copy / part).is_dir() else os.remove)(copy / part)
+    with refused(part, "--resume", by=RunError):
+        runner.run(table(), copy)
+
+
 def test_hash_that_is_not_that_of_the_configuration_is_named(small_store: Path, client: Client, copy: Path) -> None:
     root = json.loads((copy / "zarr.json").read_text())
     root["attributes"]["digest"] = "0" * 64

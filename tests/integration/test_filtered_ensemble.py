@@ -81,6 +81,19 @@ def test_mean_without_mean_field_is_the_prediction_of_the_full_sky(table, store:
         assert np.all(abs(mean - wanted) < 4.5 * error + 0.1 * abs(wanted))
 
 
+def test_dry_run_counts_the_passes_over_samples_once(table, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plan, "_timed", lambda *sizes: (1e-6, 1e-6))  # seconds of a transform, of an estimate
+    once_s = []
+    for period_s in (60.0, 30.0):
+        scan = {"kind": "hit_averaged", "model": "wmap", "sample_period_s": period_s}
+        run = config.load(table | {"channel": [one | {"scan": scan} for one in table["channel"]]})
+        found = plan.with_scans(plan.cost(run), run)
+        assert "samples, once" in dict(found.parts)["scan"]
+        once_s.append(found.once_s)
+    assert once_s[1] == pytest.approx(2.0 * once_s[0], rel=1e-4)
+    assert found.lines(1, 1)[-1] != plan.cost(run).lines(1, 1)[-1]
+
+
 def test_dry_run_says_what_the_filter_costs(table, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plan, "_timed", lambda *sizes: (1.0, 1.0))  # seconds of a transform, of an estimate
     found = plan.cost(config.load(table))

@@ -103,12 +103,14 @@ def test_merge_refuses_different_contents_and_leaves_nothing(small_store: Path, 
 
 
 def test_merge_of_a_short_and_a_long_ensemble_is_the_long_one(
-    small_store: Path, client: Client, tmp_path: Path
+    small_store: Path, client: Client, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     short = tmp_path / "short.zarr"
     runner.run(table(**ensemble(4)), short, workers=client)
     runner.merge([short, small_store], tmp_path / "merged.zarr")
     assert_same(tmp_path / "merged.zarr", small_store)
+    runner.merge([short], tmp_path / "short-merged.zarr", quiet=False)
+    assert "merge: 4/4 realizations" in capsys.readouterr().err
     attributes = store.attributes(tmp_path / "merged.zarr")
     assert attributes["configuration"] == store.attributes(small_store)["configuration"]
 

@@ -214,6 +214,13 @@ def test_a_number_of_cases_is_positive(number, tmp_path):
     assert not (tmp_path / "made").exists()
 
 
+def test_a_score_of_draws_is_written_over_nothing(tmp_path):
+    (tmp_path / "score.json").write_text("of a challenge")
+    with refused(tmp_path, "-o"):
+        score_draws(Settings(config.load("quickstart"), sampled_share=0.0), tmp_path, 2, 0, workers=0)
+    assert [path.name for path in tmp_path.iterdir()] == ["score.json"]
+
+
 @pytest.mark.parametrize("name", ["plain", 'quotes " and #', "beam \N{TELESCOPE}"])
 def test_a_run_in_toml_loads_as_the_same_run(name):
     run = config.load("quickstart")

@@ -47,6 +47,22 @@ def test_a_width_is_one_plain_number(width) -> None:
         Beam.elliptical(70.0, width, lmax=LMAX)
 
 
+def test_a_number_of_threads_is_a_number(tmp_path) -> None:
+    with refused("nthreads", "'2'"):
+        mcsim.write_maps(run(), tmp_path / "maps", nthreads="2")
+    with refused("nthreads", "'2'"):
+        Beam.gaussian(600.0, lmax=LMAX).values(0.1, 0.2, nthreads="2")
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e-3, 0.0])
+def test_a_map_in_kelvin_is_not_prepared_as_one_in_microkelvin(factor) -> None:
+    model = run(preparation=[{"kind": "subtract_dipole"}])
+    map_uk = healpy.alm2map(np.ones(91, dtype=complex), NSIDE)
+    assert mcsim.prepare([map_uk], model)[0].shape == map_uk.shape
+    with refused("map W", "TUNIT1"):
+        mcsim.prepare([factor * map_uk], model)
+
+
 def test_numbers_of_numpy_are_numbers() -> None:
     assert Beam.gaussian(np.float32(600.0), lmax=np.int32(LMAX)).lmax == LMAX
     assert systematics.build("calibration", {"amplitude": np.float32(0.5)}).amplitude == 0.5

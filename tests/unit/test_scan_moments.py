@@ -79,6 +79,26 @@ def test_progress_ends_at_one():
     assert max(seen) == 1.0
 
 
+def test_an_interruption_ends_the_passes_of_all_threads():
+    """A year at 10 kHz would go on for half an hour: a pool of threads joins what it has begun."""
+    seen = []
+
+    def interrupt(share: float) -> None:
+        seen.append(share)
+        if len(seen) == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        stream_sums(MODEL.with_sampling(MODEL.duration_days * 86400.0 / 3e11), MapGrid(1), 1, 2, interrupt)
+    assert len(seen) < 10
+
+
+@pytest.mark.parametrize("nthreads", ["2", 0, 1.5])
+def test_a_number_of_threads_is_whole(nthreads):
+    with refused("nthreads", repr(nthreads)):
+        Moments.from_model(MODEL, NSIDE, 2, nthreads=nthreads)
+
+
 def test_halves_add_up_to_the_whole():
     whole, one, two = (Moments.from_model(MODEL, NSIDE, 2, time_range=part) for part in ((0, 1), (0, 0.5), (0.5, 1)))
     np.testing.assert_array_equal(one.hits + two.hits, whole.hits)

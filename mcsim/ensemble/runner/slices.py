@@ -5,6 +5,7 @@ import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.ensemble import opening, plan, store, summary
@@ -61,11 +62,15 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
     with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=store.check_writable(target)) as folder:
         scratch = Path(folder) / "merged"
         store.create(scratch, layout, first)
-        with reporting("merge", float(size), "realizations", quiet) as report:
+        there = np.zeros(size, dtype=bool)
+        for source in sources:
+            done = store.done(source)
+            there[: len(done)] |= done
+        with reporting("merge", float(there.sum()), "realizations", quiet) as report:
             for start in range(0, size, layout.chunk):
                 stop = min(start + layout.chunk, size)
                 _merge_chunk(sources, scratch, start, stop)
-                report(float(stop))
+                report(float(there[:stop].sum()))
         total = summarise_node(str(scratch), layout, 0, size)
         if total is not None:
             store.write_summary(scratch, summary.dataset(layout, total, first))

@@ -15,7 +15,7 @@ from mcsim.instrument.beams.coefficients import check_mmax, choose_mmax, cut, po
 from mcsim.instrument.beams.files import checked_blm
 from mcsim.instrument.beams.gaussian import elliptical_blm
 from mcsim.instrument.beams.window import read_window
-from mcsim.sphere.checks import check_angle, check_finite, check_number, check_shape
+from mcsim.sphere.checks import check_angle, check_finite, check_number, check_shape, check_whole
 from mcsim.support.arrays import reals
 from mcsim.support.folders import unwritable, user_path
 from mcsim.support.npy import read_npz
@@ -399,6 +399,7 @@ class Beam:
         """
         theta, phi = reals(theta, "theta"), reals(phi, "phi")
         check_shape(phi, theta.shape, "phi")
+        check_whole(nthreads, "nthreads")
         if np.any((theta < 0.0) | (theta > np.pi)):
             raise InputError("theta must lie between 0 and pi radians: give the angle from the centre of the beam.")
         direction = np.stack([np.ravel(theta), np.ravel(phi) % (2 * np.pi)], axis=1)

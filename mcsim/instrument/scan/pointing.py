@@ -2,6 +2,7 @@
 
 import math
 from fractions import Fraction
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,9 +47,7 @@ class PointingStream:
         self._turns = [step / Fraction(period) for period in periods]
         offsets_deg = (model.spin_phase_deg + line.azimuth_deg, model.precession_phase_deg, model.orbit_phase_deg)
         self._offsets = [Fraction(offset) / 360 for offset in offsets_deg]
-        # k x turn modulo 1, exact, then rounded once.
-        parts = [(turn.numerator, turn.denominator) for turn in self._turns]
-        angles = _TWO_PI * np.array([[k * above % below / below for k in range(BLOCK)] for above, below in parts])
+        angles = _TWO_PI * np.array([_multiples(turn) for turn in self._turns])
         boresight, precession = math.radians(line.boresight_angle_deg), math.radians(model.precession_angle_deg)
         self._constant = (
             np.array([float(BLOCK * turn % 1) for turn in self._turns]),
@@ -66,6 +65,13 @@ class PointingStream:
         """
         turns = [float((o + first * t) % 1) for o, t in zip(self._offsets, self._turns, strict=True)]
         return np.array(turns), *self._constant
+
+
+@lru_cache(maxsize=64)
+def _multiples(turn: Fraction) -> list[float]:
+    """Return k x turn modulo 1 for the samples k of a block, exact, then rounded once."""
+    above, below = turn.numerator, turn.denominator
+    return [k * above % below / below for k in range(BLOCK)]
 
 
 def pointing(

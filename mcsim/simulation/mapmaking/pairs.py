@@ -19,6 +19,7 @@ from mcsim.simulation.tod import chunks
 from mcsim.support import folders
 from mcsim.support.code import package_digest
 from mcsim.support.compiled import njit
+from mcsim.support.threads import interruptible
 
 PARTS = 16  #: parts of the survey that threads share out; fixed, so that sums do not depend on the number of threads
 
@@ -146,9 +147,10 @@ def _write(
 
     def run(stream: PointingStream, share: list[tuple[int, int]], own: NDArray[np.int32]) -> None:
         for low, high in share:
+            check()
             fill_samples(stream.at(low), high - low, grid.nside, None, own[low - first : high - first])
 
-    with ThreadPoolExecutor(nthreads) as pool:
+    with interruptible(nthreads) as (pool, check):
         jobs = [
             pool.submit(run, stream, share, own)
             for share in shares

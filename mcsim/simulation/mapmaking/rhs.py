@@ -1,7 +1,6 @@
 """The right-hand side P^T d of map-making: differences of one realization, weighted and summed into pixels."""
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +14,7 @@ from mcsim.simulation.mapmaking.solve import check_imbalance
 from mcsim.simulation.tod import check_noise, chunks
 from mcsim.support.arrays import Map
 from mcsim.support.compiled import njit
+from mcsim.support.threads import interruptible
 
 SideMaps = NDArray[np.float64]
 """S_0, then 2 Re S_s and 2 Im S_s for s = 1 ... mmax of one beam at pixel centres, in uK, shape (npix, 1 + 2 mmax)."""
@@ -103,12 +103,13 @@ def rhs_from_maps(
     def run(share: list[tuple[int, int]]) -> NDArray[np.float64]:
         rhs = np.zeros((scan.npix, len(skies)))
         for low, high in share:
+            check()
             own = draw(low, high)
             _add_chunk((a.at(low), side_a), (b.at(low), side_b), scan.grid.nside, gains, own, factor, rhs)
         return rhs
 
     total = np.zeros((scan.npix, len(skies)))
-    with ThreadPoolExecutor(max(1, nthreads)) as pool:
+    with interruptible(nthreads) as (pool, check):
         for partial in (pool.map if nthreads > 1 else map)(run, parts(pieces)):
             total += partial
     return np.ascontiguousarray(total.T)
