@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from mcsim.reconstruction.grammar import ALIKE, OPPOSITE, Structure
+from mcsim.reconstruction.grammar import ALIKE, ANY, OPPOSITE, Structure
 from mcsim.reconstruction.scores import Scene
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.systematics import Library
@@ -74,10 +74,14 @@ def _what(structure: Structure, theta: Vector) -> str:
             return f"is added to the signal and depends on {SUN[kind]}"
         case "added", "spacecraft" if kind.startswith("line"):
             return f"is the dipole as the line of sight of {number} sees it at the same time"
+        case "elsewhere", _:
+            return f"has {on} as seen elsewhere: {_there(kind)}"
         case "added", "spacecraft":
             return f"is added to the signal, fixed to the spacecraft (order {number} in the orientation of the beam)"
         case "added", _:
             return f"is added to the signal and follows the {_wave(kind)}"
+        case "gain", "spacecraft":
+            return f"is proportional to {on}, and follows the orientation of the beam (order {number})"
         case "gain", "time":
             return f"is proportional to {on}, and follows the {_wave(kind)}"
         case "gain", "sky":
@@ -122,17 +126,28 @@ def _pattern(kind: str) -> str:
     return {"power": "pattern not known, by its power in ℓ"}.get(kind, kind)
 
 
+def _there(kind: str) -> str:
+    what, _, where = kind.partition(" ")
+    if what == "spin":
+        turns = f"{where.lstrip('+-')} of a spin"
+        return f"{turns} {'before' if where[0] == '-' else 'after'}" if where[0] in "+-" else f"{turns} away"
+    return f"along the line of sight of {where}" if what == "line" else "in the opposite direction"
+
+
 def _wave(kind: str) -> str:
     wave, _, harmonic = kind.partition(" ")
-    return "year" if wave == "year" else f"spin phase{_HARMONIC[harmonic]}"
+    if wave == "trend":
+        return "time, growing steadily"
+    phase = "year" if wave == "year" else "spin phase"
+    return phase + _HARMONIC[harmonic].format(wave)
 
 
 _HARMONIC = {
     "1": "",
-    "2": ", twice a spin",
-    "3": ", three times a spin",
-    "4": ", four times a spin",
-    "1-4": ", in any way",
+    "2": ", twice a {}",
+    "3": ", three times a {}",
+    "4": ", four times a {}",
+    ANY: ", in any way",
 }
 
 SUN = {

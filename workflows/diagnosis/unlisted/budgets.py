@@ -5,22 +5,14 @@ python budgets.py [A:B]     cases A to B - 1, one after the other at S/N 10, the
 What is true of each is written beside it; where two descriptions say the same thing, both are right.
 """
 
-import os
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import healpy
 import numpy as np
-from unlisted import ANY, known, row
+from unlisted import ANY
 
-from mcsim.diagnosis import unlisted
-from mcsim.diagnosis.observed_maps import ObservedMaps
-from mcsim.instrument.scan import MapGrid
-from mcsim.simulation import simulate, tod
-from mcsim.simulation.survey import survey
 from mcsim.sphere.rotation import rotation_matrix
-from mcsim.systematics.spacecraft import axes
 
 YEAR_S, DAY_S, FINE = 365.25 * 86400.0, 86400.0, 128
 
