@@ -91,7 +91,7 @@ def structures_of(data: ObservedMaps, scene: Scene, search: Search) -> tuple[tup
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
-    """Simulated skies: the maps of the first, and of all the mean scores, shape (P,), and data vectors, (p,) or (0,)."""
+    """Simulated skies: maps of the first, mean scores, shape (P,), and data vectors, shape (p,) or (0,), of all."""
 
     maps: list[Map]
     scores: Vector

@@ -5,14 +5,23 @@ python budgets.py [A:B]     cases A to B - 1, one after the other at S/N 10, the
 What is true of each is written beside it; where two descriptions say the same thing, both are right.
 """
 
+import os
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import healpy
 import numpy as np
-from unlisted import ANY
+from unlisted import ANY, ask, known, row
 
+from mcsim.diagnosis import unlisted
+from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.instrument.scan import MapGrid
+from mcsim.simulation import simulate, tod
+from mcsim.simulation.survey import survey
 from mcsim.sphere.rotation import rotation_matrix
+from mcsim.sphere.sky import dipole_alm
+from mcsim.systematics.spacecraft import axes
 
 YEAR_S, DAY_S, FINE = 365.25 * 86400.0, 86400.0, 128
 
@@ -139,3 +148,73 @@ CASES = (
     Case(polarised, (("added", "spacecraft", ("orientation 2",), ALIKE), ("added", "sky", ("orientation 2",), ALIKE))),
     Case(transponder, (("gain", "", ("constant",), ALIKE), ("gain", "time", ANY, ALIKE))),
 )
+
+
+class Sky:
+    """One realization of the model of two channels, and what acts on it."""
+
+    def __init__(self, seed):
+        self.run, self.context, self.scene, self.search = known("two")
+        self.survey, self.seed = survey(self.run), seed
+        self.maps = np.array(list(simulate.maps(self.survey, seed)))
+        lmax, dipole = self.survey.lmax, self.survey.channels[0].site.dipole_uk
+        beam = self.survey.channels[0].site.beam.blm[0, : lmax + 1].real
+        window = beam * np.sqrt(4.0 * np.pi / (2.0 * np.arange(lmax + 1) + 1.0))
+        seen = healpy.almxfl(simulate.draw_sky(self.survey, seed) + dipole_alm(dipole, lmax), window)
+        self.fine = healpy.alm2map(seen, FINE)
+
+    def change(self, case, channels):
+        """Return what a case adds to all maps, shape (maps, npix)."""
+        change = np.zeros_like(self.maps)
+        for c in channels:
+            site = self.survey.channels[c].site
+            pointing, away = site.pointing, np.deg2rad(site.pointing.line.boresight_angle_deg)
+            scale = (site.frequency_ghz / 94.0) ** 1.5 if case.common else 1.0
+
+            def signal(chunk, away=away, scale=scale):
+                n, south, east = axes(chunk.theta, chunk.phi)
+                x, y = (np.cos(a) * south + np.sin(a) * east for a in (chunk.psi, chunk.psi + 0.5 * np.pi))
+                return scale * case.act(Seen(chunk.time_s, chunk.psi, x, y, n, away, self.fine))
+
+            for k in range(2):
+                grid = MapGrid(self.survey.nside, site.frame, self.run.map.span(k))
+                stream = tod.with_signal(signal)(tod.samples(pointing.model, pointing.line, grid))
+                change[2 * c + k] = tod.bin_samples(stream, self.survey.nside)[0]
+        if case.act is cosmic_rays:
+            (c,), draw = channels, np.random.default_rng([2032, self.seed])
+            precision = self.context.analysis.model.parts[2 * c + 1].precision
+            change[2 * c + 1] = draw.normal(size=precision.size) / np.sqrt(precision)
+        return change
+
+
+def main(span="0:24"):
+    """Scale each case to an S/N of the data vector, and print what is said of it."""
+    for number in range(24)[slice(*map(int, span.split(":")))]:
+        case, wanted, sky = CASES[number % 12], (10.0, 20.0)[number // 12], Sky(95_000 + number)
+        channel = None if case.common else int(np.random.default_rng([2032, number]).integers(2))
+        change = sky.change(case, range(2) if case.common else [channel])
+        analysis, null, factor = sky.context.analysis, sky.context.null, 1.0
+        before = analysis.data_vector(list(sky.maps))
+        for _ in range(4):
+            factor *= wanted / null.expected_snr(analysis.data_vector(list(sky.maps + factor * change)) - before)
+        data = ObservedMaps(sky.context, list(sky.maps + factor * change), ask)
+        found, reduction = unlisted.structures_of(data, sky.scene, sky.search)
+        owner = None if case.common else sky.run.channels[channel].name
+        # Of several truths that is scored with which most words of the first description are right.
+        said = [] if not found else [found[0].stage, found[0].frame, found[0].kind, found[0].split]
+
+        def agree(truth, said=said):
+            stage, frame, kinds, splits = truth
+            if not said:
+                return 0
+            right = (kinds is ANY or said[2].startswith(kinds), splits is ANY or said[3] in splits)
+            return 100 * all((said[0] == stage, said[1] == frame, *right)) + (said[0] == stage) + sum(right)
+
+        stage, frame, kinds, splits = max(case.right, key=agree)
+        split = None if splits is ANY else splits[0]
+        row("further", case.act.__name__, (stage, frame, kinds), owner, split, wanted, "", found, reduction)
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    main(*sys.argv[1:])
