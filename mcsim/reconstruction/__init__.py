@@ -13,19 +13,9 @@ from mcsim.reconstruction.forms import (
     RotatedSky,
     SignalPower,
     SkyPower,
-)
+)  # fmt: skip
 
 __all__ = [
-    "AddedPattern",
-    "AddedToSamples",
-    "BeamOrder",
-    "BoostedSky",
-    "Elsewhere",
-    "GainOfOne",
-    "GainOverTime",
-    "GainPattern",
-    "NoisePattern",
-    "RotatedSky",
-    "SignalPower",
-    "SkyPower",
-]
+    "AddedPattern", "AddedToSamples", "BeamOrder", "BoostedSky", "Elsewhere", "GainOfOne", "GainOverTime",
+    "GainPattern", "NoisePattern", "RotatedSky", "SignalPower", "SkyPower",
+]  # fmt: skip

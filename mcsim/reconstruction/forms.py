@@ -270,7 +270,7 @@ class Elsewhere(Form):
     ``factor`` times sky and dipole there, or the sky alone, up to l = ``top``: a lobe has as many orders.
     """
 
-    direction: ClassVar[tuple[float, float, float]]  #: unit vector, along x and y of the beam and outward
+    towards: ClassVar[tuple[float, float, float]]  #: unit vector, along x and y of the beam and outward
     factor: ClassVar[float]
     on_dipole: ClassVar[bool] = True
     top: ClassVar[int]
@@ -278,11 +278,10 @@ class Elsewhere(Form):
     def beam(self, beam: Beam, site: Site) -> Beam:
         """Add Y*_lm of the direction, as of a beam that points there."""
         top = min(self.top, beam.lmax)
-        angles = np.array(healpy.vec2dir(np.array(self.direction)))[None]
+        angles = np.array(healpy.vec2dir(np.array(self.towards)))[None]
         one = np.ones((1, 1))
         lobe = ducc0.sht.adjoint_synthesis_general(map=one, loc=angles, spin=0, lmax=top, epsilon=1e-10, nthreads=1)[0]
-        ell = np.arange(top + 1)
-        kernel = site.beam.blm[0, : top + 1].real * np.sqrt(4.0 * np.pi / (2.0 * ell + 1.0))
+        kernel = site.beam.blm[0, : top + 1].real * np.sqrt(4.0 * np.pi / (2.0 * np.arange(top + 1) + 1.0))
         kernel[: 0 if self.on_dipole else 2] = 0.0
         blm = np.zeros((max(beam.mmax, top) + 1, beam.lmax + 1), dtype=np.complex128)
         blm[: beam.mmax + 1] = beam.blm

@@ -99,6 +99,7 @@ def plugin(name: str, structure: Structure, theta: Vector, scene: Scene) -> Plug
 def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[str, Any]] | None:
     """Return the name of the form, and its class variables."""
     pattern, alike = _numbers(structure, theta), structure.split == ALIKE
+    acting: dict[str, Any]
     splits = {} if alike else {"splits": _factors(structure.split, scene.splits)}
     timed: dict[str, Any] = {"coefficients": pattern, **splits}
     if structure.frame in ("spacecraft", "time", "Sun"):
@@ -116,12 +117,9 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
             return "GainOfOne", {"on_sky": structure.acts_on == "sky", **timed}
         case "elsewhere", _ if alike:
             channel = 0 if structure.channel is None else scene.channels.index(structure.channel)
-            return "Elsewhere", {
-                "direction": tuple(map(float, scene.elsewhere[channel][structure.kind])),
-                "factor": float(theta[0]),
-                "on_dipole": "dipole" in structure.acts_on,
-                "top": ELSEWHERE,
-            }
+            towards = tuple(map(float, scene.elsewhere[channel][structure.kind]))
+            acting = {"towards": towards, "on_dipole": "dipole" in structure.acts_on}
+            return "Elsewhere", {"factor": float(theta[0]), "top": ELSEWHERE, **acting}
         case "gain", _ if not alike:
             return "GainOverTime", {"coefficients": (float(theta[0]) / CONSTANT,), **splits}
         case "gain", _:
@@ -134,12 +132,8 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
             edges = scene.edges(max(order, 1))
             return "BeamOrder", {"order": order, "edges": edges, "top": scene.lmax, "values": values}
         case "square" | "cube", _:
-            power = 2 if structure.stage == "square" else 3
-            return "SignalPower", {
-                "factor": float(theta[0]),
-                "power": power,
-                "on_dipole": "dipole" in structure.acts_on,
-            }
+            acting = {"power": 2 if structure.stage == "square" else 3, "on_dipole": "dipole" in structure.acts_on}
+            return "SignalPower", {"factor": float(theta[0]), **acting}
         case "rotation", _:
             return "RotatedSky", {"rotation": tuple(map(float, theta))}
         case "noise", _ if structure.kind != "spectrum" and alike:

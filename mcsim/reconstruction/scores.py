@@ -29,11 +29,8 @@ MODULATION = 2  #: highest degree of patterns that multiply the sky itself
 ELONGATION = 6  #: highest harmonic of the spin phase in what depends on the distance from the Sun
 HARMONICS = 4  #: highest harmonic of spin phase, year and orientation that is said by itself
 BINS = 4  #: ranges of degrees of a profile in l, equal in log l
-ACTED_ON = ("sky and dipole", "sky", "dipole")
-"""What a wave multiplies, if it is not added."""
-
-ELSEWHERE = 32
-"""Highest degree of a signal from elsewhere: a lobe has as many orders, and what is finer averages out."""
+ACTED_ON = ("sky and dipole", "sky", "dipole")  #: what a wave multiplies, if it is not added
+ELSEWHERE = 32  #: highest degree of a signal from elsewhere: a lobe has as many orders, and what is finer averages out
 
 Key = tuple[str | int, ...]
 
@@ -48,7 +45,7 @@ class View:
     w: NDArray[np.complex128]  #: orientation moments, shape (smax, npix)
     #: means over the samples of every pixel of what follows time or orientation: cosine and sine, and so on, by name
     waves: Mapping[str, tuple[Map, ...]]
-    #: means over the samples of every coarse pixel of a map that they see elsewhere, shape (pixels, pixels), by name
+    #: means over the samples of every coarse pixel of what they see elsewhere, shape (pixels, pixels), by name
     elsewhere: Mapping[str, csr_matrix]
     precision: Map  #: one over the variance of the noise
     response: Cl  #: B_l w_l of the channel, shape (lmax + 1,)

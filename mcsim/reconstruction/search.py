@@ -151,7 +151,7 @@ class Search:
             chosen = [one.structure for one in found]
             if sky is not None:
                 sky.keep(members[best], amplitudes[best])
-            rest = self.regressed(chosen, scores) if sky is None else sky.left(chosen)
+            rest = rest - amplitudes[best] @ responses[best] if sky is None else sky.left(chosen)
         return found
 
     def evidences(self, scores: Vector) -> Vector:
@@ -169,6 +169,8 @@ class Search:
         """Return evidences from the falls of chi^2 of members, shape (members, n); not measured: NaN, and -inf.
 
         What a function of time is beyond its constant has a size of its own: most of a pulse is its mean, a monopole.
+        That the covariance is estimated makes a fall beside a larger one, T, larger by 1 + T/N on average (Rao, Linear
+        Statistical Inference, 8c.4).
         """
         place, found = {k: row for row, k in enumerate(members)}, np.full(falls.shape, -np.inf)
         for row, k in enumerate(members):
@@ -177,8 +179,9 @@ class Search:
                 continue
             found[row] = evidence(falls[row], structure.size) - _rarity(structure)
             if constant is not None:
-                more = evidence(falls[row] - falls[constant], structure.size - 1) - np.log(RARE)
-                found[row] = evidence(falls[constant], 1) + more - _rarity(structure)
+                more = (falls[row] - falls[constant]) / (1.0 + np.maximum(falls[constant], 0.0) / len(self.simulations))
+                found[row] = evidence(falls[constant], 1) + evidence(more, structure.size - 1) - np.log(RARE)
+                found[row] -= _rarity(structure)
         return found
 
     def finalists(self, values: Vector) -> list[int]:
@@ -234,15 +237,6 @@ class Search:
         """Return the unbiased fall of chi^2 of every structure by itself."""
         pairs = zip(self.grammar, self.nulls, strict=True)
         return np.array([0.0 if n is None else n.hartlap_factor * n.chi2(w.of(scores)) for w, n in pairs])
-
-    def regressed(self, chosen: Sequence[int], scores: Vector) -> Vector:
-        """Return what the regression of all scores on those of chosen structures leaves."""
-        rows = self._rows(chosen, self.simulations)
-        null = SimulatedGaussian.from_simulations(rows, floor=SMALL)
-        white = null.whitening.T
-        slopes = (rows - null.mean) @ white @ white.T
-        slopes = slopes.T @ (self.simulations - self.simulations.mean(axis=0)) / null.dof
-        return np.asarray(scores - (self._rows(chosen, scores) - null.mean) @ slopes)
 
     def fit(self, chosen: Sequence[Structure], scores: Vector) -> list[tuple[Vector, Matrix]]:
         """Return the coordinates of structures, fitted together, and the covariance of each.

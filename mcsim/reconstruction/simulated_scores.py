@@ -44,9 +44,7 @@ WAVES: dict[str, dict[str, Any]] = {
 }
 """What follows time, of two components each but for the trend, by name: class variables of a form."""
 
-LAGS = {"-1/8": -0.125, "+1/8": 0.125, "-1/4": -0.25, "+1/4": 0.25, "1/2": 0.5}
-"""Turns of the spin before (-) or after a sample where its signal may be from besides, by what they are called."""
-
+LAGS = {"-1/8": -0.125, "+1/8": 0.125, "-1/4": -0.25, "+1/4": 0.25, "1/2": 0.5}  #: turns of the spin after a sample
 SAMPLES = 200_000  #: of a map, about, by which directions elsewhere are known
 
 CODE = (

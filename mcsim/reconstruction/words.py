@@ -12,39 +12,28 @@ from mcsim.systematics.base import scan_direction
 
 _DERIVATIVES = {2: "second derivative", 3: "third derivative", 4: "fourth derivative"}
 
-_LIKE: tuple[tuple[tuple[str, str, str], str], ...] = (
-    (("beam", "scan", "order 0 at low l"), "beam_sidelobe"),
-    (("beam", "scan", "order 0"), "beam_width"),
-    (("beam", "scan", "order 1"), "pointing_offset"),
-    (("beam", "scan", "order 2"), "beam_ellipticity"),
-    (("beam", "scan", "order 3"), "beam_coma"),
-    (("gain", "time", "year"), "gain_drift"),
-    (("gain", "time", "spin"), "gain_spin"),
-    (("gain", "", "constant"), "calibration"),
-    (("added", "time", "spin"), "spin_synchronous_offset"),
-    (("added", "spacecraft", ""), "sidelobe_pickup"),
-    (("added", "Sun", "dipole"), "orbital_dipole"),
-    (("added", "sky", "dipole"), "dipole_residual"),
-    (("added", "sky", "monopole"), "monopole_residual"),
-    (("added", "sky", "latitude galactic"), "foreground_residual"),
-    (("square", "", ""), "nonlinearity"),
-    (("cube", "", ""), "nonlinearity"),
-    (("noise", "", "latitude"), "noise_anisotropy"),
-    (("noise", "", "level"), "noise_level"),
-    (("power", "", "monopole"), "monopole_residual"),
-    (("power", "", "dipole"), "dipole_residual"),
-    (("power", "", "power"), "point_sources"),
-    (("modulation", "sky", "degree 1 as a boost"), "boost"),
-    (("modulation", "sky", "degree 1"), "dipole_modulation"),
-    (("modulation", "sky", "degree 2"), "quadrupole_modulation"),
-)
-"""Stage, frame and how the kind starts of structures that an effect of the library makes; the first that fits."""
+_LIKE: tuple[tuple[str, str, str, str], ...] = (
+    ("beam", "scan", "order 0 at low l", "beam_sidelobe"), ("beam", "scan", "order 0", "beam_width"),
+    ("beam", "scan", "order 1", "pointing_offset"), ("beam", "scan", "order 2", "beam_ellipticity"),
+    ("beam", "scan", "order 3", "beam_coma"), ("gain", "time", "year", "gain_drift"),
+    ("gain", "time", "spin", "gain_spin"), ("gain", "", "constant", "calibration"),
+    ("added", "time", "spin", "spin_synchronous_offset"), ("added", "spacecraft", "", "sidelobe_pickup"),
+    ("added", "Sun", "dipole", "orbital_dipole"), ("added", "sky", "dipole", "dipole_residual"),
+    ("added", "sky", "monopole", "monopole_residual"), ("added", "sky", "latitude galactic", "foreground_residual"),
+    ("square", "", "", "nonlinearity"), ("cube", "", "", "nonlinearity"),
+    ("noise", "", "latitude", "noise_anisotropy"), ("noise", "", "level", "noise_level"),
+    ("power", "", "monopole", "monopole_residual"), ("power", "", "dipole", "dipole_residual"),
+    ("power", "", "power", "point_sources"), ("modulation", "sky", "degree 1 as a boost", "boost"),
+    ("modulation", "sky", "degree 1", "dipole_modulation"),
+    ("modulation", "sky", "degree 2", "quadrupole_modulation"),
+)  # fmt: skip
+"""Stage, frame and how the kind starts of structures, and the effect of the library that makes such; the first fits."""
 
 
 def cause(structure: Structure, library: Library) -> str:
     """Return a known cause of such structures with its reference, or nothing."""
     name = "foreground_residual" if structure.index is not None else ""
-    for (stage, frame, kind), effect in _LIKE if not name else ():
+    for stage, frame, kind, effect in _LIKE if not name else ():
         if structure.stage == stage and structure.frame == frame and structure.kind.startswith(kind):
             name = effect
             break
@@ -138,17 +127,11 @@ def _wave(kind: str) -> str:
     wave, _, harmonic = kind.partition(" ")
     if wave == "trend":
         return "time, growing steadily"
-    phase = "year" if wave == "year" else "spin phase"
-    return phase + _HARMONIC[harmonic].format(wave)
+    often = {ANY: ", in any way", "1": ""}.get(harmonic, f", {_TIMES.get(harmonic)} a {wave}")
+    return ("year" if wave == "year" else "spin phase") + often
 
 
-_HARMONIC = {
-    "1": "",
-    "2": ", twice a {}",
-    "3": ", three times a {}",
-    "4": ", four times a {}",
-    ANY: ", in any way",
-}
+_TIMES = {"2": "twice", "3": "three times", "4": "four times"}
 
 SUN = {
     "dipole": "the angles of the line of sight to the directions of the Sun and of the Earth's motion, as a dipole",
